@@ -1,0 +1,67 @@
+# Every verb makes .venv and installs what it needs first. Needs Python 3.11 or later, with its venv module, and make.
+#   make test PYTHON=python3.12        another Python
+#   make setup TORCH_BACKEND=auto      the CUDA build of torch instead of the CPU one
+PYTHON        ?= python3
+VENV          ?= .venv
+TORCH_BACKEND ?=
+JOBS          ?= logical
+
+PY    := $(VENV)/bin/python
+PIP   := $(PY) -m pip install -qq --disable-pip-version-check
+STAMP := $(VENV)/.installed
+
+# uv does not read pip's settings, so they are handed over: a directory of wheels may hold the CPU build of torch, and without
+# it the default index answers with the CUDA one (19 packages more). uv refuses a directory that is missing, pip ignores it.
+pip_setting = $(shell $(PY) -m pip config list 2>/dev/null | sed -n "s/^[^=]*\.$(1)='\(.*\)'$$/\1/p" | sed 's/\\n/ /g')
+find_links  = $(sort $(foreach p,$(call pip_setting,find-links),$(if $(findstring ://,$p),$p,$(wildcard $p))))
+index_url   = $(lastword $(call pip_setting,index-url))
+uv_flags    = $(addprefix --default-index ,$(index_url)) \
+              $(if $(TORCH_BACKEND),--torch-backend=$(TORCH_BACKEND),$(or $(addprefix --find-links ,$(find_links)),--torch-backend=cpu))
+
+.PHONY: help setup demo check test bench clean
+
+help:
+	@echo "make setup   make $(VENV) and install everything into it"
+	@echo "make demo    a short pre-training from scratch, about three minutes of self-play"
+	@echo "make check   ruff and mypy"
+	@echo "make test    check, then every test"
+	@echo "make bench   the throughput benchmarks, against panda-gym"
+	@echo "make clean   remove $(VENV) and the caches; runs/ stays"
+
+setup: $(STAMP)
+
+$(VENV)/bin/uv:
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' \
+	  || { echo "Python 3.11 or later is needed, got $$($(PYTHON) --version); try PYTHON=python3.11"; exit 1; }
+	@echo "Installing into $(VENV) ..."
+	@$(PYTHON) -m venv $(VENV)
+	@$(PIP) -c constraints.txt uv
+
+# uv takes seconds where pip takes a minute; pip is there for machines whose indexes only it knows.
+$(STAMP): pyproject.toml constraints.txt | $(VENV)/bin/uv
+	@$(VENV)/bin/uv pip install -q --python $(PY) $(uv_flags) -c constraints.txt -e '.[dev]' \
+	  || { echo "uv could not install it; trying pip, which takes longer ..."; $(PIP) -c constraints.txt -e '.[dev]'; }
+	@touch $@
+
+demo: $(STAMP)
+	$(VENV)/bin/tandem demo
+
+check: $(STAMP)
+	$(PY) -m ruff check
+	$(PY) -m ruff format --check
+	$(PY) -m mypy
+
+test: check
+	$(PY) -m pytest -n $(JOBS) --maxprocesses 8 --dist worksteal
+
+$(VENV)/.bench-installed: $(STAMP)
+	@$(PIP) -c constraints.txt -e '.[bench]'
+	@touch $@
+
+bench: $(VENV)/.bench-installed
+	$(PY) benchmarks/env_throughput.py
+	$(PY) benchmarks/selfplay_throughput.py
+
+clean:
+	rm -rf $(VENV) .mypy_cache .pytest_cache .ruff_cache build dist *.egg-info
+	find service tests benchmarks -name __pycache__ -prune -exec rm -rf {} +

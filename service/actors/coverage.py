@@ -1,0 +1,77 @@
+"""How much of the workspace random compositions of primitives reach: the paper's per-skill figure, with a number.
+
+A skill is one gate weight drawn at random and held for a whole episode (Peng et al. 2019; paper, section 5.1).
+"""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from service.config import WorkspaceConfig, WorldConfig
+from service.envs.batch import WorldBatch
+from service.envs.observations import ACTION_SIZE
+
+FloatArray = NDArray[np.float32]
+StateArray = NDArray[np.float64]
+
+
+class Composable(Protocol):
+    """Primitives that compose under given weights."""
+
+    num_primitives: int
+
+    def compose(self, positions: FloatArray, weights: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """(N, 11) positions and (N, K) weights to the composition's mean and std, (N, 4) each."""
+
+
+class RandomPolicy:
+    """One primitive that acts at random, the reference for coverage."""
+
+    num_primitives = 1
+
+    def compose(self, positions: FloatArray, weights: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Zero mean and unit std."""
+        shape = (positions.shape[0], ACTION_SIZE)
+        return np.zeros(shape, dtype=np.float32), np.ones(shape, dtype=np.float32)
+
+
+def skill_trajectories(
+    primitives: Composable, config: WorldConfig, *, num_skills: int, num_steps: int, seed: int, num_threads: int = 0
+) -> StateArray:
+    """Object positions under random compositions.
+
+    Weights are uniform in (0, 1]; actions are sampled from the composition.
+
+    Returns:
+        (num_skills, num_steps + 1, 3) metres, each from a fresh reset.
+    """
+    rng = np.random.default_rng(seed)
+    weights = (1.0 - rng.random((num_skills, primitives.num_primitives))).astype(np.float32)
+    trajectories = np.empty((num_skills, num_steps + 1, 3))
+    with WorldBatch(config, num_skills, num_threads=num_threads) as worlds:
+        worlds.reset(rng)
+        trajectories[:, 0] = worlds.object_position
+        for step in range(num_steps):
+            mean, std = primitives.compose(worlds.positions(), weights)
+            worlds.step(mean + std * rng.standard_normal(mean.shape, dtype=np.float32))
+            trajectories[:, step + 1] = worlds.object_position
+    return trajectories
+
+
+def visited_share(trajectories: StateArray, workspace: WorkspaceConfig, *, cell_size_m: float = 0.05) -> float:
+    """Share of the workspace's table cells (seen from above) that any trajectory moved the object into.
+
+    Where an object merely started does not count: only cells other than its first one.
+    """
+    low = np.array(
+        [workspace.center_x_m - workspace.length_x_m / 2, workspace.center_y_m - workspace.length_y_m / 2]
+    )
+    shape = np.array([round(workspace.length_x_m / cell_size_m), round(workspace.length_y_m / cell_size_m)])
+    cells = np.floor((trajectories[:, :, :2] - low) / cell_size_m).astype(np.int64)
+    inside = ((cells >= 0) & (cells < shape)).all(axis=2)
+    moved = (cells != cells[:, :1]).any(axis=2)
+    visited = cells[inside & moved]
+    return len(np.unique(visited, axis=0)) / int(shape.prod())

@@ -1,0 +1,110 @@
+"""Bob on goals nobody proposed: fresh resets, random goals, no exploration noise."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from typing import Literal, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from service.config import WorldConfig
+from service.envs.batch import WorldBatch, sample_in_volume, sample_on_table
+from service.envs.observations import ACTION_SIZE
+
+FloatArray = NDArray[np.float32]
+StateArray = NDArray[np.float64]
+GoalKind = Literal["table", "air", "mixed"]
+
+MIXED_AIR_SHARE = 0.7
+"""Share of mixed goals drawn anywhere in the workspace's volume; the rest lie on the table (paper: p = 0.7)."""
+
+
+class Deterministic(Protocol):
+    """A policy that acts without noise."""
+
+    def act_deterministic(self, observation: FloatArray) -> FloatArray:
+        """(N, 14) Bob's input to actions (N, 4)."""
+
+
+class Idle:
+    """Does nothing: the floor that random goals next to the object give to any policy."""
+
+    def act_deterministic(self, observation: FloatArray) -> FloatArray:
+        """Zero actions (N, 4)."""
+        return np.zeros((observation.shape[0], ACTION_SIZE), dtype=np.float32)
+
+
+@dataclass(frozen=True, slots=True)
+class Evaluation:
+    """Success rates over ``num_episodes`` goals of one kind."""
+
+    goals: str
+    num_episodes: int
+    num_steps: int
+    success_last: float
+    """Within the success distance at the last step."""
+    success_last_low: float
+    """Lower end of the 95 % Wilson interval of ``success_last``."""
+    success_last_high: float
+    """Upper end."""
+    success_ever: float
+    """Within the success distance at any step."""
+    mean_distance_m: float
+    """Distance to the goal at the last step."""
+
+    def as_dict(self) -> dict[str, float | int | str]:
+        """For JSON."""
+        return asdict(self)
+
+
+def sample_goals(kind: GoalKind, rng: np.random.Generator, num: int, config: WorldConfig, success_distance_m: float) -> StateArray:
+    """(num, 3) goals, metres: on the table; in the air (out of reach of an object that rests on the table); or mixed as the
+    paper's downstream tasks: anywhere in the volume with probability 0.7, else on the table."""  # fmt: skip
+    table = sample_on_table(rng, num, config.workspace, config.object_size_m)
+    if kind == "table":
+        return table
+    if kind == "air":
+        lowest = config.object_size_m / 2 + success_distance_m
+        return sample_in_volume(rng, num, config.workspace, config.object_size_m, lowest_m=lowest)
+    volume = sample_in_volume(rng, num, config.workspace, config.object_size_m)
+    return np.where(rng.random((num, 1)) < MIXED_AIR_SHARE, volume, table)
+
+
+def evaluate(
+    policy: Deterministic,
+    config: WorldConfig,
+    kind: GoalKind,
+    *,
+    num_episodes: int,
+    num_steps: int,
+    success_distance_m: float,
+    seed: int,
+    num_threads: int = 0,
+) -> Evaluation:
+    """Play ``num_episodes`` random goals from fresh resets; nothing ends an episode early."""
+    rng = np.random.default_rng(seed)
+    with WorldBatch(config, num_episodes, num_threads=num_threads) as worlds:
+        worlds.reset(rng)
+        goal = sample_goals(kind, rng, num_episodes, config, success_distance_m)
+        goal32 = goal.astype(np.float32)
+        ever = np.zeros(num_episodes, dtype=bool)
+        distance = np.zeros(num_episodes)
+        for _ in range(num_steps):
+            worlds.step(policy.act_deterministic(np.concatenate([worlds.positions(), goal32], axis=1)))
+            distance = np.linalg.norm(worlds.object_position - goal, axis=1)
+            ever |= distance <= success_distance_m
+    last = distance <= success_distance_m
+    low, high = wilson_interval(int(last.sum()), num_episodes)
+    return Evaluation(
+        goals=kind, num_episodes=num_episodes, num_steps=num_steps, success_last=float(last.mean()), success_last_low=low,
+        success_last_high=high, success_ever=float(ever.mean()), mean_distance_m=float(distance.mean()),
+    )  # fmt: skip
+
+
+def wilson_interval(successes: int, num: int, z: float = 1.96) -> tuple[float, float]:
+    """Wilson score interval of a proportion (Wilson 1927); z = 1.96 gives 95 %."""
+    share = successes / num
+    centre = (share + z * z / (2 * num)) / (1 + z * z / num)
+    half = z * np.sqrt(share * (1 - share) / num + z * z / (4 * num * num)) / (1 + z * z / num)
+    return float(max(centre - half, 0.0)), float(min(centre + half, 1.0))

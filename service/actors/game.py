@@ -1,0 +1,244 @@
+"""Asymmetric self-play: one round of Alice, then Bob, on a batch of worlds.
+
+Alice acts from s0 for a fixed number of steps; where the object then is becomes the goal. The worlds go back to s0 and Bob acts
+until he is there or out of time. The next round of the game starts where Alice ended, so games reach grasped objects by
+themselves; an invalid goal ends the game (OpenAI 2021; ``algorithms.md`` 1).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from service.actors.rollout import Demonstrations, GoalRecords, Rollout, Turns
+from service.config import Config
+from service.envs.batch import WorldBatch
+from service.envs.observations import ACTION_SIZE, BOB_SIZE, BOB_VALUE_SIZE, FULL_SIZE, POSITIONS_SIZE
+from service.generator.generator import GoalChoice
+from service.generator.opponents import CURRENT, RoundPlan
+from service.generator.validity import Verdict, judge
+
+FloatArray = NDArray[np.float32]
+StateArray = NDArray[np.float64]
+BoolArray = NDArray[np.bool_]
+IntArray = NDArray[np.int64]
+VerdictArray = NDArray[np.int8]
+
+
+class Acting(Protocol):
+    """A policy that acts: an evaluator of ``policies.evaluator``."""
+
+    def act(self, observation: FloatArray, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
+        """(N, O) observations to sampled actions (N, A) and log-probabilities (N,)."""
+
+
+ChooseGoals = Callable[[StateArray, StateArray, StateArray, VerdictArray], GoalChoice]
+"""(start_state, start_position, proposal, verdict) of a round to the goals Bob plays; the task generator's."""
+
+
+@dataclass(frozen=True, slots=True)
+class Players:
+    """Who plays a round: the current policies of one version, and past ones by index."""
+
+    version: int
+    alice: Acting
+    bob: Acting
+    past_alice: Sequence[Acting] = ()
+    past_bob: Sequence[Acting] = ()
+
+
+class SelfPlay:
+    """Plays rounds on N worlds and hands out rollouts.
+
+    Everything that later rounds depend on is in ``state``: the worlds, how far each game is, and the random generator.
+
+    Args:
+        config: the run.
+        rng: drives resets and both players' sampling.
+        actor, incarnation: first parts of every rollout's id.
+        num_threads: native threads for physics; 0 for one per core.
+    """
+
+    def __init__(
+        self, config: Config, rng: np.random.Generator, *, actor: int = 0, incarnation: int = 0, num_threads: int = 0
+    ) -> None:
+        self.config = config
+        self.worlds = WorldBatch(config.world, config.game.num_worlds, num_threads=num_threads)
+        self._rng = rng
+        self._actor, self._incarnation, self._sequence = actor, incarnation, 0
+        self._round_index: IntArray = np.zeros(config.game.num_worlds, dtype=np.int64)
+        self.worlds.reset(rng)
+
+    def close(self) -> None:
+        """Stop the worlds' threads."""
+        self.worlds.close()
+
+    def play_round(self, players: Players, plan: RoundPlan, choose_goals: ChooseGoals) -> Rollout:
+        """Play one round in every world.
+
+        Args:
+            players: the policies.
+            plan: which worlds use a past Alice or Bob.
+            choose_goals: asked once, between the two turns.
+        """
+        game, worlds = self.config.game, self.worlds
+        start_state, start_position = worlds.states.copy(), worlds.object_position.copy()
+        alice, contacts, broken = self._play_alice(players, plan)
+        end_state, proposal = worlds.states.copy(), worlds.object_position.copy()
+        verdict = judge(start_position, proposal, self.config.world.workspace, game.success_distance_m)
+        verdict[broken] = Verdict.FALLEN
+        choice = choose_goals(start_state, start_position, proposal, verdict)
+
+        worlds.restore(choice.start_state)
+        bob, solved, num_bob_steps = self._play_bob(players, plan, choice)
+        self._reward_alice(alice, verdict, choice, solved)
+        records = GoalRecords(
+            start_state=choice.start_state, start_position=choice.start_position, goal=choice.goal, proposal=proposal,
+            verdict=verdict, replayed=choice.replayed, played=choice.played, solved=solved, num_bob_steps=num_bob_steps,
+            alice_past=plan.alice_past, bob_past=plan.bob_past, round_index=self._round_index.copy(),
+        )  # fmt: skip
+        self._continue_games(end_state, verdict)
+        rollout = Rollout(
+            actor=self._actor, incarnation=self._incarnation, sequence=self._sequence, policy_version=players.version,
+            alice=alice, bob=bob, demonstrations=_demonstrations(alice, records), records=records,
+            num_env_steps=int(alice.active.sum() + bob.active.sum()), metrics=_contact_metrics(contacts),
+        )  # fmt: skip
+        self._sequence += 1
+        return rollout
+
+    def _play_alice(self, players: Players, plan: RoundPlan) -> tuple[Turns, BoolArray, BoolArray]:
+        """Her turns (rewards still zero), (N, 2) finger contacts during them, (N,) worlds whose physics broke."""
+        num_steps, worlds = self.config.game.alice_steps, self.worlds
+        turns = _empty_turns(num_steps, worlds.num_worlds, FULL_SIZE, FULL_SIZE, learn=~plan.alice_past)
+        everyone = np.arange(worlds.num_worlds)
+        contacts = np.zeros((worlds.num_worlds, 2), dtype=bool)
+        broken = np.zeros(worlds.num_worlds, dtype=bool)
+        for step in range(num_steps):
+            observation = worlds.full(step / num_steps)
+            action, log_prob = _act(players.alice, players.past_alice, plan.alice_opponent, observation, everyone, self._rng)
+            turns.observation[step], turns.action[step], turns.log_prob[step] = observation, action, log_prob
+            broken |= worlds.step(action)
+            contacts |= worlds.contacts()
+        turns.value_observation[:] = turns.observation
+        turns.final_value_observation[:] = worlds.full(1.0)
+        turns.active[:] = True
+        turns.terminated[-1] = True
+        turns.learn[broken] = False
+        return turns, contacts, broken
+
+    def _play_bob(self, players: Players, plan: RoundPlan, choice: GoalChoice) -> tuple[Turns, BoolArray, IntArray]:
+        """His turns, (N,) solved, (N,) steps played."""
+        game, worlds = self.config.game, self.worlds
+        num = worlds.num_worlds
+        turns = _empty_turns(game.bob_steps, num, BOB_SIZE, BOB_VALUE_SIZE, learn=choice.played & ~plan.bob_past)
+        goal = choice.goal.astype(np.float32)
+        solved = np.zeros(num, dtype=bool)
+        playing = np.flatnonzero(choice.played)
+        for step in range(game.bob_steps):
+            if not playing.size:
+                break
+            observation = np.concatenate([worlds.positions()[playing], goal[playing]], axis=1)
+            action, log_prob = _act(players.bob, players.past_bob, plan.bob_opponent, observation, playing, self._rng)
+            turns.observation[step, playing], turns.action[step, playing] = observation, action
+            turns.value_observation[step, playing] = worlds.bob_value(choice.goal)[playing]
+            turns.log_prob[step, playing], turns.active[step, playing] = log_prob, True
+            broken = worlds.step(action, playing)
+            reached = np.linalg.norm(worlds.object_position - choice.goal, axis=1) <= game.success_distance_m
+            newly = playing[reached[playing]]
+            solved[newly] = True
+            turns.reward[step, newly] = game.bob_success_reward
+            turns.terminated[step] = broken
+            turns.terminated[step, newly] = True
+            playing = playing[~(reached | broken)[playing]]
+        turns.final_value_observation[:] = worlds.bob_value(choice.goal)
+        return turns, solved, turns.active.sum(axis=0)
+
+    def _reward_alice(self, alice: Turns, verdict: VerdictArray, choice: GoalChoice, solved: BoolArray) -> None:
+        game = self.config.game
+        valid = verdict == Verdict.VALID
+        tried = valid & choice.played & ~choice.replayed
+        alice.reward[-1, verdict == Verdict.OUTSIDE] = game.alice_outside_reward
+        alice.reward[-1, valid] = game.alice_valid_reward
+        alice.reward[-1, tried & ~solved] += game.alice_difficult_reward
+        # What a valid goal was worth is unknown where Bob played another one instead.
+        alice.learn[valid & ~tried] = False
+
+    def _continue_games(self, end_state: StateArray, verdict: VerdictArray) -> None:
+        self.worlds.restore(end_state)
+        self._round_index += 1
+        over = (verdict != Verdict.VALID) | (self._round_index >= self.config.game.num_goals)
+        self.worlds.reset(self._rng, over)
+        self._round_index[over] = 0
+
+    def state(self) -> dict[str, NDArray[np.generic]]:
+        """What later rounds depend on, except the random generator, which its owner saves."""
+        return {
+            "worlds": self.worlds.states.copy(),
+            "round_index": self._round_index.copy(),
+            "sequence": np.array(self._sequence),
+            "num_broken": np.array(self.worlds.num_broken),
+        }
+
+    def load_state(self, state: dict[str, NDArray[np.generic]]) -> None:
+        """Continue exactly where ``state`` was taken."""
+        self.worlds.restore(np.asarray(state["worlds"], dtype=np.float64))
+        self._round_index = np.asarray(state["round_index"], dtype=np.int64).copy()
+        self._sequence = int(state["sequence"])
+        self.worlds.num_broken = int(state["num_broken"])
+
+
+def _act(
+    current: Acting,
+    past: Sequence[Acting],
+    opponent: IntArray,
+    observation: FloatArray,
+    worlds: IntArray,
+    rng: np.random.Generator,
+) -> tuple[FloatArray, FloatArray]:
+    """Actions (M, A) and log-probabilities (M,) of M ``worlds``, each from its own policy."""
+    opponents = opponent[worlds]
+    if (opponents == CURRENT).all():
+        return current.act(observation, rng)
+    action = np.empty((worlds.size, ACTION_SIZE), dtype=np.float32)
+    log_prob = np.empty(worlds.size, dtype=np.float32)
+    for index in np.unique(opponents):
+        rows = opponents == index
+        policy = current if index == CURRENT else past[index]
+        action[rows], log_prob[rows] = policy.act(observation[rows], rng)
+    return action, log_prob
+
+
+def _empty_turns(num_steps: int, num: int, observation_size: int, value_size: int, *, learn: BoolArray) -> Turns:
+    return Turns(
+        observation=np.zeros((num_steps, num, observation_size), dtype=np.float32),
+        value_observation=np.zeros((num_steps, num, value_size), dtype=np.float32),
+        final_value_observation=np.zeros((num, value_size), dtype=np.float32),
+        action=np.zeros((num_steps, num, ACTION_SIZE), dtype=np.float32),
+        log_prob=np.zeros((num_steps, num), dtype=np.float32),
+        reward=np.zeros((num_steps, num), dtype=np.float32),
+        active=np.zeros((num_steps, num), dtype=bool),
+        terminated=np.zeros((num_steps, num), dtype=bool),
+        learn=learn.copy(),
+    )
+
+
+def _demonstrations(alice: Turns, records: GoalRecords) -> Demonstrations:
+    """Alice's turns for the goals the current Bob failed, seen through Bob's inputs."""
+    failed = records.played & ~records.replayed & ~records.solved & ~records.bob_past
+    positions = alice.observation[:, failed, :POSITIONS_SIZE]
+    goal = np.broadcast_to(records.goal[failed].astype(np.float32), (*positions.shape[:2], 3))
+    return Demonstrations(
+        observation=np.concatenate([positions, goal], axis=2).reshape(-1, BOB_SIZE),
+        action=alice.action[:, failed].reshape(-1, ACTION_SIZE),
+    )
+
+
+def _contact_metrics(contacts: BoolArray) -> dict[str, float]:
+    return {
+        "alice/contact_fraction": float(contacts.any(axis=1).mean()),
+        "alice/both_contact_fraction": float(contacts.all(axis=1).mean()),
+    }

@@ -1,0 +1,134 @@
+"""What an actor ships: one round of self-play on N worlds, as plain arrays.
+
+Shapes: T steps of a turn (time first), N worlds, D demonstration steps. Network inputs and outputs are float32, physics
+states float64.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+FloatArray = NDArray[np.float32]
+StateArray = NDArray[np.float64]
+BoolArray = NDArray[np.bool_]
+IntArray = NDArray[np.int64]
+
+
+@dataclass(frozen=True, slots=True)
+class Turns:
+    """One player's turns in a round.
+
+    A step counts only where ``active``; the rest is zero. A turn that ends without ``terminated`` ran out of time, and its
+    return is bootstrapped from ``final_value_observation``.
+    """
+
+    observation: FloatArray
+    """(T, N, O) policy input."""
+    value_observation: FloatArray
+    """(T, N, V) value-network input."""
+    final_value_observation: FloatArray
+    """(N, V) value-network input after each world's last active step."""
+    action: FloatArray
+    """(T, N, A) as sampled, before the world clips it to [-1, 1]."""
+    log_prob: FloatArray
+    """(T, N) of ``action`` under the acting policy."""
+    reward: FloatArray
+    """(T, N)."""
+    active: BoolArray
+    """(T, N) the step was played; true up to the turn's last step."""
+    terminated: BoolArray
+    """(T, N) the turn truly ended with this step: no bootstrap."""
+    learn: BoolArray
+    """(N,) played by the current policy version; a past opponent's turn is not learned from."""
+
+
+@dataclass(frozen=True, slots=True)
+class Demonstrations:
+    """Steps of Alice's turns whose valid goal Bob failed, relabelled for Bob."""
+
+    observation: FloatArray
+    """(D, O) Bob's own input: positions and Alice's goal."""
+    action: FloatArray
+    """(D, A) Alice's action."""
+
+
+@dataclass(frozen=True, slots=True)
+class GoalRecords:
+    """What became of each world's goal in this round; all arrays have N rows."""
+
+    start_state: StateArray
+    """(N, S) full physics state both players started from."""
+    start_position: StateArray
+    """(N, 3) object position there, metres."""
+    goal: StateArray
+    """(N, 3) the goal Bob played, metres: Alice's proposal, or a replayed goal where ``replayed``."""
+    proposal: StateArray
+    """(N, 3) object position at the end of Alice's turn, metres."""
+    verdict: NDArray[np.int8]
+    """(N,) ``generator.validity.Verdict`` of Alice's proposal."""
+    replayed: BoolArray
+    """(N,) Bob played a goal from the replay buffer (``start_state`` is then that goal's own)."""
+    played: BoolArray
+    """(N,) Bob had a turn."""
+    solved: BoolArray
+    """(N,) Bob came within the success distance."""
+    num_bob_steps: IntArray
+    """(N,)."""
+    alice_past: BoolArray
+    """(N,) a past Alice proposed."""
+    bob_past: BoolArray
+    """(N,) a past Bob played."""
+    round_index: IntArray
+    """(N,) 0 for the first round after a reset."""
+
+
+@dataclass(frozen=True, slots=True)
+class Rollout:
+    """One round on a batch of worlds: everything the learner and the task generator need."""
+
+    actor: int
+    incarnation: int
+    sequence: int
+    policy_version: int
+    alice: Turns
+    bob: Turns
+    demonstrations: Demonstrations
+    records: GoalRecords
+    num_env_steps: int
+    """Both players' steps, only those simulated."""
+    metrics: dict[str, float]
+    """Counters of this round, e.g. ``alice/contact_fraction``."""
+
+    @property
+    def id(self) -> tuple[int, int, int]:
+        """(actor, incarnation, sequence), unique within a run; the learner counts a rollout once by it."""
+        return self.actor, self.incarnation, self.sequence
+
+
+def to_arrays(rollout: Rollout) -> dict[str, NDArray[Any]]:
+    """Flat named arrays, for a checkpoint; ``from_arrays`` gives an equal rollout back."""
+    arrays = {
+        f"{part}/{field.name}": getattr(getattr(rollout, part), field.name)
+        for part, kind in _PARTS.items()
+        for field in fields(kind)
+    }
+    numbers = {name: np.array(getattr(rollout, name)) for name in _NUMBERS}
+    return arrays | numbers | {f"metrics/{name}": np.array(value) for name, value in rollout.metrics.items()}
+
+
+def from_arrays(arrays: dict[str, NDArray[Any]]) -> Rollout:
+    """The rollout that ``to_arrays`` flattened."""
+    parts: dict[str, Any] = {
+        part: kind(**{field.name: arrays[f"{part}/{field.name}"] for field in fields(kind)})
+        for part, kind in _PARTS.items()
+    }
+    metrics = {k.removeprefix("metrics/"): float(v) for k, v in arrays.items() if k.startswith("metrics/")}
+    return Rollout(**parts, **{name: int(arrays[name]) for name in _NUMBERS}, metrics=metrics)
+
+
+_PARTS: dict[str, type] = {"alice": Turns, "bob": Turns, "demonstrations": Demonstrations, "records": GoalRecords}
+_NUMBERS = ("actor", "incarnation", "sequence", "policy_version", "num_env_steps")

@@ -1,0 +1,269 @@
+"""The configuration of a run: one frozen pydantic tree, nested like the packages.
+
+Unknown keys are errors, every number has its range, and units are part of the names: ``_m`` metres, ``_s`` seconds,
+``_kg`` kilograms, ``num_`` counts. Defaults follow the paper; where the paper is silent, the source is in the field's
+description. ``load_config`` reads YAML and applies ``--set a.b=c`` overrides.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, Literal, Self
+
+import yaml
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+from service.errors import TandemError
+
+
+class ConfigError(TandemError):
+    """A configuration the user can mend; the message says what, where, which value, and what to do."""
+
+
+class _Frozen(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+
+class WorkspaceConfig(_Frozen):
+    """The box in which goals are valid. Origin of the world: the table top, 0.6 m in front of the robot's base."""
+
+    center_x_m: float = Field(
+        -0.05, ge=-0.3, le=0.2, description="-0.05 keeps the downstream Larger task's 45 x 45 x 40 cm over 99 % reachable"
+    )
+    center_y_m: float = Field(0.0, ge=-0.3, le=0.3)
+    length_x_m: float = Field(0.35, gt=0.0, le=0.8, description="paper: 35 cm")
+    length_y_m: float = Field(0.35, gt=0.0, le=0.8, description="paper: 35 cm")
+    height_m: float = Field(0.35, gt=0.0, le=0.8, description="paper: 35 cm")
+
+
+class WorldConfig(_Frozen):
+    """The MuJoCo world: robot, table, one rigid object."""
+
+    object: Literal["cube", "sphere"] = "cube"
+    object_size_m: float = Field(0.05, ge=0.02, le=0.07, description="cube edge or sphere diameter; paper: 5 cm")
+    object_mass_kg: float = Field(0.1, gt=0.0, le=2.0)
+    friction: float = Field(1.0, gt=0.0, le=3.0, description="sliding friction of object, pads and table")
+    workspace: WorkspaceConfig = WorkspaceConfig()
+    start_height_m: float = Field(
+        0.08, ge=0.08, le=0.4, description="end effector at reset, above the workspace's centre; low, so that chance finds the object"
+    )
+    physics_step_s: float = Field(0.002, gt=0.0, le=0.01)
+    num_substeps: int = Field(20, ge=1, le=200, description="physics steps per action; 20 x 2 ms = 25 Hz as panda-gym")
+
+
+class GameConfig(_Frozen):
+    """Asymmetric self-play: who plays how long, for which rewards."""
+
+    num_worlds: int = Field(160, ge=1, description="worlds stepped together by one actor")
+    num_goals: int = Field(5, ge=1, description="most rounds from one reset (OpenAI 2021: 5)")
+    alice_steps: int = Field(40, ge=1)
+    bob_steps: int = Field(40, ge=1)
+    success_distance_m: float = Field(0.05, gt=0.0, description="paper: 5 cm; also the least move of a valid goal")
+    alice_valid_reward: float = Field(1.0, description="paper, appendix")
+    alice_difficult_reward: float = Field(5.0, description="paper, appendix: added when Bob fails")
+    alice_outside_reward: float = Field(0.0, description="paid for a goal outside the workspace; 0 in the paper's appendix")
+    bob_success_reward: float = Field(1.0, gt=0.0, description="once, when solved")
+
+
+class GeneratorConfig(_Frozen):
+    """The task generator: which goals and opponents a round uses, and when the run is over."""
+
+    past_opponent_fraction: float = Field(0.2, ge=0.0, le=0.5, description="share of worlds, each way (OpenAI 2021: 20 %)")
+    opponent_pool_size: int = Field(5, ge=1)
+    opponent_interval: int = Field(10, ge=1, description="iterations between two snapshots of the players")
+    replay_fraction: float = Field(0.0, ge=0.0, le=1.0, description="share of valid goals replaced by replayed ones")
+    replay_invalid: bool = Field(False, description="give Bob a replayed goal where Alice's goal was invalid")
+    replay_buffer_size: int = Field(4096, ge=1)
+    cell_size_m: float = Field(0.05, gt=0.0, description="edge of a goal cell of the difficulty grid")
+    novelty_window: int = Field(50, ge=1, description="iterations without a new cell before the run may stop")
+    stop_success_rate: float = Field(0.95, gt=0.0, le=1.0)
+
+
+class MLPConfig(_Frozen):
+    """A multi-layer perceptron with ELU."""
+
+    hidden_sizes: tuple[int, ...] = Field((256, 256), min_length=1)
+
+    @model_validator(mode="after")
+    def _positive(self) -> Self:
+        if any(size < 1 for size in self.hidden_sizes):
+            raise ValueError(f"hidden_sizes must be positive, got {self.hidden_sizes}")
+        return self
+
+
+class MCPConfig(_Frozen):
+    """Bob's Multiplicative Compositional Policy."""
+
+    num_primitives: int = Field(4, ge=1, description="K; paper: 4")
+    trunk_hidden_sizes: tuple[int, ...] = Field((256,), min_length=1, description="shared by the primitives")
+    primitive_hidden_size: int = Field(128, ge=1, description="one hidden layer of each primitive's own")
+    gate_hidden_sizes: tuple[int, ...] = Field((256, 256), min_length=1)
+    weight_floor: float = Field(0.01, gt=0.0, lt=1.0, description="least gate weight, bounds the composite variance")
+    log_std_min: float = Field(-2.0, description="of a primitive")
+    log_std_max: float = Field(0.5, description="of a primitive")
+
+    @model_validator(mode="after")
+    def _ordered(self) -> Self:
+        if self.log_std_min >= self.log_std_max:
+            raise ValueError(f"log_std_min {self.log_std_min} must be below log_std_max {self.log_std_max}")
+        return self
+
+
+class PolicyConfig(_Frozen):
+    """Networks of both players."""
+
+    alice: MLPConfig = MLPConfig()
+    alice_log_std_min: float = -2.5
+    alice_log_std_max: float = 0.5
+    bob: MCPConfig = MCPConfig()
+    value: MLPConfig = MLPConfig()
+
+
+class PPOConfig(_Frozen):
+    """One player's PPO (Schulman et al. 2017)."""
+
+    learning_rate: float = Field(3e-4, gt=0.0)
+    gamma: float = Field(0.99, gt=0.0, le=1.0)
+    gae_lambda: float = Field(0.95, ge=0.0, le=1.0)
+    clip: float = Field(0.2, gt=0.0, lt=1.0)
+    dual_clip: float = Field(3.0, gt=1.0, description="bound of the surrogate for negative advantages (Ye et al. 2020)")
+    entropy_weight: float = Field(0.001, ge=0.0)
+    value_weight: float = Field(1.0, ge=0.0)
+    num_epochs: int = Field(3, ge=1)
+    minibatch_size: int = Field(3200, ge=2)
+    max_grad_norm: float = Field(0.5, gt=0.0)
+    target_kl: float = Field(0.02, gt=0.0, description="an update stops early once its mean KL passes 1.5 x this")
+
+
+class ABCConfig(_Frozen):
+    """Alice behavioural cloning (OpenAI 2021): PPO-clipped cloning of Alice's turns whose goal Bob failed."""
+
+    weight: float = Field(0.5, ge=0.0, description="beta")
+    clip: float = Field(0.2, gt=0.0, lt=1.0, description="epsilon")
+    num_iterations: int = Field(1, ge=1, description="demonstrations of that many iterations are kept; 1 is on-policy")
+
+
+class LearnerConfig(_Frozen):
+    """Central learner."""
+
+    device: Literal["cpu", "cuda"] = "cpu"
+    num_threads: int = Field(
+        1, ge=1, description="torch threads; one leaves the other core to the worlds, and two spin when a core is taken"
+    )
+    alice: PPOConfig = PPOConfig()
+    bob: PPOConfig = PPOConfig(num_epochs=5, minibatch_size=512)
+    abc: ABCConfig = ABCConfig()
+    mirror: bool = Field(False, description="learn from every Bob sample also reflected in y; the task is symmetric")
+
+
+class RunConfig(_Frozen):
+    """Length and bookkeeping of a run."""
+
+    total_env_steps: int = Field(3_000_000, ge=1, description="both players' steps together")
+    checkpoint_interval: int = Field(20, ge=1, description="iterations between two checkpoints")
+    keep_checkpoints: int = Field(3, ge=1)
+    evaluation_interval: int = Field(20, ge=0, description="iterations between two evaluations of Bob; 0: never")
+    evaluation_episodes: int = Field(100, ge=1)
+    evaluation_steps: int = Field(50, ge=1)
+    num_threads: int = Field(0, ge=0, description="threads that step worlds; 0: one per core")
+
+
+class Config(_Frozen):
+    """A whole pre-training run."""
+
+    name: str = Field("panda-cube", pattern=r"^[a-z0-9][a-z0-9._-]{0,63}$", description="registry name of the primitives")
+    seed: int = Field(0, ge=0)
+    world: WorldConfig = WorldConfig()
+    game: GameConfig = GameConfig()
+    generator: GeneratorConfig = GeneratorConfig()
+    policy: PolicyConfig = PolicyConfig()
+    learner: LearnerConfig = LearnerConfig()
+    run: RunConfig = RunConfig()
+
+
+def load_config(path: Path | str | None = None, overrides: list[str] | tuple[str, ...] = ()) -> Config:
+    """Read a run's configuration.
+
+    Args:
+        path: YAML file; None for the defaults.
+        overrides: ``a.b=c`` strings, applied in order; the value is parsed as YAML.
+
+    Raises:
+        ConfigError: file missing or not YAML, unknown key, value out of range; one line a user can act on.
+    """
+    tree: dict[str, Any] = {}
+    if path is not None:
+        tree = _read_yaml(Path(path))
+    for override in overrides:
+        _apply_override(tree, override)
+    return parse_config(tree, where=str(path) if path is not None else "the overrides")
+
+
+def parse_config(tree: dict[str, Any], *, where: str) -> Config:
+    """Validate a plain tree; ``where`` names its origin in errors.
+
+    Raises:
+        ConfigError: unknown key or value out of range.
+    """
+    try:
+        return Config.model_validate(tree)
+    except ValidationError as error:
+        first = error.errors()[0]
+        key = ".".join(str(part) for part in first["loc"]) or "the top level"
+        more = f" (and {error.error_count() - 1} more)" if error.error_count() > 1 else ""
+        if first["type"] == "extra_forbidden":
+            known = ", ".join(_known_keys(first["loc"]))
+            raise ConfigError(f"{where}: unknown key {key!r}; known there: {known}{more}") from None
+        raise ConfigError(f"{where}: {key} = {first['input']!r}: {first['msg']}{more}") from None
+
+
+def dump_config(config: Config) -> str:
+    """The resolved configuration as YAML that ``load_config`` reads back to an equal object."""
+    return yaml.safe_dump(config.model_dump(mode="json"), sort_keys=False)
+
+
+def _read_yaml(path: Path) -> dict[str, Any]:
+    try:
+        tree = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise ConfigError(f"no configuration file {path}; see configs/pretrain/ for those that ship") from None
+    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
+        raise ConfigError(f"{path}: cannot be read as YAML: {' '.join(str(error).split())}") from None
+    if tree is None:
+        return {}
+    if not isinstance(tree, dict):
+        raise ConfigError(f"{path}: expected keys and values at the top level, got {type(tree).__name__}")
+    return tree
+
+
+def _apply_override(tree: dict[str, Any], override: str) -> None:
+    key, separator, text = override.partition("=")
+    if not separator or not key.strip():
+        raise ConfigError(f"override {override!r}: expected KEY=VALUE, for example learner.bob.num_epochs=3")
+    try:
+        value = yaml.safe_load(text)
+    except yaml.YAMLError:
+        raise ConfigError(f"override {override!r}: the value is not YAML") from None
+    if isinstance(value, str):
+        try:
+            value = float(value)  # YAML 1.1 reads 1e-3 as text
+        except ValueError:
+            pass
+    *parents, last = key.strip().split(".")
+    node = tree
+    for parent in parents:
+        child = node.setdefault(parent, {})
+        if not isinstance(child, dict):
+            raise ConfigError(f"override {override!r}: {parent!r} is a value, not a group of keys")
+        node = child
+    node[last] = value
+
+
+def _known_keys(location: tuple[int | str, ...]) -> list[str]:
+    model: type[BaseModel] = Config
+    for part in location[:-1]:
+        field = model.model_fields.get(str(part))
+        if field is None or not (isinstance(field.annotation, type) and issubclass(field.annotation, BaseModel)):
+            break
+        model = field.annotation
+    return sorted(model.model_fields)

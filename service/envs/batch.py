@@ -1,0 +1,245 @@
+"""Many worlds stepped together: native threads for the physics, NumPy over the worlds for everything else."""
+
+from __future__ import annotations
+
+import os
+from types import TracebackType
+from typing import Self
+
+import mujoco
+import numpy as np
+from mujoco import rollout
+from numpy.typing import NDArray
+
+from service.config import WorkspaceConfig, WorldConfig
+from service.envs import kinematics
+from service.envs.observations import ACTION_SIZE, BOB_VALUE_SIZE, FULL_SIZE, POSITIONS_SIZE
+from service.envs.panda import FINGER_STROKE_M, NUM_JOINTS
+from service.envs.scene import build_spec
+
+FloatArray = NDArray[np.float32]
+StateArray = NDArray[np.float64]
+BoolArray = NDArray[np.bool_]
+IntArray = NDArray[np.int64]
+
+DISPLACEMENT_M = 0.05
+"""End-effector displacement of a full action (paper)."""
+WIDTH_CHANGE_M = 0.10
+"""Change of the finger width of a full action (paper)."""
+LOWEST_TARGET_M = 0.012
+"""Least height of a commanded end effector; the fingertips end 0.8 cm below it."""
+_TABLE_TOP_M = 0.0
+
+
+class WorldBatch:
+    """N independent worlds with one flat state each.
+
+    The state of a world is MuJoCo's full physics state followed by the two finger-contact flags of the last action; a world
+    is a pure function of (state, action), because each action starts the constraint solver cold. So saving is copying rows of
+    ``states``, restoring is writing them back, and the continuation is bit-identical.
+
+    Args:
+        config: the world.
+        num_worlds: N.
+        num_threads: native threads; 0 for one per core.
+    """
+
+    def __init__(self, config: WorldConfig, num_worlds: int, *, num_threads: int = 0) -> None:
+        self.config = config
+        self.num_worlds = num_worlds
+        self.model = build_spec(config).compile()
+        num_threads = min(num_threads or os.cpu_count() or 1, num_worlds)
+        self._pool = rollout.Rollout(nthread=num_threads if num_threads > 1 else 0)
+        self._data = [mujoco.MjData(self.model) for _ in range(max(num_threads, 1))]
+        self._physics_size = mujoco.mj_stateSize(self.model, mujoco.mjtState.mjSTATE_FULLPHYSICS)
+        self.state_size = self._physics_size + 2
+        self._layout = _Layout.of(self.model)
+        self._fresh_state = self._make_fresh_state()
+        self.states: StateArray = np.tile(self._fresh_state, (num_worlds, 1))
+        self._kinematics = kinematics.forward(self.joints)
+        self.num_broken = 0
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Stop the native threads; the batch cannot step afterwards."""
+        self._pool.close()
+
+    # --- state -----------------------------------------------------------------------------------------------------
+
+    @property
+    def joints(self) -> StateArray:
+        """(N, 7) arm joint angles, rad."""
+        return self.states[:, self._layout.joints]
+
+    @property
+    def object_position(self) -> StateArray:
+        """(N, 3) object centre, metres."""
+        return self.states[:, self._layout.object]
+
+    @property
+    def ee_position(self) -> StateArray:
+        """(N, 3) point between the fingertips, metres."""
+        return self._kinematics.position
+
+    def reset(self, rng: np.random.Generator, worlds: BoolArray | None = None) -> None:
+        """Put worlds (all, or where ``worlds`` is true) back to the start: arm at home, gripper open, object anywhere on the
+        table inside the workspace."""  # fmt: skip
+        mask = np.ones(self.num_worlds, dtype=bool) if worlds is None else worlds
+        num = int(mask.sum())
+        states = np.tile(self._fresh_state, (num, 1))
+        states[:, self._layout.object] = sample_on_table(rng, num, self.config.workspace, self.config.object_size_m)
+        self.restore(states, mask)
+
+    def restore(self, states: StateArray, worlds: BoolArray | None = None) -> None:
+        """Overwrite the states of all worlds, or of those where ``worlds`` is true, with (N or count, S) rows."""
+        if worlds is None:
+            self.states[:] = states
+        else:
+            self.states[worlds] = states
+        self._kinematics = kinematics.forward(self.joints)
+
+    # --- stepping --------------------------------------------------------------------------------------------------
+
+    def step(self, actions: FloatArray, worlds: IntArray | None = None) -> BoolArray:
+        """Act for one control step (40 ms by default).
+
+        Args:
+            actions: (N, 4), or (M, 4) for M ``worlds``; clipped to [-1, 1]. End-effector displacement x, y, z from where
+                it is now, and change of the finger width.
+            worlds: indices of the worlds that act; all by default. The others stand still.
+
+        Returns:
+            (N,) true where the physics diverged. Such a world keeps its last finite state.
+
+        Raises:
+            ValueError: actions of the wrong shape or not finite.
+        """
+        index = slice(None) if worlds is None else worlds
+        start = self.states[index]
+        if actions.shape != (start.shape[0], ACTION_SIZE):
+            raise ValueError(f"actions: expected shape {(start.shape[0], ACTION_SIZE)}, got {actions.shape}")
+        if not np.isfinite(actions).all():
+            raise ValueError("actions: not finite; the policy that made them has diverged")
+        control = self._control(start, actions.astype(np.float64), index)
+        states, sensors = self._pool.rollout(
+            self.model, self._data, start[:, : self._physics_size], control[:, None, :], nstep=self.config.num_substeps
+        )
+        after = np.empty_like(start)
+        after[:, : self._physics_size] = states[:, -1]
+        after[:, self._physics_size :] = (sensors > 0).any(axis=1)
+        finite = np.isfinite(after).all(axis=1)
+        broken = np.zeros(self.num_worlds, dtype=bool)
+        if not finite.all():
+            after[~finite] = start[~finite]
+            broken[index] = ~finite
+            self.num_broken += int((~finite).sum())
+        self.states[index] = after
+        self._kinematics = kinematics.forward(self.joints)
+        return broken
+
+    def _control(self, start: StateArray, actions: StateArray, index: slice | IntArray) -> StateArray:
+        actions = np.clip(actions, -1.0, 1.0)
+        here = kinematics.Kinematics(
+            self._kinematics.position[index], self._kinematics.rotation[index], self._kinematics.jacobian[index]
+        )
+        target = kinematics.clip_to_reach(here.position + DISPLACEMENT_M * actions[:, :3], LOWEST_TARGET_M)
+        width = start[:, self._layout.fingers].sum(axis=1) + WIDTH_CHANGE_M * actions[:, 3]
+        control = np.empty((start.shape[0], NUM_JOINTS + 2))
+        control[:, :NUM_JOINTS] = kinematics.solve(start[:, self._layout.joints], target, at=here)
+        control[:, NUM_JOINTS:] = np.clip(width / 2, 0.0, FINGER_STROKE_M)[:, None]
+        return control
+
+    # --- observations ----------------------------------------------------------------------------------------------
+
+    def positions(self) -> FloatArray:
+        """(N, 11) what Bob's primitives see; layout in ``observations``."""
+        out = np.empty((self.num_worlds, POSITIONS_SIZE), dtype=np.float32)
+        self._write_positions(out)
+        return out
+
+    def full(self, elapsed: float) -> FloatArray:
+        """(N, 22) what Alice sees; ``elapsed`` is the share of her turn that has passed, in [0, 1]."""
+        out = np.empty((self.num_worlds, FULL_SIZE), dtype=np.float32)
+        self._write_full(out[:, : FULL_SIZE - 1])
+        out[:, FULL_SIZE - 1] = elapsed
+        return out
+
+    def bob_value(self, goal: StateArray) -> FloatArray:
+        """(N, 27) what Bob's value network sees for (N, 3) goals, metres."""
+        out = np.empty((self.num_worlds, BOB_VALUE_SIZE), dtype=np.float32)
+        self._write_full(out[:, : FULL_SIZE - 1])
+        out[:, FULL_SIZE - 1 : FULL_SIZE + 2] = goal
+        out[:, FULL_SIZE + 2 :] = goal - self.object_position
+        return out
+
+    def _write_positions(self, out: FloatArray) -> None:
+        ee, obj = self._kinematics.position, self.object_position
+        out[:, 0:3] = ee
+        out[:, 3:5] = self.states[:, self._layout.fingers]
+        out[:, 5:8] = obj
+        out[:, 8:11] = obj - ee
+
+    def _write_full(self, out: FloatArray) -> None:
+        self._write_positions(out[:, :POSITIONS_SIZE])
+        velocity = self.states[:, self._layout.joint_velocities]
+        out[:, 11:14] = np.matmul(self._kinematics.jacobian[:, :3], velocity[:, :, None])[:, :, 0]
+        out[:, 14:16] = self.states[:, self._layout.finger_velocities]
+        out[:, 16:19] = self.states[:, self._layout.object_velocity]
+        out[:, 19:21] = self.contacts()
+
+    def contacts(self) -> BoolArray:
+        """(N, 2) left, right finger touched the object during the last action."""
+        return self.states[:, self._physics_size :] > 0
+
+    def _make_fresh_state(self) -> StateArray:
+        workspace = self.config.workspace
+        data = mujoco.MjData(self.model)
+        home = np.array([[workspace.center_x_m, workspace.center_y_m, self.config.start_height_m]])
+        data.qpos[:NUM_JOINTS] = kinematics.solve(kinematics.NEUTRAL_JOINTS[None], home, num_iterations=30)[0]
+        data.qpos[NUM_JOINTS : NUM_JOINTS + 2] = FINGER_STROKE_M
+        state = np.zeros(self.state_size)
+        mujoco.mj_getState(self.model, data, state[: self._physics_size], int(mujoco.mjtState.mjSTATE_FULLPHYSICS))
+        return state
+
+
+class _Layout:
+    """Where things stand in MuJoCo's full physics state: time, qpos, qvel."""
+
+    def __init__(self, num_positions: int) -> None:
+        velocity = 1 + num_positions
+        self.joints = slice(1, 1 + NUM_JOINTS)
+        self.fingers = slice(1 + NUM_JOINTS, 3 + NUM_JOINTS)
+        self.object = slice(3 + NUM_JOINTS, 6 + NUM_JOINTS)
+        self.joint_velocities = slice(velocity, velocity + NUM_JOINTS)
+        self.finger_velocities = slice(velocity + NUM_JOINTS, velocity + NUM_JOINTS + 2)
+        self.object_velocity = slice(velocity + NUM_JOINTS + 2, velocity + NUM_JOINTS + 5)
+
+    @classmethod
+    def of(cls, model: mujoco.MjModel) -> _Layout:
+        assert model.nq == NUM_JOINTS + 2 + 7 and model.na == 0
+        return cls(model.nq)
+
+
+def sample_on_table(rng: np.random.Generator, num: int, workspace: WorkspaceConfig, object_size_m: float) -> StateArray:
+    """(num, 3) object centres, uniform over the workspace's table area, resting on the table."""
+    center = np.array([workspace.center_x_m, workspace.center_y_m])
+    half = np.array([workspace.length_x_m, workspace.length_y_m]) / 2
+    position = np.empty((num, 3))
+    position[:, :2] = center + rng.uniform(-half, half, (num, 2))
+    position[:, 2] = _TABLE_TOP_M + object_size_m / 2
+    return position
+
+
+def sample_in_volume(
+    rng: np.random.Generator, num: int, workspace: WorkspaceConfig, object_size_m: float, *, lowest_m: float | None = None
+) -> StateArray:
+    """(num, 3) object centres, uniform in the workspace above ``lowest_m`` (default: resting height)."""
+    position = sample_on_table(rng, num, workspace, object_size_m)
+    low = position[0, 2] if lowest_m is None and num else lowest_m
+    position[:, 2] = rng.uniform(low, workspace.height_m, num)
+    return position

@@ -1,0 +1,155 @@
+"""The Franka Emika Panda with its parallel gripper, built in code from published numbers.
+
+Kinematics, joint limits, torque limits: Franka documentation (modified DH parameters). Link masses and inertias: identified
+by Gaz et al. 2019, as used by franka_ros. Position gains follow the MuJoCo Menagerie model, whose damping is halved here so
+that a full action moves the end effector about 3 cm in one 40 ms step. The geometry is our own: primitive shapes for
+collision on the gripper only (a gripper that points down keeps the arm off the table), and decoration for rendering.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import mujoco
+import numpy as np
+
+NUM_JOINTS = 7
+BASE_POSITION = (-0.6, 0.0, 0.0)
+JOINT_LOWER = np.array([-2.8973, -1.7628, -2.8973, -3.0718, -2.8973, -0.0175, -2.8973])
+JOINT_UPPER = np.array([2.8973, 1.7628, 2.8973, -0.0698, 2.8973, 3.7525, 2.8973])
+JOINT_TORQUE = (87.0, 87.0, 87.0, 87.0, 12.0, 12.0, 12.0)
+FLANGE_TO_TIP_M = 0.107 + 0.1034
+"""Flange to the point between the fingertips, the end effector."""
+FINGER_STROKE_M = 0.04
+"""Travel of one finger; the opening width is twice this."""
+
+_STIFFNESS = (4500.0, 4500.0, 3500.0, 3500.0, 2000.0, 2000.0, 2000.0)
+_DAMPING = (225.0, 225.0, 175.0, 175.0, 100.0, 100.0, 100.0)
+_ARMATURE = 0.1
+_JOINT_DAMPING = 1.0
+_FINGER_STIFFNESS = 1000.0
+_FINGER_DAMPING = 25.0
+_FINGER_FORCE = 40.0
+
+# Link frames in their parents: position, unnormalised quaternion wxyz.
+_FRAMES: tuple[tuple[tuple[float, float, float], tuple[float, float, float, float]], ...] = (
+    ((0.0, 0.0, 0.333), (1, 0, 0, 0)),
+    ((0.0, 0.0, 0.0), (1, -1, 0, 0)),
+    ((0.0, -0.316, 0.0), (1, 1, 0, 0)),
+    ((0.0825, 0.0, 0.0), (1, 1, 0, 0)),
+    ((-0.0825, 0.384, 0.0), (1, -1, 0, 0)),
+    ((0.0, 0.0, 0.0), (1, 1, 0, 0)),
+    ((0.088, 0.0, 0.0), (1, 1, 0, 0)),
+)
+# Mass kg, centre of mass m, inertia xx yy zz xy xz yz kg m2 (Gaz et al. 2019).
+_INERTIALS = (
+    (4.970684, (0.003875, 0.002081, -0.04762), (0.70337, 0.70661, 0.009117, -0.000139, 0.006772, 0.019169)),
+    (0.646926, (-0.003141, -0.02872, 0.003495), (0.007962, 0.02811, 0.025995, -0.003925, 0.010254, 0.000704)),
+    (3.228604, (0.027518, 0.039252, -0.066502), (0.037242, 0.036155, 0.01083, -0.004761, -0.011396, -0.012805)),
+    (3.587895, (-0.05317, 0.104419, 0.027454), (0.025853, 0.019552, 0.028323, 0.007796, -0.001332, 0.008641)),
+    (1.225946, (-0.011953, 0.041065, -0.038437), (0.035549, 0.029474, 0.008627, -0.002117, -0.004037, 0.000229)),
+    (1.666555, (0.060149, -0.014117, -0.010517), (0.001964, 0.004354, 0.005433, 0.000109, -0.001158, 0.000341)),
+    (0.735522, (0.010517, -0.004252, 0.061597), (0.012516, 0.010027, 0.004815, -0.000428, -0.001196, -0.000741)),
+)
+_HAND_QUATERNION = (0.9238795, 0.0, 0.0, -0.3826834)
+
+_PAD_RADIUS = 0.006
+_PAD_CONDIM = 4
+
+GRIPPER_BIT, OBJECT_BIT, TABLE_BIT = 1, 2, 4
+
+
+def add_panda(spec: mujoco.MjSpec, *, friction: float) -> Any:
+    """Add the arm, its actuators and its collision shapes to a model under construction.
+
+    Actuators: seven joint positions (rad), then left and right finger positions (m). Gravity on the arm is compensated, as
+    the robot's own controller does.
+
+    Args:
+        spec: the model under construction.
+        friction: sliding friction of the fingertips.
+
+    Returns:
+        The bodies by name, for decoration.
+    """
+    base = spec.worldbody.add_body(name="link0", pos=BASE_POSITION)
+    bodies = {"link0": base}
+    body = base
+    for index, ((position, quaternion), (mass, centre, inertia)) in enumerate(
+        zip(_FRAMES, _INERTIALS, strict=True), start=1
+    ):
+        body = body.add_body(
+            name=f"link{index}", pos=position, quat=quaternion, mass=mass, ipos=centre, fullinertia=inertia,
+            explicitinertial=True, gravcomp=1.0,
+        )  # fmt: skip
+        body.add_joint(
+            name=f"joint{index}",
+            type=mujoco.mjtJoint.mjJNT_HINGE,
+            axis=(0, 0, 1),
+            range=(JOINT_LOWER[index - 1], JOINT_UPPER[index - 1]),
+            limited=True,
+            armature=_ARMATURE,
+            damping=(_JOINT_DAMPING, 0, 0),
+        )
+        bodies[body.name] = body
+    hand = body.add_body(
+        name="hand", pos=(0, 0, 0.107), quat=_HAND_QUATERNION, mass=0.73, ipos=(-0.01, 0, 0.03),
+        inertia=(0.001, 0.0025, 0.0017), explicitinertial=True, gravcomp=1.0,
+    )  # fmt: skip
+    bodies["hand"] = hand
+    _collision(hand, mujoco.mjtGeom.mjGEOM_CAPSULE, "hand", (0.038, 0, 0), ((0, -0.062, 0.03), (0, 0.062, 0.03)), friction)
+    for side, quaternion in (("left", (1, 0, 0, 0)), ("right", (0, 0, 0, 1))):
+        bodies[f"{side}_finger"] = _add_finger(hand, side, quaternion, friction)
+    _add_actuators(spec)
+    return bodies
+
+
+def _add_finger(hand: Any, side: str, quaternion: tuple[float, ...], friction: float) -> Any:
+    finger = hand.add_body(
+        name=f"{side}_finger", pos=(0, 0, 0.0584), quat=quaternion, mass=0.015, ipos=(0, 0.01, 0.03),
+        inertia=(2.375e-6, 2.375e-6, 7.5e-7), explicitinertial=True, gravcomp=1.0,
+    )  # fmt: skip
+    finger.add_joint(
+        name=f"{side}_finger", type=mujoco.mjtJoint.mjJNT_SLIDE, axis=(0, 1, 0), range=(0.0, FINGER_STROKE_M), limited=True,
+        armature=_ARMATURE,
+    )  # fmt: skip
+    # Two upright capsules touch a cube's face in four points that span the pad: fewer and cheaper contacts than box on box
+    # at the same grip. (One line of contact is not enough: a cube rolls out between two lines nearer than its own width.)
+    # Their inner surface is the pad plane y = 0; they end 3 mm below the end effector.
+    for end, x in (("front", 0.0075), ("back", -0.0075)):
+        pad = _collision(
+            finger, mujoco.mjtGeom.mjGEOM_CAPSULE, f"{side}_pad_{end}", (_PAD_RADIUS, 0, 0),
+            ((x, _PAD_RADIUS, 0.034), (x, _PAD_RADIUS, 0.048 - _PAD_RADIUS + 0.004)), friction,
+        )  # fmt: skip
+        pad.condim = _PAD_CONDIM
+        pad.solref = (0.01, 1.0)
+        pad.priority = 1
+    _collision(
+        finger, mujoco.mjtGeom.mjGEOM_CAPSULE, f"{side}_shaft", (0.009, 0, 0), ((0, 0.013, 0.009), (0, 0.011, 0.043)), friction
+    )
+    return finger
+
+
+def _collision(body: Any, kind: Any, name: str, size: tuple[float, ...], ends: tuple[tuple[float, ...], ...], friction: float) -> Any:
+    return body.add_geom(
+        name=name, type=kind, size=size, fromto=[*ends[0], *ends[1]], contype=GRIPPER_BIT, conaffinity=0,
+        friction=(friction, 0.005, 0.0001), mass=0.0, group=3,
+    )  # fmt: skip
+
+
+def _add_actuators(spec: mujoco.MjSpec) -> None:
+    for index in range(NUM_JOINTS):
+        actuator = spec.add_actuator(name=f"joint{index + 1}", target=f"joint{index + 1}", trntype=mujoco.mjtTrn.mjTRN_JOINT)
+        actuator.set_to_position(kp=_STIFFNESS[index], kv=_DAMPING[index])
+        _limit(actuator, JOINT_TORQUE[index], JOINT_LOWER[index], JOINT_UPPER[index])
+    for side in ("left", "right"):
+        actuator = spec.add_actuator(name=f"{side}_finger", target=f"{side}_finger", trntype=mujoco.mjtTrn.mjTRN_JOINT)
+        actuator.set_to_position(kp=_FINGER_STIFFNESS, kv=_FINGER_DAMPING)
+        _limit(actuator, _FINGER_FORCE, 0.0, FINGER_STROKE_M)
+
+
+def _limit(actuator: Any, force: float, lower: float, upper: float) -> None:
+    actuator.forcelimited = True
+    actuator.forcerange = (-force, force)
+    actuator.ctrllimited = True
+    actuator.ctrlrange = (lower, upper)

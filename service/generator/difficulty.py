@@ -1,0 +1,163 @@
+"""How difficult goals are for the present Bob: over a grid of goal cells, by height and by distance."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+from numpy.typing import NDArray
+
+from service.config import WorldConfig
+from service.generator.counts import SuccessCounts
+from service.generator.state import Array, State, prefixed, take, under
+from service.generator.validity import workspace_bounds
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+Bools = NDArray[np.bool_]
+
+AIR_ABOVE_REST_M = 0.05
+"""A goal is in the air when the object's centre is higher than it rests on the table by more than this."""
+HEIGHT_EDGES_M = (0.10, 0.20)
+"""Heights above the resting height that part low from middle and middle from high air goals."""
+HEIGHT_NAMES = ("table", "low", "middle", "high")
+DISTANCE_EDGES_M = (0.10, 0.15, 0.20, 0.30)
+"""Distances from the start that part the distance bins."""
+
+
+def in_air(positions: Floats, rest_height_m: float) -> Bools:
+    """Whether an object at each (..., 3) position is lifted rather than lying (or tilting) on the table."""
+    lifted: Bools = positions[..., 2] > rest_height_m + AIR_ABOVE_REST_M
+    return lifted
+
+
+def height_bins(positions: Floats, rest_height_m: float) -> Ints:
+    """(M,) index into ``HEIGHT_NAMES`` of (M, 3) positions; bin 0 is exactly what is not ``in_air``."""
+    edges = rest_height_m + np.array([AIR_ABOVE_REST_M, *HEIGHT_EDGES_M])
+    return np.digitize(positions[:, 2], edges, right=True).astype(np.int64)
+
+
+class DifficultyGrid:
+    """Bob's success over goal cells that cover the workspace, and over height and distance bins.
+
+    All rates are decayed running ones (see ``counts.DECAY``), one ``record`` being one iteration, so they follow Bob.
+    """
+
+    shape: tuple[int, int, int]
+    """Number of cells in x, y and z."""
+    cells: SuccessCounts
+    """Over the cells, x-major."""
+    heights: SuccessCounts
+    """Over ``HEIGHT_NAMES``."""
+    distances: SuccessCounts
+    """Over the bins between ``DISTANCE_EDGES_M``."""
+    seen: Bools
+    """(cells,) a valid goal was ever proposed there."""
+
+    def __init__(self, world: WorldConfig, cell_size_m: float) -> None:
+        self._lower, upper = workspace_bounds(world.workspace)
+        self._cell_size_m = cell_size_m
+        self._rest_height_m = world.object_size_m / 2
+        # Rounding may not add a cell: 0.45 / 0.03 is a little over 15.
+        counted = np.ceil((upper - self._lower) / cell_size_m - 1e-9).astype(int)
+        self.shape = (int(counted[0]), int(counted[1]), int(counted[2]))
+        num_cells = int(np.prod(self.shape))
+        self.cells = SuccessCounts(num_cells)
+        self.heights = SuccessCounts(len(HEIGHT_NAMES))
+        self.distances = SuccessCounts(len(DISTANCE_EDGES_M) + 1)
+        self.seen = np.zeros(num_cells, dtype=np.bool_)
+
+    @property
+    def num_cells_seen(self) -> int:
+        """Cells in which a valid goal was ever proposed."""
+        return int(np.count_nonzero(self.seen))
+
+    def cell_index(self, goals: Floats) -> Ints:
+        """(M,) flat cell of each of (M, 3) goals inside the workspace, metres; upper faces belong to the last cells."""
+        index = np.floor((goals - self._lower) / self._cell_size_m).astype(np.int64)
+        index = np.clip(index, 0, np.array(self.shape) - 1)
+        return np.ravel_multi_index((index[:, 0], index[:, 1], index[:, 2]), self.shape).astype(np.int64)
+
+    def mark_seen(self, goals: Floats) -> int:
+        """Note where (M, 3) valid goals were proposed, tried or not; returns how many cells were new."""
+        before = self.num_cells_seen
+        self.seen[self.cell_index(goals)] = True
+        return self.num_cells_seen - before
+
+    def record(self, goals: Floats, start_positions: Floats, solved: Bools) -> None:
+        """Age all counts by one iteration, then add M tries of the present Bob.
+
+        Args:
+            goals: (M, 3) valid goals he played, metres.
+            start_positions: (M, 3) where the object started, metres.
+            solved: (M,) whether he solved them.
+        """
+        self.mark_seen(goals)
+        self.cells.record(self.cell_index(goals), solved)
+        self.heights.record(height_bins(goals, self._rest_height_m), solved)
+        distance = np.linalg.norm(goals - start_positions, axis=-1)
+        self.distances.record(np.digitize(distance, DISTANCE_EDGES_M).astype(np.int64), solved)
+
+    def success_rate(self, goals: Floats) -> Floats:
+        """(M,) estimated probability that Bob solves a goal in the cell of each of (M, 3) goals; 1/2 where untried."""
+        rate: Floats = self.cells.success_rate()[self.cell_index(goals)]
+        return rate
+
+    def learnability(self, goals: Floats) -> Floats:
+        """(M,) p (1 - p) of the cell of each of (M, 3) goals; 1/4, the most, where untried."""
+        learnability: Floats = self.cells.learnability()[self.cell_index(goals)]
+        return learnability
+
+    def mean_learnability(self) -> float:
+        """Mean over the cells seen; not-a-number while there are none."""
+        return float(self.cells.learnability()[self.seen].mean()) if self.seen.any() else float("nan")
+
+    def summary(self) -> dict[str, float]:
+        """Difficulty in a few numbers; a bin that was never tried is left out."""
+        summary = {"num_cells": float(self.seen.size), "num_cells_seen": float(self.num_cells_seen)}
+        if self.seen.any():
+            summary["mean_learnability"] = self.mean_learnability()
+        edges = [0.0, *DISTANCE_EDGES_M]
+        distance_names = [f"from_{round(100 * edge)}_cm" for edge in edges]
+        for group, names, counts in (
+            ("height", HEIGHT_NAMES, self.heights),
+            ("distance", distance_names, self.distances),
+        ):
+            for name, num_tries, rate in zip(names, counts.num_tries, counts.success_rate(), strict=True):
+                if num_tries:
+                    summary[f"success_rate_{group}_{name}"] = float(rate)
+        return summary
+
+    def maps(self) -> dict[str, Array]:
+        """Arrays over the cells for plots and REST: (X, Y, Z) each, and ``center`` (X, Y, Z, 3) in metres."""
+        index = np.stack(np.meshgrid(*(np.arange(size) for size in self.shape), indexing="ij"), axis=-1)
+        flat = {
+            "seen": self.seen.copy(),
+            "num_tries": self.cells.num_tries.copy(),
+            "success_rate": self.cells.success_rate(),
+            "learnability": self.cells.learnability(),
+        }
+        maps: dict[str, Array] = {name: array.reshape(self.shape) for name, array in flat.items()}
+        maps["center"] = self._lower + (index + 0.5) * self._cell_size_m
+        return maps
+
+    def state(self) -> State:
+        """All counts, copied."""
+        state = {"seen": self.seen.copy()}
+        return (
+            state
+            | prefixed("cells", self.cells.state())
+            | prefixed("heights", self.heights.state())
+            | prefixed("distances", self.distances.state())
+        )
+
+    def load_state(self, state: Mapping[str, Array]) -> None:
+        """Take over what ``state`` gave.
+
+        Raises:
+            ConfigError: of a grid of another size.
+        """
+        self.seen = take(state, "seen", self.seen)
+        self.cells.load_state(under("cells", state))
+        self.heights.load_state(under("heights", state))
+        self.distances.load_state(under("distances", state))

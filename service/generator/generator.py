@@ -1,0 +1,176 @@
+"""The task generator: which opponents and goals a round uses, what became of them, and when the run is over."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from service.config import Config
+from service.generator.difficulty import DifficultyGrid
+from service.generator.metrics import alice_metrics, bob_metrics, current_goals, own_goals, without_nan
+from service.generator.opponents import OpponentPool, RoundPlan
+from service.generator.replay import GoalBuffer
+from service.generator.state import Array, State, prefixed, under
+from service.generator.stopping import StopCriterion
+from service.generator.validity import Verdict
+
+if TYPE_CHECKING:
+    from service.actors.rollout import GoalRecords
+
+Floats = NDArray[np.float64]
+Bools = NDArray[np.bool_]
+
+MIN_REPLAY_GOALS = 64
+"""Goals the buffer must hold before any is replayed: fewer would be played over and over."""
+
+
+@dataclass(frozen=True, slots=True)
+class GoalChoice:
+    """The goals Bob plays in a round of N worlds, and where both he and the object start."""
+
+    goal: Floats
+    """(N, 3) metres; where not ``played`` it is Alice's proposal as it came."""
+    start_state: Floats
+    """(N, S) full physics state."""
+    start_position: Floats
+    """(N, 3) object position there, metres."""
+    replayed: Bools
+    """(N,) the goal and its start come from the buffer, not from this round's Alice."""
+    played: Bools
+    """(N,) there is a goal for Bob to play."""
+
+
+class TaskGenerator:
+    """Goals, opponents, difficulty and the stop criterion of one run.
+
+    In call order: ``plan``, ``choose_goals``, ``record``, ``add_opponents`` if ``snapshot_due``, ``should_stop``; one
+    ``record`` is one iteration.
+    It draws only from the random generators it is given, so ``state`` and theirs are all that an exact resume needs.
+    """
+
+    grid: DifficultyGrid
+    """Bob's success over goal cells, heights and distances."""
+    buffer: GoalBuffer
+    """Earlier valid goals."""
+    opponents: OpponentPool
+    """Past versions of both players."""
+
+    def __init__(self, config: Config, state_size: int) -> None:
+        self._config = config.generator
+        self._rest_height_m = config.world.object_size_m / 2
+        self.grid = DifficultyGrid(config.world, config.generator.cell_size_m)
+        self.buffer = GoalBuffer(config.generator.replay_buffer_size, state_size)
+        self.opponents = OpponentPool(config.generator.opponent_pool_size)
+        self._stop = StopCriterion(config.generator)
+
+    def plan(self, num_worlds: int, rng: np.random.Generator) -> RoundPlan:
+        """Choose who plays the next round; all current while there are no past versions."""
+        return self.opponents.plan(num_worlds, self._config.past_opponent_fraction, rng)
+
+    def choose_goals(
+        self,
+        plan: RoundPlan,
+        start_state: Floats,
+        start_position: Floats,
+        proposal: Floats,
+        verdict: NDArray[np.int8],
+        rng: np.random.Generator,
+    ) -> GoalChoice:
+        """Choose what Bob plays: Alice's valid goals, or replayed ones where the configuration says so.
+
+        Replayed goals go to the current Bob only: a past Bob plays to judge Alice's goals, not to learn.
+
+        Args:
+            plan: who plays.
+            start_state: (N, S) full physics state of this round's start.
+            start_position: (N, 3) object position there, metres.
+            proposal: (N, 3) object position at the end of Alice's turn, metres.
+            verdict: (N,) ``Verdict`` of the proposal.
+            rng: source of the choice.
+        """
+        valid: Bools = verdict == Verdict.VALID
+        replayed = self._choose_replayed(valid, plan.bob_past, rng)
+        choice = GoalChoice(proposal.copy(), start_state.copy(), start_position.copy(), replayed, valid | replayed)
+        num = int(np.count_nonzero(replayed))
+        if num:
+            drawn = self.buffer.sample(rng, num, self.grid.learnability(self.buffer.goals))
+            choice.goal[replayed] = drawn.goal
+            choice.start_state[replayed] = drawn.start_state
+            choice.start_position[replayed] = drawn.start_position
+        return choice
+
+    def record(self, records: GoalRecords) -> dict[str, float]:
+        """Learn from what became of one iteration's goals.
+
+        Difficulty follows every try of the current Bob; the buffer takes the valid goals that Bob played straight from
+        Alice; a cell is new when a valid proposal, a past Alice's included, is the first in it.
+
+        Returns:
+            ``alice/*``, ``bob/*`` and ``generator/*`` metrics; a rate over no cases is left out.
+        """
+        num_new_cells = self.grid.mark_seen(records.proposal[records.verdict == Verdict.VALID])
+        tried = records.played & ~records.bob_past
+        self.grid.record(records.goal[tried], records.start_position[tried], records.solved[tried])
+        own = own_goals(records)
+        self.buffer.add(records.start_state[own], records.start_position[own], records.goal[own])
+        current = current_goals(records)
+        self._stop.record(num_new_cells, int(current.sum()), int(records.solved[current].sum()))
+        return (
+            alice_metrics(records, self._rest_height_m)
+            | bob_metrics(records, self._rest_height_m)
+            | self._own_metrics(num_new_cells)
+        )
+
+    def snapshot_due(self, iteration: int) -> bool:
+        """Whether the players of this iteration, counted from 0, join the pool; the untrained ones never do."""
+        return iteration > 0 and iteration % self._config.opponent_interval == 0
+
+    def add_opponents(self, alice: Mapping[str, Array], bob: Mapping[str, Array]) -> None:
+        """Add both players' parameters to the pool, copied; the oldest are dropped from a full pool."""
+        self.opponents.add(alice, bob)
+
+    def should_stop(self) -> bool:
+        """Whether, over ``novelty_window`` iterations, Alice found no new goal cell and Bob solved her goals."""
+        return self._stop.should_stop()
+
+    def state(self) -> State:
+        """Everything an exact resume needs, copied: flat named arrays."""
+        return (
+            prefixed("grid", self.grid.state())
+            | prefixed("buffer", self.buffer.state())
+            | prefixed("opponents", self.opponents.state())
+            | prefixed("stop", self._stop.state())
+        )
+
+    def load_state(self, state: Mapping[str, Array]) -> None:
+        """Take over what ``state`` gave.
+
+        Raises:
+            ConfigError: an array is missing, or of another configuration.
+        """
+        self.grid.load_state(under("grid", state))
+        self.buffer.load_state(under("buffer", state))
+        self.opponents.load_state(under("opponents", state))
+        self._stop.load_state(under("stop", state))
+
+    def _choose_replayed(self, valid: Bools, bob_past: Bools, rng: np.random.Generator) -> Bools:
+        """(N,) worlds whose goal comes from the buffer."""
+        if len(self.buffer) < MIN_REPLAY_GOALS:
+            return np.zeros(len(valid), dtype=np.bool_)
+        replaced: Bools = valid & (rng.random(len(valid)) < self._config.replay_fraction)
+        filled: Bools = ~valid & self._config.replay_invalid
+        return (replaced | filled) & ~bob_past
+
+    def _own_metrics(self, num_new_cells: int) -> dict[str, float]:
+        metrics = {
+            "generator/num_cells_seen": float(self.grid.num_cells_seen),
+            "generator/new_cells": float(num_new_cells),
+            "generator/iterations_without_new_cell": float(self._stop.num_iterations_without_new_cell),
+            "generator/buffer_size": float(len(self.buffer)),
+            "generator/mean_learnability": self.grid.mean_learnability(),
+        }
+        return without_nan(metrics)

@@ -1,0 +1,108 @@
+"""Past versions of both players, and which worlds of a round play against them (OpenAI 2021: 20 % each way)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from service.generator.state import Array, State
+
+Ints = NDArray[np.int64]
+Parameters = dict[str, Array]
+
+CURRENT = -1
+"""Opponent index of the current policy version."""
+
+
+@dataclass(frozen=True, slots=True)
+class RoundPlan:
+    """Who plays a round of N worlds; at most one of the two players of a world is a past version."""
+
+    alice_opponent: Ints
+    """(N,) index of Alice in ``OpponentPool.alice``, or ``CURRENT``."""
+    bob_opponent: Ints
+    """(N,) index of Bob in ``OpponentPool.bob``, or ``CURRENT``."""
+
+    @property
+    def alice_past(self) -> NDArray[np.bool_]:
+        """(N,) a past Alice proposes."""
+        past: NDArray[np.bool_] = self.alice_opponent != CURRENT
+        return past
+
+    @property
+    def bob_past(self) -> NDArray[np.bool_]:
+        """(N,) a past Bob plays."""
+        past: NDArray[np.bool_] = self.bob_opponent != CURRENT
+        return past
+
+
+class OpponentPool:
+    """The last ``capacity`` snapshots of both players, oldest first."""
+
+    alice: list[Parameters]
+    """Alice's parameters by name, one dict a snapshot."""
+    bob: list[Parameters]
+    """Bob's parameters by name, one dict a snapshot."""
+
+    def __init__(self, capacity: int) -> None:
+        self._capacity = capacity
+        self.alice = []
+        self.bob = []
+
+    def __len__(self) -> int:
+        """Number of snapshots held."""
+        return len(self.alice)
+
+    def add(self, alice: Mapping[str, Array], bob: Mapping[str, Array]) -> None:
+        """Add a snapshot of both players' parameters, copied; the oldest is dropped from a full pool."""
+        for pool, parameters in ((self.alice, alice), (self.bob, bob)):
+            pool.append({name: np.array(array) for name, array in parameters.items()})
+            del pool[: -self._capacity]
+
+    def plan(self, num_worlds: int, fraction: float, rng: np.random.Generator) -> RoundPlan:
+        """Choose which worlds meet a past Alice or Bob this round, and one snapshot of each; none of an empty pool.
+
+        Args:
+            num_worlds: N.
+            fraction: share of worlds, each way; where it is not a whole number of worlds it is met on average.
+            rng: source of the choice.
+        """
+        plan = RoundPlan(np.full(num_worlds, CURRENT), np.full(num_worlds, CURRENT))
+        if not self.alice or fraction == 0.0:
+            return plan
+        num_past = _round_at_random(fraction * num_worlds, rng)
+        num_past = min(num_past, num_worlds // 2)
+        worlds = rng.permutation(num_worlds)
+        # One past version each a round: every further one would cost another batch of inference in every step.
+        plan.alice_opponent[worlds[:num_past]] = rng.integers(len(self))
+        plan.bob_opponent[worlds[num_past : 2 * num_past]] = rng.integers(len(self))
+        return plan
+
+    def state(self) -> State:
+        """All parameters, copied, as ``SNAPSHOT/PLAYER/NAME``."""
+        return {
+            f"{index}/{player}/{name}": array.copy()
+            for player, pool in (("alice", self.alice), ("bob", self.bob))
+            for index, parameters in enumerate(pool)
+            for name, array in parameters.items()
+        }
+
+    def load_state(self, state: Mapping[str, Array]) -> None:
+        """Take over what ``state`` gave; a smaller pool keeps the newest."""
+        snapshots: dict[int, dict[str, Parameters]] = {}
+        for key, array in state.items():
+            index, player, name = key.split("/", maxsplit=2)
+            snapshots.setdefault(int(index), {"alice": {}, "bob": {}})[player][name] = array
+        self.alice, self.bob = [], []
+        for _, snapshot in sorted(snapshots.items()):
+            self.add(**snapshot)
+
+
+def _round_at_random(count: float, rng: np.random.Generator) -> int:
+    """A whole number whose mean is ``count``, so that an actor of a few worlds meets past opponents, too."""
+    whole = int(np.floor(count + 1e-9))
+    rest = count - whole
+    return whole + int(rest > 1e-9 and rng.random() < rest)

@@ -1,0 +1,48 @@
+"""The generator's state as flat named arrays, so that a checkpoint needs no pickles."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from numpy.typing import NDArray
+
+from service.config import ConfigError
+
+Array = NDArray[Any]
+State = dict[str, Array]
+
+
+def prefixed(prefix: str, state: Mapping[str, Array]) -> State:
+    """The same arrays, named ``prefix/name``."""
+    return {f"{prefix}/{name}": array for name, array in state.items()}
+
+
+def under(prefix: str, state: Mapping[str, Array]) -> State:
+    """The arrays named ``prefix/name``, named ``name``: the inverse of ``prefixed``."""
+    head = f"{prefix}/"
+    return {name[len(head) :]: array for name, array in state.items() if name.startswith(head)}
+
+
+def take(state: Mapping[str, Array], name: str, like: Array, *, any_rows: bool = False) -> Array:
+    """A copy of one array, checked against an array of the receiver.
+
+    Args:
+        state: named arrays.
+        name: which one.
+        like: array of the expected type and shape.
+        any_rows: the first axis may have another length.
+
+    Raises:
+        ConfigError: missing, or of another type or shape, as after a change of the configuration.
+    """
+    if name not in state:
+        raise ConfigError(f"generator state: array {name!r} is missing; resume from another checkpoint")
+    array = state[name]
+    skip = 1 if any_rows else 0
+    if array.dtype != like.dtype or array.ndim != like.ndim or array.shape[skip:] != like.shape[skip:]:
+        raise ConfigError(
+            f"generator state: array {name!r} is {array.dtype} {array.shape}, this configuration needs {like.dtype} "
+            f"{like.shape}; resume with the configuration of the checkpoint"
+        )
+    return array.copy()

@@ -1,0 +1,1 @@
+"""The central learner: PPO for both players, Alice behavioural cloning for Bob."""

@@ -1,0 +1,204 @@
+"""The central learner."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from service.actors.rollout import Rollout
+from service.config import Config
+from service.envs.observations import MIRROR_ACTION, MIRROR_BOB, MIRROR_BOB_VALUE
+from service.learner import random_state
+from service.learner.demonstrations import DemonstrationHistory
+from service.learner.diagnostics import cloning_metrics, composition_metrics
+from service.learner.errors import LearnerError
+from service.learner.ledger import Ledger
+from service.learner.player import Player
+from service.learner.samples import Cloning, Samples, collect, mirrored
+from service.learner.update import probes, update_player
+from service.policies import networks
+from service.policies.parameters import FloatArray
+
+Arrays = dict[str, NDArray[Any]]
+Metrics = dict[str, float]
+
+MAX_POLICY_LAG = 2
+"""A rollout of a version further behind is not learned from."""
+
+
+@dataclass(frozen=True, slots=True)
+class Weights:
+    """What actors need to play with one policy version."""
+
+    version: int
+    alice: dict[str, FloatArray]
+    bob: dict[str, FloatArray]
+
+
+class Learner:
+    """Turns rollouts into policy versions.
+
+    Call order: ``ingest`` any number of rollouts, ``update`` once, hand out ``weights``, and again. After an update,
+    ``state`` holds all that ``load_state`` needs to continue as if nothing had happened, bit for bit.
+    """
+
+    def __init__(self, config: Config) -> None:
+        """Make both players from ``config.seed``; this is version 0.
+
+        Raises:
+            LearnerError: CUDA is asked for and not there.
+        """
+        self.config = config
+        self.version = 0
+        self._device = _device(config.learner.device)
+        with torch.random.fork_rng(devices=[]):
+            torch.default_generator.manual_seed(config.seed)
+            alice = networks.make_alice(config.policy), networks.make_alice_value(config.policy)
+            bob = networks.make_bob(config.policy), networks.make_bob_value(config.policy)
+        self._alice = Player(*alice, config.learner.alice, self._device)
+        self._bob = Player(*bob, config.learner.bob, self._device)
+        self._bob_policy = bob[0]
+        self._rng = np.random.Generator(np.random.PCG64(config.seed))
+        self._history = DemonstrationHistory(config.learner.abc.num_iterations)
+        self._ledger = Ledger()
+        self._pending: dict[tuple[int, int, int], Rollout] = {}
+
+    def ingest(self, rollout: Rollout) -> bool:
+        """Take a rollout for the next update.
+
+        Returns:
+            False if it was counted before, or comes from a policy version more than two behind or one that this
+            learner has not published (actors may be ahead of a learner that was resumed).
+        """
+        if rollout.id in self._ledger or rollout.id in self._pending:
+            return False
+        if not 0 <= self.version - rollout.policy_version <= MAX_POLICY_LAG:
+            return False
+        self._pending[rollout.id] = rollout
+        return True
+
+    def update(self) -> Metrics:
+        """Learn from all rollouts taken since the last update, in the order of their ids; makes the next version.
+
+        Returns:
+            Metrics named ``learner/...``; one that could not be measured is left out.
+
+        Raises:
+            LearnerError: there are none.
+        """
+        if not self._pending:
+            raise LearnerError("learner update with 0 rollouts: ingest at least one first")
+        rollouts = [self._pending[key] for key in sorted(self._pending)]
+        metrics = self._update_alice(rollouts)
+        for name, value in self._update_bob(rollouts).items():
+            metrics[name] = metrics.get(name, 0.0) + value  # only counts of failures are both players'
+        for rollout in rollouts:
+            self._ledger.add(rollout.id)
+        self._pending.clear()
+        self.version += 1
+        metrics["version"] = float(self.version)
+        return {f"learner/{name}": value for name, value in metrics.items() if math.isfinite(value)}
+
+    def weights(self) -> Weights:
+        """Both policies of the current version, as copies."""
+        alice, bob = (networks.export_parameters(player.policy) for player in (self._alice, self._bob))
+        return Weights(self.version, alice, bob)
+
+    def state(self) -> Arrays:
+        """Everything a resumed run needs, as arrays by name; rollouts not yet learned from are not part of it."""
+        parts = {"alice": self._alice.state(), "bob": self._bob.state(), "demonstrations": self._history.state()}
+        nested = {f"{part}/{name}": array for part, arrays in parts.items() for name, array in arrays.items()}
+        version = np.array(self.version, dtype=np.int64)
+        return nested | {"version": version, "rng": random_state.dump(self._rng), "counted": self._ledger.state()}
+
+    def load_state(self, state: Mapping[str, NDArray[Any]]) -> None:
+        """Continue exactly where ``state`` was taken, by a learner of the same configuration.
+
+        Raises:
+            LearnerError: an array is missing, left over or does not fit; the learner is as it was then.
+        """
+        state = dict(state)
+        try:
+            own = {name: state.pop(name) for name in ("version", "rng", "counted")}
+            history = {name: state.pop(f"demonstrations/{name}") for name in ("observation", "action", "num_steps")}
+        except KeyError as error:
+            raise LearnerError(f"learner state: no array {error}; take an undamaged checkpoint") from None
+        self._load_players(state)
+        self.version = int(own["version"])
+        self._rng = random_state.load(own["rng"])
+        self._ledger.load_state(own["counted"])
+        self._history.load_state(history)
+        self._pending.clear()
+
+    def _load_players(self, state: Arrays) -> None:
+        players = {"alice": self._alice, "bob": self._bob}
+        for name in state:
+            if name.partition("/")[0] not in players:
+                raise LearnerError(f"learner state {name!r}: no such part; take a checkpoint of this format version")
+        states = {key: _part(state, key) for key in players}
+        for key, player in players.items():
+            player.check_state(states[key], where=key)
+        for key, player in players.items():
+            player.load_state(states[key])
+
+    def _update_alice(self, rollouts: Sequence[Rollout]) -> Metrics:
+        turns = [rollout.alice for rollout in rollouts]
+        samples = collect(turns, self._alice.value, self.config.learner.alice, self._device)
+        metrics = update_player(self._alice, samples, None, self.config.learner.abc, self._rng)
+        return _prefixed("alice", metrics) | {"num_alice_samples": float(_length(samples))}
+
+    def _update_bob(self, rollouts: Sequence[Rollout]) -> Metrics:
+        config, bob = self.config.learner, self._bob
+        samples = collect([rollout.bob for rollout in rollouts], bob.value, config.bob, self._device)
+        metrics = {"num_bob_samples": float(_length(samples))}
+        if samples is not None and config.mirror:
+            samples = mirrored(samples, bob.log_prob, MIRROR_BOB, MIRROR_BOB_VALUE, MIRROR_ACTION)
+        cloning = self._cloning(rollouts)
+        metrics["num_demonstrations"] = float(_length(cloning) // (2 if config.mirror else 1))
+        metrics |= _prefixed("bob", update_player(bob, samples, cloning, config.abc, self._rng))
+        rows = samples if samples is not None else cloning
+        if rows is not None:
+            metrics |= composition_metrics(self._bob_policy, probes(rows.observation))
+        if cloning is not None:
+            metrics |= cloning_metrics(bob, Cloning(*(probes(column) for column in cloning.tensors())))
+        return metrics
+
+    def _cloning(self, rollouts: Sequence[Rollout]) -> Cloning | None:
+        """The demonstrations to clone, this update's among them; None if there are none or they have no weight."""
+        self._history.append([rollout.demonstrations for rollout in rollouts])
+        kept = self._history.joined()
+        observation, action = kept.observation, kept.action
+        if len(action) == 0 or self.config.learner.abc.weight == 0.0:
+            return None
+        if self.config.learner.mirror:
+            observation = np.concatenate((observation, MIRROR_BOB(observation)))
+            action = np.concatenate((action, MIRROR_ACTION(action)))
+        rows, actions = (torch.from_numpy(array).to(self._device) for array in (observation, action))
+        with torch.no_grad():
+            return Cloning(rows, actions, self._bob.log_prob(rows, actions))
+
+
+def _prefixed(player: str, metrics: Metrics) -> Metrics:
+    """Put the player's name before those that both have."""
+    shared = ("cloning_loss", "non_finite_steps", "rollbacks")
+    return {name if name in shared else f"{player}_{name}": value for name, value in metrics.items()}
+
+
+def _part(state: Arrays, key: str) -> Arrays:
+    return {name.removeprefix(f"{key}/"): array for name, array in state.items() if name.startswith(f"{key}/")}
+
+
+def _length(rows: Samples | Cloning | None) -> int:
+    return 0 if rows is None else len(rows)
+
+
+def _device(name: str) -> torch.device:
+    if name == "cuda" and not torch.cuda.is_available():
+        raise LearnerError("learner.device = 'cuda': torch finds no CUDA device here; set learner.device=cpu")
+    return torch.device(name)

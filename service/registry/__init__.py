@@ -1,0 +1,1 @@
+"""Checkpoints of runs, and the registry of frozen primitives: blobs, versions, aliases."""

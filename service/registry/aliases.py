@@ -1,0 +1,78 @@
+"""Movable aliases of one name: files that each hold the number of a version."""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import os
+from collections.abc import Iterator
+from pathlib import Path
+
+from service.registry.errors import RegistryError
+from service.registry.files import os_errors, write_atomic
+from service.registry.names import check_alias, is_name, is_number
+
+
+class Aliases:
+    """The aliases of one name in a directory; any number of processes may move them at once."""
+
+    def __init__(self, directory: Path) -> None:
+        """Nothing is written before the first `move`."""
+        self._directory = directory
+
+    def read(self, alias: str) -> int | None:
+        """The number ``alias`` means; None when there is no such alias.
+
+        Raises:
+            RegistryError: a bad alias, or its file is damaged.
+        """
+        path = self._directory / check_alias(alias)
+        with os_errors("read", path):
+            try:
+                text = path.read_bytes().decode("ascii", errors="replace").strip()
+            except FileNotFoundError:
+                return None
+        if not is_number(text):
+            raise RegistryError(f"alias {path} is damaged: it holds {text!r}; set it again with tandem registry alias")
+        return int(text)
+
+    def read_all(self) -> dict[str, int]:
+        """Every alias and the number it means, sorted.
+
+        Raises:
+            RegistryError: a file is damaged.
+        """
+        found = sorted(entry.name for entry in self._directory.iterdir()) if self._directory.is_dir() else []
+        numbers = {alias: self.read(alias) for alias in found if is_name(alias)}
+        return {alias: number for alias, number in numbers.items() if number is not None}
+
+    def move(self, alias: str, number: int) -> None:
+        """Make ``alias`` mean ``number``, whatever it meant before.
+
+        Raises:
+            RegistryError: a bad alias, or the disk cannot be written.
+        """
+        path = self._directory / check_alias(alias)
+        with os_errors("write", path), self._lock():
+            write_atomic(path, f"{number}\n".encode())
+
+    def advance(self, alias: str, number: int) -> None:
+        """Make ``alias`` mean ``number`` unless it means a greater one: a slow publisher must not undo a later one.
+
+        Raises:
+            RegistryError: a bad alias, or the disk cannot be written.
+        """
+        path = self._directory / check_alias(alias)
+        with os_errors("write", path), self._lock():
+            if (self.read(alias) or 0) < number:
+                write_atomic(path, f"{number}\n".encode())
+
+    @contextlib.contextmanager
+    def _lock(self) -> Iterator[None]:
+        self._directory.mkdir(parents=True, exist_ok=True)
+        descriptor = os.open(self._directory / ".lock", os.O_RDWR | os.O_CREAT, 0o666)
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX)  # the kernel frees it when the process dies
+            yield
+        finally:
+            os.close(descriptor)

@@ -1,0 +1,68 @@
+"""A store of immutable bytes, each named by its own sha256."""
+
+from __future__ import annotations
+
+import hashlib
+from pathlib import Path
+
+from service.registry.errors import DamagedBlobError
+from service.registry.files import os_errors, write_atomic
+
+
+class BlobStore:
+    """Content-addressed files ``sha256/<digest>`` under a directory; safe for many processes at once."""
+
+    def __init__(self, directory: Path) -> None:
+        """Nothing is written before the first `put`."""
+        self._directory = directory
+
+    def path(self, digest: str) -> Path:
+        """Where the blob of that digest is, or would be."""
+        return self._directory / "sha256" / digest
+
+    def put(self, data: bytes) -> str:
+        """Store ``data`` and return its sha256 in hex; bytes already there and whole are not written again.
+
+        Raises:
+            RegistryError: the disk is full or cannot be written; nothing is left behind.
+        """
+        digest = sha256_of(data)
+        path = self.path(digest)
+        with os_errors("write", path):
+            if not (path.exists() and sha256_of(path.read_bytes()) == digest):
+                write_atomic(path, data)
+        return digest
+
+    def get(self, digest: str) -> bytes:
+        """The bytes of that digest, verified.
+
+        Raises:
+            DamagedBlobError: the file is missing or holds other bytes.
+            RegistryError: the file cannot be read.
+        """
+        path = self.path(digest)
+        with os_errors("read", path):
+            try:
+                data = path.read_bytes()
+            except FileNotFoundError:
+                raise DamagedBlobError(f"blob {path} is missing; {_MEND}") from None
+        check_digest(path, data, digest)
+        return data
+
+
+def check_digest(path: Path, data: bytes, digest: str) -> None:
+    """Check that the bytes read from ``path`` are those of ``digest``.
+
+    Raises:
+        DamagedBlobError: they are not.
+    """
+    if (actual := sha256_of(data)) != digest:
+        raise DamagedBlobError(f"{path} is damaged: expected sha256 {digest}, it has {actual}; {_MEND}")
+
+
+def sha256_of(data: bytes) -> str:
+    """The sha256 of ``data`` in hex."""
+    return hashlib.sha256(data).hexdigest()
+
+
+_MEND = "restore the file from a copy, or publish the same parameters again"

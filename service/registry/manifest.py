@@ -1,0 +1,129 @@
+"""What a version says about itself: a JSON manifest that carries its own digest."""
+
+from __future__ import annotations
+
+import functools
+import hashlib
+import json
+import subprocess
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from pydantic import BaseModel, ConfigDict, Field, JsonValue, ValidationError
+
+from service.registry.errors import DamagedBlobError, FormatVersionError, RegistryError
+
+FORMAT_VERSION = 1
+_DIGEST_KEY = "manifest_sha256"
+_MEND = "restore the file from a copy, or publish the version again"
+
+
+class _Frozen(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+
+class TensorDescription(_Frozen):
+    """Shape and dtype of one tensor."""
+
+    shape: tuple[int, ...]
+    dtype: str
+
+
+class Manifest(_Frozen):
+    """Everything known about one immutable version."""
+
+    format_version: int = FORMAT_VERSION
+    name: str
+    version: int = Field(ge=1)
+    created: str = Field(description="UTC, ISO 8601")
+    blob_sha256: str = Field(pattern=r"^[0-9a-f]{64}$", description="digest of the safetensors bytes")
+    blob_bytes: int = Field(ge=0)
+    tensors: dict[str, TensorDescription]
+    spaces: dict[str, JsonValue] = Field(description="the action and observation spaces")
+    normalisation: dict[str, JsonValue] = Field(description="fixed normalisation of the network's input")
+    config: dict[str, JsonValue] = Field(description="configuration of the run that made it")
+    metrics: dict[str, float]
+    parent: str | None = Field(None, description="NAME@VERSION this one was trained on from")
+    git_commit: str | None = Field(None, description="of the code that published it; '-dirty' with local changes")
+
+    @property
+    def reference(self) -> str:
+        """``NAME@VERSION``."""
+        return f"{self.name}@{self.version}"
+
+    def to_bytes(self) -> bytes:
+        """The manifest as the JSON text that `parse_manifest` reads back to an equal object."""
+        tree = self.model_dump(mode="json")
+        return (json.dumps({**tree, _DIGEST_KEY: _digest(tree)}, indent=1, sort_keys=True) + "\n").encode()
+
+
+def make_manifest(fields: Mapping[str, object]) -> Manifest:
+    """A manifest of these fields.
+
+    Raises:
+        RegistryError: a value that JSON cannot hold, such as NaN or an array; the message names it.
+    """
+    try:
+        manifest = Manifest.model_validate(fields)
+        json.dumps(manifest.model_dump(mode="json"), allow_nan=False)
+    except ValidationError as error:
+        first = error.errors()[0]
+        key = ".".join(str(part) for part in first["loc"])
+        raise RegistryError(
+            f"manifest of {fields.get('name')}: {key} = {first['input']!r}: {first['msg']}; give finite JSON values"
+        ) from None
+    except ValueError:
+        raise RegistryError(
+            f"manifest of {fields.get('name')}: NaN or infinity in spaces, normalisation or config; leave it out"
+        ) from None
+    return manifest
+
+
+def parse_manifest(data: bytes, path: Path) -> Manifest:
+    """Read and verify a manifest; ``path`` is named in errors.
+
+    Raises:
+        FormatVersionError: written in another format.
+        DamagedBlobError: not the bytes that were published.
+    """
+    try:
+        tree = json.loads(data)
+    except ValueError:
+        raise DamagedBlobError(f"manifest {path} is damaged: not JSON; {_MEND}") from None
+    if not isinstance(tree, dict):
+        raise DamagedBlobError(f"manifest {path} is damaged: not a JSON object; {_MEND}")
+    if tree.get("format_version") != FORMAT_VERSION:
+        raise FormatVersionError.of(path, found=tree.get("format_version"), supported=FORMAT_VERSION)
+    expected, actual = tree.pop(_DIGEST_KEY, None), _digest(tree)
+    if expected != actual:
+        raise DamagedBlobError(f"manifest {path} is damaged: expected sha256 {expected}, it has {actual}; {_MEND}")
+    try:
+        return Manifest.model_validate(tree)
+    except ValidationError as error:
+        first = error.errors()[0]
+        raise DamagedBlobError(f"manifest {path} is not valid: {first['loc']}: {first['msg']}; {_MEND}") from None
+
+
+@functools.cache
+def git_commit() -> str | None:
+    """The commit of this program's own checkout, with ``-dirty`` for local changes; None outside of one."""
+    root = Path(__file__).resolve().parents[2]
+    top = _git(root, "rev-parse", "--show-toplevel")
+    # an installation inside somebody else's repository must not claim that repository's commit
+    if top is None or Path(top).resolve() != root:
+        return None
+    return _git(root, "describe", "--always", "--dirty", "--abbrev=40", "--exclude=*")
+
+
+def _git(root: Path, *arguments: str) -> str | None:
+    command = ["git", "-C", str(root), *arguments]
+    try:
+        result = subprocess.run(command, capture_output=True, text=True, timeout=10, check=True)
+    except (OSError, subprocess.SubprocessError):
+        return None
+    return result.stdout.strip() or None
+
+
+def _digest(tree: dict[str, Any]) -> str:
+    return hashlib.sha256(json.dumps(tree, sort_keys=True, separators=(",", ":")).encode()).hexdigest()

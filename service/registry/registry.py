@@ -1,0 +1,239 @@
+"""The registry: immutable versions of named parameters, with movable aliases, in plain files.
+
+Layout under the root::
+
+    blobs/sha256/<digest>         safetensors bytes
+    models/<name>/versions/<n>    manifest, JSON; made exclusively, never changed
+    models/<name>/aliases/<a>     the number of a version; moved by replacing the file
+
+A publish writes the blob, then the manifest, then the aliases, each atomically: a reader sees all of a version or none.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from service.registry import names, tensors
+from service.registry.aliases import Aliases
+from service.registry.blobs import BlobStore, sha256_of
+from service.registry.errors import RegistryError, UnknownVersionError
+from service.registry.exported import write_exported
+from service.registry.files import os_errors, write_exclusive
+from service.registry.manifest import Manifest, git_commit, make_manifest, parse_manifest
+from service.registry.names import LATEST, Version
+
+
+class Registry:
+    """Named, versioned parameters in a directory; any number of processes may publish and read at once."""
+
+    def __init__(self, root: Path) -> None:
+        """Open ``root``; nothing is read or written before the first call."""
+        self.root = root
+        self._blobs = BlobStore(root / "blobs")
+
+    def publish(
+        self,
+        name: str,
+        parameters: Mapping[str, np.ndarray],
+        *,
+        spaces: Mapping[str, Any],
+        normalisation: Mapping[str, Any],
+        config: Mapping[str, Any],
+        metrics: Mapping[str, float],
+        parent: str | None = None,
+        aliases: Sequence[str] = (LATEST,),
+    ) -> Version:
+        """Make the next version of ``name`` and move ``aliases`` to it.
+
+        Of two publishers at the same time, the later version keeps the alias.
+
+        Args:
+            name: such as ``panda-cube``.
+            parameters: arrays by name; see `tensors.encode` for what they may be.
+            spaces: action and observation spaces, plain JSON values.
+            normalisation: the network's fixed input normalisation, plain JSON values.
+            config: configuration of the run, plain JSON values.
+            metrics: finite numbers.
+            parent: reference of the version this one was trained on from; it must exist.
+            aliases: moved to the new version.
+
+        Raises:
+            RegistryError: a bad name, alias, array or value, and nothing is written; or the disk cannot be written,
+                and what was there before is intact.
+            UnknownVersionError: no such parent.
+        """
+        names.check_name(name)
+        for alias in aliases:
+            names.check_alias(alias)
+        fields: dict[str, Any] = {
+            "name": name,
+            "created": datetime.now(UTC).isoformat(timespec="seconds"),
+            "tensors": tensors.describe(parameters),
+            "spaces": dict(spaces),
+            "normalisation": dict(normalisation),
+            "config": dict(config),
+            "metrics": dict(metrics),
+            "parent": str(self.resolve(parent)) if parent is not None else None,
+            "git_commit": git_commit(),
+        }
+        version = self._publish_version(name, parameters, fields)
+        for alias in aliases:
+            self._aliases(name).advance(alias, version.number)
+        return version
+
+    def resolve(self, reference: str) -> Version:
+        """The version that ``NAME``, ``NAME@VERSION`` or ``NAME@ALIAS`` means now; ``NAME`` is ``NAME@latest``.
+
+        Raises:
+            UnknownVersionError: there is none; the message lists what there is.
+            RegistryError: not a reference, or a damaged alias.
+        """
+        name, target = names.split_reference(reference)
+        number = target if isinstance(target, int) else self._aliases(name).read(target)
+        if number is None or not self._manifest_path(Version(name, number)).exists():
+            raise UnknownVersionError(self._what_exists(name, target))
+        return Version(name, number)
+
+    def manifest(self, reference: str) -> Manifest:
+        """The verified manifest of a version.
+
+        Raises:
+            UnknownVersionError: no such version.
+            DamagedBlobError: the manifest is damaged.
+            FormatVersionError: the manifest is of another format.
+        """
+        path = self._manifest_path(self.resolve(reference))
+        with os_errors("read", path):
+            data = path.read_bytes()
+        return parse_manifest(data, path)
+
+    def load(self, reference: str) -> tuple[Manifest, dict[str, np.ndarray]]:
+        """The verified manifest and parameters of a version.
+
+        Raises:
+            UnknownVersionError: no such version.
+            DamagedBlobError: its manifest or parameters are damaged.
+            FormatVersionError: it is of another format.
+        """
+        manifest = self.manifest(reference)
+        return manifest, tensors.decode(self._blobs.get(manifest.blob_sha256))
+
+    def names(self) -> list[str]:
+        """Every name that has a version, sorted."""
+        directory = self.root / "models"
+        found = [entry.name for entry in directory.iterdir()] if directory.is_dir() else []
+        return sorted(name for name in found if names.is_name(name) and self.versions(name))
+
+    def versions(self, name: str) -> list[Version]:
+        """The versions of ``name``, oldest first; empty when there are none."""
+        directory = self._directory(name) / "versions"
+        found = [entry.name for entry in directory.iterdir()] if directory.is_dir() else []
+        return [Version(name, number) for number in sorted(int(text) for text in found if names.is_number(text))]
+
+    def aliases(self, name: str) -> dict[str, int]:
+        """Aliases of ``name`` and the number each means, sorted.
+
+        Raises:
+            RegistryError: an alias file is damaged.
+        """
+        return self._aliases(name).read_all()
+
+    def set_alias(self, name: str, alias: str, version: int) -> Version:
+        """Make or move ``alias`` of ``name`` to ``version``, forward or back.
+
+        Raises:
+            RegistryError: a bad name or alias, or a disk that cannot be written.
+            UnknownVersionError: no such version.
+        """
+        target = self.resolve(f"{name}@{version}")
+        self._aliases(name).move(alias, version)
+        return target
+
+    def verify(self, reference: str | None = None) -> list[str]:
+        """Read a version, or everything, and check each byte.
+
+        Returns:
+            one line for each problem; empty when all is well.
+
+        Raises:
+            UnknownVersionError: no such version.
+        """
+        if reference is not None:
+            return self._problems_of(self.resolve(reference))
+        versions = [version for name in self.names() for version in self.versions(name)]
+        problems = [problem for version in versions for problem in self._problems_of(version)]
+        return problems + [problem for name in self.names() for problem in self._alias_problems(name)]
+
+    def export(self, reference: str, directory: Path) -> Manifest:
+        """Write a version into ``directory`` as two files that `exported.load_exported` reads without a registry.
+
+        Raises:
+            UnknownVersionError: no such version.
+            DamagedBlobError: the version is damaged; nothing is written.
+            RegistryError: the directory holds an export already, or cannot be written.
+        """
+        manifest = self.manifest(reference)
+        write_exported(directory, manifest, self._blobs.get(manifest.blob_sha256))
+        return manifest
+
+    def _publish_version(self, name: str, parameters: Mapping[str, np.ndarray], fields: dict[str, Any]) -> Version:
+        try:
+            data = tensors.encode(parameters)
+        except ValueError as error:
+            raise RegistryError(f"cannot publish {name}: {error}") from None
+        fields |= {"blob_sha256": sha256_of(data), "blob_bytes": len(data)}
+        make_manifest({**fields, "version": 1})  # a bad value must be found before anything is written
+        self._blobs.put(data)
+        while True:
+            # unique: only one writer makes number n; contiguous: nobody tries n + 1 before n is there
+            version = Version(name, max((last.number for last in self.versions(name)), default=0) + 1)
+            path = self._manifest_path(version)
+            with os_errors("write", path):
+                if write_exclusive(path, make_manifest({**fields, "version": version.number}).to_bytes()):
+                    return version
+
+    def _problems_of(self, version: Version) -> list[str]:
+        try:
+            manifest, parameters = self.load(str(version))
+        except RegistryError as error:
+            return [f"{version}: {error}"]
+        if (manifest.name, manifest.version) != version:
+            return [f"{version}: its manifest is that of {manifest.reference}; restore the file from a copy"]
+        assert set(parameters) == set(manifest.tensors)
+        return []
+
+    def _alias_problems(self, name: str) -> list[str]:
+        numbers = {version.number for version in self.versions(name)}
+        try:
+            aliases = self.aliases(name)
+        except RegistryError as error:
+            return [f"{name}: {error}"]
+        return [
+            f"{name}@{alias}: means version {number}, which is missing; move it with tandem registry alias"
+            for alias, number in aliases.items()
+            if number not in numbers
+        ]
+
+    def _what_exists(self, name: str, target: int | str) -> str:
+        versions = self.versions(name)
+        if not versions:
+            known = ", ".join(self.names()) or "nothing yet"
+            return f"no {name!r} in the registry {self.root}; it holds: {known}; pick one of those or another registry"
+        aliases = ", ".join(f"{alias} -> {number}" for alias, number in self.aliases(name).items()) or "none"
+        kind = "version" if isinstance(target, int) else "alias"
+        span = f"{versions[0].number} to {versions[-1].number}"
+        return f"{name} has no {kind} {target!r} in the registry {self.root}; versions: {span}; aliases: {aliases}"
+
+    def _directory(self, name: str) -> Path:
+        return self.root / "models" / names.check_name(name)
+
+    def _manifest_path(self, version: Version) -> Path:
+        return self._directory(version.name) / "versions" / str(version.number)
+
+    def _aliases(self, name: str) -> Aliases:
+        return Aliases(self._directory(name) / "aliases")

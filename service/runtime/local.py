@@ -1,0 +1,220 @@
+"""The local runner: one process, the same parts as the cluster.
+
+While one thread plays round i with the newest weights, another learns from round i-1: policy lag is exactly 1, both cores of
+a laptop are busy, and the order of everything is fixed, so a run is reproducible bit for bit.
+"""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections import defaultdict
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from service.actors.evaluation import evaluate
+from service.actors.game import Acting, Players, SelfPlay
+from service.actors.rollout import Rollout, from_arrays, to_arrays
+from service.config import Config
+from service.generator.generator import TaskGenerator
+from service.policies.evaluator import GaussianEvaluator, MCPEvaluator
+from service.registry.checkpoints import CheckpointStore
+from service.runtime.rundir import RunDirectory
+from service.runtime.timing import Timing
+
+if TYPE_CHECKING:
+    from service.learner.learner import Weights
+
+Metrics = dict[str, float]
+OnIteration = Callable[[Metrics], None]
+_logger = logging.getLogger(__name__)
+
+EVALUATION_SEED = 1_000_003
+"""Evaluations during a run always use the same goals, so that they compare."""
+
+
+@dataclass(frozen=True, slots=True)
+class RunResult:
+    """How a run ended."""
+
+    reason: str
+    """``finished`` (budget), ``converged`` (the paper's stop criterion) or ``interrupted``."""
+    iteration: int
+    num_env_steps: int
+
+
+class LocalRun:
+    """A pre-training run in this process.
+
+    Args:
+        config: the run.
+        directory: where it keeps everything; see ``RunDirectory``.
+        resume: continue from the newest checkpoint instead of starting anew.
+
+    Raises:
+        CheckpointError: ``resume`` without a usable checkpoint.
+    """
+
+    def __init__(self, config: Config, directory: RunDirectory, *, resume: bool = False) -> None:
+        import torch  # here, not by those who only read runs
+
+        from service.learner.learner import Learner
+
+        torch.set_num_threads(config.learner.num_threads)
+        self.config = config
+        self.directory = directory
+        self.timing = Timing()
+        self._rng = np.random.default_rng(config.seed)
+        self.learner = Learner(config)
+        self.game = SelfPlay(config, self._rng, num_threads=config.run.num_threads)
+        self.generator = TaskGenerator(config, self.game.worlds.state_size)
+        self.iteration = 0
+        self.num_env_steps = 0
+        self._wall_s = 0.0
+        self._stop_requested = False
+        self._past: list[tuple[Acting, Acting]] = []
+        self._pending: Rollout | None = None
+        self._executor = ThreadPoolExecutor(max_workers=1, thread_name_prefix="learner")
+        self._checkpoints = CheckpointStore(directory.checkpoints, config.run.keep_checkpoints)
+        if resume:
+            self._load()
+        directory.start(config, after_iteration=self.iteration if resume else None)
+
+    def request_stop(self) -> None:
+        """End after the current iteration, with a checkpoint. Safe to call from a signal handler."""
+        self._stop_requested = True
+
+    def run(self, on_iteration: OnIteration = lambda metrics: None) -> RunResult:
+        """Play, learn, record, until the budget is spent, the stop criterion holds, or a stop is requested."""
+        while (reason := self._over()) is None:
+            metrics = self._iterate()
+            with self.timing("record"):
+                self.directory.record(metrics)
+                on_iteration(metrics)
+            if self.iteration % self.config.run.checkpoint_interval == 0:
+                self.save()
+        self.save()
+        self._executor.shutdown()
+        self.game.close()
+        return RunResult(reason, self.iteration, self.num_env_steps)
+
+    def _over(self) -> str | None:
+        if self._stop_requested:
+            return "interrupted"
+        if self.num_env_steps >= self.config.run.total_env_steps:
+            return "finished"
+        return "converged" if self.generator.should_stop() else None
+
+    def _iterate(self) -> Metrics:
+        """Consumes the pending rollout and produces the next one; waits for play and learning both."""
+        start = time.perf_counter()
+        with self.timing("weights"):
+            weights = self.learner.weights()
+            players = self._players(weights)
+        learning = self._executor.submit(self._learn, self._pending)
+        with self.timing("play"):
+            rollout = self._play(players)
+        with self.timing("generator"):
+            metrics = rollout.metrics | self.generator.record(rollout.records)
+            self.directory.record_goals(self.iteration, self.num_env_steps, rollout.records)
+            if self.generator.snapshot_due(self.iteration):
+                self.generator.add_opponents(weights.alice, weights.bob)
+                self._past = []
+        with self.timing("wait for learner"):
+            metrics |= learning.result()
+        self._pending = rollout
+        self.iteration += 1
+        self.num_env_steps += rollout.num_env_steps
+        with self.timing("evaluate"):
+            metrics |= self._evaluate(players)
+        elapsed_s = time.perf_counter() - start
+        self._wall_s += elapsed_s
+        return {
+            "iteration": self.iteration,
+            "env_steps": self.num_env_steps,
+            "world/num_broken": float(self.game.worlds.num_broken),
+            **metrics,
+            "time/wall_s": self._wall_s,
+            "time/env_steps_per_s": rollout.num_env_steps / elapsed_s,
+        }
+
+    def _play(self, players: Players) -> Rollout:
+        plan = self.generator.plan(self.config.game.num_worlds, self._rng)
+        return self.game.play_round(
+            players, plan, lambda *proposals: self.generator.choose_goals(plan, *proposals, self._rng)
+        )
+
+    def _learn(self, rollout: Rollout | None) -> Metrics:
+        """Runs in the learner's thread; the main thread does not touch the learner meanwhile."""
+        if rollout is None:
+            return {}
+        start = time.perf_counter()
+        lag = self.learner.version - rollout.policy_version
+        self.learner.ingest(rollout)
+        metrics = self.learner.update()
+        return {**metrics, "learner/policy_lag": float(lag), "time/learn_s": time.perf_counter() - start}
+
+    def _players(self, weights: Weights) -> Players:
+        if not self._past:
+            pool = self.generator.opponents
+            self._past = [(GaussianEvaluator(a), MCPEvaluator(b)) for a, b in zip(pool.alice, pool.bob, strict=True)]
+        return Players(
+            version=weights.version,
+            alice=GaussianEvaluator(weights.alice),
+            bob=MCPEvaluator(weights.bob),
+            past_alice=[alice for alice, _ in self._past],
+            past_bob=[bob for _, bob in self._past],
+        )
+
+    def _evaluate(self, players: Players) -> Metrics:
+        run, game = self.config.run, self.config.game
+        if run.evaluation_interval == 0 or self.iteration % run.evaluation_interval:
+            return {}
+        metrics = {}
+        for kind in ("table", "air"):
+            result = evaluate(
+                players.bob, self.config.world, kind, num_episodes=run.evaluation_episodes, num_steps=run.evaluation_steps,
+                success_distance_m=game.success_distance_m, seed=EVALUATION_SEED, num_threads=run.num_threads,
+            )  # fmt: skip
+            metrics[f"evaluation/{kind}_success_last"] = result.success_last
+            metrics[f"evaluation/{kind}_success_ever"] = result.success_ever
+        return metrics
+
+    # --- exact resume ----------------------------------------------------------------------------------------------
+
+    def save(self) -> None:
+        """Write a checkpoint: with it alone a new process goes on bit-identically."""
+        with self.timing("checkpoint"):
+            parts = {"learner": self.learner.state(), "generator": self.generator.state(), "game": self.game.state()}
+            weights = self.learner.weights()  # for readers without torch: evaluate, render, coverage
+            parts |= {"alice": weights.alice, "bob": weights.bob}
+            if self._pending is not None:
+                parts["pending"] = to_arrays(self._pending)
+            arrays = {f"{part}/{name}": array for part, state in parts.items() for name, array in state.items()}
+            meta = {
+                "config": self.config.model_dump(mode="json"),
+                "env_steps": self.num_env_steps,
+                "wall_s": self._wall_s,
+                "rng": self._rng.bit_generator.state,
+            }
+            self._checkpoints.save(self.iteration, arrays, meta)
+
+    def _load(self) -> None:
+        checkpoint = self._checkpoints.load_latest()
+        parts: dict[str, dict[str, Any]] = defaultdict(dict)
+        for name, array in checkpoint.arrays.items():
+            part, _, rest = name.partition("/")
+            parts[part][rest] = array
+        self.learner.load_state(parts["learner"])
+        self.generator.load_state(parts["generator"])
+        self.game.load_state(parts["game"])
+        self._pending = from_arrays(parts["pending"]) if "pending" in parts else None
+        self.iteration = checkpoint.step
+        self.num_env_steps = int(checkpoint.meta["env_steps"])
+        self._wall_s = float(checkpoint.meta["wall_s"])
+        self._rng.bit_generator.state = checkpoint.meta["rng"]
+        _logger.info("resumed at iteration %d, %d env steps", self.iteration, self.num_env_steps)

@@ -1,0 +1,60 @@
+"""Finding a Bob to evaluate, render or compose: in a registry, or in a run directory."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from service.config import Config, parse_config
+from service.errors import TandemError
+from service.policies.evaluator import GaussianEvaluator, MCPEvaluator
+from service.policies.parameters import Parameters
+from service.registry.checkpoints import CheckpointStore
+from service.runtime.rundir import RunDirectory
+
+@dataclass(frozen=True, slots=True)
+class TrainedBob:
+    """A Bob ready to act, and the configuration he was trained with."""
+
+    label: str
+    """Where he comes from, such as ``panda-cube@3``."""
+    policy: MCPEvaluator
+    config: Config
+
+
+def load_bob(reference: str, registry: Path) -> TrainedBob:
+    """Load NAME, NAME@ALIAS or NAME@VERSION from a registry, or the newest checkpoint of a run directory.
+
+    Raises:
+        TandemError: neither a run directory nor a published version, or damaged.
+    """
+    if Path(reference).is_dir():
+        directory = RunDirectory(Path(reference))
+        config, parameters = directory.read_config(), read_parameters(directory, "bob")
+        return TrainedBob(reference, MCPEvaluator(parameters), config)
+    if "/" in reference:
+        raise TandemError(f"{reference}: no such run directory; for published primitives write NAME@ALIAS")
+    from service.registry.registry import Registry
+
+    manifest, tensors = Registry(registry).load(reference)
+    config = parse_config(manifest.config, where=f"the manifest of {reference}")
+    return TrainedBob(manifest.reference, MCPEvaluator(tensors), config)
+
+
+def load_players(directory: RunDirectory) -> tuple[GaussianEvaluator, MCPEvaluator]:
+    """Alice and Bob of a run's newest checkpoint.
+
+    Raises:
+        TandemError: no usable checkpoint.
+    """
+    return (
+        GaussianEvaluator(read_parameters(directory, "alice")),
+        MCPEvaluator(read_parameters(directory, "bob")),
+    )
+
+
+def read_parameters(directory: RunDirectory, player: str) -> Parameters:
+    """Parameters of ``alice`` or ``bob`` in a run's newest checkpoint."""
+    arrays = CheckpointStore(directory.checkpoints, keep=1).load_latest().arrays
+    prefix = f"{player}/"
+    return {name.removeprefix(prefix): array for name, array in arrays.items() if name.startswith(prefix)}

@@ -1,0 +1,115 @@
+"""A run directory: everything a run leaves behind, and nothing else.
+
+| file | content |
+|---|---|
+| ``config.yaml`` | the resolved configuration |
+| ``metrics.jsonl`` | one object per iteration; keys are the metric names; ``time/...`` differ from run to run, the rest does not |
+| ``goals.jsonl`` | per iteration a sample of valid proposals: start x y z, goal x y z (metres), solved 0/1 |
+| ``tensorboard/`` | the same metrics as TensorBoard events over env steps |
+| ``checkpoints/`` | the newest checkpoints; ``--resume`` continues from them exactly |
+| ``broken/`` | states of worlds whose physics diverged |
+"""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from service.config import Config, ConfigError, dump_config, load_config
+from service.errors import TandemError
+from service.generator.validity import Verdict
+from service.registry.files import os_errors, write_atomic
+from service.runtime.records import JsonlWriter
+
+if TYPE_CHECKING:
+    from tensorboard.summary.writer.event_file_writer import EventFileWriter
+
+    from service.actors.rollout import GoalRecords
+
+GOALS_PER_ITERATION = 32
+"""Valid proposals recorded per iteration, at most."""
+
+
+class RunDirectory:
+    """Reads and writes the files of one run."""
+
+    def __init__(self, path: Path) -> None:
+        """Nothing is read or written before ``start``."""
+        self.path = path
+        self.config_file = path / "config.yaml"
+        self.metrics_file = path / "metrics.jsonl"
+        self.goals_file = path / "goals.jsonl"
+        self.checkpoints = path / "checkpoints"
+        self._metrics = JsonlWriter(self.metrics_file)
+        self._goals = JsonlWriter(self.goals_file)
+        self._events: EventFileWriter | None = None
+
+    @property
+    def exists(self) -> bool:
+        """Whether a run has begun here."""
+        return self.config_file.exists()
+
+    def read_config(self) -> Config:
+        """The run's resolved configuration.
+
+        Raises:
+            ConfigError: no run here, or its configuration cannot be read.
+        """
+        if not self.exists:
+            raise ConfigError(f"no run in {self.path}: {self.config_file.name} is missing; name the directory of a run")
+        return load_config(self.config_file)
+
+    def start(self, config: Config, *, after_iteration: int | None = None) -> None:
+        """Begin a run here, or continue one: then records of later iterations, which will be made again, are dropped.
+
+        Raises:
+            TandemError: a new run where there is one already, or a directory that cannot be written.
+        """
+        if after_iteration is None and self.exists:
+            raise TandemError(f"{self.path} holds a run already; continue it with --resume, or name another --run-dir")
+        with os_errors("write", self.path):
+            self.checkpoints.mkdir(parents=True, exist_ok=True)
+            write_atomic(self.config_file, dump_config(config).encode())
+        if after_iteration is not None:
+            self._metrics.truncate_after(after_iteration)
+            self._goals.truncate_after(after_iteration)
+        from tensorboard.summary.writer.event_file_writer import EventFileWriter
+
+        self._events = EventFileWriter(str(self.path / "tensorboard"))
+
+    def record(self, metrics: dict[str, float]) -> None:
+        """Append one iteration's metrics to metrics.jsonl and TensorBoard."""
+        self._metrics.append(metrics)
+        if self._events is not None:
+            self._events.add_event(_event(metrics))
+
+    def record_goals(self, iteration: int, num_env_steps: int, records: GoalRecords) -> None:
+        """Append a sample of this iteration's valid proposals that the current Bob played."""
+        chosen = (records.verdict == Verdict.VALID) & records.played & ~records.replayed & ~records.bob_past
+        rows = np.flatnonzero(chosen)[:GOALS_PER_ITERATION]
+        table = np.concatenate(
+            [records.start_position[rows], records.goal[rows], records.solved[rows, None].astype(float)], axis=1
+        )
+        # "iteration" counts finished iterations, as in metrics.jsonl, so that a resume cuts both files alike.
+        self._goals.append({"iteration": iteration + 1, "env_steps": num_env_steps, "goals": np.round(table, 4)})
+
+    def close(self) -> None:
+        """Flush TensorBoard's events."""
+        if self._events is not None:
+            self._events.close()
+            self._events = None
+
+
+def _event(metrics: dict[str, float]) -> object:
+    from tensorboard.compat.proto.event_pb2 import Event
+    from tensorboard.compat.proto.summary_pb2 import Summary
+
+    values = [
+        Summary.Value(tag=name, simple_value=value)
+        for name, value in metrics.items()
+        if name not in ("iteration", "env_steps") and value is not None
+    ]
+    return Event(wall_time=time.time(), step=int(metrics["env_steps"]), summary=Summary(value=values))

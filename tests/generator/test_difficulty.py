@@ -1,0 +1,140 @@
+"""Counts, cells and bins by hand."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from service.config import ConfigError, WorkspaceConfig, WorldConfig
+from service.generator.counts import DECAY, SuccessCounts
+from service.generator.difficulty import DifficultyGrid, height_bins, in_air
+
+WORLD = WorldConfig(workspace=WorkspaceConfig(center_x_m=0.1, center_y_m=0.0))
+START = (0.1, 0.0, 0.025)
+
+
+def record(grid: DifficultyGrid, goals: list[tuple[float, ...]], solved: list[bool]) -> None:
+    grid.record(np.array(goals), np.tile(START, (len(goals), 1)), np.array(solved))
+
+
+def test_counts_by_hand() -> None:
+    counts = SuccessCounts(3)
+    counts.record(np.array([0, 0, 0, 1]), np.array([True, True, False, False]))
+    # Bin 0: (2 + 1) / (3 + 2); bin 1: (0 + 1) / (1 + 2); bin 2 untried: the prior's mean.
+    np.testing.assert_allclose(counts.success_rate(), [3 / 5, 1 / 3, 1 / 2], rtol=1e-15)
+    np.testing.assert_allclose(counts.learnability(), [6 / 25, 2 / 9, 1 / 4], rtol=1e-15)
+    counts.record(np.array([0]), np.array([False]))
+    np.testing.assert_allclose(counts.tries, [3 * DECAY + 1, DECAY, 0.0], rtol=1e-15)
+    np.testing.assert_allclose(counts.successes, [2 * DECAY, 0.0, 0.0], rtol=1e-15)
+    assert counts.num_tries.tolist() == [4, 1, 0]
+
+
+def test_counts_follow_bob() -> None:
+    counts = SuccessCounts(1)
+    for _ in range(200):
+        counts.record(np.zeros(5, dtype=np.int64), np.zeros(5, dtype=np.bool_))
+    assert counts.success_rate()[0] < 0.02
+    for _ in range(60):
+        counts.record(np.zeros(5, dtype=np.int64), np.ones(5, dtype=np.bool_))
+    # Steady 5 / (1 - 0.95) = 100 tries, of which 0.95^60 = 4.6 % are still old failures.
+    expected = (100 * (1 - DECAY**60) + 1) / (100 + 2)
+    np.testing.assert_allclose(counts.success_rate()[0], expected, atol=1e-4)
+
+
+def test_untried_bins_forget_towards_the_prior() -> None:
+    counts = SuccessCounts(1)
+    counts.record(np.zeros(50, dtype=np.int64), np.ones(50, dtype=np.bool_))
+    nothing = np.zeros(0, dtype=np.int64)
+    for _ in range(300):
+        counts.record(nothing, nothing.astype(np.bool_))
+    np.testing.assert_allclose(counts.success_rate(), 0.5, atol=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("length_m", "cell_size_m", "num_cells"),
+    [(0.35, 0.05, 7), (0.6, 0.2, 3), (0.3, 0.1, 3), (0.35, 0.1, 4), (0.35, 1.0, 1), (0.45, 0.03, 15)],
+)
+def test_number_of_cells(length_m: float, cell_size_m: float, num_cells: int) -> None:
+    workspace = WorkspaceConfig(length_x_m=length_m, length_y_m=length_m, height_m=length_m)
+    assert DifficultyGrid(WorldConfig(workspace=workspace), cell_size_m).shape == (num_cells,) * 3
+
+
+def test_cells_cover_an_off_centre_workspace() -> None:
+    grid = DifficultyGrid(WORLD, 0.05)
+    # Box: x from -0.075 to 0.275, y from -0.175 to 0.175, z from 0 to 0.35.
+    goals = np.array(
+        [[-0.075, -0.175, 0.0], [0.275, 0.175, 0.35], [-0.01, -0.17, 0.01], [-0.07, -0.12, 0.01], [-0.07, -0.17, 0.06]]
+    )
+    assert grid.cell_index(goals).tolist() == [0, 342, 49, 7, 1]
+
+
+def test_maps_are_indexed_by_x_y_z() -> None:
+    grid = DifficultyGrid(WORLD, 0.05)
+    goal = (0.20, -0.17, 0.11)  # cell (5, 0, 2)
+    record(grid, [goal, goal], [True, True])
+    maps = grid.maps()
+    assert np.argwhere(maps["num_tries"]).tolist() == [[5, 0, 2]]
+    assert np.argwhere(maps["seen"]).tolist() == [[5, 0, 2]]
+    assert maps["success_rate"][5, 0, 2] == 0.75
+    np.testing.assert_allclose(maps["center"][5, 0, 2], [0.2, -0.15, 0.125], atol=1e-12)
+    np.testing.assert_allclose(maps["center"][0, 0, 0], [-0.05, -0.15, 0.025], atol=1e-12)
+    assert np.array_equal(grid.cell_index(maps["center"].reshape(-1, 3)), np.arange(343))
+
+
+def test_grid_rates_by_hand() -> None:
+    grid = DifficultyGrid(WORLD, 0.05)
+    easy, hard, untried = (0.1, 0.1, 0.025), (0.1, -0.1, 0.2), (0.2, 0.0, 0.3)
+    record(grid, [easy, easy, easy, hard], [True, True, True, False])
+    goals = np.array([easy, hard, untried])
+    np.testing.assert_allclose(grid.success_rate(goals), [4 / 5, 1 / 3, 1 / 2], rtol=1e-15)
+    np.testing.assert_allclose(grid.learnability(goals), [4 / 25, 2 / 9, 1 / 4], rtol=1e-15)
+    np.testing.assert_allclose(grid.mean_learnability(), (4 / 25 + 2 / 9) / 2, rtol=1e-15)
+    assert grid.num_cells_seen == 2
+
+
+def test_mark_seen_counts_a_new_cell_once() -> None:
+    grid = DifficultyGrid(WORLD, 0.05)
+    assert np.isnan(grid.mean_learnability())
+    goals = np.array([[0.1, 0.1, 0.02], [0.1, 0.1, 0.03], [0.1, -0.1, 0.02]])
+    assert grid.mark_seen(goals) == 2
+    assert grid.mark_seen(goals) == 0
+    assert grid.mark_seen(np.zeros((0, 3))) == 0
+    assert grid.num_cells_seen == 2
+    assert not grid.cells.num_tries.any()
+
+
+def test_height_bins_split_table_from_air() -> None:
+    heights = [0.025, 0.025 + 0.05, 0.0751, 0.125, 0.1251, 0.225, 0.2251, 0.35]
+    positions = np.array([[0.0, 0.0, height] for height in heights])
+    assert height_bins(positions, 0.025).tolist() == [0, 0, 1, 1, 2, 2, 3, 3]
+    assert in_air(positions, 0.025).tolist() == [False, False] + 6 * [True]
+
+
+def test_summary_by_hand() -> None:
+    grid = DifficultyGrid(WORLD, 0.05)
+    table, far, air = (0.1, 0.06, 0.025), (0.1, 0.17, 0.025), (0.1, 0.0, 0.205)  # 0.06, 0.17 and 0.18 m from the start
+    record(grid, [table, table, far, air], [True, True, False, False])
+    assert grid.summary() == pytest.approx(
+        {
+            "num_cells": 343.0,
+            "num_cells_seen": 3.0,
+            "mean_learnability": (3 / 16 + 2 / 9 + 2 / 9) / 3,
+            "success_rate_height_table": 3 / 5,
+            "success_rate_height_middle": 1 / 3,
+            "success_rate_distance_from_0_cm": 3 / 4,
+            "success_rate_distance_from_15_cm": 1 / 4,
+        }
+    )
+
+
+def test_summary_of_nothing() -> None:
+    assert DifficultyGrid(WORLD, 0.05).summary() == {"num_cells": 343.0, "num_cells_seen": 0.0}
+
+
+def test_state_of_another_grid_is_refused() -> None:
+    state = DifficultyGrid(WORLD, 0.05).state()
+    with pytest.raises(ConfigError, match=r"'seen' is bool \(343,\), this configuration needs bool \(64,\)"):
+        DifficultyGrid(WORLD, 0.1).load_state(state)
+    del state["cells/tries"]
+    with pytest.raises(ConfigError, match="'tries' is missing"):
+        DifficultyGrid(WORLD, 0.05).load_state(state)

@@ -1,0 +1,275 @@
+"""The task generator as a whole: goal choice in each mode, recording, stopping, exact resume."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from service.actors.rollout import GoalRecords
+from service.config import Config, ConfigError, parse_config
+from service.generator.generator import MIN_REPLAY_GOALS, GoalChoice, TaskGenerator
+from service.generator.opponents import CURRENT, RoundPlan
+from service.generator.validity import Verdict
+
+STATE_SIZE = 4
+OLD_GOAL = (0.0, 0.1, 0.025)
+VALID, OUTSIDE = int(Verdict.VALID), int(Verdict.OUTSIDE)
+MakeRecords = Callable[..., GoalRecords]
+
+
+def config(**generator: Any) -> Config:
+    return parse_config({"generator": generator}, where="test")
+
+
+def all_current(num: int) -> RoundPlan:
+    return RoundPlan(np.full(num, CURRENT), np.full(num, CURRENT))
+
+
+def filled(make_records: MakeRecords, num_goals: int = MIN_REPLAY_GOALS, **settings: Any) -> TaskGenerator:
+    """A generator whose buffer holds ``num_goals`` times the same old goal, from a state of sevens."""
+    generator = TaskGenerator(config(**settings), STATE_SIZE)
+    generator.record(make_records(np.tile(OLD_GOAL, (num_goals, 1)), start_state=np.full((num_goals, STATE_SIZE), 7.0)))
+    return generator
+
+
+def choose(generator: TaskGenerator, verdict: list[int], plan: RoundPlan | None = None, seed: int = 0) -> GoalChoice:
+    """Goals of worlds whose Alices all proposed (-0.1, 0, 0.1), from a state of ones at (0, 0, 0.025)."""
+    num = len(verdict)
+    return generator.choose_goals(
+        plan or all_current(num),
+        np.ones((num, STATE_SIZE)),
+        np.tile([0.0, 0.0, 0.025], (num, 1)),
+        np.tile([-0.1, 0.0, 0.1], (num, 1)),
+        np.array(verdict, dtype=np.int8),
+        np.random.default_rng(seed),
+    )
+
+
+def assert_rows(choice: GoalChoice, replayed: list[bool]) -> None:
+    """Goal and start of each world come from the same place."""
+    assert choice.replayed.tolist() == replayed
+    for index, old in enumerate(replayed):
+        assert choice.goal[index].tolist() == (list(OLD_GOAL) if old else [-0.1, 0.0, 0.1])
+        assert choice.start_state[index].tolist() == [7.0 if old else 1.0] * STATE_SIZE
+        assert choice.start_position[index].tolist() == [0.0, 0.0, 0.025]
+
+
+def test_by_default_bob_plays_what_alice_proposed(make_records: MakeRecords) -> None:
+    choice = choose(filled(make_records, 200), [VALID, OUTSIDE, VALID, int(Verdict.NOT_MOVED), int(Verdict.FALLEN)])
+    assert_rows(choice, [False] * 5)
+    assert choice.played.tolist() == [True, False, True, False, False]
+
+
+def test_replay_invalid_fills_worlds_without_a_goal(make_records: MakeRecords) -> None:
+    choice = choose(filled(make_records, replay_invalid=True), [VALID, OUTSIDE, VALID, OUTSIDE])
+    assert_rows(choice, [False, True, False, True])
+    assert choice.played.all()
+
+
+def test_replay_fraction_one_replaces_every_valid_goal(make_records: MakeRecords) -> None:
+    choice = choose(filled(make_records, replay_fraction=1.0), [VALID, OUTSIDE, VALID])
+    assert_rows(choice, [True, False, True])
+    assert choice.played.tolist() == [True, False, True]
+
+
+def test_replay_fraction_is_met_on_average(make_records: MakeRecords) -> None:
+    generator = filled(make_records, replay_fraction=0.3)
+    assert choose(generator, [VALID] * 4000).replayed.mean() == pytest.approx(0.3, abs=0.03)
+    assert np.array_equal(choose(generator, [VALID] * 50).replayed, choose(generator, [VALID] * 50).replayed)
+
+
+def test_no_replay_before_the_buffer_holds_enough(make_records: MakeRecords) -> None:
+    generator = filled(make_records, MIN_REPLAY_GOALS - 1, replay_fraction=1.0, replay_invalid=True)
+    assert_rows(choose(generator, [VALID, OUTSIDE]), [False, False])
+    generator.record(make_records(OLD_GOAL, start_state=np.full((1, STATE_SIZE), 7.0)))
+    assert_rows(choose(generator, [VALID, OUTSIDE]), [True, True])
+
+
+def test_a_past_bob_plays_no_replayed_goals(make_records: MakeRecords) -> None:
+    generator = filled(make_records, replay_fraction=1.0, replay_invalid=True)
+    plan = RoundPlan(np.array([0, CURRENT, CURRENT]), np.array([CURRENT, 0, 0]))
+    choice = choose(generator, [VALID, VALID, OUTSIDE], plan)
+    assert_rows(choice, [True, False, False])
+    assert choice.played.tolist() == [True, True, False]
+
+
+def test_choice_does_not_alias_its_inputs(make_records: MakeRecords) -> None:
+    generator = filled(make_records, replay_fraction=1.0)
+    start_state, position = np.ones((1, STATE_SIZE)), np.zeros((1, 3))
+    verdict = np.zeros(1, dtype=np.int8)
+    generator.choose_goals(all_current(1), start_state, position, position, verdict, np.random.default_rng(0))
+    assert start_state.tolist() == [[1.0] * STATE_SIZE]
+    assert position.tolist() == [[0.0] * 3]
+
+
+def test_replay_prefers_learnable_goals(make_records: MakeRecords) -> None:
+    generator = TaskGenerator(config(replay_fraction=1.0), STATE_SIZE)
+    solved_always, solved_half = (0.1, 0.1, 0.025), (-0.1, -0.1, 0.025)
+    goals = [solved_always] * 100 + [solved_half] * 100
+    generator.record(make_records(goals, solved=[True] * 100 + [True, False] * 50))
+    goal = choose(generator, [VALID] * 4000).goal
+    # p = 101/102 against 1/2, each with the floor of 0.01 on top of p (1 - p).
+    easy, hard = 101 / 102**2 + 0.01, 0.25 + 0.01
+    assert np.mean(goal[:, 0] > 0) == pytest.approx(easy / (easy + hard), abs=0.015)
+
+
+def test_record_separates_who_learns_what(make_records: MakeRecords) -> None:
+    generator = TaskGenerator(config(), STATE_SIZE)
+    metrics = generator.record(
+        make_records(
+            [(-0.2, 0.0, 0.02), (-0.1, 0.0, 0.02), (0.0, 0.1, 0.02), (0.1, 0.1, 0.02), (0.5, 0.0, 0.02)],
+            goal=[(-0.2, 0.0, 0.02), (-0.1, 0.0, 0.02), (0.0, 0.1, 0.02), (-0.2, 0.0, 0.02), (-0.2, 0.0, 0.02)],
+            verdict=np.array([VALID, VALID, VALID, VALID, OUTSIDE], dtype=np.int8),
+            replayed=[False, False, False, True, True],
+            solved=[True, True, True, False, False],
+            alice_past=[False, True, False, False, False],
+            bob_past=[False, False, True, False, False],
+        )
+    )
+    # Four valid proposals open four cells; three of them were played as proposed and are kept.
+    assert metrics["generator/new_cells"] == metrics["generator/num_cells_seen"] == 4.0
+    assert metrics["generator/buffer_size"] == 3.0
+    assert metrics["generator/iterations_without_new_cell"] == 0.0
+    assert metrics["bob/success_rate"] == 1.0  # the first world alone
+    assert metrics["bob/success_rate_replayed"] == 0.0
+    # The current Bob tried the first cell three times and the past Alice's once; the past Bob's try does not count.
+    rates = generator.grid.success_rate(
+        np.array([(-0.2, 0.0, 0.02), (-0.1, 0.0, 0.02), (0.0, 0.1, 0.02), (0.1, 0.1, 0.02)])
+    )
+    np.testing.assert_allclose(rates, [2 / 5, 2 / 3, 1 / 2, 1 / 2])
+    expected = (6 / 25 + 2 / 9 + 1 / 4 + 1 / 4) / 4
+    assert metrics["generator/mean_learnability"] == pytest.approx(expected)
+
+
+def test_metric_names_are_an_api(make_records: MakeRecords) -> None:
+    metrics = TaskGenerator(config(), STATE_SIZE).record(
+        make_records([(0.1, 0.0, 0.025), (0.0, 0.0, 0.2)], solved=[True, True])
+    )
+    assert set(metrics) == {
+        *(f"alice/{name}_fraction" for name in ("valid", "not_moved", "outside", "fallen", "lifted")),
+        *(f"alice/goal_height_{name}_fraction" for name in ("table", "low", "middle", "high")),
+        *("alice/goal_distance_m", "alice/goal_height_m", "alice/goal_height_p90_m"),
+        *("bob/success_rate", "bob/success_rate_table", "bob/success_rate_air", "bob/steps_to_success"),
+        *("generator/num_cells_seen", "generator/new_cells", "generator/iterations_without_new_cell"),
+        *("generator/buffer_size", "generator/mean_learnability"),
+    }
+
+
+def test_an_iteration_without_any_goal(make_records: MakeRecords) -> None:
+    verdict = np.full(2, Verdict.FALLEN, dtype=np.int8)
+    records = make_records(np.full((2, 3), np.nan), verdict=verdict, played=[False, False])
+    metrics = TaskGenerator(config(), STATE_SIZE).record(records)
+    assert metrics["generator/iterations_without_new_cell"] == 1.0
+    assert metrics["generator/buffer_size"] == 0.0
+    assert not any(name.startswith("bob/") for name in metrics)
+    assert "generator/mean_learnability" not in metrics
+    assert all(np.isfinite(value) for value in metrics.values())
+
+
+def test_stops_on_current_players_own_goals_only(make_records: MakeRecords) -> None:
+    goals = np.tile(OLD_GOAL, (100, 1))
+    past, none = np.ones(100, dtype=np.bool_), np.zeros(100, dtype=np.bool_)
+    for overrides, expected in (
+        ({"solved": past}, True),
+        ({"solved": none}, False),
+        ({"solved": past, "replayed": past}, False),
+        ({"solved": past, "bob_past": past}, False),
+        ({"solved": past, "alice_past": past}, False),
+    ):
+        generator = TaskGenerator(config(novelty_window=2), STATE_SIZE)
+        for _ in range(3):
+            assert not generator.should_stop()
+            generator.record(make_records(goals, **overrides))
+        assert generator.should_stop() is expected, overrides
+
+
+def test_snapshots_are_due_every_interval() -> None:
+    generator = TaskGenerator(config(opponent_interval=10), STATE_SIZE)
+    assert [iteration for iteration in range(35) if generator.snapshot_due(iteration)] == [10, 20, 30]
+
+
+def test_plan_uses_the_configured_share_of_the_pool() -> None:
+    generator = TaskGenerator(config(past_opponent_fraction=0.25, opponent_pool_size=2), STATE_SIZE)
+    assert not generator.plan(40, np.random.default_rng(0)).alice_past.any()
+    for version in range(3):
+        generator.add_opponents({"w": np.array([version])}, {"w": np.array([version])})
+    plan = generator.plan(40, np.random.default_rng(0))
+    assert int(plan.alice_past.sum()) == int(plan.bob_past.sum()) == 10
+    assert set(plan.alice_opponent) <= {CURRENT, 0, 1}
+    assert [int(p["w"][0]) for p in generator.opponents.bob] == [1, 2]
+
+
+def play(generator: TaskGenerator, make_records: MakeRecords, rng: np.random.Generator, iterations: range) -> list[Any]:
+    """Run the verbs in call order on made-up proposals; everything that came out."""
+    outcomes: list[Any] = []
+    lower, upper = np.array([-0.2, -0.15, 0.0]), np.array([0.1, 0.15, 0.3])
+    num = 20
+    for iteration in iterations:
+        plan = generator.plan(num, rng)
+        start_state, start = rng.normal(size=(num, STATE_SIZE)), rng.uniform(lower, upper, size=(num, 3))
+        proposal = rng.uniform(lower, upper, size=(num, 3))
+        verdict = rng.choice([VALID, OUTSIDE], size=num, p=[0.7, 0.3]).astype(np.int8)
+        choice = generator.choose_goals(plan, start_state, start, proposal, verdict, rng)
+        records = make_records(
+            proposal,
+            **{name: getattr(choice, name) for name in GoalChoice.__slots__},
+            verdict=verdict,
+            solved=choice.played & (rng.random(num) < 0.5),
+            alice_past=plan.alice_past,
+            bob_past=plan.bob_past,
+        )
+        outcomes.append((plan.alice_opponent.tolist(), choice.goal.tolist(), generator.record(records)))
+        if generator.snapshot_due(iteration):
+            generator.add_opponents({"a/w": rng.normal(size=3)}, {"b.w": rng.normal(size=(2, 2))})
+        outcomes.append(generator.should_stop())
+    return outcomes
+
+
+def test_exact_resume_through_a_file(make_records: MakeRecords, tmp_path: Path) -> None:
+    settings = config(
+        replay_fraction=0.3,
+        replay_invalid=True,
+        replay_buffer_size=90,
+        opponent_interval=3,
+        opponent_pool_size=2,
+        novelty_window=5,
+    )
+    generator, rng = TaskGenerator(settings, STATE_SIZE), np.random.default_rng(5)
+    play(generator, make_records, rng, range(12))
+    np.savez(tmp_path / "state.npz", **generator.state())  # type: ignore[arg-type]
+    resumed, resumed_rng = TaskGenerator(settings, STATE_SIZE), np.random.default_rng()
+    resumed_rng.bit_generator.state = rng.bit_generator.state
+    with np.load(tmp_path / "state.npz", allow_pickle=False) as state:
+        resumed.load_state({name: state[name] for name in state.files})
+    assert play(resumed, make_records, resumed_rng, range(12, 24)) == play(generator, make_records, rng, range(12, 24))
+    state, again = generator.state(), resumed.state()
+    assert list(state) == list(again)
+    assert all(np.array_equal(state[name], again[name]) and state[name].dtype == again[name].dtype for name in state)
+
+
+def test_state_is_a_copy(make_records: MakeRecords) -> None:
+    generator = filled(make_records)
+    generator.add_opponents({"w": np.ones(2)}, {"w": np.ones(2)})
+    state = generator.state()
+    before = {name: array.copy() for name, array in state.items()}
+    play(generator, make_records, np.random.default_rng(0), range(20))
+    assert all(np.array_equal(state[name], before[name]) for name in state)
+
+
+def test_state_of_a_new_generator_loads(make_records: MakeRecords) -> None:
+    generator = filled(make_records)
+    generator.add_opponents({"w": np.ones(2)}, {"w": np.ones(2)})
+    generator.load_state(TaskGenerator(config(), STATE_SIZE).state())
+    assert len(generator.buffer) == len(generator.opponents) == generator.grid.num_cells_seen == 0
+
+
+def test_state_of_another_configuration_is_refused() -> None:
+    state = TaskGenerator(config(), STATE_SIZE).state()
+    with pytest.raises(ConfigError, match="resume with the configuration of the checkpoint"):
+        TaskGenerator(config(novelty_window=7), STATE_SIZE).load_state(state)
+    with pytest.raises(ConfigError, match="missing"):
+        TaskGenerator(config(), STATE_SIZE).load_state({})

@@ -1,0 +1,53 @@
+import numpy as np
+import pytest
+
+from service.learner.returns import advantages, explained_variance
+
+GAMMA, LAMBDA = 0.9, 0.5
+
+
+def gae(rewards, values, final_values, active, terminated):
+    arrays = [np.array(each, dtype=np.float64) for each in (rewards, values, final_values)]
+    masks = [np.array(each, dtype=bool) for each in (active, terminated)]
+    return advantages(*arrays, *masks, gamma=GAMMA, gae_lambda=LAMBDA)
+
+
+def column(*steps):
+    return [[step] for step in steps]
+
+
+def test_terminated_turn_does_not_bootstrap():
+    # d2 = 1 - 0.3 = 0.7; d1 = 0.9 * 0.3 - 0.2 = 0.07; d0 = 0.9 * 0.2 - 0.1 = 0.08; A_t = d_t + 0.45 A_{t+1}
+    result = gae(column(0, 0, 1), column(0.1, 0.2, 0.3), [100.0], column(1, 1, 1), column(0, 0, 1))
+    np.testing.assert_allclose(result, column(0.08 + 0.45 * 0.385, 0.07 + 0.45 * 0.7, 0.7), atol=1e-12)
+
+
+def test_timed_out_turn_bootstraps_from_the_final_value():
+    # d2 = 0.9 * 2 - 0.3 = 1.5
+    result = gae(column(0, 0, 0), column(0.1, 0.2, 0.3), [2.0], column(1, 1, 1), column(0, 0, 0))
+    np.testing.assert_allclose(result, column(0.08 + 0.45 * 0.745, 0.07 + 0.45 * 1.5, 1.5), atol=1e-12)
+
+
+def test_short_turns_bootstrap_behind_their_own_last_step():
+    # World 0 times out after one step: 0.9 * 2 - 0.1 = 1.7. World 1 terminates at its second: 1 - 0.2; 0.08 + 0.45 * 0.8.
+    # World 2 has no turn. Values and rewards behind the last step must not matter.
+    result = gae(
+        [[0, 0, 9], [9, 1, 9], [9, 9, 9]],
+        [[0.1, 0.1, 7], [7, 0.2, 7], [7, 7, 7]],
+        [2.0, 100.0, 100.0],
+        [[1, 1, 0], [0, 1, 0], [0, 0, 0]],
+        [[0, 0, 0], [0, 1, 0], [0, 0, 0]],
+    )
+    np.testing.assert_allclose(result, [[1.7, 0.44, 0], [0, 0.8, 0], [0, 0, 0]], atol=1e-12)
+
+
+def test_float32_stays_float32():
+    zeros, mask = np.zeros((2, 3), dtype=np.float32), np.ones((2, 3), dtype=bool)
+    assert advantages(zeros, zeros, zeros[0], mask, mask, gamma=0.9, gae_lambda=0.9).dtype == np.float32
+
+
+def test_explained_variance():
+    returns = np.array([1.0, 2.0, 3.0])
+    assert explained_variance(returns, returns) == 1.0
+    assert explained_variance(returns, np.full(3, 5.0)) == pytest.approx(0.0)
+    assert explained_variance(np.ones(3), returns) == 0.0

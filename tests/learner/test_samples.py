@@ -1,0 +1,129 @@
+from dataclasses import replace
+
+import numpy as np
+import torch
+
+from service.config import PPOConfig
+from service.envs.observations import BOB_SIZE, BOB_VALUE_SIZE, MIRROR_ACTION, MIRROR_BOB, MIRROR_BOB_VALUE
+from service.learner.minibatches import epoch
+from service.learner.returns import advantages
+from service.learner.samples import Cloning, Samples, collect, mirrored
+from tests.learner.rollouts import make_turns, nobody_learns
+
+CPU = torch.device("cpu")
+CONFIG = PPOConfig()
+
+
+def make_bob_turns(seed=0, **overrides):
+    return make_turns(np.random.default_rng(seed), BOB_SIZE, BOB_VALUE_SIZE, **overrides)
+
+
+def estimate(value_observation):
+    return 3.0 * value_observation[:, 0] + value_observation[:, 1]
+
+
+def make_samples(num):
+    index = torch.arange(num, dtype=torch.float32)
+    return Samples(*(index[:, None].expand(num, 3) for _ in range(3)), *(index for _ in range(4)))
+
+
+def make_cloning(num):
+    index = torch.arange(num, dtype=torch.float32)
+    return Cloning(index[:, None], index[:, None], index)
+
+
+def test_only_active_steps_of_learnable_worlds_become_samples():
+    learn = np.array([True, False] * 4)
+    turns = make_bob_turns(learn=learn)
+    samples = collect([turns], estimate, CONFIG, CPU)
+    kept = turns.active & learn
+    assert len(samples) == kept.sum() > 0
+    order = np.argwhere(kept)
+    np.testing.assert_array_equal(samples.action, [turns.action[step, world] for step, world in order])
+    np.testing.assert_array_equal(samples.old_log_prob, [turns.log_prob[step, world] for step, world in order])
+
+
+def test_targets_are_advantages_plus_values():
+    turns = make_bob_turns()
+    samples = collect([turns], estimate, CONFIG, CPU)
+    values, final = (
+        estimate(torch.from_numpy(each))
+        for each in (turns.value_observation[turns.active], turns.final_value_observation)
+    )
+    grid = np.zeros(turns.active.shape, dtype=np.float32)
+    grid[turns.active] = values.numpy()
+    masks = turns.active, turns.terminated
+    gae = advantages(turns.reward, grid, final.numpy(), *masks, gamma=CONFIG.gamma, gae_lambda=CONFIG.gae_lambda)
+    expected = gae[turns.active]
+    np.testing.assert_allclose(samples.target, expected + values.numpy(), atol=1e-6)
+    np.testing.assert_allclose(samples.advantage, (expected - expected.mean()) / expected.std(), atol=1e-5)
+
+
+def test_several_rollouts_are_joined_along_worlds():
+    first, second = make_bob_turns(0), make_bob_turns(1)
+    joined = collect([first, second], estimate, CONFIG, CPU)
+    assert len(joined) == first.active.sum() + second.active.sum()
+    apart = [collect([turns], estimate, CONFIG, CPU).target for turns in (first, second)]
+    np.testing.assert_allclose(np.sort(joined.target), np.sort(np.concatenate(apart)), atol=1e-6)
+
+
+def test_no_samples_at_all():
+    idle = make_bob_turns(active=np.zeros_like(make_bob_turns().active))
+    assert collect([idle, nobody_learns(make_bob_turns())], estimate, CONFIG, CPU) is None
+
+
+def test_equal_advantages_become_zero():
+    turns = make_bob_turns()
+    constant = replace(turns, reward=np.full_like(turns.reward, 0.1), terminated=turns.active)
+    samples = collect([constant], lambda rows: torch.zeros(len(rows)), CONFIG, CPU)
+    np.testing.assert_array_equal(samples.advantage, np.zeros(len(samples)))
+
+
+def test_mirrored_samples_are_reflections():
+    samples = collect([make_bob_turns()], estimate, CONFIG, CPU)
+    mirrors = MIRROR_BOB, MIRROR_BOB_VALUE, MIRROR_ACTION
+    doubled = mirrored(samples, lambda observation, action: observation[:, 1] + action[:, 1], *mirrors)
+    num = len(samples)
+    assert len(doubled) == 2 * num
+    for before, after in zip(samples.tensors(), doubled.tensors(), strict=True):
+        assert torch.equal(after[:num], before)
+    names = "observation", "value_observation", "action"
+    for name, mirror in zip(names, mirrors, strict=True):
+        np.testing.assert_array_equal(getattr(doubled, name)[num:], mirror(getattr(samples, name).numpy()))
+    for name in ("advantage", "target", "value"):
+        assert torch.equal(getattr(doubled, name)[num:], getattr(samples, name))
+    # The log-probability is of the reflected pair: y components change their sign.
+    expected = -(samples.observation[:, 1] + samples.action[:, 1])
+    np.testing.assert_array_equal(doubled.old_log_prob[num:], expected)
+
+
+def test_an_epoch_has_every_sample_once():
+    for num, size, parts in ((20, 8, 2), (21, 8, 3), (3, 8, 1), (11, 8, 1), (13, 8, 2)):
+        batches = epoch(make_samples(num), None, size, np.random.default_rng(0))
+        assert len(batches) == parts
+        assert all(cloning is None for _, cloning in batches)
+        seen = torch.cat([samples.target for samples, _ in batches])
+        assert sorted(seen.tolist()) == list(range(num))
+        assert seen.tolist() != list(range(num))
+        assert all(torch.equal(samples.target, samples.observation[:, 0]) for samples, _ in batches)
+
+
+def test_demonstrations_are_cycled_through():
+    batches = epoch(make_samples(40), make_cloning(6), 8, np.random.default_rng(0))
+    drawn = [cloning.old_log_prob for _, cloning in batches]
+    assert [len(each) for each in drawn] == [4] * 5
+    counts = torch.cat(drawn).int().bincount(minlength=6)
+    assert counts.min() >= 3
+    assert counts.max() <= 4
+
+
+def test_few_demonstrations_are_not_repeated_within_a_minibatch():
+    batches = epoch(make_samples(16), make_cloning(2), 8, np.random.default_rng(0))
+    assert all(sorted(cloning.old_log_prob.tolist()) == [0.0, 1.0] for _, cloning in batches)
+
+
+def test_demonstrations_alone_make_an_epoch():
+    batches = epoch(None, make_cloning(12), 8, np.random.default_rng(0))
+    assert [samples for samples, _ in batches] == [None] * 3
+    assert sorted(torch.cat([cloning.old_log_prob for _, cloning in batches]).tolist()) == list(range(12))
+    assert batches[0][1].action.shape == (4, 1)

@@ -1,0 +1,179 @@
+"""The NumPy evaluator: equal to torch, sampling, independence of rows, broken parameters, no torch."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+import torch
+
+from service.config import PolicyConfig
+from service.envs.observations import BOB_SIZE, FULL_SIZE, POSITIONS_SIZE
+from service.policies import gaussian
+from service.policies.evaluator import GaussianEvaluator, MCPEvaluator
+from service.policies.networks import GaussianPolicy, MCPPolicy, export_parameters, make_alice, make_bob
+from service.policies.parameters import FloatArray, Parameters, PolicyError
+
+Observe = Callable[[int, int], FloatArray]
+Players = list[tuple[GaussianEvaluator | MCPEvaluator, GaussianPolicy | MCPPolicy, int]]
+
+
+@pytest.fixture
+def players(alice: GaussianPolicy, bob: MCPPolicy) -> Players:
+    """Evaluator, network and observation size of both players."""
+    return [
+        (GaussianEvaluator(export_parameters(alice)), alice, FULL_SIZE),
+        (MCPEvaluator(export_parameters(bob)), bob, BOB_SIZE),
+    ]
+
+
+def _close(actual: FloatArray, expected: torch.Tensor) -> None:
+    assert actual.dtype == np.float32
+    np.testing.assert_allclose(actual, expected.detach().numpy(), atol=1e-5, rtol=1e-5)
+
+
+def test_distribution_equals_torch(players: Players, observe: Observe) -> None:
+    for evaluator, policy, size in players:
+        rows = observe(160, size)
+        for batch in (rows, rows[3], rows.reshape(4, 40, size), 1e6 * rows):
+            mean, std = evaluator.distribution(batch)
+            expected_mean, expected_std = policy(torch.tensor(batch))
+            _close(mean, expected_mean)
+            _close(std, expected_std)
+            np.testing.assert_array_equal(evaluator.act_deterministic(batch), mean)
+
+
+def test_primitives_gate_and_compose_equal_torch(bob: MCPPolicy, config: PolicyConfig, observe: Observe) -> None:
+    evaluator = MCPEvaluator(export_parameters(bob))
+    assert evaluator.num_primitives == config.bob.num_primitives
+    rows = observe(60, BOB_SIZE).reshape(3, 20, BOB_SIZE)
+    positions = rows[..., :POSITIONS_SIZE]
+    means, variances = evaluator.primitives(positions)
+    expected_means, expected_variances = bob.primitives(torch.tensor(positions))
+    _close(means, expected_means)
+    _close(variances, expected_variances)
+    weights = evaluator.gate(rows)
+    _close(weights, bob.gate(torch.tensor(rows)))
+    for actual, expected in zip(evaluator.compose(positions, weights), evaluator.distribution(rows), strict=True):
+        np.testing.assert_array_equal(actual, expected)
+
+
+def test_act_samples_the_distribution_and_its_log_prob(players: Players, observe: Observe) -> None:
+    for evaluator, policy, size in players:
+        rows = np.repeat(observe(2, size)[1:], 20_000, axis=0)
+        action, log_prob = evaluator.act(rows, np.random.default_rng(0))
+        assert action.dtype == log_prob.dtype == np.float32
+        mean, std = policy(torch.tensor(rows))
+        expected = gaussian.log_prob(torch.tensor(action), mean, std)
+        np.testing.assert_allclose(log_prob, expected.detach(), atol=2e-4)
+        noise = (action - mean.detach().numpy()) / std.detach().numpy()
+        np.testing.assert_allclose(noise.mean(0), 0.0, atol=0.03)  # 4 standard errors
+        np.testing.assert_allclose(noise.std(0), 1.0, atol=0.02)
+        np.testing.assert_allclose(np.corrcoef(noise.T), np.eye(noise.shape[1]), atol=0.03)
+
+
+def test_actions_are_not_clipped_and_follow_the_seed(players: Players, observe: Observe) -> None:
+    for evaluator, _, size in players:
+        rows = observe(4000, size)
+        action, log_prob = evaluator.act(rows, np.random.default_rng(7))
+        again, log_prob_again = evaluator.act(rows, np.random.default_rng(7))
+        np.testing.assert_array_equal(action, again)
+        np.testing.assert_array_equal(log_prob, log_prob_again)
+        assert np.abs(action).max() > 1.0
+
+
+def test_a_row_does_not_depend_on_the_others(players: Players, observe: Observe) -> None:
+    for evaluator, _, size in players:
+        rows = observe(160, size)
+        together = np.stack(evaluator.distribution(rows))
+        alone = np.stack([np.stack(evaluator.distribution(row)) for row in rows], axis=1)
+        np.testing.assert_allclose(together, alone, atol=1e-5, rtol=1e-5)
+
+
+def test_evaluating_leaves_observations_and_parameters_alone(bob: MCPPolicy, observe: Observe) -> None:
+    parameters = export_parameters(bob)
+    evaluator = MCPEvaluator(parameters)
+    rows = observe(30, BOB_SIZE)
+    kept = rows.copy()
+    before = np.stack(evaluator.distribution(rows))
+    for value in parameters.values():
+        value[...] = np.nan
+    np.testing.assert_array_equal(np.stack(evaluator.distribution(rows)), before)
+    np.testing.assert_array_equal(rows, kept)
+
+
+def test_importing_and_using_it_needs_no_torch() -> None:
+    script = (
+        "import sys, service.policies.evaluator; "
+        "heavy = {'torch', 'mujoco', 'pydantic', 'gymnasium'} & set(sys.modules); assert not heavy, heavy"
+    )
+    subprocess.run([sys.executable, "-c", script], check=True, capture_output=True, text=True)
+
+
+Break = Callable[[dict[str, FloatArray]], None]
+
+
+def _without(name: str) -> Break:
+    return lambda parameters: parameters.__delitem__(name)
+
+
+def _with(name: str, *shape: int, value: float = 0.5) -> Break:
+    return lambda parameters: parameters.__setitem__(name, np.full(shape, value, dtype=np.float32))
+
+
+BROKEN_BOB: list[tuple[Break, str]] = [
+    (_without("primitives.trunk.0.weight"), r"'primitives\.trunk\.0\.weight' is missing, expected shape \(any, 11\)"),
+    (_without("gate.weight_floor"), r"'gate\.weight_floor' is missing, expected shape \(\)"),
+    (_without("primitives.output_weight"), r"'primitives\.output_weight' is missing, expected shape \(any, any, any\)"),
+    (_with("primitives.trunk.0.bias", 3), r"'primitives\.trunk\.0\.bias': expected shape \(256,\), got \(3,\)"),
+    (_with("primitives.output_bias", 4, 6), r"'primitives\.output_bias': expected shape \(4, 8\), got \(4, 6\)"),
+    (_with("primitives.hidden.weight", 500, 256), r"'primitives\.hidden\.weight': expected shape \(512, 256\)"),
+    (_with("gate.output.weight", 3, 256), r"'gate\.output\.weight': expected shape \(4, 256\), got \(3, 256\)"),
+    (_with("gate.input.offset", 14), r"'gate\.input\.offset': expected shape \(17,\), got \(14,\)"),
+    (_with("gate.input.scale", 17, value=0.0), r"'gate\.input\.scale' = .*expected positive"),
+    (_with("gate.output.bias", 4, value=np.nan), r"'gate\.output\.bias' of shape \(4,\) is not finite"),
+    (_with("gate.weight_floor", value=0.0), r"'gate\.weight_floor' = 0\.0: expected a value between 0 and 1"),
+    (_with("primitives.squash.log_std_max", value=-3.0), r"'primitives\.squash\.log_std_max' = -3\.0: expected .* -2 "),
+    (_with("gate.hidden.2.weight", 256, 256), r"'gate\.hidden\.2\.bias' is missing, expected shape \(256,\)"),
+    (_with("primitives.more", 2, 3), r"'primitives\.more': expected none of that name, got shape \(2, 3\)"),
+]
+
+
+@pytest.mark.parametrize(("damage", "message"), BROKEN_BOB)
+def test_broken_parameters_of_bob_are_named(damage: Break, message: str) -> None:
+    parameters = export_parameters(make_bob(PolicyConfig()))
+    damage(parameters)
+    with pytest.raises(PolicyError, match=message) as caught:
+        MCPEvaluator(parameters)
+    assert "\n" not in str(caught.value)
+
+
+def test_broken_parameters_of_alice_are_named() -> None:
+    parameters = export_parameters(make_alice(PolicyConfig()))
+    odd = {**parameters, "output.weight": parameters["output.weight"][:7], "output.bias": parameters["output.bias"][:7]}
+    with pytest.raises(PolicyError, match="'squash': expected an even number of outputs, got 7"):
+        GaussianEvaluator(odd)
+    integers: Parameters = {**parameters, "output.bias": np.zeros(8, dtype=np.int64)}
+    with pytest.raises(PolicyError, match=r"'output\.bias' of shape \(8,\): expected float32, got int64"):
+        GaussianEvaluator(integers)
+
+
+def test_one_players_parameters_do_not_make_the_other() -> None:
+    config = PolicyConfig()
+    with pytest.raises(PolicyError, match=r"'primitives\.input\.offset' is missing"):
+        MCPEvaluator(export_parameters(make_alice(config)))
+    with pytest.raises(PolicyError, match=r"'input\.offset' is missing"):
+        GaussianEvaluator(export_parameters(make_bob(config)))
+
+
+def test_inputs_of_a_wrong_size_are_refused() -> None:
+    evaluator = MCPEvaluator(export_parameters(make_bob(PolicyConfig())))
+    with pytest.raises(PolicyError, match=r"observation: expected shape \(\.\.\., 14\), got \(5, 11\)"):
+        evaluator.act_deterministic(np.zeros((5, 11), dtype=np.float32))
+    with pytest.raises(PolicyError, match=r"positions: expected shape \(\.\.\., 11\), got \(14,\)"):
+        evaluator.primitives(np.zeros(14, dtype=np.float32))
+    with pytest.raises(PolicyError, match=r"weights: expected shape \(\.\.\., 4\), got \(5, 3\)"):
+        evaluator.compose(np.zeros((5, 11), dtype=np.float32), np.ones((5, 3), dtype=np.float32))

@@ -1,0 +1,208 @@
+"""The torch networks: who sees what, bounds, initial values."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+import torch
+
+from service.config import MCPConfig, MLPConfig, PolicyConfig
+from service.envs.observations import (
+    ACTION_SIZE,
+    BOB_SIZE,
+    BOB_VALUE_SIZE,
+    FULL_SIZE,
+    GOAL_SLICE,
+    NORMALISATION_BOB,
+    NORMALISATION_FULL,
+    POSITIONS_SIZE,
+)
+from service.policies.gaussian import log_prob
+from service.policies.networks import (
+    GaussianPolicy,
+    MCPPolicy,
+    export_parameters,
+    make_alice,
+    make_alice_value,
+    make_bob,
+    make_bob_value,
+)
+from service.policies.parameters import FloatArray, PolicyError
+
+Observe = Callable[[int, int], FloatArray]
+ULP = 1e-6
+
+
+@pytest.fixture
+def seeded() -> None:
+    torch.manual_seed(0)
+
+
+def test_shapes(alice: GaussianPolicy, bob: MCPPolicy, config: PolicyConfig) -> None:
+    for policy, size in ((alice, FULL_SIZE), (bob, BOB_SIZE)):
+        for batch in ((), (5,), (2, 5)):
+            mean, std = policy(torch.zeros(*batch, size))
+            assert mean.shape == std.shape == (*batch, ACTION_SIZE)
+            assert mean.dtype == torch.float32
+    means, variances = bob.primitives(torch.zeros(2, 5, POSITIONS_SIZE))
+    assert means.shape == variances.shape == (2, 5, config.bob.num_primitives, ACTION_SIZE)
+    assert make_alice_value(config)(torch.zeros(2, 5, FULL_SIZE)).shape == (2, 5)
+    assert make_bob_value(config)(torch.zeros(2, 5, BOB_VALUE_SIZE)).shape == (2, 5)
+
+
+def test_goal_reaches_only_the_gate(bob: MCPPolicy, observe: Observe) -> None:
+    rows = torch.tensor(observe(20, BOB_SIZE), requires_grad=True)
+    moved = rows.detach().clone()
+    moved[:, GOAL_SLICE] += 0.1
+    parts: list[tuple[torch.Tensor, torch.Tensor]] = []
+    bob.primitives.register_forward_hook(lambda _module, _inputs, output: parts.append(output))
+    bob(rows)
+    bob(moved)
+    for before, after in zip(*parts, strict=True):
+        assert torch.equal(before, after)
+        (gradient,) = torch.autograd.grad(before.sum(), rows, retain_graph=True)
+        assert (gradient[:, GOAL_SLICE] == 0.0).all()
+        assert (gradient[:, :POSITIONS_SIZE] != 0.0).any()
+    assert (bob.gate(rows) - bob.gate(moved)).abs().max() > 1e-3
+
+
+def test_gate_sees_the_goal_relative_to_the_object_on_its_own_scale(bob: MCPPolicy) -> None:
+    seen: list[torch.Tensor] = []
+    bob.gate.input.register_forward_hook(lambda _module, _inputs, output: seen.append(output))
+    row = torch.zeros(BOB_SIZE)
+    row[5:8] = torch.tensor([0.01, 0.02, 0.03])
+    row[11:14] = torch.tensor([0.06, -0.03, 0.03])
+    bob.gate(row)
+    np.testing.assert_allclose(seen[0][-3:], [0.5, -0.5, 0.0], atol=1e-6)
+
+
+def test_every_primitive_is_the_network_written_out(bob: MCPPolicy, config: PolicyConfig, observe: Observe) -> None:
+    positions = torch.tensor(observe(20, POSITIONS_SIZE))
+    means, variances = bob.primitives(positions)
+    head = config.bob.primitive_hidden_size
+    for index in range(config.bob.num_primitives):
+        block = slice(index * head, (index + 1) * head)
+        trunk = bob.primitives.trunk(bob.primitives.input(positions))
+        hidden = torch.nn.functional.elu(
+            trunk @ bob.primitives.hidden.weight[block].T + bob.primitives.hidden.bias[block]
+        )
+        output = hidden @ bob.primitives.output_weight[index] + bob.primitives.output_bias[index]
+        low, high = config.bob.log_std_min, config.bob.log_std_max
+        log_std = low + (high - low) / (1.0 + torch.exp(-output[:, 4:]))
+        torch.testing.assert_close(means[:, index], 2.0 * torch.tanh(output[:, :4] / 2.0), atol=1e-5, rtol=1e-5)
+        torch.testing.assert_close(variances[:, index], torch.exp(log_std) ** 2, atol=1e-5, rtol=1e-5)
+
+
+@pytest.mark.parametrize("magnitude", [1.0, 1e6, 1e30, float("inf")])
+def test_outputs_are_bounded_for_any_input(
+    alice: GaussianPolicy, bob: MCPPolicy, config: PolicyConfig, magnitude: float
+) -> None:
+    signs = torch.tensor(np.random.default_rng(0).choice([-1.0, 1.0], (64, FULL_SIZE)), dtype=torch.float32)
+    mean, std = alice(magnitude * signs)
+    assert (mean.abs() <= 2.0).all()
+    assert (std.log() >= config.alice_log_std_min - ULP).all()
+    assert (std.log() <= config.alice_log_std_max + ULP).all()
+    if math.isinf(magnitude):
+        return  # goal - object of two infinities is no number
+    rows = magnitude * signs[:, :BOB_SIZE]
+    weights = bob.gate(rows)
+    assert (weights >= config.bob.weight_floor - ULP).all()
+    assert (weights <= 1.0 + ULP).all()
+    mean, std = bob(rows)
+    assert (mean.abs() <= 2.0 + ULP).all()
+    least = config.bob.log_std_min - 0.5 * math.log(config.bob.num_primitives)
+    most = config.bob.log_std_max - 0.5 * math.log(config.bob.num_primitives * config.bob.weight_floor)
+    assert (std.log() >= least - 1e-5).all()
+    assert (std.log() <= most + 1e-5).all()
+
+
+def test_saturated_outputs_reach_their_bounds_and_no_further() -> None:
+    policy = make_bob(PolicyConfig())
+    with torch.no_grad():
+        policy.primitives.output_bias.fill_(1e6)
+        policy.gate.output.bias.fill_(-1e6)
+    means, variances = policy.primitives(torch.zeros(POSITIONS_SIZE))
+    np.testing.assert_allclose(means.detach(), 2.0)
+    np.testing.assert_allclose(variances.detach(), math.exp(2 * 0.5), rtol=1e-6)
+    np.testing.assert_allclose(policy.gate(torch.zeros(BOB_SIZE)).detach(), 0.01, rtol=1e-6)
+
+
+@pytest.mark.parametrize("num_primitives", [1, 2, 4, 8])
+@pytest.mark.usefixtures("seeded")
+def test_initial_players_explore_with_std_near_0_7(num_primitives: int) -> None:
+    config = PolicyConfig(bob=MCPConfig(num_primitives=num_primitives))
+    rng = np.random.default_rng(0)
+    full, bob_rows = (
+        torch.tensor(layout.offset + layout.scale * rng.standard_normal((500, len(layout.offset))), dtype=torch.float32)
+        for layout in (NORMALISATION_FULL, NORMALISATION_BOB)
+    )
+    mean, std = make_alice(config)(full)
+    assert mean.abs().max() < 0.1
+    np.testing.assert_allclose(std.detach(), math.exp(-0.1), rtol=0.02)
+    bob = make_bob(config)
+    mean, std = bob(bob_rows)
+    assert mean.abs().mean() < 0.3
+    assert abs(std.mean().item() - 0.7) < 0.1
+    with torch.no_grad():
+        bob.gate.output.weight.zero_()
+    np.testing.assert_allclose(bob(bob_rows)[1].detach(), math.exp(-0.1), rtol=0.02)
+
+
+@pytest.mark.usefixtures("seeded")
+def test_initial_primitives_and_weights_differ() -> None:
+    bob = make_bob(PolicyConfig())
+    rows = torch.tensor(NORMALISATION_BOB.offset) + torch.randn(500, BOB_SIZE) * torch.tensor(NORMALISATION_BOB.scale)
+    means, _ = bob.primitives(rows[:, :POSITIONS_SIZE])
+    weights = bob.gate(rows)
+    assert means.std(dim=1).mean() > 0.05
+    assert weights.std(dim=1).mean() > 0.05
+    assert abs(weights.mean().item() - 0.5) < 0.2
+
+
+@pytest.mark.usefixtures("seeded")
+def test_initial_values_are_near_zero() -> None:
+    assert make_alice_value(PolicyConfig())(torch.randn(100, FULL_SIZE)).abs().max() < 0.1
+    assert make_bob_value(PolicyConfig())(torch.randn(100, BOB_VALUE_SIZE)).abs().max() < 0.1
+
+
+def test_log_prob_has_a_gradient_for_every_parameter(alice: GaussianPolicy, bob: MCPPolicy, observe: Observe) -> None:
+    for policy, size in ((alice, FULL_SIZE), (bob, BOB_SIZE)):
+        mean, std = policy(torch.tensor(observe(50, size)))
+        log_prob(mean.detach() + 0.5, mean, std).mean().backward()
+        for name, parameter in policy.named_parameters():
+            assert parameter.grad is not None, name
+            assert parameter.grad.isfinite().all(), name
+            assert (parameter.grad != 0.0).any(), name
+
+
+def test_export_copies_parameters_and_constants(bob: MCPPolicy) -> None:
+    exported = export_parameters(bob)
+    assert exported.keys() == bob.state_dict().keys()
+    assert {"gate.weight_floor", "primitives.squash.log_std_min", "primitives.input.scale"} <= exported.keys()
+    assert all(value.dtype == np.float32 for value in exported.values())
+    before = exported["gate.output.bias"].copy()
+    with torch.no_grad():
+        bob.gate.output.bias.add_(1.0)
+    np.testing.assert_array_equal(exported["gate.output.bias"], before)
+
+
+def test_same_seed_same_players() -> None:
+    twins = []
+    for _ in range(2):
+        torch.manual_seed(11)
+        twins.append(export_parameters(make_bob(PolicyConfig())))
+    for name, value in twins[0].items():
+        np.testing.assert_array_equal(value, twins[1][name])
+
+
+def test_unordered_log_std_bounds_are_refused() -> None:
+    with pytest.raises(PolicyError, match=r"log_std_min 1\.0 must be below log_std_max 0\.5"):
+        make_alice(PolicyConfig(alice_log_std_min=1.0))
+
+
+def test_a_normalisation_of_another_layout_is_refused() -> None:
+    with pytest.raises(PolicyError, match="normalisation of 22 inputs for a network of 14"):
+        GaussianPolicy(BOB_SIZE, ACTION_SIZE, MLPConfig(), -1.0, 0.0, NORMALISATION_FULL)

@@ -1,0 +1,341 @@
+"""Versions are whole, unique, contiguous and unchanging; aliases move."""
+
+import json
+import subprocess
+import sys
+import threading
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from service.config import Config
+from service.registry import manifest as manifest_module
+from service.registry import names
+from service.registry.errors import DamagedBlobError, FormatVersionError, RegistryError, UnknownVersionError
+from service.registry.exported import load_exported
+from service.registry.names import Version
+from service.registry.registry import Registry
+from tests.registry.helpers import Publish, arrays_of_all_kinds, assert_identical, files_in
+
+
+def test_round_trip(registry: Registry, publish: Publish) -> None:
+    arrays = arrays_of_all_kinds()
+    version = registry.publish(
+        "panda-cube",
+        arrays,
+        spaces={"action": {"shape": [4]}},
+        normalisation={"mean": [0.1]},
+        config={"seed": 3},
+        metrics={"bob/success_rate": np.float32(0.25)},
+    )
+    assert version == Version("panda-cube", 1)
+    manifest, loaded = registry.load("panda-cube")
+    assert_identical(loaded, arrays)
+    assert manifest.reference == "panda-cube@1"
+    assert manifest.format_version == 1
+    assert manifest.spaces == {"action": {"shape": [4]}}
+    assert manifest.normalisation == {"mean": [0.1]}
+    assert manifest.config == {"seed": 3}
+    assert manifest.metrics == {"bob/success_rate": 0.25}
+    assert manifest.parent is None
+    assert manifest.created.endswith("+00:00")
+    assert manifest.tensors["float32.transposed"].shape == (6, 4)
+    assert manifest.tensors["uint64"].dtype == "uint64"
+
+
+def test_versions_aliases_and_references(registry: Registry, publish: Publish) -> None:
+    for value in (1.0, 2.0, 3.0):
+        publish(value=value)
+    publish("panda-sphere")
+    registry.set_alias("panda-cube", "champion", 3)
+    registry.set_alias("panda-cube", "champion", 2)
+    assert registry.names() == ["panda-cube", "panda-sphere"]
+    assert registry.versions("panda-cube") == [Version("panda-cube", number) for number in (1, 2, 3)]
+    assert registry.aliases("panda-cube") == {"champion": 2, "latest": 3}
+    assert str(registry.resolve("panda-cube")) == "panda-cube@3"
+    assert registry.resolve("panda-cube@1").number == 1
+    assert registry.load("panda-cube@champion")[1]["gate.weight"][0, 0] == 2.0
+
+
+def test_publish_moves_only_the_given_aliases(registry: Registry, publish: Publish) -> None:
+    publish()
+    publish(aliases=("candidate",))
+    assert registry.aliases("panda-cube") == {"candidate": 2, "latest": 1}
+    publish(aliases=())
+    assert registry.aliases("panda-cube") == {"candidate": 2, "latest": 1}
+
+
+def test_equal_parameters_share_one_blob_but_not_a_version(registry: Registry, publish: Publish) -> None:
+    assert publish().number == 1
+    assert publish().number == 2
+    assert len(list((registry.root / "blobs" / "sha256").iterdir())) == 1
+
+
+def test_parent_is_pinned_to_its_version(registry: Registry, publish: Publish) -> None:
+    publish()
+    publish(parent="panda-cube@latest")
+    assert registry.manifest("panda-cube@2").parent == "panda-cube@1"
+    with pytest.raises(UnknownVersionError, match="'nobody'"):
+        publish(parent="nobody@1")
+
+
+def test_unknown_references_list_what_exists(registry: Registry, publish: Publish) -> None:
+    with pytest.raises(UnknownVersionError, match="it holds: nothing yet"):
+        registry.resolve("panda-cube")
+    publish()
+    publish()
+    with pytest.raises(UnknownVersionError, match=r"no 'panda-cup' in the registry .*; it holds: panda-cube"):
+        registry.resolve("panda-cup")
+    with pytest.raises(UnknownVersionError, match=r"no alias 'best' .*; versions: 1 to 2; aliases: latest -> 2"):
+        registry.resolve("panda-cube@best")
+    for number in (0, 3):
+        with pytest.raises(UnknownVersionError, match=rf"no version {number} "):
+            registry.resolve(f"panda-cube@{number}")
+    with pytest.raises(UnknownVersionError, match="no version 9 "):
+        registry.set_alias("panda-cube", "champion", 9)
+
+
+@pytest.mark.parametrize(
+    "name", ["", "..", "../up", "a/b", ".hidden", "A", "a b", "a\n", "a@1", "x" * 65, "\u00e9", "-a"]
+)
+def test_bad_names_and_aliases_are_refused(registry: Registry, publish: Publish, tmp_path: Path, name: str) -> None:
+    with pytest.raises(RegistryError, match="bad name"):
+        publish(name)
+    with pytest.raises(RegistryError, match="bad alias"):
+        publish(aliases=(name,))
+    with pytest.raises(RegistryError, match="bad reference"):
+        registry.resolve(f"{name}@latest")
+    with pytest.raises(RegistryError, match="bad name"):
+        registry.versions(name)
+    assert files_in(tmp_path) == {}
+
+
+@pytest.mark.parametrize("alias", ["7", "007", "../../x"])
+def test_an_alias_that_reads_as_a_version_or_path_is_refused(registry: Registry, publish: Publish, alias: str) -> None:
+    publish()
+    with pytest.raises(RegistryError, match="bad alias"):
+        registry.set_alias("panda-cube", alias, 1)
+    assert registry.aliases("panda-cube") == {"latest": 1}
+
+
+@pytest.mark.parametrize("reference", ["panda-cube@", "@latest", "panda-cube@a@b", "panda-cube@-1", "panda-cube@../1"])
+def test_bad_references_are_refused(registry: Registry, reference: str) -> None:
+    with pytest.raises(RegistryError, match="expected NAME, NAME@VERSION or NAME@ALIAS"):
+        registry.resolve(reference)
+
+
+def test_every_run_name_is_a_registry_name() -> None:
+    (pattern,) = [item.pattern for item in Config.model_fields["name"].metadata if hasattr(item, "pattern")]
+    assert pattern == names.NAME_PATTERN
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"metrics": {"bob/success_rate": float("nan")}}, r"metrics.bob/success_rate = nan"),
+        ({"config": {"rate": float("inf")}}, "NaN or infinity|finite"),
+        ({"spaces": {"low": np.zeros(2)}}, r"spaces\.low"),
+    ],
+)
+def test_values_a_manifest_cannot_hold_publish_nothing(
+    registry: Registry, publish: Publish, changes: dict, message: str
+) -> None:
+    with pytest.raises(RegistryError, match=message):
+        publish(**changes)
+    assert not registry.root.exists()
+
+
+def test_an_array_safetensors_cannot_hold_publishes_nothing(registry: Registry) -> None:
+    with pytest.raises(RegistryError, match="cannot publish panda-cube: array 'odd'"):
+        registry.publish("panda-cube", {"odd": np.array(["a"])}, spaces={}, normalisation={}, config={}, metrics={})
+    assert not registry.root.exists()
+
+
+def test_a_damaged_blob_is_found_and_mended_by_publishing_again(registry: Registry, publish: Publish) -> None:
+    publish()
+    (blob,) = (registry.root / "blobs" / "sha256").iterdir()
+    data = bytearray(blob.read_bytes())
+    data[-1] ^= 0x10
+    blob.write_bytes(data)
+    with pytest.raises(DamagedBlobError, match=str(blob)):
+        registry.load("panda-cube")
+    assert [problem.partition(":")[0] for problem in registry.verify()] == ["panda-cube@1"]
+    blob.write_bytes(bytes(data[:-5]))
+    assert len(registry.verify("panda-cube@1")) == 1
+    publish()
+    assert registry.verify() == []
+
+
+def test_any_flipped_bit_of_a_manifest_is_found(registry: Registry, publish: Publish) -> None:
+    publish()
+    path = registry.root / "models" / "panda-cube" / "versions" / "1"
+    good = path.read_bytes()
+    expected = registry.manifest("panda-cube@1")
+    for position in range(0, len(good), 3):
+        data = bytearray(good)
+        data[position] ^= 1
+        path.write_bytes(data)
+        try:
+            assert registry.manifest("panda-cube@1") == expected  # white space between keys
+        except (DamagedBlobError, FormatVersionError):
+            continue
+        assert good[position : position + 1].isspace()
+
+
+def test_verify_finds_swapped_manifests_and_dangling_or_damaged_aliases(registry: Registry, publish: Publish) -> None:
+    publish()
+    publish()
+    model = registry.root / "models" / "panda-cube"
+    assert registry.verify() == []
+    (model / "versions" / "2").write_bytes((model / "versions" / "1").read_bytes())
+    (model / "aliases" / "champion").write_bytes(b"9\n")
+    assert [problem.split(":")[0] for problem in registry.verify()] == ["panda-cube@2", "panda-cube@champion"]
+    (model / "aliases" / "champion").write_bytes(b"\x00")
+    assert "champion is damaged" in registry.verify()[1]
+    registry.set_alias("panda-cube", "champion", 1)
+    assert len(registry.verify()) == 1
+
+
+def test_another_format_version_is_named(registry: Registry, publish: Publish, tmp_path: Path) -> None:
+    publish()
+    path = registry.root / "models" / "panda-cube" / "versions" / "1"
+    path.write_text(json.dumps({"format_version": 2, "something": "new"}))
+    for read in (lambda: registry.load("panda-cube"), lambda: registry.export("panda-cube", tmp_path / "out")):
+        with pytest.raises(FormatVersionError, match=r"versions/1: format version 2 found, this tandem reads 1; "):
+            read()
+    assert "format version 2" in registry.verify()[0]
+
+
+def test_a_partial_publish_is_invisible(registry: Registry, publish: Publish, monkeypatch: pytest.MonkeyPatch) -> None:
+    publish(value=1.0)
+    before = files_in(registry.root / "models")
+    with monkeypatch.context() as patch:
+        patch.setattr("service.registry.registry.write_exclusive", _killed)
+        with pytest.raises(KeyboardInterrupt):
+            publish(value=2.0)
+    versions = registry.root / "models" / "panda-cube" / "versions"
+    (versions / ".tmp-1-dead").write_bytes(b"{")  # what kill -9 leaves
+    assert registry.versions("panda-cube") == [Version("panda-cube", 1)]
+    assert registry.load("panda-cube")[1]["gate.weight"][0, 0] == 1.0
+    (versions / ".tmp-1-dead").unlink()
+    assert files_in(registry.root / "models") == before
+    assert publish(value=2.0).number == 2
+
+
+def _killed(path: Path, data: bytes) -> bool:
+    raise KeyboardInterrupt
+
+
+@pytest.mark.parametrize("call", ["write", "fsync"])
+def test_a_full_disk_changes_nothing(
+    registry: Registry, publish: Publish, full_disk: Callable[[str], None], call: str
+) -> None:
+    publish(value=1.0)
+    before = files_in(registry.root)
+    full_disk(call)
+    with pytest.raises(RegistryError, match="No space left on device"):
+        publish(value=2.0)
+    with pytest.raises(RegistryError, match="No space left on device"):
+        registry.set_alias("panda-cube", "champion", 1)
+    assert files_in(registry.root) == before
+
+
+def test_a_slow_publisher_does_not_take_latest_back(registry: Registry, publish: Publish) -> None:
+    aliases = registry._aliases("panda-cube")
+    publish()
+    publish()
+    aliases.advance("latest", 1)
+    assert registry.aliases("panda-cube") == {"latest": 2}
+
+
+_PUBLISHER = """
+import sys
+from pathlib import Path
+import numpy as np
+from service.registry.registry import Registry
+registry = Registry(Path(sys.argv[1]))
+print("ready", flush=True)
+sys.stdin.readline()
+for index in range(10):
+    value = np.full(8, 10 * int(sys.argv[2]) + index, np.int64)
+    version = registry.publish("panda-cube", {"value": value}, spaces={}, normalisation={}, config={}, metrics={})
+    print(version.number, value[0])
+"""
+
+
+def test_forty_publishes_of_four_processes_are_forty_versions(registry: Registry) -> None:
+    stop = threading.Event()
+    failures: list[str] = []
+    reader = threading.Thread(target=_read_until, args=(registry, stop, failures))
+    reader.start()
+    outputs = _publish_from_four_processes(registry.root)
+    stop.set()
+    reader.join()
+    published = dict(tuple(map(int, line.split())) for output in outputs for line in output.splitlines())
+    assert failures == []
+    assert sorted(published) == list(range(1, 41))
+    assert sorted(published.values()) == list(range(40))
+    assert [version.number for version in registry.versions("panda-cube")] == list(range(1, 41))
+    assert registry.aliases("panda-cube") == {"latest": 40}
+    assert all(registry.load(f"panda-cube@{number}")[1]["value"][0] == value for number, value in published.items())
+    assert registry.verify() == []
+
+
+def _publish_from_four_processes(root: Path) -> list[str]:
+    command = [sys.executable, "-c", _PUBLISHER, str(root)]
+    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
+    processes = [subprocess.Popen([*command, str(index)], **pipes) for index in range(4)]
+    for process in processes:
+        assert process.stdout.readline() == "ready\n"
+    for process in processes:
+        process.stdin.write("go\n")
+        process.stdin.flush()
+    outputs = [process.communicate()[0] for process in processes]
+    assert [process.returncode for process in processes] == [0, 0, 0, 0]
+    return outputs
+
+
+def _read_until(registry: Registry, stop: threading.Event, failures: list[str]) -> None:
+    newest = 0
+    while not stop.wait(0.002):
+        try:
+            if registry.versions("panda-cube"):
+                number = registry.load(str(registry.versions("panda-cube")[-1]))[0].version
+                if number < newest:
+                    failures.append(f"{number} after {newest}")
+                newest = number
+        except RegistryError as error:
+            failures.append(str(error))
+
+
+def test_export_is_read_back_without_the_registry(registry: Registry, publish: Publish, tmp_path: Path) -> None:
+    publish(value=4.0)
+    target = tmp_path / "robot" / "skills"
+    exported = registry.export("panda-cube@latest", target)
+    assert sorted(path.name for path in target.iterdir()) == ["manifest.json", "primitives.safetensors"]
+    manifest, arrays = load_exported(target)
+    assert manifest == exported == registry.manifest("panda-cube")
+    assert_identical(arrays, registry.load("panda-cube")[1])
+    with pytest.raises(RegistryError, match="exists; choose another directory"):
+        registry.export("panda-cube", target)
+
+
+def test_a_damaged_or_missing_export_is_refused(registry: Registry, publish: Publish, tmp_path: Path) -> None:
+    with pytest.raises(RegistryError, match=r"no .*manifest.json; give a directory that tandem registry export wrote"):
+        load_exported(tmp_path)
+    publish()
+    registry.export("panda-cube", tmp_path)
+    path = tmp_path / "primitives.safetensors"
+    path.write_bytes(path.read_bytes()[:-1])
+    with pytest.raises(DamagedBlobError, match=r"primitives.safetensors is damaged"):
+        load_exported(tmp_path)
+    path.unlink()
+    with pytest.raises(RegistryError, match=r"no .*primitives.safetensors"):
+        load_exported(tmp_path)
+
+
+def test_commit_is_of_this_checkout_or_none() -> None:
+    commit = manifest_module.git_commit()
+    assert commit is None or len(commit.removesuffix("-dirty")) == 40

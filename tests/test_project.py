@@ -1,0 +1,171 @@
+"""The project as a whole: what an import costs, which way imports point, and whether the documents tell the truth."""
+
+import ast
+import os
+import re
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+
+import pytest
+
+import service
+
+ROOT = Path(__file__).parents[1]
+HEAVY = ("torch", "mujoco", "matplotlib", "gymnasium", "tensorboard", "imageio", "ray")
+ROOMS_WITHOUT_TORCH = ("actors", "envs", "generator", "registry")
+ROOMS_BELOW_RUNTIME = ("envs", "policies", "actors", "generator", "learner", "registry")
+VERBS = ("demo", "pretrain", "evaluate", "render", "coverage", "registry")
+DOCUMENTS = [*sorted(ROOT.glob("*.md")), *sorted((ROOT / "docs").rglob("*.md")), ROOT / "deploy" / "README.md"]
+FOLDERS = (".ci", "benchmarks", "configs", "deploy", "docs", "service", "tests")
+TEXT = {".cfg", ".json", ".jsonl", ".md", ".py", ".toml", ".txt", ".yaml", ".yml", ""}
+
+IMPORT_ALL = """
+import importlib, sys
+forbidden, modules = sys.argv[1].split(","), sys.argv[2].split(",")
+for module in modules:
+    importlib.import_module(module)
+    found = [name for name in forbidden if name in sys.modules]
+    if found:
+        sys.exit(f"importing {module} brings in {', '.join(found)}")
+"""
+
+HELP = """
+import sys
+sys.argv = ["tandem", "--help"]
+from service.cli import main
+try:
+    main()
+except SystemExit as stop:
+    assert not stop.code, stop.code
+found = [name for name in HEAVY if name in sys.modules]
+if found:
+    sys.exit(f"tandem --help brings in {', '.join(found)}")
+"""
+
+
+def run_python(code, *args):
+    """Run code in a fresh interpreter; returns what it printed."""
+    environment = {**os.environ, "NO_COLOR": "1", "COLUMNS": "120"}
+    result = subprocess.run(
+        [sys.executable, "-c", code, *args], cwd=ROOT, env=environment, capture_output=True, text=True, timeout=120
+    )
+    assert result.returncode == 0, result.stderr
+    return result.stdout
+
+
+def modules_in(room):
+    """Names of the modules of one room, its package first."""
+    paths = sorted((ROOT / "service" / room).rglob("*.py"))
+    return [".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__") for path in paths]
+
+
+def text_files():
+    """Every text file of the project, without what is generated."""
+    paths = [path for folder in FOLDERS for path in (ROOT / folder).rglob("*")] + list(ROOT.glob("*"))
+    return [path for path in paths if path.is_file() and path.suffix in TEXT and "__pycache__" not in path.parts]
+
+
+def project_table():
+    return tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+
+
+@pytest.mark.parametrize("module", ["service", "service.config", "service.errors", "service.cli"])
+def test_import_is_light(module):
+    run_python(IMPORT_ALL, ",".join(HEAVY), module)
+
+
+def test_help_is_light_and_names_every_verb():
+    text = run_python(HELP.replace("HEAVY", repr(HEAVY)))
+    assert [verb for verb in VERBS if not re.search(rf"\b{verb}\b", text)] == []
+
+
+def test_python_dash_m_is_the_command():
+    result = subprocess.run(
+        [sys.executable, "-m", "service", "--help"], cwd=ROOT, capture_output=True, text=True, timeout=120
+    )
+    assert result.returncode == 0, result.stderr
+    assert "pretrain" in result.stdout
+
+
+def test_the_evaluator_needs_no_torch():
+    run_python(IMPORT_ALL, "torch", "service.policies.evaluator")
+
+
+@pytest.mark.parametrize("room", ROOMS_WITHOUT_TORCH)
+def test_acting_needs_no_torch(room):
+    modules = modules_in(room)
+    assert modules, f"service/{room} is empty"
+    run_python(IMPORT_ALL, "torch", ",".join(modules))
+
+
+def test_nothing_below_the_runners_knows_which_one_runs_it():
+    above = re.compile(r"(service\.(runtime|status|cli)|ray|redis)(\.|$)")
+    offenders = []
+    for path in (path for room in ROOMS_BELOW_RUNTIME for path in (ROOT / "service" / room).rglob("*.py")):
+        for node in ast.walk(ast.parse(path.read_text())):
+            names = [alias.name for alias in node.names] if isinstance(node, ast.Import) else []
+            if isinstance(node, ast.ImportFrom):
+                names = [f"{node.module}.{alias.name}" for alias in node.names]
+            offenders += [f"{path.relative_to(ROOT)} imports {name}" for name in names if above.match(name)]
+    assert offenders == []
+
+
+def test_no_module_is_long():
+    lengths = {path: len(path.read_text().splitlines()) for path in (ROOT / "service").rglob("*.py")}
+    assert lengths
+    assert {str(path.relative_to(ROOT)): lines for path, lines in lengths.items() if lines > 500} == {}
+
+
+def test_one_version_everywhere():
+    latest = re.search(r"^## \[([^\]]+)\]", (ROOT / "CHANGELOG.md").read_text(), re.MULTILINE)
+    assert latest is not None
+    assert project_table()["version"] == latest[1] == service.__version__
+
+
+def test_mujoco_has_an_upper_bound():
+    (mujoco,) = [line for line in project_table()["dependencies"] if line.startswith("mujoco")]
+    assert "<" in mujoco
+
+
+@pytest.mark.parametrize("document", DOCUMENTS, ids=lambda path: str(path.relative_to(ROOT)))
+def test_links_lead_somewhere(document):
+    text = re.sub(r"```.*?```", "", document.read_text(), flags=re.DOTALL)
+    targets = re.findall(r"\]\(([^)\s#]+)", text)
+    local = [target for target in targets if "://" not in target and not target.startswith("mailto:")]
+    assert [target for target in local if not (document.parent / target).exists()] == []
+
+
+def test_the_readme_names_only_verbs_that_exist():
+    text = (ROOT / "README.md").read_text()
+    phony = re.search(r"^\.PHONY: (.*)$", (ROOT / "Makefile").read_text(), re.MULTILINE)
+    assert phony is not None
+    named = set(re.findall(r"(?:^|`)make ([a-z]+)", text, re.MULTILINE))
+    assert {"demo", "test"} <= named <= set(phony[1].split())
+    commands = set(re.findall(r"(?:^|`)tandem ([a-z]+)", text, re.MULTILINE))
+    assert commands
+    assert commands <= set(VERBS)
+
+
+def test_ci_runs_what_the_readme_says():
+    script = ROOT / ".ci" / "run"
+    assert os.access(script, os.X_OK)
+    lines = [line for line in script.read_text().splitlines() if line and not line.startswith("#")]
+    assert lines == ["set -euo pipefail", 'cd "$(dirname "${BASH_SOURCE[0]}")/.."', "make test"]
+
+
+def test_no_path_of_somebodys_machine():
+    absolute = re.compile(r"""(?:^|[\s"'`=(:])/(?:home|root|Users|work|opt|mnt|data|farm)/\S+""")
+    hits = [
+        (str(path.relative_to(ROOT)), match[0])
+        for path in text_files()
+        for match in absolute.finditer(path.read_text())
+    ]
+    assert hits == []
+
+
+def test_ascii_only():
+    files = [path for path in text_files() if path.suffix in {".py", ".toml", ".yaml", ".md"}]
+    assert len(files) > len(DOCUMENTS)
+    assert [str(path.relative_to(ROOT)) for path in files if not path.read_bytes().isascii()] == []
