@@ -7,11 +7,12 @@ description. ``load_config`` reads YAML and applies ``--set a.b=c`` overrides.
 
 from __future__ import annotations
 
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, Literal, Self
 
 import yaml
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import BaseModel, ConfigDict, Field, PositiveInt, ValidationError, model_validator
 
 from service.errors import TandemError
 
@@ -28,7 +29,10 @@ class WorkspaceConfig(_Frozen):
     """The box in which goals are valid. Origin of the world: the table top, 0.6 m in front of the robot's base."""
 
     center_x_m: float = Field(
-        -0.05, ge=-0.3, le=0.2, description="-0.05 keeps the downstream Larger task's 45 x 45 x 40 cm over 99 % reachable"
+        -0.05,
+        ge=-0.3,
+        le=0.2,
+        description="-0.05 keeps the downstream Larger task's 45 x 45 x 40 cm over 99 % reachable",
     )
     center_y_m: float = Field(0.0, ge=-0.3, le=0.3)
     length_x_m: float = Field(0.35, gt=0.0, le=0.8, description="paper: 35 cm")
@@ -45,7 +49,10 @@ class WorldConfig(_Frozen):
     friction: float = Field(1.0, gt=0.0, le=3.0, description="sliding friction of object, pads and table")
     workspace: WorkspaceConfig = WorkspaceConfig()
     start_height_m: float = Field(
-        0.08, ge=0.08, le=0.4, description="end effector at reset, above the workspace's centre; low, so that chance finds the object"
+        0.08,
+        ge=0.08,
+        le=0.4,
+        description="end effector at reset, above the workspace's centre; low, so that chance finds the object",
     )
     physics_step_s: float = Field(0.002, gt=0.0, le=0.01)
     num_substeps: int = Field(20, ge=1, le=200, description="physics steps per action; 20 x 2 ms = 25 Hz as panda-gym")
@@ -61,14 +68,18 @@ class GameConfig(_Frozen):
     success_distance_m: float = Field(0.05, gt=0.0, description="paper: 5 cm; also the least move of a valid goal")
     alice_valid_reward: float = Field(1.0, description="paper, appendix")
     alice_difficult_reward: float = Field(5.0, description="paper, appendix: added when Bob fails")
-    alice_outside_reward: float = Field(0.0, description="paid for a goal outside the workspace; 0 in the paper's appendix")
+    alice_outside_reward: float = Field(
+        0.0, description="paid for a goal outside the workspace; 0 in the paper's appendix"
+    )
     bob_success_reward: float = Field(1.0, gt=0.0, description="once, when solved")
 
 
 class GeneratorConfig(_Frozen):
     """The task generator: which goals and opponents a round uses, and when the run is over."""
 
-    past_opponent_fraction: float = Field(0.2, ge=0.0, le=0.5, description="share of worlds, each way (OpenAI 2021: 20 %)")
+    past_opponent_fraction: float = Field(
+        0.2, ge=0.0, le=0.5, description="share of worlds, each way (OpenAI 2021: 20 %)"
+    )
     opponent_pool_size: int = Field(5, ge=1)
     opponent_interval: int = Field(10, ge=1, description="iterations between two snapshots of the players")
     replay_fraction: float = Field(0.0, ge=0.0, le=1.0, description="share of valid goals replaced by replayed ones")
@@ -82,22 +93,16 @@ class GeneratorConfig(_Frozen):
 class MLPConfig(_Frozen):
     """A multi-layer perceptron with ELU."""
 
-    hidden_sizes: tuple[int, ...] = Field((256, 256), min_length=1)
-
-    @model_validator(mode="after")
-    def _positive(self) -> Self:
-        if any(size < 1 for size in self.hidden_sizes):
-            raise ValueError(f"hidden_sizes must be positive, got {self.hidden_sizes}")
-        return self
+    hidden_sizes: tuple[PositiveInt, ...] = Field((256, 256), min_length=1)
 
 
 class MCPConfig(_Frozen):
     """Bob's Multiplicative Compositional Policy."""
 
     num_primitives: int = Field(4, ge=1, description="K; paper: 4")
-    trunk_hidden_sizes: tuple[int, ...] = Field((256,), min_length=1, description="shared by the primitives")
+    trunk_hidden_sizes: tuple[PositiveInt, ...] = Field((256,), min_length=1, description="shared by the primitives")
     primitive_hidden_size: int = Field(128, ge=1, description="one hidden layer of each primitive's own")
-    gate_hidden_sizes: tuple[int, ...] = Field((256, 256), min_length=1)
+    gate_hidden_sizes: tuple[PositiveInt, ...] = Field((256, 256), min_length=1)
     weight_floor: float = Field(0.01, gt=0.0, lt=1.0, description="least gate weight, bounds the composite variance")
     log_std_min: float = Field(-2.0, description="of a primitive")
     log_std_max: float = Field(0.5, description="of a primitive")
@@ -117,6 +122,14 @@ class PolicyConfig(_Frozen):
     alice_log_std_max: float = 0.5
     bob: MCPConfig = MCPConfig()
     value: MLPConfig = MLPConfig()
+
+    @model_validator(mode="after")
+    def _ordered(self) -> Self:
+        if self.alice_log_std_min >= self.alice_log_std_max:
+            raise ValueError(
+                f"alice_log_std_min {self.alice_log_std_min} must be below alice_log_std_max {self.alice_log_std_max}"
+            )
+        return self
 
 
 class PPOConfig(_Frozen):
@@ -171,7 +184,9 @@ class RunConfig(_Frozen):
 class Config(_Frozen):
     """A whole pre-training run."""
 
-    name: str = Field("panda-cube", pattern=r"^[a-z0-9][a-z0-9._-]{0,63}$", description="registry name of the primitives")
+    name: str = Field(
+        "panda-cube", pattern=r"^[a-z0-9][a-z0-9._-]{0,63}$", description="registry name of the primitives"
+    )
     seed: int = Field(0, ge=0)
     world: WorldConfig = WorldConfig()
     game: GameConfig = GameConfig()
@@ -219,7 +234,8 @@ def parse_config(tree: dict[str, Any], *, where: str) -> Config:
 
 def dump_config(config: Config) -> str:
     """The resolved configuration as YAML that ``load_config`` reads back to an equal object."""
-    return yaml.safe_dump(config.model_dump(mode="json"), sort_keys=False)
+    text: str = yaml.safe_dump(config.model_dump(mode="json"), sort_keys=False)
+    return text
 
 
 def _read_yaml(path: Path) -> dict[str, Any]:
@@ -245,10 +261,8 @@ def _apply_override(tree: dict[str, Any], override: str) -> None:
     except yaml.YAMLError:
         raise ConfigError(f"override {override!r}: the value is not YAML") from None
     if isinstance(value, str):
-        try:
+        with suppress(ValueError):
             value = float(value)  # YAML 1.1 reads 1e-3 as text
-        except ValueError:
-            pass
     *parents, last = key.strip().split(".")
     node = tree
     for parent in parents:

@@ -15,6 +15,7 @@ from service.envs.observations import ACTION_SIZE
 FloatArray = NDArray[np.float32]
 StateArray = NDArray[np.float64]
 GoalKind = Literal["table", "air", "mixed"]
+GOAL_KINDS: tuple[GoalKind, ...] = ("table", "air", "mixed")
 
 MIXED_AIR_SHARE = 0.7
 """Share of mixed goals drawn anywhere in the workspace's volume; the rest lie on the table (paper: p = 0.7)."""
@@ -58,9 +59,14 @@ class Evaluation:
         return asdict(self)
 
 
-def sample_goals(kind: GoalKind, rng: np.random.Generator, num: int, config: WorldConfig, success_distance_m: float) -> StateArray:
-    """(num, 3) goals, metres: on the table; in the air (out of reach of an object that rests on the table); or mixed as the
-    paper's downstream tasks: anywhere in the volume with probability 0.7, else on the table."""  # fmt: skip
+def sample_goals(
+    kind: GoalKind, rng: np.random.Generator, num: int, config: WorldConfig, success_distance_m: float
+) -> StateArray:
+    """(num, 3) goals, metres.
+
+    ``table``: on it. ``air``: out of reach of an object that rests on the table. ``mixed``: as the paper's downstream
+    tasks, anywhere in the volume with probability 0.7, else on the table.
+    """
     table = sample_on_table(rng, num, config.workspace, config.object_size_m)
     if kind == "table":
         return table
@@ -97,9 +103,15 @@ def evaluate(
     last = distance <= success_distance_m
     low, high = wilson_interval(int(last.sum()), num_episodes)
     return Evaluation(
-        goals=kind, num_episodes=num_episodes, num_steps=num_steps, success_last=float(last.mean()), success_last_low=low,
-        success_last_high=high, success_ever=float(ever.mean()), mean_distance_m=float(distance.mean()),
-    )  # fmt: skip
+        goals=kind,
+        num_episodes=num_episodes,
+        num_steps=num_steps,
+        success_last=float(last.mean()),
+        success_last_low=low,
+        success_last_high=high,
+        success_ever=float(ever.mean()),
+        mean_distance_m=float(distance.mean()),
+    )
 
 
 def wilson_interval(successes: int, num: int, z: float = 1.96) -> tuple[float, float]:

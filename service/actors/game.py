@@ -1,8 +1,8 @@
 """Asymmetric self-play: one round of Alice, then Bob, on a batch of worlds.
 
-Alice acts from s0 for a fixed number of steps; where the object then is becomes the goal. The worlds go back to s0 and Bob acts
-until he is there or out of time. The next round of the game starts where Alice ended, so games reach grasped objects by
-themselves; an invalid goal ends the game (OpenAI 2021; ``algorithms.md`` 1).
+Alice acts from s0 for a fixed number of steps; where the object then is becomes the goal. The worlds go back to s0 and
+Bob acts until the object is there or he is out of time. The next round of the game starts where Alice ended, so games
+reach grasped objects by themselves; an invalid goal ends the game (OpenAI 2021, section 3).
 """
 
 from __future__ import annotations
@@ -94,19 +94,39 @@ class SelfPlay:
         choice = choose_goals(start_state, start_position, proposal, verdict)
 
         worlds.restore(choice.start_state)
-        bob, solved, num_bob_steps = self._play_bob(players, plan, choice)
-        self._reward_alice(alice, verdict, choice, solved)
+        bob, solved, broken = self._play_bob(players, plan, choice)
+        played = choice.played & ~broken  # a turn in which the physics broke says nothing about either player
+        bob.learn[broken] = False
+        self._reward_alice(alice, verdict, played & ~choice.replayed, solved)
         records = GoalRecords(
-            start_state=choice.start_state, start_position=choice.start_position, goal=choice.goal, proposal=proposal,
-            verdict=verdict, replayed=choice.replayed, played=choice.played, solved=solved, num_bob_steps=num_bob_steps,
-            alice_past=plan.alice_past, bob_past=plan.bob_past, round_index=self._round_index.copy(),
-        )  # fmt: skip
+            start_state=choice.start_state,
+            start_position=choice.start_position,
+            goal=choice.goal,
+            proposal=proposal,
+            verdict=verdict,
+            replayed=choice.replayed,
+            played=played,
+            solved=solved,
+            num_bob_steps=bob.active.sum(axis=0),
+            alice_past=plan.alice_past,
+            bob_past=plan.bob_past,
+            round_index=self._round_index.copy(),
+        )
         self._continue_games(end_state, verdict)
         rollout = Rollout(
-            actor=self._actor, incarnation=self._incarnation, sequence=self._sequence, policy_version=players.version,
-            alice=alice, bob=bob, demonstrations=_demonstrations(alice, records), records=records,
-            num_env_steps=int(alice.active.sum() + bob.active.sum()), metrics=_contact_metrics(contacts),
-        )  # fmt: skip
+            actor=self._actor,
+            incarnation=self._incarnation,
+            sequence=self._sequence,
+            policy_version=players.version,
+            alice=alice,
+            bob=bob,
+            demonstrations=_demonstrations(alice, records),
+            records=records,
+            num_env_steps=int(alice.active.sum() + bob.active.sum()),
+            metrics=_contact_metrics(contacts),
+            broken=tuple(worlds.broken),
+        )
+        worlds.broken = []
         self._sequence += 1
         return rollout
 
@@ -119,7 +139,9 @@ class SelfPlay:
         broken = np.zeros(worlds.num_worlds, dtype=bool)
         for step in range(num_steps):
             observation = worlds.full(step / num_steps)
-            action, log_prob = _act(players.alice, players.past_alice, plan.alice_opponent, observation, everyone, self._rng)
+            action, log_prob = _act(
+                players.alice, players.past_alice, plan.alice_opponent, observation, everyone, self._rng
+            )
             turns.observation[step], turns.action[step], turns.log_prob[step] = observation, action, log_prob
             broken |= worlds.step(action)
             contacts |= worlds.contacts()
@@ -130,13 +152,13 @@ class SelfPlay:
         turns.learn[broken] = False
         return turns, contacts, broken
 
-    def _play_bob(self, players: Players, plan: RoundPlan, choice: GoalChoice) -> tuple[Turns, BoolArray, IntArray]:
-        """His turns, (N,) solved, (N,) steps played."""
+    def _play_bob(self, players: Players, plan: RoundPlan, choice: GoalChoice) -> tuple[Turns, BoolArray, BoolArray]:
+        """His turns, (N,) solved, (N,) worlds whose physics broke."""
         game, worlds = self.config.game, self.worlds
         num = worlds.num_worlds
         turns = _empty_turns(game.bob_steps, num, BOB_SIZE, BOB_VALUE_SIZE, learn=choice.played & ~plan.bob_past)
         goal = choice.goal.astype(np.float32)
-        solved = np.zeros(num, dtype=bool)
+        solved, broken = np.zeros(num, dtype=bool), np.zeros(num, dtype=bool)
         playing = np.flatnonzero(choice.played)
         for step in range(game.bob_steps):
             if not playing.size:
@@ -146,25 +168,23 @@ class SelfPlay:
             turns.observation[step, playing], turns.action[step, playing] = observation, action
             turns.value_observation[step, playing] = worlds.bob_value(choice.goal)[playing]
             turns.log_prob[step, playing], turns.active[step, playing] = log_prob, True
-            broken = worlds.step(action, playing)
+            broken |= worlds.step(action, playing)
             reached = np.linalg.norm(worlds.object_position - choice.goal, axis=1) <= game.success_distance_m
             newly = playing[reached[playing]]
             solved[newly] = True
             turns.reward[step, newly] = game.bob_success_reward
-            turns.terminated[step] = broken
             turns.terminated[step, newly] = True
             playing = playing[~(reached | broken)[playing]]
         turns.final_value_observation[:] = worlds.bob_value(choice.goal)
-        return turns, solved, turns.active.sum(axis=0)
+        return turns, solved, broken
 
-    def _reward_alice(self, alice: Turns, verdict: VerdictArray, choice: GoalChoice, solved: BoolArray) -> None:
+    def _reward_alice(self, alice: Turns, verdict: VerdictArray, tried: BoolArray, solved: BoolArray) -> None:
         game = self.config.game
         valid = verdict == Verdict.VALID
-        tried = valid & choice.played & ~choice.replayed
         alice.reward[-1, verdict == Verdict.OUTSIDE] = game.alice_outside_reward
         alice.reward[-1, valid] = game.alice_valid_reward
-        alice.reward[-1, tried & ~solved] += game.alice_difficult_reward
-        # What a valid goal was worth is unknown where Bob played another one instead.
+        alice.reward[-1, valid & tried & ~solved] += game.alice_difficult_reward
+        # What a valid goal was worth is unknown where Bob could not try it.
         alice.learn[valid & ~tried] = False
 
     def _continue_games(self, end_state: StateArray, verdict: VerdictArray) -> None:

@@ -22,8 +22,8 @@ IntArray = NDArray[np.int64]
 class Turns:
     """One player's turns in a round.
 
-    A step counts only where ``active``; the rest is zero. A turn that ends without ``terminated`` ran out of time, and its
-    return is bootstrapped from ``final_value_observation``.
+    A step counts only where ``active``; the rest is zero. A turn that ends without ``terminated`` ran out of time, and
+    its return is bootstrapped from ``final_value_observation``.
     """
 
     observation: FloatArray
@@ -103,6 +103,9 @@ class Rollout:
     metrics: dict[str, float]
     """Counters of this round, e.g. ``alice/contact_fraction``."""
 
+    broken: tuple[tuple[StateArray, FloatArray], ...] = ()
+    """(last finite state (S,), action (4,)) of each world whose physics diverged; not part of a checkpoint."""
+
     @property
     def id(self) -> tuple[int, int, int]:
         """(actor, incarnation, sequence), unique within a run; the learner counts a rollout once by it."""
@@ -122,12 +125,13 @@ def to_arrays(rollout: Rollout) -> dict[str, NDArray[Any]]:
 
 def from_arrays(arrays: dict[str, NDArray[Any]]) -> Rollout:
     """The rollout that ``to_arrays`` flattened."""
-    parts: dict[str, Any] = {
+    values: dict[str, Any] = {
         part: kind(**{field.name: arrays[f"{part}/{field.name}"] for field in fields(kind)})
         for part, kind in _PARTS.items()
     }
     metrics = {k.removeprefix("metrics/"): float(v) for k, v in arrays.items() if k.startswith("metrics/")}
-    return Rollout(**parts, **{name: int(arrays[name]) for name in _NUMBERS}, metrics=metrics)
+    values |= {name: int(arrays[name]) for name in _NUMBERS}
+    return Rollout(**values, metrics=metrics)
 
 
 _PARTS: dict[str, type] = {"alice": Turns, "bob": Turns, "demonstrations": Demonstrations, "records": GoalRecords}

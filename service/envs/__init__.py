@@ -1,0 +1,1 @@
+"""The MuJoCo world: scene, controller, observations, batches of worlds, Gymnasium environments. Importing it is cheap."""

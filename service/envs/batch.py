@@ -27,16 +27,16 @@ DISPLACEMENT_M = 0.05
 WIDTH_CHANGE_M = 0.10
 """Change of the finger width of a full action (paper)."""
 LOWEST_TARGET_M = 0.012
-"""Least height of a commanded end effector; the fingertips end 0.8 cm below it."""
+"""Least height of a commanded end effector; the fingertips end 0.7 cm below it."""
 _TABLE_TOP_M = 0.0
 
 
 class WorldBatch:
     """N independent worlds with one flat state each.
 
-    The state of a world is MuJoCo's full physics state followed by the two finger-contact flags of the last action; a world
-    is a pure function of (state, action), because each action starts the constraint solver cold. So saving is copying rows of
-    ``states``, restoring is writing them back, and the continuation is bit-identical.
+    The state of a world is MuJoCo's full physics state followed by the two finger-contact flags of the last action. A
+    world is a pure function of (state, action), because each action starts the constraint solver cold: saving is copying
+    rows of ``states``, restoring is ``restore``, and the continuation is bit-identical.
 
     Args:
         config: the world.
@@ -58,11 +58,15 @@ class WorldBatch:
         self.states: StateArray = np.tile(self._fresh_state, (num_worlds, 1))
         self._kinematics = kinematics.forward(self.joints)
         self.num_broken = 0
+        self.broken: list[tuple[StateArray, FloatArray]] = []
+        """(last finite state, action) of every world whose physics diverged; whoever reports them clears the list."""
 
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
         self.close()
 
     def close(self) -> None:
@@ -87,8 +91,10 @@ class WorldBatch:
         return self._kinematics.position
 
     def reset(self, rng: np.random.Generator, worlds: BoolArray | None = None) -> None:
-        """Put worlds (all, or where ``worlds`` is true) back to the start: arm at home, gripper open, object anywhere on the
-        table inside the workspace."""  # fmt: skip
+        """Put worlds (all, or where ``worlds`` is true) back to the start.
+
+        The arm is at home, the gripper open, the object anywhere on the table inside the workspace.
+        """
         mask = np.ones(self.num_worlds, dtype=bool) if worlds is None else worlds
         num = int(mask.sum())
         states = np.tile(self._fresh_state, (num, 1))
@@ -109,12 +115,12 @@ class WorldBatch:
         """Act for one control step (40 ms by default).
 
         Args:
-            actions: (N, 4), or (M, 4) for M ``worlds``; clipped to [-1, 1]. End-effector displacement x, y, z from where
-                it is now, and change of the finger width.
+            actions: (N, 4), or (M, 4) for M ``worlds``; clipped to [-1, 1]. End-effector displacement x, y, z from
+                where it is now, and change of the finger width.
             worlds: indices of the worlds that act; all by default. The others stand still.
 
         Returns:
-            (N,) true where the physics diverged. Such a world keeps its last finite state.
+            (N,) true where the physics diverged. Such a world keeps its last finite state and is listed in ``broken``.
 
         Raises:
             ValueError: actions of the wrong shape or not finite.
@@ -138,6 +144,7 @@ class WorldBatch:
             after[~finite] = start[~finite]
             broken[index] = ~finite
             self.num_broken += int((~finite).sum())
+            self.broken += [(start[row].copy(), actions[row].copy()) for row in np.flatnonzero(~finite)]
         self.states[index] = after
         self._kinematics = kinematics.forward(self.joints)
         return broken
@@ -221,7 +228,8 @@ class _Layout:
 
     @classmethod
     def of(cls, model: mujoco.MjModel) -> _Layout:
-        assert model.nq == NUM_JOINTS + 2 + 7 and model.na == 0
+        assert model.nq == NUM_JOINTS + 2 + 7
+        assert model.na == 0
         return cls(model.nq)
 
 
@@ -236,10 +244,15 @@ def sample_on_table(rng: np.random.Generator, num: int, workspace: WorkspaceConf
 
 
 def sample_in_volume(
-    rng: np.random.Generator, num: int, workspace: WorkspaceConfig, object_size_m: float, *, lowest_m: float | None = None
+    rng: np.random.Generator,
+    num: int,
+    workspace: WorkspaceConfig,
+    object_size_m: float,
+    *,
+    lowest_m: float | None = None,
 ) -> StateArray:
     """(num, 3) object centres, uniform in the workspace above ``lowest_m`` (default: resting height)."""
     position = sample_on_table(rng, num, workspace, object_size_m)
-    low = position[0, 2] if lowest_m is None and num else lowest_m
+    low = _TABLE_TOP_M + object_size_m / 2 if lowest_m is None else lowest_m
     position[:, 2] = rng.uniform(low, workspace.height_m, num)
     return position

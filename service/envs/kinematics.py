@@ -91,7 +91,7 @@ DOWN = np.array([[_HALF, -_HALF, 0.0], [-_HALF, -_HALF, 0.0], [0.0, 0.0, -1.0]])
 
 
 def _orientation_error(rotation: Array) -> Array:
-    """(N, 3) rotation vector (small angles) that takes ``rotation`` to DOWN: half the sum of the axes' cross products."""
+    """(N, 3) small rotation vector that takes ``rotation`` to DOWN: half the sum of the axes' cross products."""
     error: Array = 0.5 * _cross(rotation.transpose(0, 2, 1), np.broadcast_to(DOWN.T, rotation.shape)).sum(axis=1)
     return error
 
@@ -99,8 +99,8 @@ def _orientation_error(rotation: Array) -> Array:
 def clip_to_reach(target: Array, lowest_z_m: float) -> Array:
     """Nearest point a gripper-down arm can reach: height first, then horizontal distance from the base.
 
-    The wrist sits 0.2104 m above the end effector and 0.088 m nearer to the base; its distance from the shoulder is at most
-    the arm's length.
+    The wrist sits 0.2104 m above the end effector and 0.088 m nearer to the base; its distance from the shoulder is at
+    most the arm's length.
 
     Args:
         target: (N, 3) end-effector positions, metres.

@@ -1,9 +1,9 @@
 """The Franka Emika Panda with its parallel gripper, built in code from published numbers.
 
-Kinematics, joint limits, torque limits: Franka documentation (modified DH parameters). Link masses and inertias: identified
-by Gaz et al. 2019, as used by franka_ros. Position gains follow the MuJoCo Menagerie model, whose damping is halved here so
-that a full action moves the end effector about 3 cm in one 40 ms step. The geometry is our own: primitive shapes for
-collision on the gripper only (a gripper that points down keeps the arm off the table), and decoration for rendering.
+Kinematics, joint limits, torque limits: Franka documentation (modified DH parameters). Link masses and inertias:
+identified by Gaz et al. 2019, as used by franka_ros. Position gains follow the MuJoCo Menagerie model, whose damping is
+halved here so that a full action moves the end effector about 3 cm in one 40 ms step. The geometry is our own: primitive
+shapes for collision on the gripper only (a gripper that points down keeps the arm off the table).
 """
 
 from __future__ import annotations
@@ -62,8 +62,8 @@ GRIPPER_BIT, OBJECT_BIT, TABLE_BIT = 1, 2, 4
 def add_panda(spec: mujoco.MjSpec, *, friction: float) -> Any:
     """Add the arm, its actuators and its collision shapes to a model under construction.
 
-    Actuators: seven joint positions (rad), then left and right finger positions (m). Gravity on the arm is compensated, as
-    the robot's own controller does.
+    Actuators: seven joint positions (rad), then left and right finger positions (m). Gravity on the arm is compensated,
+    as the robot's own controller does.
 
     Args:
         spec: the model under construction.
@@ -79,9 +79,15 @@ def add_panda(spec: mujoco.MjSpec, *, friction: float) -> Any:
         zip(_FRAMES, _INERTIALS, strict=True), start=1
     ):
         body = body.add_body(
-            name=f"link{index}", pos=position, quat=quaternion, mass=mass, ipos=centre, fullinertia=inertia,
-            explicitinertial=True, gravcomp=1.0,
-        )  # fmt: skip
+            name=f"link{index}",
+            pos=position,
+            quat=quaternion,
+            mass=mass,
+            ipos=centre,
+            fullinertia=inertia,
+            explicitinertial=True,
+            gravcomp=1.0,
+        )
         body.add_joint(
             name=f"joint{index}",
             type=mujoco.mjtJoint.mjJNT_HINGE,
@@ -93,11 +99,19 @@ def add_panda(spec: mujoco.MjSpec, *, friction: float) -> Any:
         )
         bodies[body.name] = body
     hand = body.add_body(
-        name="hand", pos=(0, 0, 0.107), quat=_HAND_QUATERNION, mass=0.73, ipos=(-0.01, 0, 0.03),
-        inertia=(0.001, 0.0025, 0.0017), explicitinertial=True, gravcomp=1.0,
-    )  # fmt: skip
+        name="hand",
+        pos=(0, 0, 0.107),
+        quat=_HAND_QUATERNION,
+        mass=0.73,
+        ipos=(-0.01, 0, 0.03),
+        inertia=(0.001, 0.0025, 0.0017),
+        explicitinertial=True,
+        gravcomp=1.0,
+    )
     bodies["hand"] = hand
-    _collision(hand, mujoco.mjtGeom.mjGEOM_CAPSULE, "hand", (0.038, 0, 0), ((0, -0.062, 0.03), (0, 0.062, 0.03)), friction)
+    _collision(
+        hand, mujoco.mjtGeom.mjGEOM_CAPSULE, "hand", (0.038, 0, 0), ((0, -0.062, 0.03), (0, 0.062, 0.03)), friction
+    )
     for side, quaternion in (("left", (1, 0, 0, 0)), ("right", (0, 0, 0, 1))):
         bodies[f"{side}_finger"] = _add_finger(hand, side, quaternion, friction)
     _add_actuators(spec)
@@ -106,40 +120,70 @@ def add_panda(spec: mujoco.MjSpec, *, friction: float) -> Any:
 
 def _add_finger(hand: Any, side: str, quaternion: tuple[float, ...], friction: float) -> Any:
     finger = hand.add_body(
-        name=f"{side}_finger", pos=(0, 0, 0.0584), quat=quaternion, mass=0.015, ipos=(0, 0.01, 0.03),
-        inertia=(2.375e-6, 2.375e-6, 7.5e-7), explicitinertial=True, gravcomp=1.0,
-    )  # fmt: skip
+        name=f"{side}_finger",
+        pos=(0, 0, 0.0584),
+        quat=quaternion,
+        mass=0.015,
+        ipos=(0, 0.01, 0.03),
+        inertia=(2.375e-6, 2.375e-6, 7.5e-7),
+        explicitinertial=True,
+        gravcomp=1.0,
+    )
     finger.add_joint(
-        name=f"{side}_finger", type=mujoco.mjtJoint.mjJNT_SLIDE, axis=(0, 1, 0), range=(0.0, FINGER_STROKE_M), limited=True,
+        name=f"{side}_finger",
+        type=mujoco.mjtJoint.mjJNT_SLIDE,
+        axis=(0, 1, 0),
+        range=(0.0, FINGER_STROKE_M),
+        limited=True,
         armature=_ARMATURE,
-    )  # fmt: skip
-    # Two upright capsules touch a cube's face in four points that span the pad: fewer and cheaper contacts than box on box
-    # at the same grip. (One line of contact is not enough: a cube rolls out between two lines nearer than its own width.)
-    # Their inner surface is the pad plane y = 0; they end 3 mm below the end effector.
+    )
+    # Two upright capsules touch a cube's face in four points that span the pad: fewer and cheaper contacts than box on
+    # box at the same grip. (One line of contact is not enough: a cube rolls out between two lines nearer than its own
+    # width.) Their inner surface is the pad plane y = 0; they end 7 mm below the end effector.
     for end, x in (("front", 0.0075), ("back", -0.0075)):
         pad = _collision(
-            finger, mujoco.mjtGeom.mjGEOM_CAPSULE, f"{side}_pad_{end}", (_PAD_RADIUS, 0, 0),
-            ((x, _PAD_RADIUS, 0.034), (x, _PAD_RADIUS, 0.048 - _PAD_RADIUS + 0.004)), friction,
-        )  # fmt: skip
+            finger,
+            mujoco.mjtGeom.mjGEOM_CAPSULE,
+            f"{side}_pad_{end}",
+            (_PAD_RADIUS, 0, 0),
+            ((x, _PAD_RADIUS, 0.034), (x, _PAD_RADIUS, 0.048 - _PAD_RADIUS + 0.004)),
+            friction,
+        )
         pad.condim = _PAD_CONDIM
         pad.solref = (0.01, 1.0)
         pad.priority = 1
     _collision(
-        finger, mujoco.mjtGeom.mjGEOM_CAPSULE, f"{side}_shaft", (0.009, 0, 0), ((0, 0.013, 0.009), (0, 0.011, 0.043)), friction
+        finger,
+        mujoco.mjtGeom.mjGEOM_CAPSULE,
+        f"{side}_shaft",
+        (0.009, 0, 0),
+        ((0, 0.013, 0.009), (0, 0.011, 0.043)),
+        friction,
     )
     return finger
 
 
-def _collision(body: Any, kind: Any, name: str, size: tuple[float, ...], ends: tuple[tuple[float, ...], ...], friction: float) -> Any:
+def _collision(
+    body: Any, kind: Any, name: str, size: tuple[float, ...], ends: tuple[tuple[float, ...], ...], friction: float
+) -> Any:
     return body.add_geom(
-        name=name, type=kind, size=size, fromto=[*ends[0], *ends[1]], contype=GRIPPER_BIT, conaffinity=0,
-        friction=(friction, 0.005, 0.0001), mass=0.0, group=3,
-    )  # fmt: skip
+        name=name,
+        type=kind,
+        size=size,
+        fromto=[*ends[0], *ends[1]],
+        contype=GRIPPER_BIT,
+        conaffinity=0,
+        friction=(friction, 0.005, 0.0001),
+        mass=0.0,
+        group=3,
+    )
 
 
 def _add_actuators(spec: mujoco.MjSpec) -> None:
     for index in range(NUM_JOINTS):
-        actuator = spec.add_actuator(name=f"joint{index + 1}", target=f"joint{index + 1}", trntype=mujoco.mjtTrn.mjTRN_JOINT)
+        actuator = spec.add_actuator(
+            name=f"joint{index + 1}", target=f"joint{index + 1}", trntype=mujoco.mjtTrn.mjTRN_JOINT
+        )
         actuator.set_to_position(kp=_STIFFNESS[index], kv=_DAMPING[index])
         _limit(actuator, JOINT_TORQUE[index], JOINT_LOWER[index], JOINT_UPPER[index])
     for side in ("left", "right"):

@@ -32,10 +32,15 @@ def build_spec(config: WorldConfig) -> mujoco.MjSpec:
     spec.compiler.autolimits = False
     panda.add_panda(spec, friction=config.friction)
     spec.worldbody.add_geom(
-        name="table", type=mujoco.mjtGeom.mjGEOM_BOX, size=TABLE_HALF_SIZE_M, pos=(TABLE_CENTER_X_M, 0, -TABLE_HALF_SIZE_M[2]),
-        contype=panda.TABLE_BIT, conaffinity=panda.GRIPPER_BIT | panda.OBJECT_BIT, friction=(config.friction, 0.005, 0.0001),
+        name="table",
+        type=mujoco.mjtGeom.mjGEOM_BOX,
+        size=TABLE_HALF_SIZE_M,
+        pos=(TABLE_CENTER_X_M, 0, -TABLE_HALF_SIZE_M[2]),
+        contype=panda.TABLE_BIT,
+        conaffinity=panda.GRIPPER_BIT | panda.OBJECT_BIT,
+        friction=(config.friction, 0.005, 0.0001),
         group=3,
-    )  # fmt: skip
+    )
     _add_object(spec, config)
     _add_contact_sensors(spec)
     return spec
@@ -52,16 +57,22 @@ def _add_object(spec: mujoco.MjSpec, config: WorldConfig) -> None:
         mass=config.object_mass_kg,
         friction=(config.friction, 0.005, 0.0001),
         condim=3 if config.object == "cube" else 6,
-        contype=panda.OBJECT_BIT, conaffinity=panda.GRIPPER_BIT, group=2,
+        contype=panda.OBJECT_BIT,
+        conaffinity=panda.GRIPPER_BIT,
+        group=2,
         rgba=(0.86, 0.18, 0.15, 1.0),
-    )  # fmt: skip
+    )
 
 
 def _add_contact_sensors(spec: mujoco.MjSpec) -> None:
     # Sensor parameters of a contact sensor: data bits (1: "found"), reduction (0: none), slots (1).
     for side in ("left", "right"):
         sensor = spec.add_sensor(
-            name=f"{side}_contact", type=mujoco.mjtSensor.mjSENS_CONTACT, objtype=mujoco.mjtObj.mjOBJ_BODY,
-            objname=f"{side}_finger", reftype=mujoco.mjtObj.mjOBJ_BODY, refname="object",
-        )  # fmt: skip
+            name=f"{side}_contact",
+            type=mujoco.mjtSensor.mjSENS_CONTACT,
+            objtype=mujoco.mjtObj.mjOBJ_BODY,
+            objname=f"{side}_finger",
+            reftype=mujoco.mjtObj.mjOBJ_BODY,
+            refname="object",
+        )
         sensor.intprm[:3] = (1, 0, 1)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -11,12 +11,11 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from service.config import PPOConfig
+from service.learner.adam import Adam
 from service.learner.errors import LearnerError
 from service.policies import gaussian
 
 Arrays = dict[str, NDArray[Any]]
-
-ADAM_EPSILON = 1e-5
 
 
 class Player:
@@ -25,26 +24,12 @@ class Player:
     def __init__(self, policy: nn.Module, value: nn.Module, config: PPOConfig, device: torch.device) -> None:
         """Take both networks to ``device``; from now on only this player may change them."""
         self.policy, self.value, self.config = policy.to(device), value.to(device), config
+        networks = {"policy": self.policy, "value": self.value}
+        self._parameters = {
+            f"{key}/{name}": each for key, network in networks.items() for name, each in network.named_parameters()
+        }
         self.policy_parameters, self.value_parameters = list(policy.parameters()), list(value.parameters())
-        parameters = [*self.policy_parameters, *self.value_parameters]
-        self.optimizer = torch.optim.Adam(parameters, lr=config.learning_rate, eps=ADAM_EPSILON, fused=True)
-        for parameter in parameters:
-            # Adam would do this at its first step; done now, a state has the same names before and after it.
-            self.optimizer.state[parameter] = {
-                "step": torch.zeros((), device=device),
-                "exp_avg": torch.zeros_like(parameter),
-                "exp_avg_sq": torch.zeros_like(parameter),
-            }
-
-    @property
-    def learning_rate(self) -> float:
-        """Of both networks."""
-        rate: float = self.optimizer.param_groups[0]["lr"]
-        return rate
-
-    @learning_rate.setter
-    def learning_rate(self, rate: float) -> None:
-        self.optimizer.param_groups[0]["lr"] = rate
+        self.optimizer = Adam(self._parameters, config.learning_rate)
 
     def log_prob(self, observation: Tensor, action: Tensor) -> Tensor:
         """Of (B, A) actions at (B, O) observations, (B,)."""
@@ -63,7 +48,7 @@ class Player:
     def state(self) -> Arrays:
         """Copies of everything that changes: parameters, Adam's state, learning rate."""
         arrays: Arrays = {name: tensor.detach().cpu().numpy().copy() for name, tensor in self._tensors().items()}
-        return arrays | {"learning_rate": np.array(self.learning_rate)}
+        return arrays | {"learning_rate": np.array(self.optimizer.learning_rate)}
 
     def check_state(self, state: Mapping[str, NDArray[Any]], *, where: str) -> None:
         """Compare names and shapes of a state's arrays with this player's; ``where`` names the player in errors.
@@ -83,18 +68,8 @@ class Player:
     def load_state(self, state: Mapping[str, NDArray[Any]]) -> None:
         """Continue exactly where ``state``, which has been checked, was taken."""
         self.restore([torch.from_numpy(np.array(state[name])) for name in self._tensors()])
-        self.learning_rate = float(state["learning_rate"])
-
-    def _parameters(self) -> dict[str, nn.Parameter]:
-        networks = {"policy": self.policy, "value": self.value}
-        return {f"{key}/{name}": each for key, network in networks.items() for name, each in network.named_parameters()}
+        self.optimizer.learning_rate = float(state["learning_rate"])
 
     def _tensors(self) -> dict[str, Tensor]:
         """Parameters and Adam's state by name: the tensors themselves, always in the same order."""
-        return dict(self._named_tensors())
-
-    def _named_tensors(self) -> Iterator[tuple[str, Tensor]]:
-        for name, parameter in self._parameters().items():
-            yield name, parameter
-            for moment, tensor in self.optimizer.state[parameter].items():
-                yield f"adam/{moment}/{name}", tensor
+        return self._parameters | {f"adam/{name}": tensor for name, tensor in self.optimizer.tensors().items()}

@@ -17,6 +17,7 @@ from service.envs.observations import Mirror
 from service.learner.returns import advantages
 
 Estimate = Callable[[Tensor], Tensor]
+LogProb = Callable[[Tensor, Tensor], Tensor]
 
 
 class _Rows:
@@ -51,6 +52,8 @@ class Samples(_Rows):
     """(B, A)."""
     old_log_prob: Tensor
     """(B,) under the policy that acted."""
+    start_log_prob: Tensor
+    """(B,) under the policy at the start of the update, which may be a version or two ahead of the one that acted."""
     advantage: Tensor
     """(B,) normalised."""
     target: Tensor
@@ -71,12 +74,15 @@ class Cloning(_Rows):
     """(D,) under the policy at the start of the update."""
 
 
-def collect(turns: Sequence[Turns], estimate: Estimate, config: PPOConfig, device: torch.device) -> Samples | None:
+def collect(
+    turns: Sequence[Turns], estimate: Estimate, log_prob: LogProb, config: PPOConfig, device: torch.device
+) -> Samples | None:
     """Turn what was played into samples; only active steps of worlds that ``learn`` count.
 
     Args:
         turns: of one player, with equal T; joined along worlds.
         estimate: value network, (B, V) to (B,).
+        log_prob: of (B, A) actions at (B, O) observations under the policy at the start of the update.
         config: discount and lambda.
         device: where the tensors shall be.
 
@@ -92,6 +98,7 @@ def collect(turns: Sequence[Turns], estimate: Estimate, config: PPOConfig, devic
     final = torch.from_numpy(np.concatenate([part.final_value_observation[part.learn] for part in turns])).to(device)
     with torch.no_grad():
         estimates = estimate(torch.cat((tensors["value_observation"], final)))
+        tensors["start_log_prob"] = log_prob(tensors["observation"], tensors["action"])
     value = estimates[:num_samples]
     values = np.zeros(active.shape, dtype=np.float32)
     values[active] = value.cpu().numpy()
@@ -105,7 +112,7 @@ def collect(turns: Sequence[Turns], estimate: Estimate, config: PPOConfig, devic
 
 
 def mirrored(
-    samples: Samples, log_prob: Callable[[Tensor, Tensor], Tensor], policy: Mirror, value: Mirror, action: Mirror
+    samples: Samples, log_prob: LogProb, policy: Mirror, value: Mirror, action: Mirror
 ) -> Samples:
     """The samples followed by their reflections.
 
@@ -126,7 +133,7 @@ def mirrored(
         old_log_prob = log_prob(observation, actions)
     value_observation = reflect(samples.value_observation, value)
     unchanged = samples.advantage, samples.target, samples.value
-    reflections = Samples(observation, value_observation, actions, old_log_prob, *unchanged)
+    reflections = Samples(observation, value_observation, actions, old_log_prob, old_log_prob, *unchanged)
     pairs = zip(samples.tensors(), reflections.tensors(), strict=True)
     return Samples(*(torch.cat(pair) for pair in pairs))
 

@@ -36,7 +36,7 @@ def update_player(
     Returns:
         Metrics without the player's prefix; one that there is nothing to measure on is left out.
     """
-    metrics = {"learning_rate": player.learning_rate, "non_finite_steps": 0.0, "rollbacks": 0.0}
+    metrics = {"learning_rate": player.optimizer.learning_rate, "non_finite_steps": 0.0, "rollbacks": 0.0}
     rows = samples if samples is not None else cloning
     if rows is None:
         return metrics
@@ -49,7 +49,7 @@ def update_player(
     failed = tally.aborted or not kl <= COLLAPSE_KL * player.config.target_kl
     if failed:
         player.restore(snapshot)
-    player.learning_rate = _adapted(player, math.inf if failed else kl)
+    player.optimizer.learning_rate = _adapted(player, math.inf if failed else kl)
     if samples is not None:
         metrics["explained_variance"] = explained_variance(samples.target.cpu().numpy(), samples.value.cpu().numpy())
     metrics |= {"non_finite_steps": float(tally.num_non_finite), "rollbacks": float(failed)}
@@ -65,7 +65,7 @@ def _adapted(player: Player, kl: float) -> float:
     """A lower learning rate after an update that moved too far, a higher one after one that hardly moved."""
     low, high = (player.config.learning_rate * bound for bound in RATE_BOUNDS)
     if kl > 2.0 * player.config.target_kl:
-        return max(player.learning_rate / RATE_STEP, low)
+        return max(player.optimizer.learning_rate / RATE_STEP, low)
     if kl < 0.5 * player.config.target_kl:
-        return min(player.learning_rate * RATE_STEP, high)
-    return player.learning_rate
+        return min(player.optimizer.learning_rate * RATE_STEP, high)
+    return player.optimizer.learning_rate

@@ -1,7 +1,7 @@
 """The local runner: one process, the same parts as the cluster.
 
-While one thread plays round i with the newest weights, another learns from round i-1: policy lag is exactly 1, both cores of
-a laptop are busy, and the order of everything is fixed, so a run is reproducible bit for bit.
+While one thread plays round i with the newest weights, another learns from round i-1: policy lag is exactly 1, both
+cores of a laptop are busy, and the order of everything is fixed, so a run is reproducible bit for bit.
 """
 
 from __future__ import annotations
@@ -12,11 +12,12 @@ from collections import defaultdict
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from functools import partial
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from service.actors.evaluation import evaluate
+from service.actors.evaluation import GoalKind, evaluate
 from service.actors.game import Acting, Players, SelfPlay
 from service.actors.rollout import Rollout, from_arrays, to_arrays
 from service.config import Config
@@ -33,6 +34,7 @@ Metrics = dict[str, float]
 OnIteration = Callable[[Metrics], None]
 _logger = logging.getLogger(__name__)
 
+EVALUATED_GOALS: tuple[GoalKind, ...] = ("table", "air")
 EVALUATION_SEED = 1_000_003
 """Evaluations during a run always use the same goals, so that they compare."""
 
@@ -121,6 +123,7 @@ class LocalRun:
         with self.timing("generator"):
             metrics = rollout.metrics | self.generator.record(rollout.records)
             self.directory.record_goals(self.iteration, self.num_env_steps, rollout.records)
+            self.directory.dump_broken(rollout)
             if self.generator.snapshot_due(self.iteration):
                 self.generator.add_opponents(weights.alice, weights.bob)
                 self._past = []
@@ -130,7 +133,7 @@ class LocalRun:
         self.iteration += 1
         self.num_env_steps += rollout.num_env_steps
         with self.timing("evaluate"):
-            metrics |= self._evaluate(players)
+            metrics |= self._evaluate(weights)
         elapsed_s = time.perf_counter() - start
         self._wall_s += elapsed_s
         return {
@@ -144,9 +147,7 @@ class LocalRun:
 
     def _play(self, players: Players) -> Rollout:
         plan = self.generator.plan(self.config.game.num_worlds, self._rng)
-        return self.game.play_round(
-            players, plan, lambda *proposals: self.generator.choose_goals(plan, *proposals, self._rng)
-        )
+        return self.game.play_round(players, plan, partial(self.generator.choose_goals, plan, rng=self._rng))
 
     def _learn(self, rollout: Rollout | None) -> Metrics:
         """Runs in the learner's thread; the main thread does not touch the learner meanwhile."""
@@ -170,16 +171,22 @@ class LocalRun:
             past_bob=[bob for _, bob in self._past],
         )
 
-    def _evaluate(self, players: Players) -> Metrics:
+    def _evaluate(self, weights: Weights) -> Metrics:
         run, game = self.config.run, self.config.game
         if run.evaluation_interval == 0 or self.iteration % run.evaluation_interval:
             return {}
-        metrics = {}
-        for kind in ("table", "air"):
+        metrics, bob = {}, MCPEvaluator(weights.bob)
+        for kind in EVALUATED_GOALS:
             result = evaluate(
-                players.bob, self.config.world, kind, num_episodes=run.evaluation_episodes, num_steps=run.evaluation_steps,
-                success_distance_m=game.success_distance_m, seed=EVALUATION_SEED, num_threads=run.num_threads,
-            )  # fmt: skip
+                bob,
+                self.config.world,
+                kind,
+                num_episodes=run.evaluation_episodes,
+                num_steps=run.evaluation_steps,
+                success_distance_m=game.success_distance_m,
+                seed=EVALUATION_SEED,
+                num_threads=run.num_threads,
+            )
             metrics[f"evaluation/{kind}_success_last"] = result.success_last
             metrics[f"evaluation/{kind}_success_ever"] = result.success_ever
         return metrics

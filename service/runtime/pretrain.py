@@ -9,11 +9,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from types import FrameType
 
-from service.actors.evaluation import evaluate
+from service.actors.evaluation import GOAL_KINDS, evaluate
 from service.config import Config, ConfigError
 from service.envs.observations import ACTION_SIZE, BOB_SIZE, NORMALISATION_BOB, POSITIONS_SIZE
 from service.policies.evaluator import MCPEvaluator
-from service.registry.registry import Registry, Version
+from service.registry.names import Version
+from service.registry.registry import Registry
 from service.runtime.artifacts import make_artifacts
 from service.runtime.local import EVALUATION_SEED, LocalRun, OnIteration, RunResult
 from service.runtime.rundir import RunDirectory
@@ -100,11 +101,16 @@ def _stop_on_signals(run: LocalRun) -> Iterator[None]:
 def _final_evaluation(config: Config, run: LocalRun) -> dict[str, float]:
     bob = MCPEvaluator(run.learner.weights().bob)
     metrics = {}
-    for kind in ("table", "air", "mixed"):
+    for kind in GOAL_KINDS:
         result = evaluate(
-            bob, config.world, kind, num_episodes=FINAL_EVALUATION_EPISODES, num_steps=config.run.evaluation_steps,
-            success_distance_m=config.game.success_distance_m, seed=EVALUATION_SEED + 1,
-        )  # fmt: skip
+            bob,
+            config.world,
+            kind,
+            num_episodes=FINAL_EVALUATION_EPISODES,
+            num_steps=config.run.evaluation_steps,
+            success_distance_m=config.game.success_distance_m,
+            seed=EVALUATION_SEED + 1,
+        )
         metrics[f"evaluation/{kind}_success_last"] = result.success_last
         metrics[f"evaluation/{kind}_success_ever"] = result.success_ever
     return metrics
@@ -116,7 +122,12 @@ def _publish(
     return Registry(registry).publish(
         config.name,
         run.learner.weights().bob,
-        spaces={"action": ACTION_SIZE, "positions": POSITIONS_SIZE, "observation": BOB_SIZE, "layout": "service.envs.observations"},
+        spaces={
+            "action": ACTION_SIZE,
+            "positions": POSITIONS_SIZE,
+            "observation": BOB_SIZE,
+            "layout": "service.envs.observations",
+        },
         normalisation={"offset": NORMALISATION_BOB.offset.tolist(), "scale": NORMALISATION_BOB.scale.tolist()},
         config=config.model_dump(mode="json"),
         metrics=metrics | {"env_steps": run.num_env_steps},

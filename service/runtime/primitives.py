@@ -12,6 +12,7 @@ from service.policies.parameters import Parameters
 from service.registry.checkpoints import CheckpointStore
 from service.runtime.rundir import RunDirectory
 
+
 @dataclass(frozen=True, slots=True)
 class TrainedBob:
     """A Bob ready to act, and the configuration he was trained with."""

@@ -41,7 +41,9 @@ class Progress:
             self._live.start()
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
         if self._live is not None:
             self._live.stop()
 
@@ -67,5 +69,9 @@ class Progress:
         return table
 
     def _line(self, steps: int) -> str:
-        parts = [f"{key.split('/')[1]} {pattern.format(self._values[key])}" for _, key, pattern in _ROWS if key in self._values]
+        parts = [
+            f"{key.split('/')[1]} {pattern.format(self._values[key])}"
+            for _, key, pattern in _ROWS
+            if key in self._values
+        ]
         return f"{steps:>10,} env steps | " + " | ".join(parts)

@@ -3,7 +3,7 @@
 | file | content |
 |---|---|
 | ``config.yaml`` | the resolved configuration |
-| ``metrics.jsonl`` | one object per iteration; keys are the metric names; ``time/...`` differ from run to run, the rest does not |
+| ``metrics.jsonl`` | an object per iteration, keyed by metric; only ``time/...`` differs between equal runs |
 | ``goals.jsonl`` | per iteration a sample of valid proposals: start x y z, goal x y z (metres), solved 0/1 |
 | ``tensorboard/`` | the same metrics as TensorBoard events over env steps |
 | ``checkpoints/`` | the newest checkpoints; ``--resume`` continues from them exactly |
@@ -27,10 +27,11 @@ from service.runtime.records import JsonlWriter
 if TYPE_CHECKING:
     from tensorboard.summary.writer.event_file_writer import EventFileWriter
 
-    from service.actors.rollout import GoalRecords
+    from service.actors.rollout import GoalRecords, Rollout
 
 GOALS_PER_ITERATION = 32
 """Valid proposals recorded per iteration, at most."""
+MAX_BROKEN_FILES = 100
 
 
 class RunDirectory:
@@ -43,6 +44,7 @@ class RunDirectory:
         self.metrics_file = path / "metrics.jsonl"
         self.goals_file = path / "goals.jsonl"
         self.checkpoints = path / "checkpoints"
+        self.broken = path / "broken"
         self._metrics = JsonlWriter(self.metrics_file)
         self._goals = JsonlWriter(self.goals_file)
         self._events: EventFileWriter | None = None
@@ -95,6 +97,17 @@ class RunDirectory:
         )
         # "iteration" counts finished iterations, as in metrics.jsonl, so that a resume cuts both files alike.
         self._goals.append({"iteration": iteration + 1, "env_steps": num_env_steps, "goals": np.round(table, 4)})
+
+    def dump_broken(self, rollout: Rollout) -> None:
+        """Save the states and actions whose physics diverged in a round; at most 100 rounds are kept."""
+        if not rollout.broken or (self.broken.is_dir() and len(list(self.broken.iterdir())) >= MAX_BROKEN_FILES):
+            return
+        states, actions = zip(*rollout.broken, strict=True)
+        with os_errors("write", self.broken):
+            self.broken.mkdir(exist_ok=True)
+            np.savez(
+                self.broken / f"round-{rollout.sequence:06d}.npz", states=np.stack(states), actions=np.stack(actions)
+            )
 
     def close(self) -> None:
         """Flush TensorBoard's events."""

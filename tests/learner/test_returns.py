@@ -29,7 +29,7 @@ def test_timed_out_turn_bootstraps_from_the_final_value():
 
 
 def test_short_turns_bootstrap_behind_their_own_last_step():
-    # World 0 times out after one step: 0.9 * 2 - 0.1 = 1.7. World 1 terminates at its second: 1 - 0.2; 0.08 + 0.45 * 0.8.
+    # World 0 times out after its first step: 0.9 * 2 - 0.1 = 1.7. World 1 terminates: 1 - 0.2; 0.08 + 0.45 * 0.8.
     # World 2 has no turn. Values and rewards behind the last step must not matter.
     result = gae(
         [[0, 0, 9], [9, 1, 9], [9, 9, 9]],

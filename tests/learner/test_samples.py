@@ -22,9 +22,13 @@ def estimate(value_observation):
     return 3.0 * value_observation[:, 0] + value_observation[:, 1]
 
 
+def log_prob(observation, action):
+    return observation[:, 1] + action[:, 1]
+
+
 def make_samples(num):
     index = torch.arange(num, dtype=torch.float32)
-    return Samples(*(index[:, None].expand(num, 3) for _ in range(3)), *(index for _ in range(4)))
+    return Samples(*(index[:, None].expand(num, 3) for _ in range(3)), *(index for _ in range(5)))
 
 
 def make_cloning(num):
@@ -35,17 +39,18 @@ def make_cloning(num):
 def test_only_active_steps_of_learnable_worlds_become_samples():
     learn = np.array([True, False] * 4)
     turns = make_bob_turns(learn=learn)
-    samples = collect([turns], estimate, CONFIG, CPU)
+    samples = collect([turns], estimate, log_prob, CONFIG, CPU)
     kept = turns.active & learn
     assert len(samples) == kept.sum() > 0
     order = np.argwhere(kept)
     np.testing.assert_array_equal(samples.action, [turns.action[step, world] for step, world in order])
     np.testing.assert_array_equal(samples.old_log_prob, [turns.log_prob[step, world] for step, world in order])
+    np.testing.assert_array_equal(samples.start_log_prob, samples.observation[:, 1] + samples.action[:, 1])
 
 
 def test_targets_are_advantages_plus_values():
     turns = make_bob_turns()
-    samples = collect([turns], estimate, CONFIG, CPU)
+    samples = collect([turns], estimate, log_prob, CONFIG, CPU)
     values, final = (
         estimate(torch.from_numpy(each))
         for each in (turns.value_observation[turns.active], turns.final_value_observation)
@@ -61,28 +66,28 @@ def test_targets_are_advantages_plus_values():
 
 def test_several_rollouts_are_joined_along_worlds():
     first, second = make_bob_turns(0), make_bob_turns(1)
-    joined = collect([first, second], estimate, CONFIG, CPU)
+    joined = collect([first, second], estimate, log_prob, CONFIG, CPU)
     assert len(joined) == first.active.sum() + second.active.sum()
-    apart = [collect([turns], estimate, CONFIG, CPU).target for turns in (first, second)]
+    apart = [collect([turns], estimate, log_prob, CONFIG, CPU).target for turns in (first, second)]
     np.testing.assert_allclose(np.sort(joined.target), np.sort(np.concatenate(apart)), atol=1e-6)
 
 
 def test_no_samples_at_all():
     idle = make_bob_turns(active=np.zeros_like(make_bob_turns().active))
-    assert collect([idle, nobody_learns(make_bob_turns())], estimate, CONFIG, CPU) is None
+    assert collect([idle, nobody_learns(make_bob_turns())], estimate, log_prob, CONFIG, CPU) is None
 
 
 def test_equal_advantages_become_zero():
     turns = make_bob_turns()
     constant = replace(turns, reward=np.full_like(turns.reward, 0.1), terminated=turns.active)
-    samples = collect([constant], lambda rows: torch.zeros(len(rows)), CONFIG, CPU)
+    samples = collect([constant], lambda rows: torch.zeros(len(rows)), log_prob, CONFIG, CPU)
     np.testing.assert_array_equal(samples.advantage, np.zeros(len(samples)))
 
 
 def test_mirrored_samples_are_reflections():
-    samples = collect([make_bob_turns()], estimate, CONFIG, CPU)
+    samples = collect([make_bob_turns()], estimate, log_prob, CONFIG, CPU)
     mirrors = MIRROR_BOB, MIRROR_BOB_VALUE, MIRROR_ACTION
-    doubled = mirrored(samples, lambda observation, action: observation[:, 1] + action[:, 1], *mirrors)
+    doubled = mirrored(samples, log_prob, *mirrors)
     num = len(samples)
     assert len(doubled) == 2 * num
     for before, after in zip(samples.tensors(), doubled.tensors(), strict=True):

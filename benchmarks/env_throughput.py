@@ -1,0 +1,193 @@
+"""Env steps per second on one core: our world against PyBullet panda-gym, measured in turn in one process.
+
+Both sides do the same: episodes of 50 random actions with their resets, 20 physics steps of 2 ms an action, the
+observation and the test for success of every step. panda-gym steps one world with one thread, so ours gets one thread,
+too. What ours gains over its own Gymnasium environment is the batch: one call for all worlds. The last row is the physics
+that pre-training uses, half as many steps of 4 ms; it is not what panda-gym is compared with.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+from collections.abc import Iterator, Mapping
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from typing import Any, Protocol
+
+# before NumPy is imported: the comparison is about one core
+os.environ.update(dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1"))
+sys.path.insert(0, str(Path(__file__).parents[1]))
+
+import gymnasium
+import numpy as np
+
+from benchmarks.measuring import Sample, describe, machine, measure, rates, ratio, table, write_json
+from service.actors.evaluation import sample_goals
+from service.config import WorldConfig
+from service.envs.batch import WorldBatch
+from service.envs.observations import ACTION_SIZE
+from service.envs.registration import TABLETOP_ID
+from service.errors import TandemError
+
+EPISODE_STEPS = 50
+"""Of panda-gym's registration, and of ours."""
+PANDA_GYM_IDS = ("PandaPickAndPlace-v3", "PandaPush-v3")
+OURS = "tandem"
+PACKAGES = ("mujoco", "numpy", "gymnasium", "panda-gym", "pybullet")
+_SUCCESS_M = 0.05
+
+
+class Contender(Protocol):
+    """Something that plays whole episodes of random actions."""
+
+    def episode(self) -> int:
+        """Reset, play one episode, return the env steps made."""
+
+    def close(self) -> None:
+        """Free what it holds."""
+
+
+class BatchContender:
+    """Our worlds as an actor uses them: stepped together, by one thread."""
+
+    def __init__(self, config: WorldConfig, num_worlds: int, num_steps: int = EPISODE_STEPS) -> None:
+        self._worlds = WorldBatch(config, num_worlds, num_threads=1)
+        self._num_steps = num_steps
+        self._rng = np.random.default_rng(0)
+
+    def episode(self) -> int:
+        """One episode in every world."""
+        worlds, num = self._worlds, self._worlds.num_worlds
+        worlds.reset(self._rng)
+        goal = sample_goals("mixed", self._rng, num, worlds.config, _SUCCESS_M)
+        actions = self._rng.uniform(-1.0, 1.0, (self._num_steps, num, ACTION_SIZE)).astype(np.float32)
+        for step, action in enumerate(actions, start=1):
+            worlds.step(action)
+            worlds.full(step / self._num_steps)
+            np.linalg.norm(worlds.object_position - goal, axis=1) <= _SUCCESS_M  # noqa: B015 - only its time matters
+        return self._num_steps * num
+
+    def close(self) -> None:
+        """Free the worlds."""
+        self._worlds.close()
+
+
+class GymnasiumContender:
+    """One Gymnasium environment, as ``gymnasium.make`` gives it but for the checker of first steps."""
+
+    def __init__(self, name: str, num_steps: int = EPISODE_STEPS) -> None:
+        self._environment = gymnasium.make(name, disable_env_checker=True)
+        self._num_steps = num_steps
+        self._rng = np.random.default_rng(0)
+        self._environment.reset(seed=0)
+
+    def episode(self) -> int:
+        """One episode, or what the environment leaves of it."""
+        self._environment.reset()
+        shape = self._environment.action_space.shape
+        assert shape is not None
+        for step, action in enumerate(self._rng.uniform(-1.0, 1.0, (self._num_steps, *shape)), start=1):
+            _, _, terminated, truncated, _ = self._environment.step(action.astype(np.float32))
+            if terminated or truncated:
+                return step
+        return self._num_steps
+
+    def close(self) -> None:
+        """Free the environment."""
+        self._environment.close()
+
+
+def contenders(num_worlds: int) -> dict[str, Contender]:
+    """Every row of the table by its name, ours first.
+
+    Raises:
+        TandemError: panda-gym is not installed.
+    """
+    rows: dict[str, Contender] = {OURS: BatchContender(WorldConfig(), num_worlds)}
+    rows |= {name: panda_gym(name) for name in PANDA_GYM_IDS}
+    coarse = WorldConfig(physics_step_s=0.004, num_substeps=10)
+    return rows | {
+        "tandem, one world, Gymnasium": GymnasiumContender(TABLETOP_ID),
+        "tandem, 10 x 4 ms": BatchContender(coarse, num_worlds),
+    }
+
+
+def panda_gym(name: str) -> Contender:
+    """An environment of panda-gym.
+
+    Raises:
+        TandemError: panda-gym is not installed.
+    """
+    with _silent_stdout():  # PyBullet prints its arguments
+        try:
+            import panda_gym  # noqa: F401 - registers its environments
+        except ImportError as error:
+            raise TandemError(f"panda-gym cannot be imported ({error}): run `make bench`, which installs it") from None
+        return GymnasiumContender(name)
+
+
+def compare(rows: Mapping[str, Contender], *, num_pairs: int, seconds: float) -> dict[str, list[Sample]]:
+    """Measure every row ``num_pairs`` times for about ``seconds``, all in turn, after an episode each to warm up."""
+    for row in rows.values():
+        row.episode()
+    samples: dict[str, list[Sample]] = {name: [] for name in rows}
+    for _ in range(num_pairs):
+        for name, row in rows.items():
+            samples[name].append(measure(row.episode, seconds))
+    return samples
+
+
+def summarise(samples: Mapping[str, list[Sample]]) -> dict[str, Any]:
+    """Median rates by row, and the ratios of our batch to every other row."""
+    ratios = {f"{OURS} / {name}": ratio(samples[OURS], each) for name, each in samples.items() if name != OURS}
+    return {"rows": {name: rates(each) for name, each in samples.items()}, "ratios": ratios}
+
+
+@contextmanager
+def _silent_stdout() -> Iterator[None]:
+    sys.stdout.flush()
+    with ExitStack() as stack:
+        kept, nothing = os.dup(1), os.open(os.devnull, os.O_WRONLY)
+        stack.callback(os.close, kept)
+        stack.callback(os.close, nothing)
+        stack.callback(os.dup2, kept, 1)
+        os.dup2(nothing, 1)
+        yield
+
+
+def main() -> int:
+    """Parse the command line, measure, print."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--pairs", type=int, default=5, help="measurements of every row (default: %(default)s)")
+    parser.add_argument("--seconds", type=float, default=3.0, help="of each measurement (default: %(default)s)")
+    parser.add_argument("--worlds", type=int, default=64, help="in our batch (default: %(default)s)")
+    parser.add_argument("--json", type=Path, metavar="FILE", help="write everything measured")
+    given = parser.parse_args()
+    try:
+        rows = contenders(given.worlds)
+        where = machine(*PACKAGES)
+        print(describe(where), flush=True)
+        result = summarise(compare(rows, num_pairs=given.pairs, seconds=given.seconds))
+        if given.json:
+            write_json(
+                given.json, {"benchmark": "env_throughput", "machine": where, "settings": _settings(given), **result}
+            )
+    except TandemError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+    print(table(result["rows"]))
+    for name, each in result["ratios"].items():
+        print(
+            f"{name}: {each['median']:.2f} ({each['least']:.2f} to {each['greatest']:.2f}; by CPU time {each['cpu']:.2f})"
+        )
+    return 0
+
+
+def _settings(given: argparse.Namespace) -> dict[str, Any]:
+    return {"pairs": given.pairs, "seconds": given.seconds, "worlds": given.worlds, "episode_steps": EPISODE_STEPS}
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

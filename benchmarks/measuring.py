@@ -1,0 +1,146 @@
+"""What the throughput benchmarks share: samples taken in turn, their ratios pair by pair, and the machine they were taken on.
+
+A rate alone says little about a machine that others use, too. So what is compared is measured in turn within one run, and
+the ratio of each turn is what counts.
+"""
+
+from __future__ import annotations
+
+import importlib.metadata
+import json
+import os
+import platform
+import re
+import statistics
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+from service.registry.files import os_errors, write_atomic
+from service.registry.manifest import git_commit
+
+_PLAIN_LIST = re.compile(r"\[[^\[\]{}]*\]")
+
+
+@dataclass(frozen=True, slots=True)
+class Sample:
+    """Env steps made in one stretch of time."""
+
+    num_steps: int
+    wall_s: float
+    cpu_s: float
+    """CPU seconds of the whole process, all its threads together."""
+
+    @property
+    def steps_per_s(self) -> float:
+        """Env steps per wall-clock second."""
+        return self.num_steps / self.wall_s
+
+    @property
+    def steps_per_cpu_s(self) -> float:
+        """Env steps per CPU second: what one core does when nobody else wants it."""
+        return self.num_steps / self.cpu_s
+
+
+class Stopwatch:
+    """Wall-clock and CPU time since it was made."""
+
+    def __init__(self) -> None:
+        self._wall, self._cpu = time.perf_counter(), time.process_time()
+
+    def wall_s(self) -> float:
+        """Seconds so far."""
+        return time.perf_counter() - self._wall
+
+    def sample(self, num_steps: int) -> Sample:
+        """``num_steps`` env steps in the time so far."""
+        return Sample(num_steps, self.wall_s(), time.process_time() - self._cpu)
+
+
+def measure(play: Callable[[], int], seconds: float) -> Sample:
+    """Call ``play``, which returns its number of env steps, at least once and until ``seconds`` have passed."""
+    watch = Stopwatch()
+    num_steps = play()
+    while watch.wall_s() < seconds:
+        num_steps += play()
+    return watch.sample(num_steps)
+
+
+def rates(samples: Sequence[Sample]) -> dict[str, Any]:
+    """Median rates of one thing that was measured several times, and every single rate."""
+    wall, cpu = [s.steps_per_s for s in samples], [s.steps_per_cpu_s for s in samples]
+    return {
+        "env_steps_per_s": statistics.median(wall),
+        "env_steps_per_cpu_s": statistics.median(cpu),
+        "env_steps_per_s_each": wall,
+        "env_steps_per_cpu_s_each": cpu,
+        "num_steps": sum(sample.num_steps for sample in samples),
+    }
+
+
+def ratio(ours: Sequence[Sample], theirs: Sequence[Sample]) -> dict[str, float]:
+    """How many times as fast ``ours`` is as ``theirs``: median, least and greatest over the pairs, by wall-clock time.
+
+    ``cpu`` is the median by CPU time, on which other programs of the machine bear less.
+    """
+    wall = [a.steps_per_s / b.steps_per_s for a, b in zip(ours, theirs, strict=True)]
+    cpu = [a.steps_per_cpu_s / b.steps_per_cpu_s for a, b in zip(ours, theirs, strict=True)]
+    return {"median": statistics.median(wall), "least": min(wall), "greatest": max(wall), "cpu": statistics.median(cpu)}
+
+
+def machine(*packages: str) -> dict[str, Any]:
+    """The processor, how busy it is with everything that runs on it, and the versions of what is measured."""
+    return {
+        "time": datetime.now(UTC).isoformat(timespec="seconds"),
+        "git_commit": git_commit(),
+        "cpu": _cpu_model(),
+        "num_cpus": os.cpu_count(),
+        "load_average": [round(load, 2) for load in os.getloadavg()],
+        "versions": {"python": platform.python_version()}
+        | {name: importlib.metadata.version(name) for name in packages},
+    }
+
+
+def describe(where: dict[str, Any]) -> str:
+    """``machine`` in one line."""
+    versions = ", ".join(f"{name} {version}" for name, version in where["versions"].items())
+    return f"{where['cpu']}, {where['num_cpus']} cpus, load {where['load_average'][0]}; {versions}"
+
+
+def table(rows: dict[str, dict[str, Any]]) -> str:
+    """The median rates of each named row, as Markdown."""
+    width = max(len(name) for name in rows)
+    head = f"| {'':<{width}} | env steps/s | per CPU second |\n|{'-' * (width + 2)}|------------:|---------------:|"
+    lines = [
+        f"| {name:<{width}} | {row['env_steps_per_s']:>11,.0f} | {row['env_steps_per_cpu_s']:>14,.0f} |"
+        for name, row in rows.items()
+    ]
+    return "\n".join([head, *lines])
+
+
+def write_json(path: Path, result: dict[str, Any]) -> None:
+    """Write a result, its innermost lists on one line each.
+
+    Raises:
+        TandemError: the file cannot be written.
+    """
+    with os_errors("write", path):
+        write_atomic(path, to_text(result).encode())
+
+
+def to_text(value: Any) -> str:
+    """JSON for people and for ``git diff``: indented, with every list of plain values on a single line."""
+    text = json.dumps(value, indent=1, allow_nan=False)
+    return _PLAIN_LIST.sub(lambda found: " ".join(found[0].split()), text) + "\n"
+
+
+def _cpu_model() -> str:
+    try:
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
+    except OSError:
+        lines = []
+    names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
+    return names[0] if names else platform.processor() or platform.machine()

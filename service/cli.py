@@ -1,0 +1,250 @@
+"""The command line, thin: parse, call, print. Heavy packages are imported inside the commands."""
+
+from __future__ import annotations
+
+import json
+import logging
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+from rich.console import Console
+
+from service.errors import TandemError
+from service.registry.commands import registry_app
+
+if TYPE_CHECKING:
+    from service.config import Config
+    from service.runtime.pretrain import Pretrained
+
+app = typer.Typer(name="tandem", help="Robot skills, pre-trained.", no_args_is_help=True, add_completion=False)
+app.add_typer(registry_app)
+_console = Console()
+_errors = Console(stderr=True)
+
+DEMO_ENV_STEPS = 600_000
+_EXIT_USER_ERROR = 2
+_EXIT_INTERRUPTED = 130
+
+_Registry = Annotated[
+    Path, typer.Option("--registry", envvar="TANDEM_REGISTRY", metavar="DIR", help="Directory of the registry.")
+]
+_Set = Annotated[
+    list[str] | None, typer.Option("--set", metavar="A.B=C", help="Override a key of the configuration; repeatable.")
+]
+_Primitives = Annotated[str, typer.Option("--primitives", metavar="NAME@ALIAS|RUN_DIR", help="Whose Bob.")]
+_Json = Annotated[bool, typer.Option("--json", help="Print JSON.")]
+_Seed = Annotated[int, typer.Option(help="Of the episodes.", min=0)]
+
+
+@app.command()
+def pretrain(
+    config: Annotated[
+        Path | None, typer.Option("--config", metavar="FILE", help="YAML; defaults where left out.")
+    ] = None,
+    run_dir: Annotated[Path | None, typer.Option("--run-dir", metavar="DIR", help="Default: runs/NAME.")] = None,
+    resume: Annotated[bool, typer.Option("--resume", help="Continue the run in --run-dir exactly.")] = False,
+    overrides: _Set = None,
+    registry: _Registry = Path("registry"),
+) -> None:
+    """Pre-train primitives by self-play in this process, and publish them."""
+    with _user_errors():
+        from service.config import load_config
+        from service.runtime.pretrain import resumed_config
+        from service.runtime.rundir import RunDirectory
+
+        overrides = overrides or []
+        if resume:
+            if run_dir is None or config is not None:
+                raise TandemError(
+                    "--resume needs --run-dir, and takes the configuration from there: leave out --config"
+                )
+            directory = RunDirectory(run_dir)
+            resolved = resumed_config(directory, overrides)
+        else:
+            resolved = load_config(config, overrides)
+            directory = RunDirectory(run_dir or Path("runs") / resolved.name)
+        _pretrain(resolved, directory.path, registry, resume=resume)
+
+
+@app.command()
+def demo(
+    run_dir: Annotated[Path | None, typer.Option("--run-dir", metavar="DIR", help="Default: runs/demo-N.")] = None,
+    env_steps: Annotated[int, typer.Option(help="Budget; the default takes about three minutes on 2 cores.", min=1)] = (
+        DEMO_ENV_STEPS
+    ),
+) -> None:
+    """Watch a robot arm teach itself: a small pre-training from scratch, with pictures and a video."""
+    with _user_errors():
+        from service.config import load_config
+
+        path = run_dir or _next_free(Path("runs"), "demo")
+        overrides = [f"run.total_env_steps={env_steps}", "name=panda-cube-demo"]
+        _console.print("A robot arm is about to teach itself: Alice proposes goals, Bob learns to reach them.")
+        _pretrain(load_config(_demo_config(), overrides), path, path / "registry", resume=False)
+
+
+@app.command()
+def evaluate(
+    primitives: _Primitives,
+    goals: Annotated[
+        str, typer.Option(help="table, air or mixed (70 % anywhere in the volume, else table).")
+    ] = "mixed",
+    episodes: Annotated[int, typer.Option(help="Number of random goals.", min=1)] = 300,
+    steps: Annotated[int, typer.Option(help="Steps an episode, 25 a second.", min=1)] = 50,
+    seed: _Seed = 0,
+    as_json: _Json = False,
+    registry: _Registry = Path("registry"),
+) -> None:
+    """Bob on random goals from fresh resets, without noise, beside a policy that does nothing."""
+    with _user_errors():
+        from service.actors.evaluation import GOAL_KINDS, Idle
+        from service.actors.evaluation import evaluate as run
+        from service.runtime.primitives import load_bob
+
+        if goals not in GOAL_KINDS:
+            raise TandemError(f"--goals {goals!r}: choose one of {', '.join(GOAL_KINDS)}")
+        bob = load_bob(primitives, registry)
+        rows = {
+            name: run(
+                policy,
+                bob.config.world,
+                goals,
+                num_episodes=episodes,
+                num_steps=steps,
+                seed=seed,
+                success_distance_m=bob.config.game.success_distance_m,
+            )
+            for name, policy in ((bob.label, bob.policy), ("idle", Idle()))
+        }
+    if as_json:
+        typer.echo(json.dumps({name: row.as_dict() for name, row in rows.items()}, indent=1))
+        return
+    _console.print(f"{episodes} random goals ({goals}), {steps} steps, within 5 cm", highlight=False)
+    for name, row in rows.items():
+        _console.print(
+            f"  {name:<24} at the last step {row.success_last:6.1%}"
+            f"  [{row.success_last_low:.1%}, {row.success_last_high:.1%}]"
+            f"   ever {row.success_ever:6.1%}   mean distance {row.mean_distance_m:.3f} m",
+            highlight=False,
+            soft_wrap=True,
+        )
+
+
+@app.command()
+def coverage(
+    primitives: _Primitives,
+    skills: Annotated[int, typer.Option(help="Number of random compositions.", min=1)] = 32,
+    steps: Annotated[int, typer.Option(help="Steps each.", min=1)] = 100,
+    seed: _Seed = 0,
+    out: Annotated[Path, typer.Option(metavar="FILE", help="Picture to write.")] = Path("coverage.png"),
+    as_json: _Json = False,
+    registry: _Registry = Path("registry"),
+) -> None:
+    """Where random compositions of the primitives move the object, beside a random policy."""
+    with _user_errors():
+        from service.actors.coverage import RandomPolicy, skill_trajectories, visited_share
+        from service.runtime.plots import plot_coverage
+        from service.runtime.primitives import load_bob
+
+        bob = load_bob(primitives, registry)
+        world = bob.config.world
+        paths = {
+            name: skill_trajectories(policy, world, num_skills=skills, num_steps=steps, seed=seed)
+            for name, policy in ((bob.label, bob.policy), ("random policy", RandomPolicy()))
+        }
+        shares = {name: visited_share(path, world.workspace) for name, path in paths.items()}
+        picture = plot_coverage(
+            list(paths[bob.label]), world.workspace, out, f"{bob.label}: {skills} random compositions"
+        )
+    if as_json:
+        typer.echo(json.dumps({"share_of_table_cells_visited": shares, "picture": str(picture)}, indent=1))
+        return
+    for name, share in shares.items():
+        _console.print(f"  {name:<24} {share:.0%} of the workspace's table cells visited", highlight=False)
+    _console.print(f"picture: {picture}", highlight=False)
+
+
+@app.command()
+def render(
+    run_dir: Annotated[Path, typer.Argument(metavar="RUN_DIR", help="A run with a checkpoint.")],
+    rounds: Annotated[int, typer.Option(help="Rounds to film.", min=1)] = 4,
+    seed: _Seed = 0,
+    out: Annotated[Path | None, typer.Option(metavar="FILE", help="Default: RUN_DIR/rounds.mp4.")] = None,
+) -> None:
+    """Film Alice's proposals beside Bob's attempts."""
+    with _user_errors():
+        from service.runtime.primitives import load_players
+        from service.runtime.rundir import RunDirectory
+        from service.runtime.video import film_rounds, write_video
+
+        directory = RunDirectory(run_dir)
+        config = directory.read_config()
+        alice, bob = load_players(directory)
+        takes = film_rounds(config, alice, bob, num_rounds=rounds, seed=seed)
+        video = write_video(takes, config.world, out or run_dir / "rounds.mp4")
+    _console.print(f"video: {video}", highlight=False)
+
+
+def main() -> None:
+    """Entry point of ``tandem`` and ``python -m service``."""
+    # NumPy's and torch's own threads only get in each other's way: worlds are stepped by MuJoCo's threads. Both read
+    # these variables when they are first imported, which is after this line.
+    for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
+        os.environ.setdefault(name, "1")
+    logging.basicConfig(level=logging.INFO, format="%(message)s")
+    app()
+
+
+def _pretrain(config: Config, path: Path, registry: Path, *, resume: bool) -> None:
+    from service.runtime.pretrain import pretrain as run
+    from service.runtime.progress import Progress
+    from service.runtime.rundir import RunDirectory
+
+    with Progress(config.run.total_env_steps, _console) as progress:
+        done = run(config, RunDirectory(path), registry, resume=resume, on_iteration=progress.show)
+    _report(done, path, registry)
+
+
+def _report(done: Pretrained, path: Path, registry: Path) -> None:
+    def say(text: str) -> None:
+        _console.print(text, highlight=False, soft_wrap=True)
+
+    result = done.result
+    say(f"\n{result.reason} after {result.num_env_steps:,} env steps, {result.iteration} iterations")
+    say(done.timing)
+    if result.reason == "interrupted":
+        say(f"saved; continue with: tandem pretrain --resume --run-dir {path}")
+        raise typer.Exit(_EXIT_INTERRUPTED)
+    for name, value in done.metrics.items():
+        say(f"{name:<36} {value:.1%}")
+    for name, file in done.files.items():
+        say(f"{name:<12} {file}")
+    say(f"{'checkpoint':<12} {path / 'checkpoints'}")
+    say(f"{'primitives':<12} {done.version} in {registry}")
+
+
+def _demo_config() -> Path | None:
+    """The shipped recipe, in a clone; an installed wheel has none, and the defaults do."""
+    config = Path(__file__).parents[1] / "configs" / "pretrain" / "panda_cube.yaml"
+    return config if config.exists() else None
+
+
+def _next_free(parent: Path, stem: str) -> Path:
+    number = 1
+    while (parent / f"{stem}-{number}").exists():
+        number += 1
+    return parent / f"{stem}-{number}"
+
+
+@contextmanager
+def _user_errors() -> Iterator[Any]:
+    """One line on stderr and exit code 2 for a mistake of the user's."""
+    try:
+        yield
+    except TandemError as error:
+        _errors.print(f"error: {error}", style=None, highlight=False, soft_wrap=True, markup=False)
+        raise typer.Exit(_EXIT_USER_ERROR) from None

@@ -1,0 +1,259 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from safetensors.numpy import load, save
+
+from service.envs.observations import MIRROR_ACTION, MIRROR_BOB
+from service.learner.errors import LearnerError
+from service.learner.learner import Learner
+from tests.learner.rollouts import make_config, make_rollout, nobody_learns
+
+HISTORY = {"abc": {"num_iterations": 2}, "mirror": True}
+
+BOTH_PLAYERS = ("policy_loss", "value_loss", "entropy", "kl", "clip_fraction", "learning_rate")
+BOTH_PLAYERS += ("explained_variance", "grad_norm")
+COMMON = ("num_alice_samples", "num_bob_samples", "num_demonstrations", "cloning_loss", "demonstration_log_ratio")
+COMMON += ("demonstration_log_prob", "bob_std", "primitive_weight_0", "primitive_weight_1", "primitive_share_0")
+COMMON += ("primitive_share_1", "non_finite_steps", "rollbacks", "version")
+NAMES = {f"learner/{player}_{name}" for player in ("alice", "bob") for name in BOTH_PLAYERS}
+NAMES |= {f"learner/{name}" for name in COMMON}
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _one_thread():
+    torch.set_num_threads(1)
+
+
+def updated(learner, sequence, **overrides):
+    rollout = make_rollout(learner, sequence)
+    assert learner.ingest(replace(rollout, **overrides))
+    return learner.update()
+
+
+def assert_same_state(first, second):
+    first, second = first.state(), second.state()
+    assert first.keys() == second.keys()
+    for name, array in first.items():
+        assert isinstance(array, np.ndarray)
+        assert array.dtype == second[name].dtype
+        assert array.shape == second[name].shape
+        assert array.tobytes() == second[name].tobytes(), name
+
+
+def test_one_update_learns_and_reports():
+    learner = Learner(make_config())
+    before = learner.weights()
+    metrics = updated(learner, 0)
+    after = learner.weights()
+    assert metrics.keys() == NAMES
+    assert (before.version, after.version, metrics["learner/version"]) == (0, 1, 1.0)
+    assert any(not np.array_equal(before.alice[name], after.alice[name]) for name in before.alice)
+    assert any(not np.array_equal(before.bob[name], after.bob[name]) for name in before.bob)
+    assert metrics["learner/demonstration_log_ratio"] > 0.0
+    assert metrics["learner/num_demonstrations"] == 12.0
+    shares = sum(metrics[f"learner/primitive_share_{index}"] for index in range(2))
+    assert shares == pytest.approx(1.0, abs=1e-5)
+
+
+def test_weights_are_copies():
+    learner = Learner(make_config())
+    weights = learner.weights()
+    name = next(iter(weights.bob))
+    weights.bob[name][...] = 7.0
+    assert not np.array_equal(learner.weights().bob[name], weights.bob[name])
+
+
+def test_the_seed_alone_decides_the_first_version():
+    torch.manual_seed(5)
+    before = torch.random.get_rng_state()
+    first = Learner(make_config())
+    assert torch.equal(torch.random.get_rng_state(), before)
+    torch.manual_seed(6)
+    assert_same_state(first, Learner(make_config()))
+    other = Learner(make_config().model_copy(update={"seed": 1}))
+    names = [name for name in other.state() if name.startswith("alice/policy/") and name.endswith("weight")]
+    assert all(not np.array_equal(first.state()[name], other.state()[name]) for name in names)
+
+
+def test_a_rollout_counts_once():
+    learner = Learner(make_config())
+    rollout = make_rollout(learner, 3)
+    assert learner.ingest(rollout)
+    assert not learner.ingest(rollout)
+    learner.update()
+    assert not learner.ingest(replace(rollout, policy_version=1))
+    assert not learner.ingest(replace(rollout, policy_version=1, sequence=2))
+    assert learner.ingest(replace(rollout, policy_version=1, sequence=4))
+    assert learner.ingest(replace(rollout, policy_version=1, incarnation=1, sequence=0))
+    assert learner.ingest(replace(rollout, policy_version=1, actor=1, sequence=0))
+
+
+@pytest.mark.parametrize(("version", "taken"), [(0, False), (1, True), (2, True), (3, True), (4, False)])
+def test_stale_rollouts_and_those_of_unknown_versions_are_refused(version, taken):
+    learner = Learner(make_config())
+    for sequence in range(3):
+        updated(learner, sequence)
+    assert learner.ingest(replace(make_rollout(learner, 9), policy_version=version)) is taken
+
+
+def test_the_order_of_arrival_does_not_matter():
+    learners = [Learner(make_config()) for _ in range(2)]
+    rollouts = [replace(make_rollout(learners[0], 0, seed=actor), actor=actor) for actor in range(3)]
+    for learner, order in zip(learners, (rollouts, rollouts[::-1]), strict=True):
+        for rollout in order:
+            learner.ingest(rollout)
+    assert learners[0].update() == learners[1].update()
+    assert_same_state(*learners)
+
+
+def test_an_update_needs_a_rollout():
+    learner = Learner(make_config())
+    with pytest.raises(LearnerError, match="ingest"):
+        learner.update()
+    updated(learner, 0)
+    with pytest.raises(LearnerError, match="ingest"):
+        learner.update()
+
+
+def test_resume_is_exact():
+    straight, stopped, resumed = (Learner(make_config(**HISTORY)) for _ in range(3))
+    for learner in (straight, stopped):
+        updated(learner, 0)
+        updated(learner, 1)
+    resumed.load_state(load(save(stopped.state())))
+    assert_same_state(resumed, stopped)
+    for sequence in (2, 3):
+        rollout = make_rollout(straight, sequence)
+        for learner in (straight, resumed):
+            assert learner.ingest(rollout)
+        assert straight.update() == resumed.update()
+    assert_same_state(straight, resumed)
+    assert not resumed.ingest(make_rollout(resumed, 1))
+
+
+def test_a_state_is_a_copy():
+    learner = Learner(make_config(**HISTORY))
+    updated(learner, 0)
+    state = learner.state()
+    bytes_before = save(state)
+    updated(learner, 1)
+    assert save(state) == bytes_before
+
+
+def test_rollouts_not_learned_from_are_not_part_of_a_state():
+    learner, resumed = Learner(make_config()), Learner(make_config())
+    rollout = make_rollout(learner, 0)
+    assert learner.ingest(rollout)
+    resumed.load_state(learner.state())
+    assert resumed.ingest(rollout)
+
+
+@pytest.mark.parametrize(
+    "name", ["rng", "bob/policy/gate.output.weight", "demonstrations/action", "alice/learning_rate"]
+)
+def test_a_state_with_a_missing_array_is_refused(name):
+    learner = Learner(make_config())
+    state = learner.state()
+    before = save(state)
+    damaged = {key: array for key, array in state.items() if key != name}
+    with pytest.raises(LearnerError, match=name):
+        learner.load_state(damaged)
+    assert save(learner.state()) == before
+
+
+def test_a_state_of_other_networks_is_refused_as_a_whole():
+    learner, other = Learner(make_config()), Learner(make_config())
+    updated(other, 0)
+    state = other.state()
+    name = "bob/policy/gate.output.bias"
+    before = save(learner.state())
+    with pytest.raises(LearnerError, match=rf"{name}.*\(2,\).*\(5,\)"):
+        learner.load_state(state | {name: np.zeros(5, dtype=np.float32)})
+    with pytest.raises(LearnerError, match="carol"):
+        learner.load_state(state | {"carol/policy": np.zeros(1)})
+    assert save(learner.state()) == before
+
+
+def test_demonstrations_of_the_last_iterations_are_kept():
+    learner = Learner(make_config(**HISTORY))
+    counts = []
+    for sequence, num in enumerate((12, 5, 0, 0)):
+        learner.ingest(make_rollout(learner, sequence, num_demonstrations=num))
+        counts.append(learner.update()["learner/num_demonstrations"])
+    assert counts == [12.0, 17.0, 5.0, 0.0]
+
+
+def test_demonstrations_that_are_not_finite_are_left_out():
+    learner = Learner(make_config())
+    rollout = make_rollout(learner, 0)
+    rollout.demonstrations.action[3, 1] = np.nan
+    learner.ingest(rollout)
+    metrics = learner.update()
+    assert metrics["learner/num_demonstrations"] == 11.0
+    assert metrics["learner/non_finite_steps"] == 0.0
+
+
+def test_demonstrations_alone_are_cloned():
+    learner = Learner(make_config(bob={"num_epochs": 5}, abc={"weight": 1.0}))
+    metrics = updated(learner, 0, bob=nobody_learns(make_rollout(learner, 0).bob))
+    assert metrics["learner/num_bob_samples"] == 0.0
+    assert metrics["learner/demonstration_log_ratio"] > 0.01
+    assert "learner/bob_policy_loss" not in metrics
+
+
+def test_without_samples_or_demonstrations_a_player_stays():
+    learner = Learner(make_config())
+    before = learner.weights()
+    rollout = make_rollout(learner, 0, num_demonstrations=0)
+    metrics = updated(
+        learner,
+        0,
+        alice=nobody_learns(rollout.alice),
+        bob=nobody_learns(rollout.bob),
+        demonstrations=rollout.demonstrations,
+    )
+    after = learner.weights()
+    assert after.version == 1
+    for name in before.alice:
+        np.testing.assert_array_equal(before.alice[name], after.alice[name])
+    assert metrics["learner/alice_learning_rate"] == 3e-4
+
+
+def test_cloning_can_be_switched_off():
+    metrics = updated(Learner(make_config(abc={"weight": 0.0})), 0)
+    assert "learner/cloning_loss" not in metrics
+    assert metrics["learner/num_demonstrations"] == 0.0
+
+
+def test_mirroring_doubles_what_bob_learns_from():
+    learner = Learner(make_config(mirror=True))
+    rollout = make_rollout(learner, 0)
+    cloning = learner._cloning([rollout])
+    np.testing.assert_array_equal(cloning.observation[12:], MIRROR_BOB(rollout.demonstrations.observation))
+    np.testing.assert_array_equal(cloning.action[12:], MIRROR_ACTION(rollout.demonstrations.action))
+    metrics, plain = updated(learner, 0), updated(Learner(make_config()), 0)
+    for name in ("num_bob_samples", "num_demonstrations", "num_alice_samples"):
+        assert metrics[f"learner/{name}"] == plain[f"learner/{name}"]
+
+
+def test_a_broken_turn_leaves_the_player_as_it_was():
+    learner = Learner(make_config(bob={"num_epochs": 3}))
+    rollout = make_rollout(learner, 0)
+    step, world = np.argwhere(rollout.alice.active)[0]
+    rollout.alice.observation[step, world, 0] = np.nan
+    before = learner.weights()
+    learner.ingest(rollout)
+    metrics = learner.update()
+    after = learner.weights()
+    assert all(np.isfinite(array).all() for array in after.alice.values())
+    assert metrics["learner/bob_policy_loss"] == metrics["learner/bob_policy_loss"]
+    assert metrics["learner/non_finite_steps"] >= 1.0
+    assert any(not np.array_equal(before.bob[name], after.bob[name]) for name in before.bob)
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="this machine has CUDA")
+def test_cuda_that_is_not_there_is_the_users_mistake():
+    with pytest.raises(LearnerError, match=r"learner\.device=cpu"):
+        Learner(make_config(device="cuda"))

@@ -1,0 +1,203 @@
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from torch import nn
+
+from service.config import ABCConfig, PPOConfig
+from service.learner.player import Player
+from service.learner.samples import Cloning, Samples
+from service.learner.training import MAX_NON_FINITE, train
+from service.learner.update import probes, update_player
+
+CPU = torch.device("cpu")
+CONFIG = PPOConfig(learning_rate=0.01, num_epochs=4, minibatch_size=32, target_kl=0.05, max_grad_norm=10.0)
+ABC = ABCConfig()
+
+
+class Bandit(nn.Module):
+    """A Gaussian with one mean and one std, whatever it sees."""
+
+    def __init__(self):
+        super().__init__()
+        self.mean = nn.Parameter(torch.zeros(1))
+        self.log_std = nn.Parameter(torch.full((1,), -0.5))
+
+    def forward(self, observation):
+        nothing = torch.zeros_like(observation)  # added so that the outputs are no views of the parameters
+        return nothing + self.mean, nothing + self.log_std.exp()
+
+
+class Constant(nn.Module):
+    def __init__(self):
+        super().__init__()
+        self.level = nn.Parameter(torch.zeros(1))
+
+    def forward(self, observation):
+        return torch.zeros(len(observation)) + self.level
+
+
+def make_player(**overrides):
+    return Player(Bandit(), Constant(), CONFIG.model_copy(update=overrides), CPU)
+
+
+@torch.no_grad()
+def play(player, rng, num=128, target=0.8):
+    """One-step turns, paid by how close the action comes to ``target``."""
+    observation = torch.zeros(num, 1)
+    mean, std = player.policy(observation)
+    action = mean + std * torch.from_numpy(rng.standard_normal((num, 1)).astype(np.float32))
+    reward = -(action[:, 0] - target).square()
+    advantage = (reward - reward.mean()) / reward.std()
+    log_prob = player.log_prob(observation, action)
+    return Samples(observation, observation, action, log_prob, advantage, reward, player.value(observation))
+
+
+@torch.no_grad()
+def make_cloning(player, action=0.5, num=64):
+    observation, actions = torch.zeros(num, 1), torch.full((num, 1), action)
+    return Cloning(observation, actions, player.log_prob(observation, actions))
+
+
+def update(player, samples=None, cloning=None, seed=0):
+    return update_player(player, samples, cloning, ABC, np.random.default_rng(seed))
+
+
+def parameters(player):
+    return {name: array for name, array in player.state().items() if not name.startswith(("adam/", "learning_rate"))}
+
+
+def assert_same(first, second):
+    assert first.keys() == second.keys()
+    for name in first:
+        np.testing.assert_array_equal(first[name], second[name], err_msg=name)
+
+
+def test_a_bandit_is_learned():
+    player, rng = make_player(), np.random.default_rng(0)
+    levels = []
+    for _ in range(30):
+        assert update(player, play(player, rng))["rollbacks"] == 0.0
+        levels.append(player.value.level.item())
+    assert player.policy.mean.item() == pytest.approx(0.8, abs=0.1)
+    assert player.policy.log_std.item() < -1.0
+    assert min(levels) < -0.1  # the mean reward, about -1 at first ...
+    assert levels[-1] == pytest.approx(0.0, abs=0.05)  # ... and about 0 in the end
+
+
+def test_cloning_makes_demonstrations_likelier_without_samples():
+    player = make_player()
+    cloning = make_cloning(player)
+    metrics = update(player, cloning=cloning)
+    assert (player.log_prob(cloning.observation, cloning.action) > cloning.old_log_prob + 0.01).all()
+    assert metrics["cloning_loss"] < -1.0
+    assert "policy_loss" not in metrics
+    assert player.value.level.item() == 0.0
+
+
+def test_cloning_beside_samples():
+    player = make_player()
+    samples = play(player, np.random.default_rng(0))
+    without = replace(samples, advantage=torch.zeros_like(samples.advantage))
+    metrics = update(player, without, make_cloning(player))
+    assert player.policy.mean.item() > 0.0
+    assert {"policy_loss", "cloning_loss", "value_loss"} <= metrics.keys()
+
+
+def test_nothing_to_learn_from_changes_nothing():
+    player = make_player()
+    before = player.state()
+    metrics = update(player)
+    assert_same(player.state(), before)
+    assert metrics == {"learning_rate": CONFIG.learning_rate, "non_finite_steps": 0.0, "rollbacks": 0.0}
+
+
+def test_a_non_finite_minibatch_is_skipped():
+    samples = play(make_player(), np.random.default_rng(0), num=32)
+    broken = replace(samples, advantage=torch.full_like(samples.advantage, math.nan))
+    player = make_player(num_epochs=2)
+    before = player.state()
+    metrics = update(player, broken)
+    assert metrics["non_finite_steps"] == 2.0
+    assert metrics["rollbacks"] == 0.0
+    assert_same(parameters(player), {name: before[name] for name in parameters(player)})
+
+
+def test_other_minibatches_go_on_beside_a_non_finite_one():
+    samples = play(make_player(), np.random.default_rng(0))
+    samples.advantage[5] = math.inf
+    player = make_player(num_epochs=1)
+    tally = train(player, samples, None, ABC, np.random.default_rng(0))
+    assert tally.num_non_finite == 1
+    assert len(tally.terms["policy_loss"]) == 3
+    assert all(np.isfinite(array).all() for array in player.state().values())
+    assert player.policy.mean.item() != 0.0
+
+
+def test_three_non_finite_minibatches_undo_the_update():
+    player = make_player(num_epochs=1)
+    samples = play(player, np.random.default_rng(0), num=32 * 8)
+    update(player, samples)  # so that Adam has something to lose
+    samples = play(player, np.random.default_rng(1), num=32 * 8)
+    samples.advantage[::20] = math.nan
+    before = player.state()
+    metrics = update(player, samples)
+    assert metrics["non_finite_steps"] == MAX_NON_FINITE
+    assert metrics["rollbacks"] == 1.0
+    after = player.state()
+    assert after.pop("learning_rate") == pytest.approx(before.pop("learning_rate") / 1.5)
+    assert_same(after, before)
+
+
+def test_a_collapse_is_undone():
+    player = make_player(learning_rate=1.0, num_epochs=1)
+    before = player.state()
+    metrics = update(player, play(player, np.random.default_rng(0), num=32))
+    assert metrics["kl"] > 10 * CONFIG.target_kl
+    assert metrics["rollbacks"] == 1.0
+    after = player.state()
+    assert after.pop("learning_rate") == pytest.approx(before.pop("learning_rate") / 1.5)
+    assert_same(after, before)
+
+
+def test_the_policy_stops_early_and_the_value_network_goes_on():
+    player = make_player(learning_rate=0.05, num_epochs=10, target_kl=0.01)
+    samples = play(player, np.random.default_rng(0), num=320)
+    tally = train(player, samples, None, ABC, np.random.default_rng(0))
+    assert tally.stopped
+    assert 1 <= len(tally.terms["policy_loss"]) < 50
+    assert len(tally.terms["value_loss"]) == 100
+    steps = player.state()
+    assert steps["adam/step/policy/mean"] == len(tally.terms["policy_loss"])
+    assert steps["adam/step/value/level"] == 100
+
+
+@pytest.mark.parametrize(
+    ("target_kl", "num_updates", "multiple"),
+    [(10.0, 1, 1.5), (10.0, 5, 2.0), (1e-9, 1, 1 / 1.5), (1e-9, 12, 0.1)],
+)
+def test_learning_rate_follows_the_kl_within_bounds(target_kl, num_updates, multiple):
+    player, rng = make_player(target_kl=target_kl, num_epochs=1), np.random.default_rng(0)
+    for _ in range(num_updates):
+        update(player, play(player, rng, num=32))
+    assert player.optimizer.learning_rate == pytest.approx(CONFIG.learning_rate * multiple)
+
+
+def test_reported_kl_is_that_of_the_whole_update():
+    player = make_player()
+    samples = play(player, np.random.default_rng(0))
+    mean, log_std = player.policy.mean.item(), player.policy.log_std.item()
+    metrics = update(player, samples)
+    new_mean, new_log_std = player.policy.mean.item(), player.policy.log_std.item()
+    # KL of two Gaussians: ln(s1 / s0) + (s0^2 + (m0 - m1)^2) / (2 s1^2) - 1/2
+    spread = math.exp(2 * log_std) + (mean - new_mean) ** 2
+    expected = new_log_std - log_std + spread / (2 * math.exp(2 * new_log_std)) - 0.5
+    assert metrics["kl"] == pytest.approx(expected, rel=1e-3)
+
+
+def test_probes_are_spread_over_all_rows():
+    assert torch.equal(probes(torch.arange(1024)), torch.arange(1024))
+    assert probes(torch.arange(1025)).tolist() == list(range(0, 1025, 2))
+    assert len(probes(torch.arange(100_000))) <= 1024
