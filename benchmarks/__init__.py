@@ -1,1 +1,1 @@
-"""How fast it is, compared with what, and the records behind ``docs/results``; every script says its options with ``--help``."""
+"""How fast it is and compared with what, and what makes ``docs/results``; ``--help`` tells a script's options."""

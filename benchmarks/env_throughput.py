@@ -2,8 +2,8 @@
 
 Both sides do the same: episodes of 50 random actions with their resets, 20 physics steps of 2 ms an action, the
 observation and the test for success of every step. panda-gym steps one world with one thread, so ours gets one thread,
-too. What ours gains over its own Gymnasium environment is the batch: one call for all worlds. The last row is the physics
-that pre-training uses, half as many steps of 4 ms; it is not what panda-gym is compared with.
+too. What our batch gains over our own Gymnasium environment is one call for all worlds. The last row is the physics of
+pre-training, half as many steps of 4 ms; panda-gym is not compared with it.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 import gymnasium
 import numpy as np
 
-from benchmarks.measuring import Sample, describe, machine, measure, rates, ratio, table, write_json
+from benchmarks.measuring import Sample, describe, describe_ratio, machine, measure, rates, ratio, table, write_json
 from service.actors.evaluation import sample_goals
 from service.config import WorldConfig
 from service.envs.batch import WorldBatch
@@ -34,7 +34,9 @@ from service.errors import TandemError
 EPISODE_STEPS = 50
 """Of panda-gym's registration, and of ours."""
 PANDA_GYM_IDS = ("PandaPickAndPlace-v3", "PandaPush-v3")
-OURS = "tandem"
+BATCH = "tandem"
+ONE_WORLD = "tandem, one world, Gymnasium"
+PRETRAINING = "tandem, 10 x 4 ms"
 PACKAGES = ("mujoco", "numpy", "gymnasium", "panda-gym", "pybullet")
 _SUCCESS_M = 0.05
 
@@ -105,12 +107,12 @@ def contenders(num_worlds: int) -> dict[str, Contender]:
     Raises:
         TandemError: panda-gym is not installed.
     """
-    rows: dict[str, Contender] = {OURS: BatchContender(WorldConfig(), num_worlds)}
+    rows: dict[str, Contender] = {BATCH: BatchContender(WorldConfig(), num_worlds)}
     rows |= {name: panda_gym(name) for name in PANDA_GYM_IDS}
     coarse = WorldConfig(physics_step_s=0.004, num_substeps=10)
     return rows | {
-        "tandem, one world, Gymnasium": GymnasiumContender(TABLETOP_ID),
-        "tandem, 10 x 4 ms": BatchContender(coarse, num_worlds),
+        ONE_WORLD: GymnasiumContender(TABLETOP_ID),
+        PRETRAINING: BatchContender(coarse, num_worlds),
     }
 
 
@@ -140,8 +142,13 @@ def compare(rows: Mapping[str, Contender], *, num_pairs: int, seconds: float) ->
 
 
 def summarise(samples: Mapping[str, list[Sample]]) -> dict[str, Any]:
-    """Median rates by row, and the ratios of our batch to every other row."""
-    ratios = {f"{OURS} / {name}": ratio(samples[OURS], each) for name, each in samples.items() if name != OURS}
+    """Median rates by row, and how many times as fast as panda-gym our batch and our Gymnasium environment are."""
+    ratios = {
+        f"{ours} / {name}": ratio(samples[ours], samples[name])
+        for ours in (BATCH, ONE_WORLD)
+        for name in PANDA_GYM_IDS
+        if {ours, name} <= samples.keys()
+    }
     return {"rows": {name: rates(each) for name, each in samples.items()}, "ratios": ratios}
 
 
@@ -171,22 +178,14 @@ def main() -> int:
         print(describe(where), flush=True)
         result = summarise(compare(rows, num_pairs=given.pairs, seconds=given.seconds))
         if given.json:
-            write_json(
-                given.json, {"benchmark": "env_throughput", "machine": where, "settings": _settings(given), **result}
-            )
+            settings = {"pairs": given.pairs, "seconds": given.seconds, "worlds": given.worlds, "steps": EPISODE_STEPS}
+            write_json(given.json, {"benchmark": "env_throughput", "machine": where, "settings": settings, **result})
     except TandemError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
     print(table(result["rows"]))
-    for name, each in result["ratios"].items():
-        print(
-            f"{name}: {each['median']:.2f} ({each['least']:.2f} to {each['greatest']:.2f}; by CPU time {each['cpu']:.2f})"
-        )
+    print("\n".join(describe_ratio(name, each) for name, each in result["ratios"].items()))
     return 0
-
-
-def _settings(given: argparse.Namespace) -> dict[str, Any]:
-    return {"pairs": given.pairs, "seconds": given.seconds, "worlds": given.worlds, "episode_steps": EPISODE_STEPS}
 
 
 if __name__ == "__main__":

@@ -1,6 +1,6 @@
-"""What the throughput benchmarks share: samples taken in turn, their ratios pair by pair, and the machine they were taken on.
+"""What the throughput benchmarks share: samples taken in turn, their ratios, and the machine they were taken on.
 
-A rate alone says little about a machine that others use, too. So what is compared is measured in turn within one run, and
+A rate alone says little where others use the machine, too. So what is compared is measured in turn within one run, and
 the ratio of each turn is what counts.
 """
 
@@ -119,6 +119,13 @@ def table(rows: dict[str, dict[str, Any]]) -> str:
         for name, row in rows.items()
     ]
     return "\n".join([head, *lines])
+
+
+def describe_ratio(name: str, each: dict[str, float]) -> str:
+    """One of ``ratio`` in one line."""
+    return (
+        f"{name}: {each['median']:.2f} ({each['least']:.2f} to {each['greatest']:.2f}; by CPU time {each['cpu']:.2f})"
+    )
 
 
 def write_json(path: Path, result: dict[str, Any]) -> None:

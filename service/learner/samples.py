@@ -111,9 +111,7 @@ def collect(
     return Samples(**tensors, advantage=normalised, target=target, value=value)
 
 
-def mirrored(
-    samples: Samples, log_prob: LogProb, policy: Mirror, value: Mirror, action: Mirror
-) -> Samples:
+def mirrored(samples: Samples, log_prob: LogProb, policy: Mirror, value: Mirror, action: Mirror) -> Samples:
     """The samples followed by their reflections.
 
     A reflection was never acted, so its old log-probability is that of the policy at the start of the update.

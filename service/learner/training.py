@@ -115,7 +115,7 @@ def _policy_loss(
         entropy = gaussian.entropy(std[:num_samples]).mean()
         loss = surrogate - config.entropy_weight * entropy
         terms = {"policy_loss": surrogate, "entropy": entropy, "clip_fraction": clip_fraction}
-        # From the policy at the start of the update: the one that acted is a version behind, and would stop this at once.
+        # From the policy at the start of the update: the one that acted may lag behind, and would stop this at once.
         terms["kl"] = losses.approximate_kl(log_prob[:num_samples], samples.start_log_prob)
     if cloning is not None:
         terms["cloning_loss"] = losses.cloning_loss(log_prob[num_samples:], cloning.old_log_prob, abc.clip)

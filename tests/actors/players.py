@@ -29,12 +29,14 @@ class Constant:
 
 
 class Pusher(Constant):
-    """Goes down to the table and pushes forward."""
+    """Closes the fingers, goes down to the table behind the object and pushes it 7 cm forward."""
 
     def act(self, observation, rng):
         action, log_prob = super().act(observation, rng)
-        action[:, 0] = 1.0
-        action[:, 2] = np.clip((0.03 - observation[:, 2]) / 0.05, -1.0, 1.0)
+        height = observation[:, 2]
+        action[:, 0] = np.where(height < 0.05, np.clip((0.06 - observation[:, 0]) / 0.05, -1.0, 1.0), 0.0)
+        action[:, 2] = np.clip((0.03 - height) / 0.05, -1.0, 1.0)
+        action[:, 3] = -1.0
         return action, log_prob
 
 
@@ -56,7 +58,7 @@ class Start:
 
 # The workspace of the default configuration is x -0.225 to 0.125, y -0.175 to 0.175; the table ends at y = 0.45. With
 # friction 1 a cube that starts at v slides v^2 / (2 g): 11.5 cm at 1.5 m/s. The end effector starts over (-0.05, 0).
-IN_FRONT = Start((0.02, 0.0, 0.025))
+IN_FRONT = Start((0.03, 0.0, 0.025))
 AT_REST = Start((-0.15, 0.13, 0.025))
 SLIDES = Start((-0.12, -0.15, 0.025), (1.5, 0.0, 0.0))
 LEAVES = Start((0.08, 0.15, 0.025), (1.5, 0.0, 0.0))

@@ -65,7 +65,7 @@ def test_verdicts(rollout):
 
 def test_the_goal_is_where_the_object_is_at_the_end_of_alices_turn(rollout):
     path = idle_positions(SLIDES, 9)
-    np.testing.assert_allclose(rollout.records.proposal[SLID], path[-1], atol=1e-9)
+    np.testing.assert_allclose(rollout.records.proposal[SLID], path[-1], atol=1e-5)
     assert 0.10 < rollout.records.proposal[SLID, 0] - SLIDES.position[0] < 0.13  # 1.5^2 / (2 g) = 0.115
     np.testing.assert_array_equal(rollout.records.goal, rollout.records.proposal)
     pushed = rollout.records.proposal[PUSHED] - np.array(IN_FRONT.position)
@@ -420,13 +420,12 @@ def test_a_broken_world_is_reported_with_state_and_action_once():
 
 
 def test_numbers_too_large_to_be_physics_are_broken_too():
-    """MuJoCo's automatic reset is off, so a world that explodes may stay finite: joints at 1e7 rad."""
-    game = make_game(make_config(2), [AT_REST, AT_REST])
+    """MuJoCo's automatic reset is off: an arm that explodes is finite for some steps, its joints at thousands of turns."""
+    game = make_game(make_config(2, game={"alice_steps": 1}), [AT_REST, AT_REST])
     states = game.worlds.states.copy()
-    states[0, JOINT_VELOCITIES] = 1e6
+    states[0, JOINT_VELOCITIES] = 1e4
     game.worlds.restore(states)
     rollout = play(game)
     assert rollout.records.verdict.tolist() == [Verdict.FALLEN, Verdict.NOT_MOVED]
     assert rollout.alice.learn.tolist() == [False, True]
-    assert game.worlds.num_broken >= 1
-    assert np.abs(game.worlds.joints).max() < 10.0
+    assert game.worlds.num_broken == 1

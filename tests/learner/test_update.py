@@ -52,7 +52,7 @@ def play(player, rng, num=128, target=0.8):
     reward = -(action[:, 0] - target).square()
     advantage = (reward - reward.mean()) / reward.std()
     log_prob = player.log_prob(observation, action)
-    return Samples(observation, observation, action, log_prob, advantage, reward, player.value(observation))
+    return Samples(observation, observation, action, log_prob, log_prob, advantage, reward, player.value(observation))
 
 
 @torch.no_grad()
@@ -104,6 +104,32 @@ def test_cloning_beside_samples():
     metrics = update(player, without, make_cloning(player))
     assert player.policy.mean.item() > 0.0
     assert {"policy_loss", "cloning_loss", "value_loss"} <= metrics.keys()
+
+
+def test_ratios_start_at_one():
+    # Samples and demonstrations go through the policy together; each must meet its own old log-probability.
+    player = make_player(learning_rate=1e-9)
+    metrics = update(player, play(player, np.random.default_rng(0)), make_cloning(player))
+    assert metrics["cloning_loss"] == pytest.approx(-1.0, abs=1e-5)
+    assert metrics["policy_loss"] == pytest.approx(0.0, abs=1e-5)  # advantages have mean 0
+    assert metrics["clip_fraction"] == 0.0
+
+
+def test_entropy_bonus_widens_the_policy():
+    player = make_player(entropy_weight=1.0)
+    samples = play(player, np.random.default_rng(0))
+    update(player, replace(samples, advantage=torch.zeros_like(samples.advantage)))
+    assert player.policy.log_std.item() > -0.49
+
+
+def test_gradients_are_clipped_network_by_network():
+    player = make_player(num_epochs=1, max_grad_norm=0.01)
+    metrics = update(player, play(player, np.random.default_rng(0), num=32))
+    assert metrics["grad_norm"] > 0.1
+    state = player.state()
+    policy = [state[f"adam/first_moment/policy/{name}"] for name in ("mean", "log_std")]
+    assert np.linalg.norm(policy) == pytest.approx(0.1 * 0.01, rel=1e-3)  # (1 - beta_1) x the clipped gradient
+    assert np.linalg.norm(state["adam/first_moment/value/level"]) == pytest.approx(0.1 * 0.01, rel=1e-3)
 
 
 def test_nothing_to_learn_from_changes_nothing():
@@ -172,6 +198,25 @@ def test_the_policy_stops_early_and_the_value_network_goes_on():
     steps = player.state()
     assert steps["adam/step/policy/mean"] == len(tally.terms["policy_loss"])
     assert steps["adam/step/value/level"] == 100
+
+
+def test_the_kl_that_stops_the_policy_is_this_epochs():
+    player = make_player()
+    tally = train(player, play(player, np.random.default_rng(0)), None, ABC, np.random.default_rng(0))
+    assert len(tally.terms["kl"]) == 16
+    assert tally.kls == [float(kl) for kl in tally.terms["kl"][-4:]]
+    assert tally.passes(0.02, bound=np.mean([*tally.kls, 0.02]) - 1e-6)
+    assert not tally.passes(math.nan, bound=np.mean(tally.kls) + 1e-6)
+
+
+def test_a_policy_ahead_of_the_one_that_acted_does_not_stop():
+    player = make_player(num_epochs=1)
+    samples = play(player, np.random.default_rng(0))
+    lagging = replace(samples, old_log_prob=samples.old_log_prob + torch.where(samples.action[:, 0] > 0.0, 0.9, -0.9))
+    tally = train(player, lagging, None, ABC, np.random.default_rng(0))
+    assert not tally.stopped
+    assert tally.kls[0] == pytest.approx(0.0, abs=1e-6)
+    assert tally.means()["clip_fraction"] > 0.9  # the surrogate's ratios are those to the policy that acted
 
 
 @pytest.mark.parametrize(

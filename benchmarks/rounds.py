@@ -1,0 +1,121 @@
+"""Rounds of self-play without learning, and the same physics without the game."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import partial
+
+import numpy as np
+from numpy.typing import NDArray
+
+from benchmarks.measuring import Sample, measure
+from service.actors.game import Acting, Players
+from service.actors.rollout import Rollout
+from service.envs.batch import WorldBatch
+from service.envs.observations import ACTION_SIZE
+from service.policies.evaluator import GaussianEvaluator, MCPEvaluator
+from service.runtime.local import LocalRun
+from service.runtime.timing import Timing
+
+RANDOM_STEPS = 50
+"""Of an episode of random actions."""
+
+FloatArray = NDArray[np.float32]
+StateArray = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class Round:
+    """A rollout, and the (N, S) states in which Alice began it."""
+
+    start_state: StateArray
+    rollout: Rollout
+
+
+class Rounds:
+    """Plays rounds in a run's worlds with its newest policies, and repeats their physics in worlds of its own.
+
+    Args:
+        run: its game goes on, its learner never hears of it.
+    """
+
+    def __init__(self, run: LocalRun) -> None:
+        self._run = run
+        self._rng = np.random.default_rng(0)
+        self._worlds = WorldBatch(run.config.world, run.config.game.num_worlds, num_threads=run.config.run.num_threads)
+        self.timing = Timing()
+        """Seconds in the policies during all rounds."""
+        self.played: list[Round] = []
+        """The rounds of the last ``play``."""
+
+    def close(self) -> None:
+        """Free the worlds."""
+        self._worlds.close()
+
+    def play(self, seconds: float) -> Sample:
+        """Rounds as the runner plays them, past opponents included, for about ``seconds``."""
+        players = self._players()
+        self.played = []
+        return measure(lambda: self._play_round(players), seconds)
+
+    def repeat(self) -> Sample:
+        """The physics of the rounds just played, each of them once."""
+        return measure(lambda: sum(repeat_physics(self._worlds, each) for each in self.played), 0.0)
+
+    def act_at_random(self, seconds: float) -> Sample:
+        """Physics of an easier kind: every world always acts, at random, from fresh resets."""
+        return measure(self._random_episode, seconds)
+
+    def _players(self) -> Players:
+        weights, pool = self._run.learner.weights(), self._run.generator.opponents
+        return Players(
+            version=weights.version,
+            alice=_Timed(GaussianEvaluator(weights.alice), self.timing),
+            bob=_Timed(MCPEvaluator(weights.bob), self.timing),
+            past_alice=[_Timed(GaussianEvaluator(each), self.timing) for each in pool.alice],
+            past_bob=[_Timed(MCPEvaluator(each), self.timing) for each in pool.bob],
+        )
+
+    def _play_round(self, players: Players) -> int:
+        game, generator = self._run.game, self._run.generator
+        start_state = game.worlds.states.copy()
+        plan = generator.plan(game.worlds.num_worlds, self._rng)
+        rollout = game.play_round(players, plan, partial(generator.choose_goals, plan, rng=self._rng))
+        self.played.append(Round(start_state, rollout))
+        return rollout.num_env_steps
+
+    def _random_episode(self) -> int:
+        self._worlds.reset(self._rng)
+        shape = (RANDOM_STEPS, self._worlds.num_worlds, ACTION_SIZE)
+        for action in self._rng.uniform(-1.0, 1.0, shape).astype(np.float32):
+            self._worlds.step(action)
+        return shape[0] * shape[1]
+
+
+def repeat_physics(worlds: WorldBatch, played: Round) -> int:
+    """Step ``worlds`` through both turns of a round, to the very states in which Bob's turns ended.
+
+    Returns:
+        The env steps made, as many as the round's.
+    """
+    alice, bob = played.rollout.alice, played.rollout.bob
+    worlds.restore(played.start_state)
+    for action in alice.action:
+        worlds.step(action)
+    worlds.restore(played.rollout.records.start_state)
+    for action, active in zip(bob.action, bob.active, strict=True):
+        playing = np.flatnonzero(active)
+        if playing.size:
+            worlds.step(action[playing], playing)
+    return len(alice.action) * worlds.num_worlds + int(bob.active.sum())
+
+
+class _Timed:
+    """Acts as the given policy does, and counts the time."""
+
+    def __init__(self, policy: Acting, timing: Timing) -> None:
+        self._policy, self._timing = policy, timing
+
+    def act(self, observation: FloatArray, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
+        with self._timing("policies"):
+            return self._policy.act(observation, rng)

@@ -1,0 +1,203 @@
+"""The physics: what must be possible in the world is, and what must not be is not."""
+
+import mujoco
+import numpy as np
+import pytest
+
+from benchmarks.world_soak import soak
+from service.config import WorldConfig
+from service.envs import kinematics
+from service.envs.batch import LOWEST_TARGET_M, WorldBatch, sample_in_volume
+from service.envs.observations import MIRROR_ACTION, MIRROR_FULL
+from tests.envs.scripted import CLOSE, OPEN, grasp, place_in_air
+
+FINE = {"physics_step_s": 0.002, "num_substeps": 20}
+COARSE = {"physics_step_s": 0.004, "num_substeps": 10}
+"""The physics of pre-training."""
+
+
+def act(worlds, *action, num_steps=1):
+    """The same action in every world; returns the end effectors' displacement, metres."""
+    before = worlds.ee_position.copy()
+    for _ in range(num_steps):
+        worlds.step(np.tile(np.float32(action), (worlds.num_worlds, 1)))
+    return worlds.ee_position - before
+
+
+def spread_out(worlds, rng, lowest_m=LOWEST_TARGET_M):
+    """Put every arm over a random point of the workspace, at rest, and every object out of its way."""
+    states = worlds.states.copy()
+    target = sample_in_volume(rng, worlds.num_worlds, worlds.config.workspace, 0.05, lowest_m=lowest_m)
+    neutral = np.tile(kinematics.NEUTRAL_JOINTS, (worlds.num_worlds, 1))
+    states[:, 1:8] = kinematics.solve(neutral, target, num_iterations=60)
+    states[:, 10] = -0.75
+    worlds.restore(states)
+
+
+@pytest.mark.parametrize(
+    ("shape", "physics", "num_worlds", "least_share"),
+    [("cube", FINE, 500, 0.99), ("cube", COARSE, 250, 0.99), ("sphere", FINE, 250, 0.95), ("sphere", COARSE, 250, 0.95)],
+    ids=["cube", "cube-coarse", "sphere", "sphere-coarse"],
+)
+def test_pick_and_place_in_the_air_and_hold(shape, physics, num_worlds, least_share):
+    placement = place_in_air(WorldConfig(object=shape, **physics), num_worlds, seed=0)
+    assert placement.grasped.mean() >= least_share
+    arrived = placement.distance_m < 0.01
+    assert arrived.mean() >= least_share
+    held = arrived & (placement.distance_after_hold_m < 0.01) & (placement.slip_m <= 0.005)
+    assert held.mean() >= least_share
+
+
+@pytest.mark.parametrize("physics", [FINE, COARSE], ids=["fine", "coarse"])
+@pytest.mark.parametrize("shape", ["cube", "sphere"])
+def test_an_object_at_rest_stays(shape, physics):
+    with WorldBatch(WorldConfig(object=shape, **physics), 4) as worlds:
+        worlds.reset(np.random.default_rng(0))
+        before = worlds.object_position.copy()
+        furthest = 0.0
+        for _ in range(250):
+            act(worlds, 0, 0, 0, 0)
+            furthest = max(furthest, np.linalg.norm(worlds.object_position - before, axis=1).max())
+        assert furthest < 1e-3
+
+
+@pytest.mark.parametrize(
+    ("shape", "physics", "num_steps"),
+    [("cube", FINE, 100), ("cube", COARSE, 200), ("sphere", COARSE, 200)],
+    ids=["cube", "cube-coarse", "sphere-coarse"],
+)
+def test_rough_play_breaks_nothing(shape, physics, num_steps):
+    extremes = soak(WorldConfig(object=shape, **physics), num_worlds=201, num_steps=num_steps, seed=0)
+    assert extremes.num_broken == 0
+    assert extremes.contact_share > 0.05
+    assert extremes.joint_excess_rad < 1e-3
+    assert extremes.finger_excess_m < 8e-3
+    assert extremes.sunk_m < 5e-3
+
+
+def test_no_action_no_motion():
+    with WorldBatch(WorldConfig(), 50) as worlds:
+        spread_out(worlds, np.random.default_rng(0))
+        drift = np.linalg.norm(act(worlds, 0, 0, 0, 0, num_steps=40), axis=1)
+        assert drift.max() < 0.5e-3
+
+
+@pytest.mark.parametrize("axis", [0, 1, 2])
+@pytest.mark.parametrize("sign", [-1.0, 1.0])
+def test_a_full_action_moves_a_few_centimetres_along_its_axis(axis, sign):
+    action = np.zeros(4)
+    action[axis] = sign
+    with WorldBatch(WorldConfig(start_height_m=0.2), 1) as worlds:
+        from_rest = act(worlds, *action)[0]
+        assert 0.015 < sign * from_rest[axis] < 0.05
+        moving = act(worlds, *action)[0]
+        assert 0.02 < sign * moving[axis] < 0.05
+        across = np.delete(moving, axis)
+        assert np.abs(across).max() < 0.1 * np.abs(moving[axis])
+
+
+def test_actions_count_from_where_the_end_effector_is():
+    """An arm that was held back for long does not leap once it is free: no target winds up."""
+    with WorldBatch(WorldConfig(), 1) as worlds:
+        act(worlds, 0, 0, -1, 0, num_steps=40)
+        low = worlds.ee_position[0, 2]
+        assert low > LOWEST_TARGET_M - 0.002
+        assert act(worlds, 0, 0, 1, 0)[0, 2] > 0.015
+
+
+def test_fingers_open_and_close():
+    with WorldBatch(WorldConfig(), 1) as worlds:
+        fingers = [worlds.positions()[0, 3:5].copy()]
+        for grip in (CLOSE, CLOSE, OPEN, OPEN, OPEN):
+            act(worlds, 0, 0, 0, grip)
+            fingers.append(worlds.positions()[0, 3:5].copy())
+    start, _, closed, _, _, opened = fingers
+    np.testing.assert_allclose(start, 0.04, rtol=0, atol=1e-6)
+    np.testing.assert_allclose(closed, 0.0, rtol=0, atol=1e-3)
+    np.testing.assert_allclose(opened, 0.04, rtol=0, atol=1e-3)
+
+
+@pytest.mark.parametrize("shape", ["cube", "sphere"])
+def test_both_fingers_feel_what_they_hold(shape):
+    with WorldBatch(WorldConfig(object=shape), 20) as worlds:
+        worlds.reset(np.random.default_rng(0))
+        assert not worlds.contacts().any()
+        grasp(worlds)
+        assert worlds.contacts().all()
+        act(worlds, 0, 0, 0, OPEN, num_steps=3)
+        act(worlds, 0, 0, 1, OPEN, num_steps=5)
+        assert not worlds.contacts().any()
+
+
+def test_each_finger_feels_on_its_own():
+    """The left finger is at y > 0, so a closed gripper that sweeps towards +y touches with the left one only."""
+    with WorldBatch(WorldConfig(), 1) as worlds:
+        states = worlds.states.copy()
+        states[:, 8:10] = 0.0
+        states[:, 10:13] = [-0.05, 0.08, 0.025]
+        worlds.restore(states)
+        act(worlds, 0, 0, -1, -1, num_steps=3)
+        touched = []
+        for _ in range(6):
+            act(worlds, 0, 1, 0, -1)
+            touched.append(worlds.contacts()[0])
+        assert np.array(touched)[:, 0].any()
+        assert not np.array(touched)[:, 1].any()
+
+
+def mirror_state(states):
+    """States reflected in y; joints 1, 3, 5 turn about axes in the plane of the mirror, joint 7 is off by the hand's 45 deg."""
+    mirrored = states.copy()
+    joints, fingers, object_y, quaternion, velocity = 1, 8, 11, 13, 17
+    mirrored[:, [joints, joints + 2, joints + 4, object_y, quaternion + 1, quaternion + 3]] *= -1
+    mirrored[:, joints + 6] = np.pi / 2 - states[:, joints + 6]
+    mirrored[:, [fingers, fingers + 1]] = states[:, [fingers + 1, fingers]]
+    # joints 1, 3, 5, 7, then of the object: linear y, angular x and z
+    mirrored[:, [velocity + index for index in (0, 2, 4, 6, 10, 12, 14)]] *= -1
+    mirrored[:, [velocity + 7, velocity + 8]] = states[:, [velocity + 8, velocity + 7]]
+    mirrored[:, [-2, -1]] = states[:, [-1, -2]]
+    return mirrored
+
+
+def make_symmetric(model):
+    """Balls instead of the real links, whose mass is a little off the middle."""
+    for index in range(1, 8):
+        link = model.body(f"link{index}")
+        off_plane = 1 if index % 2 else 2
+        link.ipos[off_plane] = 0.0
+        if index == 7:
+            link.ipos[:2] = 0.0
+        link.iquat[:] = [1.0, 0.0, 0.0, 0.0]
+        link.inertia[:] = link.inertia.mean()
+    mujoco.mj_setConst(model, mujoco.MjData(model))
+
+
+def mirrored_runs(symmetric, num_steps):
+    """Largest difference of (22,) between a run's reflection and the run of the reflection, after each step: (T, 22)."""
+    rng = np.random.default_rng(0)
+    with WorldBatch(WorldConfig(), 40) as worlds, WorldBatch(WorldConfig(), 40) as reflected:
+        if symmetric:
+            make_symmetric(worlds.model)
+            make_symmetric(reflected.model)
+        worlds.reset(rng)
+        reflected.restore(mirror_state(worlds.states))
+        np.testing.assert_array_equal(reflected.full(0.5), MIRROR_FULL(worlds.full(0.5)))
+        differences = []
+        for _ in range(num_steps):
+            actions = rng.uniform(-1.0, 1.0, (40, 4)).astype(np.float32)
+            worlds.step(actions)
+            reflected.step(MIRROR_ACTION(actions))
+            differences.append(np.abs(MIRROR_FULL(worlds.full(0.5)) - reflected.full(0.5)).max(axis=0))
+    return np.array(differences)
+
+
+def test_the_task_has_no_left_and_right():
+    differences = mirrored_runs(symmetric=True, num_steps=10)
+    assert differences[0].max() < 1e-7
+    assert differences[:, :11].max() < 1e-4  # impacts magnify the last bits
+
+
+def test_the_real_links_spoil_the_mirror_by_a_millimetre_a_step():
+    differences = mirrored_runs(symmetric=False, num_steps=3)
+    assert 1e-5 < differences[0, :3].max() < 2e-3
+    assert differences[:, :3].max() < 4e-3

@@ -1,0 +1,127 @@
+"""Whole runs in under a second, with everything in them: valid goals, replayed ones, past opponents, demonstrations.
+
+The object is large and right under the gripper and the success distance is small, so chance moves it often enough.
+"""
+
+import json
+import re
+
+import numpy as np
+import yaml
+
+from service.config import parse_config
+from service.registry.checkpoints import CheckpointStore
+from service.runtime.local import LocalRun
+from service.runtime.rundir import RunDirectory
+
+TREE = {
+    "name": "tiny",
+    "world": {
+        "object_size_m": 0.07,
+        "physics_step_s": 0.004,
+        "num_substeps": 10,
+        "workspace": {"length_x_m": 0.15, "length_y_m": 0.15},
+    },
+    "game": {"num_worlds": 24, "num_goals": 2, "alice_steps": 4, "bob_steps": 4, "success_distance_m": 0.004},
+    "generator": {
+        "past_opponent_fraction": 0.25,
+        "opponent_pool_size": 2,
+        "opponent_interval": 2,
+        "replay_fraction": 0.25,
+        "replay_invalid": True,
+    },
+    "policy": {
+        "alice": {"hidden_sizes": [16]},
+        "value": {"hidden_sizes": [16]},
+        "bob": {
+            "num_primitives": 2,
+            "trunk_hidden_sizes": [16],
+            "primitive_hidden_size": 8,
+            "gate_hidden_sizes": [16],
+        },
+    },
+    "learner": {
+        "mirror": True,
+        "alice": {"minibatch_size": 64},
+        "bob": {"minibatch_size": 64, "num_epochs": 2},
+        "abc": {"num_iterations": 2},
+    },
+    "run": {
+        "total_env_steps": 600,
+        "checkpoint_interval": 2,
+        "evaluation_interval": 0,
+        "evaluation_steps": 2,
+        "evaluation_episodes": 4,
+        "num_threads": 1,
+    },
+}
+
+
+class KilledError(Exception):
+    """Stands for kill -9 inside this process: nothing after it is done."""
+
+
+def tiny_config(**run):
+    """``TREE`` with other values under ``run``; ``seed`` goes to the top."""
+    top = {"seed": run.pop("seed")} if "seed" in run else {}
+    return parse_config(TREE | top | {"run": TREE["run"] | run}, where="a test")
+
+
+def write_yaml(path, tree=TREE):
+    path.write_text(yaml.safe_dump(tree))
+    return path
+
+
+def play(path, config=None, *, resume=False, kill_after=None, on_iteration=None):
+    """Run to the end, or be killed after so many iterations in all; returns the run and how it ended."""
+    directory = RunDirectory(path)
+    run = LocalRun(config or tiny_config(), directory, resume=resume)
+
+    def each(metrics):
+        if on_iteration is not None:
+            on_iteration(run, metrics)
+        if metrics["iteration"] == kill_after:
+            raise KilledError
+
+    try:
+        return run, run.run(each)
+    except KilledError:
+        return run, None
+    finally:
+        directory.close()
+
+
+def newest(path):
+    """The newest checkpoint of a run directory."""
+    return CheckpointStore(path / "checkpoints", keep=1).load_latest()
+
+
+def read_lines(path):
+    return [json.loads(line) for line in path.read_text().splitlines()]
+
+
+def timeless_metrics(path):
+    """metrics.jsonl without what differs from run to run."""
+    rows = read_lines(path / "metrics.jsonl")
+    return [{name: value for name, value in row.items() if not name.startswith("time/")} for row in rows]
+
+
+def assert_same_run(one, other):
+    """Two run directories agree bit for bit: parameters, optimisers, generators, worlds, metrics, goals, config."""
+    left, right = newest(one), newest(other)
+    assert left.step == right.step
+    assert left.arrays.keys() == right.arrays.keys()
+    different = [name for name, array in left.arrays.items() if not np.array_equal(array, right.arrays[name])]
+    assert different == []
+    timeless = [{key: value for key, value in side.meta.items() if key != "wall_s"} for side in (left, right)]
+    assert timeless[0] == timeless[1]
+    assert timeless_metrics(one) == timeless_metrics(other)
+    for name in ("goals.jsonl", "config.yaml"):
+        assert (one / name).read_bytes() == (other / name).read_bytes(), name
+
+
+def assert_one_line(text, *parts):
+    """What a user reads: one line, with all of this in it."""
+    text = str(text)
+    assert "\n" not in text.rstrip("\n")
+    assert [part for part in parts if not re.search(re.escape(str(part)), text)] == [], text

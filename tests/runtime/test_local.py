@@ -1,0 +1,366 @@
+"""The local runner: what an iteration does, when a run ends, and that a resumed run equals one never stopped."""
+
+import errno
+import os
+import random
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from service.errors import TandemError
+from service.registry.errors import CheckpointError
+from service.runtime.local import LocalRun
+from service.runtime.pretrain import resumed_config
+from service.runtime.rundir import RunDirectory
+from tests.runtime.runs import (
+    KilledError,
+    assert_one_line,
+    assert_same_run,
+    newest,
+    play,
+    read_lines,
+    timeless_metrics,
+    tiny_config,
+    write_yaml,
+)
+
+ROOT = Path(__file__).parents[2]
+LONG = {"total_env_steps": 1500}
+"""Long enough for replayed goals, which need 64 in the buffer."""
+
+METRICS = {
+    "iteration", "env_steps", "world/num_broken", "time/wall_s", "time/env_steps_per_s", "time/learn_s",
+    # valid, not moved and out-of-workspace rates, and how the rest ends
+    "alice/valid_fraction", "alice/not_moved_fraction", "alice/outside_fraction", "alice/fallen_fraction",
+    # goal height histogram, lifted at the end
+    "alice/goal_height_table_fraction", "alice/goal_height_low_fraction", "alice/goal_height_middle_fraction",
+    "alice/goal_height_high_fraction", "alice/goal_height_m", "alice/goal_height_p90_m", "alice/goal_distance_m",
+    "alice/lifted_fraction",
+    # finger contact, with one and with both
+    "alice/contact_fraction", "alice/both_contact_fraction",
+    # Bob by goal type, against a past Alice, on replayed goals
+    "bob/success_rate", "bob/success_rate_table", "bob/success_rate_air", "bob/success_rate_past_alice",
+    "bob/success_rate_replayed", "bob/steps_to_success",
+    # ABC samples and their mean log-ratio
+    "learner/num_demonstrations", "learner/demonstration_log_ratio", "learner/demonstration_log_prob",
+    "learner/cloning_loss",
+    # entropy and KL of each update
+    "learner/alice_entropy", "learner/bob_entropy", "learner/alice_kl", "learner/bob_kl",
+    # each primitive's mean weight and share of the precision
+    "learner/primitive_weight_0", "learner/primitive_weight_1", "learner/primitive_share_0", "learner/primitive_share_1",
+    "learner/bob_std",
+    "learner/policy_lag", "learner/version", "learner/non_finite_steps", "learner/rollbacks",
+    "learner/num_alice_samples", "learner/num_bob_samples",
+    "learner/alice_explained_variance", "learner/bob_explained_variance",
+    "learner/alice_learning_rate", "learner/bob_learning_rate", "learner/alice_policy_loss", "learner/bob_policy_loss",
+    "learner/alice_value_loss", "learner/bob_value_loss", "learner/alice_clip_fraction", "learner/bob_clip_fraction",
+    "learner/alice_grad_norm", "learner/bob_grad_norm",
+    "generator/num_cells_seen", "generator/new_cells", "generator/iterations_without_new_cell",
+    "generator/buffer_size", "generator/mean_learnability",
+    "evaluation/table_success_last", "evaluation/table_success_ever",
+    "evaluation/air_success_last", "evaluation/air_success_ever",
+}  # fmt: skip
+"""Names are an API (algorithms.md 6.4, and what else is recorded). Change them here only on purpose."""
+
+
+@pytest.fixture(scope="module")
+def uninterrupted(tmp_path_factory):
+    """A run from start to end."""
+    path = tmp_path_factory.mktemp("uninterrupted")
+    _, result = play(path, tiny_config(**LONG))
+    assert result.reason == "finished"
+    return path
+
+
+def names_in(path):
+    return set().union(*read_lines(path / "metrics.jsonl"))
+
+
+# --- one run ---------------------------------------------------------------------------------------------------------
+
+
+def test_the_tiny_run_is_no_empty_one(uninterrupted):
+    """The comparisons below mean something only if these take part."""
+    names = names_in(uninterrupted)
+    assert {"bob/success_rate_replayed", "bob/success_rate_past_alice", "learner/demonstration_log_ratio"} <= names
+    rows = read_lines(uninterrupted / "metrics.jsonl")
+    assert any(row.get("bob/success_rate", 0.0) > 0.0 for row in rows)
+    assert sum(len(row["goals"]) for row in read_lines(uninterrupted / "goals.jsonl")) > 20
+
+
+def test_iterations_and_env_steps_add_up(uninterrupted):
+    rows = read_lines(uninterrupted / "metrics.jsonl")
+    assert [row["iteration"] for row in rows] == list(range(1, len(rows) + 1))
+    steps = [row["env_steps"] for row in rows]
+    assert steps[-1] >= 1500 > steps[-2]
+    assert newest(uninterrupted).step == len(rows)
+    assert newest(uninterrupted).meta["env_steps"] == steps[-1]
+    alice = 24 * 4  # she always plays on
+    assert all(alice <= after - before <= 2 * alice for before, after in zip([0, *steps], steps, strict=False))
+
+
+def test_policy_lag_is_one(uninterrupted):
+    lags = [row.get("learner/policy_lag") for row in read_lines(uninterrupted / "metrics.jsonl")]
+    assert lags[:2] == [None, 0.0]  # nothing to learn from yet, then both rounds by version 0
+    assert set(lags[2:]) == {1.0}
+    versions = [row.get("learner/version") for row in read_lines(uninterrupted / "metrics.jsonl")]
+    assert versions[1:] == list(range(1, len(versions)))
+
+
+def test_another_seed_is_another_run(uninterrupted, tmp_path):
+    play(tmp_path, tiny_config(seed=1, total_env_steps=200))
+    assert timeless_metrics(tmp_path)[0] != timeless_metrics(uninterrupted)[0]
+
+
+def test_every_metric_is_recorded_under_its_name(tmp_path):
+    """Objects are held up and let go, so that there are goals in the air: Alice's turn ends while they fall."""
+
+    def lift(run, metrics):
+        states = run.game.worlds.states.copy()
+        states[::2, 12] = 0.25
+        run.game.worlds.restore(states)
+
+    play(tmp_path, tiny_config(**LONG, evaluation_interval=4), on_iteration=lift)
+    assert names_in(tmp_path) == METRICS
+
+
+def test_evaluations_come_at_their_interval_and_change_nothing(uninterrupted, tmp_path):
+    play(tmp_path, tiny_config(**LONG, evaluation_interval=3))
+    rows = read_lines(tmp_path / "metrics.jsonl")
+    evaluated = [row["iteration"] for row in rows if "evaluation/table_success_last" in row]
+    assert evaluated == list(range(3, len(rows) + 1, 3))
+    without = [{k: v for k, v in row.items() if not k.startswith("evaluation/")} for row in timeless_metrics(tmp_path)]
+    assert without == timeless_metrics(uninterrupted)
+
+
+def test_a_snapshot_joins_the_pool_every_interval(tmp_path):
+    seen = {}
+
+    def look(run, metrics):
+        seen[run.iteration] = (run.learner.weights().bob, list(run.generator.opponents.bob))
+
+    play(tmp_path, tiny_config(total_env_steps=900), on_iteration=look)
+    assert [len(pool) for _, pool in list(seen.values())[:6]] == [0, 0, 1, 1, 2, 2]
+    # Iteration 3 plays with the weights that iteration 2 left, and they join the pool.
+    weights, pool = seen[2][0], seen[3][1]
+    assert all(np.array_equal(pool[0][name], array) for name, array in weights.items())
+
+
+def test_the_newest_checkpoints_are_kept(tmp_path):
+    _, result = play(tmp_path, tiny_config(keep_checkpoints=2, checkpoint_interval=1))
+    files = sorted(file.name for file in (tmp_path / "checkpoints").iterdir())
+    last = result.iteration
+    assert files == [f"checkpoint-{step:08d}.safetensors" for step in (last - 1, last)]
+
+
+def test_a_run_that_has_converged_ends(tmp_path, monkeypatch):
+    monkeypatch.setattr("service.generator.generator.TaskGenerator.should_stop", lambda self: self._stop._num_iterations == 3)
+    _, result = play(tmp_path, tiny_config(total_env_steps=10**9))
+    assert (result.reason, result.iteration) == ("converged", 3)
+    assert newest(tmp_path).step == 3
+
+
+def test_a_world_whose_physics_breaks_is_counted_and_its_state_kept(tmp_path):
+    class Diverging:
+        def __init__(self, pool):
+            self._pool, self._calls = pool, 0
+
+        def rollout(self, *args, **kwargs):
+            states, sensors = self._pool.rollout(*args, **kwargs)
+            if self._calls == 1:
+                states = states.copy()
+                states[3] = np.nan
+            self._calls += 1
+            return states, sensors
+
+        def close(self):
+            self._pool.close()
+
+    directory = RunDirectory(tmp_path)
+    run = LocalRun(tiny_config(), directory)
+    run.game.worlds._pool = Diverging(run.game.worlds._pool)
+    assert run.run().reason == "finished"
+    directory.close()
+    rows = read_lines(tmp_path / "metrics.jsonl")
+    assert {row["world/num_broken"] for row in rows} == {1.0}
+    assert rows[0]["alice/fallen_fraction"] == pytest.approx(1 / 24)
+    (file,) = (tmp_path / "broken").iterdir()
+    with np.load(file) as dump:
+        assert dump["states"].shape == (1, run.game.worlds.state_size)
+        assert dump["actions"].shape == (1, 4)
+        assert np.isfinite(dump["states"]).all()
+
+
+# --- exact resume ----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("iteration", [3, 4, 9])
+def test_a_run_killed_between_two_iterations(uninterrupted, tmp_path, iteration):
+    config = tiny_config(**LONG)
+    _, result = play(tmp_path, config, kill_after=iteration)
+    assert result is None
+    assert newest(tmp_path).step == (iteration - 1) // 2 * 2  # the one due now had not been written
+    with (tmp_path / "metrics.jsonl").open("ab") as file:
+        file.write(b'{"iteration": 10, "env_st')
+    (tmp_path / "checkpoints" / ".tmp-1-ab").write_bytes(b"half a checkpoint")
+    run, result = play(tmp_path, config, resume=True)
+    assert result.reason == "finished"
+    assert_same_run(tmp_path, uninterrupted)
+    assert run._wall_s > 0.0
+    assert list((tmp_path / "checkpoints").glob(".tmp-*")) == []
+
+
+def test_a_run_killed_before_its_first_checkpoint(uninterrupted, tmp_path):
+    config = tiny_config(**LONG)
+    play(tmp_path, config, kill_after=1)
+    play(tmp_path, config, resume=True)
+    assert_same_run(tmp_path, uninterrupted)
+
+
+def test_a_run_killed_while_it_learns_and_plays(uninterrupted, tmp_path, monkeypatch):
+    """Goals of the iteration are written, its metrics are not."""
+    config, original = tiny_config(**LONG), RunDirectory.record_goals
+
+    def record_goals(self, iteration, *args):
+        original(self, iteration, *args)
+        if iteration == 4:
+            raise KilledError
+
+    with monkeypatch.context() as patch:
+        patch.setattr(RunDirectory, "record_goals", record_goals)
+        assert play(tmp_path, config)[1] is None
+    assert len(read_lines(tmp_path / "goals.jsonl")) == 5
+    play(tmp_path, config, resume=True)
+    assert_same_run(tmp_path, uninterrupted)
+
+
+def test_a_run_killed_with_sigkill_at_a_random_moment(tmp_path):
+    path, delay_s = tmp_path / "killed", random.uniform(0.0, 0.5)  # noqa: S311 - any moment must do
+    arguments = ["--config", write_yaml(tmp_path / "tiny.yaml"), "--run-dir", path, "--registry", tmp_path / "registry"]
+    process = subprocess.Popen(
+        [sys.executable, "-m", "service", "pretrain", *map(str, arguments), "--set", "run.total_env_steps=1_000_000_000"],
+        cwd=ROOT, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE,
+    )  # fmt: skip
+    try:
+        deadline_s = time.monotonic() + 100.0
+        while not list(path.glob("checkpoints/checkpoint-*")):
+            assert process.poll() is None, process.stderr.read().decode()
+            assert time.monotonic() < deadline_s, "no checkpoint after 100 s"
+            time.sleep(0.01)
+        time.sleep(delay_s)
+    finally:
+        process.send_signal(signal.SIGKILL)
+        process.communicate()
+    assert process.returncode == -signal.SIGKILL
+    saved = newest(path)
+    total = saved.meta["env_steps"] + 500
+    config = resumed_config(RunDirectory(path), [f"run.total_env_steps={total}"])
+    play(path, config, resume=True)
+    play(tmp_path / "whole", tiny_config(total_env_steps=total))
+    print(f"killed {delay_s:.3f} s after a first checkpoint, resumed from iteration {saved.step}")
+    assert newest(path).step > saved.step
+    assert_same_run(path, tmp_path / "whole")
+
+
+def test_a_stop_is_saved_and_resumed(uninterrupted, tmp_path):
+    config = tiny_config(**LONG, checkpoint_interval=100)
+
+    def stop(run, metrics):
+        if run.iteration == 5:
+            run.request_stop()
+
+    _, result = play(tmp_path, config, on_iteration=stop)
+    assert (result.reason, result.iteration) == ("interrupted", 5)
+    assert newest(tmp_path).step == 5
+    config = resumed_config(RunDirectory(tmp_path), ["run.checkpoint_interval=2"])
+    play(tmp_path, config, resume=True)
+    assert_same_run(tmp_path, uninterrupted)
+
+
+def test_a_finished_run_goes_on_with_a_larger_budget(uninterrupted, tmp_path):
+    _, result = play(tmp_path, tiny_config(total_env_steps=600))
+    assert result.reason == "finished"
+    config = resumed_config(RunDirectory(tmp_path), ["run.total_env_steps=1500"])
+    run, longer = play(tmp_path, config, resume=True)
+    assert longer.iteration > result.iteration
+    assert_same_run(tmp_path, uninterrupted)
+
+
+def test_a_finished_run_resumed_as_it_is_stays_as_it_is(uninterrupted, tmp_path):
+    shutil.copytree(uninterrupted, tmp_path / "copy")
+    _, result = play(tmp_path / "copy", tiny_config(**LONG), resume=True)
+    assert result.reason == "finished"
+    assert_same_run(tmp_path / "copy", uninterrupted)
+
+
+@pytest.mark.parametrize("damage", ["flip", "cut"])
+def test_a_damaged_newest_checkpoint_is_passed_over(uninterrupted, tmp_path, caplog, damage):
+    path = tmp_path / "copy"
+    shutil.copytree(uninterrupted, path)
+    *_, before, last = sorted((path / "checkpoints").iterdir())
+    data = bytearray(last.read_bytes())
+    data[len(data) // 2] ^= 1
+    last.write_bytes(data if damage == "flip" else data[: len(data) // 2])
+    config, started = tiny_config(**LONG), []
+    play(path, config, resume=True, on_iteration=lambda run, metrics: started.append(run.iteration))
+    assert started[0] == int(before.stem.removeprefix("checkpoint-")) + 1
+    assert last.name in caplog.text
+    assert_same_run(path, uninterrupted)
+
+
+# --- what goes wrong -------------------------------------------------------------------------------------------------
+
+
+def test_resume_where_there_is_no_run(tmp_path):
+    with pytest.raises(CheckpointError) as error:
+        LocalRun(tiny_config(), RunDirectory(tmp_path), resume=True)
+    assert_one_line(error.value, tmp_path, "no checkpoint", "--resume")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_new_run_does_not_touch_an_old_one(uninterrupted, tmp_path):
+    path = tmp_path / "copy"
+    shutil.copytree(uninterrupted, path)
+    before = {file: file.read_bytes() for file in path.rglob("*") if file.is_file()}
+    with pytest.raises(TandemError) as error:
+        LocalRun(tiny_config(seed=5), RunDirectory(path))
+    assert_one_line(error.value, path, "--resume", "--run-dir")
+    assert {file: file.read_bytes() for file in path.rglob("*") if file.is_file()} == before
+
+
+def test_a_full_disk_leaves_the_earlier_checkpoint(uninterrupted, tmp_path, monkeypatch):
+    original = os.write
+
+    def write(descriptor, data):
+        target = os.readlink(f"/proc/self/fd/{descriptor}")
+        if len(data) > 20_000 and (tmp_path / "checkpoints" / "checkpoint-00000002.safetensors").exists():
+            original(descriptor, bytes(data[:1000]))
+            assert str(tmp_path) in target
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        return original(descriptor, data)
+
+    config = tiny_config(**LONG)
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "write", write)
+        with pytest.raises(CheckpointError) as error:
+            play(tmp_path, config)
+    assert_one_line(error.value, "checkpoint-00000004", "No space left", "intact")
+    assert [file.name for file in (tmp_path / "checkpoints").iterdir()] == ["checkpoint-00000002.safetensors"]
+    assert newest(tmp_path).step == 2
+    play(tmp_path, config, resume=True)
+    assert_same_run(tmp_path, uninterrupted)
+
+
+def test_an_error_in_the_learners_thread_reaches_the_caller(tmp_path, monkeypatch):
+    def fail(self):
+        raise TandemError("the learner cannot go on")
+
+    monkeypatch.setattr("service.learner.learner.Learner.update", fail)
+    with pytest.raises(TandemError, match="the learner cannot go on"):
+        play(tmp_path)
