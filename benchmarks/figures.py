@@ -147,15 +147,18 @@ def _points(records: Records, curve: _Curve, end: float) -> Array:
 def _draw_curve(axes: Axes, curve: _Curve, curves: Sequence[Array], end_m: float) -> None:
     """Every run thin and their mean thick, up to ``end_m`` million env steps."""
     middle = (np.arange(NUM_BINS) + 0.5) / NUM_BINS * end_m
-    stacked = np.stack(curves)
-    for each in stacked[: len(curves) if len(curves) > 1 else 0]:
-        known = np.isfinite(each)
-        axes.plot(middle[known], each[known], color=curve.color, linewidth=0.8, alpha=0.4)
-    everywhere = np.isfinite(stacked).all(axis=0)
-    mean = stacked[:, everywhere].mean(axis=0)
-    axes.plot(middle[everywhere], mean, color=curve.color, linewidth=2.2, label=curve.label)
+    lines = np.stack([_joined(middle, each) for each in curves])
+    if len(lines) > 1:
+        axes.plot(middle, lines.T, color=curve.color, linewidth=0.8, alpha=0.4)
+    axes.plot(middle, lines.mean(axis=0), color=curve.color, linewidth=2.2, label=curve.label)
     if curve.level is not None:
         axes.axhline(curve.level, color=curve.color, linewidth=1.0, linestyle=(0, (2, 3)))
+
+
+def _joined(x: Array, y: Array) -> Array:
+    """``y`` with straight lines over its gaps, but NaN before its first value and after its last."""
+    known = np.isfinite(y)
+    return np.interp(x, x[known], y[known], left=np.nan, right=np.nan) if known.any() else y
 
 
 def binned(records: Records, key: str, end: float, num_bins: int = NUM_BINS) -> Array:

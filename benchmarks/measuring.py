@@ -69,6 +69,11 @@ def measure(play: Callable[[], int], seconds: float) -> Sample:
     return watch.sample(num_steps)
 
 
+def total(samples: Sequence[Sample]) -> Sample:
+    """Several stretches of time as one."""
+    return Sample(sum(s.num_steps for s in samples), sum(s.wall_s for s in samples), sum(s.cpu_s for s in samples))
+
+
 def rates(samples: Sequence[Sample]) -> dict[str, Any]:
     """Median rates of one thing that was measured several times, and every single rate."""
     wall, cpu = [s.steps_per_s for s in samples], [s.steps_per_cpu_s for s in samples]

@@ -8,7 +8,7 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.measuring import Sample, measure
+from benchmarks.measuring import Sample, Stopwatch, measure, total
 from service.actors.game import Acting, Players
 from service.actors.rollout import Rollout
 from service.envs.batch import WorldBatch
@@ -46,21 +46,24 @@ class Rounds:
         self.timing = Timing()
         """Seconds in the policies during all rounds."""
         self.played: list[Round] = []
-        """The rounds of the last ``play``."""
+        """The rounds of the last ``play_and_repeat``."""
 
     def close(self) -> None:
         """Free the worlds."""
         self._worlds.close()
 
-    def play(self, seconds: float) -> Sample:
-        """Rounds as the runner plays them, past opponents included, for about ``seconds``."""
-        players = self._players()
-        self.played = []
-        return measure(lambda: self._play_round(players), seconds)
+    def play_and_repeat(self, seconds: float) -> tuple[Sample, Sample]:
+        """Rounds as the runner plays them, past opponents included, and after each its physics once more.
 
-    def repeat(self) -> Sample:
-        """The physics of the rounds just played, each of them once."""
-        return measure(lambda: sum(repeat_physics(self._worlds, each) for each in self.played), 0.0)
+        Returns:
+            What the rounds took, and what their physics alone took; both together take about ``seconds``.
+        """
+        players, watch = self._players(), Stopwatch()
+        self.played, whole, bare = [], [], []
+        while not self.played or watch.wall_s() < seconds:
+            whole.append(measure(lambda: self._play_round(players), 0.0))
+            bare.append(measure(lambda: repeat_physics(self._worlds, self.played[-1]), 0.0))
+        return total(whole), total(bare)
 
     def act_at_random(self, seconds: float) -> Sample:
         """Physics of an easier kind: every world always acts, at random, from fresh resets."""

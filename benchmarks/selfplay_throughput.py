@@ -1,9 +1,9 @@
 """What self-play costs on top of its physics: the bare world, rounds with policies, and the whole loop, in turn.
 
 All three make physics of the same kind. Some iterations of the whole loop, learning included, are followed by rounds
-without learning under the newest policies; the bare world then starts from the states of those rounds and repeats their
-actions, bit for bit, because an arm that touches nothing is faster. Beside it stands the same batch under random
-actions, every world always acting.
+without learning under the newest policies. After each round the bare world starts from the states of that round and
+repeats its actions, bit for bit, because an arm that touches nothing is faster. Beside it stands the same batch under
+random actions, every world always acting.
 
 With ``--run-dir`` all of it goes on from the newest checkpoint of that run, in a copy: its policies have learned to
 touch the object.
@@ -27,7 +27,18 @@ from typing import Any
 os.environ.update(dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1"))
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
-from benchmarks.measuring import Sample, Stopwatch, describe, describe_ratio, machine, rates, ratio, table, write_json
+from benchmarks.measuring import (
+    Sample,
+    Stopwatch,
+    describe,
+    describe_ratio,
+    machine,
+    rates,
+    ratio,
+    table,
+    total,
+    write_json,
+)
 from benchmarks.rounds import Rounds
 from service.config import Config, dump_config, load_config
 from service.errors import TandemError
@@ -54,8 +65,8 @@ class Settings:
     """How much is measured."""
 
     num_pairs: int = 5
-    seconds: float = 8.0
-    """Of each measurement of the rollout and of the bare world."""
+    seconds: float = 12.0
+    """Of each measurement of rounds and, after each round, its physics; half as long for random actions."""
     num_iterations: int = 20
     """Of each measurement of the whole loop; 20 hold one evaluation and one checkpoint, as the rest of a run does."""
     num_warmup_iterations: int = 12
@@ -119,20 +130,19 @@ class Comparison:
     def _measure_others(self) -> None:
         watch, seconds = Stopwatch(), self._settings.seconds
         self._loop_timing = dict(self._run.timing.seconds)
-        self.samples[ROLLOUT].append(self._rounds.play(seconds))
-        self.samples[BARE].append(self._rounds.repeat())
-        self.samples[BARE_RANDOM].append(self._rounds.act_at_random(seconds))
+        whole, bare = self._rounds.play_and_repeat(seconds)
+        self.samples[ROLLOUT].append(whole)
+        self.samples[BARE].append(bare)
+        self.samples[BARE_RANDOM].append(self._rounds.act_at_random(seconds / 2))
         self._contact += [each.rollout.metrics["alice/contact_fraction"] for each in self._rounds.played]
         if len(self.samples[LOOP]) == self._settings.num_pairs:
             self._run.request_stop()
         self._run.timing.seconds["record"] -= watch.wall_s()  # this is called within that section
 
     def _rollout_timing(self) -> dict[str, float]:
-        """The rounds' seconds; those of the physics are what it took to repeat it."""
-        rollout, bare = self.samples[ROLLOUT], self.samples[BARE]
-        total = sum(sample.wall_s for sample in rollout)
-        physics = sum(a.num_steps / b.steps_per_s for a, b in zip(rollout, bare, strict=True))
-        return {"total": total, "physics": physics, **self._rounds.timing.seconds}
+        """Seconds of all rounds; those of their physics are what repeating it took."""
+        whole, bare = total(self.samples[ROLLOUT]), total(self.samples[BARE])
+        return {"total": whole.wall_s, "physics": bare.wall_s, **self._rounds.timing.seconds}
 
 
 def compare(config: Config, directory: Path, settings: Settings, *, resume: bool = False) -> dict[str, Any]:
@@ -193,11 +203,10 @@ def copy_run(source: RunDirectory, target: Path) -> Config:
 
 def tree(seconds: dict[str, float]) -> str:
     """``total`` and its parts as lines; ``other`` is what no part accounts for."""
-    total = seconds["total"]
     parts = {name: spent for name, spent in seconds.items() if name != "total"}
-    parts["other"] = total - sum(parts.values())
-    lines = [f"  {name:<18}{spent:8.1f} s {100 * spent / total:5.1f} %" for name, spent in parts.items()]
-    return "\n".join([f"{'total':<20}{total:8.1f} s", *lines])
+    parts["other"] = seconds["total"] - sum(parts.values())
+    lines = [f"  {name:<18}{spent:8.1f} s {100 * spent / seconds['total']:5.1f} %" for name, spent in parts.items()]
+    return "\n".join([f"{'total':<20}{seconds['total']:8.1f} s", *lines])
 
 
 def report(result: dict[str, Any]) -> str:
@@ -221,9 +230,8 @@ def benchmark(config: Config, run_dir: Path | None, settings: Settings) -> dict[
         directory = Path(scratch) / "run"
         if run_dir is not None:
             config = copy_run(RunDirectory(run_dir), directory)
-        start_s = first_update_s(config, Path(scratch) / "start")
         result = compare(config, directory, settings, resume=run_dir is not None)
-    return {"start_to_first_update_s": start_s, **result}
+        return {**result, "start_to_first_update_s": first_update_s(config, Path(scratch) / "start")}
 
 
 def main() -> int:
@@ -250,7 +258,7 @@ def _parser() -> argparse.ArgumentParser:
     add("--config", type=Path, metavar="FILE", default=ROOT / "configs" / "pretrain" / "panda_cube.yaml")
     add("--run-dir", type=Path, metavar="DIR", help="go on from this run, with its configuration")
     add("--pairs", type=int, default=shown.num_pairs, help="measurements of each (default: %(default)s)")
-    add("--seconds", type=float, default=shown.seconds, help="of rollout and bare world (default: %(default)s)")
+    add("--seconds", type=float, default=shown.seconds, help="of rounds and their physics (default: %(default)s)")
     add("--iterations", type=int, default=shown.num_iterations, help="of the whole loop (default: %(default)s)")
     add("--warmup", type=int, default=shown.num_warmup_iterations, help="iterations, at least 1 (default: %(default)s)")
     add("--json", type=Path, metavar="FILE", help="write everything measured")

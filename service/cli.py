@@ -170,23 +170,36 @@ def coverage(
 
 @app.command()
 def render(
-    run_dir: Annotated[Path, typer.Argument(metavar="RUN_DIR", help="A run with a checkpoint.")],
-    rounds: Annotated[int, typer.Option(help="Rounds to film.", min=1)] = 4,
+    primitives: _Primitives,
+    episodes: Annotated[int, typer.Option(help="Rounds, or episodes, to film.", min=1)] = 4,
     seed: _Seed = 0,
-    out: Annotated[Path | None, typer.Option(metavar="FILE", help="Default: RUN_DIR/rounds.mp4.")] = None,
+    out: Annotated[Path, typer.Option(metavar="FILE", help="Video to write.")] = Path("video.mp4"),
+    registry: _Registry = Path("registry"),
 ) -> None:
-    """Film Alice's proposals beside Bob's attempts."""
+    """Film a run's Alice beside its Bob, or published primitives on random goals."""
     with _user_errors():
-        from service.runtime.primitives import load_players
+        from service.runtime import video
+        from service.runtime.primitives import load_bob, load_players
         from service.runtime.rundir import RunDirectory
-        from service.runtime.video import film_rounds, write_video
 
-        directory = RunDirectory(run_dir)
-        config = directory.read_config()
-        alice, bob = load_players(directory)
-        takes = film_rounds(config, alice, bob, num_rounds=rounds, seed=seed)
-        video = write_video(takes, config.world, out or run_dir / "rounds.mp4")
-    _console.print(f"video: {video}", highlight=False)
+        if Path(primitives).is_dir():
+            directory = RunDirectory(Path(primitives))
+            config = directory.read_config()
+            takes = video.film_rounds(config, *load_players(directory), num_rounds=episodes, seed=seed)
+            video.write_video(takes, config.world, out)
+        else:
+            bob = load_bob(primitives, registry)
+            filmed = video.film_episodes(
+                bob.policy,
+                bob.config.world,
+                "mixed",
+                num_episodes=episodes,
+                num_steps=bob.config.run.evaluation_steps,
+                success_distance_m=bob.config.game.success_distance_m,
+                seed=seed,
+            )
+            video.write_episode_video(filmed, bob.config.world, out)
+    _console.print(f"video: {out}", highlight=False)
 
 
 def main() -> None:

@@ -154,6 +154,9 @@ class ABCConfig(_Frozen):
     weight: float = Field(0.5, ge=0.0, description="beta")
     clip: float = Field(0.2, gt=0.0, lt=1.0, description="epsilon")
     num_iterations: int = Field(1, ge=1, description="demonstrations of that many iterations are kept; 1 is on-policy")
+    mean_only: bool = Field(
+        False, description="clone Alice's actions by Bob's mean and leave his std alone, or he also copies her noise"
+    )
 
 
 class LearnerConfig(_Frozen):

@@ -35,8 +35,8 @@ class WorldBatch:
     """N independent worlds with one flat state each.
 
     The state of a world is MuJoCo's full physics state followed by the two finger-contact flags of the last action. A
-    world is a pure function of (state, action), because each action starts the constraint solver cold: saving is copying
-    rows of ``states``, restoring is ``restore``, and the continuation is bit-identical.
+    world is a pure function of (state, action), because each action starts the constraint solver cold: saving is
+    copying rows of ``states``, restoring is ``restore``, and the continuation is bit-identical.
 
     Args:
         config: the world.

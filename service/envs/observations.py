@@ -5,7 +5,7 @@ Positions are metres in the world frame (origin: table top, 0.6 m in front of th
 | vector | size | content |
 |---|---|---|
 | positions | 11 | end effector 3, fingers 2 (left, right), object 3, object relative to end effector 3 |
-| full | 22 | positions 11; velocities of end effector 3, fingers 2, object 3; finger contacts 2; elapsed share of the turn |
+| full | 22 | positions 11; velocities of end effector 3, fingers 2, object 3; finger contacts 2; share of turn |
 | bob | 14 | positions 11, goal 3 |
 | bob value | 27 | full without the elapsed share 21, goal 3, goal relative to object 3 |
 

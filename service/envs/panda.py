@@ -1,9 +1,9 @@
 """The Franka Emika Panda with its parallel gripper, built in code from published numbers.
 
 Kinematics, joint limits, torque limits: Franka documentation (modified DH parameters). Link masses and inertias:
-identified by Gaz et al. 2019, as used by franka_ros. Position gains follow the MuJoCo Menagerie model, whose damping is
-halved here so that a full action moves the end effector about 3 cm in one 40 ms step. The geometry is our own: primitive
-shapes for collision on the gripper only (a gripper that points down keeps the arm off the table).
+identified by Gaz et al. 2019, as used by franka_ros. Position gains follow the MuJoCo Menagerie model, whose damping
+is halved here so that a full action moves the end effector about 3 cm in one 40 ms step. The geometry is our own:
+primitive shapes for collision on the gripper only (a gripper that points down keeps the arm off the table).
 """
 
 from __future__ import annotations

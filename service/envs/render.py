@@ -146,8 +146,8 @@ def _build_model(config: WorldConfig, width: int, height: int) -> mujoco.MjModel
     decorate(spec, config)
     spec.visual.global_.offwidth, spec.visual.global_.offheight = width, height
     spec.visual.quality.offsamples = _NUM_SAMPLES
-    # Without a graphics card the shadow map is a third of the work; in a small picture nobody sees its pixels.
-    spec.visual.quality.shadowsize = 1024 if height <= 480 else 2048
+    # Without a graphics card the shadow map is a third of the work; twice the picture's size is enough for it.
+    spec.visual.quality.shadowsize = int(np.clip(2 ** np.ceil(np.log2(2 * height)), 256, 2048))
     return spec.compile()
 
 

@@ -106,10 +106,13 @@ def _policy_loss(
     rows = [part for part in (samples, cloning) if part is not None]
     action = torch.cat([part.action for part in rows])
     mean, std = player.policy(torch.cat([part.observation for part in rows]))
-    log_prob = gaussian.log_prob(action, mean, std)
-    loss, terms, num_samples = log_prob.new_zeros(()), Terms(), 0
+    num_samples = 0 if samples is None else len(samples)
+    # Alice's noise is not part of what she demonstrates: her actions pull Bob's mean, and leave his std to PPO.
+    learned_std = torch.cat((std[:num_samples], std[num_samples:].detach())) if abc.mean_only else std
+    log_prob = gaussian.log_prob(action, mean, learned_std)
+    loss, terms = log_prob.new_zeros(()), Terms()
     if samples is not None:
-        config, num_samples = player.config, len(samples)
+        config = player.config
         pair = log_prob[:num_samples], samples.old_log_prob
         surrogate, clip_fraction = losses.clipped_surrogate(*pair, samples.advantage, config.clip, config.dual_clip)
         entropy = gaussian.entropy(std[:num_samples]).mean()

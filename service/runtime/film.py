@@ -104,7 +104,7 @@ def film_episodes(
 def _propose(config: Config, alice: Acting, num_rounds: int, rng: np.random.Generator) -> _Proposals:
     """Let Alice play batches of turns until enough are valid, or a few batches are over."""
     turns: list[_Proposals] = []
-    with WorldBatch(config.world, max(_NUM_WORLDS, num_rounds)) as worlds:
+    with WorldBatch(config.world, max(_NUM_WORLDS, num_rounds), num_threads=config.run.num_threads) as worlds:
         for _ in range(_MAX_BATCHES):
             turns.append(_play_alice(config, alice, worlds, rng))
             if sum(int((turn.verdict == Verdict.VALID).sum()) for turn in turns) >= num_rounds:
@@ -142,7 +142,7 @@ def _answer(config: Config, bob: Deterministic, proposals: _Proposals) -> list[T
     """Let Bob try the valid ones, all at once."""
     game, num = config.game, len(proposals.verdict)
     num_steps, solved = np.zeros(num, dtype=np.int64), np.zeros(num, dtype=bool)
-    with WorldBatch(config.world, num) as worlds:
+    with WorldBatch(config.world, num, num_threads=config.run.num_threads) as worlds:
         worlds.restore(proposals.states[:, 0])
         states = [worlds.states.copy()]
         playing = proposals.verdict == Verdict.VALID

@@ -7,8 +7,11 @@ machine's video shows every second state only.
 from __future__ import annotations
 
 import contextlib
+import errno
 import functools
+import itertools
 import os
+import subprocess
 import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -217,21 +220,31 @@ def _encode(frames: Iterator[Image], path: Path, *, fps: float) -> Path:
 
 
 def _run_ffmpeg(frames: Iterator[Image], path: Path, fps: float) -> None:
+    first = next(frames)
+    height, width = first.shape[:2]
+    command = [
+        _ffmpeg(), "-y", "-loglevel", "error", "-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{width}x{height}",
+        "-r", f"{fps:g}", "-i", "pipe:", "-c:v", "libx264", "-pix_fmt", "yuv420p", "-crf", "21", "-preset", "veryfast",
+        "-movflags", "+faststart", "-f", "mp4", str(path),
+    ]  # fmt: skip
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stderr=subprocess.PIPE) as ffmpeg:
+        assert ffmpeg.stdin is not None
+        try:
+            with contextlib.suppress(BrokenPipeError):  # it stopped early; its exit status and words follow
+                for frame in itertools.chain([first], frames):
+                    ffmpeg.stdin.write(frame.tobytes())
+            words = ffmpeg.communicate()[1].decode(errors="replace").strip()
+        except BaseException:
+            ffmpeg.kill()
+            raise
+    if ffmpeg.returncode:
+        raise OSError(errno.EIO, f"ffmpeg says {words.splitlines()[-1] if words else ffmpeg.returncode!r}")
+
+
+def _ffmpeg() -> str:
     import imageio_ffmpeg
 
     try:
-        imageio_ffmpeg.get_ffmpeg_exe()
+        return str(imageio_ffmpeg.get_ffmpeg_exe())
     except RuntimeError:
         raise RenderError("cannot write a video: there is no ffmpeg; install it (apt-get install ffmpeg)") from None
-    first = next(frames)
-    height, width = first.shape[:2]
-    writer = imageio_ffmpeg.write_frames(
-        str(path), (width, height), fps=fps, codec="libx264", quality=None, macro_block_size=2,
-        ffmpeg_log_level="error",
-        output_params=["-f", "mp4", "-crf", "21", "-preset", "veryfast", "-movflags", "+faststart"],
-    )  # fmt: skip
-    with contextlib.closing(writer):
-        writer.send(None)
-        writer.send(first)
-        for frame in frames:
-            writer.send(frame)

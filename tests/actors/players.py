@@ -1,4 +1,4 @@
-"""Scripted players, and starts whose outcome is known: an object that slides, falls off the table or stays where it is."""
+"""Scripted players, and starts whose outcome is known: an object that slides, falls off the table or stays."""
 
 from dataclasses import dataclass, fields
 

@@ -109,8 +109,8 @@ def idle_floor(kind, num=400_000):
 
 
 def test_the_idle_floor_is_the_analytic_one():
-    # algorithms.md 7.4: 0.057 on 35 x 35 cm, 0.021 for the mixture. By hand, with r = d / L and neglecting nothing:
-    # P(|a - b| <= d) in a square of edge L = pi r^2 - 8/3 r^3 + r^4 / 2.
+    # algorithms.md 7.4: 0.057 on 35 x 35 cm, 0.021 for the mixture. Two random points of a square of edge L are
+    # within d of each other with probability pi r^2 - 8/3 r^3 + r^4 / 2, r = d / L.
     ratio = DISTANCE_M / 0.35
     exact = math.pi * ratio**2 - 8 / 3 * ratio**3 + ratio**4 / 2
     assert abs(exact - 0.057) < 5e-4
@@ -123,7 +123,8 @@ def test_the_idle_floor_is_the_analytic_one():
 
 
 @pytest.mark.parametrize(
-    ("successes", "low", "high"), [(25, 0.38, 0.66), (40, 0.70, 0.91), (45, 0.83, 0.98), (44, 0.80, 0.97), (47, 0.89, 1.0)]
+    ("successes", "low", "high"),
+    [(25, 0.38, 0.66), (40, 0.70, 0.91), (45, 0.83, 0.98), (44, 0.80, 0.97), (47, 0.89, 1.0)],
 )
 def test_wilson_interval_of_48_episodes(successes, low, high):
     # algorithms.md 0.3

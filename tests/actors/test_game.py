@@ -1,4 +1,4 @@
-"""The game, played by scripts: whose outcome is known, so verdicts, rewards and demonstrations can be checked by hand."""
+"""The game, played by scripts with a known outcome: verdicts, rewards and demonstrations are checked by hand."""
 
 import numpy as np
 import pytest
@@ -206,9 +206,7 @@ def test_past_opponents_play_their_worlds_and_are_not_learned_from():
     plan = RoundPlan(alice_opponent=np.array([-1, 1, 0, -1, -1]), bob_opponent=np.array([-1, -1, -1, 0, 1]))
     game = make_game(make_config(5), [SLIDES] * 5)
     past_alice, past_bob = [Constant(mark=-1.0), Constant(mark=-2.0)], [Constant(mark=-5.0), Constant(mark=-6.0)]
-    rollout = play(
-        game, Constant(mark=-3.0), Constant(mark=-4.0), plan=plan, past_alice=past_alice, past_bob=past_bob
-    )
+    rollout = play(game, Constant(mark=-3.0), Constant(mark=-4.0), plan=plan, past_alice=past_alice, past_bob=past_bob)
     assert (rollout.alice.log_prob == [-3.0, -2.0, -1.0, -3.0, -3.0]).all()
     assert rollout.bob.log_prob[0].tolist() == [-4.0, -4.0, -4.0, -5.0, -6.0]
     assert rollout.alice.learn.tolist() == [True, False, False, True, True]
@@ -420,7 +418,7 @@ def test_a_broken_world_is_reported_with_state_and_action_once():
 
 
 def test_numbers_too_large_to_be_physics_are_broken_too():
-    """MuJoCo's automatic reset is off: an arm that explodes is finite for some steps, its joints at thousands of turns."""
+    """MuJoCo's automatic reset is off: an arm that explodes stays finite for some steps, thousands of turns away."""
     game = make_game(make_config(2, game={"alice_steps": 1}), [AT_REST, AT_REST])
     states = game.worlds.states.copy()
     states[0, JOINT_VELOCITIES] = 1e4

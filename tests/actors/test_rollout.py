@@ -2,8 +2,6 @@
 
 from dataclasses import fields, replace
 
-import numpy as np
-
 from service.actors.rollout import Demonstrations, GoalRecords, Rollout, Turns, from_arrays, to_arrays
 from service.registry import tensors
 from tests.actors.players import AT_REST, IN_FRONT, SLIDES, Pusher, assert_same_rollout, make_config, make_game, play

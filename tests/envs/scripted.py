@@ -1,4 +1,4 @@
-"""A hand-written pick-and-place for many worlds at once: what the world must make possible before anything can learn it."""
+"""A hand-written pick-and-place for many worlds: what must be possible before anything can learn it."""
 
 from dataclasses import dataclass
 

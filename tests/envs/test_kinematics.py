@@ -4,7 +4,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from service.config import WorldConfig, WorkspaceConfig
+from service.config import WorkspaceConfig, WorldConfig
 from service.envs import kinematics
 from service.envs.batch import DISPLACEMENT_M, LOWEST_TARGET_M, sample_in_volume
 from service.envs.panda import BASE_POSITION, JOINT_LOWER, JOINT_UPPER
@@ -107,7 +107,9 @@ def assert_reached(joints, target, tolerance_m):
     assert np.linalg.norm(found.position - target, axis=1).max() < tolerance_m
     tilt = np.arccos(np.clip(-found.rotation[:, 2, 2], -1.0, 1.0))
     assert np.degrees(tilt.max()) < 0.5
-    np.testing.assert_allclose(found.rotation, np.broadcast_to(kinematics.DOWN, found.rotation.shape), rtol=0, atol=0.01)
+    np.testing.assert_allclose(
+        found.rotation, np.broadcast_to(kinematics.DOWN, found.rotation.shape), rtol=0, atol=0.01
+    )
     assert (joints > JOINT_LOWER).all()
     assert (joints < JOINT_UPPER).all()
 

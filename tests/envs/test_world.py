@@ -36,7 +36,12 @@ def spread_out(worlds, rng, lowest_m=LOWEST_TARGET_M):
 
 @pytest.mark.parametrize(
     ("shape", "physics", "num_worlds", "least_share"),
-    [("cube", FINE, 500, 0.99), ("cube", COARSE, 250, 0.99), ("sphere", FINE, 250, 0.95), ("sphere", COARSE, 250, 0.95)],
+    [
+        ("cube", FINE, 500, 0.99),
+        ("cube", COARSE, 150, 0.99),
+        ("sphere", FINE, 200, 0.95),
+        ("sphere", COARSE, 100, 0.95),
+    ],
     ids=["cube", "cube-coarse", "sphere", "sphere-coarse"],
 )
 def test_pick_and_place_in_the_air_and_hold(shape, physics, num_worlds, least_share):
@@ -63,7 +68,7 @@ def test_an_object_at_rest_stays(shape, physics):
 
 @pytest.mark.parametrize(
     ("shape", "physics", "num_steps"),
-    [("cube", FINE, 100), ("cube", COARSE, 200), ("sphere", COARSE, 200)],
+    [("cube", FINE, 60), ("cube", COARSE, 100), ("sphere", COARSE, 100)],
     ids=["cube", "cube-coarse", "sphere-coarse"],
 )
 def test_rough_play_breaks_nothing(shape, physics, num_steps):
@@ -97,12 +102,12 @@ def test_a_full_action_moves_a_few_centimetres_along_its_axis(axis, sign):
 
 
 def test_actions_count_from_where_the_end_effector_is():
-    """An arm that was held back for long does not leap once it is free: no target winds up."""
+    """An arm that was held at the table for long comes up at once: no target winds up."""
     with WorldBatch(WorldConfig(), 1) as worlds:
         act(worlds, 0, 0, -1, 0, num_steps=40)
         low = worlds.ee_position[0, 2]
         assert low > LOWEST_TARGET_M - 0.002
-        assert act(worlds, 0, 0, 1, 0)[0, 2] > 0.015
+        assert act(worlds, 0, 0, 1, 0)[0, 2] > 0.01
 
 
 def test_fingers_open_and_close():
@@ -130,7 +135,7 @@ def test_both_fingers_feel_what_they_hold(shape):
 
 
 def test_each_finger_feels_on_its_own():
-    """The left finger is at y > 0, so a closed gripper that sweeps towards +y touches with the left one only."""
+    """The right finger is at y > 0, so a closed gripper that sweeps towards +y touches with the right one only."""
     with WorldBatch(WorldConfig(), 1) as worlds:
         states = worlds.states.copy()
         states[:, 8:10] = 0.0
@@ -141,12 +146,12 @@ def test_each_finger_feels_on_its_own():
         for _ in range(6):
             act(worlds, 0, 1, 0, -1)
             touched.append(worlds.contacts()[0])
-        assert np.array(touched)[:, 0].any()
-        assert not np.array(touched)[:, 1].any()
+        assert np.array(touched)[:, 1].any()
+        assert not np.array(touched)[:, 0].any()
 
 
 def mirror_state(states):
-    """States reflected in y; joints 1, 3, 5 turn about axes in the plane of the mirror, joint 7 is off by the hand's 45 deg."""
+    """States reflected in y; joints 1, 3, 5 and 7 turn about axes in the mirror, the hand is 45 deg off joint 7."""
     mirrored = states.copy()
     joints, fingers, object_y, quaternion, velocity = 1, 8, 11, 13, 17
     mirrored[:, [joints, joints + 2, joints + 4, object_y, quaternion + 1, quaternion + 3]] *= -1
@@ -173,7 +178,7 @@ def make_symmetric(model):
 
 
 def mirrored_runs(symmetric, num_steps):
-    """Largest difference of (22,) between a run's reflection and the run of the reflection, after each step: (T, 22)."""
+    """(T, 22) largest differences between a run's reflection and the run of its reflection, after each step."""
     rng = np.random.default_rng(0)
     with WorldBatch(WorldConfig(), 40) as worlds, WorldBatch(WorldConfig(), 40) as reflected:
         if symmetric:

@@ -5,6 +5,9 @@ The object is large and right under the gripper and the success distance is smal
 
 import json
 import re
+import subprocess
+import sys
+from pathlib import Path
 
 import numpy as np
 import yaml
@@ -14,6 +17,7 @@ from service.registry.checkpoints import CheckpointStore
 from service.runtime.local import LocalRun
 from service.runtime.rundir import RunDirectory
 
+ROOT = Path(__file__).parents[2]
 TREE = {
     "name": "tiny",
     "world": {
@@ -89,6 +93,21 @@ def play(path, config=None, *, resume=False, kill_after=None, on_iteration=None)
         return run, None
     finally:
         directory.close()
+
+
+def start_endless_run(home):
+    """A real ``tandem pretrain`` of ``TREE`` that ends only by a signal; returns the process and its run directory."""
+    paths = {"--config": write_yaml(home / "tiny.yaml"), "--run-dir": home / "run", "--registry": home / "registry"}
+    arguments = [part for pair in paths.items() for part in map(str, pair)]
+    endless = ("--set", "run.total_env_steps=1_000_000_000")
+    process = subprocess.Popen(
+        [sys.executable, "-m", "service", "pretrain", *arguments, *endless],
+        cwd=ROOT,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    return process, home / "run"
 
 
 def newest(path):

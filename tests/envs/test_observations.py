@@ -1,0 +1,145 @@
+"""The layouts, number by number."""
+
+import numpy as np
+import pytest
+
+from service.config import WorldConfig
+from service.envs import kinematics, observations
+from service.envs.batch import WorldBatch
+
+GOALS = np.array([[0.1, 0.05, 0.3], [-0.1, -0.2, 0.025]])
+ACTION = [1, 2, 3, 4]
+POSITIONS = [1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11]
+MIRRORED_POSITIONS = [1, -2, 3, 5, 4, 6, -7, 8, 9, -10, 11]
+PRIVILEGED = [12, 13, 14, 15, 16, 17, 18, 19, 20, 21]
+MIRRORED_PRIVILEGED = [12, -13, 14, 16, 15, 17, -18, 19, 21, 20]
+
+
+@pytest.fixture(scope="module")
+def worlds():
+    """Two worlds in made-up states: every number that is observed is its own."""
+    with WorldBatch(WorldConfig(), 2, num_threads=1) as batch:
+        states = batch.states.copy()
+        # time 1, joints 7, fingers 2, object 3, its quaternion 4; velocities: joints 7, fingers 2, object 6; contacts 2
+        states[:, 1:8] += np.linspace(-0.2, 0.2, 14).reshape(2, 7)
+        states[:, 8:10] = [[0.011, 0.012], [0.013, 0.014]]
+        states[:, 10:13] = [[0.2, -0.1, 0.3], [-0.15, 0.12, 0.025]]
+        states[:, 17:24] = np.linspace(-1.0, 1.0, 14).reshape(2, 7)
+        states[:, 24:26] = [[0.21, 0.22], [0.23, 0.24]]
+        states[:, 26:29] = [[0.5, 0.6, 0.7], [-0.5, -0.6, -0.7]]
+        states[:, 29:32] = 9.0
+        states[:, 32:34] = [[1, 0], [0, 1]]
+        batch.restore(states)
+        yield batch
+
+
+def end_effector(worlds):
+    return kinematics.forward(worlds.states[:, 1:8]).position
+
+
+def privileged(worlds):
+    """(2, 10) by hand; the end effector's velocity by finite differences along the joints' motion."""
+    joints, velocity, step = worlds.states[:, 1:8], worlds.states[:, 17:24], 1e-6
+    after = kinematics.forward(joints + step * velocity).position
+    before = kinematics.forward(joints - step * velocity).position
+    rest = [[0.21, 0.22, 0.5, 0.6, 0.7, 1.0, 0.0], [0.23, 0.24, -0.5, -0.6, -0.7, 0.0, 1.0]]
+    return np.hstack([(after - before) / (2 * step), rest])
+
+
+def positions(worlds):
+    """(2, 11) by hand."""
+    ee = end_effector(worlds)
+    objects = np.array([[0.2, -0.1, 0.3], [-0.15, 0.12, 0.025]])
+    fingers = [[0.011, 0.012], [0.013, 0.014]]
+    return np.hstack([ee, fingers, objects, objects - ee])
+
+
+def assert_layout(found, expected, size):
+    assert found.dtype == np.float32
+    assert found.shape == (2, size)
+    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-6)
+
+
+def test_positions(worlds):
+    assert_layout(worlds.positions(), positions(worlds), observations.POSITIONS_SIZE)
+
+
+def test_full(worlds):
+    expected = np.hstack([positions(worlds), privileged(worlds), np.full((2, 1), 0.25)])
+    assert_layout(worlds.full(0.25), expected, observations.FULL_SIZE)
+
+
+def test_bob_value(worlds):
+    relative = GOALS - [[0.2, -0.1, 0.3], [-0.15, 0.12, 0.025]]
+    expected = np.hstack([positions(worlds), privileged(worlds), GOALS, relative])
+    assert_layout(worlds.bob_value(GOALS), expected, observations.BOB_VALUE_SIZE)
+
+
+def test_named_slices_are_where_the_table_says(worlds):
+    bob = np.hstack([worlds.positions(), GOALS.astype(np.float32)])
+    assert bob.shape[1] == observations.BOB_SIZE
+    np.testing.assert_array_equal(bob[:, observations.OBJECT_SLICE], worlds.object_position.astype(np.float32))
+    np.testing.assert_array_equal(bob[:, observations.GOAL_SLICE], GOALS.astype(np.float32))
+
+
+@pytest.mark.parametrize(
+    ("mirror", "vector", "expected"),
+    [
+        (observations.MIRROR_ACTION, ACTION, [1, -2, 3, 4]),
+        (observations.MIRROR_BOB, [*POSITIONS, 12, 13, 14], [*MIRRORED_POSITIONS, 12, -13, 14]),
+        (observations.MIRROR_FULL, [*POSITIONS, *PRIVILEGED, 22], [*MIRRORED_POSITIONS, *MIRRORED_PRIVILEGED, 22]),
+        (
+            observations.MIRROR_BOB_VALUE,
+            [*POSITIONS, *PRIVILEGED, 22, 23, 24, 25, 26, 27],
+            [*MIRRORED_POSITIONS, *MIRRORED_PRIVILEGED, 22, -23, 24, 25, -26, 27],
+        ),
+    ],
+    ids=["action", "bob", "full", "bob value"],
+)
+def test_mirror_swaps_fingers_and_negates_y(mirror, vector, expected):
+    batch = np.array([[vector], [vector]], dtype=np.float32)
+    np.testing.assert_array_equal(mirror(batch), np.array([[expected], [expected]], dtype=np.float32))
+    np.testing.assert_array_equal(mirror(mirror(batch)), batch)
+    assert mirror(batch).dtype == np.float32
+
+
+@pytest.mark.parametrize(
+    ("normalisation", "size"),
+    [
+        (observations.NORMALISATION_POSITIONS, observations.POSITIONS_SIZE),
+        (observations.NORMALISATION_FULL, observations.FULL_SIZE),
+        (observations.NORMALISATION_BOB, observations.BOB_SIZE),
+        (observations.NORMALISATION_BOB_VALUE, observations.BOB_VALUE_SIZE),
+    ],
+    ids=["positions", "full", "bob", "bob value"],
+)
+def test_normalisation_fits_its_vector(normalisation, size):
+    for part in (normalisation.offset, normalisation.scale):
+        assert part.shape == (size,)
+        assert part.dtype == np.float32
+    assert (normalisation.scale > 0).all()
+    shared = observations.NORMALISATION_POSITIONS
+    np.testing.assert_array_equal(normalisation.offset[: observations.POSITIONS_SIZE], shared.offset)
+    np.testing.assert_array_equal(normalisation.scale[: observations.POSITIONS_SIZE], shared.scale)
+
+
+def test_goal_and_object_are_normalised_alike():
+    bob = observations.NORMALISATION_BOB
+    for part in (bob.offset, bob.scale):
+        np.testing.assert_array_equal(part[observations.GOAL_SLICE], part[observations.OBJECT_SLICE])
+
+
+@pytest.mark.parametrize(
+    ("normalisation", "mirror"),
+    [
+        (observations.NORMALISATION_FULL, observations.MIRROR_FULL),
+        (observations.NORMALISATION_BOB, observations.MIRROR_BOB),
+        (observations.NORMALISATION_BOB_VALUE, observations.MIRROR_BOB_VALUE),
+    ],
+    ids=["full", "bob", "bob value"],
+)
+def test_mirror_and_normalisation_commute(normalisation, mirror):
+    vector = np.random.default_rng(0).normal(size=(20, normalisation.offset.size)).astype(np.float32)
+    normalised = (vector - normalisation.offset) / normalisation.scale
+    mirrored = (mirror(vector) - normalisation.offset) / normalisation.scale
+    np.testing.assert_allclose(mirror(normalised), mirrored, rtol=1e-6, atol=1e-6)

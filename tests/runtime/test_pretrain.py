@@ -1,0 +1,179 @@
+"""A whole pre-training: how it ends by itself and by a signal, and what it publishes."""
+
+import os
+import re
+import signal
+import time
+
+import numpy as np
+import pytest
+
+from service.config import ConfigError, parse_config
+from service.registry.registry import Registry
+from service.runtime import pretrain as module
+from service.runtime.pretrain import pretrain, resumed_config
+from service.runtime.rundir import RunDirectory
+from tests.runtime.runs import (
+    TREE,
+    assert_one_line,
+    assert_same_run,
+    newest,
+    play,
+    read_lines,
+    start_endless_run,
+    tiny_config,
+    write_yaml,
+)
+
+
+@pytest.fixture
+def quick(monkeypatch):
+    """The final evaluation of a few episodes, and no pictures."""
+    monkeypatch.setattr(module, "FINAL_EVALUATION_EPISODES", 4)
+    monkeypatch.setattr(module, "make_artifacts", lambda directory: {"curves": directory.path / "curves.png"})
+
+
+def run_pretrain(tmp_path, config=None, *, on_iteration=lambda metrics: None, **kwargs):
+    directory = RunDirectory(tmp_path / "run")
+    return pretrain(
+        config or tiny_config(total_env_steps=400),
+        directory,
+        tmp_path / "registry",
+        on_iteration=on_iteration,
+        **kwargs,
+    )
+
+
+# --- to the end ------------------------------------------------------------------------------------------------------
+
+
+def test_a_finished_run_is_evaluated_drawn_and_published(tmp_path, quick):
+    done = run_pretrain(tmp_path)
+    assert done.result.reason == "finished"
+    assert done.files == {"curves": tmp_path / "run" / "curves.png"}
+    assert str(done.version) == "tiny@1"
+    kinds = [f"evaluation/{kind}_success_{when}" for kind in ("table", "air", "mixed") for when in ("last", "ever")]
+    assert sorted(done.metrics) == sorted(kinds)
+    assert all(0.0 <= rate <= 1.0 for rate in done.metrics.values())
+    assert {"play", "checkpoint"} <= {line.split()[0] for line in done.timing.splitlines()}
+
+
+def test_what_is_published_is_bob_and_all_that_a_user_of_him_needs(tmp_path, quick):
+    done = run_pretrain(tmp_path)
+    manifest, parameters = Registry(tmp_path / "registry").load("tiny@latest")
+    saved = {name.removeprefix("bob/"): a for name, a in newest(tmp_path / "run").arrays.items() if name[:4] == "bob/"}
+    assert parameters.keys() == saved.keys()
+    assert all(np.array_equal(parameters[name], array) for name, array in saved.items())
+    assert parse_config(manifest.config, where="a test") == tiny_config(total_env_steps=400)
+    assert manifest.metrics == done.metrics | {"env_steps": done.result.num_env_steps}
+    assert manifest.spaces["action"] == 4
+    assert manifest.spaces["observation"] == 14
+    assert len(manifest.normalisation["offset"]) == len(manifest.normalisation["scale"]) == 14
+
+
+def test_a_finished_run_that_goes_on_publishes_another_version(tmp_path, quick):
+    first = run_pretrain(tmp_path)
+    config = resumed_config(RunDirectory(tmp_path / "run"), ["run.total_env_steps=600"])
+    second = run_pretrain(tmp_path, config, resume=True)
+    assert (str(first.version), str(second.version)) == ("tiny@1", "tiny@2")
+    assert second.result.num_env_steps >= 600
+
+
+# --- signals ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_ends_the_run_after_the_iteration(tmp_path, quick, number):
+    before = signal.getsignal(signal.SIGINT), signal.getsignal(signal.SIGTERM)
+
+    def interrupt(metrics):
+        if metrics["iteration"] == 2:
+            os.kill(os.getpid(), number)
+
+    done = run_pretrain(tmp_path, on_iteration=interrupt)
+    assert (done.result.reason, done.result.iteration) == ("interrupted", 2)
+    assert (done.version, done.files, done.metrics) == (None, {}, {})
+    assert newest(tmp_path / "run").step == 2
+    assert not (tmp_path / "registry").exists()
+    assert (signal.getsignal(signal.SIGINT), signal.getsignal(signal.SIGTERM)) == before
+
+
+def test_a_second_signal_ends_it_at_once(tmp_path, quick):
+    def interrupt_twice(metrics):
+        if metrics["iteration"] == 2:
+            os.kill(os.getpid(), signal.SIGINT)
+            os.kill(os.getpid(), signal.SIGINT)
+
+    with pytest.raises(KeyboardInterrupt):
+        run_pretrain(tmp_path, on_iteration=interrupt_twice)
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+
+
+def test_ctrl_c_saves_and_says_how_to_resume(tmp_path):
+    """A real process, a real signal; the run it leaves goes on as if nothing had happened."""
+    process, path = start_endless_run(tmp_path)
+    deadline_s = time.monotonic() + 100.0
+    while process.poll() is None and time.monotonic() < deadline_s:
+        if (path / "metrics.jsonl").exists() and len((path / "metrics.jsonl").read_bytes().splitlines()) >= 3:
+            process.send_signal(signal.SIGINT)
+            break
+        time.sleep(0.02)
+    try:
+        out, err = process.communicate(timeout=60)
+    finally:
+        process.kill()
+    assert process.returncode == 130, err
+    assert re.search(r"^interrupted after [\d,]+ env steps, \d+ iterations$", out, re.MULTILINE)
+    assert f"tandem pretrain --resume --run-dir {path}" in out
+    assert "Traceback" not in err
+    saved = newest(path)
+    assert saved.step == read_lines(path / "metrics.jsonl")[-1]["iteration"]
+    total = saved.meta["env_steps"] + 300
+    play(path, resumed_config(RunDirectory(path), [f"run.total_env_steps={total}"]), resume=True)
+    play(tmp_path / "whole", tiny_config(total_env_steps=total))
+    assert_same_run(path, tmp_path / "whole")
+
+
+# --- the configuration of a resumed run ------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def begun(tmp_path):
+    directory = RunDirectory(tmp_path)
+    directory.start(tiny_config(seed=3))
+    directory.close()
+    return directory
+
+
+def test_a_resumed_run_keeps_its_configuration(begun):
+    assert resumed_config(begun, []) == tiny_config(seed=3)
+    changed = resumed_config(begun, ["run.total_env_steps=9e5", "run.keep_checkpoints=7"])
+    assert changed == tiny_config(seed=3, total_env_steps=900_000, keep_checkpoints=7)
+
+
+@pytest.mark.parametrize("override", ["seed=4", "game.num_worlds=3", "runs.total_env_steps=3", "name=run.x"])
+def test_only_the_run_part_may_change(begun, override):
+    with pytest.raises(ConfigError) as error:
+        resumed_config(begun, ["run.keep_checkpoints=7", override])
+    assert_one_line(error.value, override, "run.*")
+
+
+@pytest.mark.parametrize(
+    ("override", "part"), [("run.total=3", "run.total"), ("run.total_env_steps=0", "run.total_env_steps")]
+)
+def test_a_bad_value_is_found_before_anything_is_loaded(begun, override, part):
+    with pytest.raises(ConfigError) as error:
+        resumed_config(begun, [override])
+    assert_one_line(error.value, part)
+
+
+def test_nothing_to_resume(tmp_path):
+    with pytest.raises(ConfigError) as error:
+        resumed_config(RunDirectory(tmp_path / "none"), [])
+    assert_one_line(error.value, "no run in", tmp_path / "none")
+
+
+def test_the_tree_is_what_the_processes_run(tmp_path):
+    from service.config import load_config
+
+    assert load_config(write_yaml(tmp_path / "tiny.yaml", TREE)) == tiny_config()
