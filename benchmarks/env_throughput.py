@@ -1,9 +1,10 @@
 """Env steps per second on one core: our world against PyBullet panda-gym, measured in turn in one process.
 
 Both sides do the same: episodes of 50 random actions with their resets, 20 physics steps of 2 ms an action, the
-observation and the test for success of every step. panda-gym steps one world with one thread, so ours gets one thread,
-too. What our batch gains over our own Gymnasium environment is one call for all worlds. The last row is the physics of
-pre-training, half as many steps of 4 ms; panda-gym is not compared with it.
+observation and the test for success of every step. Random arms rarely meet the object, and contact is dear, so each
+side also plays episodes that reach for the object and squeeze it. panda-gym steps one world with one thread, so ours
+gets one thread, too. What our batch gains over our own Gymnasium environment is one call for all worlds. The last row
+is the physics of pre-training, half as many steps of 4 ms; panda-gym is not compared with it.
 """
 
 from __future__ import annotations
@@ -22,27 +23,41 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 
 import gymnasium
 import numpy as np
+from numpy.typing import NDArray
 
 from benchmarks.measuring import Sample, describe, describe_ratio, machine, measure, rates, ratio, table, write_json
 from service.actors.evaluation import sample_goals
 from service.config import WorldConfig
-from service.envs.batch import WorldBatch
+from service.envs.batch import DISPLACEMENT_M, WorldBatch
 from service.envs.observations import ACTION_SIZE
 from service.envs.registration import TABLETOP_ID
 from service.errors import TandemError
 
 EPISODE_STEPS = 50
 """Of panda-gym's registration, and of ours."""
-PANDA_GYM_IDS = ("PandaPickAndPlace-v3", "PandaPush-v3")
+PICK_AND_PLACE, PUSH = PANDA_GYM_IDS = ("PandaPickAndPlace-v3", "PandaPush-v3")
 BATCH = "tandem"
 ONE_WORLD = "tandem, one world, Gymnasium"
 PRETRAINING = "tandem, 10 x 4 ms"
+GRASPING = ", grasping"
+"""Ends the name of a row that reaches for the object and squeezes it."""
+COMPARED = (
+    (BATCH, PICK_AND_PLACE),
+    (BATCH, PUSH),
+    (BATCH + GRASPING, PICK_AND_PLACE + GRASPING),
+    (ONE_WORLD, PICK_AND_PLACE),
+    (ONE_WORLD, PUSH),
+)
 PACKAGES = ("mujoco", "numpy", "gymnasium", "panda-gym", "pybullet")
 _SUCCESS_M = 0.05
+_OPEN_STEPS = 8
+"""After which a grasping arm closes its gripper."""
+
+FloatArray = NDArray[np.float32]
 
 
 class Contender(Protocol):
-    """Something that plays whole episodes of random actions."""
+    """Something that plays whole episodes."""
 
     def episode(self) -> int:
         """Reset, play one episode, return the env steps made."""
@@ -54,9 +69,12 @@ class Contender(Protocol):
 class BatchContender:
     """Our worlds as an actor uses them: stepped together, by one thread."""
 
-    def __init__(self, config: WorldConfig, num_worlds: int, num_steps: int = EPISODE_STEPS) -> None:
+    def __init__(
+        self, config: WorldConfig, num_worlds: int, *, num_steps: int = EPISODE_STEPS, grasping: bool = False
+    ) -> None:
         self._worlds = WorldBatch(config, num_worlds, num_threads=1)
         self._num_steps = num_steps
+        self._grasping = grasping
         self._rng = np.random.default_rng(0)
 
     def episode(self) -> int:
@@ -66,6 +84,8 @@ class BatchContender:
         goal = sample_goals("mixed", self._rng, num, worlds.config, _SUCCESS_M)
         actions = self._rng.uniform(-1.0, 1.0, (self._num_steps, num, ACTION_SIZE)).astype(np.float32)
         for step, action in enumerate(actions, start=1):
+            if self._grasping:
+                reach(action, worlds.object_position - worlds.ee_position, step)
             worlds.step(action)
             worlds.full(step / self._num_steps)
             np.linalg.norm(worlds.object_position - goal, axis=1) <= _SUCCESS_M  # noqa: B015 - only its time matters
@@ -77,21 +97,28 @@ class BatchContender:
 
 
 class GymnasiumContender:
-    """One Gymnasium environment, as ``gymnasium.make`` gives it but for the checker of first steps."""
+    """One Gymnasium goal environment, as ``gymnasium.make`` gives it but for the checker of first steps.
 
-    def __init__(self, name: str, num_steps: int = EPISODE_STEPS) -> None:
+    A grasping one has the end effector first in its observation, as ours and panda-gym's have.
+    """
+
+    def __init__(self, name: str, *, num_steps: int = EPISODE_STEPS, grasping: bool = False) -> None:
         self._environment = gymnasium.make(name, disable_env_checker=True)
         self._num_steps = num_steps
+        self._grasping = grasping
         self._rng = np.random.default_rng(0)
         self._environment.reset(seed=0)
 
     def episode(self) -> int:
-        """One episode, or what the environment leaves of it."""
-        self._environment.reset()
+        """One episode, or what the environment's time limit leaves of it."""
+        observation, _ = self._environment.reset()
         shape = self._environment.action_space.shape
         assert shape is not None
-        for step, action in enumerate(self._rng.uniform(-1.0, 1.0, (self._num_steps, *shape)), start=1):
-            _, _, terminated, truncated, _ = self._environment.step(action.astype(np.float32))
+        actions = self._rng.uniform(-1.0, 1.0, (self._num_steps, *shape)).astype(np.float32)
+        for step, action in enumerate(actions, start=1):
+            if self._grasping:
+                reach(action, observation["achieved_goal"] - observation["observation"][:3], step)
+            observation, _, terminated, truncated, _ = self._environment.step(action)
             if terminated or truncated:
                 return step
         return self._num_steps
@@ -99,6 +126,12 @@ class GymnasiumContender:
     def close(self) -> None:
         """Free the environment."""
         self._environment.close()
+
+
+def reach(action: FloatArray, towards: NDArray[Any], step: int) -> None:
+    """Turn random actions (..., 4) into noisy ones that go to the object, ``towards`` metres off, and close."""
+    action[..., :3] = np.clip(towards / DISPLACEMENT_M, -1.0, 1.0) + 0.5 * action[..., :3]
+    action[..., 3] = 1.0 if step <= _OPEN_STEPS else -1.0
 
 
 def contenders(num_worlds: int) -> dict[str, Contender]:
@@ -111,12 +144,14 @@ def contenders(num_worlds: int) -> dict[str, Contender]:
     rows |= {name: panda_gym(name) for name in PANDA_GYM_IDS}
     coarse = WorldConfig(physics_step_s=0.004, num_substeps=10)
     return rows | {
+        BATCH + GRASPING: BatchContender(WorldConfig(), num_worlds, grasping=True),
+        PICK_AND_PLACE + GRASPING: panda_gym(PICK_AND_PLACE, grasping=True),
         ONE_WORLD: GymnasiumContender(TABLETOP_ID),
         PRETRAINING: BatchContender(coarse, num_worlds),
     }
 
 
-def panda_gym(name: str) -> Contender:
+def panda_gym(name: str, *, grasping: bool = False) -> Contender:
     """An environment of panda-gym.
 
     Raises:
@@ -127,7 +162,7 @@ def panda_gym(name: str) -> Contender:
             import panda_gym  # noqa: F401 - registers its environments
         except ImportError as error:
             raise TandemError(f"panda-gym cannot be imported ({error}): run `make bench`, which installs it") from None
-        return GymnasiumContender(name)
+        return GymnasiumContender(name, grasping=grasping)
 
 
 def compare(rows: Mapping[str, Contender], *, num_pairs: int, seconds: float) -> dict[str, list[Sample]]:
@@ -142,12 +177,11 @@ def compare(rows: Mapping[str, Contender], *, num_pairs: int, seconds: float) ->
 
 
 def summarise(samples: Mapping[str, list[Sample]]) -> dict[str, Any]:
-    """Median rates by row, and how many times as fast as panda-gym our batch and our Gymnasium environment are."""
+    """Median rates by row, and how many times as fast as panda-gym ours are."""
     ratios = {
-        f"{ours} / {name}": ratio(samples[ours], samples[name])
-        for ours in (BATCH, ONE_WORLD)
-        for name in PANDA_GYM_IDS
-        if {ours, name} <= samples.keys()
+        f"{ours} / {theirs}": ratio(samples[ours], samples[theirs])
+        for ours, theirs in COMPARED
+        if {ours, theirs} <= samples.keys()
     }
     return {"rows": {name: rates(each) for name, each in samples.items()}, "ratios": ratios}
 
@@ -168,7 +202,7 @@ def main() -> int:
     """Parse the command line, measure, print."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--pairs", type=int, default=5, help="measurements of every row (default: %(default)s)")
-    parser.add_argument("--seconds", type=float, default=3.0, help="of each measurement (default: %(default)s)")
+    parser.add_argument("--seconds", type=float, default=2.0, help="of each measurement (default: %(default)s)")
     parser.add_argument("--worlds", type=int, default=64, help="in our batch (default: %(default)s)")
     parser.add_argument("--json", type=Path, metavar="FILE", help="write everything measured")
     given = parser.parse_args()

@@ -95,8 +95,27 @@ def test_env_throughput_measures_all_rows_in_turn():
     json.loads(measuring.to_text(result))
 
 
+def test_grasping_arms_go_to_the_object_and_then_close():
+    action = np.array([[0.2, -1.0, 0.0, 0.3]] * 2, dtype=np.float32)
+    env_throughput.reach(action, np.array([[0.025, 0.0, -0.2], [0.0, 0.0, 0.0]]), step=1)
+    np.testing.assert_allclose(action, [[0.6, -0.5, -1.0, 1.0], [0.1, -0.5, 0.0, 1.0]])
+    env_throughput.reach(action, np.zeros((2, 3)), step=20)
+    np.testing.assert_array_equal(action[:, 3], -1.0)
+
+
+def test_only_grasping_arms_lift_the_object():
+    heights = []
+    for grasping in (False, True):
+        batch = env_throughput.BatchContender(WorldConfig(), 8, grasping=grasping)
+        batch.episode()
+        heights.append(batch._worlds.object_position[:, 2].max())
+        batch.close()
+    assert heights[0] < 0.04  # at rest the centre of the cube is 0.025 m high
+    assert heights[1] > 0.06
+
+
 def test_an_episode_ends_with_the_environments_time_limit():
-    contender = env_throughput.GymnasiumContender(TABLETOP_ID, num_steps=60)
+    contender = env_throughput.GymnasiumContender(TABLETOP_ID, num_steps=60, grasping=True)
     assert contender.episode() == env_throughput.EPISODE_STEPS
     contender.close()
 

@@ -25,7 +25,7 @@ EVALUATION_KEYS = {
 
 def tandem(*arguments, **environment):
     """Run a command in this process."""
-    return CliRunner().invoke(app, [str(argument) for argument in arguments], env={"COLUMNS": "200", **environment})
+    return CliRunner().invoke(app, [str(argument) for argument in arguments], env={"COLUMNS": "80", **environment})
 
 
 def assert_user_error(result, *parts):
@@ -185,7 +185,7 @@ def test_evaluate_for_people(trained):
 
 
 def test_coverage(trained, tmp_path):
-    picture = tmp_path / "sub" / "coverage.png"
+    picture = tmp_path / "sub" / "a-picture-with-quite-a-long-name-so-that-it-does-not-fit-a-line.png"
     common = ("coverage", "--primitives", "tiny", "--registry", trained.registry, "--skills", 3, "--steps", 4)
     result = tandem(*common, "--out", picture, "--json")
     assert result.exit_code == 0, result.output
@@ -194,19 +194,41 @@ def test_coverage(trained, tmp_path):
     assert list(tree["share_of_table_cells_visited"]) == ["tiny@1", "random policy"]
     assert all(0.0 <= share <= 1.0 for share in tree["share_of_table_cells_visited"].values())
     assert picture.stat().st_size > 10_000
-    assert "of the workspace's table cells visited" in tandem(*common, "--out", picture).stdout
+    text = tandem(*common, "--out", picture).stdout
+    assert text.count("of the workspace's table cells visited\n") == 2
+    assert f"picture: {picture}\n" in text  # on one line, to be copied
 
 
-def test_render_films_what_was_asked(trained, monkeypatch):
+@pytest.fixture
+def filmed(monkeypatch):
+    """(number of takes or episodes, file) of each video, none of which is drawn."""
     asked = []
-    monkeypatch.setattr(
-        "service.runtime.video.write_video", lambda takes, world, path: asked.append((len(takes), path)) or path
-    )
-    result = tandem("render", trained.run, "--rounds", 2)
+
+    def write_video(takes, world, path):
+        asked.append((len(takes), path))
+
+    def write_episode_video(episodes, world, path):
+        asked.append((episodes.goal.shape, path))
+
+    monkeypatch.setattr("service.runtime.video.write_video", write_video)
+    monkeypatch.setattr("service.runtime.video.write_episode_video", write_episode_video)
+    return asked
+
+
+def test_render_films_rounds_of_a_run(trained, filmed, tmp_path):
+    out = tmp_path / "a-video-with-quite-a-long-name-so-that-it-does-not-fit-a-line.mp4"
+    result = tandem("render", "--primitives", trained.run, "--episodes", 2, "--out", out)
     assert result.exit_code == 0, result.output
-    assert result.stdout == f"video: {trained.run / 'rounds.mp4'}\n"
-    tandem("render", trained.run, "--rounds", 1, "--out", trained.home / "x.mp4")
-    assert asked == [(2, trained.run / "rounds.mp4"), (1, trained.home / "x.mp4")]
+    assert filmed == [(2, out)]
+    assert result.stdout == f"video: {out}\n"  # on one line, to be copied
+
+
+def test_render_films_episodes_of_published_primitives(trained, filmed, tmp_path):
+    out = tmp_path / "x.mp4"
+    common = ("--registry", trained.registry, "--out", out)
+    result = tandem("render", "--primitives", "tiny@latest", "--episodes", 3, *common)
+    assert result.exit_code == 0, result.output
+    assert filmed == [((3, 3), out)]
 
 
 def test_registry_show(trained):
@@ -294,7 +316,7 @@ def test_a_run_directory_that_is_a_file(tmp_path):
         (["evaluate", "--primitives", "tiny", "--goals", "sky"], ["'sky'", "table, air, mixed"]),
         (["coverage", "--primitives", "tiny@best"], ["no alias 'best'"]),
         (["coverage", "--primitives", "tiny", "--skills", "2", "--steps", "1", "--out", "file/x.png"], ["file/x.png"]),
-        (["render", "nowhere"], ["no run in nowhere"]),
+        (["render", "--primitives", "no/where"], ["no/where", "no such run directory"]),
         (["registry", "show", "tiny@best"], ["no alias 'best'"]),
     ],
 )

@@ -34,7 +34,7 @@ from service.policies.parameters import FloatArray, PolicyError
 
 ALICE_INITIAL_LOG_STD = -0.1
 """Of a new Alice's actions: std 0.9; chance has to find the object."""
-BOB_INITIAL_LOG_STD = -0.7
+BOB_INITIAL_LOG_STD = -0.1
 """Of a new Bob's actions: std 0.5; he has demonstrations to find the way, and noise must not hide it."""
 
 _HIDDEN_GAIN = math.sqrt(2.0)
