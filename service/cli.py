@@ -123,7 +123,7 @@ def evaluate(
     if as_json:
         typer.echo(json.dumps({name: row.as_dict() for name, row in rows.items()}, indent=1))
         return
-    _console.print(f"{episodes} random goals ({goals}), {steps} steps, within 5 cm", highlight=False)
+    _say(f"{episodes} random goals ({goals}), {steps} steps, within {100 * bob.config.game.success_distance_m:g} cm")
     for name, row in rows.items():
         _console.print(
             f"  {name:<24} at the last step {row.success_last:6.1%}"
@@ -164,8 +164,8 @@ def coverage(
         typer.echo(json.dumps({"share_of_table_cells_visited": shares, "picture": str(picture)}, indent=1))
         return
     for name, share in shares.items():
-        _console.print(f"  {name:<24} {share:.0%} of the workspace's table cells visited", highlight=False)
-    _console.print(f"picture: {picture}", highlight=False)
+        _say(f"  {name:<24} {share:.0%} of the workspace's table cells visited")
+    _say(f"picture: {picture}")
 
 
 @app.command()
@@ -199,7 +199,12 @@ def render(
                 seed=seed,
             )
             video.write_episode_video(filmed, bob.config.world, out)
-    _console.print(f"video: {out}", highlight=False)
+    _say(f"video: {out}")
+
+
+def _say(text: str) -> None:
+    """One line each, whatever the width and whatever brackets a path has."""
+    _console.print(text, highlight=False, soft_wrap=True, markup=False)
 
 
 def main() -> None:

@@ -216,7 +216,7 @@ def filmed(monkeypatch):
 
 
 def test_render_films_rounds_of_a_run(trained, filmed, tmp_path):
-    out = tmp_path / "a-video-with-quite-a-long-name-so-that-it-does-not-fit-a-line.mp4"
+    out = tmp_path / "a-video-[b]-with-quite-a-long-name-so-that-it-does-not-fit-a-line.mp4"
     result = tandem("render", "--primitives", trained.run, "--episodes", 2, "--out", out)
     assert result.exit_code == 0, result.output
     assert filmed == [(2, out)]

@@ -143,7 +143,7 @@ class SelfPlay:
                 players.alice, players.past_alice, plan.alice_opponent, observation, everyone, self._rng
             )
             turns.observation[step], turns.action[step], turns.log_prob[step] = observation, action, log_prob
-            broken |= worlds.step(action)
+            broken |= worlds.step(action) if not broken.any() else worlds.step(action[~broken], np.flatnonzero(~broken))
             contacts |= worlds.contacts()
         turns.value_observation[:] = turns.observation
         turns.final_value_observation[:] = worlds.full(1.0)

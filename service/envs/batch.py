@@ -28,6 +28,8 @@ WIDTH_CHANGE_M = 0.10
 """Change of the finger width of a full action (paper)."""
 LOWEST_TARGET_M = 0.012
 """Least height of a commanded end effector; the fingertips end 0.7 cm below it."""
+MAX_SPEED = 1e3
+"""A joint (rad/s) or object (m/s, rad/s) faster than this has diverged; the arm reaches 3, a falling object 30."""
 _TABLE_TOP_M = 0.0
 
 
@@ -126,6 +128,8 @@ class WorldBatch:
             ValueError: actions of the wrong shape or not finite.
         """
         index = slice(None) if worlds is None else worlds
+        if worlds is not None and not worlds.size:
+            return np.zeros(self.num_worlds, dtype=bool)  # MuJoCo's rollout of no states is a segmentation fault
         start = self.states[index]
         if actions.shape != (start.shape[0], ACTION_SIZE):
             raise ValueError(f"actions: expected shape {(start.shape[0], ACTION_SIZE)}, got {actions.shape}")
@@ -138,7 +142,7 @@ class WorldBatch:
         after = np.empty_like(start)
         after[:, : self._physics_size] = states[:, -1]
         after[:, self._physics_size :] = (sensors > 0).any(axis=1)
-        finite = np.isfinite(after).all(axis=1)
+        finite = (np.abs(after[:, self._layout.velocities]) < MAX_SPEED).all(axis=1) & np.isfinite(after).all(axis=1)
         broken = np.zeros(self.num_worlds, dtype=bool)
         if not finite.all():
             after[~finite] = start[~finite]
@@ -223,6 +227,7 @@ class _Layout:
         self.fingers = slice(1 + NUM_JOINTS, 3 + NUM_JOINTS)
         self.object = slice(3 + NUM_JOINTS, 6 + NUM_JOINTS)
         self.joint_velocities = slice(velocity, velocity + NUM_JOINTS)
+        self.velocities = slice(velocity, velocity + NUM_JOINTS + 8)
         self.finger_velocities = slice(velocity + NUM_JOINTS, velocity + NUM_JOINTS + 2)
         self.object_velocity = slice(velocity + NUM_JOINTS + 2, velocity + NUM_JOINTS + 5)
 

@@ -9,13 +9,16 @@ from service.envs import panda
 
 TABLE_CENTER_X_M = -0.3
 TABLE_HALF_SIZE_M = (0.55, 0.45, 0.2)
+# MuJoCo's default contact yields more the lighter the object: an arm that leans on the cube pressed it 11 mm into the table.
+# These let it give 1 mm.
+_STIFF = {"solref": (0.01, 1.0), "solimp": (0.95, 0.99, 0.001, 0.5, 2.0)}
 
 
 def build_spec(config: WorldConfig) -> mujoco.MjSpec:
     """The physics of the scene; ``render.decorate`` adds what only eyes need.
 
-    The contact cone is elliptic with ``impratio`` 100: a held cube creeps 0.4 mm
-    in 5 s, against 1.7 mm at 10, and a held sphere stays at all (docs/decisions/0002).
+    The contact cone is elliptic with ``impratio`` 100: a held cube creeps 0.4 mm in 5 s,
+    against 1.7 mm at 10, and a held sphere stays at all (docs/decisions/0001).
     """
     spec = mujoco.MjSpec()
     option = spec.option
@@ -40,6 +43,7 @@ def build_spec(config: WorldConfig) -> mujoco.MjSpec:
         conaffinity=panda.GRIPPER_BIT | panda.OBJECT_BIT,
         friction=(config.friction, 0.005, 0.0001),
         group=3,
+        **_STIFF,
     )
     _add_object(spec, config)
     _add_contact_sensors(spec)
@@ -61,6 +65,7 @@ def _add_object(spec: mujoco.MjSpec, config: WorldConfig) -> None:
         conaffinity=panda.GRIPPER_BIT,
         group=2,
         rgba=(0.86, 0.18, 0.15, 1.0),
+        **_STIFF,
     )
 
 

@@ -84,6 +84,9 @@ class LocalRun:
         self._checkpoints = CheckpointStore(directory.checkpoints, config.run.keep_checkpoints)
         if resume:
             self._load()
+        else:
+            directory.check_free()
+            self.save()  # so that a run killed before its first interval can be resumed, too
         directory.start(config, after_iteration=self.iteration if resume else None)
 
     def request_stop(self) -> None:

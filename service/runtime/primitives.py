@@ -8,7 +8,7 @@ from pathlib import Path
 from service.config import Config, parse_config
 from service.errors import TandemError
 from service.policies.evaluator import GaussianEvaluator, MCPEvaluator
-from service.policies.parameters import Parameters
+from service.policies.parameters import Parameters, PolicyError
 from service.registry.checkpoints import CheckpointStore
 from service.runtime.rundir import RunDirectory
 
@@ -32,14 +32,21 @@ def load_bob(reference: str, registry: Path) -> TrainedBob:
     if Path(reference).is_dir():
         directory = RunDirectory(Path(reference))
         config, parameters = directory.read_config(), read_parameters(directory, "bob")
-        return TrainedBob(reference, MCPEvaluator(parameters), config)
+        return TrainedBob(reference, _evaluator(reference, parameters), config)
     if "/" in reference:
         raise TandemError(f"{reference}: no such run directory; for published primitives write NAME@ALIAS")
     from service.registry.registry import Registry
 
     manifest, tensors = Registry(registry).load(reference)
     config = parse_config(manifest.config, where=f"the manifest of {reference}")
-    return TrainedBob(manifest.reference, MCPEvaluator(tensors), config)
+    return TrainedBob(manifest.reference, _evaluator(manifest.reference, tensors), config)
+
+
+def _evaluator(label: str, parameters: Parameters) -> MCPEvaluator:
+    try:
+        return MCPEvaluator(parameters)
+    except PolicyError as error:
+        raise TandemError(f"{label} holds no primitives: {error}") from None
 
 
 def load_players(directory: RunDirectory) -> tuple[GaussianEvaluator, MCPEvaluator]:

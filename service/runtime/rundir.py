@@ -3,6 +3,7 @@
 | file | content |
 |---|---|
 | ``config.yaml`` | the resolved configuration |
+| ``environment.json`` | git commit, package versions and cores of the last start |
 | ``metrics.jsonl`` | an object per iteration, keyed by metric; only ``time/...`` differs between equal runs |
 | ``goals.jsonl`` | per iteration a sample of valid proposals: start x y z, goal x y z (metres), solved 0/1 |
 | ``tensorboard/`` | the same metrics as TensorBoard events over env steps |
@@ -12,7 +13,12 @@
 
 from __future__ import annotations
 
+import json
+import logging
+import os
+import platform
 import time
+from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -22,6 +28,7 @@ from service.config import Config, ConfigError, dump_config, load_config
 from service.errors import TandemError
 from service.generator.validity import Verdict
 from service.registry.files import os_errors, write_atomic
+from service.registry.manifest import git_commit
 from service.runtime.records import JsonlWriter
 
 if TYPE_CHECKING:
@@ -29,6 +36,7 @@ if TYPE_CHECKING:
 
     from service.actors.rollout import GoalRecords, Rollout
 
+_logger = logging.getLogger(__name__)
 GOALS_PER_ITERATION = 32
 """Valid proposals recorded per iteration, at most."""
 MAX_BROKEN_FILES = 100
@@ -70,23 +78,34 @@ class RunDirectory:
         Raises:
             TandemError: a new run where there is one already, or a directory that cannot be written.
         """
-        if after_iteration is None and self.exists:
-            raise TandemError(f"{self.path} holds a run already; continue it with --resume, or name another --run-dir")
-        with os_errors("write", self.path):
-            self.checkpoints.mkdir(parents=True, exist_ok=True)
-            write_atomic(self.config_file, dump_config(config).encode())
-        if after_iteration is not None:
-            self._metrics.truncate_after(after_iteration)
-            self._goals.truncate_after(after_iteration)
         from tensorboard.summary.writer.event_file_writer import EventFileWriter
 
-        self._events = EventFileWriter(str(self.path / "tensorboard"))
+        if after_iteration is None:
+            self.check_free()
+        else:
+            self._metrics.truncate_after(after_iteration)
+            self._goals.truncate_after(after_iteration)
+        with os_errors("write", self.path):
+            self.checkpoints.mkdir(parents=True, exist_ok=True)
+            self._events = EventFileWriter(str(self.path / "tensorboard"))
+            write_atomic(self.path / "environment.json", json.dumps(_environment(), indent=1).encode())
+            write_atomic(self.config_file, dump_config(config).encode())  # last: a start that failed can be tried again
+
+    def check_free(self) -> None:
+        """Assert that no run has begun here.
+
+        Raises:
+            TandemError: one has.
+        """
+        if self.exists:
+            raise TandemError(f"{self.path} holds a run already; continue it with --resume, or name another --run-dir")
 
     def record(self, metrics: dict[str, float]) -> None:
         """Append one iteration's metrics to metrics.jsonl and TensorBoard."""
         self._metrics.append(metrics)
         if self._events is not None:
-            self._events.add_event(_event(metrics))
+            with os_errors("write", self.path / "tensorboard"):
+                self._events.add_event(_event(metrics))
 
     def record_goals(self, iteration: int, num_env_steps: int, records: GoalRecords) -> None:
         """Append a sample of this iteration's valid proposals that the current Bob played."""
@@ -112,8 +131,20 @@ class RunDirectory:
     def close(self) -> None:
         """Flush TensorBoard's events."""
         if self._events is not None:
-            self._events.close()
+            try:
+                self._events.close()
+            except OSError as error:  # must not hide why the run ended; metrics.jsonl has the same numbers
+                _logger.warning("TensorBoard events in %s may be incomplete: %s", self.path, error.strerror)
             self._events = None
+
+
+def _environment() -> dict[str, object]:
+    return {
+        "git_commit": git_commit(),
+        "python": platform.python_version(),
+        "packages": {name: version(name) for name in ("mujoco", "numpy", "torch")},
+        "num_cores": os.cpu_count(),
+    }
 
 
 def _event(metrics: dict[str, float]) -> object:

@@ -29,6 +29,6 @@ class Timing:
         """A line per section with its seconds and its share of the time since this object was made."""
         total = time.perf_counter() - self._start
         lines = [f"total {total:9.1f} s"]
-        lines += [f"  {name:<12}{spent:9.1f} s {100 * spent / total:5.1f} %" for name, spent in self.seconds.items()]
+        lines += [f"  {name:<18}{spent:9.1f} s {100 * spent / total:5.1f} %" for name, spent in self.seconds.items()]
         other = total - sum(self.seconds.values())
-        return "\n".join([*lines, f"  {'other':<12}{other:9.1f} s {100 * other / total:5.1f} %"])
+        return "\n".join([*lines, f"  {'other':<18}{other:9.1f} s {100 * other / total:5.1f} %"])

@@ -243,9 +243,9 @@ def test_a_run_killed_with_sigkill_at_a_random_moment(tmp_path):
     delay_s = random.uniform(0.0, 0.5)
     try:
         deadline_s = time.monotonic() + 100.0
-        while not list(path.glob("checkpoints/checkpoint-*")):
+        while len(list(path.glob("checkpoints/checkpoint-*"))) < 2:
             assert process.poll() is None, process.stderr.read()
-            assert time.monotonic() < deadline_s, "no checkpoint after 100 s"
+            assert time.monotonic() < deadline_s, "no checkpoints after 100 s"
             time.sleep(0.01)
         time.sleep(delay_s)
     finally:
@@ -345,7 +345,8 @@ def test_a_full_disk_leaves_the_earlier_checkpoint(uninterrupted, tmp_path, monk
         with pytest.raises(CheckpointError) as error:
             play(tmp_path, config)
     assert_one_line(error.value, "checkpoint-00000004", "No space left", "intact")
-    assert [file.name for file in (tmp_path / "checkpoints").iterdir()] == ["checkpoint-00000002.safetensors"]
+    assert max(file.name for file in (tmp_path / "checkpoints").iterdir()) == "checkpoint-00000002.safetensors"
+    assert list((tmp_path / "checkpoints").glob(".*")) == []
     assert newest(tmp_path).step == 2
     play(tmp_path, config, resume=True)
     assert_same_run(tmp_path, uninterrupted)
