@@ -46,7 +46,10 @@ class WorldConfig(_Frozen):
     object: Literal["cube", "sphere"] = "cube"
     object_size_m: float = Field(0.05, ge=0.02, le=0.07, description="cube edge or sphere diameter; paper: 5 cm")
     object_mass_kg: float = Field(0.1, gt=0.0, le=2.0)
-    friction: float = Field(1.0, gt=0.0, le=3.0, description="sliding friction of object, pads and table")
+    friction: float = Field(
+        0.5, gt=0.0, le=3.0, description="sliding friction of the object on the table; panda-gym: half that of the pads"
+    )
+    pad_friction: float = Field(1.0, gt=0.0, le=3.0, description="sliding friction of the fingertips on the object")
     workspace: WorkspaceConfig = WorkspaceConfig()
     start_height_m: float = Field(
         0.08,

@@ -27,6 +27,7 @@ _STIFFNESS = (4500.0, 4500.0, 3500.0, 3500.0, 2000.0, 2000.0, 2000.0)
 _DAMPING = (225.0, 225.0, 175.0, 175.0, 100.0, 100.0, 100.0)
 _ARMATURE = 0.1
 _JOINT_DAMPING = 1.0
+_FINGER_ARMATURE = 0.3
 _FINGER_STIFFNESS = 1000.0
 _FINGER_DAMPING = 25.0
 _FINGER_FORCE = 40.0
@@ -54,12 +55,12 @@ _INERTIALS = (
 _HAND_QUATERNION = (0.9238795, 0.0, 0.0, -0.3826834)
 
 _PAD_RADIUS = 0.006
-_PAD_CONDIM = 4
+_BODY_FRICTION = 0.3
 
 GRIPPER_BIT, OBJECT_BIT, TABLE_BIT = 1, 2, 4
 
 
-def add_panda(spec: mujoco.MjSpec, *, friction: float) -> Any:
+def add_panda(spec: mujoco.MjSpec, *, pad_friction: float, physics_step_s: float) -> Any:
     """Add the arm, its actuators and its collision shapes to a model under construction.
 
     Actuators: seven joint positions (rad), then left and right finger positions (m). Gravity on the arm is compensated,
@@ -67,7 +68,8 @@ def add_panda(spec: mujoco.MjSpec, *, friction: float) -> Any:
 
     Args:
         spec: the model under construction.
-        friction: sliding friction of the fingertips.
+        pad_friction: sliding friction of the fingertips.
+        physics_step_s: time step; the fingers' end stops are as stiff as it allows.
 
     Returns:
         The bodies by name, for decoration.
@@ -109,16 +111,16 @@ def add_panda(spec: mujoco.MjSpec, *, friction: float) -> Any:
         gravcomp=1.0,
     )
     bodies["hand"] = hand
-    _collision(
-        hand, mujoco.mjtGeom.mjGEOM_CAPSULE, "hand", (0.038, 0, 0), ((0, -0.062, 0.03), (0, 0.062, 0.03)), friction
-    )
+    _collision(hand, "hand", 0.038, ((0, -0.062, 0.03), (0, 0.062, 0.03)))
     for side, quaternion in (("left", (1, 0, 0, 0)), ("right", (0, 0, 0, 1))):
-        bodies[f"{side}_finger"] = _add_finger(hand, side, quaternion, friction)
+        finger = _add_finger(hand, side, quaternion, physics_step_s)
+        _add_pads(finger, side, pad_friction)
+        bodies[f"{side}_finger"] = finger
     _add_actuators(spec)
     return bodies
 
 
-def _add_finger(hand: Any, side: str, quaternion: tuple[float, ...], friction: float) -> Any:
+def _add_finger(hand: Any, side: str, quaternion: tuple[float, ...], physics_step_s: float) -> Any:
     finger = hand.add_body(
         name=f"{side}_finger",
         pos=(0, 0, 0.0584),
@@ -135,45 +137,36 @@ def _add_finger(hand: Any, side: str, quaternion: tuple[float, ...], friction: f
         axis=(0, 1, 0),
         range=(0.0, FINGER_STROKE_M),
         limited=True,
-        armature=_ARMATURE,
+        armature=_FINGER_ARMATURE,
+        # The arm can lean on a finger with more than 100 N: a default end stop gave way by 22 mm, this one by 1 (2 ms).
+        solref_limit=(2 * physics_step_s, 1.0),
+        solimp_limit=(0.99, 0.9999, 0.001, 0.5, 2.0),
     )
+    _collision(finger, f"{side}_shaft", 0.009, ((0, 0.013, 0.009), (0, 0.011, 0.043)))
+    return finger
+
+
+def _add_pads(finger: Any, side: str, friction: float) -> None:
     # Two upright capsules touch a cube's face in four points that span the pad: fewer and cheaper contacts than box on
     # box at the same grip. (One line of contact is not enough: a cube rolls out between two lines nearer than its own
     # width.) Their inner surface is the pad plane y = 0; they end 7 mm below the end effector.
     for end, x in (("front", 0.0075), ("back", -0.0075)):
-        pad = _collision(
-            finger,
-            mujoco.mjtGeom.mjGEOM_CAPSULE,
-            f"{side}_pad_{end}",
-            (_PAD_RADIUS, 0, 0),
-            ((x, _PAD_RADIUS, 0.034), (x, _PAD_RADIUS, 0.048 - _PAD_RADIUS + 0.004)),
-            friction,
-        )
-        pad.condim = _PAD_CONDIM
+        pad = _collision(finger, f"{side}_pad_{end}", _PAD_RADIUS, ((x, _PAD_RADIUS, 0.034), (x, _PAD_RADIUS, 0.046)))
+        pad.friction = (friction, 0.005, 0.0001)
+        pad.condim = 4  # torsion, or a cube turns between the fingers
         pad.solref = (0.01, 1.0)
-        pad.priority = 1
-    _collision(
-        finger,
-        mujoco.mjtGeom.mjGEOM_CAPSULE,
-        f"{side}_shaft",
-        (0.009, 0, 0),
-        ((0, 0.013, 0.009), (0, 0.011, 0.043)),
-        friction,
-    )
-    return finger
+        pad.priority = 1  # these parameters, not a mixture with the object's
 
 
-def _collision(
-    body: Any, kind: Any, name: str, size: tuple[float, ...], ends: tuple[tuple[float, ...], ...], friction: float
-) -> Any:
+def _collision(body: Any, name: str, radius: float, ends: tuple[tuple[float, ...], ...]) -> Any:
     return body.add_geom(
         name=name,
-        type=kind,
-        size=size,
+        type=mujoco.mjtGeom.mjGEOM_CAPSULE,
+        size=(radius, 0, 0),
         fromto=[*ends[0], *ends[1]],
         contype=GRIPPER_BIT,
         conaffinity=0,
-        friction=(friction, 0.005, 0.0001),
+        friction=(_BODY_FRICTION, 0.005, 0.0001),
         mass=0.0,
         group=3,
     )

@@ -9,7 +9,7 @@ from service.envs import panda
 
 TABLE_CENTER_X_M = -0.3
 TABLE_HALF_SIZE_M = (0.55, 0.45, 0.2)
-# MuJoCo's default contact yields more the lighter the object: an arm that leans on the cube pressed it 11 mm into the table.
+# MuJoCo's default contact yields more the lighter the object: an arm leaning on the cube pressed it 11 mm into the table.
 # These let it give 1 mm.
 _STIFF = {"solref": (0.01, 1.0), "solimp": (0.95, 0.99, 0.001, 0.5, 2.0)}
 
@@ -33,7 +33,7 @@ def build_spec(config: WorldConfig) -> mujoco.MjSpec:
     option.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)
     spec.compiler.degree = False
     spec.compiler.autolimits = False
-    panda.add_panda(spec, friction=config.friction)
+    panda.add_panda(spec, pad_friction=config.pad_friction, physics_step_s=config.physics_step_s)
     spec.worldbody.add_geom(
         name="table",
         type=mujoco.mjtGeom.mjGEOM_BOX,

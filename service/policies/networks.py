@@ -32,10 +32,8 @@ from service.policies.composition import compose
 from service.policies.layers import GaussianSquash, HiddenLayers, InputNormalisation, linear, log_std_bias
 from service.policies.parameters import FloatArray, PolicyError
 
-ALICE_INITIAL_LOG_STD = -0.1
-"""Of a new Alice's actions: std 0.9; chance has to find the object."""
-BOB_INITIAL_LOG_STD = -0.1
-"""Of a new Bob's actions: std 0.5; he has demonstrations to find the way, and noise must not hide it."""
+INITIAL_LOG_STD = -0.1
+"""Of a new policy's actions: std 0.9; chance has to find the object."""
 
 _HIDDEN_GAIN = math.sqrt(2.0)
 _SMALL_GAIN = 0.01
@@ -55,7 +53,7 @@ class GaussianPolicy(nn.Module):
         log_std_max: float,
         normalisation: Normalisation,
     ) -> None:
-        """Build with orthogonal weights; initially the mean is near 0 and the std ``exp(ALICE_INITIAL_LOG_STD)``.
+        """Build with orthogonal weights; initially the mean is near 0 and the std ``exp(INITIAL_LOG_STD)``.
 
         Raises:
             PolicyError: the normalisation is not of ``input_size``, or the log-std bounds are not in order.
@@ -66,7 +64,7 @@ class GaussianPolicy(nn.Module):
         self.hidden = HiddenLayers(input_size, config.hidden_sizes)
         self.output = linear(self.hidden.output_size, 2 * action_size, gain=_SMALL_GAIN)
         self.squash = GaussianSquash(log_std_min, log_std_max)
-        nn.init.constant_(self.output.bias[action_size:], log_std_bias(ALICE_INITIAL_LOG_STD, log_std_min, log_std_max))
+        nn.init.constant_(self.output.bias[action_size:], log_std_bias(INITIAL_LOG_STD, log_std_min, log_std_max))
 
     def forward(self, observation: Tensor) -> tuple[Tensor, Tensor]:
         """Mean and std, (..., A) each, at (..., O) observations."""
@@ -78,7 +76,7 @@ class Primitives(nn.Module):
     """K Gaussians over actions at (..., 11) positions: a shared trunk, one hidden layer of each primitive's own."""
 
     def __init__(self, config: MCPConfig, action_size: int) -> None:
-        """Build; the initial std gives the composition ``exp(BOB_INITIAL_LOG_STD)`` under a new gate's weights."""
+        """Build; the initial std gives the composition ``exp(INITIAL_LOG_STD)`` under a new gate's weights."""
         super().__init__()
         self.num_primitives, self.action_size = config.num_primitives, action_size
         self.input = _input(NORMALISATION_POSITIONS, POSITIONS_SIZE)
@@ -106,7 +104,7 @@ class Primitives(nn.Module):
             nn.init.orthogonal_(output[:, : self.action_size], _PRIMITIVE_MEAN_GAIN)
             nn.init.orthogonal_(output[:, self.action_size :], _SMALL_GAIN)
         weight = config.weight_floor + (1.0 - config.weight_floor) * 0.5
-        log_std = BOB_INITIAL_LOG_STD + 0.5 * math.log(config.num_primitives * weight)
+        log_std = INITIAL_LOG_STD + 0.5 * math.log(config.num_primitives * weight)
         self.output_bias[:, self.action_size :] = log_std_bias(log_std, config.log_std_min, config.log_std_max)
 
 
