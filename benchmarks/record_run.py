@@ -58,6 +58,7 @@ def record_run(directory: RunDirectory, name: str, evaluations: Records = (), no
         "name": name,
         "note": note,
         "recorded": machine(*PACKAGES),
+        "environment": _environment(directory),
         "config": config.model_dump(mode="json"),
         "evaluations": list(evaluations),
         "series": thin(read_records(directory.metrics_file)),
@@ -91,6 +92,13 @@ def sample_goals(records: Records) -> list[dict[str, Any]]:
         chosen = sorted({round(place) for place in np.linspace(0, len(goals) - 1, GOALS_EACH)}) if goals else []
         kept.append({"env_steps": records[block[-1]]["env_steps"], "goals": [goals[index] for index in chosen]})
     return kept
+
+
+def _environment(directory: RunDirectory) -> dict[str, Any]:
+    """Commit and versions the run was last started with."""
+    path = directory.path / "environment.json"
+    environment: dict[str, Any] = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
+    return environment
 
 
 def read_evaluation(path: Path) -> list[dict[str, Any]]:

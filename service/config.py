@@ -46,9 +46,7 @@ class WorldConfig(_Frozen):
     object: Literal["cube", "sphere"] = "cube"
     object_size_m: float = Field(0.05, ge=0.02, le=0.07, description="cube edge or sphere diameter; paper: 5 cm")
     object_mass_kg: float = Field(0.1, gt=0.0, le=2.0)
-    friction: float = Field(
-        0.5, gt=0.0, le=3.0, description="sliding friction of the object on the table; panda-gym: half that of the pads"
-    )
+    friction: float = Field(1.0, gt=0.0, le=3.0, description="sliding friction of the object, also on the table")
     pad_friction: float = Field(1.0, gt=0.0, le=3.0, description="sliding friction of the fingertips on the object")
     workspace: WorkspaceConfig = WorkspaceConfig()
     start_height_m: float = Field(
@@ -73,6 +71,9 @@ class GameConfig(_Frozen):
     alice_difficult_reward: float = Field(5.0, description="paper, appendix: added when Bob fails")
     alice_outside_reward: float = Field(
         0.0, description="paid for a goal outside the workspace; 0 in the paper's appendix"
+    )
+    alice_outside_from_valid_fraction: float = Field(
+        0.0, ge=0.0, lt=1.0, description="the outside reward sets in once so many goals are valid; 0: at once"
     )
     bob_success_reward: float = Field(1.0, gt=0.0, description="once, when solved")
 

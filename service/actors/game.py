@@ -97,7 +97,7 @@ class SelfPlay:
         bob, solved, broken = self._play_bob(players, plan, choice)
         played = choice.played & ~broken  # a turn in which the physics broke says nothing about either player
         bob.learn[broken] = False
-        self._reward_alice(alice, verdict, played & ~choice.replayed, solved)
+        self._reward_alice(alice, plan, verdict, played & ~choice.replayed, solved)
         records = GoalRecords(
             start_state=choice.start_state,
             start_position=choice.start_position,
@@ -178,10 +178,13 @@ class SelfPlay:
         turns.final_value_observation[:] = worlds.bob_value(choice.goal)
         return turns, solved, broken
 
-    def _reward_alice(self, alice: Turns, verdict: VerdictArray, tried: BoolArray, solved: BoolArray) -> None:
+    def _reward_alice(
+        self, alice: Turns, plan: RoundPlan, verdict: VerdictArray, tried: BoolArray, solved: BoolArray
+    ) -> None:
         game = self.config.game
         valid = verdict == Verdict.VALID
-        alice.reward[-1, verdict == Verdict.OUTSIDE] = game.alice_outside_reward
+        if plan.penalise_outside:
+            alice.reward[-1, verdict == Verdict.OUTSIDE] = game.alice_outside_reward
         alice.reward[-1, valid] = game.alice_valid_reward
         alice.reward[-1, valid & tried & ~solved] += game.alice_difficult_reward
         # What a valid goal was worth is unknown where Bob could not try it.

@@ -9,7 +9,7 @@ from service.envs import panda
 
 TABLE_CENTER_X_M = -0.3
 TABLE_HALF_SIZE_M = (0.55, 0.45, 0.2)
-# MuJoCo's default contact yields more the lighter the object: an arm leaning on the cube pressed it 11 mm into the table.
+# MuJoCo's default contact yields more the lighter the object: an arm leaning on the cube pressed it 11 mm down.
 # These let it give 1 mm.
 _STIFF = {"solref": (0.01, 1.0), "solimp": (0.95, 0.99, 0.001, 0.5, 2.0)}
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -13,6 +13,7 @@ from service.config import Config
 from service.generator.difficulty import DifficultyGrid
 from service.generator.metrics import alice_metrics, bob_metrics, current_goals, own_goals, without_nan
 from service.generator.opponents import OpponentPool, RoundPlan
+from service.generator.penalty import OutsidePenalty
 from service.generator.replay import GoalBuffer
 from service.generator.state import Array, State, prefixed, under
 from service.generator.stopping import StopCriterion
@@ -66,10 +67,12 @@ class TaskGenerator:
         self.buffer = GoalBuffer(config.generator.replay_buffer_size, state_size)
         self.opponents = OpponentPool(config.generator.opponent_pool_size)
         self._stop = StopCriterion(config.generator)
+        self._penalty = OutsidePenalty(config.game.alice_outside_from_valid_fraction)
 
     def plan(self, num_worlds: int, rng: np.random.Generator) -> RoundPlan:
         """Choose who plays the next round; all current while there are no past versions."""
-        return self.opponents.plan(num_worlds, self._config.past_opponent_fraction, rng)
+        plan = self.opponents.plan(num_worlds, self._config.past_opponent_fraction, rng)
+        return replace(plan, penalise_outside=self._penalty.active)
 
     def choose_goals(
         self,
@@ -118,6 +121,7 @@ class TaskGenerator:
         own = own_goals(records)
         self.buffer.add(records.start_state[own], records.start_position[own], records.goal[own])
         current = current_goals(records)
+        self._penalty.record(float(np.mean(records.verdict == Verdict.VALID)))
         self._stop.record(num_new_cells, int(current.sum()), int(records.solved[current].sum()))
         return (
             alice_metrics(records, self._rest_height_m)
@@ -144,6 +148,7 @@ class TaskGenerator:
             | prefixed("buffer", self.buffer.state())
             | prefixed("opponents", self.opponents.state())
             | prefixed("stop", self._stop.state())
+            | prefixed("penalty", self._penalty.state())
         )
 
     def load_state(self, state: Mapping[str, Array]) -> None:
@@ -156,6 +161,7 @@ class TaskGenerator:
         self.buffer.load_state(under("buffer", state))
         self.opponents.load_state(under("opponents", state))
         self._stop.load_state(under("stop", state))
+        self._penalty.load_state(under("penalty", state))
 
     def _choose_replayed(self, valid: Bools, bob_past: Bools, rng: np.random.Generator) -> Bools:
         """(N,) worlds whose goal comes from the buffer."""

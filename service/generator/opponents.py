@@ -19,12 +19,14 @@ CURRENT = -1
 
 @dataclass(frozen=True, slots=True)
 class RoundPlan:
-    """Who plays a round of N worlds; at most one of the two players of a world is a past version."""
+    """How a round of N worlds is played; at most one of the two players of a world is a past version."""
 
     alice_opponent: Ints
     """(N,) index of Alice in ``OpponentPool.alice``, or ``CURRENT``."""
     bob_opponent: Ints
     """(N,) index of Bob in ``OpponentPool.bob``, or ``CURRENT``."""
+    penalise_outside: bool = True
+    """Whether ``game.alice_outside_reward`` is paid."""
 
     @property
     def alice_past(self) -> NDArray[np.bool_]:

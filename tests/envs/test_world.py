@@ -73,11 +73,8 @@ def test_an_object_at_rest_stays(shape, physics):
 )
 def test_rough_play_breaks_nothing(shape, physics, num_steps):
     extremes = soak(WorldConfig(object=shape, **physics), num_worlds=201, num_steps=num_steps, seed=0)
-    assert extremes.num_broken == 0
     assert extremes.contact_share > 0.05
-    assert extremes.joint_excess_rad < 1e-3
-    assert extremes.finger_excess_m < 8e-3
-    assert extremes.sunk_m < 5e-3
+    assert extremes.within_bounds(), extremes
 
 
 def test_no_action_no_motion():
@@ -197,9 +194,9 @@ def mirrored_runs(symmetric, num_steps):
 
 
 def test_the_task_has_no_left_and_right():
-    differences = mirrored_runs(symmetric=True, num_steps=10)
+    differences = mirrored_runs(symmetric=True, num_steps=5)
     assert differences[0].max() < 1e-7
-    assert differences[:, :11].max() < 1e-4  # impacts magnify the last bits
+    assert differences[:, :11].max() < 2e-5  # contacts magnify the last bits, so not for longer
 
 
 def test_the_real_links_spoil_the_mirror_by_a_millimetre_a_step():
