@@ -158,7 +158,10 @@ def coverage(
         }
         shares = {name: visited_share(path, world.workspace) for name, path in paths.items()}
         picture = plot_coverage(
-            list(paths[bob.label]), world.workspace, out, f"{bob.label}: {skills} random compositions"
+            list(paths[bob.label]),
+            world.workspace,
+            out,
+            f"{bob.label}, {shares[bob.label]:.0%} of the table's cells visited",
         )
     if as_json:
         typer.echo(json.dumps({"share_of_table_cells_visited": shares, "picture": str(picture)}, indent=1))

@@ -36,7 +36,7 @@ def make_artifacts(directory: RunDirectory) -> dict[str, Path]:
             list(trajectories),
             config.world.workspace,
             directory.path / "coverage.png",
-            f"{config.name}: {NUM_SKILLS} random compositions visit {100 * share:.0f} % of the table cells",
+            f"{config.name}, {share:.0%} of the table's cells visited",
         ),
     }
     try:

@@ -26,7 +26,6 @@ from service.runtime.plots.figures import (
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-_CELL_M = 0.05
 _MOVED_M = 0.05
 
 
@@ -47,7 +46,7 @@ def plot_coverage(trajectories: Sequence[Array], workspace: WorkspaceConfig, pat
     paths = [_trajectory(points, number) for number, points in enumerate(trajectories)]
     if not paths:
         raise TandemError(f"no trajectories to draw in {path}; ask for one composition or more")
-    figure = new_figure(14.0, 7.2, f"{title}: {_coverage_words(paths, workspace)}")
+    figure = new_figure(14.0, 7.2, f"{title}: {_coverage_words(paths)}")
     box = figure.add_axes((0.0, 0.0, 0.57, 0.95), projection="3d", computed_zorder=False)
     above = figure.add_axes((0.62, 0.1, 0.36, 0.74))
     _draw_box(box, workspace)
@@ -74,18 +73,9 @@ def _inside(points: Array, workspace: WorkspaceConfig) -> Array:
     return np.where(near.all(axis=1, keepdims=True), points, np.nan)
 
 
-def _coverage_words(paths: Sequence[Array], workspace: WorkspaceConfig) -> str:
-    low, high = bounds(workspace)
+def _coverage_words(paths: Sequence[Array]) -> str:
     moved = sum(bool((np.linalg.norm(points - points[0], axis=1) > _MOVED_M).any()) for points in paths)
-    points = np.concatenate(paths)
-    inside = (points >= low) & (points < high)
-    points = points[inside.all(axis=1)]
-    num_cells = np.prod(np.ceil((high - low) / _CELL_M - 1e-9))
-    visited = len(np.unique(((points - low) / _CELL_M).astype(np.int64), axis=0))
-    return (
-        f"{counted(len(paths), 'composition')}, {moved} move the object over 5 cm, "
-        f"{visited / num_cells:.0%} of the 5 cm cells visited"
-    )
+    return f"{counted(len(paths), 'composition')}, {moved} move the object over 5 cm"
 
 
 def _draw_box(axes: Any, workspace: WorkspaceConfig) -> None:
