@@ -29,6 +29,10 @@ IntArray = NDArray[np.int64]
 VerdictArray = NDArray[np.int8]
 
 
+PROXIMITY_RANGE_M = 0.3
+"""Within it ``game.alice_proximity_reward`` is paid."""
+
+
 class Acting(Protocol):
     """A policy that acts: an evaluator of ``policies.evaluator``."""
 
@@ -131,7 +135,7 @@ class SelfPlay:
         return rollout
 
     def _play_alice(self, players: Players, plan: RoundPlan) -> tuple[Turns, BoolArray, BoolArray]:
-        """Her turns (rewards still zero), (N, 2) finger contacts during them, (N,) worlds whose physics broke."""
+        """Her turns (without what her goal is worth), (N, 2) finger contacts during them, (N,) worlds whose physics broke."""
         num_steps, worlds = self.config.game.alice_steps, self.worlds
         turns = _empty_turns(num_steps, worlds.num_worlds, FULL_SIZE, FULL_SIZE, learn=~plan.alice_past)
         everyone = np.arange(worlds.num_worlds)
@@ -145,6 +149,7 @@ class SelfPlay:
             turns.observation[step], turns.action[step], turns.log_prob[step] = observation, action, log_prob
             broken |= worlds.step(action) if not broken.any() else worlds.step(action[~broken], np.flatnonzero(~broken))
             contacts |= worlds.contacts()
+            turns.reward[step] = self._proximity_reward()
         turns.value_observation[:] = turns.observation
         turns.final_value_observation[:] = worlds.full(1.0)
         turns.active[:] = True
@@ -184,11 +189,16 @@ class SelfPlay:
         game = self.config.game
         valid = verdict == Verdict.VALID
         if plan.penalise_outside:
-            alice.reward[-1, verdict == Verdict.OUTSIDE] = game.alice_outside_reward
-        alice.reward[-1, valid] = game.alice_valid_reward
+            alice.reward[-1, verdict == Verdict.OUTSIDE] += game.alice_outside_reward
+        alice.reward[-1, valid] += game.alice_valid_reward
         alice.reward[-1, valid & tried & ~solved] += game.alice_difficult_reward
         # What a valid goal was worth is unknown where Bob could not try it.
         alice.learn[valid & ~tried] = False
+
+    def _proximity_reward(self) -> StateArray:
+        distance = np.linalg.norm(self.worlds.object_position - self.worlds.ee_position, axis=1)
+        near: StateArray = self.config.game.alice_proximity_reward * np.maximum(PROXIMITY_RANGE_M - distance, 0.0)
+        return near
 
     def _continue_games(self, end_state: StateArray, verdict: VerdictArray) -> None:
         self.worlds.restore(end_state)
