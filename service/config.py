@@ -32,7 +32,7 @@ class WorkspaceConfig(_Frozen):
         -0.05,
         ge=-0.3,
         le=0.2,
-        description="-0.05 keeps the downstream Larger task's 45 x 45 x 40 cm over 99 % reachable",
+        description="-0.05 keeps the downstream Larger task reachable",
     )
     center_y_m: float = Field(0.0, ge=-0.3, le=0.3)
     length_x_m: float = Field(0.35, gt=0.0, le=0.8, description="paper: 35 cm")
@@ -79,8 +79,8 @@ class GameConfig(_Frozen):
         0.0,
         ge=0.0,
         le=0.1,
-        description="per step and metre that the gripper is nearer than 30 cm to the object; off in the paper. At 0.02 a "
-        "whole turn next to the object earns 0.24, a valid goal 1 to 6",
+        description="per step and metre that the gripper is nearer than 30 cm to the object; off in the paper. At "
+        "0.02 a whole turn next to the object earns 0.24, a valid goal 1 to 6",
     )
     bob_success_reward: float = Field(1.0, gt=0.0, description="once, when solved")
 

@@ -135,7 +135,7 @@ class SelfPlay:
         return rollout
 
     def _play_alice(self, players: Players, plan: RoundPlan) -> tuple[Turns, BoolArray, BoolArray]:
-        """Her turns (without what her goal is worth), (N, 2) finger contacts during them, (N,) worlds whose physics broke."""
+        """Her turns (without what her goal is worth), (N, 2) finger contacts, (N,) worlds whose physics broke."""
         num_steps, worlds = self.config.game.alice_steps, self.worlds
         turns = _empty_turns(num_steps, worlds.num_worlds, FULL_SIZE, FULL_SIZE, learn=~plan.alice_past)
         everyone = np.arange(worlds.num_worlds)

@@ -28,6 +28,8 @@ WIDTH_CHANGE_M = 0.10
 """Change of the finger width of a full action (paper)."""
 LOWEST_TARGET_M = 0.012
 """Least height of a commanded end effector; the fingertips end 0.7 cm below it."""
+MAX_TURN_RAD = 0.5
+"""Most a joint is asked to turn in one action; behind the base and near a straight arm the solution would ask for 2."""
 MAX_SPEED = 1e3
 """A joint (rad/s) or object (m/s, rad/s) faster than this has diverged; the arm reaches 3, a falling object 30."""
 _TABLE_TOP_M = 0.0
@@ -161,7 +163,9 @@ class WorldBatch:
         target = kinematics.clip_to_reach(here.position + DISPLACEMENT_M * actions[:, :3], LOWEST_TARGET_M)
         width = start[:, self._layout.fingers].sum(axis=1) + WIDTH_CHANGE_M * actions[:, 3]
         control = np.empty((start.shape[0], NUM_JOINTS + 2))
-        control[:, :NUM_JOINTS] = kinematics.solve(start[:, self._layout.joints], target, at=here)
+        joints = start[:, self._layout.joints]
+        solution = kinematics.solve(joints, target, at=here)
+        control[:, :NUM_JOINTS] = np.clip(solution, joints - MAX_TURN_RAD, joints + MAX_TURN_RAD)
         control[:, NUM_JOINTS:] = np.clip(width / 2, 0.0, FINGER_STROKE_M)[:, None]
         return control
 

@@ -127,16 +127,18 @@ def solve(joints: Array, target: Array, *, at: Kinematics | None = None, num_ite
         joints: (N, 7) where to start, rad.
         target: (N, 3) end-effector positions, metres.
         at: kinematics of ``joints`` if already known.
-        num_iterations: two leave an error below 1 mm for the 5 cm of one action.
+        num_iterations: two leave an error below 1 mm for one action, 3 mm where the arm is nearly straight.
 
     Returns:
         (N, 7) joint angles inside the limits, rad.
     """
-    for _ in range(num_iterations):
+    for remaining in reversed(range(num_iterations)):
         here = forward(joints) if at is None else at
         at = None
         error = np.concatenate([target - here.position, _orientation_error(here.rotation)], axis=1)
-        posture = _POSTURE_GAIN * (NEUTRAL_JOINTS - joints)
+        # Not in the last iteration: damping lets a little of the posture through to the end effector, and since every
+        # action starts from where the end effector is, that little would add up to a drift of 2 mm in 40 idle steps.
+        posture = (_POSTURE_GAIN if remaining else 0.0) * (NEUTRAL_JOINTS - joints)
         jacobian = here.jacobian
         error -= np.matmul(jacobian, posture[:, :, None])[:, :, 0]
         transposed = jacobian.transpose(0, 2, 1)

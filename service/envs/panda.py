@@ -56,6 +56,7 @@ _HAND_QUATERNION = (0.9238795, 0.0, 0.0, -0.3826834)
 
 _PAD_RADIUS = 0.006
 _BODY_FRICTION = 0.3
+_STOP_SOLIMP = (0.99, 0.9999, 0.001, 0.5, 2.0)
 
 GRIPPER_BIT, OBJECT_BIT, TABLE_BIT = 1, 2, 4
 
@@ -96,6 +97,8 @@ def add_panda(spec: mujoco.MjSpec, *, pad_friction: float, physics_step_s: float
             axis=(0, 0, 1),
             range=(JOINT_LOWER[index - 1], JOINT_UPPER[index - 1]),
             limited=True,
+            solref_limit=(2 * physics_step_s, 1.0),
+            solimp_limit=_STOP_SOLIMP,
             armature=_ARMATURE,
             damping=(_JOINT_DAMPING, 0, 0),
         )
@@ -140,7 +143,7 @@ def _add_finger(hand: Any, side: str, quaternion: tuple[float, ...], physics_ste
         armature=_FINGER_ARMATURE,
         # The arm can lean on a finger with more than 100 N: a default end stop gave way by 22 mm, this one by 1 (2 ms).
         solref_limit=(2 * physics_step_s, 1.0),
-        solimp_limit=(0.99, 0.9999, 0.001, 0.5, 2.0),
+        solimp_limit=_STOP_SOLIMP,
     )
     _collision(finger, f"{side}_shaft", 0.009, ((0, 0.013, 0.009), (0, 0.011, 0.043)))
     return finger
