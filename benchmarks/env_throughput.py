@@ -26,9 +26,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.measuring import Sample, describe, describe_ratio, machine, measure, rates, ratio, table, write_json
-from service.actors.evaluation import sample_goals
 from service.config import WorldConfig
 from service.envs.batch import DISPLACEMENT_M, WorldBatch
+from service.envs.goals import sample_goals
 from service.envs.observations import ACTION_SIZE
 from service.envs.registration import TABLETOP_ID
 from service.errors import TandemError

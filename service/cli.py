@@ -101,8 +101,9 @@ def evaluate(
 ) -> None:
     """Bob on random goals from fresh resets, without noise, beside a policy that does nothing."""
     with _user_errors():
-        from service.actors.evaluation import GOAL_KINDS, Idle
+        from service.actors.evaluation import Idle
         from service.actors.evaluation import evaluate as run
+        from service.envs.goals import GOAL_KINDS
         from service.runtime.primitives import load_bob
 
         if goals not in GOAL_KINDS:
@@ -238,7 +239,7 @@ def _report(done: Pretrained, path: Path, registry: Path) -> None:
     say(f"\n{result.reason} after {result.num_env_steps:,} env steps, {result.iteration} iterations")
     say(done.timing)
     if result.reason == "interrupted":
-        say(f"saved; continue with: tandem pretrain --resume --run-dir {path}")
+        say(f"saved; continue with: tandem pretrain --resume --run-dir {path} --registry {registry}")
         raise typer.Exit(_EXIT_INTERRUPTED)
     for name, value in done.metrics.items():
         say(f"{name:<36} {value:.1%}")

@@ -4,15 +4,15 @@ from __future__ import annotations
 
 from copy import deepcopy
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, get_args
+from typing import TYPE_CHECKING, Any
 
 import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
-from service.actors.evaluation import GoalKind, sample_goals
 from service.config import WorldConfig
 from service.envs.batch import WorldBatch
+from service.envs.goals import GOAL_KINDS, GoalKind, sample_goals
 from service.envs.observations import ACTION_SIZE, OBJECT_SLICE, POSITIONS_SIZE
 from service.errors import TandemError
 
@@ -75,8 +75,8 @@ class TabletopEnv(gymnasium.Env[Any, FloatArray]):
         width: int = 640,
         height: int = 480,
     ) -> None:
-        if goals not in get_args(GoalKind):
-            raise TandemError(f"TabletopEnv: goals = {goals!r}; choose one of {', '.join(get_args(GoalKind))}")
+        if goals not in GOAL_KINDS:
+            raise TandemError(f"TabletopEnv: goals = {goals!r}; choose one of {', '.join(GOAL_KINDS)}")
         if render_mode not in (None, *self.metadata["render_modes"]):
             raise TandemError(f"TabletopEnv: render_mode = {render_mode!r}; choose rgb_array or None")
         if not success_distance_m > 0.0:

@@ -7,10 +7,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from service.actors.evaluation import Deterministic, GoalKind, sample_goals
+from service.actors.evaluation import Deterministic
 from service.actors.game import Acting
 from service.config import Config, WorldConfig
 from service.envs.batch import WorldBatch
+from service.envs.goals import GoalKind, sample_goals
 from service.generator.difficulty import in_air
 from service.generator.validity import Verdict, judge
 

@@ -17,10 +17,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from service.actors.evaluation import GoalKind, evaluate
+from service.actors.evaluation import evaluate
 from service.actors.game import Acting, Players, SelfPlay
 from service.actors.rollout import Rollout, from_arrays, to_arrays
 from service.config import Config
+from service.envs.goals import GoalKind
 from service.generator.generator import TaskGenerator
 from service.policies.evaluator import GaussianEvaluator, MCPEvaluator
 from service.registry.checkpoints import CheckpointStore

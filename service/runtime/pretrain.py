@@ -9,8 +9,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from types import FrameType
 
-from service.actors.evaluation import GOAL_KINDS, evaluate
+from service.actors.evaluation import evaluate
 from service.config import Config, ConfigError
+from service.envs.goals import GOAL_KINDS
 from service.envs.observations import ACTION_SIZE, BOB_SIZE, NORMALISATION_BOB, POSITIONS_SIZE
 from service.policies.evaluator import MCPEvaluator
 from service.registry.names import Version

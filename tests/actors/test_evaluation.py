@@ -6,9 +6,10 @@ import math
 import numpy as np
 import pytest
 
-from service.actors.evaluation import GOAL_KINDS, Evaluation, Idle, evaluate, sample_goals, wilson_interval
+from service.actors.evaluation import Evaluation, Idle, evaluate, wilson_interval
 from service.config import WorldConfig
 from service.envs.batch import sample_on_table
+from service.envs.goals import GOAL_KINDS, sample_goals
 
 WORLD = WorldConfig()
 FAST = WorldConfig(physics_step_s=0.004, num_substeps=10)
