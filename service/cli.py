@@ -25,7 +25,7 @@ app.add_typer(registry_app)
 _console = Console()
 _errors = Console(stderr=True)
 
-DEMO_ENV_STEPS = 600_000
+DEMO_ENV_STEPS = 1_000_000
 _EXIT_USER_ERROR = 2
 _EXIT_INTERRUPTED = 130
 

@@ -1,7 +1,7 @@
 """What the players see, as flat float32 vectors, and how those vectors reflect in y.
 
-Positions are metres in the world frame (origin: table top, 0.6 m in front of the robot's base), velocities m/s. With the
-gripper down, the left finger is on the side of negative y.
+Positions are metres in the world frame (origin: table top, 0.6 m in front of the robot's base), velocities m/s. With
+the gripper down, the left finger is on the side of negative y.
 
 | vector | size | content |
 |---|---|---|
