@@ -106,7 +106,7 @@ def test_grasping_arms_go_to_the_object_and_then_close():
 def test_only_grasping_arms_lift_the_object():
     heights = []
     for grasping in (False, True):
-        batch = env_throughput.BatchContender(WorldConfig(), 8, grasping=grasping)
+        batch = env_throughput.BatchContender(WorldConfig(), 48, grasping=grasping)
         batch.episode()
         heights.append(batch._worlds.object_position[:, 2].max())
         batch.close()

