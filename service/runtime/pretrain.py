@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import signal
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -21,6 +22,7 @@ from service.runtime.local import EVALUATION_SEED, LocalRun, OnIteration, RunRes
 from service.runtime.rundir import RunDirectory
 
 FINAL_EVALUATION_EPISODES = 300
+_logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,6 +56,7 @@ def pretrain(
         version = None
         files: dict[str, Path] = {}
         if result.reason != "interrupted":
+            _logger.info("learning is over; now evaluating, publishing, drawing and filming")
             metrics = _final_evaluation(config, run)
             version = _publish(config, directory, registry, run, metrics)
             files = make_artifacts(directory)
