@@ -233,21 +233,18 @@ def _pretrain(config: Config, path: Path, registry: Path, *, resume: bool) -> No
 
 
 def _report(done: Pretrained, path: Path, registry: Path) -> None:
-    def say(text: str) -> None:
-        _console.print(text, highlight=False, soft_wrap=True)
-
     result = done.result
-    say(f"\n{result.reason} after {result.num_env_steps:,} env steps, {result.iteration} iterations")
-    say(done.timing)
+    _say(f"\n{result.reason} after {result.num_env_steps:,} env steps, {result.iteration} iterations")
+    _say(done.timing)
     if result.reason == "interrupted":
-        say(f"saved; continue with: tandem pretrain --resume --run-dir {path} --registry {registry}")
+        _say(f"saved; continue with: tandem pretrain --resume --run-dir {path} --registry {registry}")
         raise typer.Exit(_EXIT_INTERRUPTED)
     for name, value in done.metrics.items():
-        say(f"{name:<36} {value:.1%}")
+        _say(f"{name:<36} {value:.1%}")
     for name, file in done.files.items():
-        say(f"{name:<12} {file}")
-    say(f"{'checkpoint':<12} {path / 'checkpoints'}")
-    say(f"{'primitives':<12} {done.version} in {registry}")
+        _say(f"{name:<12} {file}")
+    _say(f"{'checkpoint':<12} {path / 'checkpoints'}")
+    _say(f"{'primitives':<12} {done.version} in {registry}")
 
 
 def _demo_config() -> Path | None:

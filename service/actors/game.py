@@ -58,7 +58,8 @@ class Players:
 class SelfPlay:
     """Plays rounds on N worlds and hands out rollouts.
 
-    Everything that later rounds depend on is in ``state``: the worlds, how far each game is, and the random generator.
+    Everything that later rounds depend on is in ``state``: the worlds and how far each game is; its owner saves
+    the random generator.
 
     Args:
         config: the run.

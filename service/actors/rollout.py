@@ -43,7 +43,7 @@ class Turns:
     terminated: BoolArray
     """(T, N) the turn truly ended with this step: no bootstrap."""
     learn: BoolArray
-    """(N,) played by the current policy version; a past opponent's turn is not learned from."""
+    """(N,) played by the current policy version; not a past opponent's turn, a broken world's, or an untried goal's."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,7 +61,7 @@ class GoalRecords:
     """What became of each world's goal in this round; all arrays have N rows."""
 
     start_state: StateArray
-    """(N, S) full physics state both players started from."""
+    """(N, S) full physics state Bob started from; Alice too, unless ``replayed``."""
     start_position: StateArray
     """(N, 3) object position there, metres."""
     goal: StateArray
@@ -73,7 +73,7 @@ class GoalRecords:
     replayed: BoolArray
     """(N,) Bob played a goal from the replay buffer (``start_state`` is then that goal's own)."""
     played: BoolArray
-    """(N,) Bob had a turn."""
+    """(N,) Bob had a whole turn: there was a goal, and the physics held."""
     solved: BoolArray
     """(N,) Bob came within the success distance."""
     num_bob_steps: IntArray

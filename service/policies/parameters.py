@@ -8,6 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from service.errors import TandemError
+
 FloatArray = NDArray[np.float32]
 Parameters = Mapping[str, FloatArray]
 
@@ -17,7 +19,7 @@ MEAN_BOUND = 2.0
 """Means are ``MEAN_BOUND * tanh(x / MEAN_BOUND)``: slope 1 at 0, and a little room past the action's [-1, 1]."""
 
 
-class PolicyError(ValueError):
+class PolicyError(TandemError):
     """Parameters or inputs that do not fit the policy; the message names them, with expected and actual shape."""
 
 

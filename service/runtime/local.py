@@ -126,7 +126,7 @@ class LocalRun:
             rollout = self._play(players)
         with self.timing("generator"):
             metrics = rollout.metrics | self.generator.record(rollout.records)
-            self.directory.record_goals(self.iteration, self.num_env_steps, rollout.records)
+            self.directory.record_goals(self.iteration, self.num_env_steps + rollout.num_env_steps, rollout.records)
             self.directory.dump_broken(rollout)
             if self.generator.snapshot_due(self.iteration):
                 self.generator.add_opponents(weights.alice, weights.bob)

@@ -114,6 +114,7 @@ def _final_evaluation(config: Config, run: LocalRun) -> dict[str, float]:
             num_steps=config.run.evaluation_steps,
             success_distance_m=config.game.success_distance_m,
             seed=EVALUATION_SEED + 1,
+            num_threads=config.run.num_threads,
         )
         metrics[f"evaluation/{kind}_success_last"] = result.success_last
         metrics[f"evaluation/{kind}_success_ever"] = result.success_ever
