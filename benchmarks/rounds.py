@@ -13,7 +13,7 @@ from service.actors.game import Acting, Players
 from service.actors.rollout import Rollout
 from service.envs.batch import WorldBatch
 from service.envs.observations import ACTION_SIZE
-from service.policies.evaluator import GaussianEvaluator, MCPEvaluator
+from service.policies.evaluator import GaussianEvaluator, bob_evaluator
 from service.runtime.local import LocalRun
 from service.runtime.timing import Timing
 
@@ -74,9 +74,9 @@ class Rounds:
         return Players(
             version=weights.version,
             alice=_Timed(GaussianEvaluator(weights.alice), self.timing),
-            bob=_Timed(MCPEvaluator(weights.bob), self.timing),
+            bob=_Timed(bob_evaluator(weights.bob), self.timing),
             past_alice=[_Timed(GaussianEvaluator(each), self.timing) for each in pool.alice],
-            past_bob=[_Timed(MCPEvaluator(each), self.timing) for each in pool.bob],
+            past_bob=[_Timed(bob_evaluator(each), self.timing) for each in pool.bob],
         )
 
     def _play_round(self, players: Players) -> int:

@@ -155,7 +155,7 @@ def coverage(
         world = bob.config.world
         paths = {
             name: skill_trajectories(policy, world, num_skills=skills, num_steps=steps, seed=seed)
-            for name, policy in ((bob.label, bob.policy), ("random policy", RandomPolicy()))
+            for name, policy in ((bob.label, bob.primitives), ("random policy", RandomPolicy()))
         }
         shares = {name: visited_share(path, world.workspace) for name, path in paths.items()}
         picture = plot_coverage(

@@ -82,7 +82,15 @@ class GameConfig(_Frozen):
         description="per step and metre that the gripper is nearer than 30 cm to the object; off in the paper. At "
         "0.02 a whole turn next to the object earns 0.24, a valid goal 1 to 6",
     )
-    bob_success_reward: float = Field(1.0, gt=0.0, description="once, when solved")
+    bob_success_reward: float = Field(
+        1.0, gt=0.0, description="of a whole turn: each step on the goal pays its share of ``bob_hold_steps``"
+    )
+    bob_hold_steps: int = Field(
+        1,
+        ge=1,
+        description="Bob's turn ends once the object was on the goal for so many steps in all; 1: the moment it is "
+        "solved (paper). More teach him to stay: the goals of evaluation and downstream count at the last step",
+    )
 
 
 class GeneratorConfig(_Frozen):
@@ -95,6 +103,12 @@ class GeneratorConfig(_Frozen):
     opponent_interval: int = Field(10, ge=1, description="iterations between two snapshots of the players")
     replay_fraction: float = Field(0.0, ge=0.0, le=1.0, description="share of valid goals replaced by replayed ones")
     replay_invalid: bool = Field(False, description="give Bob a replayed goal where Alice's goal was invalid")
+    replay_from_reset: float = Field(
+        0.0,
+        ge=0.0,
+        le=1.0,
+        description="share of replayed goals that Bob plays from the start of some game instead of the goal's own",
+    )
     replay_buffer_size: int = Field(4096, ge=1)
     cell_size_m: float = Field(0.05, gt=0.0, description="edge of a goal cell of the difficulty grid")
     novelty_window: int = Field(50, ge=1, description="iterations without a new cell before the run may stop")
@@ -132,6 +146,9 @@ class PolicyConfig(_Frozen):
     alice_log_std_min: float = -2.5
     alice_log_std_max: float = 0.5
     bob: MCPConfig = MCPConfig()
+    monolithic_bob: MLPConfig | None = Field(
+        None, description="a Bob of one Gaussian network instead of primitives: an ablation, nothing to publish"
+    )
     value: MLPConfig = MLPConfig()
 
     @model_validator(mode="after")
@@ -165,6 +182,10 @@ class ABCConfig(_Frozen):
     weight: float = Field(0.5, ge=0.0, description="beta")
     clip: float = Field(0.2, gt=0.0, lt=1.0, description="epsilon")
     num_iterations: int = Field(1, ge=1, description="demonstrations of that many iterations are kept; 1 is on-policy")
+    hindsight: bool = Field(
+        False,
+        description="also clone Bob's failed turns, relabelled with where the object ended (Ghosh et al. 2021)",
+    )
     mean_only: bool = Field(
         False, description="clone Alice's actions by Bob's mean and leave his std alone, or he also copies her noise"
     )

@@ -40,8 +40,8 @@ class Acting(Protocol):
         """(N, O) observations to sampled actions (N, A) and log-probabilities (N,)."""
 
 
-ChooseGoals = Callable[[StateArray, StateArray, StateArray, VerdictArray], GoalChoice]
-"""(start_state, start_position, proposal, verdict) of a round to the goals Bob plays; the task generator's."""
+ChooseGoals = Callable[[StateArray, StateArray, IntArray, StateArray, VerdictArray], GoalChoice]
+"""The task generator's: start_state, start_position, round_index, proposal, verdict of a round to Bob's goals."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,10 +96,11 @@ class SelfPlay:
         end_state, proposal = worlds.states.copy(), worlds.object_position.copy()
         verdict = judge(start_position, proposal, self.config.world.workspace, game.success_distance_m)
         verdict[broken] = Verdict.FALLEN
-        choice = choose_goals(start_state, start_position, proposal, verdict)
+        choice = choose_goals(start_state, start_position, self._round_index, proposal, verdict)
 
         worlds.restore(choice.start_state)
         bob, solved, broken = self._play_bob(players, plan, choice)
+        achieved = worlds.object_position.copy()
         played = choice.played & ~broken  # a turn in which the physics broke says nothing about either player
         bob.learn[broken] = False
         self._reward_alice(alice, plan, verdict, played & ~choice.replayed, solved)
@@ -110,6 +111,7 @@ class SelfPlay:
             proposal=proposal,
             verdict=verdict,
             replayed=choice.replayed,
+            from_reset=choice.from_reset,
             played=played,
             solved=solved,
             num_bob_steps=bob.active.sum(axis=0),
@@ -125,7 +127,7 @@ class SelfPlay:
             policy_version=players.version,
             alice=alice,
             bob=bob,
-            demonstrations=_demonstrations(alice, records),
+            demonstrations=self._demonstrations(alice, bob, records, achieved),
             records=records,
             num_env_steps=int(alice.active.sum() + bob.active.sum()),
             metrics=_contact_metrics(contacts),
@@ -165,6 +167,7 @@ class SelfPlay:
         turns = _empty_turns(game.bob_steps, num, BOB_SIZE, BOB_VALUE_SIZE, learn=choice.played & ~plan.bob_past)
         goal = choice.goal.astype(np.float32)
         solved, broken = np.zeros(num, dtype=bool), np.zeros(num, dtype=bool)
+        num_held: IntArray = np.zeros(num, dtype=np.int64)
         playing = np.flatnonzero(choice.played)
         for step in range(game.bob_steps):
             if not playing.size:
@@ -176,11 +179,12 @@ class SelfPlay:
             turns.log_prob[step, playing], turns.active[step, playing] = log_prob, True
             broken |= worlds.step(action, playing)
             reached = np.linalg.norm(worlds.object_position - choice.goal, axis=1) <= game.success_distance_m
-            newly = playing[reached[playing]]
-            solved[newly] = True
-            turns.reward[step, newly] = game.bob_success_reward
-            turns.terminated[step, newly] = True
-            playing = playing[~(reached | broken)[playing]]
+            turns.reward[step, playing] = game.bob_success_reward / game.bob_hold_steps * reached[playing]
+            solved[playing] = reached[playing]
+            num_held += reached
+            over = num_held >= game.bob_hold_steps
+            turns.terminated[step, playing] = over[playing]
+            playing = playing[~(over | broken)[playing]]
         turns.final_value_observation[:] = worlds.bob_value(choice.goal)
         return turns, solved, broken
 
@@ -195,6 +199,19 @@ class SelfPlay:
         alice.reward[-1, valid & tried & ~solved] += game.alice_difficult_reward
         # What a valid goal was worth is unknown where Bob could not try it.
         alice.learn[valid & ~tried] = False
+
+    def _demonstrations(self, alice: Turns, bob: Turns, records: GoalRecords, achieved: StateArray) -> Demonstrations:
+        """Alice's turns for the goals the current Bob failed; with hindsight, also his own failures."""
+        failed = records.played & ~records.solved & ~records.bob_past
+        by_alice = _relabelled(alice, failed & ~records.replayed, records.goal)
+        if not self.config.learner.abc.hindsight:
+            return by_alice
+        config = self.config
+        moved = judge(records.start_position, achieved, config.world.workspace, config.game.success_distance_m)
+        by_bob = _relabelled(bob, failed & (moved == Verdict.VALID), achieved)
+        return Demonstrations(
+            np.concatenate([by_alice.observation, by_bob.observation]), np.concatenate([by_alice.action, by_bob.action])
+        )
 
     def _proximity_reward(self) -> StateArray:
         distance = np.linalg.norm(self.worlds.object_position - self.worlds.ee_position, axis=1)
@@ -260,15 +277,12 @@ def _empty_turns(num_steps: int, num: int, observation_size: int, value_size: in
     )
 
 
-def _demonstrations(alice: Turns, records: GoalRecords) -> Demonstrations:
-    """Alice's turns for the goals the current Bob failed, seen through Bob's inputs."""
-    failed = records.played & ~records.replayed & ~records.solved & ~records.bob_past
-    positions = alice.observation[:, failed, :POSITIONS_SIZE]
-    goal = np.broadcast_to(records.goal[failed].astype(np.float32), (*positions.shape[:2], 3))
-    return Demonstrations(
-        observation=np.concatenate([positions, goal], axis=2).reshape(-1, BOB_SIZE),
-        action=alice.action[:, failed].reshape(-1, ACTION_SIZE),
-    )
+def _relabelled(turns: Turns, chosen: BoolArray, goal: StateArray) -> Demonstrations:
+    """The ``chosen`` worlds' turns, seen through Bob's inputs, as the way to the ``goal`` (N, 3)."""
+    active = turns.active & chosen
+    goals = np.broadcast_to(goal.astype(np.float32), (*active.shape, 3))[active]
+    observation = np.concatenate([turns.observation[active][:, :POSITIONS_SIZE], goals], axis=1)
+    return Demonstrations(observation, turns.action[active])
 
 
 def _contact_metrics(contacts: BoolArray) -> dict[str, float]:

@@ -72,6 +72,8 @@ class GoalRecords:
     """(N,) ``generator.validity.Verdict`` of Alice's proposal."""
     replayed: BoolArray
     """(N,) Bob played a goal from the replay buffer (``start_state`` is then that goal's own)."""
+    from_reset: BoolArray
+    """(N,) Bob started where a game does, as he does whenever he is evaluated."""
     played: BoolArray
     """(N,) Bob had a whole turn: there was a goal, and the physics held."""
     solved: BoolArray

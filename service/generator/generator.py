@@ -10,11 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.config import Config
+from service.generator.counts import SuccessCounts
 from service.generator.difficulty import DifficultyGrid
 from service.generator.metrics import alice_metrics, bob_metrics, current_goals, own_goals, without_nan
 from service.generator.opponents import OpponentPool, RoundPlan
 from service.generator.penalty import OutsidePenalty
-from service.generator.replay import GoalBuffer
+from service.generator.ring import Ring
 from service.generator.state import Array, State, prefixed, under
 from service.generator.stopping import StopCriterion
 from service.generator.validity import Verdict
@@ -25,6 +26,10 @@ if TYPE_CHECKING:
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
 
+LEARNABILITY_FLOOR = 0.01
+"""Added to p (1 - p), which is at most 1/4, so goals of a solved or hopeless cell stay drawable and measured."""
+NUM_STARTS = 1024
+"""Starts of games kept for ``replay_from_reset``."""
 MIN_REPLAY_GOALS = 64
 """Goals the buffer must hold before any is replayed: fewer would be played over and over."""
 
@@ -41,6 +46,8 @@ class GoalChoice:
     """(N, 3) object position there, metres."""
     replayed: Bools
     """(N,) the goal and its start come from the buffer, not from this round's Alice."""
+    from_reset: Bools
+    """(N,) the start is that of a game."""
     played: Bools
     """(N,) there is a goal for Bob to play."""
 
@@ -55,17 +62,25 @@ class TaskGenerator:
 
     grid: DifficultyGrid
     """Bob's success over goal cells, heights and distances."""
-    buffer: GoalBuffer
-    """Earlier valid goals."""
+    buffer: Ring
+    """Earlier valid goals and the states they were proposed from, drawn by learnability (Rutherford et al. 2024)."""
+    starts: Ring
+    """States right after a reset."""
+    from_reset: SuccessCounts
+    """Bob's success over the grid's cells where he started from a reset: harder than where Alice left him near."""
     opponents: OpponentPool
     """Past versions of both players."""
 
     def __init__(self, config: Config, state_size: int) -> None:
         self._config = config.generator
+        self._success_distance_m = config.game.success_distance_m
         self._rest_height_m = config.world.object_size_m / 2
         self.grid = DifficultyGrid(config.world, config.generator.cell_size_m)
-        self.buffer = GoalBuffer(config.generator.replay_buffer_size, state_size)
+        columns = {"start_state": state_size, "start_position": 3}
+        self.buffer = Ring(config.generator.replay_buffer_size, **columns, goal=3)
+        self.starts = Ring(NUM_STARTS, **columns)
         self.opponents = OpponentPool(config.generator.opponent_pool_size)
+        self.from_reset = SuccessCounts(len(self.grid.seen))
         self._stop = StopCriterion(config.generator)
         self._penalty = OutsidePenalty(config.game.alice_outside_from_valid_fraction)
 
@@ -79,6 +94,7 @@ class TaskGenerator:
         plan: RoundPlan,
         start_state: Floats,
         start_position: Floats,
+        round_index: NDArray[np.int64],
         proposal: Floats,
         verdict: NDArray[np.int8],
         rng: np.random.Generator,
@@ -91,19 +107,20 @@ class TaskGenerator:
             plan: who plays.
             start_state: (N, S) full physics state of this round's start.
             start_position: (N, 3) object position there, metres.
+            round_index: (N,) 0 where it is the start of a game.
             proposal: (N, 3) object position at the end of Alice's turn, metres.
             verdict: (N,) ``Verdict`` of the proposal.
             rng: source of the choice.
         """
+        reset = round_index == 0
+        self.starts.add(start_state=start_state[reset], start_position=start_position[reset])
         valid: Bools = verdict == Verdict.VALID
         replayed = self._choose_replayed(valid, plan.bob_past, rng)
-        choice = GoalChoice(proposal.copy(), start_state.copy(), start_position.copy(), replayed, valid | replayed)
-        num = int(np.count_nonzero(replayed))
-        if num:
-            drawn = self.buffer.sample(rng, num, self.grid.learnability(self.buffer.goals))
-            choice.goal[replayed] = drawn.goal
-            choice.start_state[replayed] = drawn.start_state
-            choice.start_position[replayed] = drawn.start_position
+        starts = start_state.copy(), start_position.copy()
+        choice = GoalChoice(proposal.copy(), *starts, replayed, reset & ~replayed, valid | replayed)
+        elsewhere = replayed & (rng.random(len(valid)) < self._config.replay_from_reset)
+        self._replay(choice, np.flatnonzero(replayed & ~elsewhere), rng)
+        self._replay_from_reset(choice, np.flatnonzero(elsewhere), rng)
         return choice
 
     def record(self, records: GoalRecords) -> dict[str, float]:
@@ -117,9 +134,13 @@ class TaskGenerator:
         """
         num_new_cells = self.grid.mark_seen(records.proposal[records.verdict == Verdict.VALID])
         tried = records.played & ~records.bob_past
+        reset = tried & records.from_reset
+        self.from_reset.record(self.grid.cell_index(records.goal[reset]), records.solved[reset])
         self.grid.record(records.goal[tried], records.start_position[tried], records.solved[tried])
         own = own_goals(records)
-        self.buffer.add(records.start_state[own], records.start_position[own], records.goal[own])
+        self.buffer.add(
+            start_state=records.start_state[own], start_position=records.start_position[own], goal=records.goal[own]
+        )
         current = current_goals(records)
         self._penalty.record(float(np.mean(records.verdict == Verdict.VALID)))
         self._stop.record(num_new_cells, int(current.sum()), int(records.solved[current].sum()))
@@ -146,6 +167,8 @@ class TaskGenerator:
         return (
             prefixed("grid", self.grid.state())
             | prefixed("buffer", self.buffer.state())
+            | prefixed("starts", self.starts.state())
+            | prefixed("from_reset", self.from_reset.state())
             | prefixed("opponents", self.opponents.state())
             | prefixed("stop", self._stop.state())
             | prefixed("penalty", self._penalty.state())
@@ -159,6 +182,8 @@ class TaskGenerator:
         """
         self.grid.load_state(under("grid", state))
         self.buffer.load_state(under("buffer", state))
+        self.starts.load_state(under("starts", state))
+        self.from_reset.load_state(under("from_reset", state))
         self.opponents.load_state(under("opponents", state))
         self._stop.load_state(under("stop", state))
         self._penalty.load_state(under("penalty", state))
@@ -170,6 +195,31 @@ class TaskGenerator:
         replaced: Bools = valid & (rng.random(len(valid)) < self._config.replay_fraction)
         filled: Bools = ~valid & self._config.replay_invalid
         return (replaced | filled) & ~bob_past
+
+    def _replay(self, choice: GoalChoice, worlds: NDArray[np.int64], rng: np.random.Generator) -> None:
+        """Give ``worlds`` earlier goals with the starts they were proposed from."""
+        if not len(worlds):
+            return
+        drawn = self.buffer.sample(rng, len(worlds), self.grid.learnability(self.buffer["goal"]) + LEARNABILITY_FLOOR)
+        choice.goal[worlds] = drawn["goal"]
+        choice.start_state[worlds], choice.start_position[worlds] = drawn["start_state"], drawn["start_position"]
+
+    def _replay_from_reset(self, choice: GoalChoice, worlds: NDArray[np.int64], rng: np.random.Generator) -> None:
+        """Give ``worlds`` earlier goals with the starts of games.
+
+        Whatever is asked of Bob downstream begins with a reset; Alice reaches far goals over several rounds, so few of
+        her own do. A goal next to the drawn start is no task: it keeps its own start.
+        """
+        if not len(worlds):
+            return
+        learnability = self.from_reset.learnability()[self.grid.cell_index(self.buffer["goal"])]
+        drawn = self.buffer.sample(rng, len(worlds), learnability + LEARNABILITY_FLOOR)
+        start = self.starts.sample(rng, len(worlds))
+        far = np.linalg.norm(drawn["goal"] - start["start_position"], axis=1) > self._success_distance_m
+        for name, rows in start.items():
+            drawn[name][far] = rows[far]
+        choice.goal[worlds], choice.from_reset[worlds] = drawn["goal"], far
+        choice.start_state[worlds], choice.start_position[worlds] = drawn["start_state"], drawn["start_position"]
 
     def _own_metrics(self, num_new_cells: int) -> dict[str, float]:
         metrics = {

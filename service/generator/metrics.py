@@ -61,6 +61,7 @@ def bob_metrics(records: GoalRecords, rest_height_m: float) -> dict[str, float]:
         "_table": current & ~air,
         "_air": current & air,
         "_past_alice": own_goals(records) & records.alice_past & ~records.bob_past,
+        "_from_reset": records.played & records.from_reset & ~records.bob_past,
         "_replayed": records.played & records.replayed & ~records.bob_past,
     }
     metrics = {f"bob/success_rate{suffix}": mean(records.solved[goals]) for suffix, goals in kinds.items()}

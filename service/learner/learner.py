@@ -164,7 +164,7 @@ class Learner:
         metrics["num_demonstrations"] = float(_length(cloning) // (2 if config.mirror else 1))
         metrics |= _prefixed("bob", update_player(bob, samples, cloning, config.abc, self._rng))
         rows = samples if samples is not None else cloning
-        if rows is not None:
+        if rows is not None and isinstance(self._bob_policy, networks.MCPPolicy):
             metrics |= composition_metrics(self._bob_policy, probes(rows.observation))
         if cloning is not None:
             metrics |= cloning_metrics(bob, Cloning(*(probes(column) for column in cloning.tensors())))

@@ -8,6 +8,9 @@ from torch import Tensor
 LOG_RATIO_BOUND = 20.0
 """Log-ratios are clamped to +- this: the ratio of two products of experts can overflow float32 otherwise."""
 
+LAG_WEIGHT_BOUND = 2.0
+"""Of the importance weight that corrects for policy lag: a bound on variance, at the price of a little bias."""
+
 
 def bounded_log_ratio(log_prob: Tensor, old_log_prob: Tensor) -> Tensor:
     """``log_prob - old_log_prob`` within +- ``LOG_RATIO_BOUND``; no gradient flows beyond it."""
@@ -37,6 +40,11 @@ def clipped_surrogate(
     bounded = torch.where(advantage < 0.0, torch.maximum(objective, dual_clip * advantage), objective)
     clip_fraction = ((ratio.detach() - 1.0).abs() > clip).float().mean()
     return -bounded.mean(), clip_fraction
+
+
+def lag_weight(start_log_prob: Tensor, old_log_prob: Tensor) -> Tensor:
+    """Importance weight of actions from a policy that is a version or two behind, at most ``LAG_WEIGHT_BOUND``."""
+    return bounded_log_ratio(start_log_prob, old_log_prob).exp().clamp(max=LAG_WEIGHT_BOUND)
 
 
 def approximate_kl(log_prob: Tensor, old_log_prob: Tensor) -> Tensor:

@@ -113,12 +113,14 @@ def _policy_loss(
     loss, terms = log_prob.new_zeros(()), Terms()
     if samples is not None:
         config = player.config
-        pair = log_prob[:num_samples], samples.old_log_prob
-        surrogate, clip_fraction = losses.clipped_surrogate(*pair, samples.advantage, config.clip, config.dual_clip)
+        # Clipping around the policy at the start of the update, and weighting by what it has moved since the one that
+        # acted, keeps the whole clip range for this update (decoupled PPO, Hilton et al. 2022).
+        advantage = samples.advantage * losses.lag_weight(samples.start_log_prob, samples.old_log_prob)
+        pair = log_prob[:num_samples], samples.start_log_prob
+        surrogate, clip_fraction = losses.clipped_surrogate(*pair, advantage, config.clip, config.dual_clip)
         entropy = gaussian.entropy(std[:num_samples]).mean()
         loss = surrogate - config.entropy_weight * entropy
         terms = {"policy_loss": surrogate, "entropy": entropy, "clip_fraction": clip_fraction}
-        # From the policy at the start of the update: the one that acted may lag behind, and would stop this at once.
         terms["kl"] = losses.approximate_kl(log_prob[:num_samples], samples.start_log_prob)
     if cloning is not None:
         terms["cloning_loss"] = losses.cloning_loss(log_prob[num_samples:], cloning.old_log_prob, abc.clip)

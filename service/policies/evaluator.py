@@ -120,6 +120,16 @@ class MCPEvaluator:
         return self.distribution(observation)[0]
 
 
+def bob_evaluator(parameters: Parameters) -> MCPEvaluator | GaussianEvaluator:
+    """Bob of a run: composed, or monolithic where the configuration said so.
+
+    Raises:
+        PolicyError: parameters of neither.
+    """
+    composed = any(name.startswith("primitives.") for name in parameters)
+    return MCPEvaluator(parameters) if composed else GaussianEvaluator(parameters)
+
+
 class _Primitives:
     """(N, 11) positions to (N, K, A) means and variances; the K heads share one matrix product per layer."""
 

@@ -17,6 +17,7 @@ from torch.nn.functional import elu
 from service.config import MCPConfig, MLPConfig, PolicyConfig
 from service.envs.observations import (
     ACTION_SIZE,
+    BOB_SIZE,
     BOB_VALUE_SIZE,
     FULL_SIZE,
     GOAL_SLICE,
@@ -42,7 +43,7 @@ _GATE_GAIN = 1.0
 
 
 class GaussianPolicy(nn.Module):
-    """Alice: a diagonal Gaussian with bounded mean and bounded, state-dependent std."""
+    """Alice, or a monolithic Bob: a diagonal Gaussian with bounded mean and bounded, state-dependent std."""
 
     def __init__(
         self,
@@ -137,7 +138,7 @@ class MCPPolicy(nn.Module):
     """Bob: the composition of ``primitives`` under the weights of ``gate``.
 
     The goal reaches the gate only, so no primitive can solve everything by itself. With K = 1 the gate can therefore
-    only widen or narrow a policy blind to the goal; the monolithic Bob of the ablation needs a class of its own.
+    only widen or narrow a policy blind to the goal; the monolithic Bob of the ablation is a ``GaussianPolicy``.
     """
 
     def __init__(self, config: MCPConfig, action_size: int = ACTION_SIZE) -> None:
@@ -188,9 +189,12 @@ def make_alice(config: PolicyConfig) -> GaussianPolicy:
     return GaussianPolicy(FULL_SIZE, ACTION_SIZE, config.alice, *bounds, NORMALISATION_FULL)
 
 
-def make_bob(config: PolicyConfig) -> MCPPolicy:
+def make_bob(config: PolicyConfig) -> MCPPolicy | GaussianPolicy:
     """A new Bob; draws from torch's global generator."""
-    return MCPPolicy(config.bob)
+    if config.monolithic_bob is None:
+        return MCPPolicy(config.bob)
+    bounds = config.bob.log_std_min, config.bob.log_std_max
+    return GaussianPolicy(BOB_SIZE, ACTION_SIZE, config.monolithic_bob, *bounds, NORMALISATION_BOB)
 
 
 def make_alice_value(config: PolicyConfig) -> ValueNetwork:

@@ -7,6 +7,7 @@ from pathlib import Path
 
 from service.actors.coverage import skill_trajectories, visited_share
 from service.errors import TandemError
+from service.policies.evaluator import MCPEvaluator
 from service.runtime.plots import plot_coverage, plot_curves, plot_goals
 from service.runtime.primitives import load_players
 from service.runtime.rundir import RunDirectory
@@ -27,18 +28,19 @@ def make_artifacts(directory: RunDirectory) -> dict[str, Path]:
     """
     config = directory.read_config()
     alice, bob = load_players(directory)
-    trajectories = skill_trajectories(bob, config.world, num_skills=NUM_SKILLS, num_steps=COVERAGE_STEPS, seed=_SEED)
-    share = visited_share(trajectories, config.world.workspace)
     files = {
         "curves": plot_curves(directory.path),
         "goals": plot_goals(directory.path, config.world.workspace),
-        "coverage": plot_coverage(
-            list(trajectories),
+    }
+    if isinstance(bob, MCPEvaluator):
+        paths = skill_trajectories(bob, config.world, num_skills=NUM_SKILLS, num_steps=COVERAGE_STEPS, seed=_SEED)
+        share = visited_share(paths, config.world.workspace)
+        files["coverage"] = plot_coverage(
+            list(paths),
             config.world.workspace,
             directory.path / "coverage.png",
             f"{config.name}, {share:.0%} of the table's cells visited",
-        ),
-    }
+        )
     try:
         from service.runtime.video import film_rounds, write_video
 

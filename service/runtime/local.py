@@ -23,7 +23,7 @@ from service.actors.rollout import Rollout, from_arrays, to_arrays
 from service.config import Config
 from service.envs.goals import GoalKind
 from service.generator.generator import TaskGenerator
-from service.policies.evaluator import GaussianEvaluator, MCPEvaluator
+from service.policies.evaluator import GaussianEvaluator, bob_evaluator
 from service.registry.checkpoints import CheckpointStore
 from service.runtime.rundir import RunDirectory
 from service.runtime.timing import Timing
@@ -166,11 +166,11 @@ class LocalRun:
     def _players(self, weights: Weights) -> Players:
         if not self._past:
             pool = self.generator.opponents
-            self._past = [(GaussianEvaluator(a), MCPEvaluator(b)) for a, b in zip(pool.alice, pool.bob, strict=True)]
+            self._past = [(GaussianEvaluator(a), bob_evaluator(b)) for a, b in zip(pool.alice, pool.bob, strict=True)]
         return Players(
             version=weights.version,
             alice=GaussianEvaluator(weights.alice),
-            bob=MCPEvaluator(weights.bob),
+            bob=bob_evaluator(weights.bob),
             past_alice=[alice for alice, _ in self._past],
             past_bob=[bob for _, bob in self._past],
         )
@@ -179,7 +179,7 @@ class LocalRun:
         run, game = self.config.run, self.config.game
         if run.evaluation_interval == 0 or self.iteration % run.evaluation_interval:
             return {}
-        metrics, bob = {}, MCPEvaluator(weights.bob)
+        metrics, bob = {}, bob_evaluator(weights.bob)
         for kind in EVALUATED_GOALS:
             result = evaluate(
                 bob,

@@ -14,7 +14,7 @@ from service.actors.evaluation import evaluate
 from service.config import Config, ConfigError
 from service.envs.goals import GOAL_KINDS
 from service.envs.observations import ACTION_SIZE, BOB_SIZE, NORMALISATION_BOB, POSITIONS_SIZE
-from service.policies.evaluator import MCPEvaluator
+from service.policies.evaluator import bob_evaluator
 from service.registry.names import Version
 from service.registry.registry import Registry
 from service.runtime.artifacts import make_artifacts
@@ -58,7 +58,8 @@ def pretrain(
         if result.reason != "interrupted":
             _logger.info("learning is over; now evaluating, publishing, drawing and filming")
             metrics = _final_evaluation(config, run)
-            version = _publish(config, directory, registry, run, metrics)
+            if config.policy.monolithic_bob is None:
+                version = _publish(config, directory, registry, run, metrics)
             files = make_artifacts(directory)
         return Pretrained(result, files, version, metrics, run.timing.tree())
     finally:
@@ -103,7 +104,7 @@ def _stop_on_signals(run: LocalRun) -> Iterator[None]:
 
 
 def _final_evaluation(config: Config, run: LocalRun) -> dict[str, float]:
-    bob = MCPEvaluator(run.learner.weights().bob)
+    bob = bob_evaluator(run.learner.weights().bob)
     metrics = {}
     for kind in GOAL_KINDS:
         result = evaluate(

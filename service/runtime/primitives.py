@@ -7,7 +7,7 @@ from pathlib import Path
 
 from service.config import Config, parse_config
 from service.errors import TandemError
-from service.policies.evaluator import GaussianEvaluator, MCPEvaluator
+from service.policies.evaluator import GaussianEvaluator, MCPEvaluator, bob_evaluator
 from service.policies.parameters import Parameters, PolicyError
 from service.registry.checkpoints import CheckpointStore
 from service.runtime.rundir import RunDirectory
@@ -19,8 +19,19 @@ class TrainedBob:
 
     label: str
     """Where he comes from, such as ``panda-cube@3``."""
-    policy: MCPEvaluator
+    policy: MCPEvaluator | GaussianEvaluator
     config: Config
+
+    @property
+    def primitives(self) -> MCPEvaluator:
+        """What can be composed.
+
+        Raises:
+            TandemError: this Bob is monolithic.
+        """
+        if not isinstance(self.policy, MCPEvaluator):
+            raise TandemError(f"{self.label} has no primitives: it was trained with policy.monolithic_bob")
+        return self.policy
 
 
 def load_bob(reference: str, registry: Path) -> TrainedBob:
@@ -32,7 +43,7 @@ def load_bob(reference: str, registry: Path) -> TrainedBob:
     if Path(reference).is_dir():
         directory = RunDirectory(Path(reference))
         config, parameters = directory.read_config(), read_parameters(directory, "bob")
-        return TrainedBob(reference, _evaluator(reference, parameters), config)
+        return TrainedBob(reference, bob_evaluator(parameters), config)
     if "/" in reference:
         raise TandemError(f"{reference}: no such run directory; for published primitives write NAME@ALIAS")
     from service.registry.registry import Registry
@@ -49,7 +60,7 @@ def _evaluator(label: str, parameters: Parameters) -> MCPEvaluator:
         raise TandemError(f"{label} holds no primitives: {error}") from None
 
 
-def load_players(directory: RunDirectory) -> tuple[GaussianEvaluator, MCPEvaluator]:
+def load_players(directory: RunDirectory) -> tuple[GaussianEvaluator, MCPEvaluator | GaussianEvaluator]:
     """Alice and Bob of a run's newest checkpoint.
 
     Raises:
@@ -57,7 +68,7 @@ def load_players(directory: RunDirectory) -> tuple[GaussianEvaluator, MCPEvaluat
     """
     return (
         GaussianEvaluator(read_parameters(directory, "alice")),
-        MCPEvaluator(read_parameters(directory, "bob")),
+        bob_evaluator(read_parameters(directory, "bob")),
     )
 
 

@@ -90,11 +90,16 @@ def everyone_current(num_worlds):
     return RoundPlan(np.full(num_worlds, CURRENT), np.full(num_worlds, CURRENT))
 
 
-def alices_own(start_state, start_position, proposal, verdict):
+def alices_own(start_state, start_position, round_index, proposal, verdict):
     """Bob plays every valid goal, nothing else."""
     replayed = np.zeros(len(verdict), dtype=bool)
     return GoalChoice(
-        proposal.copy(), start_state.copy(), start_position.copy(), replayed, np.asarray(verdict == Verdict.VALID)
+        proposal.copy(),
+        start_state.copy(),
+        start_position.copy(),
+        replayed,
+        np.asarray(round_index == 0),
+        np.asarray(verdict == Verdict.VALID),
     )
 
 

@@ -252,12 +252,14 @@ def test_each_policy_sees_its_own_worlds_rows_only():
 def replay_in(worlds, state, goal):
     """Alice's own goals, but in ``worlds`` a replayed one with its own start."""
 
-    def choose(start_state, start_position, proposal, verdict):
-        choice = alices_own(start_state, start_position, proposal, verdict)
+    def choose(start_state, start_position, round_index, proposal, verdict):
+        choice = alices_own(start_state, start_position, round_index, proposal, verdict)
         replayed, played = choice.replayed.copy(), choice.played.copy()
         replayed[worlds] = played[worlds] = True
         choice.goal[worlds], choice.start_state[worlds], choice.start_position[worlds] = goal, state, state[OBJECT]
-        return GoalChoice(choice.goal, choice.start_state, choice.start_position, replayed, played)
+        return GoalChoice(
+            choice.goal, choice.start_state, choice.start_position, replayed, choice.from_reset & ~replayed, played
+        )
 
     return choose
 

@@ -24,6 +24,7 @@ def _make_records(proposal: Any, **overrides: Any) -> GoalRecords:
         "proposal": proposal,
         "verdict": np.zeros(num, dtype=np.int8),
         "replayed": np.zeros(num, dtype=np.bool_),
+        "from_reset": np.zeros(num, dtype=np.bool_),
         "played": np.ones(num, dtype=np.bool_),
         "solved": np.zeros(num, dtype=np.bool_),
         "num_bob_steps": np.full(num, 40),

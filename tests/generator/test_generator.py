@@ -43,6 +43,7 @@ def choose(generator: TaskGenerator, verdict: list[int], plan: RoundPlan | None 
         plan or all_current(num),
         np.ones((num, STATE_SIZE)),
         np.tile([0.0, 0.0, 0.025], (num, 1)),
+        np.arange(num),
         np.tile([-0.1, 0.0, 0.1], (num, 1)),
         np.array(verdict, dtype=np.int8),
         np.random.default_rng(seed),
@@ -89,6 +90,23 @@ def test_no_replay_before_the_buffer_holds_enough(make_records: MakeRecords) -> 
     assert_rows(choose(generator, [VALID, OUTSIDE]), [True, True])
 
 
+def test_replayed_goals_may_start_where_a_game_did(make_records: MakeRecords) -> None:
+    generator = filled(make_records, replay_fraction=1.0, replay_from_reset=0.5)
+    first = choose(generator, [VALID] * 400)  # world 0 alone starts a game here, from a state of ones
+    assert set(first.start_state[:, 0]) == {1.0, 7.0}
+    assert 0.4 < np.mean(first.start_state[:, 0] == 1.0) < 0.6
+    assert first.replayed.all()
+    assert (first.goal == OLD_GOAL).all()
+
+
+def test_a_start_next_to_the_goal_is_no_task(make_records: MakeRecords) -> None:
+    generator = filled(make_records, replay_fraction=1.0, replay_from_reset=1.0)
+    state, near = np.ones((8, STATE_SIZE)), np.tile(OLD_GOAL, (8, 1)) + np.array([0.03, 0.03, 0.0])
+    index, verdict = np.zeros(8, dtype=np.int64), np.zeros(8, dtype=np.int8)
+    choice = generator.choose_goals(all_current(8), state, near, index, near, verdict, np.random.default_rng(0))
+    assert (choice.start_state == 7.0).all()
+
+
 def test_a_past_bob_plays_no_replayed_goals(make_records: MakeRecords) -> None:
     generator = filled(make_records, replay_fraction=1.0, replay_invalid=True)
     plan = RoundPlan(np.array([0, CURRENT, CURRENT]), np.array([CURRENT, 0, 0]))
@@ -101,7 +119,8 @@ def test_choice_does_not_alias_its_inputs(make_records: MakeRecords) -> None:
     generator = filled(make_records, replay_fraction=1.0)
     start_state, position = np.ones((1, STATE_SIZE)), np.zeros((1, 3))
     verdict = np.zeros(1, dtype=np.int8)
-    generator.choose_goals(all_current(1), start_state, position, position, verdict, np.random.default_rng(0))
+    index = np.zeros(1, dtype=np.int64)
+    generator.choose_goals(all_current(1), start_state, position, index, position, verdict, np.random.default_rng(0))
     assert start_state.tolist() == [[1.0] * STATE_SIZE]
     assert position.tolist() == [[0.0] * 3]
 
@@ -213,7 +232,8 @@ def play(generator: TaskGenerator, make_records: MakeRecords, rng: np.random.Gen
         start_state, start = rng.normal(size=(num, STATE_SIZE)), rng.uniform(lower, upper, size=(num, 3))
         proposal = rng.uniform(lower, upper, size=(num, 3))
         verdict = rng.choice([VALID, OUTSIDE], size=num, p=[0.7, 0.3]).astype(np.int8)
-        choice = generator.choose_goals(plan, start_state, start, proposal, verdict, rng)
+        index = rng.integers(3, size=num)
+        choice = generator.choose_goals(plan, start_state, start, index, proposal, verdict, rng)
         records = make_records(
             proposal,
             **{name: getattr(choice, name) for name in GoalChoice.__slots__},

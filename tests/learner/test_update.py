@@ -7,6 +7,7 @@ import torch
 from torch import nn
 
 from service.config import ABCConfig, PPOConfig
+from service.learner import losses
 from service.learner.player import Player
 from service.learner.samples import Cloning, Samples
 from service.learner.training import MAX_NON_FINITE, train
@@ -216,7 +217,12 @@ def test_a_policy_ahead_of_the_one_that_acted_does_not_stop():
     tally = train(player, lagging, None, ABC, np.random.default_rng(0))
     assert not tally.stopped
     assert tally.kls[0] == pytest.approx(0.0, abs=1e-6)
-    assert tally.means()["clip_fraction"] > 0.9  # the surrogate's ratios are those to the policy that acted
+    assert tally.means()["clip_fraction"] == 0.0  # the clip range is this update's own
+
+
+def test_samples_of_a_lagging_policy_are_weighted_by_what_has_changed_since():
+    weight = losses.lag_weight(torch.tensor([0.0, 0.5, -0.5, 3.0]), torch.tensor([0.0, 0.0, 0.0, 0.0]))
+    np.testing.assert_allclose(weight, [1.0, math.exp(0.5), math.exp(-0.5), losses.LAG_WEIGHT_BOUND], rtol=1e-6)
 
 
 @pytest.mark.parametrize(

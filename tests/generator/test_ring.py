@@ -1,0 +1,90 @@
+"""The ring and its sampling."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from service.config import ConfigError
+from service.generator.ring import Ring
+
+
+def add(buffer: Ring, *numbers: int) -> None:
+    column = np.array(numbers, dtype=np.float64)[:, np.newaxis]
+    buffer.add(first=np.tile(column, 2), second=np.tile(column + 0.25, 3))
+
+
+def make(capacity: int = 3, first: int = 2) -> Ring:
+    return Ring(capacity, first=first, second=3)
+
+
+def held(buffer: Ring) -> list[int]:
+    return [int(row[0]) for row in buffer["second"]]
+
+
+def test_ring_overwrites_the_oldest() -> None:
+    buffer = make(3, 2)
+    add(buffer, 1, 2)
+    assert held(buffer) == [1, 2]
+    add(buffer, 3, 4)
+    assert held(buffer) == [4, 2, 3]
+    assert len(buffer) == 3
+    add(buffer, 5)
+    assert held(buffer) == [4, 5, 3]
+    buffer.add(first=np.zeros((0, 2)), second=np.zeros((0, 3)))
+    assert held(buffer) == [4, 5, 3]
+
+
+def test_more_goals_than_capacity_keep_the_newest() -> None:
+    buffer = make(3, 2)
+    add(buffer, 1)
+    add(buffer, 2, 3, 4, 5, 6)
+    assert sorted(held(buffer)) == [4, 5, 6]
+    add(buffer, 7)
+    assert sorted(held(buffer)) == [5, 6, 7]
+
+
+def test_sampled_rows_belong_together() -> None:
+    buffer = make(8)
+    add(buffer, 1, 2, 3)
+    drawn = buffer.sample(np.random.default_rng(0), 50)
+    assert drawn["first"].shape == (50, 2)
+    np.testing.assert_array_equal(drawn["second"][:, 0], drawn["first"][:, 0] + 0.25)
+    assert set(drawn["first"][:, 0]) == {1.0, 2.0, 3.0}
+    drawn["first"][:] = 0.0
+    assert held(buffer) == [1, 2, 3]
+
+
+def test_sampling_is_proportional_to_weight() -> None:
+    buffer = make(8)
+    add(buffer, 0, 1, 2, 3)
+    weight = np.array([0.25, 0.09, 0.09, 0.01])
+    num = 20_000
+    drawn = buffer.sample(np.random.default_rng(3), num, weight)
+    counted = np.bincount(drawn["first"][:, 0].astype(int), minlength=4)
+    expected = num * weight / 0.44
+    chi_square = float(np.sum((counted - expected) ** 2 / expected))
+    assert chi_square < 11.34, counted  # 99 % point of 3 degrees of freedom
+
+
+def test_state_of_another_buffer_is_refused() -> None:
+    full = make(3, 2)
+    add(full, 1, 2, 3, 4)
+    for capacity in (2, 5):
+        with pytest.raises(
+            ConfigError, match=f"3 rows do not fit a buffer of {capacity} .generator.replay_buffer_size"
+        ):
+            make(capacity).load_state(full.state())
+    with pytest.raises(ConfigError, match=r"'first' is float64 \(3, 2\)"):
+        make(3, 5).load_state(full.state())
+
+
+def test_state_round_trip_continues_the_ring() -> None:
+    for numbers in ((), (1, 2), (1, 2, 3), (1, 2, 3, 4)):
+        buffer, copy = make(3, 2), make(3, 2)
+        if numbers:
+            add(buffer, *numbers)
+        copy.load_state(buffer.state())
+        for ring in (buffer, copy):
+            add(ring, 8, 9)
+        assert held(copy) == held(buffer)
