@@ -103,11 +103,8 @@ class GeneratorConfig(_Frozen):
     opponent_interval: int = Field(10, ge=1, description="iterations between two snapshots of the players")
     replay_fraction: float = Field(0.0, ge=0.0, le=1.0, description="share of valid goals replaced by replayed ones")
     replay_invalid: bool = Field(False, description="give Bob a replayed goal where Alice's goal was invalid")
-    replay_from_reset: float = Field(
-        0.0,
-        ge=0.0,
-        le=1.0,
-        description="share of replayed goals that Bob plays from the start of some game instead of the goal's own",
+    replay_from_reset: bool = Field(
+        False, description="replayed goals also start where games do, when Bob can learn from that"
     )
     replay_buffer_size: int = Field(4096, ge=1)
     cell_size_m: float = Field(0.05, gt=0.0, description="edge of a goal cell of the difficulty grid")

@@ -63,9 +63,12 @@ class DifficultyGrid:
         self.shape = (int(counted[0]), int(counted[1]), int(counted[2]))
         num_cells = int(np.prod(self.shape))
         self.cells = SuccessCounts(num_cells)
-        self.heights = SuccessCounts(len(HEIGHT_NAMES))
-        self.distances = SuccessCounts(len(DISTANCE_EDGES_M) + 1)
+        self.heights = SuccessCounts(self.num_height_bins)
+        self.distances = SuccessCounts(self.num_distance_bins)
         self.seen = np.zeros(num_cells, dtype=np.bool_)
+
+    num_height_bins = len(HEIGHT_NAMES)
+    num_distance_bins = len(DISTANCE_EDGES_M) + 1
 
     @property
     def num_cells_seen(self) -> int:
@@ -94,9 +97,18 @@ class DifficultyGrid:
         """
         self.mark_seen(goals)
         self.cells.record(self.cell_index(goals), solved)
-        self.heights.record(height_bins(goals, self._rest_height_m), solved)
+        self.heights.record(self.height_bin(goals), solved)
+        self.distances.record(self.distance_bin(goals, start_positions), solved)
+
+    def height_bin(self, goals: Floats) -> Ints:
+        """(M,) index into ``HEIGHT_NAMES`` of (M, 3) goals, metres."""
+        return height_bins(goals, self._rest_height_m)
+
+    def distance_bin(self, goals: Floats, start_positions: Floats) -> Ints:
+        """(M,) bin between ``DISTANCE_EDGES_M`` of the way from (M, 3) starts to (M, 3) goals, metres."""
         distance = np.linalg.norm(goals - start_positions, axis=-1)
-        self.distances.record(np.digitize(distance, DISTANCE_EDGES_M).astype(np.int64), solved)
+        bins: Ints = np.digitize(distance, DISTANCE_EDGES_M).astype(np.int64)
+        return bins
 
     def success_rate(self, goals: Floats) -> Floats:
         """(M,) estimated probability that Bob solves a goal in the cell of each of (M, 3) goals; 1/2 where untried."""

@@ -67,7 +67,7 @@ class TaskGenerator:
     starts: Ring
     """States right after a reset."""
     from_reset: SuccessCounts
-    """Bob's success over the grid's cells where he started from a reset: harder than where Alice left him near."""
+    """Bob's success from resets, by the goal's height and distance: harder than from where Alice left off."""
     opponents: OpponentPool
     """Past versions of both players."""
 
@@ -80,7 +80,7 @@ class TaskGenerator:
         self.buffer = Ring(config.generator.replay_buffer_size, **columns, goal=3)
         self.starts = Ring(NUM_STARTS, **columns)
         self.opponents = OpponentPool(config.generator.opponent_pool_size)
-        self.from_reset = SuccessCounts(len(self.grid.seen))
+        self.from_reset = SuccessCounts(self.grid.num_height_bins * self.grid.num_distance_bins)
         self._stop = StopCriterion(config.generator)
         self._penalty = OutsidePenalty(config.game.alice_outside_from_valid_fraction)
 
@@ -118,9 +118,8 @@ class TaskGenerator:
         replayed = self._choose_replayed(valid, plan.bob_past, rng)
         starts = start_state.copy(), start_position.copy()
         choice = GoalChoice(proposal.copy(), *starts, replayed, reset & ~replayed, valid | replayed)
-        elsewhere = replayed & (rng.random(len(valid)) < self._config.replay_from_reset)
-        self._replay(choice, np.flatnonzero(replayed & ~elsewhere), rng)
-        self._replay_from_reset(choice, np.flatnonzero(elsewhere), rng)
+        if replayed.any():
+            self._replay(choice, np.flatnonzero(replayed), rng)
         return choice
 
     def record(self, records: GoalRecords) -> dict[str, float]:
@@ -135,8 +134,11 @@ class TaskGenerator:
         num_new_cells = self.grid.mark_seen(records.proposal[records.verdict == Verdict.VALID])
         tried = records.played & ~records.bob_past
         reset = tried & records.from_reset
-        self.from_reset.record(self.grid.cell_index(records.goal[reset]), records.solved[reset])
-        self.grid.record(records.goal[tried], records.start_position[tried], records.solved[tried])
+        self.from_reset.record(
+            self._task_bins(records.goal[reset], records.start_position[reset]), records.solved[reset]
+        )
+        as_proposed = tried & ~(records.replayed & records.from_reset)
+        self.grid.record(records.goal[as_proposed], records.start_position[as_proposed], records.solved[as_proposed])
         own = own_goals(records)
         self.buffer.add(
             start_state=records.start_state[own], start_position=records.start_position[own], goal=records.goal[own]
@@ -197,29 +199,30 @@ class TaskGenerator:
         return (replaced | filled) & ~bob_past
 
     def _replay(self, choice: GoalChoice, worlds: NDArray[np.int64], rng: np.random.Generator) -> None:
-        """Give ``worlds`` earlier goals with the starts they were proposed from."""
-        if not len(worlds):
-            return
-        drawn = self.buffer.sample(rng, len(worlds), self.grid.learnability(self.buffer["goal"]) + LEARNABILITY_FLOOR)
-        choice.goal[worlds] = drawn["goal"]
-        choice.start_state[worlds], choice.start_position[worlds] = drawn["start_state"], drawn["start_position"]
+        """Give ``worlds`` earlier goals, from the start each was proposed from or from that of some game.
 
-    def _replay_from_reset(self, choice: GoalChoice, worlds: NDArray[np.int64], rng: np.random.Generator) -> None:
-        """Give ``worlds`` earlier goals with the starts of games.
-
-        Whatever is asked of Bob downstream begins with a reset; Alice reaches far goals over several rounds, so few of
-        her own do. A goal next to the drawn start is no task: it keeps its own start.
+        Whatever is asked of Bob downstream begins with a reset, but Alice reaches far goals over several rounds, so few
+        of her own do. Both kinds of task compete by learnability: far goals from a reset wait until Bob is ready.
         """
-        if not len(worlds):
-            return
-        learnability = self.from_reset.learnability()[self.grid.cell_index(self.buffer["goal"])]
-        drawn = self.buffer.sample(rng, len(worlds), learnability + LEARNABILITY_FLOOR)
-        start = self.starts.sample(rng, len(worlds))
-        far = np.linalg.norm(drawn["goal"] - start["start_position"], axis=1) > self._success_distance_m
-        for name, rows in start.items():
-            drawn[name][far] = rows[far]
-        choice.goal[worlds], choice.from_reset[worlds] = drawn["goal"], far
-        choice.start_state[worlds], choice.start_position[worlds] = drawn["start_state"], drawn["start_position"]
+        goal = self.buffer["goal"]
+        tasks = {name: self.buffer[name] for name in ("start_state", "start_position")}
+        weight = self.grid.learnability(goal) + LEARNABILITY_FLOOR
+        if self._config.replay_from_reset and len(self.starts):
+            start = self.starts.sample(rng, len(goal))
+            position = start["start_position"]
+            far = np.linalg.norm(goal - position, axis=1) > self._success_distance_m  # nearer ones are no task
+            learnability = self.from_reset.learnability()[self._task_bins(goal, position)]
+            weight = np.concatenate([weight, np.where(far, learnability + LEARNABILITY_FLOOR, 0.0)])
+            tasks = {name: np.concatenate([rows, start[name]]) for name, rows in tasks.items()}
+        drawn = rng.choice(len(weight), size=len(worlds), p=weight / weight.sum())
+        choice.goal[worlds] = goal[drawn % len(goal)]
+        choice.from_reset[worlds] = drawn >= len(goal)
+        choice.start_state[worlds] = tasks["start_state"][drawn]
+        choice.start_position[worlds] = tasks["start_position"][drawn]
+
+    def _task_bins(self, goals: Floats, starts: Floats) -> NDArray[np.int64]:
+        """(M,) bin of tasks by the goal's height and its distance from the object's start, (M, 3) metres each."""
+        return self.grid.height_bin(goals) * self.grid.num_distance_bins + self.grid.distance_bin(goals, starts)
 
     def _own_metrics(self, num_new_cells: int) -> dict[str, float]:
         metrics = {

@@ -17,7 +17,7 @@ from service.policies import gaussian
 
 RATE_STEP = 1.5
 """The KL-adaptive learning rate moves by this factor (rsl_rl)."""
-RATE_BOUNDS = 0.1, 2.0
+RATE_BOUNDS = 0.03, 2.0
 """It stays within these multiples of the configured one."""
 COLLAPSE_KL = 10.0
 """An update that moved the policy by more than this multiple of the target KL is undone."""
@@ -49,10 +49,11 @@ def update_player(
     failed = tally.aborted or not kl <= COLLAPSE_KL * player.config.target_kl
     if failed:
         player.restore(snapshot)
-    player.optimizer.learning_rate = _adapted(player, math.inf if failed else kl)
+    player.optimizer.learning_rate = _adapted(player, math.inf if failed or tally.stopped else kl)
     if samples is not None:
         metrics["explained_variance"] = explained_variance(samples.target.cpu().numpy(), samples.value.cpu().numpy())
     metrics |= {"non_finite_steps": float(tally.num_non_finite), "rollbacks": float(failed)}
+    metrics["policy_steps"] = float(max(len(tally.terms["policy_loss"]), len(tally.terms["cloning_loss"])))
     return metrics | tally.means() | {"kl": kl}
 
 
@@ -62,7 +63,11 @@ def probes(rows: Tensor) -> Tensor:
 
 
 def _adapted(player: Player, kl: float) -> float:
-    """A lower learning rate after an update that moved too far, a higher one after one that hardly moved."""
+    """A lower learning rate after an update that moved too far, a higher one after one that hardly moved.
+
+    One that was stopped early moved too far as well, whatever its KL: its step was so long that most of what was
+    played was not learned from.
+    """
     low, high = (player.config.learning_rate * bound for bound in RATE_BOUNDS)
     if kl > 2.0 * player.config.target_kl:
         return max(player.optimizer.learning_rate / RATE_STEP, low)

@@ -13,7 +13,7 @@ from tests.learner.rollouts import make_config, make_rollout, nobody_learns
 HISTORY = {"abc": {"num_iterations": 2}, "mirror": True}
 
 BOTH_PLAYERS = ("policy_loss", "value_loss", "entropy", "kl", "clip_fraction", "learning_rate")
-BOTH_PLAYERS += ("explained_variance", "grad_norm")
+BOTH_PLAYERS += ("explained_variance", "grad_norm", "policy_steps")
 COMMON = ("num_alice_samples", "num_bob_samples", "num_demonstrations", "cloning_loss", "demonstration_log_ratio")
 COMMON += ("demonstration_log_prob", "bob_std", "primitive_weight_0", "primitive_weight_1", "primitive_share_0")
 COMMON += ("primitive_share_1", "non_finite_steps", "rollbacks", "version")

@@ -227,13 +227,22 @@ def test_samples_of_a_lagging_policy_are_weighted_by_what_has_changed_since():
 
 @pytest.mark.parametrize(
     ("target_kl", "num_updates", "multiple"),
-    [(10.0, 1, 1.5), (10.0, 5, 2.0), (1e-9, 1, 1 / 1.5), (1e-9, 12, 0.1)],
+    [(10.0, 1, 1.5), (10.0, 5, 2.0), (1e-9, 1, 1 / 1.5), (1e-9, 12, 0.03)],
 )
 def test_learning_rate_follows_the_kl_within_bounds(target_kl, num_updates, multiple):
     player, rng = make_player(target_kl=target_kl, num_epochs=1), np.random.default_rng(0)
     for _ in range(num_updates):
         update(player, play(player, rng, num=32))
     assert player.optimizer.learning_rate == pytest.approx(CONFIG.learning_rate * multiple)
+
+
+def test_an_update_that_was_stopped_early_lowers_the_learning_rate():
+    # However small its KL is at last: a step that leaves most samples unused was too long.
+    player = make_player(target_kl=1e-9, num_epochs=1)
+    samples = play(player, np.random.default_rng(0))
+    metrics = update(player, samples)
+    assert metrics["policy_steps"] < len(samples) // player.config.minibatch_size
+    assert player.optimizer.learning_rate == pytest.approx(CONFIG.learning_rate / 1.5)
 
 
 def test_reported_kl_is_that_of_the_whole_update():
