@@ -53,7 +53,7 @@ def update_player(
     if samples is not None:
         metrics["explained_variance"] = explained_variance(samples.target.cpu().numpy(), samples.value.cpu().numpy())
     metrics |= {"non_finite_steps": float(tally.num_non_finite), "rollbacks": float(failed)}
-    metrics["policy_steps"] = float(max(len(tally.terms["policy_loss"]), len(tally.terms["cloning_loss"])))
+    metrics["policy_steps"] = float(max(len(tally.terms.get(name, ())) for name in ("policy_loss", "cloning_loss")))
     return metrics | tally.means() | {"kl": kl}
 
 
