@@ -150,16 +150,16 @@ class Learner:
     def _update_alice(self, rollouts: Sequence[Rollout]) -> Metrics:
         turns = [rollout.alice for rollout in rollouts]
         alice = self._alice
-        samples = collect(turns, alice.value, alice.log_prob, self.config.learner.alice, self._device)
+        samples = collect(turns, alice.value, alice.policy, self.config.learner.alice, self._device)
         metrics = update_player(self._alice, samples, None, self.config.learner.abc, self._rng)
         return _prefixed("alice", metrics) | {"num_alice_samples": float(_length(samples))}
 
     def _update_bob(self, rollouts: Sequence[Rollout]) -> Metrics:
         config, bob = self.config.learner, self._bob
-        samples = collect([rollout.bob for rollout in rollouts], bob.value, bob.log_prob, config.bob, self._device)
+        samples = collect([rollout.bob for rollout in rollouts], bob.value, bob.policy, config.bob, self._device)
         metrics = {"num_bob_samples": float(_length(samples))}
         if samples is not None and config.mirror:
-            samples = mirrored(samples, bob.log_prob, MIRROR_BOB, MIRROR_BOB_VALUE, MIRROR_ACTION)
+            samples = mirrored(samples, bob.policy, MIRROR_BOB, MIRROR_BOB_VALUE, MIRROR_ACTION)
         cloning = self._cloning(rollouts)
         metrics["num_demonstrations"] = float(_length(cloning) // (2 if config.mirror else 1))
         metrics |= _prefixed("bob", update_player(bob, samples, cloning, config.abc, self._rng))

@@ -47,15 +47,6 @@ def lag_weight(start_log_prob: Tensor, old_log_prob: Tensor) -> Tensor:
     return bounded_log_ratio(start_log_prob, old_log_prob).exp().clamp(max=LAG_WEIGHT_BOUND)
 
 
-def approximate_kl(log_prob: Tensor, old_log_prob: Tensor) -> Tensor:
-    """Mean of ``(ratio - 1) - log ratio``: an unbiased, never negative estimate of KL(old || new) in nats.
-
-    Schulman's "k3" (2020, joschu.net/blog/kl-approx.html); no gradient.
-    """
-    log_ratio = bounded_log_ratio(log_prob.detach(), old_log_prob)
-    return (log_ratio.expm1() - log_ratio).mean()
-
-
 def cloning_loss(log_prob: Tensor, old_log_prob: Tensor, clip: float) -> Tensor:
     """Alice behavioural cloning (OpenAI 2021): the clipped surrogate with advantage 1, ``-mean(min(ratio, 1 + clip))``.
 

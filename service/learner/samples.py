@@ -15,9 +15,10 @@ from service.actors.rollout import Turns
 from service.config import PPOConfig
 from service.envs.observations import Mirror
 from service.learner.returns import advantages
+from service.policies import gaussian
 
 Estimate = Callable[[Tensor], Tensor]
-LogProb = Callable[[Tensor, Tensor], Tensor]
+Policy = Callable[[Tensor], tuple[Tensor, Tensor]]
 
 
 class _Rows:
@@ -52,14 +53,21 @@ class Samples(_Rows):
     """(B, A)."""
     old_log_prob: Tensor
     """(B,) under the policy that acted."""
-    start_log_prob: Tensor
-    """(B,) under the policy at the start of the update, which may be a version or two ahead of the one that acted."""
+    start_mean: Tensor
+    """(B, A) of the policy at the start of the update, which may be a version or two ahead of the one that acted."""
+    start_std: Tensor
+    """(B, A)."""
     advantage: Tensor
     """(B,) normalised."""
     target: Tensor
     """(B,) of the value network: advantage, not normalised, plus ``value``."""
     value: Tensor
     """(B,) estimated at the start of the update."""
+
+    @property
+    def start_log_prob(self) -> Tensor:
+        """(B,) under the policy at the start of the update."""
+        return gaussian.log_prob(self.action, self.start_mean, self.start_std)
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,14 +83,14 @@ class Cloning(_Rows):
 
 
 def collect(
-    turns: Sequence[Turns], estimate: Estimate, log_prob: LogProb, config: PPOConfig, device: torch.device
+    turns: Sequence[Turns], estimate: Estimate, policy: Policy, config: PPOConfig, device: torch.device
 ) -> Samples | None:
     """Turn what was played into samples; only active steps of worlds that ``learn`` count.
 
     Args:
         turns: of one player, with equal T; joined along worlds.
         estimate: value network, (B, V) to (B,).
-        log_prob: of (B, A) actions at (B, O) observations under the policy at the start of the update.
+        policy: mean and std at (B, O) observations, at the start of the update.
         config: discount and lambda.
         device: where the tensors shall be.
 
@@ -98,7 +106,7 @@ def collect(
     final = torch.from_numpy(np.concatenate([part.final_value_observation[part.learn] for part in turns])).to(device)
     with torch.no_grad():
         estimates = estimate(torch.cat((tensors["value_observation"], final)))
-        tensors["start_log_prob"] = log_prob(tensors["observation"], tensors["action"])
+        tensors["start_mean"], tensors["start_std"] = policy(tensors["observation"])
     value = estimates[:num_samples]
     values = np.zeros(active.shape, dtype=np.float32)
     values[active] = value.cpu().numpy()
@@ -111,27 +119,28 @@ def collect(
     return Samples(**tensors, advantage=normalised, target=target, value=value)
 
 
-def mirrored(samples: Samples, log_prob: LogProb, policy: Mirror, value: Mirror, action: Mirror) -> Samples:
+def mirrored(samples: Samples, policy: Policy, own: Mirror, value: Mirror, action: Mirror) -> Samples:
     """The samples followed by their reflections.
 
     A reflection was never acted, so its old log-probability is that of the policy at the start of the update.
 
     Args:
         samples: B of them.
-        log_prob: of (B, O) observations and (B, A) actions under that policy.
-        policy: reflects observations.
+        policy: mean and std at (B, O) observations, at the start of the update.
+        own: reflects observations.
         value: reflects value observations.
         action: reflects actions.
 
     Returns:
         2B samples; advantage and target are the original's.
     """
-    observation, actions = reflect(samples.observation, policy), reflect(samples.action, action)
+    observation, actions = reflect(samples.observation, own), reflect(samples.action, action)
     with torch.no_grad():
-        old_log_prob = log_prob(observation, actions)
+        start = policy(observation)
+        old_log_prob = gaussian.log_prob(actions, *start)
     value_observation = reflect(samples.value_observation, value)
     unchanged = samples.advantage, samples.target, samples.value
-    reflections = Samples(observation, value_observation, actions, old_log_prob, old_log_prob, *unchanged)
+    reflections = Samples(observation, value_observation, actions, old_log_prob, *start, *unchanged)
     pairs = zip(samples.tensors(), reflections.tensors(), strict=True)
     return Samples(*(torch.cat(pair) for pair in pairs))
 

@@ -115,13 +115,17 @@ def _policy_loss(
         config = player.config
         # Clipping around the policy at the start of the update, and weighting by what it has moved since the one that
         # acted, keeps the whole clip range for this update (decoupled PPO, Hilton et al. 2022).
-        advantage = samples.advantage * losses.lag_weight(samples.start_log_prob, samples.old_log_prob)
-        pair = log_prob[:num_samples], samples.start_log_prob
+        start_log_prob = samples.start_log_prob
+        advantage = samples.advantage * losses.lag_weight(start_log_prob, samples.old_log_prob)
+        pair = log_prob[:num_samples], start_log_prob
         surrogate, clip_fraction = losses.clipped_surrogate(*pair, advantage, config.clip, config.dual_clip)
         entropy = gaussian.entropy(std[:num_samples]).mean()
         loss = surrogate - config.entropy_weight * entropy
         terms = {"policy_loss": surrogate, "entropy": entropy, "clip_fraction": clip_fraction}
-        terms["kl"] = losses.approximate_kl(log_prob[:num_samples], samples.start_log_prob)
+        # Exact: the usual estimate from sampled actions is ruled by the few that the policy would hardly have taken,
+        # of which mirroring makes many.
+        kl = gaussian.kl(samples.start_mean, samples.start_std, mean[:num_samples], std[:num_samples])
+        terms["kl"] = kl.mean().detach()
     if cloning is not None:
         terms["cloning_loss"] = losses.cloning_loss(log_prob[num_samples:], cloning.old_log_prob, abc.clip)
         loss = loss + abc.weight * terms["cloning_loss"]

@@ -1,10 +1,18 @@
+import math
 from dataclasses import replace
 
 import numpy as np
 import torch
 
 from service.config import PPOConfig
-from service.envs.observations import BOB_SIZE, BOB_VALUE_SIZE, MIRROR_ACTION, MIRROR_BOB, MIRROR_BOB_VALUE
+from service.envs.observations import (
+    ACTION_SIZE,
+    BOB_SIZE,
+    BOB_VALUE_SIZE,
+    MIRROR_ACTION,
+    MIRROR_BOB,
+    MIRROR_BOB_VALUE,
+)
 from service.learner.minibatches import epoch
 from service.learner.returns import advantages
 from service.learner.samples import Cloning, Samples, collect, mirrored
@@ -22,13 +30,19 @@ def estimate(value_observation):
     return 3.0 * value_observation[:, 0] + value_observation[:, 1]
 
 
-def log_prob(observation, action):
-    return observation[:, 1] + action[:, 1]
+def policy(observation):
+    mean = observation[:, 1:2].expand(-1, ACTION_SIZE)
+    return mean, torch.full_like(mean, 2.0)
 
 
 def make_samples(num):
     index = torch.arange(num, dtype=torch.float32)
-    return Samples(*(index[:, None].expand(num, 3) for _ in range(3)), *(index for _ in range(5)))
+    return Samples(
+        *(index[:, None].expand(num, 3) for _ in range(3)),
+        index,
+        *(index[:, None] for _ in range(2)),
+        *(index for _ in range(3)),
+    )
 
 
 def make_cloning(num):
@@ -39,18 +53,21 @@ def make_cloning(num):
 def test_only_active_steps_of_learnable_worlds_become_samples():
     learn = np.array([True, False] * 4)
     turns = make_bob_turns(learn=learn)
-    samples = collect([turns], estimate, log_prob, CONFIG, CPU)
+    samples = collect([turns], estimate, policy, CONFIG, CPU)
     kept = turns.active & learn
     assert len(samples) == kept.sum() > 0
     order = np.argwhere(kept)
     np.testing.assert_array_equal(samples.action, [turns.action[step, world] for step, world in order])
     np.testing.assert_array_equal(samples.old_log_prob, [turns.log_prob[step, world] for step, world in order])
-    np.testing.assert_array_equal(samples.start_log_prob, samples.observation[:, 1] + samples.action[:, 1])
+    np.testing.assert_array_equal(samples.start_mean[:, 3], samples.observation[:, 1])
+    standard = (samples.action - samples.start_mean) / 2.0
+    expected = -(0.5 * standard.square() + math.log(2.0) + 0.5 * math.log(2.0 * math.pi)).sum(1)
+    np.testing.assert_allclose(samples.start_log_prob, expected, rtol=1e-5)
 
 
 def test_targets_are_advantages_plus_values():
     turns = make_bob_turns()
-    samples = collect([turns], estimate, log_prob, CONFIG, CPU)
+    samples = collect([turns], estimate, policy, CONFIG, CPU)
     values, final = (
         estimate(torch.from_numpy(each))
         for each in (turns.value_observation[turns.active], turns.final_value_observation)
@@ -66,28 +83,28 @@ def test_targets_are_advantages_plus_values():
 
 def test_several_rollouts_are_joined_along_worlds():
     first, second = make_bob_turns(0), make_bob_turns(1)
-    joined = collect([first, second], estimate, log_prob, CONFIG, CPU)
+    joined = collect([first, second], estimate, policy, CONFIG, CPU)
     assert len(joined) == first.active.sum() + second.active.sum()
-    apart = [collect([turns], estimate, log_prob, CONFIG, CPU).target for turns in (first, second)]
+    apart = [collect([turns], estimate, policy, CONFIG, CPU).target for turns in (first, second)]
     np.testing.assert_allclose(np.sort(joined.target), np.sort(np.concatenate(apart)), atol=1e-6)
 
 
 def test_no_samples_at_all():
     idle = make_bob_turns(active=np.zeros_like(make_bob_turns().active))
-    assert collect([idle, nobody_learns(make_bob_turns())], estimate, log_prob, CONFIG, CPU) is None
+    assert collect([idle, nobody_learns(make_bob_turns())], estimate, policy, CONFIG, CPU) is None
 
 
 def test_equal_advantages_become_zero():
     turns = make_bob_turns()
     constant = replace(turns, reward=np.full_like(turns.reward, 0.1), terminated=turns.active)
-    samples = collect([constant], lambda rows: torch.zeros(len(rows)), log_prob, CONFIG, CPU)
+    samples = collect([constant], lambda rows: torch.zeros(len(rows)), policy, CONFIG, CPU)
     np.testing.assert_array_equal(samples.advantage, np.zeros(len(samples)))
 
 
 def test_mirrored_samples_are_reflections():
-    samples = collect([make_bob_turns()], estimate, log_prob, CONFIG, CPU)
+    samples = collect([make_bob_turns()], estimate, policy, CONFIG, CPU)
     mirrors = MIRROR_BOB, MIRROR_BOB_VALUE, MIRROR_ACTION
-    doubled = mirrored(samples, log_prob, *mirrors)
+    doubled = mirrored(samples, policy, *mirrors)
     num = len(samples)
     assert len(doubled) == 2 * num
     for before, after in zip(samples.tensors(), doubled.tensors(), strict=True):
@@ -97,9 +114,9 @@ def test_mirrored_samples_are_reflections():
         np.testing.assert_array_equal(getattr(doubled, name)[num:], mirror(getattr(samples, name).numpy()))
     for name in ("advantage", "target", "value"):
         assert torch.equal(getattr(doubled, name)[num:], getattr(samples, name))
-    # The log-probability is of the reflected pair: y components change their sign.
-    expected = -(samples.observation[:, 1] + samples.action[:, 1])
-    np.testing.assert_array_equal(doubled.old_log_prob[num:], expected)
+    # The policy is asked at the reflected observation, whose y changes its sign.
+    np.testing.assert_array_equal(doubled.start_mean[num:, 0], -samples.observation[:, 1])
+    np.testing.assert_array_equal(doubled.old_log_prob[num:], doubled.start_log_prob[num:])
 
 
 def test_an_epoch_has_every_sample_once():

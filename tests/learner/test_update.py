@@ -53,7 +53,8 @@ def play(player, rng, num=128, target=0.8):
     reward = -(action[:, 0] - target).square()
     advantage = (reward - reward.mean()) / reward.std()
     log_prob = player.log_prob(observation, action)
-    return Samples(observation, observation, action, log_prob, log_prob, advantage, reward, player.value(observation))
+    value = player.value(observation)
+    return Samples(observation, observation, action, log_prob, mean, std, advantage, reward, value)
 
 
 @torch.no_grad()
