@@ -197,6 +197,12 @@ class LearnerConfig(_Frozen):
     )
     alice: PPOConfig = PPOConfig()
     bob: PPOConfig = PPOConfig(num_epochs=5, minibatch_size=512)
+    alice_interval: int = Field(
+        1,
+        ge=1,
+        description="Alice learns every so many iterations, from all her turns since: one reward a turn, which also "
+        "hangs on Bob's luck, leaves the gradient of a single iteration mostly noise",
+    )
     abc: ABCConfig = ABCConfig()
     mirror: bool = Field(False, description="learn from every Bob sample also reflected in y; the task is symmetric")
 

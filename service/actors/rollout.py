@@ -114,6 +114,16 @@ class Rollout:
         return self.actor, self.incarnation, self.sequence
 
 
+def turns_to_arrays(turns: Turns) -> dict[str, NDArray[Any]]:
+    """The arrays by name; ``turns_from_arrays`` gives equal turns back."""
+    return {field.name: getattr(turns, field.name) for field in fields(turns)}
+
+
+def turns_from_arrays(arrays: dict[str, NDArray[Any]]) -> Turns:
+    """The turns that ``turns_to_arrays`` took apart."""
+    return Turns(**arrays)
+
+
 def to_arrays(rollout: Rollout) -> dict[str, NDArray[Any]]:
     """Flat named arrays, for a checkpoint; ``from_arrays`` gives an equal rollout back."""
     arrays = {

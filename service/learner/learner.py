@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from service.actors.rollout import Rollout
+from service.actors.rollout import Rollout, Turns, turns_from_arrays, turns_to_arrays
 from service.config import Config
 from service.envs.observations import MIRROR_ACTION, MIRROR_BOB, MIRROR_BOB_VALUE
 from service.learner import random_state
@@ -68,6 +68,7 @@ class Learner:
         self._history = DemonstrationHistory(config.learner.abc.num_iterations)
         self._ledger = Ledger()
         self._pending: dict[tuple[int, int, int], Rollout] = {}
+        self._turns: list[Turns] = []  # Alice's, since her last update
 
     def ingest(self, rollout: Rollout) -> bool:
         """Take a rollout for the next update.
@@ -113,6 +114,7 @@ class Learner:
     def state(self) -> Arrays:
         """Everything a resumed run needs, as arrays by name; rollouts not yet learned from are not part of it."""
         parts = {"alice": self._alice.state(), "bob": self._bob.state(), "demonstrations": self._history.state()}
+        parts |= {f"turns/{index:04}": turns_to_arrays(turns) for index, turns in enumerate(self._turns)}
         nested = {f"{part}/{name}": array for part, arrays in parts.items() for name, array in arrays.items()}
         version = np.array(self.version, dtype=np.int64)
         return nested | {"version": version, "rng": random_state.dump(self._rng), "counted": self._ledger.state()}
@@ -129,7 +131,10 @@ class Learner:
             history = {name: state.pop(f"demonstrations/{name}") for name in ("observation", "action", "num_steps")}
         except KeyError as error:
             raise LearnerError(f"learner state: no array {error}; take an undamaged checkpoint") from None
+        turns = {name: state.pop(name) for name in list(state) if name.startswith("turns/")}
         self._load_players(state)
+        indices = sorted({name.split("/")[1] for name in turns})
+        self._turns = [turns_from_arrays(_part(turns, f"turns/{index}")) for index in indices]
         self.version = int(own["version"])
         self._rng = random_state.load(own["rng"])
         self._ledger.load_state(own["counted"])
@@ -148,8 +153,11 @@ class Learner:
             player.load_state(states[key])
 
     def _update_alice(self, rollouts: Sequence[Rollout]) -> Metrics:
-        turns = [rollout.alice for rollout in rollouts]
         alice = self._alice
+        self._turns += [rollout.alice for rollout in rollouts]
+        if (self.version + 1) % self.config.learner.alice_interval:
+            return {"non_finite_steps": 0.0, "rollbacks": 0.0}
+        turns, self._turns = self._turns, []
         samples = collect(turns, alice.value, alice.policy, self.config.learner.alice, self._device)
         metrics = update_player(self._alice, samples, None, self.config.learner.abc, self._rng)
         return _prefixed("alice", metrics) | {"num_alice_samples": float(_length(samples))}

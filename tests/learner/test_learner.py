@@ -133,6 +133,27 @@ def test_resume_is_exact():
     assert not resumed.ingest(make_rollout(resumed, 1))
 
 
+def test_alice_learns_every_so_many_iterations_from_all_her_turns():
+    config = make_config(alice_interval=3)
+    learner, resumed = Learner(config), Learner(config)
+    first = learner.weights().alice
+    samples = 0
+    for sequence in range(2):
+        rollout = make_rollout(learner, sequence)
+        learner.ingest(rollout)
+        assert "learner/alice_kl" not in learner.update()
+        samples += int((rollout.alice.active & rollout.alice.learn).sum())
+    assert all(np.array_equal(first[name], each) for name, each in learner.weights().alice.items())
+    resumed.load_state(learner.state())
+    rollout = make_rollout(learner, 2)
+    samples += int((rollout.alice.active & rollout.alice.learn).sum())
+    for each in (learner, resumed):
+        each.ingest(rollout)
+        assert each.update()["learner/num_alice_samples"] == samples
+    assert any(not np.array_equal(first[name], each) for name, each in learner.weights().alice.items())
+    assert_same_state(learner, resumed)
+
+
 def test_a_state_is_a_copy():
     learner = Learner(make_config(**HISTORY))
     updated(learner, 0)
