@@ -64,7 +64,13 @@ class GameConfig(_Frozen):
 
     num_worlds: int = Field(160, ge=1, description="worlds stepped together by one actor")
     num_goals: int = Field(5, ge=1, description="most rounds from one reset (OpenAI 2021: 5)")
-    alice_steps: int = Field(40, ge=1)
+    alice_steps: int = Field(40, ge=1, description="most steps of her turn")
+    alice_steps_min: int | None = Field(
+        None,
+        ge=1,
+        description="least steps: a round's length is drawn from here to ``alice_steps``; None: always ``alice_steps``. "
+        "Short turns make her lift early, long ones reach objects far from the gripper",
+    )
     bob_steps: int = Field(40, ge=1)
     success_distance_m: float = Field(0.05, gt=0.0, description="paper: 5 cm; also the least move of a valid goal")
     alice_valid_reward: float = Field(1.0, description="paper, appendix")
@@ -91,6 +97,12 @@ class GameConfig(_Frozen):
         description="Bob's turn ends once the object was on the goal for so many steps in all; 1: the moment it is "
         "solved (paper). More teach him to stay: the goals of evaluation and downstream count at the last step",
     )
+
+    @model_validator(mode="after")
+    def _ordered(self) -> Self:
+        if self.alice_steps_min is not None and self.alice_steps_min > self.alice_steps:
+            raise ValueError(f"alice_steps_min {self.alice_steps_min} must not exceed alice_steps {self.alice_steps}")
+        return self
 
 
 class GeneratorConfig(_Frozen):

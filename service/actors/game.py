@@ -139,13 +139,14 @@ class SelfPlay:
 
     def _play_alice(self, players: Players, plan: RoundPlan) -> tuple[Turns, BoolArray, BoolArray]:
         """Her turns (without what her goal is worth), (N, 2) finger contacts, (N,) worlds whose physics broke."""
-        num_steps, worlds = self.config.game.alice_steps, self.worlds
-        turns = _empty_turns(num_steps, worlds.num_worlds, FULL_SIZE, FULL_SIZE, learn=~plan.alice_past)
+        game, worlds = self.config.game, self.worlds
+        num_steps = int(self._rng.integers(game.alice_steps_min or game.alice_steps, game.alice_steps + 1))
+        turns = _empty_turns(game.alice_steps, worlds.num_worlds, FULL_SIZE, FULL_SIZE, learn=~plan.alice_past)
         everyone = np.arange(worlds.num_worlds)
         contacts = np.zeros((worlds.num_worlds, 2), dtype=bool)
         broken = np.zeros(worlds.num_worlds, dtype=bool)
         for step in range(num_steps):
-            observation = worlds.full(step / num_steps)
+            observation = worlds.full(1.0 - (num_steps - step) / game.alice_steps)
             action, log_prob = _act(
                 players.alice, players.past_alice, plan.alice_opponent, observation, everyone, self._rng
             )
@@ -155,8 +156,8 @@ class SelfPlay:
             turns.reward[step] = self._proximity_reward()
         turns.value_observation[:] = turns.observation
         turns.final_value_observation[:] = worlds.full(1.0)
-        turns.active[:] = True
-        turns.terminated[-1] = True
+        turns.active[:num_steps] = True
+        turns.terminated[num_steps - 1] = True
         turns.learn[broken] = False
         return turns, contacts, broken
 
@@ -193,10 +194,11 @@ class SelfPlay:
     ) -> None:
         game = self.config.game
         valid = verdict == Verdict.VALID
+        last = int(np.flatnonzero(alice.active.any(axis=1))[-1])
         if plan.penalise_outside:
-            alice.reward[-1, verdict == Verdict.OUTSIDE] += game.alice_outside_reward
-        alice.reward[-1, valid] += game.alice_valid_reward
-        alice.reward[-1, valid & tried & ~solved] += game.alice_difficult_reward
+            alice.reward[last, verdict == Verdict.OUTSIDE] += game.alice_outside_reward
+        alice.reward[last, valid] += game.alice_valid_reward
+        alice.reward[last, valid & tried & ~solved] += game.alice_difficult_reward
         # What a valid goal was worth is unknown where Bob could not try it.
         alice.learn[valid & ~tried] = False
 

@@ -452,3 +452,25 @@ def test_numbers_too_large_to_be_physics_are_broken_too():
     assert rollout.records.verdict.tolist() == [Verdict.FALLEN, Verdict.NOT_MOVED]
     assert rollout.alice.learn.tolist() == [False, True]
     assert game.worlds.num_broken == 1
+
+
+def test_a_turn_of_alice_may_be_shorter():
+    config = make_config(5)
+    config = config.model_copy(update={"game": config.game.model_copy(update={"alice_steps_min": 5})})
+    lengths = set()
+    for seed in range(12):
+        rollout = play(make_game(config, STARTS, seed=seed), Pusher())
+        active = rollout.alice.active
+        length = int(active[:, 0].sum())
+        lengths.add(length)
+        assert active[:length].all()
+        assert not active[length:].any()
+        assert rollout.alice.terminated[length - 1].all()
+        assert not rollout.alice.reward[: length - 1].any()
+        assert rollout.alice.reward[length - 1, SLID] > 0.0
+        assert not rollout.alice.reward[length:].any()
+        # What she sees of time is what is left of it.
+        np.testing.assert_allclose(rollout.alice.observation[:length, 0, -1], 1.0 - np.arange(length, 0, -1) / 9)
+        path = idle_positions(SLIDES, length)
+        np.testing.assert_allclose(rollout.records.proposal[SLID], path[-1], atol=1e-5)
+    assert lengths == {5, 6, 7, 8, 9}
