@@ -7,6 +7,7 @@ cores of a laptop are busy, and the order of everything is fixed, so a run is re
 from __future__ import annotations
 
 import logging
+import sys
 import time
 from collections import defaultdict
 from collections.abc import Callable
@@ -35,9 +36,11 @@ Metrics = dict[str, float]
 OnIteration = Callable[[Metrics], None]
 _logger = logging.getLogger(__name__)
 
-EVALUATED_GOALS: tuple[GoalKind, ...] = ("table", "air")
+EVALUATED_GOALS: tuple[GoalKind, ...] = ("table", "air", "mixed")
 EVALUATION_SEED = 1_000_003
 """Evaluations during a run always use the same goals, so that they compare."""
+NUM_SNAPSHOTS = 10
+"""Of Bob, evenly over a run's env steps; one of him untrained comes before them."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,11 +86,13 @@ class LocalRun:
         self._pending: Rollout | None = None
         self._executor = ThreadPoolExecutor(max_workers=1, thread_name_prefix="learner")
         self._checkpoints = CheckpointStore(directory.checkpoints, config.run.keep_checkpoints)
+        self._snapshots = CheckpointStore(directory.snapshots, keep=sys.maxsize)
         if resume:
             self._load()
         else:
             directory.check_free()
             self.save()  # so that a run killed before its first interval can be resumed, too
+            self._take_snapshot(after=-1)
         directory.start(config, after_iteration=self.iteration if resume else None)
 
     def request_stop(self) -> None:
@@ -97,10 +102,12 @@ class LocalRun:
     def run(self, on_iteration: OnIteration = lambda metrics: None) -> RunResult:
         """Play, learn, record, until the budget is spent, the stop criterion holds, or a stop is requested."""
         while (reason := self._over()) is None:
+            before = self.num_env_steps
             metrics = self._iterate()
             with self.timing("record"):
                 self.directory.record(metrics)
                 on_iteration(metrics)
+            self._take_snapshot(after=before)
             if self.iteration % self.config.run.checkpoint_interval == 0:
                 self.save()
         self.save()
@@ -194,6 +201,19 @@ class LocalRun:
             metrics[f"evaluation/{kind}_success_last"] = result.success_last
             metrics[f"evaluation/{kind}_success_ever"] = result.success_ever
         return metrics
+
+    def _take_snapshot(self, *, after: int) -> None:
+        """Keep Bob for good if a tenth of the budget was reached after that many env steps.
+
+        Checkpoints go, but what he could do at the beginning and in the middle is asked when the run is over. A resumed
+        run takes those it takes again with the same bits.
+        """
+        tenths = [steps * NUM_SNAPSHOTS // self.config.run.total_env_steps for steps in (after, self.num_env_steps)]
+        if tenths[0] == tenths[1]:
+            return
+        with self.timing("checkpoint"):
+            arrays = {f"bob/{name}": array for name, array in self.learner.weights().bob.items()}
+            self._snapshots.save(self.iteration, arrays, {"env_steps": self.num_env_steps})
 
     # --- exact resume ----------------------------------------------------------------------------------------------
 

@@ -9,7 +9,7 @@ from service.config import Config, parse_config
 from service.errors import TandemError
 from service.policies.evaluator import GaussianEvaluator, MCPEvaluator, bob_evaluator
 from service.policies.parameters import Parameters, PolicyError
-from service.registry.checkpoints import CheckpointStore
+from service.registry.checkpoints import Checkpoint, CheckpointStore, read_checkpoint
 from service.runtime.rundir import RunDirectory
 
 
@@ -74,6 +74,22 @@ def load_players(directory: RunDirectory) -> tuple[GaussianEvaluator, MCPEvaluat
 
 def read_parameters(directory: RunDirectory, player: str) -> Parameters:
     """Parameters of ``alice`` or ``bob`` in a run's newest checkpoint."""
-    arrays = CheckpointStore(directory.checkpoints, keep=1).load_latest().arrays
+    return _parameters(CheckpointStore(directory.checkpoints, keep=1).load_latest(), player)
+
+
+def read_stages(directory: RunDirectory) -> dict[int, Parameters]:
+    """Bob's parameters in a run's snapshots and in its newest checkpoint, by env steps of training, in their order.
+
+    Raises:
+        TandemError: a snapshot is damaged, or there is no usable checkpoint.
+    """
+    store = CheckpointStore(directory.snapshots, keep=1)
+    saved = [read_checkpoint(store.path(step)) for step in store.steps()]
+    saved.append(CheckpointStore(directory.checkpoints, keep=1).load_latest())
+    stages = {int(each.meta["env_steps"]): _parameters(each, "bob") for each in saved}
+    return dict(sorted(stages.items()))  # a killed run may have a snapshot that is newer than its checkpoint
+
+
+def _parameters(checkpoint: Checkpoint, player: str) -> Parameters:
     prefix = f"{player}/"
-    return {name.removeprefix(prefix): array for name, array in arrays.items() if name.startswith(prefix)}
+    return {name.removeprefix(prefix): array for name, array in checkpoint.arrays.items() if name.startswith(prefix)}

@@ -8,6 +8,7 @@
 | ``goals.jsonl`` | per iteration a sample of valid proposals: start x y z, goal x y z (metres), solved 0/1 |
 | ``tensorboard/`` | the same metrics as TensorBoard events over env steps |
 | ``checkpoints/`` | the newest checkpoints; ``--resume`` continues from them exactly |
+| ``snapshots/`` | Bob's parameters untrained and after each tenth of the run, kept for good |
 | ``broken/`` | states of worlds whose physics diverged |
 """
 
@@ -52,6 +53,7 @@ class RunDirectory:
         self.metrics_file = path / "metrics.jsonl"
         self.goals_file = path / "goals.jsonl"
         self.checkpoints = path / "checkpoints"
+        self.snapshots = path / "snapshots"
         self.broken = path / "broken"
         self._metrics = JsonlWriter(self.metrics_file)
         self._goals = JsonlWriter(self.goals_file)

@@ -11,9 +11,11 @@ import numpy as np
 import pytest
 
 from service.errors import TandemError
+from service.learner.learner import Learner
 from service.registry.errors import CheckpointError
 from service.runtime.local import LocalRun
 from service.runtime.pretrain import resumed_config
+from service.runtime.primitives import read_parameters, read_stages
 from service.runtime.rundir import RunDirectory
 from tests.runtime.runs import (
     KilledError,
@@ -42,7 +44,7 @@ METRICS = {
     "alice/contact_fraction", "alice/both_contact_fraction",
     # Bob by goal type, against a past Alice, on replayed goals
     "bob/success_rate", "bob/success_rate_table", "bob/success_rate_air", "bob/success_rate_past_alice",
-    "bob/success_rate_replayed", "bob/steps_to_success",
+    "bob/success_rate_from_reset", "bob/success_rate_replayed", "bob/steps_to_success",
     # ABC samples and their mean log-ratio
     "learner/num_demonstrations", "learner/demonstration_log_ratio", "learner/demonstration_log_prob",
     "learner/cloning_loss",
@@ -56,11 +58,12 @@ METRICS = {
     "learner/alice_explained_variance", "learner/bob_explained_variance",
     "learner/alice_learning_rate", "learner/bob_learning_rate", "learner/alice_policy_loss", "learner/bob_policy_loss",
     "learner/alice_value_loss", "learner/bob_value_loss", "learner/alice_clip_fraction", "learner/bob_clip_fraction",
-    "learner/alice_grad_norm", "learner/bob_grad_norm",
+    "learner/alice_grad_norm", "learner/bob_grad_norm", "learner/alice_policy_steps", "learner/bob_policy_steps",
     "generator/num_cells_seen", "generator/new_cells", "generator/iterations_without_new_cell",
     "generator/buffer_size", "generator/mean_learnability",
     "evaluation/table_success_last", "evaluation/table_success_ever",
     "evaluation/air_success_last", "evaluation/air_success_ever",
+    "evaluation/mixed_success_last", "evaluation/mixed_success_ever",
 }  # fmt: skip
 """Names are an API (algorithms.md 6.4, and what else is recorded). Change them here only on purpose."""
 
@@ -155,6 +158,25 @@ def test_the_newest_checkpoints_are_kept(tmp_path):
     assert files == [f"checkpoint-{step:08d}.safetensors" for step in (last - 1, last)]
 
 
+def test_bob_is_kept_untrained_and_after_each_tenth(uninterrupted):
+    steps = [0, *(row["env_steps"] for row in read_lines(uninterrupted / "metrics.jsonl"))]
+    expected = sorted({min(step for step in steps if step >= tenth * 150) for tenth in range(11)})
+    stages = read_stages(RunDirectory(uninterrupted))
+    assert list(stages) == expected
+    assert len(stages) > 4
+    untrained, last = Learner(tiny_config(**LONG)).weights().bob, read_parameters(RunDirectory(uninterrupted), "bob")
+    for bob, same in ((stages[0], untrained), (stages[steps[-1]], last)):
+        assert bob.keys() == same.keys()
+        assert all(np.array_equal(bob[name], array) for name, array in same.items())
+    assert any(not np.array_equal(last[name], array) for name, array in untrained.items())
+
+
+def test_a_run_without_snapshots_has_its_last_stage(uninterrupted, tmp_path):
+    shutil.copytree(uninterrupted, tmp_path / "copy")
+    shutil.rmtree(tmp_path / "copy" / "snapshots")
+    assert list(read_stages(RunDirectory(tmp_path / "copy"))) == [newest(uninterrupted).meta["env_steps"]]
+
+
 def test_a_run_that_has_converged_ends(tmp_path, monkeypatch):
     monkeypatch.setattr(
         "service.generator.generator.TaskGenerator.should_stop", lambda self: self._stop._num_iterations == 3
@@ -211,6 +233,10 @@ def test_a_run_killed_between_two_iterations(uninterrupted, tmp_path, iteration)
     assert result.reason == "finished"
     assert_same_run(tmp_path, uninterrupted)
     assert run._wall_s > 0.0
+    snapshots = [
+        {file.name: file.read_bytes() for file in (path / "snapshots").iterdir()} for path in (tmp_path, uninterrupted)
+    ]
+    assert snapshots[0] == snapshots[1]
     assert list((tmp_path / "checkpoints").glob(".tmp-*")) == []
 
 

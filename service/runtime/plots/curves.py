@@ -74,6 +74,7 @@ _PANELS = (
             _Curve("evaluation/table_success_last", "table, last", GREEN),
             _Curve("evaluation/air_success_ever", "air, ever", ORANGE, dashed=True),
             _Curve("evaluation/air_success_last", "air, last", ORANGE),
+            _Curve("evaluation/mixed_success_last", "mixed, last", BLUE),
         ),
     ),
     _Panel(
