@@ -3,4 +3,31 @@
 Importing this package is cheap: torch, MuJoCo and matplotlib come in with the rooms that need them.
 """
 
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from service.runtime.primitives import TrainedBob
+
+__all__ = ["load_primitives"]
 __version__ = "0.1.0"
+
+
+def load_primitives(reference: str = "panda-cube@champion", registry: Path | str = "registry") -> TrainedBob:
+    """Primitives to act with and to compose, without torch; ``panda-cube@champion`` comes with the package.
+
+    Args:
+        reference: NAME, NAME@ALIAS or NAME@VERSION, or a run directory.
+        registry: directory to look in first; a name it does not have is looked up among what comes with the package.
+
+    Returns:
+        ``.primitives``, the evaluator that acts and composes; ``.config`` and ``.manifest``, what it was trained with.
+
+    Raises:
+        TandemError: nothing there by that reference, or damaged.
+    """
+    from service.runtime.primitives import load_bob
+
+    return load_bob(reference, Path(registry))

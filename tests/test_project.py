@@ -62,9 +62,10 @@ def modules_in(room):
 
 
 def text_files():
-    """Every text file of the project, without what is generated."""
+    """Every text file of the project, without what is generated and without the registry's tensors."""
     paths = [path for folder in FOLDERS for path in (ROOT / folder).rglob("*")] + list(ROOT.glob("*"))
-    return [path for path in paths if path.is_file() and path.suffix in TEXT and "__pycache__" not in path.parts]
+    paths = [path for path in paths if path.is_file() and path.suffix in TEXT]
+    return [path for path in paths if not {"__pycache__", "blobs"} & set(path.parts)]
 
 
 def project_table():

@@ -15,6 +15,7 @@ from service.errors import TandemError
 
 if TYPE_CHECKING:
     from service.registry.manifest import Manifest
+    from service.registry.names import Version
     from service.registry.registry import Registry
 
 registry_app = typer.Typer(name="registry", help="Frozen primitives: versions, aliases, export.", no_args_is_help=True)
@@ -29,24 +30,31 @@ _DEFAULT = Path("registry")
 
 @registry_app.command("list")
 def list_versions(directory: _Directory = _DEFAULT, as_json: _Json = False) -> None:
-    """List every version."""
+    """List every version, and those that come with tandem."""
     with _user_errors():
-        registry = _open(directory)
-        rows = [row for name in registry.names() for row in _rows(registry, name)]
+        from service.registry.registry import BUNDLED, Registry
+
+        own, bundled = Registry(directory), Registry(BUNDLED)
+        if not own.names():
+            typer.echo(f"nothing published in {directory} yet", err=True)
+        rows = [
+            row
+            for registry in ([own] if own.bundled else [own, bundled])
+            for name in registry.names()
+            for row in _rows(registry, name)
+        ]
     if as_json:
         typer.echo(json.dumps(rows, indent=1))
     elif rows:
         _print_table(list(rows[0]), [[_text(value) for value in row.values()] for row in rows])
-    else:
-        typer.echo(f"nothing published in {directory} yet")
 
 
 @registry_app.command()
 def show(reference: _Reference, directory: _Directory = _DEFAULT, as_json: _Json = False) -> None:
     """Show what a version says about itself."""
     with _user_errors():
-        registry = _open(directory)
-        manifest = registry.manifest(reference)
+        registry, version = _find(reference, directory)
+        manifest = registry.manifest(str(version))
         aliases = _aliases_of(registry, manifest)
     if as_json:
         typer.echo(json.dumps({**manifest.model_dump(mode="json"), "aliases": aliases}, indent=1))
@@ -61,7 +69,7 @@ def verify(
 ) -> None:
     """Check every byte against its digest; exit code 1 when something is damaged."""
     with _user_errors():
-        problems = _open(directory).verify(reference)
+        problems = _problems(reference, directory)
     for problem in problems:
         typer.echo(problem, err=True)
     if problems:
@@ -77,8 +85,7 @@ def alias(
 ) -> None:
     """Make or move an alias to a version."""
     with _user_errors():
-        registry = _open(directory)
-        version = registry.resolve(reference)
+        registry, version = _find(reference, directory)
         registry.set_alias(version.name, alias, version.number)
     typer.echo(f"{version.name}@{alias} is now {version}")
 
@@ -91,7 +98,8 @@ def export(
 ) -> None:
     """Write a version as two files that need no registry."""
     with _user_errors():
-        manifest = _open(directory).export(reference, target)
+        registry, version = _find(reference, directory)
+        manifest = registry.export(str(version), target)
     typer.echo(f"{manifest.reference} is in {target}")
 
 
@@ -104,13 +112,22 @@ def _user_errors() -> Iterator[None]:
         raise typer.Exit(2) from None
 
 
-def _open(directory: Path) -> Registry:
+def _find(reference: str, directory: Path) -> tuple[Registry, Version]:
+    from service.registry.bundled import find_version
+
+    return find_version(reference, directory)
+
+
+def _problems(reference: str | None, directory: Path) -> list[str]:
     from service.registry.errors import RegistryError
     from service.registry.registry import Registry
 
+    if reference is not None:
+        registry, version = _find(reference, directory)
+        return registry.verify(str(version))
     if not directory.is_dir():
         raise RegistryError(f"no registry at {directory}; name one with --registry or TANDEM_REGISTRY")
-    return Registry(directory)
+    return Registry(directory).verify()
 
 
 def _rows(registry: Registry, name: str) -> list[dict[str, object]]:
@@ -118,7 +135,8 @@ def _rows(registry: Registry, name: str) -> list[dict[str, object]]:
     for version in registry.versions(name):
         manifest = registry.manifest(str(version))
         row = {"created": manifest.created, "bytes": manifest.blob_bytes, "aliases": _aliases_of(registry, manifest)}
-        rows.append({"name": name, "version": version.number, **row, "parent": manifest.parent})
+        more = {"parent": manifest.parent, "bundled": registry.bundled}
+        rows.append({"name": name, "version": version.number, **row, **more})
     return rows
 
 
@@ -153,9 +171,9 @@ def _print_table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
         return
     from rich.console import Console
     from rich.markup import escape
-    from rich.table import Table
+    from rich.table import Column, Table
 
-    table = Table(*header)
+    table = Table(Column(header[0], no_wrap=True), *header[1:])  # what is typed again must stay in one piece
     for row in rows:
         table.add_row(*(escape(cell) for cell in row))
     Console().print(table)

@@ -27,6 +27,9 @@ from service.registry.files import os_errors, write_exclusive
 from service.registry.manifest import Manifest, git_commit, make_manifest, parse_manifest
 from service.registry.names import LATEST, Version
 
+BUNDLED = Path(__file__).parents[1] / "primitives"
+"""The registry that comes with the package; it is only read."""
+
 
 class Registry:
     """Named, versioned parameters in a directory; any number of processes may publish and read at once."""
@@ -35,6 +38,23 @@ class Registry:
         """Open ``root``; nothing is read or written before the first call."""
         self.root = root
         self._blobs = BlobStore(root / "blobs")
+
+    @property
+    def bundled(self) -> bool:
+        """Whether this is the registry that comes with the package."""
+        return self.root.resolve() == BUNDLED.resolve()
+
+    def check_writable(self) -> None:
+        """Check that this is not the bundled registry.
+
+        Raises:
+            RegistryError: it is.
+        """
+        if self.bundled:
+            raise RegistryError(
+                f"cannot write {self.root}: what comes with tandem is only read; "
+                "name another directory with --registry or TANDEM_REGISTRY"
+            )
 
     def publish(
         self,
@@ -63,10 +83,11 @@ class Registry:
             aliases: moved to the new version.
 
         Raises:
-            RegistryError: a bad name, alias, array or value, and nothing is written; or the disk cannot be written,
-                and what was there before is intact.
+            RegistryError: a bad name, alias, array or value, or the bundled registry, and nothing is written; or the
+                disk cannot be written, and what was there before is intact.
             UnknownVersionError: no such parent.
         """
+        self.check_writable()
         names.check_name(name)
         for alias in aliases:
             names.check_alias(alias)
@@ -147,9 +168,10 @@ class Registry:
         """Make or move ``alias`` of ``name`` to ``version``, forward or back.
 
         Raises:
-            RegistryError: a bad name or alias, or a disk that cannot be written.
+            RegistryError: a bad name or alias, the bundled registry, or a disk that cannot be written.
             UnknownVersionError: no such version.
         """
+        self.check_writable()
         target = self.resolve(f"{name}@{version}")
         self._aliases(name).move(alias, version)
         return target

@@ -9,7 +9,9 @@ from service.config import Config, parse_config
 from service.errors import TandemError
 from service.policies.evaluator import GaussianEvaluator, MCPEvaluator, bob_evaluator
 from service.policies.parameters import Parameters, PolicyError
+from service.registry.bundled import find_version
 from service.registry.checkpoints import Checkpoint, CheckpointStore, read_checkpoint
+from service.registry.manifest import Manifest
 from service.runtime.rundir import RunDirectory
 
 
@@ -21,6 +23,8 @@ class TrainedBob:
     """Where he comes from, such as ``panda-cube@3``."""
     policy: MCPEvaluator | GaussianEvaluator
     config: Config
+    manifest: Manifest | None = None
+    """What the registry knows about him; None for the Bob of a run directory."""
 
     @property
     def primitives(self) -> MCPEvaluator:
@@ -37,6 +41,10 @@ class TrainedBob:
 def load_bob(reference: str, registry: Path) -> TrainedBob:
     """Load NAME, NAME@ALIAS or NAME@VERSION from a registry, or the newest checkpoint of a run directory.
 
+    Args:
+        reference: of a version, or a run directory.
+        registry: directory to look in first; a name it does not have is looked up among what comes with the package.
+
     Raises:
         TandemError: neither a run directory nor a published version, or damaged.
     """
@@ -46,11 +54,12 @@ def load_bob(reference: str, registry: Path) -> TrainedBob:
         return TrainedBob(reference, bob_evaluator(parameters), config)
     if "/" in reference:
         raise TandemError(f"{reference}: no such run directory; for published primitives write NAME@ALIAS")
-    from service.registry.registry import Registry
-
-    manifest, tensors = Registry(registry).load(reference)
+    found, version = find_version(reference, registry)
+    manifest, tensors = found.load(str(version))
     config = parse_config(manifest.config, where=f"the manifest of {reference}")
-    return TrainedBob(manifest.reference, _evaluator(manifest.reference, tensors), config)
+    # two registries may both have a version 1: which one was meant must be seen
+    label = f"{version} (bundled)" if found.bundled else str(version)
+    return TrainedBob(label, _evaluator(label, tensors), config, manifest)
 
 
 def _evaluator(label: str, parameters: Parameters) -> MCPEvaluator:

@@ -7,7 +7,7 @@ from service.envs.observations import BOB_SIZE, FULL_SIZE
 from service.errors import TandemError
 from service.policies.evaluator import GaussianEvaluator, MCPEvaluator
 from service.registry import checkpoints
-from service.registry.registry import Registry
+from service.registry.registry import BUNDLED, Registry
 from service.runtime.primitives import load_bob, load_players, read_parameters
 from service.runtime.rundir import RunDirectory
 from tests.runtime.runs import assert_one_line, play, tiny_config
@@ -41,6 +41,7 @@ def test_the_newest_bob_of_a_run_directory(run, tmp_path):
     path, learner = run
     bob = load_bob(str(path), tmp_path)
     assert bob.label == str(path)
+    assert bob.manifest is None
     assert bob.config == tiny_config(total_env_steps=400, checkpoint_interval=1)
     rows = observations(BOB_SIZE)
     expected = MCPEvaluator(learner.weights().bob).act_deterministic(rows)
@@ -52,9 +53,17 @@ def test_a_published_bob(run, registry, reference):
     bob = load_bob(reference, registry)
     assert bob.label == "tiny@1"
     assert bob.config == tiny_config()
+    assert bob.manifest == Registry(registry).manifest("tiny@1")
     rows = observations(BOB_SIZE)
     expected = MCPEvaluator(run[1].weights().bob).act_deterministic(rows)
     assert np.array_equal(bob.policy.act_deterministic(rows), expected)
+
+
+def test_a_name_the_registry_does_not_have_is_that_of_the_package(registry):
+    bob = load_bob("panda-cube@champion", registry)
+    manifest = Registry(BUNDLED).manifest("panda-cube@champion")
+    assert (bob.label, bob.manifest) == (f"{manifest.reference} (bundled)", manifest)
+    assert isinstance(bob.primitives, MCPEvaluator)
 
 
 def test_both_players(run):
@@ -78,7 +87,7 @@ def test_parameters_are_those_of_the_player_alone(run):
     [
         ("tiny@best", ["no alias 'best'", "latest -> 2"]),
         ("tiny@9", ["no version 9"]),
-        ("nobody", ["no 'nobody'", "it holds: tiny"]),
+        ("nobody", ["no 'nobody'", "it holds: tiny", "with tandem comes: panda-cube"]),
         ("no/such/run", ["no/such/run", "no such run directory", "NAME@ALIAS"]),
         ("Tiny!", ["bad reference 'Tiny!'"]),
     ],
