@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import logging
 import signal
 from collections.abc import Iterator
@@ -9,19 +10,16 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from types import FrameType
+from typing import Any
 
-from service.actors.evaluation import evaluate
-from service.config import Config, ConfigError
-from service.envs.goals import GOAL_KINDS
-from service.envs.observations import ACTION_SIZE, BOB_SIZE, NORMALISATION_BOB, POSITIONS_SIZE
-from service.policies.evaluator import bob_evaluator
+from service.config import Config, ConfigError, load_config
 from service.registry.names import Version
 from service.registry.registry import Registry
 from service.runtime.artifacts import make_artifacts
-from service.runtime.local import EVALUATION_SEED, LocalRun, OnIteration, RunResult
+from service.runtime.local import LocalRun, OnIteration, RunResult
+from service.runtime.publishing import measure_bob, publish_run
 from service.runtime.rundir import RunDirectory
 
-FINAL_EVALUATION_EPISODES = 300
 _logger = logging.getLogger(__name__)
 
 
@@ -46,8 +44,9 @@ def pretrain(
     """Run to the end, then evaluate, draw and publish. SIGINT and SIGTERM end it after the current iteration, saved.
 
     Raises:
-        TandemError: see ``LocalRun`` and ``RunDirectory.start``.
+        TandemError: see ``LocalRun`` and ``RunDirectory.start``; or a registry that is only read.
     """
+    Registry(registry).check_writable()  # now, not after hours of learning
     run = LocalRun(config, directory, resume=resume)
     try:
         with _stop_on_signals(run):
@@ -57,20 +56,27 @@ def pretrain(
         files: dict[str, Path] = {}
         if result.reason != "interrupted":
             _logger.info("learning is over; now evaluating, publishing, drawing and filming")
-            metrics = _final_evaluation(config, run)
+            bob = run.learner.weights().bob
+            metrics = measure_bob(config, bob)
             if config.policy.monolithic_bob is None:
-                version = _publish(config, directory, registry, run, metrics)
+                about = metrics | {"env_steps": run.num_env_steps}
+                version = publish_run(directory, Registry(registry), config, bob, about)
             files = make_artifacts(directory)
         return Pretrained(result, files, version, metrics, run.timing.tree())
     finally:
         directory.close()
 
 
-def resumed_config(directory: RunDirectory, overrides: list[str]) -> Config:
+def resumed_config(directory: RunDirectory, overrides: list[str], file: Path | None = None) -> Config:
     """The configuration to resume a run with: the saved one, where only ``run.*`` may be changed.
 
+    Args:
+        directory: of the run.
+        overrides: ``run.a=b`` strings.
+        file: YAML that says the same as the saved one outside ``run``; what it says there comes before ``overrides``.
+
     Raises:
-        ConfigError: no run there, or an override of anything else.
+        ConfigError: no run there, an override of anything else, or a file that says otherwise.
     """
     for override in overrides:
         if not override.startswith("run."):
@@ -78,10 +84,31 @@ def resumed_config(directory: RunDirectory, overrides: list[str]) -> Config:
                 f"override {override!r}: a resumed run keeps its configuration; only run.* may change, "
                 "for example run.total_env_steps"
             )
-    directory.read_config()
-    from service.config import load_config
-
+    saved = directory.read_config()
+    if file is not None:
+        given = load_config(file)
+        _check_same_outside_run(saved, given, file)
+        named = given.run.model_dump(mode="json", exclude_unset=True)
+        overrides = [f"run.{key}={json.dumps(value)}" for key, value in named.items()] + overrides
     return load_config(directory.config_file, overrides)
+
+
+def _check_same_outside_run(saved: Config, given: Config, file: Path) -> None:
+    left, right = (dict(_leaves(config.model_dump(mode="json", exclude={"run"}))) for config in (saved, given))
+    for key in sorted(left.keys() | right.keys()):
+        if left.get(key) != right.get(key):
+            raise ConfigError(
+                f"{file}: {key} = {right.get(key)!r}, but the run has {left.get(key)!r}; a resumed run keeps its "
+                "configuration: leave out --config, or start another run without --resume"
+            )
+
+
+def _leaves(tree: dict[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    for key, value in tree.items():
+        if isinstance(value, dict):
+            yield from _leaves(value, f"{prefix}{key}.")
+        else:
+            yield prefix + key, value
 
 
 @contextmanager
@@ -101,40 +128,3 @@ def _stop_on_signals(run: LocalRun) -> Iterator[None]:
     finally:
         for number, handler in previous.items():
             signal.signal(number, handler)
-
-
-def _final_evaluation(config: Config, run: LocalRun) -> dict[str, float]:
-    bob = bob_evaluator(run.learner.weights().bob)
-    metrics = {}
-    for kind in GOAL_KINDS:
-        result = evaluate(
-            bob,
-            config.world,
-            kind,
-            num_episodes=FINAL_EVALUATION_EPISODES,
-            num_steps=config.run.evaluation_steps,
-            success_distance_m=config.game.success_distance_m,
-            seed=EVALUATION_SEED + 1,
-            num_threads=config.run.num_threads,
-        )
-        metrics[f"evaluation/{kind}_success_last"] = result.success_last
-        metrics[f"evaluation/{kind}_success_ever"] = result.success_ever
-    return metrics
-
-
-def _publish(
-    config: Config, directory: RunDirectory, registry: Path, run: LocalRun, metrics: dict[str, float]
-) -> Version:
-    return Registry(registry).publish(
-        config.name,
-        run.learner.weights().bob,
-        spaces={
-            "action": ACTION_SIZE,
-            "positions": POSITIONS_SIZE,
-            "observation": BOB_SIZE,
-            "layout": "service.envs.observations",
-        },
-        normalisation={"offset": NORMALISATION_BOB.offset.tolist(), "scale": NORMALISATION_BOB.scale.tolist()},
-        config=config.model_dump(mode="json"),
-        metrics=metrics | {"env_steps": run.num_env_steps},
-    )

@@ -9,6 +9,7 @@
 | ``tensorboard/`` | the same metrics as TensorBoard events over env steps |
 | ``checkpoints/`` | the newest checkpoints; ``--resume`` continues from them exactly |
 | ``snapshots/`` | Bob's parameters untrained and after each tenth of the run, kept for good |
+| ``published.json`` | the version this run published last, and the sha256 of its parameters |
 | ``broken/`` | states of worlds whose physics diverged |
 """
 
@@ -54,6 +55,7 @@ class RunDirectory:
         self.goals_file = path / "goals.jsonl"
         self.checkpoints = path / "checkpoints"
         self.snapshots = path / "snapshots"
+        self.published_file = path / "published.json"
         self.broken = path / "broken"
         self._metrics = JsonlWriter(self.metrics_file)
         self._goals = JsonlWriter(self.goals_file)

@@ -9,8 +9,10 @@ import numpy as np
 import pytest
 
 from service.config import ConfigError, parse_config
-from service.registry.registry import Registry
+from service.errors import TandemError
+from service.registry.registry import BUNDLED, Registry
 from service.runtime import pretrain as module
+from service.runtime import publishing
 from service.runtime.pretrain import pretrain, resumed_config
 from service.runtime.rundir import RunDirectory
 from tests.runtime.runs import (
@@ -29,7 +31,7 @@ from tests.runtime.runs import (
 @pytest.fixture
 def quick(monkeypatch):
     """The final evaluation of a few episodes, and no pictures."""
-    monkeypatch.setattr(module, "FINAL_EVALUATION_EPISODES", 4)
+    monkeypatch.setattr(publishing, "FINAL_EVALUATION_EPISODES", 4)
     monkeypatch.setattr(module, "make_artifacts", lambda directory: {"curves": directory.path / "curves.png"})
 
 
@@ -77,6 +79,56 @@ def test_a_finished_run_that_goes_on_publishes_another_version(tmp_path, quick):
     second = run_pretrain(tmp_path, config, resume=True)
     assert (str(first.version), str(second.version)) == ("tiny@1", "tiny@2")
     assert second.result.num_env_steps >= 600
+    registry = Registry(tmp_path / "registry")
+    assert [registry.manifest(f"tiny@{number}").parent for number in (1, 2)] == [None, "tiny@1"]
+
+
+def test_a_finished_run_with_nothing_left_to_do_publishes_nothing(tmp_path, quick):
+    first = run_pretrain(tmp_path)
+    again = run_pretrain(tmp_path, resumed_config(RunDirectory(tmp_path / "run"), []), resume=True)
+    assert first.version == again.version
+    assert [str(version) for version in Registry(tmp_path / "registry").versions("tiny")] == ["tiny@1"]
+
+
+def test_a_damaged_version_is_mended_by_resuming_its_run(tmp_path, quick):
+    run_pretrain(tmp_path)
+    registry = Registry(tmp_path / "registry")
+    next((registry.root / "blobs" / "sha256").iterdir()).write_bytes(b"")
+    assert len(registry.verify()) == 1
+    run_pretrain(tmp_path, resumed_config(RunDirectory(tmp_path / "run"), []), resume=True)
+    assert registry.verify() == []
+
+
+def test_a_version_has_the_parent_its_run_published_before_also_after_an_interruption(tmp_path, quick):
+    run_pretrain(tmp_path)
+    config = resumed_config(RunDirectory(tmp_path / "run"), ["run.total_env_steps=1500"])
+    interrupted = run_pretrain(
+        tmp_path, config, on_iteration=lambda _: os.kill(os.getpid(), signal.SIGINT), resume=True
+    )
+    assert interrupted.result.reason == "interrupted"
+    # nobody's parent, though the newest of the name
+    Registry(tmp_path / "registry").publish(
+        "tiny", {"a": np.zeros(1)}, spaces={}, normalisation={}, config={}, metrics={}
+    )
+    last = run_pretrain(tmp_path, config, resume=True)
+    assert str(last.version) == "tiny@3"
+    assert Registry(tmp_path / "registry").manifest("tiny@3").parent == "tiny@1"
+
+
+def test_a_version_of_the_same_number_in_another_registry_is_no_parent(tmp_path, quick):
+    run_pretrain(tmp_path)
+    other = Registry(tmp_path / "other")
+    other.publish("tiny", {"a": np.zeros(1)}, spaces={}, normalisation={}, config={}, metrics={})
+    config = resumed_config(RunDirectory(tmp_path / "run"), ["run.total_env_steps=600"])
+    pretrain(config, RunDirectory(tmp_path / "run"), other.root, resume=True, on_iteration=lambda metrics: None)
+    assert other.manifest("tiny@2").parent is None
+
+
+def test_a_registry_that_is_only_read_is_refused_before_anything_is_learned(tmp_path):
+    with pytest.raises(TandemError) as error:
+        pretrain(tiny_config(), RunDirectory(tmp_path / "run"), BUNDLED, on_iteration=lambda metrics: None)
+    assert_one_line(error.value, "cannot write", BUNDLED, "only read")
+    assert not (tmp_path / "run").exists()
 
 
 # --- signals ---------------------------------------------------------------------------------------------------------
@@ -165,6 +217,50 @@ def test_a_bad_value_is_found_before_anything_is_loaded(begun, override, part):
     with pytest.raises(ConfigError) as error:
         resumed_config(begun, [override])
     assert_one_line(error.value, part)
+
+
+@pytest.fixture
+def file(tmp_path):
+    """Writes a YAML file that says what ``begun`` was begun with, and this under ``run`` and at the top."""
+
+    def write(run=None, **top):
+        return write_yaml(tmp_path / "given.yaml", TREE | {"seed": 3} | top | {"run": TREE["run"] | (run or {})})
+
+    return write
+
+
+def test_a_file_may_say_again_what_the_run_has(begun, file):
+    assert resumed_config(begun, [], file()) == tiny_config(seed=3)
+
+
+def test_what_a_file_says_under_run_comes_before_the_overrides(begun, file):
+    given = file({"total_env_steps": 700, "keep_checkpoints": 5})
+    changed = resumed_config(begun, ["run.keep_checkpoints=7"], given)
+    assert changed == tiny_config(seed=3, total_env_steps=700, keep_checkpoints=7)
+
+
+def test_what_a_file_leaves_out_under_run_stays_as_saved(tmp_path):
+    directory = RunDirectory(tmp_path)
+    directory.start(tiny_config(keep_checkpoints=9))
+    directory.close()
+    given = write_yaml(tmp_path / "given.yaml", TREE | {"run": {"total_env_steps": 700}})
+    assert resumed_config(directory, [], given) == tiny_config(keep_checkpoints=9, total_env_steps=700)
+
+
+@pytest.mark.parametrize(
+    ("top", "parts"),
+    [
+        ({"seed": 4}, ["seed = 4", "has 3"]),
+        ({"game": TREE["game"] | {"num_worlds": 8}}, ["game.num_worlds = 8", "has 24"]),
+        ({"policy": TREE["policy"] | {"monolithic_bob": {"hidden_sizes": [8]}}}, ["policy.monolithic_bob."]),
+        ({"games": {}}, ["unknown key 'games'"]),
+    ],
+)
+def test_a_file_that_says_otherwise_is_refused(begun, file, top, parts):
+    given = file(**top)
+    with pytest.raises(ConfigError) as error:
+        resumed_config(begun, [], given)
+    assert_one_line(error.value, given, *parts)
 
 
 def test_nothing_to_resume(tmp_path):
