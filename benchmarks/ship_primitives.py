@@ -1,0 +1,128 @@
+"""Put a champion into the package: the primitives that come with ``pip install``.
+
+    python -m benchmarks.ship_primitives runs/cube                           # the newest Bob of a run, measured here
+    python -m benchmarks.ship_primitives panda-cube@7 --registry registry    # a published version
+
+``service/primitives`` is a registry like any other, except that only this script writes there. What it ships gets the
+next number and the aliases champion and latest; older versions of its name are removed: the package stays small.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import shutil
+import sys
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+
+# before NumPy is imported: as the command line does
+os.environ.update(dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1"))
+sys.path.insert(0, str(Path(__file__).parents[1]))
+
+from pydantic import JsonValue
+
+from service.config import parse_config
+from service.errors import TandemError
+from service.policies.evaluator import MCPEvaluator
+from service.registry import tensors
+from service.registry.blobs import BlobStore
+from service.registry.files import os_errors, write_atomic
+from service.registry.names import LATEST, Version
+from service.registry.registry import BUNDLED, Registry
+from service.runtime.primitives import read_stages
+from service.runtime.publishing import measure_bob, publish_bob
+from service.runtime.rundir import RunDirectory
+
+CHAMPION = "champion"
+
+
+def publish_newest(directory: RunDirectory, registry: Registry) -> Version:
+    """Measure and publish the newest Bob of a run, ended or not.
+
+    Raises:
+        TandemError: no run there, or no usable checkpoint.
+    """
+    config, stages = directory.read_config(), read_stages(directory)
+    env_steps = max(stages)
+    metrics = measure_bob(config, stages[env_steps]) | {"env_steps": env_steps}
+    return publish_bob(registry, config, stages[env_steps], metrics)
+
+
+def ship(reference: str, source: Registry, target: Path) -> Version:
+    """Copy a version into the bundled registry as the only one of its name.
+
+    Args:
+        reference: of the version.
+        source: where it is.
+        target: root of the bundled registry.
+
+    Raises:
+        TandemError: no such version, damaged, not primitives that this tandem can use, or a path in its manifest; then
+            nothing is changed.
+    """
+    manifest, parameters = source.load(reference)
+    MCPEvaluator(parameters)
+    parse_config(manifest.config, where=f"the manifest of {reference}")
+    for text in _texts(manifest.model_dump(mode="json")):
+        if text.startswith(("/", "~")):
+            raise TandemError(f"{reference}: its manifest names the path {text!r}, which only one machine has")
+
+    name = manifest.name
+    number = max((version.number for version in Registry(target).versions(name)), default=0) + 1
+    # its parent is a number of the source's, and means nothing here
+    shipped = manifest.model_copy(update={"version": number, "parent": None})
+    model = target / "models" / name
+    with os_errors("write", target):
+        digest = BlobStore(target / "blobs").put(tensors.encode(parameters))
+        assert digest == manifest.blob_sha256
+        shutil.rmtree(model, ignore_errors=True)
+        write_atomic(model / "versions" / str(number), shipped.to_bytes())
+        for alias in (CHAMPION, LATEST):
+            write_atomic(model / "aliases" / alias, f"{number}\n".encode())
+        _remove_unused_blobs(Registry(target))
+    return Version(name, number)
+
+
+def _remove_unused_blobs(registry: Registry) -> None:
+    versions = [version for name in registry.names() for version in registry.versions(name)]
+    used = {registry.manifest(str(version)).blob_sha256 for version in versions}
+    for path in (registry.root / "blobs" / "sha256").iterdir():
+        if path.name not in used:
+            path.unlink()
+
+
+def _texts(value: JsonValue) -> Iterator[str]:
+    if isinstance(value, str):
+        yield value
+    for inner in value.values() if isinstance(value, dict) else value if isinstance(value, list) else ():
+        yield from _texts(inner)
+
+
+def main() -> int:
+    """Parse the command line, publish a run's Bob if need be, ship, verify."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("source", metavar="RUN_DIR|NAME@ALIAS")
+    parser.add_argument("--registry", type=Path, default=Path("registry"), metavar="DIR", help="of NAME@ALIAS")
+    given = parser.parse_args()
+    try:
+        with tempfile.TemporaryDirectory() as scratch:
+            reference, source = given.source, Registry(given.registry)
+            if Path(reference).is_dir():
+                source = Registry(Path(scratch))
+                reference = str(publish_newest(RunDirectory(Path(given.source)), source))
+            version = ship(reference, source, BUNDLED)
+    except TandemError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+    bundled = Registry(BUNDLED)
+    manifest = bundled.manifest(str(version))
+    for name, value in manifest.metrics.items():
+        print(f"{name:<36} {value:g}")
+    print(f"{version} is in {BUNDLED}, {manifest.blob_bytes / 1000:.0f} kB; commit that directory")
+    return 1 if bundled.verify() else 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
