@@ -45,6 +45,7 @@ $(STAMP): pyproject.toml constraints.txt | $(VENV)/bin/uv
 
 demo: $(STAMP)
 	$(VENV)/bin/tandem demo
+	@echo "  (tandem is $(VENV)/bin/tandem; after '. $(VENV)/bin/activate' it is just tandem)"
 
 check: $(STAMP)
 	$(PY) -m ruff check

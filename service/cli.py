@@ -17,8 +17,11 @@ from service.errors import TandemError
 from service.registry.commands import registry_app
 
 if TYPE_CHECKING:
+    from service.actors.evaluation import Evaluation
     from service.config import Config
+    from service.envs.goals import GoalKind
     from service.runtime.pretrain import Pretrained
+    from service.runtime.primitives import TrainedBob
 
 app = typer.Typer(name="tandem", help="Robot skills, pre-trained.", no_args_is_help=True, add_completion=False)
 app.add_typer(registry_app)
@@ -26,6 +29,8 @@ _console = Console()
 _errors = Console(stderr=True)
 
 DEMO_ENV_STEPS = 1_000_000
+CHAMPION = "panda-cube@champion"
+"""The primitives that come with the package."""
 _EXIT_USER_ERROR = 2
 _EXIT_INTERRUPTED = 130
 
@@ -43,7 +48,8 @@ _Seed = Annotated[int, typer.Option(help="Of the episodes.", min=0)]
 @app.command()
 def pretrain(
     config: Annotated[
-        Path | None, typer.Option("--config", metavar="FILE", help="YAML; defaults where left out.")
+        Path | None,
+        typer.Option("--config", metavar="FILE", help="YAML; defaults where left out. Not needed to resume."),
     ] = None,
     run_dir: Annotated[Path | None, typer.Option("--run-dir", metavar="DIR", help="Default: runs/NAME.")] = None,
     resume: Annotated[bool, typer.Option("--resume", help="Continue the run in --run-dir exactly.")] = False,
@@ -58,12 +64,10 @@ def pretrain(
 
         overrides = overrides or []
         if resume:
-            if run_dir is None or config is not None:
-                raise TandemError(
-                    "--resume needs --run-dir, and takes the configuration from there: leave out --config"
-                )
+            if run_dir is None:
+                raise TandemError("--resume needs --run-dir, the directory of the run to continue")
             directory = RunDirectory(run_dir)
-            resolved = resumed_config(directory, overrides)
+            resolved = resumed_config(directory, overrides, config)
         else:
             resolved = load_config(config, overrides)
             directory = RunDirectory(run_dir or Path("runs") / resolved.name)
@@ -85,6 +89,7 @@ def demo(
         overrides = [f"run.total_env_steps={env_steps}", "name=panda-cube-demo"]
         _console.print("A robot arm is about to teach itself: Alice proposes goals, Bob learns to reach them.")
         _pretrain(load_config(_demo_config(), overrides), path, path / "registry", resume=False)
+        _show_champion()
 
 
 @app.command()
@@ -101,38 +106,17 @@ def evaluate(
 ) -> None:
     """Bob on random goals from fresh resets, without noise, beside a policy that does nothing."""
     with _user_errors():
-        from service.actors.evaluation import Idle
-        from service.actors.evaluation import evaluate as run
         from service.envs.goals import GOAL_KINDS
         from service.runtime.primitives import load_bob
 
         if goals not in GOAL_KINDS:
             raise TandemError(f"--goals {goals!r}: choose one of {', '.join(GOAL_KINDS)}")
         bob = load_bob(primitives, registry)
-        rows = {
-            name: run(
-                policy,
-                bob.config.world,
-                goals,
-                num_episodes=episodes,
-                num_steps=steps,
-                seed=seed,
-                success_distance_m=bob.config.game.success_distance_m,
-            )
-            for name, policy in ((bob.label, bob.policy), ("idle", Idle()))
-        }
+        rows = _evaluate(bob, goals, episodes, steps, seed)
     if as_json:
         typer.echo(json.dumps({name: row.as_dict() for name, row in rows.items()}, indent=1))
-        return
-    _say(f"{episodes} random goals ({goals}), {steps} steps, within {100 * bob.config.game.success_distance_m:g} cm")
-    for name, row in rows.items():
-        _console.print(
-            f"  {name:<24} at the last step {row.success_last:6.1%}"
-            f"  [{row.success_last_low:.1%}, {row.success_last_high:.1%}]"
-            f"   ever {row.success_ever:6.1%}   mean distance {row.mean_distance_m:.3f} m",
-            highlight=False,
-            soft_wrap=True,
-        )
+    else:
+        _print_evaluation(rows, bob.config.game.success_distance_m)
 
 
 @app.command()
@@ -206,6 +190,36 @@ def render(
     _say(f"video: {out}")
 
 
+def _evaluate(bob: TrainedBob, goals: GoalKind, episodes: int, steps: int, seed: int) -> dict[str, Evaluation]:
+    from service.actors.evaluation import Idle
+    from service.actors.evaluation import evaluate as run
+
+    return {
+        name: run(
+            policy,
+            bob.config.world,
+            goals,
+            num_episodes=episodes,
+            num_steps=steps,
+            seed=seed,
+            success_distance_m=bob.config.game.success_distance_m,
+        )
+        for name, policy in ((bob.label, bob.policy), ("idle", Idle()))
+    }
+
+
+def _print_evaluation(rows: dict[str, Evaluation], success_distance_m: float) -> None:
+    first = next(iter(rows.values()))
+    within = f"within {100 * success_distance_m:g} cm"
+    _say(f"{first.num_episodes} random goals ({first.goals}), {first.num_steps} steps, {within}")
+    for name, row in rows.items():
+        _say(
+            f"  {name:<24} at the last step {row.success_last:6.1%}"
+            f"  [{row.success_last_low:.1%}, {row.success_last_high:.1%}]"
+            f"   ever {row.success_ever:6.1%}   mean distance {row.mean_distance_m:.3f} m"
+        )
+
+
 def _say(text: str) -> None:
     """One line each, whatever the width and whatever brackets a path has."""
     _console.print(text, highlight=False, soft_wrap=True, markup=False)
@@ -244,7 +258,22 @@ def _report(done: Pretrained, path: Path, registry: Path) -> None:
     for name, file in done.files.items():
         _say(f"{name:<12} {file}")
     _say(f"{'checkpoint':<12} {path / 'checkpoints'}")
-    _say(f"{'primitives':<12} {done.version} in {registry}")
+    if done.version is not None:
+        _say(f"{'primitives':<12} {done.version} in {registry}")
+
+
+def _show_champion() -> None:
+    """What learning for longer gives, and what to type next; the first of it prints the same numbers again."""
+    from service.registry.registry import BUNDLED
+    from service.runtime.primitives import load_bob
+
+    bob = load_bob(CHAMPION, BUNDLED)
+    _say(f"\nThat was a beginning. Primitives that have learned for longer come with tandem; {CHAMPION}:")
+    _print_evaluation(_evaluate(bob, "mixed", 300, 50, seed=0), bob.config.game.success_distance_m)
+    _say("\nnext:")
+    _say(f"  tandem evaluate --primitives {CHAMPION} --goals mixed --episodes 300")
+    _say(f"  tandem render   --primitives {CHAMPION} --out champion.mp4")
+    _say(f"  tandem coverage --primitives {CHAMPION} --out champion.png")
 
 
 def _demo_config() -> Path | None:

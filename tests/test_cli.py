@@ -2,6 +2,8 @@
 
 import json
 import os
+import re
+import shlex
 import subprocess
 import sys
 from pathlib import Path
@@ -13,10 +15,13 @@ from typer.testing import CliRunner
 from service.cli import app
 from service.config import load_config
 from service.registry import checkpoints
+from service.registry.names import Version
+from service.registry.registry import BUNDLED, Registry
 from service.runtime.rundir import RunDirectory
 from tests.runtime.runs import TREE, tiny_config, write_yaml
 
 ROOT = Path(__file__).parents[1]
+README = (ROOT / "README.md").read_text()
 EVALUATION_KEYS = {
     "goals", "num_episodes", "num_steps", "success_last", "success_last_low", "success_last_high", "success_ever",
     "mean_distance_m",
@@ -98,6 +103,41 @@ def test_pretrain_refuses_a_directory_with_a_run(trained):
     assert (trained.run / "metrics.jsonl").read_bytes() == before
 
 
+def test_the_readmes_commands_of_pretraining(monkeypatch, tmp_path):
+    """As they stand there, one after the other, with a tiny configuration where the shipped one would be."""
+    monkeypatch.setattr("service.runtime.publishing.FINAL_EVALUATION_EPISODES", 4)
+    monkeypatch.setattr("service.runtime.pretrain.make_artifacts", lambda directory: {})
+    monkeypatch.chdir(tmp_path)
+    commands = [shlex.split(line) for line in re.findall(r"^tandem (pretrain .*)$", README, re.MULTILINE)]
+    (given,) = {command[command.index("--config") + 1] for command in commands if "--config" in command}
+    assert (ROOT / given).is_file()
+    Path(given).parent.mkdir(parents=True)
+    write_yaml(Path(given), TREE | {"name": "panda-cube"})
+    for command in commands:
+        result = tandem(*command)
+        assert result.exit_code == 0, (command, result.output)
+        assert "finished after" in result.stdout
+    assert any("--resume" in command for command in commands)
+    assert sorted(path.name for path in Path("runs").iterdir()) == ["cube", "panda-sphere"]
+    rows = json.loads(tandem("registry", "list", "--json").stdout)
+    own = [(row["name"], row["version"], row["parent"]) for row in rows if not row["bundled"]]
+    assert own == [("panda-cube", 1, None), ("panda-sphere", 1, None)]  # resuming what was finished made no version
+
+
+def test_a_resumed_run_takes_the_file_it_was_begun_with(trained, monkeypatch):
+    asked = []
+
+    def pretrain(config, directory, registry, **kwargs):
+        asked.append((config.run, kwargs["resume"]))
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("service.runtime.pretrain.pretrain", pretrain)
+    config = trained.home / "tiny.yaml"
+    common = ("pretrain", "--resume", "--run-dir", trained.run, "--config", config)
+    tandem(*common, "--set", "run.total_env_steps=950")
+    assert asked == [(tiny_config(total_env_steps=950, keep_checkpoints=2).run, True)]
+
+
 def test_pretrain_goes_to_runs_by_its_name(monkeypatch, tmp_path):
     asked = []
 
@@ -129,6 +169,32 @@ def test_demo_is_a_short_pretraining_with_a_registry_of_its_own(monkeypatch, tmp
     tandem("demo", "--env-steps", "8")
     one, two = Path("runs/demo-1"), Path("runs/demo-2")
     assert asked == [("panda-cube-demo", 7, one, one / "registry"), ("panda-cube-demo", 8, two, two / "registry")]
+
+
+def test_demo_ends_with_what_comes_with_tandem_and_what_to_type(monkeypatch, tmp_path):
+    from service.actors import evaluation
+    from service.runtime.local import RunResult
+    from service.runtime.pretrain import Pretrained
+
+    def pretrain(*args, **kwargs):
+        return Pretrained(RunResult("finished", 1, 7), {}, Version("panda-cube-demo", 1), {}, "total 1 s")
+
+    real = evaluation.evaluate
+    few = {"num_episodes": 4, "num_steps": 2}
+    monkeypatch.setattr(evaluation, "evaluate", lambda *args, **kwargs: real(*args, **kwargs | few))
+    monkeypatch.setattr("service.runtime.pretrain.pretrain", pretrain)
+    monkeypatch.chdir(tmp_path)
+    result = tandem("demo", "--env-steps", "7")
+    assert result.exit_code == 0, result.output
+    shown = result.stdout.partition("panda-cube-demo@1 in runs/demo-1/registry\n")[2]
+    champion = Registry(BUNDLED).resolve("panda-cube@champion")
+    assert f"\n  {champion} (bundled) " in shown
+    assert "\n  idle " in shown
+    commands = [shlex.split(line)[1:] for line in re.findall(r"^ +(tandem .*)$", shown, re.MULTILINE)]
+    assert [command[0] for command in commands] == ["evaluate", "render", "coverage"]
+    evaluated = tandem(*commands[0])
+    assert evaluated.exit_code == 0, evaluated.output
+    assert evaluated.stdout in shown  # it says the same again
 
 
 # --- what can be done with it ----------------------------------------------------------------------------------------
@@ -199,6 +265,20 @@ def test_coverage(trained, tmp_path):
     assert f"picture: {picture}\n" in text  # on one line, to be copied
 
 
+def test_what_comes_with_tandem_needs_no_registry_and_no_directory_of_its_own(filmed, monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    champion = ("--primitives", "panda-cube@champion")
+    label = f"{Registry(BUNDLED).resolve('panda-cube@champion')} (bundled)"
+    result = tandem("evaluate", *champion, "--goals", "mixed", "--episodes", 4, "--steps", 2, "--json")
+    assert result.exit_code == 0, result.output
+    assert list(json.loads(result.stdout)) == [label, "idle"]
+    result = tandem("coverage", *champion, "--skills", 2, "--steps", 2, "--json")
+    assert list(json.loads(result.stdout)["share_of_table_cells_visited"]) == [label, "random policy"]
+    assert tandem("render", *champion, "--episodes", 2).exit_code == 0
+    assert filmed == [((2, 3), Path("video.mp4"))]
+    assert [path.name for path in tmp_path.iterdir()] == ["coverage.png"]
+
+
 @pytest.fixture
 def filmed(monkeypatch):
     """(number of takes or episodes, file) of each video, none of which is drawn."""
@@ -257,7 +337,8 @@ def test_registry_show(trained):
         (["--config", "none.yaml"], ["none.yaml"]),
         (["--config", "."], ["."]),
         (["--resume"], ["--resume needs --run-dir"]),
-        (["--resume", "--run-dir", "run", "--config", "tiny.yaml"], ["leave out --config"]),
+        (["--resume", "--config", "tiny.yaml"], ["--resume needs --run-dir"]),
+        (["--resume", "--run-dir", "run", "--config", "tiny.yaml"], ["no run in run"]),
         (["--resume", "--run-dir", "none"], ["no run in none"]),
     ],
 )
@@ -270,6 +351,18 @@ def test_mistakes_of_pretrain(monkeypatch, tmp_path, arguments, parts):
 def test_a_resumed_run_keeps_its_configuration(trained):
     result = tandem("pretrain", "--resume", "--run-dir", trained.run, "--set", "seed=3")
     assert_user_error(result, "'seed=3'", "only run.*")
+
+
+def test_a_resumed_run_refuses_a_file_that_says_otherwise(trained, tmp_path):
+    config = write_yaml(tmp_path / "other.yaml", TREE | {"seed": 3})
+    result = tandem("pretrain", "--resume", "--run-dir", trained.run, "--config", config)
+    assert_user_error(result, config, "seed = 3", "leave out --config")
+
+
+def test_what_comes_with_tandem_is_not_written(tmp_path):
+    result = tandem("pretrain", "--registry", BUNDLED, "--run-dir", tmp_path / "run")
+    assert_user_error(result, "cannot write", BUNDLED, "only read")
+    assert not (tmp_path / "run").exists()
 
 
 def test_a_resume_without_a_checkpoint(tmp_path):
@@ -310,7 +403,7 @@ def test_a_run_directory_that_is_a_file(tmp_path):
     [
         (["evaluate", "--primitives", "tiny@best"], ["no alias 'best'", "latest -> 1"]),
         (["evaluate", "--primitives", "tiny@2"], ["no version 2"]),
-        (["evaluate", "--primitives", "nobody"], ["no 'nobody'", "it holds: tiny"]),
+        (["evaluate", "--primitives", "nobody"], ["no 'nobody'", "it holds: tiny", "with tandem comes: panda-cube"]),
         (["evaluate", "--primitives", "no/where"], ["no/where", "no such run directory"]),
         (["evaluate", "--primitives", "."], ["no run in ."]),
         (["evaluate", "--primitives", "tiny", "--goals", "sky"], ["'sky'", "table, air, mixed"]),
