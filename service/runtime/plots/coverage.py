@@ -41,22 +41,34 @@ def plot_coverage(trajectories: Sequence[Array], workspace: WorkspaceConfig, pat
     Raises:
         TandemError: there is no trajectory, one is not (T, 3), or the picture cannot be written.
     """
-    from matplotlib import colormaps
-
     paths = [_trajectory(points, number) for number, points in enumerate(trajectories)]
     if not paths:
         raise TandemError(f"no trajectories to draw in {path}; ask for one composition or more")
     figure = new_figure(14.0, 7.2, f"{title}: {_coverage_words(paths)}")
     box = figure.add_axes((0.0, 0.0, 0.57, 0.95), projection="3d", computed_zorder=False)
     above = figure.add_axes((0.62, 0.1, 0.36, 0.74))
+    draw_paths(box, above, paths, workspace)
+    above.set_ylabel("y (m)", color=FAINT)
+    above.set_title("From above; a dot is where the object ends", loc="left", fontsize=12, color=INK)
+    return save(figure, path)
+
+
+def draw_paths(box: Any, above: Axes, paths: Sequence[Array], workspace: WorkspaceConfig) -> None:
+    """Draw paths of the object, (T, 3) metres and a colour each: in the workspace's box, and from above.
+
+    Args:
+        box: 3-D axes, made with ``computed_zorder=False``.
+        above: plain axes.
+        paths: what to draw; points more than a few centimetres outside the workspace are left out.
+        workspace: the box.
+    """
+    from matplotlib import colormaps
+
     _draw_box(box, workspace)
     draw_outline(above, workspace)
     # the map's ends are nearly black, where neighbours no longer differ
     for points, color in zip(paths, colormaps["turbo"](np.linspace(0.05, 0.95, len(paths))), strict=True):
         _draw_trajectory(box, above, _inside(points, workspace), color)
-    above.set_ylabel("y (m)", color=FAINT)
-    above.set_title("From above; a dot is where the object ends", loc="left", fontsize=12, color=INK)
-    return save(figure, path)
 
 
 def _trajectory(points: Array, number: int) -> Array:
