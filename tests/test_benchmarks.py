@@ -1,20 +1,43 @@
 """The benchmarks on tiny settings: they run, count right and repeat the same physics. Nothing here asserts a time."""
 
 import json
+import subprocess
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
 
-from benchmarks import env_throughput, figures, measuring, record_run, rounds, selfplay_throughput
+from benchmarks import (
+    ablations,
+    compare_commits,
+    curriculum,
+    env_throughput,
+    figures,
+    loop_probe,
+    measuring,
+    record_run,
+    rounds,
+    run_files,
+    selfplay_throughput,
+    stages,
+    tables,
+    tasks,
+)
 from benchmarks.measuring import Sample
+from benchmarks.pictures.curriculum import quantiles
+from service.actors.coverage import RandomPolicy, skill_trajectories, visited_share
+from service.actors.evaluation import Idle
 from service.config import WorldConfig, dump_config, load_config
 from service.envs.batch import WorldBatch
 from service.envs.registration import TABLETOP_ID
 from service.errors import TandemError
+from service.learner.learner import Learner
 from service.runtime.local import LocalRun
 from service.runtime.records import JsonlWriter
 from service.runtime.rundir import RunDirectory
+
+ROOT = Path(__file__).parents[1]
 
 TINY = [
     "game.num_worlds=6",
@@ -212,11 +235,29 @@ def test_the_first_update_of_the_command_line_is_awaited(config, tmp_path):
     assert "learner/version" in recorded
 
 
-# --- recorded runs and their figures ----------------------------------------------------------------------------------
+# --- recorded runs ----------------------------------------------------------------------------------------------------
 
-EVALUATION = {
-    "goals": "table", "num_episodes": 300, "num_steps": 60, "success_last": 0.31, "success_last_low": 0.26,
-    "success_last_high": 0.364, "success_ever": 0.33, "mean_distance_m": 0.1,
+
+def _evaluation(policy, goals, last, ever=0.5, num_steps=50):
+    interval = {"success_last_low": last - 0.05, "success_last_high": last + 0.054}
+    return {"policy": policy, "goals": goals, "num_episodes": 300, "num_steps": num_steps, "success_last": last,
+            "success_ever": ever, "mean_distance_m": 0.1, **interval}  # fmt: skip
+
+
+EVALUATIONS = [
+    _evaluation(policy, goals, last)
+    for policy, lasts in {"bob": (0.91, 0.88, 0.95, 0.7, 0.66), "idle": (0.06, 0.05, 0.07, 0.05, 0.06)}.items()
+    for goals, last in zip(tasks.TASKS, lasts, strict=True)
+]
+PATHS_MM = [[0, 0, 25, 10 * index, 0, 25] for index in range(3)]
+COVERAGE = {
+    "num_skills": 3, "num_steps": 4, "cell_size_m": 0.05,
+    "stages": {
+        "random policy": {"shares": [0.1, 0.3], "paths_mm": PATHS_MM},
+        "beginning": {"env_steps": 0, "shares": [0.1, 0.2], "paths_mm": PATHS_MM},
+        "middle": {"env_steps": 3_500_000, "shares": [0.5, 0.4], "paths_mm": PATHS_MM},
+        "end": {"env_steps": 7_000_000, "shares": [0.7, 0.8], "paths_mm": PATHS_MM},
+    },
 }  # fmt: skip
 
 
@@ -234,86 +275,77 @@ def _run_directory(path, num_iterations=700):
             "alice/valid_fraction": share,
             "alice/lifted_fraction": share / 10,
             "alice/goal_distance_m": 0.08 + 0.06 * share,
+            "alice/goal_height_p90_m": 0.03 + 0.1 * share,
             "bob/success_rate": 0.5,
+            "learner/bob_std": 0.3,
         }
         if index % 20 == 0:
-            record |= {"evaluation/table_success_last": share, "evaluation/table_success_ever": 1.0}
+            record |= {f"evaluation/{kind}_success_last": share for kind in ("table", "air", "mixed")}
         metrics.append(record)
         goal = [0.0, 0.0, 0.025, 0.1, share / 10, 0.025, index % 2]
         goals.append({"iteration": index, "env_steps": 10_000 * index, "goals": [goal] * (index % 4)})
     return directory
 
 
-def _record(path, name="cube-0", rows=()):
-    record = record_run.record_run(_run_directory(path), name, rows)
+def _record(path, name="cube-0", **more):
+    record = record_run.record_run(_run_directory(path), name) | {"evaluations": [], "coverage": None} | more
     measuring.write_json(path / f"{name}.json", record)
     return path / f"{name}.json"
+
+
+def _record_ablation(path, name, overrides=(), seed=0):
+    file = _record(path, f"ablation-{name}-{seed}", evaluations=EVALUATIONS, coverage=COVERAGE)
+    record = json.loads(file.read_text()) | {"ablation": {"name": name, "overrides": list(overrides)}}
+    record["config"]["seed"] = seed
+    measuring.write_json(file, record)
+    return file
 
 
 def test_a_run_is_thinned_by_hand_computed_means():
     records = [{"iteration": i, "env_steps": 10 * i, "a": float(i)} for i in range(1, 8)]
     records[0]["b"], records[6]["b"] = 3.0, float("nan")
-    series = record_run.thin(records, max_points=3)  # blocks of 3, 2 and 2
+    series = run_files.thin(records, max_points=3)  # blocks of 3, 2 and 2
     assert series == {"env_steps": [30, 50, 70], "iteration": [3, 5, 7], "a": [2.0, 4.5, 6.5], "b": [3.0, None, None]}
-    assert record_run.unthin(series)[:2] == [
+    assert run_files.unthin(series)[:2] == [
         {"env_steps": 30, "iteration": 3, "a": 2.0, "b": 3.0},
         {"env_steps": 50, "iteration": 5, "a": 4.5},
     ]
+
+
+def test_bins_by_hand():
+    steps_and_values = ((1, 1.0), (4, 3.0), (9, 5.0), (10, None))
+    records = [{"env_steps": steps, "time/wall_s": 11 - steps, "a": value} for steps, value in steps_and_values]
+    np.testing.assert_array_equal(run_files.binned(records, "a", 5), [1.0, np.nan, 3.0, np.nan, 5.0])
+    over_time = run_files.binned(records, "a", 2, over="time/wall_s")  # 10, 7, 2 and 1 of 10 seconds
+    np.testing.assert_array_equal(over_time, [5.0, 2.0])
+
+
+def test_env_steps_until_a_level_by_hand():
+    records = [{"env_steps": 10 * i, "a": a} for i, a in enumerate((0.2, 1.0, 0.6, None, 0.8, 0.7), start=1)]
+    for record in records:
+        if record["a"] is None:  # not evaluated there
+            del record["a"]
+    assert run_files.steps_until(records, "a", 0.8, num_in_a_row=1) == 20
+    # (0.2 + 1.0 + 0.6) / 3 = 0.6, (1.0 + 0.6 + 0.8) / 3 = 0.8
+    assert run_files.steps_until(records, "a", 0.6) == 30
+    assert run_files.steps_until(records, "a", 0.79) == 50
+    assert run_files.steps_until(records, "a", 0.9) is None
+    assert run_files.steps_until(records[:2], "a", 0.1) is None
 
 
 def test_a_recorded_run_is_small_and_whole(tmp_path):
     path = _record(tmp_path)
     record = json.loads(path.read_text())
     assert path.stat().st_size < 400_000
-    assert {len(values) for values in record["series"].values()} == {record_run.MAX_POINTS}
+    assert {len(values) for values in record["series"].values()} == {run_files.MAX_POINTS}
     assert record["series"]["iteration"][-1] == 700
     assert sum(value is not None for value in record["series"]["evaluation/table_success_last"]) == 35
     assert len(record["goals"]) == record_run.GOAL_RECORDS
     assert {len(each["goals"]) for each in record["goals"]} == {record_run.GOALS_EACH}
     assert record["goals"][-1]["env_steps"] == 7_000_000
+    assert record["curriculum"]["env_steps"] == 7_000_000
+    assert np.sum(record["curriculum"]["height"]["goals"]) == 175 * (0 + 1 + 2 + 3)
     assert load_config().model_dump(mode="json") == record["config"]
-
-
-def test_evaluations_are_checked_when_they_are_recorded(tmp_path):
-    path = tmp_path / "evaluation.json"
-    path.write_text(json.dumps({"runs/cube": EVALUATION, "idle": EVALUATION}))
-    assert [row["policy"] for row in record_run.read_evaluation(path)] == ["runs/cube", "idle"]
-    for text in ("[1]", "{", json.dumps({"runs/cube": {"goals": "table"}}), json.dumps({"runs/cube": 5})):
-        path.write_text(text)
-        with pytest.raises(TandemError, match="tandem evaluate --json"):
-            record_run.read_evaluation(path)
-
-
-def test_bins_by_hand():
-    records = [{"env_steps": steps, "a": value} for steps, value in ((1, 1.0), (4, 3.0), (9, 5.0), (10, None))]
-    np.testing.assert_array_equal(figures.binned(records, "a", 10.0, num_bins=5), [1.0, np.nan, 3.0, np.nan, 5.0])
-
-
-@pytest.mark.filterwarnings("error")
-def test_the_page_and_its_pictures_are_made_again_and_again(tmp_path):
-    rows = [{"policy": "runs/cube", **EVALUATION}, {"policy": "idle", **EVALUATION, "success_ever": 0.07}]
-    runs = [_record(tmp_path / "0", "cube-0", rows), _record(tmp_path / "1", "cube-1")]
-    files = figures.pretraining(runs, tmp_path / "out")
-    names = ["pretraining.md", "pretraining.png", "pretraining-goals-cube-0.png", "pretraining-goals-cube-1.png"]
-    assert [path.name for path in files] == names
-    assert all(path.read_bytes().startswith(b"\x89PNG") for path in files[1:])
-    page = files[0].read_text()
-    # iterations 1 to 69 (mean share 35 / 700) and, in the last tenth, 629 to 700 (mean share 664.5 / 700)
-    assert "| cube-0 | 7.0 M | 18 | 95 % | 9 % | 50 % | 8.3 to 13.7 cm | 33 % | 31 % [26, 36] |  |" in page
-    assert "| cube-1 | 7.0 M | 18 | 95 % | 9 % | 50 % | 8.3 to 13.7 cm |  |  |  |" in page
-    assert "| idle policy |  |  |  |  |  |  | 7 % |" in page
-    files[0].write_text(f"Words before.\n{page}Words after.\n")
-    figures.pretraining(runs, tmp_path / "out")
-    assert files[0].read_text() == f"Words before.\n{page}Words after.\n"
-
-
-def test_a_page_without_markers_is_left_alone(tmp_path):
-    run = _record(tmp_path)
-    (tmp_path / "pretraining.md").write_text("no markers")
-    with pytest.raises(TandemError, match="no markers for the table"):
-        figures.pretraining([run], tmp_path)
-    assert (tmp_path / "pretraining.md").read_text() == "no markers"
-    assert not (tmp_path / "pretraining.png").exists()
 
 
 def test_other_files_are_not_runs(tmp_path):
@@ -324,4 +356,311 @@ def test_other_files_are_not_runs(tmp_path):
     ):
         (tmp_path / "run.json").write_text(text)
         with pytest.raises(TandemError, match=words):
-            figures.read_run(tmp_path / "run.json")
+            run_files.read_run(tmp_path / "run.json")
+
+
+def test_goals_are_counted_by_hand():
+    rest = 0.025
+    records = [
+        {"env_steps": 30, "goals": [[0, 0, rest, 0.06, 0, rest - 1e-4, 1], [0, 0, rest, 0.06, 0, rest, 0]]},
+        {"env_steps": 60, "goals": []},
+        # 7.6 cm up; as high and far as can be; and one that is not finite
+        {"env_steps": 300, "goals": [[0, 0, rest, 0, 0, rest + 0.076, 1], [0, 0, rest, 9, 0, 9, 0], [None] * 7]},
+    ]
+    counts = curriculum.count_goals(records, rest)
+    height, distance = counts["height"], counts["distance"]
+    assert np.shape(height["goals"]) == (curriculum.NUM_SLICES, curriculum.NUM_BINS["height"])
+    assert np.shape(distance["solved"]) == (curriculum.NUM_SLICES, curriculum.NUM_BINS["distance"])
+    assert {place: height["goals"][place[0]][place[1]] for place in zip(*np.nonzero(height["goals"]), strict=True)} == {
+        (3, 0): 2,
+        (29, 3): 1,
+        (29, 12): 1,
+    }
+    assert list(zip(*np.nonzero(height["solved"]), strict=True)) == [(3, 0), (29, 3)]
+    # 6 cm is in the third bin of 2.5 cm, 7.6 cm in the fourth
+    assert list(zip(*np.nonzero(distance["goals"]), strict=True)) == [(3, 2), (29, 3), (29, 15)]
+    assert counts["env_steps"] == 300
+
+
+def test_quantiles_by_hand():
+    counts = np.array([[0, 4, 4, 0], [2, 0, 0, 0], [0, 0, 0, 0]])
+    np.testing.assert_allclose(quantiles(counts, 0.5), [0.05, 0.0125, np.nan])
+    np.testing.assert_allclose(quantiles(counts, 0.25), [0.0375, 0.00625, np.nan])
+
+
+# --- what is measured of a run ----------------------------------------------------------------------------------------
+
+
+def test_tasks_have_worlds_of_their_own():
+    trained = load_config(None, ["world.object_mass_kg=0.2", "world.workspace.center_x_m=-0.02"]).world
+    worlds = {name: tasks.task_world(task, trained) for name, task in tasks.TASKS.items()}
+    assert [worlds[name] for name in ("mixed", "air", "table")] == [trained] * 3
+    workspace = worlds["larger"].workspace
+    size = (workspace.length_x_m, workspace.length_y_m, workspace.height_m)
+    assert (size, workspace.center_x_m, worlds["larger"].object_mass_kg) == ((0.45, 0.45, 0.40), -0.02, 0.2)
+    assert worlds["sphere"] == trained.model_copy(update={"object": "sphere"})
+
+
+def test_every_task_is_measured_beside_a_policy_that_does_nothing(config):
+    rows = tasks.measure_tasks(Idle(), config, num_episodes=20, num_steps=2)
+    assert [(row["goals"], row["policy"]) for row in rows] == [
+        (name, policy) for name in ("mixed", "air", "table", "larger", "sphere") for policy in ("bob", "idle")
+    ]
+    for bob, idle in zip(rows[::2], rows[1::2], strict=True):
+        assert bob == idle | {"policy": "bob"}
+        assert (bob["num_episodes"], bob["num_steps"]) == (20, 2)
+        assert bob["success_last_low"] <= bob["success_last"] <= bob["success_last_high"]
+
+
+def test_stages_are_the_nearest_snapshots():
+    assert stages.pick_stages([0, 12, 31, 44, 60]) == {"beginning": 0, "middle": 31, "end": 60}
+    assert stages.pick_stages({60: "b", 4: "a"}) == {"middle": 4, "end": 60}
+    assert stages.pick_stages([60]) == {"end": 60}
+
+
+def test_coverage_is_measured_at_each_stage_beside_a_random_policy(config):
+    bob = Learner(config).weights().bob
+    coverage = stages.measure_coverage({0: bob, 500: bob, 900: bob}, config, num_sets=2, num_steps=8)
+    assert {name: stage.get("env_steps") for name, stage in coverage["stages"].items()} == {
+        "random policy": None, "beginning": 0, "middle": 500, "end": 900,
+    }  # fmt: skip
+    random = coverage["stages"]["random policy"]
+    paths = [
+        skill_trajectories(RandomPolicy(), config.world, num_skills=32, num_steps=8, seed=seed, num_threads=1)
+        for seed in (0, 1)
+    ]
+    assert random["shares"] == [round(visited_share(each, config.world.workspace), 4) for each in paths]
+    assert stages.mean_share(random) == np.mean(random["shares"])
+    np.testing.assert_allclose(stages.paths_m(random), paths[0][:, [0, 4, 8]], atol=0.0005)
+    assert coverage["stages"]["beginning"]["shares"] == coverage["stages"]["end"]["shares"]
+    json.loads(measuring.to_text(coverage))
+
+
+def test_a_monolithic_bob_has_no_coverage():
+    config = load_config(None, [*TINY, "policy.monolithic_bob={hidden_sizes: [8]}"])
+    assert stages.measure_coverage({5: Learner(config).weights().bob}, config, num_sets=1, num_steps=1) is None
+
+
+def test_a_run_is_measured_from_its_snapshots_and_its_checkpoint(config, tmp_path, monkeypatch):
+    run = LocalRun(config, RunDirectory(tmp_path))
+    run.run(lambda metrics: run.request_stop())
+    run.directory.close()
+    monkeypatch.setattr(record_run, "measure_tasks", lambda bob, config: [type(bob).__name__])
+    monkeypatch.setattr(record_run, "measure_coverage", lambda bobs, config: list(bobs))
+    measured = record_run.measure_run(RunDirectory(tmp_path))
+    assert measured == {"evaluations": ["MCPEvaluator"], "coverage": [0, run.num_env_steps]}
+
+
+# --- the page ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.filterwarnings("error")
+def test_the_page_and_its_pictures_are_made_again_and_again(tmp_path):
+    runs = [
+        _record(tmp_path / "0", "cube-0", evaluations=EVALUATIONS, coverage=COVERAGE),
+        _record(tmp_path / "1", "cube-1", evaluations=[_evaluation("runs/cube", "air", 0.0, num_steps=60)]),
+        _record_ablation(tmp_path / "2", "no-abc", ["learner.abc.weight=0"], seed=1),
+        _record_ablation(tmp_path / "3", "recipe"),
+    ]
+    files = figures.pretraining(runs, tmp_path / "out")
+    names = ["", "-time", "-curriculum", "-goals-cube-0", "-goals-cube-1", "-coverage-cube-0", "-ablations"]
+    assert [path.name for path in files] == ["pretraining.md", *(f"pretraining{name}.png" for name in names)]
+    assert all(path.read_bytes().startswith(b"\x89PNG") for path in files[1:])
+    page = files[0].read_text()
+    assert all(f"]({path.name})" in page for path in files[1:])
+    # evaluated every 20 of 700 iterations: (620 + 640 + 660) / 3 / 700 = 0.91, and 0.89 one evaluation before
+    assert "| cube-0 | 91 % [86, 96] | 88 % [83, 93] | 95 % [90, 100] | 70 % [65, 75] | 66 % [61, 71] | 6.6 M |" in page
+    assert "| cube-1 (60 steps) |  | 0 % [-5, 5] |  |  |  | 6.6 M |" in page
+    assert "| doing nothing | 6 % [1, 11] | 5 % [0, 10] |" in page
+    # iterations 1 to 69 (mean share 35 / 700) and, in the last tenth, 629 to 700 (mean share 664.5 / 700)
+    assert "| cube-0 | 7 M | 18 min | 95 % | 9 % | 50 % | 8.3 to 13.7 cm | 3.5 to 12.5 cm |" in page
+    assert "| cube-0 | 20 % | 15 % | 45 % | 75 % | 3.8 |" in page
+    recipe, ablated = (page.index(row) for row in ("| recipe, seed 0 | nothing |", "| no-abc, seed 1 | `learner.abc"))
+    assert recipe < ablated
+    assert "Not recorded yet." in page  # the throughput
+    files[0].write_text(f"Words before.\n{page}Words after.\n")
+    figures.pretraining(runs, tmp_path / "out")
+    assert files[0].read_text() == f"Words before.\n{page}Words after.\n"
+
+
+def test_the_page_shows_the_throughput(tmp_path):
+    side = {"env_steps_per_s": 2000.4}
+    result = {
+        "settings": {"trained_steps": 500_000, "num_pairs": 5},
+        "rows": {"10399f0": side, "abcdef0": {"env_steps_per_s": 5000.0}},
+        "ratio": {"median": 2.5, "least": 2.375, "greatest": 2.625, "cpu": 2.0},
+    }
+    words = tables.throughput_words(result)
+    assert "5,000 env steps/s (abcdef0) instead of 2,000 env steps/s (10399f0)" in words
+    assert "2.50 times as many (2.38 to 2.62 in 5 pairs" in words
+    (tmp_path / "throughput.json").write_text(json.dumps(result))
+    run = _record(tmp_path / "0")
+    assert words in figures.pretraining([run], tmp_path)[0].read_text()
+
+
+def test_runs_recorded_before_there_was_a_coverage_are_shown(tmp_path):
+    files = figures.pretraining([ROOT / "docs" / "results" / "runs" / "cube-0.json"], tmp_path)
+    assert [path.name for path in files[1:]] == [
+        "pretraining.png",
+        "pretraining-time.png",
+        "pretraining-goals-cube-0.png",
+    ]
+    assert "| cube-0 (60 steps) | 14 % [10, 18] | 0 % [0, 2] | 35 % [30, 41] |  |  |  |" in files[0].read_text()
+
+
+def test_a_page_without_markers_is_left_alone(tmp_path):
+    run = _record(tmp_path)
+    page = figures.empty_page().replace(figures.end("coverage"), "")
+    (tmp_path / "pretraining.md").write_text(page)
+    with pytest.raises(TandemError, match="no markers for coverage"):
+        figures.pretraining([run], tmp_path)
+    assert (tmp_path / "pretraining.md").read_text() == page
+    assert not (tmp_path / "pretraining.png").exists()
+
+
+def test_durations_by_hand():
+    assert [tables.duration(seconds) for seconds in (90, 5400, 7200, 37_800)] == ["2 min", "90 min", "2.0 h", "10.5 h"]
+
+
+# --- ablations --------------------------------------------------------------------------------------------------------
+
+
+EVERYTHING_ON = [
+    "seed=3", "learner.mirror=true", "learner.abc={weight: 0.5, num_iterations: 8}", "game.num_goals=5",
+    "game.bob_hold_steps=5", "generator.past_opponent_fraction=0.2", "generator.replay_invalid=true",
+    "generator.replay_from_reset=true", "game.alice_steps_min=5", "learner.alice_interval=4",
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("name", ablations.ABLATIONS)
+def test_an_ablation_changes_what_it_says_and_nothing_else(name):
+    recipe, ablated = (
+        _leaves(ablations.ablated_config(ablations.CONFIG, each, EVERYTHING_ON).model_dump(mode="json"))
+        for each in (ablations.RECIPE, name)
+    )
+    changed = {key for key in recipe.keys() | ablated.keys() if recipe.get(key) != ablated.get(key)}
+    expected = {override.partition("=")[0] for override in ablations.ABLATIONS[name]}
+    assert {key.removesuffix(".hidden_sizes") for key in changed} == expected
+
+
+def _leaves(tree, prefix=""):
+    if not isinstance(tree, dict):
+        return {prefix[:-1]: tree}
+    return {key: leaf for name, each in tree.items() for key, leaf in _leaves(each, f"{prefix}{name}.").items()}
+
+
+def test_what_is_off_already_is_no_ablation():
+    assert ablations.ablated_config(ablations.CONFIG, "no-mirror", ["learner.mirror=false"]) is None
+    assert ablations.ablated_config(ablations.CONFIG, ablations.RECIPE, []) == load_config(ablations.CONFIG)
+    with pytest.raises(TandemError, match="no ablation 'no-such'; choose from recipe, no-abc"):
+        ablations.ablated_config(ablations.CONFIG, "no-such", [])
+
+
+def test_ablations_are_run_recorded_and_then_skipped(tmp_path, monkeypatch, capsys):
+    coverage = json.loads(json.dumps(COVERAGE))
+    monkeypatch.setattr(ablations, "measure_run", lambda directory: {"evaluations": [], "coverage": coverage})
+    (tmp_path / "tiny.yaml").write_text(dump_config(load_config(None, TINY)))
+    arguments = ["--steps", "100", "--seed", "2", "--config", tmp_path / "tiny.yaml", "--run-dir", tmp_path / "runs"]
+    command = ["ablations", *map(str, arguments), "--out", str(tmp_path), "no-abc", "no-mirror"]
+    monkeypatch.setattr(sys, "argv", command)
+    assert ablations.main() == 0
+    assert "no-mirror: learner.mirror=false\n  skipped, the recipe does not have it on" in capsys.readouterr().out
+    (file,) = tmp_path.glob("ablation-*")
+    run = run_files.read_run(file)
+    assert (file.name, run["name"]) == ("ablation-no-abc-2.json", "ablation-no-abc-2")
+    assert run["ablation"] == {"name": "no-abc", "overrides": ["learner.abc.weight=0"]}
+    assert (run["config"]["seed"], run["config"]["learner"]["abc"]["weight"]) == (2, 0.0)
+    assert run["series"]["env_steps"][-1] >= 100
+    assert not any(key.startswith("learner/") for key in run["series"])
+    assert [list(stage) for stage in run["coverage"]["stages"].values()] == [["shares"], *[["env_steps", "shares"]] * 3]
+    before = file.read_bytes()
+    assert ablations.main() == 0
+    assert "no-abc: learner.abc.weight=0\n  skipped" in capsys.readouterr().out
+    assert file.read_bytes() == before
+
+
+def test_a_stopped_ablation_goes_on_and_another_one_is_not_touched(config, tmp_path):
+    short = config.model_copy(update={"run": config.run.model_copy(update={"total_env_steps": 150})})
+    run = LocalRun(short, RunDirectory(tmp_path))
+    run.run(lambda metrics: run.request_stop())
+    run.directory.close()
+    stopped_at = run.num_env_steps
+    ablations.learn(short, RunDirectory(tmp_path))
+    steps = [json.loads(line)["env_steps"] for line in (tmp_path / "metrics.jsonl").read_text().splitlines()]
+    assert steps[0] == stopped_at < 150 <= steps[-1]
+    with pytest.raises(TandemError, match="a run of another configuration"):
+        ablations.learn(config, RunDirectory(tmp_path))
+
+
+# --- two commits ------------------------------------------------------------------------------------------------------
+
+
+def _git(path, *arguments):
+    identity = ("-c", "user.name=Nobody", "-c", "user.email=nobody@example.org")
+    subprocess.run(["git", "-C", str(path), *identity, *arguments], check=True, capture_output=True)
+
+
+def test_a_commit_is_checked_out_for_as_long_as_it_is_needed(tmp_path):
+    _git(tmp_path, "init", "--quiet")
+    for text in ("old", "new"):
+        (tmp_path / "file").write_text(text)
+        _git(tmp_path, "add", "file")
+        _git(tmp_path, "commit", "--quiet", "-m", text)
+    old = compare_commits.full_name("HEAD~1", tmp_path)
+    assert len(old) == 40
+    with compare_commits.worktree(old, tmp_path) as tree:
+        assert (tree / "file").read_text() == "old"
+        assert (tmp_path / "file").read_text() == "new"
+    assert not tree.exists()
+    assert not (tmp_path / ".git" / "worktrees").exists()
+    for use in (compare_commits.full_name, lambda name, path: compare_commits.worktree(name, path).__enter__()):
+        with pytest.raises(TandemError, match="name a commit"):
+            use("no-such-commit", tmp_path)
+
+
+def test_two_commits_are_measured_in_turn_from_the_same_checkpoint(tmp_path, monkeypatch):
+    calls = []
+
+    def probe(tree, verb, run_dir, *arguments):
+        calls.append((tree.name, verb, *arguments[-1:]))
+        if verb == "train":
+            run_dir.mkdir()
+            (run_dir / "checkpoint").write_text(tree.name)
+            return ""
+        assert (run_dir / "checkpoint").read_text() == tree.name
+        (run_dir / "checkpoint").write_text("changed")
+        return json.dumps({"num_steps": 1000.0, "wall_s": 1.0 if tree.name == "old" else 0.5, "cpu_s": 2.0})
+
+    monkeypatch.setattr(compare_commits, "probe", probe)
+    trees = {"a": tmp_path / "old", "b": tmp_path / "new"}
+    samples = compare_commits.compare(trees, tmp_path, compare_commits.Settings(300, num_pairs=2, num_iterations=7))
+    assert calls == [("old", "train", 300), ("new", "train", 300), *[("old", "measure", 7), ("new", "measure", 7)] * 2]
+    assert samples == {"a": [Sample(1000, 1.0, 2.0)] * 2, "b": [Sample(1000, 0.5, 2.0)] * 2}
+
+
+def test_a_commit_is_not_compared_with_itself(monkeypatch):
+    monkeypatch.setattr(compare_commits, "full_name", lambda name: "0" * 40)
+    with pytest.raises(TandemError, match="the same commit"):
+        compare_commits.benchmark("HEAD", "main", compare_commits.Settings())
+
+
+def test_the_loop_is_measured_after_some_iterations_to_warm_up(config, tmp_path):
+    (tmp_path / "tiny.yaml").write_text(dump_config(config))
+    directory = RunDirectory(tmp_path / "run")
+    loop_probe.train(directory, tmp_path / "tiny.yaml", 100)
+    directory.close()
+    before = [json.loads(line)["env_steps"] for line in directory.metrics_file.read_text().splitlines()]
+    taken = loop_probe.measure(directory, 3)
+    directory.close()
+    steps = [json.loads(line)["env_steps"] for line in directory.metrics_file.read_text().splitlines()]
+    assert len(steps) == len(before) + loop_probe.NUM_WARMUP_ITERATIONS + 3
+    assert taken["num_steps"] == steps[-1] - steps[-4]
+    assert taken["wall_s"] > 0.0
+    assert taken["cpu_s"] > 0.0
+
+
+def test_a_loop_that_fails_says_why(tmp_path):
+    with pytest.raises(TandemError, match=r"failed: .*no-run"):
+        compare_commits.probe(ROOT, "measure", tmp_path / "no-run", 1)
+    with pytest.raises(TandemError, match="failed: AssertionError: service is"):
+        compare_commits.probe(tmp_path, "measure", tmp_path / "no-run", 1)

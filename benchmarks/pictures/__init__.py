@@ -1,0 +1,1 @@
+"""The pictures of ``docs/results``, drawn from recorded runs alone."""

@@ -1,0 +1,96 @@
+"""The small file of a run that ``docs/results/runs`` keeps: how its series are thinned, and how it is read back.
+
+A run of hours has thousands of iterations. Consecutive ones are joined to at most 300 points: a point holds the mean
+of each metric over the iterations that have it, and the last value of the counters (iteration, env steps, wall-clock
+time).
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from service.errors import TandemError
+from service.runtime.plots.figures import Array, column
+
+FORMAT_VERSION = 1
+MAX_POINTS = 300
+"""Of every series."""
+COUNTERS = ("iteration", "env_steps", "time/wall_s")
+_DIGITS = 5
+
+Run = dict[str, Any]
+Records = Sequence[dict[str, Any]]
+
+
+def read_run(path: Path) -> Run:
+    """A file that ``record_run.py`` or ``ablations.py`` made.
+
+    Raises:
+        TandemError: it cannot be read, or is of another format.
+    """
+    try:
+        run = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise TandemError(f"cannot read {path}: {error}; make it with benchmarks/record_run.py") from error
+    found = run.get("format_version") if isinstance(run, dict) else None
+    if found != FORMAT_VERSION:
+        raise TandemError(f"{path}: format version {found!r}, this program reads {FORMAT_VERSION}; record the run anew")
+    return dict(run)
+
+
+def thin(records: Records, max_points: int = MAX_POINTS) -> dict[str, list[float | None]]:
+    """Each metric as a list of at most ``max_points`` means over equal blocks of records; null where none had it."""
+    parts = blocks(len(records), max_points)
+    keys = sorted({key for record in records for key in record}, key=lambda key: (key not in COUNTERS, key))
+    series = {}
+    for key in keys:
+        values = column(records, key)
+        points = [values[part][-1:] if key in COUNTERS else values[part] for part in parts]
+        series[key] = [_rounded(point[np.isfinite(point)], key) for point in points]
+    return series
+
+
+def unthin(series: dict[str, list[float | None]]) -> list[dict[str, Any]]:
+    """A record for each point, as ``metrics.jsonl`` has them: what was null is left out."""
+    rows = zip(*series.values(), strict=True)
+    return [{key: value for key, value in zip(series, row, strict=True) if value is not None} for row in rows]
+
+
+def blocks(num: int, max_blocks: int) -> list[NDArray[np.int64]]:
+    """The places 0 to ``num`` - 1 in at most ``max_blocks`` consecutive parts of equal size."""
+    return np.array_split(np.arange(num), min(num, max_blocks))
+
+
+def binned(records: Records, key: str, num_bins: int, *, over: str = "env_steps") -> Array:
+    """Means of a metric in ``num_bins`` equal spans of a counter from 0 to its end, NaN where a span has none."""
+    at, values = column(records, over), column(records, key)
+    known = np.isfinite(values) & np.isfinite(at)
+    index = np.minimum((at[known] / np.nanmax(at) * num_bins).astype(int), num_bins - 1)
+    with np.errstate(invalid="ignore"):  # 0 / 0 where a span has none
+        return np.bincount(index, values[known], num_bins) / np.bincount(index, minlength=num_bins)
+
+
+def steps_until(records: Records, key: str, level: float, *, num_in_a_row: int = 3) -> int | None:
+    """Env steps after which the mean of so many evaluations in a row was first at ``level``; None: never.
+
+    A single evaluation has too few goals: noise would be first.
+    """
+    evaluated = [record for record in records if key in record]
+    for last in range(num_in_a_row - 1, len(evaluated)):
+        row = evaluated[last - num_in_a_row + 1 : last + 1]
+        if float(np.mean([record[key] for record in row])) >= level:
+            return int(row[-1]["env_steps"])
+    return None
+
+
+def _rounded(values: Array, key: str) -> float | None:
+    if not values.size:
+        return None
+    mean = float(values.mean())
+    return int(mean) if key in ("iteration", "env_steps") else float(f"{mean:.{_DIGITS}g}")

@@ -1,0 +1,144 @@
+"""The tables of ``docs/results/pretraining.md``, in Markdown, from recorded runs."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+import numpy as np
+
+from benchmarks.run_files import Records, Run, binned, steps_until, unthin
+from benchmarks.stages import RANDOM, STAGES, mean_share
+from benchmarks.tasks import ASKED, NUM_STEPS, TASKS
+
+NUM_BINS = 10
+"""Of a run's env steps; rates are those of the last, distances and heights also those of the first."""
+
+Row = Sequence[str]
+
+
+def tasks_table(runs: Sequence[Run]) -> str:
+    """Bob on every task, at the last step, with the 95 % Wilson interval; a policy that does nothing below."""
+    head = ("run", *TASKS, f"env steps until {percent(ASKED)} of mixed")
+    rows = [(_label(run), *tasks_cells(run["evaluations"]), _steps_to_asked(run)) for run in runs]
+    idle = max((tasks_cells(run["evaluations"], idle=True) for run in runs), key=lambda cells: sum(map(bool, cells)))
+    return markdown(head, [*rows, ("doing nothing", *idle, "")])
+
+
+def tasks_cells(evaluations: Records, tasks: Iterable[str] = TASKS, *, idle: bool = False) -> list[str]:
+    """Success at the last step on each task, empty where it was not measured."""
+    rows = {row["goals"]: row for row in evaluations if (row["policy"] == "idle") == idle}
+    return [_success(rows[task]) if task in rows else "" for task in tasks]
+
+
+def training_table(runs: Sequence[Run]) -> str:
+    """How long each run took, and what its Alice and Bob did in the last tenth of it."""
+    head = ("run", "env steps", "time", "valid goals", "of those, lifted", "Bob on valid goals", "goal distance",
+            "goal height, 9 of 10 below")  # fmt: skip
+    return markdown(head, [_training_row(run) for run in runs])
+
+
+def _training_row(run: Run) -> Row:
+    records = unthin(run["series"])
+
+    def change(key: str) -> str:
+        first, *_, last = 100 * binned(records, key, NUM_BINS)
+        return f"{first:.1f} to {last:.1f} cm"
+
+    return (
+        str(run["name"]),
+        millions(records[-1]["env_steps"]),
+        duration(records[-1]["time/wall_s"]),
+        *(at_end(records, key) for key in ("alice/valid_fraction", "alice/lifted_fraction", "bob/success_rate")),
+        change("alice/goal_distance_m"),
+        change("alice/goal_height_p90_m"),
+    )
+
+
+def coverage_table(runs: Sequence[Run]) -> str:
+    """Share of the table's cells that random compositions visit at each stage, beside the random policy."""
+    head = ("run", RANDOM, *STAGES, f"end / {RANDOM}")
+    return markdown(head, [_coverage_row(run) for run in runs if run.get("coverage")])
+
+
+def _coverage_row(run: Run) -> Row:
+    stages = run["coverage"]["stages"]
+    shares = {name: mean_share(stage) for name, stage in stages.items()}
+    cells = [percent(shares[name]) if name in shares else "" for name in (RANDOM, *STAGES)]
+    return (str(run["name"]), *cells, f"{shares['end'] / shares[RANDOM]:.1f}")
+
+
+def ablations_table(runs: Sequence[Run]) -> str:
+    """A row for each ablation that was run, the whole recipe first."""
+    tasks = ("mixed", "air", "table")
+    head = ("run", "changed", "env steps", *tasks, "valid goals", "of those, lifted", "Bob on valid goals", "coverage")
+    return markdown(head, [_ablation_row(run, tasks) for run in runs])
+
+
+def _ablation_row(run: Run, tasks: Iterable[str]) -> Row:
+    records = unthin(run["series"])
+    changed = ", ".join(f"`{override}`" for override in run["ablation"]["overrides"])
+    return (
+        f"{run['ablation']['name']}, seed {run['config']['seed']}",
+        changed or "nothing",
+        millions(records[-1]["env_steps"]),
+        *tasks_cells(run["evaluations"], tasks),
+        *(at_end(records, key) for key in ("alice/valid_fraction", "alice/lifted_fraction", "bob/success_rate")),
+        percent(mean_share(run["coverage"]["stages"]["end"])) if run.get("coverage") else "",
+    )
+
+
+def throughput_words(result: dict[str, Any]) -> str:
+    """A sentence from what ``compare_commits.py`` measured."""
+    before, now = (f"{row['env_steps_per_s']:,.0f} env steps/s ({name})" for name, row in result["rows"].items())
+    ratio, settings = result["ratio"], result["settings"]
+    return (
+        f"The whole learning loop makes {now} instead of {before}, each commit with its own configuration after "
+        f"{millions(settings['trained_steps'])} env steps of training: {ratio['median']:.2f} times as many "
+        f"({ratio['least']:.2f} to {ratio['greatest']:.2f} in {settings['num_pairs']} pairs of measurements; "
+        f"{ratio['cpu']:.2f} by CPU time)."
+    )
+
+
+def markdown(head: Row, rows: Iterable[Row]) -> str:
+    """A table."""
+    return "\n".join("| " + " | ".join(row) + " |" for row in (head, ("---",) * len(head), *rows))
+
+
+def percent(share: float) -> str:
+    """A share for a cell; nothing for not-a-number."""
+    return f"{100 * share:.0f} %" if np.isfinite(share) else ""
+
+
+def millions(env_steps: float) -> str:
+    """Env steps for a cell."""
+    return f"{env_steps / 1e6:.3g} M"
+
+
+def duration(seconds: float) -> str:
+    """Minutes, or hours from two on."""
+    return f"{seconds / 3600:.1f} h" if seconds >= 7200 else f"{seconds / 60:.0f} min"
+
+
+def at_end(records: Records, key: str) -> str:
+    """A rate in the last tenth of a run."""
+    return percent(binned(records, key, NUM_BINS)[-1])
+
+
+def _success(row: dict[str, Any]) -> str:
+    low, high = (100 * row[f"success_last_{end}"] for end in ("low", "high"))
+    return f"{percent(row['success_last'])} [{low:.0f}, {high:.0f}]"
+
+
+def _label(run: Run) -> str:
+    """The run's name, and the steps of its episodes where they are not the usual ones."""
+    steps = {row["num_steps"] for row in run["evaluations"]} - {NUM_STEPS}
+    return f"{run['name']} ({max(steps)} steps)" if steps else str(run["name"])
+
+
+def _steps_to_asked(run: Run) -> str:
+    records = unthin(run["series"])
+    if not any("evaluation/mixed_success_last" in record for record in records):
+        return ""
+    found = steps_until(records, "evaluation/mixed_success_last", ASKED)
+    return millions(found) if found else f"not in {millions(records[-1]['env_steps'])}"
