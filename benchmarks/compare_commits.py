@@ -68,7 +68,7 @@ def full_name(commit: str, repository: Path = ROOT) -> str:
     Raises:
         TandemError: there is none of that name.
     """
-    return _git(repository, "rev-parse", "--verify", "--quiet", f"{commit}^{{commit}}")
+    return _git(repository, "rev-parse", "--verify", f"{commit}^{{commit}}")
 
 
 def _git(repository: Path, *arguments: str) -> str:
