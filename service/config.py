@@ -68,8 +68,8 @@ class GameConfig(_Frozen):
     alice_steps_min: int | None = Field(
         None,
         ge=1,
-        description="least steps: a round's length is drawn from here to ``alice_steps``; None: always ``alice_steps``. "
-        "Short turns make her lift early, long ones reach objects far from the gripper",
+        description="a round's length is drawn from here to ``alice_steps``; None: always ``alice_steps``. Short turns "
+        "make her lift early, long ones reach objects far from the gripper",
     )
     bob_steps: int = Field(40, ge=1)
     success_distance_m: float = Field(0.05, gt=0.0, description="paper: 5 cm; also the least move of a valid goal")
@@ -89,12 +89,12 @@ class GameConfig(_Frozen):
         "0.02 a whole turn next to the object earns 0.24, a valid goal 1 to 6",
     )
     bob_success_reward: float = Field(
-        1.0, gt=0.0, description="of a whole turn: each step on the goal pays its share of ``bob_hold_steps``"
+        1.0, gt=0.0, description="when the object comes onto the goal; taken back when it leaves (OpenAI 2021)"
     )
     bob_hold_steps: int = Field(
         1,
         ge=1,
-        description="Bob's turn ends once the object was on the goal for so many steps in all; 1: the moment it is "
+        description="Bob's turn ends once the object was on the goal for so many steps in a row; 1: the moment it is "
         "solved (paper). More teach him to stay: the goals of evaluation and downstream count at the last step",
     )
 
@@ -176,6 +176,9 @@ class PPOConfig(_Frozen):
     gamma: float = Field(0.99, gt=0.0, le=1.0)
     gae_lambda: float = Field(0.95, ge=0.0, le=1.0)
     clip: float = Field(0.2, gt=0.0, lt=1.0)
+    decoupled: bool = Field(
+        True, description="clip around the policy at the start of the update rather than the one that acted"
+    )
     dual_clip: float = Field(3.0, gt=1.0, description="bound of the surrogate for negative advantages (Ye et al. 2020)")
     entropy_weight: float = Field(0.001, ge=0.0)
     value_weight: float = Field(1.0, ge=0.0)

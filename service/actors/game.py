@@ -180,9 +180,9 @@ class SelfPlay:
             turns.log_prob[step, playing], turns.active[step, playing] = log_prob, True
             broken |= worlds.step(action, playing)
             reached = np.linalg.norm(worlds.object_position - choice.goal, axis=1) <= game.success_distance_m
-            turns.reward[step, playing] = game.bob_success_reward / game.bob_hold_steps * reached[playing]
+            turns.reward[step, playing] = game.bob_success_reward * (reached.astype(np.float32) - solved)[playing]
             solved[playing] = reached[playing]
-            num_held += reached
+            num_held = np.where(reached, num_held + 1, 0)
             over = num_held >= game.bob_hold_steps
             turns.terminated[step, playing] = over[playing]
             playing = playing[~(over | broken)[playing]]

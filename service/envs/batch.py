@@ -16,6 +16,7 @@ from service.envs import kinematics
 from service.envs.observations import ACTION_SIZE, BOB_VALUE_SIZE, FULL_SIZE, POSITIONS_SIZE
 from service.envs.panda import FINGER_STROKE_M, NUM_JOINTS
 from service.envs.scene import build_spec
+from service.errors import DivergedError
 
 FloatArray = NDArray[np.float32]
 StateArray = NDArray[np.float64]
@@ -52,6 +53,7 @@ class WorldBatch:
         self.config = config
         self.num_worlds = num_worlds
         self.model = build_spec(config).compile()
+        _quieten_mujoco()
         num_threads = min(num_threads or os.cpu_count() or 1, num_worlds)
         self._pool = rollout.Rollout(nthread=num_threads if num_threads > 1 else 0)
         self._data = [mujoco.MjData(self.model) for _ in range(max(num_threads, 1))]
@@ -127,7 +129,8 @@ class WorldBatch:
             (N,) true where the physics diverged. Such a world keeps its last finite state and is listed in ``broken``.
 
         Raises:
-            ValueError: actions of the wrong shape or not finite.
+            ValueError: actions of the wrong shape.
+            DivergedError: actions that are not finite; no world has moved.
         """
         index = slice(None) if worlds is None else worlds
         if worlds is not None and not worlds.size:
@@ -136,7 +139,11 @@ class WorldBatch:
         if actions.shape != (start.shape[0], ACTION_SIZE):
             raise ValueError(f"actions: expected shape {(start.shape[0], ACTION_SIZE)}, got {actions.shape}")
         if not np.isfinite(actions).all():
-            raise ValueError("actions: not finite; the policy that made them has diverged")
+            num = int((~np.isfinite(actions).all(axis=1)).sum())
+            raise DivergedError(
+                f"actions of {num} of {len(actions)} worlds are not finite: the policy that made them has diverged; "
+                "use an earlier version"
+            )
         control = self._control(start, actions.astype(np.float64), index)
         states, sensors = self._pool.rollout(
             self.model, self._data, start[:, : self._physics_size], control[:, None, :], nstep=self.config.num_substeps
@@ -220,6 +227,13 @@ class WorldBatch:
         state = np.zeros(self.state_size)
         mujoco.mj_getState(self.model, data, state[: self._physics_size], int(mujoco.mjtState.mjSTATE_FULLPHYSICS))
         return state
+
+
+def _quieten_mujoco() -> None:
+    """``WorldBatch`` itself tells of diverged worlds; MuJoCo would also write to a file in the working directory."""
+    log = mujoco.MjLogConfig.get()
+    log.logto_file = log.logto_console = False
+    log.set()
 
 
 class _Layout:

@@ -17,6 +17,9 @@ from service.policies import gaussian
 
 Arrays = dict[str, NDArray[Any]]
 
+RATE_BOUNDS = 0.03, 2.0
+"""The KL-adaptive learning rate stays within these multiples of the configured one."""
+
 
 class Player:
     """A policy and its value network under one Adam."""
@@ -66,9 +69,13 @@ class Player:
                 )
 
     def load_state(self, state: Mapping[str, NDArray[Any]]) -> None:
-        """Continue exactly where ``state``, which has been checked, was taken."""
+        """Continue exactly where ``state``, which has been checked, was taken.
+
+        Where a lower or higher learning rate is configured by now, the saved one is moved within its bounds.
+        """
         self.restore([torch.from_numpy(np.array(state[name])) for name in self._tensors()])
-        self.optimizer.learning_rate = float(state["learning_rate"])
+        low, high = (self.config.learning_rate * bound for bound in RATE_BOUNDS)
+        self.optimizer.learning_rate = min(max(float(state["learning_rate"]), low), high)
 
     def _tensors(self) -> dict[str, Tensor]:
         """Parameters and Adam's state by name: the tensors themselves, always in the same order."""

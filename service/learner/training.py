@@ -113,11 +113,13 @@ def _policy_loss(
     loss, terms = log_prob.new_zeros(()), Terms()
     if samples is not None:
         config = player.config
-        # Clipping around the policy at the start of the update, and weighting by what it has moved since the one that
-        # acted, keeps the whole clip range for this update (decoupled PPO, Hilton et al. 2022).
-        start_log_prob = samples.start_log_prob
-        advantage = samples.advantage * losses.lag_weight(start_log_prob, samples.old_log_prob)
-        pair = log_prob[:num_samples], start_log_prob
+        reference, advantage = samples.old_log_prob, samples.advantage
+        if config.decoupled:
+            # Clipping around the policy at the start of the update, and weighting by what it has moved since the one
+            # that acted, keeps the whole clip range for this update (decoupled PPO, Hilton et al. 2022).
+            reference = samples.start_log_prob
+            advantage = advantage * losses.lag_weight(reference, samples.old_log_prob)
+        pair = log_prob[:num_samples], reference
         surrogate, clip_fraction = losses.clipped_surrogate(*pair, advantage, config.clip, config.dual_clip)
         entropy = gaussian.entropy(std[:num_samples]).mean()
         loss = surrogate - config.entropy_weight * entropy

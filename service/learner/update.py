@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from service.config import ABCConfig
-from service.learner.player import Player
+from service.learner.player import RATE_BOUNDS, Player
 from service.learner.returns import explained_variance
 from service.learner.samples import Cloning, Samples
 from service.learner.training import train
@@ -17,8 +17,6 @@ from service.policies import gaussian
 
 RATE_STEP = 1.5
 """The KL-adaptive learning rate moves by this factor (rsl_rl)."""
-RATE_BOUNDS = 0.03, 2.0
-"""It stays within these multiples of the configured one."""
 COLLAPSE_KL = 10.0
 """An update that moved the policy by more than this multiple of the target KL is undone."""
 NUM_PROBES = 1024

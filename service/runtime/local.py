@@ -10,8 +10,9 @@ import logging
 import sys
 import time
 from collections import defaultdict
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING, Any
@@ -23,9 +24,12 @@ from service.actors.game import Acting, Players, SelfPlay
 from service.actors.rollout import Rollout, from_arrays, to_arrays
 from service.config import Config
 from service.envs.goals import GoalKind
+from service.errors import DivergedError
 from service.generator.generator import TaskGenerator
 from service.policies.evaluator import GaussianEvaluator, bob_evaluator
+from service.policies.parameters import PolicyError
 from service.registry.checkpoints import CheckpointStore
+from service.registry.errors import CheckpointError
 from service.runtime.rundir import RunDirectory
 from service.runtime.timing import Timing
 
@@ -51,6 +55,12 @@ class RunResult:
     """``finished`` (budget), ``converged`` (the paper's stop criterion) or ``interrupted``."""
     iteration: int
     num_env_steps: int
+
+
+class UnsavedError(CheckpointError):
+    """A run has ended, and its last checkpoint could not be written."""
+
+    exit_code = 1
 
 
 class LocalRun:
@@ -84,6 +94,7 @@ class LocalRun:
         self._stop_requested = False
         self._past: list[tuple[Acting, Acting]] = []
         self._pending: Rollout | None = None
+        self._saved: int | None = None
         self._executor = ThreadPoolExecutor(max_workers=1, thread_name_prefix="learner")
         self._checkpoints = CheckpointStore(directory.checkpoints, config.run.keep_checkpoints)
         self._snapshots = CheckpointStore(directory.snapshots, keep=sys.maxsize)
@@ -100,17 +111,25 @@ class LocalRun:
         self._stop_requested = True
 
     def run(self, on_iteration: OnIteration = lambda metrics: None) -> RunResult:
-        """Play, learn, record, until the budget is spent, the stop criterion holds, or a stop is requested."""
+        """Play, learn, record, until the budget is spent, the stop criterion holds, or a stop is requested.
+
+        Raises:
+            DivergedError: a policy has.
+            UnsavedError: the last checkpoint could not be written; earlier ones that could not are only warned of.
+        """
         while (reason := self._over()) is None:
             before = self.num_env_steps
-            metrics = self._iterate()
+            with self._diverging():
+                metrics = self._iterate()
             with self.timing("record"):
                 self.directory.record(metrics)
                 on_iteration(metrics)
-            self._take_snapshot(after=before)
+            with self._going_on():
+                self._take_snapshot(after=before)
             if self.iteration % self.config.run.checkpoint_interval == 0:
-                self.save()
-        self.save()
+                with self._going_on():
+                    self.save()
+        self._save_last()
         self._executor.shutdown()
         self.game.close()
         return RunResult(reason, self.iteration, self.num_env_steps)
@@ -215,6 +234,44 @@ class LocalRun:
             arrays = {f"bob/{name}": array for name, array in self.learner.weights().bob.items()}
             self._snapshots.save(self.iteration, arrays, {"env_steps": self.num_env_steps})
 
+    # --- what goes wrong --------------------------------------------------------------------------------------------
+
+    @contextmanager
+    def _diverging(self) -> Iterator[None]:
+        """Adds to the error of a policy that has diverged when that was, and how to go on from before it."""
+        played = self.iteration
+        try:
+            yield
+        except (DivergedError, PolicyError) as error:
+            newest, learner = max(self._checkpoints.steps(), default=0), self.config.learner
+            has_it = (
+                f"delete {self._checkpoints.path(newest).name}, which has this policy; " if newest == played else ""
+            )
+            rates = f"alice.learning_rate={learner.alice.learning_rate / 2:g} --set learner.bob.learning_rate="
+            raise DivergedError(
+                f"{self.directory.path}, iteration {played + 1}: {error}: {has_it}resume with lower learning rates, "
+                f"for example --resume --set learner.{rates}{learner.bob.learning_rate / 2:g}"
+            ) from error
+
+    @contextmanager
+    def _going_on(self) -> Iterator[None]:
+        """A full disk is no reason to end a night's run: what was saved before is intact, and what comes may fit."""
+        try:
+            yield
+        except CheckpointError as error:
+            _logger.warning("%s; the run goes on and will save again", error)
+
+    def _save_last(self) -> None:
+        if self._saved == self.iteration:
+            return
+        try:
+            self.save()
+        except CheckpointError as error:
+            saved = max(self._checkpoints.steps(), default=None)
+            raise UnsavedError(
+                f"{error}; the run is at iteration {self.iteration}, saved is iteration {saved}: --resume goes on there"
+            ) from error
+
     # --- exact resume ----------------------------------------------------------------------------------------------
 
     def save(self) -> None:
@@ -233,6 +290,7 @@ class LocalRun:
                 "rng": self._rng.bit_generator.state,
             }
             self._checkpoints.save(self.iteration, arrays, meta)
+            self._saved = self.iteration
 
     def _load(self) -> None:
         checkpoint = self._checkpoints.load_latest()

@@ -4,22 +4,24 @@ from __future__ import annotations
 
 import json
 import logging
-import signal
 from collections.abc import Iterator
-from contextlib import contextmanager
-from dataclasses import dataclass
+from contextlib import suppress
+from dataclasses import dataclass, replace
 from pathlib import Path
-from types import FrameType
 from typing import Any
 
 from service.config import Config, ConfigError, load_config
+from service.errors import TandemError
 from service.registry.names import Version
 from service.registry.registry import Registry
 from service.runtime.artifacts import make_artifacts
 from service.runtime.local import LocalRun, OnIteration, RunResult
 from service.runtime.publishing import measure_bob, publish_run
 from service.runtime.rundir import RunDirectory
+from service.runtime.signals import InterruptError, StopSignals
 
+RESUMABLE = ("run.", "learner.alice.learning_rate=", "learner.bob.learning_rate=")
+"""What an override of a resumed run may begin with: nothing that its past would have to be made again for."""
 _logger = logging.getLogger(__name__)
 
 
@@ -36,53 +38,72 @@ class Pretrained:
     """Of the final evaluation."""
     timing: str
     """Where the time went, as a text tree."""
+    signal: int | None = None
+    """That ended it before its time."""
+
+
+class UnfinishedError(TandemError):
+    """Bob has learned and is saved, but could not be published."""
+
+    exit_code = 1
 
 
 def pretrain(
     config: Config, directory: RunDirectory, registry: Path, *, resume: bool = False, on_iteration: OnIteration
 ) -> Pretrained:
-    """Run to the end, then evaluate, draw and publish. SIGINT and SIGTERM end it after the current iteration, saved.
+    """Run to the end, then evaluate, publish, draw and film.
+
+    SIGINT and SIGTERM end the run after the current iteration, saved, and what follows it at once: a resumed run does
+    that again. A second signal ends an iteration, too.
 
     Raises:
         TandemError: see ``LocalRun`` and ``RunDirectory.start``; or a registry that is only read.
+        UnfinishedError: everything is saved, and not published.
+        InterruptError: a signal while the run was being loaded, or a second one.
     """
     Registry(registry).check_writable()  # now, not after hours of learning
-    run = LocalRun(config, directory, resume=resume)
+    with StopSignals() as signals:
+        try:
+            run = LocalRun(config, directory, resume=resume)
+            with signals.asking(run.request_stop):
+                result = run.run(on_iteration)
+            done = Pretrained(result, {}, None, {}, run.timing.tree(), signals.first)
+            if result.reason != "interrupted" and signals.first is None:
+                with suppress(InterruptError):
+                    done = _finish(done, config, directory, Registry(registry), run)
+            return replace(done, signal=signals.first)
+        finally:
+            directory.close()
+
+
+def _finish(done: Pretrained, config: Config, directory: RunDirectory, registry: Registry, run: LocalRun) -> Pretrained:
+    _logger.info("learning is over; now evaluating, publishing, drawing and filming")
+    bob = run.learner.weights().bob
+    metrics, version = measure_bob(config, bob), None
     try:
-        with _stop_on_signals(run):
-            result = run.run(on_iteration)
-        metrics: dict[str, float] = {}
-        version = None
-        files: dict[str, Path] = {}
-        if result.reason != "interrupted":
-            _logger.info("learning is over; now evaluating, publishing, drawing and filming")
-            bob = run.learner.weights().bob
-            metrics = measure_bob(config, bob)
-            if config.policy.monolithic_bob is None:
-                about = metrics | {"env_steps": run.num_env_steps}
-                version = publish_run(directory, Registry(registry), config, bob, about)
-            files = make_artifacts(directory)
-        return Pretrained(result, files, version, metrics, run.timing.tree())
-    finally:
-        directory.close()
+        if config.policy.monolithic_bob is None:
+            version = publish_run(directory, registry, config, bob, metrics | {"env_steps": run.num_env_steps})
+    except TandemError as error:
+        raise UnfinishedError(f"learning is over and saved, but not published: {error}; --resume does it") from error
+    return replace(done, files=make_artifacts(directory), version=version, metrics=metrics, timing=run.timing.tree())
 
 
 def resumed_config(directory: RunDirectory, overrides: list[str], file: Path | None = None) -> Config:
-    """The configuration to resume a run with: the saved one, where only ``run.*`` may be changed.
+    """The configuration to resume a run with: the saved one, where only ``RESUMABLE`` may be changed.
 
     Args:
         directory: of the run.
-        overrides: ``run.a=b`` strings.
+        overrides: ``run.a=b`` strings, or learning rates.
         file: YAML that says the same as the saved one outside ``run``; what it says there comes before ``overrides``.
 
     Raises:
         ConfigError: no run there, an override of anything else, or a file that says otherwise.
     """
     for override in overrides:
-        if not override.startswith("run."):
+        if not override.startswith(RESUMABLE):
             raise ConfigError(
-                f"override {override!r}: a resumed run keeps its configuration; only run.* may change, "
-                "for example run.total_env_steps"
+                f"override {override!r}: a resumed run keeps its configuration; only run.* and the learning rates may "
+                "change, for example run.total_env_steps"
             )
     saved = directory.read_config()
     if file is not None:
@@ -109,22 +130,3 @@ def _leaves(tree: dict[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]
             yield from _leaves(value, f"{prefix}{key}.")
         else:
             yield prefix + key, value
-
-
-@contextmanager
-def _stop_on_signals(run: LocalRun) -> Iterator[None]:
-    """The first SIGINT or SIGTERM asks the run to end; a second one ends the process as usual."""
-    previous = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
-
-    def request_stop(number: int, frame: FrameType | None) -> None:
-        run.request_stop()
-        for each, handler in previous.items():
-            signal.signal(each, handler)
-
-    for number in previous:
-        signal.signal(number, request_stop)
-    try:
-        yield
-    finally:
-        for number, handler in previous.items():
-            signal.signal(number, handler)

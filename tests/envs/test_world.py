@@ -12,7 +12,7 @@ from service.envs.observations import MIRROR_ACTION, MIRROR_FULL
 from tests.envs.scripted import CLOSE, OPEN, grasp, place_in_air
 
 FINE = {"physics_step_s": 0.002, "num_substeps": 20}
-COARSE = {"physics_step_s": 0.004, "num_substeps": 10}
+COARSE = {"physics_step_s": 0.005, "num_substeps": 8}
 """The physics of pre-training."""
 
 

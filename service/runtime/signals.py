@@ -1,0 +1,60 @@
+"""SIGINT and SIGTERM while a run goes on: it ends where it can be resumed, and the process says which signal it was."""
+
+from __future__ import annotations
+
+import signal
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from types import FrameType, TracebackType
+from typing import Self
+
+STOPPING = (signal.SIGINT, signal.SIGTERM)
+
+
+class InterruptError(BaseException):
+    """A signal ends what is going on at once. No ``Exception``: nothing may take it for an error of its own."""
+
+    def __init__(self, number: int) -> None:
+        """Of the signal."""
+        super().__init__(signal.Signals(number).name)
+        self.number = number
+
+
+class StopSignals:
+    """Takes SIGINT and SIGTERM over while its ``with`` block runs, which has to be in the main thread.
+
+    A signal raises ``InterruptError`` there, except where ``asking`` is told of another way to stop.
+    """
+
+    def __init__(self) -> None:
+        self.first: int | None = None
+        """The first signal that came."""
+        self._ask: Callable[[], None] | None = None
+        self._previous = {number: signal.getsignal(number) for number in STOPPING}
+
+    def __enter__(self) -> Self:
+        for number in STOPPING:
+            signal.signal(number, self._handle)
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        for number, handler in self._previous.items():
+            signal.signal(number, handler)
+
+    @contextmanager
+    def asking(self, ask: Callable[[], None]) -> Iterator[None]:
+        """Inside, the first signal only calls ``ask``; a second one raises ``InterruptError``."""
+        self._ask = ask
+        try:
+            yield
+        finally:
+            self._ask = None
+
+    def _handle(self, number: int, frame: FrameType | None) -> None:
+        self.first = self.first or number
+        ask, self._ask = self._ask, None
+        if ask is None:
+            raise InterruptError(number)
+        ask()
