@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 from service.actors.coverage import skill_trajectories, visited_share
+from service.config import Config
 from service.errors import TandemError
 from service.policies.evaluator import MCPEvaluator
 from service.runtime.plots import plot_coverage, plot_curves, plot_goals
@@ -24,28 +27,39 @@ def make_artifacts(directory: RunDirectory) -> dict[str, Path]:
     """Draw the curves, the goals and the coverage, and film a few rounds.
 
     Returns:
-        Files by what they show. Without an OpenGL library there is no video, and a warning says what to install.
+        Files by what they show. What cannot be made, for want of an OpenGL library or of room on the disk, is left
+        out, and a warning says why.
     """
     config = directory.read_config()
     alice, bob = load_players(directory)
-    files = {
-        "curves": plot_curves(directory.path),
-        "goals": plot_goals(directory.path, config.world.workspace),
-    }
-    if isinstance(bob, MCPEvaluator):
-        paths = skill_trajectories(bob, config.world, num_skills=NUM_SKILLS, num_steps=COVERAGE_STEPS, seed=_SEED)
-        share = visited_share(paths, config.world.workspace)
-        files["coverage"] = plot_coverage(
-            list(paths),
-            config.world.workspace,
-            directory.path / "coverage.png",
-            f"{config.name}, {share:.0%} of the table's cells visited",
-        )
-    try:
+
+    def film() -> Path:
         from service.runtime.video import film_rounds, write_video
 
         takes = film_rounds(config, alice, bob, num_rounds=NUM_FILMED_ROUNDS, seed=_SEED)
-        files["video"] = write_video(takes, config.world, directory.path / "rounds.mp4")
-    except TandemError as error:
-        _logger.warning("no video: %s", error)
+        return write_video(takes, config.world, directory.path / "rounds.mp4")
+
+    makers: dict[str, Callable[[], Path]] = {
+        "curves": partial(plot_curves, directory.path),
+        "goals": partial(plot_goals, directory.path, config.world.workspace),
+    }
+    if isinstance(bob, MCPEvaluator):
+        makers["coverage"] = partial(_draw_coverage, directory, config, bob)
+    files = {}
+    for name, make in (makers | {"video": film}).items():
+        try:
+            files[name] = make()
+        except TandemError as error:
+            _logger.warning("no %s: %s", name, error)
     return files
+
+
+def _draw_coverage(directory: RunDirectory, config: Config, bob: MCPEvaluator) -> Path:
+    paths = skill_trajectories(bob, config.world, num_skills=NUM_SKILLS, num_steps=COVERAGE_STEPS, seed=_SEED)
+    share = visited_share(paths, config.world.workspace)
+    return plot_coverage(
+        list(paths),
+        config.world.workspace,
+        directory.path / "coverage.png",
+        f"{config.name}, {share:.0%} of the table's cells visited",
+    )

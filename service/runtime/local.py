@@ -104,7 +104,8 @@ class LocalRun:
             directory.check_free()
             self.save()  # so that a run killed before its first interval can be resumed, too
             self._take_snapshot(after=-1)
-        directory.start(config, after_iteration=self.iteration if resume else None)
+        after = {"after_iteration": self.iteration, "after_env_steps": self.num_env_steps} if resume else {}
+        directory.start(config, **after)
 
     def request_stop(self) -> None:
         """End after the current iteration, with a checkpoint. Safe to call from a signal handler."""
@@ -124,10 +125,10 @@ class LocalRun:
             with self.timing("record"):
                 self.directory.record(metrics)
                 on_iteration(metrics)
-            with self._going_on():
+            with self._going_on("without this snapshot"):
                 self._take_snapshot(after=before)
             if self.iteration % self.config.run.checkpoint_interval == 0:
-                with self._going_on():
+                with self._going_on(f"and saves again after {self.config.run.checkpoint_interval} iterations"):
                     self.save()
         self._save_last()
         self._executor.shutdown()
@@ -254,12 +255,12 @@ class LocalRun:
             ) from error
 
     @contextmanager
-    def _going_on(self) -> Iterator[None]:
+    def _going_on(self, how: str) -> Iterator[None]:
         """A full disk is no reason to end a night's run: what was saved before is intact, and what comes may fit."""
         try:
             yield
         except CheckpointError as error:
-            _logger.warning("%s; the run goes on and will save again", error)
+            _logger.warning("%s; the run goes on, %s", error, how)
 
     def _save_last(self) -> None:
         if self._saved == self.iteration:

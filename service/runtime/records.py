@@ -1,7 +1,7 @@
 """The records of a run: files of one JSON object per line, appended as the run goes and cut back when it resumes.
 
 A killed run leaves at most one torn line, at the end: readers pass over it and `JsonlWriter.truncate_after`
-drops it.
+drops it. A full disk leaves none.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ from typing import Any
 
 from service.errors import TandemError
 from service.registry.files import os_errors, write_atomic
+from service.runtime.appending import Appender
 
 
 def read_jsonl(path: Path) -> list[dict[str, Any]]:
@@ -31,6 +32,7 @@ class JsonlWriter:
     def __init__(self, path: Path) -> None:
         """A writer of ``path``; what is there already stays, and nothing is made before the first `append`."""
         self.path = path
+        self._file = Appender(path)
 
     def append(self, record: Mapping[str, Any]) -> None:
         """Write ``record`` as the file's last line and hand it to the operating system.
@@ -38,13 +40,18 @@ class JsonlWriter:
         NumPy numbers and arrays become plain ones; NaN and infinity, which JSON lacks, become null.
 
         Raises:
-            TandemError: the disk is full or the file cannot be written.
+            TandemError: the disk is full or the file cannot be written; the record waits, see `Appender.append`.
         """
         line = json.dumps(_plain(record), allow_nan=False) + "\n"
-        with os_errors("write", self.path):
-            self.path.parent.mkdir(parents=True, exist_ok=True)
-            with self.path.open("ab") as file:
-                file.write(line.encode())
+        self._file.append(line.encode())
+
+    def flush(self) -> None:
+        """Write the records that wait.
+
+        Raises:
+            TandemError: as for `append`.
+        """
+        self._file.flush()
 
     def truncate_after(self, iteration: int) -> None:
         """Drop the records whose ``iteration`` is above the given one, and a torn last line, in one atomic step.
@@ -56,9 +63,12 @@ class JsonlWriter:
         """
         if not self.path.exists():
             return
-        kept = [line for line, record in _lines(self.path) if _iteration(record, self.path) <= iteration]
+        lines = [line for line, record in _lines(self.path) if _iteration(record, self.path) <= iteration]
+        kept = b"".join(line + b"\n" for line in lines)
+        if kept == self.path.read_bytes():
+            return  # a disk that is full need not be written to
         with os_errors("write", self.path):
-            write_atomic(self.path, b"".join(line + b"\n" for line in kept))
+            write_atomic(self.path, kept)
 
 
 def _lines(path: Path) -> Iterator[tuple[bytes, dict[str, Any]]]:

@@ -15,11 +15,13 @@
 
 from __future__ import annotations
 
+import io
 import json
 import logging
 import os
 import platform
-import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -29,14 +31,14 @@ import numpy as np
 from service.config import Config, ConfigError, dump_config, load_config
 from service.errors import TandemError
 from service.generator.validity import Verdict
-from service.registry.files import os_errors, write_atomic
+from service.registry.errors import RegistryError
+from service.registry.files import os_errors, remove_temporaries, write_atomic
 from service.registry.manifest import git_commit
 from service.runtime.records import JsonlWriter
 
 if TYPE_CHECKING:
-    from tensorboard.summary.writer.event_file_writer import EventFileWriter
-
     from service.actors.rollout import GoalRecords, Rollout
+    from service.runtime.events import EventFile
 
 _logger = logging.getLogger(__name__)
 GOALS_PER_ITERATION = 32
@@ -59,7 +61,8 @@ class RunDirectory:
         self.broken = path / "broken"
         self._metrics = JsonlWriter(self.metrics_file)
         self._goals = JsonlWriter(self.goals_file)
-        self._events: EventFileWriter | None = None
+        self._events: EventFile | None = None
+        self._failing: set[Path] = set()
 
     @property
     def exists(self) -> bool:
@@ -76,13 +79,18 @@ class RunDirectory:
             raise ConfigError(f"no run in {self.path}: {self.config_file.name} is missing; name the directory of a run")
         return load_config(self.config_file)
 
-    def start(self, config: Config, *, after_iteration: int | None = None) -> None:
+    def start(self, config: Config, *, after_iteration: int | None = None, after_env_steps: int | None = None) -> None:
         """Begin a run here, or continue one: then records of later iterations, which will be made again, are dropped.
+
+        Args:
+            config: the run.
+            after_iteration: the last iteration that is not made again; None for a run that begins.
+            after_env_steps: how many there were by then.
 
         Raises:
             TandemError: a new run where there is one already, or a directory that cannot be written.
         """
-        from tensorboard.summary.writer.event_file_writer import EventFileWriter
+        from service.runtime.events import EventFile  # TensorBoard's packages, which only a run needs
 
         if after_iteration is None:
             self.check_free()
@@ -91,7 +99,8 @@ class RunDirectory:
             self._goals.truncate_after(after_iteration)
         with os_errors("write", self.path):
             self.checkpoints.mkdir(parents=True, exist_ok=True)
-            self._events = EventFileWriter(str(self.path / "tensorboard"))
+            remove_temporaries(self.path)
+            self._events = EventFile(self.path / "tensorboard", after_step=after_env_steps)
             write_atomic(self.path / "environment.json", json.dumps(_environment(), indent=1).encode())
             write_atomic(self.config_file, dump_config(config).encode())  # last: a start that failed can be tried again
 
@@ -105,11 +114,12 @@ class RunDirectory:
             raise TandemError(f"{self.path} holds a run already; continue it with --resume, or name another --run-dir")
 
     def record(self, metrics: dict[str, float]) -> None:
-        """Append one iteration's metrics to metrics.jsonl and TensorBoard."""
-        self._metrics.append(metrics)
+        """Append one iteration's metrics to metrics.jsonl and TensorBoard; where a disk is full they wait in memory."""
+        with self._going_on(self.metrics_file):
+            self._metrics.append(metrics)
         if self._events is not None:
-            with os_errors("write", self.path / "tensorboard"):
-                self._events.add_event(_event(metrics))
+            with self._going_on(self.path / "tensorboard"):
+                self._events.add(metrics)
 
     def record_goals(self, iteration: int, num_env_steps: int, records: GoalRecords) -> None:
         """Append a sample of this iteration's valid proposals that the current Bob played."""
@@ -119,27 +129,41 @@ class RunDirectory:
             [records.start_position[rows], records.goal[rows], records.solved[rows, None].astype(float)], axis=1
         )
         # "iteration" counts finished iterations, as in metrics.jsonl, so that a resume cuts both files alike.
-        self._goals.append({"iteration": iteration + 1, "env_steps": num_env_steps, "goals": np.round(table, 4)})
+        with self._going_on(self.goals_file):
+            self._goals.append({"iteration": iteration + 1, "env_steps": num_env_steps, "goals": np.round(table, 4)})
 
     def dump_broken(self, rollout: Rollout) -> None:
         """Save the states and actions whose physics diverged in a round; at most 100 rounds are kept."""
         if not rollout.broken or (self.broken.is_dir() and len(list(self.broken.iterdir())) >= MAX_BROKEN_FILES):
             return
         states, actions = zip(*rollout.broken, strict=True)
-        with os_errors("write", self.broken):
-            self.broken.mkdir(exist_ok=True)
-            np.savez(
-                self.broken / f"round-{rollout.sequence:06d}.npz", states=np.stack(states), actions=np.stack(actions)
-            )
+        path, data = self.broken / f"round-{rollout.sequence:06d}.npz", io.BytesIO()
+        np.savez(data, states=np.stack(states), actions=np.stack(actions))
+        _logger.warning("physics diverged in %d of the worlds; they start anew, and %s has them", len(states), path)
+        with self._going_on(self.broken), os_errors("write", path):
+            write_atomic(path, data.getvalue())
 
     def close(self) -> None:
-        """Flush TensorBoard's events."""
-        if self._events is not None:
+        """Write what still waits for room on the disk; what then does not fit is lost, and a warning says so."""
+        for writer in (self._metrics, self._goals, self._events):
             try:
-                self._events.close()
-            except OSError as error:  # must not hide why the run ended; metrics.jsonl has the same numbers
-                _logger.warning("TensorBoard events in %s may be incomplete: %s", self.path, error.strerror)
-            self._events = None
+                if writer is not None:
+                    writer.flush()
+            except RegistryError as error:  # must not hide why the run ended
+                _logger.warning("the newest records are lost: %s", error)
+        self._events = None
+
+    @contextmanager
+    def _going_on(self, path: Path) -> Iterator[None]:
+        """A full disk is no reason to end a night's run; what is wrong with ``path`` is said once, until it is well."""
+        try:
+            yield
+        except RegistryError as error:
+            if path not in self._failing:
+                _logger.warning("%s; the run goes on", error)
+            self._failing.add(path)
+        else:
+            self._failing.discard(path)
 
 
 def _environment() -> dict[str, object]:
@@ -149,15 +173,3 @@ def _environment() -> dict[str, object]:
         "packages": {name: version(name) for name in ("mujoco", "numpy", "torch")},
         "num_cores": os.cpu_count(),
     }
-
-
-def _event(metrics: dict[str, float]) -> object:
-    from tensorboard.compat.proto.event_pb2 import Event
-    from tensorboard.compat.proto.summary_pb2 import Summary
-
-    values = [
-        Summary.Value(tag=name, simple_value=value)
-        for name, value in metrics.items()
-        if name not in ("iteration", "env_steps") and value is not None
-    ]
-    return Event(wall_time=time.time(), step=int(metrics["env_steps"]), summary=Summary(value=values))

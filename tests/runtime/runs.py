@@ -5,8 +5,10 @@ The object is large and right under the gripper and the success distance is smal
 
 import json
 import re
+import resource
 import subprocess
 import sys
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -93,6 +95,17 @@ def play(path, config=None, *, resume=False, kill_after=None, on_iteration=None)
         return run, None
     finally:
         directory.close()
+
+
+@contextmanager
+def no_room_above(num_bytes):
+    """The kernel lets no file of this process grow beyond so many bytes; a write ends there, as on a full disk."""
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (num_bytes, before[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
 
 
 def start_endless_run(home):

@@ -1,11 +1,10 @@
 """The local runner: what an iteration does, when a run ends, and that a resumed run equals one never stopped."""
 
-import errno
-import os
 import random
 import shutil
 import signal
 import time
+from contextlib import ExitStack
 
 import numpy as np
 import pytest
@@ -13,7 +12,7 @@ import pytest
 from service.errors import TandemError
 from service.learner.learner import Learner
 from service.registry.errors import CheckpointError
-from service.runtime.local import LocalRun
+from service.runtime.local import LocalRun, UnsavedError
 from service.runtime.pretrain import resumed_config
 from service.runtime.primitives import read_parameters, read_stages
 from service.runtime.rundir import RunDirectory
@@ -22,6 +21,7 @@ from tests.runtime.runs import (
     assert_one_line,
     assert_same_run,
     newest,
+    no_room_above,
     play,
     read_lines,
     start_endless_run,
@@ -354,28 +354,55 @@ def test_a_new_run_does_not_touch_an_old_one(uninterrupted, tmp_path):
     assert {file: file.read_bytes() for file in path.rglob("*") if file.is_file()} == before
 
 
-def test_a_full_disk_leaves_the_earlier_checkpoint(uninterrupted, tmp_path, monkeypatch):
-    original = os.write
-
-    def write(descriptor, data):
-        target = os.readlink(f"/proc/self/fd/{descriptor}")
-        if len(data) > 20_000 and (tmp_path / "checkpoints" / "checkpoint-00000002.safetensors").exists():
-            original(descriptor, bytes(data[:1000]))
-            assert str(tmp_path) in target
-            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-        return original(descriptor, data)
-
+def test_a_full_disk_leaves_the_earlier_checkpoint(uninterrupted, tmp_path, caplog):
     config = tiny_config(**LONG)
-    with monkeypatch.context() as patch:
-        patch.setattr(os, "write", write)
-        with pytest.raises(CheckpointError) as error:
-            play(tmp_path, config)
-    assert_one_line(error.value, "checkpoint-00000004", "No space left", "intact")
-    assert max(file.name for file in (tmp_path / "checkpoints").iterdir()) == "checkpoint-00000002.safetensors"
-    assert list((tmp_path / "checkpoints").glob(".*")) == []
+    with no_room_above(150_000), pytest.raises(UnsavedError) as error:
+        play(tmp_path, config)
+    last = newest(uninterrupted).step
+    assert_one_line(error.value, f"checkpoint-{last:08d}", "File too large", "intact", f"iteration {last}", "--resume")
+    failed = [message for message in caplog.messages if "the run goes on" in message]
+    assert_one_line(failed[0], "checkpoint-00000004", "File too large")
+    assert len(failed) == last // 2 - 1  # it tried again at every interval
+    files = sorted(file.name for file in (tmp_path / "checkpoints").iterdir())
+    assert files == ["checkpoint-00000000.safetensors", "checkpoint-00000002.safetensors"]
     assert newest(tmp_path).step == 2
     play(tmp_path, config, resume=True)
     assert_same_run(tmp_path, uninterrupted)
+
+
+def test_a_disk_that_was_full_for_a_while_costs_nothing(uninterrupted, tmp_path, caplog):
+    """Checkpoints are skipped, and records that did not fit come later, in their places."""
+    with ExitStack() as stack:
+
+        def fill_and_clear(run, metrics):
+            if run.iteration == 3:
+                stack.enter_context(no_room_above(1_000))
+            if run.iteration == 9:
+                assert newest(tmp_path).step == 2
+                stack.close()
+
+        _, result = play(tmp_path, tiny_config(**LONG), on_iteration=fill_and_clear)
+    assert result.reason == "finished"
+    assert_same_run(tmp_path, uninterrupted)
+    for name in ("checkpoint-00000004", "checkpoint-00000008", "metrics.jsonl", "goals.jsonl", "snapshots"):
+        assert name in caplog.text
+    assert "checkpoint-00000010" not in caplog.text
+
+
+def test_the_last_checkpoint_is_not_written_twice(tmp_path, monkeypatch):
+    """The second writing could fail on a disk that is full by now, although all is saved."""
+    with ExitStack() as stack:
+        save = LocalRun.save
+
+        def save_and_fill(self):
+            save(self)
+            if self.iteration == 2:
+                stack.enter_context(no_room_above(0))
+
+        monkeypatch.setattr(LocalRun, "save", save_and_fill)
+        _, result = play(tmp_path, tiny_config(total_env_steps=200))
+    assert (result.reason, result.iteration) == ("finished", 2)
+    assert newest(tmp_path).step == 2
 
 
 def test_an_error_in_the_learners_thread_reaches_the_caller(tmp_path, monkeypatch):

@@ -1,7 +1,5 @@
 """A run directory: what is written when, what is refused, and what a resume cuts away."""
 
-import errno
-import os
 from types import SimpleNamespace
 
 import numpy as np
@@ -11,7 +9,7 @@ from service.config import ConfigError, load_config
 from service.errors import TandemError
 from service.generator.validity import Verdict
 from service.runtime.rundir import GOALS_PER_ITERATION, MAX_BROKEN_FILES, RunDirectory
-from tests.runtime.runs import assert_one_line, read_lines, tiny_config
+from tests.runtime.runs import assert_one_line, no_room_above, read_lines, tiny_config
 
 
 @pytest.fixture
@@ -183,20 +181,60 @@ def test_broken_worlds_are_kept_but_not_without_end(directory):
 # --- a full disk -----------------------------------------------------------------------------------------------------
 
 
-def no_space(*_):
-    raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+def test_records_wait_for_room_and_then_come_in_their_order(directory, caplog):
+    record(directory, 1)
+    with no_room_above(directory.metrics_file.stat().st_size + 10):
+        record(directory, 2, 3)
+    assert [row["iteration"] for row in read_lines(directory.metrics_file)] == [1]
+    record(directory, 4)
+    assert [row["iteration"] for row in read_lines(directory.metrics_file)] == [1, 2, 3, 4]
+    assert [step for step, _ in read_events(directory.path / "tensorboard")] == [100, 200, 300, 400]
+    metrics, events = caplog.messages  # said once each, although two records did not fit
+    assert_one_line(metrics, "cannot write", directory.metrics_file, "File too large", "the run goes on")
+    assert_one_line(events, "cannot write", "tensorboard", "the run goes on")
 
 
-def test_a_full_disk_under_tensorboard_is_one_line(directory, monkeypatch):
-    monkeypatch.setattr(directory._events, "add_event", no_space)
-    with pytest.raises(TandemError) as error:
+def test_a_disk_that_fills_up_again_is_said_again(directory, caplog):
+    for iteration in (1, 3):
+        with no_room_above(0):
+            record(directory, iteration)
+        record(directory, iteration + 1)
+    assert [row["iteration"] for row in read_lines(directory.metrics_file)] == [1, 2, 3, 4]
+    assert sum("metrics.jsonl" in message for message in caplog.messages) == 2
+
+
+def test_goals_and_broken_worlds_on_a_full_disk_do_not_end_a_run(directory, caplog):
+    with no_room_above(0):
+        directory.record_goals(0, 100, make_records(1))
+        directory.dump_broken(SimpleNamespace(sequence=0, broken=((np.arange(4.0), np.zeros(4)),)))
+    directory.record_goals(1, 200, make_records(1))
+    assert [row["iteration"] for row in read_lines(directory.goals_file)] == [1, 2]
+    assert list((directory.path / "broken").iterdir()) == []
+    assert "round-000000.npz: File too large" in caplog.text
+
+
+def test_what_still_waits_when_a_run_ends_is_written_then(directory):
+    with no_room_above(0):
         record(directory, 1)
-    assert_one_line(error.value, "cannot write", "tensorboard", "No space left")
-    assert len(read_lines(directory.metrics_file)) == 1
+    directory.close()
+    assert [row["iteration"] for row in read_lines(directory.metrics_file)] == [1]
 
 
-def test_closing_on_a_full_disk_does_not_hide_why_the_run_ended(directory, monkeypatch):
+def test_closing_on_a_full_disk_does_not_hide_why_the_run_ended(directory, caplog):
     """``pretrain`` closes in a ``finally``: an error there would replace the one line about the checkpoint."""
-    with monkeypatch.context() as patch:
-        patch.setattr(directory._events, "close", no_space)
+    with no_room_above(0):
+        record(directory, 1)
+        caplog.clear()
         directory.close()
+    assert_one_line(caplog.messages[0], "lost", directory.metrics_file)
+    resumed = RunDirectory(directory.path)
+    resumed.start(tiny_config(), after_iteration=1, after_env_steps=100)
+    record(resumed, 2)
+    resumed.close()
+    assert [row["iteration"] for row in read_lines(directory.metrics_file)] == [2]
+
+
+def test_a_resume_that_cuts_nothing_needs_no_room_for_the_records(directory):
+    record(directory, 1)
+    with no_room_above(0):
+        directory._metrics.truncate_after(1)
