@@ -8,7 +8,7 @@ import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, NoReturn
 
 import typer
 from rich.console import Console
@@ -31,8 +31,8 @@ _errors = Console(stderr=True)
 DEMO_ENV_STEPS = 1_000_000
 CHAMPION = "panda-cube@champion"
 """The primitives that come with the package."""
-_EXIT_USER_ERROR = 2
-_EXIT_INTERRUPTED = 130
+_EXIT_SIGNAL = 128
+"""Plus the signal's number: 130 for SIGINT, 143 for SIGTERM."""
 
 _Registry = Annotated[
     Path, typer.Option("--registry", envvar="TANDEM_REGISTRY", metavar="DIR", help="Directory of the registry.")
@@ -240,9 +240,13 @@ def _pretrain(config: Config, path: Path, registry: Path, *, resume: bool) -> No
     from service.runtime.pretrain import pretrain as run
     from service.runtime.progress import Progress
     from service.runtime.rundir import RunDirectory
+    from service.runtime.signals import InterruptError
 
-    with Progress(config.run.total_env_steps, _console) as progress:
-        done = run(config, RunDirectory(path), registry, resume=resume, on_iteration=progress.show)
+    try:
+        with Progress(config.run.total_env_steps, _console) as progress:
+            done = run(config, RunDirectory(path), registry, resume=resume, on_iteration=progress.show)
+    except InterruptError as interrupt:
+        _say_stopped("stopped at once", interrupt.number, path, registry)
     _report(done, path, registry)
 
 
@@ -250,9 +254,8 @@ def _report(done: Pretrained, path: Path, registry: Path) -> None:
     result = done.result
     _say(f"\n{result.reason} after {result.num_env_steps:,} env steps, {result.iteration} iterations")
     _say(done.timing)
-    if result.reason == "interrupted":
-        _say(f"saved; continue with: tandem pretrain --resume --run-dir {path} --registry {registry}")
-        raise typer.Exit(_EXIT_INTERRUPTED)
+    if done.signal is not None:
+        _say_stopped("saved", done.signal, path, registry)
     for name, value in done.metrics.items():
         _say(f"{name:<36} {value:.1%}")
     for name, file in done.files.items():
@@ -260,6 +263,16 @@ def _report(done: Pretrained, path: Path, registry: Path) -> None:
     _say(f"{'checkpoint':<12} {path / 'checkpoints'}")
     if done.version is not None:
         _say(f"{'primitives':<12} {done.version} in {registry}")
+
+
+def _say_stopped(what: str, number: int, path: Path, registry: Path) -> NoReturn:
+    """How to go on, and the exit code of a process that a signal ends."""
+    from service.runtime.rundir import RunDirectory
+
+    begun = RunDirectory(path).exists
+    how = f"continue with: tandem pretrain --resume --run-dir {path} --registry {registry}"
+    _say(f"{what}; {how if begun else 'nothing was saved yet'}")
+    raise typer.Exit(_EXIT_SIGNAL + number)
 
 
 def _show_champion() -> None:
@@ -291,9 +304,9 @@ def _next_free(parent: Path, stem: str) -> Path:
 
 @contextmanager
 def _user_errors() -> Iterator[Any]:
-    """One line on stderr and exit code 2 for a mistake of the user's."""
+    """One line on stderr for an error the user can mend; the exit code is 2 if it is a mistake in what was typed."""
     try:
         yield
     except TandemError as error:
         _errors.print(f"error: {error}", style=None, highlight=False, soft_wrap=True, markup=False)
-        raise typer.Exit(_EXIT_USER_ERROR) from None
+        raise typer.Exit(error.exit_code) from None

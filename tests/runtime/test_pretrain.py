@@ -15,6 +15,7 @@ from service.runtime import pretrain as module
 from service.runtime import publishing
 from service.runtime.pretrain import pretrain, resumed_config
 from service.runtime.rundir import RunDirectory
+from service.runtime.signals import InterruptError
 from tests.runtime.runs import (
     TREE,
     assert_one_line,
@@ -156,7 +157,7 @@ def test_a_second_signal_ends_it_at_once(tmp_path, quick):
             os.kill(os.getpid(), signal.SIGINT)
             os.kill(os.getpid(), signal.SIGINT)
 
-    with pytest.raises(KeyboardInterrupt):
+    with pytest.raises(InterruptError, match="SIGINT"):
         run_pretrain(tmp_path, on_iteration=interrupt_twice)
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
