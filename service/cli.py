@@ -255,7 +255,8 @@ def _report(done: Pretrained, path: Path, registry: Path) -> None:
     _say(f"\n{result.reason} after {result.num_env_steps:,} env steps, {result.iteration} iterations")
     _say(done.timing)
     if done.signal is not None:
-        _say_stopped("saved", done.signal, path, registry)
+        rest = "" if result.reason == "interrupted" else ", but not evaluated, published and drawn to the end"
+        _say_stopped(f"saved{rest}", done.signal, path, registry)
     for name, value in done.metrics.items():
         _say(f"{name:<36} {value:.1%}")
     for name, file in done.files.items():

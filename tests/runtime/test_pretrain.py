@@ -145,7 +145,7 @@ def test_a_signal_ends_the_run_after_the_iteration(tmp_path, quick, number):
 
     done = run_pretrain(tmp_path, on_iteration=interrupt)
     assert (done.result.reason, done.result.iteration) == ("interrupted", 2)
-    assert (done.version, done.files, done.metrics) == (None, {}, {})
+    assert (done.version, done.files, done.metrics, done.signal) == (None, {}, {}, number)
     assert newest(tmp_path / "run").step == 2
     assert not (tmp_path / "registry").exists()
     assert (signal.getsignal(signal.SIGINT), signal.getsignal(signal.SIGTERM)) == before
@@ -162,20 +162,21 @@ def test_a_second_signal_ends_it_at_once(tmp_path, quick):
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
 
-def test_ctrl_c_saves_and_says_how_to_resume(tmp_path):
+@pytest.mark.parametrize(("number", "exit_code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_a_signal_saves_and_says_how_to_resume(tmp_path, number, exit_code):
     """A real process, a real signal; the run it leaves goes on as if nothing had happened."""
     process, path = start_endless_run(tmp_path)
     deadline_s = time.monotonic() + 100.0
     while process.poll() is None and time.monotonic() < deadline_s:
         if (path / "metrics.jsonl").exists() and len((path / "metrics.jsonl").read_bytes().splitlines()) >= 3:
-            process.send_signal(signal.SIGINT)
+            process.send_signal(number)
             break
         time.sleep(0.02)
     try:
         out, err = process.communicate(timeout=60)
     finally:
         process.kill()
-    assert process.returncode == 130, err
+    assert process.returncode == exit_code, err
     assert re.search(r"^interrupted after [\d,]+ env steps, \d+ iterations$", out, re.MULTILINE)
     assert f"tandem pretrain --resume --run-dir {path}" in out
     assert "Traceback" not in err
