@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 from collections import deque
 from io import FileIO
@@ -51,5 +52,6 @@ def _write_whole(file: FileIO, piece: bytes) -> None:
         while view:
             view = view[file.write(view) :]
     except BaseException:  # a signal's, too
-        file.truncate(end)
+        with contextlib.suppress(OSError):  # what was wrong first is what the user has to know
+            file.truncate(end)
         raise
