@@ -139,7 +139,7 @@ class RunDirectory:
         states, actions = zip(*rollout.broken, strict=True)
         path, data = self.broken / f"round-{rollout.sequence:06d}.npz", io.BytesIO()
         np.savez(data, states=np.stack(states), actions=np.stack(actions))
-        _logger.warning("physics diverged in %d of the worlds; they start anew, and %s has them", len(states), path)
+        _logger.warning("physics diverged in %d worlds, which go on from sound states; see %s", len(states), path)
         with self._going_on(self.broken), os_errors("write", path):
             write_atomic(path, data.getvalue())
 

@@ -6,6 +6,7 @@ import pytest
 from service.config import WorkspaceConfig, WorldConfig
 from service.envs.batch import WorldBatch, sample_in_volume, sample_on_table
 from service.envs.panda import FINGER_STROKE_M
+from service.errors import DivergedError
 
 CONFIG = WorldConfig(physics_step_s=0.004, num_substeps=10)
 NUM_WORLDS = 9
@@ -158,7 +159,7 @@ def test_actions_that_are_not_finite_are_refused(worlds, value):
     actions = np.zeros((NUM_WORLDS, 4), dtype=np.float32)
     actions[5, 2] = value
     before = worlds.states.copy()
-    with pytest.raises(ValueError, match=r"actions.*not finite"):
+    with pytest.raises(DivergedError, match=r"actions of 1 of 9 worlds are not finite"):
         worlds.step(actions)
     np.testing.assert_array_equal(worlds.states, before)
 
@@ -166,11 +167,6 @@ def test_actions_that_are_not_finite_are_refused(worlds, value):
 class TestDivergence:
     BAD = 3
     OBJECT_SPIN = 17 + 9 + 3
-
-    @pytest.fixture(autouse=True)
-    def elsewhere(self, tmp_path, monkeypatch):
-        """MuJoCo may write its warnings to a file in the working directory."""
-        monkeypatch.chdir(tmp_path)
 
     @pytest.fixture
     def diverging(self, worlds):
@@ -190,6 +186,15 @@ class TestDivergence:
         ((state, action),) = diverging.broken
         np.testing.assert_array_equal(state, before[self.BAD])
         np.testing.assert_array_equal(action, actions[self.BAD])
+
+    @pytest.mark.parametrize("num_threads", [1, 2])
+    def test_mujoco_writes_nothing_about_it(self, tmp_path, monkeypatch, capfd, num_threads):
+        monkeypatch.chdir(tmp_path)
+        with WorldBatch(CONFIG, NUM_WORLDS, num_threads=num_threads) as worlds:
+            worlds.states[self.BAD, self.OBJECT_SPIN] = 1e200
+            assert worlds.step(np.zeros((NUM_WORLDS, 4), dtype=np.float32))[self.BAD]
+        assert list(tmp_path.iterdir()) == []
+        assert capfd.readouterr() == ("", "")
 
     def test_the_others_never_notice(self, recorded, diverging):
         start, actions, states = recorded
