@@ -218,6 +218,12 @@ class LearnerConfig(_Frozen):
         description="Alice learns every so many iterations, from all her turns since: one reward a turn, which also "
         "hangs on Bob's luck, leaves the gradient of a single iteration mostly noise",
     )
+    bob_window: int = Field(
+        1,
+        ge=1,
+        description="Bob learns from the rollouts of so many iterations at once, older ones weighted by what he has "
+        "changed since; instead of more epochs over the newest",
+    )
     abc: ABCConfig = ABCConfig()
     mirror: bool = Field(False, description="learn from every Bob sample also reflected in y; the task is symmetric")
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import deque
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -69,6 +70,7 @@ class Learner:
         self._ledger = Ledger()
         self._pending: dict[tuple[int, int, int], Rollout] = {}
         self._turns: list[Turns] = []  # Alice's, since her last update
+        self._window: deque[list[Turns]] = deque(maxlen=config.learner.bob_window)  # Bob's, of the last iterations
 
     def ingest(self, rollout: Rollout) -> bool:
         """Take a rollout for the next update.
@@ -114,7 +116,9 @@ class Learner:
     def state(self) -> Arrays:
         """Everything a resumed run needs, as arrays by name; rollouts not yet learned from are not part of it."""
         parts = {"alice": self._alice.state(), "bob": self._bob.state(), "demonstrations": self._history.state()}
-        parts |= {f"turns/{index:04}": turns_to_arrays(turns) for index, turns in enumerate(self._turns)}
+        parts |= _named("turns", self._turns)
+        for index, turns in enumerate(self._to_come_back()):
+            parts |= _named(f"window/{index:04}", turns)
         nested = {f"{part}/{name}": array for part, arrays in parts.items() for name, array in arrays.items()}
         version = np.array(self.version, dtype=np.int64)
         return nested | {"version": version, "rng": random_state.dump(self._rng), "counted": self._ledger.state()}
@@ -131,15 +135,22 @@ class Learner:
             history = {name: state.pop(f"demonstrations/{name}") for name in ("observation", "action", "num_steps")}
         except KeyError as error:
             raise LearnerError(f"learner state: no array {error}; take an undamaged checkpoint") from None
-        turns = {name: state.pop(name) for name in list(state) if name.startswith("turns/")}
+        played = {name: state.pop(name) for name in list(state) if name.startswith(("turns/", "window/"))}
         self._load_players(state)
-        indices = sorted({name.split("/")[1] for name in turns})
-        self._turns = [turns_from_arrays(_part(turns, f"turns/{index}")) for index in indices]
+        self._turns = _turns(_part(played, "turns"))
+        window = _part(played, "window")
+        self._window.clear()
+        self._window.extend(_turns(_part(window, index)) for index in _indices(window))
         self.version = int(own["version"])
         self._rng = random_state.load(own["rng"])
         self._ledger.load_state(own["counted"])
         self._history.load_state(history)
         self._pending.clear()
+
+    def _to_come_back(self) -> list[list[Turns]]:
+        """What of Bob's window the next update will use again: all but what then falls out of it."""
+        window = list(self._window)
+        return window[1:] if len(window) == self.config.learner.bob_window else window
 
     def _load_players(self, state: Arrays) -> None:
         players = {"alice": self._alice, "bob": self._bob}
@@ -164,7 +175,9 @@ class Learner:
 
     def _update_bob(self, rollouts: Sequence[Rollout]) -> Metrics:
         config, bob = self.config.learner, self._bob
-        samples = collect([rollout.bob for rollout in rollouts], bob.value, bob.policy, config.bob, self._device)
+        self._window.append([rollout.bob for rollout in rollouts])
+        turns = [each for iteration in self._window for each in iteration]
+        samples = collect(turns, bob.value, bob.policy, config.bob, self._device)
         metrics = {"num_bob_samples": float(_length(samples))}
         if samples is not None and config.mirror:
             samples = mirrored(samples, bob.policy, MIRROR_BOB, MIRROR_BOB_VALUE, MIRROR_ACTION)
@@ -201,6 +214,18 @@ def _prefixed(player: str, metrics: Metrics) -> Metrics:
 
 def _part(state: Arrays, key: str) -> Arrays:
     return {name.removeprefix(f"{key}/"): array for name, array in state.items() if name.startswith(f"{key}/")}
+
+
+def _named(prefix: str, turns: Sequence[Turns]) -> dict[str, Arrays]:
+    return {f"{prefix}/{index:04}": turns_to_arrays(each) for index, each in enumerate(turns)}
+
+
+def _indices(state: Arrays) -> list[str]:
+    return sorted({name.partition("/")[0] for name in state})
+
+
+def _turns(state: Arrays) -> list[Turns]:
+    return [turns_from_arrays(_part(state, index)) for index in _indices(state)]
 
 
 def _length(rows: Samples | Cloning | None) -> int:

@@ -154,6 +154,23 @@ def test_alice_learns_every_so_many_iterations_from_all_her_turns():
     assert_same_state(learner, resumed)
 
 
+def test_bob_learns_from_a_window_of_iterations():
+    config = make_config(bob_window=2)
+    learner, resumed = Learner(config), Learner(config)
+    played = []
+    for sequence in range(3):
+        rollout = make_rollout(learner, sequence)
+        played.append(int((rollout.bob.active & rollout.bob.learn).sum()))
+        for each in (learner, resumed) if sequence == 2 else (learner,):
+            assert each.ingest(rollout)
+            assert each.update()["learner/num_bob_samples"] == sum(played[-2:])
+        if sequence == 1:
+            state = learner.state()
+            assert sum(name.startswith("window/") and name.endswith("/action") for name in state) == 1
+            resumed.load_state(state)
+    assert_same_state(learner, resumed)
+
+
 def test_a_state_is_a_copy():
     learner = Learner(make_config(**HISTORY))
     updated(learner, 0)
