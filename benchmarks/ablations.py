@@ -42,7 +42,8 @@ ABLATIONS: dict[str, tuple[str, ...]] = {
     "no-hold": ("game.bob_hold_steps=1",),
     "no-old-demonstrations": ("learner.abc.num_iterations=1",),
     "no-short-turns": ("game.alice_steps_min=null",),
-    "no-alice-interval": ("learner.alice_interval=1",),
+    "no-hindsight": ("learner.abc.hindsight=false",),
+    "decoupled-alice": ("learner.alice.decoupled=true",),
 }
 """What each changes of the recipe."""
 MAX_POINTS = 100
