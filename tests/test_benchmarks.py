@@ -528,7 +528,8 @@ def test_durations_by_hand():
 EVERYTHING_ON = [
     "seed=3", "learner.mirror=true", "learner.abc={weight: 0.5, num_iterations: 8, hindsight: true}",
     "game.num_goals=5", "game.bob_hold_steps=5", "generator.past_opponent_fraction=0.2",
-    "generator.replay_invalid=true", "generator.replay_from_reset=true", "game.alice_steps_min=5", "learner.alice.decoupled=false",
+    "generator.replay_invalid=true", "generator.replay_from_reset=true", "game.alice_steps_min=5",
+    "learner.alice.decoupled=false",
 ]  # fmt: skip
 
 
