@@ -1,9 +1,6 @@
 """The local runner: what an iteration does, when a run ends, and that a resumed run equals one never stopped."""
 
-import random
 import shutil
-import signal
-import time
 from contextlib import ExitStack
 
 import numpy as np
@@ -24,7 +21,6 @@ from tests.runtime.runs import (
     no_room_above,
     play,
     read_lines,
-    start_endless_run,
     timeless_metrics,
     tiny_config,
 )
@@ -262,30 +258,6 @@ def test_a_run_killed_while_it_learns_and_plays(uninterrupted, tmp_path, monkeyp
     assert len(read_lines(tmp_path / "goals.jsonl")) == 5
     play(tmp_path, config, resume=True)
     assert_same_run(tmp_path, uninterrupted)
-
-
-def test_a_run_killed_with_sigkill_at_a_random_moment(tmp_path):
-    process, path = start_endless_run(tmp_path)
-    delay_s = random.uniform(0.0, 0.5)
-    try:
-        deadline_s = time.monotonic() + 100.0
-        while len(list(path.glob("checkpoints/checkpoint-*"))) < 2:
-            assert process.poll() is None, process.stderr.read()
-            assert time.monotonic() < deadline_s, "no checkpoints after 100 s"
-            time.sleep(0.01)
-        time.sleep(delay_s)
-    finally:
-        process.send_signal(signal.SIGKILL)
-        process.communicate()
-    assert process.returncode == -signal.SIGKILL
-    saved = newest(path)
-    total = saved.meta["env_steps"] + 500
-    config = resumed_config(RunDirectory(path), [f"run.total_env_steps={total}"])
-    play(path, config, resume=True)
-    play(tmp_path / "whole", tiny_config(total_env_steps=total))
-    print(f"killed {delay_s:.3f} s after a first checkpoint, resumed from iteration {saved.step}")
-    assert newest(path).step > saved.step
-    assert_same_run(path, tmp_path / "whole")
 
 
 def test_a_stop_is_saved_and_resumed(uninterrupted, tmp_path):
