@@ -8,6 +8,7 @@ import pytest
 
 from service.errors import TandemError
 from service.learner.learner import Learner
+from service.registry.checkpoints import CheckpointStore
 from service.registry.errors import CheckpointError
 from service.runtime.local import LocalRun, UnsavedError
 from service.runtime.pretrain import resumed_config
@@ -152,6 +153,9 @@ def test_the_newest_checkpoints_are_kept(tmp_path):
     files = sorted(file.name for file in (tmp_path / "checkpoints").iterdir())
     last = result.iteration
     assert files == [f"checkpoint-{step:08d}.safetensors" for step in (last - 1, last)]
+    config = resumed_config(RunDirectory(tmp_path), ["run.keep_checkpoints=1", "run.total_env_steps=900"])
+    _, result = play(tmp_path, config, resume=True)
+    assert CheckpointStore(tmp_path / "checkpoints", keep=1).steps() == [result.iteration]
 
 
 def test_bob_is_kept_untrained_and_after_each_tenth(uninterrupted):
