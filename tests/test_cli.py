@@ -18,7 +18,7 @@ from service.registry import checkpoints
 from service.registry.names import Version
 from service.registry.registry import BUNDLED, Registry
 from service.runtime.rundir import RunDirectory
-from tests.runtime.runs import TREE, tiny_config, write_yaml
+from tests.runtime.runs import TREE, no_room_above, tiny_config, write_yaml
 
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text()
@@ -430,6 +430,18 @@ def test_a_full_disk_during_a_checkpoint(tmp_path, monkeypatch):
     assert result.stderr.count("\n") == 1
     assert "checkpoint-" in result.stderr
     assert "No space left on device" in result.stderr
+
+
+def test_a_disk_that_is_full_to_the_end(tmp_path):
+    """It is no mistake of what was typed, and what came before it is there."""
+    config = write_yaml(tmp_path / "tiny.yaml")
+    with no_room_above(150_000):
+        result = tandem("pretrain", "--config", config, "--run-dir", tmp_path / "run", "--registry", tmp_path / "none")
+    assert result.exit_code == 1
+    assert result.stderr.startswith("error: ")
+    assert result.stderr.count("\n") == 1
+    assert [part for part in ("File too large", "saved is iteration 2", "--resume") if part not in result.stderr] == []
+    assert not (tmp_path / "none").exists()
 
 
 def test_a_mistake_in_a_real_process_is_one_line():

@@ -13,7 +13,7 @@ from service.errors import TandemError
 from service.registry.registry import BUNDLED, Registry
 from service.runtime import pretrain as module
 from service.runtime import publishing
-from service.runtime.pretrain import pretrain, resumed_config
+from service.runtime.pretrain import UnfinishedError, pretrain, resumed_config
 from service.runtime.rundir import RunDirectory
 from service.runtime.signals import InterruptError
 from tests.runtime.runs import (
@@ -21,6 +21,7 @@ from tests.runtime.runs import (
     assert_one_line,
     assert_same_run,
     newest,
+    no_room_above,
     play,
     read_lines,
     start_endless_run,
@@ -130,6 +131,23 @@ def test_a_registry_that_is_only_read_is_refused_before_anything_is_learned(tmp_
         pretrain(tiny_config(), RunDirectory(tmp_path / "run"), BUNDLED, on_iteration=lambda metrics: None)
     assert_one_line(error.value, "cannot write", BUNDLED, "only read")
     assert not (tmp_path / "run").exists()
+
+
+def test_a_registry_on_a_full_disk_costs_no_learning(tmp_path, quick, monkeypatch):
+    publish = module.publish_run
+
+    def publish_without_room(*args):
+        with no_room_above(1_000):
+            return publish(*args)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(module, "publish_run", publish_without_room)
+        with pytest.raises(UnfinishedError) as error:
+            run_pretrain(tmp_path)
+    assert_one_line(error.value, "saved, but not published", "cannot write", tmp_path / "registry", "--resume")
+    assert error.value.exit_code == 1
+    done = run_pretrain(tmp_path, resumed_config(RunDirectory(tmp_path / "run"), []), resume=True)
+    assert str(done.version) == "tiny@1"
 
 
 # --- signals ---------------------------------------------------------------------------------------------------------
