@@ -44,6 +44,17 @@ class Appender:
                     _write_whole(file, self._waiting[0])
                     self._waiting.popleft()
 
+    def sync(self) -> None:
+        """Write what waits, and see to it that a power cut leaves it there.
+
+        Raises:
+            RegistryError: as for `append`.
+        """
+        self.flush()
+        if self.path.exists():
+            with os_errors("write", self.path), self.path.open("rb") as file:
+                os.fsync(file.fileno())
+
 
 def _write_whole(file: FileIO, piece: bytes) -> None:
     end = file.seek(0, os.SEEK_END)

@@ -53,13 +53,13 @@ class EventFile:
         ]
         self._append(Event(wall_time=time.time(), step=int(metrics["env_steps"]), summary=Summary(value=values)))
 
-    def flush(self) -> None:
-        """Write what waits.
+    def sync(self) -> None:
+        """Write the events that wait, and see to it that a power cut leaves them all there.
 
         Raises:
             RegistryError: as for `add`.
         """
-        self._file.flush()
+        self._file.sync()
 
     def _append(self, event: Event) -> None:
         framed = io.BytesIO()

@@ -290,6 +290,7 @@ class LocalRun:
                 "wall_s": self._wall_s,
                 "rng": self._rng.bit_generator.state,
             }
+            self.directory.sync()
             self._checkpoints.save(self.iteration, arrays, meta)
             self._saved = self.iteration
 

@@ -45,13 +45,13 @@ class JsonlWriter:
         line = json.dumps(_plain(record), allow_nan=False) + "\n"
         self._file.append(line.encode())
 
-    def flush(self) -> None:
-        """Write the records that wait.
+    def sync(self) -> None:
+        """Write the records that wait, and see to it that a power cut leaves them all there.
 
         Raises:
             TandemError: as for `append`.
         """
-        self._file.flush()
+        self._file.sync()
 
     def truncate_after(self, iteration: int) -> None:
         """Drop the records whose ``iteration`` is above the given one, and a torn last line, in one atomic step.

@@ -143,15 +143,27 @@ class RunDirectory:
         with self._going_on(self.broken), os_errors("write", path):
             write_atomic(path, data.getvalue())
 
+    def sync(self) -> None:
+        """See to it that a power cut leaves every record there; a checkpoint must not know more than they do."""
+        for writer, path in self._writers():
+            with self._going_on(path):
+                writer.sync()
+
     def close(self) -> None:
         """Write what still waits for room on the disk; what then does not fit is lost, and a warning says so."""
-        for writer in (self._metrics, self._goals, self._events):
+        for writer, _ in self._writers():
             try:
-                if writer is not None:
-                    writer.flush()
+                writer.sync()
             except RegistryError as error:  # must not hide why the run ended
                 _logger.warning("the newest records are lost: %s", error)
         self._events = None
+
+    def _writers(self) -> list[tuple[JsonlWriter | EventFile, Path]]:
+        writers: list[tuple[JsonlWriter | EventFile, Path]] = [
+            (self._metrics, self.metrics_file),
+            (self._goals, self.goals_file),
+        ]
+        return writers if self._events is None else [*writers, (self._events, self.path / "tensorboard")]
 
     @contextmanager
     def _going_on(self, path: Path) -> Iterator[None]:

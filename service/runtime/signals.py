@@ -46,6 +46,8 @@ class StopSignals:
     @contextmanager
     def asking(self, ask: Callable[[], None]) -> Iterator[None]:
         """Inside, the first signal only calls ``ask``; a second one raises ``InterruptError``."""
+        if self.first is not None:  # what it raised was swallowed, as by the imports of some packages
+            ask()
         self._ask = ask
         try:
             yield

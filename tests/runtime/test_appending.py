@@ -30,7 +30,7 @@ def test_a_piece_that_does_not_fit_leaves_no_part_and_comes_before_the_next(path
     assert path.read_bytes() == b"aaa"
     appender.append(b"cc")
     assert path.read_bytes() == b"aaabbbcc"
-    appender.flush()
+    appender.sync()
     assert path.read_bytes() == b"aaabbbcc"
 
 

@@ -171,6 +171,21 @@ def test_what_killed_writers_left_anywhere_in_the_directory_goes(tmp_path):
     assert [file for file in left if file.exists()] == []
 
 
+def test_records_are_on_the_disk_before_the_checkpoint_that_knows_of_them(tmp_path, monkeypatch):
+    """A power cut would otherwise leave a checkpoint of iterations whose records are lost."""
+    synced, fsync = [], os.fsync
+
+    def watched(descriptor):
+        synced.append(os.readlink(f"/proc/self/fd/{descriptor}").removeprefix(f"{tmp_path}/").partition("/")[0])
+        fsync(descriptor)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "fsync", watched)
+        play(tmp_path, kill_after=3)
+    last = max(place for place, name in enumerate(synced) if name == "checkpoints")
+    assert {"metrics.jsonl", "goals.jsonl", "tensorboard"} <= set(synced[last - 5 : last])
+
+
 def test_real_processes_killed_at_random_moments(tmp_path):
     """The first while it runs, the second anywhere: in its imports, while it loads, or later."""
     process, path = start_endless_run(tmp_path)

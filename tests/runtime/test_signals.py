@@ -2,6 +2,7 @@
 
 import os
 import signal
+from contextlib import suppress
 from types import SimpleNamespace
 
 import pytest
@@ -59,6 +60,15 @@ def test_after_the_question_a_signal_raises_again():
             pass
         with pytest.raises(InterruptError):
             send(signal.SIGINT)
+
+
+def test_a_signal_that_somebody_swallowed_is_not_forgotten():
+    asked = []
+    with StopSignals() as signals:
+        with suppress(BaseException):
+            send(signal.SIGTERM)
+        with signals.asking(lambda: asked.append("stop")):
+            assert asked == ["stop"]
 
 
 def test_the_handlers_from_before_are_put_back():
