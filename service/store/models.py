@@ -1,0 +1,125 @@
+"""What a run tells about itself, as its runner writes it and the status service hands it out."""
+
+from __future__ import annotations
+
+from datetime import datetime
+from typing import Literal, Protocol
+
+from pydantic import BaseModel, ConfigDict, Field
+
+RunState = Literal["starting", "running", "finished", "converged", "interrupted", "failed"]
+ACTIVE: frozenset[RunState] = frozenset({"starting", "running"})
+Record = dict[str, float | None]
+"""One iteration's metrics; ``iteration`` and ``env_steps`` are always there. Null: JSON has no number for it."""
+
+
+class _Frozen(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+
+class ActorStatus(_Frozen):
+    """One rollout actor, the learner or the task generator, as its run sees it."""
+
+    name: str = Field(description="rollout-0, rollout-1, ..., learner, generator")
+    incarnation: int = Field(ge=0, description="how often it was replaced")
+    state: Literal["starting", "alive", "lost"]
+    node: str = Field("", description="host it is on; empty in a run of one process")
+    pid: int | None = None
+    heartbeat: datetime = Field(description="UTC, when it was last heard of")
+    num_rollouts: int = Field(0, ge=0, description="taken from it, all incarnations together")
+    num_env_steps: int = Field(0, ge=0)
+    last_error: str | None = Field(None, description="why its last incarnation was replaced")
+
+
+class RunStatus(_Frozen):
+    """A run right now."""
+
+    run_id: str = Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]{0,127}$")
+    name: str = Field(description="registry name of the primitives it makes")
+    runtime: Literal["local", "ray"]
+    state: RunState
+    started: datetime = Field(description="UTC, of the process that runs it now or ran it last")
+    heartbeat: datetime = Field(description="UTC, when its runner last wrote this")
+    iteration: int = Field(0, ge=0)
+    num_env_steps: int = Field(0, ge=0)
+    total_env_steps: int = Field(ge=1, description="its budget")
+    env_steps_per_s: float = Field(0.0, ge=0)
+    policy_version: int = Field(0, ge=0)
+    policy_lag: float = Field(0.0, ge=0, description="mean over the last update's rollouts, in versions")
+    num_rollouts_counted: int = Field(0, ge=0, description="learned from, each once")
+    num_rollouts_refused: int = Field(0, ge=0, description="seen before, or too old")
+    stopping: bool = Field(False, description="a stop was requested and the run has not ended yet")
+    published: str | None = Field(None, description="NAME@VERSION of the primitives it published last")
+    last_error: str | None = None
+    warnings: tuple[str, ...] = Field((), description="what is not as it should be right now, such as Redis being away")
+    actors: tuple[ActorStatus, ...] = ()
+
+
+class GoalCell(_Frozen):
+    """One cell of the task generator's grid in which a valid goal was ever proposed."""
+
+    center_m: tuple[float, float, float]
+    num_tries: int = Field(ge=0, description="of Bob, ever")
+    success_rate: float = Field(ge=0, le=1, description="of the present Bob, estimated; 1/2 where untried")
+    learnability: float = Field(ge=0, le=0.25, description="p (1 - p)")
+
+
+class GoalGrid(_Frozen):
+    """What the task generator knows about goals."""
+
+    iteration: int = Field(ge=0)
+    num_env_steps: int = Field(ge=0)
+    cell_size_m: float = Field(gt=0)
+    shape: tuple[int, int, int]
+    num_cells: int = Field(ge=0, description="in the workspace, seen or not")
+    lower_m: tuple[float, float, float] = Field(description="corner of the workspace, metres")
+    upper_m: tuple[float, float, float]
+    cells: tuple[GoalCell, ...]
+
+
+class RunWriter(Protocol):
+    """Where a runner tells how its run goes. No method may raise for a store that is away or full: training goes on."""
+
+    def status(self, status: RunStatus) -> None:
+        """Replace what is known about the run."""
+
+    def metrics(self, record: Record) -> None:
+        """Append one iteration's metrics."""
+
+    def goals(self, grid: GoalGrid) -> None:
+        """Replace the grid."""
+
+    def stop_requested(self) -> bool:
+        """Whether somebody asked the run to stop since it was started."""
+
+    def warnings(self) -> list[str]:
+        """What does not work at the moment, in one sentence each; empty when all is well."""
+
+    def close(self) -> None:
+        """Write what still waits, for a bounded time."""
+
+
+class RunReader(Protocol):
+    """What the status service reads runs from.
+
+    Every method may raise ``StoreUnavailableError``; those that take a run id raise ``UnknownRunError`` where there is
+    no such run.
+    """
+
+    def runs(self) -> list[RunStatus]:
+        """All runs, newest start first."""
+
+    def run(self, run_id: str) -> RunStatus:
+        """One run."""
+
+    def metrics(self, run_id: str, *, after_iteration: int = 0) -> list[Record]:
+        """The records of iterations above ``after_iteration``, in order, each iteration once (a resumed run's last)."""
+
+    def goals(self, run_id: str) -> GoalGrid | None:
+        """The newest grid; None before the first."""
+
+    def request_stop(self, run_id: str) -> None:
+        """Ask a run to end after its current iteration, saved; nothing happens if it has ended."""
+
+    def ready(self) -> None:
+        """Return if reads work right now."""
