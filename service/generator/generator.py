@@ -77,7 +77,8 @@ class TaskGenerator:
         self._rest_height_m = config.world.object_size_m / 2
         self.grid = DifficultyGrid(config.world, config.generator.cell_size_m)
         columns = {"start_state": state_size, "start_position": 3}
-        self.buffer = Ring(config.generator.replay_buffer_size, **columns, goal=3)
+        num_cells = self.grid.seen.size if config.generator.replay_over_cells else 1
+        self.buffer = Ring(config.generator.replay_buffer_size, num_cells, **columns, goal=3)
         self.starts = Ring(NUM_STARTS, **columns)
         self.opponents = OpponentPool(config.generator.opponent_pool_size)
         self.from_reset = SuccessCounts(self.grid.num_height_bins * self.grid.num_distance_bins)
@@ -140,8 +141,12 @@ class TaskGenerator:
         as_proposed = tried & ~(records.replayed & records.from_reset)
         self.grid.record(records.goal[as_proposed], records.start_position[as_proposed], records.solved[as_proposed])
         own = own_goals(records)
+        goal = records.goal[own]
         self.buffer.add(
-            start_state=records.start_state[own], start_position=records.start_position[own], goal=records.goal[own]
+            self.grid.cell_index(goal) if self._config.replay_over_cells else None,
+            start_state=records.start_state[own],
+            start_position=records.start_position[own],
+            goal=goal,
         )
         current = current_goals(records)
         self._penalty.record(float(np.mean(records.verdict == Verdict.VALID)))
@@ -206,13 +211,14 @@ class TaskGenerator:
         """
         goal = self.buffer["goal"]
         tasks = {name: self.buffer[name] for name in ("start_state", "start_position")}
-        weight = self.grid.learnability(goal) + LEARNABILITY_FLOOR
+        share = self.buffer.part_share()
+        weight = (self.grid.learnability(goal) + LEARNABILITY_FLOOR) * share
         if self._config.replay_from_reset and len(self.starts):
             start = self.starts.sample(rng, len(goal))
             position = start["start_position"]
             far = np.linalg.norm(goal - position, axis=1) > self._success_distance_m  # nearer ones are no task
             learnability = self.from_reset.learnability()[self._task_bins(goal, position)]
-            weight = np.concatenate([weight, np.where(far, learnability + LEARNABILITY_FLOOR, 0.0)])
+            weight = np.concatenate([weight, np.where(far, learnability + LEARNABILITY_FLOOR, 0.0) * share])
             tasks = {name: np.concatenate([rows, start[name]]) for name, rows in tasks.items()}
         drawn = rng.choice(len(weight), size=len(worlds), p=weight / weight.sum())
         choice.goal[worlds] = goal[drawn % len(goal)]

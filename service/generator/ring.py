@@ -11,39 +11,52 @@ from service.config import ConfigError
 from service.generator.state import Array, State, take
 
 Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
 
 
 class Ring:
-    """The last ``capacity`` rows added to named float columns.
+    """The last rows added to named float columns, of each of ``num_parts`` kinds of rows equally many at most.
 
     Args:
-        capacity: rows held at most.
+        capacity: rows held at most, all parts together; each part has an equal share, at least one.
+        num_parts: kinds of rows.
         **sizes: row length of each column.
     """
 
-    def __init__(self, capacity: int, **sizes: int) -> None:
-        self._columns = {name: np.zeros((capacity, size)) for name, size in sizes.items()}
-        self._capacity = capacity
-        self._size = 0
-        self._next = 0
+    def __init__(self, capacity: int, num_parts: int = 1, **sizes: int) -> None:
+        self._share = max(1, capacity // num_parts)
+        self._columns = {name: np.zeros((num_parts * self._share, size)) for name, size in sizes.items()}
+        self._num_added = np.zeros(num_parts, dtype=np.int64)
 
     def __len__(self) -> int:
         """Number of rows held."""
-        return self._size
+        return int(self._num_held.sum())
 
     def __getitem__(self, column: str) -> Floats:
-        """(len, size) rows held, in the order that ``sample`` and its weights mean; a view."""
-        return self._columns[column][: self._size]
+        """(len, size) rows held, in the order that ``sample``, its weights and ``share`` mean; a copy."""
+        rows: Floats = self._columns[column][self._held]
+        return rows
 
-    def add(self, **rows: Floats) -> None:
-        """Add M rows to every column; the oldest are overwritten."""
+    def add(self, part: Ints | None = None, **rows: Floats) -> None:
+        """Add M rows to every column; the oldest of their part are overwritten.
+
+        Args:
+            part: (M,) which part each belongs to; None where there is but one.
+            **rows: (M, size) each.
+        """
         assert rows.keys() == self._columns.keys(), (rows.keys(), self._columns.keys())
         num = len(next(iter(rows.values())))
-        where = (self._next + np.arange(num)[-self._capacity :]) % self._capacity
+        part = np.zeros(num, dtype=np.int64) if part is None else part
+        order = np.argsort(part, kind="stable")
+        counted = np.bincount(part, minlength=self._num_added.size)
+        rank = np.arange(num) - np.repeat(np.cumsum(counted) - counted, counted)
+        own = part[order]
+        # Of more new rows than a part has room for, only the newest are written: each place is written once.
+        newest = rank >= counted[own] - self._share
+        where = own * self._share + (self._num_added[own] + rank) % self._share
         for name, new in rows.items():
-            self._columns[name][where] = new[-self._capacity :]
-        self._next = (self._next + num) % self._capacity
-        self._size = min(self._size + num, self._capacity)
+            self._columns[name][where[newest]] = new[order[newest]]
+        self._num_added += counted
 
     def sample(self, rng: np.random.Generator, num: int, weight: Floats | None = None) -> dict[str, Floats]:
         """Draw ``num`` whole rows with replacement, as copies.
@@ -53,31 +66,47 @@ class Ring:
             num: how many.
             weight: (len,) what each row's probability is proportional to; None for all alike.
         """
-        assert self._size > 0, "sampled before anything was added"
-        assert weight is None or weight.shape == (self._size,), (self._size, weight)
-        rows = rng.choice(self._size, size=num, p=None if weight is None else weight / weight.sum())
+        held = self._held
+        assert held.size > 0, "sampled before anything was added"
+        assert weight is None or weight.shape == held.shape, (held.size, weight)
+        rows = held[rng.choice(held.size, size=num, p=None if weight is None else weight / weight.sum())]
         return {name: column[rows] for name, column in self._columns.items()}
+
+    def part_share(self) -> Floats:
+        """(len,) one over the number of rows held of each row's part: drawn by it, all parts are drawn alike."""
+        num = self._num_held
+        share: Floats = 1.0 / np.repeat(num, num)
+        return share
 
     def state(self) -> State:
         """What is held, copied; rows never written are left out."""
-        state: State = {name: self[name].copy() for name in self._columns}
-        state["next"] = np.array([self._next])
+        state: State = {name: self[name] for name in self._columns}
+        state["num_added"] = self._num_added.copy()
         return state
 
     def load_state(self, state: Mapping[str, Array]) -> None:
         """Take over what ``state`` gave.
 
         Raises:
-            ConfigError: of a ring of another capacity or row length.
+            ConfigError: of a ring of another capacity, number of parts or row length.
         """
         loaded = {name: take(state, name, column, any_rows=True) for name, column in self._columns.items()}
-        size, written_next = len(next(iter(loaded.values()))), int(take(state, "next", np.zeros(1, dtype=np.int64))[0])
-        # A ring is written next where it ends until it is full; the order of one of another capacity would be lost.
-        if size > self._capacity or (size < self._capacity and written_next != size):
+        num_added = take(state, "num_added", self._num_added)
+        size, num_held = len(next(iter(loaded.values()))), int(np.minimum(num_added, self._share).sum())
+        if size != num_held:
             raise ConfigError(
-                f"generator state: {size} rows do not fit a buffer of {self._capacity} (generator.replay_buffer_size "
-                "for goals); resume with the configuration of the checkpoint"
+                f"generator state: {size} rows do not fit a buffer that holds {num_held} "
+                "(generator.replay_buffer_size for goals); resume with the configuration of the checkpoint"
             )
-        self._size, self._next = size, written_next % self._capacity
+        self._num_added = num_added
         for name, column in self._columns.items():
-            column[: self._size] = loaded[name]
+            column[self._held] = loaded[name]
+
+    @property
+    def _num_held(self) -> Ints:
+        return np.minimum(self._num_added, self._share)
+
+    @property
+    def _held(self) -> Ints:
+        """Places that have been written, part by part."""
+        return np.flatnonzero(np.arange(self._share) < self._num_held[:, None])

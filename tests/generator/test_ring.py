@@ -72,11 +72,35 @@ def test_state_of_another_buffer_is_refused() -> None:
     add(full, 1, 2, 3, 4)
     for capacity in (2, 5):
         with pytest.raises(
-            ConfigError, match=f"3 rows do not fit a buffer of {capacity} .generator.replay_buffer_size"
+            ConfigError, match=r"3 rows do not fit a buffer that holds \d .generator.replay_buffer_size"
         ):
             make(capacity).load_state(full.state())
     with pytest.raises(ConfigError, match=r"'first' is float64 \(3, 2\)"):
         make(3, 5).load_state(full.state())
+
+
+def test_every_part_keeps_its_newest_rows() -> None:
+    buffer = Ring(6, 3, first=1)  # two each
+    for part, number in ((0, 1), (0, 2), (2, 3), (0, 4)):
+        buffer.add(np.array([part]), first=np.array([[float(number)]]))
+    assert buffer["first"].ravel().tolist() == [4, 2, 3]
+    assert buffer.part_share().tolist() == [0.5, 0.5, 1.0]
+    buffer.add(np.array([1, 2, 2, 2, 1]), first=np.arange(5.0, 10.0)[:, None])  # 3 of part 2 at once: 5 is too old
+    assert sorted(buffer["first"].ravel().tolist()) == [2, 4, 5, 7, 8, 9]
+    assert buffer["first"][2:4].ravel().tolist() == [5, 9]
+    copy = Ring(6, 3, first=1)
+    copy.load_state(buffer.state())
+    for ring in (buffer, copy):
+        ring.add(np.array([2, 0]), first=np.array([[10.0], [11.0]]))
+    assert copy["first"].tolist() == buffer["first"].tolist()
+    assert sorted(buffer["first"][4:].ravel().tolist()) == [8, 10]
+
+
+def test_parts_drawn_by_their_share_are_drawn_alike() -> None:
+    buffer = Ring(40, 2, first=1)
+    buffer.add(np.repeat([0, 1], [19, 1]), first=np.repeat([[0.0], [1.0]], [19, 1], axis=0))
+    drawn = buffer.sample(np.random.default_rng(0), 10_000, buffer.part_share())["first"]
+    assert drawn.mean() == pytest.approx(0.5, abs=0.02)
 
 
 def test_state_round_trip_continues_the_ring() -> None:
