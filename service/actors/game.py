@@ -82,6 +82,11 @@ class SelfPlay:
         """Stop the worlds' threads."""
         self.worlds.close()
 
+    def start_over(self) -> None:
+        """End every game, as after a round that was given up half-way."""
+        self.worlds.reset(self._rng)
+        self._round_index[:] = 0
+
     def play_round(self, players: Players, plan: RoundPlan, choose_goals: ChooseGoals) -> Rollout:
         """Play one round in every world.
 

@@ -15,6 +15,7 @@ from service.generator.validity import workspace_bounds
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 Bools = NDArray[np.bool_]
+Corner = tuple[float, float, float]
 
 AIR_ABOVE_REST_M = 0.05
 """A goal is in the air when the object's centre is higher than it rests on the table by more than this."""
@@ -43,6 +44,10 @@ class DifficultyGrid:
     All rates are decayed running ones (see ``counts.DECAY``), one ``record`` being one iteration, so they follow Bob.
     """
 
+    bounds_m: tuple[Corner, Corner]
+    """Lower and upper corner of the workspace, metres."""
+    cell_size_m: float
+    """Edge of a cell; the last ones may reach beyond the workspace."""
     shape: tuple[int, int, int]
     """Number of cells in x, y and z."""
     cells: SuccessCounts
@@ -56,7 +61,8 @@ class DifficultyGrid:
 
     def __init__(self, world: WorldConfig, cell_size_m: float) -> None:
         self._lower, upper = workspace_bounds(world.workspace)
-        self._cell_size_m = cell_size_m
+        self.bounds_m = _corner(self._lower), _corner(upper)
+        self.cell_size_m = cell_size_m
         self._rest_height_m = world.object_size_m / 2
         # Rounding may not add a cell: 0.45 / 0.03 is a little over 15.
         counted = np.ceil((upper - self._lower) / cell_size_m - 1e-9).astype(int)
@@ -77,7 +83,7 @@ class DifficultyGrid:
 
     def cell_index(self, goals: Floats) -> Ints:
         """(M,) flat cell of each of (M, 3) goals inside the workspace, metres; upper faces belong to the last cells."""
-        index = np.floor((goals - self._lower) / self._cell_size_m).astype(np.int64)
+        index = np.floor((goals - self._lower) / self.cell_size_m).astype(np.int64)
         index = np.clip(index, 0, np.array(self.shape) - 1)
         return np.ravel_multi_index((index[:, 0], index[:, 1], index[:, 2]), self.shape).astype(np.int64)
 
@@ -150,7 +156,7 @@ class DifficultyGrid:
             "learnability": self.cells.learnability(),
         }
         maps: dict[str, Array] = {name: array.reshape(self.shape) for name, array in flat.items()}
-        maps["center"] = self._lower + (index + 0.5) * self._cell_size_m
+        maps["center"] = self._lower + (index + 0.5) * self.cell_size_m
         return maps
 
     def state(self) -> State:
@@ -173,3 +179,8 @@ class DifficultyGrid:
         self.cells.load_state(under("cells", state))
         self.heights.load_state(under("heights", state))
         self.distances.load_state(under("distances", state))
+
+
+def _corner(point: Floats) -> Corner:
+    x, y, z = (float(value) for value in point)
+    return x, y, z

@@ -1,0 +1,118 @@
+"""A worker whose state the driver keeps, so that another can take its place: the learner, the task generator."""
+
+from __future__ import annotations
+
+import logging
+from datetime import UTC, datetime
+from typing import Any
+
+import ray
+from ray.exceptions import GetTimeoutError, RayError
+
+from service.errors import TandemError
+from service.runtime.workers import Place
+from service.store.models import ActorStatus
+
+START_S = 120.0
+"""A worker that is not up by then does not come; torch is imported within it, and images are loaded on a new node."""
+ANSWER_S = 20.0
+"""A worker that is alive and has nothing to do answers within it."""
+_logger = logging.getLogger(__name__)
+
+
+class ClusterError(TandemError):
+    """The cluster does not let the run go on; what it had learned is saved."""
+
+    exit_code = 1
+
+
+class Stateful:
+    """One worker of its kind, and all that is needed for the next.
+
+    Args:
+        name: for people.
+        actor: Ray's actor class, with its options.
+        config: first argument of the worker.
+        state: second one: the state to start from, or None.
+        others: further arguments of the first worker only.
+    """
+
+    def __init__(self, name: str, actor: Any, config: Any, state: Any, *others: Any) -> None:
+        self.name = name
+        self.state = ray.put(state)
+        """Reference to its newest state."""
+        self.incarnation = 0
+        self.handle = actor.remote(config, self.state, *others)
+        self._actor, self._config = actor, config
+        self._place = Place("", 0)
+        self._heartbeat = datetime.now(UTC)
+        self._last_error: str | None = None
+
+    def up(self) -> None:
+        """Wait until it is.
+
+        Raises:
+            ClusterError: it does not come up.
+        """
+        try:
+            self._place = ray.get(self.handle.ping.remote(), timeout=START_S)
+        except GetTimeoutError:
+            raise ClusterError(
+                f"the {self.name} did not start within {START_S:.0f} s: has the cluster a free core (and GPU, with "
+                "learner.device=cuda) for it? see ray status"
+            ) from None
+        self.heard()
+
+    def heard(self) -> None:
+        """It just answered."""
+        self._heartbeat = datetime.now(UTC)
+
+    @property
+    def alive(self) -> bool:
+        """Whether it answers. Only to be asked while it has nothing to do."""
+        try:
+            ray.get(self.handle.ping.remote(), timeout=ANSWER_S)
+        except RayError:
+            return False
+        return True
+
+    def restart(self, why: str) -> None:
+        """Another, from the newest state; what the last one was doing has to be asked of it again.
+
+        Raises:
+            ClusterError: it does not come up, or the state was lost with the node that kept it.
+        """
+        _logger.warning("the %s is gone (%s); another goes on from its last state", self.name, why)
+        ray.kill(self.handle, no_restart=True)
+        self.incarnation += 1
+        self._last_error = why
+        self.handle = self._actor.remote(self._config, self.state)
+        try:
+            self.up()
+        except RayError as error:
+            raise ClusterError(
+                f"the {self.name} cannot go on from its last state ({type(error).__name__}); start the run again, it "
+                "continues from its newest checkpoint"
+            ) from None
+
+    def close(self) -> None:
+        """Kill it."""
+        ray.kill(self.handle, no_restart=True)
+
+    def status(self) -> ActorStatus:
+        """For the status service."""
+        return ActorStatus(
+            name=self.name,
+            incarnation=self.incarnation,
+            state="alive",
+            node=self._place.node,
+            pid=self._place.pid,
+            heartbeat=self._heartbeat,
+            last_error=self._last_error,
+        )
+
+
+def one_line(error: BaseException) -> str:
+    """An error from another process in a line: the end of its traceback, which says what it was."""
+    text = str(error).strip().splitlines()
+    return f"{type(error).__name__}: {text[-1].strip() if text else ''}"[:200]
