@@ -53,6 +53,15 @@ class CheckpointStore:
         matches = (_FILE_PATTERN.fullmatch(entry.name) for entry in self.directory.iterdir())
         return sorted(int(match[1]) for match in matches if match)
 
+    def check_any(self) -> None:
+        """Check that there is a checkpoint, good or damaged.
+
+        Raises:
+            CheckpointError: there is none.
+        """
+        if not self.steps():
+            raise CheckpointError(f"no checkpoint in {self.directory}; name another run, or start without --resume")
+
     def save(self, step: int, arrays: Mapping[str, np.ndarray], meta: Mapping[str, Any]) -> Path:
         """Write a checkpoint to the disk, then delete those older than the newest ``keep``.
 
@@ -79,6 +88,7 @@ class CheckpointStore:
             CheckpointError: there is none.
             FormatVersionError: the newest readable one is of another format.
         """
+        self.check_any()
         reasons: list[str] = []
         for step in reversed(self.steps()):
             try:
@@ -89,9 +99,7 @@ class CheckpointStore:
             for reason in reasons:
                 _logger.warning("%s; continuing from %s", reason, self.path(step).name)
             return checkpoint
-        if reasons:
-            raise CheckpointError(f"no usable checkpoint in {self.directory}: {'; '.join(reasons)}; start the run anew")
-        raise CheckpointError(f"no checkpoint in {self.directory}; name another run, or start without --resume")
+        raise CheckpointError(f"no usable checkpoint in {self.directory}: {'; '.join(reasons)}; start the run anew")
 
     def _prune(self, newest: int) -> None:
         # a file above the one just written is a damaged one that was passed over: it must not crowd out a good one

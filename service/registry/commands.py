@@ -1,4 +1,4 @@
-"""``tandem registry``: list, show, verify, alias, export."""
+"""``tandem registry``: list, show, verify, alias, export, reindex."""
 
 from __future__ import annotations
 
@@ -103,13 +103,30 @@ def export(
     typer.echo(f"{manifest.reference} is in {target}")
 
 
+@registry_app.command()
+def reindex(directory: _Directory = _DEFAULT) -> None:
+    """Make the index in the Redis of TANDEM_REDIS_URL anew from the registry's files, which lose nothing without it."""
+    with _user_errors():
+        from service.registry.registry import Registry
+        from service.store.address import VARIABLE, address_from_environment
+
+        _check_there(directory)
+        address = address_from_environment()
+        if address is None:
+            raise TandemError(f"no Redis to keep an index in: set {VARIABLE}, for example to redis://127.0.0.1:6379/0")
+        from service.store.registry_index import RegistryIndex
+
+        num_versions = RegistryIndex(address).rebuild(Registry(directory))
+    typer.echo(f"{directory}: {num_versions} versions in the index at {address}")
+
+
 @contextlib.contextmanager
 def _user_errors() -> Iterator[None]:
     try:
         yield
     except TandemError as error:
         typer.echo(f"error: {error}", err=True)
-        raise typer.Exit(2) from None
+        raise typer.Exit(error.exit_code) from None
 
 
 def _find(reference: str, directory: Path) -> tuple[Registry, Version]:
@@ -119,15 +136,20 @@ def _find(reference: str, directory: Path) -> tuple[Registry, Version]:
 
 
 def _problems(reference: str | None, directory: Path) -> list[str]:
-    from service.registry.errors import RegistryError
     from service.registry.registry import Registry
 
     if reference is not None:
         registry, version = _find(reference, directory)
         return registry.verify(str(version))
+    _check_there(directory)
+    return Registry(directory).verify()
+
+
+def _check_there(directory: Path) -> None:
+    from service.registry.errors import RegistryError
+
     if not directory.is_dir():
         raise RegistryError(f"no registry at {directory}; name one with --registry or TANDEM_REGISTRY")
-    return Registry(directory).verify()
 
 
 def _rows(registry: Registry, name: str) -> list[dict[str, object]]:

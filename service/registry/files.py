@@ -19,15 +19,21 @@ from service.registry.errors import RegistryError
 TEMPORARY_PREFIX = ".tmp-"
 
 
-def write_atomic(path: Path, data: bytes) -> None:
+def write_atomic(path: Path, data: bytes, *, flush: bool = True) -> None:
     """Put ``data`` at ``path``, replacing what was there in one step; the directory is made when missing.
+
+    Args:
+        path: where to.
+        data: its new content.
+        flush: wait for the disk. Without, it is quick, and a power cut may leave an older content or none.
 
     Raises:
         OSError: the disk is full, or the directory cannot be written; ``path`` is then as it was.
     """
-    with _temporary(path, data) as temporary:
+    with _temporary(path, data, flush=flush) as temporary:
         temporary.replace(path)
-        _flush_directory(path.parent)
+        if flush:
+            _flush_directory(path.parent)
 
 
 def write_exclusive(path: Path, data: bytes) -> bool:
@@ -75,11 +81,14 @@ def remove_temporaries(directory: Path) -> None:
 
 
 @contextlib.contextmanager
-def _temporary(path: Path, data: bytes) -> Iterator[Path]:
+def _temporary(path: Path, data: bytes, *, flush: bool = True) -> Iterator[Path]:
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.parent / f"{TEMPORARY_PREFIX}{os.getpid()}-{secrets.token_hex(8)}"
     try:
-        _write_flushed(temporary, data)
+        if flush:
+            _write_flushed(temporary, data)
+        else:
+            temporary.write_bytes(data)
         yield temporary
     finally:
         temporary.unlink(missing_ok=True)

@@ -7,6 +7,7 @@ Layout under the root::
     models/<name>/aliases/<a>     the number of a version; moved by replacing the file
 
 A publish writes the blob, then the manifest, then the aliases, each atomically: a reader sees all of a version or none.
+Who listens is told last; see `announcing`.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ import numpy as np
 
 from service.registry import names, tensors
 from service.registry.aliases import Aliases
+from service.registry.announcing import Listener, default_listener
 from service.registry.blobs import BlobStore, sha256_of
 from service.registry.errors import RegistryError, UnknownVersionError
 from service.registry.exported import write_exported
@@ -34,9 +36,15 @@ BUNDLED = Path(__file__).parents[1] / "primitives"
 class Registry:
     """Named, versioned parameters in a directory; any number of processes may publish and read at once."""
 
-    def __init__(self, root: Path) -> None:
-        """Open ``root``; nothing is read or written before the first call."""
+    def __init__(self, root: Path, listener: Listener | None = None) -> None:
+        """Open ``root``; nothing is read or written before the first call.
+
+        Args:
+            root: the directory.
+            listener: told of changes; None for the index in the Redis of ``TANDEM_REDIS_URL``, if that is set.
+        """
         self.root = root
+        self._own_listener = listener
         self._blobs = BlobStore(root / "blobs")
 
     @property
@@ -105,6 +113,8 @@ class Registry:
         version = self._publish_version(name, parameters, fields)
         for alias in aliases:
             self._aliases(name).advance(alias, version.number)
+        if (listener := self._own_listener or default_listener()) is not None:
+            listener.published(self, version)
         return version
 
     def resolve(self, reference: str) -> Version:
@@ -174,6 +184,8 @@ class Registry:
         self.check_writable()
         target = self.resolve(f"{name}@{version}")
         self._aliases(name).move(alias, version)
+        if (listener := self._own_listener or default_listener()) is not None:
+            listener.alias_moved(self, target, alias)
         return target
 
     def verify(self, reference: str | None = None) -> list[str]:

@@ -72,6 +72,7 @@ class LocalRun:
         resume: continue from the newest checkpoint instead of starting anew.
 
     Raises:
+        TandemError: see ``RunDirectory.claim``.
         CheckpointError: ``resume`` without a usable checkpoint.
     """
 
@@ -80,6 +81,7 @@ class LocalRun:
 
         from service.learner.learner import Learner
 
+        directory.claim(resume=resume)
         torch.set_num_threads(config.learner.num_threads)
         self.config = config
         self.directory = directory
@@ -101,7 +103,6 @@ class LocalRun:
         if resume:
             self._load()
         else:
-            directory.check_free()
             self.save()  # so that a run killed before its first interval can be resumed, too
             self._take_snapshot(after=-1)
         after = {"after_iteration": self.iteration, "after_env_steps": self.num_env_steps} if resume else {}

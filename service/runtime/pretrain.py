@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, cast
 
 from service.config import Config, ConfigError, load_config
 from service.errors import TandemError
@@ -17,8 +17,15 @@ from service.registry.registry import Registry
 from service.runtime.artifacts import make_artifacts
 from service.runtime.local import LocalRun, OnIteration, RunResult
 from service.runtime.publishing import measure_bob, publish_run
+from service.runtime.reporting import LocalReport
 from service.runtime.rundir import RunDirectory
 from service.runtime.signals import InterruptError, StopSignals
+from service.store.address import address_from_environment
+from service.store.disk_reader import run_id_of
+from service.store.fanout import open_writer
+
+if TYPE_CHECKING:
+    from service.store.models import RunState
 
 RESUMABLE = ("run.", "learner.alice.learning_rate=", "learner.bob.learning_rate=")
 """What an override of a resumed run may begin with: nothing that its past would have to be made again for."""
@@ -54,26 +61,55 @@ def pretrain(
     """Run to the end, then evaluate, publish, draw and film.
 
     SIGINT and SIGTERM end the run after the current iteration, saved, and what follows it at once: a resumed run does
-    that again. A second signal ends an iteration, too.
+    that again. A second signal ends an iteration, too. A stop request ends it as a signal does.
 
     Raises:
-        TandemError: see ``LocalRun`` and ``RunDirectory.start``; or a registry that is only read.
+        TandemError: see ``LocalRun`` and ``RunDirectory.start``; or a registry that is only read; or a Redis that is
+            configured and cannot be used.
         UnfinishedError: everything is saved, and not published.
         InterruptError: a signal while the run was being loaded, or a second one.
     """
     Registry(registry).check_writable()  # now, not after hours of learning
     with StopSignals() as signals:
         try:
-            run = LocalRun(config, directory, resume=resume)
-            with signals.asking(run.request_stop):
-                result = run.run(on_iteration)
-            done = Pretrained(result, {}, None, {}, run.timing.tree(), signals.first)
-            if result.reason != "interrupted" and signals.first is None:
-                with suppress(InterruptError):
-                    done = _finish(done, config, directory, Registry(registry), run)
-            return replace(done, signal=signals.first)
+            directory.claim(resume=resume)
+            run_id = run_id_of(directory.path)
+            writer = open_writer(directory.path, run_id, address_from_environment())
+            with LocalReport(config, run_id, writer, published=directory.read_published()) as report:
+                done = _run(config, directory, registry, signals, report, on_iteration, resume=resume)
+                return replace(done, signal=signals.first)
         finally:
             directory.close()
+
+
+def _run(
+    config: Config,
+    directory: RunDirectory,
+    registry: Path,
+    signals: StopSignals,
+    report: LocalReport,
+    on_iteration: OnIteration,
+    *,
+    resume: bool,
+) -> Pretrained:
+    run = LocalRun(config, directory, resume=resume)
+    report.begin(run.iteration, run.num_env_steps)
+
+    def tell(metrics: dict[str, float]) -> None:
+        on_iteration(metrics)
+        report.iteration(metrics, run.generator)
+        if report.stop_requested():
+            run.request_stop()
+
+    with signals.asking(run.request_stop):
+        result = run.run(tell)
+    done = Pretrained(result, {}, None, {}, run.timing.tree(), signals.first)
+    if result.reason != "interrupted" and signals.first is None:
+        with suppress(InterruptError):
+            done = _finish(done, config, directory, Registry(registry), run)
+    complete = result.reason if signals.first is None else "interrupted"  # --resume does what is left
+    report.end(cast("RunState", complete), published=str(done.version) if done.version is not None else None)
+    return done
 
 
 def _finish(done: Pretrained, config: Config, directory: RunDirectory, registry: Registry, run: LocalRun) -> Pretrained:

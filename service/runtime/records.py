@@ -7,7 +7,6 @@ drops it. A full disk leaves none.
 from __future__ import annotations
 
 import json
-import math
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -15,6 +14,7 @@ from typing import Any
 from service.errors import TandemError
 from service.registry.files import os_errors, write_atomic
 from service.runtime.appending import Appender
+from service.store.plain import plain
 
 
 def read_jsonl(path: Path) -> list[dict[str, Any]]:
@@ -42,7 +42,7 @@ class JsonlWriter:
         Raises:
             TandemError: the disk is full or the file cannot be written; the record waits, see `Appender.append`.
         """
-        line = json.dumps(_plain(record), allow_nan=False) + "\n"
+        line = json.dumps(plain(record), allow_nan=False) + "\n"
         self._file.append(line.encode())
 
     def sync(self) -> None:
@@ -106,14 +106,3 @@ def _iteration(record: Mapping[str, Any], path: Path) -> int:
             f"{path}: a record has iteration {iteration!r}, not a whole number; remove that line and try again"
         )
     return iteration
-
-
-def _plain(value: Any) -> Any:
-    """``value`` in JSON's own types: mappings, lists, text, finite numbers, null."""
-    if isinstance(value, Mapping):
-        return {str(key): _plain(item) for key, item in value.items()}
-    if hasattr(value, "tolist"):
-        value = value.tolist()
-    if isinstance(value, (list, tuple)):
-        return [_plain(item) for item in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value

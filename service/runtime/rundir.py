@@ -11,6 +11,8 @@
 | ``snapshots/`` | Bob's parameters untrained and after each tenth of the run, kept for good |
 | ``published.json`` | the version this run published last, and the sha256 of its parameters |
 | ``broken/`` | states of worlds whose physics diverged |
+| ``status.json``, ``goals.json``, ``stop`` | what it tells while it goes on; see ``service.store.disk`` |
+| ``.lock`` | held by the process that runs it |
 """
 
 from __future__ import annotations
@@ -31,10 +33,12 @@ import numpy as np
 from service.config import Config, ConfigError, dump_config, load_config
 from service.errors import TandemError
 from service.generator.validity import Verdict
+from service.registry.checkpoints import CheckpointStore
 from service.registry.errors import RegistryError
 from service.registry.files import os_errors, remove_temporaries, write_atomic
 from service.registry.manifest import git_commit
 from service.runtime.records import JsonlWriter
+from service.store.lock import DirectoryLock
 
 if TYPE_CHECKING:
     from service.actors.rollout import GoalRecords, Rollout
@@ -63,6 +67,7 @@ class RunDirectory:
         self._goals = JsonlWriter(self.goals_file)
         self._events: EventFile | None = None
         self._failing: set[Path] = set()
+        self._lock: DirectoryLock | None = None
 
     @property
     def exists(self) -> bool:
@@ -103,6 +108,29 @@ class RunDirectory:
             self._events = EventFile(self.path / "tensorboard", after_step=after_env_steps)
             write_atomic(self.path / "environment.json", json.dumps(_environment(), indent=1).encode())
             write_atomic(self.config_file, dump_config(config).encode())  # last: a start that failed can be tried again
+
+    def read_published(self) -> str | None:
+        """``NAME@VERSION`` of what this run published last; None before the first."""
+        if not self.published_file.exists():
+            return None
+        return str(json.loads(self.published_file.read_bytes())["version"])
+
+    def claim(self, *, resume: bool) -> None:
+        """Keep every other process from running this run until ``close``; a second call does nothing.
+
+        Raises:
+            TandemError: another process runs it; or a new run where there is one already.
+            CheckpointError: ``resume`` where there is no checkpoint. Then, as always, nothing was written.
+        """
+        if self._lock is not None:
+            return
+        if resume:
+            CheckpointStore(self.checkpoints, keep=1).check_any()
+        else:
+            self.check_free()
+        self._lock = DirectoryLock(self.path, "stop that one first, or name another --run-dir")
+        if not resume:
+            self.check_free()  # of two that begin at once, the second sees here what the first has made
 
     def check_free(self) -> None:
         """Assert that no run has begun here.
@@ -150,13 +178,19 @@ class RunDirectory:
                 writer.sync()
 
     def close(self) -> None:
-        """Write what still waits for room on the disk; what then does not fit is lost, and a warning says so."""
+        """Write what still waits for room on the disk, and let other processes in.
+
+        What does not fit is lost, and a warning says so.
+        """
         for writer, _ in self._writers():
             try:
                 writer.sync()
             except RegistryError as error:  # must not hide why the run ended
                 _logger.warning("the newest records are lost: %s", error)
         self._events = None
+        if self._lock is not None:
+            self._lock.release()
+            self._lock = None
 
     def _writers(self) -> list[tuple[JsonlWriter | EventFile, Path]]:
         writers: list[tuple[JsonlWriter | EventFile, Path]] = [

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from datetime import datetime
 from typing import Literal, Protocol
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import AwareDatetime, BaseModel, ConfigDict, Field
 
 RunState = Literal["starting", "running", "finished", "converged", "interrupted", "failed"]
 ACTIVE: frozenset[RunState] = frozenset({"starting", "running"})
@@ -25,7 +24,7 @@ class ActorStatus(_Frozen):
     state: Literal["starting", "alive", "lost"]
     node: str = Field("", description="host it is on; empty in a run of one process")
     pid: int | None = None
-    heartbeat: datetime = Field(description="UTC, when it was last heard of")
+    heartbeat: AwareDatetime = Field(description="UTC, when it was last heard of")
     num_rollouts: int = Field(0, ge=0, description="taken from it, all incarnations together")
     num_env_steps: int = Field(0, ge=0)
     last_error: str | None = Field(None, description="why its last incarnation was replaced")
@@ -38,8 +37,8 @@ class RunStatus(_Frozen):
     name: str = Field(description="registry name of the primitives it makes")
     runtime: Literal["local", "ray"]
     state: RunState
-    started: datetime = Field(description="UTC, of the process that runs it now or ran it last")
-    heartbeat: datetime = Field(description="UTC, when its runner last wrote this")
+    started: AwareDatetime = Field(description="UTC, of the process that runs it now or ran it last")
+    heartbeat: AwareDatetime = Field(description="UTC, when its runner last wrote this")
     iteration: int = Field(0, ge=0)
     num_env_steps: int = Field(0, ge=0)
     total_env_steps: int = Field(ge=1, description="its budget")

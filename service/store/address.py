@@ -1,0 +1,113 @@
+"""Where Redis is, without telling its password to anyone who reads a log."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass, field
+from typing import Any
+from urllib.parse import urlsplit
+
+from service.store.errors import StoreError, StoreUnavailableError
+
+VARIABLE = "TANDEM_REDIS_URL"
+CHECK_S = 2.0
+"""How long Redis may take to answer when it is first asked."""
+_FORM = "redis://[[USER]:PASSWORD@]HOST[:PORT][/DB], with %-escapes for other characters than letters and digits"
+
+
+@dataclass(frozen=True, slots=True)
+class RedisAddress:
+    """The URL of a Redis; as text it has no password.
+
+    Raises:
+        StoreError: not a Redis URL; the message does not quote it. Or the package redis is not installed.
+    """
+
+    url: str = field(repr=False)
+    """With the password: for a client, never for people."""
+    source: str = VARIABLE
+    """What to mend when it is wrong."""
+
+    def __post_init__(self) -> None:
+        try:
+            from redis.connection import parse_url
+        except ImportError:
+            raise StoreError(
+                f"{self.source} is set, but the package redis is not installed: pip install 'tandem-skills[cluster]'"
+            ) from None
+        try:
+            parse_url(self.url)  # type: ignore[no-untyped-call]
+            usable = bool(urlsplit(self.url).hostname or urlsplit(self.url).scheme == "unix")
+        except ValueError:
+            usable = False
+        if not usable:  # from None, and no quotation: a "/" in a password makes parts of it look like the port
+            raise StoreError(f"{self.source} is no Redis URL (not shown, for its password); write {_FORM}") from None
+
+    def __str__(self) -> str:
+        parts = urlsplit(self.url)
+        if parts.scheme == "unix":
+            return f"unix://{parts.path}"
+        host = f"[{parts.hostname}]" if ":" in (parts.hostname or "") else parts.hostname
+        return f"{parts.scheme}://{host}:{parts.port or 6379}{parts.path}"
+
+    def __repr__(self) -> str:
+        return f"RedisAddress({self})"
+
+    def client(self, timeout_s: float) -> Any:
+        """A ``redis.Redis`` that gives up after ``timeout_s`` and never tries again: callers know better when to.
+
+        No annotation says so, for redis-py's own name what it would return in every one of its modes at once.
+        """
+        import redis
+        from redis.backoff import NoBackoff
+        from redis.retry import Retry
+
+        return redis.Redis.from_url(
+            self.url,
+            socket_timeout=timeout_s,
+            socket_connect_timeout=timeout_s,
+            retry=Retry(NoBackoff(), 0),
+            protocol=2,  # one shape of replies, whatever redis-py makes the default
+        )
+
+    def check(self) -> None:
+        """Return if Redis is there and lets us in.
+
+        Raises:
+            StoreUnavailableError: it is not, or does not.
+        """
+        from redis.exceptions import RedisError
+
+        try:
+            with self.client(CHECK_S) as client:
+                client.ping()
+        except (RedisError, OSError) as error:
+            raise self.unavailable(error) from None
+
+    def unavailable(self, error: Exception) -> StoreUnavailableError:
+        """What to tell a user about a client's error."""
+        return StoreUnavailableError(f"Redis at {self}: {reason_of(error)}; check {self.source} and the server")
+
+
+def address_from_environment() -> RedisAddress | None:
+    """What ``TANDEM_REDIS_URL`` says; None where it is not set or empty.
+
+    Raises:
+        StoreError: not a Redis URL, or the package redis is not installed.
+    """
+    url = os.environ.get(VARIABLE, "").strip()
+    return RedisAddress(url) if url else None
+
+
+def reason_of(error: Exception) -> str:
+    """A client's error in one line that names no password."""
+    from redis import exceptions
+
+    if isinstance(error, (exceptions.AuthenticationError, exceptions.AuthorizationError)):
+        return "wrong or missing password"
+    text = " ".join(str(error).split()) or type(error).__name__
+    if "NOAUTH" in text or "WRONGPASS" in text:
+        return "wrong or missing password"
+    if isinstance(error, (exceptions.TimeoutError, TimeoutError)):
+        return "no answer in time"
+    return text.rstrip(".")

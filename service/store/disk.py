@@ -1,0 +1,101 @@
+"""What a run tells, as files in its directory: for ``tandem serve --runs`` and for everyone with a text editor.
+
+| file | content |
+|---|---|
+| ``status.json`` | ``RunStatus``, at every change of state and else about once a second |
+| ``goals.json`` | ``GoalGrid``, about every five seconds |
+| ``stop`` | is there when somebody asked the run to stop |
+
+Metrics are in ``metrics.jsonl``, where the run writes them for itself.
+"""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+from pydantic import BaseModel
+
+from service.registry.files import write_atomic
+from service.store.models import GoalGrid, Record, RunStatus
+
+STATUS_FILE = "status.json"
+GOALS_FILE = "goals.json"
+STOP_FILE = "stop"
+STATUS_INTERVAL_S = 1.0
+GOALS_INTERVAL_S = 5.0
+_logger = logging.getLogger(__name__)
+
+
+class DiskWriter:
+    """The ``RunWriter`` of one run directory; its caller has the directory's lock.
+
+    A few small files a second are written without waiting for the disk, so the training thread does it by the way.
+    """
+
+    def __init__(self, directory: Path, *, clock: Callable[[], float] = time.monotonic) -> None:
+        """Take back the stop request of an earlier process; ``clock`` counts seconds."""
+        self._stop_file = directory / STOP_FILE
+        self._status = _LatestFile(directory / STATUS_FILE, STATUS_INTERVAL_S, clock)
+        self._goals = _LatestFile(directory / GOALS_FILE, GOALS_INTERVAL_S, clock)
+        self._state: str | None = None
+        try:
+            self._stop_file.unlink(missing_ok=True)
+        except OSError as error:
+            _logger.warning("cannot delete %s: %s; the run will stop at once", self._stop_file, error.strerror)
+
+    def status(self, status: RunStatus) -> None:
+        """Replace what is known about the run."""
+        self._status.put(status, now=status.state != self._state)
+        self._state = status.state
+
+    def metrics(self, record: Record) -> None:
+        """Nothing: the run directory has its own ``metrics.jsonl``."""
+
+    def goals(self, grid: GoalGrid) -> None:
+        """Replace the grid."""
+        self._goals.put(grid)
+
+    def stop_requested(self) -> bool:
+        """Whether somebody asked the run to stop since it was started."""
+        return self._stop_file.exists()
+
+    def warnings(self) -> list[str]:
+        """What cannot be written at the moment."""
+        return [problem for file in (self._status, self._goals) if (problem := file.problem) is not None]
+
+    def close(self) -> None:
+        """Write what still waits."""
+        self._status.flush()
+        self._goals.flush()
+
+
+class _LatestFile:
+    """Holds the newest of what it is given, not older than ``interval_s`` when something newer comes."""
+
+    def __init__(self, path: Path, interval_s: float, clock: Callable[[], float]) -> None:
+        self._path, self._interval_s, self._clock = path, interval_s, clock
+        self._waiting: BaseModel | None = None
+        self._written_s = float("-inf")
+        self.problem: str | None = None
+
+    def put(self, content: BaseModel, *, now: bool = False) -> None:
+        self._waiting = content
+        if now or self._clock() - self._written_s >= self._interval_s:
+            self.flush()
+
+    def flush(self) -> None:
+        if self._waiting is None:
+            return
+        self._written_s = self._clock()
+        try:
+            write_atomic(self._path, self._waiting.model_dump_json().encode() + b"\n", flush=False)
+        except OSError as error:
+            problem = f"{self._path.name} cannot be written: {error.strerror}"
+            if self.problem is None:
+                _logger.warning("%s: %s; the run goes on", self._path.parent, problem)
+            self.problem = problem
+        else:
+            self._waiting, self.problem = None, None

@@ -1,0 +1,95 @@
+"""Who runs a run: a key in Redis that its holder renews, and that expires when the holder is gone."""
+
+from __future__ import annotations
+
+import json
+import os
+import secrets
+import socket
+import time
+from datetime import UTC, datetime
+from typing import Any
+
+from redis.exceptions import WatchError
+
+from service.store import keys
+from service.store.errors import RunTakenError
+
+_LOOK_S = 0.1
+
+
+class Lease:
+    """One driver's claim on a run id; nobody has it before `acquire`.
+
+    Args:
+        client: of the Redis; see ``RedisAddress.client``.
+        run_id: what is claimed.
+        duration_s: how long it lives after its last renewal.
+    """
+
+    def __init__(self, client: Any, run_id: str, duration_s: float = keys.LEASE_S) -> None:
+        self._client, self._run_id, self._key = client, run_id, keys.lease(run_id)
+        self._duration_ms = int(1000 * duration_s)
+        now = datetime.now(UTC).isoformat(timespec="seconds")
+        holder = {"token": secrets.token_hex(16), "host": socket.gethostname(), "pid": os.getpid(), "since": now}
+        self._mine = json.dumps(holder).encode()
+
+    def acquire(self) -> None:
+        """Claim the run; waits for the claim of a driver that died to expire.
+
+        Raises:
+            RunTakenError: another driver renews its claim.
+            redis.exceptions.RedisError: Redis is away.
+        """
+        previous_ms, deadline_s = None, time.monotonic() + 1.5 * self._duration_ms / 1000
+        while not self._client.set(self._key, self._mine, nx=True, px=self._duration_ms):
+            left_ms = self._client.pttl(self._key)
+            renewed = previous_ms is not None and left_ms > previous_ms  # only the living do
+            if renewed or time.monotonic() > deadline_s:
+                raise RunTakenError(
+                    f"run {self._run_id} is being run by {_describe(self._client.get(self._key))}; stop that one, or "
+                    "give this run another id"
+                )
+            previous_ms = left_ms
+            time.sleep(_LOOK_S)
+
+    def renew(self, pipe: Any) -> None:
+        """Begin a transaction, on a fresh pipe, that renews the claim and fails where another has taken it meanwhile.
+
+        A claim that has expired, as after an outage, is made again.
+
+        Raises:
+            RunTakenError: another driver has it.
+            redis.exceptions.RedisError: Redis is away.
+        """
+        pipe.watch(self._key)
+        holder = pipe.get(self._key)
+        if holder not in (None, self._mine):
+            raise RunTakenError(f"run {self._run_id} was taken over by {_describe(holder)}")
+        pipe.multi()
+        pipe.set(self._key, self._mine, px=self._duration_ms)
+
+    def release(self) -> None:
+        """Give the claim up, if it is ours.
+
+        Raises:
+            redis.exceptions.RedisError: Redis is away; the claim expires by itself.
+        """
+        with self._client.pipeline() as pipe:
+            pipe.watch(self._key)
+            if pipe.get(self._key) != self._mine:
+                return
+            pipe.multi()
+            pipe.delete(self._key)
+            try:
+                pipe.execute()
+            except WatchError:  # it has expired just now
+                return
+
+
+def _describe(holder: object) -> str:
+    try:
+        tree = json.loads(holder if isinstance(holder, bytes) else b"")
+        return f"process {int(tree['pid'])} on {str(tree['host'])[:100]} since {str(tree['since'])[:30]}"
+    except (ValueError, KeyError, TypeError):
+        return "another process"

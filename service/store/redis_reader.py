@@ -1,0 +1,148 @@
+"""Runs as Redis knows them: every call is one round trip, and one that Redis does not answer at once has failed."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+from pydantic import ValidationError
+from redis.exceptions import RedisError, ResponseError
+
+from service.store import keys
+from service.store.address import RedisAddress
+from service.store.errors import DamagedStoreError, UnknownRunError
+from service.store.liveness import is_silent, vanished
+from service.store.models import ACTIVE, GoalGrid, Record, RunStatus
+from service.store.tail import parse_record
+
+TIMEOUT_S = 0.5
+_logger = logging.getLogger(__name__)
+
+
+class RedisReader:
+    """The ``RunReader`` of a Redis; any number of threads may use it at once.
+
+    Every method raises ``StoreUnavailableError`` while Redis is away, after ``TIMEOUT_S`` at the latest, and
+    ``DamagedStoreError`` where a key holds what no run has written.
+    """
+
+    def __init__(self, address: RedisAddress) -> None:
+        """For the Redis there; nothing is sent before the first call."""
+        self._address = address
+        self._client = address.client(TIMEOUT_S)
+
+    def runs(self) -> list[RunStatus]:
+        """All runs, newest start first; one with a damaged status is left out."""
+        with self._errors():
+            run_ids = [name.decode(errors="replace") for name in self._client.zrevrange(keys.RUNS, 0, -1)]
+            statuses = []
+            for run_id, (text, *flags) in zip(run_ids, self._look_at(run_ids), strict=True):
+                try:
+                    statuses.append(_status(run_id, text, *flags))
+                except (DamagedStoreError, UnknownRunError) as error:
+                    _logger.warning("%s", error)
+        return sorted(statuses, key=lambda status: status.started, reverse=True)
+
+    def run(self, run_id: str) -> RunStatus:
+        """One run.
+
+        Raises:
+            UnknownRunError: there is no such run.
+        """
+        with self._errors():
+            ((text, *flags),) = self._look_at([run_id])
+            self._check_known(run_id, text is not None)
+            return _status(run_id, text, *flags)
+
+    def metrics(self, run_id: str, *, after_iteration: int = 0) -> list[Record]:
+        """The records of iterations above ``after_iteration``, in order; see `run` for errors."""
+        with self._errors(), self._client.pipeline(transaction=False) as pipe:
+            pipe.exists(keys.status(run_id))
+            pipe.zrangebyscore(keys.metrics(run_id), f"({after_iteration}", "+inf")
+            known, lines = pipe.execute()
+            self._check_known(run_id, bool(known))
+        by_iteration: dict[int, Record] = {}
+        for line in lines:
+            record = parse_record(line)
+            if record is None:
+                _logger.warning("%s: passing over what is no record: %r", keys.metrics(run_id), line[:60])
+            else:
+                by_iteration[int(record["iteration"] or 0)] = record
+        return list(by_iteration.values())
+
+    def goals(self, run_id: str) -> GoalGrid | None:
+        """The newest grid; None before the first; see `run` for errors."""
+        with self._errors(), self._client.pipeline(transaction=False) as pipe:
+            pipe.exists(keys.status(run_id))
+            pipe.get(keys.goals(run_id))
+            known, text = pipe.execute()
+            self._check_known(run_id, bool(known))
+        try:
+            return GoalGrid.model_validate_json(text) if text is not None else None
+        except ValidationError:
+            raise _damaged(keys.goals(run_id), "goal grid") from None
+
+    def request_stop(self, run_id: str) -> None:
+        """Ask a run to end after its current iteration; nothing happens if it has ended; see `run` for errors."""
+        if self.run(run_id).state in ACTIVE:
+            with self._errors():
+                self._client.set(keys.stop(run_id), b"1")
+
+    def ready(self) -> None:
+        """Return if Redis answers."""
+        with self._errors():
+            self._client.ping()
+
+    def close(self) -> None:
+        """Give the connections back."""
+        self._client.close()
+
+    def _look_at(self, run_ids: list[str]) -> Iterator[tuple[bytes | None, bool, bool]]:
+        """Of each run its status, whether somebody runs it, and whether it was asked to stop."""
+        with self._client.pipeline(transaction=False) as pipe:
+            for run_id in run_ids:
+                pipe.get(keys.status(run_id))
+                pipe.exists(keys.lease(run_id))
+                pipe.exists(keys.stop(run_id))
+            replies = iter(pipe.execute(raise_on_error=False) if run_ids else [])
+        for text in replies:
+            if isinstance(text, ResponseError):  # another type: of one run only, the others are well
+                text = b""
+            elif isinstance(text, Exception):
+                raise text
+            yield text, bool(next(replies)), bool(next(replies))
+
+    def _check_known(self, run_id: str, known: bool) -> None:
+        if not known:
+            run_ids = [name.decode(errors="replace") for name in self._client.zrange(keys.RUNS, 0, -1)]
+            raise UnknownRunError.of(run_id, self._address, sorted(run_ids))
+
+    @contextmanager
+    def _errors(self) -> Iterator[None]:
+        try:
+            yield
+        except ResponseError as error:
+            if "WRONGTYPE" in str(error):
+                raise DamagedStoreError(
+                    f"Redis at {self._address} has another type of value in a key of tandem's; delete tandem:* there"
+                ) from None
+            raise self._address.unavailable(error) from None
+        except (RedisError, OSError) as error:
+            raise self._address.unavailable(error) from None
+
+
+def _status(run_id: str, text: bytes | None, leased: bool, stop: bool) -> RunStatus:
+    if text is None:
+        raise UnknownRunError(f"run {run_id} is in {keys.RUNS}, but {keys.status(run_id)} is missing; start it again")
+    try:
+        status = RunStatus.model_validate_json(text)
+    except ValidationError:
+        raise _damaged(keys.status(run_id), "run's status") from None
+    if not leased and is_silent(status):
+        return vanished(status)
+    return status.model_copy(update={"stopping": status.state in ACTIVE and (status.stopping or stop)})
+
+
+def _damaged(key: str, what: str) -> DamagedStoreError:
+    return DamagedStoreError(f"{key} in Redis holds no {what}; delete that key, a run writes it anew within seconds")

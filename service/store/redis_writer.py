@@ -1,0 +1,219 @@
+"""What a run tells, sent to Redis by a thread of its own: Redis may be slow or away, and the run does not notice."""
+
+from __future__ import annotations
+
+import json
+import logging
+import time
+from collections import deque
+from dataclasses import dataclass
+from threading import Event, Lock, Thread
+from typing import Any
+
+from redis.exceptions import RedisError, WatchError
+
+from service.store import keys
+from service.store.address import RedisAddress, reason_of
+from service.store.errors import RunTakenError
+from service.store.lease import Lease
+from service.store.models import GoalGrid, Record, RunStatus
+from service.store.plain import plain
+
+TICK_S = 0.5
+"""Between two messages to Redis; a stop request is noticed within it."""
+RETRY_S = 1.0
+"""At most, between two tries to reach it."""
+TIMEOUT_S = 2.0
+MAX_WAITING = 20_000
+"""Records that wait for Redis to come back, about 60 MB; of more, the oldest are left out, and a warning says so."""
+BATCH = 500
+KEPT_S = 5.0
+"""Redis flushes its file every second, so a machine that loses power forgets what it said it had. What is younger than
+this is sent again after every outage."""
+_logger = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, slots=True)
+class _Line:
+    iteration: int
+    text: str
+
+
+class RedisWriter:
+    """The ``RunWriter`` of one run in Redis. While it lives, no other driver can tell about the same run id.
+
+    One thread consumes what the methods leave behind and produces transactions; it waits for ``TICK_S`` and is
+    unblocked by ``close``. Status and grid that were not sent yet are replaced by newer ones, records wait in line.
+
+    Args:
+        address: of a Redis that has to be there now; later it may go and come.
+        run_id: of the run.
+        lease_s: how long after this process died another may take the run over.
+
+    Raises:
+        RunTakenError: another driver runs this run.
+        StoreUnavailableError: Redis is not there, or does not let us in.
+    """
+
+    def __init__(self, address: RedisAddress, run_id: str, *, lease_s: float = keys.LEASE_S) -> None:
+        self._address, self._run_id = address, run_id
+        self._client = address.client(TIMEOUT_S)
+        self._lease = Lease(self._client, run_id, lease_s)
+        try:
+            self._lease.acquire()
+            self._client.delete(keys.stop(run_id))
+        except (RedisError, OSError) as error:
+            raise address.unavailable(error) from None
+        self._lock = Lock()
+        self._status: RunStatus | None = None
+        self._grid: GoalGrid | None = None
+        self._sent_status: RunStatus | None = None
+        self._sent_grid: GoalGrid | None = None
+        self._waiting: deque[_Line] = deque()
+        self._sent: deque[tuple[float, _Line]] = deque()
+        self._num_lost = 0
+        self._cut = False
+        self._stop = False
+        self._away: tuple[float, str] | None = None
+        self._taken: str | None = None
+        self._closing = Event()
+        self._deadline_s = float("inf")
+        self._thread = Thread(target=self._work, name="redis-writer", daemon=True)
+        self._thread.start()
+
+    def status(self, status: RunStatus) -> None:
+        """Replace what is known about the run."""
+        self._status = status
+
+    def metrics(self, record: Record) -> None:
+        """Append one iteration's metrics. The first record takes the place of all of its and later iterations."""
+        line = _Line(int(record["iteration"] or 0), json.dumps(plain(record)))
+        with self._lock:
+            self._waiting.append(line)
+            if len(self._waiting) > MAX_WAITING:
+                self._waiting.popleft()
+                self._num_lost += 1
+
+    def goals(self, grid: GoalGrid) -> None:
+        """Replace the grid."""
+        self._grid = grid
+
+    def stop_requested(self) -> bool:
+        """Whether somebody asked the run to stop since it was started, as of the last message to Redis."""
+        return self._stop
+
+    def warnings(self) -> list[str]:
+        """What does not work at the moment."""
+        found, away = [], self._away
+        if away is not None:
+            since_s = time.monotonic() - away[0]
+            found.append(
+                f"Redis at {self._address} has taken nothing for {since_s:.0f} s: {away[1]}; {len(self._waiting)} "
+                "records wait for it"
+            )
+        if self._num_lost:
+            found.append(f"{self._num_lost} records did not reach Redis; metrics.jsonl has them")
+        if self._taken is not None:
+            found.append(f"{self._taken}; this process no longer tells Redis anything")
+        return found
+
+    def close(self, timeout_s: float = 2.0) -> None:
+        """Send what still waits, for at most about ``timeout_s``, and let others have the run."""
+        self._deadline_s = time.monotonic() + timeout_s
+        self._closing.set()
+        self._thread.join(timeout_s + 0.1)  # a call to a hanging Redis may last longer; the thread then dies alone
+        if self._pending() and self._taken is None:
+            _logger.warning(
+                "Redis at %s was not told the end of run %s; its files have it", self._address, self._run_id
+            )
+
+    # --- the thread ---------------------------------------------------------------------------------------------------
+
+    def _work(self) -> None:
+        pause_s = 0.0
+        while self._taken is None:
+            self._closing.wait(pause_s)
+            ending = self._closing.is_set()
+            try:
+                more = self._tell()
+            except RunTakenError as error:
+                self._taken = str(error)
+                _logger.warning("%s; this process no longer tells Redis anything", error)
+            except WatchError:  # the lease has expired or was taken in this very moment; the next try tells which
+                pause_s = 0.0
+            except (RedisError, OSError) as error:
+                self._went_away(reason_of(error))
+                pause_s = min(2 * pause_s + 0.05, RETRY_S)
+                if ending:
+                    time.sleep(0.05)
+            else:
+                self._came_back()
+                pause_s = 0.0 if more else TICK_S
+                if ending and not self._pending():
+                    break
+            if time.monotonic() > self._deadline_s:
+                break
+        self._let_go()
+
+    def _tell(self) -> bool:
+        """One transaction; returns whether records are left for another."""
+        status, grid = self._status, self._grid
+        with self._lock:
+            batch = list(self._waiting)[:BATCH]
+        with self._client.pipeline() as pipe:
+            self._lease.renew(pipe)
+            if status is not None and status is not self._sent_status:
+                pipe.zadd(keys.RUNS, {self._run_id: status.started.timestamp()})
+                pipe.set(keys.status(self._run_id), status.model_dump_json())
+            if grid is not None and grid is not self._sent_grid:
+                pipe.set(keys.goals(self._run_id), grid.model_dump_json())
+            if batch:
+                self._append(pipe, batch)
+            pipe.exists(keys.stop(self._run_id))
+            self._stop = bool(pipe.execute()[-1])
+        self._sent_status, self._sent_grid, self._cut = status, grid, self._cut or bool(batch)
+        return self._count(batch)
+
+    def _append(self, pipe: Any, batch: list[_Line]) -> None:
+        key = keys.metrics(self._run_id)
+        if not self._cut:
+            pipe.zremrangebyscore(key, batch[0].iteration, "+inf")
+        for line in batch:
+            pipe.zremrangebyscore(key, line.iteration, line.iteration)
+            pipe.zadd(key, {line.text: line.iteration})
+        pipe.zremrangebyrank(key, 0, -keys.MAX_RECORDS - 1)
+
+    def _count(self, batch: list[_Line]) -> bool:
+        now_s = time.monotonic()
+        with self._lock:
+            for line in batch:
+                if self._waiting and self._waiting[0] is line:  # else it was left out meanwhile
+                    self._waiting.popleft()
+                self._sent.append((now_s, line))
+            while self._sent and self._sent[0][0] < now_s - KEPT_S:
+                self._sent.popleft()
+            return bool(self._waiting)
+
+    def _pending(self) -> bool:
+        return bool(self._waiting) or self._status is not self._sent_status or self._grid is not self._sent_grid
+
+    def _went_away(self, reason: str) -> None:
+        if self._away is None:
+            _logger.warning("Redis at %s: %s; the run goes on", self._address, reason)
+            with self._lock:
+                self._waiting.extendleft(line for _, line in reversed(self._sent))
+                self._sent.clear()
+            self._sent_status = self._sent_grid = None
+        self._away = (self._away[0] if self._away else time.monotonic(), reason)
+
+    def _came_back(self) -> None:
+        if self._away is not None:
+            _logger.info("Redis at %s is back after %.0f s", self._address, time.monotonic() - self._away[0])
+        self._away = None
+
+    def _let_go(self) -> None:
+        try:
+            self._lease.release()
+            self._client.close()
+        except (RedisError, OSError):
+            pass  # it expires by itself
