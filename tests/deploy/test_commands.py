@@ -1,0 +1,113 @@
+"""Every command in manifests and documents is one that this tandem and this Ray take."""
+
+import re
+import shlex
+
+import pytest
+import typer
+
+from service.cli import app
+from tests.deploy.files import DEPLOY, DOCUMENTS, commands, compose, manifest, manifests, pod_templates
+
+
+def tandem_commands():
+    """Where a call of tandem stands, and its arguments."""
+    (status,) = manifest("Deployment", "status")["spec"]["template"]["spec"]["containers"]
+    found = [
+        ("compose status", compose()["services"]["status"]["command"]),
+        ("kubernetes status", status["args"]),
+        ("rayjob", shlex.split(manifest("RayJob", "cube")["spec"]["entrypoint"])[1:]),
+    ]
+    texts = [*DOCUMENTS, DEPLOY / "compose" / "compose.yaml"]
+    found += [(path.name, arguments) for path in texts for arguments in commands(path.read_text(), "tandem")]
+    return [pytest.param(arguments, id=f"{where}: {' '.join(arguments)[:60]}") for where, arguments in found]
+
+
+def ray_commands():
+    nodes = [each["command"] for each in compose()["services"].values() if each.get("entrypoint") == ["ray"]]
+    found = [("compose", [re.sub(r"\$\{\w+:-(\w+)\}", r"\1", word) for word in command]) for command in nodes]
+    for name, spec in (
+        ("raycluster", manifest("RayCluster", "tandem")["spec"]),
+        ("rayjob", manifest("RayJob", "cube")["spec"]["rayClusterSpec"]),
+    ):
+        for group in [spec["headGroupSpec"], *spec["workerGroupSpecs"]]:
+            found.append((name, ["start", *(f"--{key}={value}" for key, value in group["rayStartParams"].items())]))
+    texts = [*DOCUMENTS, DEPLOY / "compose" / "compose.yaml"]
+    found += [(path.name, arguments) for path in texts for arguments in commands(path.read_text(), "ray")]
+    return [pytest.param(arguments, id=f"{where}: {' '.join(arguments)[:60]}") for where, arguments in found]
+
+
+def parse(group, arguments):
+    """Parse a command line as its program would, down to the last subcommand, without running it."""
+    while hasattr(group, "commands"):
+        name, *arguments = arguments
+        assert name in group.commands, f"there is no {name}, only {', '.join(group.commands)}"
+        group = group.commands[name]
+    group.make_context(group.name, list(arguments))
+
+
+def not_there_yet(group, arguments):
+    """What this command line needs that is still being built; empty in the end."""
+    verb = arguments[0]
+    if verb == "serve" and verb not in group.commands:
+        return "tandem serve"
+    options = {name for parameter in group.commands[verb].params for name in parameter.opts}
+    if verb == "pretrain" and "--runtime" in arguments and "--runtime" not in options:
+        return "tandem pretrain --runtime"
+    return ""
+
+
+@pytest.mark.parametrize("arguments", tandem_commands())
+def test_tandem_takes_it(arguments):
+    group = typer.main.get_command(app)
+    if missing := not_there_yet(group, arguments):
+        pytest.skip(f"{missing} is being built")
+    parse(group, arguments)
+
+
+@pytest.mark.parametrize("arguments", ray_commands())
+def test_ray_takes_it(arguments):
+    from ray.scripts.scripts import cli
+
+    parse(cli, arguments)
+
+
+def test_a_wrong_option_is_found():
+    from ray.scripts.scripts import cli
+
+    with pytest.raises(Exception, match="--num-cpu"):
+        parse(cli, ["start", "--num-cpu=0"])
+    with pytest.raises(Exception, match="--run-dirr"):
+        parse(typer.main.get_command(app), ["pretrain", "--run-dirr", "x"])
+    with pytest.raises(AssertionError, match="there is no server"):
+        parse(typer.main.get_command(app), ["server"])
+
+
+def test_commands_are_found_in_text():
+    text = "ray job submit --no-wait \\\n  -- tandem pretrain --run-dir runs/x  # why\n#   tandem serve --port 1\n"
+    assert commands(text, "tandem") == [["pretrain", "--run-dir", "runs/x"], ["serve", "--port", "1"]]
+    assert commands(text, "ray") == [["job", "submit", "--no-wait", "--", "tandem", "pretrain", "--run-dir", "runs/x"]]
+    assert len(tandem_commands()) > 5
+    assert len(ray_commands()) > 8
+
+
+def test_configurations_that_are_named_are_in_the_image():
+    from tests.deploy.files import ROOT
+
+    named = {
+        word
+        for each in tandem_commands()
+        for option, word in zip(each.values[0], each.values[0][1:], strict=False)
+        if option == "--config"
+    }
+    in_image = {name for name in named if name.startswith("/")}
+    assert in_image == {"/usr/local/share/tandem/configs/pretrain/panda_cube.yaml"}
+    assert all((ROOT / name.removeprefix("/usr/local/share/tandem/")).is_file() for name in named)
+
+
+def test_ray_containers_leave_the_command_to_the_operator():
+    for template in pod_templates(manifests()):
+        (box,) = template["spec"]["containers"]
+        if box["name"].startswith("ray-"):
+            assert "command" not in box
+            assert "args" not in box

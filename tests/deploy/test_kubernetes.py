@@ -1,0 +1,269 @@
+"""The manifests: their keys exist, what they refer to is there, and a job that fails goes on where it was."""
+
+import copy
+import re
+import shlex
+import shutil
+import subprocess
+
+import pytest
+import yaml
+
+from tests.deploy.files import DEPLOY, KUBERNETES, ROOT, load, manifest, manifests, pod_templates, walk
+from tests.deploy.shapes import manifest_mistakes
+
+ALL = [pytest.param(each, id=f"{each['kind']}-{each['metadata']['name']}") for each in manifests()]
+FOLDERS = ("base", "cluster", "job", "monitoring")
+SECRET = "tandem"
+SECRET_KEYS = {"auth_token", "redis_password", "token"}
+"""What the command in deploy/README.md puts into the secret."""
+
+
+def ray_specs():
+    return {
+        "cluster": manifest("RayCluster", "tandem")["spec"],
+        "job": manifest("RayJob", "cube")["spec"]["rayClusterSpec"],
+    }
+
+
+def labels(template):
+    return template["metadata"]["labels"]
+
+
+def selects(selector, template):
+    return selector.get("matchLabels", {}).items() <= labels(template).items()
+
+
+@pytest.mark.parametrize("document", ALL)
+def test_every_key_exists(document):
+    assert manifest_mistakes(document) == []
+
+
+@pytest.mark.parametrize(
+    ("path", "typo", "sentence"),
+    [
+        (("spec",), "backofLimit", "it.spec has unknown backofLimit"),
+        (("spec", "rayClusterSpec"), "gcsFaultTolerance", "it.spec.rayClusterSpec has unknown gcsFaultTolerance"),
+        (("spec", "rayClusterSpec", "authOptions"), "tokenSecret", "authOptions has unknown tokenSecret"),
+        (("spec", "rayClusterSpec", "headGroupSpec"), "rayStartParam", "headGroupSpec has unknown rayStartParam"),
+        (
+            ("spec", "rayClusterSpec", "workerGroupSpecs", 0, "template", "spec", "containers", 0),
+            "resource",
+            "containers[0] has unknown resource",
+        ),
+    ],
+)
+def test_a_planted_typo_is_found(path, typo, sentence):
+    document = copy.deepcopy(manifest("RayJob", "cube"))
+    node = document
+    for key in path:
+        node = node[key]
+    node[typo] = "x"
+    (found,) = manifest_mistakes(document)
+    assert found.endswith(sentence)
+
+
+def test_what_is_missing_or_of_the_wrong_kind_is_found():
+    document = copy.deepcopy(manifest("RayJob", "cube"))
+    del document["spec"]["backoffLimit"]
+    document["spec"]["submissionMode"] = "HttpMode"
+    document["spec"]["rayClusterSpec"]["headGroupSpec"]["rayStartParams"]["num-cpus"] = 0
+    found = manifest_mistakes(document)
+    assert len(found) == 3
+    assert found[0] == "it.spec lacks backoffLimit"
+    assert "HttpMode" in found[1]
+    assert "num-cpus" in found[2]
+
+
+@pytest.mark.parametrize("document", ALL)
+def test_secrets_claims_and_volumes_are_there(document):
+    for path, value in walk(document):
+        if path[-2:] == ("secretKeyRef", "name") or path[-1] == "secretName":
+            assert value == SECRET, path
+        if path[-2:] in (("secretKeyRef", "key"), ("credentials", "key")):
+            assert value in SECRET_KEYS, path
+        if path[-1] == "claimName":
+            assert manifest("PersistentVolumeClaim", value)
+    own_claims = [each["metadata"]["name"] for each in document.get("spec", {}).get("volumeClaimTemplates", [])]
+    for template in pod_templates(document):
+        volumes = [each["name"] for each in template["spec"].get("volumes", [])] + own_claims
+        mounted = [each["name"] for box in template["spec"]["containers"] for each in box.get("volumeMounts", [])]
+        assert set(mounted) == set(volumes)
+
+
+def test_the_documented_secret_has_every_key():
+    text = (DEPLOY / "README.md").read_text()
+    (command,) = re.findall(rf"create secret generic {SECRET} ((?:.|\\\n)*?)\n```", text)
+    assert set(re.findall(r"--from-literal=(\w+)=", command)) == SECRET_KEYS
+
+
+def test_services_lead_to_pods_and_ports():
+    templates = pod_templates(manifests("base"))
+    services = [each for each in manifests("base") if each["kind"] == "Service"]
+    assert {each["metadata"]["name"] for each in services} == {"redis", "status"}
+    for service in services:
+        (template,) = [each for each in templates if service["spec"]["selector"].items() <= labels(each).items()]
+        ports = {port["name"] for box in template["spec"]["containers"] for port in box["ports"]}
+        assert {each["targetPort"] for each in service["spec"]["ports"]} <= ports
+
+
+@pytest.mark.parametrize("document", [each for each in manifests() if each["kind"] in ("Deployment", "StatefulSet")])
+def test_workloads_select_their_own_pods(document):
+    assert selects(document["spec"]["selector"], document["spec"]["template"])
+
+
+def test_redis_is_where_it_is_looked_for():
+    (port,) = manifest("Service", "redis")["spec"]["ports"]
+    address = f"redis:{port['port']}"
+    urls = [str(value) for _, value in walk(manifests()) if "redis://" in str(value)]
+    assert len(urls) == 3  # the status service and both heads
+    assert {url.rsplit("@")[1] for url in urls} == {f"{address}/1"}
+    assert ray_specs()["cluster"]["gcsFaultToleranceOptions"]["redisAddress"] == address
+
+
+@pytest.mark.parametrize("template", pod_templates(manifests()), ids=lambda each: each["spec"]["containers"][0]["name"])
+def test_pods_meet_the_restricted_standard(template):
+    spec = template["spec"]
+    assert spec["automountServiceAccountToken"] is False
+    assert spec["securityContext"]["runAsNonRoot"] is True
+    assert spec["securityContext"]["runAsUser"] > 0
+    assert spec["securityContext"]["seccompProfile"] == {"type": "RuntimeDefault"}
+    for box in spec["containers"]:
+        assert box["securityContext"]["allowPrivilegeEscalation"] is False
+        assert box["securityContext"]["capabilities"]["drop"] == ["ALL"]
+        assert {"cpu", "memory"} <= set(box["resources"]["requests"])
+        assert "memory" in box["resources"]["limits"]
+
+
+@pytest.mark.parametrize("name", ["cluster", "job"])
+def test_ray(name):
+    spec = ray_specs()[name]
+    assert f"ray=={spec['rayVersion']}" in (ROOT / "constraints.txt").read_text().splitlines()
+    assert spec["authOptions"] == {"mode": "token", "secretName": SECRET}
+    assert spec["headGroupSpec"]["rayStartParams"]["num-cpus"] == "0"
+    groups = spec["workerGroupSpecs"]
+    assert len({group["groupName"] for group in groups}) == len(groups)
+    for group in groups:
+        assert group["minReplicas"] <= group["replicas"] <= group["maxReplicas"]
+        # Ray takes the number of cores from the limit, and what is offered has to be there.
+        (box,) = group["template"]["spec"]["containers"]
+        assert box["resources"]["limits"]["cpu"] == box["resources"]["requests"]["cpu"]
+    with_gpu = [box["image"] for group in groups for box in group["template"]["spec"]["containers"] if "nvidia.com/gpu" in box["resources"]["limits"]]  # fmt: skip
+    assert with_gpu == ["tandem-cuda"]
+
+
+def test_the_job_runs_on_a_cluster_like_the_one_that_stays():
+    # Without Ray's fault tolerance: the driver is on the head, so what helps a job is to be started again.
+    specs = ray_specs()
+    kept = {key: value for key, value in specs["cluster"].items() if key != "gcsFaultToleranceOptions"}
+    assert specs["job"] == kept
+
+
+def test_a_retried_job_goes_on_with_the_same_run():
+    job = manifest("RayJob", "cube")["spec"]
+    assert job["backoffLimit"] > 0
+    assert job["shutdownAfterJobFinishes"] is True
+    assert 0 < job["preRunningDeadlineSeconds"] < job["activeDeadlineSeconds"]
+    arguments = shlex.split(job["entrypoint"])
+    options = dict(zip(arguments[2::2], arguments[3::2], strict=True))
+    # Written down, not made up at every start; and on the volume, which outlives the cluster.
+    assert re.fullmatch(r"[a-z0-9-]+", options["--run-id"])
+    (head,) = job["rayClusterSpec"]["headGroupSpec"]["template"]["spec"]["containers"]
+    mounts = [each["mountPath"] for each in head["volumeMounts"]]
+    assert options["--run-dir"] == f"{mounts[0]}/{options['--run-id']}"
+    assert options["--registry"] == mounts[1]
+
+
+def test_the_status_service_reads_where_the_driver_writes():
+    def mounts(template):
+        (box,) = template["spec"]["containers"]
+        claims = {each["name"]: each.get("persistentVolumeClaim") for each in template["spec"]["volumes"]}
+        return {
+            (each["mountPath"], each["subPath"], claims[each["name"]]["claimName"])
+            for each in box["volumeMounts"]
+            if claims[each["name"]] is not None
+        }
+
+    status = mounts(manifest("Deployment", "status")["spec"]["template"])
+    assert len(status) == 2
+    for spec in ray_specs().values():
+        assert mounts(spec["headGroupSpec"]["template"]) == status
+    (claim,) = {claim for *_, claim in status}
+    assert manifest("PersistentVolumeClaim", claim)["spec"]["accessModes"] == ["ReadWriteMany"]
+
+
+def test_nobody_may_talk_to_a_pod_unless_a_policy_says_so():
+    policies = {each["metadata"]["name"]: each["spec"] for each in manifests("base") if each["kind"] == "NetworkPolicy"}
+    assert policies.pop("nobody") == {"podSelector": {}, "policyTypes": ["Ingress"]}
+    templates = pod_templates(manifests())
+    for name, spec in policies.items():
+        assert spec["policyTypes"] == ["Ingress"], name
+        chosen = [each for each in templates if selects(spec["podSelector"], each)]
+        assert chosen, name
+        for rule in spec["ingress"]:
+            # Whoever comes from our own namespace is one of our pods; everybody else is named, and meets one port only.
+            for peer in rule["from"]:
+                ours = any(selects(peer["podSelector"], each) for each in templates)
+                assert ours or ("namespaceSelector" in peer and rule["ports"]), name
+            opened = {port["name"]: port["containerPort"] for each in chosen for box in each["spec"]["containers"] for port in box["ports"]}  # fmt: skip
+            for port in rule.get("ports", []):
+                assert port["port"] in opened or port["port"] in opened.values(), name
+
+
+def test_pod_monitors_find_pods_and_ports():
+    monitors = [each["spec"] for each in manifests("monitoring")]
+    assert len(monitors) == 2
+    for spec in monitors:
+        chosen = [each for each in pod_templates(manifests()) if selects(spec["selector"], each)]
+        assert chosen
+        for endpoint in spec["podMetricsEndpoints"]:
+            for template in chosen:
+                assert endpoint["port"] in {port["name"] for box in template["spec"]["containers"] for port in box["ports"]}  # fmt: skip
+
+
+def test_what_is_kept_of_rays_metrics_is_the_same_everywhere():
+    (ray,) = [each["spec"] for each in manifests("monitoring") if each["metadata"]["name"] == "ray"]
+    (here,) = ray["podMetricsEndpoints"][0]["metricRelabelings"]
+    (scrape,) = [each for each in load(DEPLOY / "prometheus" / "prometheus.yml")["scrape_configs"] if each["job_name"] == "ray"]  # fmt: skip
+    (there,) = scrape["metric_relabel_configs"]
+    assert here["regex"] == there["regex"]
+
+
+@pytest.mark.parametrize("folder", FOLDERS)
+def test_kustomizations_name_every_file(folder):
+    kustomization = load(KUBERNETES / folder / "kustomization.yaml")
+    assert kustomization["namespace"] == manifest("Namespace", "tandem")["metadata"]["name"]
+    files = {path.name for path in (KUBERNETES / folder).glob("*.yaml")} - {"kustomization.yaml"}
+    assert set(kustomization["resources"]) == files
+    assert all((KUBERNETES / folder / each / "kustomization.yaml").is_file() for each in kustomization.get("components", []))
+
+
+def test_images_are_ours_by_one_name_or_pinned():
+    ours = {each["name"] for each in load(KUBERNETES / "image" / "kustomization.yaml")["images"]}
+    images = {box["image"] for each in pod_templates(manifests()) for box in each["spec"]["containers"]}
+    assert ours < images
+    assert all(re.fullmatch(r"[\w/-]+:\d+\.\d+[\w.-]*", image) for image in images - ours)
+
+
+@pytest.mark.skipif(shutil.which("kubectl") is None, reason="no kubectl here")
+@pytest.mark.parametrize("folder", FOLDERS)
+def test_kustomize_builds_it(folder):
+    result = subprocess.run(
+        ["kubectl", "kustomize", KUBERNETES / folder], capture_output=True, text=True, timeout=60, check=False
+    )
+    assert result.returncode == 0, result.stderr
+    built = list(yaml.safe_load_all(result.stdout))
+    assert len(built) == len(manifests(folder))
+    for document in built:
+        assert document["kind"] == "Namespace" or document["metadata"]["namespace"] == "tandem"
+    for template in pod_templates(built):
+        for box in template["spec"]["containers"]:
+            assert ":" in box["image"], "the component has not replaced it"
+
+
+def test_the_alerts_go_in_as_they_are():
+    script = KUBERNETES / "monitoring" / "apply-alerts.sh"
+    result = subprocess.run(["sh", script], capture_output=True, text=True, timeout=30, check=True)
+    rule = yaml.safe_load(result.stdout)
+    assert (rule["apiVersion"], rule["kind"]) == ("monitoring.coreos.com/v1", "PrometheusRule")
+    assert rule["spec"] == load(DEPLOY / "prometheus" / "alerts.yml")

