@@ -229,6 +229,13 @@ class LearnerConfig(_Frozen):
         description="Bob learns from the rollouts of so many iterations at once, older ones weighted by what he has "
         "changed since; instead of more epochs over the newest",
     )
+    bob_average_decay: float = Field(
+        0.0,
+        ge=0.0,
+        lt=1.0,
+        description="evaluated, saved for readers and published are Bob's parameters averaged over about the last "
+        "1 / (1 - decay) versions; 0: the last ones. Acting and learning know nothing of it",
+    )
     abc: ABCConfig = ABCConfig()
     mirror: bool = Field(False, description="learn from every Bob sample also reflected in y; the task is symmetric")
 

@@ -40,6 +40,8 @@ class Weights:
     version: int
     alice: dict[str, FloatArray]
     bob: dict[str, FloatArray]
+    steady_bob: dict[str, FloatArray]
+    """Bob without the sway of single updates, to be evaluated and published; see ``learner.bob_average_decay``."""
 
 
 class Learner:
@@ -70,6 +72,7 @@ class Learner:
         self._ledger = Ledger()
         self._pending: dict[tuple[int, int, int], Rollout] = {}
         self._turns: list[Turns] = []  # Alice's, since her last update
+        self._steady_bob = networks.export_parameters(bob[0])
         self._window: deque[list[Turns]] = deque(maxlen=config.learner.bob_window)  # Bob's, of the last iterations
 
     def ingest(self, rollout: Rollout) -> bool:
@@ -105,17 +108,19 @@ class Learner:
             self._ledger.add(rollout.id)
         self._pending.clear()
         self.version += 1
+        self._average_bob()
         metrics["version"] = float(self.version)
         return {f"learner/{name}": value for name, value in metrics.items() if math.isfinite(value)}
 
     def weights(self) -> Weights:
         """Both policies of the current version, as copies."""
         alice, bob = (networks.export_parameters(player.policy) for player in (self._alice, self._bob))
-        return Weights(self.version, alice, bob)
+        return Weights(self.version, alice, bob, {name: array.copy() for name, array in self._steady_bob.items()})
 
     def state(self) -> Arrays:
         """Everything a resumed run needs, as arrays by name; rollouts not yet learned from are not part of it."""
         parts = {"alice": self._alice.state(), "bob": self._bob.state(), "demonstrations": self._history.state()}
+        parts |= {"steady_bob": {name: array.copy() for name, array in self._steady_bob.items()}}
         parts |= _named("turns", self._turns)
         for index, turns in enumerate(self._to_come_back()):
             parts |= _named(f"window/{index:04}", turns)
@@ -132,11 +137,13 @@ class Learner:
         state = dict(state)
         try:
             own = {name: state.pop(name) for name in ("version", "rng", "counted")}
+            steady_bob = {name: np.array(state.pop(f"steady_bob/{name}")) for name in self._steady_bob}
             history = {name: state.pop(f"demonstrations/{name}") for name in ("observation", "action", "num_steps")}
         except KeyError as error:
             raise LearnerError(f"learner state: no array {error}; take an undamaged checkpoint") from None
         played = {name: state.pop(name) for name in list(state) if name.startswith(("turns/", "window/"))}
         self._load_players(state)
+        self._steady_bob = steady_bob
         self._turns = _turns(_part(played, "turns"))
         window = _part(played, "window")
         self._window.clear()
@@ -146,6 +153,15 @@ class Learner:
         self._ledger.load_state(own["counted"])
         self._history.load_state(history)
         self._pending.clear()
+
+    def _average_bob(self) -> None:
+        """Move the average towards the new version; faster at first, when it is mostly the untrained Bob."""
+        new, decay = networks.export_parameters(self._bob.policy), self.config.learner.bob_average_decay
+        keep = min(decay, (1 + self.version) / (10 + self.version))
+        old = self._steady_bob if keep > 0.0 else new
+        self._steady_bob = {
+            name: np.asarray(each + np.float32(keep) * (old[name] - each)) for name, each in new.items()
+        }
 
     def _to_come_back(self) -> list[list[Turns]]:
         """What of Bob's window the next update will use again: all but what then falls out of it."""

@@ -207,7 +207,7 @@ class LocalRun:
         run, game = self.config.run, self.config.game
         if run.evaluation_interval == 0 or self.iteration % run.evaluation_interval:
             return {}
-        metrics, bob = {}, bob_evaluator(weights.bob)
+        metrics, bob = {}, bob_evaluator(weights.steady_bob)
         for kind in EVALUATED_GOALS:
             result = evaluate(
                 bob,
@@ -233,7 +233,7 @@ class LocalRun:
         if tenths[0] == tenths[1]:
             return
         with self.timing("checkpoint"):
-            arrays = {f"bob/{name}": array for name, array in self.learner.weights().bob.items()}
+            arrays = {f"bob/{name}": array for name, array in self.learner.weights().steady_bob.items()}
             self._snapshots.save(self.iteration, arrays, {"env_steps": self.num_env_steps})
 
     # --- what goes wrong --------------------------------------------------------------------------------------------
@@ -281,7 +281,7 @@ class LocalRun:
         with self.timing("checkpoint"):
             parts = {"learner": self.learner.state(), "generator": self.generator.state(), "game": self.game.state()}
             weights = self.learner.weights()  # for readers without torch: evaluate, render, coverage
-            parts |= {"alice": weights.alice, "bob": weights.bob}
+            parts |= {"alice": weights.alice, "bob": weights.steady_bob}
             if self._pending is not None:
                 parts["pending"] = to_arrays(self._pending)
             arrays = {f"{part}/{name}": array for part, state in parts.items() for name, array in state.items()}

@@ -114,7 +114,7 @@ def _run(
 
 def _finish(done: Pretrained, config: Config, directory: RunDirectory, registry: Registry, run: LocalRun) -> Pretrained:
     _logger.info("learning is over; now evaluating, publishing, drawing and filming")
-    bob = run.learner.weights().bob
+    bob = run.learner.weights().steady_bob
     metrics, version = measure_bob(config, bob), None
     try:
         if config.policy.monolithic_bob is None:

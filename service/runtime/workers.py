@@ -198,7 +198,7 @@ class RolloutWorker:
         """Bob's success without noise on random goals of one kind, as metrics."""
         run = self._config.run
         result = evaluate(
-            bob_evaluator(weights.bob),
+            bob_evaluator(weights.steady_bob),
             self._config.world,
             kind,
             num_episodes=run.evaluation_episodes,

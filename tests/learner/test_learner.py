@@ -57,6 +57,25 @@ def test_one_update_learns_and_reports():
     assert shares == pytest.approx(1.0, abs=1e-5)
 
 
+def test_the_steady_bob_is_a_running_average():
+    learner = Learner(make_config(bob_average_decay=0.5))
+    versions = [learner.weights().bob]
+    for sequence in range(6):
+        updated(learner, sequence)
+        versions.append(learner.weights().bob)
+    # keep 2/11, 3/12, ..., 6/15 of what was, then 1/2 (7/16 is less)
+    for name in versions[0]:
+        average = versions[0][name].astype(np.float64)
+        for number, version in enumerate(versions[1:], start=1):
+            keep = min(0.5, (1 + number) / (10 + number))
+            average = keep * average + (1 - keep) * version[name]
+        np.testing.assert_allclose(learner.weights().steady_bob[name], average, atol=1e-6)
+    plain = Learner(make_config())
+    updated(plain, 0)
+    weights = plain.weights()
+    assert all(weights.bob[name].tobytes() == each.tobytes() for name, each in weights.steady_bob.items())
+
+
 def test_weights_are_copies():
     learner = Learner(make_config())
     weights = learner.weights()
