@@ -21,13 +21,19 @@ def load_primitives(reference: str = "panda-cube@champion", registry: Path | str
     Args:
         reference: NAME, NAME@ALIAS or NAME@VERSION, or a run directory.
         registry: directory to look in first; a name it does not have is looked up among what comes with the package.
+            Or the ``http://HOST:PORT`` of a ``tandem serve``, which alone is asked, with the token in TANDEM_TOKEN.
 
     Returns:
         ``.primitives``, the evaluator that acts and composes; ``.config`` and ``.manifest``, what it was trained with.
 
     Raises:
-        TandemError: nothing there by that reference, or damaged.
+        TandemError: nothing there by that reference, or damaged; or the service cannot be reached or wants a token.
     """
     from service.runtime.primitives import load_bob
 
+    if isinstance(registry, str) and registry.startswith(("http://", "https://")):
+        from service.status.client import fetch_primitives
+
+        fetched, version = fetch_primitives(registry, reference)
+        return load_bob(str(version), fetched.root)
     return load_bob(reference, Path(registry))

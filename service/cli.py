@@ -15,6 +15,7 @@ from rich.console import Console
 
 from service.errors import TandemError
 from service.registry.commands import registry_app
+from service.status.commands import serve
 
 if TYPE_CHECKING:
     from service.actors.evaluation import Evaluation
@@ -188,6 +189,9 @@ def render(
             )
             video.write_episode_video(filmed, bob.config.world, out)
     _say(f"video: {out}")
+
+
+app.command()(serve)
 
 
 def _evaluate(bob: TrainedBob, goals: GoalKind, episodes: int, steps: int, seed: int) -> dict[str, Evaluation]:

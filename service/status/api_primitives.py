@@ -1,0 +1,112 @@
+"""``/v1/primitives`` and ``/v1/blobs``: the registry."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+from fastapi import APIRouter, Query, Request, Response
+from fastapi import Path as InPath
+
+from service.registry.errors import DamagedBlobError, FormatVersionError, RegistryError
+from service.registry.names import NAME_PATTERN, Version
+from service.registry.registry import Registry
+from service.status.blobs import VerifiedBlobs
+from service.status.files import BYTES, PARTS, file_response
+from service.status.openapi import INVALID, problems
+from service.status.problems import ProblemError
+from service.status.shapes import (
+    AliasChange,
+    AliasState,
+    ManifestDocument,
+    PrimitiveList,
+    PrimitiveSummary,
+    PrimitiveVersions,
+    VersionSummary,
+)
+
+_FOREVER = "private, max-age=31536000, immutable"
+_Name = Annotated[str, InPath(pattern=NAME_PATTERN, examples=["panda-cube"])]
+_Alias = Annotated[str, InPath(pattern=r"^([a-z]|[0-9]+[a-z._-])[a-z0-9._-]*$", max_length=64, examples=["champion"])]
+_Version = Annotated[str, InPath(pattern=NAME_PATTERN, description="a number or an alias", examples=["champion"])]
+_Digest = Annotated[str, InPath(pattern=r"^[0-9a-f]{64}$", description="a manifest's `blob_sha256`")]
+_UNKNOWN = (404, "There is no such name, version or alias.")
+
+
+def primitives_router(registry: Registry) -> APIRouter:
+    """Routes about frozen primitives."""
+    router = APIRouter(prefix="/v1", tags=["primitives"])
+    blobs = VerifiedBlobs(registry.root / "blobs")
+
+    @router.get("/primitives", summary="All names")
+    def list_primitives() -> PrimitiveList:
+        """Sorted; empty before the first is published."""
+        found = (_summary(registry, name) for name in registry.names())
+        return PrimitiveList(primitives=tuple(found))
+
+    @router.get("/primitives/{name}", summary="The versions of a name", responses=problems(_UNKNOWN, INVALID))
+    def get_primitive(name: _Name, limit: Annotated[int, Query(ge=1, le=1000)] = 50) -> PrimitiveVersions:
+        """Newest first, and the aliases."""
+        registry.resolve(f"{name}@{max((v.number for v in registry.versions(name)), default=1)}")  # or unknown
+        summary = _summary(registry, name)
+        newest = registry.versions(name)[::-1][:limit]
+        versions = tuple(_version(registry, version, summary.aliases) for version in newest)
+        return PrimitiveVersions(**dict(summary), versions=versions)
+
+    @router.get(
+        "/primitives/{name}/versions/{version}",
+        summary="The manifest of a version",
+        response_class=Response,
+        response_model=None,
+        responses={200: {"model": ManifestDocument, "description": "As published."}, **problems(_UNKNOWN, INVALID)},
+    )
+    def get_version(name: _Name, version: _Version) -> Response:
+        """Everything known about it; `/v1/blobs/sha256/{blob_sha256}` has its parameters, safetensors bytes."""
+        manifest = registry.manifest(f"{name}@{version}")
+        return Response(manifest.to_bytes(), media_type="application/json")
+
+    @router.get(
+        "/blobs/sha256/{digest}",
+        summary="Parameters",
+        response_class=Response,
+        responses={
+            200: {"description": "safetensors bytes.", "content": {"application/octet-stream": BYTES}},
+            **PARTS,
+            **problems((404, "There is no such blob."), INVALID),
+        },
+    )
+    def get_blob(request: Request, digest: _Digest) -> Response:
+        """Checked against the digest, which is the entity tag, too: what was got once never changes."""
+        path = blobs.path(digest)
+        return file_response(request, path, "application/octet-stream", etag=digest, cache=_FOREVER)
+
+    @router.put(
+        "/primitives/{name}/aliases/{alias}",
+        summary="Make or move an alias",
+        responses=problems(_UNKNOWN, INVALID, (409, "This registry is only read.")),
+    )
+    def put_alias(name: _Name, alias: _Alias, change: AliasChange) -> AliasState:
+        """To any version, forward or back."""
+        try:
+            registry.check_writable()
+        except RegistryError as error:
+            raise ProblemError(409, "read-only", str(error)) from None
+        version = registry.set_alias(name, alias, change.version)
+        return AliasState(name=name, alias=alias, version=version.number)
+
+    return router
+
+
+def _summary(registry: Registry, name: str) -> PrimitiveSummary:
+    versions = registry.versions(name)
+    aliases = registry.aliases(name)
+    return PrimitiveSummary(name=name, num_versions=len(versions), newest=versions[-1].number, aliases=aliases)
+
+
+def _version(registry: Registry, version: Version, aliases: dict[str, int]) -> VersionSummary:
+    names = tuple(alias for alias, number in aliases.items() if number == version.number)
+    try:
+        manifest = registry.manifest(str(version))
+    except (DamagedBlobError, FormatVersionError) as error:  # the others are as good as before
+        return VersionSummary(version=version.number, aliases=names, problem=str(error))
+    shown = manifest.model_dump(include=set(VersionSummary.model_fields) - {"version"})
+    return VersionSummary(version=version.number, aliases=names, **shown)

@@ -1,0 +1,233 @@
+"""``/metrics``: what Prometheus is told, read from the runs and the registry when it asks.
+
+``RUN_METRICS``, ``SERVICE_METRICS`` and ``HTTP_METRICS`` are the reference: names, kinds, labels and meanings. A run is
+told of while it is active, and the newest few after they ended, so the number of series is bounded.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections import Counter as Count
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from typing import Literal, get_args
+
+from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram, ProcessCollector, generate_latest
+from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily
+from prometheus_client.registry import Collector
+
+from service.registry.errors import RegistryError
+from service.registry.registry import Registry
+from service.store.errors import StoreError
+from service.store.models import ACTIVE, ActorStatus, Record, RunReader, RunState, RunStatus
+
+CONTENT_TYPE = "text/plain; version=0.0.4; charset=utf-8"
+NUM_ENDED_RUNS = 5
+MAX_RUNS = 50
+MAX_NAMES = 100
+_STATES: tuple[RunState, ...] = get_args(RunState)
+_ACTOR_STATES: tuple[Literal["starting", "alive", "lost"], ...] = get_args(ActorStatus.model_fields["state"].annotation)
+_logger = logging.getLogger(__name__)
+_Family = CounterMetricFamily | GaugeMetricFamily
+
+
+@dataclass(frozen=True, slots=True)
+class Metric:
+    """One metric of the reference; ``unit`` is part of the name, Prometheus' way."""
+
+    name: str
+    kind: Literal["counter", "gauge", "histogram"]
+    labels: tuple[str, ...]
+    help: str
+
+    def family(self) -> _Family:
+        """An empty family to add samples to."""
+        if self.kind == "counter":
+            return CounterMetricFamily(self.name, self.help, labels=self.labels)
+        return GaugeMetricFamily(self.name, self.help, labels=self.labels)
+
+
+@dataclass(frozen=True, slots=True)
+class RunMetric(Metric):
+    """One number of a run; None where there is none at the moment."""
+
+    value: Callable[[RunStatus, Record], float | None]
+
+
+def _run(
+    name: str,
+    kind: Literal["counter", "gauge"],
+    text: str,
+    value: Callable[[RunStatus, Record], float | None],
+) -> RunMetric:
+    return RunMetric(f"tandem_run_{name}", kind, ("run",), text, value)
+
+
+def _of_record(name: str, key: str, text: str) -> RunMetric:
+    return _run(name, "gauge", f"{text} ({key}, newest iteration)", lambda _, record: record.get(key))
+
+
+def _age_s(when: datetime) -> float:
+    return max(0.0, (datetime.now(UTC) - when).total_seconds())
+
+
+def _actor_age_s(run: RunStatus) -> float | None:
+    ages = [_age_s(actor.heartbeat) for actor in run.actors]
+    return max(ages) if ages and run.state in ACTIVE else None
+
+
+RUN_METRICS: tuple[RunMetric, ...] = (
+    _run("started_timestamp_seconds", "gauge", "When the process that runs it started, since 1970",
+         lambda run, _: run.started.timestamp()),
+    _run("heartbeat_age_seconds", "gauge", "Since the run was last heard of",
+         lambda run, _: _age_s(run.heartbeat)),
+    _run("stopping", "gauge", "1 while a stop is requested and the run has not ended", lambda run, _: run.stopping),
+    _run("warnings", "gauge", "What is not as it should be right now, such as Redis being away",
+         lambda run, _: len(run.warnings)),
+    _run("iterations_total", "counter", "Finished iterations", lambda run, _: run.iteration),
+    _run("env_steps_total", "counter", "Env steps, all worlds together", lambda run, _: run.num_env_steps),
+    _run("env_steps_budget", "gauge", "Env steps at which the run ends", lambda run, _: run.total_env_steps),
+    _run("env_steps_per_second", "gauge", "Env steps a second, newest iteration",
+         lambda run, _: run.env_steps_per_s),
+    _run("policy_version", "gauge", "Updates of the policies so far", lambda run, _: run.policy_version),
+    _run("policy_lag_versions", "gauge", "Policy versions between acting and learning, mean of the last update",
+         lambda run, _: run.policy_lag),
+    _run("rollouts_counted_total", "counter", "Rollouts learned from, each once",
+         lambda run, _: run.num_rollouts_counted),
+    _run("rollouts_refused_total", "counter", "Rollouts seen before, or too old",
+         lambda run, _: run.num_rollouts_refused),
+    _run("actor_replacements_total", "counter", "How often an actor, the learner or the generator was replaced",
+         lambda run, _: sum(actor.incarnation for actor in run.actors)),
+    _run("actor_heartbeat_age_seconds", "gauge", "Since the most silent actor of an active run was last heard of",
+         lambda run, _: _actor_age_s(run)),
+    _of_record("valid_goals_ratio", "alice/valid_fraction", "Alice's goals that are valid"),
+    _of_record("lifted_goals_ratio", "alice/lifted_fraction", "Valid goals that are in the air"),
+    _of_record("bob_success_ratio", "bob/success_rate", "Valid goals that Bob reached"),
+    _of_record("bob_success_air_ratio", "bob/success_rate_air", "Valid goals in the air that Bob reached"),
+    _of_record("learner_idle_ratio", "learner/idle_fraction", "Of the wall time, the learner waiting for rollouts"),
+    _of_record("learn_seconds", "time/learn_s", "Learning from one iteration"),
+    _of_record("goal_cells", "generator/num_cells_seen", "Cells of the grid in which a valid goal was ever proposed"),
+)  # fmt: skip
+"""One sample a run."""
+
+_RUN_INFO = Metric("tandem_run_info", "gauge", ("run", "name", "runtime"), "1; which primitives a run makes, and how")
+_RUN_STATE = Metric("tandem_run_state", "gauge", ("run", "state"), "1 for the state a run is in, 0 for the others")
+_RUN_ACTORS = Metric("tandem_run_actors", "gauge", ("run", "state"), "Actors, learner and generator by state")
+_RUNS = Metric("tandem_runs", "gauge", ("state",), "All runs there are by state")
+_STORE_UP = Metric("tandem_store_up", "gauge", (), "1 if the runs could be read for this answer")
+_REGISTRY_UP = Metric("tandem_registry_up", "gauge", (), "1 if the registry could be read for this answer")
+_VERSIONS = Metric("tandem_registry_versions", "gauge", ("name",), "Published versions")
+_ALIAS = Metric("tandem_registry_alias_version", "gauge", ("name", "alias"), "The version an alias means")
+SERVICE_METRICS: tuple[Metric, ...] = (
+    _RUN_INFO, _RUN_STATE, _RUN_ACTORS, _RUNS, _STORE_UP, _REGISTRY_UP, _VERSIONS, _ALIAS,
+)  # fmt: skip
+"""The others that are read when Prometheus asks."""
+
+_REQUESTS = Metric("tandem_http_requests_total", "counter", ("method", "route", "status"), "Answered requests")
+_DURATION = Metric("tandem_http_request_duration_seconds", "histogram", ("route",), "Until an answer begins")
+_STREAMS = Metric("tandem_http_streams", "gauge", (), "Open event streams")
+HTTP_METRICS: tuple[Metric, ...] = (_REQUESTS, _DURATION, _STREAMS)
+"""What the service counts about itself; beside them are prometheus-client's ``tandem_process_...``."""
+_METHODS = frozenset({"GET", "HEAD", "POST", "PUT", "DELETE"})
+_BUCKETS = (0.001, 0.0025, 0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1.0, 2.5, 10.0)
+
+
+class Telemetry:
+    """The metrics of one app, in a Prometheus registry of its own."""
+
+    def __init__(self, runs: RunReader, registry: Registry, num_streams: Callable[[], int]) -> None:
+        """Nothing is read before the first ``page``."""
+        self._registry = CollectorRegistry()
+        self._registry.register(_Collector(runs, registry))
+        ProcessCollector(namespace="tandem", registry=self._registry)
+        labels, into = _REQUESTS.labels, self._registry
+        self._requests = Counter(_REQUESTS.name, _REQUESTS.help, labels, registry=into)
+        self._duration = Histogram(_DURATION.name, _DURATION.help, _DURATION.labels, registry=into, buckets=_BUCKETS)
+        Gauge(_STREAMS.name, _STREAMS.help, registry=into).set_function(num_streams)
+
+    def observe(self, method: str, route: str, status: int, duration_s: float) -> None:
+        """Count one answer; ``route`` is its template, so that nobody can make series at will."""
+        self._requests.labels(method if method in _METHODS else "other", route, str(status)).inc()
+        self._duration.labels(route).observe(duration_s)
+
+    def page(self) -> bytes:
+        """The text Prometheus reads, of ``CONTENT_TYPE``; what cannot be read at the moment is left out."""
+        return generate_latest(self._registry)
+
+
+class _Collector(Collector):
+    def __init__(self, runs: RunReader, registry: Registry) -> None:
+        self._runs, self._registry = runs, registry
+
+    def describe(self) -> list[_Family]:
+        return []  # or else registering it would read the runs
+
+    def collect(self) -> Iterator[_Family]:
+        yield from self._about_runs()
+        yield from self._about_registry()
+
+    def _about_runs(self) -> Iterator[_Family]:
+        up = _STORE_UP.family()
+        try:
+            runs = self._runs.runs()
+        except StoreError as error:
+            _logger.warning("/metrics tells of no run: %s", error)
+            up.add_metric([], 0)
+            yield up
+            return
+        up.add_metric([], 1)
+        yield up
+        count = Count(run.state for run in runs)
+        by_state = _RUNS.family()
+        for state in _STATES:
+            by_state.add_metric([state], count[state])
+        yield by_state
+        yield from _families([(run, self._newest_record(run)) for run in shown(runs)])
+
+    def _newest_record(self, run: RunStatus) -> Record:
+        try:
+            records = self._runs.metrics(run.run_id, after_iteration=max(0, run.iteration - 1))
+        except StoreError:  # such as a run that was deleted just now
+            return {}
+        return records[-1] if records else {}
+
+    def _about_registry(self) -> Iterator[_Family]:
+        up, versions, aliases = _REGISTRY_UP.family(), _VERSIONS.family(), _ALIAS.family()
+        try:
+            for name in self._registry.names()[:MAX_NAMES]:
+                versions.add_metric([name], len(self._registry.versions(name)))
+                for alias, number in list(self._registry.aliases(name).items())[:MAX_NAMES]:
+                    aliases.add_metric([name, alias], number)
+        except (RegistryError, OSError) as error:
+            _logger.warning("/metrics tells not all of the registry: %s", error)
+            up.add_metric([], 0)
+        else:
+            up.add_metric([], 1)
+        yield from (up, versions, aliases)
+
+
+def shown(runs: list[RunStatus]) -> list[RunStatus]:
+    """Of the runs, newest first: those that are active and the last ``NUM_ENDED_RUNS`` others, ``MAX_RUNS`` at most."""
+    active = [run for run in runs if run.state in ACTIVE]
+    ended = [run for run in runs if run.state not in ACTIVE]
+    return (active + ended[:NUM_ENDED_RUNS])[:MAX_RUNS]
+
+
+def _families(runs: list[tuple[RunStatus, Record]]) -> Iterator[_Family]:
+    info, states, actors = _RUN_INFO.family(), _RUN_STATE.family(), _RUN_ACTORS.family()
+    for run, _ in runs:
+        info.add_metric([run.run_id, run.name, run.runtime], 1)
+        for state in _STATES:
+            states.add_metric([run.run_id, state], run.state == state)
+        count = Count(actor.state for actor in run.actors)
+        for actor_state in _ACTOR_STATES if run.actors else ():
+            actors.add_metric([run.run_id, actor_state], count[actor_state])
+    yield from (info, states, actors)
+    for metric in RUN_METRICS:
+        family = metric.family()
+        for run, record in runs:
+            value = metric.value(run, record)
+            if value is not None:
+                family.add_metric([run.run_id], value)
+        yield family

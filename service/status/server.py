@@ -1,0 +1,179 @@
+"""The status service on a port, in a thread or in the foreground.
+
+In a Ray actor: make a ``StatusServer`` and ``start`` it; ``port`` says where it listens. Nothing here knows Ray.
+"""
+
+from __future__ import annotations
+
+import errno
+import logging
+import signal
+import socket
+import threading
+import time
+from pathlib import Path
+from types import TracebackType
+
+import uvicorn
+
+from service.registry.registry import Registry
+from service.status.app import StatusApp, create_app
+from service.status.errors import StatusError
+from service.status.guard import is_loopback
+from service.store.models import RunReader
+
+DEFAULT_PORT = 8321
+START_TIMEOUT_S = 10.0
+STOP_TIMEOUT_S = 5.0
+_GRACE_S = 2
+_logger = logging.getLogger(__name__)
+
+
+class StatusServer:
+    """Serves until ``stop``, or until its process ends; also a context manager, which starts and stops it.
+
+    Args:
+        runs: where to read runs from.
+        registry: of primitives.
+        token: see `create_app`.
+        host: name or address to listen at.
+        port: 0 for one that is free, see ``port``.
+        runs_dir: directory of run directories, for their pictures and videos.
+
+    Raises:
+        StatusError: the address cannot be had, or a public one without a token.
+    """
+
+    def __init__(
+        self,
+        runs: RunReader,
+        registry: Registry,
+        *,
+        token: str | None = None,
+        host: str = "127.0.0.1",
+        port: int = DEFAULT_PORT,
+        runs_dir: Path | None = None,
+    ) -> None:
+        self._socket = _bind(host, port)
+        address, self.port = self._socket.getsockname()[:2]
+        try:
+            # what counts is where the socket is, not what its host was called
+            app = create_app(runs, registry, token=token, public=not is_loopback(address), runs_dir=runs_dir)
+            self._socket.listen()
+        except OSError as error:
+            self._socket.close()
+            raise _cannot_bind(host, port, error) from None
+        except StatusError:
+            self._socket.close()
+            raise
+        self.url = f"http://{_reachable(address)}:{self.port}"
+        """Where this machine reaches it."""
+        self._server = _Server(app)
+        self._thread = threading.Thread(target=self._serve, name=f"status-{self.port}", daemon=True)
+
+    def start(self) -> None:
+        """Answer requests from now on, in a thread.
+
+        Raises:
+            StatusError: it does not come up.
+        """
+        self._thread.start()
+        deadline_s = time.monotonic() + START_TIMEOUT_S
+        while not self._server.started:
+            if not self._thread.is_alive() or time.monotonic() > deadline_s:
+                raise StatusError(f"the status service does not start at port {self.port}; the log says more")
+            time.sleep(0.005)
+
+    def stop(self) -> None:
+        """Answer what was asked already, end event streams, and free the port."""
+        self._server.should_exit = True
+        if self._thread.is_alive():
+            self._thread.join(STOP_TIMEOUT_S)
+        self._socket.close()
+
+    def run(self) -> None:
+        """Serve in the foreground until SIGINT or SIGTERM; only in the main thread.
+
+        Raises:
+            StatusError: it does not come up, or ends by itself.
+        """
+        asked = threading.Event()
+        numbers = (signal.SIGINT, signal.SIGTERM)
+        previous = [signal.signal(number, lambda *_: asked.set()) for number in numbers]
+        try:
+            self.start()
+            while not asked.wait(1.0):
+                if not self._thread.is_alive():
+                    raise StatusError(f"the status service at port {self.port} ended by itself; the log says why")
+        finally:
+            self.stop()
+            for number, handler in zip(numbers, previous, strict=True):
+                signal.signal(number, handler)
+
+    def __enter__(self) -> StatusServer:
+        self.start()
+        return self
+
+    def __exit__(
+        self, _type: type[BaseException] | None, _error: BaseException | None, _at: TracebackType | None
+    ) -> None:
+        self.stop()
+
+    def _serve(self) -> None:
+        try:
+            self._server.run(sockets=[self._socket])
+        except Exception:
+            _logger.exception("the status service at port %d ended", self.port)
+
+
+class _Server(uvicorn.Server):
+    """Ends the event streams before it waits for open connections."""
+
+    def __init__(self, app: StatusApp) -> None:
+        config = uvicorn.Config(
+            app,
+            log_config=None,  # the program's own logging counts
+            log_level="warning",
+            access_log=False,  # /metrics counts requests
+            server_header=False,
+            proxy_headers=False,
+            lifespan="off",
+            ws="none",
+            timeout_graceful_shutdown=_GRACE_S,
+        )
+        super().__init__(config)
+        self._app = app
+
+    async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
+        self._app.streams.close()
+        await super().shutdown(sockets)
+
+
+def _bind(host: str, port: int) -> socket.socket:
+    try:
+        found = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)
+        family, kind, protocol, _, address = found[0]
+        bound = socket.socket(family, kind, protocol)
+    except (OSError, OverflowError, UnicodeError) as error:
+        raise _cannot_bind(host, port, error) from None
+    try:
+        bound.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)  # a restart need not wait for old connections
+        bound.bind(address)
+    except OSError as error:
+        bound.close()
+        raise _cannot_bind(host, port, error) from None
+    return bound
+
+
+def _cannot_bind(host: str, port: int, error: Exception) -> StatusError:
+    number = error.errno if isinstance(error, OSError) else None
+    if number == errno.EADDRINUSE:
+        return StatusError(f"port {port} of {host} is taken; stop what listens there, or choose another with --port")
+    if number == errno.EACCES:
+        return StatusError(f"port {port} of {host}: {error}; choose one above 1023 with --port")
+    return StatusError(f"cannot listen at {host!r} port {port}: {error}; --host is a name or address of this machine")
+
+
+def _reachable(address: str) -> str:
+    address = {"0.0.0.0": "127.0.0.1", "::": "::1"}.get(address, address)
+    return f"[{address}]" if ":" in address else address

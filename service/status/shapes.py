@@ -1,0 +1,124 @@
+"""The JSON the API answers with, where the store and the registry have no model of it already."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from pydantic import AwareDatetime, BaseModel, ConfigDict, Field
+
+from service.registry.manifest import Manifest
+from service.store.models import RunStatus
+
+
+class _Frozen(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+
+class Alive(_Frozen):
+    """The service answers."""
+
+    status: Literal["alive"] = "alive"
+
+
+class Ready(_Frozen):
+    """The runs and the registry can be read."""
+
+    status: Literal["ready"] = "ready"
+
+
+class RunList(_Frozen):
+    """Runs, newest start first."""
+
+    runs: tuple[RunStatus, ...]
+    num_runs: int = Field(ge=0, description="that fit what was asked, the ones over the limit included")
+
+
+class MetricHistory(_Frozen):
+    """Metrics over iterations, in columns of equal length."""
+
+    run_id: str
+    last_iteration: int = Field(
+        ge=0, description="of the newest record; 0 before the first. Ask for those after it next"
+    )
+    num_iterations: int = Field(ge=0, description="that fit what was asked, before down-sampling")
+    iteration: tuple[int, ...] = Field(description="the last of each point")
+    env_steps: tuple[int, ...] = Field(description="at that iteration")
+    metrics: dict[str, tuple[float | None, ...]] = Field(
+        description="by name, the mean over the iterations of a point; null where none of them has the metric"
+    )
+    names: tuple[str, ...] = Field(description="of all metrics the run has")
+
+
+class RunFile(_Frozen):
+    """A picture or a video that a run has made."""
+
+    name: str = Field(examples=["rounds.mp4"])
+    title: str = Field(examples=["Alice beside Bob"])
+    media_type: str = Field(examples=["video/mp4"])
+    num_bytes: int = Field(ge=0)
+    modified: AwareDatetime
+    url: str = Field(description="path on this service", examples=["/v1/runs/cube/files/rounds.mp4"])
+
+
+class RunFiles(_Frozen):
+    """What a run has to look at."""
+
+    files: tuple[RunFile, ...]
+
+
+class PrimitiveSummary(_Frozen):
+    """A name in the registry."""
+
+    name: str = Field(examples=["panda-cube"])
+    num_versions: int = Field(ge=1)
+    newest: int = Field(ge=1, description="the greatest version number")
+    aliases: dict[str, int] = Field(description="and the version each means", examples=[{"champion": 2, "latest": 3}])
+
+
+class PrimitiveList(_Frozen):
+    """All names, sorted."""
+
+    primitives: tuple[PrimitiveSummary, ...]
+
+
+class VersionSummary(_Frozen):
+    """One version; the manifest has more."""
+
+    version: int = Field(ge=1)
+    created: str | None = Field(None, description="UTC, ISO 8601")
+    metrics: dict[str, float] = {}
+    parent: str | None = Field(None, description="NAME@VERSION this one was trained on from")
+    git_commit: str | None = None
+    blob_sha256: str | None = None
+    blob_bytes: int | None = None
+    aliases: tuple[str, ...] = Field((), description="that mean this version now")
+    problem: str | None = Field(None, description="why there is nothing else here: the manifest is damaged")
+
+
+class PrimitiveVersions(PrimitiveSummary):
+    """A name and its versions, newest first."""
+
+    versions: tuple[VersionSummary, ...]
+
+
+class ManifestDocument(Manifest):
+    """Everything known about one immutable version, and a digest of it."""
+
+    manifest_sha256: str = Field(
+        pattern=r"^[0-9a-f]{64}$",
+        description="of the other members as JSON with sorted keys, no white space, and ASCII escapes",
+    )
+
+
+class AliasChange(_Frozen):
+    """Where an alias shall lead."""
+
+    version: int = Field(ge=1, le=1_000_000_000, examples=[1])
+
+
+class AliasState(_Frozen):
+    """Where an alias leads now."""
+
+    name: str
+    alias: str
+    version: int = Field(ge=1)

@@ -1,0 +1,76 @@
+"""The bearer token: where it comes from, and whether a request has it."""
+
+from __future__ import annotations
+
+import base64
+import binascii
+import hmac
+import os
+from pathlib import Path
+from typing import Literal
+
+from service.status.errors import StatusError
+
+VARIABLE = "TANDEM_TOKEN"
+MIN_CHARACTERS = 16
+_MAKE = "make one with: openssl rand -hex 32"
+
+Verdict = Literal["missing", "wrong", "right"]
+
+
+def read_token(file: Path | None = None) -> str | None:
+    """The token of a file or, where no file is named, of ``TANDEM_TOKEN``; None where that is not set or empty.
+
+    Raises:
+        StatusError: the file cannot be read, or its text is no token; the message does not quote it.
+    """
+    if file is None:
+        text, source = os.environ.get(VARIABLE, ""), VARIABLE
+        return check_token(text.strip(), source) if text.strip() else None
+    try:
+        return check_token(file.read_text(encoding="ascii").strip(), f"--token-file {file}")
+    except OSError as error:
+        raise StatusError(f"--token-file {file}: {error.strerror}; name a file that holds one token") from None
+    except UnicodeDecodeError:
+        raise StatusError(f"--token-file {file} holds more than ASCII text; {_MAKE}") from None
+
+
+def check_token(token: str, source: str) -> str:
+    """Return ``token``.
+
+    Raises:
+        StatusError: it is too short, or no header can hold it.
+    """
+    if len(token) < MIN_CHARACTERS:
+        raise StatusError(f"{source} has {len(token)} characters, {MIN_CHARACTERS} are the least; {_MAKE}")
+    if not (token.isascii() and token.isprintable() and " " not in token):
+        raise StatusError(f"{source} has other characters than visible ASCII; {_MAKE}")
+    return token
+
+
+def judge(authorization: str | None, token: str, *, basic: bool) -> Verdict:
+    """What an ``Authorization`` header says to a token.
+
+    Args:
+        authorization: the header; None where there was none.
+        token: the right one.
+        basic: also take the token as the password of HTTP Basic, which is how a browser can send it.
+    """
+    if authorization is None:
+        return "missing"
+    scheme, _, rest = authorization.strip().partition(" ")
+    if scheme.lower() == "bearer":
+        given = rest.strip()
+    elif scheme.lower() == "basic" and basic:
+        given = _password(rest.strip())
+    else:
+        return "wrong"
+    # on bytes: text that is not ASCII is refused by compare_digest, and must only be wrong here
+    return "right" if hmac.compare_digest(given.encode(), token.encode()) else "wrong"
+
+
+def _password(text: str) -> str:
+    try:
+        return base64.b64decode(text, validate=True).decode("latin-1").partition(":")[2]
+    except (binascii.Error, ValueError):
+        return ""
