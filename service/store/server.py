@@ -108,8 +108,8 @@ class RedisServer:
                 if self._answers():
                     return
                 self.close(release=False)
-                # somebody else took the free port in the meantime
-                if port is not None or attempt == _START_ATTEMPTS - 1 or "in use" not in self._last_words():
+                taken = "Failed listening" in self._last_words()  # by somebody, since we found it free
+                if port is not None or attempt == _START_ATTEMPTS - 1 or not taken:
                     raise StoreUnavailableError(
                         f"{self._binary} does not start: {self._last_words()}; see {directory / 'redis.log'}"
                     )

@@ -1,0 +1,280 @@
+"""Status files: how often they are written, a full disk, an older tandem's runs, a file cut under its reader."""
+
+import json
+import os
+import shutil
+import time
+import tracemalloc
+
+import pytest
+
+from service.runtime.records import JsonlWriter
+from service.store import disk_reader
+from service.store.disk import DiskWriter
+from service.store.disk_reader import DiskReader, run_id_of
+from service.store.errors import StoreError
+from service.store.tail import RecordFile
+from tests.runtime.runs import assert_one_line, no_room_above
+from tests.store.stores import a_grid, a_record, a_silent_status, a_status
+
+
+class Clock:
+    """Seconds that pass when told to."""
+
+    def __init__(self):
+        self.now_s = 0.0
+
+    def __call__(self):
+        return self.now_s
+
+
+def read_status(directory):
+    return json.loads((directory / "status.json").read_text())
+
+
+# --- writing ---------------------------------------------------------------------------------------------------------
+
+
+def test_status_is_written_once_a_second_and_at_changes_of_state(tmp_path):
+    clock = Clock()
+    writer = DiskWriter(tmp_path, clock=clock)
+    seen = []
+    for now_s, iteration, state in [(0.0, 1, "running"), (0.9, 2, "running"), (1.0, 3, "running"), (1.1, 4, "failed")]:
+        clock.now_s = now_s
+        writer.status(a_status(iteration=iteration, state=state))
+        seen.append(read_status(tmp_path)["iteration"])
+    assert seen == [1, 1, 3, 4]
+    writer.status(a_status(iteration=5, state="failed"))
+    writer.close()
+    assert read_status(tmp_path)["iteration"] == 5
+
+
+def test_the_grid_is_written_every_five_seconds_and_at_the_end(tmp_path):
+    clock, seen = Clock(), []
+    writer = DiskWriter(tmp_path, clock=clock)
+    for number in range(1, 8):
+        writer.goals(a_grid(number))
+        seen.append(json.loads((tmp_path / "goals.json").read_text())["iteration"])
+        clock.now_s += 1.0
+    assert seen == [1, 1, 1, 1, 1, 6, 6]
+    writer.close()
+    assert json.loads((tmp_path / "goals.json").read_text())["iteration"] == 7
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["goals.json"]
+
+
+def test_a_full_disk_is_a_warning_and_passes(tmp_path, caplog):
+    clock = Clock()
+    writer = DiskWriter(tmp_path, clock=clock)
+    writer.status(a_status(iteration=1))
+    with no_room_above(10):
+        for _ in range(3):
+            clock.now_s += 1.0
+            writer.status(a_status(iteration=2))
+        (warning,) = writer.warnings()
+        assert_one_line(warning, "status.json cannot be written", "File too large")
+    assert len([message for message in caplog.messages if "status.json" in message]) == 1
+    assert read_status(tmp_path)["iteration"] == 1
+    writer.close()
+    assert read_status(tmp_path)["iteration"] == 2
+    assert writer.warnings() == []
+    assert list(tmp_path.glob(".tmp-*")) == []
+
+
+# --- reading ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def old_run(tmp_path):
+    """A run directory without a status, as an older tandem leaves it; not heard of for an hour."""
+    directory = tmp_path / "old one"
+    directory.mkdir()
+    (directory / "config.yaml").write_text("name: panda-cube\nrun: {total_env_steps: 1000}\nno_longer_there: 1\n")
+    records = JsonlWriter(directory / "metrics.jsonl")
+    speed = {"time/env_steps_per_s": 12.5, "learner/version": 3.0, "learner/policy_lag": 1.0}
+    for number in range(1, 5):
+        records.append(a_record(number, **speed))
+    age(directory, 3600)
+    return directory
+
+
+def age(directory, seconds):
+    for path in directory.iterdir():
+        os.utime(path, (time.time() - seconds, time.time() - seconds))
+
+
+def test_an_older_run_shows_what_its_files_tell(old_run):
+    (run,) = DiskReader(old_run.parent).runs()
+    assert (run.run_id, run.name, run.state) == ("old-one", "panda-cube", "interrupted")
+    assert (run.iteration, run.num_env_steps, run.total_env_steps) == (4, 400, 1000)
+    assert (run.env_steps_per_s, run.policy_version, run.policy_lag, run.num_rollouts_counted) == (12.5, 3, 1.0, 3)
+    assert run.heartbeat.timestamp() == pytest.approx(time.time() - 3600, abs=60)
+    assert [each["iteration"] for each in DiskReader(old_run.parent).metrics("old-one", after_iteration=2)] == [3, 4]
+
+
+def test_how_an_older_run_ended(old_run):
+    def state():
+        return DiskReader(old_run.parent).run("old-one").state
+
+    (old_run / "published.json").write_text('{"version": "panda-cube@2"}')
+    assert state() == "converged"
+    assert DiskReader(old_run.parent).run("old-one").published == "panda-cube@2"
+    age(old_run, 5)
+    assert state() == "running"  # by a process of an older tandem
+    with pytest.raises(StoreError) as error:
+        DiskReader(old_run.parent).request_stop("old-one")
+    assert_one_line(error.value, "old-one", "older tandem")
+    JsonlWriter(old_run / "metrics.jsonl").append(a_record(10))
+    assert state() == "finished"
+    DiskReader(old_run.parent).request_stop("old-one")
+    assert not (old_run / "stop").exists()
+
+
+def test_an_older_run_before_its_first_record(old_run):
+    (old_run / "metrics.jsonl").unlink()
+    (old_run / "config.yaml").write_text("{: damaged")
+    run = DiskReader(old_run.parent).run("old-one")
+    assert (run.name, run.iteration, run.total_env_steps) == ("old-one", 0, 1)
+
+
+@pytest.mark.parametrize("content", [b"", b"{", b'{"run_id": "x"}', b"\xff\xfe", b"[]"])
+def test_a_damaged_status_falls_back_on_the_records(old_run, content):
+    (old_run / "status.json").write_bytes(content)
+    (run,) = DiskReader(old_run.parent).runs()
+    assert (run.iteration, run.name) == (4, "panda-cube")
+    assert_one_line(run.warnings[0], "status.json cannot be read")
+
+
+def test_a_date_without_a_time_zone_is_damage(old_run):
+    """It could not be compared with the clock."""
+    text = a_status().model_dump_json().replace("Z", "")
+    (old_run / "status.json").write_text(text)
+    assert DiskReader(old_run.parent).run("old-one").warnings != ()
+
+
+def test_a_copied_directory_is_another_run(tmp_path):
+    (tmp_path / "a").mkdir()
+    writer = DiskWriter(tmp_path / "a")
+    writer.status(a_status("a", state="finished"))
+    shutil.copytree(tmp_path / "a", tmp_path / "b")
+    assert {run.run_id for run in DiskReader(tmp_path).runs()} == {"a", "b"}
+
+
+def test_what_is_no_run_is_none(tmp_path):
+    (tmp_path / "registry" / "blobs").mkdir(parents=True)
+    (tmp_path / "note.txt").touch()
+    (tmp_path / ".hidden").mkdir()
+    (tmp_path / ".hidden" / "config.yaml").touch()
+    assert DiskReader(tmp_path).runs() == []
+
+
+@pytest.mark.parametrize(
+    ("name", "run_id"), [("cube-1", "cube-1"), ("my run", "my-run"), ("..odd_", "odd_"), ("\u00e9", "run")]
+)
+def test_run_ids_of_directories(tmp_path, name, run_id):
+    assert run_id_of(tmp_path / name) == run_id
+    assert a_status(run_id).run_id == run_id
+
+
+def test_a_silent_run_that_nobody_locks_has_vanished_and_is_not_asked_to_stop(tmp_path):
+    (tmp_path / "cube").mkdir()
+    writer = DiskWriter(tmp_path / "cube")
+    writer.status(a_silent_status())
+    reader = DiskReader(tmp_path)
+    reader.request_stop("cube")
+    assert not writer.stop_requested()
+
+
+def test_yaml_is_parsed_once(old_run, monkeypatch):
+    calls, load = [], disk_reader.yaml.safe_load
+    monkeypatch.setattr(disk_reader.yaml, "safe_load", lambda text: calls.append(1) or load(text))
+    reader = DiskReader(old_run.parent)
+    for _ in range(3):
+        reader.run("old-one")
+    assert len(calls) == 1
+    os.utime(old_run / "config.yaml")  # as a resume does
+    reader.run("old-one")
+    assert len(calls) == 2
+
+
+# --- records that grow -----------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def growing(tmp_path):
+    path = tmp_path / "metrics.jsonl"
+    return path, JsonlWriter(path), RecordFile(path)
+
+
+def test_only_what_is_new_is_read(growing):
+    path, writer, records = growing
+    for number in range(1, 400):
+        writer.append(a_record(number))
+    assert len(records.after(0)) == 399
+    writer.append(a_record(400))
+    # a limit on what may be read: the whole file is some 25 KB
+    before = bytes_read()
+    assert records.after(399) == [a_record(400)]
+    assert bytes_read() - before < path.stat().st_size // 2
+
+
+def bytes_read():
+    """Of files, by this process; /proc's own text is small."""
+    with open("/proc/self/io") as file:
+        return int(file.readline().removeprefix("rchar:"))
+
+
+def test_a_torn_line_waits_for_its_end(growing):
+    path, writer, records = growing
+    writer.append(a_record(1))
+    line = json.dumps(a_record(2)).encode()
+    with path.open("ab") as file:
+        file.write(line[:10])
+        file.flush()
+        assert records.after(0) == [a_record(1)]
+        file.write(line[10:])
+        file.flush()
+        assert records.after(0) == [a_record(1)]  # nobody knows yet whether more digits come
+        file.write(b"\n")
+    assert records.after(0) == [a_record(1), a_record(2)]
+
+
+def test_a_file_that_a_resume_has_cut(growing):
+    _, writer, records = growing
+    for number in range(1, 8):
+        writer.append(a_record(number, past=0))
+    assert len(records.after(0)) == 7
+    writer.truncate_after(4)
+    assert len(records.after(0)) == 4
+    writer.truncate_after(3)
+    for number in range(4, 12):  # longer than before when it is looked at next
+        writer.append(a_record(number, past=1))
+    found = records.after(0)
+    assert [each["iteration"] for each in found] == list(range(1, 12))
+    assert [each["past"] for each in found] == [0] * 3 + [1] * 8
+
+
+def test_a_file_that_is_not_there_and_then_is(growing):
+    path, writer, records = growing
+    assert (records.after(0), records.last()) == ([], None)
+    writer.append(a_record(1))
+    assert records.last() == a_record(1)
+    path.unlink()
+    assert records.after(0) == []
+
+
+def test_what_json_has_no_number_for(growing):
+    path, _, records = growing
+    path.write_text('{"iteration": 1, "a": NaN, "b": -Infinity, "c": "text", "d": [1], "e": null, "f": true, "g": 2}\n')
+    assert records.after(0) == [{"iteration": 1, "a": None, "b": None, "e": None, "g": 2}]
+
+
+def test_a_long_history_takes_little_memory(growing):
+    path, _, records = growing
+    with path.open("w") as file:
+        file.writelines(json.dumps(a_record(number, pad=[0] * 500)) + "\n" for number in range(1, 601))
+    tracemalloc.start()
+    try:
+        assert records.last()["iteration"] == 600
+        assert tracemalloc.get_traced_memory()[1] < path.stat().st_size / 4
+    finally:
+        tracemalloc.stop()
