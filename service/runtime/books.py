@@ -53,14 +53,6 @@ class Books:
         self.iteration, self.num_env_steps, self.wall_s = 0, 0, 0.0
         self._saved: int | None = None
 
-    def begin(self) -> None:
-        """Assert that the directory is free.
-
-        Raises:
-            TandemError: it holds a run already.
-        """
-        self.directory.check_free()
-
     def resume(self) -> tuple[dict[str, Arrays], dict[str, Any]]:
         """Take over the newest checkpoint's counters.
 
@@ -96,11 +88,10 @@ class Books:
         interval = self.config.run.evaluation_interval
         return interval > 0 and self.iteration % interval == 0
 
-    def turn(self, num_env_steps: int, elapsed_s: float) -> None:
+    def count(self, num_env_steps: int) -> None:
         """Count an iteration."""
         self.iteration += 1
         self.num_env_steps += num_env_steps
-        self.wall_s += elapsed_s
 
     def save(self, parts: Mapping[str, Mapping[str, NDArray[Any]]], meta: Mapping[str, Any]) -> None:
         """Write a checkpoint of this iteration: with it alone a new process goes on.
@@ -113,11 +104,8 @@ class Books:
             CheckpointError: a full disk; earlier checkpoints are intact.
         """
         arrays = {f"{part}/{name}": array for part, state in parts.items() for name, array in state.items()}
-        own = {
-            "config": self.config.model_dump(mode="json"),
-            "env_steps": self.num_env_steps,
-            "wall_s": self.wall_s,
-        }
+        config = self.config.model_dump(mode="json")
+        own = {"config": config, "env_steps": self.num_env_steps, "wall_s": self.wall_s}
         self.directory.sync()
         self.checkpoints.save(self.iteration, arrays, {**own, **meta})
         self._saved = self.iteration

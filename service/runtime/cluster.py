@@ -13,7 +13,6 @@ import time
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from datetime import UTC, datetime
 from functools import partial
 from typing import Any
 
@@ -27,21 +26,29 @@ from service.errors import DivergedError
 from service.policies.parameters import Parameters, PolicyError
 from service.runtime.books import Books
 from service.runtime.crew import THREAD_VARIABLES, Crew, Member
-from service.runtime.local import EVALUATED_GOALS, EVALUATION_SEED, OnIteration, RunResult
 from service.runtime.rundir import RunDirectory
+from service.runtime.runner import (
+    EVALUATED_GOALS,
+    EVALUATION_SEED,
+    ClusterError,
+    Health,
+    Metrics,
+    OnBeat,
+    OnIteration,
+    RunResult,
+)
 from service.runtime.slots import RolloutSlots
-from service.runtime.stateful import ClusterError, Stateful, one_line
+from service.runtime.stateful import Stateful, one_line
 from service.runtime.timing import Timing
 from service.runtime.workers import GeneratorGoneError, GeneratorWorker, LearnerWorker, Recorded, Round, Updated
-from service.store.models import RunState, RunStatus, RunWriter
+from service.store.models import GoalGrid
 
-Metrics = dict[str, float]
 _logger = logging.getLogger(__name__)
 
 POLL_S = 0.2
 """At least so often the driver looks at stop requests, deadlines and who is new."""
-TELL_S = 1.0
-"""Between two status reports."""
+BEAT_S = 1.0
+"""Between two signs of life."""
 RESIZE_S = 5.0
 """Between two looks at the size of the cluster."""
 MAX_ATTEMPTS = 3
@@ -103,7 +110,6 @@ class ClusterRun:
     Args:
         config: the run. Its ``game.num_worlds`` are shared out among the actors there are at the start.
         directory: where it keeps everything.
-        writer: told how the run goes.
         options: of the cluster.
         resume: continue from the newest checkpoint, whichever runner and however many actors wrote it.
 
@@ -116,7 +122,6 @@ class ClusterRun:
         self,
         config: Config,
         directory: RunDirectory,
-        writer: RunWriter,
         options: ClusterOptions = ClusterOptions(),
         *,
         resume: bool = False,
@@ -124,15 +129,14 @@ class ClusterRun:
         self.config, self.directory = config, directory
         self.books = Books(config, directory)
         self.timing = Timing()
-        self._writer, self._options = writer, options
-        self._started = datetime.now(UTC)
+        self._options = options
         self._stop_requested = self._converged = False
         self._waiting: dict[Any, Callable[[Any], None]] = {}
         self._slots = RolloutSlots()
         self._handed: list[Handed] = []
         self._current: Iteration | None = None
         self._evaluated: Metrics = {}
-        self._newest: Metrics = {}
+        self._grid: GoalGrid | None = None
         self._num_failed_rounds = self._num_counted = self._num_refused = 0
         self._last_error: str | None = None
         learner_state = generator_state = pending = None
@@ -142,8 +146,6 @@ class ClusterRun:
             learner_state, generator_state = parts["learner"], parts["generator"]
             pending = from_arrays(parts["pending"]) if "pending" in parts else None
             first_incarnation = int(meta.get("next_incarnation", 1))
-        else:
-            self.books.begin()
         self._next_incarnation = first_incarnation + 1
         self._learner = self._make_learner(learner_state, pending)
         self._generator = self._make_generator(generator_state)
@@ -163,8 +165,7 @@ class ClusterRun:
         if not resume:
             self._save()  # so that a run killed before its first interval can be resumed, too
             self._take_snapshot(after=-1)
-        self._turned = self._told = self._resized = time.monotonic()
-        self._tell("starting")
+        self._turned = self._beat = self._resized = time.monotonic()
 
     def request_stop(self) -> None:
         """End within a second, with a checkpoint of the last iteration. Safe to call from a signal handler."""
@@ -175,7 +176,7 @@ class ClusterRun:
         parameters: Parameters = ray.get(self._weights).steady_bob
         return parameters
 
-    def run(self, on_iteration: OnIteration = lambda metrics: None) -> RunResult:
+    def run(self, on_iteration: OnIteration = lambda metrics: None, on_beat: OnBeat = lambda: None) -> RunResult:
         """Play, learn, record, until the budget is spent, the stop criterion holds, or a stop is requested.
 
         Raises:
@@ -192,15 +193,28 @@ class ClusterRun:
             for reference in ready:
                 self._waiting.pop(reference)(reference)
             self._look_after()
+            if time.monotonic() - self._beat >= BEAT_S:
+                self._beat = time.monotonic()
+                on_beat()
         with self.books.saving_last(), self.timing("checkpoint"):
             if not self.books.saved:
                 self._save()
         return RunResult(reason, self.books.iteration, self.books.num_env_steps)
 
-    def close(self, state: RunState, error: str | None = None) -> None:
-        """End all workers and say how the run ended."""
-        self._last_error = error or self._last_error
-        self._tell(state)
+    def health(self) -> Health:
+        """Of all its workers."""
+        waiting = self._crew.num_waiting
+        lack = (f"{waiting} of {len(self._crew)} rollout actors wait for a free core",) if waiting else ()
+        actors = (*(each.status() for each in self._crew), self._learner.status(), self._generator.status())
+        return Health(actors, self._num_counted, self._num_refused, lack, self._last_error)
+
+    def grid(self) -> GoalGrid:
+        """What the task generator knew after the last iteration."""
+        assert self._grid is not None
+        return self._grid
+
+    def close(self) -> None:
+        """End all workers."""
         self._crew.close()
         self._learner.close()
         self._generator.close()
@@ -365,8 +379,9 @@ class ClusterRun:
         self._current = None
         self._num_counted += len(updated.counted)
         self._num_refused += len(updated.refused)
-        self._converged = recorded.should_stop
-        self.books.turn(iteration.num_env_steps, elapsed_s)
+        self._converged, self._grid = recorded.should_stop, recorded.grid
+        self.books.count(iteration.num_env_steps)
+        self.books.wall_s += elapsed_s
         metrics = {
             "iteration": self.books.iteration,
             "env_steps": self.books.num_env_steps,
@@ -381,11 +396,8 @@ class ClusterRun:
             **self._evaluated,
         }
         self._evaluated = {}
-        self._newest = metrics
         with self.timing("record"):
             self.directory.record(metrics)
-            self._writer.metrics({**metrics})
-            self._writer.goals(recorded.grid)
             self._on_iteration(metrics)
         with self.books.going_on("without this snapshot"):
             self._take_snapshot(after=before)
@@ -411,7 +423,7 @@ class ClusterRun:
     # --- looking after ---------------------------------------------------------------------------------------------
 
     def _look_after(self) -> None:
-        """Replace who hangs, follow the cluster's size, report."""
+        """Replace who hangs, follow the cluster's size."""
         for member in self._crew.hung():
             assert member.ticket is not None
             self._slots.lose(member.ticket)
@@ -421,43 +433,12 @@ class ClusterRun:
             self._resized = now
             for member in self._crew.resize(self._num_seats()):
                 self._expect(member)
-        if now - self._told >= TELL_S:
-            self._told = now
-            self._tell("running")
-            if self._writer.stop_requested():
-                self.request_stop()
 
     def _num_seats(self) -> int:
         if self._options.num_actors is not None:
             return self._options.num_actors
         cores = ray.cluster_resources().get("CPU", 0.0) - self._options.learner_cpus
         return max(1, int(cores // self._options.actor_threads))
-
-    def _tell(self, state: RunState) -> None:
-        waiting = self._crew.num_waiting
-        lack = [f"{waiting} of {len(self._crew)} rollout actors wait for a free core"] if waiting else []
-        self._writer.status(
-            RunStatus(
-                run_id=self.directory.path.name,
-                name=self.config.name,
-                runtime="ray",
-                state=state,
-                started=self._started,
-                heartbeat=datetime.now(UTC),
-                iteration=self.books.iteration,
-                num_env_steps=self.books.num_env_steps,
-                total_env_steps=self.config.run.total_env_steps,
-                env_steps_per_s=self._newest.get("time/env_steps_per_s", 0.0),
-                policy_version=self._version,
-                policy_lag=self._newest.get("learner/policy_lag", 0.0),
-                num_rollouts_counted=self._num_counted,
-                num_rollouts_refused=self._num_refused,
-                stopping=self._stop_requested,
-                last_error=self._last_error,
-                warnings=(*self._writer.warnings(), *lack),
-                actors=(*(each.status() for each in self._crew), self._learner.status(), self._generator.status()),
-            )
-        )
 
     # --- saving ----------------------------------------------------------------------------------------------------
 

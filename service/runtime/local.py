@@ -7,15 +7,14 @@ cores of a laptop are busy, and the order of everything is fixed, so a run is re
 from __future__ import annotations
 
 import logging
-import sys
+import os
 import time
-from collections import defaultdict
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
-from dataclasses import dataclass
+from datetime import UTC, datetime
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -23,44 +22,21 @@ from service.actors.evaluation import evaluate
 from service.actors.game import Acting, Players, SelfPlay
 from service.actors.rollout import Rollout, from_arrays, to_arrays
 from service.config import Config
-from service.envs.goals import GoalKind
 from service.errors import DivergedError
 from service.generator.generator import TaskGenerator
 from service.policies.evaluator import GaussianEvaluator, bob_evaluator
-from service.policies.parameters import PolicyError
-from service.registry.checkpoints import CheckpointStore
-from service.registry.errors import CheckpointError
+from service.policies.parameters import Parameters, PolicyError
+from service.runtime.books import Books
 from service.runtime.rundir import RunDirectory
+from service.runtime.runner import EVALUATED_GOALS, EVALUATION_SEED, Health, Metrics, OnBeat, OnIteration, RunResult
+from service.runtime.telling import goal_grid
 from service.runtime.timing import Timing
+from service.store.models import ActorStatus, GoalGrid
 
 if TYPE_CHECKING:
     from service.learner.learner import Weights
 
-Metrics = dict[str, float]
-OnIteration = Callable[[Metrics], None]
 _logger = logging.getLogger(__name__)
-
-EVALUATED_GOALS: tuple[GoalKind, ...] = ("table", "air", "mixed")
-EVALUATION_SEED = 1_000_003
-"""Evaluations during a run always use the same goals, so that they compare."""
-NUM_SNAPSHOTS = 10
-"""Of Bob, evenly over a run's env steps; one of him untrained comes before them."""
-
-
-@dataclass(frozen=True, slots=True)
-class RunResult:
-    """How a run ended."""
-
-    reason: str
-    """``finished`` (budget), ``converged`` (the paper's stop criterion) or ``interrupted``."""
-    iteration: int
-    num_env_steps: int
-
-
-class UnsavedError(CheckpointError):
-    """A run has ended, and its last checkpoint could not be written."""
-
-    exit_code = 1
 
 
 class LocalRun:
@@ -90,16 +66,11 @@ class LocalRun:
         self.learner = Learner(config)
         self.game = SelfPlay(config, self._rng, num_threads=config.run.num_threads)
         self.generator = TaskGenerator(config, self.game.worlds.state_size)
-        self.iteration = 0
-        self.num_env_steps = 0
-        self._wall_s = 0.0
+        self.books = Books(config, directory)
         self._stop_requested = False
         self._past: list[tuple[Acting, Acting]] = []
         self._pending: Rollout | None = None
-        self._saved: int | None = None
         self._executor = ThreadPoolExecutor(max_workers=1, thread_name_prefix="learner")
-        self._checkpoints = CheckpointStore(directory.checkpoints, config.run.keep_checkpoints)
-        self._snapshots = CheckpointStore(directory.snapshots, keep=sys.maxsize)
         if resume:
             self._load()
         else:
@@ -108,11 +79,49 @@ class LocalRun:
         after = {"after_iteration": self.iteration, "after_env_steps": self.num_env_steps} if resume else {}
         directory.start(config, **after)
 
+    @property
+    def iteration(self) -> int:
+        """Finished iterations."""
+        return self.books.iteration
+
+    @property
+    def num_env_steps(self) -> int:
+        """Of both players."""
+        return self.books.num_env_steps
+
+    def bob(self) -> Parameters:
+        """The newest Bob, as he is evaluated and published."""
+        return self.learner.weights().steady_bob
+
+    def health(self) -> Health:
+        """Of the one actor there is, this process."""
+        actor = ActorStatus(
+            name="rollout-0",
+            incarnation=0,
+            state="alive",
+            pid=os.getpid(),
+            heartbeat=datetime.now(UTC),
+            num_rollouts=self.iteration,
+            num_env_steps=self.num_env_steps,
+        )
+        return Health((actor,), num_rollouts_counted=max(0, self.iteration - 1))  # the newest is learned from next
+
+    def grid(self) -> GoalGrid:
+        """What the task generator knows about goals."""
+        return goal_grid(self.generator, self.iteration, self.num_env_steps)
+
+    def close(self) -> None:
+        """End the threads; a second call does nothing."""
+        self._executor.shutdown()
+        self.game.close()
+
     def request_stop(self) -> None:
         """End after the current iteration, with a checkpoint. Safe to call from a signal handler."""
         self._stop_requested = True
 
-    def run(self, on_iteration: OnIteration = lambda metrics: None) -> RunResult:
+    def run(
+        self, on_iteration: OnIteration = lambda metrics: None, on_beat: OnBeat = lambda: None
+    ) -> RunResult:  # an iteration is short: ``on_beat`` is never needed
         """Play, learn, record, until the budget is spent, the stop criterion holds, or a stop is requested.
 
         Raises:
@@ -126,20 +135,19 @@ class LocalRun:
             with self.timing("record"):
                 self.directory.record(metrics)
                 on_iteration(metrics)
-            with self._going_on("without this snapshot"):
+            with self.books.going_on("without this snapshot"):
                 self._take_snapshot(after=before)
-            if self.iteration % self.config.run.checkpoint_interval == 0:
-                with self._going_on(f"and saves again after {self.config.run.checkpoint_interval} iterations"):
+            if self.books.save_due:
+                with self.books.going_on(f"and saves again after {self.config.run.checkpoint_interval} iterations"):
                     self.save()
         self._save_last()
-        self._executor.shutdown()
-        self.game.close()
+        self.close()
         return RunResult(reason, self.iteration, self.num_env_steps)
 
     def _over(self) -> str | None:
         if self._stop_requested:
             return "interrupted"
-        if self.num_env_steps >= self.config.run.total_env_steps:
+        if self.books.budget_spent:
             return "finished"
         return "converged" if self.generator.should_stop() else None
 
@@ -162,18 +170,17 @@ class LocalRun:
         with self.timing("wait for learner"):
             metrics |= learning.result()
         self._pending = rollout
-        self.iteration += 1
-        self.num_env_steps += rollout.num_env_steps
+        self.books.count(rollout.num_env_steps)
         with self.timing("evaluate"):
             metrics |= self._evaluate(weights)
         elapsed_s = time.perf_counter() - start
-        self._wall_s += elapsed_s
+        self.books.wall_s += elapsed_s
         return {
             "iteration": self.iteration,
             "env_steps": self.num_env_steps,
             "world/num_broken": float(self.game.worlds.num_broken),
             **metrics,
-            "time/wall_s": self._wall_s,
+            "time/wall_s": self.books.wall_s,
             "time/env_steps_per_s": rollout.num_env_steps / elapsed_s,
         }
 
@@ -205,7 +212,7 @@ class LocalRun:
 
     def _evaluate(self, weights: Weights) -> Metrics:
         run, game = self.config.run, self.config.game
-        if run.evaluation_interval == 0 or self.iteration % run.evaluation_interval:
+        if not self.books.evaluation_due:
             return {}
         metrics, bob = {}, bob_evaluator(weights.steady_bob)
         for kind in EVALUATED_GOALS:
@@ -224,17 +231,9 @@ class LocalRun:
         return metrics
 
     def _take_snapshot(self, *, after: int) -> None:
-        """Keep Bob for good if a tenth of the budget was reached after that many env steps.
-
-        Checkpoints go, but what he could do at the beginning and in the middle is asked when the run is over. A resumed
-        run takes those it takes again with the same bits.
-        """
-        tenths = [steps * NUM_SNAPSHOTS // self.config.run.total_env_steps for steps in (after, self.num_env_steps)]
-        if tenths[0] == tenths[1]:
-            return
-        with self.timing("checkpoint"):
-            arrays = {f"bob/{name}": array for name, array in self.learner.weights().steady_bob.items()}
-            self._snapshots.save(self.iteration, arrays, {"env_steps": self.num_env_steps})
+        if self.books.snapshot_due(after=after):
+            with self.timing("checkpoint"):
+                self.books.take_snapshot(self.bob())
 
     # --- what goes wrong --------------------------------------------------------------------------------------------
 
@@ -245,9 +244,11 @@ class LocalRun:
         try:
             yield
         except (DivergedError, PolicyError) as error:
-            newest, learner = max(self._checkpoints.steps(), default=0), self.config.learner
+            newest, learner = max(self.books.checkpoints.steps(), default=0), self.config.learner
             has_it = (
-                f"delete {self._checkpoints.path(newest).name}, which has this policy; " if newest == played else ""
+                f"delete {self.books.checkpoints.path(newest).name}, which has this policy; "
+                if newest == played
+                else ""
             )
             rates = f"alice.learning_rate={learner.alice.learning_rate / 2:g} --set learner.bob.learning_rate="
             raise DivergedError(
@@ -255,24 +256,10 @@ class LocalRun:
                 f"for example --resume --set learner.{rates}{learner.bob.learning_rate / 2:g}"
             ) from error
 
-    @contextmanager
-    def _going_on(self, how: str) -> Iterator[None]:
-        """A full disk is no reason to end a night's run: what was saved before is intact, and what comes may fit."""
-        try:
-            yield
-        except CheckpointError as error:
-            _logger.warning("%s; the run goes on, %s", error, how)
-
     def _save_last(self) -> None:
-        if self._saved == self.iteration:
-            return
-        try:
-            self.save()
-        except CheckpointError as error:
-            saved = max(self._checkpoints.steps(), default=None)
-            raise UnsavedError(
-                f"{error}; the run is at iteration {self.iteration}, saved is iteration {saved}: --resume goes on there"
-            ) from error
+        with self.books.saving_last():
+            if not self.books.saved:
+                self.save()
 
     # --- exact resume ----------------------------------------------------------------------------------------------
 
@@ -284,29 +271,13 @@ class LocalRun:
             parts |= {"alice": weights.alice, "bob": weights.steady_bob}
             if self._pending is not None:
                 parts["pending"] = to_arrays(self._pending)
-            arrays = {f"{part}/{name}": array for part, state in parts.items() for name, array in state.items()}
-            meta = {
-                "config": self.config.model_dump(mode="json"),
-                "env_steps": self.num_env_steps,
-                "wall_s": self._wall_s,
-                "rng": self._rng.bit_generator.state,
-            }
-            self.directory.sync()
-            self._checkpoints.save(self.iteration, arrays, meta)
-            self._saved = self.iteration
+            self.books.save(parts, {"rng": self._rng.bit_generator.state})
 
     def _load(self) -> None:
-        checkpoint = self._checkpoints.load_latest()
-        parts: dict[str, dict[str, Any]] = defaultdict(dict)
-        for name, array in checkpoint.arrays.items():
-            part, _, rest = name.partition("/")
-            parts[part][rest] = array
+        parts, meta = self.books.resume()
         self.learner.load_state(parts["learner"])
         self.generator.load_state(parts["generator"])
-        self.game.load_state(parts["game"])
+        if "game" in parts:  # else the cluster runner saved it, whose actors are no part of a checkpoint
+            self.game.load_state(parts["game"])
         self._pending = from_arrays(parts["pending"]) if "pending" in parts else None
-        self.iteration = checkpoint.step
-        self.num_env_steps = int(checkpoint.meta["env_steps"])
-        self._wall_s = float(checkpoint.meta["wall_s"])
-        self._rng.bit_generator.state = checkpoint.meta["rng"]
-        _logger.info("resumed at iteration %d, %d env steps", self.iteration, self.num_env_steps)
+        self._rng.bit_generator.state = meta["rng"]

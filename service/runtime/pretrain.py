@@ -5,26 +5,29 @@ from __future__ import annotations
 import json
 import logging
 from collections.abc import Iterator
-from contextlib import suppress
+from contextlib import ExitStack, closing, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any, Literal, cast
 
 from service.config import Config, ConfigError, load_config
 from service.errors import TandemError
 from service.registry.names import Version
 from service.registry.registry import Registry
 from service.runtime.artifacts import make_artifacts
-from service.runtime.local import LocalRun, OnIteration, RunResult
+from service.runtime.local import LocalRun
 from service.runtime.publishing import measure_bob, publish_run
-from service.runtime.reporting import LocalReport
+from service.runtime.reporting import Report
 from service.runtime.rundir import RunDirectory
+from service.runtime.runner import OnIteration, Runner, RunResult, StateLostError
 from service.runtime.signals import InterruptError, StopSignals
 from service.store.address import address_from_environment
 from service.store.disk_reader import run_id_of
 from service.store.fanout import open_writer
+from service.store.server import redis_service
 
 if TYPE_CHECKING:
+    from service.runtime.cluster import ClusterOptions
     from service.store.models import RunState
 
 RESUMABLE = ("run.", "learner.alice.learning_rate=", "learner.bob.learning_rate=")
@@ -56,53 +59,86 @@ class UnfinishedError(TandemError):
 
 
 def pretrain(
-    config: Config, directory: RunDirectory, registry: Path, *, resume: bool = False, on_iteration: OnIteration
+    config: Config,
+    directory: RunDirectory,
+    registry: Path,
+    *,
+    resume: bool = False,
+    on_iteration: OnIteration,
+    cluster: ClusterOptions | None = None,
 ) -> Pretrained:
     """Run to the end, then evaluate, publish, draw and film.
 
     SIGINT and SIGTERM end the run after the current iteration, saved, and what follows it at once: a resumed run does
     that again. A second signal ends an iteration, too. A stop request ends it as a signal does.
 
+    Args:
+        config: the run.
+        directory: where it keeps everything.
+        registry: where it publishes.
+        resume: continue the run that the directory holds.
+        on_iteration: called with the metrics of every iteration.
+        cluster: run on the Ray cluster that this process is connected to; None: in this process.
+
     Raises:
-        TandemError: see ``LocalRun`` and ``RunDirectory.start``; or a registry that is only read; or a Redis that is
-            configured and cannot be used.
+        TandemError: see ``LocalRun``, ``ClusterRun`` and ``RunDirectory.start``; or a registry that is only read; or a
+            Redis that is configured and cannot be used.
         UnfinishedError: everything is saved, and not published.
         InterruptError: a signal while the run was being loaded, or a second one.
     """
     Registry(registry).check_writable()  # now, not after hours of learning
-    with StopSignals() as signals:
-        try:
-            directory.claim(resume=resume)
-            run_id = run_id_of(directory.path)
-            writer = open_writer(directory.path, run_id, address_from_environment())
-            with LocalReport(config, run_id, writer, published=directory.read_published()) as report:
-                done = _run(config, directory, registry, signals, report, on_iteration, resume=resume)
-                return replace(done, signal=signals.first)
-        finally:
-            directory.close()
+    runtime: Literal["local", "ray"] = "local" if cluster is None else "ray"
+    with StopSignals() as signals, ExitStack() as stack:
+        stack.callback(directory.close)
+        directory.claim(resume=resume)
+        run_id = run_id_of(directory.path)
+        # A run on a cluster has a Redis in any case; one in this process, where it is told of one.
+        redis = address_from_environment() if cluster is None else stack.enter_context(redis_service(directory.redis))
+        writer = open_writer(directory.path, run_id, redis)
+        report = Report(config, run_id, runtime, writer, published=directory.read_published())
+        with report:
+            done = None
+            while done is None:  # until a run ends otherwise than by losing its state with a machine
+                with closing(_start(config, directory, cluster, resume=resume)) as run:
+                    try:
+                        done = _run(run, config, directory, registry, signals, report, on_iteration)
+                    except StateLostError as error:
+                        _logger.warning("%s", error)
+                        resume = True
+            return replace(done, signal=signals.first)
+
+
+def _start(config: Config, directory: RunDirectory, cluster: ClusterOptions | None, *, resume: bool) -> Runner:
+    if cluster is None:
+        return LocalRun(config, directory, resume=resume)
+    from service.runtime.cluster import ClusterRun  # where there is no cluster, Ray is not needed
+
+    return ClusterRun(config, directory, cluster, resume=resume)
 
 
 def _run(
+    run: Runner,
     config: Config,
     directory: RunDirectory,
     registry: Path,
     signals: StopSignals,
-    report: LocalReport,
+    report: Report,
     on_iteration: OnIteration,
-    *,
-    resume: bool,
 ) -> Pretrained:
-    run = LocalRun(config, directory, resume=resume)
-    report.begin(run.iteration, run.num_env_steps)
-
-    def tell(metrics: dict[str, float]) -> None:
-        on_iteration(metrics)
-        report.iteration(metrics, run.generator)
+    def beat() -> None:
+        report.beat(run)
         if report.stop_requested():
             run.request_stop()
 
+    def tell(metrics: dict[str, float]) -> None:
+        on_iteration(metrics)
+        report.iteration(run, metrics)
+        if report.stop_requested():
+            run.request_stop()
+
+    report.begin(run)
     with signals.asking(run.request_stop):
-        result = run.run(tell)
+        result = run.run(tell, beat)
     done = Pretrained(result, {}, None, {}, run.timing.tree(), signals.first)
     if result.reason != "interrupted" and signals.first is None:
         with suppress(InterruptError):
@@ -112,13 +148,14 @@ def _run(
     return done
 
 
-def _finish(done: Pretrained, config: Config, directory: RunDirectory, registry: Registry, run: LocalRun) -> Pretrained:
+def _finish(done: Pretrained, config: Config, directory: RunDirectory, registry: Registry, run: Runner) -> Pretrained:
     _logger.info("learning is over; now evaluating, publishing, drawing and filming")
-    bob = run.learner.weights().steady_bob
+    bob = run.bob()
+    run.close()
     metrics, version = measure_bob(config, bob), None
     try:
         if config.policy.monolithic_bob is None:
-            version = publish_run(directory, registry, config, bob, metrics | {"env_steps": run.num_env_steps})
+            version = publish_run(directory, registry, config, bob, metrics | {"env_steps": done.result.num_env_steps})
     except TandemError as error:
         raise UnfinishedError(f"learning is over and saved, but not published: {error}; --resume does it") from error
     return replace(done, files=make_artifacts(directory), version=version, metrics=metrics, timing=run.timing.tree())

@@ -17,8 +17,8 @@ from service.registry.errors import RegistryError
 from service.registry.files import os_errors, write_atomic
 from service.registry.names import Version
 from service.registry.registry import Registry
-from service.runtime.local import EVALUATION_SEED
 from service.runtime.rundir import RunDirectory
+from service.runtime.runner import EVALUATION_SEED
 
 FINAL_EVALUATION_EPISODES = 300
 

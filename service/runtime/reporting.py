@@ -1,22 +1,20 @@
-"""What a run of one process tells about itself while it goes on, to whoever shows it."""
+"""What a run tells about itself while it goes on, to whoever shows it."""
 
 from __future__ import annotations
 
-import os
 import time
 from collections.abc import Mapping
 from datetime import UTC, datetime
 from types import TracebackType
-from typing import Any, Self
+from typing import Any, Literal, Self
 
 from service.config import Config
-from service.generator.generator import TaskGenerator
-from service.runtime.telling import goal_grid
+from service.runtime.runner import Runner
 from service.store.disk import GOALS_INTERVAL_S
-from service.store.models import ActorStatus, RunState, RunStatus, RunWriter
+from service.store.models import RunState, RunStatus, RunWriter
 
 
-class LocalReport:
+class Report:
     """Consumes the metrics of every iteration and produces statuses and goal grids; waits for nothing.
 
     A context manager: where its block ends with an exception, the run has failed or was interrupted, and in any case
@@ -25,18 +23,27 @@ class LocalReport:
     Args:
         config: the run.
         run_id: of the run.
+        runtime: which runner runs it.
         writer: to whom it is told.
         published: what the run published before.
     """
 
-    def __init__(self, config: Config, run_id: str, writer: RunWriter, *, published: str | None = None) -> None:
+    def __init__(
+        self,
+        config: Config,
+        run_id: str,
+        runtime: Literal["local", "ray"],
+        writer: RunWriter,
+        *,
+        published: str | None = None,
+    ) -> None:
         self._writer = writer
         self._gridded_s = float("-inf")
         now = datetime.now(UTC)
         self._status = RunStatus(
             run_id=run_id,
             name=config.name,
-            runtime="local",
+            runtime=runtime,
             state="starting",
             started=now,
             heartbeat=now,
@@ -59,36 +66,38 @@ class LocalReport:
         finally:
             self._writer.close()
 
-    def begin(self, iteration: int, num_env_steps: int) -> None:
-        """Say that the run goes on after that many iterations and env steps."""
-        self._tell(state="running", iteration=iteration, num_env_steps=num_env_steps)
+    def begin(self, runner: Runner) -> None:
+        """Say that the run begins, or goes on where it was."""
+        self._tell(state="running")
+        self.beat(runner)
 
-    def iteration(self, metrics: Mapping[str, float], generator: TaskGenerator) -> None:
+    def iteration(self, runner: Runner, metrics: Mapping[str, float]) -> None:
         """Tell an iteration's metrics, where the run is, and now and then what the generator knows."""
-        iteration, num_env_steps = int(metrics["iteration"]), int(metrics["env_steps"])
         self._writer.metrics(dict(metrics))
         if time.monotonic() - self._gridded_s >= GOALS_INTERVAL_S:
             self._gridded_s = time.monotonic()
-            self._writer.goals(goal_grid(generator, iteration, num_env_steps))
-        num_rollouts = iteration - 1  # the newest one is learned from during the next iteration
-        actor = ActorStatus(
-            name="rollout-0",
-            incarnation=0,
-            state="alive",
-            pid=os.getpid(),
-            heartbeat=datetime.now(UTC),
-            num_rollouts=iteration,
-            num_env_steps=num_env_steps,
+            self._writer.goals(runner.grid())
+        self._status = self._status.model_copy(
+            update={
+                "env_steps_per_s": metrics["time/env_steps_per_s"],
+                "policy_version": int(metrics.get("learner/version", self._status.policy_version)),
+                "policy_lag": metrics.get("learner/policy_lag", 0.0),
+            }
         )
+        self.beat(runner)
+
+    def beat(self, runner: Runner) -> None:
+        """Tell that the run is alive, how far it is, and how its parts are."""
+        health = runner.health()
         self._tell(
-            iteration=iteration,
-            num_env_steps=num_env_steps,
-            env_steps_per_s=metrics["time/env_steps_per_s"],
-            policy_version=int(metrics.get("learner/version", self._status.policy_version)),
-            policy_lag=metrics.get("learner/policy_lag", 0.0),
-            num_rollouts_counted=num_rollouts,
+            iteration=runner.books.iteration,
+            num_env_steps=runner.books.num_env_steps,
+            num_rollouts_counted=health.num_rollouts_counted,
+            num_rollouts_refused=health.num_rollouts_refused,
             stopping=self.stop_requested(),
-            actors=(actor,),
+            actors=health.actors,
+            last_error=health.last_error,
+            warnings=health.warnings,
         )
 
     def stop_requested(self) -> bool:
@@ -97,9 +106,11 @@ class LocalReport:
 
     def end(self, state: RunState, *, published: str | None = None, error: str | None = None) -> None:
         """Say how the run ended."""
-        self._tell(state=state, stopping=False, published=published or self._status.published, last_error=error)
+        published = published or self._status.published
+        self._tell(state=state, stopping=False, published=published, last_error=error or self._status.last_error)
 
     def _tell(self, **changes: Any) -> None:
-        changes |= {"heartbeat": datetime.now(UTC), "warnings": tuple(self._writer.warnings())}
+        warnings = (*self._writer.warnings(), *changes.pop("warnings", ()))
+        changes |= {"heartbeat": datetime.now(UTC), "warnings": warnings}
         self._status = self._status.model_copy(update=changes)
         self._writer.status(self._status)

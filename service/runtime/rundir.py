@@ -10,6 +10,7 @@
 | ``checkpoints/`` | the newest checkpoints; ``--resume`` continues from them exactly |
 | ``snapshots/`` | Bob's parameters untrained and after each tenth of the run, kept for good |
 | ``published.json`` | the version this run published last, and the sha256 of its parameters |
+| ``redis/`` | what a run on a cluster keeps in a Redis of its own, where none is configured |
 | ``broken/`` | states of worlds whose physics diverged |
 | ``status.json``, ``goals.json``, ``stop`` | what it tells while it goes on; see ``service.store.disk`` |
 | ``.lock`` | held by the process that runs it |
@@ -63,6 +64,7 @@ class RunDirectory:
         self.snapshots = path / "snapshots"
         self.published_file = path / "published.json"
         self.broken = path / "broken"
+        self.redis = path / "redis"
         self._metrics = JsonlWriter(self.metrics_file)
         self._goals = JsonlWriter(self.goals_file)
         self._events: EventFile | None = None

@@ -9,7 +9,7 @@ from typing import Any
 import ray
 from ray.exceptions import GetTimeoutError, RayError
 
-from service.errors import TandemError
+from service.runtime.runner import ClusterError, StateLostError
 from service.runtime.workers import Place
 from service.store.models import ActorStatus
 
@@ -18,12 +18,6 @@ START_S = 120.0
 ANSWER_S = 20.0
 """A worker that is alive and has nothing to do answers within it."""
 _logger = logging.getLogger(__name__)
-
-
-class ClusterError(TandemError):
-    """The cluster does not let the run go on; what it had learned is saved."""
-
-    exit_code = 1
 
 
 class Stateful:
@@ -80,7 +74,7 @@ class Stateful:
         """Another, from the newest state; what the last one was doing has to be asked of it again.
 
         Raises:
-            ClusterError: it does not come up, or the state was lost with the node that kept it.
+            StateLostError: it does not come up, or the state was lost with the node that kept it.
         """
         _logger.warning("the %s is gone (%s); another goes on from its last state", self.name, why)
         ray.kill(self.handle, no_restart=True)
@@ -90,9 +84,9 @@ class Stateful:
         try:
             self.up()
         except RayError as error:
-            raise ClusterError(
-                f"the {self.name} cannot go on from its last state ({type(error).__name__}); start the run again, it "
-                "continues from its newest checkpoint"
+            raise StateLostError(
+                f"the {self.name} cannot go on from its last state ({one_line(error)}); the run goes back to its "
+                "newest checkpoint"
             ) from None
 
     def close(self) -> None:

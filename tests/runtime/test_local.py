@@ -10,7 +10,8 @@ from service.errors import TandemError
 from service.learner.learner import Learner
 from service.registry.checkpoints import CheckpointStore
 from service.registry.errors import CheckpointError
-from service.runtime.local import LocalRun, UnsavedError
+from service.runtime.books import UnsavedError
+from service.runtime.local import LocalRun
 from service.runtime.pretrain import resumed_config
 from service.runtime.primitives import read_parameters, read_stages
 from service.runtime.rundir import RunDirectory
@@ -232,7 +233,7 @@ def test_a_run_killed_between_two_iterations(uninterrupted, tmp_path, iteration)
     run, result = play(tmp_path, config, resume=True)
     assert result.reason == "finished"
     assert_same_run(tmp_path, uninterrupted)
-    assert run._wall_s > 0.0
+    assert run.books.wall_s > 0.0
     snapshots = [
         {file.name: file.read_bytes() for file in (path / "snapshots").iterdir()} for path in (tmp_path, uninterrupted)
     ]
