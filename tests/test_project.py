@@ -13,7 +13,7 @@ import pytest
 import service
 
 ROOT = Path(__file__).parents[1]
-HEAVY = ("torch", "mujoco", "matplotlib", "gymnasium", "tensorboard", "imageio", "ray")
+HEAVY = ("torch", "mujoco", "matplotlib", "gymnasium", "tensorboard", "imageio", "ray", "redis")
 ROOMS_WITHOUT_TORCH = ("actors", "envs", "generator", "registry")
 ROOMS_BELOW_RUNTIME = ("envs", "policies", "actors", "generator", "learner", "registry")
 VERBS = ("demo", "pretrain", "evaluate", "render", "coverage", "registry")

@@ -37,9 +37,11 @@ def _listener(url: str) -> Listener | None:
         return None
     try:
         from service.store.address import RedisAddress
+
+        address = RedisAddress(url)  # says so where the package redis is missing
         from service.store.registry_index import RegistryIndex
 
-        return RegistryIndex(RedisAddress(url))
+        return RegistryIndex(address)
     except (ImportError, TandemError) as error:  # a registry works without
         _logger.warning("the registry's index is not kept up to date: %s", error)
         return None
