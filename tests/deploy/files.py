@@ -1,5 +1,6 @@
 """What is in deploy/, parsed, and the commands and shell snippets in it and in its documents."""
 
+import functools
 import re
 import shlex
 from pathlib import Path
@@ -11,20 +12,24 @@ DEPLOY = ROOT / "deploy"
 KUBERNETES = DEPLOY / "kubernetes"
 DOCUMENTS = [DEPLOY / "README.md", ROOT / "docs" / "cluster.md", ROOT / "docs" / "operations.md"]
 COMPOSE = DEPLOY / "compose" / "compose.yaml"
+PROMETHEUS = DEPLOY / "prometheus" / "prometheus.yml"
 YAML = sorted([*DEPLOY.rglob("*.yaml"), *DEPLOY.rglob("*.yml")])
 SCRIPTS = sorted(DEPLOY.rglob("*.sh"))
 
 
+@functools.cache
 def load(path):
-    """The one document of a YAML file."""
+    """The one document of a YAML file, to be read and not to be changed."""
     return yaml.safe_load(Path(path).read_text())
 
 
+@functools.cache
 def compose():
     """The compose file, without its extension fields."""
     return {key: value for key, value in load(COMPOSE).items() if not key.startswith("x-")}
 
 
+@functools.cache
 def manifests(folder="*"):
     """Every Kubernetes object under deploy/kubernetes, or in one folder of it."""
     paths = sorted(path for path in KUBERNETES.glob(f"{folder}/*.yaml") if path.name != "kustomization.yaml")
@@ -48,6 +53,17 @@ def pod_templates(document):
     return here + [found for each in document.values() for found in pod_templates(each)]
 
 
+def ports(template):
+    """The numbers of a pod's ports, by name."""
+    return {port["name"]: port["containerPort"] for box in template["spec"]["containers"] for port in box["ports"]}
+
+
+def scrape_job(name):
+    """One of Prometheus' scrape configurations."""
+    (found,) = [job for job in load(PROMETHEUS)["scrape_configs"] if job["job_name"] == name]
+    return found
+
+
 def walk(tree, path=()):
     """Every leaf of a parsed document, with the keys that lead to it."""
     if isinstance(tree, dict):
@@ -63,11 +79,13 @@ def walk(tree, path=()):
 def snippets(document):
     """The indented or fenced blocks of a Markdown file that are commands to type."""
     blocks = re.findall(r"^```(?:sh)?\n(.*?)^```$", document.read_text(), re.MULTILINE | re.DOTALL)
-    return [block for block in blocks if re.match(r"(docker|kubectl|ray|tandem|sh|export|curl|promtool|redis-cli)\b", block)]
+    return [
+        block for block in blocks if re.match(r"(docker|kubectl|ray|tandem|sh|export|curl|promtool|redis-cli)\b", block)
+    ]
 
 
 def commands(text, program):
-    """Every call of a program in shell text, as its arguments: at a line's beginning or after ``--``; comments are cut."""
+    """Every call of a program in shell text, as its arguments: at a line's beginning or after ``--``."""
     text = re.sub(r"\\\n\s*(?:#\s+)?", " ", text)
     found = re.findall(rf"(?:^(?:#\s+)?|\s--\s+|\bexec head ){program} ([^\n`|&]*)", text, re.MULTILINE)
     return [shlex.split(each, comments=True) for each in found]

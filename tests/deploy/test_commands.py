@@ -30,8 +30,10 @@ def ray_commands():
         ("raycluster", manifest("RayCluster", "tandem")["spec"]),
         ("rayjob", manifest("RayJob", "cube")["spec"]["rayClusterSpec"]),
     ):
-        for group in [spec["headGroupSpec"], *spec["workerGroupSpecs"]]:
-            found.append((name, ["start", *(f"--{key}={value}" for key, value in group["rayStartParams"].items())]))
+        groups = [spec["headGroupSpec"], *spec["workerGroupSpecs"]]
+        found += [
+            (name, ["start", *(f"--{key}={value}" for key, value in each["rayStartParams"].items())]) for each in groups
+        ]
     texts = [*DOCUMENTS, DEPLOY / "compose" / "compose.yaml"]
     found += [(path.name, arguments) for path in texts for arguments in commands(path.read_text(), "ray")]
     return [pytest.param(arguments, id=f"{where}: {' '.join(arguments)[:60]}") for where, arguments in found]

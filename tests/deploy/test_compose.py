@@ -5,7 +5,7 @@ import re
 
 import pytest
 
-from tests.deploy.files import DEPLOY, ROOT, compose, load
+from tests.deploy.files import DEPLOY, PROMETHEUS, ROOT, compose, scrape_job
 from tests.deploy.shapes import COMPOSE, mistakes
 
 SERVICES = compose()["services"]
@@ -56,7 +56,7 @@ def test_secrets_and_volumes_and_files_are_there(name):
     assert set(secrets) <= set(tree["secrets"])
     used = {path.group(1) for path in re.finditer(r"/run/secrets/(\w+)", str(service))}
     if name == "prometheus":
-        used |= set(re.findall(r"/run/secrets/(\w+)", (DEPLOY / "prometheus" / "prometheus.yml").read_text()))
+        used |= set(re.findall(r"/run/secrets/(\w+)", PROMETHEUS.read_text()))
     assert used == set(secrets)
     for volume in service.get("volumes", []):
         source = volume.split(":")[0]
@@ -100,10 +100,9 @@ def test_ray_asks_for_its_token():
 
 def test_names_in_addresses_are_services():
     addresses = re.findall(r"(?:@|--address=|//)([a-z][\w-]*):(\d+)", str(SERVICES))
-    (scraped,) = [each for each in load(DEPLOY / "prometheus" / "prometheus.yml")["scrape_configs"] if each["job_name"] == "ray"]  # fmt: skip
-    (discovered,) = scraped["dns_sd_configs"]
+    (discovered,) = scrape_job("ray")["dns_sd_configs"]
     addresses += [(name, str(discovered["port"])) for name in discovered["names"]]
-    addresses += re.findall(r'"(\w+):(\d+)"', (DEPLOY / "prometheus" / "prometheus.yml").read_text())
+    addresses += re.findall(r'"(\w+):(\d+)"', PROMETHEUS.read_text())
     datasource = (DEPLOY / "grafana" / "provisioning" / "datasources" / "prometheus.yaml").read_text()
     addresses += re.findall(r"http://(\w+):(\d+)", datasource)
     assert {name for name, _ in addresses} == {"redis", "head", "worker", "gpu-worker", "status", "prometheus"}

@@ -9,7 +9,18 @@ import subprocess
 import pytest
 import yaml
 
-from tests.deploy.files import DEPLOY, KUBERNETES, ROOT, load, manifest, manifests, pod_templates, walk
+from tests.deploy.files import (
+    DEPLOY,
+    KUBERNETES,
+    ROOT,
+    load,
+    manifest,
+    manifests,
+    pod_templates,
+    ports,
+    scrape_job,
+    walk,
+)
 from tests.deploy.shapes import manifest_mistakes
 
 ALL = [pytest.param(each, id=f"{each['kind']}-{each['metadata']['name']}") for each in manifests()]
@@ -103,8 +114,7 @@ def test_services_lead_to_pods_and_ports():
     assert {each["metadata"]["name"] for each in services} == {"redis", "status"}
     for service in services:
         (template,) = [each for each in templates if service["spec"]["selector"].items() <= labels(each).items()]
-        ports = {port["name"] for box in template["spec"]["containers"] for port in box["ports"]}
-        assert {each["targetPort"] for each in service["spec"]["ports"]} <= ports
+        assert {each["targetPort"] for each in service["spec"]["ports"]} <= set(ports(template))
 
 
 @pytest.mark.parametrize("document", [each for each in manifests() if each["kind"] in ("Deployment", "StatefulSet")])
@@ -148,7 +158,8 @@ def test_ray(name):
         # Ray takes the number of cores from the limit, and what is offered has to be there.
         (box,) = group["template"]["spec"]["containers"]
         assert box["resources"]["limits"]["cpu"] == box["resources"]["requests"]["cpu"]
-    with_gpu = [box["image"] for group in groups for box in group["template"]["spec"]["containers"] if "nvidia.com/gpu" in box["resources"]["limits"]]  # fmt: skip
+    boxes = [box for group in groups for box in group["template"]["spec"]["containers"]]
+    with_gpu = [box["image"] for box in boxes if "nvidia.com/gpu" in box["resources"]["limits"]]
     assert with_gpu == ["tandem-cuda"]
 
 
@@ -205,7 +216,7 @@ def test_nobody_may_talk_to_a_pod_unless_a_policy_says_so():
             for peer in rule["from"]:
                 ours = any(selects(peer["podSelector"], each) for each in templates)
                 assert ours or ("namespaceSelector" in peer and rule["ports"]), name
-            opened = {port["name"]: port["containerPort"] for each in chosen for box in each["spec"]["containers"] for port in box["ports"]}  # fmt: skip
+            opened = {name: number for each in chosen for name, number in ports(each).items()}
             for port in rule.get("ports", []):
                 assert port["port"] in opened or port["port"] in opened.values(), name
 
@@ -218,14 +229,13 @@ def test_pod_monitors_find_pods_and_ports():
         assert chosen
         for endpoint in spec["podMetricsEndpoints"]:
             for template in chosen:
-                assert endpoint["port"] in {port["name"] for box in template["spec"]["containers"] for port in box["ports"]}  # fmt: skip
+                assert endpoint["port"] in ports(template)
 
 
 def test_what_is_kept_of_rays_metrics_is_the_same_everywhere():
     (ray,) = [each["spec"] for each in manifests("monitoring") if each["metadata"]["name"] == "ray"]
     (here,) = ray["podMetricsEndpoints"][0]["metricRelabelings"]
-    (scrape,) = [each for each in load(DEPLOY / "prometheus" / "prometheus.yml")["scrape_configs"] if each["job_name"] == "ray"]  # fmt: skip
-    (there,) = scrape["metric_relabel_configs"]
+    (there,) = scrape_job("ray")["metric_relabel_configs"]
     assert here["regex"] == there["regex"]
 
 
@@ -235,7 +245,9 @@ def test_kustomizations_name_every_file(folder):
     assert kustomization["namespace"] == manifest("Namespace", "tandem")["metadata"]["name"]
     files = {path.name for path in (KUBERNETES / folder).glob("*.yaml")} - {"kustomization.yaml"}
     assert set(kustomization["resources"]) == files
-    assert all((KUBERNETES / folder / each / "kustomization.yaml").is_file() for each in kustomization.get("components", []))
+    assert all(
+        (KUBERNETES / folder / each / "kustomization.yaml").is_file() for each in kustomization.get("components", [])
+    )
 
 
 def test_images_are_ours_by_one_name_or_pinned():

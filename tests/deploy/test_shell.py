@@ -17,9 +17,7 @@ from tests.deploy.files import DEPLOY, DOCUMENTS, SCRIPTS, YAML, compose, manife
 
 HEALTH_CHECKS = [each["healthcheck"]["test"][1] for each in compose()["services"].values() if "healthcheck" in each]
 PROBES = [
-    value
-    for path, value in walk(manifests())
-    if path[-2:-1] == ("command",) and "Probe" in str(path) and path[-1] == 2
+    value for path, value in walk(manifests()) if path[-2:-1] == ("command",) and "Probe" in str(path) and path[-1] == 2
 ]
 
 
@@ -61,7 +59,7 @@ def test_there_are_commands_in_yaml():
 @pytest.mark.parametrize("document", DOCUMENTS, ids=lambda path: path.name)
 def test_commands_in_documents_parse(document):
     found = snippets(document)
-    assert found
+    assert len(found) == document.read_text().count("```") / 2  # every block is one of commands
     for snippet in found:
         check_syntax(snippet)
 
@@ -99,7 +97,9 @@ def test_redis_starts_with_a_password_and_keeps_what_it_is_told(where, tmp_path)
     (tmp_path / "bin").mkdir()
     (tmp_path / "bin" / "redis-server").symlink_to(redis_server())
     script = redis_scripts()[where].replace("/run/secrets", str(tmp_path))
-    script, changed = re.subn(r"^dir /data$", f"dir {tmp_path}\nport 0\nunixsocket redis.sock", script, flags=re.MULTILINE)
+    script, changed = re.subn(
+        r"^dir /data$", f"dir {tmp_path}\nport 0\nunixsocket redis.sock", script, flags=re.MULTILINE
+    )
     assert changed == 1
     environment = {"PATH": f"{tmp_path / 'bin'}:/usr/bin:/bin", "REDISCLI_AUTH": password}
     server = subprocess.Popen(["sh", "-euc", script], env=environment, cwd=tmp_path, stdout=subprocess.DEVNULL)
