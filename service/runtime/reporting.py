@@ -68,7 +68,7 @@ class Report:
 
     def begin(self, runner: Runner) -> None:
         """Say that the run begins, or goes on where it was."""
-        self._tell(state="running")
+        self._status = self._status.model_copy(update={"state": "running"})
         self.beat(runner)
 
     def iteration(self, runner: Runner, metrics: Mapping[str, float]) -> None:
