@@ -2,12 +2,16 @@
 
 import re
 import shlex
+from contextlib import nullcontext
+from pathlib import Path
 
 import pytest
 import typer
+from typer.testing import CliRunner
 
 from service.cli import app
-from tests.deploy.files import DEPLOY, DOCUMENTS, commands, compose, manifest, manifests, pod_templates
+from service.config import dump_config
+from tests.deploy.files import DEPLOY, DOCUMENTS, ROOT, commands, compose, manifest, manifests, pod_templates
 
 
 def tandem_commands():
@@ -74,6 +78,28 @@ def test_ray_takes_it(arguments):
     parse(cli, arguments)
 
 
+@pytest.mark.parametrize("arguments", [each for each in tandem_commands() if each.values[0][0] == "pretrain"])
+def test_pretrain_begins_with_it_and_goes_on_with_it(arguments, monkeypatch, tmp_path):
+    """Up to where a run would begin: options that exclude each other are found out only then."""
+    if missing := not_there_yet(typer.main.get_command(app), arguments):
+        pytest.skip(f"{missing} is being built")
+    begun = []
+
+    def pretrain(config, path, registry, *, resume, **kwargs):
+        begun.append((path, resume))
+        path.mkdir(parents=True, exist_ok=True)
+        (path / "config.yaml").write_text(dump_config(config))
+
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("service.cli._pretrain", pretrain)
+    monkeypatch.setattr("service.runtime.connecting.connected", lambda *_: nullcontext())
+    here = [re.sub(r"^(/usr/local/share/tandem/)?configs/", f"{ROOT}/configs/", word) for word in arguments]
+    for resumed in (False, True):
+        result = CliRunner().invoke(app, here)
+        assert result.exit_code == 0, result.output
+        assert begun.pop() == (Path("runs/cube"), resumed)
+
+
 def test_a_wrong_option_is_found():
     from ray.scripts.scripts import cli
 
@@ -94,8 +120,6 @@ def test_commands_are_found_in_text():
 
 
 def test_configurations_that_are_named_are_in_the_image():
-    from tests.deploy.files import ROOT
-
     named = {
         word
         for each in tandem_commands()

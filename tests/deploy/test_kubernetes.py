@@ -170,6 +170,12 @@ def test_the_job_runs_on_a_cluster_like_the_one_that_stays():
     assert specs["job"] == kept
 
 
+def working_directory():
+    """Of a container of our image: where Ray starts, and with it the driver."""
+    text = (DEPLOY / "docker" / "Dockerfile").read_text()
+    return re.findall(r"^WORKDIR (\S+)$", text, re.MULTILINE)[-1]
+
+
 def test_a_retried_job_goes_on_with_the_same_run():
     job = manifest("RayJob", "cube")["spec"]
     assert job["backoffLimit"] > 0
@@ -181,7 +187,8 @@ def test_a_retried_job_goes_on_with_the_same_run():
     assert re.fullmatch(r"[a-z0-9-]+", options["--run-id"])
     (head,) = job["rayClusterSpec"]["headGroupSpec"]["template"]["spec"]["containers"]
     mounts = [each["mountPath"] for each in head["volumeMounts"]]
-    assert options["--run-dir"] == f"{mounts[0]}/{options['--run-id']}"
+    assert "workingDir" not in head
+    assert f"{working_directory()}/runs" == mounts[0]
     assert options["--registry"] == mounts[1]
 
 
