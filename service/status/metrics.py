@@ -113,7 +113,7 @@ RUN_METRICS: tuple[RunMetric, ...] = (
 
 _RUN_INFO = Metric("tandem_run_info", "gauge", ("run", "name", "runtime"), "1; which primitives a run makes, and how")
 _RUN_STATE = Metric("tandem_run_state", "gauge", ("run", "state"), "1 for the state a run is in, 0 for the others")
-_RUN_ACTORS = Metric("tandem_run_actors", "gauge", ("run", "state"), "Actors, learner and generator by state")
+_RUN_ACTORS = Metric("tandem_run_actors", "gauge", ("run", "state"), "Actors, learner and generator of an active run")
 _RUNS = Metric("tandem_runs", "gauge", ("state",), "All runs there are by state")
 _STORE_UP = Metric("tandem_store_up", "gauge", (), "1 if the runs could be read for this answer")
 _REGISTRY_UP = Metric("tandem_registry_up", "gauge", (), "1 if the registry could be read for this answer")
@@ -221,7 +221,7 @@ def _families(runs: list[tuple[RunStatus, Record]]) -> Iterator[_Family]:
         for state in _STATES:
             states.add_metric([run.run_id, state], run.state == state)
         count = Count(actor.state for actor in run.actors)
-        for actor_state in _ACTOR_STATES if run.actors else ():
+        for actor_state in _ACTOR_STATES if run.actors and run.state in ACTIVE else ():
             actors.add_metric([run.run_id, actor_state], count[actor_state])
     yield from (info, states, actors)
     for metric in RUN_METRICS:

@@ -68,6 +68,7 @@ class StatusServer:
             raise
         self.url = f"http://{_reachable(address)}:{self.port}"
         """Where this machine reaches it."""
+        self.app = app
         self._server = _Server(app)
         self._thread = threading.Thread(target=self._serve, name=f"status-{self.port}", daemon=True)
 

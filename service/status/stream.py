@@ -110,7 +110,7 @@ class _Follower:
         try:
             # the status first: records that come in between must not be missing when it says that the run has ended
             status = self._runs.run(self._run_id)
-            events = self._new_records(status)
+            events = self._new_records()
         except StoreUnavailableError as error:
             events = [] if self._away else [_event("unavailable", json.dumps({"detail": str(error)}))]
             self._away = True
@@ -127,13 +127,13 @@ class _Follower:
             events.append(_event("end", status.model_dump_json()))
         return events
 
-    def _new_records(self, status: RunStatus) -> list[bytes]:
+    def _new_records(self) -> list[bytes]:
         # the last record heard of is read again, for it is gone when the run was resumed from before it
         records = self._runs.metrics(self._run_id, after_iteration=max(0, self._heard - 1))
         events = []
         if self._heard and not records:
-            self._heard = min(status.iteration, self._heard - 1)
-            records = self._runs.metrics(self._run_id, after_iteration=self._heard)
+            there = self._runs.metrics(self._run_id)
+            self._heard = int(there[-1]["iteration"] or 0) if there else 0
             events.append(_event("reset", json.dumps({"after_iteration": self._heard})))
         for record in records:
             iteration = int(record["iteration"] or 0)

@@ -1,0 +1,44 @@
+"""Services on loopback, each with the same two runs and a registry of two versions."""
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import httpx
+import pytest
+
+from service.registry.registry import Registry
+from service.status.server import StatusServer
+from service.store.disk_reader import DiskReader
+from tests.status.runs import BEARER, TOKEN, publish, write_runs
+
+
+@pytest.fixture(scope="module")
+def home(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Where ``runs`` and ``registry`` are."""
+    home = tmp_path_factory.mktemp("status")
+    write_runs(home / "runs")
+    registry = Registry(home / "registry")
+    publish(registry, value=1.0)
+    publish(registry, value=2.0)
+    registry.set_alias("tiny", "champion", 1)
+    return home
+
+
+def serve(home: Path, *, token: str | None = TOKEN, host: str = "127.0.0.1") -> StatusServer:
+    """A service of what is at ``home``, not started."""
+    runs = home / "runs"
+    return StatusServer(DiskReader(runs), Registry(home / "registry"), token=token, host=host, port=0, runs_dir=runs)
+
+
+@pytest.fixture(scope="module")
+def server(home: Path) -> Iterator[StatusServer]:
+    """With a token, for this machine."""
+    with serve(home) as server:
+        yield server
+
+
+@pytest.fixture(scope="module")
+def client(server: StatusServer) -> Iterator[httpx.Client]:
+    """Of that service, with its token."""
+    with httpx.Client(base_url=server.url, headers=BEARER, trust_env=False) as client:
+        yield client

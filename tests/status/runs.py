@@ -1,0 +1,113 @@
+"""Run directories and a registry as a service finds them, written by hand: nothing is trained for these tests."""
+
+from __future__ import annotations
+
+import json
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from service.registry.names import Version
+from service.registry.registry import Registry
+from service.store.models import ActorStatus, GoalCell, GoalGrid, RunStatus
+
+TOKEN = "5f1d3c0a9b7e4826d1c0b5a4938271605f4e3d2c1b0a9988"
+WRONG = "0000000000000000000000000000000000000000000000ff"
+VIDEO = bytes(range(256)) * 40
+BEARER = {"Authorization": f"Bearer {TOKEN}"}
+
+
+def status(run_id: str, **changes: Any) -> RunStatus:
+    """Of a run that is going on and was heard of just now."""
+    now = datetime.now(UTC)
+    fields: dict[str, Any] = {
+        "run_id": run_id,
+        "name": "panda-cube",
+        "runtime": "ray",
+        "state": "running",
+        "started": now,
+        "heartbeat": now,
+        "iteration": 3,
+        "num_env_steps": 3000,
+        "total_env_steps": 10_000,
+        "env_steps_per_s": 500.0,
+        "policy_version": 2,
+        "policy_lag": 1.0,
+        "num_rollouts_counted": 6,
+        "num_rollouts_refused": 1,
+        "actors": (
+            ActorStatus(name="rollout-0", incarnation=2, state="alive", heartbeat=now, last_error="killed"),
+            ActorStatus(name="rollout-1", incarnation=0, state="lost", heartbeat=now),
+            ActorStatus(name="learner", incarnation=1, state="alive", heartbeat=now),
+        ),
+    }
+    return RunStatus(**(fields | changes))
+
+
+def write_status(root: Path, run_id: str, **changes: Any) -> RunStatus:
+    """A run that is there from now on, or its new status."""
+    written = status(run_id, **changes)
+    (root / run_id).mkdir(parents=True, exist_ok=True)
+    (root / run_id / "status.json").write_text(written.model_dump_json())
+    return written
+
+
+def record(iteration: int, **values: float | None) -> dict[str, Any]:
+    """What a run has to say of an iteration."""
+    return {
+        "iteration": iteration,
+        "env_steps": 1000 * iteration,
+        "alice/valid_fraction": 0.5,
+        "alice/lifted_fraction": 0.25,
+        "bob/success_rate": 0.125 * (iteration % 8),
+        "learner/idle_fraction": 0.0625,
+        **values,
+    }
+
+
+def append(root: Path, run_id: str, *records: dict[str, Any]) -> None:
+    """Write records as a run does."""
+    with (root / run_id / "metrics.jsonl").open("a") as file:
+        file.writelines(json.dumps(each) + "\n" for each in records)
+
+
+def grid() -> GoalGrid:
+    """Of two cells."""
+    return GoalGrid(
+        iteration=3,
+        num_env_steps=3000,
+        cell_size_m=0.05,
+        shape=(7, 7, 7),
+        num_cells=343,
+        lower_m=(-0.2, -0.2, 0.0),
+        upper_m=(0.1, 0.1, 0.3),
+        cells=(
+            GoalCell(center_m=(0.0, 0.0, 0.02), num_tries=9, success_rate=0.75, learnability=0.1875),
+            GoalCell(center_m=(0.05, 0.0, 0.12), num_tries=0, success_rate=0.5, learnability=0.25),
+        ),
+    )
+
+
+def write_runs(root: Path) -> None:
+    """Two runs: "cube" goes on and has a grid, "old" has ended and has a video."""
+    write_status(root, "old", state="finished", started=datetime(2026, 1, 1, tzinfo=UTC), actors=(), published="tiny@1")
+    write_status(root, "cube")
+    for run_id in ("old", "cube"):
+        append(root, run_id, *(record(iteration) for iteration in (1, 2, 3)))
+    (root / "cube" / "goals.json").write_text(grid().model_dump_json())
+    (root / "old" / "rounds.mp4").write_bytes(VIDEO)
+    (root / "old" / "curves.png").write_bytes(b"\x89PNG picture")
+
+
+def publish(registry: Registry, name: str = "tiny", value: float = 0.0) -> Version:
+    """A small version."""
+    return registry.publish(
+        name,
+        {"gate.weight": np.full((2, 3), value, np.float32)},
+        spaces={"action": 4},
+        normalisation={"offset": [0.0]},
+        config={"seed": 3},
+        metrics={"evaluation/mixed_success_last": 0.5},
+    )

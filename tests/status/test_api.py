@@ -1,0 +1,193 @@
+"""What each route answers."""
+
+import json
+
+import httpx
+import pytest
+
+from service.registry.manifest import parse_manifest
+from service.registry.registry import BUNDLED, Registry
+from service.status.server import StatusServer
+from service.store.disk_reader import DiskReader
+from service.store.models import GoalGrid, RunStatus
+from tests.status.runs import BEARER, TOKEN, grid, publish, record, write_status
+
+
+def test_health(client):
+    assert client.get("/livez").json() == {"status": "alive"}
+    assert client.get("/readyz").json() == client.get("/healthz").json() == {"status": "ready"}
+
+
+def test_runs_newest_start_first(client):
+    answer = client.get("/v1/runs").json()
+    assert [run["run_id"] for run in answer["runs"]] == ["cube", "old"]
+    assert answer["num_runs"] == 2
+
+
+@pytest.mark.parametrize(("query", "ids", "num_runs"), [("active=true", ["cube"], 1), ("active=false", ["old"], 1)])
+def test_runs_that_go_on_or_do_not(client, query, ids, num_runs):
+    answer = client.get(f"/v1/runs?{query}").json()
+    assert ([run["run_id"] for run in answer["runs"]], answer["num_runs"]) == (ids, num_runs)
+
+
+def test_the_limit_says_how_many_there_are(client):
+    answer = client.get("/v1/runs?limit=1").json()
+    assert ([run["run_id"] for run in answer["runs"]], answer["num_runs"]) == (["cube"], 2)
+
+
+def test_a_run(client, home):
+    answer = RunStatus.model_validate_json(client.get("/v1/runs/cube").content)
+    assert answer == RunStatus.model_validate_json((home / "runs" / "cube" / "status.json").read_bytes())
+
+
+def test_metrics_in_columns(client):
+    answer = client.get("/v1/runs/old/metrics", params={"names": ["bob/success_rate", "no/such"]}).json()
+    assert answer == {
+        "run_id": "old",
+        "last_iteration": 3,
+        "num_iterations": 3,
+        "iteration": [1, 2, 3],
+        "env_steps": [1000, 2000, 3000],
+        "metrics": {"bob/success_rate": [0.125, 0.25, 0.375]},
+        "names": sorted(set(record(1)) - {"iteration", "env_steps"}),
+    }
+
+
+def test_all_metrics_where_none_is_named(client):
+    answer = client.get("/v1/runs/old/metrics?after_iteration=1&max_points=1").json()
+    assert answer["metrics"].keys() == set(answer["names"])
+    assert (answer["iteration"], answer["num_iterations"]) == ([3], 2)
+    assert answer["metrics"]["bob/success_rate"] == [(0.25 + 0.375) / 2]
+
+
+def test_goals(client):
+    assert GoalGrid.model_validate_json(client.get("/v1/runs/cube/goals").content) == grid()
+
+
+def test_no_goals_yet(client):
+    answer = client.get("/v1/runs/old/goals")
+    assert (answer.status_code, answer.json()["type"]) == (404, "urn:tandem:no-goals-yet")
+
+
+def test_files(client):
+    files = client.get("/v1/runs/old/files").json()["files"]
+    assert [(file["name"], file["num_bytes"]) for file in files] == [("rounds.mp4", 10240), ("curves.png", 12)]
+    for file in files:
+        answer = client.get(file["url"])
+        assert (answer.headers["content-type"], len(answer.content)) == (file["media_type"], file["num_bytes"])
+
+
+def test_a_run_without_pictures(client):
+    assert client.get("/v1/runs/cube/files").json() == {"files": []}
+    assert client.get("/v1/runs/cube/video").json()["type"] == "urn:tandem:no-such-file"
+
+
+@pytest.mark.parametrize("name", ["status.json", "metrics.jsonl", "..%2Fcube%2Fgoals.json", "%2Fetc%2Fpasswd"])
+def test_nothing_else_leaves_a_run_directory(client, name):
+    answer = client.get(f"/v1/runs/old/files/{name}")
+    assert answer.status_code == 404
+    assert "application/problem+json" in answer.headers["content-type"]
+
+
+def test_stop(client, home):
+    write_status(home / "runs", "stoppable")
+    answer = client.post("/v1/runs/stoppable/stop")
+    assert (answer.status_code, answer.json()["stopping"]) == (202, True)
+    assert (home / "runs" / "stoppable" / "stop").exists()
+
+
+def test_a_run_that_has_ended_stays_as_it_is(client, home):
+    answer = client.post("/v1/runs/old/stop")
+    assert (answer.status_code, answer.json()["state"]) == (202, "finished")
+    assert not (home / "runs" / "old" / "stop").exists()
+
+
+def test_primitives(client):
+    answer = client.get("/v1/primitives").json()
+    aliases = {"champion": 1, "latest": 2}
+    assert answer == {"primitives": [{"name": "tiny", "num_versions": 2, "newest": 2, "aliases": aliases}]}
+
+
+def test_versions_of_a_name(client, home):
+    answer = client.get("/v1/primitives/tiny").json()
+    assert [(each["version"], each["aliases"]) for each in answer["versions"]] == [(2, ["latest"]), (1, ["champion"])]
+    manifest = Registry(home / "registry").manifest("tiny@1")
+    first = answer["versions"][1]
+    assert (first["blob_sha256"], first["metrics"], first["problem"]) == (manifest.blob_sha256, manifest.metrics, None)
+    assert len(client.get("/v1/primitives/tiny?limit=1").json()["versions"]) == 1
+
+
+def test_a_damaged_manifest_does_not_hide_the_others(client, home):
+    registry = Registry(home / "registry")
+    publish(registry, "half")
+    publish(registry, "half")
+    (home / "registry" / "models" / "half" / "versions" / "1").write_text("{}")
+    newest, damaged = client.get("/v1/primitives/half").json()["versions"]
+    assert newest["problem"] is None
+    assert "format version" in damaged["problem"]
+    answer = client.get("/v1/primitives/half/versions/1")
+    assert (answer.status_code, answer.json()["type"]) == (500, "urn:tandem:other-format")
+
+
+@pytest.mark.parametrize(("version", "number"), [("1", 1), ("champion", 1), ("latest", 2)])
+def test_a_manifest_as_it_was_published(client, home, version, number):
+    answer = client.get(f"/v1/primitives/tiny/versions/{version}")
+    path = home / "registry" / "models" / "tiny" / "versions" / str(number)
+    assert answer.content == path.read_bytes()
+    assert parse_manifest(answer.content, path).version == number
+
+
+def test_aliases_move_forward_and_back(client, home):
+    registry = Registry(home / "registry")
+    publish(registry, "moving")
+    publish(registry, "moving")
+    for number in (2, 1):
+        answer = client.put("/v1/primitives/moving/aliases/best", json={"version": number})
+        assert (answer.status_code, answer.json()) == (200, {"name": "moving", "alias": "best", "version": number})
+        assert registry.aliases("moving")["best"] == number
+
+
+def test_the_registry_that_comes_with_tandem_is_only_read(tmp_path):
+    with StatusServer(DiskReader(tmp_path), Registry(BUNDLED), token=TOKEN, port=0) as server:
+        url = f"{server.url}/v1/primitives/panda-cube/aliases/mine"
+        answer = httpx.put(url, json={"version": 2}, headers=BEARER, trust_env=False)
+    assert (answer.status_code, answer.json()["type"]) == (409, "urn:tandem:read-only")
+
+
+def test_the_page_and_its_files(client):
+    page = client.get("/")
+    assert page.headers["content-type"].startswith("text/html")
+    assert client.get("/page/index.html").content == page.content
+
+
+def test_every_answer_is_safe_in_a_browser(client):
+    for path in ("/", "/livez", "/v1/runs", "/v1/nope", "/page/index.html", "/metrics"):
+        headers = client.get(path, headers={"Origin": "https://elsewhere.example"}).headers
+        assert headers["x-content-type-options"] == "nosniff"
+        assert headers["referrer-policy"] == "no-referrer"
+        assert "default-src 'self'" in headers["content-security-policy"]
+        assert [name for name in headers if name.startswith("access-control")] == []
+        assert "server" not in headers
+
+
+def test_head_is_get_without_a_body(client):
+    for path in ("/v1/runs", "/v1/runs/old/video", "/livez"):
+        got, headed = client.get(path), client.head(path)
+        assert (headed.status_code, headed.content) == (200, b"")
+        assert headed.headers["content-length"] == got.headers["content-length"]
+
+
+def test_openapi_lists_every_route(client, server):
+    paths = client.get("/openapi.json").json()["paths"]
+    assert set(paths) == {
+        "/livez", "/readyz", "/healthz", "/metrics", "/v1/runs", "/v1/runs/{run_id}", "/v1/runs/{run_id}/metrics",
+        "/v1/runs/{run_id}/metrics/stream", "/v1/runs/{run_id}/goals", "/v1/runs/{run_id}/stop",
+        "/v1/runs/{run_id}/files", "/v1/runs/{run_id}/files/{file}", "/v1/runs/{run_id}/video", "/v1/primitives",
+        "/v1/primitives/{name}", "/v1/primitives/{name}/versions/{version}", "/v1/blobs/sha256/{digest}",
+        "/v1/primitives/{name}/aliases/{alias}",
+    }  # fmt: skip
+    assert json.loads(json.dumps(server.app.openapi()))["paths"] == paths
+    for path, methods in paths.items():
+        for method, operation in methods.items():
+            assert operation["summary"], (method, path)
+            assert {"401", "500"} <= operation["responses"].keys()

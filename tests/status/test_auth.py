@@ -1,0 +1,178 @@
+"""Who may ask what: every route there is, taken from the OpenAPI document and the app, so that none is forgotten."""
+
+import base64
+
+import httpx
+import pytest
+from starlette.routing import Mount, Route
+
+from service.status.errors import StatusError
+from tests.status.conftest import serve
+from tests.status.runs import TOKEN, WRONG
+
+PARAMETERS = {
+    "run_id": "old",
+    "name": "tiny",
+    "version": "1",
+    "file": "rounds.mp4",
+    "alias": "by-test",
+    "digest": "0" * 64,
+}
+BODIES = {"put": {"version": 1}}
+PROBES = {"/readyz", "/healthz"}
+
+
+def basic(token):
+    return "Basic " + base64.b64encode(f"anyone:{token}".encode()).decode()
+
+
+RIGHT = {"bearer": f"Bearer {TOKEN}", "basic": basic(TOKEN)}
+REFUSED = {
+    "bearer": f"Bearer {WRONG}",
+    "basic": basic(WRONG),
+    "lower": f"Bearer {TOKEN[:-1]}",
+    "longer": f"Bearer {TOKEN}0",
+    "empty": "Bearer",
+    "another scheme": f"Digest {TOKEN}",
+    "no scheme": TOKEN,
+    "no base64": "Basic !!!",
+    "not ASCII": "Bearer \u00e9\u00e9\u00e9",
+}
+
+
+def routes(server):
+    """Method and path of everything the app serves, and of something it does not."""
+    documented = {
+        (method, path.format(**PARAMETERS))
+        for path, methods in server.app.openapi()["paths"].items()
+        for method in methods
+    }
+    hidden = {
+        ("get", "/"),
+        ("get", "/openapi.json"),
+        ("get", "/page/index.html"),
+        ("get", "/v1/nope"),
+        ("post", "/v1/nope"),
+    }
+    return sorted(documented | hidden)
+
+
+def ask(client, method, path, authorization=None):
+    headers = {} if authorization is None else {"Authorization": authorization.encode("latin-1")}
+    return client.request(method, path, headers=headers, json=BODIES.get(method))
+
+
+@pytest.fixture(scope="module")
+def public(home):
+    """A service that other machines could reach; asked over loopback."""
+    with serve(home, host="0.0.0.0") as server, httpx.Client(base_url=server.url, trust_env=False) as client:
+        yield server, client
+
+
+def test_the_matrix_knows_every_route_of_the_app(server):
+    known = {path for _, path in routes(server)} | {"/page"}
+    found = [route for route in server.app.routes if isinstance(route, Route | Mount)]
+    assert {"/livez", "/", "/page"} <= {route.path for route in found} | {"/livez"}
+    assert {route.path.format(**PARAMETERS) for route in found} <= known
+
+
+def test_a_public_service_answers_nobody_without_its_token(public):
+    server, client = public
+    for method, path in routes(server):
+        expected = 200 if path == "/livez" or path in PROBES else 401
+        answer = ask(client, method, path)
+        assert answer.status_code == expected, (method, path)
+        if expected == 401:
+            assert answer.headers["www-authenticate"].startswith("Bearer")
+            assert answer.json()["type"] == "urn:tandem:missing-token"
+
+
+@pytest.mark.parametrize("kind", REFUSED)
+def test_a_public_service_refuses_what_is_not_its_token(public, kind):
+    server, client = public
+    for method, path in routes(server):
+        expected = 200 if path == "/livez" else 401
+        assert ask(client, method, path, REFUSED[kind]).status_code == expected, (method, path)
+
+
+@pytest.mark.parametrize("kind", RIGHT)
+def test_a_public_service_answers_who_has_its_token(public, kind):
+    server, client = public
+    for method, path in routes(server):
+        answer = ask(client, method, path, RIGHT[kind])
+        refused = kind == "basic" and method != "get"
+        assert (answer.status_code == 401) == refused, (method, path)
+
+
+def test_what_changes_something_offers_no_login_to_a_browser(public):
+    _, client = public
+    assert "Basic" in client.get("/").headers["www-authenticate"]
+    assert "Basic" not in client.post("/v1/runs/old/stop").headers["www-authenticate"]
+
+
+def test_on_loopback_reading_is_free_and_changing_is_not(server):
+    with httpx.Client(base_url=server.url, trust_env=False) as client:
+        for method, path in routes(server):
+            answer = ask(client, method, path)
+            assert (answer.status_code == 401) == (method != "get"), (method, path)
+
+
+def test_on_loopback_a_wrong_token_is_refused_all_the_same(server):
+    with httpx.Client(base_url=server.url, trust_env=False) as client:
+        for method, path in routes(server):
+            expected = 200 if path == "/livez" else 401
+            assert ask(client, method, path, REFUSED["bearer"]).status_code == expected, (method, path)
+
+
+def test_without_a_token_nothing_is_changed(home):
+    with serve(home, token=None) as server, httpx.Client(base_url=server.url, trust_env=False) as client:
+        for method, path in routes(server):
+            answer = ask(client, method, path)
+            assert (answer.status_code == 403) == (method != "get"), (method, path)
+        for method in ("post", "put", "delete", "patch", "trace", "propfind"):
+            answer = ask(client, method, "/v1/runs/old/stop", RIGHT["bearer"])
+            assert (answer.status_code, answer.json()["type"]) == (403, "urn:tandem:read-only")
+    assert not (home / "runs" / "old" / "stop").exists()
+
+
+def test_a_public_service_without_a_token_does_not_start(home):
+    with pytest.raises(StatusError, match=r"^no token, .*TANDEM_TOKEN.*--token-file"):
+        serve(home, token=None, host="0.0.0.0")
+
+
+@pytest.mark.parametrize("token", ["short", "has spaces in its midst", "\u00e9" * 20])
+def test_no_token_that_is_none(home, token):
+    with pytest.raises(StatusError) as error:
+        serve(home, token=token)
+    assert token not in str(error.value)
+
+
+@pytest.mark.parametrize("host", ["evil.example", "evil.example:80", "127.0.0.1.evil.example", "10.0.0.1", "", "[::2]"])
+def test_on_loopback_a_name_that_leads_here_is_not_enough(server, host):
+    with httpx.Client(base_url=server.url, trust_env=False) as client:
+        answer = client.get("/v1/runs", headers={"Host": host, "Authorization": RIGHT["bearer"]})
+    assert (answer.status_code, answer.json()["type"]) == (421, "urn:tandem:wrong-host")
+
+
+@pytest.mark.parametrize("host", ["localhost", "localhost:1", "LOCALHOST", "127.0.0.1:8321", "127.9.9.9", "[::1]:8321"])
+def test_names_of_this_machine(server, host):
+    with httpx.Client(base_url=server.url, trust_env=False) as client:
+        assert client.get("/v1/runs", headers={"Host": host}).status_code == 200
+
+
+def test_a_public_service_has_whatever_name_it_is_given(public):
+    _, client = public
+    assert client.get("/v1/runs", headers={"Host": "lab.example", "Authorization": RIGHT["bearer"]}).status_code == 200
+
+
+def test_only_who_has_the_token_is_told_why_it_is_not_ready(tmp_path):
+    (tmp_path / "runs").mkdir()
+    with serve(tmp_path, host="0.0.0.0") as server, httpx.Client(base_url=server.url, trust_env=False) as client:
+        (tmp_path / "runs").rmdir()
+        anyone, trusted = (
+            client.get("/readyz", headers=headers) for headers in ({}, {"Authorization": RIGHT["bearer"]})
+        )
+    assert anyone.status_code == trusted.status_code == 503
+    assert str(tmp_path) in trusted.json()["detail"]
+    assert str(tmp_path) not in anyone.text
+    assert anyone.headers["retry-after"] == "5"

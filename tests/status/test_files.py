@@ -1,0 +1,76 @@
+"""Videos and blobs in ranges, and with entity tags."""
+
+import hashlib
+
+import pytest
+
+from service.registry.registry import Registry
+from tests.status.runs import VIDEO
+
+URL = "/v1/runs/old/video"
+
+
+@pytest.mark.parametrize(
+    ("asked", "start", "end"),
+    [
+        ("bytes=0-9", 0, 10),
+        ("bytes=100-", 100, len(VIDEO)),
+        ("bytes=-7", len(VIDEO) - 7, len(VIDEO)),
+        ("bytes=0-99999999", 0, len(VIDEO)),
+        (f"bytes=-{len(VIDEO) + 5}", 0, len(VIDEO)),
+        (f"bytes={len(VIDEO) - 1}-", len(VIDEO) - 1, len(VIDEO)),
+    ],
+)
+def test_a_range(client, asked, start, end):
+    answer = client.get(URL, headers={"Range": asked})
+    assert answer.status_code == 206
+    assert answer.content == VIDEO[start:end]
+    assert answer.headers["content-range"] == f"bytes {start}-{end - 1}/{len(VIDEO)}"
+
+
+@pytest.mark.parametrize("asked", [f"bytes={len(VIDEO)}-", f"bytes={10**17}-{10**17}", "bytes=-0"])
+def test_a_range_beyond_the_file(client, asked):
+    answer = client.get(URL, headers={"Range": asked})
+    assert (answer.status_code, answer.json()["type"]) == (416, "urn:tandem:no-such-range")
+    assert answer.headers["content-range"] == f"bytes */{len(VIDEO)}"
+
+
+@pytest.mark.parametrize(
+    "asked", ["bytes=-", "bytes=9-1", "lines=0-1", "bytes=a-b", "bytes=0-1,4-5", "", "bytes=0x1-2"]
+)
+def test_what_is_no_range_gives_the_whole_file(client, asked):
+    answer = client.get(URL, headers={"Range": asked})
+    assert (answer.status_code, answer.content) == (200, VIDEO)
+
+
+def test_not_changed(client):
+    first = client.get(URL)
+    assert (first.headers["content-type"], first.headers["accept-ranges"]) == ("video/mp4", "bytes")
+    tag = first.headers["etag"]
+    for given in (tag, f"W/{tag}", f'"other", {tag}'):
+        answer = client.get(URL, headers={"If-None-Match": given})
+        assert (answer.status_code, answer.content, answer.headers["etag"]) == (304, b"", tag)
+    assert client.get(URL, headers={"If-None-Match": '"other"'}).content == VIDEO
+
+
+def test_a_range_of_a_file_that_changed_meanwhile(client, home):
+    tag = client.get(URL).headers["etag"]
+    ranged = {"Range": "bytes=5-9", "If-Range": tag}
+    assert client.get(URL, headers=ranged).content == VIDEO[5:10]
+    (home / "runs" / "old" / "rounds.mp4").write_bytes(VIDEO[::-1] + b"more")
+    answer = client.get(URL, headers=ranged)
+    assert (answer.status_code, answer.content) == (200, VIDEO[::-1] + b"more")
+    (home / "runs" / "old" / "rounds.mp4").write_bytes(VIDEO)
+
+
+def test_a_blob(client, home):
+    manifest = Registry(home / "registry").manifest("tiny@champion")
+    url = f"/v1/blobs/sha256/{manifest.blob_sha256}"
+    answer = client.get(url)
+    assert hashlib.sha256(answer.content).hexdigest() == manifest.blob_sha256
+    assert len(answer.content) == manifest.blob_bytes
+    assert answer.headers["etag"] == f'"{manifest.blob_sha256}"'
+    assert "immutable" in answer.headers["cache-control"]
+    assert client.get(url, headers={"If-None-Match": answer.headers["etag"]}).status_code == 304
+    part = client.get(url, headers={"Range": "bytes=8-15"})
+    assert (part.status_code, part.content) == (206, answer.content[8:16])

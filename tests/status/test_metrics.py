@@ -1,0 +1,153 @@
+"""The page Prometheus reads, parsed by Prometheus' own parser."""
+
+import re
+from datetime import UTC, datetime, timedelta
+
+import httpx
+import pytest
+from prometheus_client.parser import text_string_to_metric_families
+
+from service.status import metrics
+from service.status.metrics import HTTP_METRICS, NUM_ENDED_RUNS, RUN_METRICS, SERVICE_METRICS
+from tests.status.conftest import serve
+from tests.status.runs import BEARER, append, record, status, write_runs, write_status
+
+
+@pytest.fixture
+def service(tmp_path):
+    """(client, directory of runs), asked already for something."""
+    write_runs(tmp_path / "runs")
+    with serve(tmp_path) as server, httpx.Client(base_url=server.url, headers=BEARER, trust_env=False) as client:
+        client.get("/v1/runs/old")
+        yield client, tmp_path / "runs"
+
+
+def scrape(client):
+    """Values by name and labels."""
+    answer = client.get("/metrics")
+    assert (answer.status_code, answer.headers["content-type"]) == (200, metrics.CONTENT_TYPE)
+    families = text_string_to_metric_families(answer.text)
+    return {(each.name, *sorted(each.labels.items())): each.value for family in families for each in family.samples}
+
+
+def value(samples, name, /, **labels):
+    return samples[(name, *sorted(labels.items()))]
+
+
+def test_what_a_run_tells(service):
+    samples = scrape(service[0])
+    expected = {
+        "tandem_run_iterations_total": 3,
+        "tandem_run_env_steps_total": 3000,
+        "tandem_run_env_steps_budget": 10_000,
+        "tandem_run_env_steps_per_second": 500,
+        "tandem_run_policy_version": 2,
+        "tandem_run_policy_lag_versions": 1,
+        "tandem_run_rollouts_counted_total": 6,
+        "tandem_run_rollouts_refused_total": 1,
+        "tandem_run_actor_replacements_total": 3,
+        "tandem_run_valid_goals_ratio": 0.5,
+        "tandem_run_lifted_goals_ratio": 0.25,
+        "tandem_run_bob_success_ratio": 0.375,
+        "tandem_run_learner_idle_ratio": 0.0625,
+        "tandem_run_stopping": 0,
+        "tandem_run_warnings": 0,
+    }
+    assert {name: value(samples, name, run="cube") for name in expected} == expected
+    assert value(samples, "tandem_run_actors", run="cube", state="alive") == 2
+    assert value(samples, "tandem_run_actors", run="cube", state="lost") == 1
+    assert value(samples, "tandem_run_info", run="cube", name="panda-cube", runtime="ray") == 1
+    assert value(samples, "tandem_run_state", run="cube", state="running") == 1
+    assert value(samples, "tandem_run_state", run="cube", state="failed") == 0
+    assert 0 <= value(samples, "tandem_run_heartbeat_age_seconds", run="cube") < 60
+    assert value(samples, "tandem_runs", state="finished") == value(samples, "tandem_runs", state="running") == 1
+
+
+def test_what_an_iteration_does_not_have_is_left_out(service):
+    client, runs = service
+    append(runs, "cube", record(4, **{"bob/success_rate": None}))
+    samples = scrape(client)
+    assert ("tandem_run_bob_success_ratio", ("run", "cube")) not in samples
+    assert ("tandem_run_bob_success_air_ratio", ("run", "cube")) not in samples
+    assert ("tandem_run_bob_success_ratio", ("run", "old")) in samples
+
+
+def test_actors_of_a_run_that_has_ended_alert_nobody(service):
+    client, runs = service
+    write_status(runs, "cube", state="failed")
+    assert [
+        key for key in scrape(client) if key[0] in ("tandem_run_actors", "tandem_run_actor_heartbeat_age_seconds")
+    ] == []
+
+
+def test_the_registry(tmp_path, home):
+    with serve(home) as server, httpx.Client(base_url=server.url, trust_env=False) as client:
+        samples = scrape(client)
+    assert value(samples, "tandem_registry_up") == 1
+    assert value(samples, "tandem_registry_versions", name="tiny") == 2
+    assert value(samples, "tandem_registry_alias_version", name="tiny", alias="champion") == 1
+
+
+def test_requests_by_route_and_never_by_path(service):
+    client, _ = service
+    for path in ("/v1/runs/a", "/v1/runs/b", "/x", "/y"):
+        client.get(path)
+    httpx.request("BREW", f"{client.base_url}/x", trust_env=False)
+    samples = scrape(client)
+    route = "/v1/runs/{run_id}"
+    assert value(samples, "tandem_http_requests_total", method="GET", route=route, status="200") == 1
+    assert value(samples, "tandem_http_requests_total", method="GET", route=route, status="404") == 2
+    assert value(samples, "tandem_http_requests_total", method="GET", route="other", status="404") == 2
+    assert value(samples, "tandem_http_requests_total", method="other", route="other", status="401") == 1
+    assert value(samples, "tandem_http_request_duration_seconds_count", route=route) == 3
+
+
+def test_the_store_is_away(service):
+    client, runs = service
+    runs.rename(runs.parent / "elsewhere")
+    samples = scrape(client)
+    assert value(samples, "tandem_store_up") == 0
+    assert [key for key in samples if key[0].startswith("tandem_run")] == []
+    assert value(samples, "tandem_registry_up") == 1
+
+
+def test_a_damaged_registry(service):
+    client, runs = service
+    aliases = runs.parent / "registry" / "models" / "tiny" / "aliases"
+    aliases.mkdir(parents=True)
+    (aliases / "latest").write_text("none")
+    (aliases.parent / "versions").mkdir()
+    (aliases.parent / "versions" / "1").write_text("{}")
+    assert value(scrape(client), "tandem_registry_up") == 0
+
+
+def test_the_number_of_series_is_bounded():
+    when = datetime(2026, 1, 1, tzinfo=UTC)
+    runs = [
+        status(f"run-{number}", state=state, started=when - timedelta(hours=number))
+        for number, state in enumerate(["finished", "running"] * 100)
+    ]
+    ids = [run.run_id for run in metrics.shown(runs)]
+    assert len(ids) == metrics.MAX_RUNS
+    assert ids[:2] == ["run-1", "run-3"]
+    ids = [run.run_id for run in metrics.shown(runs[:20])]
+    assert ids == [f"run-{n}" for n in range(1, 20, 2)] + [f"run-{n}" for n in range(0, 2 * NUM_ENDED_RUNS, 2)]
+
+
+def test_everything_served_is_in_the_reference(service):
+    served = {family.name: family for family in text_string_to_metric_families(service[0].get("/metrics").text)}
+    reference = {
+        metric.name.removesuffix("_total"): metric for metric in (*RUN_METRICS, *SERVICE_METRICS, *HTTP_METRICS)
+    }
+    own = {name for name in served if not name.startswith("tandem_process_") and not name.endswith("_created")}
+    assert own == set(reference)
+    for name in own:
+        assert (served[name].type, served[name].documentation) == (reference[name].kind, reference[name].help)
+        labels = {label for sample in served[name].samples for label in sample.labels} - {"le"}
+        assert labels <= set(reference[name].labels)
+
+
+def test_names_follow_prometheus():
+    for metric in (*RUN_METRICS, *SERVICE_METRICS, *HTTP_METRICS):
+        assert re.fullmatch(r"tandem_[a-z_]+", metric.name)
+        assert metric.name.endswith("_total") == (metric.kind == "counter")
