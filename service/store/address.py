@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 from urllib.parse import urlsplit
@@ -53,20 +54,27 @@ class RedisAddress:
     def __repr__(self) -> str:
         return f"RedisAddress({self})"
 
-    def client(self, timeout_s: float) -> Any:
-        """A ``redis.Redis`` that gives up after ``timeout_s`` and never tries again: callers know better when to.
+    def client(self, timeout_s: float, on_connect: Callable[[], None] = lambda: None) -> Any:
+        """A ``redis.Redis``; no annotation says so, for redis-py's own name the returns of all its modes at once.
 
-        No annotation says so, for redis-py's own name what it would return in every one of its modes at once.
+        Args:
+            timeout_s: after which a call has failed. It is not tried again: callers know better when to.
+            on_connect: called after every new connection, which redis-py also makes without a word.
         """
         import redis
         from redis.backoff import NoBackoff
         from redis.retry import Retry
+
+        def connected(connection: Any) -> None:
+            connection.on_connect()
+            on_connect()
 
         return redis.Redis.from_url(
             self.url,
             socket_timeout=timeout_s,
             socket_connect_timeout=timeout_s,
             retry=Retry(NoBackoff(), 0),
+            redis_connect_func=connected,
             protocol=2,  # one shape of replies, whatever redis-py makes the default
         )
 

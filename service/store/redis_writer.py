@@ -28,8 +28,8 @@ MAX_WAITING = 20_000
 """Records that wait for Redis to come back, about 60 MB; of more, the oldest are left out, and a warning says so."""
 BATCH = 500
 KEPT_S = 5.0
-"""Redis flushes its file every second, so a machine that loses power forgets what it said it had. What is younger than
-this is sent again after every outage."""
+"""Redis writes and flushes its file every second, so one that is killed may forget what it said it had. What is younger
+than this is sent again over every new connection."""
 _logger = logging.getLogger(__name__)
 
 
@@ -57,7 +57,8 @@ class RedisWriter:
 
     def __init__(self, address: RedisAddress, run_id: str, *, lease_s: float = keys.LEASE_S) -> None:
         self._address, self._run_id = address, run_id
-        self._client = address.client(TIMEOUT_S)
+        self._connected_anew = False
+        self._client = address.client(TIMEOUT_S, self._on_connect)
         self._lease = Lease(self._client, run_id, lease_s)
         try:
             self._lease.acquire()
@@ -72,7 +73,6 @@ class RedisWriter:
         self._waiting: deque[_Line] = deque()
         self._sent: deque[tuple[float, _Line]] = deque()
         self._num_lost = 0
-        self._cut = False
         self._stop = False
         self._away: tuple[float, str] | None = None
         self._taken: str | None = None
@@ -86,7 +86,7 @@ class RedisWriter:
         self._status = status
 
     def metrics(self, record: Record) -> None:
-        """Append one iteration's metrics. The first record takes the place of all of its and later iterations."""
+        """Append one iteration's metrics; those of it and of later ones, made before the run went back, are dropped."""
         line = _Line(int(record["iteration"] or 0), json.dumps(plain(record)))
         with self._lock:
             self._waiting.append(line)
@@ -171,15 +171,14 @@ class RedisWriter:
                 self._append(pipe, batch)
             pipe.exists(keys.stop(self._run_id))
             self._stop = bool(pipe.execute()[-1])
-        self._sent_status, self._sent_grid, self._cut = status, grid, self._cut or bool(batch)
-        return self._count(batch)
+        self._sent_status, self._sent_grid = status, grid
+        more = self._count(batch)
+        return self._send_again() or more
 
     def _append(self, pipe: Any, batch: list[_Line]) -> None:
         key = keys.metrics(self._run_id)
-        if not self._cut:
-            pipe.zremrangebyscore(key, batch[0].iteration, "+inf")
         for line in batch:
-            pipe.zremrangebyscore(key, line.iteration, line.iteration)
+            pipe.zremrangebyscore(key, line.iteration, "+inf")
             pipe.zadd(key, {line.text: line.iteration})
         pipe.zremrangebyrank(key, 0, -keys.MAX_RECORDS - 1)
 
@@ -194,16 +193,26 @@ class RedisWriter:
                 self._sent.popleft()
             return bool(self._waiting)
 
+    def _on_connect(self) -> None:
+        self._connected_anew = True
+
+    def _send_again(self) -> bool:
+        """Over a new connection, which may be to a Redis that was killed and has forgotten what came last."""
+        if not self._connected_anew:
+            return False
+        self._connected_anew = False
+        with self._lock:
+            self._waiting.extendleft(line for _, line in reversed(self._sent))
+            self._sent.clear()
+        self._sent_status = self._sent_grid = None
+        return True
+
     def _pending(self) -> bool:
         return bool(self._waiting) or self._status is not self._sent_status or self._grid is not self._sent_grid
 
     def _went_away(self, reason: str) -> None:
         if self._away is None:
             _logger.warning("Redis at %s: %s; the run goes on", self._address, reason)
-            with self._lock:
-                self._waiting.extendleft(line for _, line in reversed(self._sent))
-                self._sent.clear()
-            self._sent_status = self._sent_grid = None
         self._away = (self._away[0] if self._away else time.monotonic(), reason)
 
     def _came_back(self) -> None:

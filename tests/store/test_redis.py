@@ -114,6 +114,30 @@ def test_what_redis_forgot_that_it_had_is_sent_again(redis, writer, reader):
     assert reader.goals("cube") == a_grid(10)
 
 
+def test_a_restart_between_two_messages_is_noticed(redis, reader, monkeypatch):
+    """No call has failed: the client has made a new connection without a word."""
+    writer = RedisWriter(redis.address, "cube")
+    train(writer, range(1, 11))
+    wait_until(lambda: reader.runs() and iterations(reader)[-1:] == [10])
+    monkeypatch.setattr(redis_writer, "TICK_S", 60.0)
+    time.sleep(0.2)  # from now on it waits for that long
+    redis.address.client(1.0).flushall()
+    redis.kill()
+    redis.revive()
+    writer.close()
+    assert iterations(reader) == list(range(1, 11))
+    assert reader.run("cube").iteration == 10
+    assert reader.goals("cube") == a_grid(10)
+
+
+def test_a_run_that_goes_back_by_itself(writer, reader):
+    """As when the machine that had the newest state is lost."""
+    train(writer, range(1, 8))
+    train(writer, range(4, 6))
+    wait_until(lambda: reader.runs() and iterations(reader) == [1, 2, 3, 4, 5])
+    assert reader.run("cube").iteration == 5
+
+
 def test_a_disk_that_lost_everything_gets_what_comes(redis, writer, reader):
     train(writer, range(1, 4))
     wait_until(lambda: reader.runs() != [])
@@ -176,6 +200,7 @@ def test_a_reader_goes_on_when_redis_is_back(redis, writer, reader):
         reader.run("cube")
     assert_one_line(error.value, f"Redis at {redis.address}")
     redis.revive()
+    wait_until(lambda: reader.runs() != [])  # it may have forgotten the last second, which the writer knows
     assert reader.run("cube").run_id == "cube"
 
 

