@@ -13,7 +13,7 @@ from service.status.history import Histories
 from service.status.openapi import AWAY, INVALID, UNKNOWN_RUN, problems
 from service.status.problems import ProblemError
 from service.status.shapes import MetricHistory, RunFiles, RunList
-from service.status.stream import Streams
+from service.status.stream import EVENT_SCHEMA, Streams
 from service.store.models import ACTIVE, GoalGrid, RunReader, RunStatus
 
 MAX_ITERATION = 2**53 - 1
@@ -65,7 +65,7 @@ def runs_router(runs: RunReader, histories: Histories, streams: Streams, directo
             **errors,
             200: {
                 "description": "Server-sent events.",
-                "content": {"text/event-stream": {"schema": {"type": "string"}}},
+                "content": {"text/event-stream": {"schema": EVENT_SCHEMA}},
             },
         },
     )

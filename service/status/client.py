@@ -62,7 +62,7 @@ def fetch_primitives(
     headers = {"Authorization": f"Bearer {token}"} if token else {}
     with httpx.Client(base_url=base, headers=headers, timeout=_TIMEOUT) as client:
         data = _get(client, f"/v1/primitives/{name}/versions/{target}", MAX_MANIFEST_BYTES)
-        manifest = parse_manifest(data, Path(f"{name}@{target} from {base}"))
+        manifest = parse_manifest(data, _named(f"{name}@{target}", client))
         if manifest.name != name or (isinstance(target, int) and manifest.version != target):
             raise DamagedBlobError(
                 f"{base} gave the manifest of {manifest.reference} for {reference}; check its registry"
@@ -82,8 +82,13 @@ def _keep(client: httpx.Client, manifest: Manifest, registry: Registry) -> None:
         blobs.get(digest)
     except DamagedBlobError:  # or not there yet
         data = _get(client, f"/v1/blobs/sha256/{digest}", manifest.blob_bytes)
-        check_digest(Path(f"{manifest.reference} from {client.base_url}"), data, digest)
+        check_digest(_named(manifest.reference, client), data, digest)
         blobs.put(data)
+
+
+def _named(what: str, client: httpx.Client) -> Path:
+    """What errors call a thing that is in no file: ``panda-cube@3 from lab:8321``."""
+    return Path(f"{what} from {client.base_url.netloc.decode()}")
 
 
 def _get(client: httpx.Client, path: str, max_bytes: int) -> bytes:

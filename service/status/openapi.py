@@ -60,11 +60,21 @@ def document(app: FastAPI, *, public: bool) -> dict[str, Any]:
     for path, methods in tree["paths"].items():
         for method, operation in methods.items():
             reading = method in ("get", "head")
+            for parameter in operation.get("parameters", ()):
+                parameter["schema"] = _never_null(parameter["schema"])
             operation["security"] = _security(path, reading=reading, public=public)
             for status, text in {**_COMMON, **({} if reading else _CHANGING)}.items():
                 operation["responses"].setdefault(status, {"description": text, "content": _CONTENT})
             operation["responses"] = dict(sorted(operation["responses"].items()))
     return tree
+
+
+def _never_null(schema: dict[str, Any]) -> dict[str, Any]:
+    """A parameter can be left out, but there is no null in a URL or a header."""
+    options = [option for option in schema.get("anyOf", ()) if option != {"type": "null"}]
+    if len(options) != 1:
+        return schema
+    return {**{key: value for key, value in schema.items() if key != "anyOf"}, **options[0]}
 
 
 def _security(path: str, *, reading: bool, public: bool) -> list[dict[str, list[str]]]:

@@ -85,6 +85,11 @@ class StatusServer:
                 raise StatusError(f"the status service does not start at port {self.port}; the log says more")
             time.sleep(0.005)
 
+    @property
+    def started(self) -> bool:
+        """Whether it answers."""
+        return bool(self._server.started)
+
     def stop(self) -> None:
         """Answer what was asked already, end event streams, and free the port."""
         self._server.should_exit = True

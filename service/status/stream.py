@@ -32,6 +32,17 @@ MAX_STREAMS = 64
 MAX_AGE_S = 3600.0
 """A stream ends then, and its browser comes back: one that is gone without a word does not stay for ever."""
 _RETRY_MS = 2000
+EVENT_SCHEMA = {
+    "type": "object",
+    "description": "one event",
+    "properties": {
+        "event": {"enum": ["metrics", "status", "reset", "unavailable", "end"]},
+        "data": {"type": "string", "contentMediaType": "application/json"},
+        "id": {"type": "string", "description": "the iteration, of metrics only"},
+        "retry": {"type": "integer", "description": "milliseconds, once at the beginning"},
+    },
+}
+"""Of the OpenAPI document."""
 
 
 class Streams:
