@@ -17,6 +17,7 @@ def test_as_text_it_has_no_password():
     address = RedisAddress(f"redis://worker:{SECRET}@redis.lab:6390/2?socket_timeout=3&password={SECRET}")
     assert str(address) == "redis://redis.lab:6390/2"
     assert SECRET not in f"{address} {address!r} {[address]} {address.client(1.0)!r}"
+    assert address.client(1.0).get_retry().get_retries() == 0
     assert pickle.loads(pickle.dumps(address)) == address
 
 

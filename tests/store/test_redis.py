@@ -214,12 +214,20 @@ def test_no_thread_and_no_lease_is_left(redis):
 # --- who runs it -----------------------------------------------------------------------------------------------------
 
 
-def test_two_drivers_of_one_run_refuse_each_other(redis, writer):
-    with pytest.raises(RunTakenError) as error:
-        RedisWriter(redis.address, "cube")
+def test_two_drivers_of_one_run_refuse_each_other(redis):
+    """At once: a lease that is renewed is not waited for."""
+    writer, errors = RedisWriter(redis.address, "cube", lease_s=60.0), []
+
+    def second():
+        with pytest.raises(RunTakenError) as error:
+            RedisWriter(redis.address, "cube", lease_s=60.0)
+        errors.append(error.value)
+
+    assert returns(second)
     host = os.uname().nodename
-    assert_one_line(error.value, "run cube is being run by", f"process {os.getpid()} on {host}", "another id")
+    assert_one_line(errors[0], "run cube is being run by", f"process {os.getpid()} on {host}", "another id")
     RedisWriter(redis.address, "cube-2").close()
+    writer.close()
 
 
 def test_the_next_driver_may_begin_at_once(redis, writer):
