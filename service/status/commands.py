@@ -32,8 +32,8 @@ def serve(
 def _serve(runs: Path, registry: Path, host: str, port: int, token_file: Path | None) -> None:
     from service.registry.registry import Registry
     from service.status.errors import StatusError
+    from service.status.reading import open_reader
     from service.status.token import VARIABLE, read_token
-    from service.store.disk_reader import DiskReader
 
     try:
         from service.status.server import StatusServer
@@ -42,7 +42,7 @@ def _serve(runs: Path, registry: Path, host: str, port: int, token_file: Path | 
     if not runs.is_dir():
         raise StatusError(f"no directory {runs}; name with --runs the one that holds run directories")
     token = read_token(token_file)
-    server = StatusServer(DiskReader(runs), Registry(registry), token=token, host=host, port=port, runs_dir=runs)
+    server = StatusServer(open_reader(runs), Registry(registry), token=token, host=host, port=port, runs_dir=runs)
     typer.echo(f"runs of {runs}, primitives of {registry}: {server.url}")
     if token is None:
         typer.echo(f"read-only, for this machine: with {VARIABLE} set, runs can be stopped and aliases moved")

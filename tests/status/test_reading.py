@@ -1,0 +1,109 @@
+"""Runs in directories and in a real Redis, and what is left of them while it is away."""
+
+from datetime import UTC, datetime, timedelta
+
+import pytest
+
+from service.status.reading import LEAVE_ALONE_S, BothReader, open_reader
+from service.store.disk_reader import DiskReader
+from service.store.errors import UnknownRunError
+from service.store.redis_reader import RedisReader
+from service.store.redis_writer import RedisWriter
+from tests.status.runs import append, grid, record, status, write_runs, write_status
+from tests.store.stores import Killable, wait_until
+
+
+@pytest.fixture(scope="module")
+def redis(tmp_path_factory):
+    """A Redis that was told of "cube", which has a directory, and of "far", which has none."""
+    killable = Killable(tmp_path_factory.mktemp("redis"))
+    for run_id in ("cube", "far"):
+        writer = RedisWriter(killable.address, run_id)
+        writer.status(status(run_id, iteration=7, state="interrupted" if run_id == "far" else "running"))
+        writer.metrics(record(1))
+        writer.goals(grid().model_copy(update={"iteration": 7}))
+        writer.close()
+    yield killable
+    killable.server.close()
+
+
+@pytest.fixture
+def root(tmp_path):
+    write_runs(tmp_path / "runs")
+    return tmp_path / "runs"
+
+
+@pytest.fixture
+def time_s():
+    return [0.0]
+
+
+@pytest.fixture
+def reader(redis, root, time_s):
+    return BothReader(DiskReader(root), RedisReader(redis.address), clock=lambda: time_s[0])
+
+
+def test_runs_of_both(reader):
+    runs = {run.run_id: run for run in reader.runs()}
+    assert list(runs)[-1] == "old"
+    assert {run_id: run.iteration for run_id, run in runs.items()} == {"cube": 7, "far": 7, "old": 3}
+    assert {run_id: reader.run(run_id) for run_id in runs} == runs
+
+
+def test_a_directory_that_was_written_later(reader, root):
+    write_status(root, "cube", iteration=9, heartbeat=datetime.now(UTC) + timedelta(minutes=1))
+    assert reader.run("cube").iteration == 9
+
+
+def test_metrics_are_those_of_the_directory(reader, root):
+    append(root, "cube", record(4))
+    assert [each["iteration"] for each in reader.metrics("cube", after_iteration=1)] == [2, 3, 4]
+    assert [each["iteration"] for each in reader.metrics("far")] == [1]
+
+
+def test_the_newer_grid(reader):
+    assert [reader.goals(run_id).iteration for run_id in ("cube", "far")] == [7, 7]
+    assert reader.goals("old") is None
+
+
+def test_a_request_to_stop_goes_to_both(reader, redis, root):
+    reader.request_stop("cube")
+    assert (root / "cube" / "stop").exists()
+    assert RedisReader(redis.address).run("cube").stopping
+    reader.request_stop("far")  # has ended
+
+
+@pytest.mark.parametrize("call", ["run", "metrics", "goals", "request_stop"])
+def test_nobody_knows_it(reader, call):
+    with pytest.raises(UnknownRunError, match=r"no run 'nobody'"):
+        getattr(reader, call)("nobody")
+
+
+def test_redis_is_away_and_back(reader, redis, root, time_s, caplog):
+    redis.kill()
+    try:
+        assert {run.run_id: run.iteration for run in reader.runs()} == {"cube": 3, "old": 3}
+        cube, old = reader.run("cube"), reader.run("old")
+        assert "reads no Redis" in cube.warnings[0]
+        assert old.warnings == ()
+        assert reader.metrics("cube")
+        assert reader.goals("cube").iteration == 3
+        reader.request_stop("cube")
+        reader.ready()
+        assert (root / "cube" / "stop").exists()
+        assert len(caplog.records) == 1  # said once, however often it is asked for
+        with pytest.raises(UnknownRunError):
+            reader.run("far")
+    finally:
+        redis.revive()
+    assert {run.run_id for run in reader.runs()} == {"cube", "old"}  # it is left alone for a while
+    time_s[0] += LEAVE_ALONE_S
+    wait_until(lambda: {run.run_id for run in reader.runs()} == {"cube", "far", "old"})
+    assert reader.run("cube").warnings == ()
+
+
+def test_which_reader(root, redis, monkeypatch):
+    monkeypatch.delenv("TANDEM_REDIS_URL", raising=False)
+    assert isinstance(open_reader(root), DiskReader)
+    monkeypatch.setenv("TANDEM_REDIS_URL", redis.address.url)
+    assert {run.run_id for run in open_reader(root).runs()} == {"cube", "far", "old"}
