@@ -91,3 +91,8 @@ def test_they_do_more_than_nothing():
     common = {"num_episodes": 60, "num_steps": 50, "success_distance_m": bob.config.game.success_distance_m, "seed": 3}
     champion, idle = (evaluate(policy, bob.config.world, "mixed", **common) for policy in (bob.policy, Idle()))
     assert champion.success_ever > idle.success_ever + 0.1
+
+
+def test_the_web_page_is_in_it(installed):
+    page = Path("service") / "status" / "page"
+    assert files_in(installed / page) == files_in(ROOT / page) != {}

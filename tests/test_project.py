@@ -13,10 +13,22 @@ import pytest
 import service
 
 ROOT = Path(__file__).parents[1]
-HEAVY = ("torch", "mujoco", "matplotlib", "gymnasium", "tensorboard", "imageio", "ray", "redis")
-ROOMS_WITHOUT_TORCH = ("actors", "envs", "generator", "registry")
+HEAVY = (
+    "torch",
+    "mujoco",
+    "matplotlib",
+    "gymnasium",
+    "tensorboard",
+    "imageio",
+    "ray",
+    "redis",
+    "fastapi",
+    "uvicorn",
+    "httpx",
+)
+ROOMS_WITHOUT_TORCH = ("actors", "envs", "generator", "registry", "status")
 ROOMS_BELOW_RUNTIME = ("envs", "policies", "actors", "generator", "learner", "registry")
-VERBS = ("demo", "pretrain", "evaluate", "render", "coverage", "registry")
+VERBS = ("demo", "pretrain", "evaluate", "render", "coverage", "registry", "serve")
 DOCUMENTS = [*sorted(ROOT.glob("*.md")), *sorted((ROOT / "docs").rglob("*.md")), ROOT / "deploy" / "README.md"]
 FOLDERS = (".ci", "benchmarks", "configs", "deploy", "docs", "service", "tests")
 TEXT = {".cfg", ".json", ".jsonl", ".md", ".py", ".toml", ".txt", ".yaml", ".yml", ""}

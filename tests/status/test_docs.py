@@ -1,0 +1,79 @@
+"""docs/api.md: every curl in it is run, and what it says of errors and events is what there is."""
+
+import json
+import os
+import re
+import shutil
+import subprocess
+from pathlib import Path
+
+import pytest
+
+from service.registry.registry import Registry
+from service.status import guard
+from service.status.stream import EVENT_SCHEMA
+from tests.status.conftest import serve
+from tests.status.runs import TOKEN, VIDEO, append, grid, publish, record, write_status
+
+ROOT = Path(__file__).parents[2]
+TEXT = (ROOT / "docs" / "api.md").read_text()
+
+
+def commands():
+    """What stands after "$ " in the examples, lines that go on put together."""
+    blocks = re.findall(r"```console\n(.*?)```", TEXT, re.DOTALL)
+    return [found for block in blocks for found in re.findall(r"^\$ ((?:.*\\\n)*.*)$", block, re.MULTILINE)]
+
+
+@pytest.fixture(scope="module")
+def environment(tmp_path_factory):
+    home = tmp_path_factory.mktemp("docs")
+    write_status(home / "runs", "cube", state="finished")
+    append(home / "runs", "cube", record(331), record(332))
+    (home / "runs" / "cube" / "goals.json").write_text(grid().model_dump_json())
+    (home / "runs" / "cube" / "rounds.mp4").write_bytes(VIDEO)
+    publish(Registry(home / "registry"), "panda-cube")
+    Registry(home / "registry").set_alias("panda-cube", "champion", 1)
+    with serve(home) as server:
+        yield {**os.environ, "TANDEM_URL": server.url, "TANDEM_TOKEN": TOKEN, "no_proxy": "*"}
+
+
+@pytest.mark.skipif(shutil.which("curl") is None, reason="no curl here")
+@pytest.mark.parametrize("command", commands())
+def test_examples(environment, tmp_path, command):
+    checked = command.replace("curl ", "curl --fail-with-body --max-time 20 ", 1)
+    result = subprocess.run(
+        ["sh", "-c", checked], env=environment, cwd=tmp_path, capture_output=True, text=True, timeout=60, check=False
+    )
+    if command.endswith('/nope"'):
+        assert (result.returncode, json.loads(result.stdout)["type"]) == (22, "urn:tandem:unknown-run")
+        return
+    assert result.returncode == 0, result.stdout + result.stderr
+    if "-o rounds.mp4" in command:
+        assert (tmp_path / "rounds.mp4").read_bytes() == VIDEO
+    elif "/stream" in command:
+        assert "event: metrics\n" in result.stdout
+        assert "event: end\n" in result.stdout
+    else:
+        assert json.loads(result.stdout)
+
+
+def test_there_are_examples():
+    assert len(commands()) >= 12
+
+
+def test_every_kind_of_problem_is_listed():
+    sources = [path.read_text() for path in (ROOT / "service" / "status").glob("*.py")]
+    kinds = {kind for text in sources for kind in re.findall(r"(?:ProblemError\(\s*|, )\d{3}, \"([a-z-]+)\"", text)}
+    assert {"unknown-run", "too-large", "no-such-range", "read-only", "damaged"} <= kinds
+    table = TEXT[TEXT.index("## Errors") : TEXT.index("## The client")]
+    assert {kind for kind in kinds if f"`{kind}`" not in table} == set()
+
+
+def test_every_event_is_listed():
+    assert [kind for kind in EVENT_SCHEMA["properties"]["event"]["enum"] if f"| `{kind}` |" not in TEXT] == []
+
+
+def test_numbers():
+    assert f"more than {guard.BODY_TIMEOUT_S:g} s" in TEXT
+    assert f"more than {guard.MAX_BODY_BYTES // 1024} KiB" in TEXT
