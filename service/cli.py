@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from service.actors.evaluation import Evaluation
     from service.config import Config
     from service.envs.goals import GoalKind
+    from service.runtime.connecting import ClusterOptions
     from service.runtime.pretrain import Pretrained
     from service.runtime.primitives import TrainedBob
 
@@ -53,17 +54,39 @@ def pretrain(
         typer.Option("--config", metavar="FILE", help="YAML; defaults where left out. Not needed to resume."),
     ] = None,
     run_dir: Annotated[Path | None, typer.Option("--run-dir", metavar="DIR", help="Default: runs/NAME.")] = None,
+    run_id: Annotated[
+        str | None,
+        typer.Option("--run-id", metavar="ID", help="Run in runs/ID, and continue it if it has begun: for jobs."),
+    ] = None,
     resume: Annotated[bool, typer.Option("--resume", help="Continue the run in --run-dir exactly.")] = False,
     overrides: _Set = None,
     registry: _Registry = Path("registry"),
+    runtime: Annotated[str, typer.Option(help="local: in this process; ray: on a cluster.")] = "local",
+    address: Annotated[
+        str | None,
+        typer.Option(metavar="auto|HOST:PORT", help="Ray cluster; default: the job's, or a new one on this machine."),
+    ] = None,
+    num_actors: Annotated[
+        int | None, typer.Option(help="Rollout actors; default: as many as the cluster has cores.", min=1)
+    ] = None,
+    learner_cpus: Annotated[
+        float, typer.Option(help="Cores reserved for the learner; 0: it shares the actors'.", min=0)
+    ] = 0.0,
 ) -> None:
-    """Pre-train primitives by self-play in this process, and publish them."""
+    """Pre-train primitives by self-play, in this process or on a Ray cluster, and publish them."""
     with _user_errors():
         from service.config import load_config
         from service.runtime.pretrain import resumed_config
         from service.runtime.rundir import RunDirectory
 
+        if runtime not in ("local", "ray"):
+            raise TandemError(f"--runtime {runtime!r}: choose one of local, ray")
+        if run_id is not None and (resume or run_dir is not None):
+            raise TandemError("--run-id names the run directory, and continues what is there: leave out the other two")
         overrides = overrides or []
+        if run_id is not None:
+            run_dir = Path("runs") / run_id
+            resume = RunDirectory(run_dir).exists
         if resume:
             if run_dir is None:
                 raise TandemError("--resume needs --run-dir, the directory of the run to continue")
@@ -72,7 +95,14 @@ def pretrain(
         else:
             resolved = load_config(config, overrides)
             directory = RunDirectory(run_dir or Path("runs") / resolved.name)
-        _pretrain(resolved, directory.path, registry, resume=resume)
+        if runtime == "local":
+            _pretrain(resolved, directory.path, registry, resume=resume)
+            return
+        from service.runtime.connecting import ClusterOptions, connected
+
+        options = ClusterOptions(num_actors=num_actors, learner_cpus=learner_cpus)
+        with connected(address):
+            _pretrain(resolved, directory.path, registry, resume=resume, cluster=options)
 
 
 @app.command()
@@ -240,7 +270,9 @@ def main() -> None:
     app()
 
 
-def _pretrain(config: Config, path: Path, registry: Path, *, resume: bool) -> None:
+def _pretrain(
+    config: Config, path: Path, registry: Path, *, resume: bool, cluster: ClusterOptions | None = None
+) -> None:
     from service.runtime.pretrain import pretrain as run
     from service.runtime.progress import Progress
     from service.runtime.rundir import RunDirectory
@@ -248,7 +280,8 @@ def _pretrain(config: Config, path: Path, registry: Path, *, resume: bool) -> No
 
     try:
         with Progress(config.run.total_env_steps, _console) as progress:
-            done = run(config, RunDirectory(path), registry, resume=resume, on_iteration=progress.show)
+            directory = RunDirectory(path)
+            done = run(config, directory, registry, resume=resume, on_iteration=progress.show, cluster=cluster)
     except InterruptError as interrupt:
         _say_stopped("stopped at once", interrupt.number, path, registry)
     _report(done, path, registry)

@@ -74,7 +74,8 @@ class SelfPlay:
         self.config = config
         self.worlds = WorldBatch(config.world, config.game.num_worlds, num_threads=num_threads)
         self._rng = rng
-        self._actor, self._incarnation, self._sequence = actor, incarnation, 0
+        self.incarnation = incarnation
+        self._actor, self._sequence = actor, 0
         self._round_index: IntArray = np.zeros(config.game.num_worlds, dtype=np.int64)
         self.worlds.reset(rng)
 
@@ -127,7 +128,7 @@ class SelfPlay:
         self._continue_games(end_state, verdict)
         rollout = Rollout(
             actor=self._actor,
-            incarnation=self._incarnation,
+            incarnation=self.incarnation,
             sequence=self._sequence,
             policy_version=players.version,
             alice=alice,

@@ -25,6 +25,7 @@ from service.config import Config
 from service.errors import DivergedError
 from service.policies.parameters import Parameters, PolicyError
 from service.runtime.books import Books
+from service.runtime.connecting import ClusterOptions
 from service.runtime.crew import THREAD_VARIABLES, Crew, Member
 from service.runtime.rundir import RunDirectory
 from service.runtime.runner import (
@@ -58,18 +59,6 @@ MAX_FAILED_ROUNDS = 20
 
 
 @dataclass(frozen=True, slots=True)
-class ClusterOptions:
-    """What a run uses of a cluster; no part of the experiment, and free to change when it is resumed."""
-
-    num_actors: int | None = None
-    """Rollout actors; None: as many as there are cores for, following the cluster as it grows and shrinks."""
-    actor_threads: int = 1
-    """Cores of each."""
-    learner_cpus: float = 0.0
-    """Reserved for the learner. With 0 it shares the actors' cores, which is right where physics is the bottleneck."""
-
-
-@dataclass(frozen=True, slots=True)
 class Handed:
     """A rollout that an actor handed over."""
 
@@ -78,6 +67,8 @@ class Handed:
     """Reference to it."""
     records: Any
     """Reference to its records."""
+    weights: Any
+    """Reference to those it was played with."""
     numbers: Round
 
 
@@ -122,7 +113,7 @@ class ClusterRun:
         self,
         config: Config,
         directory: RunDirectory,
-        options: ClusterOptions = ClusterOptions(),
+        options: ClusterOptions,
         *,
         resume: bool = False,
     ) -> None:
@@ -241,9 +232,10 @@ class ClusterRun:
         play = member.handle.play.options(num_returns=4)
         rollout, records, rng, numbers = play.remote(self._weights, assignment, generator)
         member.begin(ticket)
-        self._waiting[numbers] = partial(self._end_round, member, ticket, rollout, records, rng)
+        made = partial(Handed, ticket, rollout, records, self._weights)
+        self._waiting[numbers] = partial(self._end_round, member, ticket, made, rng)
 
-    def _end_round(self, member: Member, ticket: int, rollout: Any, records: Any, rng: Any, numbers: Any) -> None:
+    def _end_round(self, member: Member, ticket: int, made: Callable[[Round], Handed], rng: Any, numbers: Any) -> None:
         if not self._crew.holds(member):
             return  # it was given up meanwhile, and its slot with it
         try:
@@ -255,7 +247,7 @@ class ClusterRun:
         member.finish(played, rng)
         self._crew.took(played.play_s)
         self._slots.finish(ticket)
-        self._handed.append(Handed(ticket, rollout, records, played))
+        self._handed.append(made(played))
 
     def _fail_round(self, member: Member, ticket: int, error: Exception) -> None:
         """The actor died, or the generator on which it waited, or the physics threw: who is not well is replaced."""
@@ -299,11 +291,11 @@ class ClusterRun:
     # --- iterations ------------------------------------------------------------------------------------------------
 
     def _start_iteration(self) -> None:
-        """Give the oldest rollouts to learner and generator, if there are enough, and none gets too old by it."""
+        """Give learner and generator what was played, if it is enough and makes no round being played too old."""
         num = self._crew.num_counted_on
         if self._current is not None or len(self._handed) < num or not self._slots.may_update(self._version):
             return
-        batch, self._handed = self._handed[:num], self._handed[num:]
+        batch, self._handed = self._handed, []  # all: one that were left over would only get older
         self._current = Iteration(batch)
         self._ask_generator(self._current)
         self._ask_learner(self._current)
@@ -318,7 +310,8 @@ class ClusterRun:
         num_env_steps = self.books.num_env_steps + iteration.num_env_steps
         records = [each.records for each in iteration.batch]
         record = self._generator.handle.record.options(num_returns=2)
-        recorded, state = record.remote(self.books.iteration, num_env_steps, self._weights, records)
+        weights = iteration.batch[0].weights  # who played may become past opponents
+        recorded, state = record.remote(self.books.iteration, num_env_steps, weights, records)
         iteration.states["generator"] = state
         self._waiting[recorded] = partial(self._answered, iteration, self._generator)
 

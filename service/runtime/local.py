@@ -64,6 +64,7 @@ class LocalRun:
         self.timing = Timing()
         self._rng = np.random.default_rng(config.seed)
         self.learner = Learner(config)
+        self._incarnation = 0
         self.game = SelfPlay(config, self._rng, num_threads=config.run.num_threads)
         self.generator = TaskGenerator(config, self.game.worlds.state_size)
         self.books = Books(config, directory)
@@ -271,13 +272,17 @@ class LocalRun:
             parts |= {"alice": weights.alice, "bob": weights.steady_bob}
             if self._pending is not None:
                 parts["pending"] = to_arrays(self._pending)
-            self.books.save(parts, {"rng": self._rng.bit_generator.state})
+            meta = {"rng": self._rng.bit_generator.state, "next_incarnation": self._incarnation + 1}
+            self.books.save(parts, meta)
 
     def _load(self) -> None:
         parts, meta = self.books.resume()
         self.learner.load_state(parts["learner"])
         self.generator.load_state(parts["generator"])
-        if "game" in parts:  # else the cluster runner saved it, whose actors are no part of a checkpoint
+        self._incarnation = int(meta["next_incarnation"])
+        if "game" in parts:
+            self._incarnation -= 1  # the same actor goes on; a cluster's are no part of a checkpoint, and another begins
             self.game.load_state(parts["game"])
+        self.game.incarnation = self._incarnation
         self._pending = from_arrays(parts["pending"]) if "pending" in parts else None
         self._rng.bit_generator.state = meta["rng"]

@@ -27,7 +27,7 @@ from service.store.fanout import open_writer
 from service.store.server import redis_service
 
 if TYPE_CHECKING:
-    from service.runtime.cluster import ClusterOptions
+    from service.runtime.connecting import ClusterOptions
     from service.store.models import RunState
 
 RESUMABLE = ("run.", "learner.alice.learning_rate=", "learner.bob.learning_rate=")
@@ -166,19 +166,19 @@ def resumed_config(directory: RunDirectory, overrides: list[str], file: Path | N
 
     Args:
         directory: of the run.
-        overrides: ``run.a=b`` strings, or learning rates.
+        overrides: ``run.a=b`` strings, or learning rates; others may only say what the run has.
         file: YAML that says the same as the saved one outside ``run``; what it says there comes before ``overrides``.
 
     Raises:
         ConfigError: no run there, an override of anything else, or a file that says otherwise.
     """
+    saved = directory.read_config()
     for override in overrides:
-        if not override.startswith(RESUMABLE):
+        if not override.startswith(RESUMABLE) and load_config(directory.config_file, [override]) != saved:
             raise ConfigError(
                 f"override {override!r}: a resumed run keeps its configuration; only run.* and the learning rates may "
                 "change, for example run.total_env_steps"
             )
-    saved = directory.read_config()
     if file is not None:
         given = load_config(file)
         _check_same_outside_run(saved, given, file)

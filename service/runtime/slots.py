@@ -53,7 +53,8 @@ class RolloutSlots:
     def may_update(self, version: int) -> bool:
         """Whether the version after ``version`` may be made: then no round being played ends up too far behind.
 
-        The update after it is the first that can learn from such a round; by then ``version + 1`` is out.
+        The update after it is the first that can learn from such a round; by then ``version + 1`` is out. What was
+        played already is learned from by this one.
         """
         return all(version + 1 - began <= MAX_LAG for began in self._began.values())
 

@@ -1,0 +1,71 @@
+"""This process and a Ray cluster: one that is there, or one of its own on this machine."""
+
+from __future__ import annotations
+
+import logging
+import os
+import secrets
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Any
+
+from service.runtime.runner import ClusterError
+
+
+@dataclass(frozen=True, slots=True)
+class ClusterOptions:
+    """What a run uses of a cluster; no part of the experiment, and free to change when it is resumed."""
+
+    num_actors: int | None = None
+    """Rollout actors; None: as many as there are cores for, following the cluster as it grows and shrinks."""
+    actor_threads: int = 1
+    """Cores of each."""
+    learner_cpus: float = 0.0
+    """Reserved for the learner. With 0 it shares the actors' cores, which is right where physics is the bottleneck."""
+
+
+@contextmanager
+def connected(address: str | None, num_cpus: int | None = None) -> Iterator[None]:
+    """Be a driver of a Ray cluster, for as long as the block runs.
+
+    Args:
+        address: ``auto`` for the one on this machine or of the Ray job that this process is, or ``HOST:PORT``; None for
+            the job's, and outside of a job for a new one on this machine, which ends with the block.
+        num_cpus: of a new one; None: all there are.
+
+    Raises:
+        ClusterError: nobody there, another version of Ray or Python there, or it does not let us in.
+    """
+    address = address or ("auto" if os.environ.get("RAY_ADDRESS") else None)
+    os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
+    chosen = {"RAY_AUTH_MODE", "RAY_AUTH_TOKEN", "RAY_AUTH_TOKEN_PATH"} & os.environ.keys()
+    if address is None and not chosen and "ray" not in sys.modules:  # Ray reads them when it is imported
+        # Else Ray would leave a token in the home directory, and every later cluster there would take it up.
+        os.environ |= {"RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN": secrets.token_hex(32)}
+    import ray
+
+    options: dict[str, Any] = {"num_cpus": num_cpus, "include_dashboard": False} if address is None else {}
+    try:
+        ray.init(address or "local", logging_level=logging.WARNING, **options)
+    except (ConnectionError, RuntimeError, ValueError, OSError) as error:
+        # RuntimeError: other versions; a refused token is an error of its own kind, and one of these
+        raise ClusterError(_explained(address, error)) from None
+    try:
+        yield
+    finally:
+        ray.shutdown()
+
+
+def _explained(address: str | None, error: Exception) -> str:
+    said = " ".join(str(error).split())
+    if "ersion" in said and "mismatch" in said.lower():
+        what = "it runs other versions of Ray or Python than this process; use the same image or environment everywhere"
+    elif "token" in said.lower() or "authenti" in said.lower():
+        what = "it does not let us in: set RAY_AUTH_TOKEN or RAY_AUTH_TOKEN_PATH to its token"
+    elif address is None:
+        what = "Ray does not start here"
+    else:
+        what = "no Ray cluster answers there: is it up (ray status), and is the address right (ray start prints it)?"
+    return f"--address {address or '(none)'}: {what}. Ray says: {said[:300]}"

@@ -1,0 +1,206 @@
+"""The cluster runner on a real Ray: the same experiment as the local one, and whoever is killed is replaced."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from service.registry.checkpoints import CheckpointStore
+from service.runtime.cluster import ClusterRun
+from service.runtime.connecting import ClusterOptions, connected
+from service.runtime.rundir import RunDirectory
+from service.runtime.runner import ClusterError
+from tests.runtime.runs import newest, play, read_lines, tiny_config
+
+TOGETHER = ("learner/", "alice/", "bob/", "generator/")
+
+
+@pytest.fixture(scope="module", autouse=True)
+def cluster():
+    """A Ray of four logical cores, for all tests of this file."""
+    with connected(None, num_cpus=4):
+        yield
+
+
+def run_cluster(path, config=None, *, num_actors=2, resume=False, on_iteration=None, on_beat=None):
+    """To the end; returns the run, closed, and how it ended."""
+    directory = RunDirectory(path)
+    directory.claim(resume=resume)
+    run = ClusterRun(config or tiny_config(), directory, ClusterOptions(num_actors=num_actors), resume=resume)
+    try:
+        result = run.run(
+            lambda metrics: on_iteration(run, metrics) if on_iteration else None,
+            lambda: on_beat(run) if on_beat else None,
+        )
+        return run, result
+    finally:
+        run.close()
+        directory.close()
+
+
+def pid_of(run, name):
+    return next(actor.pid for actor in run.health().actors if actor.name == name)
+
+
+def kill(run, name):
+    os.kill(pid_of(run, name), signal.SIGKILL)
+
+
+def is_alive(pid):
+    """Whether a process still runs after some seconds to end in."""
+    for _ in range(50):
+        try:
+            state = Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[0]
+        except FileNotFoundError:
+            return False
+        if state == "Z":
+            return False
+        time.sleep(0.1)
+    return True
+
+
+def ids(path):
+    """(actor, incarnation, highest sequence) of the rollouts that the newest checkpoint counts."""
+    return newest(path).arrays["learner/counted"].tolist()
+
+
+def test_one_actor_plays_and_learns_what_the_local_runner_does(tmp_path):
+    config = tiny_config(total_env_steps=1200)
+    play(tmp_path / "local", config)
+    run_cluster(tmp_path / "ray", config, num_actors=1)
+    local, cluster = (read_lines(tmp_path / name / "metrics.jsonl") for name in ("local", "ray"))
+    assert len(cluster) >= 6  # with replayed goals and past opponents
+    # Iteration i + 1 of the local runner records the update on the rollout of iteration i, here it is the same record.
+    for index in range(min(len(cluster), len(local) - 1)):
+        played = {name: value for name, value in local[index].items() if name.startswith(("alice/", "bob/"))}
+        assert {name: cluster[index][name] for name in played} == played
+        assert cluster[index]["env_steps"] == local[index]["env_steps"]
+        learned = {name: value for name, value in local[index + 1].items() if name.startswith("learner/")}
+        assert {name: cluster[index][name] for name in learned} == learned
+
+
+def test_worlds_are_shared_out_and_every_rollout_counts_once(tmp_path):
+    seen = []
+    run, result = run_cluster(
+        tmp_path, tiny_config(total_env_steps=1500), num_actors=3, on_iteration=lambda run, m: seen.append(m)
+    )
+    assert result.reason == "finished"
+    assert run._num_worlds == 8
+    health = run.health()
+    assert health.num_rollouts_refused == 0
+    counted = sum(highest + 1 for _, _, highest in ids(tmp_path))
+    assert counted == health.num_rollouts_counted
+    assert max(m["learner/max_policy_lag"] for m in seen) <= 2
+    assert np.mean([m["learner/policy_lag"] for m in seen]) <= 1
+    assert [m["learner/version"] for m in seen] == list(range(1, len(seen) + 1))
+    assert newest(tmp_path).meta["env_steps"] == result.num_env_steps == seen[-1]["env_steps"]
+
+
+def test_a_checkpoint_belongs_to_no_topology_and_no_runner(tmp_path):
+    _, first = play(tmp_path, tiny_config(total_env_steps=600))  # with a pending rollout
+    _, second = run_cluster(tmp_path, tiny_config(total_env_steps=1200), num_actors=3, resume=True)
+    _, third = run_cluster(tmp_path, tiny_config(total_env_steps=1800), num_actors=1, resume=True)
+    _, last = play(tmp_path, tiny_config(total_env_steps=2400), resume=True)
+    steps = [result.num_env_steps for result in (first, second, third, last)]
+    assert all(result.reason == "finished" for result in (first, second, third, last))
+    assert steps == sorted(steps)
+    rows = read_lines(tmp_path / "metrics.jsonl")
+    assert [row["iteration"] for row in rows] == list(range(1, len(rows) + 1))
+    assert all(row.get("learner/non_finite_steps", 0.0) == 0.0 for row in rows)
+    versions = [row["learner/version"] for row in rows if "learner/version" in row]
+    assert versions == list(range(1, len(versions) + 1))  # nobody lost or repeated an update
+    assert len({(actor, incarnation) for actor, incarnation, _ in ids(tmp_path)}) == 1 + 3 + 1 + 1
+
+
+@pytest.mark.parametrize("name", ["rollout-1", "learner", "generator"])
+def test_whoever_is_killed_is_replaced(tmp_path, name):
+    killed = []
+
+    def strike(run, metrics):
+        if metrics["iteration"] in (4, 8) and len(killed) < 2:
+            killed.append(pid_of(run, name))
+            kill(run, name)
+
+    run, result = run_cluster(tmp_path, tiny_config(total_env_steps=5000), on_iteration=strike)
+    assert result.reason == "finished"
+    assert len(set(killed)) == 2
+    actor = next(actor for actor in run.health().actors if actor.name == name) if name != "rollout-1" else None
+    if actor is not None:
+        assert actor.incarnation == 2
+        assert actor.last_error
+    rows = read_lines(tmp_path / "metrics.jsonl")
+    assert [row["learner/version"] for row in rows] == list(range(1, len(rows) + 1))
+    assert sum(highest + 1 for _, _, highest in ids(tmp_path)) >= run.health().num_rollouts_counted
+    assert rows[-1]["env_steps"] >= 5000
+
+
+def test_an_actor_that_hangs_is_replaced(tmp_path, monkeypatch):
+    monkeypatch.setattr("service.runtime.crew.MIN_DEADLINE_S", 1.5)
+    stopped = []
+
+    def stop(run, metrics):
+        if metrics["iteration"] == 4 and not stopped:
+            stopped.append(pid_of(run, "rollout-0"))
+            os.kill(stopped[0], signal.SIGSTOP)
+
+    run, result = run_cluster(tmp_path, tiny_config(total_env_steps=6000), on_iteration=stop)
+    assert result.reason == "finished"
+    assert run.health().last_error is not None
+    assert "no rollout for" in run.health().last_error
+    assert {(actor, incarnation) for actor, incarnation, _ in ids(tmp_path)} >= {(0, 0), (0, 1), (1, 0)}
+    assert not is_alive(stopped[0])
+
+
+def test_a_stop_ends_it_at_once_and_saved(tmp_path):
+    asked = []
+
+    def ask(run, metrics):
+        if metrics["iteration"] == 5:
+            asked.append(time.monotonic())
+            run.request_stop()
+
+    _, result = run_cluster(tmp_path, tiny_config(total_env_steps=10**9, checkpoint_interval=1000), on_iteration=ask)
+    assert time.monotonic() - asked[0] < 3 + 5  # saving takes a moment; killing the actors is in it
+    assert (result.reason, result.iteration) == ("interrupted", 5)
+    assert CheckpointStore(tmp_path / "checkpoints", keep=1).steps()[-1] == 5
+
+
+def test_a_learner_that_dies_of_every_batch_ends_the_run_with_one_line(tmp_path):
+    def strike(run, metrics):
+        if metrics["iteration"] >= 3:
+            real = run._learner.restart
+
+            def restart_and_strike(why):
+                real(why)
+                os.kill(run._learner._place.pid, signal.SIGKILL)
+
+            run._learner.restart = restart_and_strike
+            kill(run, "learner")
+
+    with pytest.raises(ClusterError, match=r"3 times in a row the learner failed") as error:
+        run_cluster(tmp_path, tiny_config(total_env_steps=10**9), on_iteration=strike)
+    assert "\n" not in str(error.value)
+
+
+def test_no_cluster_at_an_address_is_one_line():
+    code = (
+        "from service.runtime.connecting import connected\n"
+        "from service.errors import TandemError\n"
+        "try:\n    connected('127.0.0.1:1').__enter__()\n"
+        "except TandemError as error:\n    print(error)\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code],
+        capture_output=True,
+        text=True,
+        timeout=120,
+        cwd=Path(__file__).parents[2],
+        env={**os.environ, "RAY_gcs_rpc_server_reconnect_timeout_s": "2"},
+    )
+    assert "no Ray cluster answers there" in done.stdout
+    assert len(done.stdout.strip().splitlines()) == 1
