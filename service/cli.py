@@ -39,6 +39,9 @@ _EXIT_SIGNAL = 128
 _Registry = Annotated[
     Path, typer.Option("--registry", envvar="TANDEM_REGISTRY", metavar="DIR", help="Directory of the registry.")
 ]
+_Runs = Annotated[
+    Path, typer.Option("--runs", envvar="TANDEM_RUNS", metavar="DIR", help="Directory of run directories.")
+]
 _Set = Annotated[
     list[str] | None, typer.Option("--set", metavar="A.B=C", help="Override a key of the configuration; repeatable.")
 ]
@@ -53,11 +56,12 @@ def pretrain(
         Path | None,
         typer.Option("--config", metavar="FILE", help="YAML; defaults where left out. Not needed to resume."),
     ] = None,
-    run_dir: Annotated[Path | None, typer.Option("--run-dir", metavar="DIR", help="Default: runs/NAME.")] = None,
+    run_dir: Annotated[Path | None, typer.Option("--run-dir", metavar="DIR", help="Default: RUNS/NAME.")] = None,
     run_id: Annotated[
         str | None,
-        typer.Option("--run-id", metavar="ID", help="Run in runs/ID, and continue it if it has begun: for jobs."),
+        typer.Option("--run-id", metavar="ID", help="Run in RUNS/ID, and continue it if it has begun: for jobs."),
     ] = None,
+    runs: _Runs = Path("runs"),
     resume: Annotated[bool, typer.Option("--resume", help="Continue the run in --run-dir exactly.")] = False,
     overrides: _Set = None,
     registry: _Registry = Path("registry"),
@@ -72,6 +76,14 @@ def pretrain(
     learner_cpus: Annotated[
         float, typer.Option(help="Cores reserved for the learner; 0: it shares the actors'.", min=0)
     ] = 0.0,
+    status: Annotated[
+        str,
+        typer.Option(metavar="HOST:PORT|off", help="Where the status service of a run on a cluster listens."),
+    ] = "127.0.0.1:8321",
+    token_file: Annotated[
+        Path | None,
+        typer.Option("--token-file", metavar="FILE", help="Its token; default: TANDEM_TOKEN. See tandem serve."),
+    ] = None,
 ) -> None:
     """Pre-train primitives by self-play, in this process or on a Ray cluster, and publish them."""
     with _user_errors():
@@ -85,7 +97,7 @@ def pretrain(
             raise TandemError("--run-id names the run directory, and continues what is there: leave out the other two")
         overrides = overrides or []
         if run_id is not None:
-            run_dir = Path("runs") / run_id
+            run_dir = runs / run_id
             resume = RunDirectory(run_dir).exists
         if resume:
             if run_dir is None:
@@ -94,13 +106,16 @@ def pretrain(
             resolved = resumed_config(directory, overrides, config)
         else:
             resolved = load_config(config, overrides)
-            directory = RunDirectory(run_dir or Path("runs") / resolved.name)
+            directory = RunDirectory(run_dir or runs / resolved.name)
         if runtime == "local":
             _pretrain(resolved, directory.path, registry, resume=resume)
             return
-        from service.runtime.connecting import ClusterOptions, connected
+        from service.runtime.connecting import ClusterOptions, connected, parse_status
+        from service.status.token import read_token
 
-        options = ClusterOptions(num_actors=num_actors, learner_cpus=learner_cpus)
+        options = ClusterOptions(
+            num_actors=num_actors, learner_cpus=learner_cpus, status=parse_status(status, read_token(token_file))
+        )
         with connected(address):
             _pretrain(resolved, directory.path, registry, resume=resume, cluster=options)
 

@@ -5,13 +5,26 @@ from __future__ import annotations
 import logging
 import os
 import secrets
+import socket
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 from service.runtime.runner import ClusterError
+
+CONNECT_S = 5.0
+
+
+@dataclass(frozen=True, slots=True)
+class StatusOptions:
+    """Where the status service of a run on a cluster listens."""
+
+    host: str = "127.0.0.1"
+    port: int = 8321
+    """0: one that is free."""
+    token: str | None = field(default=None, repr=False)
 
 
 @dataclass(frozen=True, slots=True)
@@ -24,6 +37,22 @@ class ClusterOptions:
     """Cores of each."""
     learner_cpus: float = 0.0
     """Reserved for the learner. With 0 it shares the actors' cores, which is right where physics is the bottleneck."""
+    status: StatusOptions | None = None
+    """None: no status service of its own."""
+
+
+def parse_status(text: str, token: str | None) -> StatusOptions | None:
+    """``HOST:PORT`` or ``off``.
+
+    Raises:
+        ClusterError: neither.
+    """
+    if text == "off":
+        return None
+    host, separator, port = text.rpartition(":")
+    if not separator or not host or not port.isdecimal():
+        raise ClusterError(f"--status {text!r}: expected HOST:PORT, such as 127.0.0.1:8321, or off")
+    return StatusOptions(host.strip("[]"), int(port), token)
 
 
 @contextmanager
@@ -46,6 +75,7 @@ def connected(address: str | None, num_cpus: int | None = None) -> Iterator[None
         os.environ |= {"RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN": secrets.token_hex(32)}
     import ray
 
+    _check_reachable(address)
     options: dict[str, Any] = {"num_cpus": num_cpus, "include_dashboard": False} if address is None else {}
     try:
         ray.init(address or "local", logging_level=logging.WARNING, **options)
@@ -58,6 +88,19 @@ def connected(address: str | None, num_cpus: int | None = None) -> Iterator[None
         ray.shutdown()
 
 
+def _check_reachable(address: str | None) -> None:
+    """Ray itself would end the whole process where nobody answers."""
+    host, separator, port = (address or "").removeprefix("ray://").rpartition(":")
+    if not separator:
+        return
+    if not port.isdecimal():
+        raise ClusterError(f"--address {address}: expected auto or HOST:PORT, as ray start prints it")
+    try:
+        socket.create_connection((host.strip("[]"), int(port)), timeout=CONNECT_S).close()
+    except (OSError, OverflowError) as error:
+        raise ClusterError(_explained(address, error)) from None
+
+
 def _explained(address: str | None, error: Exception) -> str:
     said = " ".join(str(error).split())
     if "ersion" in said and "mismatch" in said.lower():
@@ -68,4 +111,4 @@ def _explained(address: str | None, error: Exception) -> str:
         what = "Ray does not start here"
     else:
         what = "no Ray cluster answers there: is it up (ray status), and is the address right (ray start prints it)?"
-    return f"--address {address or '(none)'}: {what}. Ray says: {said[:300]}"
+    return f"--address {address or '(none)'}: {what}. It says: {said[:300]}"

@@ -279,9 +279,10 @@ class LocalRun:
         parts, meta = self.books.resume()
         self.learner.load_state(parts["learner"])
         self.generator.load_state(parts["generator"])
-        self._incarnation = int(meta["next_incarnation"])
+        next_incarnation = int(meta.get("next_incarnation", 1))
+        # The same actor goes on. A cluster's are no part of a checkpoint: after them another begins.
+        self._incarnation = next_incarnation - 1 if "game" in parts else next_incarnation
         if "game" in parts:
-            self._incarnation -= 1  # the same actor goes on; a cluster's are no part of a checkpoint, and another begins
             self.game.load_state(parts["game"])
         self.game.incarnation = self._incarnation
         self._pending = from_arrays(parts["pending"]) if "pending" in parts else None

@@ -28,6 +28,7 @@ from service.store.server import redis_service
 
 if TYPE_CHECKING:
     from service.runtime.connecting import ClusterOptions
+    from service.store.address import RedisAddress
     from service.store.models import RunState
 
 RESUMABLE = ("run.", "learner.alice.learning_rate=", "learner.bob.learning_rate=")
@@ -95,17 +96,29 @@ def pretrain(
         # A run on a cluster has a Redis in any case; one in this process, where it is told of one.
         redis = address_from_environment() if cluster is None else stack.enter_context(redis_service(directory.redis))
         writer = open_writer(directory.path, run_id, redis)
-        report = Report(config, run_id, runtime, writer, published=directory.read_published())
-        with report:
-            done = None
-            while done is None:  # until a run ends otherwise than by losing its state with a machine
-                with closing(_start(config, directory, cluster, resume=resume)) as run:
-                    try:
-                        done = _run(run, config, directory, registry, signals, report, on_iteration)
-                    except StateLostError as error:
-                        _logger.warning("%s", error)
-                        resume = True
-            return replace(done, signal=signals.first)
+        report = stack.enter_context(Report(config, run_id, runtime, writer, published=directory.read_published()))
+        if cluster is not None and cluster.status is not None and redis is not None:
+            from service.runtime.status_actor import serving
+
+            url = stack.enter_context(serving(cluster.status, directory.path.absolute().parent, registry, redis))
+            _logger.info("status: %s/v1/runs/%s", url, run_id)
+        while True:
+            with closing(_start(config, directory, cluster, resume=resume)) as run:
+                try:
+                    done = _run(run, config, directory, _open(registry, redis), signals, report, on_iteration)
+                except StateLostError as error:  # with a machine of the cluster
+                    _logger.warning("%s", error)
+                    resume = True
+                else:
+                    return replace(done, signal=signals.first)
+
+
+def _open(registry: Path, redis: RedisAddress | None) -> Registry:
+    if redis is None:
+        return Registry(registry)
+    from service.store.registry_index import RegistryIndex
+
+    return Registry(registry, listener=RegistryIndex(redis))
 
 
 def _start(config: Config, directory: RunDirectory, cluster: ClusterOptions | None, *, resume: bool) -> Runner:
@@ -120,7 +133,7 @@ def _run(
     run: Runner,
     config: Config,
     directory: RunDirectory,
-    registry: Path,
+    registry: Registry,
     signals: StopSignals,
     report: Report,
     on_iteration: OnIteration,
@@ -142,7 +155,7 @@ def _run(
     done = Pretrained(result, {}, None, {}, run.timing.tree(), signals.first)
     if result.reason != "interrupted" and signals.first is None:
         with suppress(InterruptError):
-            done = _finish(done, config, directory, Registry(registry), run)
+            done = _finish(done, config, directory, registry, run)
     complete = result.reason if signals.first is None else "interrupted"  # --resume does what is left
     report.end(cast("RunState", complete), published=str(done.version) if done.version is not None else None)
     return done

@@ -19,7 +19,7 @@ from datetime import timedelta
 from pathlib import Path
 from typing import TypeVar
 
-from service.store.address import address_from_environment
+from service.store.address import RedisAddress, address_from_environment
 from service.store.disk_reader import DiskReader
 from service.store.errors import StoreUnavailableError, UnknownRunError
 from service.store.models import ACTIVE, GoalGrid, Record, RunReader, RunStatus
@@ -31,13 +31,17 @@ _Answer = TypeVar("_Answer")
 _logger = logging.getLogger(__name__)
 
 
-def open_reader(runs_dir: Path) -> RunReader:
-    """A reader of the runs in a directory and, where ``TANDEM_REDIS_URL`` is set, of those in Redis.
+def open_reader(runs_dir: Path, redis: RedisAddress | None = None) -> RunReader:
+    """A reader of the runs in a directory and, where there is one, of those in a Redis.
+
+    Args:
+        runs_dir: directory of run directories.
+        redis: None for the one of ``TANDEM_REDIS_URL``, if that is set.
 
     Raises:
         StoreError: not a Redis URL, or the package redis is not installed.
     """
-    address = address_from_environment()
+    address = redis or address_from_environment()
     if address is None:
         return DiskReader(runs_dir)
     from service.store.redis_reader import RedisReader  # its package is for those who have a Redis
