@@ -16,6 +16,8 @@ FloatArray = NDArray[np.float32]
 StateArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
 IntArray = NDArray[np.int64]
+Broken = tuple[tuple[StateArray, FloatArray], ...]
+"""(last finite state (S,), action (4,)) of each world whose physics diverged."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -105,8 +107,8 @@ class Rollout:
     metrics: dict[str, float]
     """Counters of this round, e.g. ``alice/contact_fraction``."""
 
-    broken: tuple[tuple[StateArray, FloatArray], ...] = ()
-    """(last finite state (S,), action (4,)) of each world whose physics diverged; not part of a checkpoint."""
+    broken: Broken = ()
+    """Not part of a checkpoint."""
 
     @property
     def id(self) -> tuple[int, int, int]:

@@ -248,6 +248,7 @@ class ClusterRun:
         self._crew.took(played.play_s)
         self._slots.finish(ticket)
         self._handed.append(made(played))
+        self.directory.dump_broken("-".join(map(str, played.id)), played.broken)
 
     def _fail_round(self, member: Member, ticket: int, error: Exception) -> None:
         """The actor died, or the generator on which it waited, or the physics threw: who is not well is replaced."""
@@ -391,6 +392,7 @@ class ClusterRun:
         self._evaluated = {}
         with self.timing("record"):
             self.directory.record(metrics)
+            self.directory.record_goals(self.books.iteration - 1, self.books.num_env_steps, recorded.sample)
             self._on_iteration(metrics)
         with self.books.going_on("without this snapshot"):
             self._take_snapshot(after=before)

@@ -164,7 +164,7 @@ class LocalRun:
         with self.timing("generator"):
             metrics = rollout.metrics | self.generator.record(rollout.records)
             self.directory.record_goals(self.iteration, self.num_env_steps + rollout.num_env_steps, rollout.records)
-            self.directory.dump_broken(rollout)
+            self.directory.dump_broken(f"{rollout.sequence:06d}", rollout.broken)
             if self.generator.snapshot_due(self.iteration):
                 self.generator.add_opponents(weights.alice, weights.bob)
                 self._past = []

@@ -30,6 +30,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
 from service.config import Config, ConfigError, dump_config, load_config
 from service.errors import TandemError
@@ -42,7 +43,7 @@ from service.runtime.records import JsonlWriter
 from service.store.lock import DirectoryLock
 
 if TYPE_CHECKING:
-    from service.actors.rollout import GoalRecords, Rollout
+    from service.actors.rollout import Broken, GoalRecords
     from service.runtime.events import EventFile
 
 _logger = logging.getLogger(__name__)
@@ -153,8 +154,7 @@ class RunDirectory:
 
     def record_goals(self, iteration: int, num_env_steps: int, records: GoalRecords) -> None:
         """Append a sample of this iteration's valid proposals that the current Bob played."""
-        chosen = (records.verdict == Verdict.VALID) & records.played & ~records.replayed & ~records.bob_past
-        rows = np.flatnonzero(chosen)[:GOALS_PER_ITERATION]
+        rows = sampled_goals(records)
         table = np.concatenate(
             [records.start_position[rows], records.goal[rows], records.solved[rows, None].astype(float)], axis=1
         )
@@ -162,12 +162,12 @@ class RunDirectory:
         with self._going_on(self.goals_file):
             self._goals.append({"iteration": iteration + 1, "env_steps": num_env_steps, "goals": np.round(table, 4)})
 
-    def dump_broken(self, rollout: Rollout) -> None:
-        """Save the states and actions whose physics diverged in a round; at most 100 rounds are kept."""
-        if not rollout.broken or (self.broken.is_dir() and len(list(self.broken.iterdir())) >= MAX_BROKEN_FILES):
+    def dump_broken(self, name: str, broken: Broken) -> None:
+        """Save the states and actions whose physics diverged in a round, by its name; at most 100 rounds are kept."""
+        if not broken or (self.broken.is_dir() and len(list(self.broken.iterdir())) >= MAX_BROKEN_FILES):
             return
-        states, actions = zip(*rollout.broken, strict=True)
-        path, data = self.broken / f"round-{rollout.sequence:06d}.npz", io.BytesIO()
+        states, actions = zip(*broken, strict=True)
+        path, data = self.broken / f"round-{name}.npz", io.BytesIO()
         np.savez(data, states=np.stack(states), actions=np.stack(actions))
         _logger.warning("physics diverged in %d worlds, which go on from sound states; see %s", len(states), path)
         with self._going_on(self.broken), os_errors("write", path):
@@ -212,6 +212,12 @@ class RunDirectory:
             self._failing.add(path)
         else:
             self._failing.discard(path)
+
+
+def sampled_goals(records: GoalRecords) -> NDArray[np.int64]:
+    """The worlds whose goals are recorded: valid proposals that the current Bob played, not too many."""
+    chosen = (records.verdict == Verdict.VALID) & records.played & ~records.replayed & ~records.bob_past
+    return np.flatnonzero(chosen)[:GOALS_PER_ITERATION]
 
 
 def _environment() -> dict[str, object]:

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from service.actors.evaluation import evaluate
 from service.actors.game import Acting, Players, SelfPlay
-from service.actors.rollout import GoalRecords, Rollout
+from service.actors.rollout import Broken, GoalRecords, Rollout
 from service.config import Config
 from service.envs.batch import WorldBatch
 from service.envs.goals import GoalKind
@@ -26,6 +26,7 @@ from service.generator.generator import GoalChoice, TaskGenerator
 from service.generator.opponents import RoundPlan
 from service.policies.evaluator import GaussianEvaluator, bob_evaluator
 from service.policies.parameters import Parameters
+from service.runtime.rundir import sampled_goals
 from service.runtime.telling import goal_grid
 from service.store.models import GoalGrid
 
@@ -85,6 +86,8 @@ class Round:
     num_worlds: int
     num_broken: int
     """Worlds whose physics diverged, in this incarnation."""
+    broken: Broken
+    """Those of this round."""
     play_s: float
     generator_s: float
     """Of it, waiting for the task generator."""
@@ -99,6 +102,8 @@ class Recorded:
     metrics: Metrics
     should_stop: bool
     grid: GoalGrid
+    sample: GoalRecords
+    """Some of the goals, for the run directory."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -187,6 +192,7 @@ class RolloutWorker:
             num_env_steps=rollout.num_env_steps,
             num_worlds=self._config.game.num_worlds,
             num_broken=self._game.worlds.num_broken,
+            broken=rollout.broken,
             play_s=play_s,
             generator_s=waited,
             pool_version=self._pool_version,
@@ -293,7 +299,8 @@ class GeneratorWorker:
             self._generator.add_opponents(weights.alice, weights.bob)
             self._pool_version += 1
         grid = goal_grid(self._generator, iteration + 1, num_env_steps)
-        return Recorded(metrics, self._generator.should_stop(), grid), self._generator.state()
+        sample = rows_of(joined, sampled_goals(joined))
+        return Recorded(metrics, self._generator.should_stop(), grid, sample), self._generator.state()
 
 
 class LearnerWorker:
@@ -354,10 +361,13 @@ def join_records(records: Sequence[GoalRecords]) -> GoalRecords:
     """Records of several rounds as one of all their worlds."""
     if len(records) == 1:
         return records[0]
-    columns = {
-        field.name: np.concatenate([getattr(each, field.name) for each in records]) for field in fields(GoalRecords)
-    }
-    return GoalRecords(**columns)
+    names = [field.name for field in fields(GoalRecords)]
+    return GoalRecords(**{name: np.concatenate([getattr(each, name) for each in records]) for name in names})
+
+
+def rows_of(records: GoalRecords, rows: NDArray[np.int64]) -> GoalRecords:
+    """Some of the worlds' records."""
+    return GoalRecords(**{field.name: getattr(records, field.name)[rows] for field in fields(GoalRecords)})
 
 
 def _ask(generator: Any, *arguments: Any) -> tuple[GoalChoice, np.random.Generator]:

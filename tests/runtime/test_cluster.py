@@ -73,6 +73,8 @@ def test_one_actor_plays_and_learns_what_the_local_runner_does(tmp_path):
     run_cluster(tmp_path / "ray", config, num_actors=1)
     local, cluster = (read_lines(tmp_path / name / "metrics.jsonl") for name in ("local", "ray"))
     assert len(cluster) >= 6  # with replayed goals and past opponents
+    goals = [read_lines(tmp_path / name / "goals.jsonl") for name in ("local", "ray")]
+    assert goals[1] == goals[0][: len(goals[1])]
     # Iteration i + 1 of the local runner records the update on the rollout of iteration i, here it is the same record.
     for index in range(min(len(cluster), len(local) - 1)):
         played = {name: value for name, value in local[index].items() if name.startswith(("alice/", "bob/"))}

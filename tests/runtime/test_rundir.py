@@ -167,10 +167,10 @@ def test_no_goals_and_very_many(directory):
 
 def test_broken_worlds_are_kept_but_not_without_end(directory):
     broken = ((np.arange(4.0), np.zeros(4, dtype=np.float32)), (np.arange(4.0) + 1, np.ones(4, dtype=np.float32)))
-    directory.dump_broken(SimpleNamespace(sequence=0, broken=()))
+    directory.dump_broken("000000", ())
     assert not (directory.path / "broken").exists()
     for sequence in range(MAX_BROKEN_FILES + 5):
-        directory.dump_broken(SimpleNamespace(sequence=sequence, broken=broken))
+        directory.dump_broken(f"{sequence:06d}", broken)
     files = sorted((directory.path / "broken").iterdir())
     assert len(files) == MAX_BROKEN_FILES
     with np.load(files[0]) as dump:
@@ -206,7 +206,7 @@ def test_a_disk_that_fills_up_again_is_said_again(directory, caplog):
 def test_goals_and_broken_worlds_on_a_full_disk_do_not_end_a_run(directory, caplog):
     with no_room_above(0):
         directory.record_goals(0, 100, make_records(1))
-        directory.dump_broken(SimpleNamespace(sequence=0, broken=((np.arange(4.0), np.zeros(4)),)))
+        directory.dump_broken("000000", ((np.arange(4.0), np.zeros(4)),))
     directory.record_goals(1, 200, make_records(1))
     assert [row["iteration"] for row in read_lines(directory.goals_file)] == [1, 2]
     assert list((directory.path / "broken").iterdir()) == []
