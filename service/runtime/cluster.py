@@ -383,7 +383,7 @@ class ClusterRun:
             **recorded.metrics,
             **updated.metrics,
             "actor/num_alive": float(sum(member.place is not None for member in self._crew)),
-            "learner/idle_fraction": max(0.0, 1.0 - updated.update_s / elapsed_s),
+            "time/learner_idle_fraction": max(0.0, 1.0 - updated.update_s / elapsed_s),
             "time/learn_s": updated.update_s,
             "time/wall_s": self.books.wall_s,
             "time/env_steps_per_s": iteration.num_env_steps / elapsed_s,

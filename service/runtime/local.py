@@ -181,6 +181,7 @@ class LocalRun:
             "env_steps": self.num_env_steps,
             "world/num_broken": float(self.game.worlds.num_broken),
             **metrics,
+            "time/learner_idle_fraction": max(0.0, 1.0 - metrics.get("time/learn_s", 0.0) / elapsed_s),
             "time/wall_s": self.books.wall_s,
             "time/env_steps_per_s": rollout.num_env_steps / elapsed_s,
         }

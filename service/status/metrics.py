@@ -105,8 +105,11 @@ RUN_METRICS: tuple[RunMetric, ...] = (
     _of_record("lifted_goals_ratio", "alice/lifted_fraction", "Valid goals that are in the air"),
     _of_record("bob_success_ratio", "bob/success_rate", "Valid goals that Bob reached"),
     _of_record("bob_success_air_ratio", "bob/success_rate_air", "Valid goals in the air that Bob reached"),
-    _of_record("learner_idle_ratio", "learner/idle_fraction", "Of the wall time, the learner waiting for rollouts"),
+    _of_record("learner_idle_ratio", "time/learner_idle_fraction", "Of the wall time, the learner waiting for rollouts"),
     _of_record("learn_seconds", "time/learn_s", "Learning from one iteration"),
+    _of_record("non_finite_steps", "learner/non_finite_steps", "Gradient steps left out, not finite"),
+    _of_record("rollbacks", "learner/rollbacks", "Players taken back to before the update"),
+    _of_record("broken_worlds", "world/num_broken", "Worlds whose physics diverged so far"),
     _of_record("goal_cells", "generator/num_cells_seen", "Cells of the grid in which a valid goal was ever proposed"),
 )  # fmt: skip
 """One sample a run."""

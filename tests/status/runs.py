@@ -62,7 +62,7 @@ def record(iteration: int, **values: float | None) -> dict[str, Any]:
         "alice/valid_fraction": 0.5,
         "alice/lifted_fraction": 0.25,
         "bob/success_rate": 0.125 * (iteration % 8),
-        "learner/idle_fraction": 0.0625,
+        "time/learner_idle_fraction": 0.0625,
         **values,
     }
 
