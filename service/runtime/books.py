@@ -12,7 +12,8 @@ from typing import Any
 from numpy.typing import NDArray
 
 from service.config import Config
-from service.policies.parameters import Parameters
+from service.errors import DivergedError
+from service.policies.parameters import Parameters, PolicyError
 from service.registry.checkpoints import CheckpointStore
 from service.registry.errors import CheckpointError
 from service.runtime.rundir import RunDirectory
@@ -122,6 +123,26 @@ class Books:
             yield
         except CheckpointError as error:
             _logger.warning("%s; the run goes on, %s", error, how)
+
+    @contextmanager
+    def diverging(self) -> Iterator[None]:
+        """Adds to the error of a policy that has diverged when that was, and how to go on from before it.
+
+        Raises:
+            DivergedError: one has.
+        """
+        played = self.iteration
+        try:
+            yield
+        except (DivergedError, PolicyError) as error:
+            newest, learner = max(self.checkpoints.steps(), default=0), self.config.learner
+            has_it = f"delete {self.checkpoints.path(newest).name}, which has this policy; " if newest == played else ""
+            rates = f"alice.learning_rate={learner.alice.learning_rate / 2:g} --set learner.bob.learning_rate="
+            said = str(error).strip().splitlines()[-1]  # from another process it comes with its traceback
+            raise DivergedError(
+                f"{self.directory.path}, iteration {played + 1}: {said}: {has_it}resume with lower learning rates, "
+                f"for example --resume --set learner.{rates}{learner.bob.learning_rate / 2:g}"
+            ) from error
 
     @contextmanager
     def saving_last(self) -> Iterator[None]:

@@ -181,8 +181,9 @@ class ClusterRun:
             self._begin_rounds()
             with self.timing("wait"):
                 ready, _ = ray.wait(list(self._waiting), timeout=POLL_S)
-            for reference in ready:
-                self._waiting.pop(reference)(reference)
+            with self.books.diverging():
+                for reference in ready:
+                    self._waiting.pop(reference)(reference)
             self._look_after()
             if time.monotonic() - self._beat >= BEAT_S:
                 self._beat = time.monotonic()

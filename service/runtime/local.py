@@ -9,9 +9,7 @@ from __future__ import annotations
 import logging
 import os
 import time
-from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
 from datetime import UTC, datetime
 from functools import partial
 from typing import TYPE_CHECKING
@@ -22,10 +20,9 @@ from service.actors.evaluation import evaluate
 from service.actors.game import Acting, Players, SelfPlay
 from service.actors.rollout import Rollout, from_arrays, to_arrays
 from service.config import Config
-from service.errors import DivergedError
 from service.generator.generator import TaskGenerator
 from service.policies.evaluator import GaussianEvaluator, bob_evaluator
-from service.policies.parameters import Parameters, PolicyError
+from service.policies.parameters import Parameters
 from service.runtime.books import Books
 from service.runtime.rundir import RunDirectory
 from service.runtime.runner import EVALUATED_GOALS, EVALUATION_SEED, Health, Metrics, OnBeat, OnIteration, RunResult
@@ -131,7 +128,7 @@ class LocalRun:
         """
         while (reason := self._over()) is None:
             before = self.num_env_steps
-            with self._diverging():
+            with self.books.diverging():
                 metrics = self._iterate()
             with self.timing("record"):
                 self.directory.record(metrics)
@@ -236,27 +233,6 @@ class LocalRun:
         if self.books.snapshot_due(after=after):
             with self.timing("checkpoint"):
                 self.books.take_snapshot(self.bob())
-
-    # --- what goes wrong --------------------------------------------------------------------------------------------
-
-    @contextmanager
-    def _diverging(self) -> Iterator[None]:
-        """Adds to the error of a policy that has diverged when that was, and how to go on from before it."""
-        played = self.iteration
-        try:
-            yield
-        except (DivergedError, PolicyError) as error:
-            newest, learner = max(self.books.checkpoints.steps(), default=0), self.config.learner
-            has_it = (
-                f"delete {self.books.checkpoints.path(newest).name}, which has this policy; "
-                if newest == played
-                else ""
-            )
-            rates = f"alice.learning_rate={learner.alice.learning_rate / 2:g} --set learner.bob.learning_rate="
-            raise DivergedError(
-                f"{self.directory.path}, iteration {played + 1}: {error}: {has_it}resume with lower learning rates, "
-                f"for example --resume --set learner.{rates}{learner.bob.learning_rate / 2:g}"
-            ) from error
 
     def _save_last(self) -> None:
         with self.books.saving_last():

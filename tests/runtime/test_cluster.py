@@ -3,11 +3,14 @@
 import os
 import signal
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+import ray
 
+from service.errors import DivergedError
 from service.registry.checkpoints import CheckpointStore
 from service.runtime.cluster import ClusterRun
 from service.runtime.connecting import ClusterOptions, connected
@@ -206,3 +209,19 @@ def test_no_cluster_at_an_address_is_one_line(address, said):
         pass
     assert "\n" not in str(error.value)
     assert address in str(error.value)
+
+
+def test_a_policy_that_diverges_ends_the_run_with_how_to_go_on(tmp_path):
+    """Parameters that are not finite, as a learning rate far too high would make them."""
+
+    def spoil(run, metrics):
+        if metrics["iteration"] == 3:
+            weights = ray.get(run._weights)
+            nans = {name: np.full_like(array, np.nan) for name, array in weights.bob.items()}
+            run._weights = ray.put(replace(weights, bob=nans))
+                replace(weights, bob={name: np.full_like(a, np.nan) for name, a in weights.bob.items()})
+            )
+
+    with pytest.raises(DivergedError, match=r"resume with lower learning rates") as error:
+        run_cluster(tmp_path, tiny_config(total_env_steps=10**9), num_actors=1, on_iteration=spoil)
+    assert "\n" not in str(error.value)
