@@ -219,8 +219,6 @@ def test_a_policy_that_diverges_ends_the_run_with_how_to_go_on(tmp_path):
             weights = ray.get(run._weights)
             nans = {name: np.full_like(array, np.nan) for name, array in weights.bob.items()}
             run._weights = ray.put(replace(weights, bob=nans))
-                replace(weights, bob={name: np.full_like(a, np.nan) for name, a in weights.bob.items()})
-            )
 
     with pytest.raises(DivergedError, match=r"resume with lower learning rates") as error:
         run_cluster(tmp_path, tiny_config(total_env_steps=10**9), num_actors=1, on_iteration=spoil)
