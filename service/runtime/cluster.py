@@ -70,6 +70,8 @@ class Handed:
     weights: Any
     """Reference to those it was played with."""
     numbers: Round
+    hand_over_s: float
+    """From giving the round until its end was noticed, without playing it: all that was on its way or in line."""
 
 
 @dataclass(slots=True)
@@ -236,7 +238,7 @@ class ClusterRun:
         made = partial(Handed, ticket, rollout, records, self._weights)
         self._waiting[numbers] = partial(self._end_round, member, ticket, made, rng)
 
-    def _end_round(self, member: Member, ticket: int, made: Callable[[Round], Handed], rng: Any, numbers: Any) -> None:
+    def _end_round(self, member: Member, ticket: int, made: Callable[..., Handed], rng: Any, numbers: Any) -> None:
         if not self._crew.holds(member):
             return  # it was given up meanwhile, and its slot with it
         try:
@@ -248,7 +250,7 @@ class ClusterRun:
         member.finish(played, rng)
         self._crew.took(played.play_s)
         self._slots.finish(ticket)
-        self._handed.append(made(played))
+        self._handed.append(made(played, time.monotonic() - member.began - played.play_s))
         self.directory.dump_broken("-".join(map(str, played.id)), played.broken)
 
     def _fail_round(self, member: Member, ticket: int, error: Exception) -> None:
@@ -383,6 +385,7 @@ class ClusterRun:
             **_mean_metrics(iteration.batch),
             **recorded.metrics,
             **updated.metrics,
+            "actor/num_rollouts": float(len(iteration.batch)),
             "actor/num_alive": float(sum(member.place is not None for member in self._crew)),
             "time/learner_idle_fraction": max(0.0, 1.0 - updated.update_s / elapsed_s),
             "time/learn_s": updated.update_s,
@@ -475,4 +478,5 @@ def _mean_metrics(batch: list[Handed]) -> Metrics:
         "world/num_broken": float(sum(each.numbers.num_broken for each in batch)),
         "time/play_s": float(np.mean(play_s)),
         "time/wait_for_generator_s": float(np.mean([each.numbers.generator_s for each in batch])),
+        "time/hand_over_s": float(np.mean([each.hand_over_s for each in batch])),
     }
