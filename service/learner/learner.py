@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -23,25 +22,14 @@ from service.learner.ledger import Ledger
 from service.learner.player import Player
 from service.learner.samples import Cloning, Samples, collect, mirrored
 from service.learner.update import probes, update_player
+from service.learner.weights import Weights
 from service.policies import networks
-from service.policies.parameters import FloatArray
 
 Arrays = dict[str, NDArray[Any]]
 Metrics = dict[str, float]
 
 MAX_POLICY_LAG = 2
 """A rollout of a version further behind is not learned from."""
-
-
-@dataclass(frozen=True, slots=True)
-class Weights:
-    """What actors need to play with one policy version."""
-
-    version: int
-    alice: dict[str, FloatArray]
-    bob: dict[str, FloatArray]
-    steady_bob: dict[str, FloatArray]
-    """Bob without the sway of single updates, to be evaluated and published; see ``learner.bob_average_decay``."""
 
 
 class Learner:

@@ -31,7 +31,7 @@ from service.runtime.timing import Timing
 from service.store.models import ActorStatus, GoalGrid
 
 if TYPE_CHECKING:
-    from service.learner.learner import Weights
+    from service.learner.weights import Weights
 
 _logger = logging.getLogger(__name__)
 

@@ -31,7 +31,7 @@ from service.runtime.telling import goal_grid
 from service.store.models import GoalGrid
 
 if TYPE_CHECKING:
-    from service.learner.learner import Weights
+    from service.learner.weights import Weights
 
 Arrays = dict[str, NDArray[Any]]
 StateArray = NDArray[np.float64]
