@@ -104,11 +104,15 @@ def test_pretrain_refuses_a_directory_with_a_run(trained):
 
 
 def test_the_readmes_commands_of_pretraining(monkeypatch, tmp_path):
-    """As they stand there, one after the other, with a tiny configuration where the shipped one would be."""
+    """As they stand there, one after the other, with a tiny configuration where the shipped one would be.
+
+    What they do with ``--runtime ray`` is shown in tests/runtime.
+    """
     monkeypatch.setattr("service.runtime.publishing.FINAL_EVALUATION_EPISODES", 4)
     monkeypatch.setattr("service.runtime.pretrain.make_artifacts", lambda directory: {})
     monkeypatch.chdir(tmp_path)
     commands = [shlex.split(line) for line in re.findall(r"^tandem (pretrain .*)$", README, re.MULTILINE)]
+    commands = [command for command in commands if "--runtime" not in command]
     (given,) = {command[command.index("--config") + 1] for command in commands if "--config" in command}
     assert (ROOT / given).is_file()
     Path(given).parent.mkdir(parents=True)

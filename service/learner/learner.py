@@ -47,7 +47,7 @@ class Learner:
         """
         self.config = config
         self.version = 0
-        self._device = _device(config.learner.device)
+        self._device = torch_device(config.learner.device)
         with torch.random.fork_rng(devices=[]):
             torch.default_generator.manual_seed(config.seed)
             alice = networks.make_alice(config.policy), networks.make_alice_value(config.policy)
@@ -236,7 +236,12 @@ def _length(rows: Samples | Cloning | None) -> int:
     return 0 if rows is None else len(rows)
 
 
-def _device(name: str) -> torch.device:
+def torch_device(name: str) -> torch.device:
+    """The device that ``learner.device`` names.
+
+    Raises:
+        LearnerError: it is not there.
+    """
     if name == "cuda" and not torch.cuda.is_available():
         raise LearnerError("learner.device = 'cuda': torch finds no CUDA device here; set learner.device=cpu")
     return torch.device(name)

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any, Literal, cast
 
 from service.config import Config, ConfigError, load_config
 from service.errors import TandemError
+from service.learner.learner import torch_device
 from service.registry.names import Version
 from service.registry.registry import Registry
 from service.runtime.artifacts import make_artifacts
@@ -88,6 +89,8 @@ def pretrain(
         InterruptError: a signal while the run was being loaded, or a second one.
     """
     Registry(registry).check_writable()  # now, not after hours of learning
+    if cluster is None:  # on a cluster, another machine has it
+        torch_device(config.learner.device)
     runtime: Literal["local", "ray"] = "local" if cluster is None else "ray"
     with StopSignals() as signals, ExitStack() as stack:
         stack.callback(directory.close)
@@ -187,7 +190,7 @@ def resumed_config(directory: RunDirectory, overrides: list[str], file: Path | N
     """
     saved = directory.read_config()
     for override in overrides:
-        if not override.startswith(RESUMABLE) and load_config(directory.config_file, [override]) != saved:
+        if not override.startswith(RESUMABLE) and not _says(saved, directory.config_file, override):
             raise ConfigError(
                 f"override {override!r}: a resumed run keeps its configuration; only run.* and the learning rates may "
                 "change, for example run.total_env_steps"
@@ -198,6 +201,13 @@ def resumed_config(directory: RunDirectory, overrides: list[str], file: Path | N
         named = given.run.model_dump(mode="json", exclude_unset=True)
         overrides = [f"run.{key}={json.dumps(value)}" for key, value in named.items()] + overrides
     return load_config(directory.config_file, overrides)
+
+
+def _says(saved: Config, file: Path, override: str) -> bool:
+    try:
+        return load_config(file, [override]) == saved
+    except ConfigError:
+        return False
 
 
 def _check_same_outside_run(saved: Config, given: Config, file: Path) -> None:
