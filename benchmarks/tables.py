@@ -9,7 +9,7 @@ import numpy as np
 
 from benchmarks.run_files import Records, Run, binned, steps_until, unthin
 from benchmarks.stages import RANDOM, STAGES, mean_share
-from benchmarks.tasks import ASKED, NUM_STEPS, TASKS
+from benchmarks.tasks import ASKED, ASKED_STEPS, NUM_STEPS, TASKS
 
 NUM_BINS = 10
 """Of a run's env steps; rates are those of the last, distances and heights also those of the first."""
@@ -18,11 +18,12 @@ Row = Sequence[str]
 
 
 def tasks_table(runs: Sequence[Run]) -> str:
-    """Bob on every task, at the last step, with the 95 % Wilson interval; a policy that does nothing below."""
+    """Bob on every task, at the last step, with the 95 % Wilson interval; what is asked and a policy that does nothing below."""
     head = ("run", *TASKS, f"env steps until {percent(ASKED)} of mixed")
     rows = [(_label(run), *tasks_cells(run["evaluations"]), _steps_to_asked(run)) for run in runs]
     idle = max((tasks_cells(run["evaluations"], idle=True) for run in runs), key=lambda cells: sum(map(bool, cells)))
-    return markdown(head, [*rows, ("doing nothing", *idle, "")])
+    asked = (percent(task.asked) for task in TASKS.values())
+    return markdown(head, [*rows, ("asked for", *asked, millions(ASKED_STEPS)), ("doing nothing", *idle, "")])
 
 
 def tasks_cells(evaluations: Records, tasks: Iterable[str] = TASKS, *, idle: bool = False) -> list[str]:

@@ -10,8 +10,8 @@ from service.config import Config, WorldConfig
 from service.envs.goals import GoalKind
 
 NUM_EPISODES, NUM_STEPS = 300, 50
-ASKED = 0.90
-"""Of mixed goals, at the last step."""
+ASKED, ASKED_STEPS = 0.90, 30e6
+"""Of mixed goals, at the last step, after at most so many env steps from scratch."""
 SEED = 0
 """Of the goals; those evaluated during a run are others."""
 
@@ -22,20 +22,23 @@ class Task:
 
     goals: GoalKind
     words: str
+    asked: float
+    """Success at the last step that we ask of Bob."""
     world: dict[str, Any] = field(default_factory=dict)
     """What of the run's own world is replaced."""
 
 
 TASKS = {
-    "mixed": Task("mixed", "anywhere in the workspace with probability 0.7, else on the table"),
-    "air": Task("air", "more than 5 cm above an object that rests on the table"),
-    "table": Task("table", "on the table"),
+    "mixed": Task("mixed", "anywhere in the workspace with probability 0.7, else on the table", 0.95),
+    "air": Task("air", "more than 5 cm above an object that rests on the table", 0.95),
+    "table": Task("table", "on the table", 0.95),
     "larger": Task(
         "mixed",
         "mixed goals in a workspace of 45 x 45 x 40 cm",
+        0.90,
         {"workspace": {"length_x_m": 0.45, "length_y_m": 0.45, "height_m": 0.40}},
     ),
-    "sphere": Task("mixed", "mixed goals for a sphere", {"object": "sphere"}),
+    "sphere": Task("mixed", "mixed goals for a sphere", 0.85, {"object": "sphere"}),
 }
 
 
