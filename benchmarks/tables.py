@@ -18,7 +18,7 @@ Row = Sequence[str]
 
 
 def tasks_table(runs: Sequence[Run]) -> str:
-    """Bob on every task, at the last step, with the 95 % Wilson interval; what is asked and a policy that does nothing below."""
+    """Bob on every task, at the last step, with the 95 % Wilson interval; below, what is asked, and doing nothing."""
     head = ("run", *TASKS, f"env steps until {percent(ASKED)} of mixed")
     rows = [(_label(run), *tasks_cells(run["evaluations"]), _steps_to_asked(run)) for run in runs]
     idle = max((tasks_cells(run["evaluations"], idle=True) for run in runs), key=lambda cells: sum(map(bool, cells)))

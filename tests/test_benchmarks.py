@@ -498,14 +498,14 @@ def test_the_page_shows_the_throughput(tmp_path):
     assert words in figures.pretraining([run], tmp_path)[0].read_text()
 
 
-def test_runs_recorded_before_there_was_a_coverage_are_shown(tmp_path):
-    files = figures.pretraining([ROOT / "docs" / "results" / "runs" / "cube-0.json"], tmp_path)
-    assert [path.name for path in files[1:]] == [
-        "pretraining.png",
-        "pretraining-time.png",
-        "pretraining-goals-cube-0.png",
-    ]
-    assert "| cube-0 (60 steps) | 14 % [10, 18] | 0 % [0, 2] | 35 % [30, 41] |  |  |  |" in files[0].read_text()
+def test_a_bob_without_primitives_is_shown_without_coverage(tmp_path):
+    run = json.loads((ROOT / "docs" / "results" / "runs" / "cube-3.json").read_text())
+    run |= {"coverage": None, "evaluations": [row for row in run["evaluations"] if row["goals"] != "sphere"]}
+    (tmp_path / "cube-3.json").write_text(json.dumps(run))
+    files = figures.pretraining([tmp_path / "cube-3.json"], tmp_path)
+    assert "pretraining-goals-cube-3.png" in {path.name for path in files}
+    assert not [path.name for path in files if "coverage" in path.name]
+    assert "| cube-3 | 98 % [96, 99] | 98 % [96, 99] | 97 % [95, 99] | 93 % [89, 95] |  |" in files[0].read_text()
 
 
 def test_a_page_without_markers_is_left_alone(tmp_path):
