@@ -211,7 +211,9 @@ class ABCConfig(_Frozen):
 class LearnerConfig(_Frozen):
     """Central learner."""
 
-    device: Literal["cpu", "cuda"] = "cpu"
+    device: Literal["cpu", "cuda", "auto"] = Field(
+        "cpu", description="of the learner; auto: cuda where there is one, else cpu. These networks gain little from it"
+    )
     num_threads: int = Field(
         1, ge=1, description="torch threads; one leaves the other core to the worlds, and two spin when a core is taken"
     )

@@ -26,7 +26,7 @@ from service.errors import DivergedError
 from service.policies.parameters import Parameters, PolicyError
 from service.runtime.books import Books
 from service.runtime.connecting import ClusterOptions
-from service.runtime.crew import THREAD_VARIABLES, Crew, Member
+from service.runtime.crew import QUIET, THREAD_VARIABLES, Crew, Member
 from service.runtime.rundir import RunDirectory
 from service.runtime.runner import (
     EVALUATED_GOALS,
@@ -458,13 +458,14 @@ class ClusterRun:
     def _make_learner(self, *arguments: Any) -> Stateful:
         actor = ray.remote(LearnerWorker).options(
             num_cpus=self._options.learner_cpus,
-            num_gpus=1 if self.config.learner.device == "cuda" else 0,
+            num_gpus=num_gpus(self.config.learner.device),
             runtime_env={"env_vars": THREAD_VARIABLES},
+            **QUIET,
         )
         return Stateful("learner", actor, self.config, *arguments)
 
     def _make_generator(self, state: Any) -> Stateful:
-        actor = ray.remote(GeneratorWorker).options(num_cpus=0, runtime_env={"env_vars": THREAD_VARIABLES})
+        actor = ray.remote(GeneratorWorker).options(num_cpus=0, runtime_env={"env_vars": THREAD_VARIABLES}, **QUIET)
         return Stateful("generator", actor, self.config, state)
 
 
@@ -480,3 +481,10 @@ def _mean_metrics(batch: list[Handed]) -> Metrics:
         "time/wait_for_generator_s": float(np.mean([each.numbers.generator_s for each in batch])),
         "time/hand_over_s": float(np.mean([each.hand_over_s for each in batch])),
     }
+
+
+def num_gpus(device: str) -> int:
+    """What the learner asks Ray for; an actor that asks for none sees none."""
+    if device == "auto":
+        return min(1, int(ray.cluster_resources().get("GPU", 0)))
+    return int(device == "cuda")

@@ -7,7 +7,7 @@ from safetensors.numpy import load, save
 
 from service.envs.observations import MIRROR_ACTION, MIRROR_BOB
 from service.learner.errors import LearnerError
-from service.learner.learner import Learner
+from service.learner.learner import Learner, torch_device
 from tests.learner.rollouts import make_config, make_rollout, nobody_learns
 
 HISTORY = {"abc": {"num_iterations": 2}, "mirror": True}
@@ -314,3 +314,9 @@ def test_a_broken_turn_leaves_the_player_as_it_was():
 def test_cuda_that_is_not_there_is_the_users_mistake():
     with pytest.raises(LearnerError, match=r"learner\.device=cpu"):
         Learner(make_config(device="cuda"))
+
+
+@pytest.mark.parametrize(("found", "expected"), [(False, "cpu"), (True, "cuda")])
+def test_the_device_is_what_there_is(monkeypatch, found, expected):
+    monkeypatch.setattr("torch.cuda.is_available", lambda: found)
+    assert torch_device("auto") == torch.device(expected)

@@ -12,7 +12,7 @@ import ray
 
 from service.errors import DivergedError
 from service.registry.checkpoints import CheckpointStore
-from service.runtime.cluster import ClusterRun
+from service.runtime.cluster import ClusterRun, num_gpus
 from service.runtime.connecting import ClusterOptions, connected
 from service.runtime.rundir import RunDirectory
 from service.runtime.runner import ClusterError
@@ -237,3 +237,11 @@ def test_a_policy_that_diverges_ends_the_run_with_how_to_go_on(tmp_path):
     with pytest.raises(DivergedError, match=r"resume with lower learning rates") as error:
         run_cluster(tmp_path, tiny_config(total_env_steps=10**9), num_actors=1, on_iteration=spoil)
     assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("device", "there", "asked"), [("cpu", 2.0, 0), ("cuda", 0.0, 1), ("auto", 0.0, 0), ("auto", 2.0, 1)]
+)
+def test_the_learner_asks_for_a_gpu(monkeypatch, device, there, asked):
+    monkeypatch.setattr("ray.cluster_resources", lambda: {"CPU": 8.0} | ({"GPU": there} if there else {}))
+    assert num_gpus(device) == asked
