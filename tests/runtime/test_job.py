@@ -47,7 +47,7 @@ def wait_for(what, seconds=120.0):
 
 @pytest.fixture(scope="module")
 def head():
-    """The address of the jobs' server of a fresh head with three logical cores."""
+    """The addresses of the jobs' server and of a fresh head itself, with three logical cores."""
     scratch = Path(tempfile.mkdtemp(prefix="ray", dir="/tmp"))  # short: the paths of its sockets have 107 bytes
     gcs, dashboard, client, agent = free_ports(4)
     ports = [f"--port={gcs}", f"--dashboard-port={dashboard}", f"--ray-client-server-port={client}"]
@@ -58,7 +58,7 @@ def head():
         try:
             address = f"http://127.0.0.1:{dashboard}"
             wait_for(lambda: answers(f"{address}/api/gcs_healthz"))
-            yield address
+            yield address, f"127.0.0.1:{gcs}"
         finally:
             process.send_signal(signal.SIGTERM)  # ends what it started, and nothing else
             try:
@@ -77,6 +77,7 @@ def answers(url):
 
 
 def test_a_job_is_stopped_and_continued_and_publishes(head, tmp_path):
+    jobs, _ = head
     work, home = tmp_path / "work", tmp_path / "home"
     work.mkdir()
     write_yaml(work / "tiny.yaml")
@@ -85,7 +86,7 @@ def test_a_job_is_stopped_and_continued_and_publishes(head, tmp_path):
 
     def submit(total_env_steps):
         command = [
-            *(RAY, "job", "submit", "--address", head, "--no-wait", "--working-dir", work),
+            *(RAY, "job", "submit", "--address", jobs, "--no-wait", "--working-dir", work),
             *("--runtime-env-json", json.dumps({"env_vars": variables}), "--"),
             *(sys.executable, "-m", "service", "pretrain", "--runtime", "ray", "--run-id", "night"),
             *("--config", "tiny.yaml", "--num-actors", "2", "--status", f"127.0.0.1:{port}"),
@@ -95,7 +96,7 @@ def test_a_job_is_stopped_and_continued_and_publishes(head, tmp_path):
         assert done.returncode == 0, done.stderr
         return next(word.strip("'") for word in done.stdout.split() if word.strip("'").startswith("raysubmit_"))
 
-    client = JobSubmissionClient(head)
+    client = JobSubmissionClient(jobs)
 
     def end_of(job):
         state = client.get_job_status(job)
@@ -112,7 +113,7 @@ def test_a_job_is_stopped_and_continued_and_publishes(head, tmp_path):
     assert status["policy_lag"] <= 2
 
     stopped = time.monotonic()
-    subprocess.run([RAY, "job", "stop", "--address", head, first], capture_output=True, timeout=60, check=True)
+    subprocess.run([RAY, "job", "stop", "--address", jobs, first], capture_output=True, timeout=60, check=True)
     assert wait_for(lambda: end_of(first)) == "STOPPED"
     assert time.monotonic() - stopped < 30
     saved = newest(home / "runs" / "night").step
@@ -130,3 +131,17 @@ def test_a_job_is_stopped_and_continued_and_publishes(head, tmp_path):
     assert registry.manifest("tiny@1").metrics["env_steps"] == rows[-1]["env_steps"]
     assert not (work / "runs").exists()
     assert os.environ["RAY_AUTH_TOKEN"] not in json.dumps(told)
+
+
+def test_a_cluster_of_another_version_of_ray(head, tmp_path):
+    """This process is the one with another version: a second one of Ray is not here."""
+    _, address = head
+    program = "import ray; ray.__version__ = '2.0.0'; from service.cli import main; main()"
+    command = [sys.executable, "-c", program, "pretrain", "--runtime", "ray", "--address", address, "--run-id", "night"]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=120)
+    assert done.returncode == 1, done.stderr
+    (line,) = [line for line in done.stderr.splitlines() if "error" in line]
+    assert address in line
+    assert "use the same image or environment everywhere" in line
+    assert "2.0.0" in line
+    assert not (tmp_path / "runs").exists()
