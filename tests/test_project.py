@@ -165,7 +165,9 @@ def test_ci_runs_what_the_readme_says():
     script = ROOT / ".ci" / "run"
     assert os.access(script, os.X_OK)
     lines = [line for line in script.read_text().splitlines() if line and not line.startswith("#")]
-    assert lines == ["set -euo pipefail", 'cd "$(dirname "${BASH_SOURCE[0]}")/.."', "make test"]
+    assert lines[:2] == ["set -euo pipefail", 'cd "$(dirname "${BASH_SOURCE[0]}")/.."']
+    assert lines[-1] == "make test"  # between them: what the machine lacks is installed
+    assert [line for line in lines if "make" in line or "pytest" in line] == ["make test"]
 
 
 def test_no_path_of_somebodys_machine():

@@ -20,6 +20,7 @@ import ipaddress
 import logging
 import time
 from collections.abc import Callable
+from http import HTTPStatus
 
 from starlette.datastructures import Headers, MutableHeaders
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
@@ -44,6 +45,8 @@ _HEADERS = {
     "cache-control": "no-store",
 }
 """Set where an answer has none of its own."""
+_BASIC = 'Basic realm="tandem", charset="UTF-8"'
+"""In a header of its own: behind another challenge in the same header Chromium does not see it, and asks nobody."""
 _logger = logging.getLogger(__name__)
 
 Observer = Callable[[str, str, int, float], None]
@@ -80,6 +83,8 @@ class Guard:
                 headers = MutableHeaders(scope=message)
                 for name, value in _HEADERS.items():
                     headers.setdefault(name, value)
+                if status == HTTPStatus.UNAUTHORIZED and scope["method"] in _SAFE:
+                    headers.append("www-authenticate", _BASIC)
                 self._observe(scope["method"], _template(inner), status, time.perf_counter() - begun_s)
             await send(message)
 
@@ -124,12 +129,11 @@ class Guard:
         if verdict == "missing" and safe and path in PROBES:
             return False
         what = "a token is needed" if verdict == "missing" else "wrong token"
-        challenge = 'Bearer realm="tandem"' + (', Basic realm="tandem", charset="UTF-8"' if safe else "")
         raise ProblemError(
             401,
             f"{verdict}-token",
             f"{what}: send the header 'Authorization: Bearer TOKEN' with the one this service was started with",
-            {"WWW-Authenticate": challenge},
+            {"WWW-Authenticate": 'Bearer realm="tandem"'},
         )
 
 

@@ -1,0 +1,44 @@
+// Elements made by code. Text only ever becomes a text node, so no name or message can be markup.
+
+const SVG = "http://www.w3.org/2000/svg";
+
+/** An element with attributes (null and false leave one out) and children: nodes, or text. */
+export function el(tag, attributes = {}, ...children) {
+  return fill(document.createElement(tag), attributes, children);
+}
+
+/** The same in SVG. */
+export function svg(tag, attributes = {}, ...children) {
+  return fill(document.createElementNS(SVG, tag), attributes, children);
+}
+
+function fill(element, attributes, children) {
+  for (const [name, value] of Object.entries(attributes)) {
+    if (value !== null && value !== false && value !== undefined) element.setAttribute(name, value === true ? "" : value);
+  }
+  element.append(...children.filter((child) => child !== null && child !== undefined));
+  return element;
+}
+
+/** Set text only where it changed: what a reader has selected stays selected. */
+export function setText(element, text) {
+  if (element.textContent !== text) element.textContent = text;
+}
+
+/** A part of a page: a heading, and a body that its owner fills. */
+export function section(title, className = "") {
+  const id = `s-${title.toLowerCase().replace(/[^a-z]+/g, "-")}`;
+  const body = el("div", { class: "body" });
+  const root = el("section", { class: `card ${className}`, "aria-labelledby": id }, el("h2", { id }, title), body);
+  return { root, body };
+}
+
+/** A sentence in place of what there is not. */
+export function note(...content) {
+  return el("p", { class: "note" }, ...content);
+}
+
+/** A link within the page. */
+export function runLink(runId, text = runId) {
+  return el("a", { href: `#/runs/${encodeURIComponent(runId)}` }, text);
+}

@@ -1,0 +1,95 @@
+"""A real Chromium without a window, and what it shows of a service."""
+
+from __future__ import annotations
+
+import re
+import shutil
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+from playwright.sync_api import Browser, ConsoleMessage, Dialog, Locator, Page, sync_playwright
+
+CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome", "chrome"))), None)
+_ARGUMENTS = (
+    "--headless",
+    "--no-sandbox",
+    "--disable-gpu",
+    "--disable-quic",
+    "--no-first-run",
+    "--no-proxy-server",
+    "--disable-background-networking",
+    "--disable-component-update",
+    "--disable-sync",
+    "--disable-dev-shm-usage",
+)
+_TIMEOUT_MS = 20_000
+
+
+@contextmanager
+def chromium() -> Iterator[Browser]:
+    """The system's."""
+    with sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=list(_ARGUMENTS))
+        yield browser
+        browser.close()
+
+
+class Visit:
+    """A page, and everything it asked for and complained of."""
+
+    def __init__(self, browser: Browser, url: str, **options: Any) -> None:
+        self.url = url
+        self.context = browser.new_context(**options)
+        self.context.set_default_timeout(_TIMEOUT_MS)
+        self.page: Page = self.context.new_page()
+        self.complaints: list[str] = []
+        self.asked: list[str] = []
+        self.page.on("request", lambda request: self.asked.append(request.url))
+        self.page.on("pageerror", lambda error: self.complaints.append(str(error)))
+        self.page.on("console", self._on_console)
+        self.page.on("dialog", self._on_dialog)
+
+    def _on_console(self, said: ConsoleMessage) -> None:
+        if said.type != "log":
+            self.complaints.append(said.text)
+
+    def _on_dialog(self, dialog: Dialog) -> None:
+        self.complaints.append(dialog.message)
+        dialog.dismiss()
+
+    def go(self, place: str = "#/") -> Visit:
+        """To a view by its address: as from a bookmark at first, and later as by a link."""
+        self.page.goto(f"{self.url}/{place}")
+        return self
+
+    def wait(self, condition: str) -> None:
+        """Until a JavaScript expression holds; Playwright's own way is not allowed by the page's policy for scripts."""
+        deadline_s = time.monotonic() + _TIMEOUT_MS / 1000
+        while not self.page.evaluate(condition):
+            assert time.monotonic() < deadline_s, condition
+            self.page.wait_for_timeout(30)
+
+    def chart(self, title: str) -> Locator:
+        """The panel of that title."""
+        return self.page.locator("figure.chart").filter(has=self.page.get_by_role("heading", name=title, exact=True))
+
+    def raw(self, name: str) -> list[list[tuple[float, float]]]:
+        """(env steps, value) of the unbroken parts of a curve, read off its axes as a person would."""
+        group = self.page.locator(f'g.curve[data-name="{name}"]')
+        drawing = self.page.locator(".plot svg").filter(has=group)
+        ticks = [
+            drawing.locator(f".tick.{axis}").evaluate_all(
+                f"all => all.map(t => [+t.dataset.value, +t.getAttribute('{axis}')])"
+            )
+            for axis in "xy"
+        ]
+        path = group.locator("path.raw").get_attribute("d") or ""
+        parts = [re.findall(r"([\d.-]+) ([\d.-]+)", part) for part in path.split("M")[1:]]
+        return [[(_read(x, ticks[0]), _read(y, ticks[1])) for x, y in part] for part in parts]
+
+
+def _read(pixels: str, ticks: list[list[float]]) -> float:
+    (value, at), (other_value, other_at) = ticks[0], ticks[-1]
+    return value + (float(pixels) - at) * (other_value - value) / (other_at - at)

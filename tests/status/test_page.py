@@ -1,0 +1,464 @@
+"""The web page in a real browser: what it draws, that it goes on by itself, and that no text it is told is markup."""
+
+import re
+
+import imageio.v2 as imageio
+import numpy as np
+import pytest
+from playwright.sync_api import Error
+
+from service.registry.registry import Registry
+from service.status.server import StatusServer
+from service.store.disk_reader import DiskReader
+from service.store.models import ActorStatus
+from tests.status.browser import CHROMIUM, Visit, chromium
+from tests.status.conftest import serve
+from tests.status.runs import TOKEN, append, grid, publish, record, write_runs, write_status
+
+pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="no chromium on PATH; on Debian: apt-get install chromium")
+
+NBSP = "\u00a0"
+PHONE = {"viewport": {"width": 360, "height": 740}, "has_touch": True, "is_mobile": True}
+HOSTILE = "<img src=x onerror=alert(1)><script>alert(2)</script>"
+LUMINANCE = """colour => {
+  const channels = colour.match(/[0-9.]+/g).slice(0, 3).map(c => c / 255)
+  const linear = channels.map(c => c <= 0.04045 ? c / 12.92 : ((c + 0.055) / 1.055) ** 2.4)
+  return 0.2126 * linear[0] + 0.7152 * linear[1] + 0.0722 * linear[2]
+}"""
+
+
+@pytest.fixture(scope="module")
+def browser():
+    with chromium() as browser:
+        yield browser
+
+
+@pytest.fixture
+def visit(browser, server):
+    """The service of all tests here, which nobody changes."""
+    visit = Visit(browser, server.url)
+    yield visit
+    visit.context.close()
+
+
+@pytest.fixture
+def own(browser, tmp_path):
+    """(visit, home, server): a service for one test, which may change everything."""
+    write_runs(tmp_path / "runs")
+    publish(Registry(tmp_path / "registry"), "panda-cube")
+    with serve(tmp_path) as server:
+        visit = Visit(browser, server.url)
+        yield visit, tmp_path, server
+        visit.context.close()
+
+
+def num_points(visit, name, number):
+    """Until a curve has so many points."""
+    d = f"document.querySelector('g.curve[data-name=\"{name}\"] path.raw')?.getAttribute('d')"
+    visit.wait(f"({d} ?? '').split(/[ML]/).length - 1 === {number}")
+
+
+# --- what it shows --------------------------------------------------------------------------------------------------
+
+
+def test_nothing_goes_wrong_and_nothing_leaves_the_service(own):
+    visit, _, server = own
+    for place, table in (
+        ("#/", "Runs"),
+        ("#/runs/cube", "Versions of panda-cube"),
+        ("#/primitives", "Versions of panda-cube"),
+    ):
+        visit.go(place).page.get_by_role("table", name=table).wait_for()
+        visit.page.wait_for_load_state("networkidle") if place != "#/runs/cube" else num_points(
+            visit, "alice/valid_fraction", 3
+        )
+    assert visit.complaints == []
+    assert len(visit.asked) > 10
+    assert [url for url in visit.asked if not url.startswith((f"{server.url}/", "about:blank"))] == []
+
+
+def test_runs(visit):
+    page = visit.go().page
+    page.get_by_text("1 active run, 2 runs in all.").wait_for()
+    first, second = page.locator("tbody tr").all()
+    assert first.locator("td").all_inner_texts()[:2] == ["cube\npanda-cube, ray", "running"]
+    assert first.get_by_role("progressbar").get_attribute("value") == "0.3"
+    assert f"3,000 of 10{NBSP}k" in first.inner_text()
+    assert "500" in first.locator("td").nth(3).inner_text()
+    first.get_by_text(f"37.5{NBSP}%").wait_for()  # Bob's success, the newest
+    assert len(first.locator("polyline").get_attribute("points").split()) == 3
+    assert second.locator(".chip").inner_text() == "finished"
+
+
+def test_a_run(visit):
+    page = visit.go("#/runs/cube").page
+    page.get_by_role("heading", name="cube running").wait_for()
+    assert page.title() == "cube \u00b7 Tandem"
+    tiles = dict(text.split("\n", 1) for text in page.locator(".tile").all_inner_texts())
+    assert tiles["Progress"].startswith(f"30.0{NBSP}%")
+    assert f"about 14{NBSP}s to go" in tiles["Progress"]  # 7,000 env steps at 500 a second
+    assert "6\n1 refused" in re.sub("\n+", "\n", tiles["Rollouts"])
+
+
+def test_curves(visit):
+    visit.go("#/runs/cube")
+    num_points(visit, "bob/success_rate", 3)
+    for name, values in {
+        "alice/valid_fraction": [0.5, 0.5, 0.5],
+        "alice/lifted_fraction": [0.25, 0.25, 0.25],
+        "bob/success_rate": [0.125, 0.25, 0.375],
+    }.items():
+        (points,) = visit.raw(name)
+        assert points == [pytest.approx((1000 * i, value), rel=0.002, abs=0.002) for i, value in enumerate(values, 1)]
+    assert visit.chart("Bob on Alice's goals").locator(".legend li").first.inner_text() == f"all 37.5{NBSP}%"
+    assert visit.chart("Bob on random goals").get_by_text("no values yet").count() == 1
+
+
+def test_what_is_missing_is_a_gap(own):
+    visit, home, _ = own
+    append(home / "runs", "cube", record(4, **{"bob/success_rate": None}), record(5))
+    visit.go("#/runs/cube")
+    num_points(visit, "bob/success_rate", 4)
+    before, after = visit.raw("bob/success_rate")
+    assert [round(steps) for steps, _ in before] == [1000, 2000, 3000]
+    assert after == [pytest.approx((5000, 0.625), rel=0.002)]
+
+
+def test_smooth_curves(own):
+    visit, home, _ = own
+    append(home / "runs", "cube", *(record(i, **{"alice/valid_fraction": i % 2}) for i in range(4, 201)))
+    visit.go("#/runs/cube")
+    num_points(visit, "alice/valid_fraction", 200)
+    # span 10 of 200 iterations keeps 9/11 of the average: between 0 and 1 it ends (2/11) / (1 + 9/11) = 0.1 around 1/2
+    smooth = visit.page.locator('g.curve[data-name="alice/valid_fraction"] path.smooth').get_attribute("d")
+    ends = [float(point.split()[1]) for point in smooth.split("L")[-2:]]
+    top, bottom = 8.0, 166.0  # of the plot, in pixels: 1 and 0
+    values = sorted((bottom - y) / (bottom - top) for y in ends)
+    assert values == pytest.approx([0.45, 0.55], abs=0.002)
+
+
+def test_the_keyboard_reads_curves(visit):
+    visit.go("#/runs/cube")
+    num_points(visit, "alice/valid_fraction", 3)
+    plot = visit.page.get_by_role("slider", name="Bob on Alice's goals")
+    plot.press("Home")
+    assert plot.get_attribute("aria-valuetext").startswith(f"1,000 env steps: all 12.5{NBSP}%, air \u2013")
+    plot.press("ArrowRight")
+    assert plot.get_attribute("aria-valuetext").startswith("2,000 env steps")
+    assert (
+        visit.chart("Alice's proposals").locator(".where").inner_text() == "at 2,000 env steps"
+    )  # they share a cursor
+    plot.press("Escape")
+    assert plot.get_attribute("aria-valuetext").startswith("3,000 env steps")
+    assert visit.chart("Alice's proposals").locator(".where").inner_text() == ""
+
+
+def test_pointing_reads_curves(visit):
+    visit.go("#/runs/cube")
+    num_points(visit, "alice/valid_fraction", 3)
+    box = visit.chart("Alice's proposals").locator(".plot").bounding_box()
+    visit.page.mouse.move(box["x"] + 52, box["y"] + 90)  # near the left end: the first point
+    assert visit.chart("Bob on Alice's goals").locator("output").first.inner_text() == f"12.5{NBSP}%"
+    visit.page.mouse.move(5, 5)
+    assert visit.chart("Bob on Alice's goals").locator("output").first.inner_text() == f"37.5{NBSP}%"
+
+
+def test_the_goal_map(visit):
+    page = visit.go("#/runs/cube").page
+    page.get_by_text("goals in 2 of 343 cells").wait_for()
+    assert page.locator(".layer").count() == 7
+    tried, untried = page.locator("rect.cell").all()
+    assert tried.get_attribute("fill") == "rgb(94, 201, 98)"  # 0.75 on the scale
+    assert untried.get_attribute("fill") is None
+    # columns of 0.05 m from -0.2 m: 0.0 is in the fifth, and in the fifth row from below of seven
+    assert [float(tried.get_attribute(axis)) for axis in "xy"] == pytest.approx([4.04, 2.04])
+    assert page.locator(".layer").nth(2).locator("rect.cell").count() == 1  # 0.12 m is in the third layer
+    tried.hover()
+    reading = page.locator(".reading")
+    assert reading.inner_text() == f"x 0, y 0, z 0.02 m: Bob solves 75.0{NBSP}%, learnability 0.188, 9 tries"
+    untried.hover()
+    assert reading.inner_text().endswith("m: proposed, not tried yet")
+    page.get_by_label("Learnability").check()
+    assert page.locator("rect.cell").first.get_attribute("fill") == "rgb(94, 201, 98)"  # 0.1875 of 0.25
+    page.get_by_label("Tries").check()
+    assert page.locator("rect.cell").first.get_attribute("fill") == "rgb(253, 231, 37)"  # it has the most
+
+
+def test_the_keyboard_reads_the_goal_map(own):
+    visit, home, _ = own
+    cells = [
+        grid().cells[0].model_copy(update={"center_m": (x, 0.0, z)})
+        for x, z in ((-0.15, 0.02), (0.0, 0.02), (0.0, 0.27))
+    ]
+    (home / "runs" / "cube" / "goals.json").write_text(
+        grid().model_copy(update={"cells": tuple(cells)}).model_dump_json()
+    )
+    page = visit.go("#/runs/cube").page
+    page.locator("rect.cell").first.wait_for()
+    reading, goal_map = page.locator(".reading"), page.get_by_role("application")
+    for key, place in (("ArrowUp", "x -0.15"), ("ArrowRight", "x 0,"), ("ArrowRight", "x 0,"), ("PageUp", "z 0.27")):
+        goal_map.press(key)
+        assert place in reading.inner_text()
+    assert page.locator("rect.cell.chosen").count() == 1
+
+
+def test_actors(visit):
+    page = visit.go("#/runs/cube").page
+    rows = page.get_by_role("table", name="Actors").locator("tbody tr")
+    rows.first.wait_for()
+    texts = [row.locator("td").all_inner_texts() for row in rows.all()]
+    assert [text[0] for text in texts] == ["rollout-1", "learner", "rollout-0"]  # the lost one first
+    assert texts[2][1:4] == ["alive", "2", "this machine"]
+    assert re.fullmatch(rf"\d+{NBSP}(s|min) ago", texts[2][4])
+    assert texts[2][7] == "killed"
+
+
+def test_versions(visit):
+    page = visit.go("#/primitives").page
+    rows = page.get_by_role("table", name="Versions of tiny").locator("tbody tr")
+    rows.first.wait_for()
+    texts = [row.locator("td").all_inner_texts() for row in rows.all()]
+    assert [text[:3] for text in texts] == [
+        ["tiny@2", "latest", f"50.0{NBSP}%"],
+        ["tiny@1", "champion", f"50.0{NBSP}%"],
+    ]
+    with page.expect_download() as download:
+        rows.first.get_by_role("link", name="parameters of tiny@2").click()
+    assert download.value.suggested_filename == "tiny-2.safetensors"
+    assert visit.complaints == []
+
+
+def test_the_newest_video_plays(own):
+    visit, home, _ = own
+    film = [np.full((32, 64, 3), shade, np.uint8) for shade in range(0, 250, 10)]
+    imageio.mimwrite(home / "runs" / "old" / "rounds.mp4", film, fps=25, codec="libx264", macro_block_size=2)
+    page = visit.go("#/runs/old").page
+    visit.wait("document.querySelector('video')?.readyState >= 1")
+    found = page.locator("video").evaluate("v => [v.videoWidth, v.videoHeight, v.duration]")
+    assert found == [64, 32, pytest.approx(1.0, abs=0.1)]
+    assert page.get_by_role("link", name="Curves").count() == 1
+    assert page.get_by_text("has no goal grid yet").count() == 1
+
+
+# --- how it goes on -------------------------------------------------------------------------------------------------
+
+
+def test_a_run_goes_on_before_ones_eyes(own):
+    visit, home, _ = own
+    page = visit.go("#/runs/cube").page
+    num_points(visit, "alice/valid_fraction", 3)
+    append(home / "runs", "cube", record(4, **{"alice/valid_fraction": 0.875}))
+    num_points(visit, "alice/valid_fraction", 4)
+    assert visit.raw("alice/valid_fraction")[0][3] == pytest.approx((4000, 0.875), rel=0.002)
+    write_status(home / "runs", "cube", state="failed", last_error="it broke", warnings=("no Redis",), iteration=4)
+    page.get_by_text("it broke").wait_for()
+    assert page.locator(".warning").inner_text() == "Warning: no Redis"
+    assert page.locator("h1 .chip").inner_text() == "failed"
+    assert visit.complaints == []
+
+
+def test_a_run_that_was_resumed_from_before(own):
+    visit, home, _ = own
+    visit.go("#/runs/cube")
+    num_points(visit, "bob/success_rate", 3)
+    metrics = home / "runs" / "cube" / "metrics.jsonl"
+    replaced = metrics.with_suffix(".new")
+    replaced.write_bytes(metrics.read_bytes().splitlines(keepends=True)[0])
+    replaced.replace(metrics)
+    num_points(visit, "bob/success_rate", 1)
+    append(home / "runs", "cube", record(2, **{"bob/success_rate": 0.75}))
+    num_points(visit, "bob/success_rate", 2)
+    assert visit.raw("bob/success_rate")[0][1] == pytest.approx((2000, 0.75), rel=0.002)
+
+
+def test_the_list_of_runs_goes_on(own):
+    visit, home, _ = own
+    page = visit.go().page
+    link = page.get_by_role("link", name="cube", exact=True)
+    link.focus()
+    write_status(home / "runs", "cube", num_env_steps=5000)
+    write_status(home / "runs", "another")
+    page.get_by_text("2 active runs, 3 runs in all.").wait_for()
+    page.get_by_text(f"5,000 of 10{NBSP}k").wait_for()
+    assert page.evaluate("document.activeElement.textContent") == "cube"  # a keyboard does not lose its place
+
+
+def test_the_service_goes_away_and_comes_back(own):
+    visit, home, server = own
+    page = visit.go("#/runs/cube").page
+    num_points(visit, "alice/valid_fraction", 3)
+    banner = page.locator("#banner")
+    assert banner.is_hidden()
+    server.stop()
+    page.get_by_text("No answer from the service since").wait_for()
+    append(home / "runs", "cube", record(4))
+    assert page.locator("figure.chart").count() == 6  # what was known stays to be seen
+    runs = home / "runs"
+    with StatusServer(DiskReader(runs), Registry(home / "registry"), port=server.port, runs_dir=runs):
+        num_points(visit, "alice/valid_fraction", 4)
+        banner.wait_for(state="hidden")
+
+
+@pytest.mark.parametrize("place", ["#/", "#/runs/cube"])
+def test_the_runs_go_away_and_come_back(own, place):
+    visit, home, _ = own
+    page = visit.go(place).page
+    page.get_by_role("table").first.wait_for()
+    (home / "runs").rename(home / "elsewhere")
+    page.locator("#banner").get_by_text(str(home / "runs")).wait_for()
+    (home / "elsewhere").rename(home / "runs")
+    write_status(home / "runs", "cube", iteration=4)
+    page.locator("#banner").wait_for(state="hidden")
+
+
+# --- where one is ---------------------------------------------------------------------------------------------------
+
+
+def test_links_last(visit):
+    page = visit.go().page
+    page.get_by_role("link", name="old", exact=True).click()
+    page.get_by_role("heading", name="old finished").wait_for()
+    assert page.url == f"{visit.url}/#/runs/old"
+    page.reload()
+    page.get_by_role("heading", name="old finished").wait_for()
+    page.go_back()
+    page.get_by_role("heading", name="Runs").wait_for()
+
+
+def test_the_keyboard_skips_to_the_content(visit):
+    page = visit.go("#/runs/cube").page
+    page.keyboard.press("Tab")
+    page.keyboard.press("Enter")
+    assert page.evaluate("document.activeElement.id") == "main"
+    assert page.url.endswith("#/runs/cube")
+
+
+def test_what_there_is_not(visit):
+    for place, sentence in {
+        "#/runs/nope": "No run 'nope' in",
+        "#/runs/a/b": "This page has no such part.",
+        "#/runs/-bad-": "Path.run_id",
+        "#/%": "This page has no such part.",
+        f"#/runs/{HOSTILE.replace('/', '%2F')}": "/openapi.json lists every route",
+        f"#/runs/{HOSTILE}": "This page has no such part.",
+    }.items():
+        page = visit.go(place).page
+        page.locator("main").get_by_text(sentence).wait_for()
+        assert page.get_by_role("link", name="All runs").count() == 1
+        assert page.locator("main img, main script").count() == 0
+    assert [said for said in visit.complaints if "Failed to load resource" not in said] == []
+
+
+def test_a_run_that_does_not_exist_yet(own):
+    visit, home, _ = own
+    page = visit.go("#/runs/soon").page
+    page.get_by_text("No run 'soon' in").wait_for()
+    write_status(home / "runs", "soon")
+    page.get_by_role("heading", name="soon running").wait_for()
+
+
+def test_nothing_yet(browser, tmp_path):
+    (tmp_path / "runs").mkdir()
+    with serve(tmp_path) as server:
+        visit = Visit(browser, server.url)
+        page = visit.go().page
+        page.get_by_text("tandem pretrain --config configs/pretrain/panda_cube.yaml").wait_for()
+        write_status(tmp_path / "runs", "first")
+        page.get_by_role("link", name="first").wait_for()
+        visit.go("#/primitives").page.get_by_text("The registry is empty.").wait_for()
+        assert visit.complaints == []
+        visit.context.close()
+
+
+# --- for everybody, and nobody else ---------------------------------------------------------------------------------
+
+
+def make_hostile(home):
+    """Every text of a run that may be anything is."""
+    long = f"{HOSTILE} {'x' * 300}"
+    actor = ActorStatus(**{**RUNNING, "name": HOSTILE, "node": long, "last_error": long})
+    write_status(
+        home / "runs",
+        "cube",
+        name=HOSTILE,
+        last_error=long,
+        warnings=(HOSTILE, long),
+        actors=(actor,),
+        published=HOSTILE,
+    )
+
+
+RUNNING = {"incarnation": 0, "state": "alive", "heartbeat": "2026-01-01T00:00:00Z"}
+
+
+def test_no_text_is_markup(own):
+    visit, home, _ = own
+    make_hostile(home)
+    for place, table in (("#/", "Runs"), ("#/runs/cube", "Actors")):
+        page = visit.go(place).page
+        page.get_by_role("table", name=table).get_by_text(HOSTILE).first.wait_for()
+        assert page.locator("main img, main script").count() == 0
+    assert [said for said in visit.complaints if "Failed to load resource" not in said] == []
+    assert [url for url in visit.asked if url.endswith("/x")] == []
+
+
+def test_a_phone_need_not_scroll_sideways(own, browser):
+    _, home, server = own
+    make_hostile(home)
+    visit = Visit(browser, server.url, **PHONE)
+    for place, table in (("#/", "Runs"), ("#/runs/cube", "Actors"), ("#/primitives", "Versions of panda-cube")):
+        page = visit.go(place).page
+        page.get_by_role("table", name=table).wait_for()
+        if place == "#/runs/cube":
+            num_points(visit, "alice/valid_fraction", 3)
+            page.locator("rect.cell").first.wait_for()
+        assert (
+            page.evaluate("[document.documentElement.scrollWidth, document.body.scrollWidth, innerWidth]") == [360] * 3
+        )
+        assert page.locator("td").first.evaluate("cell => getComputedStyle(cell).display") == "flex"
+        inner = "[...document.querySelectorAll('.scroll')].every(part => part.scrollWidth <= part.clientWidth)"
+        assert page.evaluate(inner), place
+    visit.context.close()
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_light_and_dark(browser, server, scheme):
+    visit = Visit(browser, server.url, color_scheme=scheme)
+    page = visit.go("#/runs/cube").page
+    page.get_by_role("table", name="Actors").wait_for()
+    num_points(visit, "alice/valid_fraction", 3)
+    luminance = page.evaluate(f"({LUMINANCE})(getComputedStyle(document.body).backgroundColor)")
+    assert luminance > 0.8 if scheme == "light" else luminance < 0.05
+    card = page.evaluate(f"({LUMINANCE})(getComputedStyle(document.querySelector('.card')).backgroundColor)")
+    contrasts = {}
+    for what, style in {
+        "h1": "color",
+        ".summary": "color",
+        ".hint": "color",
+        "td": "color",
+        "td a": "color",
+        ".tick": "fill",
+        "g.c0 .smooth": "stroke",
+        "g.c1 .smooth": "stroke",
+    }.items():
+        script = f"({LUMINANCE})(getComputedStyle(document.querySelector('{what}')).{style})"
+        low, high = sorted((card, page.evaluate(script) if page.locator(what).count() else 1 - round(card)))
+        contrasts[what] = (high + 0.05) / (low + 0.05)
+    # WCAG 2: 4.5 for text, 3 for what is drawn
+    assert {what: x for what, x in contrasts.items() if x < (3.0 if "smooth" in what else 4.5)} == {}
+    visit.context.close()
+
+
+def test_for_other_machines_with_the_token_as_password(browser, tmp_path):
+    write_runs(tmp_path / "runs")
+    with serve(tmp_path, host="0.0.0.0") as server:
+        stranger = Visit(browser, server.url)
+        with pytest.raises(Error, match="AUTH"):  # a window would ask for a password here
+            stranger.page.goto(server.url)
+        stranger.context.close()
+        visit = Visit(browser, server.url, http_credentials={"username": "any", "password": TOKEN})
+        visit.go("#/runs/cube")
+        num_points(visit, "alice/valid_fraction", 3)
+        append(tmp_path / "runs", "cube", record(4))
+        num_points(visit, "alice/valid_fraction", 4)
+        visit.context.close()
