@@ -26,7 +26,6 @@ _TITLES = (
     ("autoscaler", "autoscaler"),
 )
 """What a command line contains, first match counts, and what the process is called here."""
-_MB = 1024 * 1024
 _TICKS = os.sysconf("SC_CLK_TCK")
 
 
@@ -38,11 +37,9 @@ class Memory:
     """Its own memory and its share of what it shares with others."""
     shared_pss: float
     """Of it, in shared memory: rollouts and weights in Ray's object store."""
-
-    @property
-    def own(self) -> float:
-        """What a leak would add to: everything but shared memory."""
-        return self.pss - self.shared_pss
+    own: float
+    """What a leak would add to: neither shared memory nor files, also where it was swapped out. What a process pays of
+    a library depends on who else uses it, so that all others seem to shrink when a program starts."""
 
 
 def role(command_line: str) -> str:
@@ -82,13 +79,20 @@ def memory(pid: int) -> Memory | None:
     kilobytes = {name: int(rest.split()[0]) for name, _, rest in (line.partition(":") for line in lines)}
     if not kilobytes:  # ending just now
         return None
-    return Memory(kilobytes["Pss"] * 1024 / _MB, kilobytes.get("Pss_Shmem", 0) * 1024 / _MB)
+    pss, shared, own, swapped = (kilobytes.get(name, 0) / 1024 for name in ("Pss", "Pss_Shmem", "Pss_Anon", "SwapPss"))
+    return Memory(pss, shared, own + swapped)
 
 
 def cpu_s(pid: int) -> float:
     """CPU seconds a process has taken, its dead children's included; 0 if it has ended."""
     fields = _stat(pid)
     return sum(map(int, fields[11:15])) / _TICKS if fields else 0.0
+
+
+def parent(pid: int) -> int | None:
+    """Who started a process; None if it has ended."""
+    fields = _stat(pid)
+    return int(fields[1]) if fields else None
 
 
 def is_running(pid: int) -> bool:

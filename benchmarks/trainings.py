@@ -14,6 +14,7 @@ import time
 import urllib.request
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
+from http.client import HTTPException
 from pathlib import Path
 from tempfile import mkdtemp
 from types import TracebackType
@@ -92,12 +93,16 @@ class Training:
 
     def get(self, path: str, timeout_s: float = 5.0) -> Any:
         """What the status service answers, parsed; None if it does not within ``timeout_s``."""
+        body = self.text(path, timeout_s)
+        return None if body is None else json.loads(body)
+
+    def text(self, path: str, timeout_s: float = 5.0) -> bytes | None:
+        """What the status service answers, as it is; None if it does not within ``timeout_s``."""
         try:
             with _DIRECT.open(self._url + path, timeout=timeout_s) as response:
-                body = response.read()
-        except OSError:
+                return bytes(response.read())
+        except (OSError, HTTPException):
             return None
-        return json.loads(body)
 
     @property
     def address(self) -> tuple[str, int]:

@@ -19,6 +19,8 @@ from service.store.models import ActorStatus
 
 THREAD_VARIABLES = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
 """NumPy's own threads would fight with those that step the worlds and with the other actors."""
+QUIET = {"enable_task_events": False}
+"""Else Ray's head keeps the last 100,000 calls, some 350 MB: a run makes as many in half a day."""
 START_GRACE_S = 30.0
 """An actor that has not come up for so long waits for a free core; updates no longer count on it."""
 MIN_DEADLINE_S = 60.0
@@ -108,7 +110,11 @@ class Crew:
         self._members: dict[int, Member] = {}
         self._round_s: list[float] = []
         self._actor = ray.remote(RolloutWorker).options(
-            num_cpus=num_threads, max_restarts=0, max_task_retries=0, runtime_env={"env_vars": THREAD_VARIABLES}
+            num_cpus=num_threads,
+            max_restarts=0,
+            max_task_retries=0,
+            runtime_env={"env_vars": THREAD_VARIABLES},
+            **QUIET,
         )
 
     def __iter__(self) -> Iterator[Member]:

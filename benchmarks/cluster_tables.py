@@ -1,0 +1,246 @@
+"""The blocks of ``docs/results/cluster.md``, in Markdown, from recorded files. Nothing is judged by hand."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from benchmarks.tables import duration, markdown
+
+Result = Mapping[str, Any]
+
+MIN_RATIO, MAX_IDLE, MAX_MEAN_LAG, MAX_LAG, MIN_OVERLAPPED = 0.85, 0.10, 1.0, 2.0, 0.9
+ACTOR_BACK_S, LEARNER_BACK_S = 10.0, 30.0
+WITHIN_NOISE = 1.5
+"""The disturbed curve may be so many times as far from undisturbed ones as those are from each other."""
+MAX_P99_MS, MAX_SLOW_DOWN, REQUESTS_PER_S = 10.0, 0.02, 200.0
+NUM_ROUNDS = 50_000
+_NAMES = {"actor": "rollout actor", "generator": "task generator", "status": "status actor", "redis": "Redis"}
+
+
+@dataclass(frozen=True, slots=True)
+class Target:
+    """What was asked, beside what was measured."""
+
+    what: str
+    asked: str
+    measured: str
+    reached: bool | None
+    """None: not measured."""
+
+
+def targets(found: Mapping[str, Result]) -> list[Target]:
+    """All of them.
+
+    Args:
+        found: recorded results by the name of their benchmark; those that are missing were not measured.
+    """
+    makers = {"cluster_throughput": _throughput_targets, "chaos": _chaos_targets, "rest_load": _rest_targets,
+              "soak": _soak_targets}  # fmt: skip
+    return [target for name, maker in makers.items() if name in found for target in maker(found[name])]
+
+
+def targets_table(found: Mapping[str, Result]) -> str:
+    """What was asked and whether it was reached."""
+    rows = [(each.what, each.asked, each.measured, verdict(each.reached)) for each in targets(found)]
+    return markdown(("", "asked", "measured", ""), rows) if rows else ""
+
+
+def verdict(reached: bool | None) -> str:
+    """For a cell."""
+    return "not measured" if reached is None else "reached" if reached else "**missed**"
+
+
+def _throughput_targets(result: Result) -> list[Target]:
+    ratio, ray, sent = result["ratio"], result["ray"], result["broadcast"]
+    lag, idle = ray["policy_lag"], ray["learner_idle_share"]
+    return [
+        Target("env steps/s, Ray / local", f">= {share(MIN_RATIO)}", _spread(ratio), ratio["median"] >= MIN_RATIO),
+        Target("learner idle", f"< {share(MAX_IDLE)}", share(idle), idle < MAX_IDLE),
+        Target("mean policy lag", f"<= {MAX_MEAN_LAG:g}", f"{lag['mean']:.2f}", lag["mean"] <= MAX_MEAN_LAG),
+        Target("greatest policy lag", f"<= {MAX_LAG:g}", f"{lag['max']:g}", lag["max"] <= MAX_LAG),
+        Target("updates and broadcasts overlapped with acting", f">= {share(MIN_OVERLAPPED)}",
+               share(sent["overlapped_share"]), sent["overlapped_share"] >= MIN_OVERLAPPED),
+    ]  # fmt: skip
+
+
+def _chaos_targets(result: Result) -> list[Target]:
+    ended, account, redis = result["ended"], result["account"], result["redis"]
+    missed = account["num_handed_by_the_dead"] - account["num_counted_of_the_dead"]
+    twice = account["num_counted"] - account["num_in_ledger"]
+    went_on = redis["iterations_meanwhile"]
+    return [
+        Target("the run that is shot at ends by itself", "finished", str(ended["state"]),
+               ended["exit_code"] == 0 and ended["state"] == "finished"),
+        Target("rollouts lost after hand-over", "0", f"{missed} of {account['num_handed_by_the_dead']} by actors that "
+               "were killed", missed == 0 and account["num_left_at_the_end"] >= 0),
+        Target("rollouts counted twice", "0", f"{twice} of {account['num_counted']}", twice == 0),
+        Target("records complete", "yes", "yes" if account["complete"] else "no", bool(account["complete"])),
+        _back("rollout actor back", result["recovery"].get("actor"), ACTOR_BACK_S),
+        _back("learner back", result["recovery"].get("learner"), LEARNER_BACK_S),
+        Target("iterations while Redis is away", "> 0", str(went_on), None if went_on is None else went_on > 0),
+        Target("Redis has the whole history again", "yes", "yes" if redis["history_complete"] else "no",
+               bool(redis["history_complete"])),
+        _curve(result["compared"]["bob/success_rate"]),
+    ]  # fmt: skip
+
+
+def _back(what: str, found: Mapping[str, Any] | None, seconds: float) -> Target:
+    asked = f"<= {seconds:g} s"
+    if found is None or found["up_s"]["worst"] is None:
+        return Target(what, asked, "never", None if found is None else False)
+    worst, median = found["up_s"]["worst"], found["up_s"]["median"]
+    words = f"{worst:.1f} s at worst, {median:.1f} s as a rule ({found['back']} of {found['killed']})"
+    return Target(what, asked, words, worst <= seconds and found["back"] == found["killed"])
+
+
+def _curve(compared: Mapping[str, Any]) -> Target:
+    away, noise = compared["disturbed_from_undisturbed"], compared["undisturbed_from_each_other"]
+    mean = sum(away) / len(away)
+    if not noise:
+        return Target("success curve, distance from undisturbed", "within noise", f"{mean:.3f}", None)
+    asked = f"<= {WITHIN_NOISE:g} x {max(noise):.3f}, as far as undisturbed ones are apart"
+    return Target("success curve, distance from undisturbed", asked, f"{mean:.3f}", mean <= WITHIN_NOISE * max(noise))
+
+
+def _rest_targets(result: Result) -> list[Target]:
+    p99, slow, rate = result["answered"]["all"]["p99_ms"], result["slow_down"], result["requests_per_s"]
+    asked = result["settings"]["rate"]
+    return [
+        Target("requests a second, all answered", f"{REQUESTS_PER_S:.0f}", f"{rate:.0f}, {result['num_failed']} failed",
+               rate >= 0.98 * asked and asked >= REQUESTS_PER_S and result["num_failed"] == 0),
+        Target("p99 of all routes", f"< {MAX_P99_MS:g} ms", f"{p99:.1f} ms", p99 < MAX_P99_MS),
+        Target("the training slows by", f"< {share(MAX_SLOW_DOWN)}", _spread(slow), slow["median"] < MAX_SLOW_DOWN),
+    ]  # fmt: skip
+
+
+def _soak_targets(result: Result) -> list[Target]:
+    grown = [name for name, each in result["processes"].items() if not each["flat"]]
+    leaking = [name for name, each in result["processes"].items() if not each["descriptors_flat"]]
+    return [
+        Target("rounds of tiny games", f">= {NUM_ROUNDS:,}", f"{result['num_rounds']:,}",
+               result["num_rounds"] >= NUM_ROUNDS),
+        Target("memory flat", "every process", _but(grown), not grown),
+        Target("file descriptors and threads flat", "every process", _but(leaking), not leaking),
+    ]  # fmt: skip
+
+
+def share(value: float, digits: int = 0) -> str:
+    """A share for a cell or a sentence."""
+    return f"{100.0 * value:.{digits}f} %"
+
+
+def _but(exceptions: list[str]) -> str:
+    return f"all but {', '.join(exceptions)}" if exceptions else "all"
+
+
+def _spread(each: Mapping[str, Any]) -> str:
+    return f"{share(each['median'], 1)} ({share(each['least'], 1)} to {share(each['greatest'], 1)})"
+
+
+# --- blocks -----------------------------------------------------------------------------------------------------------
+
+
+def throughput_block(result: Result) -> str:
+    """Rates and shares of both runners, and what weights take."""
+    ray, local, rows, sent = result["ray"], result["local"], result["rows"], result["broadcast"]
+    table = markdown(
+        ("", "Ray", "local"),
+        [
+            ("env steps/s", *(f"{rows[name]['env_steps_per_s']:,.0f}" for name in ("ray", "local"))),
+            ("env steps per CPU second", *(f"{rows[name]['env_steps_per_cpu_s']:,.0f}" for name in ("ray", "local"))),
+            ("actors", str(ray["num_actors"]), "one process"),
+            ("an iteration", f"{ray['iteration_s']:.2f} s", f"{local['iteration_s']:.2f} s"),
+            ("of it, an update", f"{ray['learn_s']:.2f} s", f"{local['learn_s']:.2f} s"),
+            ("learner idle", share(ray["learner_idle_share"]), share(local["learner_idle_share"])),
+            ("actors idle", share(ray["actor_idle_share"]), ""),
+            ("of it, waiting for the learner", share(ray["slot_wait_share"]), ""),
+            ("policy lag, mean (max)", *(f"{each['policy_lag']['mean']:.2f} ({each['policy_lag']['max']:g})"
+                                         for each in (ray, local))),
+        ],
+    )  # fmt: skip
+    words = (
+        f"{len(rows['ray']['env_steps_per_s_each'])} pairs of measurements in turn, "
+        f"{result['settings']['num_iterations']} iterations each. One `ray.put` of the weights takes "
+        f"{1000 * sent['put_s']:.1f} ms and all actors have them {1000 * sent['delivered_s']:.1f} ms later, together "
+        f"{share(sent['share_of_iteration'], 2)} of an iteration (a call without them: "
+        f"{1000 * sent['idle_call_s']:.1f} ms)."
+    )
+    return f"{table}\n\n{words}{_where(result)}"
+
+
+def chaos_block(result: Result, picture: str) -> str:
+    """Every strike with its recovery, the account, and the curve."""
+    account, redis, calm = result["account"], result["redis"], result["curves"]["undisturbed"][0]
+    rows = [
+        (f"{each['at']:.0f} s", each["name"] if each["target"] == "actor" else _NAMES.get(each["target"], each["name"]),
+         f"{each['num_env_steps']:,}", _seconds(each["up_s"]), _seconds(each["working_s"]))
+        for each in result["strikes"]
+    ]  # fmt: skip
+    shot = result["curves"]["disturbed"]
+    words = (
+        f"{len(result['strikes'])} of {result['num_planned']} planned strikes. The run took {duration(shot['wall_s'])} "
+        f"for {shot['env_steps']:,} env steps, undisturbed {duration(calm['wall_s'])}, and published "
+        f"`{result['ended']['published']}`. The driver counted {account['num_counted']:,} rollouts, the learner's "
+        f"ledger {account['num_in_ledger']:,}; {account['num_refused']} were refused. Actors that were killed had "
+        f"handed over {account['num_handed_by_the_dead']:,}, of which {account['num_counted_of_the_dead']:,} were "
+        "learned from; "
+        f"{account['num_left_at_the_end']} came too late for the last update. Redis was away for "
+        f"{_seconds(redis['away_s'])}: {redis['iterations_meanwhile']} iterations meanwhile, status "
+        f"{'said so' if redis['status_said_so'] else 'did not say so'}, told again "
+        f"{_seconds(redis['told_again_s'])} after its return."
+    )
+    table = markdown(("at", "killed", "env steps so far", "another is up after", "and has done its work after"), rows)
+    return f"{words}{_where(result)}\n\n![Success, shot at and not]({picture})\n\n{table}"
+
+
+def rest_block(result: Result) -> str:
+    """Latencies by route, and what the load cost."""
+    head = ("route", "requests", "p50", "p90", "p99", "max")
+    rows = [
+        (route, f"{each['num']:,}", *(f"{each[key]:.1f} ms" for key in ("p50_ms", "p90_ms", "p99_ms", "max_ms")))
+        for route, each in result["answered"].items()
+    ]
+    slow, cores, settings = result["slow_down"], result["cores"], result["settings"]
+    error = f", standard error {share(slow['standard_error'], 1)}" if slow["standard_error"] is not None else ""
+    words = (
+        f"{settings['num_windows']} windows of {settings['window_s']:g} s with requests, each between two without. The "
+        f"training made {_spread(slow)} fewer env steps a second with them (mean {share(slow['mean'], 1)}{error}); "
+        f"windows without, next to each other, differ by {share(slow['between_calm_neighbours'], 1)}. The client took "
+        f"{cores['client']:.2f} of a core on the same machine; the service and Redis took {cores['service_more']:.2f} "
+        f"of a core more than without load, {share(result['service_share_of_cores'], 1)} of all cores: what it would "
+        f"cost a training with every core busy, were the client elsewhere. The client itself sent 99 % of requests "
+        f"within {result['sent_late_p99_ms']:.1f} ms of their schedule; that counts in the table."
+    )
+    return f"{markdown(head, rows)}\n\n{words}{_where(result)}"
+
+
+def soak_block(result: Result, picture: str) -> str:
+    """Memory of every process in the middle, at the end, and by the day."""
+    head = ("process", "in the middle", "at the end", "in a day, 95 % interval", "its history", "files", "")
+    rows = [
+        (name, f"{each['middle_mb']:.1f} MB", f"{each['end_mb']:.1f} MB",
+         f"{each['per_day_mb']:+.1f} MB [{each['per_day_low_mb']:+.1f}, {each['per_day_high_mb']:+.1f}]",
+         f"{each['history_mb']:.1f} MB" if each["history_mb"] else "",
+         f"{each['num_files']['middle']} to {each['num_files']['end']}",
+         "flat" if each["flat"] and each["descriptors_flat"] else "**grows**")
+        for name, each in result["processes"].items()
+    ]  # fmt: skip
+    asked = result["asked"]
+    words = (
+        f"{result['num_rounds']:,} rounds and {result['num_iterations']:,} updates in {duration(result['seconds'])}; "
+        f"{result['num_replaced']} workers replaced, {result['num_refused']} rollouts refused, the status service "
+        f"asked {asked['num']:,} times ({asked['unanswered']} unanswered). A day of a real run has "
+        f"{result['iterations_a_day']:,.0f} updates."
+    )
+    return f"{words}{_where(result)}\n\n![Memory of every process]({picture})\n\n{markdown(head, rows)}"
+
+
+def _seconds(value: float | None) -> str:
+    return "not within the run" if value is None else f"{value:.1f} s"
+
+
+def _where(result: Result) -> str:
+    where = result["machine"]
+    return f" On {where['num_cpus']} cores of {where['cpu']}, commit `{where['git_commit'][:7]}`, {where['time'][:10]}."

@@ -1,0 +1,114 @@
+"""How many rollout actors a run can use, from what each of its parts costs: arithmetic only, nothing is measured here.
+
+An update takes one rollout of each of N actors, and all parts work side by side: while actors play, the learner
+learns from the rollouts before. So the slowest part sets the pace, and what it costs is
+
+    seconds per update = update_s + N (rollout_s + W world_s) + N^2 pair_s
+
+with W worlds for each actor. Actors work at the same time and pay for their own rollout only. As long as they are
+the slowest, N actors are N times as fast as one; the first part that takes longer than they do is the first
+bottleneck, and from there on more actors help no more.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+ACTORS = "actors"
+MAX_ACTORS = 1 << 24
+
+
+@dataclass(frozen=True, slots=True)
+class Cost:
+    """Seconds that one part is busy for an update."""
+
+    update_s: float = 0.0
+    rollout_s: float = 0.0
+    """For each rollout, whatever its size."""
+    world_s: float = 0.0
+    """For each world of each rollout."""
+    pair_s: float = 0.0
+    """For each rollout and each actor there is: what looks at all actors whenever one of them is done."""
+
+    def seconds(self, num_actors: int, num_worlds: float) -> float:
+        """Of an update.
+
+        Args:
+            num_actors: so many rollouts.
+            num_worlds: of each actor.
+        """
+        each = self.rollout_s + num_worlds * self.world_s
+        return self.update_s + num_actors * each + num_actors**2 * self.pair_s
+
+
+@dataclass(frozen=True, slots=True)
+class Model:
+    """What every part costs."""
+
+    actor: Cost
+    """Of one actor for its own rollout."""
+    parts: Mapping[str, Cost]
+    """Everything there is only one of, by name."""
+    env_steps: float
+    """Of one world in a round."""
+
+
+@dataclass(frozen=True, slots=True)
+class Prediction:
+    """A run with so many actors."""
+
+    num_actors: int
+    num_worlds: float
+    """Of each."""
+    seconds: Mapping[str, float]
+    """That each part is busy for an update, by name; the actors beside the others."""
+    env_steps_per_s: float
+
+    @property
+    def update_s(self) -> float:
+        """From one update to the next."""
+        return max(self.seconds.values())
+
+    @property
+    def bottleneck(self) -> str:
+        """The slowest part."""
+        return max(self.seconds, key=lambda name: self.seconds[name])
+
+    def busy(self, name: str) -> float:
+        """Share of the time in which a part works."""
+        return self.seconds[name] / self.update_s
+
+
+def predict(model: Model, num_actors: int, num_worlds: float) -> Prediction:
+    """What a run with ``num_actors`` of ``num_worlds`` each does."""
+    seconds = {ACTORS: model.actor.seconds(1, num_worlds)}
+    seconds |= {name: cost.seconds(num_actors, num_worlds) for name, cost in model.parts.items()}
+    steps = num_actors * num_worlds * model.env_steps
+    return Prediction(num_actors, num_worlds, seconds, steps / max(seconds.values()))
+
+
+def limit(model: Model, part: str, num_worlds: float) -> int | None:
+    """The most actors that a part keeps up with: with one more it takes longer for an update than they do.
+
+    Returns:
+        None: more than ``MAX_ACTORS``.
+    """
+    cost, actor_s = model.parts[part], model.actor.seconds(1, num_worlds)
+    low, high = 0, MAX_ACTORS
+    if cost.seconds(high, num_worlds) <= actor_s:
+        return None
+    while high - low > 1:
+        middle = (low + high) // 2
+        if cost.seconds(middle, num_worlds) <= actor_s:
+            low = middle
+        else:
+            high = middle
+    return low
+
+
+def line(few: tuple[float, float], many: tuple[float, float]) -> tuple[float, float]:
+    """Intercept and slope through two points, neither below 0: a cost that seems to fall with its number is noise."""
+    (x0, y0), (x1, y1) = few, many
+    slope = max(0.0, (y1 - y0) / (x1 - x0))
+    return max(0.0, y0 - slope * x0), slope

@@ -1,0 +1,126 @@
+"""The blocks of ``docs/scaling.md``, in Markdown, from ``scaling.json``."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from benchmarks.cluster_tables import share
+from benchmarks.tables import markdown
+from service.runtime.plots.figures import counted
+
+Result = Mapping[str, Any]
+NAMED = (16, 256, 4096)
+"""Numbers of actors for which every part is told."""
+
+
+def box_block(result: Result) -> str:
+    """One box, and several nodes on it."""
+    rows = [
+        (num, f"{each['num_worlds']}", f"{each['env_steps_per_s']:,.0f}", f"{each['iteration_s']:.2f} s",
+         share(each["learner_idle_share"]), share(each["actor_idle_share"]),
+         f"{sum(each['cores'].values()):.2f} of {result['machine']['num_cpus']}")
+        for num, each in result["one_box"].items()
+    ]  # fmt: skip
+    head = ("actors", "worlds of each", "env steps/s", "an iteration", "learner idle", "actors idle", "cores busy")
+    where = result["machine"]
+    words = f"{where['cpu']}, {where['num_cpus']} cores, commit `{where['git_commit'][:7]}`, {where['time'][:10]}."
+    return f"{words}\n\n{markdown(head, rows)}"
+
+
+def nodes_block(result: Result) -> str:
+    """The test cluster."""
+    nodes, sizes = result["nodes"], result["sizes"]
+    placed = ", ".join(f"{name} on node {place}" for name, place in sorted(nodes["places"].items()))
+    return (
+        f"A head without cores and two nodes beside it: {nodes['env_steps_per_s']:,.0f} env steps/s over "
+        f"{nodes['num_iterations']} iterations, rollout actors on "
+        f"{counted(nodes['num_nodes_with_actors'], 'node')} ({placed}), "
+        f"greatest policy lag {nodes['max_policy_lag']:g}. {nodes['loopback_bytes_per_iteration'] / 1e6:.1f} MB an "
+        f"iteration went over the loopback interface, everything else on it included; its rollouts have "
+        f"{_mb(sizes['rollout'])}, weights {_mb(sizes['weights'])}, the learner's state {_mb(sizes['learner_state'])} "
+        f"and the generator's {_mb(sizes['generator_state'])}."
+    )
+
+
+def constants_block(result: Result) -> str:
+    """What everything costs."""
+    head = ("", "an update", "and each rollout", "and each world of it", "and each actor at each rollout")
+    rows = [
+        (name, *(_time(cost[key]) for key in ("update_s", "rollout_s", "world_s", "pair_s")))
+        for name, cost in result["model"]["constants"].items()
+    ]
+    assumed = result["assumed"]
+    words = (
+        f"Assumed, not measured: a node receives {assumed['network_mb_per_s']:g} MB/s (two Ray nodes on one box do, so "
+        f"a cluster does better), Redis takes {assumed['redis_mb_per_s']:g} MB/s, a node has "
+        f"{assumed['actors_per_node']} actors."
+    )
+    return f"{markdown(head, rows)}\n\n{words}"
+
+
+def model_block(result: Result) -> str:
+    """Predictions: as many worlds for each actor, and the same worlds shared out."""
+    model = result["model"]
+    each = _predictions(model["worlds_each"])
+    shared = _predictions(model["worlds_shared"])
+    num = model["worlds_each"][0]["num_worlds"]
+    total = result["sizes"]["num_worlds"]
+    return (
+        f"Every actor brings {num} worlds, so that more actors make larger updates:\n\n{each}\n\n"
+        f"The same experiment shared out, {total} worlds in all and at least one for each actor:\n\n{shared}"
+    )
+
+
+def _predictions(rows: list[Mapping[str, Any]]) -> str:
+    head = ("actors", "worlds of each", "env steps/s", "an update every", "actors busy", "learner idle", "bottleneck")
+    return markdown(
+        head,
+        [
+            (f"{row['num_actors']:,}", f"{row['num_worlds']:g}", f"{row['env_steps_per_s']:,.0f}",
+             f"{row['update_s']:,.3g} s", share(row["actors_busy"], 1), share(row["learner_idle"]),
+             row["bottleneck"])
+            for row in rows
+        ],
+    )  # fmt: skip
+
+
+def limits_block(result: Result) -> str:
+    """The first bottleneck, the next ones, and how busy each part is with many actors."""
+    model = result["model"]
+    limits = model["limits"]
+    first, most = next(iter(limits.items()))
+    rows = {row["num_actors"]: row for row in model["worlds_each"]}
+    head = ("part", "keeps up with", *(f"seconds an update, {num:,} actors" for num in NAMED))
+    table = markdown(
+        head,
+        [
+            (name, _actors(most_actors), *(f"{rows[num]['seconds'][name]:,.3g}" for num in NAMED))
+            for name, most_actors in limits.items()
+        ],
+    )
+    playing = rows[NAMED[0]]["seconds"]["actors"]
+    words = f"**The first bottleneck is the {first}**: it keeps up with {_actors(most)}"
+    world = result["sizes"]["rollout"] / result["sizes"]["num_worlds"]
+    held = ", ".join(f"{_mb(num * rows[num]['num_worlds'] * world)} with {num:,}" for num in NAMED)
+    return (
+        f"{words}, whose rounds take {playing:.2f} s. The rollouts of one update, which the learner holds in memory, "
+        f"have {held}. In the order in which parts become one:\n\n{table}"
+    )
+
+
+def _actors(num: int | None) -> str:
+    return "any number" if num is None else f"{num:,} actor{'' if num == 1 else 's'}"
+
+
+def _time(seconds: float) -> str:
+    if seconds == 0.0:
+        return ""
+    for unit, scale in (("s", 1.0), ("ms", 1e3), ("us", 1e6)):
+        if seconds * scale >= 1.0:
+            return f"{seconds * scale:.3g} {unit}"
+    return f"{seconds * 1e9:.3g} ns"
+
+
+def _mb(num_bytes: float) -> str:
+    return f"{num_bytes / 1e6:.2f} MB" if num_bytes < 1e8 else f"{num_bytes / 1e9:,.1f} GB"
