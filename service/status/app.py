@@ -12,6 +12,7 @@ from starlette.staticfiles import StaticFiles
 import service
 from service.registry.registry import Registry
 from service.status import openapi, problems
+from service.status.answers import AGE_S, Answers
 from service.status.api_health import health_router
 from service.status.api_primitives import primitives_router
 from service.status.api_runs import runs_router
@@ -50,6 +51,7 @@ def create_app(
     public: bool,
     runs_dir: Path | None = None,
     max_stream_s: float = MAX_AGE_S,
+    answer_age_s: float = AGE_S,
 ) -> StatusApp:
     """The REST API, ``/metrics`` and the web page.
 
@@ -60,6 +62,7 @@ def create_app(
         public: whether other machines can reach the service. If not, only requests for localhost are answered.
         runs_dir: directory of run directories, for their pictures and videos; None where there are none.
         max_stream_s: how long an event stream may last before its listener has to come back.
+        answer_age_s: how long an answer to one may be given to others.
 
     Raises:
         StatusError: public without a token, or a token that is too short.
@@ -88,6 +91,7 @@ def create_app(
     app.include_router(primitives_router(registry))
     _add_page(app)
     problems.add_handlers(app)
+    app.add_middleware(Answers, age_s=answer_age_s)
     app.add_middleware(Guard, token=token, public=public, observe=telemetry.observe)
     return app
 

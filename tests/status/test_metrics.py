@@ -92,7 +92,7 @@ def test_requests_by_route_and_never_by_path(service):
     client, _ = service
     for path in ("/v1/runs/a", "/v1/runs/b", "/x", "/y"):
         client.get(path)
-    httpx.request("BREW", f"{client.base_url}/x", trust_env=False)
+    httpx.request("PROPFIND", f"{client.base_url}/x", trust_env=False)
     samples = scrape(client)
     route = "/v1/runs/{run_id}"
     assert value(samples, "tandem_http_requests_total", method="GET", route=route, status="200") == 1
