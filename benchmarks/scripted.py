@@ -14,6 +14,9 @@ from numpy.typing import NDArray
 from service.config import WorldConfig
 from service.envs import fixtures, kinematics
 from service.envs.batch import DISPLACEMENT_M, LOWEST_TARGET_M, WorldBatch
+from service.envs.observations import ACTION_SIZE
+from service.envs.registration import EPISODE_STEPS
+from service.envs.tabletop import Setting
 
 Array = NDArray[np.float64]
 Bools = NDArray[np.bool_]
@@ -89,7 +92,7 @@ class Scripted:
         return self._advance(targets, grips, done)
 
     def _push(self) -> tuple[Array, Array]:
-        """Above the place behind the object, down, then towards the goal, always behind the object; else round again."""
+        """Above a place behind the object, down, then towards the goal; where the object slips aside, round again."""
         ee, obj = self.worlds.ee_position, self.worlds.object_position
         way = (self.goal - obj) * [1.0, 1.0, 0.0]
         distance = np.linalg.norm(way, axis=1)
@@ -134,6 +137,50 @@ def _at_height(position: Array, height_m: float) -> Array:
     return np.column_stack([position[:, :2], np.full(len(position), height_m)])
 
 
-def make_worlds(config: WorldConfig, num: int, *, num_threads: int = 0) -> WorldBatch:
-    """Worlds to act in."""
-    return WorldBatch(config, num, num_threads=num_threads)
+@dataclass(frozen=True, slots=True)
+class Played:
+    """How N episodes of one task went."""
+
+    start: Array
+    """(N, 3) where the objects were at first, metres."""
+    goal: Array
+    """(N, 3) metres."""
+    distance_m: Array
+    """(T, N) object to goal after each step."""
+    success_distance_m: float
+
+    @property
+    def success_last(self) -> Bools:
+        """(N,) on the goal after the last step."""
+        return np.asarray(self.distance_m[-1] <= self.success_distance_m)
+
+    @property
+    def first_step(self) -> NDArray[np.int64]:
+        """(M,) steps until the object was on the goal, of the episodes in which it ever was."""
+        reached = self.distance_m <= self.success_distance_m
+        first: NDArray[np.int64] = np.argmax(reached, axis=0)[reached.any(axis=0)] + 1
+        return first
+
+
+def play_task(
+    task: str,
+    config: WorldConfig,
+    *,
+    num_episodes: int,
+    seed: int,
+    num_steps: int = EPISODE_STEPS,
+    idle: bool = False,
+    num_threads: int = 0,
+) -> Played:
+    """Play random episodes of a task by the script, or doing nothing."""
+    setting = Setting.of(config, task, None, success_distance_m=0.05)
+    rng = np.random.default_rng(seed)
+    with WorldBatch(setting.config, num_episodes, num_threads=num_threads) as worlds:
+        worlds.reset(rng)
+        start, goal = worlds.object_position.copy(), setting.draw_goals(rng, worlds)
+        script = Scripted(worlds, goal)
+        distances = []
+        for _ in range(num_steps):
+            worlds.step(np.zeros((num_episodes, ACTION_SIZE), dtype=np.float32) if idle else script.act())
+            distances.append(np.linalg.norm(worlds.object_position - goal, axis=1))
+    return Played(start, goal, np.array(distances), setting.success_distance_m)

@@ -2,7 +2,7 @@
 
 Neither can be moved. The wall is part of the table; the box is elsewhere in every world, so its place is part of a
 world's state (three numbers behind MuJoCo's own). Both are touched by the object, the hand and the fingers; the arm's
-links collide with nothing, and a gripper that points down keeps them far above (the wrist is 21 cm over the fingertips).
+links collide with nothing, and a gripper that points down keeps them far above (its flange is at least 21 cm up).
 Sizes and where objects and goals are drawn: docs/decisions/0007.
 """
 
@@ -11,13 +11,11 @@ from __future__ import annotations
 from typing import Any
 
 import mujoco
-import numpy as np
-from numpy.typing import NDArray
 
 from service.config import WorldConfig
 from service.envs import panda
 
-StateArray = NDArray[np.float64]
+_Vector = tuple[float, float, float]
 
 PLACE_SIZE = 3
 """Numbers in a state that say where the box is: the middle of its bottom, metres."""
@@ -37,7 +35,7 @@ GAP_M = 0.005
 """Least distance of a new object from wall or box."""
 FINGER_GAP_M = 0.04
 """The same where a finger has to go in between: fingers open along y, and reach 3.7 cm beyond a 5 cm cube."""
-_RGBA = (0.52, 0.56, 0.62, 1.0)
+_PREFIX = "fixture_"
 
 
 def add_fixture(spec: mujoco.MjSpec, config: WorldConfig, contact: dict[str, Any]) -> None:
@@ -51,15 +49,21 @@ def add_fixture(spec: mujoco.MjSpec, config: WorldConfig, contact: dict[str, Any
     workspace = config.workspace
     center = (workspace.center_x_m, workspace.center_y_m, 0.0)
     if config.fixture == "wall":
-        half = (WALL_THICKNESS_M / 2, workspace.length_y_m / 2, WALL_HEIGHT_M / 2)
-        _add_plate(spec.worldbody, "wall", (*center[:2], half[2]), half, config, contact)
+        half: _Vector = (WALL_THICKNESS_M / 2, workspace.length_y_m / 2, WALL_HEIGHT_M / 2)
+        middle = (center[0], center[1], half[2])
+        _add_plate(spec.worldbody, "wall", middle, half, config, contact)
     elif config.fixture == "box":
         body = spec.worldbody.add_body(name="box", pos=center, mocap=True)
         for name, (middle, half) in _plates().items():
-            _add_plate(body, f"box_{name}", middle, half, config, contact)
+            _add_plate(body, name, middle, half, config, contact)
 
 
-def _plates() -> dict[str, tuple[tuple[float, ...], tuple[float, ...]]]:
+def fixture_geoms(spec: mujoco.MjSpec) -> list[Any]:
+    """What ``add_fixture`` added."""
+    return [geom for geom in spec.geoms if geom.name.startswith(_PREFIX)]
+
+
+def _plates() -> dict[str, tuple[_Vector, _Vector]]:
     """Middle and half size of the box's bottom and walls."""
     outer, half_shell, half_height = BOX_SIZE_M / 2, BOX_SHELL_M / 2, BOX_HEIGHT_M / 2
     side, inner = outer - half_shell, outer - BOX_SHELL_M
@@ -73,10 +77,10 @@ def _plates() -> dict[str, tuple[tuple[float, ...], tuple[float, ...]]]:
 
 
 def _add_plate(
-    body: Any, name: str, middle: tuple[float, ...], half: tuple[float, ...], config: WorldConfig, contact: Any
+    body: Any, name: str, middle: _Vector, half: _Vector, config: WorldConfig, contact: dict[str, Any]
 ) -> None:
     body.add_geom(
-        name=name,
+        name=f"{_PREFIX}{name}",
         type=mujoco.mjtGeom.mjGEOM_BOX,
         pos=middle,
         size=half,
@@ -84,6 +88,5 @@ def _add_plate(
         conaffinity=panda.GRIPPER_BIT | panda.OBJECT_BIT,
         friction=(config.friction, 0.005, 0.0001),
         group=2,
-        rgba=_RGBA,
         **contact,
     )

@@ -64,7 +64,8 @@ def behind_wall(rng: np.random.Generator, start: StateArray, config: WorldConfig
 
 def in_box(place: StateArray, config: WorldConfig) -> StateArray:
     """(num, 3) goals in the middle of boxes at (num, 3) places: the object's centre when it lies on the bottom."""
-    return place + np.array([0.0, 0.0, fixtures.BOX_SHELL_M + config.object_size_m / 2])
+    goal: StateArray = place + np.array([0.0, 0.0, fixtures.BOX_SHELL_M + config.object_size_m / 2])
+    return goal
 
 
 def _beside_wall(rng: np.random.Generator, side: StateArray, config: WorldConfig) -> StateArray:

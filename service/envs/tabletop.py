@@ -48,7 +48,9 @@ class Setting:
         config = config or WorldConfig()
         if task is not None:
             if goals is not None:
-                raise TandemError(f"goals = {goals!r} beside task = {task!r}: the task has its own; give one of the two")
+                raise TandemError(
+                    f"goals = {goals!r} beside task = {task!r}: the task has its own; give one of the two"
+                )
             config, goals = find_task(task).world_from(config), find_task(task).goals
         goals = goals or ("mixed" if config.fixture == "none" else "table")
         check_goals(goals, config)
@@ -75,7 +77,7 @@ def goal_space() -> gymnasium.spaces.Dict:
     )
 
 
-def action_space() -> gymnasium.spaces.Box:
+def action_space() -> gymnasium.Space[FloatArray]:
     """The actions of one world."""
     return gymnasium.spaces.Box(-1.0, 1.0, (ACTION_SIZE,), np.float32)
 

@@ -119,7 +119,7 @@ class TabletopVectorEnv(gymnasium.vector.VectorEnv[Any, FloatArray, NDArray[Any]
             info |= _with_masks({"diverged": diverged & ~truncated}, ~truncated)
         return observation, success.astype(np.float64), np.zeros_like(truncated), truncated, info
 
-    def compute_reward(self, achieved_goal: NDArray[Any], desired_goal: NDArray[Any], info: Any) -> NDArray[np.float64]:
+    def compute_reward(self, achieved_goal: NDArray[Any], desired_goal: NDArray[Any], info: Any) -> Any:
         """As ``TabletopEnv.compute_reward``."""
         return self._setting.reward(achieved_goal, desired_goal)
 
@@ -137,12 +137,15 @@ class TabletopVectorEnv(gymnasium.vector.VectorEnv[Any, FloatArray, NDArray[Any]
         self._elapsed[worlds] = 0
 
     def _is_success(self, observation: Observation) -> BoolArray:
-        return self._setting.reward(observation["achieved_goal"], observation["desired_goal"]) > 0.0
+        success: BoolArray = self._setting.reward(observation["achieved_goal"], observation["desired_goal"]) > 0.0
+        return success
 
 
 def _with_masks(values: Info, mask: BoolArray | None = None) -> Info:
     """Gymnasium's vector info: beside every ``key``, ``_key`` says for which worlds it holds; None: for all."""
-    masks = {f"_{key}": np.ones(len(value), dtype=bool) if mask is None else mask.copy() for key, value in values.items()}
+    masks = {
+        f"_{key}": np.ones(len(value), dtype=bool) if mask is None else mask.copy() for key, value in values.items()
+    }
     return {**values, **masks}
 
 
