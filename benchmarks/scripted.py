@@ -27,7 +27,6 @@ _ABOVE_M = 0.025
 """Least space between what is carried and what it is carried over."""
 _NEAR_M = 0.012
 _CLOSE_STEPS = 3
-_CARRY_SPEED = 0.7
 _DROPPED_M = 0.03
 _BEHIND_M = 0.068
 """From the object to where the closed gripper is lowered: half a cube's diagonal, half a gripper, and some space."""
@@ -55,8 +54,7 @@ class Scripted:
         """(N, 4) the next actions."""
         target, grip = self._push() if self.worlds.config.gripper == "blocked" else self._pick()
         actions = np.empty((self.worlds.num_worlds, 4), dtype=np.float32)
-        most = np.where(grip == CLOSE, _CARRY_SPEED, 1.0)[:, None]
-        actions[:, :3] = np.clip((target - self.worlds.ee_position) / DISPLACEMENT_M, -most, most)
+        actions[:, :3] = np.clip((target - self.worlds.ee_position) / DISPLACEMENT_M, -1.0, 1.0)
         actions[:, 3] = grip
         return actions
 
