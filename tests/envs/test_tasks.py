@@ -1,6 +1,8 @@
 """The six downstream tasks: where things are, what a wall and a box do, and that every one can be solved."""
 
+import json
 import warnings
+from pathlib import Path
 
 import gymnasium
 import numpy as np
@@ -15,12 +17,14 @@ from service.config import WorldConfig
 from service.envs import fixtures
 from service.envs.batch import DISPLACEMENT_M, WorldBatch
 from service.envs.registration import EPISODE_STEPS
+from service.envs.render import Mark, RenderError, SceneRenderer
 from service.envs.tabletop import Setting, TabletopEnv
 from service.envs.tasks import TASKS, find_task
 from service.envs.vector import TabletopVectorEnv
 from service.errors import TandemError
 
 CONFIG = WorldConfig(physics_step_s=0.005, num_substeps=8)
+RECORDED = Path(__file__).parents[2] / "docs" / "results" / "scripted_tasks.json"
 CENTER = np.array([-0.05, 0.0])
 HALF = 0.175
 """Of the workspace."""
@@ -318,3 +322,48 @@ def test_a_script_is_told_from_a_lucky_start():
     played = play_task("wall", CONFIG, num_episodes=4, seed=0, num_steps=3)
     assert not played.success_last.any()
     assert played.first_step.size == 0
+
+
+def test_the_recorded_check_has_every_task_solved():
+    recorded = json.loads(RECORDED.read_text())
+    assert recorded["settings"] == {"num_episodes": 300, "num_steps": EPISODE_STEPS, "seed": 0}
+    for rows in recorded["physics"].values():
+        assert list(rows) == list(TASKS)
+        assert all(row["success_last_low"] > 0.9 for row in rows.values())
+
+
+@pytest.fixture(scope="module")
+def drawn():
+    """Pictures of one world, of the same with its box elsewhere, and of the same with a mark."""
+    config = TASKS["box"].world_from(CONFIG)
+    with WorldBatch(config, 1, num_threads=1) as worlds:
+        state = worlds.states[0].copy()
+    state[10:13], state[-3:] = [-0.9, 0.3, 0.025], [0.05, -0.12, 0.0]
+    moved = state.copy()
+    moved[-3:] = [0.05, 0.12, 0.0]
+    try:
+        renderer = SceneRenderer(config, 200, 150)
+    except RenderError as error:
+        pytest.skip(str(error))
+    with renderer:
+        marks = [Mark((0.0, -0.05, 0.0), (0.1, 0.05, 0.002), (0.0, 1.0, 0.0, 0.9))]
+        return [renderer.render(state), renderer.render(moved), renderer.render(state, marks=marks)]
+
+
+class TestPictures:
+    def changed(self, left, right):
+        """(columns, rows) of pixels that differ."""
+        rows, columns = np.nonzero(np.abs(left.astype(int) - right).max(axis=2) > 30)
+        return columns, rows
+
+    def test_a_box_is_drawn_where_the_state_says(self, drawn):
+        columns, _ = self.changed(drawn[0], drawn[1])
+        # two boxes of 10 cm, seen from 2 m: one left of the middle, one right of it
+        assert 200 < columns.size < 2500
+        assert columns.min() < 100 < columns.max()
+
+    def test_a_mark_is_drawn_in_its_colour(self, drawn):
+        columns, rows = self.changed(drawn[0], drawn[2])
+        assert 50 < columns.size < 1000
+        colour = drawn[2][rows, columns].astype(int)
+        assert np.median(colour[:, 1] - colour[:, 0]) > 60
