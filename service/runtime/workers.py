@@ -126,7 +126,7 @@ def place() -> Place:
 
 
 def give_way() -> None:
-    """Whoever computes all the time goes behind whoever answers now and then: driver, status service, Redis, Ray itself.
+    """Who computes all the time goes behind who answers now and then: driver, status service, Redis, Ray itself.
 
     To be called before threads are started; they inherit it.
     """
