@@ -9,7 +9,7 @@ import numpy as np
 
 from benchmarks.run_files import Records, Run, binned, steps_until, unthin
 from benchmarks.stages import RANDOM, STAGES, mean_share
-from benchmarks.tasks import ASKED, ASKED_STEPS, NUM_STEPS, TASKS
+from benchmarks.tasks import ASKED, ASKED_RATES, ASKED_STEPS, NUM_STEPS, TASKS
 
 NUM_BINS = 10
 """Of a run's env steps; rates are those of the last, distances and heights also those of the first."""
@@ -22,7 +22,7 @@ def tasks_table(runs: Sequence[Run]) -> str:
     head = ("run", *TASKS, f"env steps until {percent(ASKED)} of mixed")
     rows = [(_label(run), *tasks_cells(run["evaluations"]), _steps_to_asked(run)) for run in runs]
     idle = max((tasks_cells(run["evaluations"], idle=True) for run in runs), key=lambda cells: sum(map(bool, cells)))
-    asked = (percent(task.asked) for task in TASKS.values())
+    asked = (percent(ASKED_RATES[task]) for task in TASKS)
     return markdown(head, [*rows, ("asked for", *asked, millions(ASKED_STEPS)), ("doing nothing", *idle, "")])
 
 

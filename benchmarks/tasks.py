@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
 from typing import Any
 
 from service.actors.evaluation import Deterministic, Idle, evaluate
-from service.config import Config, WorldConfig
-from service.envs.goals import GoalKind
+from service.config import Config
+from service.envs.tasks import TASKS as DOWNSTREAM
+from service.envs.tasks import Task
 
 NUM_EPISODES, NUM_STEPS = 300, 50
 ASKED, ASKED_STEPS = 0.90, 30e6
@@ -16,38 +16,15 @@ SEED = 0
 """Of the goals; those evaluated during a run are others."""
 
 
-@dataclass(frozen=True, slots=True)
-class Task:
-    """Random goals in a world."""
-
-    goals: GoalKind
-    words: str
-    asked: float
-    """Success at the last step that we ask of Bob."""
-    world: dict[str, Any] = field(default_factory=dict)
-    """What of the run's own world is replaced."""
-
-
 TASKS = {
-    "mixed": Task("mixed", "anywhere in the workspace with probability 0.7, else on the table", 0.95),
-    "air": Task("air", "more than 5 cm above an object that rests on the table", 0.95),
-    "table": Task("table", "on the table", 0.95),
-    "larger": Task(
-        "mixed",
-        "mixed goals in a workspace of 45 x 45 x 40 cm",
-        0.90,
-        {"workspace": {"length_x_m": 0.45, "length_y_m": 0.45, "height_m": 0.40}},
-    ),
-    "sphere": Task("mixed", "mixed goals for a sphere", 0.85, {"object": "sphere"}),
+    "mixed": Task("Mixed", "anywhere in the workspace with probability 0.7, else on the table", "mixed", 0.7),
+    "air": Task("Air", "more than 5 cm above an object that rests on the table", "air", 1.0),
+    "table": Task("Table", "on the table", "table", 0.0),
+    "larger": DOWNSTREAM["larger"],
+    "sphere": DOWNSTREAM["sphere"],
 }
-
-
-def task_world(task: Task, world: WorldConfig) -> WorldConfig:
-    """The world of a task, for a Bob who was trained in ``world``."""
-    tree = world.model_dump()
-    for key, value in task.world.items():
-        tree[key] = {**tree[key], **value} if isinstance(value, dict) else value
-    return WorldConfig.model_validate(tree)
+ASKED_RATES = {"mixed": 0.95, "air": 0.95, "table": 0.95, "larger": 0.90, "sphere": 0.85}
+"""Success at the last step that we ask of Bob."""
 
 
 def measure_tasks(
@@ -63,7 +40,7 @@ def measure_tasks(
         for label, policy in {"bob": bob, "idle": Idle()}.items():
             result = evaluate(
                 policy,
-                task_world(task, config.world),
+                task.world_from(config.world),
                 task.goals,
                 num_episodes=num_episodes,
                 num_steps=num_steps,

@@ -142,7 +142,7 @@ def demo(
 def evaluate(
     primitives: _Primitives,
     goals: Annotated[
-        str, typer.Option(help="table, air or mixed (70 % anywhere in the volume, else table).")
+        str, typer.Option(help="table, air, volume or mixed (70 % anywhere in the volume, else table).")
     ] = "mixed",
     episodes: Annotated[int, typer.Option(help="Number of random goals.", min=1)] = 300,
     steps: Annotated[int, typer.Option(help="Steps an episode, 25 a second.", min=1)] = 50,

@@ -48,6 +48,10 @@ class WorldConfig(_Frozen):
     object_mass_kg: float = Field(0.1, gt=0.0, le=2.0)
     friction: float = Field(1.0, gt=0.0, le=3.0, description="sliding friction of the object, also on the table")
     pad_friction: float = Field(1.0, gt=0.0, le=3.0, description="sliding friction of the fingertips on the object")
+    gripper: Literal["free", "blocked"] = Field("free", description="blocked: held closed, whatever the action says")
+    fixture: Literal["none", "wall", "box"] = Field(
+        "none", description="what stands on the table besides the object; docs/decisions/0007 has its geometry"
+    )
     workspace: WorkspaceConfig = WorkspaceConfig()
     start_height_m: float = Field(
         0.08,

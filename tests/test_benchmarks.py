@@ -393,7 +393,7 @@ def test_quantiles_by_hand():
 
 def test_tasks_have_worlds_of_their_own():
     trained = load_config(None, ["world.object_mass_kg=0.2", "world.workspace.center_x_m=-0.02"]).world
-    worlds = {name: tasks.task_world(task, trained) for name, task in tasks.TASKS.items()}
+    worlds = {name: task.world_from(trained) for name, task in tasks.TASKS.items()}
     assert [worlds[name] for name in ("mixed", "air", "table")] == [trained] * 3
     workspace = worlds["larger"].workspace
     size = (workspace.length_x_m, workspace.length_y_m, workspace.height_m)

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from service.config import WorldConfig
 from service.envs.batch import WorldBatch
-from service.envs.goals import GoalKind, sample_goals
+from service.envs.goals import GoalKind, draw_goals
 from service.envs.observations import ACTION_SIZE
 
 FloatArray = NDArray[np.float32]
@@ -69,7 +69,8 @@ def evaluate(
     rng = np.random.default_rng(seed)
     with WorldBatch(config, num_episodes, num_threads=num_threads) as worlds:
         worlds.reset(rng)
-        goal = sample_goals(kind, rng, num_episodes, config, success_distance_m)
+        start, box = worlds.object_position, worlds.box_place
+        goal = draw_goals(kind, rng, config, success_distance_m, start=start, box=box)
         goal32 = goal.astype(np.float32)
         ever = np.zeros(num_episodes, dtype=bool)
         distance = np.zeros(num_episodes)

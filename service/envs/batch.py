@@ -11,12 +11,24 @@ import numpy as np
 from mujoco import rollout
 from numpy.typing import NDArray
 
-from service.config import WorkspaceConfig, WorldConfig
-from service.envs import kinematics
+from service.config import WorldConfig
+from service.envs import fixtures, kinematics
 from service.envs.observations import ACTION_SIZE, BOB_VALUE_SIZE, FULL_SIZE, POSITIONS_SIZE
 from service.envs.panda import FINGER_STROKE_M, NUM_JOINTS
+from service.envs.sampling import draw_starts, sample_in_volume, sample_on_table
 from service.envs.scene import build_spec
 from service.errors import DivergedError
+
+__all__ = [
+    "DISPLACEMENT_M",
+    "LOWEST_TARGET_M",
+    "MAX_SPEED",
+    "MAX_TURN_RAD",
+    "WIDTH_CHANGE_M",
+    "WorldBatch",
+    "sample_in_volume",
+    "sample_on_table",
+]
 
 FloatArray = NDArray[np.float32]
 StateArray = NDArray[np.float64]
@@ -33,15 +45,17 @@ MAX_TURN_RAD = 0.5
 """Most a joint is asked to turn in one action; behind the base and near a straight arm the solution would ask for 2."""
 MAX_SPEED = 1e3
 """A joint (rad/s) or object (m/s, rad/s) faster than this has diverged; the arm reaches 3, a falling object 30."""
-_TABLE_TOP_M = 0.0
+_NUM_CONTACTS = 2
+_NUM_CONTROLS = NUM_JOINTS + 2
+_CONTROL_AND_BOX = int(mujoco.mjtState.mjSTATE_CTRL) | int(mujoco.mjtState.mjSTATE_MOCAP_POS)
 
 
 class WorldBatch:
     """N independent worlds with one flat state each.
 
-    The state of a world is MuJoCo's full physics state followed by the two finger-contact flags of the last action. A
-    world is a pure function of (state, action), because each action starts the constraint solver cold: saving is
-    copying rows of ``states``, restoring is ``restore``, and the continuation is bit-identical.
+    The state of a world is MuJoCo's full physics state, the two finger-contact flags of the last action, and, where the
+    world has a box, its place. A world is a pure function of (state, action), because each action starts the constraint
+    solver cold: saving is copying rows of ``states``, restoring is ``restore``, and the continuation is bit-identical.
 
     Args:
         config: the world.
@@ -58,7 +72,11 @@ class WorldBatch:
         self._pool = rollout.Rollout(nthread=num_threads if num_threads > 1 else 0)
         self._data = [mujoco.MjData(self.model) for _ in range(max(num_threads, 1))]
         self._physics_size = mujoco.mj_stateSize(self.model, mujoco.mjtState.mjSTATE_FULLPHYSICS)
-        self.state_size = self._physics_size + 2
+        self._contacts = slice(self._physics_size, self._physics_size + _NUM_CONTACTS)
+        self._place = slice(self._contacts.stop, self._contacts.stop + fixtures.PLACE_SIZE * self.model.nmocap)
+        self.state_size = self._place.stop
+        self._control_spec = _CONTROL_AND_BOX if self.model.nmocap else int(mujoco.mjtState.mjSTATE_CTRL)
+        self._widest_m = 2 * FINGER_STROKE_M if config.gripper == "free" else 0.0
         self._layout = _Layout.of(self.model)
         self._fresh_state = self._make_fresh_state()
         self.states: StateArray = np.tile(self._fresh_state, (num_worlds, 1))
@@ -92,20 +110,29 @@ class WorldBatch:
         return self.states[:, self._layout.object]
 
     @property
+    def box_place(self) -> StateArray:
+        """(N, 3) middle of the bottom of each world's box, metres; (N, 0) in worlds without."""
+        return self.states[:, self._place]
+
+    @property
     def ee_position(self) -> StateArray:
         """(N, 3) point between the fingertips, metres."""
         return self._kinematics.position
 
     def reset(self, rng: np.random.Generator, worlds: BoolArray | None = None) -> None:
-        """Put worlds (all, or where ``worlds`` is true) back to the start.
-
-        The arm is at home, the gripper open, the object anywhere on the table inside the workspace.
-        """
+        """Put worlds (all, or where ``worlds`` is true) back to a start, see ``draw_starts``."""
         mask = np.ones(self.num_worlds, dtype=bool) if worlds is None else worlds
-        num = int(mask.sum())
+        self.restore(self.draw_starts(rng, int(mask.sum())), mask)
+
+    def draw_starts(self, rng: np.random.Generator, num: int) -> StateArray:
+        """(num, S) states in which games and episodes start.
+
+        The arm is at home, the gripper open unless it is blocked, the object anywhere on the table inside the
+        workspace. Beside a wall or a box it is where ``sampling.draw_starts`` says, and a box is anywhere.
+        """
         states = np.tile(self._fresh_state, (num, 1))
-        states[:, self._layout.object] = sample_on_table(rng, num, self.config.workspace, self.config.object_size_m)
-        self.restore(states, mask)
+        states[:, self._layout.object], states[:, self._place] = draw_starts(rng, num, self.config)
+        return states
 
     def restore(self, states: StateArray, worlds: BoolArray | None = None) -> None:
         """Overwrite the states of all worlds, or of those where ``worlds`` is true, with (N or count, S) rows."""
@@ -146,11 +173,17 @@ class WorldBatch:
             )
         control = self._control(start, actions.astype(np.float64), index)
         states, sensors = self._pool.rollout(
-            self.model, self._data, start[:, : self._physics_size], control[:, None, :], nstep=self.config.num_substeps
+            self.model,
+            self._data,
+            start[:, : self._physics_size],
+            control[:, None, :],
+            control_spec=self._control_spec,
+            nstep=self.config.num_substeps,
         )
         after = np.empty_like(start)
         after[:, : self._physics_size] = states[:, -1]
-        after[:, self._physics_size :] = (sensors > 0).any(axis=1)
+        after[:, self._contacts] = (sensors > 0).any(axis=1)
+        after[:, self._place] = start[:, self._place]
         finite = (np.abs(after[:, self._layout.velocities]) < MAX_SPEED).all(axis=1) & np.isfinite(after).all(axis=1)
         broken = np.zeros(self.num_worlds, dtype=bool)
         if not finite.all():
@@ -169,11 +202,12 @@ class WorldBatch:
         )
         target = kinematics.clip_to_reach(here.position + DISPLACEMENT_M * actions[:, :3], LOWEST_TARGET_M)
         width = start[:, self._layout.fingers].sum(axis=1) + WIDTH_CHANGE_M * actions[:, 3]
-        control = np.empty((start.shape[0], NUM_JOINTS + 2))
+        control = np.empty((start.shape[0], _NUM_CONTROLS + self._place.stop - self._place.start))
         joints = start[:, self._layout.joints]
         solution = kinematics.solve(joints, target, at=here)
         control[:, :NUM_JOINTS] = np.clip(solution, joints - MAX_TURN_RAD, joints + MAX_TURN_RAD)
-        control[:, NUM_JOINTS:] = np.clip(width / 2, 0.0, FINGER_STROKE_M)[:, None]
+        control[:, NUM_JOINTS:_NUM_CONTROLS] = np.clip(width, 0.0, self._widest_m)[:, None] / 2
+        control[:, _NUM_CONTROLS:] = start[:, self._place]
         return control
 
     # --- observations ----------------------------------------------------------------------------------------------
@@ -216,14 +250,14 @@ class WorldBatch:
 
     def contacts(self) -> BoolArray:
         """(N, 2) left, right finger touched the object during the last action."""
-        return self.states[:, self._physics_size :] > 0
+        return self.states[:, self._contacts] > 0
 
     def _make_fresh_state(self) -> StateArray:
         workspace = self.config.workspace
         data = mujoco.MjData(self.model)
         home = np.array([[workspace.center_x_m, workspace.center_y_m, self.config.start_height_m]])
         data.qpos[:NUM_JOINTS] = kinematics.solve(kinematics.NEUTRAL_JOINTS[None], home, num_iterations=30)[0]
-        data.qpos[NUM_JOINTS : NUM_JOINTS + 2] = FINGER_STROKE_M
+        data.qpos[NUM_JOINTS : NUM_JOINTS + 2] = self._widest_m / 2
         state = np.zeros(self.state_size)
         mujoco.mj_getState(self.model, data, state[: self._physics_size], int(mujoco.mjtState.mjSTATE_FULLPHYSICS))
         return state
@@ -254,28 +288,3 @@ class _Layout:
         assert model.nq == NUM_JOINTS + 2 + 7
         assert model.na == 0
         return cls(model.nq)
-
-
-def sample_on_table(rng: np.random.Generator, num: int, workspace: WorkspaceConfig, object_size_m: float) -> StateArray:
-    """(num, 3) object centres, uniform over the workspace's table area, resting on the table."""
-    center = np.array([workspace.center_x_m, workspace.center_y_m])
-    half = np.array([workspace.length_x_m, workspace.length_y_m]) / 2
-    position = np.empty((num, 3))
-    position[:, :2] = center + rng.uniform(-half, half, (num, 2))
-    position[:, 2] = _TABLE_TOP_M + object_size_m / 2
-    return position
-
-
-def sample_in_volume(
-    rng: np.random.Generator,
-    num: int,
-    workspace: WorkspaceConfig,
-    object_size_m: float,
-    *,
-    lowest_m: float | None = None,
-) -> StateArray:
-    """(num, 3) object centres, uniform in the workspace above ``lowest_m`` (default: resting height)."""
-    position = sample_on_table(rng, num, workspace, object_size_m)
-    low = _TABLE_TOP_M + object_size_m / 2 if lowest_m is None else lowest_m
-    position[:, 2] = rng.uniform(low, workspace.height_m, num)
-    return position

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.config import WorkspaceConfig, WorldConfig
+from service.envs.fixtures import fixture_geoms
 from service.envs.scene import TABLE_CENTER_X_M, TABLE_HALF_SIZE_M
 from service.envs.shells import add_shells, only_seen
 
@@ -25,6 +26,7 @@ _TABLE_THICKNESS_M = 0.035
 _TEXTURE_SIZE = 512
 _MATERIALS: dict[str, dict[str, Any]] = {
     "object": {"rgba": (*OBJECT_RGB, 1.0), "specular": 0.35, "shininess": 0.5},
+    "fixture": {"rgba": (0.42, 0.47, 0.54, 1.0), "specular": 0.3, "shininess": 0.4},
     "leg": {"rgba": (0.24, 0.25, 0.27, 1.0), "specular": 0.2, "shininess": 0.3},
     "outline": {"rgba": (0.10, 0.36, 0.62, 0.85), "emission": 0.3, "specular": 0.0},
     "edge": {"rgba": (0.10, 0.36, 0.62, 0.22), "emission": 0.3, "specular": 0.0},
@@ -42,6 +44,8 @@ def decorate(spec: mujoco.MjSpec, config: WorldConfig) -> None:
     _add_lights(spec)
     _add_workspace(spec, config.workspace)
     spec.geom("object").material = "object"
+    for geom in fixture_geoms(spec):
+        geom.material = "fixture"
 
 
 def _add_table(spec: mujoco.MjSpec) -> None:

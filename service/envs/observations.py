@@ -31,6 +31,8 @@ BOB_SIZE = POSITIONS_SIZE + 3
 BOB_VALUE_SIZE = FULL_SIZE - 1 + 6
 OBJECT_SLICE = slice(5, 8)
 GOAL_SLICE = slice(11, 14)
+SPACES = {"action": ACTION_SIZE, "positions": POSITIONS_SIZE, "observation": BOB_SIZE, "layout": __name__}
+"""What the manifest of primitives says they act by and see; those of another robot or layout say something else."""
 
 
 @dataclass(frozen=True)

@@ -6,6 +6,7 @@ a ``SceneRenderer`` is made and not before.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from types import TracebackType
 from typing import Any, Self
@@ -15,11 +16,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.config import WorldConfig
+from service.envs.fixtures import PLACE_SIZE
 from service.envs.gl import RenderError, open_drawing
 from service.envs.looks import OBJECT_RGB, decorate
 from service.envs.scene import build_spec
 
-__all__ = ["DEFAULT_CAMERA", "TOP_CAMERA", "Camera", "RenderError", "SceneRenderer", "decorate"]
+__all__ = ["DEFAULT_CAMERA", "TOP_CAMERA", "Camera", "Mark", "RenderError", "SceneRenderer", "decorate"]
 
 Image = NDArray[np.uint8]
 Array = NDArray[np.float64]
@@ -42,6 +44,15 @@ class Camera:
     """Direction of the view in the table's plane: 0 looks along x, 90 along y."""
     elevation_deg: float
     """-90 looks straight down."""
+
+
+@dataclass(frozen=True, slots=True)
+class Mark:
+    """A transparent box in a picture, such as the area where goals may be."""
+
+    low: tuple[float, float, float]
+    high: tuple[float, float, float]
+    rgba: tuple[float, float, float, float]
 
 
 DEFAULT_CAMERA = Camera((-0.20, 0.0, 0.21), 1.95, 146.0, -21.0)
@@ -94,22 +105,28 @@ class SceneRenderer:
             self._context.free()
             self._context = None
 
-    def render(self, state: Array, goal: Array | None = None) -> Image:
+    def render(self, state: Array, goal: Array | None = None, marks: Sequence[Mark] = ()) -> Image:
         """Draw one world.
 
         Args:
             state: (S,) row of ``WorldBatch.states``.
             goal: (3,) metres, shown as a transparent copy of the object; None for none.
+            marks: transparent boxes.
 
         Returns:
             (H, W, 3), the top row first.
         """
         assert self._context is not None, "drawing after close"
         mujoco.mj_setState(self.model, self._data, state[: self._state_size], mujoco.mjtState.mjSTATE_FULLPHYSICS)
+        if self.model.nmocap:
+            self._data.mocap_pos[0] = state[-PLACE_SIZE:]
         mujoco.mj_kinematics(self.model, self._data)
         mujoco.mj_camlight(self.model, self._data)
         camera, everything = _mujoco_camera(self.camera), mujoco.mjtCatBit.mjCAT_ALL
         mujoco.mjv_updateScene(self.model, self._data, self._option, None, camera, everything, self._scene)
+        for mark in marks:
+            low, high = np.asarray(mark.low), np.asarray(mark.high)
+            self._add(mujoco.mjtGeom.mjGEOM_BOX, tuple((high - low) / 2), (low + high) / 2, mark.rgba)
         if goal is not None:
             self._add_goal(np.asarray(goal, dtype=np.float64))
         return self._draw()

@@ -1,11 +1,11 @@
-"""The scene: a Panda at a table with one rigid object."""
+"""The scene: a Panda at a table with one rigid object, and a wall or a box where a task wants one."""
 
 from __future__ import annotations
 
 import mujoco
 
 from service.config import WorldConfig
-from service.envs import panda
+from service.envs import fixtures, panda
 
 TABLE_CENTER_X_M = -0.3
 TABLE_HALF_SIZE_M = (0.55, 0.45, 0.2)
@@ -46,6 +46,7 @@ def build_spec(config: WorldConfig) -> mujoco.MjSpec:
         **_STIFF,
     )
     _add_object(spec, config)
+    fixtures.add_fixture(spec, config, _STIFF)
     _add_contact_sensors(spec)
     return spec
 

@@ -1,4 +1,4 @@
-"""One world as a Gymnasium goal environment: bring the object to a given place."""
+"""One world as a Gymnasium goal environment: bring the object to a given place. ``vector`` has many at once."""
 
 from __future__ import annotations
 
@@ -12,8 +12,9 @@ from numpy.typing import NDArray
 
 from service.config import WorldConfig
 from service.envs.batch import WorldBatch
-from service.envs.goals import GOAL_KINDS, GoalKind, sample_goals
+from service.envs.goals import GoalKind, check_goals, draw_goals
 from service.envs.observations import ACTION_SIZE, OBJECT_SLICE, POSITIONS_SIZE
+from service.envs.tasks import find_task
 from service.errors import TandemError
 
 if TYPE_CHECKING:
@@ -25,6 +26,70 @@ Observation = dict[str, FloatArray]
 
 _FURTHEST_M = 10.0
 """Bound of every position: an object off the table falls for ever, a space needs an end."""
+
+
+@dataclass(frozen=True, slots=True)
+class Setting:
+    """What an environment of one world and one of many have in common: a world, and where its goals are."""
+
+    config: WorldConfig
+    goals: GoalKind
+    success_distance_m: float
+
+    @classmethod
+    def of(
+        cls, config: WorldConfig | None, task: str | None, goals: GoalKind | None, success_distance_m: float
+    ) -> Setting:
+        """From the arguments of an environment.
+
+        Raises:
+            TandemError: unknown task or goals, goals that the world cannot have, a distance that is not positive.
+        """
+        config = config or WorldConfig()
+        if task is not None:
+            if goals is not None:
+                raise TandemError(
+                    f"goals = {goals!r} beside task = {task!r}: the task has its own; give one of the two"
+                )
+            config, goals = find_task(task).world_from(config), find_task(task).goals
+        goals = goals or ("mixed" if config.fixture == "none" else "table")
+        check_goals(goals, config)
+        if not success_distance_m > 0.0:
+            raise TandemError(f"success_distance_m = {success_distance_m}; give a distance above 0 m")
+        return cls(config, goals, success_distance_m)
+
+    def draw_goals(self, rng: np.random.Generator, worlds: WorldBatch, index: slice = slice(None)) -> StateArray:
+        """(num, 3) goals for worlds at their start, metres."""
+        start, box = worlds.object_position[index], worlds.box_place[index]
+        return draw_goals(self.goals, rng, self.config, self.success_distance_m, start=start, box=box)
+
+    def reward(self, achieved_goal: NDArray[Any], desired_goal: NDArray[Any]) -> Any:
+        """(...) 1 where (..., 3) achieved goals are within the success distance of (..., 3) desired ones, else 0."""
+        distance = np.linalg.norm(np.asarray(achieved_goal) - np.asarray(desired_goal), axis=-1)
+        return (distance <= self.success_distance_m).astype(np.float64)
+
+
+def goal_space() -> gymnasium.spaces.Dict:
+    """The observations of one world."""
+    sizes = {"observation": POSITIONS_SIZE, "achieved_goal": 3, "desired_goal": 3}
+    return gymnasium.spaces.Dict(
+        {name: gymnasium.spaces.Box(-_FURTHEST_M, _FURTHEST_M, (size,), np.float32) for name, size in sizes.items()}
+    )
+
+
+def action_space() -> gymnasium.Space[FloatArray]:
+    """The actions of one world."""
+    return gymnasium.spaces.Box(-1.0, 1.0, (ACTION_SIZE,), np.float32)
+
+
+def observe(worlds: WorldBatch, goal: StateArray) -> Observation:
+    """What N worlds with (N, 3) goals show, (N, ...) each."""
+    positions = np.clip(worlds.positions(), -_FURTHEST_M, _FURTHEST_M)
+    return {
+        "observation": positions,
+        "achieved_goal": positions[:, OBJECT_SLICE].copy(),
+        "desired_goal": goal.astype(np.float32),
+    }
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,14 +118,16 @@ class TabletopEnv(gymnasium.Env[Any, FloatArray]):
 
     Args:
         config: the world; the paper's by default.
-        goals: where goals are: ``table``, ``air``, or ``mixed`` as in the paper's downstream tasks.
+        task: name of a downstream task (``service.envs.tasks``), which replaces part of ``config`` and has its goals.
+        goals: where goals are: ``table``, ``air``, ``volume``, or ``mixed`` as in most of the paper's downstream tasks,
+            which is the default; with a wall or a box in ``config`` only ``table``.
         success_distance_m: greatest distance that counts as reached, metres.
         render_mode: ``rgb_array`` or None.
         width: of rendered images, pixels.
         height: of rendered images, pixels.
 
     Raises:
-        TandemError: unknown ``goals`` or ``render_mode``, or a success distance that is not positive.
+        TandemError: unknown ``task``, ``goals`` or ``render_mode``, or a success distance that is not positive.
     """
 
     metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 25}  # noqa: RUF012 - as the base class has it
@@ -69,30 +136,22 @@ class TabletopEnv(gymnasium.Env[Any, FloatArray]):
         self,
         config: WorldConfig | None = None,
         *,
-        goals: GoalKind = "mixed",
+        task: str | None = None,
+        goals: GoalKind | None = None,
         success_distance_m: float = 0.05,
         render_mode: str | None = None,
         width: int = 640,
         height: int = 480,
     ) -> None:
-        if goals not in GOAL_KINDS:
-            raise TandemError(f"TabletopEnv: goals = {goals!r}; choose one of {', '.join(GOAL_KINDS)}")
         if render_mode not in (None, *self.metadata["render_modes"]):
             raise TandemError(f"TabletopEnv: render_mode = {render_mode!r}; choose rgb_array or None")
-        if not success_distance_m > 0.0:
-            raise TandemError(f"TabletopEnv: success_distance_m = {success_distance_m}; give a distance above 0 m")
-        self.config = config or WorldConfig()
-        self.goals = goals
+        self._setting = Setting.of(config, task, goals, success_distance_m)
+        self.config = self._setting.config
+        self.goals = self._setting.goals
         self.success_distance_m = success_distance_m
         self.render_mode = render_mode
-        self.observation_space = gymnasium.spaces.Dict(
-            {
-                "observation": _positions_box(POSITIONS_SIZE),
-                "achieved_goal": _positions_box(3),
-                "desired_goal": _positions_box(3),
-            }
-        )
-        self.action_space = gymnasium.spaces.Box(-1.0, 1.0, (ACTION_SIZE,), np.float32)
+        self.observation_space = goal_space()
+        self.action_space = action_space()
         self._image_size = (width, height)
         self._renderer: SceneRenderer | None = None
         self._worlds = WorldBatch(self.config, 1, num_threads=1)
@@ -101,7 +160,7 @@ class TabletopEnv(gymnasium.Env[Any, FloatArray]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Observation, dict[str, Any]]:
-        """Arm at home, gripper open, object at a random place on the table, a new random goal.
+        """Arm at home, object at a random place on the table, a new random goal, a box elsewhere.
 
         Args:
             seed: restarts the environment's random numbers; the same seed gives the same episodes, bit for bit.
@@ -109,7 +168,7 @@ class TabletopEnv(gymnasium.Env[Any, FloatArray]):
         """
         super().reset(seed=seed, options=options)
         self._worlds.reset(self.np_random)
-        self._goal = sample_goals(self.goals, self.np_random, 1, self.config, self.success_distance_m)[0]
+        self._goal = self._setting.draw_goals(self.np_random, self._worlds)[0]
         observation = self._observe()
         return observation, {"is_success": self._is_success(observation)}
 
@@ -129,8 +188,7 @@ class TabletopEnv(gymnasium.Env[Any, FloatArray]):
 
         ``info`` is there for the convention of goal environments and is not read.
         """
-        distance = np.linalg.norm(np.asarray(achieved_goal) - np.asarray(desired_goal), axis=-1)
-        return (distance <= self.success_distance_m).astype(np.float64)
+        return self._setting.reward(achieved_goal, desired_goal)
 
     def state(self) -> TabletopState:
         """Copy everything that :meth:`restore` needs; the elapsed steps of a time limit belong to its wrapper."""
@@ -166,16 +224,7 @@ class TabletopEnv(gymnasium.Env[Any, FloatArray]):
         self._worlds.close()
 
     def _observe(self) -> Observation:
-        positions = np.clip(self._worlds.positions()[0], -_FURTHEST_M, _FURTHEST_M)
-        return {
-            "observation": positions,
-            "achieved_goal": positions[OBJECT_SLICE].copy(),
-            "desired_goal": self._goal.astype(np.float32),
-        }
+        return {name: value[0] for name, value in observe(self._worlds, self._goal[None]).items()}
 
     def _is_success(self, observation: Observation) -> bool:
         return bool(self.compute_reward(observation["achieved_goal"], observation["desired_goal"], {}))
-
-
-def _positions_box(size: int) -> gymnasium.spaces.Box:
-    return gymnasium.spaces.Box(-_FURTHEST_M, _FURTHEST_M, (size,), np.float32)

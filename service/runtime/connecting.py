@@ -73,6 +73,8 @@ def connected(address: str | None, num_cpus: int | None = None) -> Iterator[None
     if address is None and not chosen and "ray" not in sys.modules:  # Ray reads them when it is imported
         # Else Ray would leave a token in the home directory, and every later cluster there would take it up.
         os.environ |= {"RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN": secrets.token_hex(32)}
+    if address is None:
+        os.environ.setdefault("RAY_worker_niceness", "0")  # not 15 for all: see ``workers.give_way``
     import ray
 
     _check_reachable(address)

@@ -11,7 +11,7 @@ from service.actors.evaluation import Deterministic
 from service.actors.game import Acting
 from service.config import Config, WorldConfig
 from service.envs.batch import WorldBatch
-from service.envs.goals import GoalKind, sample_goals
+from service.envs.goals import GoalKind, draw_goals
 from service.generator.difficulty import in_air
 from service.generator.validity import Verdict, judge
 
@@ -92,7 +92,8 @@ def film_episodes(
     rng = np.random.default_rng(seed)
     with WorldBatch(config, num_episodes) as worlds:
         worlds.reset(rng)
-        goal = sample_goals(kind, rng, num_episodes, config, success_distance_m)
+        start, box = worlds.object_position, worlds.box_place
+        goal = draw_goals(kind, rng, config, success_distance_m, start=start, box=box)
         states, reached = [], []
         for step in range(num_steps + 1):
             if step:

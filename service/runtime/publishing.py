@@ -7,8 +7,7 @@ import json
 
 from service.actors.evaluation import evaluate
 from service.config import Config
-from service.envs.goals import GOAL_KINDS
-from service.envs.observations import ACTION_SIZE, BOB_SIZE, NORMALISATION_BOB, POSITIONS_SIZE
+from service.envs.observations import NORMALISATION_BOB, SPACES
 from service.policies.evaluator import bob_evaluator
 from service.policies.parameters import Parameters
 from service.registry import tensors
@@ -18,16 +17,16 @@ from service.registry.files import os_errors, write_atomic
 from service.registry.names import Version
 from service.registry.registry import Registry
 from service.runtime.rundir import RunDirectory
-from service.runtime.runner import EVALUATION_SEED
+from service.runtime.runner import EVALUATED_GOALS, EVALUATION_SEED
 
 FINAL_EVALUATION_EPISODES = 300
 
 
 def measure_bob(config: Config, parameters: Parameters) -> dict[str, float]:
-    """Bob's success rates without noise on every kind of goals, by metric; not the goals he is watched on in a run."""
+    """Bob's success rates without noise on every kind of goals of a run, by metric; but not the run's own goals."""
     bob = bob_evaluator(parameters)
     metrics = {}
-    for kind in GOAL_KINDS:
+    for kind in EVALUATED_GOALS:
         result = evaluate(
             bob,
             config.world,
@@ -87,12 +86,7 @@ def publish_bob(
     return registry.publish(
         config.name,
         parameters,
-        spaces={
-            "action": ACTION_SIZE,
-            "positions": POSITIONS_SIZE,
-            "observation": BOB_SIZE,
-            "layout": "service.envs.observations",
-        },
+        spaces=SPACES,
         normalisation={"offset": NORMALISATION_BOB.offset.tolist(), "scale": NORMALISATION_BOB.scale.tolist()},
         config=config.model_dump(mode="json"),
         metrics=metrics,

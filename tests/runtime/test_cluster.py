@@ -16,6 +16,7 @@ from service.runtime.cluster import ClusterRun, num_gpus
 from service.runtime.connecting import ClusterOptions, connected
 from service.runtime.rundir import RunDirectory
 from service.runtime.runner import ClusterError
+from service.runtime.workers import NICENESS
 from tests.runtime.runs import newest, play, read_lines, tiny_config
 
 TOGETHER = ("learner/", "alice/", "bob/", "generator/")
@@ -104,18 +105,22 @@ def test_worlds_are_shared_out_and_every_rollout_counts_once(tmp_path):
     assert newest(tmp_path).meta["env_steps"] == result.num_env_steps == seen[-1]["env_steps"]
 
 
-def test_only_the_learner_has_torch(tmp_path):
-    """An actor with it takes three times the memory and comes up three times as slowly."""
-    found = {}
+def test_only_the_learner_has_torch_and_who_computes_gives_way(tmp_path):
+    """An actor with torch takes three times the memory and comes up three times as slowly."""
+    torch, nice = {}, {}
 
     def look(run, metrics):
         if metrics["iteration"] == 3:  # by then all have unpickled weights
             for actor in run.health().actors:
-                found[actor.name] = "libtorch" in Path(f"/proc/{actor.pid}/maps").read_text()
+                torch[actor.name] = "libtorch" in Path(f"/proc/{actor.pid}/maps").read_text()
+                nice[actor.name] = os.getpriority(os.PRIO_PROCESS, actor.pid)
             run.request_stop()
 
     run_cluster(tmp_path, tiny_config(total_env_steps=10**9), on_iteration=look)
-    assert found == {"rollout-0": False, "rollout-1": False, "learner": True, "generator": False}
+    assert torch == {"rollout-0": False, "rollout-1": False, "learner": True, "generator": False}
+    answers = nice.pop("generator")
+    assert set(nice.values()) == {min(19, answers + NICENESS)}
+    assert answers < 19
 
 
 def test_a_checkpoint_belongs_to_no_topology_and_no_runner(tmp_path):

@@ -1,0 +1,246 @@
+"""Frozen primitives as an action space: a learner's action is the K weights with which they are composed.
+
+``ComposePrimitives`` wraps an environment, ``ComposePrimitivesVector`` many at once. What a learner sees stays as it
+was; what it sets, K numbers in [-1, 1], are weights on a logarithmic scale, and the environment is handed the mean of
+the composition, which is deterministic and inside the range of the primitives' means (``policies.composition``). Only
+ratios of weights bear on that mean. NumPy alone: acting needs no torch.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import math
+from collections.abc import Callable, Iterator, Mapping
+from typing import Any, Protocol
+
+import gymnasium
+import numpy as np
+from numpy.typing import NDArray
+
+from service.envs.observations import POSITIONS_SIZE, SPACES
+from service.errors import TandemError
+from service.policies.evaluator import MCPEvaluator
+
+FloatArray = NDArray[np.float32]
+Info = dict[str, Any]
+Positions = Callable[[Any], FloatArray]
+
+WEIGHT_RATIO = 100.0
+"""Greatest weight over least. Bob's own gate has the same range, [0.01, 1]."""
+
+
+class Trained(Protocol):
+    """What ``service.load_primitives`` returns, as far as it matters here."""
+
+    @property
+    def label(self) -> str:
+        """Where it comes from."""
+
+    @property
+    def primitives(self) -> MCPEvaluator:
+        """What can be composed."""
+
+    @property
+    def manifest(self) -> Any:
+        """What the registry knows about it, or None."""
+
+
+def action_weights(actions: FloatArray, ratio: float = WEIGHT_RATIO) -> FloatArray:
+    """Weights ``ratio ** ((a - 1) / 2)`` of (..., K) actions: 1 / ratio at -1, 1 at 1; equal actions, equal weights.
+
+    A linear scale would be its upper half nearly everywhere: a weight has to be 100 times another for its primitive to
+    decide alone.
+    """
+    exponent = 0.5 * (np.clip(np.asarray(actions, dtype=np.float32), -1.0, 1.0) - 1.0)
+    weights: FloatArray = np.exp(np.float32(math.log(ratio)) * exponent)
+    return weights
+
+
+def check_primitives(primitives: MCPEvaluator | Trained) -> MCPEvaluator:
+    """What can be composed, once its manifest says that it is for this robot and layout.
+
+    Raises:
+        TandemError: a monolithic Bob, or primitives of another robot or layout.
+    """
+    if isinstance(primitives, MCPEvaluator):
+        return primitives
+    if primitives.manifest is not None:
+        spaces = primitives.manifest.spaces
+        wrong = {key: spaces.get(key) for key, value in SPACES.items() if spaces.get(key) != value}
+        if wrong:
+            found, wanted = (", ".join(f"{key} {tree[key]}" for key in wrong) for tree in (wrong, SPACES))
+            raise TandemError(f"{primitives.label} is for another robot or layout: {found}; this one has {wanted}")
+    return primitives.primitives
+
+
+def parameters_digest(primitives: MCPEvaluator) -> str:
+    """SHA-256 of every array of the primitives, in their order: the same before and after they were used."""
+    digest = hashlib.sha256()
+    for name, array in _arrays(primitives, ""):
+        digest.update(f"{name} {array.dtype} {array.shape} ".encode() + np.ascontiguousarray(array).tobytes())
+    return digest.hexdigest()
+
+
+class ComposePrimitives(gymnasium.Wrapper[Any, FloatArray, Any, FloatArray], gymnasium.utils.RecordConstructorArgs):
+    """An environment whose action is K weights in [-1, 1]; everything else stays.
+
+    Args:
+        env: acts by the four numbers of ``TabletopEnv``, and shows the primitives' 11 positions.
+        primitives: what ``service.load_primitives`` returns, or its ``.primitives``. Never changed.
+        positions: takes the (11,) positions (``service.envs.observations``) out of an observation. By default they are
+            the observation itself, or its entry ``observation``.
+        weight_ratio: greatest weight over least.
+
+    Raises:
+        TandemError: primitives of another robot or layout, an environment that does not fit them, a ratio not above 1.
+    """
+
+    def __init__(
+        self,
+        env: gymnasium.Env[Any, FloatArray],
+        primitives: MCPEvaluator | Trained,
+        *,
+        positions: Positions | None = None,
+        weight_ratio: float = WEIGHT_RATIO,
+    ) -> None:
+        gymnasium.utils.RecordConstructorArgs.__init__(
+            self, _disable_deepcopy=True, primitives=primitives, positions=positions, weight_ratio=weight_ratio
+        )
+        super().__init__(env)
+        self._mixer = _Mixer(primitives, env.observation_space, env.action_space, positions, weight_ratio)
+        self.primitives = self._mixer.primitives
+        self.action_space = _weights_space(self.primitives.num_primitives)
+
+    def reset(self, *, seed: int | None = None, options: Info | None = None) -> tuple[Any, Info]:
+        """Reset the environment."""
+        observation, info = self.env.reset(seed=seed, options=options)
+        self._mixer.see(observation)
+        return observation, info
+
+    def step(self, action: FloatArray) -> tuple[Any, Any, bool, bool, Info]:
+        """Act by the composition with these (K,) weights.
+
+        Raises:
+            TandemError: not one number per primitive.
+        """
+        observation, *rest = self.env.step(self._mixer.act(action, ()))
+        self._mixer.see(observation)
+        return (observation, *rest)
+
+    def compute_reward(self, achieved_goal: Any, desired_goal: Any, info: Any) -> Any:
+        """The environment's own, where it has goals: hindsight relabelling asks for it here."""
+        return self.env.get_wrapper_attr("compute_reward")(achieved_goal, desired_goal, info)
+
+
+class ComposePrimitivesVector(gymnasium.vector.VectorWrapper[Any, FloatArray, Any, FloatArray, Any]):
+    """As ``ComposePrimitives``, for N environments at once: actions are (N, K), ``positions`` takes out (N, 11)."""
+
+    def __init__(
+        self,
+        env: gymnasium.vector.VectorEnv[Any, FloatArray, Any],
+        primitives: MCPEvaluator | Trained,
+        *,
+        positions: Positions | None = None,
+        weight_ratio: float = WEIGHT_RATIO,
+    ) -> None:
+        super().__init__(env)
+        spaces = env.single_observation_space, env.single_action_space
+        self._mixer = _Mixer(primitives, *spaces, positions, weight_ratio)
+        self.primitives = self._mixer.primitives
+        self.single_action_space = _weights_space(self.primitives.num_primitives)
+        self.action_space = gymnasium.vector.utils.batch_space(self.single_action_space, env.num_envs)
+
+    def reset(self, *, seed: Any = None, options: Info | None = None) -> tuple[Any, Info]:
+        """Reset the environments."""
+        observation, info = self.env.reset(seed=seed, options=options)
+        self._mixer.see(observation)
+        return observation, info
+
+    def step(self, actions: FloatArray) -> tuple[Any, Any, Any, Any, Info]:
+        """Act by the compositions with these (N, K) weights.
+
+        Raises:
+            TandemError: not one number per environment and primitive.
+        """
+        observation, *rest = self.env.step(self._mixer.act(actions, (self.num_envs,)))
+        self._mixer.see(observation)
+        return (observation, *rest)
+
+    def compute_reward(self, achieved_goal: Any, desired_goal: Any, info: Any) -> Any:
+        """The environments' own, where they have goals."""
+        compute: Callable[..., Any] = getattr(self.env, "compute_reward")  # noqa: B009 - only goal environments have it
+        return compute(achieved_goal, desired_goal, info)
+
+
+class _Mixer:
+    """From weights and the last positions to actions; what both wrappers share."""
+
+    def __init__(
+        self,
+        primitives: MCPEvaluator | Trained,
+        observation_space: gymnasium.Space[Any],
+        action_space: gymnasium.Space[Any],
+        positions: Positions | None,
+        weight_ratio: float,
+    ) -> None:
+        self.primitives = check_primitives(primitives)
+        if not 1.0 < weight_ratio < math.inf:
+            raise TandemError(f"weight_ratio = {weight_ratio}; give a number above 1")
+        if not isinstance(action_space, gymnasium.spaces.Box) or action_space.shape != (self.primitives.action_size,):
+            raise TandemError(
+                f"the environment's actions are {action_space}; the primitives act by {self.primitives.action_size} "
+                "numbers: end-effector displacement 3, change of the finger width"
+            )
+        if positions is None:
+            _check_positions(observation_space)
+        self._take = positions or _positions
+        self._low, self._high = action_space.low, action_space.high
+        self._ratio = weight_ratio
+        self._seen: FloatArray | None = None
+
+    def see(self, observation: Any) -> None:
+        """Keep what the next composition acts on."""
+        self._seen = np.array(self._take(observation), dtype=np.float32)
+
+    def act(self, actions: FloatArray, worlds: tuple[int, ...]) -> FloatArray:
+        """(*worlds, 4) the mean of each composition, inside the environment's range."""
+        if self._seen is None:
+            raise gymnasium.error.ResetNeeded("call reset before step")
+        expected = (*worlds, self.primitives.num_primitives)
+        if np.shape(actions) != expected:
+            raise TandemError(
+                f"action: expected shape {expected}, a number for each of {expected[-1]} primitives, "
+                f"got {np.shape(actions)}; an orchestrator acts with the primitives it was trained with"
+            )
+        mean, _ = self.primitives.compose(self._seen, action_weights(actions, self._ratio))
+        return np.clip(mean, self._low, self._high)
+
+
+def _positions(observation: Any) -> FloatArray:
+    taken: FloatArray = observation["observation"] if isinstance(observation, Mapping) else observation
+    return taken
+
+
+def _check_positions(space: gymnasium.Space[Any]) -> None:
+    found = space.get("observation") if isinstance(space, gymnasium.spaces.Dict) else space
+    if not isinstance(found, gymnasium.spaces.Box) or found.shape != (POSITIONS_SIZE,):
+        raise TandemError(
+            f"the environment's observations are {found}; the primitives see the {POSITIONS_SIZE} positions of "
+            "service.envs.observations: give positions=, which takes them out of an observation"
+        )
+
+
+def _weights_space(num_primitives: int) -> gymnasium.Space[FloatArray]:
+    return gymnasium.spaces.Box(-1.0, 1.0, (num_primitives,), np.float32)
+
+
+def _arrays(owner: Any, prefix: str) -> Iterator[tuple[str, NDArray[Any]]]:
+    """Every array below an object, by the path to it."""
+    if isinstance(owner, np.ndarray | np.generic):
+        yield prefix, np.asarray(owner)
+    elif isinstance(owner, list):
+        for index, value in enumerate(owner):
+            yield from _arrays(value, f"{prefix}.{index}")
+    elif hasattr(owner, "__dict__"):
+        for name, value in sorted(vars(owner).items()):
+            yield from _arrays(value, f"{prefix}.{name}")

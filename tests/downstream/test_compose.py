@@ -1,0 +1,214 @@
+"""Composing frozen primitives: the weights, what the environment is handed, both checkers, learners, bad input."""
+
+import dataclasses
+import re
+import warnings
+from pathlib import Path
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import check_env as check_gymnasium
+from stable_baselines3 import SAC, HerReplayBuffer
+from stable_baselines3.common.env_checker import check_env as check_stable_baselines
+
+import service
+import service.envs.registration
+from service.config import WorldConfig
+from service.downstream.compose import (
+    ComposePrimitives,
+    ComposePrimitivesVector,
+    action_weights,
+    check_primitives,
+    parameters_digest,
+)
+from service.envs.tabletop import TabletopEnv
+from service.envs.vector import TabletopVectorEnv
+from service.errors import TandemError
+
+DOCUMENT = Path(__file__).parents[2] / "docs" / "downstream.md"
+CONFIG = WorldConfig(physics_step_s=0.005, num_substeps=8)
+NUM_PRIMITIVES = 4
+
+
+@pytest.fixture(scope="module")
+def trained():
+    return service.load_primitives("panda-cube@champion", registry="no registry here")
+
+
+@pytest.fixture
+def env(trained):
+    env = ComposePrimitives(gymnasium.make("tandem/Wall-v0", config=CONFIG), trained)
+    yield env
+    env.close()
+
+
+class Recorder(gymnasium.Wrapper):
+    """Keeps the actions that reach the environment."""
+
+    def __init__(self, env):
+        super().__init__(env)
+        self.actions = []
+
+    def step(self, action):
+        self.actions.append(action)
+        return self.env.step(action)
+
+
+def test_weights_by_hand():
+    actions = np.array([-1.0, 0.0, 1.0, 5.0, -9.0], dtype=np.float32)
+    found = action_weights(actions)
+    assert found.dtype == np.float32
+    np.testing.assert_allclose(found, [0.01, 0.1, 1.0, 1.0, 0.01], rtol=1e-6)
+    np.testing.assert_allclose(action_weights(actions, 16.0), [1 / 16, 1 / 4, 1.0, 1.0, 1 / 16], rtol=1e-6)
+
+
+def test_weights_have_the_range_of_bobs_own_gate(trained):
+    assert action_weights(np.float32([-1.0]))[0] == pytest.approx(trained.config.policy.bob.weight_floor)
+
+
+def test_the_environment_is_handed_the_mean_of_the_composition(trained):
+    recorder = Recorder(TabletopEnv(CONFIG))
+    env = ComposePrimitives(recorder, trained)
+    observation, _ = env.reset(seed=0)
+    rng = np.random.default_rng(0)
+    for _ in range(5):
+        action = rng.uniform(-1.0, 1.0, NUM_PRIMITIVES).astype(np.float32)
+        means, variances = trained.primitives.primitives(observation["observation"])
+        precision = (10.0 ** (action - 1.0))[:, None] / variances
+        expected = np.clip((precision * means).sum(0) / precision.sum(0), -1.0, 1.0)
+        observation, *_ = env.step(action)
+        np.testing.assert_allclose(recorder.actions[-1], expected, rtol=0, atol=1e-5)
+    env.close()
+
+
+def test_equal_weights_are_one_composition(env):
+    ends = []
+    for value in (-0.7, 0.9):
+        env.reset(seed=3)
+        ends.append(env.step(np.full(NUM_PRIMITIVES, value, dtype=np.float32))[0]["observation"])
+    np.testing.assert_allclose(ends[0], ends[1], rtol=0, atol=1e-6)
+
+
+def test_what_the_learner_sees_and_is_paid_stays(env):
+    inner = env.unwrapped
+    assert env.observation_space == inner.observation_space
+    assert env.action_space == gymnasium.spaces.Box(-1.0, 1.0, (NUM_PRIMITIVES,), np.float32)
+    achieved = np.array([[0.0, 0.0, 0.0], [0.1, 0.0, 0.0]])
+    np.testing.assert_array_equal(env.compute_reward(achieved, np.zeros((2, 3)), [{}] * 2), [1.0, 0.0])
+
+
+def test_the_checkers_have_nothing_to_say(env):
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        warnings.filterwarnings("ignore", message=".*is different from the unwrapped version")  # it is a wrapper
+        check_gymnasium(env, skip_render_check=True)
+        check_stable_baselines(env)
+
+
+def test_many_at_once_do_the_same(trained, env):
+    many = ComposePrimitivesVector(TabletopVectorEnv(3, CONFIG, task="wall"), trained)
+    assert many.action_space.shape == (3, NUM_PRIMITIVES)
+    assert many.single_action_space == env.action_space
+    rng = np.random.default_rng(0)
+    seen, alone = many.reset(seed=6)[0], env.reset(seed=7)[0]
+    for _ in range(10):
+        # one row of a matrix product may differ from the product of one row in the last bit
+        np.testing.assert_allclose(seen["observation"][1], alone["observation"], rtol=0, atol=1e-5)
+        actions = rng.uniform(-1.0, 1.0, (3, NUM_PRIMITIVES)).astype(np.float32)
+        seen, alone = many.step(actions)[0], env.step(actions[1])[0]
+    many.close()
+
+
+def test_a_new_episode_acts_on_its_own_start(trained):
+    """After the end of an episode the next composition sees the first observation of the new one."""
+    many = ComposePrimitivesVector(TabletopVectorEnv(2, CONFIG, max_episode_steps=3), trained)
+    many.reset(seed=0)
+    actions = np.zeros((2, NUM_PRIMITIVES), dtype=np.float32)
+    for _ in range(3):
+        observation, _, _, truncated, _ = many.step(actions)
+    assert truncated.all()
+    mean, _ = trained.primitives.compose(observation["observation"], action_weights(actions))
+    np.testing.assert_array_equal(many._mixer.act(actions, (2,)), np.clip(mean, -1.0, 1.0))
+    many.close()
+
+
+def test_a_learner_that_knows_nothing_of_it_learns_and_the_primitives_stay_frozen(env):
+    before = parameters_digest(env.primitives)
+    model = SAC(
+        "MultiInputPolicy",
+        env,
+        replay_buffer_class=HerReplayBuffer,
+        learning_starts=55,
+        batch_size=8,
+        policy_kwargs={"net_arch": [8]},
+        seed=0,
+    )
+    model.learn(65)
+    action, _ = model.predict(env.reset()[0], deterministic=True)
+    assert action.shape == (NUM_PRIMITIVES,)
+    assert parameters_digest(env.primitives) == before
+
+
+def test_the_digest_sees_a_single_bit(trained):
+    primitives = service.load_primitives("panda-cube@champion", registry="no registry here").primitives
+    assert parameters_digest(primitives) == parameters_digest(trained.primitives)
+    bias = primitives._primitives._bias
+    bias.flat[0] = np.nextafter(bias.flat[0], np.float32(9.0))
+    assert parameters_digest(primitives) != parameters_digest(trained.primitives)
+
+
+class TestBadInput:
+    def refused(self, words, env, primitives, **options):
+        with pytest.raises(TandemError, match=words) as caught:
+            ComposePrimitives(env, primitives, **options)
+        assert "\n" not in str(caught.value)
+
+    @pytest.mark.parametrize(("key", "value"), [("layout", "another.robot"), ("positions", 14), ("action", 7)])
+    def test_primitives_of_another_robot_or_layout(self, trained, key, value):
+        manifest = trained.manifest.model_copy(update={"spaces": {**trained.manifest.spaces, key: value}})
+        other = dataclasses.replace(trained, manifest=manifest)
+        with pytest.raises(
+            TandemError, match=rf"panda-cube@\d+ .*another robot or layout: {key} {value}; this one has"
+        ):
+            check_primitives(other)
+
+    def test_an_environment_that_acts_otherwise(self, trained):
+        self.refused(r"actions are Box.*\(4,\)|Box.*act by 4 numbers", gymnasium.make("Pendulum-v1"), trained)
+
+    def test_an_environment_that_shows_something_else(self, trained):
+        env = gymnasium.wrappers.FlattenObservation(TabletopEnv(CONFIG))
+        self.refused(r"observations are Box.*\(17,\).*11 positions .* give positions=", env, trained)
+        ours = ComposePrimitives(env, trained, positions=lambda flat: flat[-POSITIONS:])
+        ours.reset(seed=0)
+        ours.step(np.zeros(NUM_PRIMITIVES, dtype=np.float32))
+        env.close()
+
+    def test_a_ratio_that_is_none(self, trained):
+        self.refused(r"weight_ratio = 1\.0", TabletopEnv(CONFIG), trained, weight_ratio=1.0)
+
+    @pytest.mark.parametrize("shape", [(8,), (1, 4), ()])
+    def test_weights_for_other_primitives(self, env, shape):
+        env.reset(seed=0)
+        with pytest.raises(TandemError, match=rf"expected shape \(4,\), .* got {re.escape(str(shape))}"):
+            env.step(np.zeros(shape, dtype=np.float32))
+
+    def test_a_step_before_the_first_reset(self, trained):
+        env = ComposePrimitives(TabletopEnv(CONFIG), trained)
+        with pytest.raises(gymnasium.error.ResetNeeded):
+            env.step(np.zeros(NUM_PRIMITIVES, dtype=np.float32))
+        env.close()
+
+
+POSITIONS = 11
+"""``FlattenObservation`` sorts the entries by name: achieved goal, desired goal, observation."""
+
+
+def test_the_documents_ten_lines_run():
+    (code,) = re.findall(r"```python\n(.*?)```", DOCUMENT.read_text(), re.DOTALL)
+    lines = [line for line in code.splitlines() if line.strip()]
+    assert len(lines) <= 10
+    assert "10_000" in code
+    scope = {}
+    exec(code.replace("10_000", "60"), scope)
+    assert scope["model"].num_timesteps == 60

@@ -1,0 +1,369 @@
+"""The six downstream tasks: where things are, what a wall and a box do, and that every one can be solved."""
+
+import json
+import warnings
+from pathlib import Path
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import check_env as check_gymnasium
+from gymnasium.utils.env_checker import data_equivalence
+from gymnasium.vector import AutoresetMode
+from stable_baselines3.common.env_checker import check_env as check_stable_baselines
+
+from benchmarks.scripted import play_task
+from service.config import WorldConfig
+from service.envs import fixtures
+from service.envs.batch import DISPLACEMENT_M, WorldBatch
+from service.envs.registration import EPISODE_STEPS
+from service.envs.render import Mark, RenderError, SceneRenderer
+from service.envs.tabletop import Setting, TabletopEnv
+from service.envs.tasks import TASKS, find_task
+from service.envs.vector import TabletopVectorEnv
+from service.errors import TandemError
+
+CONFIG = WorldConfig(physics_step_s=0.005, num_substeps=8)
+RECORDED = Path(__file__).parents[2] / "docs" / "results" / "scripted_tasks.json"
+CENTER = np.array([-0.05, 0.0])
+HALF = 0.175
+"""Of the workspace."""
+
+
+def draw(task, num, seed=0):
+    """Starts, goals and places of the box of ``num`` episodes."""
+    setting = Setting.of(CONFIG, task, None, 0.05)
+    rng = np.random.default_rng(seed)
+    with WorldBatch(setting.config, num, num_threads=1) as worlds:
+        worlds.reset(rng)
+        goal = setting.draw_goals(rng, worlds)
+        return worlds.object_position.copy(), goal, worlds.box_place.copy()
+
+
+def drive(worlds, target, num_steps, grip=-1.0):
+    """Servo every end effector towards ``target()`` (N, 3)."""
+    actions = np.full((worlds.num_worlds, 4), grip, dtype=np.float32)
+    for _ in range(num_steps):
+        actions[:, :3] = np.clip((target() - worlds.ee_position) / DISPLACEMENT_M, -1.0, 1.0)
+        worlds.step(actions)
+
+
+class TestTable:
+    def test_they_are_the_papers(self):
+        assert [task.title for task in TASKS.values()] == ["Larger", "InAir", "Push", "Sphere", "Wall", "Box"]
+        assert [task.air_share for task in TASKS.values()] == [0.7, 1.0, 0.0, 0.7, 0.0, 0.0]
+        assert TASKS["inair"].id == "tandem/InAir-v0"
+
+    def test_each_replaces_its_part_of_a_world_and_no_other(self):
+        trained = WorldConfig(object_mass_kg=0.2, physics_step_s=0.005, num_substeps=8)
+        worlds = {name: task.world_from(trained) for name, task in TASKS.items()}
+        assert worlds["inair"] == trained
+        assert worlds["push"] == trained.model_copy(update={"gripper": "blocked"})
+        assert worlds["sphere"] == trained.model_copy(update={"object": "sphere"})
+        assert worlds["wall"] == trained.model_copy(update={"fixture": "wall", "start_height_m": 0.12})
+        assert worlds["box"] == trained.model_copy(update={"fixture": "box"})
+        size = worlds["larger"].workspace.model_dump()
+        assert (size["length_x_m"], size["length_y_m"], size["height_m"], size["center_x_m"]) == (
+            0.45,
+            0.45,
+            0.4,
+            -0.05,
+        )
+
+    def test_an_unknown_one_is_named_with_those_there_are(self):
+        with pytest.raises(TandemError, match=r"unknown task 'moon'; choose one of larger, inair, push, .* box"):
+            find_task("moon")
+        with pytest.raises(TandemError, match="unknown task 'moon'"):
+            TabletopEnv(CONFIG, task="moon")
+
+    @pytest.mark.parametrize(
+        ("options", "words"),
+        [
+            ({"task": "push", "goals": "air"}, "goals = 'air' beside task = 'push'"),
+            ({"config": WorldConfig(fixture="box"), "goals": "mixed"}, "goals = 'mixed' with a box"),
+            ({"config": WorldConfig(fixture="wall"), "goals": "air"}, "goals = 'air' with a wall"),
+            ({"success_distance_m": float("nan")}, "success_distance_m = nan"),
+        ],
+    )
+    @pytest.mark.parametrize("make", [TabletopEnv, TabletopVectorEnv])
+    def test_what_does_not_go_together_is_refused(self, make, options, words):
+        with pytest.raises(TandemError, match=words) as caught:
+            make(**options)
+        assert "\n" not in str(caught.value)
+
+
+class TestDraws:
+    @pytest.mark.parametrize(
+        ("task", "in_volume", "half", "height"),
+        [
+            ("larger", 0.7, 0.225, 0.4),
+            ("inair", 1.0, HALF, 0.35),
+            ("push", 0.0, HALF, 0.025),
+            ("sphere", 0.7, HALF, 0.35),
+        ],
+    )
+    def test_goals_are_in_the_workspace_and_off_the_table_with_probability_p(self, task, in_volume, half, height):
+        start, goal, box = draw(task, 2000)
+        assert box.shape == (2000, 0)
+        np.testing.assert_array_equal(start[:, 2], 0.025)
+        for position in (start, goal):
+            offset = np.abs(position[:, :2] - CENTER).max()
+            assert 0.99 * half < offset <= half
+        np.testing.assert_allclose((goal[:, 2] > 0.025).mean(), in_volume, rtol=0, atol=0.05)
+        assert 0.97 * height < goal[:, 2].max() <= height
+
+    def test_a_wall_is_between_object_and_goal(self):
+        start, goal, _ = draw("wall", 2000)
+        sides = np.sign(start[:, 0] - CENTER[0])
+        np.testing.assert_array_equal(np.sign(goal[:, 0] - CENTER[0]), -sides)
+        np.testing.assert_allclose((sides > 0).mean(), 0.5, rtol=0, atol=0.05)
+        for position in (start, goal):
+            np.testing.assert_array_equal(position[:, 2], 0.025)
+            assert np.abs(position[:, 1]).max() <= HALF
+            # half a wall of 1 cm, a gap of 5 mm, half a cube; then an area of 15 cm
+            distance = np.abs(position[:, 0] - CENTER[0])
+            assert 0.035 <= distance.min() < 0.036
+            assert 0.184 < distance.max() <= 0.185
+
+    def test_an_object_that_touches_the_wall_is_not_at_a_goal_behind_it(self):
+        nearest = fixtures.WALL_THICKNESS_M / 2 + 0.025
+        _, goal, _ = draw("wall", 2000)
+        assert np.abs(goal[:, 0] - CENTER[0]).min() + nearest > 0.05
+
+    def test_a_box_is_anywhere_and_the_object_beside_it_with_room_for_a_finger(self):
+        start, goal, box = draw("box", 2000)
+        np.testing.assert_allclose(goal - box, np.tile([0.0, 0.0, 0.03], (2000, 1)), rtol=0, atol=1e-12)
+        offset = np.abs(box[:, :2] - CENTER)
+        assert (offset.max(axis=0) > 0.99 * HALF).all()
+        assert (offset <= HALF).all()
+        apart = np.abs(start - box)[:, :2]
+        # half a box, half a cube, and 5 mm along x or 4 cm along y, where a finger has to go between
+        assert ((apart[:, 0] >= 0.08) | (apart[:, 1] >= 0.115)).all()
+        assert np.abs(start[:, :2] - CENTER).max() <= HALF
+
+    def test_without_a_fixture_nothing_is_drawn_that_was_not_before(self):
+        """Seeds of the world without wall and box, and so evaluations, mean what they meant."""
+        rng, other = np.random.default_rng(5), np.random.default_rng(5)
+        with WorldBatch(CONFIG, 3, num_threads=1) as worlds:
+            worlds.reset(rng)
+            expected = CENTER + other.uniform(-HALF, HALF, (3, 2))
+            np.testing.assert_array_equal(worlds.object_position[:, :2], expected)
+        assert rng.random() == other.random()
+
+
+class TestEnvironment:
+    @pytest.fixture(params=TASKS)
+    def made(self, request):
+        env = gymnasium.make(TASKS[request.param].id, config=CONFIG)
+        yield env
+        env.close()
+
+    def test_the_checkers_have_nothing_to_say(self, made):
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            check_gymnasium(made.unwrapped, skip_render_check=True)
+            check_stable_baselines(made.unwrapped)
+
+    def test_a_restored_state_continues_bit_identically(self, made):
+        env, actions = made.unwrapped, np.random.default_rng(0).uniform(-1, 1, (20, 4)).astype(np.float32)
+        env.reset(seed=4)
+        for action in actions[:8]:
+            env.step(action)
+        state = env.state()
+        expected = [env.step(action)[0]["observation"] for action in actions[8:]]
+        other = TabletopEnv(env.config, goals=env.goals)
+        other.reset(seed=5)
+        other.restore(state)
+        np.testing.assert_array_equal([other.step(action)[0]["observation"] for action in actions[8:]], expected)
+        np.testing.assert_array_equal(other.state().world, env.state().world)
+        other.close()
+
+    def test_it_is_paid_at_every_step_on_target_and_ends_by_time_alone(self, made):
+        made.reset(seed=0)
+        env = made.unwrapped
+        state = env.state()
+        state.goal[:] = state.world[10:13]
+        env.restore(state)
+        idle = np.zeros(4, dtype=np.float32)
+        rows = [made.step(idle) for _ in range(EPISODE_STEPS)]
+        assert [row[1] for row in rows] == [1.0] * EPISODE_STEPS
+        assert all(row[4]["is_success"] for row in rows)
+        assert [row[2] for row in rows] == [False] * EPISODE_STEPS
+        assert [row[3] for row in rows] == [False] * (EPISODE_STEPS - 1) + [True]
+
+    def test_many_at_once_play_the_same_episodes(self, made):
+        """Bit for bit what gymnasium's own vector of single environments gives, through two ends of episodes."""
+        single = {"autoreset_mode": AutoresetMode.SAME_STEP}
+        few = gymnasium.make_vec(made.spec.id, 2, "sync", config=CONFIG, vector_kwargs=single)
+        many = gymnasium.make_vec(made.spec.id, 2, config=CONFIG)
+        assert isinstance(many, TabletopVectorEnv)
+        assert many.max_episode_steps == EPISODE_STEPS
+        assert data_equivalence(few.reset(seed=7), many.reset(seed=7), exact=True)
+        rng = np.random.default_rng(1)
+        for _ in range(2 * EPISODE_STEPS + 2):
+            actions = rng.uniform(-1.0, 1.0, (2, 4)).astype(np.float32)
+            assert data_equivalence(few.step(actions), many.step(actions), exact=True)
+        few.close()
+        many.close()
+
+
+class TestVector:
+    def test_worlds_that_diverge_end_alone(self):
+        envs = TabletopVectorEnv(3, CONFIG)
+        envs.reset(seed=0)
+        envs._worlds.states[1, 29] = 1e200
+        observation, _, terminated, truncated, info = envs.step(np.zeros((3, 4), dtype=np.float32))
+        assert truncated.tolist() == info["_final_obs"].tolist() == [False, True, False]
+        assert not terminated.any()
+        assert info["final_info"]["diverged"].tolist() == [False, True, False]
+        assert observation in envs.observation_space
+        ends = [envs.step(np.zeros((3, 4), dtype=np.float32))[3] for _ in range(EPISODE_STEPS)]
+        assert np.argmax(ends, axis=0).tolist() == [EPISODE_STEPS - 2, EPISODE_STEPS - 1, EPISODE_STEPS - 2]
+        envs.close()
+
+    @pytest.mark.parametrize(("option", "value"), [("num_envs", 0), ("max_episode_steps", 0)])
+    def test_bad_numbers_are_named(self, option, value):
+        with pytest.raises(TandemError, match=f"{option} = {value}"):
+            TabletopVectorEnv(**{option: value})
+
+    def test_seeds_are_one_per_world(self):
+        envs = TabletopVectorEnv(3, CONFIG)
+        with pytest.raises(ValueError, match="expected 3"):
+            envs.reset(seed=[1, 2])
+        envs.close()
+
+
+class TestGripper:
+    def test_a_blocked_gripper_stays_closed(self):
+        with WorldBatch(TASKS["push"].world_from(CONFIG), 4, num_threads=1) as worlds:
+            worlds.reset(np.random.default_rng(0))
+            np.testing.assert_array_equal(worlds.positions()[:, 3:5], 0.0)
+            drive(worlds, lambda: worlds.ee_position, 10, grip=1.0)
+            assert np.abs(worlds.positions()[:, 3:5]).max() < 0.001
+
+
+def assert_touched(distance):
+    """A cube's centre came as near to a face as it can: half its edge, or half its diagonal if it turned."""
+    assert (distance > 0.025 - 0.004).all()
+    assert (distance < 0.025 * np.sqrt(2) + 0.001).all()
+
+
+class TestFixtures:
+    """What stands on the table stops what it must, and only that."""
+
+    SIDES = np.array([-1.0, 1.0])
+
+    def pushed(self, task, place):
+        """How near an object's centre comes to the middle of ``place`` along x, pushed from either side."""
+        config = TASKS[task].world_from(CONFIG)
+        with WorldBatch(config, 2, num_threads=1) as worlds:
+            worlds.reset(np.random.default_rng(0))
+            worlds.object_position[:] = place + np.outer(self.SIDES, [0.12, 0.0, 0.0]) + [0.0, 0.0, 0.025]
+            if task == "box":
+                worlds.box_place[:] = place
+            behind = np.outer(self.SIDES, [0.07, 0.0, 0.0])
+            drive(worlds, lambda: worlds.object_position * [1, 1, 0] + behind + [0, 0, 0.12], 16)
+            drive(worlds, lambda: worlds.object_position * [1, 1, 0] + behind + [0, 0, 0.02], 5)
+            nearest = np.full(2, np.inf)
+            for _ in range(20):
+                drive(worlds, lambda: worlds.object_position * [1, 1, 0] - behind + [0, 0, 0.02], 1)
+                nearest = np.minimum(nearest, (worlds.object_position[:, 0] - place[0]) * self.SIDES)
+            return nearest
+
+    def test_an_object_is_not_pushed_through_a_wall(self):
+        nearest = self.pushed("wall", np.array([-0.05, 0.0, 0.0]))
+        assert_touched(nearest - 0.005)
+
+    def test_an_object_is_not_pushed_into_a_box_and_no_box_is_pushed(self):
+        nearest = self.pushed("box", np.array([-0.05, 0.05, 0.0]))
+        assert_touched(nearest - 0.05)
+
+    def test_a_gripper_stands_on_a_wall_and_on_a_rim(self):
+        for task, x, height in (("wall", 0.0, 0.07), ("box", 0.0475, 0.05)):
+            with WorldBatch(TASKS[task].world_from(CONFIG), 1, num_threads=1) as worlds:
+                worlds.reset(np.random.default_rng(0))
+                worlds.object_position[:] = [-0.9, 0.3, 0.025]
+                if task == "box":
+                    worlds.box_place[:] = [-0.05, 0.0, 0.0]
+                top = np.array([[-0.05 + x, 0.0, 0.12]])
+                drive(worlds, lambda top=top: top, 8)
+                drive(worlds, lambda top=top: top - [0.0, 0.0, 0.2], 10)
+                # the fingertips end 7 mm below the end effector
+                np.testing.assert_allclose(worlds.ee_position[0, 2] - 0.007, height, rtol=0, atol=0.003)
+
+    def test_an_object_dropped_into_a_box_lies_on_its_bottom(self):
+        with WorldBatch(TASKS["box"].world_from(CONFIG), 3, num_threads=1) as worlds:
+            worlds.reset(np.random.default_rng(0))
+            worlds.object_position[:] = worlds.box_place + np.array([0.01, -0.01, 0.08])
+            away = worlds.ee_position + np.array([0.0, 0.0, 0.3])
+            drive(worlds, lambda: away, 25)
+            assert np.abs(worlds.object_position[:, 2] - 0.03).max() < 0.001
+
+    def test_the_box_is_part_of_the_state(self):
+        config = TASKS["box"].world_from(CONFIG)
+        with WorldBatch(config, 3, num_threads=2) as worlds, WorldBatch(CONFIG, 1, num_threads=1) as plain:
+            assert worlds.state_size == plain.state_size + 3
+            worlds.reset(np.random.default_rng(0))
+            place = worlds.box_place.copy()
+            worlds.step(np.zeros((3, 4), dtype=np.float32))
+            np.testing.assert_array_equal(worlds.box_place, place)
+            assert len(np.unique(place, axis=0)) == 3
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_every_task_can_be_solved_in_its_time(task):
+    played = play_task(task, CONFIG, num_episodes=30, seed=0, num_threads=2)
+    idle = play_task(task, CONFIG, num_episodes=30, seed=0, idle=True, num_threads=2)
+    assert played.success_last.mean() >= 0.9
+    assert idle.success_last.mean() <= 0.2
+
+
+def test_a_script_is_told_from_a_lucky_start():
+    played = play_task("wall", CONFIG, num_episodes=4, seed=0, num_steps=3)
+    assert not played.success_last.any()
+    assert played.first_step.size == 0
+
+
+def test_the_recorded_check_has_every_task_solved():
+    recorded = json.loads(RECORDED.read_text())
+    assert recorded["settings"] == {"num_episodes": 300, "num_steps": EPISODE_STEPS, "seed": 0}
+    for rows in recorded["physics"].values():
+        assert list(rows) == list(TASKS)
+        assert all(row["success_last_low"] > 0.9 for row in rows.values())
+
+
+@pytest.fixture(scope="module")
+def drawn():
+    """Pictures of one world, of the same with its box elsewhere, and of the same with a mark."""
+    config = TASKS["box"].world_from(CONFIG)
+    with WorldBatch(config, 1, num_threads=1) as worlds:
+        state = worlds.states[0].copy()
+    state[10:13], state[-3:] = [-0.9, 0.3, 0.025], [0.05, -0.12, 0.0]
+    moved = state.copy()
+    moved[-3:] = [0.05, 0.12, 0.0]
+    try:
+        renderer = SceneRenderer(config, 200, 150)
+    except RenderError as error:
+        pytest.skip(str(error))
+    with renderer:
+        marks = [Mark((0.0, -0.05, 0.0), (0.1, 0.05, 0.002), (0.0, 1.0, 0.0, 0.9))]
+        return [renderer.render(state), renderer.render(moved), renderer.render(state, marks=marks)]
+
+
+class TestPictures:
+    def changed(self, left, right):
+        """(columns, rows) of pixels that differ."""
+        rows, columns = np.nonzero(np.abs(left.astype(int) - right).max(axis=2) > 30)
+        return columns, rows
+
+    def test_a_box_is_drawn_where_the_state_says(self, drawn):
+        columns, _ = self.changed(drawn[0], drawn[1])
+        # two boxes of 10 cm, seen from 2 m: one left of the middle, one right of it
+        assert 200 < columns.size < 2500
+        assert columns.min() < 100 < columns.max()
+
+    def test_a_mark_is_drawn_in_its_colour(self, drawn):
+        columns, rows = self.changed(drawn[0], drawn[2])
+        assert 50 < columns.size < 1000
+        colour = drawn[2][rows, columns].astype(int)
+        assert np.median(colour[:, 1] - colour[:, 0]) > 60
