@@ -15,7 +15,7 @@ from typing import Any
 from starlette.datastructures import Headers
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-AGE_S = 0.25
+AGE_S = 0.5
 """How old an answer may be; runs write their status once a second."""
 MAX_ANSWERS, MAX_BYTES = 64, 1 << 18
 """How many are kept, and of how long a body: metrics of a whole run in 1,000 points have some 100 kB."""
