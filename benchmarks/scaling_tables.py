@@ -78,7 +78,7 @@ def _predictions(rows: list[Mapping[str, Any]]) -> str:
         head,
         [
             (f"{row['num_actors']:,}", f"{row['num_worlds']:g}", f"{row['env_steps_per_s']:,.0f}",
-             f"{row['update_s']:,.3g} s", share(row["actors_busy"], 1), share(row["learner_idle"]),
+             f"{_seconds(row['update_s'])} s", share(row["actors_busy"], 1), share(row["learner_idle"]),
              row["bottleneck"])
             for row in rows
         ],
@@ -95,7 +95,7 @@ def limits_block(result: Result) -> str:
     table = markdown(
         head,
         [
-            (name, _actors(most_actors), *(f"{rows[num]['seconds'][name]:,.3g}" for num in NAMED))
+            (name, _actors(most_actors), *(_seconds(rows[num]["seconds"][name]) for num in NAMED))
             for name, most_actors in limits.items()
         ],
     )
@@ -124,3 +124,8 @@ def _time(seconds: float) -> str:
 
 def _mb(num_bytes: float) -> str:
     return f"{num_bytes / 1e6:.2f} MB" if num_bytes < 1e8 else f"{num_bytes / 1e9:,.1f} GB"
+
+
+def _seconds(seconds: float) -> str:
+    """Three digits, or all before the point."""
+    return f"{seconds:,.0f}" if seconds >= 100 else f"{seconds:.3g}"
