@@ -74,7 +74,7 @@ def check_primitives(primitives: MCPEvaluator | Trained) -> MCPEvaluator:
 
 
 def parameters_digest(primitives: object) -> str:
-    """SHA-256 of every array of the primitives, or of any evaluator, in their order: the same before and after they were used."""
+    """SHA-256 of every array of an evaluator, in their order: the same before and after it was used."""
     digest = hashlib.sha256()
     for name, array in _arrays(primitives, ""):
         digest.update(f"{name} {array.dtype} {array.shape} ".encode() + np.ascontiguousarray(array).tobytes())

@@ -98,7 +98,7 @@ def restore_learner(learner: SAC, env: WorldsVecEnv, saved: dict[str, Any]) -> N
     for name, value in saved["counters"].items():
         setattr(learner, name, value)
     _restore_replay(buffer, saved["replay"])
-    learner._last_obs = env.restore(_worlds_state(saved["worlds"]))  # type: ignore[assignment]
+    learner._last_obs = env.restore(_worlds_state(saved["worlds"]))
     learner._last_episode_starts = np.zeros(env.num_envs, dtype=bool)
     torch.set_rng_state(saved["torch_random"])
     kind, keys, *rest = saved["numpy_random"]
