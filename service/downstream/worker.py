@@ -48,7 +48,8 @@ class Running:
     resume: bool = False
     num_threads: int = 0
     """Of physics and torch; 0: as many as there are cores."""
-    film: bool = True
+    film: bool = False
+    """Whether to make a video; half a minute without a graphics card."""
     stop: Callable[[], bool] = lambda: False
     """Asked between iterations."""
     on_iteration: OnIteration = lambda metrics: None

@@ -44,8 +44,7 @@ def test_a_signal_saves_and_the_same_command_continues(tmp_path, monkeypatch):
     assert json.loads(done.stdout)["env_steps"] == 600
 
 
-def test_a_table_from_the_command_line(tmp_path, monkeypatch):
-    monkeypatch.setattr("service.downstream.worker._film", lambda *arguments: tmp_path)
+def test_a_table_from_the_command_line(tmp_path):
     made = invoke("table", "--methods", "idle", "--tasks", "push,box", "--seeds", "0,1", "--episodes", 4, "--out", "o")
     assert made.exit_code == 0, made.output
     assert "0 of 4 cells are there, 4 to run" in made.stderr

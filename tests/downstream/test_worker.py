@@ -24,7 +24,7 @@ class Stop:
 
 
 def run(cell, champion, path, **options):
-    return run_cell(cell, champion, path, Running(**{"num_threads": 1, "film": False, **options}))
+    return run_cell(cell, champion, path, Running(**{"num_threads": 1, **options}))
 
 
 def without_times(records):
