@@ -39,7 +39,7 @@ class CellConfig(_Frozen):
     seed: int = Field(0, ge=0)
     num_env_steps: int = Field(300_000, ge=1, description="of learning; 0 in the result of a method that does not")
     sac: SACConfig = SACConfig()
-    curve_every: int = Field(8, ge=1, description="iterations between evaluations on the way; one is 50 steps a world")
+    curve_every: int = Field(4, ge=1, description="iterations between evaluations on the way; one is 50 steps a world")
     curve_episodes: int = Field(100, ge=1)
     num_episodes: int = Field(300, ge=1, description="of the final evaluation; paper: 16, likely")
 
