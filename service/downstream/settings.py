@@ -19,7 +19,7 @@ class SACConfig(_Frozen):
     """Soft actor-critic on many worlds: every world makes a step, then there are several large updates."""
 
     num_worlds: int = Field(64, ge=1)
-    gradient_steps: int = Field(16, ge=1, description="updates after a step of every world")
+    gradient_steps: int = Field(8, ge=1, description="updates after a step of every world")
     batch_size: int = Field(256, ge=1)
     learning_rate: float = Field(1e-3, gt=0.0, description="rl-zoo for Panda and Fetch")
     gamma: float = Field(0.95, gt=0.0, lt=1.0, description="rl-zoo; a horizon of 20 of the 50 steps")
