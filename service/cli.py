@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any, NoReturn
 import typer
 from rich.console import Console
 
+from service.downstream.commands import downstream_app
 from service.errors import TandemError
 from service.registry.commands import registry_app
 from service.status.commands import serve
@@ -27,6 +28,7 @@ if TYPE_CHECKING:
 
 app = typer.Typer(name="tandem", help="Robot skills, pre-trained.", no_args_is_help=True, add_completion=False)
 app.add_typer(registry_app)
+app.add_typer(downstream_app)
 _console = Console()
 _errors = Console(stderr=True)
 

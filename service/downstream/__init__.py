@@ -1,1 +1,1 @@
-"""Learning new tasks with frozen primitives: the wrapper that composes them. Importing this package is cheap."""
+"""New tasks with frozen primitives: composing them, SAC workers, the table. Importing this package is cheap."""

@@ -73,8 +73,8 @@ def check_primitives(primitives: MCPEvaluator | Trained) -> MCPEvaluator:
     return primitives.primitives
 
 
-def parameters_digest(primitives: MCPEvaluator) -> str:
-    """SHA-256 of every array of the primitives, in their order: the same before and after they were used."""
+def parameters_digest(primitives: object) -> str:
+    """SHA-256 of every array of an evaluator, in their order: the same before and after it was used."""
     digest = hashlib.sha256()
     for name, array in _arrays(primitives, ""):
         digest.update(f"{name} {array.dtype} {array.shape} ".encode() + np.ascontiguousarray(array).tobytes())
@@ -170,6 +170,16 @@ class ComposePrimitivesVector(gymnasium.vector.VectorWrapper[Any, FloatArray, An
         """The environments' own, where they have goals."""
         compute: Callable[..., Any] = getattr(self.env, "compute_reward")  # noqa: B009 - only goal environments have it
         return compute(achieved_goal, desired_goal, info)
+
+    def state(self) -> Any:
+        """The environments' own, where they can be saved; composing has none."""
+        return getattr(self.env, "state")()  # noqa: B009 - only ``TabletopVectorEnv`` has it
+
+    def restore(self, state: Any) -> Any:
+        """Go back to a saved state; the observation there."""
+        observation = getattr(self.env, "restore")(state)  # noqa: B009 - as above
+        self._mixer.see(observation)
+        return observation
 
 
 class _Mixer:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from copy import deepcopy
+from dataclasses import dataclass
 from typing import Any
 
 import gymnasium
@@ -20,7 +22,22 @@ from service.errors import TandemError
 
 FloatArray = NDArray[np.float32]
 BoolArray = NDArray[np.bool_]
+StateArray = NDArray[np.float64]
 Info = dict[str, Any]
+
+
+@dataclass(frozen=True, slots=True)
+class VectorState:
+    """Everything a :class:`TabletopVectorEnv` continues from."""
+
+    worlds: StateArray
+    """(N, S) ``WorldBatch.states``."""
+    goal: StateArray
+    """(N, 3) metres."""
+    elapsed: NDArray[np.int64]
+    """(N,) steps of the episode."""
+    random: tuple[dict[str, Any], ...]
+    """State of each world's bit generator."""
 
 
 class TabletopVectorEnv(gymnasium.vector.VectorEnv[Any, FloatArray, NDArray[Any]]):
@@ -122,6 +139,28 @@ class TabletopVectorEnv(gymnasium.vector.VectorEnv[Any, FloatArray, NDArray[Any]
     def compute_reward(self, achieved_goal: NDArray[Any], desired_goal: NDArray[Any], info: Any) -> Any:
         """As ``TabletopEnv.compute_reward``."""
         return self._setting.reward(achieved_goal, desired_goal)
+
+    def state(self) -> VectorState:
+        """Copy everything that :meth:`restore` needs."""
+        random = tuple(deepcopy(dict(each.bit_generator.state)) for each in self._random)
+        return VectorState(self._worlds.states.copy(), self._goal.copy(), self._elapsed.copy(), random)
+
+    def restore(self, state: VectorState) -> Observation:
+        """Go back to a saved state, of this or another environment alike; continues bit-identically.
+
+        Returns:
+            The observation there.
+
+        Raises:
+            ValueError: a state of another number of worlds.
+        """
+        if state.worlds.shape != self._worlds.states.shape:
+            raise ValueError(f"states: expected shape {self._worlds.states.shape}, got {state.worlds.shape}")
+        self._worlds.restore(state.worlds)
+        self._goal, self._elapsed = state.goal.copy(), state.elapsed.copy()
+        for generator, random in zip(self._random, state.random, strict=True):
+            generator.bit_generator.state = deepcopy(random)
+        return observe(self._worlds, self._goal)
 
     def close_extras(self, **kwargs: Any) -> None:
         """Stop the native threads."""

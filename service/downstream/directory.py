@@ -1,0 +1,168 @@
+"""The directory of one downstream training.
+
+| file | content |
+|---|---|
+| ``cell.json`` | settings, and which primitives (version and SHA-256 of their parameters) |
+| ``metrics.jsonl`` | an object per iteration, keyed by metric; only ``time/...`` differs between equal runs |
+| ``tensorboard/`` | the same metrics as TensorBoard events over env steps |
+| ``checkpoint.pt`` | everything the training continues from exactly, replay buffer included |
+| ``result.json`` | how well it does in the end |
+| ``model.zip`` | the learner as Stable-Baselines3 saves it: ``SAC.load`` |
+| ``curves.png``, ``episodes.mp4`` | for people |
+| ``.lock`` | held by the process that trains |
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import pickle
+from pathlib import Path
+from typing import Any, Self
+
+from service.downstream.settings import differences
+from service.errors import TandemError
+from service.registry.files import os_errors, remove_temporaries, write_atomic
+from service.runtime.events import EventFile
+from service.runtime.records import JsonlWriter
+from service.store.lock import DirectoryLock
+
+FORMAT_VERSION = 1
+"""Of ``cell.json``, ``checkpoint.pt`` and ``result.json``, and of the table's files."""
+
+
+class TrainingDirectory:
+    """Reads and writes the files of one training."""
+
+    def __init__(self, path: Path) -> None:
+        """Nothing is read or written before ``start``."""
+        self.path = path
+        self.cell_file = path / "cell.json"
+        self.metrics_file = path / "metrics.jsonl"
+        self.checkpoint_file = path / "checkpoint.pt"
+        self.result_file = path / "result.json"
+        self._metrics = JsonlWriter(self.metrics_file)
+        self._events: EventFile | None = None
+        self._lock: DirectoryLock | None = None
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self._metrics.sync()
+        if self._lock is not None:
+            self._lock.release()
+            self._lock = None
+
+    @property
+    def exists(self) -> bool:
+        """Whether a training has begun here."""
+        return self.cell_file.exists()
+
+    def start(self, identity: dict[str, Any], *, resume: bool) -> dict[str, Any] | None:
+        """Begin a training here, or continue one, and keep other processes out until the ``with`` block ends.
+
+        Args:
+            identity: settings and primitives, as JSON has them.
+            resume: continue what is here; where nothing is, begin.
+
+        Returns:
+            The checkpoint to continue from; None for a beginning.
+
+        Raises:
+            TandemError: a training is here already and is not to be resumed, or is another one; another process is at
+                it; or the directory cannot be read or written.
+        """
+        self.check(identity, resume=resume)
+        self._lock = DirectoryLock(self.path, "stop that one first, or name another --run-dir")
+        self.check(identity, resume=resume)  # of two that begin at once, the second sees here what the first has made
+        saved = self._read_checkpoint() if self.exists else None
+        self._metrics.truncate_after(saved["iteration"] if saved else 0)
+        with os_errors("write", self.path):
+            remove_temporaries(self.path)
+            self._events = EventFile(self.path / "tensorboard", after_step=saved["env_steps"] if saved else None)
+            write_json(self.cell_file, {"format_version": FORMAT_VERSION, **identity})
+        return saved
+
+    def check(self, identity: dict[str, Any], *, resume: bool) -> None:
+        """Assert that this training can begin, or continue, here.
+
+        Raises:
+            TandemError: it cannot; nothing was written.
+        """
+        if not self.exists:
+            return
+        if not resume:
+            raise TandemError(
+                f"{self.path} holds a training already; continue it with --resume, or name another --run-dir"
+            )
+        recorded = read_json(self.cell_file)
+        if wrong := differences(recorded, {"format_version": FORMAT_VERSION, **identity}):
+            raise TandemError(f"{self.path} was begun with {'; '.join(wrong)}; name another --run-dir")
+
+    def record(self, metrics: dict[str, float]) -> None:
+        """Append one iteration's metrics to metrics.jsonl and TensorBoard."""
+        self._metrics.append(metrics)
+        if self._events is not None:
+            self._events.add(metrics)
+
+    def write_checkpoint(self, saved: dict[str, Any]) -> None:
+        """Replace the checkpoint in one step; the records it knows of are on the disk before.
+
+        Raises:
+            TandemError: the disk is full; the last checkpoint is as it was.
+        """
+        import torch
+
+        self._metrics.sync()
+        data = io.BytesIO()
+        torch.save({"format_version": FORMAT_VERSION, **saved}, data)
+        with os_errors("write", self.checkpoint_file):
+            write_atomic(self.checkpoint_file, data.getvalue())
+
+    def _read_checkpoint(self) -> dict[str, Any] | None:
+        if not self.checkpoint_file.exists():
+            return None
+        import torch
+
+        try:
+            with os_errors("read", self.checkpoint_file):
+                saved: dict[str, Any] = torch.load(self.checkpoint_file, weights_only=True)
+        except (RuntimeError, EOFError, pickle.UnpicklingError) as error:
+            raise TandemError(
+                f"{self.checkpoint_file} is damaged ({str(error).splitlines()[0][:80]}); remove it to begin anew"
+            ) from None
+        if saved.get("format_version") != FORMAT_VERSION:
+            raise TandemError(
+                f"{self.checkpoint_file}: format version {saved.get('format_version')!r}, this program reads "
+                f"{FORMAT_VERSION}; name another --run-dir"
+            )
+        return saved
+
+
+def read_json(path: Path) -> dict[str, Any]:
+    """The object in a file.
+
+    Raises:
+        TandemError: there is none.
+    """
+    try:
+        with os_errors("read", path):
+            tree = json.loads(path.read_text(encoding="utf-8"))
+    except ValueError as error:
+        if isinstance(error, TandemError):
+            raise
+        raise TandemError(f"{path} is no JSON: {error}; remove it, or name another directory") from None
+    if not isinstance(tree, dict):
+        raise TandemError(f"{path} holds no JSON object; remove it, or name another directory")
+    return tree
+
+
+def write_json(path: Path, tree: dict[str, Any]) -> None:
+    """Put an object into a file in one step.
+
+    Raises:
+        TandemError: the file cannot be written.
+    """
+    with os_errors("write", path):
+        write_atomic(path, (json.dumps(tree, indent=1, allow_nan=False) + "\n").encode())

@@ -1,0 +1,145 @@
+"""Stable-Baselines3's SAC on many worlds: made from settings, saved whole, and restored to continue exactly."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict
+from typing import TYPE_CHECKING, Any, cast
+
+import numpy as np
+import torch
+from stable_baselines3 import SAC, HerReplayBuffer
+from stable_baselines3.common.buffers import DictReplayBuffer
+
+from service.downstream.networks import GoalFeatures
+from service.downstream.vec_env import VecEnvState, WorldsVecEnv
+from service.envs.observations import GOAL_SLICE, OBJECT_SLICE, POSITIONS_SIZE
+from service.envs.vector import VectorState
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from service.downstream.methods import Method
+    from service.downstream.settings import CellConfig
+    from service.runtime.primitives import TrainedBob
+
+    FloatArray = NDArray[np.float32]
+
+_ROWS = ("actions", "rewards", "dones", "timeouts", "ep_start", "ep_length")
+_COUNTERS = ("num_timesteps", "_n_updates", "_episode_num")
+
+
+def make_learner(cell: CellConfig, method: Method, env: WorldsVecEnv) -> SAC:
+    """A new learner; draws from the global random numbers of torch and NumPy, which its seed restarts."""
+    sac = cell.sac
+    return SAC(
+        method.policy(),
+        env,
+        learning_rate=sac.learning_rate,
+        buffer_size=-(-cell.num_env_steps // sac.num_worlds) * sac.num_worlds,  # everything is kept
+        learning_starts=sac.learning_starts,
+        batch_size=sac.batch_size,
+        tau=sac.tau,
+        gamma=sac.gamma,
+        train_freq=1,
+        gradient_steps=sac.gradient_steps,
+        ent_coef=f"auto_{sac.initial_entropy_coefficient}",
+        replay_buffer_class=HerReplayBuffer if method.hindsight else DictReplayBuffer,
+        replay_buffer_kwargs={"n_sampled_goal": 4, "goal_selection_strategy": "future"} if method.hindsight else None,
+        policy_kwargs={"features_extractor_class": GoalFeatures, "net_arch": list(sac.hidden_sizes)},
+        seed=cell.seed,
+        device="cpu",
+    )
+
+
+class LearnedPolicy:
+    """What a learner has learned, as evaluation and films take it: Bob's input to actions, without noise."""
+
+    def __init__(self, learner: SAC, method: Method, trained: TrainedBob) -> None:
+        self._learner, self._method, self._trained = learner, method, trained
+
+    def act_deterministic(self, observation: FloatArray) -> FloatArray:
+        """(N, 14) Bob's input to actions (N, 4)."""
+        positions = observation[:, :POSITIONS_SIZE]
+        seen = {
+            "observation": positions,
+            "achieved_goal": observation[:, OBJECT_SLICE],
+            "desired_goal": observation[:, GOAL_SLICE],
+        }
+        actions, _ = self._learner.predict(cast("dict[str, Any]", seen), deterministic=True)
+        return self._method.decode(self._trained, positions, actions)
+
+
+def save_learner(learner: SAC, env: WorldsVecEnv) -> dict[str, Any]:
+    """Everything the learner continues from, as tensors and plain values; its chance and its worlds, too."""
+    buffer, entropy = learner.replay_buffer, learner.log_ent_coef
+    assert buffer is not None
+    assert entropy is not None
+    return {
+        "parameters": learner.get_parameters(),
+        "log_ent_coef": entropy.detach().clone(),
+        "counters": {name: getattr(learner, name) for name in _COUNTERS},
+        "replay": _save_replay(buffer),
+        "worlds": _save_worlds(env.state()),
+        "torch_random": torch.get_rng_state(),
+        "numpy_random": _numpy_random(),
+        "action_random": json.dumps(learner.action_space.np_random.bit_generator.state),
+    }
+
+
+def restore_learner(learner: SAC, env: WorldsVecEnv, saved: dict[str, Any]) -> None:
+    """Go back to what ``save_learner`` gave, in a new learner and worlds of the same settings."""
+    buffer, entropy = learner.replay_buffer, learner.log_ent_coef
+    assert buffer is not None
+    assert entropy is not None
+    learner.set_parameters(saved["parameters"], exact_match=True, device="cpu")
+    with torch.no_grad():
+        entropy.copy_(saved["log_ent_coef"])  # in place: its optimiser holds it
+    for name, value in saved["counters"].items():
+        setattr(learner, name, value)
+    _restore_replay(buffer, saved["replay"])
+    learner._last_obs = env.restore(_worlds_state(saved["worlds"]))
+    learner._last_episode_starts = np.zeros(env.num_envs, dtype=bool)
+    torch.set_rng_state(saved["torch_random"])
+    kind, keys, *rest = saved["numpy_random"]
+    np.random.set_state((kind, keys.numpy(), *rest))
+    learner.action_space.np_random.bit_generator.state = json.loads(saved["action_random"])
+
+
+def _save_replay(buffer: Any) -> dict[str, Any]:
+    """The rows of a replay buffer that are in use."""
+    used = buffer.buffer_size if buffer.full else buffer.pos
+    rows = {name: torch.from_numpy(getattr(buffer, name)[:used]) for name in _ROWS if hasattr(buffer, name)}
+    for group in ("observations", "next_observations"):
+        rows |= {f"{group}/{key}": torch.from_numpy(each[:used]) for key, each in getattr(buffer, group).items()}
+    starts = getattr(buffer, "_current_ep_start", None)
+    return {"rows": rows, "pos": buffer.pos, "full": buffer.full, "starts": None if starts is None else starts.tolist()}
+
+
+def _restore_replay(buffer: Any, saved: dict[str, Any]) -> None:
+    for name, rows in saved["rows"].items():
+        group, _, key = name.partition("/")
+        target = getattr(buffer, group)
+        (target[key] if key else target)[: len(rows)] = rows.numpy()
+    buffer.pos, buffer.full = saved["pos"], saved["full"]
+    if saved["starts"] is not None:
+        buffer._current_ep_start[:] = saved["starts"]
+
+
+def _save_worlds(state: VecEnvState) -> dict[str, Any]:
+    worlds: VectorState = state.worlds
+    tree = asdict(worlds) | {"returns": state.returns, "lengths": state.lengths}
+    arrays = {name: torch.from_numpy(value) for name, value in tree.items() if name != "random"}
+    return {"arrays": arrays, "random": json.dumps(worlds.random)}
+
+
+def _worlds_state(saved: dict[str, Any]) -> VecEnvState:
+    arrays = {name: value.numpy() for name, value in saved["arrays"].items()}
+    returns, lengths = arrays.pop("returns"), arrays.pop("lengths")
+    return VecEnvState(VectorState(**arrays, random=tuple(json.loads(saved["random"]))), returns, lengths)
+
+
+def _numpy_random() -> list[Any]:
+    """Of the global generator, from which Stable-Baselines3 draws its batches."""
+    kind, keys, *rest = cast("tuple[Any, ...]", np.random.get_state())
+    return [kind, torch.from_numpy(keys.copy()), *rest]

@@ -1,0 +1,124 @@
+"""The methods of the paper's table, by name. The harness knows nothing of a method but what is here.
+
+A method that learns says what its learner acts by (``wrap`` and ``decode``), which network and replay buffer it has;
+one with nothing to learn says who plays. A skill-discovery baseline joins as one more entry: its ``wrap`` hands the
+environment the actions of its frozen skill policy, with skill vectors as actions.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import gymnasium
+import numpy as np
+from numpy.typing import NDArray
+
+from service.actors.evaluation import Deterministic, Idle
+from service.downstream.compose import ComposePrimitivesVector, action_weights, check_primitives
+from service.errors import TandemError
+
+if TYPE_CHECKING:
+    from stable_baselines3.sac.policies import SACPolicy
+
+    from service.runtime.primitives import TrainedBob
+
+FloatArray = NDArray[np.float32]
+Worlds = gymnasium.vector.VectorEnv[Any, Any, Any]
+
+
+def _same(env: Worlds, trained: TrainedBob) -> Worlds:
+    return env
+
+
+def _act(trained: TrainedBob, positions: FloatArray, actions: FloatArray) -> FloatArray:
+    return actions
+
+
+def _gaussian() -> type[SACPolicy]:
+    from stable_baselines3.sac.policies import MultiInputPolicy
+
+    return MultiInputPolicy
+
+
+def _mcp() -> type[SACPolicy]:
+    from service.downstream.networks import MCPSACPolicy
+
+    return MCPSACPolicy
+
+
+def _compose(env: Worlds, trained: TrainedBob) -> Worlds:
+    return ComposePrimitivesVector(env, trained)
+
+
+def _composed(trained: TrainedBob, positions: FloatArray, actions: FloatArray) -> FloatArray:
+    mean, _ = trained.primitives.compose(positions, action_weights(actions))
+    return np.clip(mean, -1.0, 1.0)
+
+
+def _bob(trained: TrainedBob) -> Deterministic:
+    return trained.policy
+
+
+def _idle(trained: TrainedBob) -> Deterministic:
+    return Idle()
+
+
+@dataclass(frozen=True, slots=True)
+class Method:
+    """One row of the table."""
+
+    title: str
+    """As the table writes it."""
+    words: str
+    """What it is."""
+    wrap: Callable[[Worlds, TrainedBob], Worlds] = _same
+    """The worlds its learner acts in."""
+    decode: Callable[[TrainedBob, FloatArray, FloatArray], FloatArray] = _act
+    """From (N, 11) positions and the learner's (N, A) actions to (N, 4) actions, as the wrapped worlds do it."""
+    policy: Callable[[], type[SACPolicy]] = _gaussian
+    """Class of actor and critics; imports torch."""
+    hindsight: bool = False
+    """Whether replayed goals are relabelled (HER, ``future``, k = 4)."""
+    composes: bool = False
+    """Whether it needs primitives that can be composed; else they only say in which world it plays."""
+    player: Callable[[TrainedBob], Deterministic] | None = None
+    """Who plays, where nothing is learned."""
+
+    def check(self, trained: TrainedBob) -> None:
+        """Assert that these primitives are for this method.
+
+        Raises:
+            TandemError: primitives of another robot or layout, or none that can be composed.
+        """
+        if self.composes:
+            check_primitives(trained)
+
+
+METHODS: Mapping[str, Method] = {
+    "ours": Method("ours", "SAC sets the weights of the frozen primitives", _compose, _composed, composes=True),
+    "ours-her": Method(
+        "ours + HER", "the same, with relabelled goals", _compose, _composed, composes=True, hindsight=True
+    ),
+    "asp-only": Method("ASP only", "Bob as he is", player=_bob),
+    "scratch-monolithic-her": Method("scratch monolithic + HER", "SAC alone, with relabelled goals", hindsight=True),
+    "scratch-mcp-her": Method(
+        "scratch MCP + HER", "primitives and gate learned together, with relabelled goals", policy=_mcp, hindsight=True
+    ),
+    "scratch-monolithic": Method("scratch monolithic", "SAC alone"),
+    "scratch-mcp": Method("scratch MCP", "primitives and gate learned together by SAC", policy=_mcp),
+    "idle": Method("idle", "does nothing", player=_idle),
+}
+"""By the name that commands take, in the order of the table's rows."""
+
+
+def find_method(name: str) -> Method:
+    """A method by its name.
+
+    Raises:
+        TandemError: no such method.
+    """
+    if name not in METHODS:
+        raise TandemError(f"unknown method {name!r}; choose one of {', '.join(METHODS)}")
+    return METHODS[name]

@@ -1,0 +1,72 @@
+"""The networks of downstream learners, as Stable-Baselines3 takes them: what they see, and the MCP actor."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import gymnasium
+import torch
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
+from stable_baselines3.sac.policies import LOG_STD_MAX, LOG_STD_MIN, Actor, MultiInputPolicy
+from torch import Tensor
+
+from service.config import MCPConfig
+from service.envs.observations import BOB_SIZE, GOAL_SLICE, NORMALISATION_BOB, NORMALISATION_BOB_VALUE, OBJECT_SLICE
+from service.policies.layers import InputNormalisation
+from service.policies.networks import MCPPolicy
+
+
+class GoalFeatures(BaseFeaturesExtractor):
+    """(N, 17): the 11 positions, the goal, and the goal relative to the object, normalised as for Bob's gate.
+
+    Positions in metres are too small for a new network; all methods see the same.
+    """
+
+    scale: Tensor
+
+    def __init__(self, observation_space: gymnasium.spaces.Dict) -> None:
+        super().__init__(observation_space, BOB_SIZE + 3)
+        self.normalise = InputNormalisation(NORMALISATION_BOB)
+        self.register_buffer("scale", torch.tensor(NORMALISATION_BOB_VALUE.scale[-3:]))
+
+    def forward(self, observations: dict[str, Tensor]) -> Tensor:
+        """From a batch of goal observations."""
+        rows = bob_input(observations)
+        relative = (rows[:, GOAL_SLICE] - rows[:, OBJECT_SLICE]) / self.scale
+        return torch.cat((self.normalise(rows), relative.clamp(-5.0, 5.0)), dim=1)
+
+
+def bob_input(observations: dict[str, Tensor]) -> Tensor:
+    """(N, 14) positions and goal, as Bob sees them."""
+    return torch.cat((observations["observation"], observations["desired_goal"]), dim=1)
+
+
+class MCPActor(Actor):
+    """SAC's actor as a Multiplicative Compositional Policy: the network of our Bob, learned end to end.
+
+    K primitives see positions only, a gate sees the goal as well, and the product of the primitives' Gaussians, raised
+    to the gate's weights, is one diagonal Gaussian (Peng et al. 2019, eq. 4; ``policies.composition``). SAC needs
+    actions in [-1, 1] and their log-probabilities: that Gaussian is the one *before* the tanh, so an action is
+    ``tanh(mean + std * noise)``, its log-probability has the tanh's Jacobian as in SAC's own actor, and the
+    deterministic action is ``tanh(mean)``. Squashing the composition, not each primitive, keeps the product a Gaussian.
+    """
+
+    def __init__(self, *args: Any, mcp: MCPConfig | None = None, **kwargs: Any) -> None:
+        super().__init__(*args, **kwargs)
+        del self.latent_pi, self.mu, self.log_std  # SAC's own network
+        assert self.action_space.shape is not None
+        self.mcp = MCPPolicy(mcp or MCPConfig(), self.action_space.shape[0])
+
+    def get_action_dist_params(self, obs: Any) -> tuple[Tensor, Tensor, dict[str, Tensor]]:
+        """Mean and log-std, (N, A) each, before the tanh."""
+        mean, std = self.mcp(bob_input(obs))
+        return mean, std.log().clamp(LOG_STD_MIN, LOG_STD_MAX), {}
+
+
+class MCPSACPolicy(MultiInputPolicy):
+    """SAC's critics with an MCP actor of K = 4 primitives."""
+
+    def make_actor(self, features_extractor: BaseFeaturesExtractor | None = None) -> MCPActor:
+        """The actor; its inputs are normalised by the network itself."""
+        kwargs = self._update_features_extractor(self.actor_kwargs, features_extractor)
+        return MCPActor(**kwargs).to(self.device)

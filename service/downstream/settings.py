@@ -1,0 +1,93 @@
+"""What a cell of the table is: a method on a task with a seed, how it learns, and how it is evaluated."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from pydantic import BaseModel, ConfigDict, Field, PositiveInt, ValidationError
+
+from service.downstream.methods import find_method
+from service.envs.tasks import find_task
+from service.errors import TandemError
+
+
+class _Frozen(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+
+class SACConfig(_Frozen):
+    """Soft actor-critic on many worlds: every world makes a step, then there are several large updates."""
+
+    num_worlds: int = Field(64, ge=1)
+    gradient_steps: int = Field(8, ge=1, description="updates after a step of every world")
+    batch_size: int = Field(256, ge=1)
+    learning_rate: float = Field(1e-3, gt=0.0, description="rl-zoo for Panda and Fetch")
+    gamma: float = Field(0.95, gt=0.0, lt=1.0, description="rl-zoo; a horizon of 20 of the 50 steps")
+    tau: float = Field(0.05, gt=0.0, le=1.0, description="rl-zoo")
+    initial_entropy_coefficient: float = Field(
+        0.1, gt=0.0, description="adapted from there; SB3 starts at 1, which drowns the first rewards"
+    )
+    hidden_sizes: tuple[PositiveInt, ...] = Field((256, 256), min_length=1, description="actor and critics")
+    learning_starts: int = Field(6_400, ge=0, description="env steps of uniform actions first; more than an episode")
+
+
+class CellConfig(_Frozen):
+    """One run of a method on a task."""
+
+    task: str
+    method: str
+    seed: int = Field(0, ge=0)
+    num_env_steps: int = Field(300_000, ge=1, description="of learning; 0 in the result of a method that does not")
+    sac: SACConfig = SACConfig()
+    curve_every: int = Field(4, ge=1, description="iterations between evaluations on the way; one is 50 steps a world")
+    curve_episodes: int = Field(100, ge=1)
+    num_episodes: int = Field(300, ge=1, description="of the final evaluation; paper: 16, likely")
+
+    @property
+    def name(self) -> str:
+        """Of its files."""
+        return f"{self.task}-{self.method}-{self.seed}"
+
+
+def make_cell(**values: Any) -> CellConfig:
+    """A cell, checked.
+
+    Raises:
+        TandemError: an unknown task or method, or a value out of its range.
+    """
+    find_task(values.get("task", ""))
+    find_method(values.get("method", ""))
+    try:
+        return CellConfig(**values)
+    except ValidationError as error:
+        raise TandemError(_first_line(error)) from None
+
+
+def make_sac(**values: Any) -> SACConfig:
+    """How to learn, checked.
+
+    Raises:
+        TandemError: a value out of its range.
+    """
+    try:
+        return SACConfig(**values)
+    except ValidationError as error:
+        raise TandemError(_first_line(error)) from None
+
+
+def differences(recorded: dict[str, Any], wanted: dict[str, Any], prefix: str = "") -> list[str]:
+    """``key: recorded, not wanted`` for each key in which two trees of settings differ."""
+    found = []
+    for key in sorted(recorded.keys() | wanted.keys()):
+        old, new = recorded.get(key), wanted.get(key)
+        if isinstance(old, dict) and isinstance(new, dict):
+            found += differences(old, new, f"{prefix}{key}.")
+        elif old != new:
+            found.append(f"{prefix}{key} {old!r}, not {new!r}")
+    return found
+
+
+def _first_line(error: ValidationError) -> str:
+    first = error.errors()[0]
+    where = ".".join(str(part) for part in first["loc"])
+    return f"{where} = {first['input']!r}: {first['msg'][:1].lower()}{first['msg'][1:]}"

@@ -1,0 +1,126 @@
+"""Worlds as a Stable-Baselines3 ``VecEnv``: many native environments behind the interface that its learners know."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import gymnasium
+import numpy as np
+from numpy.typing import NDArray
+from stable_baselines3.common.vec_env import VecEnv
+
+Observation = dict[str, NDArray[np.float32]]
+Info = dict[str, Any]
+
+
+@dataclass(frozen=True, slots=True)
+class VecEnvState:
+    """Everything a :class:`WorldsVecEnv` continues from."""
+
+    worlds: Any
+    """State of the vector environment."""
+    returns: NDArray[np.float64]
+    """(N,) rewards of the episodes that go on."""
+    lengths: NDArray[np.int64]
+    """(N,) their steps."""
+
+
+class WorldsVecEnv(VecEnv):
+    """A ``TabletopVectorEnv``, bare or composed, for Stable-Baselines3.
+
+    Seeds, observations, rewards, dones and infos are those of a ``DummyVecEnv`` of single environments under a time
+    limit, with monitors: at an episode's end ``terminal_observation``, ``TimeLimit.truncated`` and ``episode`` (its
+    return r and length l). As there, a world starts anew within the step that ends its episode.
+
+    Args:
+        env: restarts episodes in the same step (``gymnasium.vector.AutoresetMode.SAME_STEP``), and observes a mapping.
+    """
+
+    def __init__(self, env: gymnasium.vector.VectorEnv[Any, Any, Any]) -> None:
+        self.env = env
+        self.finished: list[tuple[float, bool]] = []
+        """Return and success at the last step of the episodes that ended since this list was last cleared."""
+        self._returns = np.zeros(env.num_envs)
+        self._lengths = np.zeros(env.num_envs, dtype=np.int64)
+        self._actions: NDArray[np.float32] | None = None
+        super().__init__(env.num_envs, env.single_observation_space, env.single_action_space)
+
+    def reset(self) -> Any:
+        """Start an episode in every world, from the seeds given by ``seed``."""
+        seeds: Any = None if all(seed is None for seed in self._seeds) else self._seeds
+        observation, _ = self.env.reset(seed=seeds)
+        self._returns[:], self._lengths[:] = 0.0, 0
+        self._reset_seeds()
+        self._reset_options()
+        return observation
+
+    def step_async(self, actions: NDArray[np.float32]) -> None:
+        """Keep what ``step_wait`` does."""
+        self._actions = actions
+
+    def step_wait(self) -> Any:
+        """Observations, float32 rewards, dones and infos, (N, ...) each."""
+        assert self._actions is not None, "step_async comes first"
+        observation, rewards, terminated, truncated, info = self.env.step(self._actions)
+        done = terminated | truncated
+        self._returns += rewards
+        self._lengths += 1
+        infos: list[Info] = [{"TimeLimit.truncated": False} for _ in range(self.num_envs)]
+        for world, success in enumerate(info["is_success"]):
+            infos[world]["is_success"] = bool(success)
+        for world in np.flatnonzero(done).tolist():
+            infos[world] = self._last_info(world, info, only_time=bool(truncated[world] and not terminated[world]))
+        return observation, rewards.astype(np.float32), done, infos
+
+    def _last_info(self, world: int, info: Info, *, only_time: bool) -> Info:
+        """The info of a world whose episode has ended; its sums begin again."""
+        success = bool(info["final_info"]["is_success"][world])
+        total, length = float(self._returns[world]), int(self._lengths[world])
+        self.finished.append((total, success))
+        self._returns[world], self._lengths[world] = 0.0, 0
+        return {
+            "TimeLimit.truncated": only_time,
+            "terminal_observation": info["final_obs"][world],
+            "is_success": success,
+            "episode": {"r": total, "l": length},
+        }
+
+    def state(self) -> VecEnvState:
+        """Copy everything that :meth:`restore` needs."""
+        return VecEnvState(getattr(self.env, "state")(), self._returns.copy(), self._lengths.copy())  # noqa: B009
+
+    def restore(self, state: VecEnvState) -> Observation:
+        """Go back to a saved state; continues bit-identically. The observation there."""
+        self._returns, self._lengths = state.returns.copy(), state.lengths.copy()
+        observation: Observation = getattr(self.env, "restore")(state.worlds)  # noqa: B009
+        return observation
+
+    def close(self) -> None:
+        """Stop the worlds' threads."""
+        self.env.close()
+
+    def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
+        """The environments' common attribute, once per world asked for."""
+        return [getattr(self.env, attr_name)] * self._num_asked(indices)
+
+    def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
+        """Refused: the worlds share everything.
+
+        Raises:
+            AttributeError: always.
+        """
+        raise AttributeError(f"the worlds of one batch share {attr_name}; make the environment with it")
+
+    def env_method(self, method_name: str, *method_args: Any, indices: Any = None, **method_kwargs: Any) -> list[Any]:
+        """The common method's answer, once per world asked for; hindsight relabelling asks for ``compute_reward``."""
+        answer = getattr(self.env, method_name)(*method_args, **method_kwargs)
+        return [answer] * self._num_asked(indices)
+
+    def env_is_wrapped(self, wrapper_class: type[gymnasium.Wrapper[Any, Any, Any, Any]], indices: Any = None) -> Any:
+        """False for each: wrappers of single environments have no place here."""
+        return [False] * self._num_asked(indices)
+
+    def _num_asked(self, indices: int | Sequence[int] | Iterable[int] | None) -> int:
+        return len(list(self._get_indices(indices)))

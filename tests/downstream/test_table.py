@@ -1,0 +1,159 @@
+import json
+
+import pytest
+
+from service.downstream.page import steps_until, write_page
+from service.downstream.results import ResultsDirectory
+from service.downstream.table import Source, Watching, make_table, run_here, run_on_ray
+from service.errors import TandemError
+from tests.downstream.cells import small_cell
+
+CELLS = [small_cell(method, task) for task in ("push", "box") for method in ("idle", "asp-only")]
+
+
+@pytest.fixture
+def source(tmp_path):
+    return Source("panda-cube@champion", "no registry here", tmp_path / "runs")
+
+
+def counted(ran, before=None):
+    """A runner that keeps the names of what it ran, and calls ``before`` before each."""
+    here = run_here(1)
+
+    def run(cells, source, watching):
+        for cell, result in here(cells, source, watching):
+            ran.append(cell.name)
+            yield cell, result
+            if before is not None:
+                before()
+
+    return run
+
+
+def table(cells, source, tmp_path, runner=None, **watching):
+    return make_table(cells, source, tmp_path / "out", runner or run_here(1), Watching(**watching))
+
+
+def test_a_table_runs_what_is_missing_and_nothing_else(source, tmp_path):
+    ran = []
+
+    class KilledError(Exception):
+        pass
+
+    def kill():
+        if len(ran) == 2:
+            raise KilledError
+
+    with pytest.raises(KilledError):
+        table(CELLS, source, tmp_path, counted(ran, kill))
+    results = tmp_path / "out" / "downstream"
+    assert sorted(path.name for path in results.iterdir()) == ["push-asp-only-0.json", "push-idle-0.json"]
+    stamps = {path: path.stat().st_mtime_ns for path in results.iterdir()}
+    assert table(CELLS, source, tmp_path, counted(ran))
+    assert ran == [cell.name for cell in CELLS]
+    assert all(path.stat().st_mtime_ns == stamp for path, stamp in stamps.items())
+    page = (tmp_path / "out" / "downstream.md").read_text()
+    assert "| ASP only |" in page
+    assert "| idle |" in page
+    assert (tmp_path / "out" / "downstream.png").stat().st_size > 10_000
+
+
+def test_a_stopped_table_says_so_and_continues_its_training(source, tmp_path):
+    asked = []
+
+    def stop():
+        asked.append(True)
+        return len(asked) > 2
+
+    cells = [small_cell(), small_cell("idle")]
+    assert not table(cells, source, tmp_path, stop=stop)
+    assert (source.runs / "push-ours-0" / "checkpoint.pt").exists()
+    assert not (tmp_path / "out" / "downstream").exists()
+    assert table(cells, source, tmp_path)
+    lines = (source.runs / "push-ours-0" / "metrics.jsonl").read_text().splitlines()
+    assert [json.loads(line)["iteration"] for line in lines] == [1, 2, 3]
+
+
+def test_many_at_once_on_ray(source, tmp_path):
+    from service.runtime.connecting import connected
+
+    with connected(None, num_cpus=2):
+        assert table(CELLS[:2], source, tmp_path, run_on_ray(2))
+    found = ResultsDirectory(tmp_path / "out" / "downstream").read_all()
+    assert [each["cell"]["method"] for each in found] == ["asp-only", "idle"]
+    assert table(CELLS[:2], Source("panda-cube@champion", "no registry here", tmp_path / "elsewhere"), tmp_path)
+
+
+class TestBadInput:
+    def refused(self, words, cells, source, tmp_path):
+        def never(*arguments):
+            raise AssertionError("ran")
+
+        before = {file: file.read_bytes() for file in (tmp_path / "out").rglob("*") if file.is_file()}
+        with pytest.raises(TandemError, match=words) as caught:
+            table(cells, source, tmp_path, never)
+        assert "\n" not in str(caught.value)
+        assert {file: file.read_bytes() for file in (tmp_path / "out").rglob("*") if file.is_file()} == before
+
+    @pytest.fixture
+    def file(self, source, tmp_path):
+        table(CELLS[:1], source, tmp_path)
+        return tmp_path / "out" / "downstream" / "push-idle-0.json"
+
+    def test_another_version(self, file, source, tmp_path):
+        file.write_text(json.dumps({**json.loads(file.read_text()), "format_version": 9}))
+        self.refused(r"push-idle-0\.json: format version 9, this program reads 1", CELLS, source, tmp_path)
+
+    def test_another_version_of_a_cell_that_is_not_asked_for(self, file, source, tmp_path):
+        file.write_text(json.dumps({**json.loads(file.read_text()), "format_version": 9}))
+        self.refused(r"push-idle-0\.json: format version 9", CELLS[3:], source, tmp_path)
+
+    def test_other_settings(self, file, source, tmp_path):
+        cells = [small_cell("idle", num_episodes=9)]
+        self.refused(r"push-idle-0\.json is of cell\.num_episodes 6, not 9", cells, source, tmp_path)
+
+    def test_other_primitives(self, file, source, tmp_path):
+        tree = json.loads(file.read_text())
+        tree["primitives"]["digest"] = "0" * 64
+        file.write_text(json.dumps(tree))
+        self.refused(r"push-idle-0\.json is of primitives\.digest '000", CELLS, source, tmp_path)
+
+    def test_no_json(self, file, source, tmp_path):
+        file.write_text("{")
+        self.refused(r"push-idle-0\.json is no JSON", CELLS, source, tmp_path)
+
+
+def result(method, task, seed, last, ever, curve=(), num=100):
+    evaluation = {"num_episodes": num, "success_last": last, "success_ever": ever}
+    return {
+        "cell": {"method": method, "task": task, "seed": seed},
+        "evaluation": evaluation,
+        "primitives": {"name": "panda-cube@4", "digest": "ab" * 32},
+        "made": {"git_commit": "c" * 40},
+        "env_steps": 2000,
+        "wall_s": 60.0,
+        "curve": list(curve),
+    }
+
+
+def test_the_page_by_hand():
+    curve = [{"env_steps": 1000 * step, "success_last": rate} for step, rate in enumerate((0.0, 0.9, 0.4, 0.8, 0.9))]
+    page = write_page(
+        [result("ours", "wall", 1, 0.97, 1.0, curve), result("ours", "wall", 0, 0.95, 0.97, curve)], "picture.png"
+    )
+    lines = page.splitlines()
+    # 192 of 200: Wilson (z = 1.96) is 0.923 to 0.980
+    assert "| ours |  |  |  |  | 96.0 % [92, 98] (2) |  |" in lines
+    assert "| *the paper's* | *83 %* | *100 %* | *52 %* | *100 %* | *98 %* | *98 %* |" in lines
+    assert "| ours |  |  |  |  | 98.5 % [96, 99] (2) |  |" in lines
+    assert "| ours |  |  |  |  | 95.0, 97.0 |  |" in lines
+    assert "| ours |  |  |  |  | 2, 1 min: - |  |" in lines  # 0.9 x 0.97 is not held by any two in a row
+    assert "scratch" not in page
+
+
+def test_how_soon_by_hand():
+    curve = [{"env_steps": step, "success_last": rate} for step, rate in [(1, 0.9), (2, 0.1), (3, 0.8), (4, 0.9)]]
+    assert steps_until(curve, 0.5) == 1
+    assert steps_until(curve, 0.6) == 3
+    assert steps_until(curve, 0.9) is None
+    assert steps_until(curve, 0.0) is None

@@ -1,0 +1,139 @@
+import dataclasses
+import json
+
+import numpy as np
+import pytest
+import torch
+
+from service.downstream.compose import parameters_digest
+from service.downstream.worker import Running, run_cell
+from service.errors import TandemError
+from service.runtime.records import read_jsonl
+from tests.downstream.cells import small_cell
+
+
+class Stop:
+    """Says so once it has been asked more than ``after`` times."""
+
+    def __init__(self, after):
+        self.left = after
+
+    def __call__(self):
+        self.left -= 1
+        return self.left < 0
+
+
+def run(cell, champion, path, **options):
+    return run_cell(cell, champion, path, Running(**{"num_threads": 1, **options}))
+
+
+def without_times(records):
+    return [{key: value for key, value in each.items() if not key.startswith("time/")} for each in records]
+
+
+@pytest.mark.parametrize("method", ["ours-her", "scratch-mcp"])
+def test_a_resumed_training_is_the_uninterrupted_one(champion, tmp_path, method):
+    cell = small_cell(method)
+    whole = run(cell, champion, tmp_path / "whole")
+    assert run(cell, champion, tmp_path / "cut", stop=Stop(2)) is None
+    assert len(read_jsonl(tmp_path / "cut" / "metrics.jsonl")) == 2
+    assert not (tmp_path / "cut" / "result.json").exists()
+    torch.manual_seed(99)
+    np.random.seed(99)
+    resumed = run(cell, champion, tmp_path / "cut", resume=True)
+    records = [without_times(read_jsonl(tmp_path / name / "metrics.jsonl")) for name in ("whole", "cut")]
+    assert records[0] == records[1]
+    assert resumed["evaluation"] == whole["evaluation"]
+    saved = [torch.load(tmp_path / name / "checkpoint.pt", weights_only=True)["learner"] for name in ("whole", "cut")]
+    first, second = (each["parameters"]["policy"] for each in saved)
+    assert all(torch.equal(first[name], second[name]) for name in first)
+    rows = [each["replay"]["rows"] for each in saved]
+    assert all(torch.equal(rows[0][name], rows[1][name]) for name in rows[0])
+
+
+def test_a_training_killed_between_checkpoints_makes_the_rest_again(champion, tmp_path):
+    cell = small_cell()
+    run(cell, champion, tmp_path, stop=Stop(1))
+    with (tmp_path / "metrics.jsonl").open("a") as file:
+        file.write('{"iteration": 2, "env_steps": 400, "made": "after the checkpoint"}\n{"iterat')
+    run(cell, champion, tmp_path, resume=True)
+    records = read_jsonl(tmp_path / "metrics.jsonl")
+    assert [each["iteration"] for each in records] == [1, 2, 3]
+    assert not any("made" in each for each in records)
+
+
+def test_what_a_training_leaves(champion, tmp_path):
+    before = parameters_digest(champion.primitives)
+    seen = []
+    result = run(small_cell(), champion, tmp_path, on_iteration=seen.append)
+    files = {path.name for path in tmp_path.iterdir()} - {".lock"}
+    assert files == {
+        "cell.json", "metrics.jsonl", "tensorboard", "checkpoint.pt", "result.json", "model.zip", "curves.png"
+    }  # fmt: skip
+    assert parameters_digest(champion.primitives) == before == result["primitives"]["digest"]
+    assert result["primitives"]["name"] == "panda-cube@4"
+    assert result == json.loads((tmp_path / "result.json").read_text())
+    assert result["env_steps"] == 600
+    assert [point["env_steps"] for point in result["curve"]] == [400, 600]
+    assert seen[-1]["train/n_updates"] == 2 * 50 * 2  # two iterations that learn, 50 steps each, two updates a step
+    found = result["evaluation"]
+    assert found["num_episodes"] == 6
+    assert found["success_last_low"] <= found["success_last"] <= found["success_last_high"]
+    assert found["success_last"] <= found["success_ever"] <= found["success_ever_high"]
+
+
+def test_a_finished_training_is_not_run_again(champion, tmp_path):
+    first = run(small_cell("idle"), champion, tmp_path)
+    stamp = (tmp_path / "result.json").stat().st_mtime_ns
+    assert run(small_cell("idle"), champion, tmp_path, resume=True) == first
+    assert (tmp_path / "result.json").stat().st_mtime_ns == stamp
+
+
+def test_methods_without_learning_play_as_they_are(champion, tmp_path):
+    """Bob is good in the air; who does nothing is at the goal at times, at the last step as at any."""
+    cells = [small_cell(method, "inair", num_episodes=60) for method in ("asp-only", "idle")]
+    bob, idle = (run(cell, champion, tmp_path / cell.method)["evaluation"] for cell in cells)
+    assert bob["success_last"] > 0.8
+    assert idle["success_last"] == idle["success_ever"] < 0.1
+    assert json.loads((tmp_path / "idle" / "result.json").read_text())["env_steps"] == 0
+
+
+class TestBadInput:
+    def refused(self, words, cell, trained, path, **options):
+        before = {file: file.read_bytes() for file in path.rglob("*") if file.is_file()}
+        with pytest.raises(TandemError, match=words) as caught:
+            run(cell, trained, path, **options)
+        assert "\n" not in str(caught.value)
+        assert {file: file.read_bytes() for file in path.rglob("*") if file.is_file()} == before
+
+    def test_a_directory_with_a_training(self, champion, tmp_path):
+        run(small_cell("idle"), champion, tmp_path)
+        self.refused("holds a training already; continue it with --resume", small_cell("idle"), champion, tmp_path)
+
+    def test_another_training(self, champion, tmp_path):
+        run(small_cell("idle"), champion, tmp_path)
+        other = small_cell("idle", num_episodes=7)
+        self.refused(r"begun with cell\.num_episodes 6, not 7", other, champion, tmp_path, resume=True)
+
+    def test_other_primitives(self, champion, tmp_path):
+        run(small_cell(), champion, tmp_path, stop=Stop(1))
+        manifest = champion.manifest.model_copy(update={"version": 5})
+        other = dataclasses.replace(champion, manifest=manifest)
+        self.refused(r"primitives\.name 'panda-cube@4', not .*@5", small_cell(), other, tmp_path, resume=True)
+
+    def test_primitives_of_another_robot(self, champion, tmp_path):
+        spaces = {**champion.manifest.spaces, "action": 7}
+        other = dataclasses.replace(champion, manifest=champion.manifest.model_copy(update={"spaces": spaces}))
+        self.refused("another robot or layout: action 7", small_cell(), other, tmp_path / "new")
+
+    def test_a_damaged_checkpoint(self, champion, tmp_path):
+        run(small_cell(), champion, tmp_path, stop=Stop(1))
+        file = tmp_path / "checkpoint.pt"
+        file.write_bytes(file.read_bytes()[:1000])
+        self.refused(r"checkpoint\.pt is damaged", small_cell(), champion, tmp_path, resume=True)
+
+    def test_a_checkpoint_of_another_version(self, champion, tmp_path):
+        run(small_cell(), champion, tmp_path, stop=Stop(1))
+        saved = torch.load(tmp_path / "checkpoint.pt", weights_only=True)
+        torch.save({**saved, "format_version": 9}, tmp_path / "checkpoint.pt")
+        self.refused("format version 9, this program reads 1", small_cell(), champion, tmp_path, resume=True)
