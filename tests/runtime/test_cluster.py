@@ -105,24 +105,6 @@ def test_worlds_are_shared_out_and_every_rollout_counts_once(tmp_path):
     assert newest(tmp_path).meta["env_steps"] == result.num_env_steps == seen[-1]["env_steps"]
 
 
-def test_only_the_learner_has_torch_and_who_computes_gives_way(tmp_path):
-    """An actor with torch takes three times the memory and comes up three times as slowly."""
-    torch, nice = {}, {}
-
-    def look(run, metrics):
-        if metrics["iteration"] == 3:  # by then all have unpickled weights
-            for actor in run.health().actors:
-                torch[actor.name] = "libtorch" in Path(f"/proc/{actor.pid}/maps").read_text()
-                nice[actor.name] = os.getpriority(os.PRIO_PROCESS, actor.pid)
-            run.request_stop()
-
-    run_cluster(tmp_path, tiny_config(total_env_steps=10**9), on_iteration=look)
-    assert torch == {"rollout-0": False, "rollout-1": False, "learner": True, "generator": False}
-    answers = nice.pop("generator")
-    assert set(nice.values()) == {min(19, answers + NICENESS)}
-    assert answers < 19
-
-
 def test_a_checkpoint_belongs_to_no_topology_and_no_runner(tmp_path):
     _, first = play(tmp_path, tiny_config(total_env_steps=600))  # with a pending rollout
     _, second = run_cluster(tmp_path, tiny_config(total_env_steps=1200), num_actors=3, resume=True)
@@ -139,35 +121,37 @@ def test_a_checkpoint_belongs_to_no_topology_and_no_runner(tmp_path):
     assert {incarnation for _, incarnation, _ in ids(tmp_path)} == {0, 1, 2, 3}  # one for each process
 
 
-@pytest.mark.parametrize("name", ["rollout-1", "learner", "generator"])
-def test_whoever_is_killed_is_replaced(tmp_path, name):
-    killed, up = [], []
+def test_whoever_is_killed_is_replaced(tmp_path):
+    strikes = [["rollout-1"], ["learner"], ["generator"], ["rollout-1", "learner", "generator"]]
+    killed, since = [], []
 
     def strike(run, metrics):
-        """Two incarnations are killed, then the third one's first iterations end the run."""
-        pid = pid_of(run, name)
-        if metrics["iteration"] < 4 or pid is None or pid in killed:
+        """One after the other, then all at once; six iterations with everybody there end the run."""
+        pids = [pid_of(run, name) for name in ("rollout-0", "rollout-1", "learner", "generator")]
+        if None in pids or set(pids) & set(killed):
             return
-        up.append(pid)
-        if up.count(pid) < 6:  # each has some rollouts or updates
+        since.append(metrics["iteration"])
+        if len(since) < 6:  # each has some rollouts or updates
             return
-        if len(killed) == 2:
+        since.clear()
+        if not strikes:
             run.request_stop()
-        else:
-            killed.append(pid)
-            os.kill(pid, signal.SIGKILL)
+            return
+        for name in strikes.pop(0):
+            killed.append(pid_of(run, name))
+            os.kill(killed[-1], signal.SIGKILL)
 
     run, result = run_cluster(tmp_path, tiny_config(total_env_steps=10**9), on_iteration=strike)
     assert result.reason == "interrupted"
+    assert len(killed) == 6
     rows = read_lines(tmp_path / "metrics.jsonl")
     assert [row["learner/version"] for row in rows] == list(range(1, len(rows) + 1))  # no update lost or made twice
-    steps = np.diff([row["env_steps"] for row in rows])
-    assert (steps > 0).all()
-    if name == "rollout-1":
-        assert {(actor, incarnation) for actor, incarnation, _ in ids(tmp_path)} >= {(0, 0), (1, 0), (1, 1), (1, 2)}
-    else:  # not one of the rollouts that the actors handed over is missing
-        assert sum(highest + 1 for _, _, highest in ids(tmp_path)) == run.health().num_rollouts_counted
-        assert run.books.iteration == result.iteration == rows[-1]["iteration"]
+    assert (np.diff([row["env_steps"] for row in rows]) > 0).all()
+    counted = ids(tmp_path)
+    assert {(actor, incarnation) for actor, incarnation, _ in counted} >= {(0, 0), (1, 0), (1, 1), (1, 2)}
+    # Not one of the rollouts that the actors handed over is missing.
+    assert sum(highest + 1 for _, _, highest in counted) == run.health().num_rollouts_counted
+    assert run.books.iteration == result.iteration == rows[-1]["iteration"]
 
 
 def test_an_actor_that_hangs_is_replaced(tmp_path, monkeypatch):
@@ -190,17 +174,29 @@ def test_an_actor_that_hangs_is_replaced(tmp_path, monkeypatch):
 
 
 def test_a_stop_ends_it_at_once_and_saved(tmp_path):
-    asked = []
+    torch, nice, asked = {}, {}, []
 
-    def ask(run, metrics):
-        if metrics["iteration"] == 5:
-            asked.append(time.monotonic())
+    def look_and_ask(run, metrics):
+        actors = run.health().actors
+        if metrics["iteration"] >= 5 and not any(actor.pid is None for actor in actors):  # all have unpickled weights
+            for actor in actors:
+                torch[actor.name] = "libtorch" in Path(f"/proc/{actor.pid}/maps").read_text()
+                nice[actor.name] = os.getpriority(os.PRIO_PROCESS, actor.pid)
+            asked.append((metrics["iteration"], time.monotonic()))
             run.request_stop()
 
-    _, result = run_cluster(tmp_path, tiny_config(total_env_steps=10**9, checkpoint_interval=1000), on_iteration=ask)
-    assert time.monotonic() - asked[0] < 3 + 5  # saving takes a moment; killing the actors is in it
-    assert (result.reason, result.iteration) == ("interrupted", 5)
-    assert CheckpointStore(tmp_path / "checkpoints", keep=1).steps()[-1] == 5
+    config = tiny_config(total_env_steps=10**9, checkpoint_interval=10**6)
+    _, result = run_cluster(tmp_path, config, on_iteration=look_and_ask)
+    ((iteration, since),) = asked
+    assert time.monotonic() - since < 3 + 5  # saving takes a moment; killing the actors is in it
+    assert (result.reason, result.iteration) == ("interrupted", iteration)
+    assert CheckpointStore(tmp_path / "checkpoints", keep=1).steps()[-1] == iteration
+    # Only the learner has torch: an actor with it takes three times the memory and comes up three times as slowly.
+    assert torch == {"rollout-0": False, "rollout-1": False, "learner": True, "generator": False}
+    # Who computes gives way to who answers.
+    answers = nice.pop("generator")
+    assert set(nice.values()) == {min(19, answers + NICENESS)}
+    assert answers < 19
 
 
 def test_a_learner_that_dies_of_every_batch_ends_the_run_with_one_line(tmp_path):

@@ -89,7 +89,7 @@ def test_a_job_is_stopped_and_continued_and_publishes(head, tmp_path):
             *(RAY, "job", "submit", "--address", jobs, "--no-wait", "--working-dir", work),
             *("--runtime-env-json", json.dumps({"env_vars": variables}), "--"),
             *(sys.executable, "-m", "service", "pretrain", "--runtime", "ray", "--run-id", "night"),
-            *("--config", "tiny.yaml", "--num-actors", "2", "--status", f"127.0.0.1:{port}"),
+            *("--config", "tiny.yaml", "--num-actors", "1", "--status", f"127.0.0.1:{port}"),
             *("--set", f"run.total_env_steps={total_env_steps}"),
         ]
         done = subprocess.run(command, capture_output=True, text=True, timeout=120)
@@ -109,7 +109,7 @@ def test_a_job_is_stopped_and_continued_and_publishes(head, tmp_path):
     first = submit(10**9)
     status = wait_for(lambda: (found := read_status()) and found["iteration"] >= 5 and found)
     assert (status["state"], status["runtime"]) == ("running", "ray")
-    assert {actor["name"] for actor in status["actors"]} == {"rollout-0", "rollout-1", "learner", "generator"}
+    assert {actor["name"] for actor in status["actors"]} == {"rollout-0", "learner", "generator"}
     assert status["policy_lag"] <= 2
 
     stopped = time.monotonic()
