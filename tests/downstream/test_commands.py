@@ -1,5 +1,6 @@
 import json
 import os
+import shutil
 import signal
 
 import pytest
@@ -7,8 +8,9 @@ from typer.testing import CliRunner
 
 from service.cli import app
 from service.downstream import commands
-from service.registry.errors import DamagedBlobError
+from service.registry.registry import BUNDLED
 from tests.downstream.cells import SETS
+from tests.status.conftest import serve
 
 
 def invoke(*arguments):
@@ -80,16 +82,22 @@ def test_what_is_wrong_is_one_line_and_nothing_is_written(tmp_path, arguments, w
 
 
 def test_a_registry_that_serves_a_wrong_digest(tmp_path, monkeypatch):
-    def damaged(url, reference):
-        raise DamagedBlobError("what http://lab serves is not what was published")
-
-    monkeypatch.setattr("service.status.client.fetch_primitives", damaged)
-    for refused in (
-        invoke("train", "--task", "wall", "--registry", "http://lab"),
-        invoke("table", "--registry", "http://lab"),
-    ):
-        assert refused.stderr == "error: what http://lab serves is not what was published\n"
-        assert list(tmp_path.iterdir()) == []
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    home = tmp_path / "home"
+    (home / "runs").mkdir(parents=True)
+    shutil.copytree(BUNDLED, home / "registry")
+    for blob in (home / "registry" / "blobs" / "sha256").iterdir():
+        blob.chmod(0o600)
+        blob.write_bytes(b"x" * blob.stat().st_size)
+    with serve(home) as server:
+        for refused in (
+            invoke("train", "--task", "wall", "--registry", server.url),
+            invoke("table", "--registry", server.url),
+        ):
+            assert refused.stderr.startswith(f"error: {server.url} says: ")
+            assert "is damaged: expected sha256" in refused.stderr
+            assert refused.stderr.count("\n") == 1
+    assert {path.name for path in tmp_path.iterdir()} <= {"home", "cache"}
 
 
 @pytest.mark.parametrize(

@@ -79,6 +79,11 @@ def test_many_at_once_on_ray(source, tmp_path):
 
     with connected(None, num_cpus=2):
         assert table(CELLS[:2], source, tmp_path, run_on_ray(2))
+        other = [small_cell("idle", num_episodes=9)]  # where a training directory of that name is of other settings
+        with pytest.raises(TandemError, match="num_episodes 6, not 9") as caught:
+            make_table(other, source, tmp_path / "other", run_on_ray(2), Watching())
+    assert "\n" not in str(caught.value)
+    assert not list((tmp_path / "other").rglob("*.json"))
     found = ResultsDirectory(tmp_path / "out" / "downstream").read_all()
     assert [each["cell"]["method"] for each in found] == ["asp-only", "idle"]
     assert table(CELLS[:2], Source("panda-cube@champion", "no registry here", tmp_path / "elsewhere"), tmp_path)
