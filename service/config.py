@@ -92,6 +92,13 @@ class GameConfig(_Frozen):
         description="per step and metre that the gripper is nearer than 30 cm to the object; off in the paper. At "
         "0.02 a whole turn next to the object earns 0.24, a valid goal 1 to 6",
     )
+    blocked_gripper_fraction: float = Field(
+        0.0,
+        ge=0.0,
+        lt=1.0,
+        description="share of games in which the gripper stays closed for both players, whatever they ask for; 0 in "
+        "the paper. What is learned there are primitives that push",
+    )
     bob_success_reward: float = Field(
         1.0, gt=0.0, description="when the object comes onto the goal; taken back when it leaves (OpenAI 2021)"
     )

@@ -72,7 +72,12 @@ class SelfPlay:
         self, config: Config, rng: np.random.Generator, *, actor: int = 0, incarnation: int = 0, num_threads: int = 0
     ) -> None:
         self.config = config
-        self.worlds = WorldBatch(config.world, config.game.num_worlds, num_threads=num_threads)
+        self.worlds = WorldBatch(
+            config.world,
+            config.game.num_worlds,
+            num_threads=num_threads,
+            blocked_fraction=config.game.blocked_gripper_fraction,
+        )
         self._rng = rng
         self.incarnation = incarnation
         self._actor, self._sequence = actor, 0

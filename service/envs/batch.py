@@ -53,17 +53,21 @@ _CONTROL_AND_BOX = int(mujoco.mjtState.mjSTATE_CTRL) | int(mujoco.mjtState.mjSTA
 class WorldBatch:
     """N independent worlds with one flat state each.
 
-    The state of a world is MuJoCo's full physics state, the two finger-contact flags of the last action, and, where the
-    world has a box, its place. A world is a pure function of (state, action), because each action starts the constraint
-    solver cold: saving is copying rows of ``states``, restoring is ``restore``, and the continuation is bit-identical.
+    The state of a world is MuJoCo's full physics state, the two finger-contact flags of the last action, where the
+    world has a box its place, and, as the last number, whether its gripper is blocked where only some are. A world is a
+    pure function of (state, action), because each action starts the constraint solver cold: saving is copying rows of
+    ``states``, restoring is ``restore``, and the continuation is bit-identical.
 
     Args:
         config: the world.
         num_worlds: N.
         num_threads: native threads; 0 for one per core.
+        blocked_fraction: share of starts whose gripper stays closed as if ``config.gripper`` were ``blocked``.
     """
 
-    def __init__(self, config: WorldConfig, num_worlds: int, *, num_threads: int = 0) -> None:
+    def __init__(
+        self, config: WorldConfig, num_worlds: int, *, num_threads: int = 0, blocked_fraction: float = 0.0
+    ) -> None:
         self.config = config
         self.num_worlds = num_worlds
         self.model = build_spec(config).compile()
@@ -74,7 +78,10 @@ class WorldBatch:
         self._physics_size = mujoco.mj_stateSize(self.model, mujoco.mjtState.mjSTATE_FULLPHYSICS)
         self._contacts = slice(self._physics_size, self._physics_size + _NUM_CONTACTS)
         self._place = slice(self._contacts.stop, self._contacts.stop + fixtures.PLACE_SIZE * self.model.nmocap)
-        self.state_size = self._place.stop
+        self._blocked_fraction = blocked_fraction
+        self._blocked = slice(self._place.stop, self._place.stop + (blocked_fraction > 0.0))
+        self._kept = slice(self._place.start, self._blocked.stop)
+        self.state_size = self._blocked.stop
         self._control_spec = _CONTROL_AND_BOX if self.model.nmocap else int(mujoco.mjtState.mjSTATE_CTRL)
         self._widest_m = 2 * FINGER_STROKE_M if config.gripper == "free" else 0.0
         self._layout = _Layout.of(self.model)
@@ -132,6 +139,10 @@ class WorldBatch:
         """
         states = np.tile(self._fresh_state, (num, 1))
         states[:, self._layout.object], states[:, self._place] = draw_starts(rng, num, self.config)
+        if self._blocked_fraction:
+            blocked = rng.random(num) < self._blocked_fraction
+            states[blocked, self._layout.fingers] = 0.0
+            states[:, self._blocked] = blocked[:, None]
         return states
 
     def restore(self, states: StateArray, worlds: BoolArray | None = None) -> None:
@@ -183,7 +194,7 @@ class WorldBatch:
         after = np.empty_like(start)
         after[:, : self._physics_size] = states[:, -1]
         after[:, self._contacts] = (sensors > 0).any(axis=1)
-        after[:, self._place] = start[:, self._place]
+        after[:, self._kept] = start[:, self._kept]
         finite = (np.abs(after[:, self._layout.velocities]) < MAX_SPEED).all(axis=1) & np.isfinite(after).all(axis=1)
         broken = np.zeros(self.num_worlds, dtype=bool)
         if not finite.all():
@@ -206,7 +217,8 @@ class WorldBatch:
         joints = start[:, self._layout.joints]
         solution = kinematics.solve(joints, target, at=here)
         control[:, :NUM_JOINTS] = np.clip(solution, joints - MAX_TURN_RAD, joints + MAX_TURN_RAD)
-        control[:, NUM_JOINTS:_NUM_CONTROLS] = np.clip(width, 0.0, self._widest_m)[:, None] / 2
+        widest_m = self._widest_m * ~(start[:, self._blocked] > 0.0).any(axis=1)
+        control[:, NUM_JOINTS:_NUM_CONTROLS] = np.clip(width, 0.0, widest_m)[:, None] / 2
         control[:, _NUM_CONTROLS:] = start[:, self._place]
         return control
 

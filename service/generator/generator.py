@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from service.config import Config
 from service.generator.counts import SuccessCounts
-from service.generator.difficulty import DifficultyGrid
-from service.generator.metrics import alice_metrics, bob_metrics, current_goals, own_goals, without_nan
+from service.generator.difficulty import DifficultyGrid, in_air
+from service.generator.metrics import alice_metrics, bob_metrics, current_goals, mean, own_goals, without_nan
 from service.generator.opponents import OpponentPool, RoundPlan
 from service.generator.penalty import OutsidePenalty
 from service.generator.ring import Ring
@@ -67,7 +67,8 @@ class TaskGenerator:
     starts: Ring
     """States right after a reset."""
     from_reset: SuccessCounts
-    """Bob's success from resets, by the goal's height and distance: harder than from where Alice left off."""
+    """Bob's success from resets, by the goal's height and distance; those with a blocked gripper apart. They are harder
+    than what starts where Alice left off."""
     opponents: OpponentPool
     """Past versions of both players."""
 
@@ -75,13 +76,15 @@ class TaskGenerator:
         self._config = config.generator
         self._success_distance_m = config.game.success_distance_m
         self._rest_height_m = config.world.object_size_m / 2
+        self._some_blocked = config.game.blocked_gripper_fraction > 0.0
         self.grid = DifficultyGrid(config.world, config.generator.cell_size_m)
         columns = {"start_state": state_size, "start_position": 3}
         num_cells = self.grid.seen.size if config.generator.replay_over_cells else 1
         self.buffer = Ring(config.generator.replay_buffer_size, num_cells, **columns, goal=3)
         self.starts = Ring(NUM_STARTS, **columns)
         self.opponents = OpponentPool(config.generator.opponent_pool_size)
-        self.from_reset = SuccessCounts(self.grid.num_height_bins * self.grid.num_distance_bins)
+        self._num_task_bins = self.grid.num_height_bins * self.grid.num_distance_bins
+        self.from_reset = SuccessCounts(self._num_task_bins * (1 + self._some_blocked))
         self._stop = StopCriterion(config.generator)
         self._penalty = OutsidePenalty(config.game.alice_outside_from_valid_fraction)
 
@@ -135,9 +138,8 @@ class TaskGenerator:
         num_new_cells = self.grid.mark_seen(records.proposal[records.verdict == Verdict.VALID])
         tried = records.played & ~records.bob_past
         reset = tried & records.from_reset
-        self.from_reset.record(
-            self._task_bins(records.goal[reset], records.start_position[reset]), records.solved[reset]
-        )
+        tasks = records.goal[reset], records.start_position[reset], self._blocked(records.start_state[reset])
+        self.from_reset.record(self._task_bins(*tasks), records.solved[reset])
         as_proposed = tried & ~(records.replayed & records.from_reset)
         self.grid.record(records.goal[as_proposed], records.start_position[as_proposed], records.solved[as_proposed])
         own = own_goals(records)
@@ -154,6 +156,7 @@ class TaskGenerator:
         return (
             alice_metrics(records, self._rest_height_m)
             | bob_metrics(records, self._rest_height_m)
+            | self._blocked_metrics(records, tried)
             | self._own_metrics(num_new_cells)
         )
 
@@ -216,9 +219,11 @@ class TaskGenerator:
         if self._config.replay_from_reset and len(self.starts):
             start = self.starts.sample(rng, len(goal))
             position = start["start_position"]
+            blocked = self._blocked(start["start_state"])
             far = np.linalg.norm(goal - position, axis=1) > self._success_distance_m  # nearer ones are no task
-            learnability = self.from_reset.learnability()[self._task_bins(goal, position)]
-            weight = np.concatenate([weight, np.where(far, learnability + LEARNABILITY_FLOOR, 0.0) * share])
+            possible = ~(blocked & in_air(goal, self._rest_height_m))
+            learnability = self.from_reset.learnability()[self._task_bins(goal, position, blocked)]
+            weight = np.concatenate([weight, np.where(far & possible, learnability + LEARNABILITY_FLOOR, 0.0) * share])
             tasks = {name: np.concatenate([rows, start[name]]) for name, rows in tasks.items()}
         drawn = rng.choice(len(weight), size=len(worlds), p=weight / weight.sum())
         choice.goal[worlds] = goal[drawn % len(goal)]
@@ -226,9 +231,25 @@ class TaskGenerator:
         choice.start_state[worlds] = tasks["start_state"][drawn]
         choice.start_position[worlds] = tasks["start_position"][drawn]
 
-    def _task_bins(self, goals: Floats, starts: Floats) -> NDArray[np.int64]:
-        """(M,) bin of tasks by the goal's height and its distance from the object's start, (M, 3) metres each."""
-        return self.grid.height_bin(goals) * self.grid.num_distance_bins + self.grid.distance_bin(goals, starts)
+    def _task_bins(self, goals: Floats, starts: Floats, blocked: Bools) -> NDArray[np.int64]:
+        """(M,) bin of tasks by the goal's height, its distance from the object's start, and (M,) blocked grippers."""
+        bins = self.grid.height_bin(goals) * self.grid.num_distance_bins + self.grid.distance_bin(goals, starts)
+        return bins + blocked * self._num_task_bins
+
+    def _blocked(self, states: Floats) -> Bools:
+        """(M,) whether the gripper of (M, S) states is blocked; where some are, their last number says so."""
+        return states[:, -1] > 0.0 if self._some_blocked else np.zeros(len(states), dtype=np.bool_)
+
+    def _blocked_metrics(self, records: GoalRecords, tried: Bools) -> dict[str, float]:
+        if not self._some_blocked:
+            return {}
+        blocked = self._blocked(records.start_state)
+        valid = records.verdict[blocked & ~records.alice_past & ~records.replayed] == Verdict.VALID
+        rates = {
+            "alice/valid_fraction_blocked": mean(valid),
+            "bob/success_rate_blocked": mean(records.solved[tried & blocked]),
+        }
+        return without_nan(rates)
 
     def _own_metrics(self, num_new_cells: int) -> dict[str, float]:
         metrics = {

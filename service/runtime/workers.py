@@ -257,7 +257,8 @@ class GeneratorWorker:
     """
 
     def __init__(self, config: Config, state: Arrays | None) -> None:
-        with WorldBatch(config.world, 1, num_threads=1) as worlds:
+        blocked_fraction = config.game.blocked_gripper_fraction
+        with WorldBatch(config.world, 1, num_threads=1, blocked_fraction=blocked_fraction) as worlds:
             self._generator = TaskGenerator(config, worlds.state_size)
         self._config = config
         self._pool_version = 0

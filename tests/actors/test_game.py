@@ -222,6 +222,20 @@ def test_a_game_is_over_after_num_goals():
     assert indices == [[0, 0], [1, 1], [0, 0]]
 
 
+def test_a_blocked_gripper_is_blocked_for_the_whole_game_and_both_players():
+    game = make_game(make_config(40, game={"num_goals": 3, "blocked_gripper_fraction": 0.5}))
+    blocked = game.worlds.states[:, -1] == 1.0
+    assert 10 < blocked.sum() < 30
+    rollout = play(game, Constant((0.0, 0.0, 0.0, 1.0)), Constant((0.0, 0.0, 0.0, 1.0)))
+    for turns in (rollout.alice, rollout.bob):
+        seen = turns.observation[..., 3:5][turns.active & blocked]
+        assert (np.abs(seen) < 2e-3).all()
+    assert (rollout.records.start_state[:, -1] == blocked).all()
+    restored = make_game(game.config, seed=1)
+    restored.load_state(game.state())
+    assert (restored.worlds.states[:, -1] == game.worlds.states[:, -1]).all()
+
+
 # --- past opponents and replayed goals -------------------------------------------------------------------------------
 
 

@@ -247,3 +247,46 @@ def assert_uniform(values, low, high):
     assert values.max() <= high
     quartiles = np.quantile(values, [0.25, 0.5, 0.75])
     np.testing.assert_allclose((quartiles - low) / (high - low), [0.25, 0.5, 0.75], rtol=0, atol=0.04)
+
+
+class TestBlockedGrippers:
+    FINGERS = slice(3, 5)
+
+    @pytest.fixture
+    def some(self):
+        with WorldBatch(CONFIG, 200, num_threads=2, blocked_fraction=0.25) as batch:
+            batch.reset(np.random.default_rng(0))
+            yield batch
+
+    def test_a_share_of_the_starts(self, some):
+        blocked = some.states[:, -1] == 1.0
+        assert 30 < blocked.sum() < 70  # 50 +- 6
+        width = some.positions()[:, self.FINGERS]
+        assert (width[blocked] == 0.0).all()
+        assert (width[~blocked] == np.float32(FINGER_STROKE_M)).all()
+
+    def test_they_stay_closed_and_the_others_obey(self, some):
+        blocked = some.states[:, -1] == 1.0
+        for finger_action in (-1.0, -1.0, 1.0, 1.0):
+            actions = np.zeros((200, 4), dtype=np.float32)
+            actions[:, 3] = finger_action
+            some.step(actions)
+            assert (np.abs(some.positions()[blocked, self.FINGERS]) < 2e-3).all()
+            assert (some.states[:, -1] == blocked).all()
+        assert (some.positions()[~blocked, self.FINGERS] > 0.03).all()
+
+    def test_a_state_takes_it_along(self, some):
+        states = some.states.copy()
+        blocked = states[:, -1] == 1.0
+        some.restore(states[::-1])
+        some.step(np.ones((200, 4), dtype=np.float32))
+        first = some.states.copy()
+        assert (first[:, -1] == blocked[::-1]).all()
+        some.restore(states)
+        some.step(np.ones((200, 4), dtype=np.float32))
+        assert (some.states[::-1] == first).all()
+
+    def test_without_any_nothing_changes(self, worlds):
+        with WorldBatch(CONFIG, NUM_WORLDS, blocked_fraction=0.0) as same:
+            same.reset(np.random.default_rng(0))
+            assert (same.states == worlds.states).all()

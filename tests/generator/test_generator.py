@@ -121,6 +121,43 @@ def test_a_start_next_to_the_goal_is_no_task(make_records: MakeRecords) -> None:
     assert not choice.from_reset.any()
 
 
+def test_no_goal_in_the_air_from_a_blocked_reset(make_records: MakeRecords) -> None:
+    settings = {"generator": {"replay_fraction": 1.0, "replay_from_reset": True}}
+    generator = TaskGenerator(
+        parse_config({**settings, "game": {"blocked_gripper_fraction": 0.2}}, where="t"), STATE_SIZE
+    )
+    goals = np.tile([[0.0, 0.1, 0.025], [0.0, 0.1, 0.2]], (40, 1))
+    generator.record(make_records(goals, start_state=np.zeros((80, STATE_SIZE))))  # free: the last number is 0
+    num = 400
+    state, start = np.zeros((num, STATE_SIZE)), np.tile([0.0, 0.0, 0.025], (num, 1))
+    state[::2, -1] = 1.0
+    index, verdict = np.zeros(num, dtype=np.int64), np.zeros(num, dtype=np.int8)
+    choice = generator.choose_goals(all_current(num), state, start, index, start, verdict, np.random.default_rng(0))
+    blocked, in_air = choice.start_state[:, -1] == 1.0, choice.goal[:, 2] > 0.1
+    assert choice.from_reset[blocked].all()
+    assert 0.1 < (blocked & ~in_air).mean() < 0.5
+    assert (~blocked & in_air).mean() > 0.1
+    assert not (blocked & in_air).any()
+
+
+def test_blocked_tasks_are_counted_apart(make_records: MakeRecords) -> None:
+    config = parse_config({"game": {"blocked_gripper_fraction": 0.2}}, where="test")
+    generator = TaskGenerator(config, STATE_SIZE)
+    blocked = np.arange(40) % 4 == 0
+    state = np.zeros((40, STATE_SIZE))
+    state[:, -1] = blocked
+    records = make_records(
+        np.tile(OLD_GOAL, (40, 1)), start_state=state, from_reset=np.ones(40, dtype=np.bool_), solved=~blocked
+    )
+    metrics = generator.record(records)
+    assert metrics["bob/success_rate_blocked"] == 0.0
+    assert metrics["bob/success_rate"] == 0.75
+    assert metrics["alice/valid_fraction_blocked"] == 1.0
+    rates = np.unique(generator.from_reset.learnability())  # of no tries, of 10 failures, of 30 successes
+    expected = [p * (1 - p) for p in (1 / 32, 1 / 12, 1 / 2)]
+    assert rates == pytest.approx(expected)
+
+
 def test_a_past_bob_plays_no_replayed_goals(make_records: MakeRecords) -> None:
     generator = filled(make_records, replay_fraction=1.0, replay_invalid=True)
     plan = RoundPlan(np.array([0, CURRENT, CURRENT]), np.array([CURRENT, 0, 0]))
