@@ -18,7 +18,6 @@ from service.envs.vector import VectorState
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
-    from stable_baselines3.common.noise import ActionNoise
 
     from service.downstream.methods import Method
     from service.downstream.settings import CellConfig
@@ -26,52 +25,14 @@ if TYPE_CHECKING:
 
     FloatArray = NDArray[np.float32]
 
-
-class ExploringSAC(SAC):
-    """SAC that also explores by holding: a share of its worlds acts by one uniform action for some steps.
-
-    SAC's own noise is drawn anew every step and hardly moves anything: the end effector integrates it to nothing. Of
-    episodes of Push that act by uniform weights, 6 % move the cube by 5 cm and keep it on the table with weights drawn
-    every step, and 16 % with weights held for five. Where the buffer has nothing that moved, relabelled goals teach
-    nothing. The first ``learning_starts`` env steps are all of this kind.
-
-    Args:
-        hold_steps: control steps for which a random action is held; every world decides anew after as many.
-        explore_share: probability with which a world explores next, once it learns.
-    """
-
-    def __init__(self, *args: Any, hold_steps: int = 1, explore_share: float = 0.0, **kwargs: Any) -> None:
-        super().__init__(*args, **kwargs)
-        self.hold_steps, self.explore_share = hold_steps, explore_share
-        self.held = np.zeros((0, 0), dtype=np.float32)
-        """(N, A) what worlds that explore do; NaN where a world does not."""
-
-    def _sample_action(
-        self, learning_starts: int, action_noise: ActionNoise | None = None, n_envs: int = 1
-    ) -> tuple[FloatArray, FloatArray]:
-        if self.num_timesteps // n_envs % self.hold_steps == 0:
-            self._decide(1.0 if self.num_timesteps < learning_starts else self.explore_share, n_envs)
-        follows = np.isnan(self.held)
-        if not follows.any():
-            return self.policy.unscale_action(self.held), self.held
-        _, own = super()._sample_action(0, action_noise, n_envs)
-        scaled = np.where(follows, own, self.held)
-        return self.policy.unscale_action(scaled), scaled
-
-    def _decide(self, share: float, num_worlds: int) -> None:
-        random, size = self.action_space.np_random, (num_worlds, *(self.action_space.shape or ()))
-        self.held = random.uniform(-1.0, 1.0, size).astype(np.float32)
-        self.held[random.random(num_worlds) >= share] = np.nan
-
-
 _ROWS = ("actions", "rewards", "dones", "timeouts", "ep_start", "ep_length")
 _COUNTERS = ("num_timesteps", "_n_updates", "_episode_num")
 
 
-def make_learner(cell: CellConfig, method: Method, env: WorldsVecEnv) -> ExploringSAC:
+def make_learner(cell: CellConfig, method: Method, env: WorldsVecEnv) -> SAC:
     """A new learner; draws from the global random numbers of torch and NumPy, which its seed restarts."""
     sac = cell.sac
-    return ExploringSAC(
+    return SAC(
         method.policy(),
         env,
         learning_rate=sac.learning_rate,
@@ -88,8 +49,6 @@ def make_learner(cell: CellConfig, method: Method, env: WorldsVecEnv) -> Explori
         policy_kwargs={"features_extractor_class": GoalFeatures, "net_arch": list(sac.hidden_sizes)},
         seed=cell.seed,
         device="cpu",
-        hold_steps=sac.hold_steps,
-        explore_share=sac.explore_share,
     )
 
 
@@ -111,7 +70,7 @@ class LearnedPolicy:
         return self._method.decode(self._trained, positions, actions)
 
 
-def save_learner(learner: ExploringSAC, env: WorldsVecEnv) -> dict[str, Any]:
+def save_learner(learner: SAC, env: WorldsVecEnv) -> dict[str, Any]:
     """Everything the learner continues from, as tensors and plain values; its chance and its worlds, too."""
     buffer, entropy = learner.replay_buffer, learner.log_ent_coef
     assert buffer is not None
@@ -120,7 +79,6 @@ def save_learner(learner: ExploringSAC, env: WorldsVecEnv) -> dict[str, Any]:
         "parameters": learner.get_parameters(),
         "log_ent_coef": entropy.detach().clone(),
         "counters": {name: getattr(learner, name) for name in _COUNTERS},
-        "held": torch.from_numpy(learner.held),
         "replay": _save_replay(buffer),
         "worlds": _save_worlds(env.state()),
         "torch_random": torch.get_rng_state(),
@@ -129,7 +87,7 @@ def save_learner(learner: ExploringSAC, env: WorldsVecEnv) -> dict[str, Any]:
     }
 
 
-def restore_learner(learner: ExploringSAC, env: WorldsVecEnv, saved: dict[str, Any]) -> None:
+def restore_learner(learner: SAC, env: WorldsVecEnv, saved: dict[str, Any]) -> None:
     """Go back to what ``save_learner`` gave, in a new learner and worlds of the same settings."""
     buffer, entropy = learner.replay_buffer, learner.log_ent_coef
     assert buffer is not None
@@ -139,7 +97,6 @@ def restore_learner(learner: ExploringSAC, env: WorldsVecEnv, saved: dict[str, A
         entropy.copy_(saved["log_ent_coef"])  # in place: its optimiser holds it
     for name, value in saved["counters"].items():
         setattr(learner, name, value)
-    learner.held = saved["held"].numpy()
     _restore_replay(buffer, saved["replay"])
     learner._last_obs = env.restore(_worlds_state(saved["worlds"]))
     learner._last_episode_starts = np.zeros(env.num_envs, dtype=bool)

@@ -29,8 +29,6 @@ class SACConfig(_Frozen):
     )
     hidden_sizes: tuple[PositiveInt, ...] = Field((256, 256), min_length=1, description="actor and critics")
     learning_starts: int = Field(6_400, ge=0, description="env steps of uniform actions first; more than an episode")
-    hold_steps: int = Field(1, ge=1, description="a uniform action is held for as many control steps")
-    explore_share: float = Field(0.0, ge=0.0, lt=1.0, description="of worlds that act by one, once it learns")
 
 
 class CellConfig(_Frozen):

@@ -3,7 +3,6 @@
 from service.downstream.settings import make_cell, make_sac
 
 SMALL = {"num_worlds": 4, "gradient_steps": 2, "batch_size": 16, "learning_starts": 200, "hidden_sizes": (8,)}
-SMALL |= {"hold_steps": 7, "explore_share": 0.3}  # held beyond the end of an iteration
 SETS = [f"--set={key}={list(value) if isinstance(value, tuple) else value}" for key, value in SMALL.items()]
 
 
