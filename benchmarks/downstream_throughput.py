@@ -95,7 +95,7 @@ def main() -> int:
     """Parse the command line, measure, print, write."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--task", default="wall")
-    parser.add_argument("--method", default="ours", choices=[name for name, each in METHODS.items() if not each.player])
+    parser.add_argument("--method", default="ours", choices=[name for name, each in METHODS.items() if each.composes])
     parser.add_argument("--primitives", default="panda-cube@champion")
     parser.add_argument("--pairs", type=int, default=5)
     parser.add_argument("--seconds", type=float, default=20.0, help="of each sample, at least")

@@ -6,7 +6,7 @@ import json
 import sys
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager, nullcontext
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -113,6 +113,7 @@ def table(
             for task in _names(tasks, TASKS)
             for method in _names(methods, METHODS)
         ]
+        cells = list(dict.fromkeys(cells))
         source = Source(primitives, registry, runs.absolute())
         with _runtime(runtime, address, num_workers, threads) as runner, _stopping() as watching:
             complete = make_table(cells, source, out, runner, watching)
@@ -169,8 +170,7 @@ def _runtime(name: str, address: str | None, num_workers: int | None, threads: i
         for option, value in (("--address", address), ("--num-workers", num_workers)):
             if value is not None:
                 raise TandemError(f"{option} needs --runtime ray")
-        with nullcontext():
-            yield run_here(threads or 0)
+        yield run_here(threads or 0)
         return
     from service.runtime.connecting import connected
 
@@ -207,10 +207,13 @@ class _Line:
     """A line of progress now and then."""
 
     def __init__(self) -> None:
-        self._shown_s, self._evaluated = float("-inf"), ""
+        self._shown_s, self._evaluated, self._steps = float("-inf"), "", 0.0
 
     def show(self, metrics: dict[str, float]) -> None:
         """Take in an iteration."""
+        if metrics["env_steps"] <= self._steps:  # another training
+            self._evaluated = ""
+        self._steps = metrics["env_steps"]
         if (rate := metrics.get("evaluation/success_last")) is not None:
             self._evaluated = f" | without noise {rate:.0%}"
         if time.monotonic() - self._shown_s >= _LINE_EVERY_S:

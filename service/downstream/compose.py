@@ -64,13 +64,23 @@ def check_primitives(primitives: MCPEvaluator | Trained) -> MCPEvaluator:
     """
     if isinstance(primitives, MCPEvaluator):
         return primitives
-    if primitives.manifest is not None:
-        spaces = primitives.manifest.spaces
-        wrong = {key: spaces.get(key) for key, value in SPACES.items() if spaces.get(key) != value}
-        if wrong:
-            found, wanted = (", ".join(f"{key} {tree[key]}" for key in wrong) for tree in (wrong, SPACES))
-            raise TandemError(f"{primitives.label} is for another robot or layout: {found}; this one has {wanted}")
+    check_robot(primitives)
     return primitives.primitives
+
+
+def check_robot(trained: Trained) -> None:
+    """Assert that a policy, composable or not, is for this robot and layout, as far as its manifest says.
+
+    Raises:
+        TandemError: it is for another.
+    """
+    if trained.manifest is None:
+        return
+    spaces = trained.manifest.spaces
+    wrong = {key: spaces.get(key) for key, value in SPACES.items() if spaces.get(key) != value}
+    if wrong:
+        found, wanted = (", ".join(f"{key} {tree[key]}" for key in wrong) for tree in (wrong, SPACES))
+        raise TandemError(f"{trained.label} is for another robot or layout: {found}; this one has {wanted}")
 
 
 def parameters_digest(primitives: object) -> str:

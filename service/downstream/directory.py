@@ -7,7 +7,7 @@
 | ``tensorboard/`` | the same metrics as TensorBoard events over env steps |
 | ``checkpoint.pt`` | everything the training continues from exactly, replay buffer included |
 | ``result.json`` | how well it does in the end |
-| ``model.zip`` | the learner as Stable-Baselines3 saves it: ``SAC.load`` |
+| ``model.zip`` | the learner as Stable-Baselines3 saves it: ``SAC.load(file, env)`` |
 | ``curves.png``, ``episodes.mp4`` | for people |
 | ``.lock`` | held by the process that trains |
 """
@@ -22,13 +22,14 @@ from typing import Any, Self
 
 from service.downstream.settings import differences
 from service.errors import TandemError
-from service.registry.files import os_errors, remove_temporaries, write_atomic
+from service.registry.files import TEMPORARY_PREFIX, os_errors, remove_temporaries, write_atomic
 from service.runtime.events import EventFile
 from service.runtime.records import JsonlWriter
-from service.store.lock import DirectoryLock
+from service.store.lock import LOCK_FILE, DirectoryLock
 
 FORMAT_VERSION = 1
 """Of ``cell.json``, ``checkpoint.pt`` and ``result.json``, and of the table's files."""
+_ELSEWHERE = "name another directory (--run-dir, of a table --runs)"
 
 
 class TrainingDirectory:
@@ -74,14 +75,15 @@ class TrainingDirectory:
                 it; or the directory cannot be read or written.
         """
         self.check(identity, resume=resume)
-        self._lock = DirectoryLock(self.path, "stop that one first, or name another --run-dir")
+        self._lock = DirectoryLock(self.path, f"stop that one first, or {_ELSEWHERE}")
         self.check(identity, resume=resume)  # of two that begin at once, the second sees here what the first has made
         saved = self._read_checkpoint() if self.exists else None
-        self._metrics.truncate_after(saved["iteration"] if saved else 0)
         with os_errors("write", self.path):
             remove_temporaries(self.path)
+        write_json(self.cell_file, {"format_version": FORMAT_VERSION, **identity})  # first: it says whose the rest is
+        self._metrics.truncate_after(saved["iteration"] if saved else 0)
+        with os_errors("write", self.path):
             self._events = EventFile(self.path / "tensorboard", after_step=saved["env_steps"] if saved else None)
-            write_json(self.cell_file, {"format_version": FORMAT_VERSION, **identity})
         return saved
 
     def check(self, identity: dict[str, Any], *, resume: bool) -> None:
@@ -91,14 +93,22 @@ class TrainingDirectory:
             TandemError: it cannot; nothing was written.
         """
         if not self.exists:
+            if self._holds_something_else():
+                raise TandemError(f"{self.path} holds something else than a downstream training; {_ELSEWHERE}")
             return
         if not resume:
-            raise TandemError(
-                f"{self.path} holds a training already; continue it with --resume, or name another --run-dir"
-            )
+            raise TandemError(f"{self.path} holds a training already; continue it with --resume, or {_ELSEWHERE}")
         recorded = read_json(self.cell_file)
         if wrong := differences(recorded, {"format_version": FORMAT_VERSION, **identity}):
-            raise TandemError(f"{self.path} was begun with {'; '.join(wrong)}; name another --run-dir")
+            raise TandemError(f"{self.path} was begun with {'; '.join(wrong)}; {_ELSEWHERE}")
+
+    def _holds_something_else(self) -> bool:
+        """Whether anything is here but what a process leaves that was killed before it wrote its first file."""
+        if not self.path.exists():
+            return False
+        with os_errors("read", self.path):
+            names = [file.name for file in self.path.iterdir()]
+        return any(name != LOCK_FILE and not name.startswith(TEMPORARY_PREFIX) for name in names)
 
     def record(self, metrics: dict[str, float]) -> None:
         """Append one iteration's metrics to metrics.jsonl and TensorBoard."""
@@ -135,7 +145,7 @@ class TrainingDirectory:
         if saved.get("format_version") != FORMAT_VERSION:
             raise TandemError(
                 f"{self.checkpoint_file}: format version {saved.get('format_version')!r}, this program reads "
-                f"{FORMAT_VERSION}; name another --run-dir"
+                f"{FORMAT_VERSION}; {_ELSEWHERE}"
             )
         return saved
 
@@ -165,4 +175,9 @@ def write_json(path: Path, tree: dict[str, Any]) -> None:
         TandemError: the file cannot be written.
     """
     with os_errors("write", path):
-        write_atomic(path, (json.dumps(tree, indent=1, allow_nan=False) + "\n").encode())
+        write_atomic(path, to_json(tree))
+
+
+def to_json(tree: dict[str, Any]) -> bytes:
+    """As the files have it."""
+    return (json.dumps(tree, indent=1, allow_nan=False) + "\n").encode()

@@ -10,6 +10,7 @@ import numpy as np
 import torch
 from stable_baselines3 import SAC, HerReplayBuffer
 from stable_baselines3.common.buffers import DictReplayBuffer
+from stable_baselines3.common.logger import Logger
 
 from service.downstream.networks import GoalFeatures
 from service.downstream.vec_env import VecEnvState, WorldsVecEnv
@@ -32,7 +33,7 @@ _COUNTERS = ("num_timesteps", "_n_updates", "_episode_num")
 def make_learner(cell: CellConfig, method: Method, env: WorldsVecEnv) -> SAC:
     """A new learner; draws from the global random numbers of torch and NumPy, which its seed restarts."""
     sac = cell.sac
-    return SAC(
+    learner = SAC(
         method.policy(),
         env,
         learning_rate=sac.learning_rate,
@@ -47,9 +48,16 @@ def make_learner(cell: CellConfig, method: Method, env: WorldsVecEnv) -> SAC:
         replay_buffer_class=HerReplayBuffer if method.hindsight else DictReplayBuffer,
         replay_buffer_kwargs={"n_sampled_goal": 4, "goal_selection_strategy": "future"} if method.hindsight else None,
         policy_kwargs={"features_extractor_class": GoalFeatures, "net_arch": list(sac.hidden_sizes)},
-        seed=cell.seed,
+        seed=_spread(cell.seed),
         device="cpu",
     )
+    learner.set_logger(Logger(folder=None, output_formats=[]))  # else every ``learn`` makes a directory in /tmp
+    return learner
+
+
+def _spread(seed: int) -> int:
+    """A seed far from those of other cells: world i gets it plus i, so neighbours would share nearly all episodes."""
+    return int(np.random.SeedSequence(seed).generate_state(1)[0]) >> 1
 
 
 class LearnedPolicy:

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.actors.evaluation import Deterministic, Idle
-from service.downstream.compose import ComposePrimitivesVector, action_weights, check_primitives
+from service.downstream.compose import ComposePrimitivesVector, action_weights, check_primitives, check_robot
 from service.errors import TandemError
 
 if TYPE_CHECKING:
@@ -92,6 +92,7 @@ class Method:
         Raises:
             TandemError: primitives of another robot or layout, or none that can be composed.
         """
+        check_robot(trained)
         if self.composes:
             check_primitives(trained)
 

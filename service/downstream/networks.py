@@ -42,7 +42,7 @@ def bob_input(observations: dict[str, Tensor]) -> Tensor:
 
 
 class MCPActor(Actor):
-    """SAC's actor as a Multiplicative Compositional Policy: the network of our Bob, learned end to end.
+    """SAC's actor as a Multiplicative Compositional Policy: built as our Bob (``MCPConfig()``), learned end to end.
 
     K primitives see positions only, a gate sees the goal as well, and the product of the primitives' Gaussians, raised
     to the gate's weights, is one diagonal Gaussian (Peng et al. 2019, eq. 4; ``policies.composition``). SAC needs
@@ -51,11 +51,11 @@ class MCPActor(Actor):
     deterministic action is ``tanh(mean)``. Squashing the composition, not each primitive, keeps the product a Gaussian.
     """
 
-    def __init__(self, *args: Any, mcp: MCPConfig | None = None, **kwargs: Any) -> None:
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
         del self.latent_pi, self.mu, self.log_std  # SAC's own network
         assert self.action_space.shape is not None
-        self.mcp = MCPPolicy(mcp or MCPConfig(), self.action_space.shape[0])
+        self.mcp = MCPPolicy(MCPConfig(), self.action_space.shape[0])
 
     def get_action_dist_params(self, obs: Any) -> tuple[Tensor, Tensor, dict[str, Tensor]]:
         """Mean and log-std, (N, A) each, before the tanh."""

@@ -18,9 +18,11 @@ Cell = Sequence[Result]
 FINAL_SHARE = 0.9
 """Of a method's own final success: how soon it is reached is compared."""
 
-_HEAD = """# Downstream
+MARK = "Written by `tandem downstream table`"
+"""In every page, to tell it from one that a person wrote."""
+_HEAD = f"""# Downstream
 
-Written by `tandem downstream table` from the files in `downstream/`, one for each cell and run; [what the tasks and
+{MARK} from the files in `downstream/`, one for each cell and run; [what the tasks and
 methods are](../downstream.md).
 """
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from itertools import cycle
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -52,7 +53,7 @@ def draw_table(results: Results, path: Path) -> Path:
     """
     figure = new_figure(14.0, 8.0, "Success at the last step, over thousands of env steps")
     for axes, (name, task) in zip(figure.subplots(2, 3).flat, TASKS.items(), strict=True):
-        for (method, words), colour in zip(METHODS.items(), _COLOURS, strict=False):
+        for (method, words), colour in zip(METHODS.items(), cycle(_COLOURS), strict=False):
             chosen = [each for each in results if each["cell"]["task"] == name and each["cell"]["method"] == method]
             _draw_method(axes, chosen, words.title, colour)
         _finish(axes, task.title)

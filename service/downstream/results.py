@@ -6,9 +6,13 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
-from service.downstream.directory import FORMAT_VERSION, read_json, write_json
-from service.downstream.settings import CellConfig, differences
+from pydantic import ValidationError
+
+from service.downstream.directory import FORMAT_VERSION, read_json, to_json
+from service.downstream.methods import METHODS
+from service.downstream.settings import CellConfig, differences, first_line
 from service.errors import TandemError
+from service.registry.files import os_errors, write_exclusive
 
 Result = dict[str, Any]
 
@@ -34,18 +38,32 @@ class ResultsDirectory:
         if not path.exists():
             return None
         result = _read(path)
-        wanted = {"cell": cell.model_dump(mode="json"), "primitives": primitives}
-        if wrong := differences({key: result.get(key) for key in wanted}, wanted):
+        wanted = {"cell": _settings(cell), "primitives": primitives}
+        if wrong := differences({"cell": _settings(_cell(path, result)), "primitives": result["primitives"]}, wanted):
             raise TandemError(f"{path} is of {'; '.join(wrong)}: give the same settings, or name another directory")
         return result
 
     def missing(self, cells: Iterable[CellConfig], primitives: dict[str, str]) -> list[CellConfig]:
         """The cells that have to be run; every file is checked before any is.
 
+        What is in the directory and what is asked for comes onto one page: of the same primitives, and the seeds of a
+        method on a task with the same settings.
+
         Raises:
-            TandemError: as for ``find``.
+            TandemError: as for ``find``; or the page would mix what cannot be compared.
         """
-        return [cell for cell in cells if self.find(cell, primitives) is None]
+        missing = [cell for cell in cells if self.find(cell, primitives) is None]
+        of_all_seeds = {(cell.method, cell.task): (f"{cell.name}, asked for,", _settings(cell)) for cell in missing}
+        for path in self._files():
+            result = _read(path)
+            if result["primitives"] != primitives:
+                those = "; ".join(differences(result["primitives"], primitives))
+                raise TandemError(f"{path} is of primitives {those}: name another directory, or move it away")
+            cell = _cell(path, result)
+            other, settings = of_all_seeds.setdefault((cell.method, cell.task), (str(path), _settings(cell)))
+            if wrong := differences(_settings(cell) | {"seed": 0}, settings | {"seed": 0}):
+                raise TandemError(f"{path} and {other} are seeds of one method, but of {'; '.join(wrong)}")
+        return missing
 
     def add(self, cell: CellConfig, result: Result) -> None:
         """Keep a result, in one step.
@@ -54,9 +72,11 @@ class ResultsDirectory:
             TandemError: there is one already, or the disk is full.
         """
         path = self.file(cell)
-        if path.exists():
+        with os_errors("write", path):
+            path.parent.mkdir(parents=True, exist_ok=True)
+            kept = write_exclusive(path, to_json(result))
+        if not kept:
             raise TandemError(f"{path} is there already; another process runs the same table")
-        write_json(path, result)
 
     def read_all(self) -> list[Result]:
         """Every result there, by task, method and seed.
@@ -64,7 +84,25 @@ class ResultsDirectory:
         Raises:
             TandemError: a file is damaged or of another format version.
         """
-        return [_read(path) for path in sorted(self.path.glob("*.json"))]
+        return [_read(path) for path in self._files()]
+
+    def _files(self) -> list[Path]:
+        return sorted(self.path.glob("*.json"))
+
+
+def _cell(path: Path, result: Result) -> CellConfig:
+    """What a result is of; settings that are younger than it have their defaults."""
+    try:
+        return CellConfig.model_validate(result["cell"])
+    except ValidationError as error:
+        raise TandemError(f"{path}: {first_line(error)}; name another directory") from None
+
+
+def _settings(cell: CellConfig) -> dict[str, Any]:
+    """What a cell's result depends on: where nothing is learned, not on how."""
+    method = METHODS.get(cell.method)
+    learning = {"sac", "num_env_steps", "curve_every", "curve_episodes"}
+    return cell.model_dump(mode="json", exclude=learning if method and method.player else None)
 
 
 def _read(path: Path) -> Result:

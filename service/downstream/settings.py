@@ -7,8 +7,11 @@ from typing import Any
 from pydantic import BaseModel, ConfigDict, Field, PositiveInt, ValidationError
 
 from service.downstream.methods import find_method
+from service.envs.registration import EPISODE_STEPS
 from service.envs.tasks import find_task
 from service.errors import TandemError
+
+_MAX_SEED = 2**32 - 1
 
 
 class _Frozen(BaseModel):
@@ -27,7 +30,9 @@ class SACConfig(_Frozen):
     initial_entropy_coefficient: float = Field(
         0.1, gt=0.0, description="adapted from there; SB3 starts at 1, which drowns the first rewards"
     )
-    hidden_sizes: tuple[PositiveInt, ...] = Field((256, 256), min_length=1, description="actor and critics")
+    hidden_sizes: tuple[PositiveInt, ...] = Field(
+        (256, 256), min_length=1, description="actor and critics; an MCP actor has its own"
+    )
     learning_starts: int = Field(6_400, ge=0, description="env steps of uniform actions first; more than an episode")
 
 
@@ -36,7 +41,7 @@ class CellConfig(_Frozen):
 
     task: str
     method: str
-    seed: int = Field(0, ge=0)
+    seed: int = Field(0, ge=0, le=_MAX_SEED)
     num_env_steps: int = Field(300_000, ge=1, description="of learning; 0 in the result of a method that does not")
     sac: SACConfig = SACConfig()
     curve_every: int = Field(4, ge=1, description="iterations between evaluations on the way; one is 50 steps a world")
@@ -53,14 +58,30 @@ def make_cell(**values: Any) -> CellConfig:
     """A cell, checked.
 
     Raises:
-        TandemError: an unknown task or method, or a value out of its range.
+        TandemError: an unknown task or method, a value out of its range, or too few env steps to learn anything.
     """
     find_task(values.get("task", ""))
-    find_method(values.get("method", ""))
+    method = find_method(values.get("method", ""))
     try:
-        return CellConfig(**values)
+        cell = CellConfig(**values)
     except ValidationError as error:
-        raise TandemError(_first_line(error)) from None
+        raise TandemError(first_line(error)) from None
+    if method.player is None:
+        _check_learning(cell.sac, cell.num_env_steps, hindsight=method.hindsight)
+    return cell
+
+
+def _check_learning(sac: SACConfig, num_env_steps: int, *, hindsight: bool) -> None:
+    if num_env_steps <= sac.learning_starts:
+        raise TandemError(
+            f"{num_env_steps} env steps are all uniform actions: give more than learning_starts, {sac.learning_starts}"
+        )
+    episodes = EPISODE_STEPS * sac.num_worlds
+    if hindsight and sac.learning_starts < episodes:
+        raise TandemError(
+            f"learning_starts = {sac.learning_starts}: goals are relabelled from whole episodes, so give at least "
+            f"{episodes}, one of each of {sac.num_worlds} worlds"
+        )
 
 
 def make_sac(**values: Any) -> SACConfig:
@@ -72,7 +93,7 @@ def make_sac(**values: Any) -> SACConfig:
     try:
         return SACConfig(**values)
     except ValidationError as error:
-        raise TandemError(_first_line(error)) from None
+        raise TandemError(first_line(error)) from None
 
 
 def differences(recorded: dict[str, Any], wanted: dict[str, Any], prefix: str = "") -> list[str]:
@@ -87,7 +108,8 @@ def differences(recorded: dict[str, Any], wanted: dict[str, Any], prefix: str = 
     return found
 
 
-def _first_line(error: ValidationError) -> str:
+def first_line(error: ValidationError) -> str:
+    """What is wrong first, as ``key = value: why``."""
     first = error.errors()[0]
     where = ".".join(str(part) for part in first["loc"])
     return f"{where} = {first['input']!r}: {first['msg'][:1].lower()}{first['msg'][1:]}"

@@ -13,11 +13,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import service
-from service.downstream.page import write_page
+from service.downstream.methods import find_method
+from service.downstream.page import MARK, write_page
 from service.downstream.pictures import draw_table
 from service.downstream.results import Result, ResultsDirectory
 from service.downstream.settings import CellConfig
-from service.downstream.worker import Running, describe_primitives, run_cell
+from service.downstream.worker import Running, check_cell, describe_primitives, run_cell
 from service.errors import TandemError
 from service.registry.files import os_errors, write_atomic
 
@@ -37,6 +38,11 @@ class Source:
     """A directory, or the URL of a status service."""
     runs: Path
     """Training directories are made here."""
+
+    @property
+    def is_service(self) -> bool:
+        """Whether the registry is a status service."""
+        return self.registry.startswith(("http://", "https://"))
 
     def load(self) -> TrainedBob:
         """The primitives.
@@ -68,9 +74,9 @@ def make_table(cells: Sequence[CellConfig], source: Source, out: Path, runner: R
         TandemError: results of another version or other settings, primitives that do not fit or cannot be fetched, or a
             cell that failed. What had ended is kept.
     """
+    _check_page(out / PAGE_FILE)
     results, primitives = ResultsDirectory(out / RESULTS), describe_primitives(source.load())
     missing = results.missing(cells, primitives)
-    results.read_all()  # what the page cannot take in is found before hours of work
     watching.say(f"{len(cells) - len(missing)} of {len(cells)} cells are there, {len(missing)} to run")
     done = 0
     for cell, result in runner(missing, source, watching):
@@ -83,6 +89,14 @@ def make_table(cells: Sequence[CellConfig], source: Source, out: Path, runner: R
     for path in write_results(out):
         watching.say(str(path))
     return done == len(missing)
+
+
+def _check_page(path: Path) -> None:
+    """Refuse to replace what a person wrote."""
+    with os_errors("read", path):
+        ours = not path.exists() or MARK in path.read_text(encoding="utf-8")
+    if not ours:
+        raise TandemError(f"{path} was not written by this command; name another directory with --out")
 
 
 def write_results(out: Path) -> list[Path]:
@@ -106,7 +120,11 @@ def run_here(num_threads: int = 0) -> Runner:
 
     def run(cells: Sequence[CellConfig], source: Source, watching: Watching) -> Iterator[tuple[CellConfig, Result]]:
         trained = source.load()
+        for cell in cells:  # before hours of work
+            check_cell(cell, trained, source.runs / cell.name)
         for cell in cells:
+            if watching.stop():
+                return
             watching.say(f"{cell.name} ...")
             running = Running(
                 resume=True, num_threads=num_threads, stop=watching.stop, on_iteration=watching.on_iteration
@@ -122,8 +140,10 @@ def run_here(num_threads: int = 0) -> Runner:
 def run_on_ray(num_workers: int | None, num_threads: int = 1) -> Runner:
     """A runner that gives cells to tasks on the connected cluster.
 
-    Waits for whichever task ends first; told to stop, it lets tasks save and end. A task that a machine took with it is
-    tried again, and continues from its training directory where the new place has it.
+    Waits for whichever task ends first; told to stop, it ends them at once, and each loses what came after its last
+    checkpoint. A task that a machine took with it is tried again, and continues from its training directory where the
+    new place has it. Tasks fetch primitives from a service themselves; a directory is read here, and what was in it
+    sent along: another machine has another one.
 
     Args:
         num_workers: tasks at once, at most; None: as many as there are cores for.
@@ -135,30 +155,36 @@ def run_on_ray(num_workers: int | None, num_threads: int = 1) -> Runner:
 
         limit = num_workers or max(int(ray.cluster_resources().get("CPU", 1)) // num_threads, 1)
         task = ray.remote(num_cpus=num_threads, max_retries=3)(_run_remotely)
+        trained = source.load()
+        for cell in cells:
+            find_method(cell.method).check(trained)
+        primitives: Any = source if source.is_service else ray.put(trained)
         waiting, running = iter(cells), dict[Any, CellConfig]()
         while True:
             for cell in itertools.islice(waiting, limit - len(running)):
                 watching.say(f"{cell.name} ...")
-                running[task.remote(cell, source, num_threads)] = cell
+                running[task.remote(cell, primitives, source.runs / cell.name, num_threads)] = cell
             if not running or watching.stop():
                 for reference in running:
                     ray.cancel(reference, force=False)
                 return
             ended, _ = ray.wait(list(running), num_returns=1, timeout=_POLL_S)
             for reference in ended:
-                yield running.pop(reference), _fetch(reference)
+                cell = running.pop(reference)
+                yield cell, _fetch(cell, reference)
 
     return run
 
 
-def _run_remotely(cell: CellConfig, source: Source, num_threads: int) -> Result:
+def _run_remotely(cell: CellConfig, primitives: Source | TrainedBob, path: Path, num_threads: int) -> Result:
     """What a Ray task does, wherever it is."""
-    result = run_cell(cell, source.load(), source.runs / cell.name, Running(resume=True, num_threads=num_threads))
+    trained = primitives.load() if isinstance(primitives, Source) else primitives
+    result = run_cell(cell, trained, path, Running(resume=True, num_threads=num_threads))
     assert result is not None, "nobody asks a task to stop"
     return result
 
 
-def _fetch(reference: Any) -> Result:
+def _fetch(cell: CellConfig, reference: Any) -> Result:
     import ray
 
     try:
@@ -167,4 +193,7 @@ def _fetch(reference: Any) -> Result:
         if isinstance(error.cause, TandemError):
             raise error.cause from None
         raise
+    except ray.exceptions.RayError as error:  # the process was killed, out of memory, or its machine went, every time
+        why = str(error).strip().splitlines()[0]
+        raise TandemError(f"{cell.name}: its task died ({why}); the same command continues") from None
     return result

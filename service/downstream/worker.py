@@ -23,7 +23,7 @@ from service.downstream.directory import FORMAT_VERSION, TrainingDirectory, read
 from service.downstream.methods import Method, find_method
 from service.downstream.settings import CellConfig
 from service.envs.registration import EPISODE_STEPS
-from service.envs.tasks import find_task
+from service.envs.tasks import SUCCESS_DISTANCE_M, find_task
 from service.envs.vector import TabletopVectorEnv
 from service.errors import TandemError
 from service.registry.manifest import git_commit
@@ -66,7 +66,7 @@ def run_cell(cell: CellConfig, trained: TrainedBob, path: Path, running: Running
     """
     method = find_method(cell.method)
     method.check(trained)
-    identity = {"cell": cell.model_dump(mode="json"), "primitives": describe_primitives(trained)}
+    identity = _identity(cell, trained)
     with TrainingDirectory(path) as directory:
         saved = directory.start(identity, resume=running.resume)
         if directory.result_file.exists():
@@ -85,6 +85,20 @@ def run_cell(cell: CellConfig, trained: TrainedBob, path: Path, running: Running
             return _finish({**identity, **learned}, cell, trained, training.player, directory, running)
         finally:
             training.env.close()
+
+
+def check_cell(cell: CellConfig, trained: TrainedBob, path: Path) -> None:
+    """Assert that ``run_cell`` could begin or continue in that directory; nothing is written.
+
+    Raises:
+        TandemError: it could not.
+    """
+    find_method(cell.method).check(trained)
+    TrainingDirectory(path).check(_identity(cell, trained), resume=True)
+
+
+def _identity(cell: CellConfig, trained: TrainedBob) -> dict[str, Any]:
+    return {"cell": cell.model_dump(mode="json"), "primitives": describe_primitives(trained)}
 
 
 def describe_primitives(trained: TrainedBob) -> dict[str, str]:
@@ -188,6 +202,7 @@ def make_worlds(cell: CellConfig, method: Method, trained: TrainedBob, num_threa
         cell.sac.num_worlds,
         trained.config.world,
         task=cell.task,
+        success_distance_m=SUCCESS_DISTANCE_M,
         max_episode_steps=EPISODE_STEPS,
         num_threads=num_threads,
     )
@@ -204,7 +219,7 @@ def _play(
         task.goals,
         num_episodes=num_episodes,
         num_steps=EPISODE_STEPS,
-        success_distance_m=trained.config.game.success_distance_m,
+        success_distance_m=SUCCESS_DISTANCE_M,
         seed=seed,
         num_threads=running.num_threads,
     )
@@ -256,7 +271,7 @@ def _film(cell: CellConfig, trained: TrainedBob, player: Deterministic, path: Pa
         task.goals,
         num_episodes=_NUM_FILMED,
         num_steps=EPISODE_STEPS,
-        success_distance_m=trained.config.game.success_distance_m,
+        success_distance_m=SUCCESS_DISTANCE_M,
         seed=cell.seed + _FINAL_SEED,
     )
     return write_episode_video(filmed, world, path)

@@ -38,6 +38,9 @@ class Task:
         return WorldConfig.model_validate(tree)
 
 
+SUCCESS_DISTANCE_M = 0.05
+"""Of every task (paper), whatever primitives were trained with."""
+
 TASKS: Mapping[str, Task] = {
     "larger": Task(
         "Larger",

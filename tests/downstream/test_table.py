@@ -74,6 +74,19 @@ def test_a_stopped_table_says_so_and_continues_its_training(source, tmp_path):
     assert [json.loads(line)["iteration"] for line in lines] == [1, 2, 3]
 
 
+def test_how_to_learn_is_nothing_to_what_does_not(source, tmp_path):
+    table(CELLS[:1], source, tmp_path)
+    ran = []
+    assert table([small_cell("idle", num_env_steps=9000)], source, tmp_path, counted(ran))
+    assert ran == []
+
+
+def test_a_stop_between_cells_that_do_not_learn(source, tmp_path):
+    ran = []
+    assert not table(CELLS, source, tmp_path, counted(ran), stop=lambda: len(ran) >= 1)
+    assert ran == [CELLS[0].name]
+
+
 def test_many_at_once_on_ray(source, tmp_path):
     from service.runtime.connecting import connected
 
@@ -122,6 +135,29 @@ class TestBadInput:
         tree["primitives"]["digest"] = "0" * 64
         file.write_text(json.dumps(tree))
         self.refused(r"push-idle-0\.json is of primitives\.digest '000", CELLS, source, tmp_path)
+
+    def test_a_page_that_a_person_wrote(self, source, tmp_path):
+        (tmp_path / "out").mkdir()
+        (tmp_path / "out" / "downstream.md").write_text("# How to learn downstream\n")
+        self.refused(r"downstream\.md was not written by this command", CELLS, source, tmp_path)
+
+    def test_seeds_of_other_settings(self, file, source, tmp_path):
+        cells = [small_cell("idle", seed=1, num_episodes=9)]
+        words = r"push-idle-0\.json and push-idle-1, asked for, are seeds of one method, but of num_episodes 6, not 9"
+        self.refused(words, cells, source, tmp_path)
+
+    def test_other_primitives_of_a_cell_that_is_not_asked_for(self, file, source, tmp_path):
+        tree = json.loads(file.read_text())
+        tree["primitives"]["name"] = "panda-cube@3"
+        file.write_text(json.dumps(tree))
+        self.refused(r"push-idle-0\.json is of primitives name 'panda-cube@3', not", CELLS[3:], source, tmp_path)
+
+    def test_a_training_directory_of_other_settings(self, source, tmp_path):
+        table([small_cell("idle", "box", num_episodes=9)], source, tmp_path)
+        ran = []
+        with pytest.raises(TandemError, match=r"num_episodes 9, not 6.* of a table --runs"):
+            make_table(CELLS, source, tmp_path / "other", counted(ran), Watching())
+        assert ran == []
 
     def test_no_json(self, file, source, tmp_path):
         file.write_text("{")

@@ -6,7 +6,9 @@ import pytest
 import torch
 
 from service.downstream.compose import parameters_digest
-from service.downstream.worker import Running, run_cell
+from service.downstream.learner import make_learner
+from service.downstream.methods import find_method
+from service.downstream.worker import Running, make_worlds, run_cell
 from service.errors import TandemError
 from service.runtime.records import read_jsonl
 from tests.downstream.cells import small_cell
@@ -89,6 +91,32 @@ def test_a_finished_training_is_not_run_again(champion, tmp_path):
     assert (tmp_path / "result.json").stat().st_mtime_ns == stamp
 
 
+def test_what_a_killed_process_left_before_its_first_file_is_no_training(champion, tmp_path):
+    for name in (".lock", ".tmp-1-cell"):
+        (tmp_path / name).touch()
+    run(small_cell("idle"), champion, tmp_path)
+    assert not list(tmp_path.glob(".tmp-*"))
+
+
+def test_success_is_within_5_cm_whatever_primitives_were_trained_with(champion, tmp_path):
+    game = champion.config.game.model_copy(update={"success_distance_m": 0.001})
+    strict = dataclasses.replace(champion, config=champion.config.model_copy(update={"game": game}))
+    cell = small_cell("asp-only", "inair", num_episodes=40)
+    assert run(cell, strict, tmp_path / "strict")["evaluation"]["success_last"] > 0.8
+
+
+def test_seeds_share_no_episodes(champion):
+    streams = []
+    for seed in (0, 1):
+        cell = small_cell(seed=seed)
+        env = make_worlds(cell, find_method("ours"), champion, 1)
+        make_learner(cell, find_method("ours"), env)
+        streams.append(env.reset()["desired_goal"])
+        env.close()
+    distance = np.linalg.norm(streams[0][:, None] - streams[1][None], axis=2)
+    assert distance.min() > 1e-6
+
+
 def test_methods_without_learning_play_as_they_are(champion, tmp_path):
     """Bob is good in the air; who does nothing is at the goal at times, at the last step as at any."""
     cells = [small_cell(method, "inair", num_episodes=60) for method in ("asp-only", "idle")]
@@ -110,6 +138,14 @@ class TestBadInput:
         run(small_cell("idle"), champion, tmp_path)
         self.refused("holds a training already; continue it with --resume", small_cell("idle"), champion, tmp_path)
 
+    def test_a_directory_of_something_else(self, champion, tmp_path):
+        (tmp_path / "metrics.jsonl").write_text('{"iteration": 1}\n')
+        (tmp_path / "config.yaml").write_text("name: cube\n")
+        for resume in (False, True):
+            self.refused(
+                "something else than a downstream training", small_cell("idle"), champion, tmp_path, resume=resume
+            )
+
     def test_another_training(self, champion, tmp_path):
         run(small_cell("idle"), champion, tmp_path)
         other = small_cell("idle", num_episodes=7)
@@ -124,7 +160,8 @@ class TestBadInput:
     def test_primitives_of_another_robot(self, champion, tmp_path):
         spaces = {**champion.manifest.spaces, "action": 7}
         other = dataclasses.replace(champion, manifest=champion.manifest.model_copy(update={"spaces": spaces}))
-        self.refused("another robot or layout: action 7", small_cell(), other, tmp_path / "new")
+        for method in ("ours", "asp-only", "idle", "scratch-mcp"):
+            self.refused("another robot or layout: action 7", small_cell(method), other, tmp_path / "new")
 
     def test_a_damaged_checkpoint(self, champion, tmp_path):
         run(small_cell(), champion, tmp_path, stop=Stop(1))
