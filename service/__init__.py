@@ -15,6 +15,11 @@ __all__ = ["load_primitives"]
 __version__ = "0.1.0"
 
 
+def is_service(registry: Path | str) -> bool:
+    """Whether a registry is the URL of a ``tandem serve``, not a directory."""
+    return str(registry).startswith(("http://", "https://"))
+
+
 def load_primitives(reference: str = "panda-cube@champion", registry: Path | str = "registry") -> TrainedBob:
     """Primitives to act with and to compose, without torch; ``panda-cube@champion`` comes with the package.
 
@@ -31,9 +36,9 @@ def load_primitives(reference: str = "panda-cube@champion", registry: Path | str
     """
     from service.runtime.primitives import load_bob
 
-    if isinstance(registry, str) and registry.startswith(("http://", "https://")):
+    if is_service(registry):
         from service.status.client import fetch_primitives
 
-        fetched, version = fetch_primitives(registry, reference)
+        fetched, version = fetch_primitives(str(registry), reference)
         return load_bob(str(version), fetched.root)
     return load_bob(reference, Path(registry))

@@ -39,11 +39,6 @@ class Source:
     runs: Path
     """Training directories are made here."""
 
-    @property
-    def is_service(self) -> bool:
-        """Whether the registry is a status service."""
-        return self.registry.startswith(("http://", "https://"))
-
     def load(self) -> TrainedBob:
         """The primitives.
 
@@ -158,7 +153,7 @@ def run_on_ray(num_workers: int | None, num_threads: int = 1) -> Runner:
         trained = source.load()
         for cell in cells:
             find_method(cell.method).check(trained)
-        primitives: Any = source if source.is_service else ray.put(trained)
+        primitives: Any = source if service.is_service(source.registry) else ray.put(trained)
         waiting, running = iter(cells), dict[Any, CellConfig]()
         while True:
             for cell in itertools.islice(waiting, limit - len(running)):

@@ -264,7 +264,7 @@ def test_images_are_ours_by_one_name_or_pinned():
     assert all(re.fullmatch(r"[\w/-]+:\d+\.\d+[\w.-]*", image) for image in images - ours)
 
 
-@pytest.mark.skipif(shutil.which("kubectl") is None, reason="no kubectl here")
+@pytest.mark.skipif(shutil.which("kubectl") is None, reason="kubectl, which renders kustomizations, is not on PATH")
 @pytest.mark.parametrize("folder", FOLDERS)
 def test_kustomize_builds_it(folder):
     result = subprocess.run(

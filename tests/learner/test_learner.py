@@ -310,7 +310,7 @@ def test_a_broken_turn_leaves_the_player_as_it_was():
     assert any(not np.array_equal(before.bob[name], after.bob[name]) for name in before.bob)
 
 
-@pytest.mark.skipif(torch.cuda.is_available(), reason="this machine has CUDA")
+@pytest.mark.skipif(torch.cuda.is_available(), reason="asking for CUDA is no mistake on a machine that has it")
 def test_cuda_that_is_not_there_is_the_users_mistake():
     with pytest.raises(LearnerError, match=r"learner\.device=cpu"):
         Learner(make_config(device="cuda"))

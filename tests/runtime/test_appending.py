@@ -64,7 +64,7 @@ def test_a_part_is_taken_back_when_a_signal_comes_between_two_writes(path, monke
     assert path.read_bytes() == b"aaa"
 
 
-@pytest.mark.skipif(not os.path.exists("/dev/full"), reason="no such device here")
+@pytest.mark.skipif(not os.path.exists("/dev/full"), reason="/dev/full, which refuses every write, is Linux only")
 def test_a_device_that_is_always_full(tmp_path):
     path = tmp_path / "pieces"
     path.symlink_to("/dev/full")

@@ -38,7 +38,7 @@ def environment(tmp_path_factory):
         yield {**os.environ, "TANDEM_URL": server.url, "TANDEM_TOKEN": TOKEN, "no_proxy": "*"}
 
 
-@pytest.mark.skipif(shutil.which("curl") is None, reason="no curl here")
+@pytest.mark.skipif(shutil.which("curl") is None, reason="the documents' examples call curl, which is not on PATH")
 @pytest.mark.parametrize("command", commands())
 def test_examples(environment, tmp_path, command):
     checked = command.replace("curl ", "curl --fail-with-body --max-time 20 ", 1)

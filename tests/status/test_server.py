@@ -38,12 +38,12 @@ def test_every_address_is_reached_over_loopback(home):
         assert server.url == f"http://127.0.0.1:{server.port}"
 
 
-@pytest.mark.skipif(not socket.has_ipv6, reason="no IPv6 here")
+@pytest.mark.skipif(not socket.has_ipv6, reason="this Python was built without IPv6")
 def test_ipv6(home):
     try:
         server = serve(home, host="::1", token=None)
     except StatusError:
-        pytest.skip("no IPv6 loopback here")
+        pytest.skip("this machine has no IPv6 loopback, ::1")
     with server:
         assert server.url == f"http://[::1]:{server.port}"
         assert httpx.get(f"{server.url}/v1/runs", trust_env=False).status_code == 200

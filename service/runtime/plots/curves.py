@@ -119,7 +119,7 @@ def plot_curves(run_dir: Path) -> Path:
     for place, (axes, panel) in enumerate(zip(figure.subplots(2, 3).flat, _PANELS, strict=True)):
         _draw_panel(axes, panel, steps, records)
         axes.set_xlabel("million env steps" if place >= 3 else "", color=FAINT)
-    figure.subplots_adjust(left=0.05, right=0.908, top=0.85, bottom=0.08, wspace=0.48, hspace=0.42)
+    figure.subplots_adjust(left=0.05, right=0.908, top=0.85, bottom=0.08, wspace=0.64, hspace=0.42)
     return save(figure, run_dir / CURVES_FILE)
 
 
