@@ -82,9 +82,14 @@ class Method:
     hindsight: bool = False
     """Whether replayed goals are relabelled (HER, ``future``, k = 4)."""
     composes: bool = False
-    """Whether it needs primitives that can be composed; else they only say in which world it plays."""
+    """Whether it needs primitives that can be composed."""
     player: Callable[[TrainedBob], Deterministic] | None = None
     """Who plays, where nothing is learned."""
+
+    @property
+    def takes_primitives(self) -> bool:
+        """Whether its result depends on them; else they only say in which world it plays."""
+        return self.composes or self.player is _bob
 
     def check(self, trained: TrainedBob) -> None:
         """Assert that these primitives are for this method.

@@ -130,6 +130,7 @@ def _markdown(rows: Sequence[Sequence[str]]) -> str:
 
 
 def _origin(results: Sequence[Result]) -> str:
-    primitives = sorted({f"{each['primitives']['name']} ({each['primitives']['digest'][:12]})" for each in results})
+    taken = [each["primitives"] for each in results if each["primitives"]]
+    primitives = sorted({f"{each['name']} ({each['digest'][:12]})" for each in taken})
     commits = sorted({each["made"]["git_commit"][:12] for each in results if each["made"]["git_commit"]})
     return f"Primitives: {', '.join(primitives) or 'none'}. Commits: {', '.join(commits) or 'unknown'}.\n"

@@ -11,6 +11,7 @@ from pydantic import ValidationError
 from service.downstream.directory import FORMAT_VERSION, read_json, to_json
 from service.downstream.methods import METHODS
 from service.downstream.settings import CellConfig, differences, first_line
+from service.downstream.worker import Described
 from service.errors import TandemError
 from service.registry.files import os_errors, write_exclusive
 
@@ -28,7 +29,7 @@ class ResultsDirectory:
         """Where the result of a cell is, or will be."""
         return self.path / f"{cell.name}.json"
 
-    def find(self, cell: CellConfig, primitives: dict[str, str]) -> Result | None:
+    def find(self, cell: CellConfig, described: Described) -> Result | None:
         """The result of a cell; None where it has not been run.
 
         Raises:
@@ -38,28 +39,27 @@ class ResultsDirectory:
         if not path.exists():
             return None
         result = _read(path)
-        wanted = {"cell": _settings(cell), "primitives": primitives}
-        if wrong := differences({"cell": _settings(_cell(path, result)), "primitives": result["primitives"]}, wanted):
+        wanted = {"cell": _settings(cell), **described.of(cell.method)}
+        if wrong := differences({"cell": _settings(_cell(path, result)), **_made_with(result)}, wanted):
             raise TandemError(f"{path} is of {'; '.join(wrong)}: give the same settings, or name another directory")
         return result
 
-    def missing(self, cells: Iterable[CellConfig], primitives: dict[str, str]) -> list[CellConfig]:
+    def missing(self, cells: Iterable[CellConfig], described: Described) -> list[CellConfig]:
         """The cells that have to be run; every file is checked before any is.
 
-        What is in the directory and what is asked for comes onto one page: of the same primitives, and the seeds of a
-        method on a task with the same settings.
+        What is in the directory and what is asked for comes onto one page: of the same world, of the same primitives
+        where a method takes any, and the seeds of a method on a task with the same settings.
 
         Raises:
             TandemError: as for ``find``; or the page would mix what cannot be compared.
         """
-        missing = [cell for cell in cells if self.find(cell, primitives) is None]
+        missing = [cell for cell in cells if self.find(cell, described) is None]
         of_all_seeds = {(cell.method, cell.task): (f"{cell.name}, asked for,", _settings(cell)) for cell in missing}
         for path in self._files():
             result = _read(path)
-            if result["primitives"] != primitives:
-                those = "; ".join(differences(result["primitives"], primitives))
-                raise TandemError(f"{path} is of primitives {those}: name another directory, or move it away")
             cell = _cell(path, result)
+            if wrong := differences(_made_with(result), described.of(cell.method)):
+                raise TandemError(f"{path} is of {'; '.join(wrong)}: name another directory, or move it away")
             other, settings = of_all_seeds.setdefault((cell.method, cell.task), (str(path), _settings(cell)))
             if wrong := differences(_settings(cell) | {"seed": 0}, settings | {"seed": 0}):
                 raise TandemError(f"{path} and {other} are seeds of one method, but of {'; '.join(wrong)}")
@@ -96,6 +96,10 @@ def _cell(path: Path, result: Result) -> CellConfig:
         return CellConfig.model_validate(result["cell"])
     except ValidationError as error:
         raise TandemError(f"{path}: {first_line(error)}; name another directory") from None
+
+
+def _made_with(result: Result) -> dict[str, Any]:
+    return {key: result.get(key) for key in ("primitives", "world")}
 
 
 def _settings(cell: CellConfig) -> dict[str, Any]:

@@ -18,7 +18,7 @@ from service.downstream.page import MARK, write_page
 from service.downstream.pictures import draw_table
 from service.downstream.results import Result, ResultsDirectory
 from service.downstream.settings import CellConfig
-from service.downstream.worker import Running, check_cell, describe_primitives, run_cell
+from service.downstream.worker import Running, check_cell, describe, run_cell
 from service.errors import TandemError
 from service.registry.files import os_errors, write_atomic
 
@@ -70,12 +70,12 @@ def make_table(cells: Sequence[CellConfig], source: Source, out: Path, runner: R
             cell that failed. What had ended is kept.
     """
     _check_page(out / PAGE_FILE)
-    results, primitives = ResultsDirectory(out / RESULTS), describe_primitives(source.load())
-    missing = results.missing(cells, primitives)
+    results, described = ResultsDirectory(out / RESULTS), describe(source.load())
+    missing = results.missing(cells, described)
     watching.say(f"{len(cells) - len(missing)} of {len(cells)} cells are there, {len(missing)} to run")
     done = 0
     for cell, result in runner(missing, source, watching):
-        if result["primitives"] != primitives:
+        if any(result[key] != value for key, value in described.of(cell.method).items()):
             raise TandemError(f"{source.primitives} has changed in {source.registry} meanwhile; give NAME@VERSION")
         results.add(cell, result)
         done += 1

@@ -20,7 +20,7 @@ import numpy as np
 from service.actors.evaluation import Deterministic, Evaluation, evaluate, wilson_interval
 from service.downstream.compose import parameters_digest
 from service.downstream.directory import FORMAT_VERSION, TrainingDirectory, read_json, write_json
-from service.downstream.methods import Method, find_method
+from service.downstream.methods import METHODS, Method, find_method
 from service.downstream.settings import CellConfig
 from service.envs.registration import EPISODE_STEPS
 from service.envs.tasks import SUCCESS_DISTANCE_M, find_task
@@ -80,7 +80,7 @@ def run_cell(cell: CellConfig, trained: TrainedBob, path: Path, running: Running
             learned = training.run(saved)
             if learned is None:
                 return None
-            if describe_primitives(trained) != identity["primitives"]:
+            if _identity(cell, trained) != identity:
                 raise RuntimeError("the frozen primitives have changed while they were composed")
             return _finish({**identity, **learned}, cell, trained, training.player, directory, running)
         finally:
@@ -98,13 +98,30 @@ def check_cell(cell: CellConfig, trained: TrainedBob, path: Path) -> None:
 
 
 def _identity(cell: CellConfig, trained: TrainedBob) -> dict[str, Any]:
-    return {"cell": cell.model_dump(mode="json"), "primitives": describe_primitives(trained)}
+    return {"cell": cell.model_dump(mode="json"), **describe(trained).of(cell.method)}
 
 
-def describe_primitives(trained: TrainedBob) -> dict[str, str]:
-    """Which primitives, and the SHA-256 of their parameters."""
+@dataclass(frozen=True, slots=True)
+class Described:
+    """What results are of, besides their cells: the primitives, and the world that they bring along."""
+
+    primitives: dict[str, str]
+    """Name, and SHA-256 of the parameters as ``digest``."""
+    world: dict[str, Any]
+    """Its settings, before a task replaces some."""
+
+    def of(self, method: str) -> dict[str, Any]:
+        """What a method's result says of them: no primitives where it takes none."""
+        known = METHODS.get(method)
+        without = known is not None and not known.takes_primitives
+        return {"primitives": None if without else self.primitives, "world": self.world}
+
+
+def describe(trained: TrainedBob) -> Described:
+    """Which primitives and world these are."""
     name = trained.label if trained.manifest is None else trained.manifest.reference  # the same wherever it came from
-    return {"name": name, "digest": parameters_digest(trained.policy)}
+    primitives = {"name": name, "digest": parameters_digest(trained.policy)}
+    return Described(primitives, trained.config.world.model_dump(mode="json"))
 
 
 class _Training:

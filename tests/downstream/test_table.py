@@ -1,3 +1,4 @@
+import dataclasses
 import json
 
 import pytest
@@ -5,6 +6,7 @@ import pytest
 from service.downstream.page import steps_until, write_page
 from service.downstream.results import ResultsDirectory
 from service.downstream.table import Source, Watching, make_table, run_here, run_on_ray
+from service.downstream.worker import describe
 from service.errors import TandemError
 from tests.downstream.cells import small_cell
 
@@ -81,6 +83,18 @@ def test_how_to_learn_is_nothing_to_what_does_not(source, tmp_path):
     assert ran == []
 
 
+def test_new_primitives_leave_what_takes_none(source, tmp_path):
+    scratch = small_cell("scratch-monolithic")
+    table([scratch, *CELLS[:2]], source, tmp_path)
+    described = describe(source.load())
+    newer = dataclasses.replace(described, primitives={"name": "panda-cube@99", "digest": "0" * 64})
+    results = ResultsDirectory(tmp_path / "out" / "downstream")
+    assert results.find(scratch, newer)["primitives"] is None
+    assert results.find(CELLS[0], newer)["world"] == described.world
+    with pytest.raises(TandemError, match=r"primitives\.name 'panda-cube@4', not 'panda-cube@99'"):
+        results.find(CELLS[1], newer)
+
+
 def test_a_stop_between_cells_that_do_not_learn(source, tmp_path):
     ran = []
     assert not table(CELLS, source, tmp_path, counted(ran), stop=lambda: len(ran) >= 1)
@@ -130,11 +144,16 @@ class TestBadInput:
         cells = [small_cell("idle", num_episodes=9)]
         self.refused(r"push-idle-0\.json is of cell\.num_episodes 6, not 9", cells, source, tmp_path)
 
-    def test_other_primitives(self, file, source, tmp_path):
-        tree = json.loads(file.read_text())
+    @pytest.fixture
+    def played(self, source, tmp_path):
+        table(CELLS[1:2], source, tmp_path)
+        return tmp_path / "out" / "downstream" / "push-asp-only-0.json"
+
+    def test_other_primitives(self, played, source, tmp_path):
+        tree = json.loads(played.read_text())
         tree["primitives"]["digest"] = "0" * 64
-        file.write_text(json.dumps(tree))
-        self.refused(r"push-idle-0\.json is of primitives\.digest '000", CELLS, source, tmp_path)
+        played.write_text(json.dumps(tree))
+        self.refused(r"push-asp-only-0\.json is of primitives\.digest '000", CELLS, source, tmp_path)
 
     def test_a_page_that_a_person_wrote(self, source, tmp_path):
         (tmp_path / "out").mkdir()
@@ -146,11 +165,18 @@ class TestBadInput:
         words = r"push-idle-0\.json and push-idle-1, asked for, are seeds of one method, but of num_episodes 6, not 9"
         self.refused(words, cells, source, tmp_path)
 
-    def test_other_primitives_of_a_cell_that_is_not_asked_for(self, file, source, tmp_path):
-        tree = json.loads(file.read_text())
+    def test_other_primitives_of_a_cell_that_is_not_asked_for(self, played, source, tmp_path):
+        tree = json.loads(played.read_text())
         tree["primitives"]["name"] = "panda-cube@3"
+        played.write_text(json.dumps(tree))
+        words = r"push-asp-only-0\.json is of primitives\.name 'panda-cube@3', not"
+        self.refused(words, CELLS[3:], source, tmp_path)
+
+    def test_another_world(self, file, source, tmp_path):
+        tree = json.loads(file.read_text())
+        tree["world"]["friction"] = 0.5
         file.write_text(json.dumps(tree))
-        self.refused(r"push-idle-0\.json is of primitives name 'panda-cube@3', not", CELLS[3:], source, tmp_path)
+        self.refused(r"push-idle-0\.json is of world\.friction 0\.5, not 1\.0", CELLS[2:], source, tmp_path)
 
     def test_a_training_directory_of_other_settings(self, source, tmp_path):
         table([small_cell("idle", "box", num_episodes=9)], source, tmp_path)
