@@ -7,7 +7,7 @@
 | ``tensorboard/`` | the same metrics as TensorBoard events over env steps |
 | ``checkpoint.pt`` | everything the training continues from exactly, replay buffer included |
 | ``result.json`` | how well it does in the end |
-| ``model.zip`` | the learner as Stable-Baselines3 saves it: ``SAC.load(file, env)`` |
+| ``model.zip`` | the learner as Stable-Baselines3 saves it: ``SAC.load(file, env)``, env as of ``worker.make_worlds`` |
 | ``curves.png``, ``episodes.mp4`` | for people |
 | ``.lock`` | held by the process that trains |
 """

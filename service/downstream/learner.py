@@ -13,6 +13,7 @@ from stable_baselines3.common.buffers import DictReplayBuffer
 from stable_baselines3.common.logger import Logger
 
 from service.downstream.networks import GoalFeatures
+from service.downstream.previous import PREVIOUS, PreviousState
 from service.downstream.vec_env import VecEnvState, WorldsVecEnv
 from service.envs.observations import GOAL_SLICE, OBJECT_SLICE, POSITIONS_SIZE
 from service.envs.vector import VectorState
@@ -47,7 +48,11 @@ def make_learner(cell: CellConfig, method: Method, env: WorldsVecEnv) -> SAC:
         ent_coef=f"auto_{sac.initial_entropy_coefficient}",
         replay_buffer_class=HerReplayBuffer if method.hindsight else DictReplayBuffer,
         replay_buffer_kwargs={"n_sampled_goal": 4, "goal_selection_strategy": "future"} if method.hindsight else None,
-        policy_kwargs={"features_extractor_class": GoalFeatures, "net_arch": list(sac.hidden_sizes)},
+        policy_kwargs={
+            "features_extractor_class": GoalFeatures,
+            "net_arch": list(sac.hidden_sizes),
+            "optimizer_kwargs": {"fused": True},  # a tenth of an update's time
+        },
         seed=_spread(cell.seed),
         device="cpu",
     )
@@ -61,18 +66,24 @@ def _spread(seed: int) -> int:
 
 
 class LearnedPolicy:
-    """What a learner has learned, as evaluation and films take it: Bob's input to actions, without noise."""
+    """What a learner has learned, as evaluation and films take it: Bob's input to actions, without noise.
+
+    Plays N episodes from their start; others need another one, since it keeps the positions of the step before.
+    """
 
     def __init__(self, learner: SAC, method: Method, trained: TrainedBob) -> None:
         self._learner, self._method, self._trained = learner, method, trained
+        self._previous: FloatArray | None = None
 
     def act_deterministic(self, observation: FloatArray) -> FloatArray:
         """(N, 14) Bob's input to actions (N, 4)."""
         positions = observation[:, :POSITIONS_SIZE]
+        previous, self._previous = self._previous, positions.copy()
         seen = {
             "observation": positions,
             "achieved_goal": observation[:, OBJECT_SLICE],
             "desired_goal": observation[:, GOAL_SLICE],
+            PREVIOUS: positions if previous is None else previous,
         }
         actions, _ = self._learner.predict(cast("dict[str, Any]", seen), deterministic=True)
         return self._method.decode(self._trained, positions, actions)
@@ -135,16 +146,18 @@ def _restore_replay(buffer: Any, saved: dict[str, Any]) -> None:
 
 
 def _save_worlds(state: VecEnvState) -> dict[str, Any]:
-    worlds: VectorState = state.worlds
-    tree = asdict(worlds) | {"returns": state.returns, "lengths": state.lengths}
+    inside: PreviousState = state.worlds
+    worlds: VectorState = inside.worlds
+    tree = asdict(worlds) | {"previous": inside.previous, "returns": state.returns, "lengths": state.lengths}
     arrays = {name: torch.from_numpy(value) for name, value in tree.items() if name != "random"}
     return {"arrays": arrays, "random": json.dumps(worlds.random)}
 
 
 def _worlds_state(saved: dict[str, Any]) -> VecEnvState:
     arrays = {name: value.numpy() for name, value in saved["arrays"].items()}
-    returns, lengths = arrays.pop("returns"), arrays.pop("lengths")
-    return VecEnvState(VectorState(**arrays, random=tuple(json.loads(saved["random"]))), returns, lengths)
+    previous, returns, lengths = (arrays.pop(name) for name in ("previous", "returns", "lengths"))
+    worlds = VectorState(**arrays, random=tuple(json.loads(saved["random"])))
+    return VecEnvState(PreviousState(worlds, previous), returns, lengths)
 
 
 def _numpy_random() -> list[Any]:

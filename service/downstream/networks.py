@@ -11,21 +11,32 @@ from stable_baselines3.sac.policies import LOG_STD_MAX, LOG_STD_MIN, Actor, Mult
 from torch import Tensor
 
 from service.config import MCPConfig
-from service.envs.observations import BOB_SIZE, GOAL_SLICE, NORMALISATION_BOB, NORMALISATION_BOB_VALUE, OBJECT_SLICE
+from service.downstream.previous import PREVIOUS
+from service.envs.observations import (
+    BOB_SIZE,
+    EFFECTOR_SLICE,
+    GOAL_SLICE,
+    NORMALISATION_BOB,
+    NORMALISATION_BOB_VALUE,
+    OBJECT_SLICE,
+)
 from service.policies.layers import InputNormalisation
 from service.policies.networks import MCPPolicy
 
+STEP_SCALE_M = 0.02
+"""Of movements in a step, as inputs: the hand's full speed is two to three times as much."""
+
 
 class GoalFeatures(BaseFeaturesExtractor):
-    """(N, 17): the 11 positions, the goal, and the goal relative to the object, normalised as for Bob's gate.
+    """(N, 23): positions 11, goal 3, goal relative to object 3, movements of end effector 3 and object 3 in a step.
 
-    Positions in metres are too small for a new network; all methods see the same.
+    Normalised, as for Bob's gate: metres are too small for a new network. All methods see the same.
     """
 
     scale: Tensor
 
     def __init__(self, observation_space: gymnasium.spaces.Dict) -> None:
-        super().__init__(observation_space, BOB_SIZE + 3)
+        super().__init__(observation_space, BOB_SIZE + 9)
         self.normalise = InputNormalisation(NORMALISATION_BOB)
         self.register_buffer("scale", torch.tensor(NORMALISATION_BOB_VALUE.scale[-3:]))
 
@@ -33,7 +44,9 @@ class GoalFeatures(BaseFeaturesExtractor):
         """From a batch of goal observations."""
         rows = bob_input(observations)
         relative = (rows[:, GOAL_SLICE] - rows[:, OBJECT_SLICE]) / self.scale
-        return torch.cat((self.normalise(rows), relative.clamp(-5.0, 5.0)), dim=1)
+        moved = (observations["observation"] - observations[PREVIOUS]) / STEP_SCALE_M
+        moved = torch.cat((moved[:, EFFECTOR_SLICE], moved[:, OBJECT_SLICE]), dim=1)
+        return torch.cat((self.normalise(rows), relative.clamp(-5.0, 5.0), moved.clamp(-5.0, 5.0)), dim=1)
 
 
 def bob_input(observations: dict[str, Tensor]) -> Tensor:

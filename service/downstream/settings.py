@@ -22,7 +22,7 @@ class SACConfig(_Frozen):
     """Soft actor-critic on many worlds: every world makes a step, then there are several large updates."""
 
     num_worlds: int = Field(64, ge=1)
-    gradient_steps: int = Field(8, ge=1, description="updates after a step of every world")
+    gradient_steps: int = Field(16, ge=1, description="updates after a step of every world")
     batch_size: int = Field(256, ge=1)
     learning_rate: float = Field(1e-3, gt=0.0, description="rl-zoo for Panda and Fetch")
     gamma: float = Field(0.95, gt=0.0, lt=1.0, description="rl-zoo; a horizon of 20 of the 50 steps")
@@ -42,7 +42,7 @@ class CellConfig(_Frozen):
     task: str
     method: str
     seed: int = Field(0, ge=0, le=_MAX_SEED)
-    num_env_steps: int = Field(300_000, ge=1, description="of learning; 0 in the result of a method that does not")
+    num_env_steps: int = Field(200_000, ge=1, description="of learning; 0 in the result of a method that does not")
     sac: SACConfig = SACConfig()
     curve_every: int = Field(4, ge=1, description="iterations between evaluations on the way; one is 50 steps a world")
     curve_episodes: int = Field(100, ge=1)

@@ -7,6 +7,7 @@ last checkpoint, and ``resume`` makes that again bit for bit.
 
 from __future__ import annotations
 
+import functools
 import logging
 import os
 import time
@@ -39,6 +40,8 @@ _CURVE_SEED, _FINAL_SEED = 1_000_000, 2_000_000
 _NUM_FILMED = 6
 _logger = logging.getLogger(__name__)
 OnIteration = Callable[[dict[str, float]], None]
+NewPlayer = Callable[[], Deterministic]
+"""Makes who plays a batch of episodes, from their start."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,9 +75,10 @@ def run_cell(cell: CellConfig, trained: TrainedBob, path: Path, running: Running
         if directory.result_file.exists():
             return read_json(directory.result_file)
         if method.player is not None:
-            player = method.player(trained)
-            result = {**identity, **_score(cell, trained, player, running), "env_steps": 0, "wall_s": 0.0, "curve": []}
-            return _finish(result, cell, trained, player, directory, running)
+            new_player = functools.partial(method.player, trained)
+            score = _score(cell, trained, new_player, running)
+            result = {**identity, **score, "env_steps": 0, "wall_s": 0.0, "curve": []}
+            return _finish(result, cell, trained, new_player, directory, running)
         training = _Training(cell, method, trained, directory, running)
         try:
             learned = training.run(saved)
@@ -82,7 +86,7 @@ def run_cell(cell: CellConfig, trained: TrainedBob, path: Path, running: Running
                 return None
             if _identity(cell, trained) != identity:
                 raise RuntimeError("the frozen primitives have changed while they were composed")
-            return _finish({**identity, **learned}, cell, trained, training.player, directory, running)
+            return _finish({**identity, **learned}, cell, trained, training.new_player, directory, running)
         finally:
             training.env.close()
 
@@ -132,13 +136,13 @@ class _Training:
     ) -> None:
         import torch
 
-        from service.downstream.learner import LearnedPolicy, make_learner
+        from service.downstream.learner import make_learner
 
         torch.set_num_threads(running.num_threads or os.cpu_count() or 1)
         self.env = make_worlds(cell, method, trained, running.num_threads)
         self._learner = make_learner(cell, method, self.env)
-        self.player = LearnedPolicy(self._learner, method, trained)
-        self._cell, self._trained, self._directory, self._running = cell, trained, directory, running
+        self._cell, self._method, self._trained = cell, method, trained
+        self._directory, self._running = directory, running
         self._iteration, self._wall_s, self._saved_s = 0, 0.0, time.monotonic()
         self._curve: list[dict[str, float]] = []
 
@@ -157,8 +161,14 @@ class _Training:
         if self._running.stop():
             return None
         self._learner.save(self._directory.path / "model.zip")
-        score = _score(self._cell, self._trained, self.player, self._running)
+        score = _score(self._cell, self._trained, self.new_player, self._running)
         return {**score, "env_steps": self._learner.num_timesteps, "wall_s": self._wall_s, "curve": self._curve}
+
+    def new_player(self) -> Deterministic:
+        """What has been learned so far, ready for a batch of episodes."""
+        from service.downstream.learner import LearnedPolicy
+
+        return LearnedPolicy(self._learner, self._method, self._trained)
 
     def _iterate(self) -> None:
         """An episode of every world, with its updates; now and then an evaluation, which is not counted as time."""
@@ -189,7 +199,7 @@ class _Training:
 
     def _evaluate(self) -> dict[str, float]:
         cell = self._cell
-        found = _play(cell, self._trained, self.player, cell.curve_episodes, cell.seed + _CURVE_SEED, self._running)
+        found = _play(cell, self._trained, self.new_player, cell.curve_episodes, cell.seed + _CURVE_SEED, self._running)
         point = {"success_last": found.success_last, "success_ever": found.success_ever}
         self._curve.append({"env_steps": self._learner.num_timesteps, "wall_s": self._wall_s, **point})
         return {f"evaluation/{name}": value for name, value in point.items()}
@@ -213,6 +223,7 @@ class _Training:
 
 def make_worlds(cell: CellConfig, method: Method, trained: TrainedBob, num_threads: int) -> WorldsVecEnv:
     """The worlds that a method's learner acts in."""
+    from service.downstream.previous import PreviousPositionsVector
     from service.downstream.vec_env import WorldsVecEnv
 
     worlds = TabletopVectorEnv(
@@ -223,15 +234,15 @@ def make_worlds(cell: CellConfig, method: Method, trained: TrainedBob, num_threa
         max_episode_steps=EPISODE_STEPS,
         num_threads=num_threads,
     )
-    return WorldsVecEnv(method.wrap(worlds, trained))
+    return WorldsVecEnv(method.wrap(PreviousPositionsVector(worlds), trained))
 
 
 def _play(
-    cell: CellConfig, trained: TrainedBob, player: Deterministic, num_episodes: int, seed: int, running: Running
+    cell: CellConfig, trained: TrainedBob, new_player: NewPlayer, num_episodes: int, seed: int, running: Running
 ) -> Evaluation:
     task = find_task(cell.task)
     return evaluate(
-        player,
+        new_player(),
         task.world_from(trained.config.world),
         task.goals,
         num_episodes=num_episodes,
@@ -242,9 +253,9 @@ def _play(
     )
 
 
-def _score(cell: CellConfig, trained: TrainedBob, player: Deterministic, running: Running) -> dict[str, Any]:
+def _score(cell: CellConfig, trained: TrainedBob, new_player: NewPlayer, running: Running) -> dict[str, Any]:
     """The final evaluation, and where it was made."""
-    found = _play(cell, trained, player, cell.num_episodes, cell.seed + _FINAL_SEED, running)
+    found = _play(cell, trained, new_player, cell.num_episodes, cell.seed + _FINAL_SEED, running)
     low, high = wilson_interval(round(found.success_ever * found.num_episodes), found.num_episodes)
     evaluation = {**found.as_dict(), "success_ever_low": low, "success_ever_high": high}
     where = {"git_commit": git_commit(), "num_cores": os.cpu_count(), "num_threads": running.num_threads}
@@ -255,7 +266,7 @@ def _finish(
     result: dict[str, Any],
     cell: CellConfig,
     trained: TrainedBob,
-    player: Deterministic,
+    new_player: NewPlayer,
     directory: TrainingDirectory,
     running: Running,
 ) -> dict[str, Any]:
@@ -266,7 +277,7 @@ def _finish(
     if directory.metrics_file.exists():
         makers["curves"] = lambda: draw_training(directory.path)
     if running.film:
-        makers["video"] = lambda: _film(cell, trained, player, directory.path / "episodes.mp4")
+        makers["video"] = lambda: _film(cell, trained, new_player(), directory.path / "episodes.mp4")
     for name, make in makers.items():
         try:
             make()

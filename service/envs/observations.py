@@ -29,6 +29,7 @@ POSITIONS_SIZE = 11
 FULL_SIZE = 22
 BOB_SIZE = POSITIONS_SIZE + 3
 BOB_VALUE_SIZE = FULL_SIZE - 1 + 6
+EFFECTOR_SLICE = slice(0, 3)
 OBJECT_SLICE = slice(5, 8)
 GOAL_SLICE = slice(11, 14)
 SPACES = {"action": ACTION_SIZE, "positions": POSITIONS_SIZE, "observation": BOB_SIZE, "layout": __name__}

@@ -68,13 +68,16 @@ def test_features_by_hand():
     observation = torch.zeros(1, 11)
     observation[0, 5:8] = torch.tensor([0.1, 0.2, 0.3])
     goal = torch.tensor([[0.15, 0.1, 0.3]])
-    found = GoalFeatures(goal_space())({"observation": observation, "desired_goal": goal, "achieved_goal": goal})
-    assert found.shape == (1, 17)
+    moved = torch.tensor([[0.02, 0.0, -0.01, 0.001, 0.0, 0.0, 0.2, -0.04, 0.0, 0.0, 0.0]])  # fingers are left out
+    seen = {"observation": observation, "previous": observation - moved, "desired_goal": goal, "achieved_goal": goal}
+    found = GoalFeatures(goal_space())(seen)
+    assert found.shape == (1, 23)
     rows = np.concatenate((observation, goal), 1)
     np.testing.assert_allclose(
         found[:, :14], np.clip((rows - NORMALISATION_BOB.offset) / NORMALISATION_BOB.scale, -5, 5)
     )
-    np.testing.assert_allclose(found[0, 14:], [0.5, -1.0, 0.0], atol=1e-6)
+    np.testing.assert_allclose(found[0, 14:17], [0.5, -1.0, 0.0], atol=1e-6)
+    np.testing.assert_allclose(found[0, 17:], [1.0, 0.0, -0.5, 0.0, 5.0, -2.0], atol=1e-5)  # of 2 cm, at most five
 
 
 def test_a_learned_policy_acts_as_in_its_worlds(champion):
@@ -83,14 +86,14 @@ def test_a_learned_policy_acts_as_in_its_worlds(champion):
 
     for method in ("ours", "scratch-monolithic"):
         learner, env = learner_of(method, champion)
-        seen = {key: value.numpy() for key, value in observations(env).items()}
-        weights, _ = learner.predict(seen, deterministic=True)
-        handed = []
+        player, handed = LearnedPolicy(learner, METHODS[method], champion), []
         worlds = env.env if method == "scratch-monolithic" else env.env.env
         step = worlds.step
         worlds.step = lambda actions, handed=handed, step=step: handed.append(actions) or step(actions)
-        env.step(weights)
-        rows = np.concatenate((seen["observation"], seen["desired_goal"]), 1)
-        found = LearnedPolicy(learner, METHODS[method], champion).act_deterministic(rows)
-        np.testing.assert_allclose(found, handed[0], rtol=0, atol=1e-6)
+        seen = env.reset()
+        for _ in range(3):
+            weights, _ = learner.predict(seen, deterministic=True)
+            rows = np.concatenate((seen["observation"], seen["desired_goal"]), 1)
+            seen, *_ = env.step(weights)
+            np.testing.assert_allclose(player.act_deterministic(rows), handed[-1], rtol=0, atol=1e-6)
         env.close()
