@@ -46,8 +46,8 @@ def make_learner(cell: CellConfig, method: Method, env: WorldsVecEnv) -> SAC:
         train_freq=1,
         gradient_steps=sac.gradient_steps,
         ent_coef=f"auto_{sac.initial_entropy_coefficient}",
-        replay_buffer_class=HerReplayBuffer if method.hindsight else DictReplayBuffer,
-        replay_buffer_kwargs={"n_sampled_goal": 4, "goal_selection_strategy": "future"} if method.hindsight else None,
+        replay_buffer_class=HerReplayBuffer if method.relabelled else DictReplayBuffer,
+        replay_buffer_kwargs={"goal_selection_strategy": "future"} if method.relabelled else None,
         policy_kwargs={
             "features_extractor_class": GoalFeatures,
             "net_arch": list(sac.hidden_sizes),
@@ -58,6 +58,15 @@ def make_learner(cell: CellConfig, method: Method, env: WorldsVecEnv) -> SAC:
     )
     learner.set_logger(Logger(folder=None, output_formats=[]))  # else every ``learn`` makes a directory in /tmp
     return learner
+
+
+def set_progress(learner: SAC, method: Method, progress: float) -> None:
+    """What changes while a method learns, from 0 at the beginning to 1 at the end: the share of relabelled goals."""
+    if method.relabelled is None:
+        return
+    first, last = method.relabelled
+    assert isinstance(learner.replay_buffer, HerReplayBuffer)
+    learner.replay_buffer.her_ratio = first + (last - first) * progress
 
 
 def _spread(seed: int) -> int:

@@ -79,8 +79,9 @@ class Method:
     """From (N, 11) positions and the learner's (N, A) actions to (N, 4) actions, as the wrapped worlds do it."""
     policy: Callable[[], type[SACPolicy]] = _gaussian
     """Class of actor and critics; imports torch."""
-    hindsight: bool = False
-    """Whether replayed goals are relabelled (HER, ``future``, k = 4)."""
+    relabelled: tuple[float, float] | None = None
+    """Share of a batch whose goals are relabelled (HER, ``future``), when learning begins and when it ends, linear in
+    between; None: no HER."""
     composes: bool = False
     """Whether it needs primitives that can be composed."""
     player: Callable[[TrainedBob], Deterministic] | None = None
@@ -102,15 +103,29 @@ class Method:
             check_primitives(trained)
 
 
+_USUAL_SHARE = 0.8
+"""1 - 1 / (k + 1) for the usual k = 4 (Andrychowicz et al. 2017)."""
+_USUAL_SHARES = (_USUAL_SHARE, _USUAL_SHARE)
+
 METHODS: Mapping[str, Method] = {
     "ours": Method("ours", "SAC sets the weights of the frozen primitives", _compose, _composed, composes=True),
     "ours-her": Method(
-        "ours + HER", "the same, with relabelled goals", _compose, _composed, composes=True, hindsight=True
+        "ours + HER",
+        "the same, with relabelled goals, fewer and fewer",
+        _compose,
+        _composed,
+        composes=True,
+        relabelled=(_USUAL_SHARE, 0.0),
     ),
     "asp-only": Method("ASP only", "Bob as he is", player=_bob),
-    "scratch-monolithic-her": Method("scratch monolithic + HER", "SAC alone, with relabelled goals", hindsight=True),
+    "scratch-monolithic-her": Method(
+        "scratch monolithic + HER", "SAC alone, with relabelled goals", relabelled=_USUAL_SHARES
+    ),
     "scratch-mcp-her": Method(
-        "scratch MCP + HER", "primitives and gate learned together, with relabelled goals", policy=_mcp, hindsight=True
+        "scratch MCP + HER",
+        "primitives and gate learned together, with relabelled goals",
+        policy=_mcp,
+        relabelled=_USUAL_SHARES,
     ),
     "scratch-monolithic": Method("scratch monolithic", "SAC alone"),
     "scratch-mcp": Method("scratch MCP", "primitives and gate learned together by SAC", policy=_mcp),

@@ -67,7 +67,7 @@ def make_cell(**values: Any) -> CellConfig:
     except ValidationError as error:
         raise TandemError(first_line(error)) from None
     if method.player is None:
-        _check_learning(cell.sac, cell.num_env_steps, hindsight=method.hindsight)
+        _check_learning(cell.sac, cell.num_env_steps, hindsight=method.relabelled is not None)
     return cell
 
 

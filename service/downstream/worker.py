@@ -172,7 +172,10 @@ class _Training:
 
     def _iterate(self) -> None:
         """An episode of every world, with its updates; now and then an evaluation, which is not counted as time."""
+        from service.downstream.learner import set_progress
+
         begun, before = time.perf_counter(), self._learner.num_timesteps
+        set_progress(self._learner, self._method, before / self._cell.num_env_steps)
         num = min(EPISODE_STEPS * self.env.num_envs, self._cell.num_env_steps - before)
         self._learner.learn(num, reset_num_timesteps=self._iteration == 0, log_interval=None)  # type: ignore[arg-type]
         self._iteration += 1
