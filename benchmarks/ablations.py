@@ -40,6 +40,7 @@ ABLATIONS: dict[str, tuple[str, ...]] = {
     "no-replay-invalid": ("generator.replay_invalid=false",),
     "no-replay-over-cells": ("generator.replay_over_cells=false",),
     "no-average": ("learner.bob_average_decay=0",),
+    "no-blocked-gripper": ("game.blocked_gripper_fraction=0",),
     "no-replay-from-reset": ("generator.replay_from_reset=false",),
     "no-hold": ("game.bob_hold_steps=1",),
     "no-old-demonstrations": ("learner.abc.num_iterations=1",),

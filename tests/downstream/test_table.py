@@ -91,7 +91,7 @@ def test_new_primitives_leave_what_takes_none(source, tmp_path):
     results = ResultsDirectory(tmp_path / "out" / "downstream")
     assert results.find(scratch, newer)["primitives"] is None
     assert results.find(CELLS[0], newer)["world"] == described.world
-    with pytest.raises(TandemError, match=r"primitives\.name 'panda-cube@4', not 'panda-cube@99'"):
+    with pytest.raises(TandemError, match=rf"primitives\.name '{described.primitives['name']}', not 'panda-cube@99'"):
         results.find(CELLS[1], newer)
 
 

@@ -73,7 +73,7 @@ def test_what_a_training_leaves(champion, tmp_path):
         "cell.json", "metrics.jsonl", "tensorboard", "checkpoint.pt", "result.json", "model.zip", "curves.png"
     }  # fmt: skip
     assert parameters_digest(champion.primitives) == before == result["primitives"]["digest"]
-    assert result["primitives"]["name"] == "panda-cube@4"
+    assert result["primitives"]["name"] == champion.manifest.reference
     assert result == json.loads((tmp_path / "result.json").read_text())
     assert result["env_steps"] == 600
     assert [point["env_steps"] for point in result["curve"]] == [400, 600]
@@ -153,9 +153,10 @@ class TestBadInput:
 
     def test_other_primitives(self, champion, tmp_path):
         run(small_cell(), champion, tmp_path, stop=Stop(1))
-        manifest = champion.manifest.model_copy(update={"version": 5})
+        manifest = champion.manifest.model_copy(update={"version": 99})
         other = dataclasses.replace(champion, manifest=manifest)
-        self.refused(r"primitives\.name 'panda-cube@4', not .*@5", small_cell(), other, tmp_path, resume=True)
+        words = rf"primitives\.name '{champion.manifest.reference}', not .*@99"
+        self.refused(words, small_cell(), other, tmp_path, resume=True)
 
     def test_primitives_of_another_robot(self, champion, tmp_path):
         spaces = {**champion.manifest.spaces, "action": 7}
