@@ -70,11 +70,12 @@ def make_table(cells: Sequence[CellConfig], source: Source, out: Path, runner: R
             cell that failed. What had ended is kept.
     """
     _check_page(out / PAGE_FILE)
-    results, described = ResultsDirectory(out / RESULTS), describe(source.load())
+    trained = source.load()
+    results, described = ResultsDirectory(out / RESULTS), describe(trained)
     missing = results.missing(cells, described)
     watching.say(f"{len(cells) - len(missing)} of {len(cells)} cells are there, {len(missing)} to run")
     done = 0
-    for cell, result in runner(missing, source, watching):
+    for cell, result in runner(missing, trained, source, watching):
         if any(result[key] != value for key, value in described.of(cell.method).items()):
             raise TandemError(f"{source.primitives} has changed in {source.registry} meanwhile; give NAME@VERSION")
         results.add(cell, result)
@@ -107,14 +108,16 @@ def write_results(out: Path) -> list[Path]:
     return [page, picture]
 
 
-Runner = Callable[[Sequence[CellConfig], Source, Watching], Iterator[tuple[CellConfig, Result]]]
+Runner = Callable[[Sequence[CellConfig], "TrainedBob", Source, Watching], Iterator[tuple[CellConfig, Result]]]
+"""Runs cells with these primitives, which are the source's."""
 
 
 def run_here(num_threads: int = 0) -> Runner:
     """A runner that takes one cell after another in this process."""
 
-    def run(cells: Sequence[CellConfig], source: Source, watching: Watching) -> Iterator[tuple[CellConfig, Result]]:
-        trained = source.load()
+    def run(
+        cells: Sequence[CellConfig], trained: TrainedBob, source: Source, watching: Watching
+    ) -> Iterator[tuple[CellConfig, Result]]:
         for cell in cells:  # before hours of work
             check_cell(cell, trained, source.runs / cell.name)
         for cell in cells:
@@ -145,12 +148,13 @@ def run_on_ray(num_workers: int | None, num_threads: int = 1) -> Runner:
         num_threads: cores of each.
     """
 
-    def run(cells: Sequence[CellConfig], source: Source, watching: Watching) -> Iterator[tuple[CellConfig, Result]]:
+    def run(
+        cells: Sequence[CellConfig], trained: TrainedBob, source: Source, watching: Watching
+    ) -> Iterator[tuple[CellConfig, Result]]:
         import ray
 
         limit = num_workers or max(int(ray.cluster_resources().get("CPU", 1)) // num_threads, 1)
         task = ray.remote(num_cpus=num_threads, max_retries=3)(_run_remotely)
-        trained = source.load()
         for cell in cells:
             find_method(cell.method).check(trained)
         primitives: Any = source if service.is_service(source.registry) else ray.put(trained)

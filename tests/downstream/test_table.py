@@ -22,8 +22,8 @@ def counted(ran, before=None):
     """A runner that keeps the names of what it ran, and calls ``before`` before each."""
     here = run_here(1)
 
-    def run(cells, source, watching):
-        for cell, result in here(cells, source, watching):
+    def run(cells, *rest):
+        for cell, result in here(cells, *rest):
             ran.append(cell.name)
             yield cell, result
             if before is not None:
