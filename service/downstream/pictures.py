@@ -52,17 +52,21 @@ def draw_table(results: Results, path: Path) -> Path:
         TandemError: the picture cannot be written.
     """
     figure = new_figure(14.0, 8.0, "Success at the last step, over thousands of env steps")
+    longest = max((each["env_steps"] for each in results), default=0) / 1e3
     for axes, (name, task) in zip(figure.subplots(2, 3).flat, TASKS.items(), strict=True):
         for (method, words), colour in zip(METHODS.items(), cycle(_COLOURS), strict=False):
             chosen = [each for each in results if each["cell"]["task"] == name and each["cell"]["method"] == method]
             _draw_method(axes, chosen, words.title, colour)
         _finish(axes, task.title)
         axes.set_ylim(-0.02, 1.02)
+        axes.set_xlim(0.0, 1.02 * longest or 1.0)
     handles: dict[str, Any] = {}
     for axes in figure.axes:
         handles |= dict(zip(*reversed(axes.get_legend_handles_labels()), strict=True))
-    if handles:
-        figure.legend(list(handles.values()), list(handles), loc="upper right", ncols=4, fontsize=9, frameon=False)
+    titles = [words.title for words in METHODS.values() if words.title in handles]
+    if titles:
+        lines = [handles[title] for title in titles]
+        figure.legend(lines, titles, loc="upper right", ncols=4, fontsize=9, frameon=False)
     figure.subplots_adjust(left=0.05, right=0.98, top=0.86, bottom=0.07, hspace=0.3)
     return save(figure, path)
 
