@@ -22,6 +22,7 @@ os.environ.update(dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL
 import gymnasium
 import torch
 from stable_baselines3 import SAC
+from stable_baselines3.common.logger import Logger
 
 import service
 import service.envs.registration
@@ -53,10 +54,17 @@ def make_worker(cell: CellConfig, trained: TrainedBob, num_threads: int) -> Play
     return _player(learner, num)
 
 
-def make_default(cell: CellConfig, trained: TrainedBob) -> Play:
-    """Plays some steps of one environment, learning; it has begun to learn."""
+def default_learner(cell: CellConfig, trained: TrainedBob) -> SAC:
+    """SAC as it comes, in one environment of the cell's task."""
     env = ComposePrimitives(gymnasium.make(find_task(cell.task).id, config=trained.config.world), trained)
     learner = SAC("MultiInputPolicy", env, seed=cell.seed, device="cpu")
+    learner.set_logger(Logger(folder=None, output_formats=[]))  # else every ``learn`` makes a directory in /tmp
+    return learner
+
+
+def make_default(cell: CellConfig, trained: TrainedBob) -> Play:
+    """Plays some steps of one environment, learning; it has begun to learn."""
+    learner = default_learner(cell, trained)
     learner.learn(_DEFAULT_WARM_UP)
     return _player(learner, _DEFAULT_STEPS)
 

@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from service.runtime.primitives import TrainedBob
 
 CHECKPOINT_EVERY_S = 120.0
-_CURVE_SEED, _FINAL_SEED = 1_000_000, 2_000_000
+CURVE_SEED, FINAL_SEED = 1_000_000, 2_000_000
 """Added to a cell's seed: goals of evaluations are none that were learned on, and the same for every method."""
 _NUM_FILMED = 6
 _logger = logging.getLogger(__name__)
@@ -202,7 +202,7 @@ class _Training:
 
     def _evaluate(self) -> dict[str, float]:
         cell = self._cell
-        found = _play(cell, self._trained, self.new_player, cell.curve_episodes, cell.seed + _CURVE_SEED, self._running)
+        found = _play(cell, self._trained, self.new_player, cell.curve_episodes, cell.seed + CURVE_SEED, self._running)
         point = {"success_last": found.success_last, "success_ever": found.success_ever}
         self._curve.append({"env_steps": self._learner.num_timesteps, "wall_s": self._wall_s, **point})
         return {f"evaluation/{name}": value for name, value in point.items()}
@@ -258,7 +258,7 @@ def _play(
 
 def _score(cell: CellConfig, trained: TrainedBob, new_player: NewPlayer, running: Running) -> dict[str, Any]:
     """The final evaluation, and where it was made."""
-    found = _play(cell, trained, new_player, cell.num_episodes, cell.seed + _FINAL_SEED, running)
+    found = _play(cell, trained, new_player, cell.num_episodes, cell.seed + FINAL_SEED, running)
     low, high = wilson_interval(round(found.success_ever * found.num_episodes), found.num_episodes)
     evaluation = {**found.as_dict(), "success_ever_low": low, "success_ever_high": high}
     where = {"git_commit": git_commit(), "num_cores": os.cpu_count(), "num_threads": running.num_threads}
@@ -303,6 +303,6 @@ def _film(cell: CellConfig, trained: TrainedBob, player: Deterministic, path: Pa
         num_episodes=_NUM_FILMED,
         num_steps=EPISODE_STEPS,
         success_distance_m=SUCCESS_DISTANCE_M,
-        seed=cell.seed + _FINAL_SEED,
+        seed=cell.seed + FINAL_SEED,
     )
     return write_episode_video(filmed, world, path)
