@@ -92,6 +92,11 @@ class Method:
         """Whether its result depends on them; else they only say in which world it plays."""
         return self.composes or self.player is _bob
 
+    @property
+    def learns_from_nothing(self) -> bool:
+        """Whether it learns, and takes nothing that was learned before."""
+        return self.player is None and not self.takes_primitives
+
     def check(self, trained: TrainedBob) -> None:
         """Assert that these primitives are for this method.
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from itertools import pairwise
 from typing import Any
 
@@ -47,11 +47,12 @@ def write_page(results: Sequence[Result], picture: str) -> str:
         table.of(_seeds),
         "\n## Learning curves\n",
         f"![Success at the last step over env steps; bands from the least to the greatest seed]({picture})\n",
-        "Without noise, 100 goals a point; dotted: what learns nothing.\n",
+        "Without noise, 100 goals a point; dotted: what learns nothing. Curves that still rise say what a method has after "
+        "so many env steps, not what it would come to.\n",
         "## Env steps and time\n",
-        "Learning alone, without evaluations: env steps in thousands, minutes of wall-clock time and, after the colon, "
-        f"env steps in thousands until {FINAL_SHARE:.0%} of the final success.\n",
+        "Learning alone, without evaluations: env steps in thousands, minutes of wall-clock time.\n",
         table.of(_cost),
+        *table.efficiency(),
         "\n" + _origin(results),
     ]
     return "\n".join(parts)
@@ -81,6 +82,29 @@ class _Table:
         if paper:
             rows.append(("*best of the paper*", *(f"*{100 * BEST[task]:.0f} %*" for task in TASKS)))
         return _markdown(rows)
+
+    def efficiency(self) -> Sequence[str]:
+        """How soon what composes primitives is at most of its final success, and what learns from nothing as far."""
+        composing = [name for name, method in METHODS.items() if method.composes and self._has(name)]
+        scratch = [name for name, method in METHODS.items() if method.learns_from_nothing and self._has(name)]
+        if not composing or not scratch:
+            return ()
+        rows = []
+        for method in composing:
+            own, others = [METHODS[method].title], ["*best from scratch*"]
+            for task in TASKS:
+                cell = self._cells.get((method, task), [])
+                level, until = _level(cell), _mean_until(cell, _level(cell))
+                known = {name: self._cells[name, task] for name in scratch if (name, task) in self._cells}
+                own.append("" if until is None else f"{until / 1e3:.0f}")
+                others.append("" if until is None or not known else f"*{_soonest(known, level)}*")
+            rows += [own, others]
+        return (
+            "\n## How soon\n",
+            f"Env steps in thousands until {FINAL_SHARE:.0%} of the row's own final success, below it until the first "
+            "method that learns from nothing is as good; in brackets how many of them were run on the task.\n",
+            _markdown(rows),
+        )
 
     def _has(self, method: str) -> bool:
         return any(found == method for found, _ in self._cells)
@@ -117,10 +141,30 @@ def _cost(cell: Cell) -> str:
     if not cell[0]["curve"]:
         return "0"
     steps, minutes = (float(np.mean([result[key] for result in cell])) for key in ("env_steps", "wall_s"))
-    soon = [steps_until(result["curve"], FINAL_SHARE * result["evaluation"]["success_last"]) for result in cell]
+    return f"{steps / 1e3:.0f}, {minutes / 60:.0f} min"
+
+
+def _level(cell: Cell) -> float:
+    """``FINAL_SHARE`` of the final success, all seeds together."""
+    return FINAL_SHARE * float(np.mean([result["evaluation"]["success_last"] for result in cell])) if cell else 0.0
+
+
+def _mean_until(cell: Cell, level: float) -> float | None:
+    """Env steps until a level, mean of the seeds; None: not every seed reaches it."""
+    soon = [steps_until(result["curve"], level) for result in cell]
     known = [each for each in soon if each is not None]
-    until = f"{np.mean(known) / 1e3:.0f}" if len(known) == len(cell) else "-"
-    return f"{steps / 1e3:.0f}, {minutes / 60:.0f} min: {until}"
+    return float(np.mean(known)) if known and len(known) == len(cell) else None
+
+
+def _soonest(cells: Mapping[str, Cell], level: float) -> str:
+    """``128, scratch monolithic + HER (4)``, or ``> 200 (4)`` where no method reaches the level."""
+    found = {name: _mean_until(cell, level) for name, cell in cells.items()}
+    reached = {name: until for name, until in found.items() if until is not None}
+    if not reached:
+        longest = max(result["env_steps"] for cell in cells.values() for result in cell)
+        return f"> {longest / 1e3:.0f} ({len(cells)})"
+    first = min(reached, key=lambda name: reached[name])
+    return f"{reached[first] / 1e3:.0f}, {METHODS[first].title} ({len(cells)})"
 
 
 def _markdown(rows: Sequence[Sequence[str]]) -> str:

@@ -214,8 +214,32 @@ def test_the_page_by_hand():
     assert "| *the paper's* | *83 %* | *100 %* | *52 %* | *100 %* | *98 %* | *98 %* |" in lines
     assert "| ours |  |  |  |  | 98.5 % [96, 99] (2) |  |" in lines
     assert "| ours |  |  |  |  | 95.0, 97.0 |  |" in lines
-    assert "| ours |  |  |  |  | 2, 1 min: - |  |" in lines  # 0.9 x 0.97 is not held by any two in a row
+    assert "| ours |  |  |  |  | 2, 1 min |  |" in lines
     assert "scratch" not in page
+
+
+def test_how_soon_beside_what_learns_from_nothing_by_hand():
+    def learned(method, task, seed, last, *rates):
+        points = [{"env_steps": 1000 * step, "success_last": rate} for step, rate in enumerate(rates, 1)]
+        return result(method, task, seed, last, last, points)
+
+    page = write_page(
+        [
+            learned("ours", "wall", 0, 0.9, 0.0, 0.9, 0.9),  # 0.9 x 0.8, the mean of the seeds: 2,000 env steps
+            learned("ours", "wall", 1, 0.7, 0.1, 0.2, 0.3, 0.9, 0.7),  # 4,000
+            learned("scratch-monolithic", "wall", 0, 0.3, 0.1, 0.3, 0.3),
+            learned("scratch-monolithic-her", "wall", 0, 0.8, 0.1, 0.3, 0.5, 0.8, 0.8),  # 4,000
+            learned("ours", "box", 0, 0.9, 0.0, 0.9, 0.9),
+            learned("scratch-monolithic", "box", 0, 0.3, 0.1, 0.3, 0.3),  # never
+            learned("ours", "push", 0, 0.9, 0.0, 0.9, 0.9),  # nothing to compare with
+            learned("ours", "inair", 0, 0.9, 0.0, 0.8, 0.8),  # 0.81 is not held
+            learned("scratch-monolithic", "larger", 0, 0.3, 0.1, 0.3, 0.3),
+        ],
+        "picture.png",
+    )
+    lines = page.splitlines()
+    assert "| ours |  |  | 2 |  | 3 | 2 |" in lines
+    assert "| *best from scratch* |  |  |  |  | *4, scratch monolithic + HER (2)* | *> 2 (1)* |" in lines
 
 
 def test_how_soon_by_hand():
