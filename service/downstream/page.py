@@ -47,8 +47,8 @@ def write_page(results: Sequence[Result], picture: str) -> str:
         table.of(_seeds),
         "\n## Learning curves\n",
         f"![Success at the last step over env steps; bands from the least to the greatest seed]({picture})\n",
-        "Without noise, 100 goals a point; dotted: what learns nothing. Where a curve still rises, the tables say what the "
-        "method has after so many env steps, not what it would come to.\n",
+        "Without noise, 100 goals a point; dotted: what learns nothing. Where a curve still rises, the tables say what "
+        "the method has after so many env steps, not what it would come to.\n",
         "## Env steps and time\n",
         "Learning alone, without evaluations: env steps in thousands, minutes of wall-clock time.\n",
         table.of(_cost),
