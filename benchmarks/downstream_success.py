@@ -13,66 +13,31 @@ import os
 import sys
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from typing import Any
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 os.environ.update(dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"), "1"))
 
-import numpy as np
 import torch
 
 import service
 from benchmarks.downstream_throughput import default_learner
 from benchmarks.measuring import machine, write_json
-from service.actors.evaluation import Evaluation, evaluate
+from service.downstream.learner import LearnedPolicy
 from service.downstream.methods import METHODS
 from service.downstream.settings import CellConfig, make_cell
-from service.downstream.worker import CURVE_SEED, FINAL_SEED, describe
-from service.envs.observations import GOAL_SLICE, OBJECT_SLICE, POSITIONS_SIZE
-from service.envs.registration import EPISODE_STEPS
-from service.envs.tasks import SUCCESS_DISTANCE_M, find_task
+from service.downstream.worker import CURVE_SEED, FINAL_SEED, Running, describe, play
 from service.errors import TandemError
 from service.runtime.primitives import TrainedBob
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-    from stable_baselines3 import SAC
-
-
-class DefaultPolicy:
-    """What the learner has learned, as ``evaluate`` takes it."""
-
-    def __init__(self, learner: SAC, cell: CellConfig, trained: TrainedBob) -> None:
-        self._learner, self._method, self._trained = learner, METHODS[cell.method], trained
-
-    def act_deterministic(self, observation: NDArray[np.float32]) -> NDArray[np.float32]:
-        """(N, 14) Bob's input to actions (N, 4)."""
-        positions = observation[:, :POSITIONS_SIZE]
-        seen = {
-            "observation": positions,
-            "achieved_goal": observation[:, OBJECT_SLICE],
-            "desired_goal": observation[:, GOAL_SLICE],
-        }
-        actions, _ = self._learner.predict(cast("dict[str, Any]", seen), deterministic=True)
-        return self._method.decode(self._trained, positions, actions)
 
 
 def learn(cell: CellConfig, trained: TrainedBob, *, every: int, threads: int) -> dict[str, Any]:
     """Learn ``cell.num_env_steps``; evaluate after every ``every`` env steps and at the end."""
     torch.set_num_threads(threads)
-    learner, task = default_learner(cell, trained), find_task(cell.task)
+    learner, running = default_learner(cell, trained), Running(num_threads=threads)
 
-    def play(num_episodes: int, seed: int) -> Evaluation:
-        return evaluate(
-            DefaultPolicy(learner, cell, trained),
-            task.world_from(trained.config.world),
-            task.goals,
-            num_episodes=num_episodes,
-            num_steps=EPISODE_STEPS,
-            success_distance_m=SUCCESS_DISTANCE_M,
-            seed=cell.seed + seed,
-            num_threads=threads,
-        )
+    def player() -> LearnedPolicy:
+        return LearnedPolicy(learner, METHODS[cell.method], trained)
 
     curve: list[dict[str, float]] = []
     wall_s = 0.0
@@ -81,16 +46,17 @@ def learn(cell: CellConfig, trained: TrainedBob, *, every: int, threads: int) ->
         num = min(every, cell.num_env_steps - learner.num_timesteps)
         learner.learn(num, reset_num_timesteps=not curve, log_interval=None)  # type: ignore[arg-type]
         wall_s += time.perf_counter() - begun
-        found = play(cell.curve_episodes, CURVE_SEED)
+        found = play(cell, trained, player, cell.curve_episodes, cell.seed + CURVE_SEED, running)
         rates = {"success_last": found.success_last, "success_ever": found.success_ever}
         curve.append({"env_steps": learner.num_timesteps, "wall_s": wall_s, **rates})
         print(f"{learner.num_timesteps:10,} env steps, {wall_s:6.0f} s: {found.success_last:.0%}", flush=True)
+    final = play(cell, trained, player, cell.num_episodes, cell.seed + FINAL_SEED, running)
     settings = cell.model_dump(mode="json", include={"task", "method", "seed", "num_env_steps"})
     return {
         "machine": machine("torch", "mujoco", "stable-baselines3"),
         "settings": {"cell": settings, **describe(trained).of(cell.method), "threads": threads},
         "curve": curve,
-        "evaluation": play(cell.num_episodes, FINAL_SEED).as_dict(),
+        "evaluation": final.as_dict(),
         "wall_s": wall_s,
     }
 

@@ -19,6 +19,7 @@ from service.envs.observations import GOAL_SLICE, OBJECT_SLICE, POSITIONS_SIZE
 from service.envs.vector import VectorState
 
 if TYPE_CHECKING:
+    from gymnasium.spaces import Dict
     from numpy.typing import NDArray
 
     from service.downstream.methods import Method
@@ -77,7 +78,8 @@ def _spread(seed: int) -> int:
 class LearnedPolicy:
     """What a learner has learned, as evaluation and films take it: Bob's input to actions, without noise.
 
-    Plays N episodes from their start; others need another one, since it keeps the positions of the step before.
+    Plays N episodes from their start; others need another one, since it keeps the positions of the step before, which
+    it shows to learners whose worlds do.
     """
 
     def __init__(self, learner: SAC, method: Method, trained: TrainedBob) -> None:
@@ -94,7 +96,8 @@ class LearnedPolicy:
             "desired_goal": observation[:, GOAL_SLICE],
             PREVIOUS: positions if previous is None else previous,
         }
-        actions, _ = self._learner.predict(cast("dict[str, Any]", seen), deterministic=True)
+        known = {name: seen[name] for name in cast("Dict", self._learner.observation_space)}
+        actions, _ = self._learner.predict(cast("dict[str, Any]", known), deterministic=True)
         return self._method.decode(self._trained, positions, actions)
 
 

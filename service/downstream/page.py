@@ -84,7 +84,7 @@ class _Table:
         return _markdown(rows)
 
     def efficiency(self) -> Sequence[str]:
-        """How soon what composes primitives is at most of its final success, and what learns from nothing as far."""
+        """How soon methods that compose primitives are good, and when the first that learns from nothing is as good."""
         composing = [name for name, method in METHODS.items() if method.composes and self._has(name)]
         scratch = [name for name, method in METHODS.items() if method.learns_from_nothing and self._has(name)]
         if not composing or not scratch:
@@ -94,7 +94,8 @@ class _Table:
             own, others = [METHODS[method].title], ["*best from scratch*"]
             for task in TASKS:
                 cell = self._cells.get((method, task), [])
-                level, until = _level(cell), _mean_until(cell, _level(cell))
+                level = _level(cell)
+                until = _mean_until(cell, level)
                 known = {name: self._cells[name, task] for name in scratch if (name, task) in self._cells}
                 own.append("" if until is None else f"{until / 1e3:.0f}")
                 others.append("" if until is None or not known else f"*{_soonest(known, level)}*")

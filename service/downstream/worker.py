@@ -202,7 +202,7 @@ class _Training:
 
     def _evaluate(self) -> dict[str, float]:
         cell = self._cell
-        found = _play(cell, self._trained, self.new_player, cell.curve_episodes, cell.seed + CURVE_SEED, self._running)
+        found = play(cell, self._trained, self.new_player, cell.curve_episodes, cell.seed + CURVE_SEED, self._running)
         point = {"success_last": found.success_last, "success_ever": found.success_ever}
         self._curve.append({"env_steps": self._learner.num_timesteps, "wall_s": self._wall_s, **point})
         return {f"evaluation/{name}": value for name, value in point.items()}
@@ -240,9 +240,10 @@ def make_worlds(cell: CellConfig, method: Method, trained: TrainedBob, num_threa
     return WorldsVecEnv(method.wrap(PreviousPositionsVector(worlds), trained))
 
 
-def _play(
+def play(
     cell: CellConfig, trained: TrainedBob, new_player: NewPlayer, num_episodes: int, seed: int, running: Running
 ) -> Evaluation:
+    """Evaluate somebody on the cell's task."""
     task = find_task(cell.task)
     return evaluate(
         new_player(),
@@ -258,7 +259,7 @@ def _play(
 
 def _score(cell: CellConfig, trained: TrainedBob, new_player: NewPlayer, running: Running) -> dict[str, Any]:
     """The final evaluation, and where it was made."""
-    found = _play(cell, trained, new_player, cell.num_episodes, cell.seed + FINAL_SEED, running)
+    found = play(cell, trained, new_player, cell.num_episodes, cell.seed + FINAL_SEED, running)
     low, high = wilson_interval(round(found.success_ever * found.num_episodes), found.num_episodes)
     evaluation = {**found.as_dict(), "success_ever_low": low, "success_ever_high": high}
     where = {"git_commit": git_commit(), "num_cores": os.cpu_count(), "num_threads": running.num_threads}
