@@ -19,6 +19,7 @@ from tests.actors.players import (
     Constant,
     Noise,
     Pusher,
+    Start,
     alices_own,
     assert_same_rollout,
     assert_shapes,
@@ -123,6 +124,53 @@ def test_bob_is_paid_once_and_his_turn_ends_there(rollout):
     assert bob.active[:, SLID].tolist() == [step < num_steps for step in range(7)]
     assert bob.reward[:, SLID].tolist() == [float(step == num_steps - 1) for step in range(7)]
     assert bob.terminated[:, SLID].tolist() == [step == num_steps - 1 for step in range(7)]
+
+
+class Mover(Constant):
+    """Puts the object of every world somewhere before each step, and does nothing else."""
+
+    def __init__(self, game, positions):
+        super().__init__()
+        self.game, self.positions = game, iter(positions)
+
+    def act(self, observation, rng):
+        place(self.game, [Start(next(self.positions))] * self.game.worlds.num_worlds)
+        return super().act(observation, rng)
+
+
+ON_GOAL, OFF_GOAL = (-0.15, 0.0, 0.025), (-0.15, 0.13, 0.025)
+
+
+def play_moved(hold_steps, positions):
+    """Bob's turn of a round in one world, whose goal is ``ON_GOAL`` and whose object is moved while Bob plays."""
+    game = make_game(make_config(1, game={"bob_hold_steps": hold_steps}), [Start(OFF_GOAL)])
+    choose = replay_in([0], game.worlds.states[0].copy(), ON_GOAL)
+    return play(game, bob=Mover(game, positions), choose_goals=choose)
+
+
+def test_bobs_reward_is_taken_back_when_the_object_leaves_the_goal():
+    rollout = play_moved(3, [OFF_GOAL, ON_GOAL, ON_GOAL, OFF_GOAL, OFF_GOAL, ON_GOAL, OFF_GOAL])
+    assert rollout.bob.reward[:, 0].tolist() == [0.0, 1.0, 0.0, -1.0, 0.0, 1.0, -1.0]
+    assert not rollout.bob.terminated.any()
+    assert not rollout.records.solved[0]
+    assert rollout.records.num_bob_steps[0] == 7
+
+
+@pytest.mark.parametrize(("hold_steps", "last"), [(1, 1), (2, 4), (3, 5)])
+def test_bobs_turn_ends_once_the_object_was_on_the_goal_for_so_many_steps_in_a_row(hold_steps, last):
+    rollout = play_moved(hold_steps, [OFF_GOAL, ON_GOAL, OFF_GOAL, ON_GOAL, ON_GOAL, ON_GOAL, ON_GOAL])
+    assert rollout.bob.active[:, 0].tolist() == [step <= last for step in range(7)]
+    assert rollout.bob.terminated[:, 0].tolist() == [step == last for step in range(7)]
+    assert rollout.bob.reward[: last + 1, 0].tolist() == [0.0, 1.0, -1.0, 1.0, 0.0, 0.0][: last + 1]
+    assert rollout.records.solved[0]
+    assert rollout.records.num_bob_steps[0] == last + 1
+
+
+def test_a_goal_that_is_held_to_the_end_of_the_turn_is_solved_without_an_end():
+    rollout = play_moved(3, [OFF_GOAL] * 5 + [ON_GOAL] * 2)
+    assert rollout.records.solved[0]
+    assert not rollout.bob.terminated.any()
+    assert rollout.bob.reward[:, 0].tolist() == [0.0] * 5 + [1.0, 0.0]
 
 
 def test_running_out_of_time_is_not_an_end(rollout):
@@ -314,6 +362,34 @@ def test_demonstrations_are_alices_turns_of_failed_goals_seen_by_bob():
         assert np.array_equal(demonstrations.observation[row, 11:], rollout.records.goal[world].astype(np.float32))
         assert np.array_equal(demonstrations.action[row], rollout.alice.action[step, world])
     assert demonstrations.observation.dtype == demonstrations.action.dtype == np.float32
+
+
+def test_with_hindsight_bobs_failures_show_the_way_to_where_the_object_came():
+    starts = [IN_FRONT, AT_REST, LEAVES, SLIDES, IN_FRONT]
+    plan = RoundPlan(np.full(5, -1), np.array([-1, -1, -1, -1, 0]))
+    slid = idle_positions(SLIDES, 7)[-1]
+    goals = np.array([(-0.1, -0.1, 0.025)] * 3 + [slid] + [(-0.1, -0.1, 0.025)])
+
+    def choose(start_state, start_position, round_index, proposal, verdict):
+        """These goals everywhere; only the first world's is Alice's own."""
+        every, own = np.ones(5, dtype=bool), np.arange(5) == 0
+        return GoalChoice(goals.copy(), start_state.copy(), start_position.copy(), ~own, own, every)
+
+    config = make_config(5, learner={"abc": {"hindsight": True}})
+    rollout = play(make_game(config, starts), Pusher(), Pusher(), plan=plan, choose_goals=choose, past_bob=[Pusher()])
+    assert rollout.records.solved.tolist() == [False, False, False, True, False]
+    # Bob moved 0 and 4 to a place inside, but 4 was a past Bob. He left 1 alone, and 2 slid out of the workspace.
+    demonstrations, bob = rollout.demonstrations, rollout.bob
+    assert demonstrations.observation.shape == (9 + 7, 14)
+    assert np.array_equal(demonstrations.observation[:9, :11], rollout.alice.observation[:, 0, :11])
+    assert np.array_equal(demonstrations.observation[:9, 11:], np.tile(goals[0].astype(np.float32), (9, 1)))
+    achieved = bob.final_value_observation[0, 5:8]
+    assert achieved[0] > IN_FRONT.position[0] + 0.05
+    assert np.array_equal(demonstrations.observation[9:, :11], bob.observation[:, 0, :11])
+    assert np.array_equal(demonstrations.observation[9:, 11:], np.tile(achieved, (7, 1)))
+    assert np.array_equal(demonstrations.action[9:], bob.action[:, 0])
+    without = play(make_game(make_config(5), starts), Pusher(), Pusher(), choose_goals=choose)
+    assert len(without.demonstrations.action) == 9
 
 
 def test_no_failure_no_demonstrations():

@@ -284,6 +284,14 @@ def test_cloning_can_be_switched_off():
     assert metrics["learner/num_demonstrations"] == 0.0
 
 
+def test_the_weight_of_cloning_is_that_of_the_configuration():
+    log_ratios = []
+    for weight in (0.1, 2.0):
+        metrics = updated(Learner(make_config(abc={"weight": weight}, bob={"target_kl": 1.0})), 0)
+        log_ratios.append(metrics["learner/demonstration_log_ratio"])
+    assert log_ratios[1] > 1.5 * log_ratios[0] > 0.0
+
+
 def test_mirroring_doubles_what_bob_learns_from():
     learner = Learner(make_config(mirror=True))
     rollout = make_rollout(learner, 0)

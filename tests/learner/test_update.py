@@ -108,6 +108,20 @@ def test_cloning_beside_samples():
     assert {"policy_loss", "cloning_loss", "value_loss"} <= metrics.keys()
 
 
+@pytest.mark.parametrize("weight", [0.25, 1.0])
+@pytest.mark.parametrize("beside_samples", [False, True])
+def test_cloning_has_its_weight(weight, beside_samples):
+    player = make_player(num_epochs=1)
+    samples = play(player, np.random.default_rng(0), num=32) if beside_samples else None
+    if samples is not None:
+        samples = replace(samples, advantage=torch.zeros_like(samples.advantage))  # only cloning moves the mean
+    abc = ABCConfig(weight=weight)
+    update_player(player, samples, make_cloning(player, num=16), abc, np.random.default_rng(0))
+    # Of a Gaussian with mean 0 and std e^-0.5, d log p(0.5) / d mean is 0.5 e; Adam's moment is 0.1 x the gradient.
+    moment = player.state()["adam/first_moment/policy/mean"]
+    np.testing.assert_allclose(moment, [-0.1 * weight * 0.5 * math.e], rtol=1e-5)
+
+
 def test_ratios_start_at_one():
     # Samples and demonstrations go through the policy together; each must meet its own old log-probability.
     player = make_player(learning_rate=1e-9)

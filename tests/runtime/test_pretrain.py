@@ -8,7 +8,9 @@ import time
 import numpy as np
 import pytest
 
+from service.actors import evaluation
 from service.config import ConfigError, parse_config
+from service.envs.goals import draw_goals
 from service.errors import TandemError
 from service.registry.registry import BUNDLED, Registry
 from service.runtime import pretrain as module
@@ -60,6 +62,32 @@ def test_a_finished_run_is_evaluated_drawn_and_published(tmp_path, quick):
     assert sorted(done.metrics) == sorted(kinds)
     assert all(0.0 <= rate <= 1.0 for rate in done.metrics.values())
     assert {"play", "checkpoint"} <= {line.split()[0] for line in done.timing.splitlines()}
+
+
+def test_the_final_evaluation_is_played_on_goals_of_its_own(tmp_path, quick, monkeypatch):
+    """Or the choice of a run by its learning curve would be a choice by the same episodes that then measure it."""
+    drawn = []
+
+    def watched(kind, *args, **kwargs):
+        drawn.append((kind, draw_goals(kind, *args, **kwargs)))
+        return drawn[-1][1]
+
+    monkeypatch.setattr(evaluation, "draw_goals", watched)
+    curve, final = [], []
+    for name in ("one", "another"):
+        config = tiny_config(total_env_steps=400, evaluation_interval=1)
+        done = pretrain(config, RunDirectory(tmp_path / name), tmp_path / "registry", on_iteration=lambda metrics: None)
+        assert done.result.iteration == (len(drawn) - 3) / 3 >= 2
+        curve += [drawn[start : start + 3] for start in range(0, len(drawn) - 3, 3)]
+        final.append(drawn[-3:])
+        drawn.clear()
+    for evaluations in (curve, final):
+        for goals in evaluations:
+            assert [kind for kind, _ in goals] == ["table", "air", "mixed"]
+            assert all(np.array_equal(one, first) for (_, one), (_, first) in zip(goals, evaluations[0], strict=True))
+    for (_, one), (_, other) in zip(curve[0], final[0], strict=True):
+        assert one.shape == other.shape == (4, 3)
+        assert not np.isin(one[:, :2], other[:, :2]).any()
 
 
 def test_what_is_published_is_bob_and_all_that_a_user_of_him_needs(tmp_path, quick):
