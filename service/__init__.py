@@ -25,8 +25,9 @@ def load_primitives(reference: str = "panda-cube@champion", registry: Path | str
 
     Args:
         reference: NAME, NAME@ALIAS or NAME@VERSION, or a run directory.
-        registry: directory to look in first; a name it does not have is looked up among what comes with the package.
-            Or the ``http://HOST:PORT`` of a ``tandem serve``, which alone is asked, with the token in TANDEM_TOKEN.
+        registry: directory to look in first; a version or alias it does not have is looked up among what comes with
+            the package. Or the ``http://HOST:PORT`` of a ``tandem serve``, which alone is asked, with the token in
+            TANDEM_TOKEN.
 
     Returns:
         ``.primitives``, the evaluator that acts and composes; ``.config`` and ``.manifest``, what it was trained with.

@@ -124,8 +124,13 @@ def test_the_readmes_commands_of_pretraining(monkeypatch, tmp_path):
     assert any("--resume" in command for command in commands)
     assert sorted(path.name for path in Path("runs").iterdir()) == ["cube", "panda-sphere"]
     rows = json.loads(tandem("registry", "list", "--json").stdout)
-    own = [(row["name"], row["version"], row["parent"]) for row in rows if not row["bundled"]]
+    own = [(row["name"], row["version"], row["parent"]) for row in rows if row["where"] == "yours"]
     assert own == [("panda-cube", 1, None), ("panda-sphere", 1, None)]  # resuming what was finished made no version
+    few = ("--episodes", 2, "--steps", 2, "--json")  # after which the README's primitives are still there
+    evaluated = json.loads(tandem("evaluate", "--primitives", "panda-cube@champion", *few).stdout)
+    assert list(evaluated) == [f"{Registry(BUNDLED).resolve('panda-cube@champion')} (bundled)", "idle"]
+    evaluated = json.loads(tandem("evaluate", "--primitives", "panda-cube", *few).stdout)
+    assert list(evaluated) == ["panda-cube@1", "idle"]
 
 
 def test_a_resumed_run_takes_the_file_it_was_begun_with(trained, monkeypatch):

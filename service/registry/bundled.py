@@ -10,9 +10,10 @@ from service.registry.registry import BUNDLED, Registry
 
 
 def find_version(reference: str, root: Path) -> tuple[Registry, Version]:
-    """Find a version in the registry at ``root`` or, where that has nothing of this name, in the bundled one.
+    """Find a version in the registry at ``root`` or, where that does not have it, in the bundled one.
 
-    A name is never looked up in both: its versions and aliases all belong to one registry.
+    What the user's registry has is always the user's. An alias of it that means a missing version is not looked up
+    again: the user means a version of their own.
 
     Args:
         reference: NAME, NAME@VERSION or NAME@ALIAS.
@@ -23,19 +24,16 @@ def find_version(reference: str, root: Path) -> tuple[Registry, Version]:
         RegistryError: not a reference, or a damaged alias.
     """
     own, bundled = Registry(root), Registry(BUNDLED)
-    if own.bundled:
-        return own, own.resolve(reference)
-    name, _ = split_reference(reference)
-    registry = bundled if bundled.versions(name) and not own.versions(name) else own
     try:
-        return registry, registry.resolve(reference)
+        return own, own.resolve(reference)
     except UnknownVersionError as error:
-        raise UnknownVersionError(f"{error}; {_elsewhere(name, own, bundled)}") from None
-
-
-def _elsewhere(name: str, own: Registry, bundled: Registry) -> str:
-    if not bundled.versions(name):
-        return f"with tandem comes: {', '.join(bundled.names()) or 'nothing'}"
-    if own.versions(name):
-        return f"this {name} hides the one that comes with tandem, which is in --registry {bundled.root}"
-    return f"the registry {own.root} has no {name} at all"
+        name, target = split_reference(reference)
+        if own.bundled or target in own.aliases(name):
+            raise
+        if not bundled.versions(name):
+            raise UnknownVersionError(f"{error}; with tandem comes: {', '.join(bundled.names()) or 'nothing'}") from None
+        missing = str(error) if own.versions(name) else f"the registry {own.root} has no {name} at all"
+    try:
+        return bundled, bundled.resolve(reference)
+    except UnknownVersionError as error:
+        raise UnknownVersionError(f"{missing}; nor does one come with tandem: {error}") from None

@@ -30,7 +30,7 @@ _DEFAULT = Path("registry")
 
 @registry_app.command("list")
 def list_versions(directory: _Directory = _DEFAULT, as_json: _Json = False) -> None:
-    """List every version, and those that come with tandem."""
+    """List every version: yours, and those that come with tandem (bundled)."""
     with _user_errors():
         from service.registry.registry import BUNDLED, Registry
 
@@ -55,11 +55,11 @@ def show(reference: _Reference, directory: _Directory = _DEFAULT, as_json: _Json
     with _user_errors():
         registry, version = _find(reference, directory)
         manifest = registry.manifest(str(version))
-        aliases = _aliases_of(registry, manifest)
+        aliases, where = _aliases_of(registry, manifest), _where(registry)
     if as_json:
-        typer.echo(json.dumps({**manifest.model_dump(mode="json"), "aliases": aliases}, indent=1))
+        typer.echo(json.dumps({**manifest.model_dump(mode="json"), "aliases": aliases, "where": where}, indent=1))
     else:
-        _print_table(["key", "value"], _describe(manifest, aliases))
+        _print_table(["key", "value"], [*_describe(manifest, aliases), ["where", where]])
 
 
 @registry_app.command()
@@ -157,9 +157,14 @@ def _rows(registry: Registry, name: str) -> list[dict[str, object]]:
     for version in registry.versions(name):
         manifest = registry.manifest(str(version))
         row = {"created": manifest.created, "bytes": manifest.blob_bytes, "aliases": _aliases_of(registry, manifest)}
-        more = {"parent": manifest.parent, "bundled": registry.bundled}
-        rows.append({"name": name, "version": version.number, **row, **more})
+        identity = {"name": name, "version": version.number, "where": _where(registry)}
+        rows.append({**identity, **row, "parent": manifest.parent})
     return rows
+
+
+def _where(registry: Registry) -> str:
+    """Two registries may both have a version 1: which one is meant must be seen."""
+    return "bundled" if registry.bundled else "yours"
 
 
 def _aliases_of(registry: Registry, manifest: Manifest) -> list[str]:

@@ -43,7 +43,8 @@ def load_bob(reference: str, registry: Path) -> TrainedBob:
 
     Args:
         reference: of a version, or a run directory.
-        registry: directory to look in first; a name it does not have is looked up among what comes with the package.
+        registry: directory to look in first; a version or alias it does not have is looked up among what comes with
+            the package.
 
     Raises:
         TandemError: neither a run directory nor a published version, or damaged.

@@ -35,13 +35,35 @@ def test_a_name_the_user_does_not_have_is_looked_up_in_the_package(
     assert registry.root.exists() == bool(others)
 
 
-def test_an_alias_of_the_users_own_name_is_not_looked_up_in_the_package(registry: Registry, publish: Publish) -> None:
+def test_an_own_version_hides_nothing_that_it_does_not_have(registry: Registry, publish: Publish) -> None:
     publish()
-    with pytest.raises(UnknownVersionError) as error:
+    champion = Registry(BUNDLED).resolve("panda-cube@champion")
+    assert champion.number > 1
+    for reference in ("panda-cube@champion", str(champion)):
+        found, version = find_version(reference, registry.root)
+        assert (found.bundled, version) == (True, champion)
+    for reference in ("panda-cube", "panda-cube@latest", "panda-cube@1"):
+        found, version = find_version(reference, registry.root)
+        assert (found.root, version) == (registry.root, Version("panda-cube", 1))
+
+
+def test_what_the_users_registry_has_is_the_users(registry: Registry, publish: Publish) -> None:
+    champion = Registry(BUNDLED).resolve("panda-cube@champion")
+    for _ in range(champion.number):
+        publish()
+    registry.set_alias("panda-cube", "champion", 2)
+    for reference, number in (("panda-cube@champion", 2), (str(champion), champion.number)):
+        found, version = find_version(reference, registry.root)
+        assert (found.root, version) == (registry.root, Version("panda-cube", number))
+
+
+def test_an_own_alias_of_a_version_that_is_gone_is_no_other_version(registry: Registry, publish: Publish) -> None:
+    publish()
+    publish()
+    registry.set_alias("panda-cube", "champion", 1)
+    (registry.root / "models" / "panda-cube" / "versions" / "1").unlink()
+    with pytest.raises(UnknownVersionError, match="champion -> 1"):
         find_version("panda-cube@champion", registry.root)
-    assert f"no alias 'champion' in the registry {registry.root}; versions: 1 to 1" in str(error.value)
-    assert f"hides the one that comes with tandem, which is in --registry {BUNDLED}" in str(error.value)
-    assert find_version("panda-cube@champion", BUNDLED)[0].bundled
 
 
 def test_what_is_nowhere(registry: Registry, publish: Publish) -> None:
@@ -56,6 +78,14 @@ def test_what_is_nowhere(registry: Registry, publish: Publish) -> None:
     assert f"the registry {registry.root} has no panda-cube" in str(error.value)
     with pytest.raises(UnknownVersionError, match="no alias 'best'"):
         find_version("panda-cube@best", BUNDLED)
+    publish()
+    for target, missing in (("best", "alias 'best'"), ("99", "version 99")):
+        with pytest.raises(UnknownVersionError) as error:
+            find_version(f"panda-cube@{target}", registry.root)
+        own = f"no {missing} in the registry {registry.root}; versions: 1 to 1; aliases: latest -> 1; nor does one come"
+        assert own in str(error.value)
+        assert f"no {missing} in the registry {BUNDLED}" in str(error.value)
+        assert "\n" not in str(error.value)
 
 
 @pytest.mark.parametrize("through", ["path", "detour", "link"])

@@ -40,20 +40,21 @@ def assert_user_error(result: Any, *parts: str) -> None:
 
 def test_list(run: Run) -> None:
     lines = run("list").stdout.splitlines()
-    assert lines[0].split("\t") == ["name", "version", "created", "bytes", "aliases", "parent", "bundled"]
-    assert [line.split("\t")[:2] for line in lines[1:3]] == [["panda-cube", "1"], ["panda-cube", "2"]]
-    assert lines[2].split("\t")[4:] == ["latest", "panda-cube@1", "false"]
-    assert {line.split("\t")[6] for line in lines[3:]} == {"true"}
+    assert lines[0].split("\t") == ["name", "version", "where", "created", "bytes", "aliases", "parent"]
+    assert [line.split("\t")[:3] for line in lines[1:3]] == [["panda-cube", str(n), "yours"] for n in (1, 2)]
+    assert lines[2].split("\t")[5:] == ["latest", "panda-cube@1"]
+    champion = Registry(BUNDLED).resolve("panda-cube@champion")
+    assert [line.split("\t")[:3] for line in lines[3:]] == [["panda-cube", str(champion.number), "bundled"]]
 
 
 def test_list_json(run: Run) -> None:
     rows = json.loads(run("list", "--json").stdout)
-    own = [row for row in rows if not row["bundled"]]
+    own = [row for row in rows if row["where"] == "yours"]
     assert [(row["name"], row["version"], row["aliases"], row["parent"]) for row in own] == [
         ("panda-cube", 1, [], None),
         ("panda-cube", 2, ["latest"], "panda-cube@1"),
     ]
-    assert len(rows) > len(own)
+    assert {row["where"] for row in rows[len(own) :]} == {"bundled"}
 
 
 @pytest.mark.parametrize("directory", [".", "none"])
@@ -63,8 +64,8 @@ def test_list_of_an_empty_registry_has_what_comes_with_tandem(tmp_path: Path, di
     assert result.exit_code == 0
     assert result.stderr == f"nothing published in {path} yet\n"
     rows = json.loads(result.stdout)
-    assert [(row["name"], row["aliases"], row["bundled"]) for row in rows] == [
-        ("panda-cube", ["champion", "latest"], True)
+    assert [(row["name"], row["aliases"], row["where"]) for row in rows] == [
+        ("panda-cube", ["champion", "latest"], "bundled")
     ]
     assert list(tmp_path.iterdir()) == []
 
@@ -76,7 +77,7 @@ def test_what_comes_with_tandem_is_listed_once_shown_verified_and_exported_but_n
     own = ("--registry", tmp_path / "none")
     assert len(json.loads(run("list", "--json", "--registry", BUNDLED).stdout)) == len(Registry(BUNDLED).names())
     tree = json.loads(run("show", "panda-cube@champion", "--json", *own).stdout)
-    assert (tree["name"], tree["aliases"]) == ("panda-cube", ["champion", "latest"])
+    assert (tree["name"], tree["aliases"], tree["where"]) == ("panda-cube", ["champion", "latest"], "bundled")
     assert run("verify", "panda-cube", *own).exit_code == 0
     assert run("export", "panda-cube", tmp_path / "out", *own).exit_code == 0
     assert load_exported(tmp_path / "out")[0] == Registry(BUNDLED).manifest("panda-cube")
@@ -87,9 +88,11 @@ def test_what_comes_with_tandem_is_listed_once_shown_verified_and_exported_but_n
 def test_show(run: Run) -> None:
     rows = dict(line.split("\t") for line in run("show", "panda-cube").stdout.splitlines())
     assert rows["reference"] == "panda-cube@2"
-    assert rows["aliases"] == "latest"
+    assert (rows["aliases"], rows["where"]) == ("latest", "yours")
     assert rows["tensors.gate.weight"] == "float32 [2, 3]"
     assert rows["config.seed"] == "3"
+    rows = dict(line.split("\t") for line in run("show", "panda-cube@champion").stdout.splitlines())
+    assert (rows["aliases"], rows["where"]) == ("champion, latest", "bundled")
     tree = json.loads(run("show", "panda-cube@1", "--json").stdout)
     assert (tree["version"], tree["aliases"], tree["metrics"]) == (1, [], {"bob/success_rate": 0.5})
 
@@ -120,7 +123,7 @@ def test_verify(run: Run, registry: Registry) -> None:
 
 
 def test_mistakes_are_one_line_and_exit_code_2(run: Run, tmp_path: Path) -> None:
-    assert_user_error(run("show", "panda-cube@best"), "no alias 'best'", "latest -> 2")
+    assert_user_error(run("show", "panda-cube@best"), "no alias 'best'", "latest -> 2", "champion -> ")
     assert_user_error(run("show", "panda-cup"), "it holds: panda-cube")
     assert_user_error(run("alias", "panda-cube", "7"), "bad alias '7'")
     assert_user_error(run("verify", "../x"), "bad reference")
