@@ -456,7 +456,7 @@ def test_a_disk_that_is_full_to_the_end(tmp_path):
 def test_a_mistake_in_a_real_process_is_one_line():
     result = subprocess.run(
         [sys.executable, "-m", "service", "pretrain", "--set", "game.num_world=3"],
-        cwd=ROOT, capture_output=True, text=True, timeout=100,
+        cwd=ROOT, capture_output=True, text=True, timeout=600,
     )  # fmt: skip
     assert (result.returncode, result.stdout) == (2, "")
     assert result.stderr.count("\n") == 1

@@ -40,7 +40,7 @@ def installed(tmp_path_factory):
         shutil.copy(ROOT / name, source)
     options = ("--quiet", "--no-deps", "--no-build-isolation", "--no-index", "--disable-pip-version-check")
     subprocess.run(
-        [sys.executable, "-m", "pip", "wheel", *options, "--wheel-dir", home, source], check=True, timeout=100
+        [sys.executable, "-m", "pip", "wheel", *options, "--wheel-dir", home, source], check=True, timeout=600
     )
     (wheel,) = home.glob("*.whl")
     zipfile.ZipFile(wheel).extractall(home / "site")
@@ -52,7 +52,7 @@ def run(installed, directory, *arguments):
     environment = {**os.environ, "PYTHONPATH": str(installed)}
     environment.pop("TANDEM_REGISTRY", None)
     result = subprocess.run(
-        [sys.executable, *arguments], cwd=directory, env=environment, capture_output=True, text=True, timeout=100
+        [sys.executable, *arguments], cwd=directory, env=environment, capture_output=True, text=True, timeout=600
     )
     assert result.returncode == 0, result.stderr
     return result.stdout

@@ -61,7 +61,7 @@ def run_python(code, *args):
     """Run code in a fresh interpreter; returns what it printed."""
     environment = {**os.environ, "NO_COLOR": "1", "COLUMNS": "120"}
     result = subprocess.run(
-        [sys.executable, "-c", code, *args], cwd=ROOT, env=environment, capture_output=True, text=True, timeout=120
+        [sys.executable, "-c", code, *args], cwd=ROOT, env=environment, capture_output=True, text=True, timeout=600
     )
     assert result.returncode == 0, result.stderr
     return result.stdout
@@ -96,7 +96,7 @@ def test_help_is_light_and_names_every_verb():
 
 def test_python_dash_m_is_the_command():
     result = subprocess.run(
-        [sys.executable, "-m", "service", "--help"], cwd=ROOT, capture_output=True, text=True, timeout=120
+        [sys.executable, "-m", "service", "--help"], cwd=ROOT, capture_output=True, text=True, timeout=600
     )
     assert result.returncode == 0, result.stderr
     assert "pretrain" in result.stdout

@@ -268,7 +268,7 @@ def test_images_are_ours_by_one_name_or_pinned():
 @pytest.mark.parametrize("folder", FOLDERS)
 def test_kustomize_builds_it(folder):
     result = subprocess.run(
-        ["kubectl", "kustomize", KUBERNETES / folder], capture_output=True, text=True, timeout=60, check=False
+        ["kubectl", "kustomize", KUBERNETES / folder], capture_output=True, text=True, timeout=600, check=False
     )
     assert result.returncode == 0, result.stderr
     built = list(yaml.safe_load_all(result.stdout))
@@ -282,7 +282,7 @@ def test_kustomize_builds_it(folder):
 
 def test_the_alerts_go_in_as_they_are():
     script = KUBERNETES / "monitoring" / "apply-alerts.sh"
-    result = subprocess.run(["sh", script], capture_output=True, text=True, timeout=30, check=True)
+    result = subprocess.run(["sh", script], capture_output=True, text=True, timeout=600, check=True)
     rule = yaml.safe_load(result.stdout)
     assert (rule["apiVersion"], rule["kind"]) == ("monitoring.coreos.com/v1", "PrometheusRule")
     assert rule["spec"] == load(DEPLOY / "prometheus" / "alerts.yml")

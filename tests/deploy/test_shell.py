@@ -30,7 +30,7 @@ def redis_scripts():
 
 
 def check_syntax(script):
-    result = subprocess.run(["sh", "-n"], input=script, capture_output=True, text=True, timeout=30, check=False)
+    result = subprocess.run(["sh", "-n"], input=script, capture_output=True, text=True, timeout=600, check=False)
     assert result.returncode == 0, f"{result.stderr}\n{script}"
 
 
@@ -69,7 +69,7 @@ def test_make_env_fills_in_secrets_once(tmp_path):
     for name in (".env.example", "make-env.sh"):
         shutil.copy(DEPLOY / "compose" / name, tmp_path)
     run = ["sh", tmp_path / "make-env.sh"]
-    subprocess.run(run, check=True, capture_output=True, timeout=30)
+    subprocess.run(run, check=True, capture_output=True, timeout=600)
     written = (tmp_path / ".env").read_text()
     assert stat.S_IMODE((tmp_path / ".env").stat().st_mode) == 0o600
     values = dict(re.findall(r"^(\w+)=(.*)$", written, re.MULTILINE))
@@ -78,7 +78,7 @@ def test_make_env_fills_in_secrets_once(tmp_path):
     assert len(set(secrets)) == len(secrets) == 4
     assert all(re.fullmatch(r"[0-9a-f]{64}", secret) for secret in secrets)
     assert {name: values[name] for name, value in example.items() if value} == {n: v for n, v in example.items() if v}
-    again = subprocess.run(run, check=False, capture_output=True, text=True, timeout=30)
+    again = subprocess.run(run, check=False, capture_output=True, text=True, timeout=600)
     assert again.returncode == 1
     assert "stays as it is" in again.stderr
     assert (tmp_path / ".env").read_text() == written
@@ -120,7 +120,7 @@ def test_redis_starts_with_a_password_and_keeps_what_it_is_told(where, tmp_path)
             assert password.encode() not in command.read_bytes()
     finally:
         server.terminate()
-        assert server.wait(10) == 0
+        assert server.wait(300) == 0
 
 
 def accepts(path):
@@ -129,7 +129,7 @@ def accepts(path):
         return client.connect_ex(str(path)) == 0
 
 
-def wait_until(happened, seconds=10):
+def wait_until(happened, seconds=300):
     deadline = time.monotonic() + seconds
     while not happened():
         assert time.monotonic() < deadline

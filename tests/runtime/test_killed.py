@@ -30,7 +30,7 @@ def killed(work):
     """Let a child of this process do ``work``; it has to die of it."""
     child = os.fork()
     if child == 0:
-        signal.alarm(60)
+        signal.alarm(600)
         try:
             work()
         finally:
@@ -191,10 +191,10 @@ def test_real_processes_killed_at_random_moments(tmp_path):
     process, path = start_endless_run(tmp_path)
     delays_s = random.uniform(0.0, 0.5), random.uniform(1.0, 4.0)
     try:
-        deadline_s = time.monotonic() + 100.0
+        deadline_s = time.monotonic() + 600.0
         while len(list(path.glob("checkpoints/checkpoint-*"))) < 2:
             assert process.poll() is None, process.stderr.read()
-            assert time.monotonic() < deadline_s, "no checkpoints after 100 s"
+            assert time.monotonic() < deadline_s, "no checkpoints after 600 s"
             time.sleep(0.01)
         time.sleep(delays_s[0])
     finally:

@@ -31,6 +31,8 @@ from tests.runtime.runs import (
     write_yaml,
 )
 
+pytestmark = pytest.mark.usefixtures("default_signals")
+
 
 @pytest.fixture
 def quick(monkeypatch):
@@ -212,14 +214,14 @@ def test_a_second_signal_ends_it_at_once(tmp_path, quick):
 def test_a_signal_saves_and_says_how_to_resume(tmp_path, number, exit_code):
     """A real process, a real signal; the run it leaves goes on as if nothing had happened."""
     process, path = start_endless_run(tmp_path)
-    deadline_s = time.monotonic() + 100.0
+    deadline_s = time.monotonic() + 600.0
     while process.poll() is None and time.monotonic() < deadline_s:
         if (path / "metrics.jsonl").exists() and len((path / "metrics.jsonl").read_bytes().splitlines()) >= 3:
             process.send_signal(number)
             break
         time.sleep(0.02)
     try:
-        out, err = process.communicate(timeout=60)
+        out, err = process.communicate(timeout=600)
     finally:
         process.kill()
     assert process.returncode == exit_code, err

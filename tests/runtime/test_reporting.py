@@ -6,13 +6,14 @@ import subprocess
 import sys
 import threading
 import time
+from functools import partial
 
 import pytest
 
 from service.errors import DivergedError, TandemError
 from service.registry.registry import Registry
 from service.runtime import pretrain as module
-from service.runtime import publishing
+from service.runtime import publishing, rundir
 from service.runtime.pretrain import UnfinishedError, pretrain, resumed_config
 from service.runtime.rundir import RunDirectory
 from service.runtime.signals import InterruptError
@@ -31,6 +32,8 @@ from tests.runtime.runs import (
     tiny_config,
 )
 from tests.store.stores import Killable, wait_until
+
+pytestmark = pytest.mark.usefixtures("default_signals")
 
 
 @pytest.fixture(autouse=True)
@@ -147,10 +150,10 @@ def test_a_second_process_is_refused_and_a_killed_one_has_vanished(tmp_path):
     process, path = start_endless_run(tmp_path)
     try:
         reader = DiskReader(tmp_path)
-        wait_until(lambda: reader.runs() and reader.run("run").iteration > 0, within_s=100.0)
+        wait_until(lambda: reader.runs() and reader.run("run").iteration > 0, within_s=600.0)
         assert reader.run("run").state == "running"
         command = [sys.executable, "-m", "service", "pretrain", "--resume", "--run-dir", str(path)]
-        second = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=100)
+        second = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=600)
         assert process.poll() is None
         assert second.returncode == 2
         assert_one_line(second.stderr, f"{path} is in use by process {process.pid}", "--run-dir")
@@ -165,7 +168,8 @@ def test_a_second_process_is_refused_and_a_killed_one_has_vanished(tmp_path):
     directory.close()
 
 
-def test_of_two_new_runs_at_once_one_begins(tmp_path):
+def test_of_two_new_runs_at_once_one_begins(tmp_path, monkeypatch):
+    monkeypatch.setattr(rundir, "DirectoryLock", partial(rundir.DirectoryLock, wait_s=600.0))
     first, second = RunDirectory(tmp_path), RunDirectory(tmp_path)
     first.claim(resume=False)
     first.claim(resume=False)
@@ -182,7 +186,7 @@ def test_of_two_new_runs_at_once_one_begins(tmp_path):
     time.sleep(0.1)  # it waits for the lock by now
     first.start(tiny_config())
     first.close()
-    waiting.join(20.0)
+    waiting.join()
     assert_one_line(errors[0], tmp_path, "holds a run already")
     second.close()
 

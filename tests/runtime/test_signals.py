@@ -14,6 +14,7 @@ from service.runtime.local import LocalRun
 from service.runtime.signals import InterruptError, StopSignals
 from tests.runtime.runs import assert_same_run, newest, play, tiny_config, write_yaml
 
+pytestmark = pytest.mark.usefixtures("default_signals")
 BOTH = pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM], ids=lambda number: number.name)
 
 

@@ -24,7 +24,7 @@ _ARGUMENTS = (
     "--disable-sync",
     "--disable-dev-shm-usage",
 )
-_TIMEOUT_MS = 20_000
+_TIMEOUT_MS = 300_000
 
 
 @contextmanager

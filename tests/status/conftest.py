@@ -1,6 +1,7 @@
 """Services on loopback, each with the same two runs and a registry of two versions."""
 
 from collections.abc import Iterator
+from datetime import timedelta
 from pathlib import Path
 
 import httpx
@@ -8,8 +9,15 @@ import pytest
 
 from service.registry.registry import Registry
 from service.status.server import StatusServer
+from service.store import liveness
 from service.store.disk_reader import DiskReader
-from tests.status.runs import BEARER, TOKEN, publish, write_runs
+from tests.status.runs import BEARER, CLIENT, TOKEN, publish, write_runs
+
+
+@pytest.fixture(autouse=True)
+def slow_tests(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A run that was written when a module's tests began is heard of long enough for all of them."""
+    monkeypatch.setattr(liveness, "SILENT_AFTER", timedelta(hours=1))
 
 
 @pytest.fixture(scope="module")
@@ -40,5 +48,5 @@ def server(home: Path) -> Iterator[StatusServer]:
 @pytest.fixture(scope="module")
 def client(server: StatusServer) -> Iterator[httpx.Client]:
     """Of that service, with its token."""
-    with httpx.Client(base_url=server.url, headers=BEARER, trust_env=False) as client:
+    with httpx.Client(base_url=server.url, headers=BEARER, **CLIENT) as client:
         yield client

@@ -10,7 +10,7 @@ from service.registry.registry import BUNDLED, Registry
 from service.status.server import StatusServer
 from service.store.disk_reader import DiskReader
 from service.store.models import GoalGrid, RunStatus
-from tests.status.runs import BEARER, TOKEN, grid, publish, record, write_status
+from tests.status.runs import BEARER, CLIENT, TOKEN, grid, publish, record, write_status
 
 
 def test_health(client):
@@ -150,7 +150,7 @@ def test_aliases_move_forward_and_back(client, home):
 def test_the_registry_that_comes_with_tandem_is_only_read(tmp_path):
     with StatusServer(DiskReader(tmp_path), Registry(BUNDLED), token=TOKEN, port=0) as server:
         url = f"{server.url}/v1/primitives/panda-cube/aliases/mine"
-        answer = httpx.put(url, json={"version": 2}, headers=BEARER, trust_env=False)
+        answer = httpx.put(url, json={"version": 2}, headers=BEARER, **CLIENT)
     assert (answer.status_code, answer.json()["type"]) == (409, "urn:tandem:read-only")
 
 

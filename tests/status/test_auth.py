@@ -8,7 +8,7 @@ from starlette.routing import Mount, Route
 
 from service.status.errors import StatusError
 from tests.status.conftest import serve
-from tests.status.runs import TOKEN, WRONG
+from tests.status.runs import CLIENT, TOKEN, WRONG
 
 PARAMETERS = {
     "run_id": "old",
@@ -65,7 +65,7 @@ def ask(client, method, path, authorization=None):
 @pytest.fixture(scope="module")
 def public(home):
     """A service that other machines could reach; asked over loopback."""
-    with serve(home, host="0.0.0.0") as server, httpx.Client(base_url=server.url, trust_env=False) as client:
+    with serve(home, host="0.0.0.0") as server, httpx.Client(base_url=server.url, **CLIENT) as client:
         yield server, client
 
 
@@ -111,21 +111,21 @@ def test_what_changes_something_offers_no_login_to_a_browser(public):
 
 
 def test_on_loopback_reading_is_free_and_changing_is_not(server):
-    with httpx.Client(base_url=server.url, trust_env=False) as client:
+    with httpx.Client(base_url=server.url, **CLIENT) as client:
         for method, path in routes(server):
             answer = ask(client, method, path)
             assert (answer.status_code == 401) == (method != "get"), (method, path)
 
 
 def test_on_loopback_a_wrong_token_is_refused_all_the_same(server):
-    with httpx.Client(base_url=server.url, trust_env=False) as client:
+    with httpx.Client(base_url=server.url, **CLIENT) as client:
         for method, path in routes(server):
             expected = 200 if path == "/livez" else 401
             assert ask(client, method, path, REFUSED["bearer"]).status_code == expected, (method, path)
 
 
 def test_without_a_token_nothing_is_changed(home):
-    with serve(home, token=None) as server, httpx.Client(base_url=server.url, trust_env=False) as client:
+    with serve(home, token=None) as server, httpx.Client(base_url=server.url, **CLIENT) as client:
         for method, path in routes(server):
             answer = ask(client, method, path)
             assert (answer.status_code == 403) == (method != "get"), (method, path)
@@ -149,14 +149,14 @@ def test_no_token_that_is_none(home, token):
 
 @pytest.mark.parametrize("host", ["evil.example", "evil.example:80", "127.0.0.1.evil.example", "10.0.0.1", "", "[::2]"])
 def test_on_loopback_a_name_that_leads_here_is_not_enough(server, host):
-    with httpx.Client(base_url=server.url, trust_env=False) as client:
+    with httpx.Client(base_url=server.url, **CLIENT) as client:
         answer = client.get("/v1/runs", headers={"Host": host, "Authorization": RIGHT["bearer"]})
     assert (answer.status_code, answer.json()["type"]) == (421, "urn:tandem:wrong-host")
 
 
 @pytest.mark.parametrize("host", ["localhost", "localhost:1", "LOCALHOST", "127.0.0.1:8321", "127.9.9.9", "[::1]:8321"])
 def test_names_of_this_machine(server, host):
-    with httpx.Client(base_url=server.url, trust_env=False) as client:
+    with httpx.Client(base_url=server.url, **CLIENT) as client:
         assert client.get("/v1/runs", headers={"Host": host}).status_code == 200
 
 
@@ -167,7 +167,7 @@ def test_a_public_service_has_whatever_name_it_is_given(public):
 
 def test_only_who_has_the_token_is_told_why_it_is_not_ready(tmp_path):
     (tmp_path / "runs").mkdir()
-    with serve(tmp_path, host="0.0.0.0") as server, httpx.Client(base_url=server.url, trust_env=False) as client:
+    with serve(tmp_path, host="0.0.0.0") as server, httpx.Client(base_url=server.url, **CLIENT) as client:
         (tmp_path / "runs").rmdir()
         anyone, trusted = (
             client.get("/readyz", headers=headers) for headers in ({}, {"Authorization": RIGHT["bearer"]})

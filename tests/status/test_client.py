@@ -277,7 +277,7 @@ def test_load_primitives_imports_neither_torch_nor_the_service(champions, tmp_pa
         env=environment,
         capture_output=True,
         text=True,
-        timeout=120,
+        timeout=600,
     )
     assert result.returncode == 0, result.stderr
     assert result.stdout.startswith("panda-cube@")

@@ -43,7 +43,7 @@ def environment(tmp_path_factory):
 def test_examples(environment, tmp_path, command):
     checked = command.replace("curl ", "curl --fail-with-body --max-time 20 ", 1)
     result = subprocess.run(
-        ["sh", "-c", checked], env=environment, cwd=tmp_path, capture_output=True, text=True, timeout=60, check=False
+        ["sh", "-c", checked], env=environment, cwd=tmp_path, capture_output=True, text=True, timeout=600, check=False
     )
     if command.endswith('/nope"'):
         assert (result.returncode, json.loads(result.stdout)["type"]) == (22, "urn:tandem:unknown-run")

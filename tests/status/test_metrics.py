@@ -10,14 +10,14 @@ from prometheus_client.parser import text_string_to_metric_families
 from service.status import metrics
 from service.status.metrics import HTTP_METRICS, NUM_ENDED_RUNS, RUN_METRICS, SERVICE_METRICS
 from tests.status.conftest import serve
-from tests.status.runs import BEARER, append, record, status, write_runs, write_status
+from tests.status.runs import BEARER, CLIENT, append, record, status, write_runs, write_status
 
 
 @pytest.fixture
 def service(tmp_path):
     """(client, directory of runs), asked already for something."""
     write_runs(tmp_path / "runs")
-    with serve(tmp_path) as server, httpx.Client(base_url=server.url, headers=BEARER, trust_env=False) as client:
+    with serve(tmp_path) as server, httpx.Client(base_url=server.url, headers=BEARER, **CLIENT) as client:
         client.get("/v1/runs/old")
         yield client, tmp_path / "runs"
 
@@ -59,7 +59,7 @@ def test_what_a_run_tells(service):
     assert value(samples, "tandem_run_info", run="cube", name="panda-cube", runtime="ray") == 1
     assert value(samples, "tandem_run_state", run="cube", state="running") == 1
     assert value(samples, "tandem_run_state", run="cube", state="failed") == 0
-    assert 0 <= value(samples, "tandem_run_heartbeat_age_seconds", run="cube") < 60
+    assert 0 <= value(samples, "tandem_run_heartbeat_age_seconds", run="cube") < 3600
     assert value(samples, "tandem_runs", state="finished") == value(samples, "tandem_runs", state="running") == 1
 
 
@@ -81,7 +81,7 @@ def test_actors_of_a_run_that_has_ended_alert_nobody(service):
 
 
 def test_the_registry(tmp_path, home):
-    with serve(home) as server, httpx.Client(base_url=server.url, trust_env=False) as client:
+    with serve(home) as server, httpx.Client(base_url=server.url, **CLIENT) as client:
         samples = scrape(client)
     assert value(samples, "tandem_registry_up") == 1
     assert value(samples, "tandem_registry_versions", name="tiny") == 2
@@ -92,7 +92,7 @@ def test_requests_by_route_and_never_by_path(service):
     client, _ = service
     for path in ("/v1/runs/a", "/v1/runs/b", "/x", "/y"):
         client.get(path)
-    httpx.request("PROPFIND", f"{client.base_url}/x", trust_env=False)
+    httpx.request("PROPFIND", f"{client.base_url}/x", **CLIENT)
     samples = scrape(client)
     route = "/v1/runs/{run_id}"
     assert value(samples, "tandem_http_requests_total", method="GET", route=route, status="200") == 1

@@ -43,7 +43,7 @@ def test_schemathesis_finds_nothing(tmp_path):
             cwd=tmp_path,
             capture_output=True,
             text=True,
-            timeout=300,
+            timeout=600,
             check=False,
         )
     assert result.returncode == 0, result.stdout + result.stderr

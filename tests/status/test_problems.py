@@ -13,7 +13,7 @@ from service.status.guard import MAX_BODY_BYTES
 from service.status.server import StatusServer
 from service.store.disk_reader import DiskReader
 from tests.status.conftest import serve
-from tests.status.runs import BEARER, publish, write_runs
+from tests.status.runs import BEARER, CLIENT, publish, write_runs
 
 JSON = {"Content-Type": "application/json"}
 
@@ -124,7 +124,7 @@ def test_a_body_as_long_as_it_may_be(client):
 
 def test_what_is_announced_is_refused_before_it_comes(server):
     head = f"POST /v1/runs/old/stop HTTP/1.1\r\nHost: localhost\r\nAuthorization: {BEARER['Authorization']}\r\n"
-    with socket.create_connection(("127.0.0.1", server.port), timeout=10) as connection:
+    with socket.create_connection(("127.0.0.1", server.port), timeout=300) as connection:
         connection.sendall(f"{head}Content-Length: {10**15}\r\n\r\n".encode())
         assert connection.recv(1000).startswith(b"HTTP/1.1 413")
 
@@ -132,14 +132,14 @@ def test_what_is_announced_is_refused_before_it_comes(server):
 def test_a_body_that_does_not_come(server, monkeypatch):
     monkeypatch.setattr(guard, "BODY_TIMEOUT_S", 0.1)
     head = f"POST /v1/runs/old/stop HTTP/1.1\r\nHost: localhost\r\nAuthorization: {BEARER['Authorization']}\r\n"
-    with socket.create_connection(("127.0.0.1", server.port), timeout=10) as connection:
+    with socket.create_connection(("127.0.0.1", server.port), timeout=300) as connection:
         connection.sendall(f"{head}Content-Length: 10\r\n\r\nhalf".encode())
         assert connection.recv(1000).startswith(b"HTTP/1.1 408")
 
 
 def test_the_store_is_away_and_back(tmp_path):
     write_runs(tmp_path / "runs")
-    with serve(tmp_path) as server, httpx.Client(base_url=server.url, headers=BEARER, trust_env=False) as client:
+    with serve(tmp_path) as server, httpx.Client(base_url=server.url, headers=BEARER, **CLIENT) as client:
         (tmp_path / "runs").rename(tmp_path / "elsewhere")
         for path in (
             "/v1/runs",
@@ -163,7 +163,7 @@ def test_damaged_files(tmp_path):
     publish(registry)
     digest = registry.manifest("tiny@1").blob_sha256
     (tmp_path / "runs" / "cube" / "goals.json").write_text("{}")
-    with serve(tmp_path) as server, httpx.Client(base_url=server.url, headers=BEARER, trust_env=False) as client:
+    with serve(tmp_path) as server, httpx.Client(base_url=server.url, headers=BEARER, **CLIENT) as client:
         assert_problem(client.get("/v1/runs/cube/goals"), 500, "damaged", "goals.json")
         assert client.get(f"/v1/blobs/sha256/{digest}").status_code == 200
         blob = tmp_path / "registry" / "blobs" / "sha256" / digest
@@ -183,7 +183,7 @@ class BrokenReader(DiskReader):
 def test_a_mistake_of_ours_is_told_to_the_log_alone(tmp_path, caplog):
     caplog.set_level(logging.ERROR)
     with StatusServer(BrokenReader(tmp_path), Registry(tmp_path / "registry"), port=0) as server:
-        answer = httpx.get(f"{server.url}/v1/runs", trust_env=False)
+        answer = httpx.get(f"{server.url}/v1/runs", **CLIENT)
     assert_problem(answer, 500, "failed", "unforeseen")
     assert answer.headers["x-content-type-options"] == "nosniff"
     assert "secret" not in answer.text
@@ -195,6 +195,6 @@ def test_a_mistake_of_ours_is_told_to_the_log_alone(tmp_path, caplog):
 
 def test_no_web_sockets(server):
     key = "Upgrade: websocket\r\nConnection: Upgrade\r\nSec-WebSocket-Version: 13\r\nSec-WebSocket-Key: AAAA\r\n"
-    with socket.create_connection(("127.0.0.1", server.port), timeout=10) as connection:
+    with socket.create_connection(("127.0.0.1", server.port), timeout=300) as connection:
         connection.sendall(f"GET /v1/runs/nope HTTP/1.1\r\nHost: localhost\r\n{key}\r\n".encode())
         assert connection.recv(1000).startswith(b"HTTP/1.1 404")  # as if it had not asked for one

@@ -5,7 +5,7 @@ import logging
 import httpx
 
 from tests.status.conftest import serve
-from tests.status.runs import TOKEN, WRONG
+from tests.status.runs import CLIENT, TOKEN, WRONG
 from tests.status.test_auth import BODIES, basic, routes
 
 
@@ -15,7 +15,7 @@ def test_no_secret_leaves(home, caplog):
     logging.getLogger("httpcore").setLevel(logging.WARNING)
     secrets = {TOKEN, WRONG, basic(TOKEN).split()[1], basic(WRONG).split()[1]}
     answers = []
-    with serve(home, host="0.0.0.0") as server, httpx.Client(base_url=server.url, trust_env=False) as client:
+    with serve(home, host="0.0.0.0") as server, httpx.Client(base_url=server.url, **CLIENT) as client:
         for authorization in (f"Bearer {TOKEN}", f"Bearer {WRONG}", basic(TOKEN), basic(WRONG), f"Token {TOKEN}"):
             for method, path in routes(server):
                 headers = {"Authorization": authorization}

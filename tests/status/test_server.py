@@ -21,16 +21,17 @@ from service.status.server import StatusServer
 from service.status.token import read_token
 from service.store.disk_reader import DiskReader
 from tests.status.conftest import serve
-from tests.status.runs import BEARER, TOKEN, publish, write_runs
+from tests.status.runs import BEARER, CLIENT, TOKEN, publish, write_runs
 
 ROOT = Path(__file__).parents[2]
+pytestmark = pytest.mark.usefixtures("default_signals")
 
 
 def test_a_free_port_is_told(home):
     with serve(home) as server:
         assert server.port != 0
         assert server.url == f"http://127.0.0.1:{server.port}"
-        assert httpx.get(f"{server.url}/livez", trust_env=False).status_code == 200
+        assert httpx.get(f"{server.url}/livez", **CLIENT).status_code == 200
 
 
 def test_every_address_is_reached_over_loopback(home):
@@ -46,7 +47,7 @@ def test_ipv6(home):
         pytest.skip("this machine has no IPv6 loopback, ::1")
     with server:
         assert server.url == f"http://[::1]:{server.port}"
-        assert httpx.get(f"{server.url}/v1/runs", trust_env=False).status_code == 200
+        assert httpx.get(f"{server.url}/v1/runs", **CLIENT).status_code == 200
 
 
 def test_stopping_frees_the_port_and_ends_the_thread(home):
@@ -129,7 +130,7 @@ def test_the_foreground_ends_with_a_signal(home, number):
     def use_and_end():
         while not server.started:
             time.sleep(0.01)
-        answers.append(httpx.get(f"{server.url}/livez", trust_env=False).status_code)
+        answers.append(httpx.get(f"{server.url}/livez", **CLIENT).status_code)
         os.kill(os.getpid(), number)
 
     other = threading.Thread(target=use_and_end)
@@ -149,14 +150,14 @@ def test_the_command(tmp_path):
     try:
         first = process.stdout.readline()
         url = re.search(r"http://\S+", first)[0]
-        with httpx.Client(base_url=url, trust_env=False) as client:
+        with httpx.Client(base_url=url, **CLIENT) as client:
             assert {run["run_id"] for run in client.get("/v1/runs").json()["runs"]} == {"cube", "old"}
             assert client.get("/v1/primitives/tiny").json()["newest"] == 1
             assert client.get("/v1/runs/old/video").status_code == 200
             assert client.post("/v1/runs/cube/stop").status_code == 401
             assert client.post("/v1/runs/cube/stop", headers=BEARER).status_code == 202
         process.send_signal(signal.SIGTERM)
-        rest, _ = process.communicate(timeout=30)
+        rest, _ = process.communicate(timeout=600)
     finally:
         process.kill()
         process.wait()

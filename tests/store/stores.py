@@ -35,7 +35,7 @@ def a_record(iteration, **more):
     return {"iteration": iteration, "env_steps": 100 * iteration, "bob/success_rate": iteration / 7} | more
 
 
-def wait_until(holds, *, within_s=10.0):
+def wait_until(holds, *, within_s=300.0):
     """Return once ``holds()`` is true; what it last said when it never is."""
     deadline_s = time.monotonic() + within_s
     while not (said := holds()):
