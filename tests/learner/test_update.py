@@ -122,6 +122,25 @@ def test_cloning_has_its_weight(weight, beside_samples):
     np.testing.assert_allclose(moment, [-0.1 * weight * 0.5 * math.e], rtol=1e-5)
 
 
+@pytest.mark.parametrize("mean_only", [False, True])
+def test_cloning_of_the_mean_only_leaves_the_std_alone(mean_only):
+    player = make_player(num_epochs=1)
+    abc = ABCConfig(mean_only=mean_only)
+    update_player(player, None, make_cloning(player, num=16), abc, np.random.default_rng(0))
+    assert player.policy.mean.item() > 0.0
+    assert (player.policy.log_std.item() == -0.5) == mean_only
+
+
+@pytest.mark.parametrize("weight", [0.25, 1.0])
+def test_the_value_loss_has_its_weight(weight):
+    player = make_player(num_epochs=1, value_weight=weight)
+    samples = play(player, np.random.default_rng(0), num=32)
+    update(player, samples)
+    # The values are 0, so the gradient of half the mean squared error is minus the mean target.
+    moment = player.state()["adam/first_moment/value/level"]
+    np.testing.assert_allclose(moment, [-0.1 * weight * samples.target.mean().item()], rtol=1e-5)
+
+
 def test_ratios_start_at_one():
     # Samples and demonstrations go through the policy together; each must meet its own old log-probability.
     player = make_player(learning_rate=1e-9)
