@@ -312,8 +312,8 @@ def test_a_broken_turn_leaves_the_player_as_it_was():
     learner.ingest(rollout)
     metrics = learner.update()
     after = learner.weights()
-    assert all(np.isfinite(array).all() for array in after.alice.values())
-    assert metrics["learner/bob_policy_loss"] == metrics["learner/bob_policy_loss"]
+    assert all(np.array_equal(before.alice[name], array) for name, array in after.alice.items())
+    assert "learner/bob_policy_loss" in metrics
     assert metrics["learner/non_finite_steps"] >= 1.0
     assert any(not np.array_equal(before.bob[name], after.bob[name]) for name in before.bob)
 
