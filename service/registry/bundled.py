@@ -31,7 +31,9 @@ def find_version(reference: str, root: Path) -> tuple[Registry, Version]:
         if own.bundled or target in own.aliases(name):
             raise
         if not bundled.versions(name):
-            raise UnknownVersionError(f"{error}; with tandem comes: {', '.join(bundled.names()) or 'nothing'}") from None
+            raise UnknownVersionError(
+                f"{error}; with tandem comes: {', '.join(bundled.names()) or 'nothing'}"
+            ) from None
         missing = str(error) if own.versions(name) else f"the registry {own.root} has no {name} at all"
     try:
         return bundled, bundled.resolve(reference)

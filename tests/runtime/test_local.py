@@ -8,8 +8,10 @@ import pytest
 
 from service.errors import TandemError
 from service.learner.learner import Learner
+from service.policies.evaluator import bob_evaluator
 from service.registry.checkpoints import CheckpointStore
 from service.registry.errors import CheckpointError
+from service.runtime import local
 from service.runtime.books import UnsavedError
 from service.runtime.local import LocalRun
 from service.runtime.pretrain import resumed_config
@@ -135,6 +137,21 @@ def test_evaluations_come_at_their_interval_and_change_nothing(uninterrupted, tm
     assert evaluated == list(range(3, len(rows) + 1, 3))
     without = [{k: v for k, v in row.items() if not k.startswith("evaluation/")} for row in timeless_metrics(tmp_path)]
     assert without == timeless_metrics(uninterrupted)
+
+
+def test_the_average_bob_is_evaluated(tmp_path, monkeypatch):
+    handed, asked, weights = [], [], Learner.weights
+
+    def watched(self):
+        handed.append(weights(self))
+        return handed[-1]
+
+    def look(run, metrics):
+        assert asked[-1] is handed[-1].steady_bob
+
+    monkeypatch.setattr(Learner, "weights", watched)
+    monkeypatch.setattr(local, "bob_evaluator", lambda bob: asked.append(bob) or bob_evaluator(bob))
+    play(tmp_path, tiny_config(total_env_steps=200, evaluation_interval=1), on_iteration=look)
 
 
 def test_a_snapshot_joins_the_pool_every_interval(tmp_path):
