@@ -10,7 +10,7 @@ from service.config import load_config
 from service.downstream.compose import parameters_digest
 from service.learner.learner import Learner
 from service.policies.evaluator import bob_evaluator
-from service.runtime.primitives import TrainedBob
+from service.primitives.loading import TrainedBob
 
 
 def test_the_fastest_of_those_that_go_straight():

@@ -13,8 +13,8 @@ from service.downstream.methods import find_method
 from service.downstream.worker import Running, make_worlds, play, run_cell
 from service.envs.tasks import TASKS
 from service.errors import TandemError
-from service.runtime.records import read_jsonl
-from service.store.lock import is_locked
+from service.io.jsonl import read_jsonl
+from service.io.lock import is_locked
 from tests.downstream.cells import small_cell
 
 
