@@ -23,9 +23,9 @@ from benchmarks.record_run import measure_run, record_run
 from benchmarks.run_files import COUNTERS, Run, thin
 from service.config import Config, load_config
 from service.errors import TandemError
+from service.io.run_directory import RunDirectory
+from service.media.plots.figures import read_records
 from service.runtime.local import LocalRun
-from service.runtime.plots.figures import read_records
-from service.runtime.rundir import RunDirectory
 
 ROOT = Path(__file__).parents[1]
 CONFIG = ROOT / "configs" / "pretrain" / "panda_cube.yaml"

@@ -47,7 +47,7 @@ from benchmarks.strikes import (
 )
 from benchmarks.trainings import ENDLESS, ROOT, Training, overrides, scratch
 from service.errors import TandemError
-from service.registry.checkpoints import CheckpointStore
+from service.io.checkpoints import CheckpointStore
 from service.store.errors import StoreError
 from service.store.redis_reader import RedisReader
 from service.store.server import RedisServer

@@ -29,7 +29,7 @@ from benchmarks.measuring import Sample, describe, describe_ratio, machine, rate
 from benchmarks.runner_probe import Measured
 from benchmarks.trainings import ROOT, copy_run, environment, scratch
 from service.errors import TandemError
-from service.runtime.rundir import RunDirectory
+from service.io.run_directory import RunDirectory
 
 PACKAGES = ("ray", "redis", "mujoco", "numpy", "torch")
 RUNTIMES = ("ray", "local")

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.run_files import Records
-from service.runtime.plots.figures import Array
+from service.media.plots.figures import Array
 
 NUM_SLICES = 30
 """Of env steps."""

@@ -28,7 +28,7 @@ from service.downstream.methods import METHODS
 from service.downstream.settings import CellConfig, make_cell
 from service.downstream.worker import CURVE_SEED, FINAL_SEED, Running, describe, play
 from service.errors import TandemError
-from service.runtime.primitives import TrainedBob
+from service.primitives.loading import TrainedBob
 
 
 def learn(cell: CellConfig, trained: TrainedBob, *, every: int, threads: int) -> dict[str, Any]:

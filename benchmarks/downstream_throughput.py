@@ -25,17 +25,17 @@ from stable_baselines3 import SAC
 from stable_baselines3.common.logger import Logger
 
 import service
-import service.envs.registration
+import service.envs.gym.registration
 from benchmarks.measuring import Sample, describe, describe_ratio, machine, measure, rates, ratio, table, write_json
 from service.downstream.compose import ComposePrimitives
 from service.downstream.learner import make_learner
 from service.downstream.methods import METHODS
 from service.downstream.settings import CellConfig, make_cell
 from service.downstream.worker import make_worlds
-from service.envs.registration import EPISODE_STEPS
+from service.envs.gym.registration import EPISODE_STEPS
 from service.envs.tasks import find_task
 from service.errors import TandemError
-from service.runtime.primitives import TrainedBob
+from service.primitives.loading import TrainedBob
 
 WORKER, DEFAULT = "downstream worker", "SB3's SAC, defaults, one environment"
 _DEFAULT_STEPS = 100

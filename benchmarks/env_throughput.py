@@ -29,8 +29,8 @@ from benchmarks.measuring import Sample, describe, describe_ratio, machine, meas
 from service.config import WorldConfig
 from service.envs.batch import DISPLACEMENT_M, WorldBatch
 from service.envs.goals import sample_goals
+from service.envs.gym.registration import TABLETOP_ID
 from service.envs.observations import ACTION_SIZE
-from service.envs.registration import TABLETOP_ID
 from service.errors import TandemError
 
 EPISODE_STEPS = 50

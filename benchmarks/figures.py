@@ -26,10 +26,10 @@ from benchmarks.run_files import Run, read_run
 from benchmarks.tables import ablations_table, coverage_table, tasks_table, throughput_words, training_table
 from service.config import WorkspaceConfig
 from service.errors import TandemError
-from service.registry.files import os_errors, write_atomic
-from service.runtime.plots import plot_goals
-from service.runtime.records import JsonlWriter
-from service.runtime.rundir import RunDirectory
+from service.io.files import os_errors, write_atomic
+from service.io.jsonl import JsonlWriter
+from service.io.run_directory import RunDirectory
+from service.media.plots import plot_goals
 
 BLOCKS = ("tasks", "curves", "curriculum", "coverage", "ablations", "throughput")
 THROUGHPUT_FILE = "throughput.json"

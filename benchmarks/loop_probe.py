@@ -19,8 +19,8 @@ os.environ.update(dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL
 
 import service
 from service.config import load_config
+from service.io.run_directory import RunDirectory
 from service.runtime.local import LocalRun
-from service.runtime.rundir import RunDirectory
 
 NUM_WARMUP_ITERATIONS = 2
 """After a start, before it is measured; the first has nothing to learn from but the round that was saved."""

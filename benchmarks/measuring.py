@@ -19,7 +19,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from service.registry.files import os_errors, write_atomic
+from service.io.files import os_errors, write_atomic
 from service.registry.manifest import git_commit
 
 _PLAIN_LIST = re.compile(r"\[[^\[\]{}]*\]")

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from service.errors import TandemError
-from service.registry.files import os_errors, write_atomic
+from service.io.files import os_errors, write_atomic
 
 NOTHING = "Not recorded yet."
 

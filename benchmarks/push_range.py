@@ -26,7 +26,7 @@ from service.errors import TandemError
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from service.runtime.primitives import TrainedBob
+    from service.primitives.loading import TrainedBob
 
 DIRECTIONS = {"+x": (1.0, 0.0), "-x": (-1.0, 0.0), "+y": (0.0, 1.0), "-y": (0.0, -1.0)}
 _RESTING_HEIGHT_M = 0.025

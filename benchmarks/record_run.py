@@ -28,10 +28,10 @@ from benchmarks.run_files import FORMAT_VERSION, Records, Run, blocks, thin
 from benchmarks.stages import measure_coverage
 from benchmarks.tasks import measure_tasks
 from service.errors import TandemError
+from service.io.run_directory import RunDirectory
+from service.media.plots.figures import read_records
 from service.policies.evaluator import bob_evaluator
-from service.runtime.plots.figures import read_records
-from service.runtime.primitives import read_stages
-from service.runtime.rundir import RunDirectory
+from service.primitives.loading import read_stages
 
 GOAL_RECORDS, GOALS_EACH = 60, 10
 """Stages of the run of which goals are kept, and how many of each."""

@@ -40,9 +40,9 @@ from benchmarks.open_loop import ROUTES
 from benchmarks.processes import cpu_s
 from benchmarks.trainings import ENDLESS, ROOT, Training, copy_run, overrides, scratch
 from service.errors import TandemError
-from service.registry.checkpoints import CheckpointStore
-from service.runtime.records import read_jsonl
-from service.runtime.rundir import RunDirectory
+from service.io.checkpoints import CheckpointStore
+from service.io.jsonl import read_jsonl
+from service.io.run_directory import RunDirectory
 from service.store.redis_writer import RedisWriter
 from service.store.server import RedisServer
 

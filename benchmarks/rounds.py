@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.measuring import Sample, Stopwatch, measure, total
-from service.actors.game import Acting, Players
 from service.actors.rollout import Rollout
+from service.actors.self_play import Acting, Players
 from service.envs.batch import WorldBatch
 from service.envs.observations import ACTION_SIZE
 from service.policies.evaluator import GaussianEvaluator, bob_evaluator

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.errors import TandemError
-from service.runtime.plots.figures import Array, column
+from service.media.plots.figures import Array, column
 
 FORMAT_VERSION = 1
 MAX_POINTS = 300

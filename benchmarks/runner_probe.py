@@ -28,9 +28,9 @@ os.environ.update(dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL
 from benchmarks.processes import cpu_s, descendants
 from benchmarks.trainings import ENDLESS
 from service.config import load_config
+from service.io.run_directory import RunDirectory
 from service.runtime.local import LocalRun
 from service.runtime.reporting import Report
-from service.runtime.rundir import RunDirectory
 from service.runtime.runner import Metrics, Runner
 from service.store.fanout import open_writer
 from service.store.server import redis_service
@@ -182,7 +182,7 @@ def probe(
         run: Runner
         if redis is not None:
             from service.runtime.cluster import ClusterRun
-            from service.runtime.connecting import ClusterOptions, StatusOptions
+            from service.runtime.ray_connection import ClusterOptions, StatusOptions
             from service.runtime.status_actor import serving
 
             home = directory.path.absolute().parent
@@ -234,7 +234,7 @@ def broadcast(weights: Any, num_actors: int) -> dict[str, float]:
 def newest_weights(directory: RunDirectory) -> Any:
     """The weights of the newest checkpoint, as the learner would give them out; and they have no torch in them."""
     from service.learner.weights import Weights
-    from service.runtime.primitives import read_parameters
+    from service.primitives.loading import read_parameters
 
     alice, bob = (dict(read_parameters(directory, player)) for player in ("alice", "bob"))
     return Weights(0, alice, bob, bob)
@@ -252,7 +252,7 @@ def main() -> None:
     directory, result = RunDirectory(given.run_dir), dict[str, Any]()
     with ExitStack() as stack:
         if given.runtime == "ray":
-            from service.runtime.connecting import connected
+            from service.runtime.ray_connection import connected
 
             stack.enter_context(connected(None, max(given.num_actors, os.cpu_count() or 1)))
         found = probe(directory, given.runtime, given.iterations, given.num_actors, plain=given.plain)

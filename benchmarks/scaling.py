@@ -36,8 +36,8 @@ from benchmarks.soak import TINY
 from benchmarks.trainings import ROOT, copy_run, environment, scratch
 from service.config import load_config
 from service.errors import TandemError
+from service.io.run_directory import RunDirectory
 from service.runtime.local import LocalRun
-from service.runtime.rundir import RunDirectory
 
 PACKAGES = ("ray", "redis", "mujoco", "numpy", "torch")
 PREDICTED = (1, 2, 4, 16, 256, 4096)

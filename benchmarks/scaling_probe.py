@@ -27,10 +27,10 @@ from benchmarks.processes import parent
 from benchmarks.runner_probe import NEVER, Watch
 from benchmarks.trainings import ENDLESS
 from service.config import load_config
-from service.runtime.connecting import ClusterOptions, connected
+from service.io.jsonl import read_jsonl
+from service.io.run_directory import RunDirectory
 from service.runtime.local import LocalRun
-from service.runtime.records import read_jsonl
-from service.runtime.rundir import RunDirectory
+from service.runtime.ray_connection import ClusterOptions, connected
 from service.store.models import ActorStatus, RunStatus
 
 NUM_NODES, ACTORS_PER_NODE = 2, 1
@@ -111,7 +111,7 @@ def _wait_s(num: int) -> float:
 
 def _look_s(num: int) -> float:
     """What the loop asks about every actor: idle, counted on, hung; with all of them busy but one."""
-    from service.runtime.crew import Crew, Member
+    from service.runtime.actor_pool import Crew, Member
     from service.runtime.slots import RolloutSlots
     from service.runtime.workers import Place
 

@@ -7,7 +7,7 @@ from typing import Any
 
 from benchmarks.cluster_tables import share
 from benchmarks.tables import markdown
-from service.runtime.plots.figures import counted
+from service.media.plots.figures import counted
 
 Result = Mapping[str, Any]
 NAMED = (16, 256, 4096)

@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 from service.config import WorldConfig
 from service.envs import fixtures, kinematics
 from service.envs.batch import DISPLACEMENT_M, LOWEST_TARGET_M, WorldBatch
+from service.envs.gym.registration import EPISODE_STEPS
+from service.envs.gym.tabletop import Setting
 from service.envs.observations import ACTION_SIZE
-from service.envs.registration import EPISODE_STEPS
-from service.envs.tabletop import Setting
 
 Array = NDArray[np.float64]
 Bools = NDArray[np.bool_]

@@ -24,7 +24,7 @@ from benchmarks.measuring import machine, write_json
 from benchmarks.scripted import play_task
 from service.actors.evaluation import wilson_interval
 from service.config import WorldConfig
-from service.envs.registration import EPISODE_STEPS
+from service.envs.gym.registration import EPISODE_STEPS
 from service.envs.tasks import TASKS
 
 PACKAGES = ("mujoco", "numpy")

@@ -42,11 +42,11 @@ from benchmarks.measuring import (
 from benchmarks.rounds import Rounds
 from service.config import Config, dump_config, load_config
 from service.errors import TandemError
-from service.registry.checkpoints import CheckpointStore
+from service.io.checkpoints import CheckpointStore
+from service.io.jsonl import read_jsonl
+from service.io.run_directory import RunDirectory
 from service.runtime.local import LocalRun
 from service.runtime.pretrain import resumed_config
-from service.runtime.records import read_jsonl
-from service.runtime.rundir import RunDirectory
 from service.runtime.timing import Timing
 
 ROOT = Path(__file__).parents[1]

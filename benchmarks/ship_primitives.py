@@ -25,15 +25,15 @@ from pydantic import JsonValue
 
 from service.config import parse_config
 from service.errors import TandemError
+from service.io import tensors
+from service.io.files import os_errors, write_atomic
+from service.io.run_directory import RunDirectory
 from service.policies.evaluator import MCPEvaluator
-from service.registry import tensors
+from service.primitives.loading import read_stages
+from service.primitives.publishing import measure_bob, publish_bob
 from service.registry.blobs import BlobStore
-from service.registry.files import os_errors, write_atomic
 from service.registry.names import LATEST, Version
 from service.registry.registry import BUNDLED, Registry
-from service.runtime.primitives import read_stages
-from service.runtime.publishing import measure_bob, publish_bob
-from service.runtime.rundir import RunDirectory
 
 CHAMPION = "champion"
 

@@ -13,10 +13,10 @@ import numpy as np
 
 from service.actors.coverage import Composable, RandomPolicy, skill_trajectories, visited_share
 from service.config import Config
+from service.media.artifacts import COVERAGE_STEPS, NUM_SKILLS
+from service.media.plots.figures import Array
 from service.policies.evaluator import MCPEvaluator, bob_evaluator
 from service.policies.parameters import Parameters
-from service.runtime.artifacts import COVERAGE_STEPS, NUM_SKILLS
-from service.runtime.plots.figures import Array
 
 NUM_SETS = 10
 CELL_SIZE_M = 0.05

@@ -21,8 +21,8 @@ from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
 from service.envs import fixtures
-from service.envs.render import Camera, Mark, RenderError, SceneRenderer
-from service.envs.tabletop import TabletopEnv, TabletopState
+from service.envs.gym.tabletop import TabletopEnv, TabletopState
+from service.envs.rendering.renderer import Camera, Mark, RenderError, SceneRenderer
 from service.envs.tasks import TASKS, Task
 
 WIDTH, HEIGHT, CAPTION = 480, 390, 48

@@ -24,9 +24,9 @@ from pydantic import ValidationError
 
 from benchmarks.processes import descendants, is_running
 from service.errors import TandemError
-from service.registry.checkpoints import CheckpointStore
-from service.runtime.records import read_jsonl
-from service.runtime.rundir import RunDirectory
+from service.io.checkpoints import CheckpointStore
+from service.io.jsonl import read_jsonl
+from service.io.run_directory import RunDirectory
 from service.store.disk import STATUS_FILE
 from service.store.models import RunStatus
 

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from service.runtime.primitives import TrainedBob
+    from service.primitives.loading import TrainedBob
 
 __all__ = ["load_primitives"]
 __version__ = "0.1.0"
@@ -34,7 +34,7 @@ def load_primitives(reference: str = "panda-cube@champion", registry: Path | str
     Raises:
         TandemError: nothing there by that reference, or damaged; or the service cannot be reached or wants a token.
     """
-    from service.runtime.primitives import load_bob
+    from service.primitives.loading import load_bob
 
     if is_service(registry):
         from service.status.client import fetch_primitives

@@ -1,13 +1,80 @@
-"""One thread per test process: xdist already keeps every core busy, and results do not depend on the thread count.
+"""Fixtures that several rooms use, and one thread per test process.
 
+xdist keeps every core busy, and results do not depend on the thread count.
 The variables have to be set before NumPy or torch is imported, so that happens here, at import.
 """
 
+from __future__ import annotations
+
+import errno
 import os
 import secrets
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import pytest
+
+if TYPE_CHECKING:
+    from service.primitives.loading import TrainedBob
+    from service.registry.names import Version
+    from service.registry.registry import Registry
+    from tests.registry.helpers import Publish
 
 for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMEXPR_NUM_THREADS"):
     os.environ[variable] = "1"
 os.environ["MPLBACKEND"] = "agg"
 # Ray reads these at import, too. With a token of our own it leaves none in the home directory.
 os.environ |= {"RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN": secrets.token_hex(32), "RAY_USAGE_STATS_ENABLED": "0"}
+
+
+@pytest.fixture
+def registry(tmp_path: Path) -> Registry:
+    """An empty registry."""
+    from service.registry.registry import Registry
+
+    return Registry(tmp_path / "registry")
+
+
+@pytest.fixture
+def publish(registry: Registry) -> Publish:
+    """Publish one small version; keyword arguments replace the defaults."""
+    import numpy as np
+
+    def _publish(name: str = "panda-cube", value: float = 0.0, **changes: Any) -> Version:
+        fields: dict[str, Any] = {
+            "spaces": {"action": {"shape": [4], "low": -1.0, "high": 1.0}},
+            "normalisation": {"mean": [0.0, 0.5], "scale": [1.0, 2.0]},
+            "config": {"seed": 3, "world": {"object": "cube"}},
+            "metrics": {"bob/success_rate": 0.5},
+        }
+        return registry.publish(name, {"gate.weight": np.full((2, 3), value, np.float32)}, **(fields | changes))
+
+    return _publish
+
+
+@pytest.fixture(scope="session")
+def champion() -> TrainedBob:
+    """The primitives in the box."""
+    import service
+
+    return service.load_primitives("panda-cube@champion", registry="no registry here")
+
+
+@pytest.fixture
+def full_disk(monkeypatch: pytest.MonkeyPatch) -> Callable[[str], None]:
+    """Call with "write" or "fsync": from then on that call finds the disk full; a write first stores half its bytes."""
+    real_write = os.write
+
+    def _write(descriptor: int, data: memoryview) -> int:
+        if len(data) > 1:
+            return real_write(descriptor, data[: len(data) // 2])
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    def _fsync(descriptor: int) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    def _fill(call: str) -> None:
+        monkeypatch.setattr(os, call, {"write": _write, "fsync": _fsync}[call])
+
+    return _fill

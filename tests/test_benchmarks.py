@@ -30,12 +30,12 @@ from service.actors.coverage import RandomPolicy, skill_trajectories, visited_sh
 from service.actors.evaluation import Idle
 from service.config import WorldConfig, dump_config, load_config
 from service.envs.batch import WorldBatch
-from service.envs.registration import TABLETOP_ID
+from service.envs.gym.registration import TABLETOP_ID
 from service.errors import TandemError
+from service.io.jsonl import JsonlWriter
+from service.io.run_directory import RunDirectory
 from service.learner.learner import Learner
 from service.runtime.local import LocalRun
-from service.runtime.records import JsonlWriter
-from service.runtime.rundir import RunDirectory
 
 ROOT = Path(__file__).parents[1]
 

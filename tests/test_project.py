@@ -46,7 +46,7 @@ for module in modules:
 HELP = """
 import sys
 sys.argv = ["tandem", "--help"]
-from service.cli import main
+from service.cli.main import main
 try:
     main()
 except SystemExit as stop:

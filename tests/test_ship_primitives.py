@@ -8,11 +8,11 @@ import pytest
 from benchmarks import ship_primitives
 from benchmarks.ship_primitives import publish_newest, ship
 from service.errors import TandemError
+from service.io.run_directory import RunDirectory
+from service.primitives import publishing
+from service.primitives.loading import load_bob, read_parameters
+from service.primitives.publishing import publish_bob
 from service.registry.registry import Registry
-from service.runtime import publishing
-from service.runtime.primitives import load_bob, read_parameters
-from service.runtime.publishing import publish_bob
-from service.runtime.rundir import RunDirectory
 from tests.registry.helpers import assert_identical, files_in
 from tests.runtime.runs import TREE, assert_one_line, play, tiny_config
 

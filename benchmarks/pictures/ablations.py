@@ -11,7 +11,7 @@ import numpy as np
 from benchmarks.ablations import RECIPE
 from benchmarks.pictures.curves import Clock, draw_curve
 from benchmarks.run_files import Run, unthin
-from service.runtime.plots.figures import BLUE, FAINT, GREEN, INK, column, new_figure, save, style_axes
+from service.media.plots.figures import BLUE, FAINT, GREEN, INK, column, new_figure, save, style_axes
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from benchmarks.pictures.curves import Clock, draw_curve
 from benchmarks.run_files import unthin
-from service.runtime.plots.figures import BLUE, FAINT, GREEN, INK, ORANGE, new_figure, save, style_axes
+from service.media.plots.figures import BLUE, FAINT, GREEN, INK, ORANGE, new_figure, save, style_axes
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -10,8 +10,8 @@ import numpy as np
 from benchmarks.run_files import Run
 from benchmarks.stages import CELL_SIZE_M, RANDOM, STAGES, mean_share, paths_m
 from service.config import WorkspaceConfig
-from service.runtime.plots.coverage import draw_paths
-from service.runtime.plots.figures import FAINT, INK, bounds, new_figure, save
+from service.media.plots.coverage import draw_paths
+from service.media.plots.figures import FAINT, INK, bounds, new_figure, save
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -10,7 +10,7 @@ import numpy as np
 
 from benchmarks.curriculum import BIN_M, NUM_BINS, NUM_SLICES
 from benchmarks.run_files import Run
-from service.runtime.plots.figures import FAINT, INK, Array, new_figure, save, style_axes
+from service.media.plots.figures import FAINT, INK, Array, new_figure, save, style_axes
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -10,7 +10,7 @@ import numpy as np
 
 from benchmarks.run_files import Records, Run, binned, unthin
 from benchmarks.tasks import ASKED
-from service.runtime.plots.figures import (
+from service.media.plots.figures import (
     BLUE,
     FAINT,
     GREEN,

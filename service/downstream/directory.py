@@ -22,10 +22,10 @@ from typing import Any, Self
 
 from service.downstream.settings import differences
 from service.errors import TandemError
-from service.registry.files import TEMPORARY_PREFIX, os_errors, remove_temporaries, write_atomic
-from service.runtime.events import EventFile
-from service.runtime.records import JsonlWriter
-from service.store.lock import LOCK_FILE, DirectoryLock
+from service.io.files import TEMPORARY_PREFIX, os_errors, remove_temporaries, write_atomic
+from service.io.jsonl import JsonlWriter
+from service.io.lock import LOCK_FILE, DirectoryLock
+from service.io.tensorboard import EventFile
 
 FORMAT_VERSION = 1
 """Of ``cell.json``, ``checkpoint.pt`` and ``result.json``, and of the table's files."""

@@ -15,8 +15,8 @@ from stable_baselines3.common.logger import Logger
 from service.downstream.networks import GoalFeatures
 from service.downstream.previous import PREVIOUS, PreviousState
 from service.downstream.vec_env import VecEnvState, WorldsVecEnv
+from service.envs.gym.vector import VectorState
 from service.envs.observations import GOAL_SLICE, OBJECT_SLICE, POSITIONS_SIZE
-from service.envs.vector import VectorState
 
 if TYPE_CHECKING:
     from gymnasium.spaces import Dict
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
     from service.downstream.methods import Method
     from service.downstream.settings import CellConfig
-    from service.runtime.primitives import TrainedBob
+    from service.primitives.loading import TrainedBob
 
     FloatArray = NDArray[np.float32]
 

@@ -22,7 +22,7 @@ from service.errors import TandemError
 if TYPE_CHECKING:
     from stable_baselines3.sac.policies import SACPolicy
 
-    from service.runtime.primitives import TrainedBob
+    from service.primitives.loading import TrainedBob
 
 FloatArray = NDArray[np.float32]
 Worlds = gymnasium.vector.VectorEnv[Any, Any, Any]

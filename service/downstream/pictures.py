@@ -11,7 +11,7 @@ import numpy as np
 
 from service.downstream.methods import METHODS
 from service.envs.tasks import TASKS
-from service.runtime.plots.figures import BLUE, FAINT, GREEN, ORANGE, column, new_figure, read_records, save, style_axes
+from service.media.plots.figures import BLUE, FAINT, GREEN, ORANGE, column, new_figure, read_records, save, style_axes
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

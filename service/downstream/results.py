@@ -13,7 +13,7 @@ from service.downstream.methods import METHODS
 from service.downstream.settings import CellConfig, differences, first_line
 from service.downstream.worker import Described
 from service.errors import TandemError
-from service.registry.files import os_errors, write_exclusive
+from service.io.files import os_errors, write_exclusive
 
 Result = dict[str, Any]
 

@@ -7,7 +7,7 @@ from typing import Any
 from pydantic import BaseModel, ConfigDict, Field, PositiveInt, ValidationError
 
 from service.downstream.methods import find_method
-from service.envs.registration import EPISODE_STEPS
+from service.envs.gym.registration import EPISODE_STEPS
 from service.envs.tasks import find_task
 from service.errors import TandemError
 

@@ -20,10 +20,10 @@ from service.downstream.results import Result, ResultsDirectory
 from service.downstream.settings import CellConfig
 from service.downstream.worker import Running, check_cell, describe, run_cell
 from service.errors import TandemError
-from service.registry.files import os_errors, write_atomic
+from service.io.files import os_errors, write_atomic
 
 if TYPE_CHECKING:
-    from service.runtime.primitives import TrainedBob
+    from service.primitives.loading import TrainedBob
 
 PAGE_FILE, PICTURE_FILE, RESULTS = "downstream.md", "downstream.png", "downstream"
 _POLL_S = 1.0

@@ -23,16 +23,16 @@ from service.downstream.compose import parameters_digest
 from service.downstream.directory import FORMAT_VERSION, TrainingDirectory, read_json, write_json
 from service.downstream.methods import METHODS, Method, find_method
 from service.downstream.settings import CellConfig
-from service.envs.registration import EPISODE_STEPS
+from service.envs.gym.registration import EPISODE_STEPS
+from service.envs.gym.vector import TabletopVectorEnv
 from service.envs.tasks import SUCCESS_DISTANCE_M, find_task
-from service.envs.vector import TabletopVectorEnv
 from service.errors import TandemError
+from service.io.plain import plain
 from service.registry.manifest import git_commit
-from service.store.plain import plain
 
 if TYPE_CHECKING:
     from service.downstream.vec_env import WorldsVecEnv
-    from service.runtime.primitives import TrainedBob
+    from service.primitives.loading import TrainedBob
 
 CHECKPOINT_EVERY_S = 120.0
 CURVE_SEED, FINAL_SEED = 1_000_000, 2_000_000
@@ -293,7 +293,7 @@ def _finish(
 
 
 def _film(cell: CellConfig, trained: TrainedBob, player: Deterministic, path: Path) -> Path:
-    from service.runtime.video import film_episodes, write_episode_video
+    from service.media.video import film_episodes, write_episode_video
 
     task = find_task(cell.task)
     world = task.world_from(trained.config.world)

@@ -3,6 +3,6 @@
 Importing this package is cheap; it only keeps a wrong ``MUJOCO_GL`` from breaking the import of MuJoCo later.
 """
 
-from service.envs import gl
+from service.envs.rendering import gl
 
 gl.protect_import()

@@ -8,8 +8,8 @@ import os
 from collections.abc import Iterator
 from pathlib import Path
 
+from service.io.files import os_errors, write_atomic
 from service.registry.errors import RegistryError
-from service.registry.files import os_errors, write_atomic
 from service.registry.names import check_alias, is_name, is_number
 
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import hashlib
 from pathlib import Path
 
+from service.io.files import os_errors, write_atomic
 from service.registry.errors import DamagedBlobError
-from service.registry.files import os_errors, write_atomic
 
 
 class BlobStore:

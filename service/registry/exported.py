@@ -6,10 +6,10 @@ from pathlib import Path
 
 import numpy as np
 
-from service.registry import tensors
+from service.io import tensors
+from service.io.files import os_errors, write_atomic
 from service.registry.blobs import check_digest
 from service.registry.errors import RegistryError
-from service.registry.files import os_errors, write_atomic
 from service.registry.manifest import Manifest, parse_manifest
 
 PARAMETERS_FILE = "primitives.safetensors"

@@ -19,17 +19,18 @@ from typing import Any
 
 import numpy as np
 
-from service.registry import names, tensors
+from service.io import tensors
+from service.io.files import os_errors, write_exclusive
+from service.registry import names
 from service.registry.aliases import Aliases
 from service.registry.announcing import Listener, default_listener
 from service.registry.blobs import BlobStore, sha256_of
 from service.registry.errors import RegistryError, UnknownVersionError
 from service.registry.exported import write_exported
-from service.registry.files import os_errors, write_exclusive
 from service.registry.manifest import Manifest, git_commit, make_manifest, parse_manifest
 from service.registry.names import LATEST, Version
 
-BUNDLED = Path(__file__).parents[1] / "primitives"
+BUNDLED = Path(__file__).parents[1] / "primitives" / "data"
 """The registry that comes with the package; it is only read."""
 
 

@@ -23,11 +23,12 @@ from ray.exceptions import ObjectLostError, RayActorError, RayError, RayTaskErro
 from service.actors.rollout import from_arrays
 from service.config import Config
 from service.errors import DivergedError
+from service.io.run_directory import RunDirectory
 from service.policies.parameters import Parameters, PolicyError
-from service.runtime.books import Books
-from service.runtime.connecting import ClusterOptions
-from service.runtime.crew import QUIET, THREAD_VARIABLES, Crew, Member
-from service.runtime.rundir import RunDirectory
+from service.runtime.actor_pool import QUIET, THREAD_VARIABLES, Crew, Member
+from service.runtime.bookkeeping import Books
+from service.runtime.ray_connection import ClusterOptions
+from service.runtime.remote_worker import Stateful, one_line
 from service.runtime.runner import (
     EVALUATED_GOALS,
     EVALUATION_SEED,
@@ -39,7 +40,6 @@ from service.runtime.runner import (
     RunResult,
 )
 from service.runtime.slots import RolloutSlots
-from service.runtime.stateful import Stateful, one_line
 from service.runtime.timing import Timing
 from service.runtime.workers import GeneratorGoneError, GeneratorWorker, LearnerWorker, Recorded, Round, Updated
 from service.store.models import GoalGrid

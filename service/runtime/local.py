@@ -17,14 +17,14 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from service.actors.evaluation import evaluate
-from service.actors.game import Acting, Players, SelfPlay
 from service.actors.rollout import Rollout, from_arrays, to_arrays
+from service.actors.self_play import Acting, Players, SelfPlay
 from service.config import Config
 from service.generator.generator import TaskGenerator
+from service.io.run_directory import RunDirectory
 from service.policies.evaluator import GaussianEvaluator, bob_evaluator
 from service.policies.parameters import Parameters
-from service.runtime.books import Books
-from service.runtime.rundir import RunDirectory
+from service.runtime.bookkeeping import Books
 from service.runtime.runner import EVALUATED_GOALS, EVALUATION_SEED, Health, Metrics, OnBeat, OnIteration, RunResult
 from service.runtime.telling import goal_grid
 from service.runtime.timing import Timing

@@ -12,14 +12,14 @@ from typing import TYPE_CHECKING, Any, Literal, cast
 
 from service.config import Config, ConfigError, load_config
 from service.errors import TandemError
+from service.io.run_directory import RunDirectory
 from service.learner.learner import torch_device
+from service.media.artifacts import make_artifacts
+from service.primitives.publishing import measure_bob, publish_run
 from service.registry.names import Version
 from service.registry.registry import Registry
-from service.runtime.artifacts import make_artifacts
 from service.runtime.local import LocalRun
-from service.runtime.publishing import measure_bob, publish_run
 from service.runtime.reporting import Report
-from service.runtime.rundir import RunDirectory
 from service.runtime.runner import OnIteration, Runner, RunResult, StateLostError
 from service.runtime.signals import InterruptError, StopSignals
 from service.store.address import address_from_environment
@@ -28,7 +28,7 @@ from service.store.fanout import open_writer
 from service.store.server import redis_service
 
 if TYPE_CHECKING:
-    from service.runtime.connecting import ClusterOptions
+    from service.runtime.ray_connection import ClusterOptions
     from service.store.address import RedisAddress
     from service.store.models import RunState
 

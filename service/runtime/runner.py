@@ -9,7 +9,7 @@ from typing import Protocol
 from service.envs.goals import GoalKind
 from service.errors import TandemError
 from service.policies.parameters import Parameters
-from service.runtime.books import Books
+from service.runtime.bookkeeping import Books
 from service.runtime.timing import Timing
 from service.store.models import ActorStatus, GoalGrid
 

@@ -14,9 +14,9 @@ import ray
 from ray.exceptions import RayError, RayTaskError
 from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
-from service.runtime.connecting import StatusOptions
+from service.runtime.ray_connection import StatusOptions
+from service.runtime.remote_worker import one_line
 from service.runtime.runner import ClusterError
-from service.runtime.stateful import one_line
 from service.status.errors import StatusError
 from service.store.address import RedisAddress
 

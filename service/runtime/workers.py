@@ -17,16 +17,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.actors.evaluation import evaluate
-from service.actors.game import Acting, Players, SelfPlay
 from service.actors.rollout import Broken, GoalRecords, Rollout
+from service.actors.self_play import Acting, Players, SelfPlay
 from service.config import Config
 from service.envs.batch import WorldBatch
 from service.envs.goals import GoalKind
 from service.generator.generator import GoalChoice, TaskGenerator
 from service.generator.opponents import RoundPlan
+from service.io.run_directory import sampled_goals
 from service.policies.evaluator import GaussianEvaluator, bob_evaluator
 from service.policies.parameters import Parameters
-from service.runtime.rundir import sampled_goals
 from service.runtime.telling import goal_grid
 from service.store.models import GoalGrid
 

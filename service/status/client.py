@@ -11,9 +11,9 @@ from pathlib import Path
 from typing import Any
 
 from service.errors import TandemError
+from service.io.files import os_errors, write_atomic
 from service.registry.blobs import BlobStore, check_digest
 from service.registry.errors import DamagedBlobError, UnknownVersionError
-from service.registry.files import os_errors, write_atomic
 from service.registry.manifest import Manifest, parse_manifest
 from service.registry.names import Version, split_reference
 from service.registry.registry import Registry

@@ -18,7 +18,7 @@ from pathlib import Path
 
 from pydantic import BaseModel
 
-from service.registry.files import write_atomic
+from service.io.files import write_atomic
 from service.store.models import GoalGrid, Record, RunStatus
 
 STATUS_FILE = "status.json"

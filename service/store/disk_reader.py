@@ -13,10 +13,10 @@ from typing import Any
 import yaml
 from pydantic import ValidationError
 
+from service.io.lock import is_locked
 from service.store.disk import GOALS_FILE, STATUS_FILE, STOP_FILE
 from service.store.errors import DamagedStoreError, StoreError, StoreUnavailableError, UnknownRunError
 from service.store.liveness import SILENT_AFTER, is_silent, vanished
-from service.store.lock import is_locked
 from service.store.models import ACTIVE, GoalGrid, Record, RunState, RunStatus
 from service.store.tail import RecordFile
 

@@ -12,12 +12,12 @@ from typing import Any
 
 from redis.exceptions import RedisError, WatchError
 
+from service.io.plain import plain
 from service.store import keys
 from service.store.address import RedisAddress, reason_of
 from service.store.errors import RunTakenError
 from service.store.lease import Lease
 from service.store.models import GoalGrid, Record, RunStatus
-from service.store.plain import plain
 
 TICK_S = 0.5
 """Between two messages to Redis; a stop request is noticed within it."""

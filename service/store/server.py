@@ -14,9 +14,9 @@ from pathlib import Path
 from types import TracebackType
 from typing import Self
 
+from service.io.lock import DirectoryLock
 from service.store.address import RedisAddress, address_from_environment
 from service.store.errors import StoreError, StoreUnavailableError
-from service.store.lock import DirectoryLock
 
 START_S = 10.0
 """A server that does not answer by then has failed; a large append-only file takes some of it."""

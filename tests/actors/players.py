@@ -4,8 +4,8 @@ from dataclasses import dataclass, fields
 
 import numpy as np
 
-from service.actors.game import Players, SelfPlay
 from service.actors.rollout import to_arrays
+from service.actors.self_play import Players, SelfPlay
 from service.config import parse_config
 from service.generator.generator import GoalChoice
 from service.generator.opponents import CURRENT, RoundPlan

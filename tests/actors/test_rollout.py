@@ -3,7 +3,7 @@
 from dataclasses import fields, replace
 
 from service.actors.rollout import Demonstrations, GoalRecords, Rollout, Turns, from_arrays, to_arrays
-from service.registry import tensors
+from service.io import tensors
 from tests.actors.players import AT_REST, IN_FRONT, SLIDES, Pusher, assert_same_rollout, make_config, make_game, play
 
 PARTS = {"alice": Turns, "bob": Turns, "demonstrations": Demonstrations, "records": GoalRecords}

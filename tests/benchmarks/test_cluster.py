@@ -32,7 +32,7 @@ from benchmarks.runner_probe import Measured, Watch
 from benchmarks.scaling_model import ACTORS, Cost, Model, limit, line, predict
 from benchmarks.strikes import Recovery, Seen, Strike
 from service.errors import TandemError
-from service.runtime.rundir import RunDirectory
+from service.io.run_directory import RunDirectory
 from service.store.models import ActorStatus, RunStatus
 
 WHERE = {"cpu": "Xeon", "num_cpus": 2, "git_commit": "abcdef0123", "time": "2026-11-21T12:00:00+00:00"}

@@ -9,7 +9,7 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
-from service.cli import app
+from service.cli.main import app
 from service.config import dump_config
 from tests.deploy.files import DEPLOY, DOCUMENTS, ROOT, commands, compose, manifest, manifests, pod_templates
 
@@ -76,7 +76,7 @@ def test_pretrain_begins_with_it_and_goes_on_with_it(arguments, monkeypatch, tmp
 
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("service.cli._pretrain", pretrain)
-    monkeypatch.setattr("service.runtime.connecting.connected", lambda *_: nullcontext())
+    monkeypatch.setattr("service.runtime.ray_connection.connected", lambda *_: nullcontext())
     here = [re.sub(r"^(/usr/local/share/tandem/)?configs/", f"{ROOT}/configs/", word) for word in arguments]
     for resumed in (False, True):
         result = CliRunner().invoke(app, here)

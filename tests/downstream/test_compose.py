@@ -13,7 +13,7 @@ from stable_baselines3 import SAC, HerReplayBuffer
 from stable_baselines3.common.env_checker import check_env as check_stable_baselines
 
 import service
-import service.envs.registration
+import service.envs.gym.registration
 from service.config import WorldConfig
 from service.downstream.compose import (
     ComposePrimitives,
@@ -22,8 +22,8 @@ from service.downstream.compose import (
     check_primitives,
     parameters_digest,
 )
-from service.envs.tabletop import TabletopEnv
-from service.envs.vector import TabletopVectorEnv
+from service.envs.gym.tabletop import TabletopEnv
+from service.envs.gym.vector import TabletopVectorEnv
 from service.errors import TandemError
 
 DOCUMENT = Path(__file__).parents[2] / "docs" / "downstream.md"

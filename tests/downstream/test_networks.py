@@ -63,7 +63,7 @@ def test_everything_the_mcp_actor_has_is_learned(champion):
 
 
 def test_features_by_hand():
-    from service.envs.tabletop import goal_space
+    from service.envs.gym.tabletop import goal_space
 
     observation = torch.zeros(1, 11)
     observation[0, 5:8] = torch.tensor([0.1, 0.2, 0.3])

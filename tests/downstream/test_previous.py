@@ -3,7 +3,7 @@ import pytest
 
 from service.config import WorldConfig
 from service.downstream.previous import PREVIOUS, PreviousPositionsVector
-from service.envs.vector import TabletopVectorEnv
+from service.envs.gym.vector import TabletopVectorEnv
 
 CONFIG = WorldConfig(physics_step_s=0.005, num_substeps=8)
 NUM, LENGTH = 3, 4

@@ -102,7 +102,7 @@ def test_a_stop_between_cells_that_do_not_learn(source, tmp_path):
 
 
 def test_many_at_once_on_ray(source, tmp_path):
-    from service.runtime.connecting import connected
+    from service.runtime.ray_connection import connected
 
     with connected(None, num_cpus=2):
         assert table(CELLS[:2], source, tmp_path, run_on_ray(2))

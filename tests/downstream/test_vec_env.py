@@ -10,7 +10,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 from service.config import WorldConfig
 from service.downstream.compose import ComposePrimitivesVector
 from service.downstream.vec_env import WorldsVecEnv
-from service.envs.vector import TabletopVectorEnv
+from service.envs.gym.vector import TabletopVectorEnv
 
 CONFIG = WorldConfig(physics_step_s=0.005, num_substeps=8)
 NUM, LENGTH = 3, 6

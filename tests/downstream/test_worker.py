@@ -10,7 +10,7 @@ from service.downstream.learner import make_learner
 from service.downstream.methods import find_method
 from service.downstream.worker import Running, make_worlds, run_cell
 from service.errors import TandemError
-from service.runtime.records import read_jsonl
+from service.io.jsonl import read_jsonl
 from tests.downstream.cells import small_cell
 
 

@@ -16,11 +16,11 @@ from benchmarks.scripted import play_task
 from service.config import WorldConfig
 from service.envs import fixtures
 from service.envs.batch import DISPLACEMENT_M, WorldBatch
-from service.envs.registration import EPISODE_STEPS
-from service.envs.render import Mark, RenderError, SceneRenderer
-from service.envs.tabletop import Setting, TabletopEnv
+from service.envs.gym.registration import EPISODE_STEPS
+from service.envs.gym.tabletop import Setting, TabletopEnv
+from service.envs.gym.vector import TabletopVectorEnv
+from service.envs.rendering.renderer import Mark, RenderError, SceneRenderer
 from service.envs.tasks import TASKS, find_task
-from service.envs.vector import TabletopVectorEnv
 from service.errors import TandemError
 
 CONFIG = WorldConfig(physics_step_s=0.005, num_substeps=8)

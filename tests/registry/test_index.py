@@ -12,13 +12,13 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
+from service.cli.registry import registry_app
 from service.registry import announcing
-from service.registry.commands import registry_app
 from service.registry.registry import BUNDLED, Registry
 from service.store import keys
 from service.store.errors import DamagedStoreError, StoreUnavailableError
 from service.store.registry_index import RegistryIndex
-from tests.registry.test_commands import assert_user_error
+from tests.cli.test_registry import assert_user_error
 from tests.store.stores import Killable
 
 ROOT = Path(__file__).parents[2]
@@ -268,7 +268,7 @@ def test_the_registry_works_without_the_package_redis(tmp_path, configured):
 import sys
 sys.modules["redis"] = None
 from pathlib import Path
-import service, service.registry.commands
+import service, service.cli.registry
 from service.registry.registry import Registry
 fields = dict(spaces={}, normalisation={}, config={}, metrics={})
 print(Registry(Path(sys.argv[1])).publish("panda-cube", {}, **fields))

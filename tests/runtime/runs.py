@@ -15,9 +15,9 @@ import numpy as np
 import yaml
 
 from service.config import parse_config
-from service.registry.checkpoints import CheckpointStore
+from service.io.checkpoints import CheckpointStore
+from service.io.run_directory import RunDirectory
 from service.runtime.local import LocalRun
-from service.runtime.rundir import RunDirectory
 
 ROOT = Path(__file__).parents[2]
 TREE = {

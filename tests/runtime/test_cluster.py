@@ -11,10 +11,10 @@ import pytest
 import ray
 
 from service.errors import DivergedError
-from service.registry.checkpoints import CheckpointStore
+from service.io.checkpoints import CheckpointStore
+from service.io.run_directory import RunDirectory
 from service.runtime.cluster import ClusterRun, num_gpus
-from service.runtime.connecting import ClusterOptions, connected
-from service.runtime.rundir import RunDirectory
+from service.runtime.ray_connection import ClusterOptions, connected
 from service.runtime.runner import ClusterError
 from service.runtime.workers import NICENESS
 from tests.runtime.runs import newest, play, read_lines, tiny_config
@@ -155,8 +155,8 @@ def test_whoever_is_killed_is_replaced(tmp_path):
 
 
 def test_an_actor_that_hangs_is_replaced(tmp_path, monkeypatch):
-    monkeypatch.setattr("service.runtime.crew.MIN_DEADLINE_S", 3.0)
-    monkeypatch.setattr("service.runtime.crew.DEADLINE_ROUNDS", 0.0)
+    monkeypatch.setattr("service.runtime.actor_pool.MIN_DEADLINE_S", 3.0)
+    monkeypatch.setattr("service.runtime.actor_pool.DEADLINE_ROUNDS", 0.0)
     stopped = []
 
     def stop(run, metrics):

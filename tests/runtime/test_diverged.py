@@ -5,12 +5,12 @@ import pytest
 import torch
 from typer.testing import CliRunner
 
-from service.cli import app
+from service.cli.main import app
 from service.errors import DivergedError
+from service.io.run_directory import RunDirectory
 from service.policies.evaluator import GaussianEvaluator
 from service.runtime.local import LocalRun
 from service.runtime.pretrain import resumed_config
-from service.runtime.rundir import RunDirectory
 from tests.runtime.runs import assert_one_line, assert_same_run, newest, play, read_lines, write_yaml
 
 

@@ -136,7 +136,7 @@ def test_a_job_is_stopped_and_continued_and_publishes(head, tmp_path):
 def test_a_cluster_of_another_version_of_ray(head, tmp_path):
     """This process is the one with another version: a second one of Ray is not here."""
     _, address = head
-    program = "import ray; ray.__version__ = '2.0.0'; from service.cli import main; main()"
+    program = "import ray; ray.__version__ = '2.0.0'; from service.cli.main import main; main()"
     command = [sys.executable, "-c", program, "pretrain", "--runtime", "ray", "--address", address, "--run-id", "night"]
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=120)
     assert done.returncode == 1, done.stderr

@@ -10,12 +10,12 @@ import time
 
 import pytest
 
-from service.registry import files, tensors
-from service.registry.checkpoints import CheckpointStore
-from service.runtime import appending
+from service.io import append_file as appending
+from service.io import files, tensors
+from service.io.checkpoints import CheckpointStore
+from service.io.jsonl import JsonlWriter
+from service.io.run_directory import RunDirectory
 from service.runtime.pretrain import resumed_config
-from service.runtime.records import JsonlWriter
-from service.runtime.rundir import RunDirectory
 from tests.runtime.runs import ROOT, assert_same_run, newest, play, start_endless_run, tiny_config
 
 STEP = 4

@@ -7,14 +7,14 @@ import numpy as np
 import pytest
 
 from service.errors import TandemError
+from service.io.checkpoints import CheckpointStore
+from service.io.run_directory import RunDirectory
 from service.learner.learner import Learner
-from service.registry.checkpoints import CheckpointStore
+from service.primitives.loading import read_parameters, read_stages
 from service.registry.errors import CheckpointError
-from service.runtime.books import UnsavedError
+from service.runtime.bookkeeping import UnsavedError
 from service.runtime.local import LocalRun
 from service.runtime.pretrain import resumed_config
-from service.runtime.primitives import read_parameters, read_stages
-from service.runtime.rundir import RunDirectory
 from tests.runtime.runs import (
     KilledError,
     assert_one_line,

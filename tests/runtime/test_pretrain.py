@@ -10,11 +10,11 @@ import pytest
 
 from service.config import ConfigError, parse_config
 from service.errors import TandemError
+from service.io.run_directory import RunDirectory
+from service.primitives import publishing
 from service.registry.registry import BUNDLED, Registry
 from service.runtime import pretrain as module
-from service.runtime import publishing
 from service.runtime.pretrain import UnfinishedError, pretrain, resumed_config
-from service.runtime.rundir import RunDirectory
 from service.runtime.signals import InterruptError
 from tests.runtime.runs import (
     TREE,

@@ -10,11 +10,11 @@ import time
 import pytest
 
 from service.errors import DivergedError, TandemError
+from service.io.run_directory import RunDirectory
+from service.primitives import publishing
 from service.registry.registry import Registry
 from service.runtime import pretrain as module
-from service.runtime import publishing
 from service.runtime.pretrain import UnfinishedError, pretrain, resumed_config
-from service.runtime.rundir import RunDirectory
 from service.runtime.signals import InterruptError
 from service.store import disk, redis_writer
 from service.store.disk_reader import DiskReader

@@ -8,7 +8,7 @@ from types import SimpleNamespace
 import pytest
 from typer.testing import CliRunner
 
-from service.cli import app
+from service.cli.main import app
 from service.registry.registry import Registry
 from service.runtime.local import LocalRun
 from service.runtime.signals import InterruptError, StopSignals
@@ -84,10 +84,10 @@ def test_the_handlers_from_before_are_put_back():
 @pytest.fixture
 def home(tmp_path, monkeypatch):
     """A quick end of a run, and ``run(*more)``: a pre-training there from the command line."""
-    monkeypatch.setattr("service.runtime.publishing.FINAL_EVALUATION_EPISODES", 4)
-    monkeypatch.setattr("service.runtime.artifacts.NUM_SKILLS", 2)
-    monkeypatch.setattr("service.runtime.artifacts.COVERAGE_STEPS", 2)
-    monkeypatch.setattr("service.runtime.video.write_video", lambda takes, world, path: path)
+    monkeypatch.setattr("service.primitives.publishing.FINAL_EVALUATION_EPISODES", 4)
+    monkeypatch.setattr("service.media.artifacts.NUM_SKILLS", 2)
+    monkeypatch.setattr("service.media.artifacts.COVERAGE_STEPS", 2)
+    monkeypatch.setattr("service.media.video.write_video", lambda takes, world, path: path)
     home = SimpleNamespace(path=tmp_path / "run", registry=tmp_path / "registry")
     config = write_yaml(tmp_path / "tiny.yaml")
 
@@ -111,11 +111,11 @@ def uninterrupted(tmp_path_factory):
 @pytest.mark.parametrize(
     ("where", "number"),
     [
-        ("service.runtime.publishing.evaluate", signal.SIGINT),
+        ("service.primitives.publishing.evaluate", signal.SIGINT),
         ("service.runtime.pretrain.publish_run", signal.SIGTERM),
-        ("service.runtime.artifacts.plot_curves", signal.SIGTERM),
-        ("service.runtime.artifacts.skill_trajectories", signal.SIGINT),
-        ("service.runtime.video.film_rounds", signal.SIGTERM),
+        ("service.media.artifacts.plot_curves", signal.SIGTERM),
+        ("service.media.artifacts.skill_trajectories", signal.SIGINT),
+        ("service.media.video.film_rounds", signal.SIGTERM),
     ],
 )
 def test_a_signal_behind_the_learning(home, uninterrupted, where, number):
@@ -130,7 +130,7 @@ def test_a_signal_behind_the_learning(home, uninterrupted, where, number):
 
 def test_a_resume_does_what_the_signal_kept_from_being_done(home, uninterrupted, monkeypatch):
     with monkeypatch.context() as patch:
-        send_when_called(patch, "service.runtime.artifacts.plot_goals", signal.SIGTERM)
+        send_when_called(patch, "service.media.artifacts.plot_goals", signal.SIGTERM)
         assert home.run().exit_code == 143
     result = home.run("--resume")
     assert result.exit_code == 0, result.output
@@ -140,7 +140,7 @@ def test_a_resume_does_what_the_signal_kept_from_being_done(home, uninterrupted,
 
 
 @BOTH
-@pytest.mark.parametrize("where", ["service.runtime.local.SelfPlay", "service.registry.checkpoints.write_atomic"])
+@pytest.mark.parametrize("where", ["service.runtime.local.SelfPlay", "service.io.checkpoints.write_atomic"])
 def test_a_signal_while_a_run_is_being_begun(home, monkeypatch, where, number):
     with monkeypatch.context() as patch:
         send_when_called(patch, where, number)

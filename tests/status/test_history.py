@@ -4,7 +4,7 @@ from datetime import UTC, datetime
 
 import pytest
 
-from service.registry.files import write_atomic
+from service.io.files import write_atomic
 from service.status import history
 from service.status.history import Histories
 from service.store.disk_reader import DiskReader

@@ -14,7 +14,7 @@ import httpx
 import pytest
 from typer.testing import CliRunner
 
-from service.cli import app
+from service.cli.main import app
 from service.registry.registry import Registry
 from service.status.errors import StatusError
 from service.status.server import StatusServer

@@ -7,7 +7,7 @@ from contextlib import contextmanager
 import httpx
 import pytest
 
-from service.registry.files import write_atomic
+from service.io.files import write_atomic
 from service.status import stream
 from tests.status.conftest import serve
 from tests.status.runs import BEARER, append, record, write_status

@@ -8,7 +8,7 @@ import tracemalloc
 
 import pytest
 
-from service.runtime.records import JsonlWriter
+from service.io.jsonl import JsonlWriter
 from service.store import disk_reader
 from service.store.disk import DiskWriter
 from service.store.disk_reader import DiskReader, run_id_of

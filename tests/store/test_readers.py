@@ -4,13 +4,13 @@ import threading
 
 import pytest
 
-from service.runtime.records import JsonlWriter
+from service.io.jsonl import JsonlWriter
+from service.io.lock import DirectoryLock
 from service.store.disk import DiskWriter
 from service.store.disk_reader import DiskReader
 from service.store.errors import DamagedStoreError, StoreUnavailableError, UnknownRunError
 from service.store.keys import goals, metrics, status
 from service.store.liveness import SILENT_AFTER
-from service.store.lock import DirectoryLock
 from service.store.redis_reader import RedisReader
 from service.store.redis_writer import RedisWriter
 from tests.runtime.runs import assert_one_line

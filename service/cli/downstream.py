@@ -1,0 +1,243 @@
+"""``tandem downstream``: learn a task with frozen primitives, and the table of all methods on all tasks."""
+
+from __future__ import annotations
+
+import json
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from service.errors import TandemError
+
+if TYPE_CHECKING:
+    from service.downstream.table import Runner, Watching
+
+downstream_app = typer.Typer(name="downstream", help="New tasks with frozen primitives.", no_args_is_help=True)
+
+_EXIT_SIGNAL = 128
+_LINE_EVERY_S = 10.0
+_Primitives = Annotated[str, typer.Option("--primitives", metavar="NAME@ALIAS|RUN_DIR", help="What is composed.")]
+_Registry = Annotated[
+    str, typer.Option("--registry", envvar="TANDEM_REGISTRY", metavar="DIR|URL", help="Where primitives come from.")
+]
+_Set = Annotated[
+    list[str] | None, typer.Option("--set", metavar="A=B", help="How SAC learns, such as gamma=0.9; repeatable.")
+]
+_Steps = Annotated[int | None, typer.Option("--steps", help="Env steps of learning.", min=1)]
+_Episodes = Annotated[int, typer.Option(help="Of the final evaluation.", min=1)]
+_Threads = Annotated[int | None, typer.Option(help="Cores of one training; default: all, on a cluster one.", min=1)]
+_CHAMPION = "panda-cube@champion"
+
+
+@downstream_app.command()
+def train(
+    task: Annotated[str, typer.Option(help="larger, inair, push, sphere, wall or box.")],
+    method: Annotated[str, typer.Option(help="See tandem downstream methods.")] = "ours",
+    primitives: _Primitives = _CHAMPION,
+    seed: Annotated[int, typer.Option(min=0)] = 0,
+    steps: _Steps = None,
+    episodes: _Episodes = 300,
+    run_dir: Annotated[
+        Path | None, typer.Option("--run-dir", metavar="DIR", help="Default: runs/downstream/TASK-METHOD-SEED.")
+    ] = None,
+    resume: Annotated[bool, typer.Option("--resume", help="Continue the training in the directory exactly.")] = False,
+    overrides: _Set = None,
+    registry: _Registry = "registry",
+    threads: _Threads = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print the result as JSON.")] = False,
+) -> None:
+    """Learn one task, evaluate, film."""
+    with _user_errors():
+        _check_installed()
+        import service
+        from service.downstream.settings import make_cell
+        from service.downstream.worker import Running, run_cell
+
+        cell = make_cell(task=task, method=method, seed=seed, num_episodes=episodes, **_learning(steps, overrides))
+        path = run_dir or Path("runs") / "downstream" / cell.name
+        with _stopping() as watching:
+            running = Running(resume, threads or 0, True, watching.stop, watching.on_iteration)
+            result = run_cell(cell, service.load_primitives(primitives, registry), path, running)
+    if result is None:
+        typer.echo(f"saved; continue with the same command and --resume --run-dir {path}", err=True)
+        raise typer.Exit(_signal_code(watching))
+    if as_json:
+        typer.echo(json.dumps(result, indent=1))
+        return
+    found = result["evaluation"]
+    typer.echo(
+        f"{cell.name}: at the last step {found['success_last']:.1%} [{found['success_last_low']:.1%}, "
+        f"{found['success_last_high']:.1%}], ever {found['success_ever']:.1%}, of {found['num_episodes']} episodes"
+    )
+    typer.echo(f"{result['env_steps']:,} env steps in {result['wall_s']:.0f} s; {path}")
+
+
+@downstream_app.command()
+def table(
+    methods: Annotated[str, typer.Option(help="Names with commas between, or all.")] = "all",
+    tasks: Annotated[str, typer.Option(help="Names with commas between, or all.")] = "all",
+    seeds: Annotated[str, typer.Option(help="Numbers with commas between.")] = "0",
+    primitives: _Primitives = _CHAMPION,
+    steps: _Steps = None,
+    episodes: _Episodes = 300,
+    out: Annotated[
+        Path, typer.Option(metavar="DIR", help="Page and picture; in its downstream/ one file for each cell.")
+    ] = Path("docs/results"),
+    runs: Annotated[Path, typer.Option(metavar="DIR", help="Trainings, to continue them.")] = Path("runs/downstream"),
+    overrides: _Set = None,
+    registry: _Registry = "registry",
+    runtime: Annotated[str, typer.Option(help="local: in this process; ray: many at once on a cluster.")] = "local",
+    address: Annotated[
+        str | None, typer.Option(metavar="auto|HOST:PORT", help="Ray cluster; default: a new one on this machine.")
+    ] = None,
+    num_workers: Annotated[int | None, typer.Option(help="Trainings at once; default: one a core.", min=1)] = None,
+    threads: _Threads = None,
+) -> None:
+    """Run the cells that are missing, and write downstream.md."""
+    with _user_errors():
+        _check_installed()
+        from service.downstream.methods import METHODS
+        from service.downstream.settings import make_cell
+        from service.downstream.table import Source, make_table
+        from service.envs.tasks import TASKS
+
+        learning = _learning(steps, overrides)
+        cells = [
+            make_cell(task=task, method=method, seed=seed, num_episodes=episodes, **learning)
+            for seed in _numbers(seeds)
+            for task in _names(tasks, TASKS)
+            for method in _names(methods, METHODS)
+        ]
+        cells = list(dict.fromkeys(cells))
+        source = Source(primitives, registry, runs.absolute())
+        with _runtime(runtime, address, num_workers, threads) as runner, _stopping() as watching:
+            complete = make_table(cells, source, out, runner, watching)
+    if not complete:
+        typer.echo("stopped; the same command continues", err=True)
+        raise typer.Exit(_signal_code(watching))
+
+
+@downstream_app.command("methods")
+def list_methods() -> None:
+    """List the methods."""
+    from service.downstream.methods import METHODS
+
+    for name, method in METHODS.items():
+        typer.echo(f"{name:<24} {method.words}")
+
+
+def _learning(steps: int | None, overrides: list[str] | None) -> dict[str, Any]:
+    """Settings of a cell about learning, defaults where left out."""
+    import yaml
+
+    from service.downstream.settings import SACConfig, make_sac
+
+    values = {}
+    for override in overrides or []:
+        key, separator, text = override.partition("=")
+        if not separator or key not in SACConfig.model_fields:
+            raise TandemError(f"--set {override}: write KEY=VALUE with KEY one of {', '.join(SACConfig.model_fields)}")
+        try:
+            values[key] = yaml.safe_load(text)
+        except yaml.YAMLError:
+            raise TandemError(f"--set {override}: the value is no YAML") from None
+    return {"sac": make_sac(**values)} | ({} if steps is None else {"num_env_steps": steps})
+
+
+def _names(text: str, known: Any) -> list[str]:
+    return list(known) if text == "all" else [name.strip() for name in text.split(",")]
+
+
+def _numbers(text: str) -> list[int]:
+    parts = [part.strip() for part in text.split(",")]
+    if not all(part.isdecimal() for part in parts):
+        raise TandemError(f"--seeds {text!r}: write numbers from 0 on with commas between, such as 0,1,2")
+    return [int(part) for part in parts]
+
+
+@contextmanager
+def _runtime(name: str, address: str | None, num_workers: int | None, threads: int | None) -> Iterator[Runner]:
+    from service.downstream.table import run_here, run_on_ray
+
+    if name not in ("local", "ray"):
+        raise TandemError(f"--runtime {name!r}: choose one of local, ray")
+    if name == "local":
+        for option, value in (("--address", address), ("--num-workers", num_workers)):
+            if value is not None:
+                raise TandemError(f"{option} needs --runtime ray")
+        yield run_here(threads or 0)
+        return
+    from service.runtime.ray_connection import connected
+
+    with connected(address):
+        yield run_on_ray(num_workers, threads or 1)
+
+
+@contextmanager
+def _stopping() -> Iterator[Watching]:
+    """SIGINT and SIGTERM end it where it can be continued; progress goes to stderr."""
+    from service.downstream.table import Watching
+    from service.runtime.signals import InterruptError, StopSignals
+
+    asked: list[bool] = []
+    with StopSignals() as signals, signals.asking(lambda: asked.append(True)):
+        try:
+            yield Watching(
+                lambda: bool(asked),
+                _Line().show,
+                lambda text: typer.echo(text, err=True),
+                lambda: signals.first or 0,
+            )
+        except InterruptError as interrupt:  # a second one
+            typer.echo("stopped at once; what came after the last checkpoint is lost", err=True)
+            raise typer.Exit(_EXIT_SIGNAL + interrupt.number) from None
+
+
+def _signal_code(watching: Watching) -> int:
+    """The exit code of a process that a signal ends."""
+    return _EXIT_SIGNAL + watching.signal()
+
+
+class _Line:
+    """A line of progress now and then."""
+
+    def __init__(self) -> None:
+        self._shown_s, self._evaluated, self._steps = float("-inf"), "", 0.0
+
+    def show(self, metrics: dict[str, float]) -> None:
+        """Take in an iteration."""
+        if metrics["env_steps"] <= self._steps:  # another training
+            self._evaluated = ""
+        self._steps = metrics["env_steps"]
+        if (rate := metrics.get("evaluation/success_last")) is not None:
+            self._evaluated = f" | without noise {rate:.0%}"
+        if time.monotonic() - self._shown_s >= _LINE_EVERY_S:
+            self._shown_s = time.monotonic()
+            typer.echo(
+                f"{int(metrics['env_steps']):>10,} env steps | success with noise "
+                f"{metrics.get('rollout/success_last', 0.0):.0%}{self._evaluated} | "
+                f"{metrics['time/env_steps_per_s']:,.0f} env steps/s",
+                err=True,
+            )
+
+
+def _check_installed() -> None:
+    from importlib.util import find_spec
+
+    if find_spec("stable_baselines3") is None:
+        raise TandemError("learning needs the package stable-baselines3: pip install 'tandem-skills[downstream]'")
+
+
+@contextmanager
+def _user_errors() -> Iterator[None]:
+    """One line on stderr for an error the user can mend."""
+    try:
+        yield
+    except TandemError as error:
+        print(f"error: {error}", file=sys.stderr)
+        raise typer.Exit(error.exit_code) from None

@@ -1,0 +1,37 @@
+"""The Gymnasium names of the environments. Importing this module registers them.
+
+Gymnasium 1.x loads no plug-ins by itself, so a program imports this module first, or lets ``make`` do it:
+``gymnasium.make("service.envs.gym.registration:tandem/Tabletop-v0")``. ``gymnasium.make_vec`` of any of them makes a
+``TabletopVectorEnv``, unless it is asked for ``vectorization_mode="sync"``.
+"""
+
+from __future__ import annotations
+
+import gymnasium
+
+from service.envs.tasks import TASKS
+
+TABLETOP_ID = "tandem/Tabletop-v0"
+EPISODE_STEPS = 50
+"""Steps of an episode (paper: 50)."""
+
+
+def register_all() -> None:
+    """Register every environment; a second call changes nothing."""
+    _register(TABLETOP_ID)
+    for name, task in TASKS.items():
+        _register(task.id, task=name)
+
+
+def _register(name: str, **options: str) -> None:
+    if name not in gymnasium.registry:
+        gymnasium.register(
+            id=name,
+            entry_point="service.envs.gym.tabletop:TabletopEnv",
+            vector_entry_point="service.envs.gym.vector:TabletopVectorEnv",
+            max_episode_steps=EPISODE_STEPS,
+            kwargs=options,
+        )
+
+
+register_all()

@@ -1,0 +1,230 @@
+"""One world as a Gymnasium goal environment: bring the object to a given place. ``vector`` has many at once."""
+
+from __future__ import annotations
+
+from copy import deepcopy
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import gymnasium
+import numpy as np
+from numpy.typing import NDArray
+
+from service.config import WorldConfig
+from service.envs.batch import WorldBatch
+from service.envs.goals import GoalKind, check_goals, draw_goals
+from service.envs.observations import ACTION_SIZE, OBJECT_SLICE, POSITIONS_SIZE
+from service.envs.tasks import find_task
+from service.errors import TandemError
+
+if TYPE_CHECKING:
+    from service.envs.rendering.renderer import SceneRenderer
+
+FloatArray = NDArray[np.float32]
+StateArray = NDArray[np.float64]
+Observation = dict[str, FloatArray]
+
+_FURTHEST_M = 10.0
+"""Bound of every position: an object off the table falls for ever, a space needs an end."""
+
+
+@dataclass(frozen=True, slots=True)
+class Setting:
+    """What an environment of one world and one of many have in common: a world, and where its goals are."""
+
+    config: WorldConfig
+    goals: GoalKind
+    success_distance_m: float
+
+    @classmethod
+    def of(
+        cls, config: WorldConfig | None, task: str | None, goals: GoalKind | None, success_distance_m: float
+    ) -> Setting:
+        """From the arguments of an environment.
+
+        Raises:
+            TandemError: unknown task or goals, goals that the world cannot have, a distance that is not positive.
+        """
+        config = config or WorldConfig()
+        if task is not None:
+            if goals is not None:
+                raise TandemError(
+                    f"goals = {goals!r} beside task = {task!r}: the task has its own; give one of the two"
+                )
+            config, goals = find_task(task).world_from(config), find_task(task).goals
+        goals = goals or ("mixed" if config.fixture == "none" else "table")
+        check_goals(goals, config)
+        if not success_distance_m > 0.0:
+            raise TandemError(f"success_distance_m = {success_distance_m}; give a distance above 0 m")
+        return cls(config, goals, success_distance_m)
+
+    def draw_goals(self, rng: np.random.Generator, worlds: WorldBatch, index: slice = slice(None)) -> StateArray:
+        """(num, 3) goals for worlds at their start, metres."""
+        start, box = worlds.object_position[index], worlds.box_place[index]
+        return draw_goals(self.goals, rng, self.config, self.success_distance_m, start=start, box=box)
+
+    def reward(self, achieved_goal: NDArray[Any], desired_goal: NDArray[Any]) -> Any:
+        """(...) 1 where (..., 3) achieved goals are within the success distance of (..., 3) desired ones, else 0."""
+        distance = np.linalg.norm(np.asarray(achieved_goal) - np.asarray(desired_goal), axis=-1)
+        return (distance <= self.success_distance_m).astype(np.float64)
+
+
+def goal_space() -> gymnasium.spaces.Dict:
+    """The observations of one world."""
+    sizes = {"observation": POSITIONS_SIZE, "achieved_goal": 3, "desired_goal": 3}
+    return gymnasium.spaces.Dict(
+        {name: gymnasium.spaces.Box(-_FURTHEST_M, _FURTHEST_M, (size,), np.float32) for name, size in sizes.items()}
+    )
+
+
+def action_space() -> gymnasium.Space[FloatArray]:
+    """The actions of one world."""
+    return gymnasium.spaces.Box(-1.0, 1.0, (ACTION_SIZE,), np.float32)
+
+
+def observe(worlds: WorldBatch, goal: StateArray) -> Observation:
+    """What N worlds with (N, 3) goals show, (N, ...) each."""
+    positions = np.clip(worlds.positions(), -_FURTHEST_M, _FURTHEST_M)
+    return {
+        "observation": positions,
+        "achieved_goal": positions[:, OBJECT_SLICE].copy(),
+        "desired_goal": goal.astype(np.float32),
+    }
+
+
+@dataclass(frozen=True, slots=True)
+class TabletopState:
+    """Everything a :class:`TabletopEnv` continues from."""
+
+    world: StateArray
+    """(S,) row of ``WorldBatch.states``."""
+    goal: StateArray
+    """(3,) metres."""
+    random: dict[str, Any]
+    """State of the bit generator that draws object and goal at the next reset."""
+
+
+class TabletopEnv(gymnasium.Env[Any, FloatArray]):
+    """A Panda at a table, one rigid object, and a goal for the object's centre.
+
+    - observation: ``observation`` (11,) positions as Bob's primitives see them (``service.envs.observations``),
+      ``achieved_goal`` (3,) and ``desired_goal`` (3,) object and goal in the world frame, metres, within +-10.
+    - action: (4,) in [-1, 1]: end-effector displacement x, y, z from where it is now (1 is 5 cm), change of the finger
+      width (1 is 10 cm).
+    - reward: 1 at every step the object is within ``success_distance_m`` of the goal, else 0 (paper, downstream tasks).
+    - never terminates; truncated where the physics diverged, else by the time limit of the registration.
+
+    ``info`` holds ``is_success`` (bool) and, after a step, ``diverged`` (bool).
+
+    Args:
+        config: the world; the paper's by default.
+        task: name of a downstream task (``service.envs.tasks``), which replaces part of ``config`` and has its goals.
+        goals: where goals are: ``table``, ``air``, ``volume``, or ``mixed`` as in most of the paper's downstream tasks,
+            which is the default; with a wall or a box in ``config`` only ``table``.
+        success_distance_m: greatest distance that counts as reached, metres.
+        render_mode: ``rgb_array`` or None.
+        width: of rendered images, pixels.
+        height: of rendered images, pixels.
+
+    Raises:
+        TandemError: unknown ``task``, ``goals`` or ``render_mode``, or a success distance that is not positive.
+    """
+
+    metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 25}  # noqa: RUF012 - as the base class has it
+
+    def __init__(
+        self,
+        config: WorldConfig | None = None,
+        *,
+        task: str | None = None,
+        goals: GoalKind | None = None,
+        success_distance_m: float = 0.05,
+        render_mode: str | None = None,
+        width: int = 640,
+        height: int = 480,
+    ) -> None:
+        if render_mode not in (None, *self.metadata["render_modes"]):
+            raise TandemError(f"TabletopEnv: render_mode = {render_mode!r}; choose rgb_array or None")
+        self._setting = Setting.of(config, task, goals, success_distance_m)
+        self.config = self._setting.config
+        self.goals = self._setting.goals
+        self.success_distance_m = success_distance_m
+        self.render_mode = render_mode
+        self.observation_space = goal_space()
+        self.action_space = action_space()
+        self._image_size = (width, height)
+        self._renderer: SceneRenderer | None = None
+        self._worlds = WorldBatch(self.config, 1, num_threads=1)
+        self._goal = self._worlds.object_position[0].copy()
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Observation, dict[str, Any]]:
+        """Arm at home, object at a random place on the table, a new random goal, a box elsewhere.
+
+        Args:
+            seed: restarts the environment's random numbers; the same seed gives the same episodes, bit for bit.
+            options: none are known.
+        """
+        super().reset(seed=seed, options=options)
+        self._worlds.reset(self.np_random)
+        self._goal = self._setting.draw_goals(self.np_random, self._worlds)[0]
+        observation = self._observe()
+        return observation, {"is_success": self._is_success(observation)}
+
+    def step(self, action: FloatArray) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
+        """Act for one control step.
+
+        Raises:
+            ValueError: action of the wrong shape or not finite.
+        """
+        diverged = bool(self._worlds.step(np.asarray(action, dtype=np.float32)[None])[0])
+        observation = self._observe()
+        success = self._is_success(observation)
+        return observation, float(success), False, diverged, {"is_success": success, "diverged": diverged}
+
+    def compute_reward(self, achieved_goal: NDArray[Any], desired_goal: NDArray[Any], info: Any) -> Any:
+        """Reward of (..., 3) achieved for (..., 3) desired goals, metres: (...) float64, 1 where reached, else 0.
+
+        ``info`` is there for the convention of goal environments and is not read.
+        """
+        return self._setting.reward(achieved_goal, desired_goal)
+
+    def state(self) -> TabletopState:
+        """Copy everything that :meth:`restore` needs; the elapsed steps of a time limit belong to its wrapper."""
+        random = deepcopy(self.np_random.bit_generator.state)
+        return TabletopState(self._worlds.states[0].copy(), self._goal.copy(), dict(random))
+
+    def restore(self, state: TabletopState) -> Observation:
+        """Go back to a saved state, of this or another environment of the same config; continues bit-identically.
+
+        Returns:
+            The observation there.
+        """
+        self._worlds.restore(state.world[None])
+        self._goal = state.goal.copy()
+        self.np_random.bit_generator.state = deepcopy(state.random)
+        return self._observe()
+
+    def render(self) -> Any:
+        """(height, width, 3) uint8 picture of the world and its goal; None without a render mode."""
+        if self.render_mode is None:
+            return None
+        if self._renderer is None:
+            from service.envs.rendering.renderer import SceneRenderer
+
+            self._renderer = SceneRenderer(self.config, *self._image_size)
+        return self._renderer.render(self._worlds.states[0], self._goal)
+
+    def close(self) -> None:
+        """Free the renderer and the physics; the environment cannot step afterwards."""
+        if self._renderer is not None:
+            self._renderer.close()
+            self._renderer = None
+        self._worlds.close()
+
+    def _observe(self) -> Observation:
+        return {name: value[0] for name, value in observe(self._worlds, self._goal[None]).items()}
+
+    def _is_success(self, observation: Observation) -> bool:
+        return bool(self.compute_reward(observation["achieved_goal"], observation["desired_goal"], {}))

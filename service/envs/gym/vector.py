@@ -1,0 +1,196 @@
+"""Many worlds as one Gymnasium vector environment, stepped together: what a learner needs that wants many samples."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from copy import deepcopy
+from dataclasses import dataclass
+from typing import Any
+
+import gymnasium
+import numpy as np
+from gymnasium.utils import seeding
+from gymnasium.vector import AutoresetMode
+from gymnasium.vector.utils import batch_space
+from numpy.typing import NDArray
+
+from service.config import WorldConfig
+from service.envs.batch import WorldBatch
+from service.envs.goals import GoalKind
+from service.envs.gym.tabletop import Observation, Setting, action_space, goal_space, observe
+from service.errors import TandemError
+
+FloatArray = NDArray[np.float32]
+BoolArray = NDArray[np.bool_]
+StateArray = NDArray[np.float64]
+Info = dict[str, Any]
+
+
+@dataclass(frozen=True, slots=True)
+class VectorState:
+    """Everything a :class:`TabletopVectorEnv` continues from."""
+
+    worlds: StateArray
+    """(N, S) ``WorldBatch.states``."""
+    goal: StateArray
+    """(N, 3) metres."""
+    elapsed: NDArray[np.int64]
+    """(N,) steps of the episode."""
+    random: tuple[dict[str, Any], ...]
+    """State of each world's bit generator."""
+
+
+class TabletopVectorEnv(gymnasium.vector.VectorEnv[Any, FloatArray, NDArray[Any]]):
+    """N environments like ``TabletopEnv``, whose worlds are stepped in native threads.
+
+    World i of a reset with seed s plays the very episodes, bit for bit, of a ``TabletopEnv`` that was reset with seed
+    s + i, under a time limit. An episode that ends starts anew within the same step
+    (``gymnasium.vector.AutoresetMode.SAME_STEP``): the observation is the first of the next episode, and
+    ``info["final_obs"]`` and ``info["final_info"]`` hold the last of the old one, laid out as by
+    ``gymnasium.vector.SyncVectorEnv``. All other ``info`` is as that class has it, too.
+
+    Args:
+        num_envs: N.
+        config: the world; the paper's by default.
+        task: see ``TabletopEnv``.
+        goals: see ``TabletopEnv``.
+        success_distance_m: greatest distance that counts as reached, metres.
+        max_episode_steps: where episodes are truncated.
+        num_threads: native threads; 0 for one per core.
+
+    Raises:
+        TandemError: unknown ``task`` or ``goals``, or a number that is not positive.
+    """
+
+    metadata: dict[str, Any] = {"render_modes": [], "autoreset_mode": AutoresetMode.SAME_STEP}  # noqa: RUF012 - as the base class has it
+
+    def __init__(
+        self,
+        num_envs: int = 1,
+        config: WorldConfig | None = None,
+        *,
+        task: str | None = None,
+        goals: GoalKind | None = None,
+        success_distance_m: float = 0.05,
+        max_episode_steps: int = 50,
+        num_threads: int = 0,
+    ) -> None:
+        for name, value in {"num_envs": num_envs, "max_episode_steps": max_episode_steps}.items():
+            if value < 1:
+                raise TandemError(f"TabletopVectorEnv: {name} = {value}; give at least 1")
+        self._setting = Setting.of(config, task, goals, success_distance_m)
+        self.config = self._setting.config
+        self.num_envs = num_envs
+        self.max_episode_steps = max_episode_steps
+        self.single_observation_space, self.single_action_space = goal_space(), action_space()
+        self.observation_space = batch_space(self.single_observation_space, num_envs)
+        self.action_space = batch_space(self.single_action_space, num_envs)
+        self._worlds = WorldBatch(self.config, num_envs, num_threads=num_threads)
+        self._goal = self._worlds.object_position.copy()
+        self._elapsed = np.zeros(num_envs, dtype=np.int64)
+        self._random = [seeding.np_random()[0] for _ in range(num_envs)]
+
+    def reset(
+        self, *, seed: int | Sequence[int | None] | None = None, options: Info | None = None
+    ) -> tuple[Observation, Info]:
+        """Start an episode in every world.
+
+        Args:
+            seed: world i draws its episodes from ``seed + i``, or ``seed[i]``; None goes on with the random numbers.
+            options: none are known.
+
+        Raises:
+            ValueError: not one seed per world.
+        """
+        seeds = [seed + world for world in range(self.num_envs)] if isinstance(seed, int) else seed
+        if seeds is not None:
+            if len(seeds) != self.num_envs:
+                raise ValueError(f"seed: expected {self.num_envs} of them, one per world, got {len(seeds)}")
+            for world, each in enumerate(seeds):
+                if each is not None:
+                    self._random[world] = seeding.np_random(each)[0]
+        self._start(np.ones(self.num_envs, dtype=bool))
+        observation = observe(self._worlds, self._goal)
+        return observation, _with_masks({"is_success": self._is_success(observation)})
+
+    def step(self, actions: FloatArray) -> tuple[Observation, NDArray[Any], BoolArray, BoolArray, Info]:
+        """Act for one control step in every world; see the class for what happens where an episode ends.
+
+        Raises:
+            ValueError: actions of the wrong shape or not finite.
+        """
+        diverged = self._worlds.step(np.asarray(actions, dtype=np.float32))
+        self._elapsed += 1
+        observation = observe(self._worlds, self._goal)
+        success = self._is_success(observation)
+        truncated = diverged | (self._elapsed >= self.max_episode_steps)
+        info: Info = {}
+        if truncated.any():
+            info = _with_masks({"final_obs": _rows(observation, truncated)}, truncated)
+            last = {"is_success": success & truncated, "diverged": diverged}
+            info |= _with_masks({"final_info": _with_masks(last, truncated)}, truncated)
+            self._start(truncated)
+            observation = observe(self._worlds, self._goal)
+        info |= _with_masks({"is_success": self._is_success(observation)})
+        if not truncated.all():
+            info |= _with_masks({"diverged": diverged & ~truncated}, ~truncated)
+        return observation, success.astype(np.float64), np.zeros_like(truncated), truncated, info
+
+    def compute_reward(self, achieved_goal: NDArray[Any], desired_goal: NDArray[Any], info: Any) -> Any:
+        """As ``TabletopEnv.compute_reward``."""
+        return self._setting.reward(achieved_goal, desired_goal)
+
+    def state(self) -> VectorState:
+        """Copy everything that :meth:`restore` needs."""
+        random = tuple(deepcopy(dict(each.bit_generator.state)) for each in self._random)
+        return VectorState(self._worlds.states.copy(), self._goal.copy(), self._elapsed.copy(), random)
+
+    def restore(self, state: VectorState) -> Observation:
+        """Go back to a saved state, of this or another environment alike; continues bit-identically.
+
+        Returns:
+            The observation there.
+
+        Raises:
+            ValueError: a state of another number of worlds.
+        """
+        if state.worlds.shape != self._worlds.states.shape:
+            raise ValueError(f"states: expected shape {self._worlds.states.shape}, got {state.worlds.shape}")
+        self._worlds.restore(state.worlds)
+        self._goal, self._elapsed = state.goal.copy(), state.elapsed.copy()
+        for generator, random in zip(self._random, state.random, strict=True):
+            generator.bit_generator.state = deepcopy(random)
+        return observe(self._worlds, self._goal)
+
+    def close_extras(self, **kwargs: Any) -> None:
+        """Stop the native threads."""
+        self._worlds.close()
+
+    def _start(self, worlds: BoolArray) -> None:
+        """New episodes, each from its own world's random numbers, so that no world depends on when others end."""
+        index = np.flatnonzero(worlds)
+        starts = [self._worlds.draw_starts(self._random[world], 1) for world in index]
+        self._worlds.restore(np.concatenate(starts), worlds)
+        for world in index:
+            self._goal[world] = self._setting.draw_goals(self._random[world], self._worlds, slice(world, world + 1))[0]
+        self._elapsed[worlds] = 0
+
+    def _is_success(self, observation: Observation) -> BoolArray:
+        success: BoolArray = self._setting.reward(observation["achieved_goal"], observation["desired_goal"]) > 0.0
+        return success
+
+
+def _with_masks(values: Info, mask: BoolArray | None = None) -> Info:
+    """Gymnasium's vector info: beside every ``key``, ``_key`` says for which worlds it holds; None: for all."""
+    masks = {
+        f"_{key}": np.ones(len(value), dtype=bool) if mask is None else mask.copy() for key, value in values.items()
+    }
+    return {**values, **masks}
+
+
+def _rows(observation: Observation, worlds: BoolArray) -> NDArray[np.object_]:
+    """(N,) each world's own observation, None where ``worlds`` is false."""
+    rows = np.full(len(worlds), None, dtype=object)
+    for world in np.flatnonzero(worlds):
+        rows[world] = {name: value[world] for name, value in observation.items()}
+    return rows

@@ -1,0 +1,176 @@
+"""Pictures of a world: MuJoCo's own renderer, offscreen, on states of a ``WorldBatch``.
+
+A second model is drawn, the physics with its decoration; states of one are states of the other. OpenGL is touched when
+a ``SceneRenderer`` is made and not before.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from types import TracebackType
+from typing import Any, Self
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from service.config import WorldConfig
+from service.envs.fixtures import PLACE_SIZE
+from service.envs.rendering.decoration import OBJECT_RGB, decorate
+from service.envs.rendering.gl import RenderError, open_drawing
+from service.envs.scene import build_spec
+
+__all__ = ["DEFAULT_CAMERA", "TOP_CAMERA", "Camera", "Mark", "RenderError", "SceneRenderer", "decorate"]
+
+Image = NDArray[np.uint8]
+Array = NDArray[np.float64]
+
+_GOAL_RGBA = (*OBJECT_RGB, 0.30)
+_DROP_RGBA = (*OBJECT_RGB, 0.55)
+_DROP_RADIUS_M, _FOOT_RADIUS_M, _FOOT_HALF_HEIGHT_M = 0.0015, 0.012, 0.0006
+_MAX_GEOMS = 200
+_NUM_SAMPLES = 4
+
+
+@dataclass(frozen=True, slots=True)
+class Camera:
+    """Where a picture is taken from: it looks at a point from a distance in a direction."""
+
+    target: tuple[float, float, float]
+    """The point in the middle of the picture, metres."""
+    distance_m: float
+    azimuth_deg: float
+    """Direction of the view in the table's plane: 0 looks along x, 90 along y."""
+    elevation_deg: float
+    """-90 looks straight down."""
+
+
+@dataclass(frozen=True, slots=True)
+class Mark:
+    """A transparent box in a picture, such as the area where goals may be."""
+
+    low: tuple[float, float, float]
+    high: tuple[float, float, float]
+    rgba: tuple[float, float, float, float]
+
+
+DEFAULT_CAMERA = Camera((-0.20, 0.0, 0.21), 1.95, 146.0, -21.0)
+"""Three-quarter view from the front: arm, workspace and object."""
+TOP_CAMERA = Camera((-0.28, 0.0, 0.05), 2.4, 180.0, -72.0)
+"""From above, the robot at the top."""
+
+
+class SceneRenderer:
+    """Draws states of a ``WorldBatch`` of the same configuration; for use in the thread that made it.
+
+    Args:
+        config: the world.
+        width: of the pictures, pixels.
+        height: of the pictures, pixels.
+        camera: where they are taken from; may be replaced at any time.
+
+    Raises:
+        RenderError: this machine has no OpenGL that works without a window.
+    """
+
+    def __init__(
+        self, config: WorldConfig, width: int = 640, height: int = 480, camera: Camera = DEFAULT_CAMERA
+    ) -> None:
+        self.camera = camera
+        self.model = _build_model(config, width, height)
+        self._data = mujoco.MjData(self.model)
+        self._state_size = mujoco.mj_stateSize(self.model, mujoco.mjtState.mjSTATE_FULLPHYSICS)
+        self._half_m = config.object_size_m / 2
+        self._goal_geom = mujoco.mjtGeom.mjGEOM_BOX if config.object == "cube" else mujoco.mjtGeom.mjGEOM_SPHERE
+        self._rectangle = mujoco.MjrRect(0, 0, width, height)
+        self._option = mujoco.MjvOption()
+        self._scene = mujoco.MjvScene(self.model, maxgeom=_MAX_GEOMS)
+        self._scene.flags[mujoco.mjtRndFlag.mjRND_HAZE] = True
+        self._context, self._drawing = open_drawing(self.model, width, height)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Free OpenGL's memory; nothing can be drawn afterwards."""
+        if self._context is not None:
+            self._context.make_current()
+            self._drawing.free()
+            self._context.free()
+            self._context = None
+
+    def render(self, state: Array, goal: Array | None = None, marks: Sequence[Mark] = ()) -> Image:
+        """Draw one world.
+
+        Args:
+            state: (S,) row of ``WorldBatch.states``.
+            goal: (3,) metres, shown as a transparent copy of the object; None for none.
+            marks: transparent boxes.
+
+        Returns:
+            (H, W, 3), the top row first.
+        """
+        assert self._context is not None, "drawing after close"
+        mujoco.mj_setState(self.model, self._data, state[: self._state_size], mujoco.mjtState.mjSTATE_FULLPHYSICS)
+        if self.model.nmocap:
+            self._data.mocap_pos[0] = state[-PLACE_SIZE:]
+        mujoco.mj_kinematics(self.model, self._data)
+        mujoco.mj_camlight(self.model, self._data)
+        camera, everything = _mujoco_camera(self.camera), mujoco.mjtCatBit.mjCAT_ALL
+        mujoco.mjv_updateScene(self.model, self._data, self._option, None, camera, everything, self._scene)
+        for mark in marks:
+            low, high = np.asarray(mark.low), np.asarray(mark.high)
+            self._add(mujoco.mjtGeom.mjGEOM_BOX, tuple((high - low) / 2), (low + high) / 2, mark.rgba)
+        if goal is not None:
+            self._add_goal(np.asarray(goal, dtype=np.float64))
+        return self._draw()
+
+    def _draw(self) -> Image:
+        self._context.make_current()
+        image = np.empty((self._rectangle.height, self._rectangle.width, 3), dtype=np.uint8)
+        mujoco.mjr_render(self._rectangle, self._scene, self._drawing)
+        mujoco.mjr_readPixels(image, None, self._rectangle, self._drawing)
+        return np.ascontiguousarray(image[::-1])
+
+    def _add_goal(self, goal: Array) -> None:
+        """A ghost of the object, and a line down to the table, which tells its height."""
+        self._add(self._goal_geom, (self._half_m, self._half_m, self._half_m), goal, _GOAL_RGBA)
+        cylinder, foot = mujoco.mjtGeom.mjGEOM_CYLINDER, np.array([goal[0], goal[1], 0.0])
+        self._add(cylinder, (_FOOT_RADIUS_M, _FOOT_HALF_HEIGHT_M, 0.0), foot, _DROP_RGBA)
+        half_drop = (goal[2] - self._half_m) / 2
+        if half_drop > _FOOT_HALF_HEIGHT_M:
+            middle = np.array([goal[0], goal[1], half_drop])
+            self._add(cylinder, (_DROP_RADIUS_M, half_drop, 0.0), middle, _DROP_RGBA)
+
+    def _add(self, kind: Any, size: tuple[float, ...], position: Array, rgba: tuple[float, ...]) -> None:
+        geom = self._scene.geoms[self._scene.ngeom]
+        mujoco.mjv_initGeom(
+            geom, kind, np.asarray(size), position, np.eye(3).ravel(), np.asarray(rgba, dtype=np.float32)
+        )
+        geom.category, geom.castshadow = mujoco.mjtCatBit.mjCAT_DECOR, 0
+        geom.emission, geom.specular = 0.25, 0.2
+        self._scene.ngeom += 1
+
+
+def _build_model(config: WorldConfig, width: int, height: int) -> mujoco.MjModel:
+    spec = build_spec(config)
+    decorate(spec, config)
+    spec.visual.global_.offwidth, spec.visual.global_.offheight = width, height
+    spec.visual.quality.offsamples = _NUM_SAMPLES
+    # Without a graphics card the shadow map is a third of the work; twice the picture's size is enough for it.
+    spec.visual.quality.shadowsize = int(np.clip(2 ** np.ceil(np.log2(2 * height)), 256, 2048))
+    return spec.compile()
+
+
+def _mujoco_camera(camera: Camera) -> Any:
+    out = mujoco.MjvCamera()
+    out.type = mujoco.mjtCamera.mjCAMERA_FREE
+    out.lookat, out.distance = camera.target, camera.distance_m
+    out.azimuth, out.elevation = camera.azimuth_deg, camera.elevation_deg
+    return out

@@ -1,0 +1,1 @@
+"""Files: atomic writes, locks, json lines, tensors, checkpoints, run directories."""

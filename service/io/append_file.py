@@ -1,0 +1,68 @@
+"""Files that only grow, by whole pieces: a disk that fills up tears none, and loses none while the process lives."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+from collections import deque
+from io import FileIO
+from pathlib import Path
+
+from service.io.files import os_errors
+
+
+class Appender:
+    """Appends pieces to one file; a piece that does not fit waits, and comes before the next one."""
+
+    def __init__(self, path: Path) -> None:
+        """For ``path``; what is there already stays, and nothing is made before the first `append`."""
+        self.path = path
+        self._waiting: deque[bytes] = deque()
+
+    def append(self, piece: bytes) -> None:
+        """Put ``piece`` at the file's end and hand it to the operating system.
+
+        Raises:
+            RegistryError: the disk is full or the file cannot be written; it ends with a whole piece, and ``piece``
+                waits for the next `append` or `flush`.
+        """
+        self._waiting.append(piece)
+        self.flush()
+
+    def flush(self) -> None:
+        """Write what waits.
+
+        Raises:
+            RegistryError: as for `append`.
+        """
+        if not self._waiting:
+            return
+        with os_errors("write", self.path):
+            self.path.parent.mkdir(parents=True, exist_ok=True)
+            with self.path.open("ab", buffering=0) as file:
+                while self._waiting:
+                    _write_whole(file, self._waiting[0])
+                    self._waiting.popleft()
+
+    def sync(self) -> None:
+        """Write what waits, and see to it that a power cut leaves it there.
+
+        Raises:
+            RegistryError: as for `append`.
+        """
+        self.flush()
+        if self.path.exists():
+            with os_errors("write", self.path), self.path.open("rb") as file:
+                os.fsync(file.fileno())
+
+
+def _write_whole(file: FileIO, piece: bytes) -> None:
+    end = file.seek(0, os.SEEK_END)
+    try:
+        view = memoryview(piece)
+        while view:
+            view = view[file.write(view) :]
+    except BaseException:  # a signal's, too
+        with contextlib.suppress(OSError):  # what was wrong first is what the user has to know
+            file.truncate(end)
+        raise

@@ -1,0 +1,153 @@
+"""Checkpoints of a run, from which it continues bit-identically.
+
+A checkpoint is one safetensors file. Its header holds a JSON text with the format version, the step, the caller's meta,
+and a sha256 over that text and all arrays, so that any changed bit is found.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import re
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from service.io import tensors
+from service.io.files import os_errors, remove_temporaries, write_atomic
+from service.registry.errors import CheckpointError, FormatVersionError
+
+FORMAT_VERSION = 1
+_HEADER_KEY = "tandem_checkpoint"
+_FILE_PATTERN = re.compile(r"checkpoint-([0-9]{8,})\.safetensors")
+_logger = logging.getLogger(__name__)
+
+
+class Checkpoint(NamedTuple):
+    """What was saved: the step, the arrays by name, and the plain values."""
+
+    step: int
+    arrays: dict[str, np.ndarray]
+    meta: dict[str, Any]
+
+
+class CheckpointStore:
+    """The newest ``keep`` checkpoints of one run in a directory; one writer, any number of readers."""
+
+    def __init__(self, directory: Path, keep: int) -> None:
+        """Nothing is read or written before the first call."""
+        assert keep >= 1
+        self.directory = directory
+        self.keep = keep
+
+    def path(self, step: int) -> Path:
+        """Where the checkpoint of ``step`` is, or would be."""
+        return self.directory / f"checkpoint-{step:08d}.safetensors"
+
+    def steps(self) -> list[int]:
+        """The steps of which a checkpoint is there, good or damaged, in order."""
+        if not self.directory.is_dir():
+            return []
+        matches = (_FILE_PATTERN.fullmatch(entry.name) for entry in self.directory.iterdir())
+        return sorted(int(match[1]) for match in matches if match)
+
+    def check_any(self) -> None:
+        """Check that there is a checkpoint, good or damaged.
+
+        Raises:
+            CheckpointError: there is none.
+        """
+        if not self.steps():
+            raise CheckpointError(f"no checkpoint in {self.directory}; name another run, or start without --resume")
+
+    def save(self, step: int, arrays: Mapping[str, np.ndarray], meta: Mapping[str, Any]) -> Path:
+        """Write a checkpoint to the disk, then delete those older than the newest ``keep``.
+
+        Args:
+            step: the iteration after which the state was taken, >= 0.
+            arrays: any shape and memory order; see `tensors.encode`.
+            meta: plain JSON values; integers of any size, NaN and infinities come back exactly, tuples as lists.
+
+        Raises:
+            CheckpointError: an array or value that cannot be saved, or a full disk; earlier checkpoints are intact.
+        """
+        assert step >= 0
+        path = self.path(step)
+        data = _encode(path, step, arrays, meta)
+        with os_errors("write", path, CheckpointError):
+            write_atomic(path, data)
+        self._prune(step)
+        return path
+
+    def load_latest(self) -> Checkpoint:
+        """The newest checkpoint that is whole; a damaged one is passed over with a warning in the log.
+
+        Raises:
+            CheckpointError: there is none.
+            FormatVersionError: the newest readable one is of another format.
+        """
+        self.check_any()
+        reasons: list[str] = []
+        for step in reversed(self.steps()):
+            try:
+                checkpoint = read_checkpoint(self.path(step))
+            except CheckpointError as error:
+                reasons.append(str(error))
+                continue
+            for reason in reasons:
+                _logger.warning("%s; continuing from %s", reason, self.path(step).name)
+            return checkpoint
+        raise CheckpointError(f"no usable checkpoint in {self.directory}: {'; '.join(reasons)}; start the run anew")
+
+    def _prune(self, newest: int) -> None:
+        # a file above the one just written is a damaged one that was passed over: it must not crowd out a good one
+        remaining = [step for step in self.steps() if step <= newest]
+        try:
+            for step in remaining[: -self.keep]:
+                self.path(step).unlink(missing_ok=True)
+            remove_temporaries(self.directory)
+        except OSError as error:
+            _logger.warning("cannot delete old checkpoints in %s: %s", self.directory, error.strerror)
+
+
+def read_checkpoint(path: Path) -> Checkpoint:
+    """Read and verify one checkpoint file.
+
+    Raises:
+        CheckpointError: it cannot be read, or is damaged.
+        FormatVersionError: it is of another format.
+    """
+    with os_errors("read", path, CheckpointError):
+        data = path.read_bytes()
+    try:
+        header = json.loads(tensors.read_metadata(data)[_HEADER_KEY])
+        format_version = header["format_version"]
+    except (ValueError, KeyError, TypeError):
+        raise CheckpointError(f"{path} is damaged: its header cannot be read") from None
+    if format_version != FORMAT_VERSION:
+        raise FormatVersionError.of(path, found=format_version, supported=FORMAT_VERSION)
+    return _decode(path, data, header)
+
+
+def _encode(path: Path, step: int, arrays: Mapping[str, np.ndarray], meta: Mapping[str, Any]) -> bytes:
+    content = {"format_version": FORMAT_VERSION, "step": step, "meta": dict(meta)}
+    try:
+        text = json.dumps(content, sort_keys=True)
+        digest = tensors.digest_of(text, arrays)
+        return tensors.encode(arrays, {_HEADER_KEY: json.dumps({**content, "sha256": digest}, sort_keys=True)})
+    except (TypeError, ValueError) as error:
+        raise CheckpointError(f"cannot write {path}: {error}; give plain arrays and JSON values") from None
+
+
+def _decode(path: Path, data: bytes, header: dict[str, Any]) -> Checkpoint:
+    expected = header.pop("sha256", None)
+    try:
+        arrays = tensors.decode(data)
+    except ValueError as error:
+        raise CheckpointError(f"{path} is damaged: {error}") from None
+    actual = tensors.digest_of(json.dumps(header, sort_keys=True), arrays)
+    if actual != expected:
+        raise CheckpointError(f"{path} is damaged: expected sha256 {expected}, it has {actual}")
+    return Checkpoint(header["step"], arrays, header["meta"])

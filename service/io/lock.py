@@ -1,0 +1,92 @@
+"""One process at a time in a directory: a lock that the kernel frees when its holder dies, however that happens."""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import json
+import logging
+import os
+import socket
+import time
+from io import FileIO
+from pathlib import Path
+
+from service.io.files import os_errors
+from service.store.errors import RunTakenError
+
+LOCK_FILE = ".lock"
+WAIT_S = 0.5
+"""Longer than ``is_locked`` of another process keeps the lock to itself."""
+_logger = logging.getLogger(__name__)
+
+
+class DirectoryLock:
+    """Keeps other processes out of a directory from its making until ``release``, or until this process dies.
+
+    Args:
+        directory: made when missing. On a network file system without locks a warning says that there is none.
+        what_to_do: the end of the error's message.
+        wait_s: how long to wait for a holder that may be about to end.
+
+    Raises:
+        RunTakenError: another process, or another object in this one, has the lock.
+        RegistryError: the directory cannot be written.
+    """
+
+    def __init__(self, directory: Path, what_to_do: str, *, wait_s: float = WAIT_S) -> None:
+        path = directory / LOCK_FILE
+        with os_errors("write", path):
+            directory.mkdir(parents=True, exist_ok=True)
+            self._file = FileIO(path, "a+")
+        try:
+            taken = _take(self._file, fcntl.LOCK_EX, wait_s)
+        except OSError as error:
+            _logger.warning("%s: no locks there (%s); see to it that only one process uses it", path, error.strerror)
+            return
+        if not taken:
+            holder = _read_holder(self._file)
+            self._file.close()
+            raise RunTakenError(f"{directory} is in use by {holder}; {what_to_do}")
+        note = {"pid": os.getpid(), "host": socket.gethostname()}
+        with contextlib.suppress(OSError):  # a full disk: who has it is only told to people
+            self._file.truncate(0)
+            self._file.write(json.dumps(note).encode())
+
+    def fileno(self) -> int:
+        """Of the locked file: a child process that inherits it holds the lock, too."""
+        return self._file.fileno()
+
+    def release(self) -> None:
+        """Let others in; a second call does nothing."""
+        self._file.close()
+
+
+def is_locked(directory: Path) -> bool:
+    """Whether some process holds the directory's lock now."""
+    try:
+        with FileIO(directory / LOCK_FILE, "r") as file:
+            return not _take(file, fcntl.LOCK_SH, 0.0)
+    except OSError:  # nobody ever locked it, or nobody can
+        return False
+
+
+def _take(file: FileIO, kind: int, wait_s: float) -> bool:
+    deadline_s = time.monotonic() + wait_s
+    while True:
+        try:
+            fcntl.flock(file, kind | fcntl.LOCK_NB)
+        except BlockingIOError:
+            if time.monotonic() >= deadline_s:
+                return False
+            time.sleep(0.02)
+        else:
+            return True
+
+
+def _read_holder(file: FileIO) -> str:
+    with contextlib.suppress(OSError, ValueError, KeyError, TypeError):
+        file.seek(0)
+        note = json.loads(file.read(1000))
+        return f"process {int(note['pid'])} on {str(note['host'])[:100]}"
+    return "another process"

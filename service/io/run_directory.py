@@ -1,0 +1,229 @@
+"""A run directory: everything a run leaves behind, and nothing else.
+
+| file | content |
+|---|---|
+| ``config.yaml`` | the resolved configuration |
+| ``environment.json`` | git commit, package versions and cores of the last start |
+| ``metrics.jsonl`` | an object per iteration, keyed by metric; only ``time/...`` differs between equal runs |
+| ``goals.jsonl`` | per iteration a sample of valid proposals: start x y z, goal x y z (metres), solved 0/1 |
+| ``tensorboard/`` | the same metrics as TensorBoard events over env steps |
+| ``checkpoints/`` | the newest checkpoints; ``--resume`` continues from them exactly |
+| ``snapshots/`` | Bob's parameters untrained and after each tenth of the run, kept for good |
+| ``published.json`` | the version this run published last, and the sha256 of its parameters |
+| ``redis/`` | what a run on a cluster keeps in a Redis of its own, where none is configured |
+| ``broken/`` | states of worlds whose physics diverged |
+| ``status.json``, ``goals.json``, ``stop`` | what it tells while it goes on; see ``service.store.disk`` |
+| ``.lock`` | held by the process that runs it |
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import logging
+import os
+import platform
+from collections.abc import Iterator
+from contextlib import contextmanager
+from importlib.metadata import version
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from service.config import Config, ConfigError, dump_config, load_config
+from service.errors import TandemError
+from service.generator.validity import Verdict
+from service.io.checkpoints import CheckpointStore
+from service.io.files import os_errors, remove_temporaries, write_atomic
+from service.io.jsonl import JsonlWriter
+from service.io.lock import DirectoryLock
+from service.registry.errors import RegistryError
+from service.registry.manifest import git_commit
+
+if TYPE_CHECKING:
+    from service.actors.rollout import Broken, GoalRecords
+    from service.io.tensorboard import EventFile
+
+_logger = logging.getLogger(__name__)
+GOALS_PER_ITERATION = 32
+"""Valid proposals recorded per iteration, at most."""
+MAX_BROKEN_FILES = 100
+
+
+class RunDirectory:
+    """Reads and writes the files of one run."""
+
+    def __init__(self, path: Path) -> None:
+        """Nothing is read or written before ``start``."""
+        self.path = path
+        self.config_file = path / "config.yaml"
+        self.metrics_file = path / "metrics.jsonl"
+        self.goals_file = path / "goals.jsonl"
+        self.checkpoints = path / "checkpoints"
+        self.snapshots = path / "snapshots"
+        self.published_file = path / "published.json"
+        self.broken = path / "broken"
+        self.redis = path / "redis"
+        self._metrics = JsonlWriter(self.metrics_file)
+        self._goals = JsonlWriter(self.goals_file)
+        self._events: EventFile | None = None
+        self._failing: set[Path] = set()
+        self._lock: DirectoryLock | None = None
+
+    @property
+    def exists(self) -> bool:
+        """Whether a run has begun here."""
+        return self.config_file.exists()
+
+    def read_config(self) -> Config:
+        """The run's resolved configuration.
+
+        Raises:
+            ConfigError: no run here, or its configuration cannot be read.
+        """
+        if not self.exists:
+            raise ConfigError(f"no run in {self.path}: {self.config_file.name} is missing; name the directory of a run")
+        return load_config(self.config_file)
+
+    def start(self, config: Config, *, after_iteration: int | None = None, after_env_steps: int | None = None) -> None:
+        """Begin a run here, or continue one: then records of later iterations, which will be made again, are dropped.
+
+        Args:
+            config: the run.
+            after_iteration: the last iteration that is not made again; None for a run that begins.
+            after_env_steps: how many there were by then.
+
+        Raises:
+            TandemError: a new run where there is one already, or a directory that cannot be written.
+        """
+        from service.io.tensorboard import EventFile  # TensorBoard's packages, which only a run needs
+
+        if after_iteration is None:
+            self.check_free()
+        else:
+            self._metrics.truncate_after(after_iteration)
+            self._goals.truncate_after(after_iteration)
+        with os_errors("write", self.path):
+            self.checkpoints.mkdir(parents=True, exist_ok=True)
+            remove_temporaries(self.path)
+            self._events = EventFile(self.path / "tensorboard", after_step=after_env_steps)
+            write_atomic(self.path / "environment.json", json.dumps(_environment(), indent=1).encode())
+            write_atomic(self.config_file, dump_config(config).encode())  # last: a start that failed can be tried again
+
+    def read_published(self) -> str | None:
+        """``NAME@VERSION`` of what this run published last; None before the first."""
+        if not self.published_file.exists():
+            return None
+        return str(json.loads(self.published_file.read_bytes())["version"])
+
+    def claim(self, *, resume: bool) -> None:
+        """Keep every other process from running this run until ``close``; a second call does nothing.
+
+        Raises:
+            TandemError: another process runs it; or a new run where there is one already.
+            CheckpointError: ``resume`` where there is no checkpoint. Then, as always, nothing was written.
+        """
+        if self._lock is not None:
+            return
+        if resume:
+            CheckpointStore(self.checkpoints, keep=1).check_any()
+        else:
+            self.check_free()
+        self._lock = DirectoryLock(self.path, "stop that one first, or name another --run-dir")
+        if not resume:
+            self.check_free()  # of two that begin at once, the second sees here what the first has made
+
+    def check_free(self) -> None:
+        """Assert that no run has begun here.
+
+        Raises:
+            TandemError: one has.
+        """
+        if self.exists:
+            raise TandemError(f"{self.path} holds a run already; continue it with --resume, or name another --run-dir")
+
+    def record(self, metrics: dict[str, float]) -> None:
+        """Append one iteration's metrics to metrics.jsonl and TensorBoard; where a disk is full they wait in memory."""
+        with self._going_on(self.metrics_file):
+            self._metrics.append(metrics)
+        if self._events is not None:
+            with self._going_on(self.path / "tensorboard"):
+                self._events.add(metrics)
+
+    def record_goals(self, iteration: int, num_env_steps: int, records: GoalRecords) -> None:
+        """Append a sample of this iteration's valid proposals that the current Bob played."""
+        rows = sampled_goals(records)
+        table = np.concatenate(
+            [records.start_position[rows], records.goal[rows], records.solved[rows, None].astype(float)], axis=1
+        )
+        # "iteration" counts finished iterations, as in metrics.jsonl, so that a resume cuts both files alike.
+        with self._going_on(self.goals_file):
+            self._goals.append({"iteration": iteration + 1, "env_steps": num_env_steps, "goals": np.round(table, 4)})
+
+    def dump_broken(self, name: str, broken: Broken) -> None:
+        """Save the states and actions whose physics diverged in a round, by its name; at most 100 rounds are kept."""
+        if not broken or (self.broken.is_dir() and len(list(self.broken.iterdir())) >= MAX_BROKEN_FILES):
+            return
+        states, actions = zip(*broken, strict=True)
+        path, data = self.broken / f"round-{name}.npz", io.BytesIO()
+        np.savez(data, states=np.stack(states), actions=np.stack(actions))
+        _logger.warning("physics diverged in %d worlds, which go on from sound states; see %s", len(states), path)
+        with self._going_on(self.broken), os_errors("write", path):
+            write_atomic(path, data.getvalue())
+
+    def sync(self) -> None:
+        """See to it that a power cut leaves every record there; a checkpoint must not know more than they do."""
+        for writer, path in self._writers():
+            with self._going_on(path):
+                writer.sync()
+
+    def close(self) -> None:
+        """Write what still waits for room on the disk, and let other processes in.
+
+        What does not fit is lost, and a warning says so.
+        """
+        for writer, _ in self._writers():
+            try:
+                writer.sync()
+            except RegistryError as error:  # must not hide why the run ended
+                _logger.warning("the newest records are lost: %s", error)
+        self._events = None
+        if self._lock is not None:
+            self._lock.release()
+            self._lock = None
+
+    def _writers(self) -> list[tuple[JsonlWriter | EventFile, Path]]:
+        writers: list[tuple[JsonlWriter | EventFile, Path]] = [
+            (self._metrics, self.metrics_file),
+            (self._goals, self.goals_file),
+        ]
+        return writers if self._events is None else [*writers, (self._events, self.path / "tensorboard")]
+
+    @contextmanager
+    def _going_on(self, path: Path) -> Iterator[None]:
+        """A full disk is no reason to end a night's run; what is wrong with ``path`` is said once, until it is well."""
+        try:
+            yield
+        except RegistryError as error:
+            if path not in self._failing:
+                _logger.warning("%s; the run goes on", error)
+            self._failing.add(path)
+        else:
+            self._failing.discard(path)
+
+
+def sampled_goals(records: GoalRecords) -> NDArray[np.int64]:
+    """The worlds whose goals are recorded: valid proposals that the current Bob played, not too many."""
+    chosen = (records.verdict == Verdict.VALID) & records.played & ~records.replayed & ~records.bob_past
+    return np.flatnonzero(chosen)[:GOALS_PER_ITERATION]
+
+
+def _environment() -> dict[str, object]:
+    return {
+        "git_commit": git_commit(),
+        "python": platform.python_version(),
+        "packages": {name: version(name) for name in ("mujoco", "numpy", "torch")},
+        "num_cores": os.cpu_count(),
+    }

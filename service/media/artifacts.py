@@ -1,0 +1,65 @@
+"""What a run leaves for a person to look at, made from its directory alone."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+
+from service.actors.coverage import skill_trajectories, visited_share
+from service.config import Config
+from service.errors import TandemError
+from service.io.run_directory import RunDirectory
+from service.media.plots import plot_coverage, plot_curves, plot_goals
+from service.policies.evaluator import MCPEvaluator
+from service.primitives.loading import load_players
+
+NUM_SKILLS = 32
+"""Random compositions in the coverage picture (paper)."""
+COVERAGE_STEPS = 100
+NUM_FILMED_ROUNDS = 4
+_SEED = 7
+_logger = logging.getLogger(__name__)
+
+
+def make_artifacts(directory: RunDirectory) -> dict[str, Path]:
+    """Draw the curves, the goals and the coverage, and film a few rounds.
+
+    Returns:
+        Files by what they show. What cannot be made, for want of an OpenGL library or of room on the disk, is left
+        out, and a warning says why.
+    """
+    config = directory.read_config()
+    alice, bob = load_players(directory)
+
+    def film() -> Path:
+        from service.media.video import film_rounds, write_video
+
+        takes = film_rounds(config, alice, bob, num_rounds=NUM_FILMED_ROUNDS, seed=_SEED)
+        return write_video(takes, config.world, directory.path / "rounds.mp4")
+
+    makers: dict[str, Callable[[], Path]] = {
+        "curves": partial(plot_curves, directory.path),
+        "goals": partial(plot_goals, directory.path, config.world.workspace),
+    }
+    if isinstance(bob, MCPEvaluator):
+        makers["coverage"] = partial(_draw_coverage, directory, config, bob)
+    files = {}
+    for name, make in (makers | {"video": film}).items():
+        try:
+            files[name] = make()
+        except TandemError as error:
+            _logger.warning("no %s: %s", name, error)
+    return files
+
+
+def _draw_coverage(directory: RunDirectory, config: Config, bob: MCPEvaluator) -> Path:
+    paths = skill_trajectories(bob, config.world, num_skills=NUM_SKILLS, num_steps=COVERAGE_STEPS, seed=_SEED)
+    share = visited_share(paths, config.world.workspace)
+    return plot_coverage(
+        list(paths),
+        config.world.workspace,
+        directory.path / "coverage.png",
+        f"{config.name}, {share:.0%} of the table's cells visited",
+    )

@@ -1,0 +1,10 @@
+"""The pictures of a run: its curves, where its goals are, and what random compositions of its primitives do.
+
+matplotlib is loaded by the first call, not by the import.
+"""
+
+from service.media.plots.coverage import plot_coverage
+from service.media.plots.curves import plot_curves
+from service.media.plots.goals import plot_goals
+
+__all__ = ["plot_coverage", "plot_curves", "plot_goals"]

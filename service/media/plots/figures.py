@@ -1,0 +1,110 @@
+"""What the pictures share: their figure, axes, colours, and how they are read and saved.
+
+A ``Figure`` is made without pyplot, so no window system and no global state is needed. Colours are Okabe and Ito's,
+which colour-blind readers tell apart.
+"""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from service.config import WorkspaceConfig
+from service.errors import TandemError
+from service.io.files import os_errors, write_atomic
+from service.io.jsonl import read_jsonl
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+Array = NDArray[np.float64]
+
+BLUE, ORANGE, GREEN = "#0072B2", "#D55E00", "#009E73"
+INK, FAINT = "#222222", "#777777"
+MARGIN_M = 0.03
+EDGE_STYLE = (0, (4, 3))
+_DPI = 100
+
+
+def read_records(path: Path) -> list[dict[str, Any]]:
+    """The records of ``path``.
+
+    Raises:
+        TandemError: the file is missing, damaged, or holds no record yet.
+    """
+    records = read_jsonl(path)
+    if not records:
+        raise TandemError(f"{path} holds no record yet; wait for the run's first iteration and draw again")
+    return records
+
+
+def column(records: Sequence[dict[str, Any]], key: str) -> Array:
+    """The values of ``key``, NaN where a record lacks it or its value is not finite, (len(records),)."""
+    values = np.array([_number(record.get(key)) for record in records])
+    return np.where(np.isfinite(values), values, np.nan)
+
+
+def _number(value: Any) -> float:
+    return float(value) if isinstance(value, (int, float)) else np.nan
+
+
+def new_figure(width: float, height: float, title: str) -> Figure:
+    """An empty figure of ``width`` by ``height`` hundred pixels with its title at the top left."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(width, height), dpi=_DPI, facecolor="white")
+    figure.text(0.02, 0.955, title, fontsize=15, weight="bold", color=INK, va="center")
+    return figure
+
+
+def save(figure: Figure, path: Path) -> Path:
+    """Write ``figure`` as a PNG that takes its name only when it is whole; gives ``path`` back.
+
+    Raises:
+        TandemError: the disk is full or the file cannot be written.
+    """
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png")
+    with os_errors("write", path):
+        write_atomic(path, buffer.getvalue())
+    return path
+
+
+def style_axes(axes: Axes) -> None:
+    """Two quiet axis lines, small ticks, a faint grid behind the data."""
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.spines[["left", "bottom"]].set_color("#bbbbbb")
+    axes.tick_params(colors="#555555", labelsize=9, length=3)
+    axes.grid(True, color="#ececec", linewidth=0.8)
+    axes.set_axisbelow(True)
+    axes.locator_params(nbins=5)
+
+
+def counted(number: int, noun: str) -> str:
+    """``number`` and ``noun``, with the plural's s where it belongs."""
+    return f"{number} {noun}" if number == 1 else f"{number} {noun}s"
+
+
+def bounds(workspace: WorkspaceConfig) -> tuple[Array, Array]:
+    """The lowest and the highest corner of the workspace's box, metres, (3,) each."""
+    half = np.array([workspace.length_x_m, workspace.length_y_m]) / 2
+    center = np.array([workspace.center_x_m, workspace.center_y_m])
+    return np.append(center - half, 0.0), np.append(center + half, workspace.height_m)
+
+
+def draw_outline(axes: Axes, workspace: WorkspaceConfig) -> None:
+    """Set ``axes`` up as a view from above, with the edge of the workspace dashed."""
+    low, high = bounds(workspace)
+    style_axes(axes)
+    corners = np.array([[0, 0], [1, 0], [1, 1], [0, 1], [0, 0]])
+    axes.plot(*(low[:2] + corners * (high - low)[:2]).T, color=INK, linewidth=1.0, linestyle=EDGE_STYLE)
+    axes.set_aspect("equal", adjustable="box")
+    axes.set_xlim(low[0] - MARGIN_M, high[0] + MARGIN_M)
+    axes.set_ylim(low[1] - MARGIN_M, high[1] + MARGIN_M)
+    axes.set_xlabel("x (m), away from the robot", color=FAINT)

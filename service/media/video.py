@@ -1,0 +1,250 @@
+"""Videos for people: Alice's proposal beside Bob's attempt, and Bob on several goals at once.
+
+H.264 at the world's own pace. Without a graphics card a picture takes a twentieth to a tenth of a second, so a slow
+machine's video shows every second state only.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import functools
+import itertools
+import os
+import subprocess
+import time
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from service.config import WorldConfig
+from service.envs.rendering.renderer import RenderError, SceneRenderer
+from service.generator.validity import Verdict
+from service.io.files import TEMPORARY_PREFIX, os_errors
+from service.media.recording import Episodes, StateArray, Take, film_episodes, film_rounds
+
+__all__ = ["Episodes", "Take", "film_episodes", "film_rounds", "write_episode_video", "write_video"]
+
+Image = NDArray[np.uint8]
+Colour = tuple[int, int, int]
+
+PANE_SIZE = 400
+"""Width and height of one player's picture, pixels."""
+EPISODE_PANE_SIZE = 272
+BAR_HEIGHT = 36
+"""Height of the caption over each picture, pixels."""
+EPISODE_COLUMNS = 3
+MAX_DRAWING_S = 25.0
+"""Where drawing every state would take longer, every second one is drawn."""
+GOAL_PAUSE_S, END_PAUSE_S = 0.4, 0.8
+
+_PAPER, _INK, _FAINT = (248, 248, 248), (34, 34, 34), (140, 140, 140)
+_BLUE, _ORANGE, _GREEN = (0, 114, 178), (213, 94, 0), (0, 138, 100)
+_NO_GOAL = {
+    Verdict.NOT_MOVED: "the object hardly moved",
+    Verdict.OUTSIDE: "it left the workspace",
+    Verdict.FALLEN: "it fell off the table",
+}
+
+
+def write_video(takes: Sequence[Take], config: WorldConfig, path: Path, *, pane_size: int = PANE_SIZE) -> Path:
+    """Write rounds one after another, Alice on the left and Bob on the right.
+
+    Args:
+        takes: at least one, from ``film_rounds``.
+        config: the world they were played in.
+        path: where to; an mp4 that takes its name only when it is whole.
+        pane_size: width and height of one player's picture, pixels, even.
+
+    Returns:
+        ``path``.
+
+    Raises:
+        RenderError: no OpenGL or no ffmpeg here.
+        TandemError: the disk is full or the file cannot be written.
+    """
+    num_pictures = sum(len(take.alice_states) + len(take.bob_states) for take in takes)
+    with SceneRenderer(config, pane_size, pane_size) as renderer:
+        every = _stride(renderer, takes[0].alice_states[0], num_pictures)
+        frame_s = every * _step_s(config)
+        frames = (
+            frame
+            for index, take in enumerate(takes)
+            for frame in _round_frames(renderer, take, f"{index + 1}/{len(takes)}", every, _step_s(config))
+        )
+        return _encode(frames, path, fps=1 / frame_s)
+
+
+def write_episode_video(
+    episodes: Episodes, config: WorldConfig, path: Path, *, pane_size: int = EPISODE_PANE_SIZE
+) -> Path:
+    """Write episodes all at once, in rows of three.
+
+    Args:
+        episodes: from ``film_episodes``.
+        config: the world they were played in.
+        path: where to; an mp4 that takes its name only when it is whole.
+        pane_size: width and height of one picture, pixels, even.
+
+    Returns:
+        ``path``.
+
+    Raises:
+        RenderError: no OpenGL or no ffmpeg here.
+        TandemError: the disk is full or the file cannot be written.
+    """
+    num_steps, num_episodes = episodes.reached.shape
+    with SceneRenderer(config, pane_size, pane_size) as renderer:
+        every = _stride(renderer, episodes.states[0, 0], num_steps * num_episodes)
+        frame_s = every * _step_s(config)
+        return _encode(_episode_frames(renderer, episodes, every, frame_s), path, fps=1 / frame_s)
+
+
+# --- what is shown -------------------------------------------------------------------------------------------------
+
+
+def _round_frames(renderer: SceneRenderer, take: Take, number: str, every: int, step_s: float) -> Iterator[Image]:
+    """Alice moves while Bob waits, then Bob moves, then both rest; ``number`` is shown with it."""
+    waiting = _caption(_faded(renderer.render(take.bob_states[0])), "Bob waits", _FAINT, number)
+    for step in _thinned(len(take.alice_states), every):
+        picture = renderer.render(take.alice_states[step])
+        yield _beside(_caption(picture, "Alice proposes a goal", _ORANGE), waiting)
+    if take.verdict != Verdict.VALID:
+        left = _caption(picture, f"Alice: no goal, {_NO_GOAL[take.verdict]}", _ORANGE)
+        yield from _hold(_beside(left, waiting), END_PAUSE_S, every * step_s)
+        return
+    left = _caption(picture, "Alice proposed this goal", _INK)
+    picture = renderer.render(take.bob_states[0], take.goal)
+    yield from _hold(_beside(left, _caption(picture, "Bob's turn", _BLUE, number)), GOAL_PAUSE_S, every * step_s)
+    for step in _thinned(len(take.bob_states), every):
+        picture = renderer.render(take.bob_states[step], take.goal)
+        yield _beside(left, _caption(picture, f"Bob tries: {step * step_s:.1f} s", _BLUE, number))
+    right = _caption(picture, *_result(take, step_s), number)
+    yield from _hold(_beside(left, right), END_PAUSE_S, every * step_s)
+
+
+def _result(take: Take, step_s: float) -> tuple[str, Colour]:
+    elapsed_s = (len(take.bob_states) - 1) * step_s
+    if take.solved:
+        return f"Bob: solved after {elapsed_s:.1f} s", _GREEN
+    return f"Bob: not solved in {elapsed_s:.1f} s", _ORANGE
+
+
+def _episode_frames(renderer: SceneRenderer, episodes: Episodes, every: int, frame_s: float) -> Iterator[Image]:
+    num = len(episodes.goal)
+    for step in _thinned(len(episodes.states), every):
+        panes = []
+        for episode in range(num):
+            picture = renderer.render(episodes.states[step, episode], episodes.goal[episode])
+            text, colour = ("at the goal", _GREEN) if episodes.reached[step, episode] else ("on the way", _FAINT)
+            panes.append(_caption(picture, text, colour, f"{episode + 1}/{num}"))
+        frame = _grid(panes)
+        yield frame
+    yield from _hold(frame, END_PAUSE_S, frame_s)
+
+
+def _step_s(config: WorldConfig) -> float:
+    return config.physics_step_s * config.num_substeps
+
+
+def _stride(renderer: SceneRenderer, state: StateArray, num_pictures: int) -> int:
+    """1, or 2 where this machine is too slow to draw every state."""
+    renderer.render(state)  # the first picture takes longer
+    start = time.perf_counter()
+    renderer.render(state)
+    return 1 if num_pictures * (time.perf_counter() - start) <= MAX_DRAWING_S else 2
+
+
+def _thinned(num: int, every: int) -> list[int]:
+    """Every so many of ``num`` indices, and always the last."""
+    return [*range(0, num - 1, every), num - 1]
+
+
+def _hold(frame: Image, pause_s: float, frame_s: float) -> Iterator[Image]:
+    for _ in range(max(round(pause_s / frame_s), 1)):
+        yield frame
+
+
+# --- pictures ------------------------------------------------------------------------------------------------------
+
+
+def _faded(image: Image) -> Image:
+    faded: Image = (0.45 * image + 0.55 * 235).astype(np.uint8)
+    return faded
+
+
+def _beside(*panes: Image) -> Image:
+    return np.concatenate(panes, axis=1)
+
+
+def _grid(panes: list[Image]) -> Image:
+    """Panes in rows of three, the last row filled up with paper."""
+    columns = min(len(panes), EPISODE_COLUMNS)
+    panes = panes + [np.full_like(panes[0], _PAPER)] * (-len(panes) % columns)
+    return np.concatenate([_beside(*panes[first : first + columns]) for first in range(0, len(panes), columns)])
+
+
+def _caption(image: Image, text: str, colour: Colour, number: str = "") -> Image:
+    return np.concatenate([_bar(image.shape[1], text, colour, number), image])
+
+
+@functools.lru_cache(maxsize=64)
+def _bar(width: int, text: str, colour: Colour, number: str) -> Image:
+    from PIL import Image as Pillow
+    from PIL import ImageDraw, ImageFont
+
+    bar = Pillow.new("RGB", (width, BAR_HEIGHT), _PAPER)
+    drawing, font = ImageDraw.Draw(bar), ImageFont.load_default(17)
+    drawing.text((12, BAR_HEIGHT / 2), text, fill=colour, font=font, anchor="lm")
+    drawing.text((width - 12, BAR_HEIGHT / 2), number, fill=_FAINT, font=font, anchor="rm")
+    return np.asarray(bar)
+
+
+# --- file ----------------------------------------------------------------------------------------------------------
+
+
+def _encode(frames: Iterator[Image], path: Path, *, fps: float) -> Path:
+    """Send frames to ffmpeg; the file takes its name only when it is whole."""
+    temporary = path.parent / f"{TEMPORARY_PREFIX}{os.getpid()}-{path.name}"
+    try:
+        with os_errors("write", path):
+            path.parent.mkdir(parents=True, exist_ok=True)
+            _run_ffmpeg(frames, temporary, fps)
+            temporary.replace(path)
+    finally:
+        with contextlib.suppress(OSError):
+            temporary.unlink(missing_ok=True)
+    return path
+
+
+def _run_ffmpeg(frames: Iterator[Image], path: Path, fps: float) -> None:
+    first = next(frames)
+    height, width = first.shape[:2]
+    command = [
+        _ffmpeg(), "-y", "-loglevel", "error", "-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{width}x{height}",
+        "-r", f"{fps:g}", "-i", "pipe:", "-c:v", "libx264", "-pix_fmt", "yuv420p", "-crf", "21", "-preset", "veryfast",
+        "-movflags", "+faststart", "-f", "mp4", str(path),
+    ]  # fmt: skip
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stderr=subprocess.PIPE) as ffmpeg:
+        assert ffmpeg.stdin is not None
+        try:
+            with contextlib.suppress(BrokenPipeError):  # it stopped early; its exit status and words follow
+                for frame in itertools.chain([first], frames):
+                    ffmpeg.stdin.write(frame.tobytes())
+            words = ffmpeg.communicate()[1].decode(errors="replace").strip()
+        except BaseException:
+            ffmpeg.kill()
+            raise
+    if ffmpeg.returncode:
+        raise OSError(errno.EIO, f"ffmpeg says {words.splitlines()[-1] if words else ffmpeg.returncode!r}")
+
+
+def _ffmpeg() -> str:
+    import imageio_ffmpeg
+
+    try:
+        return str(imageio_ffmpeg.get_ffmpeg_exe())
+    except RuntimeError:
+        raise RenderError("cannot write a video: there is no ffmpeg; install it (apt-get install ffmpeg)") from None

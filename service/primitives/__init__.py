@@ -1,0 +1,1 @@
+"""Primitives: loading, publishing, and those that come with the package."""

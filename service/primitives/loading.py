@@ -1,0 +1,104 @@
+"""Finding a Bob to evaluate, render or compose: in a registry, or in a run directory."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from service.config import Config, parse_config
+from service.errors import TandemError
+from service.io.checkpoints import Checkpoint, CheckpointStore, read_checkpoint
+from service.io.run_directory import RunDirectory
+from service.policies.evaluator import GaussianEvaluator, MCPEvaluator, bob_evaluator
+from service.policies.parameters import Parameters, PolicyError
+from service.primitives.bundled import find_version
+from service.registry.manifest import Manifest
+
+
+@dataclass(frozen=True, slots=True)
+class TrainedBob:
+    """A Bob ready to act, and the configuration he was trained with."""
+
+    label: str
+    """Where he comes from, such as ``panda-cube@3``."""
+    policy: MCPEvaluator | GaussianEvaluator
+    config: Config
+    manifest: Manifest | None = None
+    """What the registry knows about him; None for the Bob of a run directory."""
+
+    @property
+    def primitives(self) -> MCPEvaluator:
+        """What can be composed.
+
+        Raises:
+            TandemError: this Bob is monolithic.
+        """
+        if not isinstance(self.policy, MCPEvaluator):
+            raise TandemError(f"{self.label} has no primitives: it was trained with policy.monolithic_bob")
+        return self.policy
+
+
+def load_bob(reference: str, registry: Path) -> TrainedBob:
+    """Load NAME, NAME@ALIAS or NAME@VERSION from a registry, or the newest checkpoint of a run directory.
+
+    Args:
+        reference: of a version, or a run directory.
+        registry: directory to look in first; a name it does not have is looked up among what comes with the package.
+
+    Raises:
+        TandemError: neither a run directory nor a published version, or damaged.
+    """
+    if Path(reference).is_dir():
+        directory = RunDirectory(Path(reference))
+        config, parameters = directory.read_config(), read_parameters(directory, "bob")
+        return TrainedBob(reference, bob_evaluator(parameters), config)
+    if "/" in reference:
+        raise TandemError(f"{reference}: no such run directory; for published primitives write NAME@ALIAS")
+    found, version = find_version(reference, registry)
+    manifest, tensors = found.load(str(version))
+    config = parse_config(manifest.config, where=f"the manifest of {reference}")
+    # two registries may both have a version 1: which one was meant must be seen
+    label = f"{version} (bundled)" if found.bundled else str(version)
+    return TrainedBob(label, _evaluator(label, tensors), config, manifest)
+
+
+def _evaluator(label: str, parameters: Parameters) -> MCPEvaluator:
+    try:
+        return MCPEvaluator(parameters)
+    except PolicyError as error:
+        raise TandemError(f"{label} holds no primitives: {error}") from None
+
+
+def load_players(directory: RunDirectory) -> tuple[GaussianEvaluator, MCPEvaluator | GaussianEvaluator]:
+    """Alice and Bob of a run's newest checkpoint.
+
+    Raises:
+        TandemError: no usable checkpoint.
+    """
+    return (
+        GaussianEvaluator(read_parameters(directory, "alice")),
+        bob_evaluator(read_parameters(directory, "bob")),
+    )
+
+
+def read_parameters(directory: RunDirectory, player: str) -> Parameters:
+    """Parameters of ``alice`` or ``bob`` in a run's newest checkpoint."""
+    return _parameters(CheckpointStore(directory.checkpoints, keep=1).load_latest(), player)
+
+
+def read_stages(directory: RunDirectory) -> dict[int, Parameters]:
+    """Bob's parameters in a run's snapshots and in its newest checkpoint, by env steps of training, in their order.
+
+    Raises:
+        TandemError: a snapshot is damaged, or there is no usable checkpoint.
+    """
+    store = CheckpointStore(directory.snapshots, keep=1)
+    saved = [read_checkpoint(store.path(step)) for step in store.steps()]
+    saved.append(CheckpointStore(directory.checkpoints, keep=1).load_latest())
+    stages = {int(each.meta["env_steps"]): _parameters(each, "bob") for each in saved}
+    return dict(sorted(stages.items()))  # a killed run may have a snapshot that is newer than its checkpoint
+
+
+def _parameters(checkpoint: Checkpoint, player: str) -> Parameters:
+    prefix = f"{player}/"
+    return {name.removeprefix(prefix): array for name, array in checkpoint.arrays.items() if name.startswith(prefix)}

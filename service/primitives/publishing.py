@@ -1,0 +1,115 @@
+"""From a trained Bob to a version in the registry: measured, published once, and told which version he comes from."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+
+from service.actors.evaluation import evaluate
+from service.config import Config
+from service.envs.observations import NORMALISATION_BOB, SPACES
+from service.io import tensors
+from service.io.files import os_errors, write_atomic
+from service.io.run_directory import RunDirectory
+from service.policies.evaluator import bob_evaluator
+from service.policies.parameters import Parameters
+from service.registry.blobs import sha256_of
+from service.registry.errors import RegistryError
+from service.registry.names import Version
+from service.registry.registry import Registry
+from service.runtime.runner import EVALUATED_GOALS, EVALUATION_SEED
+
+FINAL_EVALUATION_EPISODES = 300
+
+
+def measure_bob(config: Config, parameters: Parameters) -> dict[str, float]:
+    """Bob's success rates without noise on every kind of goals of a run, by metric; but not the run's own goals."""
+    bob = bob_evaluator(parameters)
+    metrics = {}
+    for kind in EVALUATED_GOALS:
+        result = evaluate(
+            bob,
+            config.world,
+            kind,
+            num_episodes=FINAL_EVALUATION_EPISODES,
+            num_steps=config.run.evaluation_steps,
+            success_distance_m=config.game.success_distance_m,
+            seed=EVALUATION_SEED + 1,
+            num_threads=config.run.num_threads,
+        )
+        metrics[f"evaluation/{kind}_success_last"] = result.success_last
+        metrics[f"evaluation/{kind}_success_ever"] = result.success_ever
+    return metrics
+
+
+def publish_run(
+    directory: RunDirectory, registry: Registry, config: Config, parameters: Parameters, metrics: dict[str, float]
+) -> Version:
+    """Publish a run's Bob, and note it in the run directory: of what the run publishes next, this is the parent.
+
+    Args:
+        directory: of the run.
+        registry: where to.
+        config: the run's.
+        parameters: Bob's.
+        metrics: finite numbers for the manifest.
+
+    Returns:
+        The new version, or the newest one of that name where it has the same parameters already.
+
+    Raises:
+        RegistryError: see ``Registry.publish``; or the run directory cannot be written.
+    """
+    version = _newest_if_same(registry, config.name, parameters)
+    if version is None:
+        parent = _published_before(directory, registry)
+        version = publish_bob(registry, config, parameters, metrics, parent=parent)
+    note = {"version": str(version), "blob_sha256": registry.manifest(str(version)).blob_sha256}
+    with os_errors("write", directory.published_file):
+        write_atomic(directory.published_file, json.dumps(note).encode())
+    return version
+
+
+def publish_bob(
+    registry: Registry,
+    config: Config,
+    parameters: Parameters,
+    metrics: dict[str, float],
+    *,
+    parent: str | None = None,
+) -> Version:
+    """Publish Bob with everything a user of him needs.
+
+    Raises:
+        RegistryError: see ``Registry.publish``.
+    """
+    return registry.publish(
+        config.name,
+        parameters,
+        spaces=SPACES,
+        normalisation={"offset": NORMALISATION_BOB.offset.tolist(), "scale": NORMALISATION_BOB.scale.tolist()},
+        config=config.model_dump(mode="json"),
+        metrics=metrics,
+        parent=parent,
+    )
+
+
+def _newest_if_same(registry: Registry, name: str, parameters: Parameters) -> Version | None:
+    """A finished run that is resumed and has nothing left to do must not publish its Bob a second time."""
+    for version in registry.versions(name)[-1:]:
+        with contextlib.suppress(RegistryError):  # a damaged version is mended by publishing again
+            manifest, _ = registry.load(str(version))
+            if manifest.blob_sha256 == sha256_of(tensors.encode(parameters)):
+                return version
+    return None
+
+
+def _published_before(directory: RunDirectory, registry: Registry) -> str | None:
+    """What this run published last, if this registry is where it did so."""
+    if not directory.published_file.exists():
+        return None
+    note = json.loads(directory.published_file.read_bytes())
+    with contextlib.suppress(RegistryError):
+        if registry.manifest(note["version"]).blob_sha256 == note["blob_sha256"]:
+            return str(note["version"])
+    return None

@@ -1,0 +1,177 @@
+"""What both runners keep alike: counters, records, checkpoints, snapshots, and when a run is over."""
+
+from __future__ import annotations
+
+import logging
+import sys
+from collections import defaultdict
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from typing import Any
+
+from numpy.typing import NDArray
+
+from service.config import Config
+from service.errors import DivergedError
+from service.io.checkpoints import CheckpointStore
+from service.io.run_directory import RunDirectory
+from service.policies.parameters import Parameters, PolicyError
+from service.registry.errors import CheckpointError
+
+Arrays = dict[str, NDArray[Any]]
+Metrics = dict[str, float]
+_logger = logging.getLogger(__name__)
+
+NUM_SNAPSHOTS = 10
+"""Of Bob, evenly over a run's env steps; one of him untrained comes before them."""
+
+
+class UnsavedError(CheckpointError):
+    """A run has ended, and its last checkpoint could not be written."""
+
+    exit_code = 1
+
+
+class Books:
+    """The books of one run: how far it is, and all that it leaves behind.
+
+    Args:
+        config: the run.
+        directory: where it keeps everything.
+    """
+
+    iteration: int
+    """Finished ones."""
+    num_env_steps: int
+    wall_s: float
+    """Spent on iterations, by all processes that ran this run."""
+
+    def __init__(self, config: Config, directory: RunDirectory) -> None:
+        self.config = config
+        self.directory = directory
+        self.checkpoints = CheckpointStore(directory.checkpoints, config.run.keep_checkpoints)
+        self._snapshots = CheckpointStore(directory.snapshots, keep=sys.maxsize)
+        self.iteration, self.num_env_steps, self.wall_s = 0, 0, 0.0
+        self._saved: int | None = None
+
+    def resume(self) -> tuple[dict[str, Arrays], dict[str, Any]]:
+        """Take over the newest checkpoint's counters.
+
+        Returns:
+            Its arrays by part, and what else was saved.
+
+        Raises:
+            CheckpointError: there is no usable one.
+        """
+        checkpoint = self.checkpoints.load_latest()
+        parts: dict[str, Arrays] = defaultdict(dict)
+        for name, array in checkpoint.arrays.items():
+            part, _, rest = name.partition("/")
+            parts[part][rest] = array
+        self.iteration, self.num_env_steps = checkpoint.step, int(checkpoint.meta["env_steps"])
+        self.wall_s = float(checkpoint.meta["wall_s"])
+        _logger.info("resumed at iteration %d, %d env steps", self.iteration, self.num_env_steps)
+        return parts, checkpoint.meta
+
+    @property
+    def budget_spent(self) -> bool:
+        """Whether there were as many env steps as there shall be."""
+        return self.num_env_steps >= self.config.run.total_env_steps
+
+    @property
+    def save_due(self) -> bool:
+        """Whether a checkpoint is to be written after this iteration."""
+        return self.iteration % self.config.run.checkpoint_interval == 0
+
+    @property
+    def evaluation_due(self) -> bool:
+        """Whether Bob is to be evaluated after this iteration."""
+        interval = self.config.run.evaluation_interval
+        return interval > 0 and self.iteration % interval == 0
+
+    def count(self, num_env_steps: int) -> None:
+        """Count an iteration."""
+        self.iteration += 1
+        self.num_env_steps += num_env_steps
+
+    def save(self, parts: Mapping[str, Mapping[str, NDArray[Any]]], meta: Mapping[str, Any]) -> None:
+        """Write a checkpoint of this iteration: with it alone a new process goes on.
+
+        Args:
+            parts: arrays by part and name.
+            meta: plain values beside those of the books.
+
+        Raises:
+            CheckpointError: a full disk; earlier checkpoints are intact.
+        """
+        arrays = {f"{part}/{name}": array for part, state in parts.items() for name, array in state.items()}
+        config = self.config.model_dump(mode="json")
+        own = {"config": config, "env_steps": self.num_env_steps, "wall_s": self.wall_s}
+        self.directory.sync()
+        self.checkpoints.save(self.iteration, arrays, {**own, **meta})
+        self._saved = self.iteration
+
+    @property
+    def saved(self) -> bool:
+        """Whether this iteration has a checkpoint."""
+        return self._saved == self.iteration
+
+    @contextmanager
+    def going_on(self, how: str) -> Iterator[None]:
+        """A full disk is no reason to end a night's run: what was saved before is intact, and what comes may fit."""
+        try:
+            yield
+        except CheckpointError as error:
+            _logger.warning("%s; the run goes on, %s", error, how)
+
+    @contextmanager
+    def diverging(self) -> Iterator[None]:
+        """Adds to the error of a policy that has diverged when that was, and how to go on from before it.
+
+        Raises:
+            DivergedError: one has.
+        """
+        played = self.iteration
+        try:
+            yield
+        except (DivergedError, PolicyError) as error:
+            newest, learner = max(self.checkpoints.steps(), default=0), self.config.learner
+            has_it = f"delete {self.checkpoints.path(newest).name}, which has this policy; " if newest == played else ""
+            rates = f"alice.learning_rate={learner.alice.learning_rate / 2:g} --set learner.bob.learning_rate="
+            said = str(error).strip().splitlines()[-1]  # from another process it comes with its traceback
+            raise DivergedError(
+                f"{self.directory.path}, iteration {played + 1}: {said}: {has_it}resume with lower learning rates, "
+                f"for example --resume --set learner.{rates}{learner.bob.learning_rate / 2:g}"
+            ) from error
+
+    @contextmanager
+    def saving_last(self) -> Iterator[None]:
+        """Says what is lost where the last checkpoint of a run cannot be written.
+
+        Raises:
+            UnsavedError: it could not.
+        """
+        try:
+            yield
+        except CheckpointError as error:
+            saved = max(self.checkpoints.steps(), default=None)
+            raise UnsavedError(
+                f"{error}; the run is at iteration {self.iteration}, saved is iteration {saved}: --resume goes on there"
+            ) from error
+
+    def snapshot_due(self, *, after: int) -> bool:
+        """Whether a tenth of the budget was reached after that many env steps."""
+        tenths = [steps * NUM_SNAPSHOTS // self.config.run.total_env_steps for steps in (after, self.num_env_steps)]
+        return tenths[0] != tenths[1]
+
+    def take_snapshot(self, bob: Parameters) -> None:
+        """Keep Bob for good.
+
+        Checkpoints go, but what he could do at the beginning and in the middle is asked when the run is over. A resumed
+        run takes those it takes again with the same bits.
+
+        Raises:
+            CheckpointError: a full disk.
+        """
+        arrays = {f"bob/{name}": array for name, array in bob.items()}
+        self._snapshots.save(self.iteration, arrays, {"env_steps": self.num_env_steps})

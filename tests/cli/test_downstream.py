@@ -1,0 +1,121 @@
+import json
+import os
+import shutil
+import signal
+
+import pytest
+from typer.testing import CliRunner
+
+from service.cli import downstream as commands
+from service.cli.main import app
+from service.registry.registry import BUNDLED
+from tests.downstream.cells import SETS
+from tests.status.conftest import serve
+
+
+def invoke(*arguments):
+    return CliRunner().invoke(app, ["downstream", *map(str, arguments)])
+
+
+def train(*arguments):
+    return invoke("train", "--steps", 600, "--episodes", 4, "--threads", 1, *SETS, *arguments)
+
+
+@pytest.fixture(autouse=True)
+def nowhere(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.delenv("TANDEM_REGISTRY", raising=False)
+
+
+def test_a_signal_saves_and_the_same_command_continues(tmp_path, monkeypatch):
+    show = commands._Line.show
+    monkeypatch.setattr(
+        commands._Line, "show", lambda line, metrics: show(line, metrics) or os.kill(os.getpid(), signal.SIGTERM)
+    )
+    cut = train("--task", "wall")
+    assert cut.exit_code == 128 + signal.SIGTERM
+    assert "saved; continue with the same command and --resume" in cut.stderr
+    assert "env steps" in cut.stderr
+    path = tmp_path / "runs" / "downstream" / "wall-ours-0"
+    assert (path / "checkpoint.pt").exists()
+    assert not (path / "result.json").exists()
+    monkeypatch.setattr(commands._Line, "show", lambda line, metrics: None)
+    monkeypatch.setattr("service.downstream.worker._film", lambda *arguments: path)
+    done = train("--task", "wall", "--resume", "--json")
+    assert done.exit_code == 0, done.output
+    assert json.loads(done.stdout)["env_steps"] == 600
+
+
+def test_a_table_from_the_command_line(tmp_path):
+    made = invoke("table", "--methods", "idle", "--tasks", "push,box", "--seeds", "0,1", "--episodes", 4, "--out", "o")
+    assert made.exit_code == 0, made.output
+    assert "0 of 4 cells are there, 4 to run" in made.stderr
+    assert len(list((tmp_path / "o" / "downstream").iterdir())) == 4
+    again = invoke("table", "--methods", "idle", "--tasks", "push,box", "--seeds", "0,1", "--episodes", 4, "--out", "o")
+    assert "4 of 4 cells are there, 0 to run" in again.stderr
+
+
+def test_methods_are_listed():
+    listed = invoke("methods").stdout
+    for name in ("ours-her", "scratch-monolithic-her", "scratch-mcp", "asp-only", "idle"):
+        assert name in listed
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["--task", "lift"], "unknown task 'lift'; choose one of larger, inair"),
+        (["--task", "wall", "--method", "diayn"], "unknown method 'diayn'; choose one of ours"),
+        (["--task", "wall", "--primitives", "nothing@latest"], "nothing"),
+        (["--task", "wall", "--registry", "http://127.0.0.1:9"], "127.0.0.1:9"),
+        (["--task", "wall", "--set", "gama=0.9"], "--set gama=0.9: write KEY=VALUE with KEY one of num_worlds"),
+        (["--task", "wall", "--set", "gamma=2"], "gamma = 2: input should be less than 1"),
+        (["--task", "wall", "--seed", 5_000_000_000], "seed = 5000000000: input should be less than"),
+        (["--task", "wall", "--steps", 200], "200 env steps are all uniform actions"),
+        (["--task", "wall", "--method", "ours-her", "--set", "num_worlds=256"], "learning_starts = 6400: goals"),
+    ],
+)
+def test_what_is_wrong_is_one_line_and_nothing_is_written(tmp_path, arguments, words):
+    refused = invoke("train", *arguments)
+    assert refused.exit_code in (1, 2)
+    assert refused.stderr.startswith("error: ")
+    assert refused.stderr.count("\n") == 1
+    assert words in refused.stderr
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_registry_that_serves_a_wrong_digest(tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    home = tmp_path / "home"
+    (home / "runs").mkdir(parents=True)
+    shutil.copytree(BUNDLED, home / "registry")
+    for blob in (home / "registry" / "blobs" / "sha256").iterdir():
+        blob.chmod(0o600)
+        blob.write_bytes(b"x" * blob.stat().st_size)
+    with serve(home) as server:
+        for refused in (
+            invoke("train", "--task", "wall", "--registry", server.url),
+            invoke("table", "--registry", server.url),
+        ):
+            assert refused.stderr.startswith(f"error: {server.url} says: ")
+            assert "is damaged: expected sha256" in refused.stderr
+            assert refused.stderr.count("\n") == 1
+    assert {path.name for path in tmp_path.iterdir()} <= {"home", "cache"}
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["--seeds", "0,x"], "--seeds '0,x': write numbers"),
+        (["--tasks", "wall,lift"], "unknown task 'lift'"),
+        (["--methods", "ours,theirs"], "unknown method 'theirs'"),
+        (["--runtime", "slurm"], "--runtime 'slurm': choose one of local, ray"),
+        (["--num-workers", 2], "--num-workers needs --runtime ray"),
+    ],
+)
+def test_a_table_that_cannot_be(tmp_path, arguments, words):
+    refused = invoke("table", *arguments)
+    assert refused.exit_code == 2
+    assert words in refused.stderr
+    assert refused.stderr.count("\n") == 1
+    assert list(tmp_path.iterdir()) == []

@@ -1,0 +1,458 @@
+"""The command line as typed: one whole pre-training and what can be done with it, and what a mistake gets."""
+
+import json
+import os
+import re
+import shlex
+import subprocess
+import sys
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+from typer.testing import CliRunner
+
+from service.cli.main import app
+from service.config import load_config
+from service.io import checkpoints
+from service.io.run_directory import RunDirectory
+from service.registry.names import Version
+from service.registry.registry import BUNDLED, Registry
+from tests.runtime.runs import TREE, no_room_above, tiny_config, write_yaml
+
+ROOT = Path(__file__).parents[2]
+README = (ROOT / "README.md").read_text()
+EVALUATION_KEYS = {
+    "goals", "num_episodes", "num_steps", "success_last", "success_last_low", "success_last_high", "success_ever",
+    "mean_distance_m",
+}  # fmt: skip
+
+
+def tandem(*arguments, **environment):
+    """Run a command in this process."""
+    return CliRunner().invoke(app, [str(argument) for argument in arguments], env={"COLUMNS": "80", **environment})
+
+
+def assert_user_error(result, *parts):
+    """Exit code 2, and one line on stderr that has all of this in it."""
+    assert result.exit_code == 2, result.exception
+    assert result.stdout == ""
+    assert result.stderr.startswith("error: ")
+    assert result.stderr.count("\n") == 1, result.stderr
+    assert result.stderr.endswith("\n")
+    assert [part for part in parts if str(part) not in result.stderr] == [], result.stderr
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory):
+    """A tiny pre-training from the command line: its directory, its registry, and what was printed."""
+    home = tmp_path_factory.mktemp("home")
+    config = write_yaml(home / "tiny.yaml", TREE | {"run": TREE["run"] | {"total_env_steps": 900}})
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("service.media.artifacts.NUM_FILMED_ROUNDS", 1)
+        patch.setattr("service.media.artifacts.COVERAGE_STEPS", 20)
+        result = tandem(
+            "pretrain", "--config", config, "--run-dir", home / "run", "--registry", home / "registry",
+            "--set", "run.keep_checkpoints=2",
+        )  # fmt: skip
+    return SimpleNamespace(result=result, home=home, run=home / "run", registry=home / "registry")
+
+
+# --- pretrain --------------------------------------------------------------------------------------------------------
+
+
+def test_pretrain_leaves_everything_a_person_looks_at(trained):
+    assert trained.result.exit_code == 0, trained.result.output
+    pictures = {name: (trained.run / f"{name}.png").read_bytes() for name in ("curves", "goals", "coverage")}
+    assert [name for name, data in pictures.items() if data[:8] != b"\x89PNG\r\n\x1a\n" or len(data) < 10_000] == []
+    for name in ("config.yaml", "metrics.jsonl", "goals.jsonl"):
+        assert (trained.run / name).stat().st_size > 0
+    assert len(list((trained.run / "tensorboard").iterdir())) == 1
+    assert len(list((trained.run / "checkpoints").iterdir())) == 2
+    assert load_config(trained.run / "config.yaml") == tiny_config(total_env_steps=900, keep_checkpoints=2)
+
+
+def test_pretrain_says_where_things_are(trained):
+    out = trained.result.stdout
+    steps = json.loads((trained.run / "metrics.jsonl").read_text().splitlines()[-1])["env_steps"]
+    assert f"finished after {steps:,} env steps" in out
+    for name in ("curves.png", "goals.png", "coverage.png", "checkpoints"):
+        assert str(trained.run / name) in out
+    assert f"tiny@1 in {trained.registry}" in out
+    assert "evaluation/table_success_last" in out
+    for section in ("total", "play", "wait for learner", "checkpoint"):
+        assert section in out
+
+
+def test_pretrain_films_rounds_where_pictures_can_be_drawn(trained):
+    from service.envs.rendering.renderer import RenderError, SceneRenderer
+
+    try:
+        SceneRenderer(tiny_config().world, 64, 48).close()
+    except RenderError:
+        assert "rounds.mp4" not in trained.result.stdout
+        pytest.skip("films need OpenGL: EGL or OSMesa, apt-get install libegl1")
+    video = trained.run / "rounds.mp4"
+    assert str(video) in trained.result.stdout
+    assert video.read_bytes()[4:8] == b"ftyp"
+
+
+def test_pretrain_refuses_a_directory_with_a_run(trained):
+    before = (trained.run / "metrics.jsonl").read_bytes()
+    assert_user_error(tandem("pretrain", "--run-dir", trained.run), trained.run, "--resume")
+    assert (trained.run / "metrics.jsonl").read_bytes() == before
+
+
+def test_the_readmes_commands_of_pretraining(monkeypatch, tmp_path):
+    """As they stand there, one after the other, with a tiny configuration where the shipped one would be.
+
+    What they do with ``--runtime ray`` is shown in tests/runtime.
+    """
+    monkeypatch.setattr("service.primitives.publishing.FINAL_EVALUATION_EPISODES", 4)
+    monkeypatch.setattr("service.runtime.pretrain.make_artifacts", lambda directory: {})
+    monkeypatch.chdir(tmp_path)
+    commands = [shlex.split(line) for line in re.findall(r"^tandem (pretrain .*)$", README, re.MULTILINE)]
+    commands = [command for command in commands if "--runtime" not in command]
+    (given,) = {command[command.index("--config") + 1] for command in commands if "--config" in command}
+    assert (ROOT / given).is_file()
+    Path(given).parent.mkdir(parents=True)
+    write_yaml(Path(given), TREE | {"name": "panda-cube"})
+    for command in commands:
+        result = tandem(*command)
+        assert result.exit_code == 0, (command, result.output)
+        assert "finished after" in result.stdout
+    assert any("--resume" in command for command in commands)
+    assert sorted(path.name for path in Path("runs").iterdir()) == ["cube", "panda-sphere"]
+    rows = json.loads(tandem("registry", "list", "--json").stdout)
+    own = [(row["name"], row["version"], row["parent"]) for row in rows if not row["bundled"]]
+    assert own == [("panda-cube", 1, None), ("panda-sphere", 1, None)]  # resuming what was finished made no version
+
+
+def test_a_resumed_run_takes_the_file_it_was_begun_with(trained, monkeypatch):
+    asked = []
+
+    def pretrain(config, directory, registry, **kwargs):
+        asked.append((config.run, kwargs["resume"]))
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("service.runtime.pretrain.pretrain", pretrain)
+    config = trained.home / "tiny.yaml"
+    common = ("pretrain", "--resume", "--run-dir", trained.run, "--config", config)
+    tandem(*common, "--set", "run.total_env_steps=950")
+    assert asked == [(tiny_config(total_env_steps=950, keep_checkpoints=2).run, True)]
+
+
+def test_pretrain_goes_to_runs_by_its_name(monkeypatch, tmp_path):
+    asked = []
+
+    def pretrain(config, directory, registry, **kwargs):
+        asked.append((config.name, directory.path, registry, kwargs["resume"]))
+        raise KeyboardInterrupt
+
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("service.runtime.pretrain.pretrain", pretrain)
+    tandem("pretrain", "--set", "name=blue")
+    tandem("pretrain", "--set", "name=blue", "--run-dir", "here", TANDEM_REGISTRY="/there")
+    assert asked == [
+        ("blue", Path("runs/blue"), Path("registry"), False),
+        ("blue", Path("here"), Path("/there"), False),
+    ]
+
+
+def test_demo_is_a_short_pretraining_with_a_registry_of_its_own(monkeypatch, tmp_path):
+    asked = []
+
+    def pretrain(config, directory, registry, **kwargs):
+        asked.append((config.name, config.run.total_env_steps, directory.path, registry))
+        directory.path.mkdir(parents=True)
+        raise KeyboardInterrupt
+
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("service.runtime.pretrain.pretrain", pretrain)
+    tandem("demo", "--env-steps", "7")
+    tandem("demo", "--env-steps", "8")
+    one, two = Path("runs/demo-1"), Path("runs/demo-2")
+    assert asked == [("panda-cube-demo", 7, one, one / "registry"), ("panda-cube-demo", 8, two, two / "registry")]
+
+
+def test_demo_ends_with_what_comes_with_tandem_and_what_to_type(monkeypatch, tmp_path):
+    from service.actors import evaluation
+    from service.runtime.local import RunResult
+    from service.runtime.pretrain import Pretrained
+
+    def pretrain(*args, **kwargs):
+        return Pretrained(RunResult("finished", 1, 7), {}, Version("panda-cube-demo", 1), {}, "total 1 s")
+
+    real = evaluation.evaluate
+    few = {"num_episodes": 4, "num_steps": 2}
+    monkeypatch.setattr(evaluation, "evaluate", lambda *args, **kwargs: real(*args, **kwargs | few))
+    monkeypatch.setattr("service.runtime.pretrain.pretrain", pretrain)
+    monkeypatch.chdir(tmp_path)
+    result = tandem("demo", "--env-steps", "7")
+    assert result.exit_code == 0, result.output
+    shown = result.stdout.partition("panda-cube-demo@1 in runs/demo-1/registry\n")[2]
+    champion = Registry(BUNDLED).resolve("panda-cube@champion")
+    assert f"\n  {champion} (bundled) " in shown
+    assert "\n  idle " in shown
+    commands = [shlex.split(line)[1:] for line in re.findall(r"^ +(tandem .*)$", shown, re.MULTILINE)]
+    assert [command[0] for command in commands] == ["evaluate", "render", "coverage"]
+    evaluated = tandem(*commands[0])
+    assert evaluated.exit_code == 0, evaluated.output
+    assert evaluated.stdout in shown  # it says the same again
+
+
+# --- what can be done with it ----------------------------------------------------------------------------------------
+
+
+def evaluate(trained, primitives, *arguments):
+    return tandem(
+        "evaluate",
+        "--primitives",
+        primitives,
+        "--registry",
+        trained.registry,
+        "--episodes",
+        8,
+        "--steps",
+        2,
+        *arguments,
+    )
+
+
+def test_evaluate_published_primitives(trained):
+    result = evaluate(trained, "tiny@latest", "--goals", "table", "--json")
+    assert result.exit_code == 0, result.output
+    rows = json.loads(result.stdout)
+    assert list(rows) == ["tiny@1", "idle"]
+    for row in rows.values():
+        assert set(row) == EVALUATION_KEYS
+        assert (row["goals"], row["num_episodes"], row["num_steps"]) == ("table", 8, 2)
+        assert 0.0 <= row["success_last_low"] <= row["success_last"] <= row["success_last_high"] <= 1.0
+    assert rows["tiny@1"]["mean_distance_m"] != rows["idle"]["mean_distance_m"]
+
+
+def test_evaluate_a_run_directory_gives_the_same(trained):
+    published = json.loads(evaluate(trained, "tiny", "--json").stdout)
+    from_run = json.loads(evaluate(trained, trained.run, "--json").stdout)
+    assert list(from_run) == [str(trained.run), "idle"]
+    assert from_run[str(trained.run)] == published["tiny@1"]
+    assert from_run["idle"] == published["idle"]
+
+
+def test_evaluate_follows_the_seed(trained):
+    one, same, other = (evaluate(trained, "tiny", "--json", "--seed", seed).stdout for seed in (0, 0, 1))
+    assert one == same != other
+
+
+def test_evaluate_for_people(trained):
+    result = evaluate(trained, "tiny@1", "--goals", "mixed")
+    assert result.exit_code == 0
+    head, *rows = result.stdout.splitlines()
+    assert head.startswith("8 random goals (mixed), 2 steps")
+    assert "0.4 cm" in head  # this run's own success distance
+    assert [row.split()[0] for row in rows] == ["tiny@1", "idle"]
+    assert all("%" in row and "mean distance" in row for row in rows)
+
+
+def test_coverage(trained, tmp_path):
+    picture = tmp_path / "sub" / "a-picture-with-quite-a-long-name-so-that-it-does-not-fit-a-line.png"
+    common = ("coverage", "--primitives", "tiny", "--registry", trained.registry, "--skills", 3, "--steps", 4)
+    result = tandem(*common, "--out", picture, "--json")
+    assert result.exit_code == 0, result.output
+    tree = json.loads(result.stdout)
+    assert tree["picture"] == str(picture)
+    assert list(tree["share_of_table_cells_visited"]) == ["tiny@1", "random policy"]
+    assert all(0.0 <= share <= 1.0 for share in tree["share_of_table_cells_visited"].values())
+    assert picture.stat().st_size > 10_000
+    text = tandem(*common, "--out", picture).stdout
+    assert text.count("of the workspace's table cells visited\n") == 2
+    assert f"picture: {picture}\n" in text  # on one line, to be copied
+
+
+def test_what_comes_with_tandem_needs_no_registry_and_no_directory_of_its_own(filmed, monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    champion = ("--primitives", "panda-cube@champion")
+    label = f"{Registry(BUNDLED).resolve('panda-cube@champion')} (bundled)"
+    result = tandem("evaluate", *champion, "--goals", "mixed", "--episodes", 4, "--steps", 2, "--json")
+    assert result.exit_code == 0, result.output
+    assert list(json.loads(result.stdout)) == [label, "idle"]
+    result = tandem("coverage", *champion, "--skills", 2, "--steps", 2, "--json")
+    assert list(json.loads(result.stdout)["share_of_table_cells_visited"]) == [label, "random policy"]
+    assert tandem("render", *champion, "--episodes", 2).exit_code == 0
+    assert filmed == [((2, 3), Path("video.mp4"))]
+    assert [path.name for path in tmp_path.iterdir()] == ["coverage.png"]
+
+
+@pytest.fixture
+def filmed(monkeypatch):
+    """(number of takes or episodes, file) of each video, none of which is drawn."""
+    asked = []
+
+    def write_video(takes, world, path):
+        asked.append((len(takes), path))
+
+    def write_episode_video(episodes, world, path):
+        asked.append((episodes.goal.shape, path))
+
+    monkeypatch.setattr("service.media.video.write_video", write_video)
+    monkeypatch.setattr("service.media.video.write_episode_video", write_episode_video)
+    return asked
+
+
+def test_render_films_rounds_of_a_run(trained, filmed, tmp_path):
+    out = tmp_path / "a-video-[b]-with-quite-a-long-name-so-that-it-does-not-fit-a-line.mp4"
+    result = tandem("render", "--primitives", trained.run, "--episodes", 2, "--out", out)
+    assert result.exit_code == 0, result.output
+    assert filmed == [(2, out)]
+    assert result.stdout == f"video: {out}\n"  # on one line, to be copied
+
+
+def test_render_films_episodes_of_published_primitives(trained, filmed, tmp_path):
+    out = tmp_path / "x.mp4"
+    common = ("--registry", trained.registry, "--out", out)
+    result = tandem("render", "--primitives", "tiny@latest", "--episodes", 3, *common)
+    assert result.exit_code == 0, result.output
+    assert filmed == [((3, 3), out)]
+
+
+def test_registry_show(trained):
+    result = tandem("registry", "show", "tiny@latest", "--registry", trained.registry, "--json")
+    assert result.exit_code == 0, result.output
+    tree = json.loads(result.stdout)
+    assert (tree["name"], tree["version"], tree["aliases"]) == ("tiny", 1, ["latest"])
+    assert tree["metrics"]["env_steps"] >= 900
+    assert 0.0 <= tree["metrics"]["evaluation/mixed_success_last"] <= 1.0
+    assert tree["config"]["policy"]["bob"]["num_primitives"] == 2
+    assert "gate.output.weight" in tree["tensors"]
+    assert tandem("registry", "verify", "--registry", trained.registry).exit_code == 0
+
+
+# --- mistakes --------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("arguments", "parts"),
+    [
+        (["--set", "learner.bob.num_epoch=3"], ["learner.bob.num_epoch", "num_epochs"]),
+        (["--set", "game.num_worlds=0"], ["game.num_worlds", "0"]),
+        (["--set", "world.object=bunny"], ["world.object", "bunny"]),
+        (["--set", "name=No Name"], ["name", "No Name"]),
+        (["--set", "seed"], ["'seed'", "KEY=VALUE"]),
+        (["--config", "none.yaml"], ["none.yaml"]),
+        (["--config", "."], ["."]),
+        (["--resume"], ["--resume needs --run-dir"]),
+        (["--resume", "--config", "tiny.yaml"], ["--resume needs --run-dir"]),
+        (["--resume", "--run-dir", "run", "--config", "tiny.yaml"], ["no run in run"]),
+        (["--resume", "--run-dir", "none"], ["no run in none"]),
+    ],
+)
+def test_mistakes_of_pretrain(monkeypatch, tmp_path, arguments, parts):
+    monkeypatch.chdir(tmp_path)
+    assert_user_error(tandem("pretrain", *arguments), *parts)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_resumed_run_keeps_its_configuration(trained):
+    result = tandem("pretrain", "--resume", "--run-dir", trained.run, "--set", "seed=3")
+    assert_user_error(result, "'seed=3'", "only run.*")
+
+
+def test_a_resumed_run_refuses_a_file_that_says_otherwise(trained, tmp_path):
+    config = write_yaml(tmp_path / "other.yaml", TREE | {"seed": 3})
+    result = tandem("pretrain", "--resume", "--run-dir", trained.run, "--config", config)
+    assert_user_error(result, config, "seed = 3", "leave out --config")
+
+
+def test_what_comes_with_tandem_is_not_written(tmp_path):
+    result = tandem("pretrain", "--registry", BUNDLED, "--run-dir", tmp_path / "run")
+    assert_user_error(result, "cannot write", BUNDLED, "only read")
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_resume_without_a_checkpoint(tmp_path):
+    directory = RunDirectory(tmp_path)
+    directory.start(tiny_config())
+    directory.close()
+    for file in (tmp_path / "checkpoints").iterdir():
+        file.unlink()
+    assert_user_error(tandem("pretrain", "--resume", "--run-dir", tmp_path), "no checkpoint in", tmp_path)
+
+
+def test_a_resume_from_another_format(tmp_path, monkeypatch):
+    directory = RunDirectory(tmp_path)
+    directory.start(tiny_config())
+    directory.close()
+    with monkeypatch.context() as patch:
+        patch.setattr(checkpoints, "FORMAT_VERSION", 7)
+        checkpoints.CheckpointStore(directory.checkpoints, keep=1).save(3, {}, {})
+    result = tandem("pretrain", "--resume", "--run-dir", tmp_path)
+    assert_user_error(result, "checkpoint-00000003.safetensors", "format version 7")
+
+
+def test_no_cuda_here(tmp_path, monkeypatch):
+    monkeypatch.setattr("torch.cuda.is_available", lambda: False)
+    result = tandem("pretrain", "--run-dir", tmp_path / "run", "--set", "learner.device=cuda")
+    assert_user_error(result, "learner.device", "cuda", "cpu")
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_run_directory_that_is_a_file(tmp_path):
+    (tmp_path / "run").write_text("")
+    result = tandem("pretrain", "--config", write_yaml(tmp_path / "tiny.yaml"), "--run-dir", tmp_path / "run")
+    assert_user_error(result, "cannot write", tmp_path / "run")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "parts"),
+    [
+        (["evaluate", "--primitives", "tiny@best"], ["no alias 'best'", "latest -> 1"]),
+        (["evaluate", "--primitives", "tiny@2"], ["no version 2"]),
+        (["evaluate", "--primitives", "nobody"], ["no 'nobody'", "it holds: tiny", "with tandem comes: panda-cube"]),
+        (["evaluate", "--primitives", "no/where"], ["no/where", "no such run directory"]),
+        (["evaluate", "--primitives", "."], ["no run in ."]),
+        (["evaluate", "--primitives", "tiny", "--goals", "sky"], ["'sky'", "table, air, mixed"]),
+        (["coverage", "--primitives", "tiny@best"], ["no alias 'best'"]),
+        (["coverage", "--primitives", "tiny", "--skills", "2", "--steps", "1", "--out", "file/x.png"], ["file/x.png"]),
+        (["render", "--primitives", "no/where"], ["no/where", "no such run directory"]),
+        (["registry", "show", "tiny@best"], ["no alias 'best'"]),
+    ],
+)
+def test_mistakes_of_the_others(trained, monkeypatch, tmp_path, arguments, parts):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "file").write_text("")
+    assert_user_error(tandem(*arguments, TANDEM_REGISTRY=str(trained.registry)), *parts)
+
+
+def test_a_full_disk_during_a_checkpoint(tmp_path, monkeypatch):
+    def no_space(path, data):
+        raise OSError(28, os.strerror(28))
+
+    config = write_yaml(tmp_path / "tiny.yaml")
+    monkeypatch.setattr("service.io.checkpoints.write_atomic", no_space)
+    result = tandem("pretrain", "--config", config, "--run-dir", tmp_path / "run", "--registry", tmp_path / "registry")
+    assert result.exit_code == 2
+    assert result.stderr.count("\n") == 1
+    assert "checkpoint-" in result.stderr
+    assert "No space left on device" in result.stderr
+
+
+def test_a_disk_that_is_full_to_the_end(tmp_path):
+    """It is no mistake of what was typed, and what came before it is there."""
+    config = write_yaml(tmp_path / "tiny.yaml")
+    with no_room_above(150_000):
+        result = tandem("pretrain", "--config", config, "--run-dir", tmp_path / "run", "--registry", tmp_path / "none")
+    assert result.exit_code == 1
+    assert result.stderr.startswith("error: ")
+    assert result.stderr.count("\n") == 1
+    assert [part for part in ("File too large", "saved is iteration 2", "--resume") if part not in result.stderr] == []
+    assert not (tmp_path / "none").exists()
+
+
+def test_a_mistake_in_a_real_process_is_one_line():
+    result = subprocess.run(
+        [sys.executable, "-m", "service", "pretrain", "--set", "game.num_world=3"],
+        cwd=ROOT, capture_output=True, text=True, timeout=100,
+    )  # fmt: skip
+    assert (result.returncode, result.stdout) == (2, "")
+    assert result.stderr.count("\n") == 1
+    assert "game.num_world" in result.stderr

@@ -1,0 +1,132 @@
+"""tandem registry, as typed."""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+from typer.testing import CliRunner
+
+from service.cli.registry import registry_app
+from service.registry.exported import load_exported
+from service.registry.registry import BUNDLED, Registry
+from tests.registry.helpers import Publish
+
+Run = Callable[..., Any]
+
+
+@pytest.fixture
+def run(registry: Registry, publish: Publish) -> Run:
+    """Run a command on a registry of two versions."""
+    publish()
+    publish(value=1.0, parent="panda-cube@1")
+
+    def _run(*arguments: str) -> Any:
+        return CliRunner().invoke(registry_app, list(arguments), env={"TANDEM_REGISTRY": str(registry.root)})
+
+    return _run
+
+
+def assert_user_error(result: Any, *parts: str) -> None:
+    """One line on stderr, exit code 2."""
+    assert result.exit_code == 2
+    assert result.stdout == ""
+    assert result.stderr.count("\n") == 1
+    assert result.stderr.startswith("error: ")
+    for part in parts:
+        assert part in result.stderr
+
+
+def test_list(run: Run) -> None:
+    lines = run("list").stdout.splitlines()
+    assert lines[0].split("\t") == ["name", "version", "created", "bytes", "aliases", "parent", "bundled"]
+    assert [line.split("\t")[:2] for line in lines[1:3]] == [["panda-cube", "1"], ["panda-cube", "2"]]
+    assert lines[2].split("\t")[4:] == ["latest", "panda-cube@1", "false"]
+    assert {line.split("\t")[6] for line in lines[3:]} == {"true"}
+
+
+def test_list_json(run: Run) -> None:
+    rows = json.loads(run("list", "--json").stdout)
+    own = [row for row in rows if not row["bundled"]]
+    assert [(row["name"], row["version"], row["aliases"], row["parent"]) for row in own] == [
+        ("panda-cube", 1, [], None),
+        ("panda-cube", 2, ["latest"], "panda-cube@1"),
+    ]
+    assert len(rows) > len(own)
+
+
+@pytest.mark.parametrize("directory", [".", "none"])
+def test_list_of_an_empty_registry_has_what_comes_with_tandem(tmp_path: Path, directory: str) -> None:
+    path = tmp_path / directory
+    result = CliRunner().invoke(registry_app, ["list", "--json", "--registry", str(path)])
+    assert result.exit_code == 0
+    assert result.stderr == f"nothing published in {path} yet\n"
+    rows = json.loads(result.stdout)
+    assert [(row["name"], row["aliases"], row["bundled"]) for row in rows] == [
+        ("panda-cube", ["champion", "latest"], True)
+    ]
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_what_comes_with_tandem_is_listed_once_shown_verified_and_exported_but_not_changed(tmp_path: Path) -> None:
+    def run(*arguments: object) -> Any:
+        return CliRunner().invoke(registry_app, [str(argument) for argument in arguments])
+
+    own = ("--registry", tmp_path / "none")
+    assert len(json.loads(run("list", "--json", "--registry", BUNDLED).stdout)) == len(Registry(BUNDLED).names())
+    tree = json.loads(run("show", "panda-cube@champion", "--json", *own).stdout)
+    assert (tree["name"], tree["aliases"]) == ("panda-cube", ["champion", "latest"])
+    assert run("verify", "panda-cube", *own).exit_code == 0
+    assert run("export", "panda-cube", tmp_path / "out", *own).exit_code == 0
+    assert load_exported(tmp_path / "out")[0] == Registry(BUNDLED).manifest("panda-cube")
+    assert_user_error(run("alias", "panda-cube", "best", *own), "cannot write", str(BUNDLED), "only read")
+    assert_user_error(run("verify", *own), "no registry at", "--registry")
+
+
+def test_show(run: Run) -> None:
+    rows = dict(line.split("\t") for line in run("show", "panda-cube").stdout.splitlines())
+    assert rows["reference"] == "panda-cube@2"
+    assert rows["aliases"] == "latest"
+    assert rows["tensors.gate.weight"] == "float32 [2, 3]"
+    assert rows["config.seed"] == "3"
+    tree = json.loads(run("show", "panda-cube@1", "--json").stdout)
+    assert (tree["version"], tree["aliases"], tree["metrics"]) == (1, [], {"bob/success_rate": 0.5})
+
+
+def test_tables_on_a_terminal(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("service.cli.registry._is_terminal", lambda: True)
+    assert "panda-cube" in run("list").stdout
+    assert "\t" not in run("list").stdout
+
+
+def test_alias(run: Run, registry: Registry) -> None:
+    assert run("alias", "panda-cube@1", "champion").stdout == "panda-cube@champion is now panda-cube@1\n"
+    assert registry.aliases("panda-cube") == {"champion": 1, "latest": 2}
+
+
+def test_export(run: Run, tmp_path: Path) -> None:
+    assert run("export", "panda-cube@1", str(tmp_path / "out")).exit_code == 0
+    assert load_exported(tmp_path / "out")[0].version == 1
+
+
+def test_verify(run: Run, registry: Registry) -> None:
+    assert run("verify").exit_code == 0
+    assert run("verify", "panda-cube@1").exit_code == 0
+    next((registry.root / "blobs" / "sha256").iterdir()).write_bytes(b"")
+    result = run("verify")
+    assert result.exit_code == 1
+    assert "is damaged" in result.stderr
+
+
+def test_mistakes_are_one_line_and_exit_code_2(run: Run, tmp_path: Path) -> None:
+    assert_user_error(run("show", "panda-cube@best"), "no alias 'best'", "latest -> 2")
+    assert_user_error(run("show", "panda-cup"), "it holds: panda-cube")
+    assert_user_error(run("alias", "panda-cube", "7"), "bad alias '7'")
+    assert_user_error(run("verify", "../x"), "bad reference")
+    assert_user_error(
+        run("show", "nobody", "--registry", str(tmp_path / "none")), "none", "with tandem comes: panda-cube"
+    )
+    (tmp_path / "manifest.json").write_text("")
+    assert_user_error(run("export", "panda-cube", str(tmp_path)), "exists")
+    assert run("show").exit_code == 2

@@ -1,0 +1,262 @@
+"""The Gymnasium goal environment: the convention, both checkers, exact seeds and states."""
+
+import sys
+import types
+import warnings
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import check_env as check_gymnasium
+from stable_baselines3.common.env_checker import check_env as check_stable_baselines
+
+from service.config import WorldConfig
+from service.envs.gym.registration import EPISODE_STEPS, TABLETOP_ID, register_all
+from service.envs.gym.tabletop import TabletopEnv
+from service.errors import TandemError
+
+CONFIG = WorldConfig(physics_step_s=0.004, num_substeps=10)
+
+
+@pytest.fixture
+def env():
+    env = TabletopEnv(CONFIG)
+    yield env
+    env.close()
+
+
+@pytest.fixture
+def made():
+    env = gymnasium.make(TABLETOP_ID, config=CONFIG)
+    yield env
+    env.close()
+
+
+def play(env, actions):
+    """Everything that was returned, in one row per step."""
+    rows = []
+    for action in actions:
+        observation, reward, terminated, truncated, info = env.step(action)
+        flat = np.concatenate([observation[key] for key in sorted(observation)])
+        rows.append([*flat, reward, terminated, truncated, info["is_success"]])
+    return np.array(rows)
+
+
+def random_actions(num, seed=0):
+    return np.random.default_rng(seed).uniform(-1.0, 1.0, (num, 4)).astype(np.float32)
+
+
+def assert_same(left, right):
+    assert left.keys() == right.keys()
+    for key in left:
+        np.testing.assert_array_equal(left[key], right[key])
+
+
+def test_gymnasiums_checker_has_nothing_to_say(made):
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        check_gymnasium(made.unwrapped, skip_render_check=True)
+
+
+def test_stable_baselines_checker_has_nothing_to_say(env):
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        check_stable_baselines(env)
+
+
+def test_made_by_its_name(made):
+    assert isinstance(made.unwrapped, TabletopEnv)
+    assert made.spec.max_episode_steps == EPISODE_STEPS == 50
+    direct = gymnasium.make(f"service.envs.gym.registration:{TABLETOP_ID}", goals="air")
+    assert direct.unwrapped.goals == "air"
+    direct.close()
+
+
+def test_registering_again_changes_nothing():
+    before = gymnasium.registry[TABLETOP_ID]
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        register_all()
+    assert gymnasium.registry[TABLETOP_ID] is before
+
+
+def test_an_episode_is_truncated_by_time_alone(made):
+    made.reset(seed=0)
+    rows = play(made, random_actions(EPISODE_STEPS))
+    terminated, truncated = rows[:, -3], rows[:, -2]
+    assert not terminated.any()
+    assert np.flatnonzero(truncated).tolist() == [EPISODE_STEPS - 1]
+
+
+def test_several_in_a_vector():
+    envs = gymnasium.make_vec(TABLETOP_ID, num_envs=2, vectorization_mode="sync", config=CONFIG)
+    observation, _ = envs.reset(seed=3)
+    assert observation["observation"].shape == (2, 11)
+    assert envs.step(random_actions(2))[1].shape == (2,)
+    envs.close()
+
+
+def test_observation_is_what_the_world_says(env):
+    observation, info = env.reset(seed=1)
+    position = observation["observation"]
+    np.testing.assert_array_equal(observation["achieved_goal"], position[5:8])
+    np.testing.assert_allclose(position[8:11], position[5:8] - position[:3], rtol=0, atol=1e-6)
+    np.testing.assert_allclose(observation["desired_goal"], env.state().goal, rtol=0, atol=1e-6)
+    distance = np.linalg.norm(observation["achieved_goal"] - observation["desired_goal"])
+    assert info == {"is_success": bool(distance <= 0.05)}
+
+
+def test_reward_is_paid_at_every_step_on_target(env):
+    env.reset(seed=0)
+    state = env.state()
+    rewards = {}
+    for offset_m in (0.0, 0.04, 0.06):
+        state.goal[:] = state.world[10:13] + np.array([0.0, 0.0, offset_m])
+        env.restore(state)
+        rows = play(env, np.zeros((5, 4), dtype=np.float32))
+        np.testing.assert_array_equal(rows[:, -1], rows[:, -4])
+        rewards[offset_m] = rows[:, -4].tolist()
+    assert rewards == {0.0: [1.0] * 5, 0.04: [1.0] * 5, 0.06: [0.0] * 5}
+
+
+def test_compute_reward_by_hand(env):
+    achieved = np.array([[0.0, 0.0, 0.0], [0.03, 0.04, 0.0], [0.03, 0.0401, 0.0], [1.0, 1.0, 1.0]])
+    found = env.compute_reward(achieved, np.zeros((4, 3)), [{}] * 4)
+    assert found.dtype == np.float64
+    np.testing.assert_array_equal(found, [1.0, 1.0, 0.0, 0.0])
+    assert env.compute_reward(achieved[1], np.zeros(3), {}) == 1.0
+    assert env.compute_reward(achieved.reshape(2, 2, 3), np.zeros(3), None).shape == (2, 2)
+
+
+def test_success_distance_is_the_users():
+    env = TabletopEnv(CONFIG, success_distance_m=0.2)
+    assert env.compute_reward(np.array([0.19, 0.0, 0.0]), np.zeros(3), {}) == 1.0
+    env.close()
+
+
+@pytest.mark.parametrize(("goals", "air_share"), [("table", 0.0), ("air", 1.0), ("mixed", 0.7)])
+def test_goals_are_where_they_were_asked_for(goals, air_share):
+    env = TabletopEnv(CONFIG, goals=goals)
+    heights = np.array([env.reset(seed=index)[0]["desired_goal"][2] for index in range(200)])
+    env.close()
+    np.testing.assert_allclose((heights > 0.0251).mean(), air_share, rtol=0, atol=0.1)
+    if goals == "air":
+        assert heights.min() >= 0.075
+
+
+def test_a_seed_gives_the_same_episodes_and_another_does_not(env):
+    actions = random_actions(20)
+    episodes = {}
+    for name, seed in (("first", 5), ("again", 5), ("other", 6)):
+        start, _ = env.reset(seed=seed)
+        rows = play(env, actions)
+        following, _ = env.reset()
+        episodes[name] = (start, rows, following)
+    for left, right in zip(episodes["first"], episodes["again"], strict=True):
+        if isinstance(left, dict):
+            assert_same(left, right)
+        else:
+            np.testing.assert_array_equal(left, right)
+    assert (episodes["first"][0]["achieved_goal"] != episodes["other"][0]["achieved_goal"]).any()
+    assert (episodes["first"][0]["desired_goal"] != episodes["first"][2]["desired_goal"]).any()
+
+
+def test_a_restored_state_continues_bit_identically(env):
+    env.reset(seed=0)
+    play(env, random_actions(7))
+    state = env.state()
+    expected, expected_start = play(env, random_actions(15, seed=1)), env.reset()[0]
+    for other in (env, TabletopEnv(CONFIG)):
+        observation = other.restore(state)
+        assert observation in env.observation_space
+        np.testing.assert_array_equal(play(other, random_actions(15, seed=1)), expected)
+        assert_same(other.reset()[0], expected_start)
+        other.close()
+
+
+def test_a_saved_state_is_a_copy(env):
+    env.reset(seed=0)
+    state = env.state()
+    world, goal = state.world.copy(), state.goal.copy()
+    play(env, random_actions(3))
+    env.reset()
+    np.testing.assert_array_equal(state.world, world)
+    np.testing.assert_array_equal(state.goal, goal)
+
+
+def test_an_object_in_free_fall_stays_in_the_space(env):
+    env.reset(seed=0)
+    state = env.state()
+    state.world[10:13] = [2.0, 0.0, -500.0]
+    assert env.restore(state) in env.observation_space
+    observation, reward, *_ = env.step(np.zeros(4, dtype=np.float32))
+    assert observation in env.observation_space
+    assert reward == 0.0
+
+
+def test_a_diverged_world_ends_the_episode(env):
+    env.reset(seed=0)
+    state = env.state()
+    state.world[29] = 1e200
+    env.restore(state)
+    observation, _, terminated, truncated, info = env.step(np.zeros(4, dtype=np.float32))
+    assert (terminated, truncated, info["diverged"]) == (False, True, True)
+    assert observation in env.observation_space
+    env.reset()
+    assert env.step(np.zeros(4, dtype=np.float32))[4]["diverged"] is False
+
+
+@pytest.mark.parametrize("action", [np.zeros(3), np.zeros((1, 4)), np.array([0.0, np.nan, 0.0, 0.0])])
+def test_bad_actions_are_refused(env, action):
+    env.reset(seed=0)
+    with pytest.raises(ValueError, match="actions"):
+        env.step(action.astype(np.float32))
+
+
+@pytest.mark.parametrize(
+    ("option", "value"), [("goals", "moon"), ("render_mode", "human"), ("success_distance_m", 0.0)]
+)
+def test_bad_options_are_named(option, value):
+    with pytest.raises(TandemError, match=rf"{option} = {value!r}") as caught:
+        TabletopEnv(CONFIG, **{option: value})
+    assert "\n" not in str(caught.value)
+
+
+class TestRender:
+    @pytest.fixture
+    def calls(self, monkeypatch):
+        """A renderer that needs no OpenGL."""
+        calls = []
+
+        class Renderer:
+            def __init__(self, config, width, height):
+                calls.append(("open", config, width, height))
+
+            def render(self, state, goal):
+                calls.append(("render", state.copy(), goal.copy()))
+                return np.zeros((120, 160, 3), dtype=np.uint8)
+
+            def close(self):
+                calls.append(("close",))
+
+        fake = types.ModuleType("service.envs.rendering.renderer")
+        fake.SceneRenderer = Renderer
+        monkeypatch.setitem(sys.modules, "service.envs.rendering.renderer", fake)
+        return calls
+
+    def test_the_renderer_is_opened_when_asked_and_closed(self, calls):
+        env = TabletopEnv(CONFIG, render_mode="rgb_array", width=160, height=120)
+        env.reset(seed=0)
+        assert calls == []
+        for _ in range(2):
+            assert env.render().shape == (120, 160, 3)
+        env.close()
+        assert [call[0] for call in calls] == ["open", "render", "render", "close"]
+        assert calls[0][1:] == (CONFIG, 160, 120)
+        np.testing.assert_array_equal(calls[1][1], env.state().world)
+        np.testing.assert_array_equal(calls[1][2], env.state().goal)
+
+    def test_without_a_mode_nothing_is_drawn(self, calls, env):
+        env.reset(seed=0)
+        assert env.render() is None
+        assert calls == []

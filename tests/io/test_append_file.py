@@ -1,0 +1,73 @@
+import os
+
+import pytest
+
+from service.io.append_file import Appender
+from service.registry.errors import RegistryError
+from tests.runtime.runs import assert_one_line, no_room_above
+
+
+@pytest.fixture
+def path(tmp_path):
+    return tmp_path / "run" / "pieces"
+
+
+def test_pieces_come_one_after_the_other_behind_what_is_there(path):
+    appender = Appender(path)
+    assert not path.parent.exists()
+    appender.append(b"ab")
+    Appender(path).append(b"c")
+    appender.append(b"d")
+    assert path.read_bytes() == b"abcd"
+
+
+def test_a_piece_that_does_not_fit_leaves_no_part_and_comes_before_the_next(path):
+    appender = Appender(path)
+    appender.append(b"aaa")
+    with no_room_above(5), pytest.raises(RegistryError) as error:
+        appender.append(b"bbb")  # the kernel takes two of its bytes
+    assert_one_line(error.value, "cannot write", path, "File too large")
+    assert path.read_bytes() == b"aaa"
+    appender.append(b"cc")
+    assert path.read_bytes() == b"aaabbbcc"
+    appender.sync()
+    assert path.read_bytes() == b"aaabbbcc"
+
+
+def test_a_part_is_taken_back_when_a_signal_comes_between_two_writes(path, monkeypatch):
+    class Interrupted:
+        def __init__(self, file):
+            self._file, self._calls = file, 0
+
+        def __getattr__(self, name):
+            return getattr(self._file, name)
+
+        def __enter__(self):
+            return self
+
+        def __exit__(self, *error):
+            self._file.close()
+
+        def write(self, data):
+            self._calls += 1
+            if self._calls == 2:
+                raise KeyboardInterrupt
+            return self._file.write(data[:2])
+
+    appender = Appender(path)
+    appender.append(b"aaa")
+    with monkeypatch.context() as patch:
+        unbuffered = type(path).open
+        patch.setattr(type(path), "open", lambda *args, **kwargs: Interrupted(unbuffered(*args, **kwargs)))
+        with pytest.raises(KeyboardInterrupt):
+            appender.append(b"bbb")
+    assert path.read_bytes() == b"aaa"
+
+
+@pytest.mark.skipif(not os.path.exists("/dev/full"), reason="/dev/full, which refuses every write, is Linux only")
+def test_a_device_that_is_always_full(tmp_path):
+    path = tmp_path / "pieces"
+    path.symlink_to("/dev/full")
+    with pytest.raises(RegistryError) as error:
+        Appender(path).append(b"a")
+    assert_one_line(error.value, "cannot write", path, "No space left on device")

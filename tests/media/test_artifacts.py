@@ -1,0 +1,37 @@
+import pytest
+
+from service.io.run_directory import RunDirectory
+from service.media import artifacts
+from service.media.artifacts import make_artifacts
+from tests.runtime.runs import assert_one_line, no_room_above, play
+
+
+@pytest.fixture(scope="module")
+def directory(tmp_path_factory):
+    path = tmp_path_factory.mktemp("run")
+    play(path)
+    return RunDirectory(path)
+
+
+@pytest.fixture(autouse=True)
+def quick(monkeypatch):
+    monkeypatch.setattr(artifacts, "NUM_SKILLS", 2)
+    monkeypatch.setattr(artifacts, "COVERAGE_STEPS", 2)
+    monkeypatch.setattr("service.media.video.film_rounds", lambda *args, **kwargs: [])
+    monkeypatch.setattr("service.media.video.write_video", lambda takes, world, path: path)
+
+
+def test_every_picture_by_what_it_shows(directory):
+    files = make_artifacts(directory)
+    assert list(files) == ["curves", "goals", "coverage", "video"]
+    assert all(files[name].stat().st_size > 10_000 for name in ("curves", "goals", "coverage"))
+
+
+def test_pictures_for_which_there_is_no_room_are_left_out(directory, caplog):
+    before = {path: path.read_bytes() for path in directory.path.glob("*.png")}
+    with no_room_above(5_000):
+        assert list(make_artifacts(directory)) == ["video"]
+    for message, name in zip(caplog.messages, ("curves", "goals", "coverage"), strict=True):
+        assert_one_line(message, f"no {name}", f"{name}.png", "File too large")
+    assert {path: path.read_bytes() for path in directory.path.glob("*.png")} == before
+    assert list(directory.path.glob(".tmp-*")) == []

@@ -1,0 +1,179 @@
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from service.config import WorkspaceConfig
+from service.errors import TandemError
+from service.io.jsonl import JsonlWriter
+from service.media.plots import plot_coverage, plot_curves, plot_goals
+from service.media.plots.coverage import _coverage_words, _inside
+from service.media.plots.curves import _smooth
+from service.media.plots.figures import bounds, column, new_figure
+from service.media.plots.goals import _goals, _slice_title
+
+# x and y from -0.1 to 0.1, z from 0 to 0.2: 4 x 4 x 4 cells of 5 cm
+WORKSPACE = WorkspaceConfig(center_x_m=0.0, length_x_m=0.2, length_y_m=0.2, height_m=0.2)
+GOAL = [0.0, 0.0, 0.025, 0.1, 0.0, 0.2, 1]
+
+
+def _png_size(path):
+    data = path.read_bytes()
+    assert data[:8] == b"\x89PNG\r\n\x1a\n"
+    return len(data), int.from_bytes(data[16:20], "big")
+
+
+def _append(path, *records):
+    for record in records:
+        JsonlWriter(path).append(record)
+
+
+def _metrics(iteration):
+    wave = 0.5 + 0.4 * np.sin(iteration)
+    keys = ("alice/valid_fraction", "bob/success_rate", "alice/goal_height_m", "learner/bob_entropy")
+    return {"iteration": iteration, "env_steps": iteration * 1000, "time/wall_s": iteration * 2.0} | dict.fromkeys(
+        keys, wave
+    )
+
+
+def test_curves_are_drawn_1400_pixels_wide(tmp_path):
+    _append(tmp_path / "metrics.jsonl", *map(_metrics, range(30)))
+    path = plot_curves(tmp_path)
+    size, width = _png_size(path)
+    assert path == tmp_path / "curves.png"
+    assert width == 1400
+    assert size > 30_000
+    assert sorted(file.name for file in tmp_path.iterdir()) == ["curves.png", "metrics.jsonl"]
+
+
+def test_more_values_change_the_picture(tmp_path):
+    _append(tmp_path / "metrics.jsonl", *map(_metrics, range(10)))
+    before = plot_curves(tmp_path).read_bytes()
+    assert plot_curves(tmp_path).read_bytes() == before
+    _append(tmp_path / "metrics.jsonl", {"iteration": 10, "env_steps": 9000, "evaluation/air_success_ever": 0.5})
+    assert plot_curves(tmp_path).read_bytes() != before
+
+
+@pytest.mark.parametrize(
+    "records",
+    [
+        [{"iteration": 0}],
+        [_metrics(0)],
+        [_metrics(5)],
+        [{"iteration": 0, "env_steps": 10, "bob/success_rate": None}, _metrics(2)],
+        [_metrics(1), {"iteration": 2, "bob/success_rate": 0.5}, _metrics(3) | {"alice/valid_fraction": float("nan")}],
+    ],
+)
+@pytest.mark.filterwarnings("error")
+def test_curves_bear_missing_values(tmp_path, records):
+    _append(tmp_path / "metrics.jsonl", *records)
+    assert _png_size(plot_curves(tmp_path))[0] > 20_000
+
+
+def test_a_torn_last_line_does_not_change_the_picture(tmp_path):
+    _append(tmp_path / "metrics.jsonl", *map(_metrics, range(5)))
+    before = plot_curves(tmp_path).read_bytes()
+    with (tmp_path / "metrics.jsonl").open("a") as file:
+        file.write('{"iteration": 5, "env_st')
+    assert plot_curves(tmp_path).read_bytes() == before
+
+
+@pytest.mark.parametrize(("plot", "name"), [(plot_curves, "metrics.jsonl"), (plot_goals, "goals.jsonl")])
+def test_an_empty_or_missing_file_is_an_error_that_names_it(tmp_path, plot, name):
+    with pytest.raises(TandemError, match=f"cannot read .*{name}"):
+        plot(tmp_path)
+    (tmp_path / name).write_text('{"torn')
+    with pytest.raises(TandemError, match=f"{name} holds no record yet"):
+        plot(tmp_path)
+
+
+def test_column_has_nan_where_a_record_has_no_finite_number():
+    records = [{"a": 1}, {}, {"a": None}, {"a": float("inf")}, {"a": "text"}, {"a": 0.5}]
+    np.testing.assert_array_equal(column(records, "a"), [1.0, np.nan, np.nan, np.nan, np.nan, 0.5])
+
+
+def test_smoothing_by_hand():
+    # span 3: decay 1/2, so (0.5 * 1) / 0.5, (0.25 * 1 + 0.5 * 4) / 0.75, (0.125 * 1 + 0.25 * 4 + 0.5 * 0) / 0.875
+    np.testing.assert_allclose(_smooth(np.array([1.0, 4.0, 0.0]), span=3.0), [1.0, 3.0, 1.125 / 0.875])
+    np.testing.assert_allclose(_smooth(np.array([2.0, 5.0]), span=1.0), [2.0, 5.0])
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("num_records", [1, 3, 9])
+def test_goals_are_drawn_for_short_and_long_runs(tmp_path, num_records):
+    _append(
+        tmp_path / "goals.jsonl",
+        *({"iteration": i, "env_steps": 1000 * i, "goals": [GOAL] * (i % 3)} for i in range(num_records)),
+    )
+    path = plot_goals(tmp_path, WORKSPACE)
+    assert path == tmp_path / "goals.png"
+    assert _png_size(path)[0] > 20_000
+
+
+def test_goals_of_many_records_are_joined_and_broken_ones_left_out(tmp_path):
+    unsolved, broken = [*GOAL[:6], 0], [None, *GOAL[1:]]
+    records = [{"env_steps": 1e6, "goals": [GOAL, unsolved]}, {}, {"env_steps": 3e6, "goals": [GOAL, broken, GOAL]}]
+    goals = _goals(records, tmp_path)
+    np.testing.assert_array_equal(goals, [GOAL, unsolved, GOAL, GOAL])
+    assert _slice_title(records, goals) == "1.00 to 3.00 M env steps\n4 goals, 75% solved"
+    assert _slice_title([], goals[:0]) == "\nno goals yet"
+
+
+@pytest.mark.parametrize("goals", [[GOAL[:6]], [GOAL, [1]], [GOAL * 2], [["a"] * 7], 5])
+def test_goals_of_another_layout_are_refused(tmp_path, goals):
+    _append(tmp_path / "goals.jsonl", {"iteration": 0, "goals": goals})
+    with pytest.raises(TandemError, match=r"goals\.jsonl: a goal is not 7 numbers"):
+        plot_goals(tmp_path)
+
+
+def test_bounds_by_hand():
+    low, high = bounds(WorkspaceConfig(center_x_m=-0.05, center_y_m=0.1, length_x_m=0.3, length_y_m=0.2, height_m=0.4))
+    np.testing.assert_allclose(low, [-0.2, 0.0, 0.0])
+    np.testing.assert_allclose(high, [0.1, 0.2, 0.4])
+
+
+@pytest.mark.filterwarnings("error")
+def test_coverage_is_drawn_also_for_trajectories_that_leave_or_have_one_point(tmp_path):
+    line = np.linspace([0.0, 0.0, 0.025], [0.05, 0.05, 0.15], 20)
+    away = np.linspace([0.0, 0.0, 0.025], [2.0, 0.0, -1.0], 20)
+    path = plot_coverage([line, away, line[:1], away + np.nan], WORKSPACE, tmp_path / "new" / "coverage.png", "v1")
+    assert _png_size(path) == (pytest.approx(120_000, rel=0.7), 1400)
+
+
+def test_coverage_counts_by_hand():
+    still = np.full((3, 3), 0.01)
+    moving = np.array([[0.01, 0.01, 0.01], [0.09, 0.01, 0.01], [5.0, 0.01, 0.01]])
+    assert _coverage_words([still, moving]) == "2 compositions, 1 move the object over 5 cm"
+
+
+def test_points_far_outside_break_the_line():
+    points = np.array([[0.0, 0.0, 0.1], [0.12, 0.0, 0.1], [0.14, 0.0, 0.1]])
+    np.testing.assert_array_equal(np.isnan(_inside(points, WORKSPACE))[:, 0], [False, False, True])
+
+
+@pytest.mark.parametrize("shape", [(0, 3), (5, 2), (3,), (2, 5, 3)])
+def test_coverage_refuses_another_shape(tmp_path, shape):
+    with pytest.raises(TandemError, match="trajectory 1 has shape"):
+        plot_coverage([np.zeros((2, 3)), np.zeros(shape)], WORKSPACE, tmp_path / "coverage.png", "v1")
+
+
+def test_coverage_refuses_nothing(tmp_path):
+    with pytest.raises(TandemError, match="no trajectories"):
+        plot_coverage([], WORKSPACE, tmp_path / "coverage.png", "v1")
+
+
+def test_a_picture_that_cannot_be_written_is_one_line_for_the_user(tmp_path):
+    (tmp_path / "taken").write_text("a file where a directory should be")
+    with pytest.raises(TandemError, match="cannot write"):
+        plot_coverage([np.zeros((2, 3))], WORKSPACE, tmp_path / "taken" / "coverage.png", "v1")
+
+
+def test_import_loads_no_matplotlib_and_drawing_no_pyplot():
+    new_figure(1.0, 1.0, "")
+    code = (
+        "import sys, service.media.plots as p; assert 'matplotlib' not in sys.modules; "
+        "from service.media.plots.figures import new_figure; new_figure(1, 1, ''); "
+        "assert 'matplotlib.pyplot' not in sys.modules and 'torch' not in sys.modules"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True)

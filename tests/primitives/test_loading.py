@@ -1,0 +1,140 @@
+"""Finding a Bob: in a registry, or in a run directory."""
+
+import numpy as np
+import pytest
+
+from service.envs.observations import BOB_SIZE, FULL_SIZE
+from service.errors import TandemError
+from service.io import checkpoints
+from service.io.run_directory import RunDirectory
+from service.policies.evaluator import GaussianEvaluator, MCPEvaluator
+from service.primitives.loading import load_bob, load_players, read_parameters
+from service.registry.registry import BUNDLED, Registry
+from tests.runtime.runs import assert_one_line, play, tiny_config
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    """(directory, learner) of a short run."""
+    path = tmp_path_factory.mktemp("primitives") / "run"
+    run, _ = play(path, tiny_config(total_env_steps=400, checkpoint_interval=1))
+    return path, run.learner
+
+
+@pytest.fixture
+def registry(run, tmp_path):
+    """A registry with the run's Bob as version 1, and nobody of use as version 2."""
+    registry = Registry(tmp_path / "registry")
+    config = tiny_config().model_dump(mode="json")
+    common = {"spaces": {}, "normalisation": {}, "config": config, "metrics": {}}
+    registry.publish("tiny", run[1].weights().bob, **common)
+    registry.publish("tiny", run[1].weights().alice, **common)
+    registry.set_alias("tiny", "champion", 1)
+    return registry.root
+
+
+def observations(size):
+    return 0.1 * np.random.default_rng(0).standard_normal((7, size)).astype(np.float32)
+
+
+def test_the_newest_bob_of_a_run_directory(run, tmp_path):
+    path, learner = run
+    bob = load_bob(str(path), tmp_path)
+    assert bob.label == str(path)
+    assert bob.manifest is None
+    assert bob.config == tiny_config(total_env_steps=400, checkpoint_interval=1)
+    rows = observations(BOB_SIZE)
+    expected = MCPEvaluator(learner.weights().bob).act_deterministic(rows)
+    assert np.array_equal(bob.policy.act_deterministic(rows), expected)
+
+
+@pytest.mark.parametrize("reference", ["tiny@1", "tiny@champion"])
+def test_a_published_bob(run, registry, reference):
+    bob = load_bob(reference, registry)
+    assert bob.label == "tiny@1"
+    assert bob.config == tiny_config()
+    assert bob.manifest == Registry(registry).manifest("tiny@1")
+    rows = observations(BOB_SIZE)
+    expected = MCPEvaluator(run[1].weights().bob).act_deterministic(rows)
+    assert np.array_equal(bob.policy.act_deterministic(rows), expected)
+
+
+def test_a_name_the_registry_does_not_have_is_that_of_the_package(registry):
+    bob = load_bob("panda-cube@champion", registry)
+    manifest = Registry(BUNDLED).manifest("panda-cube@champion")
+    assert (bob.label, bob.manifest) == (f"{manifest.reference} (bundled)", manifest)
+    assert isinstance(bob.primitives, MCPEvaluator)
+
+
+def test_both_players(run):
+    path, learner = run
+    alice, bob = load_players(RunDirectory(path))
+    weights = learner.weights()
+    rows = observations(FULL_SIZE)
+    assert np.array_equal(alice.act_deterministic(rows), GaussianEvaluator(weights.alice).act_deterministic(rows))
+    rows = observations(BOB_SIZE)
+    assert np.array_equal(bob.act_deterministic(rows), MCPEvaluator(weights.bob).act_deterministic(rows))
+
+
+def test_parameters_are_those_of_the_player_alone(run):
+    path, learner = run
+    parameters = read_parameters(RunDirectory(path), "alice")
+    assert parameters.keys() == learner.weights().alice.keys()
+
+
+@pytest.mark.parametrize(
+    ("reference", "parts"),
+    [
+        ("tiny@best", ["no alias 'best'", "latest -> 2"]),
+        ("tiny@9", ["no version 9"]),
+        ("nobody", ["no 'nobody'", "it holds: tiny", "with tandem comes: panda-cube"]),
+        ("no/such/run", ["no/such/run", "no such run directory", "NAME@ALIAS"]),
+        ("Tiny!", ["bad reference 'Tiny!'"]),
+    ],
+)
+def test_nobody_there(registry, reference, parts):
+    with pytest.raises(TandemError) as error:
+        load_bob(reference, registry)
+    assert_one_line(error.value, *parts)
+
+
+def test_a_directory_without_a_run(tmp_path):
+    with pytest.raises(TandemError) as error:
+        load_bob(str(tmp_path), tmp_path)
+    assert_one_line(error.value, "no run in", tmp_path)
+
+
+def test_a_run_without_a_checkpoint(tmp_path):
+    directory = RunDirectory(tmp_path)
+    directory.start(tiny_config())
+    directory.close()
+    with pytest.raises(TandemError) as error:
+        load_bob(str(tmp_path), tmp_path)
+    assert_one_line(error.value, "no checkpoint", tmp_path)
+
+
+def test_a_checkpoint_of_another_format(tmp_path, monkeypatch):
+    directory = RunDirectory(tmp_path)
+    directory.start(tiny_config())
+    directory.close()
+    monkeypatch.setattr(checkpoints, "FORMAT_VERSION", 99)
+    checkpoints.CheckpointStore(directory.checkpoints, keep=1).save(4, {}, {})
+    monkeypatch.undo()
+    with pytest.raises(TandemError) as error:
+        load_bob(str(tmp_path), tmp_path)
+    assert_one_line(error.value, "checkpoint-00000004", "format version 99", "reads 1")
+
+
+def test_parameters_of_another_policy_are_the_users_mistake(registry):
+    with pytest.raises(TandemError) as error:
+        load_bob("tiny@2", registry)
+    assert_one_line(error.value, "tiny@2")
+
+
+def test_primitives_of_a_configuration_of_another_time(run, tmp_path):
+    config = tiny_config().model_dump(mode="json") | {"worlds": {}}
+    common = {"spaces": {}, "normalisation": {}, "metrics": {}}
+    Registry(tmp_path).publish("tiny", run[1].weights().bob, config=config, **common)
+    with pytest.raises(TandemError) as error:
+        load_bob("tiny", tmp_path)
+    assert_one_line(error.value, "the manifest of tiny", "'worlds'")
