@@ -34,7 +34,6 @@ from numpy.typing import NDArray
 
 from service.config import Config, ConfigError, dump_config, load_config
 from service.errors import TandemError
-from service.generator.validity import Verdict
 from service.io.checkpoints import CheckpointStore
 from service.io.files import os_errors, remove_temporaries, write_atomic
 from service.io.jsonl import JsonlWriter
@@ -43,12 +42,10 @@ from service.registry.errors import RegistryError
 from service.registry.manifest import git_commit
 
 if TYPE_CHECKING:
-    from service.actors.rollout import Broken, GoalRecords
+    from service.actors.rollout import Broken
     from service.io.tensorboard import EventFile
 
 _logger = logging.getLogger(__name__)
-GOALS_PER_ITERATION = 32
-"""Valid proposals recorded per iteration, at most."""
 MAX_BROKEN_FILES = 100
 
 
@@ -152,15 +149,10 @@ class RunDirectory:
             with self._going_on(self.path / "tensorboard"):
                 self._events.add(metrics)
 
-    def record_goals(self, iteration: int, num_env_steps: int, records: GoalRecords) -> None:
-        """Append a sample of this iteration's valid proposals that the current Bob played."""
-        rows = sampled_goals(records)
-        table = np.concatenate(
-            [records.start_position[rows], records.goal[rows], records.solved[rows, None].astype(float)], axis=1
-        )
-        # "iteration" counts finished iterations, as in metrics.jsonl, so that a resume cuts both files alike.
+    def record_goals(self, iteration: int, num_env_steps: int, goals: NDArray[np.float64]) -> None:
+        """Append a sample of an iteration's valid proposals: (M, 7) start x y z, goal x y z (metres), solved 0/1."""
         with self._going_on(self.goals_file):
-            self._goals.append({"iteration": iteration + 1, "env_steps": num_env_steps, "goals": np.round(table, 4)})
+            self._goals.append({"iteration": iteration, "env_steps": num_env_steps, "goals": np.round(goals, 4)})
 
     def dump_broken(self, name: str, broken: Broken) -> None:
         """Save the states and actions whose physics diverged in a round, by its name; at most 100 rounds are kept."""
@@ -212,12 +204,6 @@ class RunDirectory:
             self._failing.add(path)
         else:
             self._failing.discard(path)
-
-
-def sampled_goals(records: GoalRecords) -> NDArray[np.int64]:
-    """The worlds whose goals are recorded: valid proposals that the current Bob played, not too many."""
-    chosen = (records.verdict == Verdict.VALID) & records.played & ~records.replayed & ~records.bob_past
-    return np.flatnonzero(chosen)[:GOALS_PER_ITERATION]
 
 
 def _environment() -> dict[str, object]:

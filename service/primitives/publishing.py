@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import json
 
-from service.actors.evaluation import evaluate
+from service.actors.evaluation import EVALUATED_GOALS, EVALUATION_SEED, success_metrics
 from service.config import Config
 from service.envs.observations import NORMALISATION_BOB, SPACES
 from service.io import tensors
@@ -17,7 +17,6 @@ from service.registry.blobs import sha256_of
 from service.registry.errors import RegistryError
 from service.registry.names import Version
 from service.registry.registry import Registry
-from service.runtime.runner import EVALUATED_GOALS, EVALUATION_SEED
 
 FINAL_EVALUATION_EPISODES = 300
 
@@ -25,20 +24,16 @@ FINAL_EVALUATION_EPISODES = 300
 def measure_bob(config: Config, parameters: Parameters) -> dict[str, float]:
     """Bob's success rates without noise on every kind of goals of a run, by metric; but not the run's own goals."""
     bob = bob_evaluator(parameters)
-    metrics = {}
+    metrics: dict[str, float] = {}
     for kind in EVALUATED_GOALS:
-        result = evaluate(
+        metrics |= success_metrics(
             bob,
-            config.world,
+            config,
             kind,
-            num_episodes=FINAL_EVALUATION_EPISODES,
-            num_steps=config.run.evaluation_steps,
-            success_distance_m=config.game.success_distance_m,
+            FINAL_EVALUATION_EPISODES,
             seed=EVALUATION_SEED + 1,
             num_threads=config.run.num_threads,
         )
-        metrics[f"evaluation/{kind}_success_last"] = result.success_last
-        metrics[f"evaluation/{kind}_success_ever"] = result.success_ever
     return metrics
 
 

@@ -177,8 +177,8 @@ def test_demo_is_a_short_pretraining_with_a_registry_of_its_own(monkeypatch, tmp
 
 def test_demo_ends_with_what_comes_with_tandem_and_what_to_type(monkeypatch, tmp_path):
     from service.actors import evaluation
-    from service.runtime.local import RunResult
     from service.runtime.pretrain import Pretrained
+    from service.runtime.runner import RunResult
 
     def pretrain(*args, **kwargs):
         return Pretrained(RunResult("finished", 1, 7), {}, Version("panda-cube-demo", 1), {}, "total 1 s")

@@ -36,7 +36,7 @@ def diverge_after(patch, iteration):
 
     def spoiled(self, weights):
         if self.iteration >= iteration:
-            patch.setattr("service.runtime.local.GaussianEvaluator", NotANumber)
+            patch.setattr("service.runtime.workers.GaussianEvaluator", NotANumber)
         return players(self, weights)
 
     patch.setattr(LocalRun, "_players", spoiled)

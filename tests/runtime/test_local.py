@@ -234,7 +234,7 @@ def test_a_run_killed_between_two_iterations(uninterrupted, tmp_path, iteration)
     run, result = play(tmp_path, config, resume=True)
     assert result.reason == "finished"
     assert_same_run(tmp_path, uninterrupted)
-    assert run.books.wall_s > 0.0
+    assert run.bookkeeper.wall_s > 0.0
     snapshots = [
         {file.name: file.read_bytes() for file in (path / "snapshots").iterdir()} for path in (tmp_path, uninterrupted)
     ]

@@ -140,7 +140,7 @@ def test_a_resume_does_what_the_signal_kept_from_being_done(home, uninterrupted,
 
 
 @BOTH
-@pytest.mark.parametrize("where", ["service.runtime.local.SelfPlay", "service.io.checkpoints.write_atomic"])
+@pytest.mark.parametrize("where", ["service.runtime.workers.SelfPlay", "service.io.checkpoints.write_atomic"])
 def test_a_signal_while_a_run_is_being_begun(home, monkeypatch, where, number):
     with monkeypatch.context() as patch:
         send_when_called(patch, where, number)
@@ -154,7 +154,7 @@ def test_a_signal_while_a_run_is_being_begun(home, monkeypatch, where, number):
 def test_a_signal_while_a_run_is_being_loaded(home, uninterrupted, monkeypatch, number):
     play(home.path, kill_after=3)
     with monkeypatch.context() as patch:
-        send_when_called(patch, "service.runtime.local.TaskGenerator.load_state", number)
+        send_when_called(patch, "service.runtime.workers.TaskGenerator.load_state", number)
         result = home.run("--resume")
     assert result.exit_code == 128 + number
     assert result.stdout == f"stopped at once; {home.hint}"
