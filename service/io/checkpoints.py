@@ -16,8 +16,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from service.io import tensors
+from service.io.errors import CheckpointError, FormatVersionError
 from service.io.files import os_errors, remove_temporaries, write_atomic
-from service.registry.errors import CheckpointError, FormatVersionError
 
 FORMAT_VERSION = 1
 _HEADER_KEY = "tandem_checkpoint"

@@ -14,7 +14,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Literal
 
-from service.registry.errors import RegistryError
+from service.io.errors import StorageError
 
 TEMPORARY_PREFIX = ".tmp-"
 
@@ -53,7 +53,7 @@ def write_exclusive(path: Path, data: bytes) -> bool:
 
 @contextlib.contextmanager
 def os_errors(
-    action: Literal["read", "write"], path: Path, error_type: type[RegistryError] = RegistryError
+    action: Literal["read", "write"], path: Path, error_type: type[StorageError] = StorageError
 ) -> Iterator[None]:
     """Turn an operating-system error of the block into ``error_type`` with one line for the user.
 

@@ -31,7 +31,7 @@ class EventFile:
                 hidden from then on. None for a run that begins.
 
         Raises:
-            RegistryError: the disk is full or the file cannot be written.
+            StorageError: the disk is full or the file cannot be written.
         """
         host, process = socket.gethostname(), os.getpid()
         self._file = Appender(directory / f"events.out.tfevents.{_stamp(directory):010d}.{host}.{process}")
@@ -44,7 +44,7 @@ class EventFile:
         """Append one iteration's metrics, over its env steps.
 
         Raises:
-            RegistryError: the disk is full; the event waits, see `Appender.append`.
+            StorageError: the disk is full; the event waits, see `Appender.append`.
         """
         values = [
             Summary.Value(tag=name, simple_value=value)
@@ -57,7 +57,7 @@ class EventFile:
         """Write the events that wait, and see to it that a power cut leaves them all there.
 
         Raises:
-            RegistryError: as for `add`.
+            StorageError: as for `add`.
         """
         self._file.sync()
 

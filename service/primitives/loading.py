@@ -11,7 +11,7 @@ from service.io.checkpoints import Checkpoint, CheckpointStore, read_checkpoint
 from service.io.run_directory import RunDirectory
 from service.policies.evaluator import GaussianEvaluator, MCPEvaluator, bob_evaluator
 from service.policies.parameters import Parameters, PolicyError
-from service.primitives.bundled import find_version
+from service.primitives.bundled import find_version, is_bundled
 from service.registry.manifest import Manifest
 
 
@@ -58,7 +58,7 @@ def load_bob(reference: str, registry: Path) -> TrainedBob:
     manifest, tensors = found.load(str(version))
     config = parse_config(manifest.config, where=f"the manifest of {reference}")
     # two registries may both have a version 1: which one was meant must be seen
-    label = f"{version} (bundled)" if found.bundled else str(version)
+    label = f"{version} (bundled)" if is_bundled(found) else str(version)
     return TrainedBob(label, _evaluator(label, tensors), config, manifest)
 
 

@@ -24,7 +24,7 @@ class BlobStore:
         """Store ``data`` and return its sha256 in hex; bytes already there and whole are not written again.
 
         Raises:
-            RegistryError: the disk is full or cannot be written; nothing is left behind.
+            StorageError: the disk is full or cannot be written; nothing is left behind.
         """
         digest = sha256_of(data)
         path = self.path(digest)
@@ -38,7 +38,7 @@ class BlobStore:
 
         Raises:
             DamagedBlobError: the file is missing or holds other bytes.
-            RegistryError: the file cannot be read.
+            StorageError: the file cannot be read.
         """
         path = self.path(digest)
         with os_errors("read", path):

@@ -20,6 +20,7 @@ import numpy as np
 import ray
 from ray.exceptions import ObjectLostError, RayActorError, RayError, RayTaskError
 
+from service.actors.evaluation import EVALUATED_GOALS, EVALUATION_SEED
 from service.actors.rollout import from_arrays
 from service.config import Config
 from service.errors import DivergedError
@@ -30,8 +31,6 @@ from service.runtime.bookkeeping import Books
 from service.runtime.ray_connection import ClusterOptions
 from service.runtime.remote_worker import Stateful, one_line
 from service.runtime.runner import (
-    EVALUATED_GOALS,
-    EVALUATION_SEED,
     ClusterError,
     Health,
     Metrics,
@@ -396,7 +395,7 @@ class ClusterRun:
         self._evaluated = {}
         with self.timing("record"):
             self.directory.record(metrics)
-            self.directory.record_goals(self.books.iteration - 1, self.books.num_env_steps, recorded.sample)
+            self.directory.record_goals(self.books.iteration, self.books.num_env_steps, recorded.goals)
             self._on_iteration(metrics)
         with self.books.going_on("without this snapshot"):
             self._take_snapshot(after=before)

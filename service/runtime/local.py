@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from service.actors.evaluation import evaluate
+from service.actors.evaluation import EVALUATED_GOALS, EVALUATION_SEED, evaluate
 from service.actors.rollout import Rollout, from_arrays, to_arrays
 from service.actors.self_play import Acting, Players, SelfPlay
 from service.config import Config
@@ -25,9 +25,10 @@ from service.io.run_directory import RunDirectory
 from service.policies.evaluator import GaussianEvaluator, bob_evaluator
 from service.policies.parameters import Parameters
 from service.runtime.bookkeeping import Books
-from service.runtime.runner import EVALUATED_GOALS, EVALUATION_SEED, Health, Metrics, OnBeat, OnIteration, RunResult
+from service.runtime.runner import Health, Metrics, OnBeat, OnIteration, RunResult
 from service.runtime.telling import goal_grid
 from service.runtime.timing import Timing
+from service.runtime.workers import sampled_goals
 from service.store.models import ActorStatus, GoalGrid
 
 if TYPE_CHECKING:
@@ -160,7 +161,8 @@ class LocalRun:
             rollout = self._play(players)
         with self.timing("generator"):
             metrics = rollout.metrics | self.generator.record(rollout.records)
-            self.directory.record_goals(self.iteration, self.num_env_steps + rollout.num_env_steps, rollout.records)
+            num_env_steps = self.num_env_steps + rollout.num_env_steps
+            self.directory.record_goals(self.iteration + 1, num_env_steps, sampled_goals(rollout.records))
             self.directory.dump_broken(f"{rollout.sequence:06d}", rollout.broken)
             if self.generator.snapshot_due(self.iteration):
                 self.generator.add_opponents(weights.alice, weights.bob)

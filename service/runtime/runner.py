@@ -6,7 +6,6 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol
 
-from service.envs.goals import GoalKind
 from service.errors import TandemError
 from service.policies.parameters import Parameters
 from service.runtime.bookkeeping import Books
@@ -16,10 +15,6 @@ from service.store.models import ActorStatus, GoalGrid
 Metrics = dict[str, float]
 OnIteration = Callable[[Metrics], None]
 OnBeat = Callable[[], None]
-
-EVALUATED_GOALS: tuple[GoalKind, ...] = ("table", "air", "mixed")
-EVALUATION_SEED = 1_000_003
-"""Evaluations during a run always use the same goals, so that they compare."""
 
 
 class ClusterError(TandemError):

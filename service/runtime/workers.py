@@ -24,7 +24,7 @@ from service.envs.batch import WorldBatch
 from service.envs.goals import GoalKind
 from service.generator.generator import GoalChoice, TaskGenerator
 from service.generator.opponents import RoundPlan
-from service.io.run_directory import sampled_goals
+from service.generator.validity import Verdict
 from service.policies.evaluator import GaussianEvaluator, bob_evaluator
 from service.policies.parameters import Parameters
 from service.runtime.telling import goal_grid
@@ -38,6 +38,8 @@ StateArray = NDArray[np.float64]
 RolloutId = tuple[int, int, int]
 Metrics = dict[str, float]
 
+GOALS_PER_ITERATION = 32
+"""Valid proposals kept for the run directory per iteration, at most."""
 GENERATOR_TIMEOUT_S = 30.0
 """It answers within milliseconds, if it is there."""
 NICENESS = 10
@@ -103,8 +105,8 @@ class Recorded:
     metrics: Metrics
     should_stop: bool
     grid: GoalGrid
-    sample: GoalRecords
-    """Some of the goals, for the run directory."""
+    goals: StateArray
+    """(M, 7) some of the goals, for the run directory; see ``RunDirectory.record_goals``."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -311,8 +313,8 @@ class GeneratorWorker:
             self._generator.add_opponents(weights.alice, weights.bob)
             self._pool_version += 1
         grid = goal_grid(self._generator, iteration + 1, num_env_steps)
-        sample = rows_of(joined, sampled_goals(joined))
-        return Recorded(metrics, self._generator.should_stop(), grid, sample), self._generator.state()
+        recorded = Recorded(metrics, self._generator.should_stop(), grid, sampled_goals(joined))
+        return recorded, self._generator.state()
 
 
 class LearnerWorker:
@@ -378,9 +380,12 @@ def join_records(records: Sequence[GoalRecords]) -> GoalRecords:
     return GoalRecords(**{name: np.concatenate([getattr(each, name) for each in records]) for name in names})
 
 
-def rows_of(records: GoalRecords, rows: NDArray[np.int64]) -> GoalRecords:
-    """Some of the worlds' records."""
-    return GoalRecords(**{field.name: getattr(records, field.name)[rows] for field in fields(GoalRecords)})
+def sampled_goals(records: GoalRecords) -> StateArray:
+    """Valid proposals that the current Bob played, not too many, as ``Recorded.goals``."""
+    chosen = (records.verdict == Verdict.VALID) & records.played & ~records.replayed & ~records.bob_past
+    rows = np.flatnonzero(chosen)[:GOALS_PER_ITERATION]
+    solved = records.solved[rows, None].astype(float)
+    return np.concatenate([records.start_position[rows], records.goal[rows], solved], axis=1)
 
 
 def _ask(generator: Any, *arguments: Any) -> tuple[GoalChoice, np.random.Generator]:

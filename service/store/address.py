@@ -11,8 +11,6 @@ from urllib.parse import urlsplit
 from service.store.errors import StoreError, StoreUnavailableError
 
 VARIABLE = "TANDEM_REDIS_URL"
-CHECK_S = 2.0
-"""How long Redis may take to answer when it is first asked."""
 _FORM = "redis://[[USER]:PASSWORD@]HOST[:PORT][/DB], with %-escapes for other characters than letters and digits"
 
 
@@ -77,20 +75,6 @@ class RedisAddress:
             redis_connect_func=connected,
             protocol=2,  # one shape of replies, whatever redis-py makes the default
         )
-
-    def check(self) -> None:
-        """Return if Redis is there and lets us in.
-
-        Raises:
-            StoreUnavailableError: it is not, or does not.
-        """
-        from redis.exceptions import RedisError
-
-        try:
-            with self.client(CHECK_S) as client:
-                client.ping()
-        except (RedisError, OSError) as error:
-            raise self.unavailable(error) from None
 
     def unavailable(self, error: Exception) -> StoreUnavailableError:
         """What to tell a user about a client's error."""

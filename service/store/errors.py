@@ -19,10 +19,6 @@ class UnknownRunError(StoreError):
         return cls(f"no run {run_id[:128]!r} in {where}; it holds: {shown or 'nothing yet'}")
 
 
-class RunTakenError(StoreError):
-    """Another process runs this run."""
-
-
 class StoreUnavailableError(StoreError):
     """The store cannot be reached at the moment."""
 

@@ -12,8 +12,8 @@ from typing import Any
 
 from redis.exceptions import WatchError
 
+from service.io.errors import RunTakenError
 from service.store import keys
-from service.store.errors import RunTakenError
 
 _LOOK_S = 0.1
 

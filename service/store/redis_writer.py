@@ -12,10 +12,10 @@ from typing import Any
 
 from redis.exceptions import RedisError, WatchError
 
+from service.io.errors import RunTakenError
 from service.io.plain import plain
 from service.store import keys
 from service.store.address import RedisAddress, reason_of
-from service.store.errors import RunTakenError
 from service.store.lease import Lease
 from service.store.models import GoalGrid, Record, RunStatus
 

@@ -9,9 +9,10 @@ import time
 
 import pytest
 
+from service.io.errors import RunTakenError
 from service.store import keys, redis_writer
 from service.store.address import RedisAddress
-from service.store.errors import DamagedStoreError, RunTakenError, StoreUnavailableError
+from service.store.errors import DamagedStoreError, StoreUnavailableError
 from service.store.redis_reader import RedisReader
 from service.store.redis_writer import RedisWriter
 from tests.runtime.runs import assert_one_line
