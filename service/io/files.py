@@ -1,4 +1,4 @@
-"""Files that are either wholly there or not there at all, also after a kill or a power cut.
+"""Files that are wholly there or not at all, also after a kill or a power cut.
 
 Every write goes to a temporary file beside its target, is flushed to the disk, and then takes its name in one step. A
 temporary file's name starts with ``.tmp-``, which no name or alias can, so readers never meet one.

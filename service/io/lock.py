@@ -1,4 +1,4 @@
-"""One process at a time in a directory: a lock that the kernel frees when its holder dies, however that happens."""
+"""A lock on a directory: one process at a time, and the kernel frees it when its holder dies, however that happens."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _logger = logging.getLogger(__name__)
 
 
 class DirectoryLock:
-    """Keeps other processes out of a directory from its making until ``release``, or until this process dies.
+    """An exclusive hold on a directory, from construction until `release` or until this process dies.
 
     Args:
         directory: made when missing. On a network file system without locks a warning says that there is none.

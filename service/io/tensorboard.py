@@ -1,4 +1,7 @@
-"""A run's metrics as TensorBoard events, written at once: TensorBoard's own writer keeps them back for two minutes."""
+"""Metrics as TensorBoard events, each written whole and at once.
+
+TensorBoard's own writers give up for good after the first write that fails, and name their files by the clock alone.
+"""
 
 from __future__ import annotations
 
@@ -54,7 +57,7 @@ class EventFile:
         self._append(Event(wall_time=time.time(), step=int(metrics["env_steps"]), summary=Summary(value=values)))
 
     def sync(self) -> None:
-        """Write the events that wait, and see to it that a power cut leaves them all there.
+        """Write the events that wait, and wait until the disk has them all.
 
         Raises:
             StorageError: as for `add`.

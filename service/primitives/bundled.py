@@ -1,4 +1,4 @@
-"""The primitives that come with the package, and which registry answers for a reference."""
+"""The primitives that come with the package, and the look-up of a reference in both registries."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Finding a Bob to evaluate, render or compose: in a registry, or in a run directory."""
+"""Loading a Bob to evaluate, render or compose, from a registry or a run directory."""
 
 from __future__ import annotations
 
@@ -24,11 +24,11 @@ class TrainedBob:
     policy: MCPEvaluator | GaussianEvaluator
     config: Config
     manifest: Manifest | None = None
-    """What the registry knows about him; None for the Bob of a run directory."""
+    """His manifest in the registry; None for the Bob of a run directory."""
 
     @property
     def primitives(self) -> MCPEvaluator:
-        """What can be composed.
+        """The policy as primitives that can be composed.
 
         Raises:
             TandemError: this Bob is monolithic.

@@ -1,4 +1,4 @@
-"""From a trained Bob to a version in the registry: measured, published once, and told which version he comes from."""
+"""Publishing a trained Bob: measured, published once, with the version he was trained on from as parent."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ FINAL_EVALUATION_EPISODES = 300
 
 
 def measure_bob(config: Config, parameters: Parameters) -> dict[str, float]:
-    """Bob's success rates without noise on every kind of goals of a run, by metric; but not the run's own goals."""
+    """Bob's success rates without noise on every kind of goals, by metric; the goals are not those of the run."""
     bob = bob_evaluator(parameters)
     metrics: dict[str, float] = {}
     for kind in EVALUATED_GOALS:
@@ -90,7 +90,7 @@ def publish_bob(
 
 
 def _newest_if_same(registry: Registry, name: str, parameters: Parameters) -> Version | None:
-    """A finished run that is resumed and has nothing left to do must not publish its Bob a second time."""
+    """The newest version, if it has these parameters: a finished run that is resumed must not publish them again."""
     for version in registry.versions(name)[-1:]:
         with contextlib.suppress(StorageError):  # a damaged version is mended by publishing again
             manifest, _ = registry.load(str(version))
@@ -100,7 +100,7 @@ def _newest_if_same(registry: Registry, name: str, parameters: Parameters) -> Ve
 
 
 def _published_before(directory: RunDirectory, registry: Registry) -> str | None:
-    """What this run published last, if this registry is where it did so."""
+    """The version this run published last, if it did so in this registry."""
     if not directory.published_file.exists():
         return None
     note = json.loads(directory.published_file.read_bytes())

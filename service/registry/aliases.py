@@ -17,7 +17,7 @@ class Aliases:
     """The aliases of one name in a directory; any number of processes may move them at once."""
 
     def __init__(self, directory: Path) -> None:
-        """Nothing is written before the first `move`."""
+        """Take the directory; nothing is written before the first `move`."""
         self._directory = directory
 
     def read(self, alias: str) -> int | None:

@@ -13,11 +13,11 @@ class BlobStore:
     """Content-addressed files ``sha256/<digest>`` under a directory; safe for many processes at once."""
 
     def __init__(self, directory: Path) -> None:
-        """Nothing is written before the first `put`."""
+        """Take the directory; nothing is written before the first `put`."""
         self._directory = directory
 
     def path(self, digest: str) -> Path:
-        """Where the blob of that digest is, or would be."""
+        """File of the blob of that digest, there or not."""
         return self._directory / "sha256" / digest
 
     def put(self, data: bytes) -> str:

@@ -1,4 +1,4 @@
-"""What a version says about itself: a JSON manifest that carries its own digest."""
+"""Manifests: the description of a version, as JSON that carries its own digest."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What can go wrong with reading what runs tell."""
+"""Errors of reading and writing the reports of runs."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from service.errors import TandemError
 
 
 class StoreError(TandemError):
-    """Something about the store or a request to it is wrong."""
+    """The store cannot do what was asked."""
 
 
 class UnknownRunError(StoreError):
@@ -26,6 +26,6 @@ class StoreUnavailableError(StoreError):
 
 
 class DamagedStoreError(StoreError):
-    """The store holds something that no run has written."""
+    """The store holds a value that no run has written."""
 
     exit_code = 1

@@ -42,5 +42,5 @@ def stop(run_id: str) -> str:
 
 
 def lease(run_id: str) -> str:
-    """Key of who runs it."""
+    """Key of the claim of the process that runs it."""
     return f"tandem:run:{run_id}:lease"

@@ -1,4 +1,4 @@
-"""Who runs a run: a key in Redis that its holder renews, and that expires when the holder is gone."""
+"""A claim on a run: a key in Redis that its holder renews, and that expires when the holder is gone."""
 
 from __future__ import annotations
 

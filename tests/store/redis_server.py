@@ -90,7 +90,6 @@ class RedisServer:
             except StoreUnavailableError:
                 time.sleep(0.005)
             else:
-                reader.close()
                 return self._process.poll() is None
         return False
 

@@ -180,7 +180,7 @@ def test_closing_waits_for_a_bounded_time(redis, caplog, monkeypatch):
         assert returns(lambda: writer.close(timeout_s=0.3))
     finally:
         os.kill(redis.server.pid, signal.SIGCONT)
-    assert_one_line(caplog.messages[-1], "was not told the end of run cube", "its files have it")
+    assert_one_line(caplog.messages[-1], "did not get the end of run cube", "its files have it")
 
 
 def test_closing_sends_what_waits(redis, reader):
