@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from typing import Protocol
 
@@ -98,23 +99,30 @@ def evaluate(
 
 
 def success_metrics(
-    policy: Deterministic, config: Config, kind: GoalKind, num_episodes: int, *, seed: int, num_threads: int
+    policy: Deterministic,
+    config: Config,
+    kinds: Sequence[GoalKind],
+    num_episodes: int,
+    *,
+    seed: int,
+    num_threads: int,
 ) -> dict[str, float]:
-    """Success rates on goals of one kind in a run's world, as metrics ``evaluation/KIND_success_...``."""
-    result = evaluate(
-        policy,
-        config.world,
-        kind,
-        num_episodes=num_episodes,
-        num_steps=config.run.evaluation_steps,
-        success_distance_m=config.game.success_distance_m,
-        seed=seed,
-        num_threads=num_threads,
-    )
-    return {
-        f"evaluation/{kind}_success_last": result.success_last,
-        f"evaluation/{kind}_success_ever": result.success_ever,
-    }
+    """Success rates on several kinds of goals in a run's world, as metrics ``evaluation/KIND_success_...``."""
+    metrics = {}
+    for kind in kinds:
+        result = evaluate(
+            policy,
+            config.world,
+            kind,
+            num_episodes=num_episodes,
+            num_steps=config.run.evaluation_steps,
+            success_distance_m=config.game.success_distance_m,
+            seed=seed,
+            num_threads=num_threads,
+        )
+        metrics[f"evaluation/{kind}_success_last"] = result.success_last
+        metrics[f"evaluation/{kind}_success_ever"] = result.success_ever
+    return metrics
 
 
 def wilson_interval(successes: int, num: int, z: float = 1.96) -> tuple[float, float]:

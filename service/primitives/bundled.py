@@ -1,4 +1,4 @@
-"""The primitives that come with the package, and which registry answers for a reference."""
+"""The primitives that come with the package, and the look-up of a reference in both registries."""
 
 from __future__ import annotations
 
@@ -6,7 +6,10 @@ from pathlib import Path
 
 from service.registry.errors import UnknownVersionError
 from service.registry.names import Version, split_reference
-from service.registry.registry import BUNDLED, Registry
+from service.registry.registry import Registry
+
+BUNDLED = Path(__file__).parent / "data"
+"""The registry that comes with the package; it is only read."""
 
 
 def find_version(reference: str, root: Path) -> tuple[Registry, Version]:
@@ -23,7 +26,7 @@ def find_version(reference: str, root: Path) -> tuple[Registry, Version]:
         RegistryError: not a reference, or a damaged alias.
     """
     own, bundled = Registry(root), Registry(BUNDLED)
-    if own.bundled:
+    if is_bundled(own):
         return own, own.resolve(reference)
     name, _ = split_reference(reference)
     registry = bundled if bundled.versions(name) and not own.versions(name) else own
@@ -31,6 +34,11 @@ def find_version(reference: str, root: Path) -> tuple[Registry, Version]:
         return registry, registry.resolve(reference)
     except UnknownVersionError as error:
         raise UnknownVersionError(f"{error}; {_elsewhere(name, own, bundled)}") from None
+
+
+def is_bundled(registry: Registry) -> bool:
+    """Whether this is the registry that comes with the package."""
+    return registry.root.resolve() == BUNDLED.resolve()
 
 
 def _elsewhere(name: str, own: Registry, bundled: Registry) -> str:

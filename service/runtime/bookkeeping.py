@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 from service.config import Config
 from service.errors import DivergedError
 from service.io.checkpoints import CheckpointStore
+from service.io.errors import CheckpointError
 from service.io.run_directory import RunDirectory
 from service.policies.parameters import Parameters, PolicyError
-from service.registry.errors import CheckpointError
 
 Arrays = dict[str, NDArray[Any]]
 Metrics = dict[str, float]

@@ -357,7 +357,7 @@ class ClusterRun(Runner):
         alive = [slot for slot in self._pool if slot.alive]
         for index, kind in enumerate(EVALUATED_GOALS if alive else ()):
             slot = alive[index % len(alive)]
-            self._waiting[slot.handle.evaluate.remote(self._weights, kind)] = self._on_evaluation
+            self._waiting[slot.handle.evaluate.remote(self._weights, [kind])] = self._on_evaluation
 
     def _on_evaluation(self, reference: Any) -> None:
         try:

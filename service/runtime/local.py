@@ -107,16 +107,8 @@ class LocalRun(Runner):
         result = IterationResult([summary], recorded, updated, num_actors_alive=1)
         self._count(result)
         with self.timing("evaluate"):
-            return result, self._evaluate(weights)
-
-    def _evaluate(self, weights: Weights) -> Metrics:
-        """Success of the Bob who has just played, if an evaluation is due after this iteration."""
-        if not self.bookkeeper.evaluation_due:
-            return {}
-        metrics: Metrics = {}
-        for kind in EVALUATED_GOALS:
-            metrics |= self._actor.evaluate(weights, kind)
-        return metrics
+            due = self.bookkeeper.evaluation_due
+            return result, self._actor.evaluate(weights, EVALUATED_GOALS) if due else {}
 
     # --- exact resume ----------------------------------------------------------------------------------------------
 

@@ -161,10 +161,10 @@ class RolloutWorker:
             metrics=rollout.metrics,
         )
 
-    def evaluate(self, weights: Weights, kind: GoalKind) -> Metrics:
-        """Bob's success without noise on the run's goals of one kind, as metrics."""
+    def evaluate(self, weights: Weights, kinds: Sequence[GoalKind]) -> Metrics:
+        """Bob's success without noise on the run's goals of some kinds, as metrics."""
         bob, episodes = bob_evaluator(weights.steady_bob), self._config.run.evaluation_episodes
-        return success_metrics(bob, self._config, kind, episodes, seed=EVALUATION_SEED, num_threads=self._num_threads)
+        return success_metrics(bob, self._config, kinds, episodes, seed=EVALUATION_SEED, num_threads=self._num_threads)
 
     def _accept(self, assignment: Assignment) -> None:
         self.rng.bit_generator.state = assignment.rng.bit_generator.state

@@ -16,8 +16,9 @@ from service.cli.main import app
 from service.config import load_config
 from service.io import checkpoints
 from service.io.run_directory import RunDirectory
+from service.primitives.bundled import BUNDLED
 from service.registry.names import Version
-from service.registry.registry import BUNDLED, Registry
+from service.registry.registry import Registry
 from tests.runtime.runs import TREE, no_room_above, tiny_config, write_yaml
 
 ROOT = Path(__file__).parents[2]

@@ -8,10 +8,10 @@ import pytest
 
 from service.errors import TandemError
 from service.io.checkpoints import CheckpointStore
+from service.io.errors import CheckpointError
 from service.io.run_directory import RunDirectory
 from service.learner.learner import Learner
 from service.primitives.loading import read_parameters, read_stages
-from service.registry.errors import CheckpointError
 from service.runtime.bookkeeping import UnsavedError
 from service.runtime.local import LocalRun
 from service.runtime.pretrain import resumed_config
@@ -255,7 +255,7 @@ def test_a_run_killed_while_it_learns_and_plays(uninterrupted, tmp_path, monkeyp
 
     def record_goals(self, iteration, *args):
         original(self, iteration, *args)
-        if iteration == 4:
+        if iteration == 5:
             raise KilledError
 
     with monkeypatch.context() as patch:
