@@ -22,7 +22,7 @@ from service.runtime.workers import GeneratorWorker, LearnerWorker, Metrics, Rol
 from service.store.models import ActorStatus, GoalGrid
 
 if TYPE_CHECKING:
-    from service.learner.weights import Weights
+    pass
 
 
 class LocalRun(Runner):

@@ -115,9 +115,7 @@ class Runner(ABC):
         self._on_iteration = on_iteration
         while (reason := self._stop_reason()) is None:
             self._advance(on_beat)
-        with self.bookkeeper.explaining_unsaved():
-            if not self.bookkeeper.saved:
-                self._save()
+        self._save_last()
         return RunResult(reason, self.iteration, self.num_env_steps)
 
     @abstractmethod
@@ -160,6 +158,11 @@ class Runner(ABC):
         """Save an untrained run, so that one that is killed before its first interval can be resumed, too."""
         self._save()
         self._take_snapshot(after=-1)
+
+    def _save_last(self) -> None:
+        with self.bookkeeper.explaining_unsaved():
+            if not self.bookkeeper.saved:
+                self._save()
 
     def _metrics(self, result: IterationResult, elapsed_s: float) -> Metrics:
         """The metrics of an iteration that was counted and took ``elapsed_s``."""

@@ -10,6 +10,7 @@ from service.errors import DivergedError
 from service.io.run_directory import RunDirectory
 from service.policies.evaluator import GaussianEvaluator
 from service.runtime.local import LocalRun
+from service.runtime.workers import RolloutWorker
 from service.runtime.pretrain import resumed_config
 from tests.runtime.runs import assert_one_line, assert_same_run, newest, play, read_lines, write_yaml
 
@@ -32,14 +33,14 @@ def uninterrupted(tmp_path_factory):
 
 def diverge_after(patch, iteration):
     """Alice's policy is no good from the iteration behind this one."""
-    players = LocalRun._players
+    players = RolloutWorker._players
 
     def spoiled(self, weights):
-        if self.iteration >= iteration:
+        if weights.version >= iteration - 1:  # the first iteration has nothing to learn from
             patch.setattr("service.runtime.workers.GaussianEvaluator", NotANumber)
         return players(self, weights)
 
-    patch.setattr(LocalRun, "_players", spoiled)
+    patch.setattr(RolloutWorker, "_players", spoiled)
 
 
 def test_a_policy_that_diverges_is_one_line_that_says_how_to_go_on(uninterrupted, tmp_path, monkeypatch):

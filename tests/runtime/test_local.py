@@ -31,7 +31,8 @@ LONG = {"total_env_steps": 1500}
 """Long enough for replayed goals, which need 64 in the buffer."""
 
 METRICS = {
-    "iteration", "env_steps", "world/num_broken", "time/wall_s", "time/env_steps_per_s", "time/learn_s",
+    "iteration", "env_steps", "world/num_broken", "actor/num_rollouts", "actor/num_alive", "time/wall_s",
+    "time/env_steps_per_s", "time/play_s", "time/wait_for_generator_s", "time/hand_over_s", "time/learn_s",
     "time/learner_idle_fraction",
     # valid, not moved and out-of-workspace rates, and how the rest ends
     "alice/valid_fraction", "alice/not_moved_fraction", "alice/outside_fraction", "alice/fallen_fraction",
@@ -52,7 +53,7 @@ METRICS = {
     # each primitive's mean weight and share of the precision
     "learner/primitive_weight_0", "learner/primitive_weight_1",
     "learner/primitive_share_0", "learner/primitive_share_1", "learner/bob_std",
-    "learner/policy_lag", "learner/version", "learner/non_finite_steps", "learner/rollbacks",
+    "learner/policy_lag", "learner/max_policy_lag", "learner/version", "learner/non_finite_steps", "learner/rollbacks",
     "learner/num_alice_samples", "learner/num_bob_samples",
     "learner/alice_explained_variance", "learner/bob_explained_variance",
     "learner/alice_learning_rate", "learner/bob_learning_rate", "learner/alice_policy_loss", "learner/bob_policy_loss",
@@ -370,14 +371,14 @@ def test_a_disk_that_was_full_for_a_while_costs_nothing(uninterrupted, tmp_path,
 def test_the_last_checkpoint_is_not_written_twice(tmp_path, monkeypatch):
     """The second writing could fail on a disk that is full by now, although all is saved."""
     with ExitStack() as stack:
-        save = LocalRun.save
+        save = LocalRun._save
 
         def save_and_fill(self):
             save(self)
             if self.iteration == 2:
                 stack.enter_context(no_room_above(0))
 
-        monkeypatch.setattr(LocalRun, "save", save_and_fill)
+        monkeypatch.setattr(LocalRun, "_save", save_and_fill)
         _, result = play(tmp_path, tiny_config(total_env_steps=200))
     assert (result.reason, result.iteration) == ("finished", 2)
     assert newest(tmp_path).step == 2

@@ -111,7 +111,7 @@ def uninterrupted(tmp_path_factory):
 @pytest.mark.parametrize(
     ("where", "number"),
     [
-        ("service.primitives.publishing.evaluate", signal.SIGINT),
+        ("service.primitives.publishing.success_metrics", signal.SIGINT),
         ("service.runtime.pretrain.publish_run", signal.SIGTERM),
         ("service.media.artifacts.plot_curves", signal.SIGTERM),
         ("service.media.artifacts.skill_trajectories", signal.SIGINT),
@@ -183,12 +183,12 @@ def test_a_signal_during_an_iteration(home, uninterrupted, monkeypatch, number):
 
 
 def test_two_signals_during_an_iteration(home, uninterrupted, monkeypatch):
-    def signalled(self, weights):
+    def signalled(self, *args):
         send(signal.SIGTERM)
         send(signal.SIGINT)
 
     with monkeypatch.context() as patch:
-        patch.setattr(LocalRun, "_evaluate", signalled)
+        patch.setattr(LocalRun, "_metrics", signalled)
         result = home.run()
     assert result.exit_code == 130
     assert result.stdout == f"stopped at once; {home.hint}"
