@@ -1,5 +1,7 @@
 """A policy or a world that diverges in the middle of a run: what is said, what is kept, and how it goes on."""
 
+from itertools import count
+
 import numpy as np
 import pytest
 import torch
@@ -10,8 +12,8 @@ from service.errors import DivergedError
 from service.io.run_directory import RunDirectory
 from service.policies.evaluator import GaussianEvaluator
 from service.runtime.local import LocalRun
-from service.runtime.workers import RolloutWorker
 from service.runtime.pretrain import resumed_config
+from service.runtime.workers import RolloutWorker
 from tests.runtime.runs import assert_one_line, assert_same_run, newest, play, read_lines, write_yaml
 
 
@@ -33,10 +35,10 @@ def uninterrupted(tmp_path_factory):
 
 def diverge_after(patch, iteration):
     """Alice's policy is no good from the iteration behind this one."""
-    players = RolloutWorker._players
+    players, rounds = RolloutWorker._players, count()
 
     def spoiled(self, weights):
-        if weights.version >= iteration - 1:  # the first iteration has nothing to learn from
+        if next(rounds) >= iteration:
             patch.setattr("service.runtime.workers.GaussianEvaluator", NotANumber)
         return players(self, weights)
 
