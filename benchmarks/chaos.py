@@ -50,7 +50,7 @@ from service.errors import TandemError
 from service.io.checkpoints import CheckpointStore
 from service.store.errors import StoreError
 from service.store.redis_reader import RedisReader
-from service.store.server import RedisServer
+from tests.store.redis_server import RedisServer
 
 PACKAGES = ("ray", "redis", "torch", "mujoco", "numpy")
 TICK_S = 0.1
@@ -91,7 +91,7 @@ class Outage:
     def kill(self) -> None:
         """As when its machine loses power, but for the disk."""
         self.killed = time.time()
-        os.kill(self.server.pid, signal.SIGKILL)
+        self.server.kill()
         self.server.close()
 
     def restart(self) -> None:

@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Any
 
 from service.io.files import os_errors, write_atomic
-from service.registry.manifest import git_commit
+from service.io.git import git_commit
 
 _PLAIN_LIST = re.compile(r"\[[^\[\]{}]*\]")
 

@@ -44,7 +44,7 @@ from service.io.checkpoints import CheckpointStore
 from service.io.jsonl import read_jsonl
 from service.io.run_directory import RunDirectory
 from service.store.redis_writer import RedisWriter
-from service.store.server import RedisServer
+from tests.store.redis_server import RedisServer
 
 PACKAGES = ("ray", "redis", "fastapi", "uvicorn", "mujoco", "torch")
 NUM_WARMUP_ITERATIONS = 4

@@ -32,8 +32,8 @@ from service.io.run_directory import RunDirectory
 from service.runtime.local import LocalRun
 from service.runtime.reporting import Report
 from service.runtime.runner import Metrics, Runner
+from service.store.address import address_from_environment
 from service.store.fanout import open_writer
-from service.store.server import redis_service
 
 NUM_WARMUP_ITERATIONS = 4
 """After a start, before it is measured: by then the learner and all actors are busy."""
@@ -176,11 +176,11 @@ def probe(
     with ExitStack() as stack:
         stack.callback(directory.close)
         directory.claim(resume=True)
-        redis = stack.enter_context(redis_service(directory.redis)) if runtime == "ray" else None
+        redis = address_from_environment() if runtime == "ray" else None
         writer = open_writer(directory.path, directory.path.name, redis)
         report = stack.enter_context(Report(config, directory.path.name, runtime, writer))
         run: Runner
-        if redis is not None:
+        if runtime == "ray":
             from service.runtime.cluster import ClusterRun
             from service.runtime.ray_connection import ClusterOptions, StatusOptions
             from service.runtime.status_actor import serving

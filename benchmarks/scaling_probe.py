@@ -113,7 +113,6 @@ def _look_s(num: int) -> float:
     """What the loop asks about every actor: idle, counted on, hung; with all of them busy but one."""
     from service.runtime.actor_pool import Crew, Member
     from service.runtime.slots import RolloutSlots
-    from service.runtime.workers import Place
 
     class Seats(Crew):
         def _hire(self, index: int, incarnation: int) -> Member:

@@ -29,11 +29,12 @@ from service.io import tensors
 from service.io.files import os_errors, write_atomic
 from service.io.run_directory import RunDirectory
 from service.policies.evaluator import MCPEvaluator
+from service.primitives.bundled import BUNDLED
 from service.primitives.loading import read_stages
 from service.primitives.publishing import measure_bob, publish_bob
 from service.registry.blobs import BlobStore
 from service.registry.names import LATEST, Version
-from service.registry.registry import BUNDLED, Registry
+from service.registry.registry import Registry
 
 CHAMPION = "champion"
 

@@ -38,7 +38,7 @@ from benchmarks.run_files import blocks
 from benchmarks.trainings import ENDLESS, Training, overrides, scratch
 from service.errors import TandemError
 from service.store import keys
-from service.store.server import RedisServer
+from tests.store.redis_server import RedisServer
 
 PACKAGES = ("ray", "redis", "fastapi", "mujoco", "numpy", "torch")
 TINY = {

@@ -23,8 +23,6 @@ if TYPE_CHECKING:
 import signal
 from collections.abc import Iterator
 
-import pytest
-
 for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMEXPR_NUM_THREADS"):
     os.environ[variable] = "1"
 os.environ["MPLBACKEND"] = "agg"

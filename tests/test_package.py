@@ -15,7 +15,8 @@ import service
 from service.config import parse_config
 from service.errors import TandemError
 from service.policies.evaluator import MCPEvaluator
-from service.registry.registry import BUNDLED, Registry
+from service.primitives.bundled import BUNDLED
+from service.registry.registry import Registry
 from tests.registry.helpers import files_in
 
 ROOT = Path(__file__).parents[1]

@@ -2,18 +2,24 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from service.config import WorldConfig
+from service.config import Config, WorldConfig
 from service.envs.batch import WorldBatch
 from service.envs.goals import GoalKind, draw_goals
 from service.envs.observations import ACTION_SIZE
 
 FloatArray = NDArray[np.float32]
+
+EVALUATED_GOALS: tuple[GoalKind, ...] = ("table", "air", "mixed")
+"""Kinds of goals on which a run evaluates its Bob."""
+EVALUATION_SEED = 1_000_003
+"""Evaluations during a run always use the same goals, so that they compare."""
 
 
 class Deterministic(Protocol):
@@ -90,6 +96,33 @@ def evaluate(
         success_ever=float(ever.mean()),
         mean_distance_m=float(distance.mean()),
     )
+
+
+def success_metrics(
+    policy: Deterministic,
+    config: Config,
+    kinds: Sequence[GoalKind],
+    num_episodes: int,
+    *,
+    seed: int,
+    num_threads: int,
+) -> dict[str, float]:
+    """Success rates on several kinds of goals in a run's world, as metrics ``evaluation/KIND_success_...``."""
+    metrics = {}
+    for kind in kinds:
+        result = evaluate(
+            policy,
+            config.world,
+            kind,
+            num_episodes=num_episodes,
+            num_steps=config.run.evaluation_steps,
+            success_distance_m=config.game.success_distance_m,
+            seed=seed,
+            num_threads=num_threads,
+        )
+        metrics[f"evaluation/{kind}_success_last"] = result.success_last
+        metrics[f"evaluation/{kind}_success_ever"] = result.success_ever
+    return metrics
 
 
 def wilson_interval(successes: int, num: int, z: float = 1.96) -> tuple[float, float]:

@@ -332,8 +332,8 @@ def _say_stopped(what: str, number: int, path: Path, registry: Path) -> NoReturn
 
 def _show_champion() -> None:
     """What learning for longer gives, and what to type next; the first of it prints the same numbers again."""
+    from service.primitives.bundled import BUNDLED
     from service.primitives.loading import load_bob
-    from service.registry.registry import BUNDLED
 
     bob = load_bob(CHAMPION, BUNDLED)
     _say(f"\nThat was a beginning. Primitives that have learned for longer come with tandem; {CHAMPION}:")

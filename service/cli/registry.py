@@ -1,4 +1,4 @@
-"""``tandem registry``: list, show, verify, alias, export, reindex."""
+"""``tandem registry``: list, show, verify, alias, export."""
 
 from __future__ import annotations
 
@@ -32,14 +32,15 @@ _DEFAULT = Path("registry")
 def list_versions(directory: _Directory = _DEFAULT, as_json: _Json = False) -> None:
     """List every version: yours, and those that come with tandem (bundled)."""
     with _user_errors():
-        from service.registry.registry import BUNDLED, Registry
+        from service.primitives.bundled import BUNDLED, is_bundled
+        from service.registry.registry import Registry
 
         own, bundled = Registry(directory), Registry(BUNDLED)
         if not own.names():
             typer.echo(f"nothing published in {directory} yet", err=True)
         rows = [
             row
-            for registry in ([own] if own.bundled else [own, bundled])
+            for registry in ([own] if is_bundled(own) else [own, bundled])
             for name in registry.names()
             for row in _rows(registry, name)
         ]
@@ -103,23 +104,6 @@ def export(
     typer.echo(f"{manifest.reference} is in {target}")
 
 
-@registry_app.command()
-def reindex(directory: _Directory = _DEFAULT) -> None:
-    """Make the index in the Redis of TANDEM_REDIS_URL anew from the registry's files, which lose nothing without it."""
-    with _user_errors():
-        from service.registry.registry import Registry
-        from service.store.address import VARIABLE, address_from_environment
-
-        _check_there(directory)
-        address = address_from_environment()
-        if address is None:
-            raise TandemError(f"no Redis to keep an index in: set {VARIABLE}, for example to redis://127.0.0.1:6379/0")
-        from service.store.registry_index import RegistryIndex
-
-        num_versions = RegistryIndex(address).rebuild(Registry(directory))
-    typer.echo(f"{directory}: {num_versions} versions in the index at {address}")
-
-
 @contextlib.contextmanager
 def _user_errors() -> Iterator[None]:
     try:
@@ -153,6 +137,7 @@ def _check_there(directory: Path) -> None:
 
 
 def _rows(registry: Registry, name: str) -> list[dict[str, object]]:
+
     rows: list[dict[str, object]] = []
     for version in registry.versions(name):
         manifest = registry.manifest(str(version))
@@ -164,7 +149,9 @@ def _rows(registry: Registry, name: str) -> list[dict[str, object]]:
 
 def _where(registry: Registry) -> str:
     """Two registries may both have a version 1: which one is meant must be seen."""
-    return "bundled" if registry.bundled else "yours"
+    from service.primitives.bundled import is_bundled
+
+    return "bundled" if is_bundled(registry) else "yours"
 
 
 def _aliases_of(registry: Registry, manifest: Manifest) -> list[str]:

@@ -27,8 +27,8 @@ from service.envs.gym.registration import EPISODE_STEPS
 from service.envs.gym.vector import TabletopVectorEnv
 from service.envs.tasks import SUCCESS_DISTANCE_M, find_task
 from service.errors import TandemError
-from service.io.plain import plain
-from service.registry.manifest import git_commit
+from service.io.git import git_commit
+from service.io.jsonl import plain
 
 if TYPE_CHECKING:
     from service.downstream.vec_env import WorldsVecEnv

@@ -1,4 +1,4 @@
-"""Files that only grow, by whole pieces: a disk that fills up tears none, and loses none while the process lives."""
+"""Files that grow by whole pieces: a full disk leaves no torn piece, and none is lost while the process lives."""
 
 from __future__ import annotations
 
@@ -12,10 +12,13 @@ from service.io.files import os_errors
 
 
 class Appender:
-    """Appends pieces to one file; a piece that does not fit waits, and comes before the next one."""
+    """Appends pieces to one file; a piece that does not fit waits, and comes before the next one.
+
+    Args:
+        path: the file; what is there already stays, and nothing is made before the first `append`.
+    """
 
     def __init__(self, path: Path) -> None:
-        """For ``path``; what is there already stays, and nothing is made before the first `append`."""
         self.path = path
         self._waiting: deque[bytes] = deque()
 
@@ -23,18 +26,24 @@ class Appender:
         """Put ``piece`` at the file's end and hand it to the operating system.
 
         Raises:
-            RegistryError: the disk is full or the file cannot be written; it ends with a whole piece, and ``piece``
-                waits for the next `append` or `flush`.
+            StorageError: the disk is full or the file cannot be written; the file ends with a whole piece, and
+                ``piece`` waits for the next `append` or `sync`.
         """
         self._waiting.append(piece)
-        self.flush()
+        self._flush()
 
-    def flush(self) -> None:
-        """Write what waits.
+    def sync(self) -> None:
+        """Write what waits, and wait until the disk has it.
 
         Raises:
-            RegistryError: as for `append`.
+            StorageError: as for `append`.
         """
+        self._flush()
+        if self.path.exists():
+            with os_errors("write", self.path), self.path.open("rb") as file:
+                os.fsync(file.fileno())
+
+    def _flush(self) -> None:
         if not self._waiting:
             return
         with os_errors("write", self.path):
@@ -44,17 +53,6 @@ class Appender:
                     _write_whole(file, self._waiting[0])
                     self._waiting.popleft()
 
-    def sync(self) -> None:
-        """Write what waits, and see to it that a power cut leaves it there.
-
-        Raises:
-            RegistryError: as for `append`.
-        """
-        self.flush()
-        if self.path.exists():
-            with os_errors("write", self.path), self.path.open("rb") as file:
-                os.fsync(file.fileno())
-
 
 def _write_whole(file: FileIO, piece: bytes) -> None:
     end = file.seek(0, os.SEEK_END)
@@ -63,6 +61,6 @@ def _write_whole(file: FileIO, piece: bytes) -> None:
         while view:
             view = view[file.write(view) :]
     except BaseException:  # a signal's, too
-        with contextlib.suppress(OSError):  # what was wrong first is what the user has to know
+        with contextlib.suppress(OSError):  # the first error is the one the user has to know
             file.truncate(end)
         raise

@@ -16,8 +16,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from service.io import tensors
+from service.io.errors import CheckpointError, FormatVersionError
 from service.io.files import os_errors, remove_temporaries, write_atomic
-from service.registry.errors import CheckpointError, FormatVersionError
 
 FORMAT_VERSION = 1
 _HEADER_KEY = "tandem_checkpoint"
@@ -26,7 +26,7 @@ _logger = logging.getLogger(__name__)
 
 
 class Checkpoint(NamedTuple):
-    """What was saved: the step, the arrays by name, and the plain values."""
+    """A saved state: the step, the arrays by name, and the plain values."""
 
     step: int
     arrays: dict[str, np.ndarray]
@@ -37,13 +37,13 @@ class CheckpointStore:
     """The newest ``keep`` checkpoints of one run in a directory; one writer, any number of readers."""
 
     def __init__(self, directory: Path, keep: int) -> None:
-        """Nothing is read or written before the first call."""
+        """Take the directory; nothing is read or written before the first call."""
         assert keep >= 1
         self.directory = directory
         self.keep = keep
 
     def path(self, step: int) -> Path:
-        """Where the checkpoint of ``step`` is, or would be."""
+        """File of the checkpoint of ``step``, there or not."""
         return self.directory / f"checkpoint-{step:08d}.safetensors"
 
     def steps(self) -> list[int]:

@@ -1,4 +1,4 @@
-"""Files that are either wholly there or not there at all, also after a kill or a power cut.
+"""Files that are wholly there or not at all, also after a kill or a power cut.
 
 Every write goes to a temporary file beside its target, is flushed to the disk, and then takes its name in one step. A
 temporary file's name starts with ``.tmp-``, which no name or alias can, so readers never meet one.
@@ -14,7 +14,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Literal
 
-from service.registry.errors import RegistryError
+from service.io.errors import StorageError
 
 TEMPORARY_PREFIX = ".tmp-"
 
@@ -53,7 +53,7 @@ def write_exclusive(path: Path, data: bytes) -> bool:
 
 @contextlib.contextmanager
 def os_errors(
-    action: Literal["read", "write"], path: Path, error_type: type[RegistryError] = RegistryError
+    action: Literal["read", "write"], path: Path, error_type: type[StorageError] = StorageError
 ) -> Iterator[None]:
     """Turn an operating-system error of the block into ``error_type`` with one line for the user.
 

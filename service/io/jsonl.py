@@ -7,21 +7,32 @@ drops it. A full disk leaves none.
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from service.errors import TandemError
 from service.io.append_file import Appender
+from service.io.errors import StorageError
 from service.io.files import os_errors, write_atomic
-from service.io.plain import plain
+
+
+def plain(value: Any) -> Any:
+    """``value`` in JSON's own types: NumPy's become plain ones; NaN and infinity, which JSON lacks, become null."""
+    if isinstance(value, Mapping):
+        return {str(key): plain(item) for key, item in value.items()}
+    if hasattr(value, "tolist"):
+        value = value.tolist()
+    if isinstance(value, (list, tuple)):
+        return [plain(item) for item in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def read_jsonl(path: Path) -> list[dict[str, Any]]:
     """The records of ``path`` in their order; a torn last line (no line end, not JSON) is passed over.
 
     Raises:
-        TandemError: the file is missing or unreadable, or a line other than a torn last one is no JSON object.
+        StorageError: the file is missing or unreadable, or a line other than a torn last one is no JSON object.
     """
     return [record for _, record in _lines(path)]
 
@@ -30,26 +41,24 @@ class JsonlWriter:
     """Appends records to one file, a line each, so that a kill loses no record already written."""
 
     def __init__(self, path: Path) -> None:
-        """A writer of ``path``; what is there already stays, and nothing is made before the first `append`."""
+        """Take ``path``; what is there already stays, and nothing is made before the first `append`."""
         self.path = path
         self._file = Appender(path)
 
     def append(self, record: Mapping[str, Any]) -> None:
-        """Write ``record`` as the file's last line and hand it to the operating system.
-
-        NumPy numbers and arrays become plain ones; NaN and infinity, which JSON lacks, become null.
+        """Write ``record``, made `plain`, as the file's last line and hand it to the operating system.
 
         Raises:
-            TandemError: the disk is full or the file cannot be written; the record waits, see `Appender.append`.
+            StorageError: the disk is full or the file cannot be written; the record waits, see `Appender.append`.
         """
         line = json.dumps(plain(record), allow_nan=False) + "\n"
         self._file.append(line.encode())
 
     def sync(self) -> None:
-        """Write the records that wait, and see to it that a power cut leaves them all there.
+        """Write the records that wait, and wait until the disk has them all.
 
         Raises:
-            TandemError: as for `append`.
+            StorageError: as for `append`.
         """
         self._file.sync()
 
@@ -59,7 +68,7 @@ class JsonlWriter:
         The lines kept keep their bytes, so a resumed run's file equals an uninterrupted one's. A missing file is empty.
 
         Raises:
-            TandemError: a line is damaged or lacks ``iteration``, or the file cannot be written; it is then as it was.
+            StorageError: a line is damaged or lacks ``iteration``, or the file cannot be written; it is then as it was.
         """
         if not self.path.exists():
             return
@@ -73,16 +82,12 @@ class JsonlWriter:
 
 def _lines(path: Path) -> Iterator[tuple[bytes, dict[str, Any]]]:
     """Each line of ``path`` without its line end, and the record in it."""
-    try:
+    with os_errors("read", path):
         *whole, tail = path.read_bytes().split(b"\n")
-    except OSError as error:
-        raise TandemError(
-            f"cannot read {path}: {error.strerror}; give the directory of a run that has begun"
-        ) from error
     for number, line in enumerate(whole, start=1):
         record = _parse(line)
         if record is None:
-            raise TandemError(
+            raise StorageError(
                 f"{path} line {number}: {line[:40]!r} is not a JSON object; remove that line and try again"
             )
         yield line, record
@@ -102,7 +107,7 @@ def _parse(line: bytes) -> dict[str, Any] | None:
 def _iteration(record: Mapping[str, Any], path: Path) -> int:
     iteration = record.get("iteration")
     if not isinstance(iteration, int):
-        raise TandemError(
+        raise StorageError(
             f"{path}: a record has iteration {iteration!r}, not a whole number; remove that line and try again"
         )
     return iteration

@@ -1,4 +1,4 @@
-"""One process at a time in a directory: a lock that the kernel frees when its holder dies, however that happens."""
+"""A lock on a directory: one process at a time, and the kernel frees it when its holder dies, however that happens."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ import time
 from io import FileIO
 from pathlib import Path
 
+from service.io.errors import RunTakenError
 from service.io.files import os_errors
-from service.store.errors import RunTakenError
 
 LOCK_FILE = ".lock"
 WAIT_S = 0.5
@@ -22,25 +22,24 @@ _logger = logging.getLogger(__name__)
 
 
 class DirectoryLock:
-    """Keeps other processes out of a directory from its making until ``release``, or until this process dies.
+    """An exclusive hold on a directory, from construction until `release` or until this process dies.
 
     Args:
         directory: made when missing. On a network file system without locks a warning says that there is none.
         what_to_do: the end of the error's message.
-        wait_s: how long to wait for a holder that may be about to end.
 
     Raises:
         RunTakenError: another process, or another object in this one, has the lock.
-        RegistryError: the directory cannot be written.
+        StorageError: the directory cannot be written.
     """
 
-    def __init__(self, directory: Path, what_to_do: str, *, wait_s: float = WAIT_S) -> None:
+    def __init__(self, directory: Path, what_to_do: str) -> None:
         path = directory / LOCK_FILE
         with os_errors("write", path):
             directory.mkdir(parents=True, exist_ok=True)
             self._file = FileIO(path, "a+")
         try:
-            taken = _take(self._file, fcntl.LOCK_EX, wait_s)
+            taken = _take(self._file, fcntl.LOCK_EX, WAIT_S)
         except OSError as error:
             _logger.warning("%s: no locks there (%s); see to it that only one process uses it", path, error.strerror)
             return
@@ -52,10 +51,6 @@ class DirectoryLock:
         with contextlib.suppress(OSError):  # a full disk: who has it is only told to people
             self._file.truncate(0)
             self._file.write(json.dumps(note).encode())
-
-    def fileno(self) -> int:
-        """Of the locked file: a child process that inherits it holds the lock, too."""
-        return self._file.fileno()
 
     def release(self) -> None:
         """Let others in; a second call does nothing."""

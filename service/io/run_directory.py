@@ -10,9 +10,8 @@
 | ``checkpoints/`` | the newest checkpoints; ``--resume`` continues from them exactly |
 | ``snapshots/`` | Bob's parameters untrained and after each tenth of the run, kept for good |
 | ``published.json`` | the version this run published last, and the sha256 of its parameters |
-| ``redis/`` | what a run on a cluster keeps in a Redis of its own, where none is configured |
 | ``broken/`` | states of worlds whose physics diverged |
-| ``status.json``, ``goals.json``, ``stop`` | what it tells while it goes on; see ``service.store.disk`` |
+| ``status.json``, ``goals.json``, ``stop`` | the run's state while it goes on; see ``service.store.disk`` |
 | ``.lock`` | held by the process that runs it |
 """
 
@@ -23,7 +22,7 @@ import json
 import logging
 import os
 import platform
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from importlib.metadata import version
 from pathlib import Path
@@ -34,21 +33,20 @@ from numpy.typing import NDArray
 
 from service.config import Config, ConfigError, dump_config, load_config
 from service.errors import TandemError
-from service.generator.validity import Verdict
 from service.io.checkpoints import CheckpointStore
+from service.io.errors import StorageError
 from service.io.files import os_errors, remove_temporaries, write_atomic
+from service.io.git import git_commit
 from service.io.jsonl import JsonlWriter
 from service.io.lock import DirectoryLock
-from service.registry.errors import RegistryError
-from service.registry.manifest import git_commit
 
 if TYPE_CHECKING:
-    from service.actors.rollout import Broken, GoalRecords
     from service.io.tensorboard import EventFile
 
+StateArray = NDArray[np.float64]
+FloatArray = NDArray[np.float32]
+
 _logger = logging.getLogger(__name__)
-GOALS_PER_ITERATION = 32
-"""Valid proposals recorded per iteration, at most."""
 MAX_BROKEN_FILES = 100
 
 
@@ -56,7 +54,7 @@ class RunDirectory:
     """Reads and writes the files of one run."""
 
     def __init__(self, path: Path) -> None:
-        """Nothing is read or written before ``start``."""
+        """Take ``path``; nothing is read or written before `claim` or `start`."""
         self.path = path
         self.config_file = path / "config.yaml"
         self.metrics_file = path / "metrics.jsonl"
@@ -65,7 +63,6 @@ class RunDirectory:
         self.snapshots = path / "snapshots"
         self.published_file = path / "published.json"
         self.broken = path / "broken"
-        self.redis = path / "redis"
         self._metrics = JsonlWriter(self.metrics_file)
         self._goals = JsonlWriter(self.goals_file)
         self._events: EventFile | None = None
@@ -146,37 +143,32 @@ class RunDirectory:
 
     def record(self, metrics: dict[str, float]) -> None:
         """Append one iteration's metrics to metrics.jsonl and TensorBoard; where a disk is full they wait in memory."""
-        with self._going_on(self.metrics_file):
+        with self._keep_running(self.metrics_file):
             self._metrics.append(metrics)
         if self._events is not None:
-            with self._going_on(self.path / "tensorboard"):
+            with self._keep_running(self.path / "tensorboard"):
                 self._events.add(metrics)
 
-    def record_goals(self, iteration: int, num_env_steps: int, records: GoalRecords) -> None:
-        """Append a sample of this iteration's valid proposals that the current Bob played."""
-        rows = sampled_goals(records)
-        table = np.concatenate(
-            [records.start_position[rows], records.goal[rows], records.solved[rows, None].astype(float)], axis=1
-        )
-        # "iteration" counts finished iterations, as in metrics.jsonl, so that a resume cuts both files alike.
-        with self._going_on(self.goals_file):
-            self._goals.append({"iteration": iteration + 1, "env_steps": num_env_steps, "goals": np.round(table, 4)})
+    def record_goals(self, iteration: int, num_env_steps: int, goals: StateArray) -> None:
+        """Append a sample of an iteration's valid proposals: (M, 7) start x y z, goal x y z (metres), solved 0/1."""
+        with self._keep_running(self.goals_file):
+            self._goals.append({"iteration": iteration, "env_steps": num_env_steps, "goals": np.round(goals, 4)})
 
-    def dump_broken(self, name: str, broken: Broken) -> None:
-        """Save the states and actions whose physics diverged in a round, by its name; at most 100 rounds are kept."""
+    def dump_broken(self, name: str, broken: Sequence[tuple[StateArray, FloatArray]]) -> None:
+        """Save the (state, action) pairs of a round whose physics diverged, under the round's name, for 100 rounds."""
         if not broken or (self.broken.is_dir() and len(list(self.broken.iterdir())) >= MAX_BROKEN_FILES):
             return
         states, actions = zip(*broken, strict=True)
         path, data = self.broken / f"round-{name}.npz", io.BytesIO()
         np.savez(data, states=np.stack(states), actions=np.stack(actions))
         _logger.warning("physics diverged in %d worlds, which go on from sound states; see %s", len(states), path)
-        with self._going_on(self.broken), os_errors("write", path):
+        with self._keep_running(self.broken), os_errors("write", path):
             write_atomic(path, data.getvalue())
 
     def sync(self) -> None:
-        """See to it that a power cut leaves every record there; a checkpoint must not know more than they do."""
+        """Wait until the disk has every record; a checkpoint must not know more than they do."""
         for writer, path in self._writers():
-            with self._going_on(path):
+            with self._keep_running(path):
                 writer.sync()
 
     def close(self) -> None:
@@ -187,7 +179,7 @@ class RunDirectory:
         for writer, _ in self._writers():
             try:
                 writer.sync()
-            except RegistryError as error:  # must not hide why the run ended
+            except StorageError as error:  # must not hide why the run ended
                 _logger.warning("the newest records are lost: %s", error)
         self._events = None
         if self._lock is not None:
@@ -202,22 +194,16 @@ class RunDirectory:
         return writers if self._events is None else [*writers, (self._events, self.path / "tensorboard")]
 
     @contextmanager
-    def _going_on(self, path: Path) -> Iterator[None]:
-        """A full disk is no reason to end a night's run; what is wrong with ``path`` is said once, until it is well."""
+    def _keep_running(self, path: Path) -> Iterator[None]:
+        """Turn a full disk into one warning for ``path`` until a write succeeds again: the run does not end for it."""
         try:
             yield
-        except RegistryError as error:
+        except StorageError as error:
             if path not in self._failing:
                 _logger.warning("%s; the run goes on", error)
             self._failing.add(path)
         else:
             self._failing.discard(path)
-
-
-def sampled_goals(records: GoalRecords) -> NDArray[np.int64]:
-    """The worlds whose goals are recorded: valid proposals that the current Bob played, not too many."""
-    chosen = (records.verdict == Verdict.VALID) & records.played & ~records.replayed & ~records.bob_past
-    return np.flatnonzero(chosen)[:GOALS_PER_ITERATION]
 
 
 def _environment() -> dict[str, object]:

@@ -1,4 +1,7 @@
-"""A run's metrics as TensorBoard events, written at once: TensorBoard's own writer keeps them back for two minutes."""
+"""Metrics as TensorBoard events, each written whole and at once.
+
+TensorBoard's own writers give up for good after the first write that fails, and name their files by the clock alone.
+"""
 
 from __future__ import annotations
 
@@ -31,7 +34,7 @@ class EventFile:
                 hidden from then on. None for a run that begins.
 
         Raises:
-            RegistryError: the disk is full or the file cannot be written.
+            StorageError: the disk is full or the file cannot be written.
         """
         host, process = socket.gethostname(), os.getpid()
         self._file = Appender(directory / f"events.out.tfevents.{_stamp(directory):010d}.{host}.{process}")
@@ -44,7 +47,7 @@ class EventFile:
         """Append one iteration's metrics, over its env steps.
 
         Raises:
-            RegistryError: the disk is full; the event waits, see `Appender.append`.
+            StorageError: the disk is full; the event waits, see `Appender.append`.
         """
         values = [
             Summary.Value(tag=name, simple_value=value)
@@ -54,10 +57,10 @@ class EventFile:
         self._append(Event(wall_time=time.time(), step=int(metrics["env_steps"]), summary=Summary(value=values)))
 
     def sync(self) -> None:
-        """Write the events that wait, and see to it that a power cut leaves them all there.
+        """Write the events that wait, and wait until the disk has them all.
 
         Raises:
-            RegistryError: as for `add`.
+            StorageError: as for `add`.
         """
         self._file.sync()
 

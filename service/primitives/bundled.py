@@ -1,4 +1,4 @@
-"""The primitives that come with the package, and which registry answers for a reference."""
+"""The primitives that come with the package, and the look-up of a reference in both registries."""
 
 from __future__ import annotations
 
@@ -6,7 +6,10 @@ from pathlib import Path
 
 from service.registry.errors import UnknownVersionError
 from service.registry.names import Version, split_reference
-from service.registry.registry import BUNDLED, Registry
+from service.registry.registry import Registry
+
+BUNDLED = Path(__file__).parent / "data"
+"""The registry that comes with the package; it is only read."""
 
 
 def find_version(reference: str, root: Path) -> tuple[Registry, Version]:
@@ -28,7 +31,7 @@ def find_version(reference: str, root: Path) -> tuple[Registry, Version]:
         return own, own.resolve(reference)
     except UnknownVersionError as error:
         name, target = split_reference(reference)
-        if own.bundled or target in own.aliases(name):
+        if is_bundled(own) or target in own.aliases(name):
             raise
         if not bundled.versions(name):
             raise UnknownVersionError(
@@ -39,3 +42,8 @@ def find_version(reference: str, root: Path) -> tuple[Registry, Version]:
         return bundled, bundled.resolve(reference)
     except UnknownVersionError as error:
         raise UnknownVersionError(f"{missing}; nor does one come with tandem: {error}") from None
+
+
+def is_bundled(registry: Registry) -> bool:
+    """Whether this is the registry that comes with the package."""
+    return registry.root.resolve() == BUNDLED.resolve()

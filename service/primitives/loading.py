@@ -1,4 +1,4 @@
-"""Finding a Bob to evaluate, render or compose: in a registry, or in a run directory."""
+"""Loading a Bob to evaluate, render or compose, from a registry or a run directory."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from service.io.checkpoints import Checkpoint, CheckpointStore, read_checkpoint
 from service.io.run_directory import RunDirectory
 from service.policies.evaluator import GaussianEvaluator, MCPEvaluator, bob_evaluator
 from service.policies.parameters import Parameters, PolicyError
-from service.primitives.bundled import find_version
+from service.primitives.bundled import find_version, is_bundled
 from service.registry.manifest import Manifest
 
 
@@ -24,11 +24,11 @@ class TrainedBob:
     policy: MCPEvaluator | GaussianEvaluator
     config: Config
     manifest: Manifest | None = None
-    """What the registry knows about him; None for the Bob of a run directory."""
+    """His manifest in the registry; None for the Bob of a run directory."""
 
     @property
     def primitives(self) -> MCPEvaluator:
-        """What can be composed.
+        """The policy as primitives that can be composed.
 
         Raises:
             TandemError: this Bob is monolithic.
@@ -59,7 +59,7 @@ def load_bob(reference: str, registry: Path) -> TrainedBob:
     manifest, tensors = found.load(str(version))
     config = parse_config(manifest.config, where=f"the manifest of {reference}")
     # two registries may both have a version 1: which one was meant must be seen
-    label = f"{version} (bundled)" if found.bundled else str(version)
+    label = f"{version} (bundled)" if is_bundled(found) else str(version)
     return TrainedBob(label, _evaluator(label, tensors), config, manifest)
 
 

@@ -1,45 +1,36 @@
-"""From a trained Bob to a version in the registry: measured, published once, and told which version he comes from."""
+"""Publishing a trained Bob: measured, published once, with the version he was trained on from as parent."""
 
 from __future__ import annotations
 
 import contextlib
 import json
 
-from service.actors.evaluation import evaluate
+from service.actors.evaluation import EVALUATED_GOALS, EVALUATION_SEED, success_metrics
 from service.config import Config
 from service.envs.observations import NORMALISATION_BOB, SPACES
 from service.io import tensors
+from service.io.errors import StorageError
 from service.io.files import os_errors, write_atomic
 from service.io.run_directory import RunDirectory
 from service.policies.evaluator import bob_evaluator
 from service.policies.parameters import Parameters
 from service.registry.blobs import sha256_of
-from service.registry.errors import RegistryError
 from service.registry.names import Version
 from service.registry.registry import Registry
-from service.runtime.runner import EVALUATED_GOALS, EVALUATION_SEED
 
 FINAL_EVALUATION_EPISODES = 300
 
 
 def measure_bob(config: Config, parameters: Parameters) -> dict[str, float]:
-    """Bob's success rates without noise on every kind of goals of a run, by metric; but not the run's own goals."""
-    bob = bob_evaluator(parameters)
-    metrics = {}
-    for kind in EVALUATED_GOALS:
-        result = evaluate(
-            bob,
-            config.world,
-            kind,
-            num_episodes=FINAL_EVALUATION_EPISODES,
-            num_steps=config.run.evaluation_steps,
-            success_distance_m=config.game.success_distance_m,
-            seed=EVALUATION_SEED + 1,
-            num_threads=config.run.num_threads,
-        )
-        metrics[f"evaluation/{kind}_success_last"] = result.success_last
-        metrics[f"evaluation/{kind}_success_ever"] = result.success_ever
-    return metrics
+    """Bob's success rates without noise on every kind of goals, by metric; the goals are not those of the run."""
+    return success_metrics(
+        bob_evaluator(parameters),
+        config,
+        EVALUATED_GOALS,
+        FINAL_EVALUATION_EPISODES,
+        seed=EVALUATION_SEED + 1,
+        num_threads=config.run.num_threads,
+    )
 
 
 def publish_run(
@@ -58,7 +49,7 @@ def publish_run(
         The new version, or the newest one of that name where it has the same parameters already.
 
     Raises:
-        RegistryError: see ``Registry.publish``; or the run directory cannot be written.
+        StorageError: see ``Registry.publish``; or the run directory cannot be written.
     """
     version = _newest_if_same(registry, config.name, parameters)
     if version is None:
@@ -81,7 +72,7 @@ def publish_bob(
     """Publish Bob with everything a user of him needs.
 
     Raises:
-        RegistryError: see ``Registry.publish``.
+        StorageError: see ``Registry.publish``.
     """
     return registry.publish(
         config.name,
@@ -95,9 +86,9 @@ def publish_bob(
 
 
 def _newest_if_same(registry: Registry, name: str, parameters: Parameters) -> Version | None:
-    """A finished run that is resumed and has nothing left to do must not publish its Bob a second time."""
+    """The newest version, if it has these parameters: a finished run that is resumed must not publish them again."""
     for version in registry.versions(name)[-1:]:
-        with contextlib.suppress(RegistryError):  # a damaged version is mended by publishing again
+        with contextlib.suppress(StorageError):  # a damaged version is mended by publishing again
             manifest, _ = registry.load(str(version))
             if manifest.blob_sha256 == sha256_of(tensors.encode(parameters)):
                 return version
@@ -105,11 +96,11 @@ def _newest_if_same(registry: Registry, name: str, parameters: Parameters) -> Ve
 
 
 def _published_before(directory: RunDirectory, registry: Registry) -> str | None:
-    """What this run published last, if this registry is where it did so."""
+    """The version this run published last, if it did so in this registry."""
     if not directory.published_file.exists():
         return None
     note = json.loads(directory.published_file.read_bytes())
-    with contextlib.suppress(RegistryError):
+    with contextlib.suppress(StorageError):
         if registry.manifest(note["version"]).blob_sha256 == note["blob_sha256"]:
             return str(note["version"])
     return None

@@ -1,1 +1,1 @@
-"""Checkpoints of runs, and the registry of frozen primitives: blobs, versions, aliases."""
+"""The registry of frozen primitives: blobs, versions, aliases."""

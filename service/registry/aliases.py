@@ -17,7 +17,7 @@ class Aliases:
     """The aliases of one name in a directory; any number of processes may move them at once."""
 
     def __init__(self, directory: Path) -> None:
-        """Nothing is written before the first `move`."""
+        """Take the directory; nothing is written before the first `move`."""
         self._directory = directory
 
     def read(self, alias: str) -> int | None:
@@ -25,6 +25,7 @@ class Aliases:
 
         Raises:
             RegistryError: a bad alias, or its file is damaged.
+            StorageError: the file cannot be read.
         """
         path = self._directory / check_alias(alias)
         with os_errors("read", path):
@@ -46,25 +47,21 @@ class Aliases:
         numbers = {alias: self.read(alias) for alias in found if is_name(alias)}
         return {alias: number for alias, number in numbers.items() if number is not None}
 
-    def move(self, alias: str, number: int) -> None:
-        """Make ``alias`` mean ``number``, whatever it meant before.
+    def move(self, alias: str, number: int, *, back: bool = True) -> None:
+        """Make ``alias`` mean ``number``.
+
+        Args:
+            alias: to move.
+            number: of the version.
+            back: also where it means a greater one; without, a slow publisher cannot undo a later one.
 
         Raises:
-            RegistryError: a bad alias, or the disk cannot be written.
+            RegistryError: a bad alias.
+            StorageError: the disk cannot be written.
         """
         path = self._directory / check_alias(alias)
         with os_errors("write", path), self._lock():
-            write_atomic(path, f"{number}\n".encode())
-
-    def advance(self, alias: str, number: int) -> None:
-        """Make ``alias`` mean ``number`` unless it means a greater one: a slow publisher must not undo a later one.
-
-        Raises:
-            RegistryError: a bad alias, or the disk cannot be written.
-        """
-        path = self._directory / check_alias(alias)
-        with os_errors("write", path), self._lock():
-            if (self.read(alias) or 0) < number:
+            if back or (self.read(alias) or 0) < number:
                 write_atomic(path, f"{number}\n".encode())
 
     @contextlib.contextmanager

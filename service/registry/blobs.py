@@ -13,18 +13,18 @@ class BlobStore:
     """Content-addressed files ``sha256/<digest>`` under a directory; safe for many processes at once."""
 
     def __init__(self, directory: Path) -> None:
-        """Nothing is written before the first `put`."""
+        """Take the directory; nothing is written before the first `put`."""
         self._directory = directory
 
     def path(self, digest: str) -> Path:
-        """Where the blob of that digest is, or would be."""
+        """File of the blob of that digest, there or not."""
         return self._directory / "sha256" / digest
 
     def put(self, data: bytes) -> str:
         """Store ``data`` and return its sha256 in hex; bytes already there and whole are not written again.
 
         Raises:
-            RegistryError: the disk is full or cannot be written; nothing is left behind.
+            StorageError: the disk is full or cannot be written; nothing is left behind.
         """
         digest = sha256_of(data)
         path = self.path(digest)
@@ -38,7 +38,7 @@ class BlobStore:
 
         Raises:
             DamagedBlobError: the file is missing or holds other bytes.
-            RegistryError: the file cannot be read.
+            StorageError: the file cannot be read.
         """
         path = self.path(digest)
         with os_errors("read", path):

@@ -25,7 +25,8 @@ def write_exported(directory: Path, manifest: Manifest, data: bytes) -> None:
         data: its safetensors bytes.
 
     Raises:
-        RegistryError: a file is there already, or the directory cannot be written.
+        RegistryError: a file is there already.
+        StorageError: the directory cannot be written.
     """
     for path in (directory / PARAMETERS_FILE, directory / MANIFEST_FILE):
         if path.exists():

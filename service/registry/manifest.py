@@ -1,18 +1,17 @@
-"""What a version says about itself: a JSON manifest that carries its own digest."""
+"""Manifests: the description of a version, as JSON that carries its own digest."""
 
 from __future__ import annotations
 
-import functools
 import hashlib
 import json
-import subprocess
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from pydantic import BaseModel, ConfigDict, Field, JsonValue, ValidationError
 
-from service.registry.errors import DamagedBlobError, FormatVersionError, RegistryError
+from service.io.errors import FormatVersionError
+from service.registry.errors import DamagedBlobError, RegistryError
 
 FORMAT_VERSION = 1
 _DIGEST_KEY = "manifest_sha256"
@@ -103,26 +102,6 @@ def parse_manifest(data: bytes, path: Path) -> Manifest:
     except ValidationError as error:
         first = error.errors()[0]
         raise DamagedBlobError(f"manifest {path} is not valid: {first['loc']}: {first['msg']}; {_MEND}") from None
-
-
-@functools.cache
-def git_commit() -> str | None:
-    """The commit of this program's own checkout, with ``-dirty`` for local changes; None outside of one."""
-    root = Path(__file__).resolve().parents[2]
-    top = _git(root, "rev-parse", "--show-toplevel")
-    # an installation inside somebody else's repository must not claim that repository's commit
-    if top is None or Path(top).resolve() != root:
-        return None
-    return _git(root, "describe", "--always", "--dirty", "--abbrev=40", "--exclude=*")
-
-
-def _git(root: Path, *arguments: str) -> str | None:
-    command = ["git", "-C", str(root), *arguments]
-    try:
-        result = subprocess.run(command, capture_output=True, text=True, timeout=10, check=True)
-    except (OSError, subprocess.SubprocessError):
-        return None
-    return result.stdout.strip() or None
 
 
 def _digest(tree: dict[str, Any]) -> str:

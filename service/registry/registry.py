@@ -6,8 +6,9 @@ Layout under the root::
     models/<name>/versions/<n>    manifest, JSON; made exclusively, never changed
     models/<name>/aliases/<a>     the number of a version; moved by replacing the file
 
+    READ_ONLY                     is there where nothing may be published
+
 A publish writes the blob, then the manifest, then the aliases, each atomically: a reader sees all of a version or none.
-Who listens is told last; see `announcing`.
 """
 
 from __future__ import annotations
@@ -20,48 +21,40 @@ from typing import Any
 import numpy as np
 
 from service.io import tensors
+from service.io.errors import StorageError
 from service.io.files import os_errors, write_exclusive
+from service.io.git import git_commit
 from service.registry import names
 from service.registry.aliases import Aliases
-from service.registry.announcing import Listener, default_listener
 from service.registry.blobs import BlobStore, sha256_of
 from service.registry.errors import RegistryError, UnknownVersionError
 from service.registry.exported import write_exported
-from service.registry.manifest import Manifest, git_commit, make_manifest, parse_manifest
+from service.registry.manifest import Manifest, make_manifest, parse_manifest
 from service.registry.names import LATEST, Version
 
-BUNDLED = Path(__file__).parents[1] / "primitives" / "data"
-"""The registry that comes with the package; it is only read."""
+READ_ONLY_FILE = "READ_ONLY"
 
 
 class Registry:
-    """Named, versioned parameters in a directory; any number of processes may publish and read at once."""
+    """Named, versioned parameters in a directory; any number of processes may publish and read at once.
 
-    def __init__(self, root: Path, listener: Listener | None = None) -> None:
-        """Open ``root``; nothing is read or written before the first call.
+    Args:
+        root: the directory; nothing is read or written before the first call.
+    """
 
-        Args:
-            root: the directory.
-            listener: told of changes; None for the index in the Redis of ``TANDEM_REDIS_URL``, if that is set.
-        """
+    def __init__(self, root: Path) -> None:
         self.root = root
-        self._own_listener = listener
         self._blobs = BlobStore(root / "blobs")
 
-    @property
-    def bundled(self) -> bool:
-        """Whether this is the registry that comes with the package."""
-        return self.root.resolve() == BUNDLED.resolve()
-
     def check_writable(self) -> None:
-        """Check that this is not the bundled registry.
+        """Check that this registry may be written.
 
         Raises:
-            RegistryError: it is.
+            RegistryError: it is marked as only read, as the one that comes with tandem is.
         """
-        if self.bundled:
+        if (self.root / READ_ONLY_FILE).exists():  # a file: it is found through whatever path leads to the directory
             raise RegistryError(
-                f"cannot write {self.root}: what comes with tandem is only read; "
+                f"cannot write {self.root}: this registry is only read; "
                 "name another directory with --registry or TANDEM_REGISTRY"
             )
 
@@ -92,9 +85,9 @@ class Registry:
             aliases: moved to the new version.
 
         Raises:
-            RegistryError: a bad name, alias, array or value, or the bundled registry, and nothing is written; or the
-                disk cannot be written, and what was there before is intact.
+            RegistryError: a bad name, alias, array or value, or a registry that is only read; nothing is written.
             UnknownVersionError: no such parent.
+            StorageError: the disk cannot be written; what was there before is intact.
         """
         self.check_writable()
         names.check_name(name)
@@ -113,9 +106,7 @@ class Registry:
         }
         version = self._publish_version(name, parameters, fields)
         for alias in aliases:
-            self._aliases(name).advance(alias, version.number)
-        if (listener := self._own_listener or default_listener()) is not None:
-            listener.published(self, version)
+            self._aliases(name).move(alias, version.number, back=False)
         return version
 
     def resolve(self, reference: str) -> Version:
@@ -179,14 +170,13 @@ class Registry:
         """Make or move ``alias`` of ``name`` to ``version``, forward or back.
 
         Raises:
-            RegistryError: a bad name or alias, the bundled registry, or a disk that cannot be written.
+            RegistryError: a bad name or alias, or a registry that is only read.
             UnknownVersionError: no such version.
+            StorageError: the disk cannot be written.
         """
         self.check_writable()
         target = self.resolve(f"{name}@{version}")
         self._aliases(name).move(alias, version)
-        if (listener := self._own_listener or default_listener()) is not None:
-            listener.alias_moved(self, target, alias)
         return target
 
     def verify(self, reference: str | None = None) -> list[str]:
@@ -210,7 +200,8 @@ class Registry:
         Raises:
             UnknownVersionError: no such version.
             DamagedBlobError: the version is damaged; nothing is written.
-            RegistryError: the directory holds an export already, or cannot be written.
+            RegistryError: the directory holds an export already.
+            StorageError: it cannot be written.
         """
         manifest = self.manifest(reference)
         write_exported(directory, manifest, self._blobs.get(manifest.blob_sha256))
@@ -235,7 +226,7 @@ class Registry:
     def _problems_of(self, version: Version) -> list[str]:
         try:
             manifest, parameters = self.load(str(version))
-        except RegistryError as error:
+        except StorageError as error:
             return [f"{version}: {error}"]
         if (manifest.name, manifest.version) != version:
             return [f"{version}: its manifest is that of {manifest.reference}; restore the file from a copy"]
@@ -246,7 +237,7 @@ class Registry:
         numbers = {version.number for version in self.versions(name)}
         try:
             aliases = self.aliases(name)
-        except RegistryError as error:
+        except StorageError as error:
             return [f"{name}: {error}"]
         return [
             f"{name}@{alias}: means version {number}, which is missing; move it with tandem registry alias"

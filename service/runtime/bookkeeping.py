@@ -1,4 +1,4 @@
-"""What both runners keep alike: counters, records, checkpoints, snapshots, and when a run is over."""
+"""Bookkeeping of a run: counters, checkpoints, snapshots of Bob, and what is due when."""
 
 from __future__ import annotations
 
@@ -14,16 +14,16 @@ from numpy.typing import NDArray
 from service.config import Config
 from service.errors import DivergedError
 from service.io.checkpoints import CheckpointStore
+from service.io.errors import CheckpointError
 from service.io.run_directory import RunDirectory
 from service.policies.parameters import Parameters, PolicyError
-from service.registry.errors import CheckpointError
 
 Arrays = dict[str, NDArray[Any]]
 Metrics = dict[str, float]
 _logger = logging.getLogger(__name__)
 
 NUM_SNAPSHOTS = 10
-"""Of Bob, evenly over a run's env steps; one of him untrained comes before them."""
+"""Snapshots of Bob, evenly over a run's env steps; one of him untrained comes before them."""
 
 
 class UnsavedError(CheckpointError):
@@ -32,8 +32,8 @@ class UnsavedError(CheckpointError):
     exit_code = 1
 
 
-class Books:
-    """The books of one run: how far it is, and all that it leaves behind.
+class Bookkeeper:
+    """Counters, checkpoints and snapshots of one run.
 
     Args:
         config: the run.
@@ -41,10 +41,10 @@ class Books:
     """
 
     iteration: int
-    """Finished ones."""
+    """Finished iterations."""
     num_env_steps: int
     wall_s: float
-    """Spent on iterations, by all processes that ran this run."""
+    """Seconds spent on iterations, by all processes that ran this run."""
 
     def __init__(self, config: Config, directory: RunDirectory) -> None:
         self.config = config
@@ -75,7 +75,7 @@ class Books:
 
     @property
     def budget_spent(self) -> bool:
-        """Whether there were as many env steps as there shall be."""
+        """Whether the run has had all its env steps."""
         return self.num_env_steps >= self.config.run.total_env_steps
 
     @property
@@ -90,7 +90,7 @@ class Books:
         return interval > 0 and self.iteration % interval == 0
 
     def count(self, num_env_steps: int) -> None:
-        """Count an iteration."""
+        """Count an iteration and its env steps."""
         self.iteration += 1
         self.num_env_steps += num_env_steps
 
@@ -99,7 +99,7 @@ class Books:
 
         Args:
             parts: arrays by part and name.
-            meta: plain values beside those of the books.
+            meta: plain values beside the counters.
 
         Raises:
             CheckpointError: a full disk; earlier checkpoints are intact.
@@ -117,19 +117,19 @@ class Books:
         return self._saved == self.iteration
 
     @contextmanager
-    def going_on(self, how: str) -> Iterator[None]:
-        """A full disk is no reason to end a night's run: what was saved before is intact, and what comes may fit."""
+    def tolerating(self, consequence: str) -> Iterator[None]:
+        """Warn of a full disk and go on: what was saved before is intact, and what comes may fit."""
         try:
             yield
         except CheckpointError as error:
-            _logger.warning("%s; the run goes on, %s", error, how)
+            _logger.warning("%s; the run goes on, %s", error, consequence)
 
     @contextmanager
-    def diverging(self) -> Iterator[None]:
-        """Adds to the error of a policy that has diverged when that was, and how to go on from before it.
+    def explaining_divergence(self) -> Iterator[None]:
+        """Add to the error of a policy that has diverged when that was, and how to go on from before it.
 
         Raises:
-            DivergedError: one has.
+            DivergedError: a policy has.
         """
         played = self.iteration
         try:
@@ -145,11 +145,11 @@ class Books:
             ) from error
 
     @contextmanager
-    def saving_last(self) -> Iterator[None]:
-        """Says what is lost where the last checkpoint of a run cannot be written.
+    def explaining_unsaved(self) -> Iterator[None]:
+        """Say what is lost where the last checkpoint of a run cannot be written.
 
         Raises:
-            UnsavedError: it could not.
+            UnsavedError: it could not be written.
         """
         try:
             yield

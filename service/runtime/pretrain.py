@@ -25,11 +25,9 @@ from service.runtime.signals import InterruptError, StopSignals
 from service.store.address import address_from_environment
 from service.store.disk_reader import run_id_of
 from service.store.fanout import open_writer
-from service.store.server import redis_service
 
 if TYPE_CHECKING:
     from service.runtime.ray_connection import ClusterOptions
-    from service.store.address import RedisAddress
     from service.store.models import RunState
 
 RESUMABLE = ("run.", "learner.alice.learning_rate=", "learner.bob.learning_rate=")
@@ -96,11 +94,10 @@ def pretrain(
         stack.callback(directory.close)
         directory.claim(resume=resume)
         run_id = run_id_of(directory.path)
-        # A run on a cluster has a Redis in any case; one in this process, where it is told of one.
-        redis = address_from_environment() if cluster is None else stack.enter_context(redis_service(directory.redis))
+        redis = address_from_environment()
         writer = open_writer(directory.path, run_id, redis)
         report = stack.enter_context(Report(config, run_id, runtime, writer, published=directory.read_published()))
-        if cluster is not None and cluster.status is not None and redis is not None:
+        if cluster is not None and cluster.status is not None:
             from service.runtime.status_actor import serving
 
             url = stack.enter_context(serving(cluster.status, directory.path.absolute().parent, registry, redis))
@@ -108,20 +105,12 @@ def pretrain(
         while True:
             with closing(_start(config, directory, cluster, resume=resume)) as run:
                 try:
-                    done = _run(run, config, directory, _open(registry, redis), signals, report, on_iteration)
+                    done = _run(run, config, directory, Registry(registry), signals, report, on_iteration)
                 except StateLostError as error:  # with a machine of the cluster
                     _logger.warning("%s", error)
                     resume = True
                 else:
                     return replace(done, signal=signals.first)
-
-
-def _open(registry: Path, redis: RedisAddress | None) -> Registry:
-    if redis is None:
-        return Registry(registry)
-    from service.store.registry_index import RegistryIndex
-
-    return Registry(registry, listener=RegistryIndex(redis))
 
 
 def _start(config: Config, directory: RunDirectory, cluster: ClusterOptions | None, *, resume: bool) -> Runner:

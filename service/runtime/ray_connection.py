@@ -15,6 +15,8 @@ from typing import Any
 from service.runtime.runner import ClusterError
 
 CONNECT_S = 5.0
+START_ATTEMPTS = 3
+"""Ray gives up on a node of its own after 30 s, which a busy machine may need."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,16 +76,19 @@ def connected(address: str | None, num_cpus: int | None = None) -> Iterator[None
         # Else Ray would leave a token in the home directory, and every later cluster there would take it up.
         os.environ |= {"RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN": secrets.token_hex(32)}
     if address is None:
-        os.environ.setdefault("RAY_worker_niceness", "0")  # not 15 for all: see ``workers.give_way``
+        os.environ.setdefault("RAY_worker_niceness", "0")  # not 15 for all: see ``ray_actors.lower_priority``
     import ray
 
     _check_reachable(address)
     options: dict[str, Any] = {"num_cpus": num_cpus, "include_dashboard": False} if address is None else {}
-    try:
-        ray.init(address or "local", logging_level=logging.WARNING, **options)
-    except (ConnectionError, RuntimeError, ValueError, OSError) as error:
-        # RuntimeError: other versions; a refused token is an error of its own kind, and one of these
-        raise ClusterError(_explained(address, error)) from None
+    for attempt in range(START_ATTEMPTS, 0, -1):
+        try:
+            ray.init(address or "local", logging_level=logging.WARNING, **options)
+            break
+        except Exception as error:  # other versions, a refused token, a slow node: Ray has no common class for them
+            ray.shutdown()
+            if attempt == 1 or address is not None or "timed out during startup" not in str(error):
+                raise ClusterError(_explained(address, error)) from None
     try:
         yield
     finally:

@@ -1,4 +1,4 @@
-"""A worker whose state the driver keeps, so that another can take its place: the learner, the task generator."""
+"""A worker in another process whose state the driver keeps: the learner, the task generator."""
 
 from __future__ import annotations
 
@@ -9,22 +9,22 @@ from typing import Any
 import ray
 from ray.exceptions import GetTimeoutError, RayError
 
+from service.runtime.ray_actors import Location
 from service.runtime.runner import ClusterError, StateLostError
-from service.runtime.workers import Place
 from service.store.models import ActorStatus
 
 START_S = 120.0
-"""A worker that is not up by then does not come; torch is imported within it, and images are loaded on a new node."""
+"""A worker that has not started by then will not; torch is imported within it, and images are loaded on a new node."""
 ANSWER_S = 20.0
 """A worker that is alive and has nothing to do answers within it."""
 _logger = logging.getLogger(__name__)
 
 
-class Stateful:
-    """One worker of its kind, and all that is needed for the next.
+class RemoteWorker:
+    """A worker, and all that is needed to start the next one in its place.
 
     Args:
-        name: for people.
+        name: of the worker, for people.
         actor: Ray's actor class, with its options.
         config: first argument of the worker.
         state: second one: the state to start from, or None.
@@ -38,27 +38,27 @@ class Stateful:
         self.incarnation = 0
         self.handle = actor.remote(config, self.state, *others)
         self._actor, self._config = actor, config
-        self._place = Place("", 0)
+        self._location = Location("", 0)
         self._heartbeat = datetime.now(UTC)
         self._last_error: str | None = None
 
-    def up(self) -> None:
-        """Wait until it is.
+    def wait_ready(self) -> None:
+        """Wait until it has started.
 
         Raises:
-            ClusterError: it does not come up.
+            ClusterError: it does not start.
         """
         try:
-            self._place = ray.get(self.handle.ping.remote(), timeout=START_S)
+            self._location = ray.get(self.handle.ping.remote(), timeout=START_S)
         except GetTimeoutError:
             raise ClusterError(
                 f"the {self.name} did not start within {START_S:.0f} s: has the cluster a free core (and GPU, with "
                 "learner.device=cuda) for it? see ray status"
             ) from None
-        self.heard()
+        self.record_heartbeat()
 
-    def heard(self) -> None:
-        """It just answered."""
+    def record_heartbeat(self) -> None:
+        """Note that it just answered."""
         self._heartbeat = datetime.now(UTC)
 
     @property
@@ -70,19 +70,19 @@ class Stateful:
             return False
         return True
 
-    def restart(self, why: str) -> None:
-        """Another, from the newest state; what the last one was doing has to be asked of it again.
+    def restart(self, reason: str) -> None:
+        """Start another from the newest state; what the last one was doing has to be asked of it again.
 
         Raises:
-            StateLostError: it does not come up, or the state was lost with the node that kept it.
+            StateLostError: it does not start, or the state was lost with the node that kept it.
         """
-        _logger.warning("the %s is gone (%s); another goes on from its last state", self.name, why)
+        _logger.warning("the %s is gone (%s); another goes on from its last state", self.name, reason)
         ray.kill(self.handle, no_restart=True)
         self.incarnation += 1
-        self._last_error = why
+        self._last_error = reason
         self.handle = self._actor.remote(self._config, self.state)
         try:
-            self.up()
+            self.wait_ready()
         except RayError as error:
             raise StateLostError(
                 f"the {self.name} cannot go on from its last state ({one_line(error)}); the run goes back to its "
@@ -90,17 +90,17 @@ class Stateful:
             ) from None
 
     def close(self) -> None:
-        """Kill it."""
+        """Kill the worker."""
         ray.kill(self.handle, no_restart=True)
 
     def status(self) -> ActorStatus:
-        """For the status service."""
+        """Its state for the status service."""
         return ActorStatus(
             name=self.name,
             incarnation=self.incarnation,
             state="alive",
-            node=self._place.node,
-            pid=self._place.pid,
+            node=self._location.node,
+            pid=self._location.pid,
             heartbeat=self._heartbeat,
             last_error=self._last_error,
         )

@@ -90,8 +90,8 @@ class Report:
         """Tell that the run is alive, how far it is, and how its parts are."""
         health = runner.health()
         self._tell(
-            iteration=runner.books.iteration,
-            num_env_steps=runner.books.num_env_steps,
+            iteration=runner.iteration,
+            num_env_steps=runner.num_env_steps,
             num_rollouts_counted=health.num_rollouts_counted,
             num_rollouts_refused=health.num_rollouts_refused,
             stopping=self.stop_requested(),

@@ -1,25 +1,24 @@
-"""What the two runners have in common for those who start them and tell how they go."""
+"""The interface of the two runners, and the part of an iteration that is the same in both."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Protocol
 
-from service.envs.goals import GoalKind
+import numpy as np
+
+from service.config import Config
 from service.errors import TandemError
+from service.io.run_directory import RunDirectory
 from service.policies.parameters import Parameters
-from service.runtime.bookkeeping import Books
+from service.runtime.bookkeeping import Bookkeeper
 from service.runtime.timing import Timing
+from service.runtime.workers import GeneratorResult, Metrics, RoundSummary, UpdateResult
 from service.store.models import ActorStatus, GoalGrid
 
-Metrics = dict[str, float]
 OnIteration = Callable[[Metrics], None]
 OnBeat = Callable[[], None]
-
-EVALUATED_GOALS: tuple[GoalKind, ...] = ("table", "air", "mixed")
-EVALUATION_SEED = 1_000_003
-"""Evaluations during a run always use the same goals, so that they compare."""
 
 
 class ClusterError(TandemError):
@@ -44,7 +43,7 @@ class RunResult:
 
 @dataclass(frozen=True, slots=True)
 class Health:
-    """What a runner knows about its parts."""
+    """The state of a runner's workers."""
 
     actors: tuple[ActorStatus, ...]
     num_rollouts_counted: int
@@ -54,38 +53,166 @@ class Health:
     last_error: str | None = None
 
 
-def _nothing(*_: object) -> None:
-    """For who wants to know nothing."""
+@dataclass(frozen=True, slots=True)
+class IterationResult:
+    """What the workers made of one iteration."""
 
-
-class Runner(Protocol):
-    """A pre-training run that can be started, watched and stopped."""
-
-    timing: Timing
+    rounds: Sequence[RoundSummary]
+    recorded: GeneratorResult
+    updated: UpdateResult | None
+    """None where there was nothing to learn from yet."""
+    num_actors_alive: int
+    hand_over_s: float = 0.0
+    """Mean time a round's result was on its way or in line, seconds."""
 
     @property
-    def books(self) -> Books:
-        """How far it is."""
+    def num_env_steps(self) -> int:
+        """Steps of both players."""
+        return sum(each.num_env_steps for each in self.rounds)
 
-    def run(self, on_iteration: OnIteration = _nothing, on_beat: OnBeat = _nothing) -> RunResult:
+
+class Runner(ABC):
+    """A pre-training run that can be started, watched and stopped.
+
+    Args:
+        config: the run.
+        directory: where it keeps everything.
+    """
+
+    def __init__(self, config: Config, directory: RunDirectory) -> None:
+        self.config, self.directory = config, directory
+        self.bookkeeper = Bookkeeper(config, directory)
+        self.timing = Timing()
+        self._stop_requested = self._converged = False
+        self._on_iteration: OnIteration = lambda metrics: None
+
+    @property
+    def iteration(self) -> int:
+        """Finished iterations."""
+        return self.bookkeeper.iteration
+
+    @property
+    def num_env_steps(self) -> int:
+        """Env steps of both players."""
+        return self.bookkeeper.num_env_steps
+
+    def request_stop(self) -> None:
+        """End soon, with a checkpoint. Safe to call from a signal handler."""
+        self._stop_requested = True
+
+    def run(self, on_iteration: OnIteration = lambda metrics: None, on_beat: OnBeat = lambda: None) -> RunResult:
         """Play, learn, record, until the budget is spent, the stop criterion holds, or a stop is requested.
 
         Args:
             on_iteration: called with the metrics of every iteration.
             on_beat: called about every second where iterations may take longer.
+
+        Raises:
+            DivergedError: a policy has.
+            ClusterError: rounds, or workers, keep failing.
+            UnsavedError: the last checkpoint could not be written; earlier ones that could not are only warned of.
         """
+        self._on_iteration = on_iteration
+        while (reason := self._stop_reason()) is None:
+            self._advance(on_beat)
+        self._save_last()
+        return RunResult(reason, self.iteration, self.num_env_steps)
 
-    def request_stop(self) -> None:
-        """End soon, with a checkpoint. Safe to call from a signal handler."""
-
+    @abstractmethod
     def bob(self) -> Parameters:
         """The newest Bob, as he is evaluated and published."""
 
+    @abstractmethod
     def health(self) -> Health:
-        """Of its parts, right now."""
+        """The state of its workers, right now."""
 
+    @abstractmethod
     def grid(self) -> GoalGrid:
         """What its task generator knows about goals."""
 
+    @abstractmethod
     def close(self) -> None:
         """End what it started; a second call does nothing."""
+
+    @abstractmethod
+    def _advance(self, on_beat: OnBeat) -> None:
+        """Go on by an iteration, or by as much of one as is done within a moment."""
+
+    @abstractmethod
+    def _save(self) -> None:
+        """Write a checkpoint of the last iteration."""
+
+    def _stop_reason(self) -> str | None:
+        if self._stop_requested:
+            return "interrupted"
+        if self.bookkeeper.budget_spent:
+            return "finished"
+        return "converged" if self._converged else None
+
+    def _open_directory(self, *, resume: bool) -> None:
+        """Begin the run's records, or cut them back to where it goes on."""
+        position = {"after_iteration": self.iteration, "after_env_steps": self.num_env_steps} if resume else {}
+        self.directory.start(self.config, **position)
+
+    def _save_first(self) -> None:
+        """Save an untrained run, so that one that is killed before its first interval can be resumed, too."""
+        self._save()
+        self._take_snapshot(after=-1)
+
+    def _save_last(self) -> None:
+        with self.bookkeeper.explaining_unsaved():
+            if not self.bookkeeper.saved:
+                self._save()
+
+    def _metrics(self, result: IterationResult, elapsed_s: float) -> Metrics:
+        """The metrics of an iteration that was counted and took ``elapsed_s``."""
+        learned: Metrics = {}
+        if result.updated is not None:
+            learned = result.updated.metrics | {"time/learn_s": result.updated.update_s}
+        return {
+            "iteration": self.iteration,
+            "env_steps": self.num_env_steps,
+            **_round_metrics(result.rounds),
+            **result.recorded.metrics,
+            **learned,
+            "actor/num_rollouts": float(len(result.rounds)),
+            "actor/num_alive": float(result.num_actors_alive),
+            "time/hand_over_s": result.hand_over_s,
+            "time/learner_idle_fraction": max(0.0, 1.0 - learned.get("time/learn_s", 0.0) / elapsed_s),
+            "time/wall_s": self.bookkeeper.wall_s,
+            "time/env_steps_per_s": result.num_env_steps / elapsed_s,
+        }
+
+    def _count(self, result: IterationResult) -> None:
+        """Count an iteration, and ask whether it is the last."""
+        self.bookkeeper.count(result.num_env_steps)
+        self._converged = result.recorded.should_stop
+
+    def _record(self, result: IterationResult, metrics: Metrics) -> None:
+        """Write the records of an iteration that was counted, and what is due after it."""
+        with self.timing("record"):
+            self.directory.record(metrics)
+            self.directory.record_goals(self.iteration, self.num_env_steps, result.recorded.goals)
+            self._on_iteration(metrics)
+        with self.bookkeeper.tolerating("without this snapshot"):
+            self._take_snapshot(after=self.num_env_steps - result.num_env_steps)
+        if self.bookkeeper.save_due:
+            with self.bookkeeper.tolerating(f"and saves again after {self.config.run.checkpoint_interval} iterations"):
+                self._save()
+
+    def _take_snapshot(self, *, after: int) -> None:
+        if self.bookkeeper.snapshot_due(after=after):
+            with self.timing("checkpoint"):
+                self.bookkeeper.take_snapshot(self.bob())
+
+
+def _round_metrics(rounds: Sequence[RoundSummary]) -> Metrics:
+    """Means of the rounds' own metrics, weighted by their worlds, and how many worlds broke."""
+    num_worlds = np.array([each.num_worlds for each in rounds], dtype=np.float64)
+    shares = num_worlds / num_worlds.sum()
+    means = {name: float(shares @ [each.metrics[name] for each in rounds]) for name in rounds[0].metrics}
+    return means | {
+        "world/num_broken": float(sum(each.num_broken for each in rounds)),
+        "time/play_s": float(np.mean([each.play_s for each in rounds])),
+        "time/wait_for_generator_s": float(np.mean([each.generator_s for each in rounds])),
+    }

@@ -1,4 +1,4 @@
-"""The one place that knows how stale a rollout can get."""
+"""The bound on policy lag: how stale a rollout can get."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ class RolloutSlots:
     """
 
     _began: dict[int, int] = field(default_factory=dict)
-    """Policy version by ticket, of rounds that are being played."""
+    """Policy version by ticket, for rounds that are being played."""
     _done: set[int] = field(default_factory=set)
     """Tickets of rollouts that were played and are not yet learned from, or just being learned from."""
     _tickets: count[int] = field(default_factory=count)
 
     @property
     def num_taken(self) -> int:
-        """Slots that are not free."""
+        """Number of slots that are not free."""
         return len(self._began) + len(self._done)
 
     def may_begin(self, num_per_update: int) -> bool:
@@ -41,12 +41,12 @@ class RolloutSlots:
         return ticket
 
     def finish(self, ticket: int) -> None:
-        """The round is over and its rollout handed over."""
+        """Note that the round is over and its rollout handed over."""
         del self._began[ticket]
         self._done.add(ticket)
 
     def lose(self, ticket: int) -> None:
-        """The round, or its rollout, will never come."""
+        """Free the slot of a round, or a rollout, that will never come."""
         self._began.pop(ticket, None)
         self._done.discard(ticket)
 
@@ -59,5 +59,5 @@ class RolloutSlots:
         return all(version + 1 - began <= MAX_LAG for began in self._began.values())
 
     def publish(self, tickets: list[int]) -> None:
-        """The version that learned from these rollouts is out."""
+        """Free the slots of rollouts whose version is out."""
         self._done.difference_update(tickets)

@@ -26,9 +26,16 @@ REBIND_S = 10.0
 
 
 class StatusWorker:
-    """Serves run directories, Redis and the registry, which it only reads but for stop requests and aliases."""
+    """Serves run directories, Redis and the registry, which it only reads but for stop requests and aliases.
 
-    def __init__(self, options: StatusOptions, runs_dir: Path, registry: Path, redis: RedisAddress) -> None:
+    Args:
+        options: where it listens.
+        runs_dir: directory of run directories.
+        registry: root of the registry.
+        redis: None where none is configured; run directories then tell everything.
+    """
+
+    def __init__(self, options: StatusOptions, runs_dir: Path, registry: Path, redis: RedisAddress | None) -> None:
         self._options, self._runs_dir, self._registry, self._redis = options, runs_dir, registry, redis
         if ray.get_runtime_context().was_current_actor_reconstructed:  # nobody asks a second time
             self.start(patience_s=REBIND_S)
@@ -48,10 +55,9 @@ class StatusWorker:
         from service.registry.registry import Registry
         from service.status.reading import open_reader
         from service.status.server import StatusServer
-        from service.store.registry_index import RegistryIndex
 
         reader, options = open_reader(self._runs_dir, self._redis), self._options
-        registry = Registry(self._registry, listener=RegistryIndex(self._redis))
+        registry = Registry(self._registry)
         place: dict[str, Any] = {"host": options.host, "port": options.port, "runs_dir": self._runs_dir}
         deadline_s = time.monotonic() + patience_s
         while True:
@@ -67,7 +73,7 @@ class StatusWorker:
 
 
 @contextmanager
-def serving(options: StatusOptions, runs_dir: Path, registry: Path, redis: RedisAddress) -> Iterator[str]:
+def serving(options: StatusOptions, runs_dir: Path, registry: Path, redis: RedisAddress | None) -> Iterator[str]:
     """Serve for as long as the block runs, on the driver's machine, where the run directories are.
 
     Yields:

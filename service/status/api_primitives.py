@@ -7,7 +7,8 @@ from typing import Annotated
 from fastapi import APIRouter, Query, Request, Response
 from fastapi import Path as InPath
 
-from service.registry.errors import DamagedBlobError, FormatVersionError, RegistryError
+from service.io.errors import FormatVersionError
+from service.registry.errors import DamagedBlobError, RegistryError
 from service.registry.names import NAME_PATTERN, Version
 from service.registry.registry import Registry
 from service.status.blobs import VerifiedBlobs

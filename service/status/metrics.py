@@ -17,7 +17,7 @@ from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram, Proc
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily
 from prometheus_client.registry import Collector
 
-from service.registry.errors import RegistryError
+from service.io.errors import StorageError
 from service.registry.registry import Registry
 from service.store.errors import StoreError
 from service.store.models import ACTIVE, ActorStatus, Record, RunReader, RunState, RunStatus
@@ -203,7 +203,7 @@ class _Collector(Collector):
                 versions.add_metric([name], len(self._registry.versions(name)))
                 for alias, number in list(self._registry.aliases(name).items())[:MAX_NAMES]:
                     aliases.add_metric([name, alias], number)
-        except (RegistryError, OSError) as error:
+        except (StorageError, OSError) as error:
             _logger.warning("/metrics tells not all of the registry: %s", error)
             up.add_metric([], 0)
         else:

@@ -13,7 +13,8 @@ from starlette.exceptions import HTTPException
 from starlette.responses import JSONResponse
 
 from service.errors import TandemError
-from service.registry.errors import DamagedBlobError, FormatVersionError, UnknownVersionError
+from service.io.errors import FormatVersionError
+from service.registry.errors import DamagedBlobError, UnknownVersionError
 from service.store.errors import DamagedStoreError, StoreError, StoreUnavailableError, UnknownRunError
 
 MEDIA_TYPE = "application/problem+json"

@@ -1,1 +1,1 @@
-"""What is known about runs while they go on: told by runners, kept on disk and in Redis, read by the status service."""
+"""Live reports of runs: written by runners to disk and to Redis, read by the status service."""

@@ -1,4 +1,4 @@
-"""Where Redis is, without telling its password to anyone who reads a log."""
+"""The address of Redis, which keeps its password out of every log."""
 
 from __future__ import annotations
 
@@ -11,8 +11,6 @@ from urllib.parse import urlsplit
 from service.store.errors import StoreError, StoreUnavailableError
 
 VARIABLE = "TANDEM_REDIS_URL"
-CHECK_S = 2.0
-"""How long Redis may take to answer when it is first asked."""
 _FORM = "redis://[[USER]:PASSWORD@]HOST[:PORT][/DB], with %-escapes for other characters than letters and digits"
 
 
@@ -27,7 +25,7 @@ class RedisAddress:
     url: str = field(repr=False)
     """With the password: for a client, never for people."""
     source: str = VARIABLE
-    """What to mend when it is wrong."""
+    """Setting to mend when it is wrong."""
 
     def __post_init__(self) -> None:
         try:
@@ -55,7 +53,7 @@ class RedisAddress:
         return f"RedisAddress({self})"
 
     def client(self, timeout_s: float, on_connect: Callable[[], None] = lambda: None) -> Any:
-        """A ``redis.Redis``; no annotation says so, for redis-py's own name the returns of all its modes at once.
+        """A ``redis.Redis``, annotated as Any: redis-py's annotations name the returns of all its modes at once.
 
         Args:
             timeout_s: after which a call has failed. It is not tried again: callers know better when to.
@@ -78,27 +76,13 @@ class RedisAddress:
             protocol=2,  # one shape of replies, whatever redis-py makes the default
         )
 
-    def check(self) -> None:
-        """Return if Redis is there and lets us in.
-
-        Raises:
-            StoreUnavailableError: it is not, or does not.
-        """
-        from redis.exceptions import RedisError
-
-        try:
-            with self.client(CHECK_S) as client:
-                client.ping()
-        except (RedisError, OSError) as error:
-            raise self.unavailable(error) from None
-
     def unavailable(self, error: Exception) -> StoreUnavailableError:
-        """What to tell a user about a client's error."""
+        """The error for a user that stands for a client's ``error``."""
         return StoreUnavailableError(f"Redis at {self}: {reason_of(error)}; check {self.source} and the server")
 
 
 def address_from_environment() -> RedisAddress | None:
-    """What ``TANDEM_REDIS_URL`` says; None where it is not set or empty.
+    """The Redis of ``TANDEM_REDIS_URL``; None where it is not set or empty.
 
     Raises:
         StoreError: not a Redis URL, or the package redis is not installed.

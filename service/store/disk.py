@@ -1,4 +1,4 @@
-"""What a run tells, as files in its directory: for ``tandem serve --runs`` and for everyone with a text editor.
+"""Live reports as files in the run directory: for ``tandem serve --runs`` and for everyone with a text editor.
 
 | file | content |
 |---|---|
@@ -52,7 +52,7 @@ class DiskWriter:
         self._state = status.state
 
     def metrics(self, record: Record) -> None:
-        """Nothing: the run directory has its own ``metrics.jsonl``."""
+        """Do nothing: the run directory has its own ``metrics.jsonl``."""
 
     def goals(self, grid: GoalGrid) -> None:
         """Replace the grid."""
@@ -63,7 +63,7 @@ class DiskWriter:
         return self._stop_file.exists()
 
     def warnings(self) -> list[str]:
-        """What cannot be written at the moment."""
+        """Files that cannot be written at the moment, a sentence each."""
         return [problem for file in (self._status, self._goals) if (problem := file.problem) is not None]
 
     def close(self) -> None:

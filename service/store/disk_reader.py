@@ -1,4 +1,4 @@
-"""Runs as their directories show them, those of an older tandem, which has no ``status.json``, included."""
+"""Runs read from their directories, those of an older tandem, which has no ``status.json``, included."""
 
 from __future__ import annotations
 
@@ -16,8 +16,7 @@ from pydantic import ValidationError
 from service.io.lock import is_locked
 from service.store.disk import GOALS_FILE, STATUS_FILE, STOP_FILE
 from service.store.errors import DamagedStoreError, StoreError, StoreUnavailableError, UnknownRunError
-from service.store.liveness import SILENT_AFTER, is_silent, vanished
-from service.store.models import ACTIVE, GoalGrid, Record, RunState, RunStatus
+from service.store.models import ACTIVE, SILENT_AFTER, GoalGrid, Record, RunState, RunStatus
 from service.store.tail import RecordFile
 
 _logger = logging.getLogger(__name__)
@@ -33,7 +32,7 @@ class DiskReader:
     """The ``RunReader`` of a directory of run directories; any number of threads may use it at once."""
 
     def __init__(self, root: Path) -> None:
-        """For ``root``/*/; nothing is read before the first call."""
+        """Take the directory of run directories; nothing is read before the first call."""
         self.root = root
         self._runs: dict[Path, _RunFiles] = {}
         self._lock = Lock()
@@ -122,8 +121,8 @@ class _RunFiles:
             reason = error.strerror if isinstance(error, OSError) else "it is no run's status"
             note = f"{STATUS_FILE} cannot be read: {reason}; what is shown comes from metrics.jsonl"
             return self._guess(run_id).model_copy(update={"warnings": (note,)})
-        if is_silent(status) and not is_locked(self.path):
-            status = vanished(status)
+        if status.is_silent and not is_locked(self.path):
+            status = status.vanished()
         stopping = status.state in ACTIVE and (status.stopping or (self.path / STOP_FILE).exists())
         return status.model_copy(update={"run_id": run_id, "stopping": stopping})  # a copied directory has another id
 
@@ -162,7 +161,7 @@ class _RunFiles:
     # --- without a status ---------------------------------------------------------------------------------------------
 
     def _guess(self, run_id: str) -> RunStatus:
-        """What the configuration and the newest record tell."""
+        """The status as the configuration and the newest record show it."""
         started, heartbeat = self._time("config.yaml"), self._time("metrics.jsonl", "config.yaml")
         if self._config is None or self._config[0] != started:  # YAML takes its time
             self._config = (started, *self._read_config())
@@ -198,7 +197,7 @@ class _RunFiles:
         return "converged" if published else "interrupted"
 
     def _read_config(self) -> tuple[str | None, int | None]:
-        """Name and budget, from a configuration of whatever version."""
+        """Name and budget, from a configuration of any version."""
         try:
             tree = yaml.safe_load((self.path / "config.yaml").read_bytes())
             return str(tree["name"]), max(1, int(tree["run"]["total_env_steps"]))
@@ -213,7 +212,7 @@ class _RunFiles:
             return None
 
     def _time(self, *names: str) -> datetime:
-        """When the first of these files that exists was last written."""
+        """Time at which the first of these files that exists was last written."""
         for name in names:
             try:
                 return datetime.fromtimestamp((self.path / name).stat().st_mtime, UTC)

@@ -1,4 +1,4 @@
-"""What can go wrong with reading what runs tell."""
+"""Errors of reading and writing the reports of runs."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from service.errors import TandemError
 
 
 class StoreError(TandemError):
-    """Something about the store or a request to it is wrong."""
+    """The store cannot do what was asked."""
 
 
 class UnknownRunError(StoreError):
@@ -19,10 +19,6 @@ class UnknownRunError(StoreError):
         return cls(f"no run {run_id[:128]!r} in {where}; it holds: {shown or 'nothing yet'}")
 
 
-class RunTakenError(StoreError):
-    """Another process runs this run."""
-
-
 class StoreUnavailableError(StoreError):
     """The store cannot be reached at the moment."""
 
@@ -30,6 +26,6 @@ class StoreUnavailableError(StoreError):
 
 
 class DamagedStoreError(StoreError):
-    """The store holds something that no run has written."""
+    """The store holds a value that no run has written."""
 
     exit_code = 1

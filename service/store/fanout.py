@@ -1,4 +1,4 @@
-"""Telling several places at once how a run goes."""
+"""Reports to several places at once."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ class FanoutWriter:
     """A ``RunWriter`` that hands everything to several others, in their order."""
 
     def __init__(self, writers: Sequence[RunWriter]) -> None:
-        """Of ``writers``, which it closes with itself."""
+        """Take ``writers``, which it closes with itself."""
         self._writers = tuple(writers)
 
     def status(self, status: RunStatus) -> None:
@@ -38,7 +38,7 @@ class FanoutWriter:
         return any(writer.stop_requested() for writer in self._writers)
 
     def warnings(self) -> list[str]:
-        """What does not work at the moment, everywhere."""
+        """Problems of all of them at the moment."""
         return [warning for writer in self._writers for warning in writer.warnings()]
 
     def close(self) -> None:

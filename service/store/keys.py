@@ -8,24 +8,16 @@
 | ``tandem:run:ID:goals`` | string | ``GoalGrid`` as JSON |
 | ``tandem:run:ID:stop`` | string | is there when somebody asked the run to stop |
 | ``tandem:run:ID:lease`` | string, expires | who runs it, as JSON; gone ``LEASE_S`` after its last sign of life |
-| ``tandem:registry:ROOT:versions`` | hash | ``IndexedVersion`` as JSON by NAME@VERSION |
-| ``tandem:registry:ROOT:aliases`` | hash | the aliases of a name and the version of each, as JSON by name |
-| ``tandem:registry:ROOT:published`` | stream | what was published and which aliases moved, the newest ``MAX_NOTICES`` |
 
-ROOT stands for a registry's directory: 12 hexadecimal digits of the sha256 of its absolute path, so machines that
-share one mount it at the same place. Records are in a sorted set and no stream: written twice, as after an answer that
-got lost, a record is there once, and a resumed run's takes the place of the earlier one.
+Records are in a sorted set and no stream: written twice, as after an answer that got lost, a record is there once, and
+a resumed run's takes the place of the earlier one.
 """
 
 from __future__ import annotations
 
-import hashlib
-from pathlib import Path
-
 RUNS = "tandem:runs"
 MAX_RECORDS = 20_000
 """Of one run, about 60 MB; ``metrics.jsonl`` has them all."""
-MAX_NOTICES = 10_000
 LEASE_S = 10.0
 
 
@@ -50,10 +42,5 @@ def stop(run_id: str) -> str:
 
 
 def lease(run_id: str) -> str:
-    """Key of who runs it."""
+    """Key of the claim of the process that runs it."""
     return f"tandem:run:{run_id}:lease"
-
-
-def registry(root: Path, part: str) -> str:
-    """Key of the ``versions``, ``aliases`` or ``published`` of the registry in a directory."""
-    return f"tandem:registry:{hashlib.sha256(str(root.resolve()).encode()).hexdigest()[:12]}:{part}"

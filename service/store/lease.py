@@ -1,4 +1,4 @@
-"""Who runs a run: a key in Redis that its holder renews, and that expires when the holder is gone."""
+"""A claim on a run: a key in Redis that its holder renews, and that expires when the holder is gone."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from typing import Any
 
 from redis.exceptions import WatchError
 
+from service.io.errors import RunTakenError
 from service.store import keys
-from service.store.errors import RunTakenError
 
 _LOOK_S = 0.1
 

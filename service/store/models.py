@@ -1,13 +1,16 @@
-"""What a run tells about itself, as its runner writes it and the status service hands it out."""
+"""The report of a run about itself, as its runner writes it and the status service hands it out."""
 
 from __future__ import annotations
 
-from typing import Literal, Protocol
+from datetime import UTC, datetime, timedelta
+from typing import Literal, Protocol, Self
 
 from pydantic import AwareDatetime, BaseModel, ConfigDict, Field
 
 RunState = Literal["starting", "running", "finished", "converged", "interrupted", "failed"]
 ACTIVE: frozenset[RunState] = frozenset({"starting", "running"})
+SILENT_AFTER = timedelta(seconds=60)
+"""A run without a word for so long may have lost its process, killed or cut off from power."""
 Record = dict[str, float | None]
 """One iteration's metrics; ``iteration`` and ``env_steps`` are always there. Null: JSON has no number for it."""
 
@@ -31,7 +34,7 @@ class ActorStatus(_Frozen):
 
 
 class RunStatus(_Frozen):
-    """A run right now."""
+    """The state of a run right now."""
 
     run_id: str = Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]{0,127}$")
     name: str = Field(description="registry name of the primitives it makes")
@@ -53,6 +56,19 @@ class RunStatus(_Frozen):
     warnings: tuple[str, ...] = Field((), description="what is not as it should be right now, such as Redis being away")
     actors: tuple[ActorStatus, ...] = ()
 
+    @property
+    def is_silent(self) -> bool:
+        """Whether the run has not ended, and was not heard of for ``SILENT_AFTER``."""
+        return self.state in ACTIVE and datetime.now(UTC) - self.heartbeat > SILENT_AFTER
+
+    def vanished(self) -> Self:
+        """The status of a silent run that no process runs any more: it must not seem to run for ever."""
+        when = self.heartbeat.astimezone(UTC).isoformat(timespec="seconds")
+        error = (
+            f"its process vanished without a word, last heard of at {when}; --resume goes on from its last checkpoint"
+        )
+        return self.model_copy(update={"state": "interrupted", "stopping": False, "last_error": error})
+
 
 class GoalCell(_Frozen):
     """One cell of the task generator's grid in which a valid goal was ever proposed."""
@@ -64,7 +80,7 @@ class GoalCell(_Frozen):
 
 
 class GoalGrid(_Frozen):
-    """What the task generator knows about goals."""
+    """The task generator's estimates of goals."""
 
     iteration: int = Field(ge=0)
     num_env_steps: int = Field(ge=0)
@@ -77,7 +93,7 @@ class GoalGrid(_Frozen):
 
 
 class RunWriter(Protocol):
-    """Where a runner tells how its run goes. No method may raise for a store that is away or full: training goes on."""
+    """A place a runner reports to. No method may raise for a store that is away or full: training goes on."""
 
     def status(self, status: RunStatus) -> None:
         """Replace what is known about the run."""
@@ -92,14 +108,14 @@ class RunWriter(Protocol):
         """Whether somebody asked the run to stop since it was started."""
 
     def warnings(self) -> list[str]:
-        """What does not work at the moment, in one sentence each; empty when all is well."""
+        """Problems at the moment, in one sentence each; empty when all is well."""
 
     def close(self) -> None:
         """Write what still waits, for a bounded time."""
 
 
 class RunReader(Protocol):
-    """What the status service reads runs from.
+    """A place the status service reads runs from.
 
     Every method may raise ``StoreUnavailableError``; those that take a run id raise ``UnknownRunError`` where there is
     no such run.

@@ -1,4 +1,4 @@
-"""Runs as Redis knows them: every call is one round trip, and one that Redis does not answer at once has failed."""
+"""Runs read from Redis: every call is one round trip, and one that Redis does not answer at once has failed."""
 
 from __future__ import annotations
 
@@ -12,7 +12,6 @@ from redis.exceptions import RedisError, ResponseError
 from service.store import keys
 from service.store.address import RedisAddress
 from service.store.errors import DamagedStoreError, UnknownRunError
-from service.store.liveness import is_silent, vanished
 from service.store.models import ACTIVE, GoalGrid, Record, RunStatus
 from service.store.tail import parse_record
 
@@ -28,7 +27,7 @@ class RedisReader:
     """
 
     def __init__(self, address: RedisAddress) -> None:
-        """For the Redis there; nothing is sent before the first call."""
+        """Take the address of a Redis; nothing is sent before the first call."""
         self._address = address
         self._client = address.client(TIMEOUT_S)
 
@@ -37,7 +36,7 @@ class RedisReader:
         with self._errors():
             run_ids = [name.decode(errors="replace") for name in self._client.zrevrange(keys.RUNS, 0, -1)]
             statuses = []
-            for run_id, (text, *flags) in zip(run_ids, self._look_at(run_ids), strict=True):
+            for run_id, (text, *flags) in zip(run_ids, self._look_up(run_ids), strict=True):
                 try:
                     statuses.append(_status(run_id, text, *flags))
                 except (DamagedStoreError, UnknownRunError) as error:
@@ -51,7 +50,7 @@ class RedisReader:
             UnknownRunError: there is no such run.
         """
         with self._errors():
-            ((text, *flags),) = self._look_at([run_id])
+            ((text, *flags),) = self._look_up([run_id])
             self._check_known(run_id, text is not None)
             return _status(run_id, text, *flags)
 
@@ -94,12 +93,8 @@ class RedisReader:
         with self._errors():
             self._client.ping()
 
-    def close(self) -> None:
-        """Give the connections back."""
-        self._client.close()
-
-    def _look_at(self, run_ids: list[str]) -> Iterator[tuple[bytes | None, bool, bool]]:
-        """Of each run its status, whether somebody runs it, and whether it was asked to stop."""
+    def _look_up(self, run_ids: list[str]) -> Iterator[tuple[bytes | None, bool, bool]]:
+        """Status of each run, whether a process runs it, and whether it was asked to stop."""
         with self._client.pipeline(transaction=False) as pipe:
             for run_id in run_ids:
                 pipe.get(keys.status(run_id))
@@ -139,8 +134,8 @@ def _status(run_id: str, text: bytes | None, leased: bool, stop: bool) -> RunSta
         status = RunStatus.model_validate_json(text)
     except ValidationError:
         raise _damaged(keys.status(run_id), "run's status") from None
-    if not leased and is_silent(status):
-        return vanished(status)
+    if not leased and status.is_silent:
+        return status.vanished()
     return status.model_copy(update={"stopping": status.state in ACTIVE and (status.stopping or stop)})
 
 

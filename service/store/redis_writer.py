@@ -1,4 +1,4 @@
-"""What a run tells, sent to Redis by a thread of its own: Redis may be slow or away, and the run does not notice."""
+"""Live reports sent to Redis by a thread of its own: Redis may be slow or away, and the run does not notice."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from typing import Any
 
 from redis.exceptions import RedisError, WatchError
 
-from service.io.plain import plain
+from service.io.errors import RunTakenError
+from service.io.jsonl import plain
 from service.store import keys
 from service.store.address import RedisAddress, reason_of
-from service.store.errors import RunTakenError
 from service.store.lease import Lease
 from service.store.models import GoalGrid, Record, RunStatus
 
@@ -40,7 +40,7 @@ class _Line:
 
 
 class RedisWriter:
-    """The ``RunWriter`` of one run in Redis. While it lives, no other driver can tell about the same run id.
+    """The ``RunWriter`` of one run in Redis. While it lives, no other driver can write the same run id.
 
     One thread consumes what the methods leave behind and produces transactions; it waits for ``TICK_S`` and is
     unblocked by ``close``. Status and grid that were not sent yet are replaced by newer ones, records wait in line.
@@ -103,7 +103,7 @@ class RedisWriter:
         return self._stop
 
     def warnings(self) -> list[str]:
-        """What does not work at the moment."""
+        """Problems at the moment."""
         found, away = [], self._away
         if away is not None:
             since_s = time.monotonic() - away[0]
@@ -114,7 +114,7 @@ class RedisWriter:
         if self._num_lost:
             found.append(f"{self._num_lost} records did not reach Redis; metrics.jsonl has them")
         if self._taken is not None:
-            found.append(f"{self._taken}; this process no longer tells Redis anything")
+            found.append(f"{self._taken}; this process no longer writes to Redis")
         return found
 
     def close(self, timeout_s: float = 2.0) -> None:
@@ -123,9 +123,7 @@ class RedisWriter:
         self._closing.set()
         self._thread.join(timeout_s + 0.1)  # a call to a hanging Redis may last longer; the thread then dies alone
         if self._pending() and self._taken is None:
-            _logger.warning(
-                "Redis at %s was not told the end of run %s; its files have it", self._address, self._run_id
-            )
+            _logger.warning("Redis at %s did not get the end of run %s; its files have it", self._address, self._run_id)
 
     # --- the thread ---------------------------------------------------------------------------------------------------
 
@@ -135,10 +133,10 @@ class RedisWriter:
             self._closing.wait(pause_s)
             ending = self._closing.is_set()
             try:
-                more = self._tell()
+                more = self._send()
             except RunTakenError as error:
                 self._taken = str(error)
-                _logger.warning("%s; this process no longer tells Redis anything", error)
+                _logger.warning("%s; this process no longer writes to Redis", error)
             except WatchError:  # the lease has expired or was taken in this very moment; the next try tells which
                 pause_s = 0.0
             except (RedisError, OSError) as error:
@@ -153,10 +151,10 @@ class RedisWriter:
                     break
             if time.monotonic() > self._deadline_s:
                 break
-        self._let_go()
+        self._release()
 
-    def _tell(self) -> bool:
-        """One transaction; returns whether records are left for another."""
+    def _send(self) -> bool:
+        """Send one transaction; True when records are left for another."""
         status, grid = self._status, self._grid
         with self._lock:
             batch = list(self._waiting)[:BATCH]
@@ -197,7 +195,7 @@ class RedisWriter:
         self._connected_anew = True
 
     def _send_again(self) -> bool:
-        """Over a new connection, which may be to a Redis that was killed and has forgotten what came last."""
+        """Queue the newest reports again after a reconnect: a Redis that was killed has forgotten what came last."""
         if not self._connected_anew:
             return False
         self._connected_anew = False
@@ -220,7 +218,7 @@ class RedisWriter:
             _logger.info("Redis at %s is back after %.0f s", self._address, time.monotonic() - self._away[0])
         self._away = None
 
-    def _let_go(self) -> None:
+    def _release(self) -> None:
         try:
             self._lease.release()
             self._client.close()

@@ -1,4 +1,4 @@
-"""A growing file of records, read again and again: only what is new is parsed, and nothing is kept but where it is."""
+"""A growing file of records, read again and again: only new lines are parsed, and only their places are kept."""
 
 from __future__ import annotations
 

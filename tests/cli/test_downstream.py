@@ -8,7 +8,7 @@ from typer.testing import CliRunner
 
 from service.cli import downstream as commands
 from service.cli.main import app
-from service.registry.registry import BUNDLED
+from service.primitives.bundled import BUNDLED
 from tests.downstream.cells import SETS
 from tests.status.conftest import serve
 

@@ -16,8 +16,9 @@ from service.cli.main import app
 from service.config import load_config
 from service.io import checkpoints
 from service.io.run_directory import RunDirectory
+from service.primitives.bundled import BUNDLED
 from service.registry.names import Version
-from service.registry.registry import BUNDLED, Registry
+from service.registry.registry import Registry
 from tests.runtime.runs import TREE, no_room_above, tiny_config, write_yaml
 
 ROOT = Path(__file__).parents[2]
@@ -182,8 +183,8 @@ def test_demo_is_a_short_pretraining_with_a_registry_of_its_own(monkeypatch, tmp
 
 def test_demo_ends_with_what_comes_with_tandem_and_what_to_type(monkeypatch, tmp_path):
     from service.actors import evaluation
-    from service.runtime.local import RunResult
     from service.runtime.pretrain import Pretrained
+    from service.runtime.runner import RunResult
 
     def pretrain(*args, **kwargs):
         return Pretrained(RunResult("finished", 1, 7), {}, Version("panda-cube-demo", 1), {}, "total 1 s")

@@ -9,8 +9,9 @@ import pytest
 from typer.testing import CliRunner
 
 from service.cli.registry import registry_app
+from service.primitives.bundled import BUNDLED
 from service.registry.exported import load_exported
-from service.registry.registry import BUNDLED, Registry
+from service.registry.registry import Registry
 from tests.registry.helpers import Publish
 
 Run = Callable[..., Any]

@@ -3,7 +3,7 @@ import os
 import pytest
 
 from service.io.append_file import Appender
-from service.registry.errors import RegistryError
+from service.io.errors import StorageError
 from tests.runtime.runs import assert_one_line, no_room_above
 
 
@@ -24,7 +24,7 @@ def test_pieces_come_one_after_the_other_behind_what_is_there(path):
 def test_a_piece_that_does_not_fit_leaves_no_part_and_comes_before_the_next(path):
     appender = Appender(path)
     appender.append(b"aaa")
-    with no_room_above(5), pytest.raises(RegistryError) as error:
+    with no_room_above(5), pytest.raises(StorageError) as error:
         appender.append(b"bbb")  # the kernel takes two of its bytes
     assert_one_line(error.value, "cannot write", path, "File too large")
     assert path.read_bytes() == b"aaa"
@@ -68,6 +68,6 @@ def test_a_part_is_taken_back_when_a_signal_comes_between_two_writes(path, monke
 def test_a_device_that_is_always_full(tmp_path):
     path = tmp_path / "pieces"
     path.symlink_to("/dev/full")
-    with pytest.raises(RegistryError) as error:
+    with pytest.raises(StorageError) as error:
         Appender(path).append(b"a")
     assert_one_line(error.value, "cannot write", path, "No space left on device")

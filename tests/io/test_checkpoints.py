@@ -14,7 +14,7 @@ import pytest
 
 from service.io import checkpoints, tensors
 from service.io.checkpoints import CheckpointStore, read_checkpoint
-from service.registry.errors import CheckpointError, FormatVersionError
+from service.io.errors import CheckpointError, FormatVersionError
 
 
 @pytest.fixture

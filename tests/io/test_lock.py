@@ -9,8 +9,9 @@ import time
 
 import pytest
 
+from service.io import lock
+from service.io.errors import RunTakenError
 from service.io.lock import DirectoryLock, is_locked
-from service.store.errors import RunTakenError
 from tests.runtime.runs import assert_one_line
 
 HOLD = """
@@ -34,7 +35,7 @@ def other(tmp_path):
 
 def test_a_second_process_is_refused_in_one_line(tmp_path, other):
     with pytest.raises(RunTakenError) as error:
-        DirectoryLock(tmp_path, "name another one", wait_s=0.0)
+        DirectoryLock(tmp_path, "name another one")
     assert_one_line(error.value, tmp_path, f"process {other.pid} on {os.uname().nodename}", "name another one")
 
 
@@ -46,11 +47,12 @@ def test_a_process_that_is_killed_leaves_no_lock(tmp_path, other):
     DirectoryLock(tmp_path, "").release()
 
 
-def test_a_lock_is_waited_for(tmp_path, other):
+def test_a_lock_is_waited_for(tmp_path, other, monkeypatch):
+    monkeypatch.setattr(lock, "WAIT_S", 600.0)
     start_s = time.monotonic()
     signal.signal(signal.SIGALRM, lambda *_: other.kill())
     signal.setitimer(signal.ITIMER_REAL, 0.2)
-    DirectoryLock(tmp_path, "", wait_s=600.0).release()
+    DirectoryLock(tmp_path, "").release()
     assert time.monotonic() - start_s >= 0.2
 
 
@@ -63,7 +65,7 @@ def test_asking_does_not_take_the_lock(tmp_path):
     first.release()
     assert not is_locked(tmp_path)
     with pytest.raises(RunTakenError):  # an object counts as a process does
-        _ = DirectoryLock(tmp_path, ""), DirectoryLock(tmp_path, "", wait_s=0.0)
+        _ = DirectoryLock(tmp_path, ""), DirectoryLock(tmp_path, "")
 
 
 def test_a_damaged_lock_file_is_as_good_as_any(tmp_path):
@@ -71,17 +73,8 @@ def test_a_damaged_lock_file_is_as_good_as_any(tmp_path):
     first = DirectoryLock(tmp_path, "")
     (tmp_path / ".lock").write_bytes(b"\xff{")
     with pytest.raises(RunTakenError, match="in use by another process"):
-        DirectoryLock(tmp_path, "", wait_s=0.0)
+        DirectoryLock(tmp_path, "")
     first.release()
-
-
-def test_a_child_that_inherits_the_lock_holds_it(tmp_path):
-    lock = DirectoryLock(tmp_path, "")
-    with subprocess.Popen(["cat"], stdin=subprocess.PIPE, pass_fds=[lock.fileno()]) as child:
-        lock.release()
-        assert is_locked(tmp_path)
-        child.kill()
-    assert not is_locked(tmp_path)
 
 
 def test_a_file_system_without_locks_is_warned_of(tmp_path, monkeypatch, caplog):

@@ -1,14 +1,11 @@
 """A run directory: what is written when, what is refused, and what a resume cuts away."""
 
-from types import SimpleNamespace
-
 import numpy as np
 import pytest
 
 from service.config import ConfigError, load_config
 from service.errors import TandemError
-from service.generator.validity import Verdict
-from service.io.run_directory import GOALS_PER_ITERATION, MAX_BROKEN_FILES, RunDirectory
+from service.io.run_directory import MAX_BROKEN_FILES, RunDirectory
 from tests.runtime.runs import assert_one_line, no_room_above, read_lines, tiny_config
 
 
@@ -103,8 +100,8 @@ def test_metrics_are_a_line_and_an_event_each(directory):
 
 def test_a_resume_cuts_both_files_and_goes_on(directory):
     record(directory, 1, 2, 3)
-    for iteration in range(3):
-        directory.record_goals(iteration, 100 * iteration, make_records(1))
+    for iteration in (1, 2, 3):
+        directory.record_goals(iteration, 100 * iteration, np.zeros((1, 7)))
     directory.close()
     resumed = RunDirectory(directory.path)
     resumed.start(tiny_config(total_env_steps=900), after_iteration=1)
@@ -121,48 +118,13 @@ def test_close_twice(directory):
     directory.close()
 
 
-def make_records(num, **overrides):
-    """What ``record_goals`` reads of N solved, valid, own goals."""
-    positions = np.arange(3 * num, dtype=float).reshape(num, 3) / 1000 + 1e-5
-    fields = {
-        "start_position": positions,
-        "goal": positions + 0.1,
-        "solved": np.ones(num, dtype=bool),
-        "verdict": np.full(num, Verdict.VALID),
-        "played": np.ones(num, dtype=bool),
-        "replayed": np.zeros(num, dtype=bool),
-        "bob_past": np.zeros(num, dtype=bool),
-    }
-    return SimpleNamespace(**fields | {name: np.array(value) for name, value in overrides.items()})
-
-
 def test_goals_are_start_goal_and_result(directory):
-    directory.record_goals(6, 1234, make_records(2, solved=[True, False]))
-    (row,) = read_lines(directory.goals_file)
-    assert (row["iteration"], row["env_steps"]) == (7, 1234)
-    assert row["goals"] == [
-        [0.0, 0.001, 0.002, 0.1, 0.101, 0.102, 1.0],
-        [0.003, 0.004, 0.005, 0.103, 0.104, 0.105, 0.0],
+    directory.record_goals(7, 1234, np.array([[0.00001, 0.001, 0.002, 0.1, 0.101, 0.10204, 1.0], [0.3] * 6 + [0.0]]))
+    directory.record_goals(8, 2345, np.empty((0, 7)))
+    assert read_lines(directory.goals_file) == [
+        {"iteration": 7, "env_steps": 1234, "goals": [[0.0, 0.001, 0.002, 0.1, 0.101, 0.102, 1.0], [0.3] * 6 + [0.0]]},
+        {"iteration": 8, "env_steps": 2345, "goals": []},
     ]
-
-
-def test_only_goals_the_current_bob_played_himself(directory):
-    records = make_records(
-        5,
-        verdict=[Verdict.VALID, Verdict.OUTSIDE, Verdict.VALID, Verdict.VALID, Verdict.VALID],
-        played=[True, False, True, True, False],
-        replayed=[False, False, True, False, False],
-        bob_past=[False, False, False, True, False],
-    )
-    directory.record_goals(0, 0, records)
-    (row,) = read_lines(directory.goals_file)
-    assert [goal[0] for goal in row["goals"]] == [0.0]
-
-
-def test_no_goals_and_very_many(directory):
-    directory.record_goals(0, 0, make_records(0))
-    directory.record_goals(1, 0, make_records(100))
-    assert [len(row["goals"]) for row in read_lines(directory.goals_file)] == [0, GOALS_PER_ITERATION]
 
 
 def test_broken_worlds_are_kept_but_not_without_end(directory):
@@ -205,9 +167,9 @@ def test_a_disk_that_fills_up_again_is_said_again(directory, caplog):
 
 def test_goals_and_broken_worlds_on_a_full_disk_do_not_end_a_run(directory, caplog):
     with no_room_above(0):
-        directory.record_goals(0, 100, make_records(1))
+        directory.record_goals(1, 100, np.zeros((1, 7)))
         directory.dump_broken("000000", ((np.arange(4.0), np.zeros(4)),))
-    directory.record_goals(1, 200, make_records(1))
+    directory.record_goals(2, 200, np.zeros((1, 7)))
     assert [row["iteration"] for row in read_lines(directory.goals_file)] == [1, 2]
     assert list((directory.path / "broken").iterdir()) == []
     assert "round-000000.npz: File too large" in caplog.text

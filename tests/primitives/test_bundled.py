@@ -6,10 +6,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from service.primitives.bundled import find_version
+from service.primitives.bundled import BUNDLED, find_version, is_bundled
 from service.registry.errors import RegistryError, UnknownVersionError
 from service.registry.names import Version
-from service.registry.registry import BUNDLED, Registry
+from service.registry.registry import Registry
 from tests.registry.helpers import Publish, files_in
 
 MAX_BYTES = 5_000_000
@@ -20,7 +20,7 @@ def test_the_users_own_comes_first(registry: Registry, publish: Publish) -> None
     publish()
     found, version = find_version("panda-cube", registry.root)
     assert (found.root, version) == (registry.root, Version("panda-cube", 2))
-    assert not found.bundled
+    assert not is_bundled(found)
 
 
 @pytest.mark.parametrize("others", [(), ("panda-cup",)])
@@ -30,7 +30,7 @@ def test_a_name_the_user_does_not_have_is_looked_up_in_the_package(
     for name in others:
         publish(name)
     found, version = find_version("panda-cube@champion", registry.root)
-    assert found.bundled
+    assert is_bundled(found)
     assert version == Registry(BUNDLED).resolve("panda-cube@champion")
     assert registry.root.exists() == bool(others)
 
@@ -41,7 +41,7 @@ def test_an_own_version_hides_nothing_that_it_does_not_have(registry: Registry, 
     assert champion.number > 1
     for reference in ("panda-cube@champion", str(champion)):
         found, version = find_version(reference, registry.root)
-        assert (found.bundled, version) == (True, champion)
+        assert (is_bundled(found), version) == (True, champion)
     for reference in ("panda-cube", "panda-cube@latest", "panda-cube@1"):
         found, version = find_version(reference, registry.root)
         assert (found.root, version) == (registry.root, Version("panda-cube", 1))

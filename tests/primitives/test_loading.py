@@ -8,8 +8,9 @@ from service.errors import TandemError
 from service.io import checkpoints
 from service.io.run_directory import RunDirectory
 from service.policies.evaluator import GaussianEvaluator, MCPEvaluator
+from service.primitives.bundled import BUNDLED
 from service.primitives.loading import load_bob, load_players, read_parameters
-from service.registry.registry import BUNDLED, Registry
+from service.registry.registry import Registry
 from tests.runtime.runs import assert_one_line, play, tiny_config
 
 

@@ -6,8 +6,9 @@ from pathlib import Path
 
 import pytest
 
+from service.io.errors import StorageError
 from service.registry.blobs import BlobStore
-from service.registry.errors import DamagedBlobError, RegistryError
+from service.registry.errors import DamagedBlobError
 
 
 def test_put_and_get(tmp_path: Path) -> None:
@@ -52,6 +53,6 @@ def test_a_full_disk_leaves_nothing_half_written(tmp_path: Path, full_disk: Call
     store = BlobStore(tmp_path)
     first = store.put(b"first")
     full_disk(call)
-    with pytest.raises(RegistryError, match=r"cannot write .*: No space left on device \([0-9]+ bytes free there\)"):
+    with pytest.raises(StorageError, match=r"cannot write .*: No space left on device \([0-9]+ bytes free there\)"):
         store.put(b"second")
     assert [path.name for path in (tmp_path / "sha256").iterdir()] == [first]

@@ -94,6 +94,7 @@ def play(path, config=None, *, resume=False, kill_after=None, on_iteration=None)
     except KilledError:
         return run, None
     finally:
+        run.close()
         directory.close()
 
 

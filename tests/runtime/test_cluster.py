@@ -14,9 +14,9 @@ from service.errors import DivergedError
 from service.io.checkpoints import CheckpointStore
 from service.io.run_directory import RunDirectory
 from service.runtime.cluster import ClusterRun, num_gpus
+from service.runtime.ray_actors import NICENESS
 from service.runtime.ray_connection import ClusterOptions, connected
 from service.runtime.runner import ClusterError
-from service.runtime.workers import NICENESS
 from tests.runtime.runs import newest, play, read_lines, tiny_config
 
 TOGETHER = ("learner/", "alice/", "bob/", "generator/")
@@ -94,7 +94,7 @@ def test_worlds_are_shared_out_and_every_rollout_counts_once(tmp_path):
         tmp_path, tiny_config(total_env_steps=1500), num_actors=3, on_iteration=lambda run, m: seen.append(m)
     )
     assert result.reason == "finished"
-    assert run._num_worlds == 8
+    assert run._pool.num_worlds == 8
     health = run.health()
     assert health.num_rollouts_refused == 0
     counted = sum(highest + 1 for _, _, highest in ids(tmp_path))
@@ -151,7 +151,7 @@ def test_whoever_is_killed_is_replaced(tmp_path):
     assert {(actor, incarnation) for actor, incarnation, _ in counted} >= {(0, 0), (1, 0), (1, 1), (1, 2)}
     # Not one of the rollouts that the actors handed over is missing.
     assert sum(highest + 1 for _, _, highest in counted) == run.health().num_rollouts_counted
-    assert run.books.iteration == result.iteration == rows[-1]["iteration"]
+    assert run.iteration == result.iteration == rows[-1]["iteration"]
 
 
 def test_an_actor_that_hangs_is_replaced(tmp_path, monkeypatch):

@@ -1,5 +1,7 @@
 """A policy or a world that diverges in the middle of a run: what is said, what is kept, and how it goes on."""
 
+from itertools import count
+
 import numpy as np
 import pytest
 import torch
@@ -11,6 +13,7 @@ from service.io.run_directory import RunDirectory
 from service.policies.evaluator import GaussianEvaluator
 from service.runtime.local import LocalRun
 from service.runtime.pretrain import resumed_config
+from service.runtime.workers import RolloutWorker
 from tests.runtime.runs import assert_one_line, assert_same_run, newest, play, read_lines, write_yaml
 
 
@@ -32,14 +35,14 @@ def uninterrupted(tmp_path_factory):
 
 def diverge_after(patch, iteration):
     """Alice's policy is no good from the iteration behind this one."""
-    players = LocalRun._players
+    players, rounds = RolloutWorker._players, count()
 
     def spoiled(self, weights):
-        if self.iteration >= iteration:
-            patch.setattr("service.runtime.local.GaussianEvaluator", NotANumber)
+        if next(rounds) >= iteration:
+            patch.setattr("service.runtime.workers.GaussianEvaluator", NotANumber)
         return players(self, weights)
 
-    patch.setattr(LocalRun, "_players", spoiled)
+    patch.setattr(RolloutWorker, "_players", spoiled)
 
 
 def test_a_policy_that_diverges_is_one_line_that_says_how_to_go_on(uninterrupted, tmp_path, monkeypatch):

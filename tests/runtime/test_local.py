@@ -8,12 +8,12 @@ import pytest
 
 from service.errors import TandemError
 from service.io.checkpoints import CheckpointStore
+from service.io.errors import CheckpointError
 from service.io.run_directory import RunDirectory
 from service.learner.learner import Learner
 from service.policies.evaluator import bob_evaluator
 from service.primitives.loading import read_parameters, read_stages
-from service.registry.errors import CheckpointError
-from service.runtime import local
+from service.runtime import workers
 from service.runtime.bookkeeping import UnsavedError
 from service.runtime.local import LocalRun
 from service.runtime.pretrain import resumed_config
@@ -33,7 +33,8 @@ LONG = {"total_env_steps": 1500}
 """Long enough for replayed goals, which need 64 in the buffer."""
 
 METRICS = {
-    "iteration", "env_steps", "world/num_broken", "time/wall_s", "time/env_steps_per_s", "time/learn_s",
+    "iteration", "env_steps", "world/num_broken", "actor/num_rollouts", "actor/num_alive", "time/wall_s",
+    "time/env_steps_per_s", "time/play_s", "time/wait_for_generator_s", "time/hand_over_s", "time/learn_s",
     "time/learner_idle_fraction",
     # valid, not moved and out-of-workspace rates, and how the rest ends
     "alice/valid_fraction", "alice/not_moved_fraction", "alice/outside_fraction", "alice/fallen_fraction",
@@ -54,7 +55,7 @@ METRICS = {
     # each primitive's mean weight and share of the precision
     "learner/primitive_weight_0", "learner/primitive_weight_1",
     "learner/primitive_share_0", "learner/primitive_share_1", "learner/bob_std",
-    "learner/policy_lag", "learner/version", "learner/non_finite_steps", "learner/rollbacks",
+    "learner/policy_lag", "learner/max_policy_lag", "learner/version", "learner/non_finite_steps", "learner/rollbacks",
     "learner/num_alice_samples", "learner/num_bob_samples",
     "learner/alice_explained_variance", "learner/bob_explained_variance",
     "learner/alice_learning_rate", "learner/bob_learning_rate", "learner/alice_policy_loss", "learner/bob_policy_loss",
@@ -150,7 +151,7 @@ def test_the_average_bob_is_evaluated(tmp_path, monkeypatch):
         assert asked[-1] is handed[-1].steady_bob
 
     monkeypatch.setattr(Learner, "weights", watched)
-    monkeypatch.setattr(local, "bob_evaluator", lambda bob: asked.append(bob) or bob_evaluator(bob))
+    monkeypatch.setattr(workers, "bob_evaluator", lambda bob: asked.append(bob) or bob_evaluator(bob))
     play(tmp_path, tiny_config(total_env_steps=200, evaluation_interval=1), on_iteration=look)
 
 
@@ -251,7 +252,7 @@ def test_a_run_killed_between_two_iterations(uninterrupted, tmp_path, iteration)
     run, result = play(tmp_path, config, resume=True)
     assert result.reason == "finished"
     assert_same_run(tmp_path, uninterrupted)
-    assert run.books.wall_s > 0.0
+    assert run.bookkeeper.wall_s > 0.0
     snapshots = [
         {file.name: file.read_bytes() for file in (path / "snapshots").iterdir()} for path in (tmp_path, uninterrupted)
     ]
@@ -272,7 +273,7 @@ def test_a_run_killed_while_it_learns_and_plays(uninterrupted, tmp_path, monkeyp
 
     def record_goals(self, iteration, *args):
         original(self, iteration, *args)
-        if iteration == 4:
+        if iteration == 5:
             raise KilledError
 
     with monkeypatch.context() as patch:
@@ -387,14 +388,14 @@ def test_a_disk_that_was_full_for_a_while_costs_nothing(uninterrupted, tmp_path,
 def test_the_last_checkpoint_is_not_written_twice(tmp_path, monkeypatch):
     """The second writing could fail on a disk that is full by now, although all is saved."""
     with ExitStack() as stack:
-        save = LocalRun.save
+        save = LocalRun._save
 
         def save_and_fill(self):
             save(self)
             if self.iteration == 2:
                 stack.enter_context(no_room_above(0))
 
-        monkeypatch.setattr(LocalRun, "save", save_and_fill)
+        monkeypatch.setattr(LocalRun, "_save", save_and_fill)
         _, result = play(tmp_path, tiny_config(total_env_steps=200))
     assert (result.reason, result.iteration) == ("finished", 2)
     assert newest(tmp_path).step == 2

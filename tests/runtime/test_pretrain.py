@@ -14,7 +14,8 @@ from service.envs.goals import draw_goals
 from service.errors import TandemError
 from service.io.run_directory import RunDirectory
 from service.primitives import publishing
-from service.registry.registry import BUNDLED, Registry
+from service.primitives.bundled import BUNDLED
+from service.registry.registry import Registry
 from service.runtime import pretrain as module
 from service.runtime.pretrain import UnfinishedError, pretrain, resumed_config
 from service.runtime.signals import InterruptError

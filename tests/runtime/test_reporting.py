@@ -6,12 +6,12 @@ import subprocess
 import sys
 import threading
 import time
-from functools import partial
 
 import pytest
 
 from service.errors import DivergedError, TandemError
-from service.io import run_directory as rundir
+from service.io import lock
+from service.io.errors import RunTakenError
 from service.io.run_directory import RunDirectory
 from service.primitives import publishing
 from service.registry.registry import Registry
@@ -20,9 +20,8 @@ from service.runtime.pretrain import UnfinishedError, pretrain, resumed_config
 from service.runtime.signals import InterruptError
 from service.store import disk, redis_writer
 from service.store.disk_reader import DiskReader
-from service.store.errors import RunTakenError, StoreUnavailableError
+from service.store.errors import StoreUnavailableError
 from service.store.redis_reader import RedisReader
-from service.store.registry_index import RegistryIndex
 from tests.runtime.runs import (
     ROOT,
     assert_one_line,
@@ -170,7 +169,7 @@ def test_a_second_process_is_refused_and_a_killed_one_has_vanished(tmp_path):
 
 
 def test_of_two_new_runs_at_once_one_begins(tmp_path, monkeypatch):
-    monkeypatch.setattr(rundir, "DirectoryLock", partial(rundir.DirectoryLock, wait_s=600.0))
+    monkeypatch.setattr(lock, "WAIT_S", 600.0)
     first, second = RunDirectory(tmp_path), RunDirectory(tmp_path)
     first.claim(resume=False)
     first.claim(resume=False)
@@ -215,8 +214,6 @@ def test_a_run_tells_redis_too(tmp_path, redis):
     assert told.model_dump(exclude={"heartbeat"}) == status(tmp_path).model_dump(exclude={"heartbeat"})
     assert reader.metrics("cube") == read_lines(tmp_path / "runs" / "cube" / "metrics.jsonl")
     assert reader.goals("cube") is not None
-    (version,) = RegistryIndex(redis.address).versions(tmp_path / "registry")
-    assert (version.name, version.version) == ("tiny", 1)
 
 
 def test_a_run_whose_redis_is_killed_and_comes_back(tmp_path, redis, monkeypatch):

@@ -112,7 +112,7 @@ def uninterrupted(tmp_path_factory):
 @pytest.mark.parametrize(
     ("where", "number"),
     [
-        ("service.primitives.publishing.evaluate", signal.SIGINT),
+        ("service.primitives.publishing.success_metrics", signal.SIGINT),
         ("service.runtime.pretrain.publish_run", signal.SIGTERM),
         ("service.media.artifacts.plot_curves", signal.SIGTERM),
         ("service.media.artifacts.skill_trajectories", signal.SIGINT),
@@ -141,7 +141,7 @@ def test_a_resume_does_what_the_signal_kept_from_being_done(home, uninterrupted,
 
 
 @BOTH
-@pytest.mark.parametrize("where", ["service.runtime.local.SelfPlay", "service.io.checkpoints.write_atomic"])
+@pytest.mark.parametrize("where", ["service.runtime.workers.SelfPlay", "service.io.checkpoints.write_atomic"])
 def test_a_signal_while_a_run_is_being_begun(home, monkeypatch, where, number):
     with monkeypatch.context() as patch:
         send_when_called(patch, where, number)
@@ -155,7 +155,7 @@ def test_a_signal_while_a_run_is_being_begun(home, monkeypatch, where, number):
 def test_a_signal_while_a_run_is_being_loaded(home, uninterrupted, monkeypatch, number):
     play(home.path, kill_after=3)
     with monkeypatch.context() as patch:
-        send_when_called(patch, "service.runtime.local.TaskGenerator.load_state", number)
+        send_when_called(patch, "service.runtime.workers.TaskGenerator.load_state", number)
         result = home.run("--resume")
     assert result.exit_code == 128 + number
     assert result.stdout == f"stopped at once; {home.hint}"
@@ -184,12 +184,12 @@ def test_a_signal_during_an_iteration(home, uninterrupted, monkeypatch, number):
 
 
 def test_two_signals_during_an_iteration(home, uninterrupted, monkeypatch):
-    def signalled(self, weights):
+    def signalled(self, *args):
         send(signal.SIGTERM)
         send(signal.SIGINT)
 
     with monkeypatch.context() as patch:
-        patch.setattr(LocalRun, "_evaluate", signalled)
+        patch.setattr(LocalRun, "_metrics", signalled)
         result = home.run()
     assert result.exit_code == 130
     assert result.stdout == f"stopped at once; {home.hint}"

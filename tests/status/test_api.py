@@ -5,8 +5,9 @@ import json
 import httpx
 import pytest
 
+from service.primitives.bundled import BUNDLED
 from service.registry.manifest import parse_manifest
-from service.registry.registry import BUNDLED, Registry
+from service.registry.registry import Registry
 from service.status.server import StatusServer
 from service.store.disk_reader import DiskReader
 from service.store.models import GoalGrid, RunStatus

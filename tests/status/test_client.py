@@ -13,8 +13,10 @@ import pytest
 
 import service
 from service.errors import TandemError
+from service.io.errors import StorageError
+from service.primitives.bundled import BUNDLED
 from service.registry.errors import DamagedBlobError, RegistryError, UnknownVersionError
-from service.registry.registry import BUNDLED, Registry
+from service.registry.registry import Registry
 from service.status.client import fetch_primitives
 from service.status.errors import FetchError, StatusError, WrongTokenError
 from service.status.server import StatusServer
@@ -248,7 +250,7 @@ def test_what_is_no_url_of_a_service(tmp_path, url):
 
 def test_a_cache_that_cannot_be_written(server, tmp_path):
     (tmp_path / "cache").write_text("a file")
-    with pytest.raises(RegistryError, match=r"^cannot (read|write) .*cache"):
+    with pytest.raises(StorageError, match=r"^cannot (read|write) .*cache"):
         fetch_primitives(server.url, "tiny", cache_dir=tmp_path / "cache")
 
 

@@ -4,7 +4,7 @@ import time
 from datetime import UTC, datetime, timedelta
 
 from service.store.models import GoalCell, GoalGrid, RunStatus
-from service.store.server import RedisServer
+from tests.store.redis_server import RedisServer
 
 
 def a_status(run_id="cube", **changes):
@@ -53,8 +53,7 @@ class Killable:
         self.address = self.server.address
 
     def kill(self):
-        self.server._process.kill()
-        self.server._process.wait()
+        self.server.kill()
 
     def revive(self):
         port, password = int(self.address.url.rpartition(":")[2].partition("/")[0]), self._password()

@@ -8,6 +8,7 @@ import pytest
 
 from service.store.address import RedisAddress, address_from_environment
 from service.store.errors import StoreError, StoreUnavailableError
+from service.store.redis_reader import RedisReader
 from tests.runtime.runs import assert_one_line
 
 SECRET = "s3cret-word"
@@ -58,7 +59,7 @@ def test_nobody_there():
         taken.bind(("127.0.0.1", 0))
         address = RedisAddress(f"redis://:{SECRET}@127.0.0.1:{taken.getsockname()[1]}/0")
         with pytest.raises(StoreUnavailableError) as error:
-            address.check()
+            RedisReader(address).ready()
     assert_one_line(error.value, f"Redis at {address}", "refused", "check TANDEM_REDIS_URL")
     assert SECRET not in str(error.value)
     assert error.value.exit_code == 1
@@ -68,19 +69,18 @@ def test_a_wrong_password_and_none(redis):
     host = redis.address.url.rpartition("@")[2]
     for url in (f"redis://:{SECRET}@{host}", f"redis://{host}", f"redis://nobody:{SECRET}@{host}"):
         with pytest.raises(StoreUnavailableError) as error:
-            RedisAddress(url).check()
+            RedisReader(RedisAddress(url)).ready()
         assert_one_line(error.value, "wrong or missing password", "TANDEM_REDIS_URL")
         assert SECRET not in str(error.value)
-    redis.address.check()
+    RedisReader(redis.address).ready()
 
 
-def test_something_else_listens_there(monkeypatch):
-    monkeypatch.setattr("service.store.address.CHECK_S", 0.2)
+def test_something_else_listens_there():
     with socket.socket() as mute:
         mute.bind(("127.0.0.1", 0))
         mute.listen()
         with pytest.raises(StoreUnavailableError, match="no answer in time"):
-            RedisAddress(f"redis://127.0.0.1:{mute.getsockname()[1]}").check()
+            RedisReader(RedisAddress(f"redis://127.0.0.1:{mute.getsockname()[1]}")).ready()
 
 
 def test_the_package_is_missing(monkeypatch):

@@ -5,8 +5,9 @@ import json
 
 import pytest
 
+from service.io.errors import RunTakenError
 from service.store.disk import DiskWriter
-from service.store.errors import RunTakenError, UnknownRunError
+from service.store.errors import UnknownRunError
 from service.store.fanout import FanoutWriter, open_writer
 from service.store.following import follow
 from service.store.redis_reader import RedisReader

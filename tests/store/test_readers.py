@@ -10,7 +10,7 @@ from service.store.disk import DiskWriter
 from service.store.disk_reader import DiskReader
 from service.store.errors import DamagedStoreError, StoreUnavailableError, UnknownRunError
 from service.store.keys import goals, metrics, status
-from service.store.liveness import SILENT_AFTER
+from service.store.models import SILENT_AFTER
 from service.store.redis_reader import RedisReader
 from service.store.redis_writer import RedisWriter
 from tests.runtime.runs import assert_one_line

@@ -9,9 +9,10 @@ import time
 
 import pytest
 
+from service.io.errors import RunTakenError
 from service.store import keys, redis_writer
 from service.store.address import RedisAddress
-from service.store.errors import DamagedStoreError, RunTakenError, StoreUnavailableError
+from service.store.errors import DamagedStoreError, StoreUnavailableError
 from service.store.redis_reader import RedisReader
 from service.store.redis_writer import RedisWriter
 from tests.runtime.runs import assert_one_line
@@ -179,7 +180,7 @@ def test_closing_waits_for_a_bounded_time(redis, caplog, monkeypatch):
         assert returns(lambda: writer.close(timeout_s=0.3))
     finally:
         os.kill(redis.server.pid, signal.SIGCONT)
-    assert_one_line(caplog.messages[-1], "was not told the end of run cube", "its files have it")
+    assert_one_line(caplog.messages[-1], "did not get the end of run cube", "its files have it")
 
 
 def test_closing_sends_what_waits(redis, reader):
