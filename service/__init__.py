@@ -29,7 +29,7 @@ def load_primitives(reference: str = "panda-cube@champion", registry: Path | str
             Or the ``http://HOST:PORT`` of a ``tandem serve``, which alone is asked, with the token in TANDEM_TOKEN.
 
     Returns:
-        ``.primitives``, the evaluator that acts and composes; ``.config`` and ``.manifest``, what it was trained with.
+        ``.primitives``, which act and compose; ``.config`` and ``.manifest``, what it was trained with.
 
     Raises:
         TandemError: nothing there by that reference, or damaged; or the service cannot be reached or wants a token.

@@ -448,7 +448,7 @@ def test_a_run_is_measured_from_its_snapshots_and_its_checkpoint(config, tmp_pat
     monkeypatch.setattr(record_run, "measure_tasks", lambda bob, config: [type(bob).__name__])
     monkeypatch.setattr(record_run, "measure_coverage", lambda bobs, config: list(bobs))
     measured = record_run.measure_run(RunDirectory(tmp_path))
-    assert measured == {"evaluations": ["MCPEvaluator"], "coverage": [0, run.num_env_steps]}
+    assert measured == {"evaluations": ["NumpyMCPPolicy"], "coverage": [0, run.num_env_steps]}
 
 
 # --- the page ---------------------------------------------------------------------------------------------------------

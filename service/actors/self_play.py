@@ -34,7 +34,7 @@ PROXIMITY_RANGE_M = 0.3
 
 
 class Acting(Protocol):
-    """A policy that acts: an evaluator of ``policies.evaluator``."""
+    """A policy that acts: one of ``policies.numpy_policy``."""
 
     def act(self, observation: FloatArray, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
         """(N, O) observations to sampled actions (N, A) and log-probabilities (N,)."""

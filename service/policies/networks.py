@@ -208,7 +208,7 @@ def make_bob_value(config: PolicyConfig) -> ValueNetwork:
 
 
 def export_parameters(module: nn.Module) -> dict[str, FloatArray]:
-    """Parameters and buffers by their state-dict names, as float32 copies: all that an evaluator needs."""
+    """Parameters and buffers by their state-dict names, as float32 copies: all that a NumPy policy needs."""
     return {name: tensor.detach().cpu().numpy().astype(np.float32) for name, tensor in module.state_dict().items()}
 
 

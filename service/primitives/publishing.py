@@ -11,7 +11,7 @@ from service.envs.observations import NORMALISATION_BOB, SPACES
 from service.io import tensors
 from service.io.files import os_errors, write_atomic
 from service.io.run_directory import RunDirectory
-from service.policies.evaluator import bob_evaluator
+from service.policies.numpy_policy import numpy_bob
 from service.policies.parameters import Parameters
 from service.registry.blobs import sha256_of
 from service.registry.errors import RegistryError
@@ -24,7 +24,7 @@ FINAL_EVALUATION_EPISODES = 300
 
 def measure_bob(config: Config, parameters: Parameters) -> dict[str, float]:
     """Bob's success rates without noise on every kind of goals of a run, by metric; but not the run's own goals."""
-    bob = bob_evaluator(parameters)
+    bob = numpy_bob(parameters)
     metrics = {}
     for kind in EVALUATED_GOALS:
         result = evaluate(

@@ -22,7 +22,7 @@ from service.actors.self_play import Acting, Players, SelfPlay
 from service.config import Config
 from service.generator.generator import TaskGenerator
 from service.io.run_directory import RunDirectory
-from service.policies.evaluator import GaussianEvaluator, bob_evaluator
+from service.policies.numpy_policy import NumpyGaussianPolicy, numpy_bob
 from service.policies.parameters import Parameters
 from service.runtime.bookkeeping import Books
 from service.runtime.runner import EVALUATED_GOALS, EVALUATION_SEED, Health, Metrics, OnBeat, OnIteration, RunResult
@@ -200,11 +200,11 @@ class LocalRun:
     def _players(self, weights: Weights) -> Players:
         if not self._past:
             pool = self.generator.opponents
-            self._past = [(GaussianEvaluator(a), bob_evaluator(b)) for a, b in zip(pool.alice, pool.bob, strict=True)]
+            self._past = [(NumpyGaussianPolicy(a), numpy_bob(b)) for a, b in zip(pool.alice, pool.bob, strict=True)]
         return Players(
             version=weights.version,
-            alice=GaussianEvaluator(weights.alice),
-            bob=bob_evaluator(weights.bob),
+            alice=NumpyGaussianPolicy(weights.alice),
+            bob=numpy_bob(weights.bob),
             past_alice=[alice for alice, _ in self._past],
             past_bob=[bob for _, bob in self._past],
         )
@@ -213,7 +213,7 @@ class LocalRun:
         run, game = self.config.run, self.config.game
         if not self.books.evaluation_due:
             return {}
-        metrics, bob = {}, bob_evaluator(weights.steady_bob)
+        metrics, bob = {}, numpy_bob(weights.steady_bob)
         for kind in EVALUATED_GOALS:
             result = evaluate(
                 bob,

@@ -25,7 +25,7 @@ from service.envs.goals import GoalKind
 from service.generator.generator import GoalChoice, TaskGenerator
 from service.generator.opponents import RoundPlan
 from service.io.run_directory import sampled_goals
-from service.policies.evaluator import GaussianEvaluator, bob_evaluator
+from service.policies.numpy_policy import NumpyGaussianPolicy, numpy_bob
 from service.policies.parameters import Parameters
 from service.runtime.telling import goal_grid
 from service.store.models import GoalGrid
@@ -215,7 +215,7 @@ class RolloutWorker:
         """Bob's success without noise on random goals of one kind, as metrics."""
         run = self._config.run
         result = evaluate(
-            bob_evaluator(weights.steady_bob),
+            numpy_bob(weights.steady_bob),
             self._config.world,
             kind,
             num_episodes=run.evaluation_episodes,
@@ -233,14 +233,14 @@ class RolloutWorker:
         self._rng.bit_generator.state = assignment.rng.bit_generator.state
         if assignment.pool is not None:
             pairs = zip(assignment.pool.alice, assignment.pool.bob, strict=True)
-            self._past = [(GaussianEvaluator(alice), bob_evaluator(bob)) for alice, bob in pairs]
+            self._past = [(NumpyGaussianPolicy(alice), numpy_bob(bob)) for alice, bob in pairs]
         self._pool_version = assignment.pool_version
 
     def _players(self, weights: Weights) -> Players:
         return Players(
             version=weights.version,
-            alice=GaussianEvaluator(weights.alice),
-            bob=bob_evaluator(weights.bob),
+            alice=NumpyGaussianPolicy(weights.alice),
+            bob=numpy_bob(weights.bob),
             past_alice=[alice for alice, _ in self._past],
             past_bob=[bob for _, bob in self._past],
         )

@@ -7,7 +7,7 @@ from service.envs.observations import BOB_SIZE, FULL_SIZE
 from service.errors import TandemError
 from service.io import checkpoints
 from service.io.run_directory import RunDirectory
-from service.policies.evaluator import GaussianEvaluator, MCPEvaluator
+from service.policies.numpy_policy import NumpyGaussianPolicy, NumpyMCPPolicy
 from service.primitives.loading import load_bob, load_players, read_parameters
 from service.registry.registry import BUNDLED, Registry
 from tests.runtime.runs import assert_one_line, play, tiny_config
@@ -44,7 +44,7 @@ def test_the_newest_bob_of_a_run_directory(run, tmp_path):
     assert bob.manifest is None
     assert bob.config == tiny_config(total_env_steps=400, checkpoint_interval=1)
     rows = observations(BOB_SIZE)
-    expected = MCPEvaluator(learner.weights().bob).act_deterministic(rows)
+    expected = NumpyMCPPolicy(learner.weights().bob).act_deterministic(rows)
     assert np.array_equal(bob.policy.act_deterministic(rows), expected)
 
 
@@ -55,7 +55,7 @@ def test_a_published_bob(run, registry, reference):
     assert bob.config == tiny_config()
     assert bob.manifest == Registry(registry).manifest("tiny@1")
     rows = observations(BOB_SIZE)
-    expected = MCPEvaluator(run[1].weights().bob).act_deterministic(rows)
+    expected = NumpyMCPPolicy(run[1].weights().bob).act_deterministic(rows)
     assert np.array_equal(bob.policy.act_deterministic(rows), expected)
 
 
@@ -63,7 +63,7 @@ def test_a_name_the_registry_does_not_have_is_that_of_the_package(registry):
     bob = load_bob("panda-cube@champion", registry)
     manifest = Registry(BUNDLED).manifest("panda-cube@champion")
     assert (bob.label, bob.manifest) == (f"{manifest.reference} (bundled)", manifest)
-    assert isinstance(bob.primitives, MCPEvaluator)
+    assert isinstance(bob.primitives, NumpyMCPPolicy)
 
 
 def test_both_players(run):
@@ -71,9 +71,9 @@ def test_both_players(run):
     alice, bob = load_players(RunDirectory(path))
     weights = learner.weights()
     rows = observations(FULL_SIZE)
-    assert np.array_equal(alice.act_deterministic(rows), GaussianEvaluator(weights.alice).act_deterministic(rows))
+    assert np.array_equal(alice.act_deterministic(rows), NumpyGaussianPolicy(weights.alice).act_deterministic(rows))
     rows = observations(BOB_SIZE)
-    assert np.array_equal(bob.act_deterministic(rows), MCPEvaluator(weights.bob).act_deterministic(rows))
+    assert np.array_equal(bob.act_deterministic(rows), NumpyMCPPolicy(weights.bob).act_deterministic(rows))
 
 
 def test_parameters_are_those_of_the_player_alone(run):

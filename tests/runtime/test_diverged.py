@@ -8,13 +8,13 @@ from typer.testing import CliRunner
 from service.cli.main import app
 from service.errors import DivergedError
 from service.io.run_directory import RunDirectory
-from service.policies.evaluator import GaussianEvaluator
+from service.policies.numpy_policy import NumpyGaussianPolicy
 from service.runtime.local import LocalRun
 from service.runtime.pretrain import resumed_config
 from tests.runtime.runs import assert_one_line, assert_same_run, newest, play, read_lines, write_yaml
 
 
-class NotANumber(GaussianEvaluator):
+class NotANumber(NumpyGaussianPolicy):
     """Acts as it should, except in the last of its worlds."""
 
     def act(self, observation, rng):
@@ -36,7 +36,7 @@ def diverge_after(patch, iteration):
 
     def spoiled(self, weights):
         if self.iteration >= iteration:
-            patch.setattr("service.runtime.local.GaussianEvaluator", NotANumber)
+            patch.setattr("service.runtime.local.NumpyGaussianPolicy", NotANumber)
         return players(self, weights)
 
     patch.setattr(LocalRun, "_players", spoiled)
