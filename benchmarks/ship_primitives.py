@@ -64,7 +64,7 @@ def ship(reference: str, source: Registry, target: Path) -> Version:
     """
     manifest, parameters = source.load(reference)
     NumpyMCPPolicy(parameters)
-    parse_config(manifest.config, where=f"the manifest of {reference}")
+    parse_config(manifest.config, where=f"the manifest of {reference}", recorded=True)
     for text in _texts(manifest.model_dump(mode="json")):
         if text.startswith(("/", "~")):
             raise TandemError(f"{reference}: its manifest names the path {text!r}, which only one machine has")

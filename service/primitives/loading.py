@@ -56,7 +56,7 @@ def load_bob(reference: str, registry: Path) -> TrainedBob:
         raise TandemError(f"{reference}: no such run directory; for published primitives write NAME@ALIAS")
     found, version = find_version(reference, registry)
     manifest, tensors = found.load(str(version))
-    config = parse_config(manifest.config, where=f"the manifest of {reference}")
+    config = parse_config(manifest.config, where=f"the manifest of {reference}", recorded=True)
     # two registries may both have a version 1: which one was meant must be seen
     label = f"{version} (bundled)" if found.bundled else str(version)
     return TrainedBob(label, _primitives(label, tensors), config, manifest)

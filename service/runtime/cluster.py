@@ -166,7 +166,7 @@ class ClusterRun:
 
     def bob(self) -> Parameters:
         """The newest Bob, as he is evaluated and published."""
-        parameters: Parameters = ray.get(self._weights).steady_bob
+        parameters: Parameters = ray.get(self._weights).bob_ema
         return parameters
 
     def run(self, on_iteration: OnIteration = lambda metrics: None, on_beat: OnBeat = lambda: None) -> RunResult:
@@ -446,7 +446,7 @@ class ClusterRun:
         with self.timing("checkpoint"):
             weights = ray.get(self._weights)
             parts = {"learner": ray.get(self._learner.state), "generator": ray.get(self._generator.state)}
-            parts |= {"alice": weights.alice, "bob": weights.steady_bob}  # for readers without torch
+            parts |= {"alice": weights.alice, "bob": weights.bob_ema}  # for readers without torch
             rng = np.random.default_rng([self.config.seed, self.books.iteration])  # what a local runner goes on with
             meta = {"next_incarnation": self._next_incarnation, "rng": rng.bit_generator.state}
             self.books.save(parts, meta)

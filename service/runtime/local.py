@@ -89,7 +89,7 @@ class LocalRun:
 
     def bob(self) -> Parameters:
         """The newest Bob, as he is evaluated and published."""
-        return self.learner.weights().steady_bob
+        return self.learner.weights().bob_ema
 
     def health(self) -> Health:
         """Of the one actor there is, this process."""
@@ -213,7 +213,7 @@ class LocalRun:
         run, game = self.config.run, self.config.game
         if not self.books.evaluation_due:
             return {}
-        metrics, bob = {}, numpy_bob(weights.steady_bob)
+        metrics, bob = {}, numpy_bob(weights.bob_ema)
         for kind in EVALUATED_GOALS:
             result = evaluate(
                 bob,
@@ -246,7 +246,7 @@ class LocalRun:
         with self.timing("checkpoint"):
             parts = {"learner": self.learner.state(), "generator": self.generator.state(), "game": self.game.state()}
             weights = self.learner.weights()  # for readers without torch: evaluate, render, coverage
-            parts |= {"alice": weights.alice, "bob": weights.steady_bob}
+            parts |= {"alice": weights.alice, "bob": weights.bob_ema}
             if self._pending is not None:
                 parts["pending"] = to_arrays(self._pending)
             meta = {"rng": self._rng.bit_generator.state, "next_incarnation": self._incarnation + 1}

@@ -215,7 +215,7 @@ class RolloutWorker:
         """Bob's success without noise on random goals of one kind, as metrics."""
         run = self._config.run
         result = evaluate(
-            numpy_bob(weights.steady_bob),
+            numpy_bob(weights.bob_ema),
             self._config.world,
             kind,
             num_episodes=run.evaluation_episodes,

@@ -48,6 +48,27 @@ def test_the_newest_bob_of_a_run_directory(run, tmp_path):
     assert np.array_equal(bob.policy.act_deterministic(rows), expected)
 
 
+def test_the_manifests_that_come_with_the_package_are_those_of_version_0_1_0(tmp_path):
+    """Their bytes stay as they were published; what they call by an old name is read under the new one."""
+    manifest = Registry(BUNDLED).manifest("panda-cube@champion")
+    assert manifest.config["learner"]["bob_average_decay"] == 0.97
+    assert manifest.config["learner"]["alice_interval"] == 1
+    assert manifest.config["game"]["alice_proximity_reward"] == 0.0
+    bob = load_bob("panda-cube@champion", tmp_path)
+    assert bob.config.learner.bob_ema_decay == 0.97
+    assert bob.manifest == manifest
+
+
+def test_a_manifest_with_a_removed_key_that_mattered(run, tmp_path):
+    config = tiny_config().model_dump(mode="json")
+    config["game"]["alice_outside_reward"] = -3.0
+    common = {"spaces": {}, "normalisation": {}, "config": config, "metrics": {}}
+    Registry(tmp_path).publish("old", run[1].weights().bob, **common)
+    with pytest.raises(TandemError) as error:
+        load_bob("old@1", tmp_path)
+    assert_one_line(error.value, "the manifest of old@1", "game.alice_outside_reward = -3.0", "tandem 0.1.0")
+
+
 @pytest.mark.parametrize("reference", ["tiny@1", "tiny@champion"])
 def test_a_published_bob(run, registry, reference):
     bob = load_bob(reference, registry)
