@@ -14,7 +14,7 @@ from service.policies import gaussian
 from service.policies.networks import MCPPolicy
 
 NUM_PROBES = 1024
-"""So many rows are enough for what is measured once an update."""
+"""Number of rows that are enough for what is measured once an update."""
 
 
 def probes(rows: Tensor) -> Tensor:

@@ -34,7 +34,7 @@ Scalars = dict[str, Tensor]
 MAX_IMPORTANCE_WEIGHT = 2.0
 """Bound on the variance of importance weights, at the price of a little bias."""
 MAX_NON_FINITE = 3
-"""So many minibatches with a loss or gradient that is not finite end an update."""
+"""Number of minibatches with a loss or gradient that is not finite, after which an update ends."""
 KL_STOP = 1.5
 """The policy stops learning once an epoch's mean KL passes this multiple of the target."""
 KL_COLLAPSE = 10.0

@@ -1,4 +1,4 @@
-"""What a player learns from, as flat tensors: B samples of turns, D steps of demonstrations."""
+"""The data a player learns from, as flat tensors: B samples of turns, D steps of demonstrations."""
 
 from __future__ import annotations
 

@@ -34,7 +34,7 @@ from service.policies.layers import GaussianSquash, HiddenLayers, InputNormalisa
 from service.policies.parameters import FloatArray, PolicyError
 
 INITIAL_LOG_STD = -0.1
-"""Of a new policy's actions: std 0.9; chance has to find the object."""
+"""Log-std of a new policy's actions. The std is 0.9: chance has to find the object."""
 
 _HIDDEN_GAIN = math.sqrt(2.0)
 _SMALL_GAIN = 0.01

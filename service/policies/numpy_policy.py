@@ -134,7 +134,7 @@ def numpy_bob(parameters: Parameters) -> NumpyPolicy:
 
 
 class _Primitives:
-    """(N, 11) positions to (N, K, A) means and variances; the K heads share one matrix product per layer."""
+    """Means and variances (N, K, A) at (N, 11) positions; the K heads share one matrix product per layer."""
 
     def __init__(self, reader: ParameterReader) -> None:
         self._input = _Input(reader, "primitives.input", POSITIONS_SIZE)
@@ -158,7 +158,7 @@ class _Primitives:
 
 
 class _Gate:
-    """(N, 14) observations to (N, K) weights."""
+    """Weights (N, K) at (N, 14) observations."""
 
     def __init__(self, reader: ParameterReader, num_primitives: int) -> None:
         self._input = _Input(reader, "gate.input", BOB_SIZE + 3)
@@ -221,7 +221,7 @@ class _HiddenLayers:
 
 
 class _GaussianSquash:
-    """Raw outputs (..., 2A) to a bounded mean and log-std, (..., A) each."""
+    """Bounded mean and log-std, (..., A) each, of raw outputs (..., 2A)."""
 
     def __init__(self, reader: ParameterReader, prefix: str, outputs: int) -> None:
         self.action_size, odd = divmod(outputs, 2)

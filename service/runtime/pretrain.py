@@ -196,7 +196,7 @@ def resumed_config(directory: RunDirectory, overrides: list[str], file: Path | N
                 "change, for example run.total_env_steps"
             )
     if file is not None:
-        given = load_config(file)
+        given = load_config(file, recorded=True)  # maybe the one the run was begun with, by an earlier version
         _check_same_outside_run(saved, given, file)
         named = given.run.model_dump(mode="json", exclude_unset=True)
         overrides = [f"run.{key}={json.dumps(value)}" for key, value in named.items()] + overrides

@@ -109,6 +109,15 @@ def test_a_rollout_counts_once():
     assert learner.ingest(replace(rollout, policy_version=1, actor=1, sequence=0))
 
 
+def test_the_last_rollout_counts_whatever_the_order_of_arrival():
+    learner = Learner(make_config())
+    assert learner.ingest(make_rollout(learner, 4))
+    assert learner.ingest(make_rollout(learner, 3))
+    learner.update()
+    assert learner.state()["counted"].tolist() == [[0, 0, 4]]
+    assert not learner.ingest(make_rollout(learner, 4))
+
+
 @pytest.mark.parametrize(("version", "taken"), [(0, False), (1, True), (2, True), (3, True), (4, False)])
 def test_stale_rollouts_and_those_of_unknown_versions_are_refused(version, taken):
     learner = Learner(make_config())

@@ -232,6 +232,7 @@ def test_a_run_of_version_0_1_0_is_resumed(begun):
     assert begun.read_config() == tiny_config(seed=3)
     changed = resumed_config(begun, ["run.keep_checkpoints=7", "seed=3"])
     assert changed == tiny_config(seed=3, keep_checkpoints=7)
+    assert resumed_config(begun, [], begun.config_file) == tiny_config(seed=3)  # the same command as before
     tree["learner"]["alice_interval"] = 2
     begun.config_file.write_text(yaml.safe_dump(tree))
     with pytest.raises(ConfigError) as error:
