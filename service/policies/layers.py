@@ -48,7 +48,7 @@ class HiddenLayers(nn.ModuleList):
 
 
 class GaussianSquash(nn.Module):
-    """Bounds on raw outputs (..., 2A): ``MEAN_BOUND * tanh(x / MEAN_BOUND)`` for the mean, a sigmoid for the log-std."""
+    """Bounded outputs (..., 2A): ``MEAN_BOUND * tanh(x / MEAN_BOUND)`` for the mean, a sigmoid for the log-std."""
 
     log_std_min: Tensor
     log_std_max: Tensor
