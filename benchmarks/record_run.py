@@ -30,7 +30,7 @@ from benchmarks.tasks import measure_tasks
 from service.errors import TandemError
 from service.io.run_directory import RunDirectory
 from service.media.plots.figures import read_records
-from service.policies.evaluator import bob_evaluator
+from service.policies.numpy_policy import numpy_bob
 from service.primitives.loading import read_stages
 
 GOAL_RECORDS, GOALS_EACH = 60, 10
@@ -71,7 +71,7 @@ def measure_run(directory: RunDirectory) -> dict[str, Any]:
         TandemError: not a run, or without a usable checkpoint.
     """
     config, bobs = directory.read_config(), read_stages(directory)
-    newest = bob_evaluator(bobs[max(bobs)])
+    newest = numpy_bob(bobs[max(bobs)])
     return {"evaluations": measure_tasks(newest, config), "coverage": measure_coverage(bobs, config)}
 
 

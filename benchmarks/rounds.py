@@ -13,7 +13,7 @@ from service.actors.rollout import Rollout
 from service.actors.self_play import Acting, Players
 from service.envs.batch import WorldBatch
 from service.envs.observations import ACTION_SIZE
-from service.policies.evaluator import GaussianEvaluator, bob_evaluator
+from service.policies.numpy_policy import NumpyGaussianPolicy, numpy_bob
 from service.runtime.local import LocalRun
 from service.runtime.timing import Timing
 
@@ -73,10 +73,10 @@ class Rounds:
         weights, pool = self._run.learner.weights(), self._run.generator.opponents
         return Players(
             version=weights.version,
-            alice=_Timed(GaussianEvaluator(weights.alice), self.timing),
-            bob=_Timed(bob_evaluator(weights.bob), self.timing),
-            past_alice=[_Timed(GaussianEvaluator(each), self.timing) for each in pool.alice],
-            past_bob=[_Timed(bob_evaluator(each), self.timing) for each in pool.bob],
+            alice=_Timed(NumpyGaussianPolicy(weights.alice), self.timing),
+            bob=_Timed(numpy_bob(weights.bob), self.timing),
+            past_alice=[_Timed(NumpyGaussianPolicy(each), self.timing) for each in pool.alice],
+            past_bob=[_Timed(numpy_bob(each), self.timing) for each in pool.bob],
         )
 
     def _play_round(self, players: Players) -> int:

@@ -28,7 +28,7 @@ from service.errors import TandemError
 from service.io import tensors
 from service.io.files import os_errors, write_atomic
 from service.io.run_directory import RunDirectory
-from service.policies.evaluator import MCPEvaluator
+from service.policies.numpy_policy import NumpyMCPPolicy
 from service.primitives.bundled import BUNDLED
 from service.primitives.loading import read_stages
 from service.primitives.publishing import measure_bob, publish_bob
@@ -64,7 +64,7 @@ def ship(reference: str, source: Registry, target: Path) -> Version:
             nothing is changed.
     """
     manifest, parameters = source.load(reference)
-    MCPEvaluator(parameters)
+    NumpyMCPPolicy(parameters)
     parse_config(manifest.config, where=f"the manifest of {reference}")
     for text in _texts(manifest.model_dump(mode="json")):
         if text.startswith(("/", "~")):

@@ -15,7 +15,7 @@ from service.actors.coverage import Composable, RandomPolicy, skill_trajectories
 from service.config import Config
 from service.media.artifacts import COVERAGE_STEPS, NUM_SKILLS
 from service.media.plots.figures import Array
-from service.policies.evaluator import MCPEvaluator, bob_evaluator
+from service.policies.numpy_policy import NumpyMCPPolicy, numpy_bob
 from service.policies.parameters import Parameters
 
 NUM_SETS = 10
@@ -52,10 +52,10 @@ def measure_coverage(
     Returns:
         For JSON; None for a monolithic Bob, who has nothing to compose.
     """
-    evaluators = {name: (steps, bob_evaluator(bobs[steps])) for name, steps in pick_stages(bobs).items()}
+    evaluators = {name: (steps, numpy_bob(bobs[steps])) for name, steps in pick_stages(bobs).items()}
     stages: dict[str, dict[str, Any]] = {RANDOM: _measure(RandomPolicy(), config, num_sets, num_steps)}
     for name, (env_steps, bob) in evaluators.items():
-        if not isinstance(bob, MCPEvaluator):
+        if not isinstance(bob, NumpyMCPPolicy):
             return None
         stages[name] = {"env_steps": env_steps, **_measure(bob, config, num_sets, num_steps)}
     return {"num_skills": NUM_SKILLS, "num_steps": num_steps, "cell_size_m": CELL_SIZE_M, "stages": stages}

@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from service.primitives.loading import TrainedBob
 
 __all__ = ["load_primitives"]
-__version__ = "0.1.0"
+__version__ = "0.2.0"
 
 
 def is_service(registry: Path | str) -> bool:
@@ -30,7 +30,7 @@ def load_primitives(reference: str = "panda-cube@champion", registry: Path | str
             TANDEM_TOKEN.
 
     Returns:
-        ``.primitives``, the evaluator that acts and composes; ``.config`` and ``.manifest``, what it was trained with.
+        ``.primitives``, which act and compose; ``.config`` and ``.manifest``, what it was trained with.
 
     Raises:
         TandemError: nothing there by that reference, or damaged; or the service cannot be reached or wants a token.

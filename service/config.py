@@ -8,6 +8,7 @@ description. ``load_config`` reads YAML and applies ``--set a.b=c`` overrides.
 from __future__ import annotations
 
 from contextlib import suppress
+from copy import deepcopy
 from pathlib import Path
 from typing import Any, Literal, Self
 
@@ -15,6 +16,16 @@ import yaml
 from pydantic import BaseModel, ConfigDict, Field, PositiveInt, ValidationError, model_validator
 
 from service.errors import TandemError
+
+_RENAMED = {"learner.bob_average_decay": "learner.bob_ema_decay"}
+"""Keys that had another name in version 0.1.0."""
+_REMOVED = {
+    "game.alice_outside_reward": 0.0,
+    "game.alice_outside_from_valid_fraction": 0.0,
+    "game.alice_proximity_reward": 0.0,
+    "learner.alice_interval": 1,
+}
+"""Keys that only version 0.1.0 has, each with its default, at which it did nothing."""
 
 
 class ConfigError(TandemError):
@@ -79,19 +90,6 @@ class GameConfig(_Frozen):
     success_distance_m: float = Field(0.05, gt=0.0, description="paper: 5 cm; also the least move of a valid goal")
     alice_valid_reward: float = Field(1.0, description="paper, appendix")
     alice_difficult_reward: float = Field(5.0, description="paper, appendix: added when Bob fails")
-    alice_outside_reward: float = Field(
-        0.0, description="paid for a goal outside the workspace; 0 in the paper's appendix"
-    )
-    alice_outside_from_valid_fraction: float = Field(
-        0.0, ge=0.0, lt=1.0, description="the outside reward sets in once so many goals are valid; 0: at once"
-    )
-    alice_proximity_reward: float = Field(
-        0.0,
-        ge=0.0,
-        le=0.1,
-        description="per step and metre that the gripper is nearer than 30 cm to the object; off in the paper. At "
-        "0.02 a whole turn next to the object earns 0.24, a valid goal 1 to 6",
-    )
     blocked_gripper_fraction: float = Field(
         0.0,
         ge=0.0,
@@ -230,24 +228,18 @@ class LearnerConfig(_Frozen):
     )
     alice: PPOConfig = PPOConfig()
     bob: PPOConfig = PPOConfig(num_epochs=5, minibatch_size=512)
-    alice_interval: int = Field(
-        1,
-        ge=1,
-        description="Alice learns every so many iterations, from all her turns since: one reward a turn, which also "
-        "hangs on Bob's luck, leaves the gradient of a single iteration mostly noise",
-    )
     bob_window: int = Field(
         1,
         ge=1,
         description="Bob learns from the rollouts of so many iterations at once, older ones weighted by what he has "
         "changed since; instead of more epochs over the newest",
     )
-    bob_average_decay: float = Field(
+    bob_ema_decay: float = Field(
         0.0,
         ge=0.0,
         lt=1.0,
-        description="evaluated, saved for readers and published are Bob's parameters averaged over about the last "
-        "1 / (1 - decay) versions; 0: the last ones. Acting and learning know nothing of it",
+        description="the Bob that is evaluated and published is an exponential moving average of his parameters, over "
+        "about the last 1 / (1 - decay) versions; 0: the last version. Acting and learning do not use it",
     )
     abc: ABCConfig = ABCConfig()
     mirror: bool = Field(False, description="learn from every Bob sample also reflected in y; the task is symmetric")
@@ -280,12 +272,15 @@ class Config(_Frozen):
     run: RunConfig = RunConfig()
 
 
-def load_config(path: Path | str | None = None, overrides: list[str] | tuple[str, ...] = ()) -> Config:
+def load_config(
+    path: Path | str | None = None, overrides: list[str] | tuple[str, ...] = (), *, recorded: bool = False
+) -> Config:
     """Read a run's configuration.
 
     Args:
         path: YAML file; None for the defaults.
         overrides: ``a.b=c`` strings, applied in order; the value is parsed as YAML.
+        recorded: the file was written by a run, maybe of an earlier version; see ``parse_config``.
 
     Raises:
         ConfigError: file missing or not YAML, unknown key, value out of range; one line a user can act on.
@@ -293,23 +288,33 @@ def load_config(path: Path | str | None = None, overrides: list[str] | tuple[str
     tree: dict[str, Any] = {}
     if path is not None:
         tree = _read_yaml(Path(path))
+    if recorded:
+        tree = _updated(tree, where=str(path))
     for override in overrides:
         _apply_override(tree, override)
     return parse_config(tree, where=str(path) if path is not None else "the overrides")
 
 
-def parse_config(tree: dict[str, Any], *, where: str) -> Config:
-    """Validate a plain tree; ``where`` names its origin in errors.
+def parse_config(tree: dict[str, Any], *, where: str, recorded: bool = False) -> Config:
+    """Validate a plain tree.
+
+    Args:
+        tree: nested as ``Config``.
+        where: its origin, named in errors.
+        recorded: a run of this or an earlier version wrote it: renamed keys get their new names, and removed keys are
+            dropped where they have their defaults.
 
     Raises:
-        ConfigError: unknown key or value out of range.
+        ConfigError: unknown key, value out of range, or a recorded key whose effect is no longer there.
     """
     try:
-        return Config.model_validate(tree)
+        return Config.model_validate(_updated(tree, where=where) if recorded else tree)
     except ValidationError as error:
         first = error.errors()[0]
         key = ".".join(str(part) for part in first["loc"]) or "the top level"
         more = f" (and {error.error_count() - 1} more)" if error.error_count() > 1 else ""
+        if key in _RENAMED:
+            raise ConfigError(f"{where}: {key!r} is now called {_RENAMED[key]!r}{more}") from None
         if first["type"] == "extra_forbidden":
             known = ", ".join(_known_keys(first["loc"]))
             raise ConfigError(f"{where}: unknown key {key!r}; known there: {known}{more}") from None
@@ -347,14 +352,34 @@ def _apply_override(tree: dict[str, Any], override: str) -> None:
     if isinstance(value, str):
         with suppress(ValueError):
             value = float(value)  # YAML 1.1 reads 1e-3 as text
-    *parents, last = key.strip().split(".")
-    node = tree
+    group, name = _group(tree, key.strip(), where=f"override {override!r}")
+    group[name] = value
+
+
+def _updated(recorded: dict[str, Any], *, where: str) -> dict[str, Any]:
+    """A copy of a recorded tree, with the keys of this version."""
+    tree = deepcopy(recorded)
+    for key, default in _REMOVED.items():
+        group, name = _group(tree, key, where=where)
+        value = group.pop(name, default)
+        if value != default:
+            raise ConfigError(f"{where}: {key} = {value!r}: this key was removed; tandem 0.1.0 still reads it")
+    for old, new in _RENAMED.items():
+        group, name = _group(tree, old, where=where)
+        if name in group:
+            new_group, new_name = _group(tree, new, where=where)
+            new_group[new_name] = group.pop(name)
+    return tree
+
+
+def _group(tree: dict[str, Any], key: str, *, where: str) -> tuple[dict[str, Any], str]:
+    """The group of a dotted key, made if it is not there, and the key's name in it."""
+    *parents, name = key.split(".")
     for parent in parents:
-        child = node.setdefault(parent, {})
-        if not isinstance(child, dict):
-            raise ConfigError(f"override {override!r}: {parent!r} is a value, not a group of keys")
-        node = child
-    node[last] = value
+        tree = tree.setdefault(parent, {})
+        if not isinstance(tree, dict):
+            raise ConfigError(f"{where}: {parent!r} is a value, not a group of keys")
+    return tree, name
 
 
 def _known_keys(location: tuple[int | str, ...]) -> list[str]:

@@ -36,7 +36,7 @@ from service.errors import TandemError
 from service.io.jsonl import JsonlWriter
 from service.io.run_directory import RunDirectory
 from service.learner.learner import Learner
-from service.policies.evaluator import bob_evaluator
+from service.policies.numpy_policy import numpy_bob
 from service.primitives.loading import read_parameters, read_stages
 from service.registry.registry import BUNDLED, Registry
 from service.runtime.local import LocalRun
@@ -443,7 +443,7 @@ def test_coverage_is_measured_at_each_stage_beside_a_random_policy(config):
     assert {name: stage.get("env_steps") for name, stage in coverage["stages"].items()} == {
         "random policy": None, "beginning": 0, "middle": 500, "end": 900,
     }  # fmt: skip
-    policies = [RandomPolicy(), *map(bob_evaluator, bobs.values())]
+    policies = [RandomPolicy(), *map(numpy_bob, bobs.values())]
     for policy, stage in zip(policies, coverage["stages"].values(), strict=True):
         paths = [
             skill_trajectories(policy, config.world, num_skills=32, num_steps=24, seed=seed, num_threads=1)
@@ -473,11 +473,11 @@ def test_a_run_is_measured_from_its_snapshots_and_its_checkpoint(tmp_path, monke
 
     monkeypatch.setattr(record_run, "measure_tasks", lambda bob, config: [acts(bob)])
     monkeypatch.setattr(
-        record_run, "measure_coverage", lambda bobs, _: {at: acts(bob_evaluator(bob)) for at, bob in bobs.items()}
+        record_run, "measure_coverage", lambda bobs, _: {at: acts(numpy_bob(bob)) for at, bob in bobs.items()}
     )
     measured = record_run.measure_run(RunDirectory(tmp_path))
-    newest = acts(bob_evaluator(read_parameters(RunDirectory(tmp_path), "bob")))
-    first = acts(bob_evaluator(Learner(config).weights().bob))
+    newest = acts(numpy_bob(read_parameters(RunDirectory(tmp_path), "bob")))
+    first = acts(numpy_bob(Learner(config).weights().bob))
     assert measured["evaluations"] == [newest]
     assert (measured["coverage"][0], measured["coverage"][run.num_env_steps]) == (first, newest)
     assert set(measured["coverage"]) == set(read_stages(RunDirectory(tmp_path)))

@@ -1,8 +1,10 @@
-"""The configuration: defaults, YAML, overrides, and what a user is told when something is wrong."""
+"""The configuration: defaults, YAML, overrides, what a run recorded before, and errors a user can act on."""
 
+from copy import deepcopy
 from pathlib import Path
 
 import pytest
+import yaml
 from pydantic import ValidationError
 
 from service.config import Config, ConfigError, dump_config, load_config, parse_config
@@ -197,3 +199,61 @@ def test_every_shipped_configuration_loads():
     assert paths, "no configuration ships in configs/"
     for path in paths:
         load_config(path)
+
+
+RECORDED = {
+    "game": {
+        "alice_outside_reward": 0.0,
+        "alice_outside_from_valid_fraction": 0.0,
+        "alice_proximity_reward": 0.0,
+        "num_goals": 7,
+    },
+    "learner": {"alice_interval": 1, "bob_average_decay": 0.9},
+}
+TODAY = {"game": {"num_goals": 7}, "learner": {"bob_ema_decay": 0.9}}
+
+
+def test_what_version_0_1_0_recorded_is_read(tmp_path):
+    tree = deepcopy(RECORDED)
+    expected = parse_config(TODAY, where="today")
+    assert parse_config(tree, where="a manifest", recorded=True) == expected
+    assert tree == RECORDED  # a manifest carries a digest of it
+    path = tmp_path / "config.yaml"
+    path.write_text(yaml.safe_dump(RECORDED))
+    assert load_config(path, recorded=True) == expected
+    path.write_text(dump_config(expected))
+    assert load_config(path, recorded=True) == expected
+
+
+@pytest.mark.parametrize(
+    ("group", "key", "value"),
+    [
+        ("game", "alice_outside_reward", -3.0),
+        ("game", "alice_outside_from_valid_fraction", 0.3),
+        ("game", "alice_proximity_reward", 0.02),
+        ("learner", "alice_interval", 3),
+    ],
+)
+def test_a_removed_key_that_mattered_is_refused(group, key, value):
+    with pytest.raises(ConfigError) as raised:
+        parse_config({group: {key: value}}, where="the manifest of cube@3", recorded=True)
+    text = str(raised.value)
+    assert text.startswith(f"the manifest of cube@3: {group}.{key} = {value}")
+    assert "tandem 0.1.0" in text
+    assert "\n" not in text
+
+
+def test_a_recorded_group_that_is_none():
+    with pytest.raises(ConfigError, match="'game' is a value, not a group of keys"):
+        parse_config({"game": 3}, where="a manifest", recorded=True)
+
+
+def test_old_keys_in_a_configuration_of_today(tmp_path):
+    path = tmp_path / "run.yaml"
+    path.write_text("learner: {bob_average_decay: 0.9}\n")
+    assert "'learner.bob_average_decay' is now called 'learner.bob_ema_decay'" in message(path)
+    assert "now called 'learner.bob_ema_decay'" in message(overrides=["learner.bob_average_decay=0.9"])
+    assert "unknown key 'learner.alice_interval'" in message(overrides=["learner.alice_interval=1"])
+    path.write_text(yaml.safe_dump(RECORDED))
+    with pytest.raises(ConfigError, match=r"now called 'learner\.bob_ema_decay'"):  # an override is not recorded
+        load_config(path, ["learner.bob_average_decay=0.8"], recorded=True)

@@ -14,7 +14,7 @@ import pytest
 import service
 from service.config import parse_config
 from service.errors import TandemError
-from service.policies.evaluator import MCPEvaluator
+from service.policies.numpy_policy import NumpyMCPPolicy
 from service.primitives.bundled import BUNDLED
 from service.registry.registry import Registry
 from tests.registry.helpers import files_in
@@ -77,9 +77,10 @@ def test_load_primitives(tmp_path, monkeypatch):
     bob = service.load_primitives()
     manifest, parameters = Registry(BUNDLED).load("panda-cube@champion")
     assert bob.manifest == manifest
-    assert bob.config == parse_config(manifest.config, where="the manifest")
+    assert bob.config == parse_config(manifest.config, where="the manifest", recorded=True)
+    assert bob.config.learner.bob_ema_decay == 0.97
     rows = 0.1 * np.random.default_rng(0).standard_normal((5, 14)).astype(np.float32)
-    expected = MCPEvaluator(parameters)
+    expected = NumpyMCPPolicy(parameters)
     assert np.array_equal(bob.primitives.act_deterministic(rows), expected.act_deterministic(rows))
     with pytest.raises(TandemError, match=r"no 'nobody' in the registry here; .* with tandem comes: panda-cube"):
         service.load_primitives("nobody", registry="here")

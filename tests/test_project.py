@@ -102,8 +102,8 @@ def test_python_dash_m_is_the_command():
     assert "pretrain" in result.stdout
 
 
-def test_the_evaluator_needs_no_torch():
-    run_python(IMPORT_ALL, "torch", "service.policies.evaluator")
+def test_the_numpy_policies_need_no_torch():
+    run_python(IMPORT_ALL, "torch", "service.policies.numpy_policy")
 
 
 @pytest.mark.parametrize("room", ROOMS_WITHOUT_TORCH)

@@ -13,7 +13,7 @@ from service.actors.evaluation import evaluate
 from service.config import dump_config, parse_config
 from service.errors import TandemError
 from service.io.run_directory import RunDirectory
-from service.policies.evaluator import bob_evaluator
+from service.policies.numpy_policy import numpy_bob
 from service.primitives import publishing
 from service.primitives.loading import load_bob, read_parameters
 from service.primitives.publishing import publish_bob
@@ -113,7 +113,7 @@ def test_the_newest_bob_of_a_run_is_measured(run, tmp_path, monkeypatch):
     config = near.read_config()
     for kind in ("mixed", "air", "table"):
         found = evaluate(
-            bob_evaluator(parameters),
+            numpy_bob(parameters),
             config.world,
             kind,
             num_episodes=40,

@@ -29,12 +29,8 @@ IntArray = NDArray[np.int64]
 VerdictArray = NDArray[np.int8]
 
 
-PROXIMITY_RANGE_M = 0.3
-"""Within it ``game.alice_proximity_reward`` is paid."""
-
-
 class Acting(Protocol):
-    """A policy that acts: an evaluator of ``policies.evaluator``."""
+    """A policy that acts: one of ``policies.numpy_policy``."""
 
     def act(self, observation: FloatArray, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
         """(N, O) observations to sampled actions (N, A) and log-probabilities (N,)."""
@@ -114,7 +110,7 @@ class SelfPlay:
         achieved = worlds.object_position.copy()
         played = choice.played & ~broken  # a turn in which the physics broke says nothing about either player
         bob.learn[broken] = False
-        self._reward_alice(alice, plan, verdict, played & ~choice.replayed, solved)
+        self._reward_alice(alice, verdict, played & ~choice.replayed, solved)
         records = GoalRecords(
             start_state=choice.start_state,
             start_position=choice.start_position,
@@ -164,7 +160,6 @@ class SelfPlay:
             turns.observation[step], turns.action[step], turns.log_prob[step] = observation, action, log_prob
             broken |= worlds.step(action) if not broken.any() else worlds.step(action[~broken], np.flatnonzero(~broken))
             contacts |= worlds.contacts()
-            turns.reward[step] = self._proximity_reward()
         turns.value_observation[:] = turns.observation
         turns.final_value_observation[:] = worlds.full(1.0)
         turns.active[:num_steps] = True
@@ -200,14 +195,10 @@ class SelfPlay:
         turns.final_value_observation[:] = worlds.bob_value(choice.goal)
         return turns, solved, broken
 
-    def _reward_alice(
-        self, alice: Turns, plan: RoundPlan, verdict: VerdictArray, tried: BoolArray, solved: BoolArray
-    ) -> None:
+    def _reward_alice(self, alice: Turns, verdict: VerdictArray, tried: BoolArray, solved: BoolArray) -> None:
         game = self.config.game
         valid = verdict == Verdict.VALID
         last = int(np.flatnonzero(alice.active.any(axis=1))[-1])
-        if plan.penalise_outside:
-            alice.reward[last, verdict == Verdict.OUTSIDE] += game.alice_outside_reward
         alice.reward[last, valid] += game.alice_valid_reward
         alice.reward[last, valid & tried & ~solved] += game.alice_difficult_reward
         # What a valid goal was worth is unknown where Bob could not try it.
@@ -225,11 +216,6 @@ class SelfPlay:
         return Demonstrations(
             np.concatenate([by_alice.observation, by_bob.observation]), np.concatenate([by_alice.action, by_bob.action])
         )
-
-    def _proximity_reward(self) -> StateArray:
-        distance = np.linalg.norm(self.worlds.object_position - self.worlds.ee_position, axis=1)
-        near: StateArray = self.config.game.alice_proximity_reward * np.maximum(PROXIMITY_RANGE_M - distance, 0.0)
-        return near
 
     def _continue_games(self, end_state: StateArray, verdict: VerdictArray) -> None:
         self.worlds.restore(end_state)

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from service.envs.observations import POSITIONS_SIZE, SPACES
 from service.errors import TandemError
-from service.policies.evaluator import MCPEvaluator
+from service.policies.numpy_policy import NumpyMCPPolicy
 
 FloatArray = NDArray[np.float32]
 Info = dict[str, Any]
@@ -37,7 +37,7 @@ class Trained(Protocol):
         """Where it comes from."""
 
     @property
-    def primitives(self) -> MCPEvaluator:
+    def primitives(self) -> NumpyMCPPolicy:
         """What can be composed."""
 
     @property
@@ -56,13 +56,13 @@ def action_weights(actions: FloatArray, ratio: float = WEIGHT_RATIO) -> FloatArr
     return weights
 
 
-def check_primitives(primitives: MCPEvaluator | Trained) -> MCPEvaluator:
+def check_primitives(primitives: NumpyMCPPolicy | Trained) -> NumpyMCPPolicy:
     """What can be composed, once its manifest says that it is for this robot and layout.
 
     Raises:
         TandemError: a monolithic Bob, or primitives of another robot or layout.
     """
-    if isinstance(primitives, MCPEvaluator):
+    if isinstance(primitives, NumpyMCPPolicy):
         return primitives
     check_robot(primitives)
     return primitives.primitives
@@ -84,7 +84,7 @@ def check_robot(trained: Trained) -> None:
 
 
 def parameters_digest(primitives: object) -> str:
-    """SHA-256 of every array of an evaluator, in their order: the same before and after it was used."""
+    """SHA-256 of every array of a policy, in their order: the same before and after it was used."""
     digest = hashlib.sha256()
     for name, array in _arrays(primitives, ""):
         digest.update(f"{name} {array.dtype} {array.shape} ".encode() + np.ascontiguousarray(array).tobytes())
@@ -108,7 +108,7 @@ class ComposePrimitives(gymnasium.Wrapper[Any, FloatArray, Any, FloatArray], gym
     def __init__(
         self,
         env: gymnasium.Env[Any, FloatArray],
-        primitives: MCPEvaluator | Trained,
+        primitives: NumpyMCPPolicy | Trained,
         *,
         positions: Positions | None = None,
         weight_ratio: float = WEIGHT_RATIO,
@@ -148,7 +148,7 @@ class ComposePrimitivesVector(gymnasium.vector.VectorWrapper[Any, FloatArray, An
     def __init__(
         self,
         env: gymnasium.vector.VectorEnv[Any, FloatArray, Any],
-        primitives: MCPEvaluator | Trained,
+        primitives: NumpyMCPPolicy | Trained,
         *,
         positions: Positions | None = None,
         weight_ratio: float = WEIGHT_RATIO,
@@ -197,7 +197,7 @@ class _Mixer:
 
     def __init__(
         self,
-        primitives: MCPEvaluator | Trained,
+        primitives: NumpyMCPPolicy | Trained,
         observation_space: gymnasium.Space[Any],
         action_space: gymnasium.Space[Any],
         positions: Positions | None,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -14,7 +14,6 @@ from service.generator.counts import SuccessCounts
 from service.generator.difficulty import DifficultyGrid, in_air
 from service.generator.metrics import alice_metrics, bob_metrics, current_goals, mean, own_goals, without_nan
 from service.generator.opponents import OpponentPool, RoundPlan
-from service.generator.penalty import OutsidePenalty
 from service.generator.ring import Ring
 from service.generator.state import Array, State, prefixed, under
 from service.generator.stopping import StopCriterion
@@ -86,12 +85,10 @@ class TaskGenerator:
         self._num_task_bins = self.grid.num_height_bins * self.grid.num_distance_bins
         self.from_reset = SuccessCounts(self._num_task_bins * (1 + self._some_blocked))
         self._stop = StopCriterion(config.generator)
-        self._penalty = OutsidePenalty(config.game.alice_outside_from_valid_fraction)
 
     def plan(self, num_worlds: int, rng: np.random.Generator) -> RoundPlan:
         """Choose who plays the next round; all current while there are no past versions."""
-        plan = self.opponents.plan(num_worlds, self._config.past_opponent_fraction, rng)
-        return replace(plan, penalise_outside=self._penalty.active)
+        return self.opponents.plan(num_worlds, self._config.past_opponent_fraction, rng)
 
     def choose_goals(
         self,
@@ -151,7 +148,6 @@ class TaskGenerator:
             goal=goal,
         )
         current = current_goals(records)
-        self._penalty.record(float(np.mean(records.verdict == Verdict.VALID)))
         self._stop.record(num_new_cells, int(current.sum()), int(records.solved[current].sum()))
         return (
             alice_metrics(records, self._rest_height_m)
@@ -181,7 +177,6 @@ class TaskGenerator:
             | prefixed("from_reset", self.from_reset.state())
             | prefixed("opponents", self.opponents.state())
             | prefixed("stop", self._stop.state())
-            | prefixed("penalty", self._penalty.state())
         )
 
     def load_state(self, state: Mapping[str, Array]) -> None:
@@ -196,7 +191,6 @@ class TaskGenerator:
         self.from_reset.load_state(under("from_reset", state))
         self.opponents.load_state(under("opponents", state))
         self._stop.load_state(under("stop", state))
-        self._penalty.load_state(under("penalty", state))
 
     def _choose_replayed(self, valid: Bools, bob_past: Bools, rng: np.random.Generator) -> Bools:
         """(N,) worlds whose goal comes from the buffer."""

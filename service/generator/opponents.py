@@ -25,8 +25,6 @@ class RoundPlan:
     """(N,) index of Alice in ``OpponentPool.alice``, or ``CURRENT``."""
     bob_opponent: Ints
     """(N,) index of Bob in ``OpponentPool.bob``, or ``CURRENT``."""
-    penalise_outside: bool = True
-    """Whether ``game.alice_outside_reward`` is paid."""
 
     @property
     def alice_past(self) -> NDArray[np.bool_]:

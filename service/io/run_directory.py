@@ -74,15 +74,15 @@ class RunDirectory:
         """Whether a run has begun here."""
         return self.config_file.exists()
 
-    def read_config(self) -> Config:
-        """The run's resolved configuration.
+    def read_config(self, overrides: list[str] | tuple[str, ...] = ()) -> Config:
+        """Read the run's resolved configuration, with ``overrides`` as in ``load_config``.
 
         Raises:
             ConfigError: no run here, or its configuration cannot be read.
         """
         if not self.exists:
             raise ConfigError(f"no run in {self.path}: {self.config_file.name} is missing; name the directory of a run")
-        return load_config(self.config_file)
+        return load_config(self.config_file, overrides, recorded=True)
 
     def start(self, config: Config, *, after_iteration: int | None = None, after_env_steps: int | None = None) -> None:
         """Begin a run here, or continue one: then records of later iterations, which will be made again, are dropped.

@@ -16,7 +16,7 @@ _BETA1, _BETA2 = 0.9, 0.999
 
 
 class Adam:
-    """Steps named parameters; its state exists from the start, so it has the same names at any time."""
+    """Optimiser of named parameters; its state exists from the start, so it has the same names at any time."""
 
     def __init__(self, parameters: Mapping[str, nn.Parameter], learning_rate: float) -> None:
         """Start with moments of zero; ``learning_rate`` may be changed between steps."""

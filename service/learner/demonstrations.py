@@ -1,4 +1,4 @@
-"""The demonstrations of the last iterations. D steps in all."""
+"""The demonstrations of the last iterations; D steps in all."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ Arrays = dict[str, NDArray[Any]]
 
 
 class DemonstrationHistory:
-    """What the last ``num_iterations`` iterations demonstrated; one without demonstrations counts too."""
+    """Demonstrations of the last ``num_iterations`` iterations; one without demonstrations counts too."""
 
     def __init__(self, num_iterations: int) -> None:
         """Start empty."""
@@ -29,11 +29,11 @@ class DemonstrationHistory:
         self._iterations.append(Demonstrations(new.observation[finite], new.action[finite]))
 
     def joined(self) -> Demonstrations:
-        """All that is kept, oldest first."""
+        """Join all that is kept, oldest first."""
         return _join(self._iterations)
 
     def state(self) -> Arrays:
-        """Everything, by name."""
+        """Everything that a resumed run needs, by name."""
         everything = self.joined()
         sizes = np.array([len(each.action) for each in self._iterations], dtype=np.int64)
         return {"observation": everything.observation, "action": everything.action, "num_steps": sizes}

@@ -1,15 +1,31 @@
-"""What Bob's policy looks like from inside: how wide it is and which primitives it uses. P probes, K primitives."""
+"""Metrics of an update and of Bob's policy: P probes, K primitives."""
 
 from __future__ import annotations
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from service.envs.observations import POSITIONS_SIZE
-from service.learner import losses
 from service.learner.player import Player
 from service.learner.samples import Cloning
+from service.policies import gaussian
 from service.policies.networks import MCPPolicy
+
+NUM_PROBES = 1024
+"""Number of rows that are enough for what is measured once an update."""
+
+
+def probes(rows: Tensor) -> Tensor:
+    """At most ``NUM_PROBES`` of the rows, evenly spread."""
+    return rows[:: -(-len(rows) // NUM_PROBES)]
+
+
+def explained_variance(returns: NDArray[np.floating], values: NDArray[np.floating]) -> float:
+    """Share of the variance of ``returns`` that ``values`` predict: 1 at best, 0 for a constant (any shape)."""
+    variance = float(np.var(returns))
+    return 1.0 - float(np.var(returns - values)) / variance if variance > 0.0 else 0.0
 
 
 @torch.no_grad()
@@ -33,7 +49,7 @@ def composition_metrics(bob: MCPPolicy, observation: Tensor) -> dict[str, float]
 
 @torch.no_grad()
 def cloning_metrics(bob: Player, demonstrations: Cloning) -> dict[str, float]:
-    """How likely the demonstrations became under the policy, in nats, and by how much that changed in this update."""
+    """Mean log-probability of the demonstrations, in nats, and its change by this update."""
     log_prob = bob.log_prob(demonstrations.observation, demonstrations.action)
-    log_ratio = losses.bounded_log_ratio(log_prob, demonstrations.old_log_prob)
+    log_ratio = gaussian.log_ratio(log_prob, demonstrations.proximal_log_prob)
     return {"demonstration_log_prob": float(log_prob.mean()), "demonstration_log_ratio": float(log_ratio.mean())}

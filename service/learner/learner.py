@@ -14,14 +14,11 @@ from numpy.typing import NDArray
 from service.actors.rollout import Rollout, Turns, turns_from_arrays, turns_to_arrays
 from service.config import Config
 from service.envs.observations import MIRROR_ACTION, MIRROR_BOB, MIRROR_BOB_VALUE
-from service.learner import random_state
+from service.learner import ppo
 from service.learner.demonstrations import DemonstrationHistory
-from service.learner.diagnostics import cloning_metrics, composition_metrics
-from service.learner.errors import LearnerError
-from service.learner.ledger import Ledger
-from service.learner.player import Player
-from service.learner.samples import Cloning, Samples, collect, mirrored
-from service.learner.update import probes, update_player
+from service.learner.diagnostics import cloning_metrics, composition_metrics, probes
+from service.learner.player import LearnerError, Player
+from service.learner.samples import Cloning, Samples, augment_by_symmetry
 from service.learner.weights import Weights
 from service.policies import networks
 
@@ -30,10 +27,13 @@ Metrics = dict[str, float]
 
 MAX_POLICY_LAG = 2
 """A rollout of a version further behind is not learned from."""
+_LOW_WORD = (1 << 64) - 1
+_BOB_EMA = "steady_bob"
+"""The name of Bob's moving average in a checkpoint, which it has had since version 0.1.0."""
 
 
 class Learner:
-    """Turns rollouts into policy versions.
+    """The learner of both players: rollouts in, policy versions out.
 
     Call order: ``ingest`` any number of rollouts, ``update`` once, hand out ``weights``, and again. After an update,
     ``state`` holds all that ``load_state`` needs to continue as if nothing had happened, bit for bit.
@@ -57,10 +57,9 @@ class Learner:
         self._bob_policy = bob[0]
         self._rng = np.random.Generator(np.random.PCG64(config.seed))
         self._history = DemonstrationHistory(config.learner.abc.num_iterations)
-        self._ledger = Ledger()
+        self._counted: dict[tuple[int, int], int] = {}  # (actor, incarnation) to the last sequence learned from
         self._pending: dict[tuple[int, int, int], Rollout] = {}
-        self._turns: list[Turns] = []  # Alice's, since her last update
-        self._steady_bob = networks.export_parameters(bob[0])
+        self._bob_ema = networks.export_parameters(bob[0])
         self._window: deque[list[Turns]] = deque(maxlen=config.learner.bob_window)  # Bob's, of the last iterations
 
     def ingest(self, rollout: Rollout) -> bool:
@@ -70,7 +69,8 @@ class Learner:
             False if it was counted before, or comes from a policy version more than two behind or one that this
             learner has not published (actors may be ahead of a learner that was resumed).
         """
-        if rollout.id in self._ledger or rollout.id in self._pending:
+        actor, incarnation, sequence = rollout.id  # an actor's rollouts come in order
+        if sequence <= self._counted.get((actor, incarnation), -1) or rollout.id in self._pending:
             return False
         if not 0 <= self.version - rollout.policy_version <= MAX_POLICY_LAG:
             return False
@@ -92,8 +92,7 @@ class Learner:
         metrics = self._update_alice(rollouts)
         for name, value in self._update_bob(rollouts).items():
             metrics[name] = metrics.get(name, 0.0) + value  # only counts of failures are both players'
-        for rollout in rollouts:
-            self._ledger.add(rollout.id)
+        self._counted |= {(actor, incarnation): sequence for actor, incarnation, sequence in sorted(self._pending)}
         self._pending.clear()
         self.version += 1
         self._average_bob()
@@ -103,18 +102,21 @@ class Learner:
     def weights(self) -> Weights:
         """Both policies of the current version, as copies."""
         alice, bob = (networks.export_parameters(player.policy) for player in (self._alice, self._bob))
-        return Weights(self.version, alice, bob, {name: array.copy() for name, array in self._steady_bob.items()})
+        return Weights(self.version, alice, bob, {name: array.copy() for name, array in self._bob_ema.items()})
 
     def state(self) -> Arrays:
         """Everything a resumed run needs, as arrays by name; rollouts not yet learned from are not part of it."""
         parts = {"alice": self._alice.state(), "bob": self._bob.state(), "demonstrations": self._history.state()}
-        parts |= {"steady_bob": {name: array.copy() for name, array in self._steady_bob.items()}}
-        parts |= _named("turns", self._turns)
-        for index, turns in enumerate(self._to_come_back()):
-            parts |= _named(f"window/{index:04}", turns)
+        parts |= {_BOB_EMA: {name: array.copy() for name, array in self._bob_ema.items()}}
+        for index, iteration in enumerate(self._used_again()):
+            parts |= {f"window/{index:04}/{place:04}": turns_to_arrays(each) for place, each in enumerate(iteration)}
         nested = {f"{part}/{name}": array for part, arrays in parts.items() for name, array in arrays.items()}
-        version = np.array(self.version, dtype=np.int64)
-        return nested | {"version": version, "rng": random_state.dump(self._rng), "counted": self._ledger.state()}
+        counted = [(*source, sequence) for source, sequence in sorted(self._counted.items())]
+        return nested | {
+            "version": np.array(self.version, dtype=np.int64),
+            "rng": _rng_to_array(self._rng),
+            "counted": np.array(counted, dtype=np.int64).reshape(-1, 3),
+        }
 
     def load_state(self, state: Mapping[str, NDArray[Any]]) -> None:
         """Continue exactly where ``state`` was taken, by a learner of the same configuration.
@@ -125,34 +127,31 @@ class Learner:
         state = dict(state)
         try:
             own = {name: state.pop(name) for name in ("version", "rng", "counted")}
-            steady_bob = {name: np.array(state.pop(f"steady_bob/{name}")) for name in self._steady_bob}
+            bob_ema = {name: np.array(state.pop(f"{_BOB_EMA}/{name}")) for name in self._bob_ema}
             history = {name: state.pop(f"demonstrations/{name}") for name in ("observation", "action", "num_steps")}
         except KeyError as error:
             raise LearnerError(f"learner state: no array {error}; take an undamaged checkpoint") from None
-        played = {name: state.pop(name) for name in list(state) if name.startswith(("turns/", "window/"))}
+        window = {name: state.pop(name) for name in list(state) if name.startswith("window/")}
         self._load_players(state)
-        self._steady_bob = steady_bob
-        self._turns = _turns(_part(played, "turns"))
-        window = _part(played, "window")
+        self._bob_ema = bob_ema
         self._window.clear()
-        self._window.extend(_turns(_part(window, index)) for index in _indices(window))
+        for iteration in _parts(_part(window, "window")):
+            self._window.append([turns_from_arrays(arrays) for arrays in _parts(iteration)])
         self.version = int(own["version"])
-        self._rng = random_state.load(own["rng"])
-        self._ledger.load_state(own["counted"])
+        self._rng = _rng_from_array(own["rng"])
+        self._counted = {(int(actor), int(incarnation)): int(last) for actor, incarnation, last in own["counted"]}
         self._history.load_state(history)
         self._pending.clear()
 
     def _average_bob(self) -> None:
         """Move the average towards the new version; faster at first, when it is mostly the untrained Bob."""
-        new, decay = networks.export_parameters(self._bob.policy), self.config.learner.bob_average_decay
+        new, decay = networks.export_parameters(self._bob.policy), self.config.learner.bob_ema_decay
         keep = min(decay, (1 + self.version) / (10 + self.version))
-        old = self._steady_bob if keep > 0.0 else new
-        self._steady_bob = {
-            name: np.asarray(each + np.float32(keep) * (old[name] - each)) for name, each in new.items()
-        }
+        old = self._bob_ema if keep > 0.0 else new
+        self._bob_ema = {name: np.asarray(each + np.float32(keep) * (old[name] - each)) for name, each in new.items()}
 
-    def _to_come_back(self) -> list[list[Turns]]:
-        """What of Bob's window the next update will use again: all but what then falls out of it."""
+    def _used_again(self) -> list[list[Turns]]:
+        """The iterations of Bob's window that the next update will use again: all but one that then falls out of it."""
         window = list(self._window)
         return window[1:] if len(window) == self.config.learner.bob_window else window
 
@@ -168,26 +167,20 @@ class Learner:
             player.load_state(states[key])
 
     def _update_alice(self, rollouts: Sequence[Rollout]) -> Metrics:
-        alice = self._alice
-        self._turns += [rollout.alice for rollout in rollouts]
-        if (self.version + 1) % self.config.learner.alice_interval:
-            return {"non_finite_steps": 0.0, "rollbacks": 0.0}
-        turns, self._turns = self._turns, []
-        samples = collect(turns, alice.value, alice.policy, self.config.learner.alice, self._device)
-        metrics = update_player(self._alice, samples, None, self.config.learner.abc, self._rng)
+        samples = ppo.collect([rollout.alice for rollout in rollouts], self._alice)
+        metrics = ppo.update(self._alice, samples, None, self.config.learner.abc, self._rng)
         return _prefixed("alice", metrics) | {"num_alice_samples": float(_length(samples))}
 
     def _update_bob(self, rollouts: Sequence[Rollout]) -> Metrics:
         config, bob = self.config.learner, self._bob
         self._window.append([rollout.bob for rollout in rollouts])
-        turns = [each for iteration in self._window for each in iteration]
-        samples = collect(turns, bob.value, bob.policy, config.bob, self._device)
+        samples = ppo.collect([turns for iteration in self._window for turns in iteration], bob)
         metrics = {"num_bob_samples": float(_length(samples))}
         if samples is not None and config.mirror:
-            samples = mirrored(samples, bob.policy, MIRROR_BOB, MIRROR_BOB_VALUE, MIRROR_ACTION)
+            samples = augment_by_symmetry(samples, bob, MIRROR_BOB, MIRROR_BOB_VALUE, MIRROR_ACTION)
         cloning = self._cloning(rollouts)
         metrics["num_demonstrations"] = float(_length(cloning) // (2 if config.mirror else 1))
-        metrics |= _prefixed("bob", update_player(bob, samples, cloning, config.abc, self._rng))
+        metrics |= _prefixed("bob", ppo.update(bob, samples, cloning, config.abc, self._rng))
         rows = samples if samples is not None else cloning
         if rows is not None and isinstance(self._bob_policy, networks.MCPPolicy):
             metrics |= composition_metrics(self._bob_policy, probes(rows.observation))
@@ -220,16 +213,29 @@ def _part(state: Arrays, key: str) -> Arrays:
     return {name.removeprefix(f"{key}/"): array for name, array in state.items() if name.startswith(f"{key}/")}
 
 
-def _named(prefix: str, turns: Sequence[Turns]) -> dict[str, Arrays]:
-    return {f"{prefix}/{index:04}": turns_to_arrays(each) for index, each in enumerate(turns)}
+def _parts(state: Arrays) -> list[Arrays]:
+    """The numbered parts of a state, in their order."""
+    return [_part(state, number) for number in sorted({name.partition("/")[0] for name in state})]
 
 
-def _indices(state: Arrays) -> list[str]:
-    return sorted({name.partition("/")[0] for name in state})
+def _rng_to_array(rng: np.random.Generator) -> NDArray[np.uint64]:
+    """A PCG64 generator as six words (6,): its 128-bit state and increment in halves, then its buffered half-draw."""
+    state = rng.bit_generator.state
+    wide = (word for value in state["state"].values() for word in (value >> 64, value & _LOW_WORD))
+    return np.array([*wide, state["has_uint32"], state["uinteger"]], dtype=np.uint64)
 
 
-def _turns(state: Arrays) -> list[Turns]:
-    return [turns_from_arrays(_part(state, index)) for index in _indices(state)]
+def _rng_from_array(words: NDArray[np.uint64]) -> np.random.Generator:
+    """The generator that ``_rng_to_array`` made these (6,) words of."""
+    values = [int(word) for word in words]
+    rng = np.random.Generator(np.random.PCG64())
+    rng.bit_generator.state = {
+        "bit_generator": "PCG64",
+        "state": {"state": values[0] << 64 | values[1], "inc": values[2] << 64 | values[3]},
+        "has_uint32": values[4],
+        "uinteger": values[5],
+    }
+    return rng
 
 
 def _length(rows: Samples | Cloning | None) -> int:

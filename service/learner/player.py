@@ -11,14 +11,18 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from service.config import PPOConfig
+from service.errors import TandemError
 from service.learner.adam import Adam
-from service.learner.errors import LearnerError
 from service.policies import gaussian
 
 Arrays = dict[str, NDArray[Any]]
 
-RATE_BOUNDS = 0.03, 2.0
+LEARNING_RATE_BOUNDS = 0.03, 2.0
 """The KL-adaptive learning rate stays within these multiples of the configured one."""
+
+
+class LearnerError(TandemError):
+    """A device that is not there, or a state that does not fit; the message says what to do."""
 
 
 class Player:
@@ -26,7 +30,7 @@ class Player:
 
     def __init__(self, policy: nn.Module, value: nn.Module, config: PPOConfig, device: torch.device) -> None:
         """Take both networks to ``device``; from now on only this player may change them."""
-        self.policy, self.value, self.config = policy.to(device), value.to(device), config
+        self.policy, self.value, self.config, self.device = policy.to(device), value.to(device), config, device
         networks = {"policy": self.policy, "value": self.value}
         self._parameters = {
             f"{key}/{name}": each for key, network in networks.items() for name, each in network.named_parameters()
@@ -35,11 +39,11 @@ class Player:
         self.optimizer = Adam(self._parameters, config.learning_rate)
 
     def log_prob(self, observation: Tensor, action: Tensor) -> Tensor:
-        """Of (B, A) actions at (B, O) observations, (B,)."""
+        """Log-probabilities (B,) of (B, A) actions at (B, O) observations."""
         return gaussian.log_prob(action, *self.policy(observation))
 
     def snapshot(self) -> list[Tensor]:
-        """Copies of the parameters and of Adam's state, for ``restore``."""
+        """Copy the parameters and Adam's state, for ``restore``."""
         return [tensor.detach().clone() for tensor in self._tensors().values()]
 
     def restore(self, snapshot: list[Tensor]) -> None:
@@ -49,7 +53,7 @@ class Player:
                 tensor.copy_(value)
 
     def state(self) -> Arrays:
-        """Copies of everything that changes: parameters, Adam's state, learning rate."""
+        """Copy everything that changes: parameters, Adam's state, learning rate."""
         arrays: Arrays = {name: tensor.detach().cpu().numpy().copy() for name, tensor in self._tensors().items()}
         return arrays | {"learning_rate": np.array(self.optimizer.learning_rate)}
 
@@ -74,7 +78,7 @@ class Player:
         Where a lower or higher learning rate is configured by now, the saved one is moved within its bounds.
         """
         self.restore([torch.from_numpy(np.array(state[name])) for name in self._tensors()])
-        low, high = (self.config.learning_rate * bound for bound in RATE_BOUNDS)
+        low, high = (self.config.learning_rate * bound for bound in LEARNING_RATE_BOUNDS)
         self.optimizer.learning_rate = min(max(float(state["learning_rate"]), low), high)
 
     def _tensors(self) -> dict[str, Tensor]:

@@ -1,24 +1,17 @@
-"""What a player learns from, as flat tensors: B samples of turns, D steps of demonstrations."""
+"""The data a player learns from, as flat tensors: B samples of turns, D steps of demonstrations."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields
-from typing import Any, Self
+from dataclasses import dataclass, fields, replace
+from typing import Self, TypeVar
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
-from service.actors.rollout import Turns
-from service.config import PPOConfig
 from service.envs.observations import Mirror
-from service.learner.returns import advantages
+from service.learner.player import Player
 from service.policies import gaussian
-
-Estimate = Callable[[Tensor], Tensor]
-Policy = Callable[[Tensor], tuple[Tensor, Tensor]]
 
 
 class _Rows:
@@ -28,11 +21,11 @@ class _Rows:
         return len(self.tensors()[0])
 
     def take(self, rows: Tensor) -> Self:
-        """The rows of these indices, in their order."""
+        """Take the rows of these indices, in their order."""
         return type(self)(*(tensor.index_select(0, rows) for tensor in self.tensors()))
 
     def split(self, num_parts: int) -> list[Self]:
-        """Consecutive parts, as views; sizes differ by one at most."""
+        """Cut into consecutive parts, as views; sizes differ by one at most."""
         parts = [tensor.tensor_split(num_parts) for tensor in self.tensors()]
         return [type(self)(*columns) for columns in zip(*parts, strict=True)]
 
@@ -43,7 +36,7 @@ class _Rows:
 
 @dataclass(frozen=True, slots=True)
 class Samples(_Rows):
-    """Steps of one player's own turns."""
+    """Steps of one player's own turns; ``ppo`` says which policies are meant."""
 
     observation: Tensor
     """(B, O)."""
@@ -51,23 +44,23 @@ class Samples(_Rows):
     """(B, V)."""
     action: Tensor
     """(B, A)."""
-    old_log_prob: Tensor
-    """(B,) under the policy that acted."""
-    start_mean: Tensor
-    """(B, A) of the policy at the start of the update, which may be a version or two ahead of the one that acted."""
-    start_std: Tensor
+    behaviour_log_prob: Tensor
+    """(B,) of the action under the policy that acted."""
+    proximal_mean: Tensor
+    """(B, A) of the policy at the start of the update."""
+    proximal_std: Tensor
     """(B, A)."""
     advantage: Tensor
     """(B,) normalised."""
-    target: Tensor
-    """(B,) of the value network: advantage, not normalised, plus ``value``."""
+    value_target: Tensor
+    """(B,) advantage, not normalised, plus ``value``."""
     value: Tensor
     """(B,) estimated at the start of the update."""
 
     @property
-    def start_log_prob(self) -> Tensor:
-        """(B,) under the policy at the start of the update."""
-        return gaussian.log_prob(self.action, self.start_mean, self.start_std)
+    def proximal_log_prob(self) -> Tensor:
+        """(B,) of the action under the policy at the start of the update."""
+        return gaussian.log_prob(self.action, self.proximal_mean, self.proximal_std)
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,87 +71,79 @@ class Cloning(_Rows):
     """(D, O)."""
     action: Tensor
     """(D, A)."""
-    old_log_prob: Tensor
-    """(D,) under the policy at the start of the update."""
+    proximal_log_prob: Tensor
+    """(D,) of the action under the policy at the start of the update."""
 
 
-def collect(
-    turns: Sequence[Turns], estimate: Estimate, policy: Policy, config: PPOConfig, device: torch.device
-) -> Samples | None:
-    """Turn what was played into samples; only active steps of worlds that ``learn`` count.
-
-    Args:
-        turns: of one player, with equal T; joined along worlds.
-        estimate: value network, (B, V) to (B,).
-        policy: mean and std at (B, O) observations, at the start of the update.
-        config: discount and lambda.
-        device: where the tensors shall be.
-
-    Returns:
-        The samples, None if there are none.
-    """
-    active = _join(turns, "active")
-    num_samples = int(active.sum())
-    if num_samples == 0:
-        return None
-    names = {name: name for name in ("observation", "value_observation", "action")} | {"old_log_prob": "log_prob"}
-    tensors = {key: torch.from_numpy(_join(turns, name)[active]).to(device) for key, name in names.items()}
-    final = torch.from_numpy(np.concatenate([part.final_value_observation[part.learn] for part in turns])).to(device)
-    with torch.no_grad():
-        estimates = estimate(torch.cat((tensors["value_observation"], final)))
-        tensors["start_mean"], tensors["start_std"] = policy(tensors["observation"])
-    value = estimates[:num_samples]
-    values = np.zeros(active.shape, dtype=np.float32)
-    values[active] = value.cpu().numpy()
-    final_values = estimates[num_samples:].cpu().numpy()
-    rewards, terminated = _join(turns, "reward"), _join(turns, "terminated")
-    discounts = {"gamma": config.gamma, "gae_lambda": config.gae_lambda}
-    advantage = advantages(rewards, values, final_values, active, terminated, **discounts)[active]
-    target = torch.from_numpy(advantage + values[active]).to(device)
-    normalised = torch.from_numpy(_normalise(advantage)).to(device)
-    return Samples(**tensors, advantage=normalised, target=target, value=value)
+Rows = TypeVar("Rows", Samples, Cloning)
 
 
-def mirrored(samples: Samples, policy: Policy, own: Mirror, value: Mirror, action: Mirror) -> Samples:
-    """The samples followed by their reflections.
+def augment_by_symmetry(
+    samples: Samples, player: Player, observation: Mirror, value_observation: Mirror, action: Mirror
+) -> Samples:
+    """Append the samples' reflections in y.
 
-    A reflection was never acted, so its old log-probability is that of the policy at the start of the update.
+    Nobody acted a reflection, so its behaviour log-probability is that of the policy at the start of the update.
 
     Args:
         samples: B of them.
-        policy: mean and std at (B, O) observations, at the start of the update.
-        own: reflects observations.
-        value: reflects value observations.
-        action: reflects actions.
+        player: has the policy at the start of the update.
+        observation: reflects the column of that name.
+        value_observation: reflects the column of that name.
+        action: reflects the column of that name.
 
     Returns:
-        2B samples; advantage and target are the original's.
+        2B samples; the reflections have the originals' advantages and values.
     """
-    observation, actions = reflect(samples.observation, own), reflect(samples.action, action)
+    observations, actions = _reflect(samples.observation, observation), _reflect(samples.action, action)
     with torch.no_grad():
-        start = policy(observation)
-        old_log_prob = gaussian.log_prob(actions, *start)
-    value_observation = reflect(samples.value_observation, value)
-    unchanged = samples.advantage, samples.target, samples.value
-    reflections = Samples(observation, value_observation, actions, old_log_prob, *start, *unchanged)
+        mean, std = player.policy(observations)
+    reflections = replace(
+        samples,
+        observation=observations,
+        value_observation=_reflect(samples.value_observation, value_observation),
+        action=actions,
+        behaviour_log_prob=gaussian.log_prob(actions, mean, std),
+        proximal_mean=mean,
+        proximal_std=std,
+    )
     pairs = zip(samples.tensors(), reflections.tensors(), strict=True)
     return Samples(*(torch.cat(pair) for pair in pairs))
 
 
-def reflect(rows: Tensor, mirror: Mirror) -> Tensor:
+def minibatches(
+    samples: Samples | None, cloning: Cloning | None, size: int, rng: np.random.Generator
+) -> list[tuple[Samples | None, Cloning | None]]:
+    """Cut an epoch: each sample once, in random order, beside demonstrations drawn from a shuffled permutation.
+
+    Samples are cut into as many equal minibatches as bring them nearest to ``size``. Demonstrations come in half that
+    size, and are cycled through if they are too few. Demonstrations alone are gone through once.
+
+    Args:
+        samples: B of them, or None.
+        cloning: D demonstrations, or None; not both None.
+        size: of a minibatch of samples.
+        rng: shuffles.
+    """
+    half = max(size // 2, 1)
+    if samples is not None:
+        num = max(round(len(samples) / size), 1)
+    else:
+        assert cloning is not None, "an epoch needs samples or demonstrations"
+        num = max(round(len(cloning) / half), 1)
+    own = [None] * num if samples is None else _draw(samples, len(samples), rng).split(num)
+    drawn = [None] * num if cloning is None else _draw(cloning, num * min(half, len(cloning)), rng).split(num)
+    return list(zip(own, drawn, strict=True))
+
+
+def _draw(rows: Rows, num: int, rng: np.random.Generator) -> Rows:
+    """Draw ``num`` rows in random order, none twice before each was drawn once."""
+    rounds = [rng.permutation(len(rows)) for _ in range(-(-num // len(rows)))]
+    indices = torch.from_numpy(np.concatenate(rounds)[:num])
+    return rows.take(indices.to(rows.observation.device))
+
+
+def _reflect(rows: Tensor, mirror: Mirror) -> Tensor:
     """Reflect (B, size) rows in y."""
     source = torch.from_numpy(mirror.source).to(rows.device)
     return rows.index_select(1, source) * torch.from_numpy(mirror.sign).to(rows.device)
-
-
-def _join(turns: Sequence[Turns], name: str) -> NDArray[Any]:
-    """A (T, N, ...) field of all turns, learnable worlds only."""
-    joined: NDArray[Any] = np.concatenate([getattr(part, name)[:, part.learn] for part in turns], axis=1)
-    return joined
-
-
-def _normalise(advantage: NDArray[np.float32]) -> NDArray[np.float32]:
-    """To mean 0 and standard deviation 1; all zero if they do not differ."""
-    wide = advantage.astype(np.float64)
-    normalised: NDArray[np.float32] = ((wide - wide.mean()) / (wide.std() + 1e-8)).astype(np.float32)
-    return normalised

@@ -1,4 +1,4 @@
-"""What the learner gives out. Whoever plays with it unpickles it, so nothing here may import torch."""
+"""The parameters that actors get. They unpickle them without torch, so nothing here may import it."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ from service.policies.parameters import FloatArray
 
 @dataclass(frozen=True, slots=True)
 class Weights:
-    """What actors need to play with one policy version."""
+    """Parameters of both players, of one policy version."""
 
     version: int
     alice: dict[str, FloatArray]
     bob: dict[str, FloatArray]
-    steady_bob: dict[str, FloatArray]
-    """Bob without the sway of single updates, to be evaluated and published; see ``learner.bob_average_decay``."""
+    bob_ema: dict[str, FloatArray]
+    """Moving average of Bob's parameters, to be evaluated and published; see ``learner.bob_ema_decay``."""

@@ -12,7 +12,7 @@ from service.config import Config
 from service.errors import TandemError
 from service.io.run_directory import RunDirectory
 from service.media.plots import plot_coverage, plot_curves, plot_goals
-from service.policies.evaluator import MCPEvaluator
+from service.policies.numpy_policy import NumpyMCPPolicy
 from service.primitives.loading import load_players
 
 NUM_SKILLS = 32
@@ -43,7 +43,7 @@ def make_artifacts(directory: RunDirectory) -> dict[str, Path]:
         "curves": partial(plot_curves, directory.path),
         "goals": partial(plot_goals, directory.path, config.world.workspace),
     }
-    if isinstance(bob, MCPEvaluator):
+    if isinstance(bob, NumpyMCPPolicy):
         makers["coverage"] = partial(_draw_coverage, directory, config, bob)
     files = {}
     for name, make in (makers | {"video": film}).items():
@@ -54,7 +54,7 @@ def make_artifacts(directory: RunDirectory) -> dict[str, Path]:
     return files
 
 
-def _draw_coverage(directory: RunDirectory, config: Config, bob: MCPEvaluator) -> Path:
+def _draw_coverage(directory: RunDirectory, config: Config, bob: NumpyMCPPolicy) -> Path:
     paths = skill_trajectories(bob, config.world, num_skills=NUM_SKILLS, num_steps=COVERAGE_STEPS, seed=_SEED)
     share = visited_share(paths, config.world.workspace)
     return plot_coverage(

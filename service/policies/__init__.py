@@ -1,1 +1,1 @@
-"""Policies of Alice and Bob: torch networks for learning, a NumPy evaluator of the same parameters for acting."""
+"""Policies of Alice and Bob: torch networks for learning, the same in NumPy for acting."""

@@ -41,14 +41,14 @@ class HiddenLayers(nn.ModuleList):
         self.output_size = sizes[-1]
 
     def forward(self, values: Tensor) -> Tensor:
-        """(..., input_size) to (..., output_size)."""
+        """Map (..., input_size) to (..., output_size)."""
         for layer in self:
             values = elu(layer(values), inplace=True)
         return values
 
 
 class GaussianSquash(nn.Module):
-    """Bounds raw outputs (..., 2A): ``MEAN_BOUND * tanh(x / MEAN_BOUND)`` for the mean, a sigmoid for the log-std."""
+    """Bounded outputs (..., 2A): ``MEAN_BOUND * tanh(x / MEAN_BOUND)`` for the mean, a sigmoid for the log-std."""
 
     log_std_min: Tensor
     log_std_max: Tensor

@@ -34,7 +34,7 @@ from service.policies.layers import GaussianSquash, HiddenLayers, InputNormalisa
 from service.policies.parameters import FloatArray, PolicyError
 
 INITIAL_LOG_STD = -0.1
-"""Of a new policy's actions: std 0.9; chance has to find the object."""
+"""Log-std of a new policy's actions. The std is 0.9: chance has to find the object."""
 
 _HIDDEN_GAIN = math.sqrt(2.0)
 _SMALL_GAIN = 0.01
@@ -208,7 +208,7 @@ def make_bob_value(config: PolicyConfig) -> ValueNetwork:
 
 
 def export_parameters(module: nn.Module) -> dict[str, FloatArray]:
-    """Parameters and buffers by their state-dict names, as float32 copies: all that an evaluator needs."""
+    """Parameters and buffers by their state-dict names, as float32 copies: all that a NumPy policy needs."""
     return {name: tensor.detach().cpu().numpy().astype(np.float32) for name, tensor in module.state_dict().items()}
 
 

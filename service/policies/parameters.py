@@ -1,4 +1,4 @@
-"""What torch and NumPy policies agree on: constants of the architecture and checked reading of exported parameters."""
+"""Exported parameters, as torch and NumPy share them: constants of the architecture, and a reader that checks."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class PolicyError(TandemError):
 
 
 class ParameterReader:
-    """Takes parameters out of an exported dict one by one, checking each; ``finish`` tells of any left over."""
+    """Reader of an exported dict: parameters are taken one by one and checked; ``finish`` tells of any left over."""
 
     def __init__(self, parameters: Parameters) -> None:
         """Read from ``parameters``, which stays as it is."""

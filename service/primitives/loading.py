@@ -9,7 +9,7 @@ from service.config import Config, parse_config
 from service.errors import TandemError
 from service.io.checkpoints import Checkpoint, CheckpointStore, read_checkpoint
 from service.io.run_directory import RunDirectory
-from service.policies.evaluator import GaussianEvaluator, MCPEvaluator, bob_evaluator
+from service.policies.numpy_policy import NumpyGaussianPolicy, NumpyMCPPolicy, NumpyPolicy, numpy_bob
 from service.policies.parameters import Parameters, PolicyError
 from service.primitives.bundled import find_version, is_bundled
 from service.registry.manifest import Manifest
@@ -21,19 +21,19 @@ class TrainedBob:
 
     label: str
     """Where he comes from, such as ``panda-cube@3``."""
-    policy: MCPEvaluator | GaussianEvaluator
+    policy: NumpyPolicy
     config: Config
     manifest: Manifest | None = None
     """His manifest in the registry; None for the Bob of a run directory."""
 
     @property
-    def primitives(self) -> MCPEvaluator:
+    def primitives(self) -> NumpyMCPPolicy:
         """The policy as primitives that can be composed.
 
         Raises:
             TandemError: this Bob is monolithic.
         """
-        if not isinstance(self.policy, MCPEvaluator):
+        if not isinstance(self.policy, NumpyMCPPolicy):
             raise TandemError(f"{self.label} has no primitives: it was trained with policy.monolithic_bob")
         return self.policy
 
@@ -52,33 +52,33 @@ def load_bob(reference: str, registry: Path) -> TrainedBob:
     if Path(reference).is_dir():
         directory = RunDirectory(Path(reference))
         config, parameters = directory.read_config(), read_parameters(directory, "bob")
-        return TrainedBob(reference, bob_evaluator(parameters), config)
+        return TrainedBob(reference, numpy_bob(parameters), config)
     if "/" in reference:
         raise TandemError(f"{reference}: no such run directory; for published primitives write NAME@ALIAS")
     found, version = find_version(reference, registry)
     manifest, tensors = found.load(str(version))
-    config = parse_config(manifest.config, where=f"the manifest of {reference}")
+    config = parse_config(manifest.config, where=f"the manifest of {reference}", recorded=True)
     # two registries may both have a version 1: which one was meant must be seen
     label = f"{version} (bundled)" if is_bundled(found) else str(version)
-    return TrainedBob(label, _evaluator(label, tensors), config, manifest)
+    return TrainedBob(label, _primitives(label, tensors), config, manifest)
 
 
-def _evaluator(label: str, parameters: Parameters) -> MCPEvaluator:
+def _primitives(label: str, parameters: Parameters) -> NumpyMCPPolicy:
     try:
-        return MCPEvaluator(parameters)
+        return NumpyMCPPolicy(parameters)
     except PolicyError as error:
         raise TandemError(f"{label} holds no primitives: {error}") from None
 
 
-def load_players(directory: RunDirectory) -> tuple[GaussianEvaluator, MCPEvaluator | GaussianEvaluator]:
+def load_players(directory: RunDirectory) -> tuple[NumpyGaussianPolicy, NumpyPolicy]:
     """Alice and Bob of a run's newest checkpoint.
 
     Raises:
         TandemError: no usable checkpoint.
     """
     return (
-        GaussianEvaluator(read_parameters(directory, "alice")),
-        bob_evaluator(read_parameters(directory, "bob")),
+        NumpyGaussianPolicy(read_parameters(directory, "alice")),
+        numpy_bob(read_parameters(directory, "bob")),
     )
 
 

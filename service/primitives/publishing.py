@@ -12,7 +12,7 @@ from service.io import tensors
 from service.io.errors import StorageError
 from service.io.files import os_errors, write_atomic
 from service.io.run_directory import RunDirectory
-from service.policies.evaluator import bob_evaluator
+from service.policies.numpy_policy import numpy_bob
 from service.policies.parameters import Parameters
 from service.registry.blobs import sha256_of
 from service.registry.names import Version
@@ -24,7 +24,7 @@ FINAL_EVALUATION_EPISODES = 300
 def measure_bob(config: Config, parameters: Parameters) -> dict[str, float]:
     """Bob's success rates without noise on every kind of goals, by metric; the goals are not those of the run."""
     return success_metrics(
-        bob_evaluator(parameters),
+        numpy_bob(parameters),
         config,
         EVALUATED_GOALS,
         FINAL_EVALUATION_EPISODES,

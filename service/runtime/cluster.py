@@ -146,7 +146,7 @@ class ClusterRun(Runner):
 
     def bob(self) -> Parameters:
         """The newest Bob, as he is evaluated and published."""
-        parameters: Parameters = ray.get(self._weights).steady_bob
+        parameters: Parameters = ray.get(self._weights).bob_ema
         return parameters
 
     def health(self) -> Health:
@@ -400,7 +400,7 @@ class ClusterRun(Runner):
         with self.timing("checkpoint"):
             weights = ray.get(self._weights)
             parts = {"learner": ray.get(self._learner.state), "generator": ray.get(self._generator.state)}
-            parts |= {"alice": weights.alice, "bob": weights.steady_bob}  # for readers without torch
+            parts |= {"alice": weights.alice, "bob": weights.bob_ema}  # for readers without torch
             rng = np.random.default_rng([self.config.seed, self.iteration])  # what a local runner goes on with
             meta = {"next_incarnation": self._next_incarnation, "rng": rng.bit_generator.state}
             self.bookkeeper.save(parts, meta)

@@ -56,7 +56,7 @@ class LocalRun(Runner):
 
     def bob(self) -> Parameters:
         """The newest Bob, as he is evaluated and published."""
-        return self.learner.weights().steady_bob
+        return self.learner.weights().bob_ema
 
     def health(self) -> Health:
         """The state of the one actor there is, this process."""
@@ -121,7 +121,7 @@ class LocalRun(Runner):
                 "generator": self.generator.state(),
                 "game": self.game.state(),
                 "alice": weights.alice,  # for readers without torch: evaluate, render, coverage
-                "bob": weights.steady_bob,
+                "bob": weights.bob_ema,
             }
             if self._pending is not None:
                 parts["pending"] = to_arrays(self._pending)

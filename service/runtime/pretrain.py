@@ -179,22 +179,22 @@ def resumed_config(directory: RunDirectory, overrides: list[str], file: Path | N
     """
     saved = directory.read_config()
     for override in overrides:
-        if not override.startswith(RESUMABLE) and not _says(saved, directory.config_file, override):
+        if not override.startswith(RESUMABLE) and not _says(saved, directory, override):
             raise ConfigError(
                 f"override {override!r}: a resumed run keeps its configuration; only run.* and the learning rates may "
                 "change, for example run.total_env_steps"
             )
     if file is not None:
-        given = load_config(file)
+        given = load_config(file, recorded=True)  # maybe the one the run was begun with, by an earlier version
         _check_same_outside_run(saved, given, file)
         named = given.run.model_dump(mode="json", exclude_unset=True)
         overrides = [f"run.{key}={json.dumps(value)}" for key, value in named.items()] + overrides
-    return load_config(directory.config_file, overrides)
+    return directory.read_config(overrides)
 
 
-def _says(saved: Config, file: Path, override: str) -> bool:
+def _says(saved: Config, directory: RunDirectory, override: str) -> bool:
     try:
-        return load_config(file, [override]) == saved
+        return directory.read_config([override]) == saved
     except ConfigError:
         return False
 

@@ -22,7 +22,7 @@ from service.envs.goals import GoalKind
 from service.generator.generator import GoalChoice, TaskGenerator
 from service.generator.opponents import RoundPlan
 from service.generator.validity import Verdict
-from service.policies.evaluator import GaussianEvaluator, bob_evaluator
+from service.policies.numpy_policy import NumpyGaussianPolicy, numpy_bob
 from service.policies.parameters import Parameters
 from service.store.models import GoalCell, GoalGrid
 
@@ -163,21 +163,21 @@ class RolloutWorker:
 
     def evaluate(self, weights: Weights, kinds: Sequence[GoalKind]) -> Metrics:
         """Bob's success without noise on the run's goals of some kinds, as metrics."""
-        bob, episodes = bob_evaluator(weights.steady_bob), self._config.run.evaluation_episodes
+        bob, episodes = numpy_bob(weights.bob_ema), self._config.run.evaluation_episodes
         return success_metrics(bob, self._config, kinds, episodes, seed=EVALUATION_SEED, num_threads=self._num_threads)
 
     def _accept(self, assignment: Assignment) -> None:
         self.rng.bit_generator.state = assignment.rng.bit_generator.state
         if assignment.pool is not None:
             pairs = zip(assignment.pool.alice, assignment.pool.bob, strict=True)
-            self._past = [(GaussianEvaluator(alice), bob_evaluator(bob)) for alice, bob in pairs]
+            self._past = [(NumpyGaussianPolicy(alice), numpy_bob(bob)) for alice, bob in pairs]
         self.pool_version = assignment.pool_version
 
     def _players(self, weights: Weights) -> Players:
         return Players(
             version=weights.version,
-            alice=GaussianEvaluator(weights.alice),
-            bob=bob_evaluator(weights.bob),
+            alice=NumpyGaussianPolicy(weights.alice),
+            bob=numpy_bob(weights.bob),
             past_alice=[alice for alice, _ in self._past],
             past_bob=[bob for _, bob in self._past],
         )

@@ -9,8 +9,8 @@ from service.downstream.networks import GoalFeatures
 from service.downstream.worker import make_worlds
 from service.envs.observations import NORMALISATION_BOB
 from service.policies.composition import compose
-from service.policies.evaluator import MCPEvaluator
 from service.policies.networks import export_parameters
+from service.policies.numpy_policy import NumpyMCPPolicy
 from tests.downstream.cells import small_cell
 
 
@@ -30,12 +30,12 @@ def observations(env, num_steps=3):
 
 
 def test_the_mcp_actor_is_the_composition_squashed(champion):
-    """Against the torch-free evaluator of the same parameters, and the tanh's Jacobian by hand."""
+    """Against the torch-free policy of the same parameters, and the tanh's Jacobian by hand."""
     learner, env = learner_of("scratch-mcp", champion)
     seen, actor = observations(env), learner.actor
-    evaluator = MCPEvaluator(export_parameters(actor.mcp))
+    policy = NumpyMCPPolicy(export_parameters(actor.mcp))
     rows = torch.cat((seen["observation"], seen["desired_goal"]), 1).numpy()
-    weights, (means, variances) = evaluator.gate(rows), evaluator.primitives(rows[:, :11])
+    weights, (means, variances) = policy.gate(rows), policy.primitives(rows[:, :11])
     assert weights.shape == (4, 4)
     mean, variance = compose(weights, means, variances)
     with torch.no_grad():

@@ -350,6 +350,15 @@ def test_state_of_a_new_generator_loads(make_records: MakeRecords) -> None:
     assert len(generator.buffer) == len(generator.opponents) == generator.grid.num_cells_seen == 0
 
 
+def test_state_of_version_0_1_0_loads(make_records: MakeRecords) -> None:
+    """It also held when goals outside the workspace began to cost something."""
+    generator, resumed = filled(make_records), TaskGenerator(config(), STATE_SIZE)
+    state = generator.state()
+    resumed.load_state(state | {"penalty/valid_fraction": np.array(0.4), "penalty/active": np.array(True)})
+    assert state.keys() == resumed.state().keys()
+    assert all(np.array_equal(array, resumed.state()[name]) for name, array in state.items())
+
+
 def test_state_of_another_configuration_is_refused() -> None:
     state = TaskGenerator(config(), STATE_SIZE).state()
     with pytest.raises(ConfigError, match="resume with the configuration of the checkpoint"):

@@ -7,7 +7,7 @@ from service.envs.observations import BOB_SIZE, FULL_SIZE
 from service.errors import TandemError
 from service.io import checkpoints
 from service.io.run_directory import RunDirectory
-from service.policies.evaluator import GaussianEvaluator, MCPEvaluator
+from service.policies.numpy_policy import NumpyGaussianPolicy, NumpyMCPPolicy
 from service.primitives.bundled import BUNDLED
 from service.primitives.loading import load_bob, load_players, read_parameters
 from service.registry.registry import Registry
@@ -45,8 +45,29 @@ def test_the_newest_bob_of_a_run_directory(run, tmp_path):
     assert bob.manifest is None
     assert bob.config == tiny_config(total_env_steps=400, checkpoint_interval=1)
     rows = observations(BOB_SIZE)
-    expected = MCPEvaluator(learner.weights().bob).act_deterministic(rows)
+    expected = NumpyMCPPolicy(learner.weights().bob).act_deterministic(rows)
     assert np.array_equal(bob.policy.act_deterministic(rows), expected)
+
+
+def test_the_manifests_that_come_with_the_package_are_those_of_version_0_1_0(tmp_path):
+    """Their bytes stay as they were published; what they call by an old name is read under the new one."""
+    manifest = Registry(BUNDLED).manifest("panda-cube@champion")
+    assert manifest.config["learner"]["bob_average_decay"] == 0.97
+    assert manifest.config["learner"]["alice_interval"] == 1
+    assert manifest.config["game"]["alice_proximity_reward"] == 0.0
+    bob = load_bob("panda-cube@champion", tmp_path)
+    assert bob.config.learner.bob_ema_decay == 0.97
+    assert bob.manifest == manifest
+
+
+def test_a_manifest_with_a_removed_key_that_mattered(run, tmp_path):
+    config = tiny_config().model_dump(mode="json")
+    config["game"]["alice_outside_reward"] = -3.0
+    common = {"spaces": {}, "normalisation": {}, "config": config, "metrics": {}}
+    Registry(tmp_path).publish("old", run[1].weights().bob, **common)
+    with pytest.raises(TandemError) as error:
+        load_bob("old@1", tmp_path)
+    assert_one_line(error.value, "the manifest of old@1", "game.alice_outside_reward = -3.0", "tandem 0.1.0")
 
 
 @pytest.mark.parametrize("reference", ["tiny@1", "tiny@champion"])
@@ -56,7 +77,7 @@ def test_a_published_bob(run, registry, reference):
     assert bob.config == tiny_config()
     assert bob.manifest == Registry(registry).manifest("tiny@1")
     rows = observations(BOB_SIZE)
-    expected = MCPEvaluator(run[1].weights().bob).act_deterministic(rows)
+    expected = NumpyMCPPolicy(run[1].weights().bob).act_deterministic(rows)
     assert np.array_equal(bob.policy.act_deterministic(rows), expected)
 
 
@@ -64,7 +85,7 @@ def test_a_name_the_registry_does_not_have_is_that_of_the_package(registry):
     bob = load_bob("panda-cube@champion", registry)
     manifest = Registry(BUNDLED).manifest("panda-cube@champion")
     assert (bob.label, bob.manifest) == (f"{manifest.reference} (bundled)", manifest)
-    assert isinstance(bob.primitives, MCPEvaluator)
+    assert isinstance(bob.primitives, NumpyMCPPolicy)
 
 
 def test_both_players(run):
@@ -72,9 +93,9 @@ def test_both_players(run):
     alice, bob = load_players(RunDirectory(path))
     weights = learner.weights()
     rows = observations(FULL_SIZE)
-    assert np.array_equal(alice.act_deterministic(rows), GaussianEvaluator(weights.alice).act_deterministic(rows))
+    assert np.array_equal(alice.act_deterministic(rows), NumpyGaussianPolicy(weights.alice).act_deterministic(rows))
     rows = observations(BOB_SIZE)
-    assert np.array_equal(bob.act_deterministic(rows), MCPEvaluator(weights.bob).act_deterministic(rows))
+    assert np.array_equal(bob.act_deterministic(rows), NumpyMCPPolicy(weights.bob).act_deterministic(rows))
 
 
 def test_parameters_are_those_of_the_player_alone(run):

@@ -10,14 +10,14 @@ from typer.testing import CliRunner
 from service.cli.main import app
 from service.errors import DivergedError
 from service.io.run_directory import RunDirectory
-from service.policies.evaluator import GaussianEvaluator
+from service.policies.numpy_policy import NumpyGaussianPolicy
 from service.runtime.local import LocalRun
 from service.runtime.pretrain import resumed_config
 from service.runtime.workers import RolloutWorker
 from tests.runtime.runs import assert_one_line, assert_same_run, newest, play, read_lines, write_yaml
 
 
-class NotANumber(GaussianEvaluator):
+class NotANumber(NumpyGaussianPolicy):
     """Acts as it should, except in the last of its worlds."""
 
     def act(self, observation, rng):
@@ -39,7 +39,7 @@ def diverge_after(patch, iteration):
 
     def spoiled(self, weights):
         if next(rounds) >= iteration:
-            patch.setattr("service.runtime.workers.GaussianEvaluator", NotANumber)
+            patch.setattr("service.runtime.workers.NumpyGaussianPolicy", NotANumber)
         return players(self, weights)
 
     patch.setattr(RolloutWorker, "_players", spoiled)

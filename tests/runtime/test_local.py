@@ -11,7 +11,7 @@ from service.io.checkpoints import CheckpointStore
 from service.io.errors import CheckpointError
 from service.io.run_directory import RunDirectory
 from service.learner.learner import Learner
-from service.policies.evaluator import bob_evaluator
+from service.policies.numpy_policy import numpy_bob
 from service.primitives.loading import read_parameters, read_stages
 from service.runtime import workers
 from service.runtime.bookkeeping import UnsavedError
@@ -148,10 +148,10 @@ def test_the_average_bob_is_evaluated(tmp_path, monkeypatch):
         return handed[-1]
 
     def look(run, metrics):
-        assert asked[-1] is handed[-1].steady_bob
+        assert asked[-1] is handed[-1].bob_ema
 
     monkeypatch.setattr(Learner, "weights", watched)
-    monkeypatch.setattr(workers, "bob_evaluator", lambda bob: asked.append(bob) or bob_evaluator(bob))
+    monkeypatch.setattr(workers, "numpy_bob", lambda bob: asked.append(bob) or numpy_bob(bob))
     play(tmp_path, tiny_config(total_env_steps=200, evaluation_interval=1), on_iteration=look)
 
 

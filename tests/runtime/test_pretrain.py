@@ -7,6 +7,7 @@ import time
 
 import numpy as np
 import pytest
+import yaml
 
 from service.actors import evaluation
 from service.config import ConfigError, parse_config
@@ -252,6 +253,22 @@ def test_a_resumed_run_keeps_its_configuration(begun):
     assert resumed_config(begun, []) == tiny_config(seed=3)
     changed = resumed_config(begun, ["run.total_env_steps=9e5", "run.keep_checkpoints=7"])
     assert changed == tiny_config(seed=3, total_env_steps=900_000, keep_checkpoints=7)
+
+
+def test_a_run_of_version_0_1_0_is_resumed(begun):
+    tree = yaml.safe_load(begun.config_file.read_text())
+    tree["learner"]["bob_ema_decay"] = tree["learner"].pop("bob_ema_decay")
+    tree["learner"]["alice_interval"] = 1
+    begun.config_file.write_text(yaml.safe_dump(tree))
+    assert begun.read_config() == tiny_config(seed=3)
+    changed = resumed_config(begun, ["run.keep_checkpoints=7", "seed=3"])
+    assert changed == tiny_config(seed=3, keep_checkpoints=7)
+    assert resumed_config(begun, [], begun.config_file) == tiny_config(seed=3)  # the same command as before
+    tree["learner"]["alice_interval"] = 2
+    begun.config_file.write_text(yaml.safe_dump(tree))
+    with pytest.raises(ConfigError) as error:
+        resumed_config(begun, [])
+    assert_one_line(error.value, begun.config_file, "learner.alice_interval = 2", "tandem 0.1.0")
 
 
 @pytest.mark.parametrize("override", ["seed=4", "game.num_worlds=3", "runs.total_env_steps=3", "name=run.x"])

@@ -7,11 +7,11 @@ import torch
 from torch import nn
 
 from service.config import ABCConfig, PPOConfig
-from service.learner import losses
+from service.learner import ppo
+from service.learner.diagnostics import probes
 from service.learner.player import Player
+from service.learner.ppo import MAX_NON_FINITE, train
 from service.learner.samples import Cloning, Samples
-from service.learner.training import MAX_NON_FINITE, train
-from service.learner.update import probes, update_player
 
 CPU = torch.device("cpu")
 CONFIG = PPOConfig(learning_rate=0.01, num_epochs=4, minibatch_size=32, target_kl=0.05, max_grad_norm=10.0)
@@ -64,7 +64,7 @@ def make_cloning(player, action=0.5, num=64):
 
 
 def update(player, samples=None, cloning=None, seed=0):
-    return update_player(player, samples, cloning, ABC, np.random.default_rng(seed))
+    return ppo.update(player, samples, cloning, ABC, np.random.default_rng(seed))
 
 
 def parameters(player):
@@ -93,7 +93,7 @@ def test_cloning_makes_demonstrations_likelier_without_samples():
     player = make_player()
     cloning = make_cloning(player)
     metrics = update(player, cloning=cloning)
-    assert (player.log_prob(cloning.observation, cloning.action) > cloning.old_log_prob + 0.01).all()
+    assert (player.log_prob(cloning.observation, cloning.action) > cloning.proximal_log_prob + 0.01).all()
     assert metrics["cloning_loss"] < -1.0
     assert "policy_loss" not in metrics
     assert player.value.level.item() == 0.0
@@ -116,7 +116,7 @@ def test_cloning_has_its_weight(weight, beside_samples):
     if samples is not None:
         samples = replace(samples, advantage=torch.zeros_like(samples.advantage))  # only cloning moves the mean
     abc = ABCConfig(weight=weight)
-    update_player(player, samples, make_cloning(player, num=16), abc, np.random.default_rng(0))
+    ppo.update(player, samples, make_cloning(player, num=16), abc, np.random.default_rng(0))
     # Of a Gaussian with mean 0 and std e^-0.5, d log p(0.5) / d mean is 0.5 e; Adam's moment is 0.1 x the gradient.
     moment = player.state()["adam/first_moment/policy/mean"]
     np.testing.assert_allclose(moment, [-0.1 * weight * 0.5 * math.e], rtol=1e-5)
@@ -126,7 +126,7 @@ def test_cloning_has_its_weight(weight, beside_samples):
 def test_cloning_of_the_mean_only_leaves_the_std_alone(mean_only):
     player = make_player(num_epochs=1)
     abc = ABCConfig(mean_only=mean_only)
-    update_player(player, None, make_cloning(player, num=16), abc, np.random.default_rng(0))
+    ppo.update(player, None, make_cloning(player, num=16), abc, np.random.default_rng(0))
     assert player.policy.mean.item() > 0.0
     assert (player.policy.log_std.item() == -0.5) == mean_only
 
@@ -138,7 +138,7 @@ def test_the_value_loss_has_its_weight(weight):
     update(player, samples)
     # The values are 0, so the gradient of half the mean squared error is minus the mean target.
     moment = player.state()["adam/first_moment/value/level"]
-    np.testing.assert_allclose(moment, [-0.1 * weight * samples.target.mean().item()], rtol=1e-5)
+    np.testing.assert_allclose(moment, [-0.1 * weight * samples.value_target.mean().item()], rtol=1e-5)
 
 
 def test_ratios_start_at_one():
@@ -190,9 +190,9 @@ def test_other_minibatches_go_on_beside_a_non_finite_one():
     samples = play(make_player(), np.random.default_rng(0))
     samples.advantage[5] = math.inf
     player = make_player(num_epochs=1)
-    tally = train(player, samples, None, ABC, np.random.default_rng(0))
-    assert tally.num_non_finite == 1
-    assert len(tally.terms["policy_loss"]) == 3
+    stats = train(player, samples, None, ABC, np.random.default_rng(0))
+    assert stats.num_non_finite == 1
+    assert len(stats.scalars["policy_loss"]) == 3
     assert all(np.isfinite(array).all() for array in player.state().values())
     assert player.policy.mean.item() != 0.0
 
@@ -226,37 +226,38 @@ def test_a_collapse_is_undone():
 def test_the_policy_stops_early_and_the_value_network_goes_on():
     player = make_player(learning_rate=0.05, num_epochs=10, target_kl=0.01)
     samples = play(player, np.random.default_rng(0), num=320)
-    tally = train(player, samples, None, ABC, np.random.default_rng(0))
-    assert tally.stopped
-    assert 1 <= len(tally.terms["policy_loss"]) < 50
-    assert len(tally.terms["value_loss"]) == 100
+    stats = train(player, samples, None, ABC, np.random.default_rng(0))
+    assert stats.stopped
+    assert 1 <= len(stats.scalars["policy_loss"]) < 50
+    assert len(stats.scalars["value_loss"]) == 100
     steps = player.state()
-    assert steps["adam/step/policy/mean"] == len(tally.terms["policy_loss"])
+    assert steps["adam/step/policy/mean"] == len(stats.scalars["policy_loss"])
     assert steps["adam/step/value/level"] == 100
 
 
 def test_the_kl_that_stops_the_policy_is_this_epochs():
     player = make_player()
-    tally = train(player, play(player, np.random.default_rng(0)), None, ABC, np.random.default_rng(0))
-    assert len(tally.terms["kl"]) == 16
-    assert tally.kls == [float(kl) for kl in tally.terms["kl"][-4:]]
-    assert tally.passes(0.02, bound=np.mean([*tally.kls, 0.02]) - 1e-6)
-    assert not tally.passes(math.nan, bound=np.mean(tally.kls) + 1e-6)
+    stats = train(player, play(player, np.random.default_rng(0)), None, ABC, np.random.default_rng(0))
+    assert len(stats.scalars["kl"]) == 16
+    assert stats.kls == [float(kl) for kl in stats.scalars["kl"][-4:]]
+    assert stats.passes(0.02, bound=np.mean([*stats.kls, 0.02]) - 1e-6)
+    assert not stats.passes(math.nan, bound=np.mean(stats.kls) + 1e-6)
 
 
 def test_a_policy_ahead_of_the_one_that_acted_does_not_stop():
     player = make_player(num_epochs=1)
     samples = play(player, np.random.default_rng(0))
-    lagging = replace(samples, old_log_prob=samples.old_log_prob + torch.where(samples.action[:, 0] > 0.0, 0.9, -0.9))
-    tally = train(player, lagging, None, ABC, np.random.default_rng(0))
-    assert not tally.stopped
-    assert tally.kls[0] == pytest.approx(0.0, abs=1e-6)
-    assert tally.means()["clip_fraction"] == 0.0  # the clip range is this update's own
+    moved = torch.where(samples.action[:, 0] > 0.0, 0.9, -0.9)
+    lagging = replace(samples, behaviour_log_prob=samples.behaviour_log_prob + moved)
+    stats = train(player, lagging, None, ABC, np.random.default_rng(0))
+    assert not stats.stopped
+    assert stats.kls[0] == pytest.approx(0.0, abs=1e-6)
+    assert stats.means()["clip_fraction"] == 0.0  # the clip range is this update's own
 
 
 def test_samples_of_a_lagging_policy_are_weighted_by_what_has_changed_since():
-    weight = losses.lag_weight(torch.tensor([0.0, 0.5, -0.5, 3.0]), torch.tensor([0.0, 0.0, 0.0, 0.0]))
-    np.testing.assert_allclose(weight, [1.0, math.exp(0.5), math.exp(-0.5), losses.LAG_WEIGHT_BOUND], rtol=1e-6)
+    weight = ppo.importance_weight(torch.tensor([0.0, 0.5, -0.5, 3.0]), torch.tensor([0.0, 0.0, 0.0, 0.0]))
+    np.testing.assert_allclose(weight, [1.0, math.exp(0.5), math.exp(-0.5), ppo.MAX_IMPORTANCE_WEIGHT], rtol=1e-6)
 
 
 @pytest.mark.parametrize(

@@ -1,12 +1,13 @@
-"""Acting without torch: the policies of ``networks`` in NumPy, from exported parameters.
+"""The policies of ``networks`` in NumPy, from exported parameters: acting without torch.
 
-This is what actors, downstream users and a robot run. Everything is float32; an evaluator holds no state but its
-parameters, so threads may share one. N rows; H, h hidden sizes; K primitives; A action components.
+This is what actors, downstream users and a robot run. Everything is float32. A policy has no state but its parameters,
+so threads may share one. Shapes: N rows, O observation size, K primitives, A action components.
 """
 
 from __future__ import annotations
 
 import math
+from abc import ABC, abstractmethod
 
 import numpy as np
 
@@ -17,8 +18,31 @@ from service.policies.parameters import INPUT_CLIP, MEAN_BOUND, FloatArray, Para
 _HALF_LOG_TWO_PI = np.float32(0.5 * math.log(2.0 * math.pi))
 
 
-class GaussianEvaluator:
-    """Alice: a diagonal Gaussian whose mean and std are functions of the observation."""
+class NumpyPolicy(ABC):
+    """A diagonal Gaussian over actions whose mean and std are functions of the observation."""
+
+    @abstractmethod
+    def distribution(self, observation: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Mean and std, (..., A) each, of the action at (..., O) observations.
+
+        Raises:
+            PolicyError: the observation's last axis is not O.
+        """
+
+    def act(self, observation: FloatArray, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
+        """Sample actions (..., A), not clipped, and compute their log-probabilities (...,)."""
+        mean, std = self.distribution(observation)
+        noise = rng.standard_normal(mean.shape, dtype=np.float32)
+        log_prob = -(0.5 * noise * noise + np.log(std) + _HALF_LOG_TWO_PI).sum(-1)
+        return mean + std * noise, log_prob
+
+    def act_deterministic(self, observation: FloatArray) -> FloatArray:
+        """Compute the mean action (..., A)."""
+        return self.distribution(observation)[0]
+
+
+class NumpyGaussianPolicy(NumpyPolicy):
+    """Alice, or a monolithic Bob: one network gives mean and std."""
 
     def __init__(self, parameters: Parameters) -> None:
         """Take the parameters of a ``networks.GaussianPolicy``.
@@ -31,31 +55,18 @@ class GaussianEvaluator:
         self._hidden = _HiddenLayers(reader, "hidden", self._input.size)
         self._output = _Layer(reader, "output", None, self._hidden.output_size)
         self._squash = _GaussianSquash(reader, "squash", self._output.output_size)
-        self.observation_size = self._input.size
         self.action_size = self._squash.action_size
         reader.finish()
 
     def distribution(self, observation: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Mean and std, (..., A) each, of the action at (..., O) observations.
-
-        Raises:
-            PolicyError: the observation's last axis is not O.
-        """
-        rows = _rows(observation, self.observation_size, "observation")
+        """Mean and std, (..., A) each; see ``NumpyPolicy.distribution``."""
+        rows = _rows(observation, self._input.size, "observation")
         mean, log_std = self._squash(self._output(self._hidden(self._input(rows))))
         shape = (*np.shape(observation)[:-1], self.action_size)
         return mean.reshape(shape), np.exp(log_std).reshape(shape)
 
-    def act(self, observation: FloatArray, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
-        """Sample actions (..., A), not clipped, and their log-probabilities (...,)."""
-        return _sample(*self.distribution(observation), rng)
 
-    def act_deterministic(self, observation: FloatArray) -> FloatArray:
-        """The mean action (..., A)."""
-        return self.distribution(observation)[0]
-
-
-class MCPEvaluator:
+class NumpyMCPPolicy(NumpyPolicy):
     """Bob: primitives that see positions only, a gate that sees the goal as well, and their composition."""
 
     def __init__(self, parameters: Parameters) -> None:
@@ -106,32 +117,24 @@ class MCPEvaluator:
         """Mean and std, (..., A) each, of the composition at (..., 14) observations.
 
         Raises:
-            PolicyError: the last axis is not 14.
+            PolicyError: the observation's last axis is not 14.
         """
         weights = self.gate(observation)
         return self.compose(np.asarray(observation)[..., :POSITIONS_SIZE], weights)
 
-    def act(self, observation: FloatArray, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
-        """Sample actions (..., A), not clipped, and their log-probabilities (...,)."""
-        return _sample(*self.distribution(observation), rng)
 
-    def act_deterministic(self, observation: FloatArray) -> FloatArray:
-        """The mean action (..., A)."""
-        return self.distribution(observation)[0]
-
-
-def bob_evaluator(parameters: Parameters) -> MCPEvaluator | GaussianEvaluator:
-    """Bob of a run: composed, or monolithic where the configuration said so.
+def numpy_bob(parameters: Parameters) -> NumpyPolicy:
+    """Make the Bob of a run: composed, or monolithic where the configuration said so.
 
     Raises:
         PolicyError: parameters of neither.
     """
     composed = any(name.startswith("primitives.") for name in parameters)
-    return MCPEvaluator(parameters) if composed else GaussianEvaluator(parameters)
+    return NumpyMCPPolicy(parameters) if composed else NumpyGaussianPolicy(parameters)
 
 
 class _Primitives:
-    """(N, 11) positions to (N, K, A) means and variances; the K heads share one matrix product per layer."""
+    """Means and variances (N, K, A) at (N, 11) positions; the K heads share one matrix product per layer."""
 
     def __init__(self, reader: ParameterReader) -> None:
         self._input = _Input(reader, "primitives.input", POSITIONS_SIZE)
@@ -155,7 +158,7 @@ class _Primitives:
 
 
 class _Gate:
-    """(N, 14) observations to (N, K) weights."""
+    """Weights (N, K) at (N, 14) observations."""
 
     def __init__(self, reader: ParameterReader, num_primitives: int) -> None:
         self._input = _Input(reader, "gate.input", BOB_SIZE + 3)
@@ -218,7 +221,7 @@ class _HiddenLayers:
 
 
 class _GaussianSquash:
-    """Raw outputs (..., 2A) to a bounded mean and log-std, (..., A) each."""
+    """Bounded mean and log-std, (..., A) each, of raw outputs (..., 2A)."""
 
     def __init__(self, reader: ParameterReader, prefix: str, outputs: int) -> None:
         self.action_size, odd = divmod(outputs, 2)
@@ -235,6 +238,7 @@ class _GaussianSquash:
 
 
 def _rows(values: FloatArray, size: int, name: str) -> FloatArray:
+    """The (..., size) values as (N, size) float32 rows."""
     array = np.asarray(values, dtype=np.float32)
     if array.shape[-1:] != (size,):
         raise PolicyError(f"{name}: expected shape (..., {size}), got {array.shape}")
@@ -242,7 +246,7 @@ def _rows(values: FloatArray, size: int, name: str) -> FloatArray:
 
 
 def _elu(values: FloatArray) -> FloatArray:
-    """In place. For x < 0, exp(x) - 1 >= x, and for x >= 0 the first term is 0: a maximum picks the branch."""
+    """ELU in place. For x < 0, exp(x) - 1 >= x, and for x >= 0 the first term is 0: a maximum picks the branch."""
     negative = np.minimum(values, 0.0)
     np.exp(negative, out=negative)
     negative -= 1.0
@@ -250,16 +254,13 @@ def _elu(values: FloatArray) -> FloatArray:
 
 
 def _squash(values: FloatArray, low: FloatArray | np.float32, span: FloatArray | np.float32) -> FloatArray:
-    """``low + span * sigmoid(x)`` in place; through tanh, which does not overflow. ``2 tanh(x/2)`` is one of these."""
+    """``low + span * sigmoid(x)`` in place, by way of tanh, which does not overflow.
+
+    The mean's ``2 tanh(x / 2)`` is ``-2 + 4 sigmoid(x)``.
+    """
     values *= 0.5
     np.tanh(values, out=values)
     values += 1.0
     values *= 0.5 * span
     values += low
     return values
-
-
-def _sample(mean: FloatArray, std: FloatArray, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
-    noise = rng.standard_normal(mean.shape, dtype=np.float32)
-    log_prob = -(0.5 * noise * noise + np.log(std) + _HALF_LOG_TWO_PI).sum(-1)
-    return mean + std * noise, log_prob

@@ -1,4 +1,4 @@
-"""The NumPy evaluator: equal to torch, sampling, independence of rows, broken parameters, no torch."""
+"""The NumPy policies: equal to torch, sampling, independence of rows, broken parameters, no torch."""
 
 from __future__ import annotations
 
@@ -13,20 +13,20 @@ import torch
 from service.config import PolicyConfig
 from service.envs.observations import BOB_SIZE, FULL_SIZE, POSITIONS_SIZE
 from service.policies import gaussian
-from service.policies.evaluator import GaussianEvaluator, MCPEvaluator
 from service.policies.networks import GaussianPolicy, MCPPolicy, export_parameters, make_alice, make_bob
+from service.policies.numpy_policy import NumpyGaussianPolicy, NumpyMCPPolicy
 from service.policies.parameters import FloatArray, Parameters, PolicyError
 
 Observe = Callable[[int, int], FloatArray]
-Players = list[tuple[GaussianEvaluator | MCPEvaluator, GaussianPolicy | MCPPolicy, int]]
+Players = list[tuple[NumpyGaussianPolicy | NumpyMCPPolicy, GaussianPolicy | MCPPolicy, int]]
 
 
 @pytest.fixture
 def players(alice: GaussianPolicy, bob: MCPPolicy) -> Players:
-    """Evaluator, network and observation size of both players."""
+    """NumPy policy, network and observation size of both players."""
     return [
-        (GaussianEvaluator(export_parameters(alice)), alice, FULL_SIZE),
-        (MCPEvaluator(export_parameters(bob)), bob, BOB_SIZE),
+        (NumpyGaussianPolicy(export_parameters(alice)), alice, FULL_SIZE),
+        (NumpyMCPPolicy(export_parameters(bob)), bob, BOB_SIZE),
     ]
 
 
@@ -36,35 +36,35 @@ def _close(actual: FloatArray, expected: torch.Tensor) -> None:
 
 
 def test_distribution_equals_torch(players: Players, observe: Observe) -> None:
-    for evaluator, policy, size in players:
+    for numpy_policy, policy, size in players:
         rows = observe(160, size)
         for batch in (rows, rows[3], rows.reshape(4, 40, size), 1e6 * rows):
-            mean, std = evaluator.distribution(batch)
+            mean, std = numpy_policy.distribution(batch)
             expected_mean, expected_std = policy(torch.tensor(batch))
             _close(mean, expected_mean)
             _close(std, expected_std)
-            np.testing.assert_array_equal(evaluator.act_deterministic(batch), mean)
+            np.testing.assert_array_equal(numpy_policy.act_deterministic(batch), mean)
 
 
 def test_primitives_gate_and_compose_equal_torch(bob: MCPPolicy, config: PolicyConfig, observe: Observe) -> None:
-    evaluator = MCPEvaluator(export_parameters(bob))
-    assert evaluator.num_primitives == config.bob.num_primitives
+    numpy_policy = NumpyMCPPolicy(export_parameters(bob))
+    assert numpy_policy.num_primitives == config.bob.num_primitives
     rows = observe(60, BOB_SIZE).reshape(3, 20, BOB_SIZE)
     positions = rows[..., :POSITIONS_SIZE]
-    means, variances = evaluator.primitives(positions)
+    means, variances = numpy_policy.primitives(positions)
     expected_means, expected_variances = bob.primitives(torch.tensor(positions))
     _close(means, expected_means)
     _close(variances, expected_variances)
-    weights = evaluator.gate(rows)
+    weights = numpy_policy.gate(rows)
     _close(weights, bob.gate(torch.tensor(rows)))
-    for actual, expected in zip(evaluator.compose(positions, weights), evaluator.distribution(rows), strict=True):
+    for actual, expected in zip(numpy_policy.compose(positions, weights), numpy_policy.distribution(rows), strict=True):
         np.testing.assert_array_equal(actual, expected)
 
 
 def test_act_samples_the_distribution_and_its_log_prob(players: Players, observe: Observe) -> None:
-    for evaluator, policy, size in players:
+    for numpy_policy, policy, size in players:
         rows = np.repeat(observe(2, size)[1:], 20_000, axis=0)
-        action, log_prob = evaluator.act(rows, np.random.default_rng(0))
+        action, log_prob = numpy_policy.act(rows, np.random.default_rng(0))
         assert action.dtype == log_prob.dtype == np.float32
         mean, std = policy(torch.tensor(rows))
         expected = gaussian.log_prob(torch.tensor(action), mean, std)
@@ -76,38 +76,38 @@ def test_act_samples_the_distribution_and_its_log_prob(players: Players, observe
 
 
 def test_actions_are_not_clipped_and_follow_the_seed(players: Players, observe: Observe) -> None:
-    for evaluator, _, size in players:
+    for numpy_policy, _, size in players:
         rows = observe(4000, size)
-        action, log_prob = evaluator.act(rows, np.random.default_rng(7))
-        again, log_prob_again = evaluator.act(rows, np.random.default_rng(7))
+        action, log_prob = numpy_policy.act(rows, np.random.default_rng(7))
+        again, log_prob_again = numpy_policy.act(rows, np.random.default_rng(7))
         np.testing.assert_array_equal(action, again)
         np.testing.assert_array_equal(log_prob, log_prob_again)
         assert np.abs(action).max() > 1.0
 
 
 def test_a_row_does_not_depend_on_the_others(players: Players, observe: Observe) -> None:
-    for evaluator, _, size in players:
+    for numpy_policy, _, size in players:
         rows = observe(160, size)
-        together = np.stack(evaluator.distribution(rows))
-        alone = np.stack([np.stack(evaluator.distribution(row)) for row in rows], axis=1)
+        together = np.stack(numpy_policy.distribution(rows))
+        alone = np.stack([np.stack(numpy_policy.distribution(row)) for row in rows], axis=1)
         np.testing.assert_allclose(together, alone, atol=1e-5, rtol=1e-5)
 
 
 def test_evaluating_leaves_observations_and_parameters_alone(bob: MCPPolicy, observe: Observe) -> None:
     parameters = export_parameters(bob)
-    evaluator = MCPEvaluator(parameters)
+    numpy_policy = NumpyMCPPolicy(parameters)
     rows = observe(30, BOB_SIZE)
     kept = rows.copy()
-    before = np.stack(evaluator.distribution(rows))
+    before = np.stack(numpy_policy.distribution(rows))
     for value in parameters.values():
         value[...] = np.nan
-    np.testing.assert_array_equal(np.stack(evaluator.distribution(rows)), before)
+    np.testing.assert_array_equal(np.stack(numpy_policy.distribution(rows)), before)
     np.testing.assert_array_equal(rows, kept)
 
 
 def test_importing_and_using_it_needs_no_torch() -> None:
     script = (
-        "import sys, service.policies.evaluator; "
+        "import sys, service.policies.numpy_policy; "
         "heavy = {'torch', 'mujoco', 'pydantic', 'gymnasium'} & set(sys.modules); assert not heavy, heavy"
     )
     subprocess.run([sys.executable, "-c", script], check=True, capture_output=True, text=True)
@@ -147,7 +147,7 @@ def test_broken_parameters_of_bob_are_named(damage: Break, message: str) -> None
     parameters = export_parameters(make_bob(PolicyConfig()))
     damage(parameters)
     with pytest.raises(PolicyError, match=message) as caught:
-        MCPEvaluator(parameters)
+        NumpyMCPPolicy(parameters)
     assert "\n" not in str(caught.value)
 
 
@@ -155,25 +155,25 @@ def test_broken_parameters_of_alice_are_named() -> None:
     parameters = export_parameters(make_alice(PolicyConfig()))
     odd = {**parameters, "output.weight": parameters["output.weight"][:7], "output.bias": parameters["output.bias"][:7]}
     with pytest.raises(PolicyError, match="'squash': expected an even number of outputs, got 7"):
-        GaussianEvaluator(odd)
+        NumpyGaussianPolicy(odd)
     integers: Parameters = {**parameters, "output.bias": np.zeros(8, dtype=np.int64)}
     with pytest.raises(PolicyError, match=r"'output\.bias' of shape \(8,\): expected float32, got int64"):
-        GaussianEvaluator(integers)
+        NumpyGaussianPolicy(integers)
 
 
 def test_one_players_parameters_do_not_make_the_other() -> None:
     config = PolicyConfig()
     with pytest.raises(PolicyError, match=r"'primitives\.input\.offset' is missing"):
-        MCPEvaluator(export_parameters(make_alice(config)))
+        NumpyMCPPolicy(export_parameters(make_alice(config)))
     with pytest.raises(PolicyError, match=r"'input\.offset' is missing"):
-        GaussianEvaluator(export_parameters(make_bob(config)))
+        NumpyGaussianPolicy(export_parameters(make_bob(config)))
 
 
 def test_inputs_of_a_wrong_size_are_refused() -> None:
-    evaluator = MCPEvaluator(export_parameters(make_bob(PolicyConfig())))
+    numpy_policy = NumpyMCPPolicy(export_parameters(make_bob(PolicyConfig())))
     with pytest.raises(PolicyError, match=r"observation: expected shape \(\.\.\., 14\), got \(5, 11\)"):
-        evaluator.act_deterministic(np.zeros((5, 11), dtype=np.float32))
+        numpy_policy.act_deterministic(np.zeros((5, 11), dtype=np.float32))
     with pytest.raises(PolicyError, match=r"positions: expected shape \(\.\.\., 11\), got \(14,\)"):
-        evaluator.primitives(np.zeros(14, dtype=np.float32))
+        numpy_policy.primitives(np.zeros(14, dtype=np.float32))
     with pytest.raises(PolicyError, match=r"weights: expected shape \(\.\.\., 4\), got \(5, 3\)"):
-        evaluator.compose(np.zeros((5, 11), dtype=np.float32), np.ones((5, 3), dtype=np.float32))
+        numpy_policy.compose(np.zeros((5, 11), dtype=np.float32), np.ones((5, 3), dtype=np.float32))

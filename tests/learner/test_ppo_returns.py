@@ -1,7 +1,8 @@
 import numpy as np
 import pytest
 
-from service.learner.returns import advantages, explained_variance
+from service.learner.diagnostics import explained_variance
+from service.learner.ppo import advantages
 
 GAMMA, LAMBDA = 0.9, 0.5
 
