@@ -27,7 +27,7 @@ from benchmarks import (
 from benchmarks.measuring import Sample
 from benchmarks.pictures.curriculum import quantiles
 from service.actors.coverage import RandomPolicy, skill_trajectories, visited_share
-from service.actors.evaluation import Idle
+from service.actors.evaluation import IdlePolicy
 from service.config import WorldConfig, dump_config, load_config
 from service.envs.batch import WorldBatch
 from service.envs.gym.registration import TABLETOP_ID
@@ -402,7 +402,7 @@ def test_tasks_have_worlds_of_their_own():
 
 
 def test_every_task_is_measured_beside_a_policy_that_does_nothing(config):
-    rows = tasks.measure_tasks(Idle(), config, num_episodes=20, num_steps=2)
+    rows = tasks.measure_tasks(IdlePolicy(), config, num_episodes=20, num_steps=2)
     assert [(row["goals"], row["policy"]) for row in rows] == [
         (name, policy) for name in ("mixed", "air", "table", "larger", "sphere") for policy in ("bob", "idle")
     ]

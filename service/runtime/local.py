@@ -18,7 +18,7 @@ import numpy as np
 
 from service.actors.evaluation import evaluate
 from service.actors.rollout import Rollout, from_arrays, to_arrays
-from service.actors.self_play import Acting, Players, SelfPlay
+from service.actors.self_play import Players, SelfPlay, StochasticPolicy
 from service.config import Config
 from service.generator.generator import TaskGenerator
 from service.io.run_directory import RunDirectory
@@ -66,7 +66,7 @@ class LocalRun:
         self.generator = TaskGenerator(config, self.game.worlds.state_size)
         self.books = Books(config, directory)
         self._stop_requested = False
-        self._past: list[tuple[Acting, Acting]] = []
+        self._past: list[tuple[StochasticPolicy, StochasticPolicy]] = []
         self._pending: Rollout | None = None
         self._executor = ThreadPoolExecutor(max_workers=1, thread_name_prefix="learner")
         if resume:

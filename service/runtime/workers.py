@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from service.actors.evaluation import evaluate
 from service.actors.rollout import Broken, GoalRecords, Rollout
-from service.actors.self_play import Acting, Players, SelfPlay
+from service.actors.self_play import Players, SelfPlay, StochasticPolicy
 from service.config import Config
 from service.envs.batch import WorldBatch
 from service.envs.goals import GoalKind
@@ -153,7 +153,7 @@ class RolloutWorker:
         source = config.seed if (actor, incarnation) == (0, 0) else [config.seed, actor, incarnation]
         self._rng = np.random.default_rng(source)
         self._game = SelfPlay(config, self._rng, actor=actor, incarnation=incarnation, num_threads=num_threads)
-        self._past: list[tuple[Acting, Acting]] = []
+        self._past: list[tuple[StochasticPolicy, StochasticPolicy]] = []
         self._pool_version = 0
         self._count = _actor_metrics(actor)
 

@@ -6,7 +6,7 @@ import math
 import numpy as np
 import pytest
 
-from service.actors.evaluation import Evaluation, Idle, evaluate, wilson_interval
+from service.actors.evaluation import Evaluation, IdlePolicy, evaluate, play_episodes, wilson_interval
 from service.config import WorldConfig
 from service.envs.batch import sample_on_table
 from service.envs.goals import GOAL_KINDS, sample_goals
@@ -37,7 +37,7 @@ class PickAndPlace:
         return action
 
 
-class Recorder(Idle):
+class Recorder(IdlePolicy):
     """Does nothing, and keeps what it was shown."""
 
     def __init__(self):
@@ -189,14 +189,29 @@ def test_ever_counts_what_was_left_again():
     assert result.success_last < result.success_ever < 1.0
 
 
+def test_episodes_have_the_distance_after_every_step():
+    states = []
+    episodes = play_episodes(
+        Sweep(), FAST, "mixed", num_episodes=16, num_steps=12, success_distance_m=0.12, seed=0, num_threads=1,
+        observe=lambda now: states.append(now.copy()),
+    )  # fmt: skip
+    positions = np.stack(states)[..., 10:13]  # after time, seven joints and two fingers
+    assert positions.shape == (13, 16, 3)
+    np.testing.assert_array_equal(episodes.distance_m, np.linalg.norm(positions - episodes.goal, axis=2))
+    assert (episodes.distance_m[0] != episodes.distance_m[-1]).any()
+    result = run(Sweep(), "mixed", num_episodes=16, num_steps=12, distance_m=0.12)
+    assert result.success_last == (episodes.distance_m[-1] <= 0.12).mean()
+    assert result.success_ever == (episodes.distance_m[1:].min(axis=0) <= 0.12).mean()
+
+
 def test_a_seed_determines_goals_and_starts():
-    one, same, other = (run(Idle(), num_episodes=20, seed=seed) for seed in (3, 3, 4))
+    one, same, other = (run(IdlePolicy(), num_episodes=20, seed=seed) for seed in (3, 3, 4))
     assert one == same
     assert one.mean_distance_m != other.mean_distance_m
 
 
 def test_as_dict_is_json():
-    result = run(Idle(), "mixed", num_episodes=3)
+    result = run(IdlePolicy(), "mixed", num_episodes=3)
     tree = json.loads(json.dumps(result.as_dict()))
     assert Evaluation(**tree) == result
     assert (tree["goals"], tree["num_episodes"], tree["num_steps"]) == ("mixed", 3, 2)
