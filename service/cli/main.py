@@ -190,12 +190,7 @@ def coverage(
             for name, policy in ((bob.label, bob.primitives), ("random policy", RandomPolicy()))
         }
         shares = {name: visited_share(path, world.workspace) for name, path in paths.items()}
-        picture = plot_coverage(
-            list(paths[bob.label]),
-            world.workspace,
-            out,
-            f"{bob.label}, {shares[bob.label]:.0%} of the table's cells visited",
-        )
+        picture = plot_coverage(paths[bob.label], world.workspace, out, bob.label)
     if as_json:
         typer.echo(json.dumps({"share_of_table_cells_visited": shares, "picture": str(picture)}, indent=1))
         return

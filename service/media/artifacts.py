@@ -7,7 +7,7 @@ from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
-from service.actors.coverage import skill_trajectories, visited_share
+from service.actors.coverage import skill_trajectories
 from service.config import Config
 from service.errors import TandemError
 from service.io.run_directory import RunDirectory
@@ -55,10 +55,4 @@ def make_artifacts(directory: RunDirectory) -> dict[str, Path]:
 
 def _draw_coverage(directory: RunDirectory, config: Config, bob: MCPEvaluator) -> Path:
     paths = skill_trajectories(bob, config.world, num_skills=NUM_SKILLS, num_steps=COVERAGE_STEPS, seed=_SEED)
-    share = visited_share(paths, config.world.workspace)
-    return plot_coverage(
-        list(paths),
-        config.world.workspace,
-        directory.path / "coverage.png",
-        f"{config.name}, {share:.0%} of the table's cells visited",
-    )
+    return plot_coverage(paths, config.world.workspace, directory.path / "coverage.png", config.name)
