@@ -1,4 +1,4 @@
-"""What an actor ships: one round of self-play on N worlds, as plain arrays.
+"""Rollouts: one round of self-play on N worlds, as plain arrays.
 
 Shapes: T steps of a turn (time first), N worlds, D demonstration steps. Network inputs and outputs are float32, physics
 states float64.
@@ -60,7 +60,7 @@ class Demonstrations:
 
 @dataclass(frozen=True, slots=True)
 class GoalRecords:
-    """What became of each world's goal in this round; all arrays have N rows."""
+    """Each world's goal in this round, and how it was played; all arrays have N rows."""
 
     start_state: StateArray
     """(N, S) full physics state Bob started from; Alice too, unless ``replayed``."""
@@ -75,7 +75,7 @@ class GoalRecords:
     replayed: BoolArray
     """(N,) Bob played a goal from the replay buffer (``start_state`` is then that goal's own)."""
     from_reset: BoolArray
-    """(N,) Bob started where a game does, as he does whenever he is evaluated."""
+    """(N,) Bob started from a reset, as in an evaluation."""
     played: BoolArray
     """(N,) Bob had a whole turn: there was a goal, and the physics held."""
     solved: BoolArray
@@ -92,7 +92,7 @@ class GoalRecords:
 
 @dataclass(frozen=True, slots=True)
 class Rollout:
-    """One round on a batch of worlds: everything the learner and the task generator need."""
+    """One round on a batch of worlds, as the learner and the task generator need it."""
 
     actor: int
     incarnation: int

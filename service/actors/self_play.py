@@ -1,8 +1,8 @@
 """Asymmetric self-play: one round of Alice, then Bob, on a batch of worlds.
 
-Alice acts from s0 for a fixed number of steps; where the object then is becomes the goal. The worlds go back to s0 and
-Bob acts until the object is there or he is out of time. The next round of the game starts where Alice ended, so games
-reach grasped objects by themselves; an invalid goal ends the game (OpenAI 2021, section 3).
+Alice acts from s0 for a number of steps that is fixed or drawn; where the object then is becomes the goal. The worlds go
+back to s0, and Bob acts until he has held the object there or his time is over. The next round of the game starts where
+Alice ended, so games reach grasped objects by themselves; an invalid goal ends the game (OpenAI 2021, section 3).
 """
 
 from __future__ import annotations
@@ -269,7 +269,7 @@ class SelfPlay:
         self._round_index[over] = 0
 
     def state(self) -> dict[str, NDArray[np.generic]]:
-        """What later rounds depend on, except the random generator, which its owner saves."""
+        """Everything later rounds depend on, except the random generator, which its owner saves."""
         return {
             "worlds": self.worlds.states.copy(),
             "round_index": self._round_index.copy(),

@@ -35,7 +35,7 @@ BAR_HEIGHT = 36
 """Height of the caption over each picture, pixels."""
 EPISODE_COLUMNS = 3
 MAX_DRAWING_S = 25.0
-"""Where drawing every state would take longer, every second one is drawn."""
+"""Only every second state is drawn if all of them would take longer."""
 GOAL_PAUSE_S, END_PAUSE_S = 0.4, 0.8
 
 _PAPER, _INK, _FAINT = (248, 248, 248), (34, 34, 34), (140, 140, 140)
@@ -209,7 +209,7 @@ def _bar(width: int, text: str, colour: Colour, number: str) -> Image:
 
 
 def _encode(frames: Iterator[Image], path: Path, *, fps: float) -> Path:
-    """Send frames to ffmpeg; the file takes its name only when it is whole."""
+    """Write frames as H.264; the file takes its name only when it is whole."""
     temporary = path.parent / f"{TEMPORARY_PREFIX}{os.getpid()}-{path.name}"
     try:
         with os_errors("write", path):
@@ -223,6 +223,10 @@ def _encode(frames: Iterator[Image], path: Path, *, fps: float) -> Path:
 
 
 def _run_ffmpeg(frames: Iterator[Image], path: Path, fps: float) -> None:
+    """Send frames to ffmpeg.
+
+    ``imageio_ffmpeg.write_frames`` would be shorter, but ignores ffmpeg's exit status: a full disk would go unnoticed.
+    """
     first = next(frames)
     height, width = first.shape[:2]
     command = [
@@ -233,7 +237,7 @@ def _run_ffmpeg(frames: Iterator[Image], path: Path, fps: float) -> None:
     with subprocess.Popen(command, stdin=subprocess.PIPE, stderr=subprocess.PIPE) as ffmpeg:
         assert ffmpeg.stdin is not None
         try:
-            with contextlib.suppress(BrokenPipeError):  # it stopped early; its exit status and words follow
+            with contextlib.suppress(BrokenPipeError):  # it stopped early; its exit status says why
                 for frame in itertools.chain([first], frames):
                     ffmpeg.stdin.write(frame.tobytes())
             words = ffmpeg.communicate()[1].decode(errors="replace").strip()

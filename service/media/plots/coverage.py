@@ -1,4 +1,4 @@
-"""Where random compositions of the primitives take the object: the paper's figure of a skill set."""
+"""Plot of where random compositions of the primitives take the object: the paper's figure of a skill set."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Where Alice's goals are, over time, and which of them Bob solves."""
+"""Plot of Alice's goals over time, and which of them Bob solves."""
 
 from __future__ import annotations
 
