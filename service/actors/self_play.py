@@ -1,7 +1,7 @@
 """Asymmetric self-play: one round of Alice, then Bob, on a batch of worlds.
 
-Alice acts from s0 for a number of steps that is fixed or drawn; where the object then is becomes the goal. The worlds go
-back to s0, and Bob acts until he has held the object there or his time is over. The next round of the game starts where
+Alice acts from s0 for a number of steps, fixed or drawn; where the object then is becomes the goal. The worlds go back
+to s0, and Bob acts until he has held the object there or his time is over. The next round of the game starts where
 Alice ended, so games reach grasped objects by themselves; an invalid goal ends the game (OpenAI 2021, section 3).
 """
 
@@ -50,9 +50,7 @@ class StochasticPolicy(Protocol):
 ChooseGoals = Callable[[StateArray, StateArray, IntArray, StateArray, VerdictArray], GoalChoice]
 """Start state, start position, round index, proposal and verdict of a round to Bob's goals (``TaskGenerator``)."""
 Observer = Callable[[StateArray], None]
-"""Called with the (N, S) states of the worlds at the start of a turn and after each of its steps, to record them.
-
-The array is the worlds' own: an observer copies what it keeps, and changes nothing."""
+"""Called with the (N, S) states at the start of a turn and after each of its steps; it must copy what it keeps."""
 
 
 @dataclass(frozen=True, slots=True)

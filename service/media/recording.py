@@ -1,7 +1,7 @@
 """Recorded rounds and episodes: the states from which a video is drawn.
 
-Rounds are played by ``SelfPlay`` and episodes by ``play_episodes``, so a video obeys the rules of training and of
-evaluation. Nothing is drawn or learned here.
+Rounds are played by ``SelfPlay`` and episodes by ``evaluate``, so a video obeys the rules of training and evaluation.
+Nothing is drawn or learned here.
 """
 
 from __future__ import annotations
@@ -14,10 +14,11 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from service.actors.evaluation import DeterministicPolicy, play_episodes
+from service.actors.evaluation import DeterministicPolicy, evaluate
 from service.actors.rollout import GoalRecords, Rollout
 from service.actors.self_play import Players, SelfPlay, StochasticPolicy
 from service.config import Config, WorldConfig
+from service.envs.batch import WorldBatch
 from service.envs.goals import GoalKind
 from service.generator.difficulty import in_air
 from service.generator.generator import TaskGenerator
@@ -104,7 +105,15 @@ def record_episodes(
 ) -> RecordedEpisodes:
     """Play the episodes that ``evaluate`` plays with these arguments, and keep every state."""
     states: list[StateArray] = []
-    episodes = play_episodes(
+    reached: list[BoolArray] = []
+    goals: list[StateArray] = []
+
+    def keep(worlds: WorldBatch, goal: StateArray) -> None:
+        states.append(worlds.states.copy())
+        reached.append(np.linalg.norm(worlds.object_position - goal, axis=1) <= success_distance_m)
+        goals.append(goal)
+
+    evaluate(
         bob,
         config,
         kind,
@@ -112,9 +121,9 @@ def record_episodes(
         num_steps=num_steps,
         success_distance_m=success_distance_m,
         seed=seed,
-        observe=lambda now: states.append(now.copy()),
+        observe=keep,
     )
-    return RecordedEpisodes(np.stack(states), episodes.goal, episodes.distance_m <= success_distance_m)
+    return RecordedEpisodes(np.stack(states), goals[0], np.stack(reached))
 
 
 class _WithoutNoise:

@@ -6,7 +6,7 @@ import math
 import numpy as np
 import pytest
 
-from service.actors.evaluation import Evaluation, IdlePolicy, evaluate, play_episodes, wilson_interval
+from service.actors.evaluation import Evaluation, IdlePolicy, evaluate, wilson_interval
 from service.config import WorldConfig
 from service.envs.batch import sample_on_table
 from service.envs.goals import GOAL_KINDS, sample_goals
@@ -189,19 +189,19 @@ def test_ever_counts_what_was_left_again():
     assert result.success_last < result.success_ever < 1.0
 
 
-def test_episodes_have_the_distance_after_every_step():
-    states = []
-    episodes = play_episodes(
-        Sweep(), FAST, "mixed", num_episodes=16, num_steps=12, success_distance_m=0.12, seed=0, num_threads=1,
-        observe=lambda now: states.append(now.copy()),
+def test_an_observer_is_given_the_worlds_at_the_start_and_after_every_step():
+    steps = []
+    common = {"num_episodes": 16, "num_steps": 12, "success_distance_m": 0.12, "seed": 0, "num_threads": 1}
+    result = evaluate(
+        Sweep(), FAST, "mixed", **common,
+        observe=lambda worlds, goal: steps.append(np.linalg.norm(worlds.object_position - goal, axis=1)),
     )  # fmt: skip
-    positions = np.stack(states)[..., 10:13]  # after time, seven joints and two fingers
-    assert positions.shape == (13, 16, 3)
-    np.testing.assert_array_equal(episodes.distance_m, np.linalg.norm(positions - episodes.goal, axis=2))
-    assert (episodes.distance_m[0] != episodes.distance_m[-1]).any()
-    result = run(Sweep(), "mixed", num_episodes=16, num_steps=12, distance_m=0.12)
-    assert result.success_last == (episodes.distance_m[-1] <= 0.12).mean()
-    assert result.success_ever == (episodes.distance_m[1:].min(axis=0) <= 0.12).mean()
+    assert result == evaluate(Sweep(), FAST, "mixed", **common)
+    distance = np.stack(steps)
+    assert distance.shape == (13, 16)
+    assert result.mean_distance_m == distance[-1].mean() != distance[0].mean()
+    assert result.success_last == (distance[-1] <= 0.12).mean()
+    assert result.success_ever == (distance[1:].min(axis=0) <= 0.12).mean()
 
 
 def test_a_seed_determines_goals_and_starts():
