@@ -60,7 +60,7 @@ class Demonstrations:
 
 @dataclass(frozen=True, slots=True)
 class GoalRecords:
-    """Each world's goal in this round, and how it was played; all arrays have N rows."""
+    """What became of each world's goal in this round; all arrays have N rows."""
 
     start_state: StateArray
     """(N, S) full physics state Bob started from; Alice too, unless ``replayed``."""
@@ -75,7 +75,7 @@ class GoalRecords:
     replayed: BoolArray
     """(N,) Bob played a goal from the replay buffer (``start_state`` is then that goal's own)."""
     from_reset: BoolArray
-    """(N,) Bob started from a reset, as in an evaluation."""
+    """(N,) Bob started where a game does, as he does whenever he is evaluated."""
     played: BoolArray
     """(N,) Bob had a whole turn: there was a goal, and the physics held."""
     solved: BoolArray

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.actors.evaluation import DeterministicPolicy, evaluate
-from service.actors.rollout import GoalRecords, Rollout
+from service.actors.rollout import Rollout
 from service.actors.self_play import Players, SelfPlay, StochasticPolicy
 from service.config import Config, WorldConfig
 from service.envs.batch import WorldBatch
@@ -85,7 +85,7 @@ def record_rounds(
         for _ in range(_MAX_ROLLOUTS):
             rollout, states = _play_round(self_play, players, generator, rng)
             rounds += _split(rollout, states)
-            interest += _interest(rollout.records, config.world.object_size_m / 2)
+            interest += _interest(rollout, config.world.object_size_m / 2)
             if sum(played for played, *_ in interest) >= num_rounds:
                 break
             self_play.start_over()
@@ -163,7 +163,8 @@ def _split(rollout: Rollout, states: Sequence[StateArray]) -> Iterator[RecordedR
         )
 
 
-def _interest(records: GoalRecords, rest_height_m: float) -> Iterator[tuple[float, ...]]:
+def _interest(rollout: Rollout, rest_height_m: float) -> Iterator[tuple[float, ...]]:
     """Sort keys of each world's round: Bob played it, its goal is in the air, its distance in metres."""
+    records = rollout.records
     distance_m = np.linalg.norm(records.goal - records.start_position, axis=1)
     return zip(records.played, in_air(records.goal, rest_height_m), distance_m, strict=True)

@@ -1,10 +1,11 @@
 """Recorded rounds and episodes obey the rules of training and of evaluation: by the numbers of their states."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
 from service.actors.evaluation import evaluate
-from service.actors.rollout import GoalRecords
 from service.config import Config, GameConfig, WorldConfig
 from service.envs.batch import WorldBatch
 from service.generator.validity import Verdict
@@ -154,10 +155,8 @@ def test_more_rounds_than_worlds_can_be_asked_for():
 def test_played_before_lifted_before_far():
     start = np.tile([0.0, 0.0, 0.025], (4, 1))
     goal = start + np.array([[0.30, 0, 0], [0.12, 0, 0.06], [0.20, 0, 0], [0.50, 0, 0.10]])
-    unused = dict.fromkeys(GoalRecords.__dataclass_fields__)
-    played = np.array([True, True, True, False])
-    records = GoalRecords(**unused | {"start_position": start, "goal": goal, "played": played})
-    interest = list(recording._interest(records, 0.025))
+    records = SimpleNamespace(start_position=start, goal=goal, played=np.array([True, True, True, False]))
+    interest = list(recording._interest(SimpleNamespace(records=records), 0.025))
     assert sorted(range(4), key=interest.__getitem__, reverse=True) == [1, 0, 2, 3]
 
 
