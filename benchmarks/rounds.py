@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from benchmarks.measuring import Sample, Stopwatch, measure, total
 from service.actors.rollout import Rollout
-from service.actors.self_play import Acting, Players
+from service.actors.self_play import Players, StochasticPolicy
 from service.envs.batch import WorldBatch
 from service.envs.observations import ACTION_SIZE
 from service.policies.numpy_policy import NumpyGaussianPolicy, numpy_bob
@@ -116,7 +116,7 @@ def repeat_physics(worlds: WorldBatch, played: Round) -> int:
 class _Timed:
     """Acts as the given policy does, and counts the time."""
 
-    def __init__(self, policy: Acting, timing: Timing) -> None:
+    def __init__(self, policy: StochasticPolicy, timing: Timing) -> None:
         self._policy, self._timing = policy, timing
 
     def act(self, observation: FloatArray, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:

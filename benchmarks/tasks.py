@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from service.actors.evaluation import Deterministic, Idle, evaluate
+from service.actors.evaluation import DeterministicPolicy, IdlePolicy, evaluate
 from service.config import Config
 from service.envs.tasks import TASKS as DOWNSTREAM
 from service.envs.tasks import Task
@@ -28,7 +28,7 @@ ASKED_RATES = {"mixed": 0.95, "air": 0.95, "table": 0.95, "larger": 0.90, "spher
 
 
 def measure_tasks(
-    bob: Deterministic, config: Config, *, num_episodes: int = NUM_EPISODES, num_steps: int = NUM_STEPS
+    bob: DeterministicPolicy, config: Config, *, num_episodes: int = NUM_EPISODES, num_steps: int = NUM_STEPS
 ) -> list[dict[str, Any]]:
     """Bob without noise and a policy that does nothing, from fresh resets.
 
@@ -37,7 +37,7 @@ def measure_tasks(
     """
     rows = []
     for name, task in TASKS.items():
-        for label, policy in {"bob": bob, "idle": Idle()}.items():
+        for label, policy in {"bob": bob, "idle": IdlePolicy()}.items():
             result = evaluate(
                 policy,
                 task.world_from(config.world),

@@ -28,7 +28,7 @@ from benchmarks import (
 from benchmarks.measuring import Sample
 from benchmarks.pictures.curriculum import quantiles
 from service.actors.coverage import RandomPolicy, skill_trajectories, visited_share
-from service.actors.evaluation import Idle, evaluate
+from service.actors.evaluation import IdlePolicy, evaluate
 from service.config import WorldConfig, dump_config, load_config
 from service.envs.batch import WorldBatch
 from service.envs.gym.registration import TABLETOP_ID
@@ -416,7 +416,7 @@ def test_every_task_is_measured_beside_a_policy_that_does_nothing():
     goals = {"larger": "mixed", "sphere": "mixed"}
     for row in rows:
         found = evaluate(
-            champion.policy if row["policy"] == "bob" else Idle(),
+            champion.policy if row["policy"] == "bob" else IdlePolicy(),
             config.world.model_copy(update=worlds.get(row["goals"], {})),
             goals.get(row["goals"], row["goals"]),
             num_episodes=20,

@@ -88,11 +88,11 @@ def test_load_primitives(tmp_path, monkeypatch):
 
 def test_they_do_more_than_nothing():
     """The champion, whichever he is, moves the object to random goals on the table and above it."""
-    from service.actors.evaluation import Idle, evaluate
+    from service.actors.evaluation import IdlePolicy, evaluate
 
     bob = service.load_primitives()
     common = {"num_episodes": 60, "num_steps": 50, "success_distance_m": bob.config.game.success_distance_m, "seed": 3}
-    champion, idle = (evaluate(policy, bob.config.world, "mixed", **common) for policy in (bob.policy, Idle()))
+    champion, idle = (evaluate(policy, bob.config.world, "mixed", **common) for policy in (bob.policy, IdlePolicy()))
     assert champion.success_ever > idle.success_ever + 0.1
 
 

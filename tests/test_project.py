@@ -19,7 +19,7 @@ HEAVY = (
     "matplotlib",
     "gymnasium",
     "tensorboard",
-    "imageio",
+    "imageio_ffmpeg",
     "ray",
     "redis",
     "fastapi",

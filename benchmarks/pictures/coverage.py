@@ -36,7 +36,7 @@ def draw_coverage(run: Run, path: Path) -> Path:
         left = 0.015 + place * width
         box = figure.add_axes((left - 0.01, 0.47, width - 0.025, 0.4), projection="3d", computed_zorder=False)
         above = figure.add_axes((left + 0.035, 0.075, width - 0.05, 0.38))
-        draw_paths(box, above, list(paths_m(stage)), workspace)
+        draw_paths(box, above, paths_m(stage), workspace)
         box.set(xlabel="", ylabel="", zlabel="")  # the view from above has them
         figure.text(left, 0.905, _words(name, stage, stages[RANDOM]), fontsize=11, color=INK, va="top")
         above.set_ylabel("y (m)" if place == 0 else "", color=FAINT)

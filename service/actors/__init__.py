@@ -1,1 +1,1 @@
-"""The game: rounds of Alice and Bob on a batch of worlds, and what an actor ships of them. No torch in here."""
+"""Rounds of self-play on a batch of worlds, their rollouts, evaluation and coverage. No torch in here."""

@@ -1,4 +1,4 @@
-"""How much of the workspace random compositions of primitives reach: the paper's per-skill figure, with a number.
+"""Coverage: the share of the workspace that random compositions of primitives reach, the paper's figure as a number.
 
 A skill is one gate weight drawn at random and held for a whole episode (Peng et al. 2019; paper, section 5.1).
 """
@@ -28,7 +28,7 @@ class Composable(Protocol):
 
 
 class RandomPolicy:
-    """One primitive that acts at random, the reference for coverage."""
+    """One primitive that acts at random, as a baseline for coverage."""
 
     num_primitives = 1
 
@@ -62,9 +62,9 @@ def skill_trajectories(
 
 
 def visited_share(trajectories: StateArray, workspace: WorkspaceConfig, *, cell_size_m: float = 0.05) -> float:
-    """Share of the workspace's table cells (seen from above) that any trajectory moved the object into.
+    """Share of the workspace's table cells (seen from above) into which any trajectory moved the object.
 
-    Where an object merely started does not count: only cells other than its first one.
+    The cell in which an object started does not count for its own trajectory.
     """
     low = np.array([workspace.center_x_m - workspace.length_x_m / 2, workspace.center_y_m - workspace.length_y_m / 2])
     shape = np.array([round(workspace.length_x_m / cell_size_m), round(workspace.length_y_m / cell_size_m)])

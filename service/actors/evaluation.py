@@ -1,8 +1,8 @@
-"""Bob on goals nobody proposed: fresh resets, random goals, no exploration noise."""
+"""Bob's success on random goals: fresh resets, no exploration noise, a fixed number of steps."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from typing import Protocol
 
@@ -12,9 +12,12 @@ from numpy.typing import NDArray
 from service.config import Config, WorldConfig
 from service.envs.batch import WorldBatch
 from service.envs.goals import GoalKind, draw_goals
-from service.envs.observations import ACTION_SIZE
+from service.envs.observations import ACTION_SIZE, bob_observation
 
 FloatArray = NDArray[np.float32]
+StateArray = NDArray[np.float64]
+Observer = Callable[[WorldBatch, StateArray], None]
+"""Called with the worlds and their (N, 3) goals, metres, at the start and after each step."""
 
 EVALUATED_GOALS: tuple[GoalKind, ...] = ("table", "air", "mixed")
 """Kinds of goals on which a run evaluates its Bob."""
@@ -22,15 +25,15 @@ EVALUATION_SEED = 1_000_003
 """Evaluations during a run always use the same goals, so that they compare."""
 
 
-class Deterministic(Protocol):
+class DeterministicPolicy(Protocol):
     """A policy that acts without noise."""
 
     def act_deterministic(self, observation: FloatArray) -> FloatArray:
         """(N, 14) Bob's input to actions (N, 4)."""
 
 
-class Idle:
-    """Does nothing: the floor that random goals next to the object give to any policy."""
+class IdlePolicy:
+    """A policy that does nothing. It still solves the goals that happen to lie next to the object: a lower bound."""
 
     def act_deterministic(self, observation: FloatArray) -> FloatArray:
         """Zero actions (N, 4)."""
@@ -51,17 +54,17 @@ class Evaluation:
     success_last_high: float
     """Upper end."""
     success_ever: float
-    """Within the success distance at any step."""
+    """Within the success distance after any step."""
     mean_distance_m: float
     """Distance to the goal at the last step."""
 
     def as_dict(self) -> dict[str, float | int | str]:
-        """For JSON."""
+        """The rates by name, for JSON."""
         return asdict(self)
 
 
 def evaluate(
-    policy: Deterministic,
+    policy: DeterministicPolicy,
     config: WorldConfig,
     kind: GoalKind,
     *,
@@ -70,20 +73,27 @@ def evaluate(
     success_distance_m: float,
     seed: int,
     num_threads: int = 0,
+    observe: Observer | None = None,
 ) -> Evaluation:
-    """Play ``num_episodes`` random goals from fresh resets; nothing ends an episode early."""
+    """Play ``num_episodes`` random goals from fresh resets; nothing ends an episode early.
+
+    ``observe`` records the episodes; it changes nothing in the result.
+    """
     rng = np.random.default_rng(seed)
     with WorldBatch(config, num_episodes, num_threads=num_threads) as worlds:
         worlds.reset(rng)
         start, box = worlds.object_position, worlds.box_place
         goal = draw_goals(kind, rng, config, success_distance_m, start=start, box=box)
-        goal32 = goal.astype(np.float32)
         ever = np.zeros(num_episodes, dtype=bool)
         distance = np.zeros(num_episodes)
+        if observe:
+            observe(worlds, goal)
         for _ in range(num_steps):
-            worlds.step(policy.act_deterministic(np.concatenate([worlds.positions(), goal32], axis=1)))
+            worlds.step(policy.act_deterministic(bob_observation(worlds.positions(), goal)))
             distance = np.linalg.norm(worlds.object_position - goal, axis=1)
             ever |= distance <= success_distance_m
+            if observe:
+                observe(worlds, goal)
     last = distance <= success_distance_m
     low, high = wilson_interval(int(last.sum()), num_episodes)
     return Evaluation(
@@ -99,7 +109,7 @@ def evaluate(
 
 
 def success_metrics(
-    policy: Deterministic,
+    policy: DeterministicPolicy,
     config: Config,
     kinds: Sequence[GoalKind],
     num_episodes: int,

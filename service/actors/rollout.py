@@ -1,4 +1,4 @@
-"""What an actor ships: one round of self-play on N worlds, as plain arrays.
+"""Rollouts: one round of self-play on N worlds, as plain arrays.
 
 Shapes: T steps of a turn (time first), N worlds, D demonstration steps. Network inputs and outputs are float32, physics
 states float64.
@@ -92,7 +92,7 @@ class GoalRecords:
 
 @dataclass(frozen=True, slots=True)
 class Rollout:
-    """One round on a batch of worlds: everything the learner and the task generator need."""
+    """One round on a batch of worlds, as the learner and the task generator need it."""
 
     actor: int
     incarnation: int

@@ -1,8 +1,8 @@
 """Asymmetric self-play: one round of Alice, then Bob, on a batch of worlds.
 
-Alice acts from s0 for a fixed number of steps; where the object then is becomes the goal. The worlds go back to s0 and
-Bob acts until the object is there or he is out of time. The next round of the game starts where Alice ended, so games
-reach grasped objects by themselves; an invalid goal ends the game (OpenAI 2021, section 3).
+Alice acts from s0 for a number of steps, fixed or drawn; where the object then is becomes the goal. The worlds go back
+to s0, and Bob acts until he has held the object there or his time is over. The next round of the game starts where
+Alice ended, so games reach grasped objects by themselves; an invalid goal ends the game (OpenAI 2021, section 3).
 """
 
 from __future__ import annotations
@@ -17,7 +17,14 @@ from numpy.typing import NDArray
 from service.actors.rollout import Demonstrations, GoalRecords, Rollout, Turns
 from service.config import Config
 from service.envs.batch import WorldBatch
-from service.envs.observations import ACTION_SIZE, BOB_SIZE, BOB_VALUE_SIZE, FULL_SIZE, POSITIONS_SIZE
+from service.envs.observations import (
+    ACTION_SIZE,
+    BOB_SIZE,
+    BOB_VALUE_SIZE,
+    FULL_SIZE,
+    POSITIONS_SIZE,
+    bob_observation,
+)
 from service.generator.generator import GoalChoice
 from service.generator.opponents import CURRENT, RoundPlan
 from service.generator.validity import Verdict, judge
@@ -29,30 +36,32 @@ IntArray = NDArray[np.int64]
 VerdictArray = NDArray[np.int8]
 
 
-class Acting(Protocol):
-    """A policy that acts: one of ``policies.numpy_policy``."""
+class StochasticPolicy(Protocol):
+    """A policy whose actions are sampled, such as those of ``policies.numpy_policy``."""
 
     def act(self, observation: FloatArray, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
         """(N, O) observations to sampled actions (N, A) and log-probabilities (N,)."""
 
 
 ChooseGoals = Callable[[StateArray, StateArray, IntArray, StateArray, VerdictArray], GoalChoice]
-"""The task generator's: start_state, start_position, round_index, proposal, verdict of a round to Bob's goals."""
+"""Start state, start position, round index, proposal and verdict of a round to Bob's goals (``TaskGenerator``)."""
+Observer = Callable[[StateArray], None]
+"""Called with the (N, S) states at the start of a turn and after each of its steps; it must copy what it keeps."""
 
 
 @dataclass(frozen=True, slots=True)
 class Players:
-    """Who plays a round: the current policies of one version, and past ones by index."""
+    """The policies that play a round: the current ones of one version, and past ones by index."""
 
     version: int
-    alice: Acting
-    bob: Acting
-    past_alice: Sequence[Acting] = ()
-    past_bob: Sequence[Acting] = ()
+    alice: StochasticPolicy
+    bob: StochasticPolicy
+    past_alice: Sequence[StochasticPolicy] = ()
+    past_bob: Sequence[StochasticPolicy] = ()
 
 
 class SelfPlay:
-    """Plays rounds on N worlds and hands out rollouts.
+    """Rounds of self-play on N worlds, one rollout each.
 
     Everything that later rounds depend on is in ``state``: the worlds and how far each game is; its owner saves
     the random generator.
@@ -89,24 +98,27 @@ class SelfPlay:
         self.worlds.reset(self._rng)
         self._round_index[:] = 0
 
-    def play_round(self, players: Players, plan: RoundPlan, choose_goals: ChooseGoals) -> Rollout:
+    def play_round(
+        self, players: Players, plan: RoundPlan, choose_goals: ChooseGoals, *, observe: Observer | None = None
+    ) -> Rollout:
         """Play one round in every world.
 
         Args:
             players: the policies.
             plan: which worlds use a past Alice or Bob.
-            choose_goals: asked once, between the two turns.
+            choose_goals: called once, between the two turns.
+            observe: records the round, Alice's turn and then Bob's; it changes nothing in the rollout.
         """
         game, worlds = self.config.game, self.worlds
         start_state, start_position = worlds.states.copy(), worlds.object_position.copy()
-        alice, contacts, broken = self._play_alice(players, plan)
+        alice, contacts, broken = self._play_alice(players, plan, observe)
         end_state, proposal = worlds.states.copy(), worlds.object_position.copy()
         verdict = judge(start_position, proposal, self.config.world.workspace, game.success_distance_m)
         verdict[broken] = Verdict.FALLEN
         choice = choose_goals(start_state, start_position, self._round_index, proposal, verdict)
 
         worlds.restore(choice.start_state)
-        bob, solved, broken = self._play_bob(players, plan, choice)
+        bob, solved, broken = self._play_bob(players, plan, choice, observe)
         achieved = worlds.object_position.copy()
         played = choice.played & ~broken  # a turn in which the physics broke says nothing about either player
         bob.learn[broken] = False
@@ -144,21 +156,27 @@ class SelfPlay:
         self._sequence += 1
         return rollout
 
-    def _play_alice(self, players: Players, plan: RoundPlan) -> tuple[Turns, BoolArray, BoolArray]:
-        """Her turns (without what her goal is worth), (N, 2) finger contacts, (N,) worlds whose physics broke."""
+    def _play_alice(
+        self, players: Players, plan: RoundPlan, observe: Observer | None
+    ) -> tuple[Turns, BoolArray, BoolArray]:
+        """Her turns (without the reward of her goal), (N, 2) finger contacts, (N,) worlds whose physics broke."""
         game, worlds = self.config.game, self.worlds
         num_steps = int(self._rng.integers(game.alice_steps_min or game.alice_steps, game.alice_steps + 1))
         turns = _empty_turns(game.alice_steps, worlds.num_worlds, FULL_SIZE, FULL_SIZE, learn=~plan.alice_past)
-        everyone = np.arange(worlds.num_worlds)
+        all_worlds = np.arange(worlds.num_worlds)
         contacts = np.zeros((worlds.num_worlds, 2), dtype=bool)
         broken = np.zeros(worlds.num_worlds, dtype=bool)
+        if observe:
+            observe(worlds.states)
         for step in range(num_steps):
             observation = worlds.full(1.0 - (num_steps - step) / game.alice_steps)
             action, log_prob = _act(
-                players.alice, players.past_alice, plan.alice_opponent, observation, everyone, self._rng
+                players.alice, players.past_alice, plan.alice_opponent, observation, all_worlds, self._rng
             )
             turns.observation[step], turns.action[step], turns.log_prob[step] = observation, action, log_prob
             broken |= worlds.step(action) if not broken.any() else worlds.step(action[~broken], np.flatnonzero(~broken))
+            if observe:
+                observe(worlds.states)
             contacts |= worlds.contacts()
         turns.value_observation[:] = turns.observation
         turns.final_value_observation[:] = worlds.full(1.0)
@@ -167,25 +185,35 @@ class SelfPlay:
         turns.learn[broken] = False
         return turns, contacts, broken
 
-    def _play_bob(self, players: Players, plan: RoundPlan, choice: GoalChoice) -> tuple[Turns, BoolArray, BoolArray]:
-        """His turns, (N,) solved, (N,) worlds whose physics broke."""
+    def _play_bob(
+        self, players: Players, plan: RoundPlan, choice: GoalChoice, observe: Observer | None
+    ) -> tuple[Turns, BoolArray, BoolArray]:
+        """His turns, (N,) solved, (N,) worlds whose physics broke.
+
+        A world's turn ends when its object has been at the goal for ``bob_hold_steps`` steps in a row, or its physics
+        broke. The others go on; ``playing`` holds their indices.
+        """
         game, worlds = self.config.game, self.worlds
         num = worlds.num_worlds
         turns = _empty_turns(game.bob_steps, num, BOB_SIZE, BOB_VALUE_SIZE, learn=choice.played & ~plan.bob_past)
-        goal = choice.goal.astype(np.float32)
         solved, broken = np.zeros(num, dtype=bool), np.zeros(num, dtype=bool)
         num_held: IntArray = np.zeros(num, dtype=np.int64)
         playing = np.flatnonzero(choice.played)
+        if observe:
+            observe(worlds.states)
         for step in range(game.bob_steps):
             if not playing.size:
                 break
-            observation = np.concatenate([worlds.positions()[playing], goal[playing]], axis=1)
+            observation = bob_observation(worlds.positions()[playing], choice.goal[playing])
             action, log_prob = _act(players.bob, players.past_bob, plan.bob_opponent, observation, playing, self._rng)
             turns.observation[step, playing], turns.action[step, playing] = observation, action
             turns.value_observation[step, playing] = worlds.bob_value(choice.goal)[playing]
             turns.log_prob[step, playing], turns.active[step, playing] = log_prob, True
             broken |= worlds.step(action, playing)
+            if observe:
+                observe(worlds.states)
             reached = np.linalg.norm(worlds.object_position - choice.goal, axis=1) <= game.success_distance_m
+            # Reaching the goal earns the reward and leaving it takes the reward back; ``solved`` is the step before.
             turns.reward[step, playing] = game.bob_success_reward * (reached.astype(np.float32) - solved)[playing]
             solved[playing] = reached[playing]
             num_held = np.where(reached, num_held + 1, 0)
@@ -225,7 +253,7 @@ class SelfPlay:
         self._round_index[over] = 0
 
     def state(self) -> dict[str, NDArray[np.generic]]:
-        """What later rounds depend on, except the random generator, which its owner saves."""
+        """Everything later rounds depend on, except the random generator, which its owner saves."""
         return {
             "worlds": self.worlds.states.copy(),
             "round_index": self._round_index.copy(),
@@ -242,14 +270,14 @@ class SelfPlay:
 
 
 def _act(
-    current: Acting,
-    past: Sequence[Acting],
+    current: StochasticPolicy,
+    past: Sequence[StochasticPolicy],
     opponent: IntArray,
     observation: FloatArray,
     worlds: IntArray,
     rng: np.random.Generator,
 ) -> tuple[FloatArray, FloatArray]:
-    """Actions (M, A) and log-probabilities (M,) of M ``worlds``, each from its own policy."""
+    """Actions (M, A) and log-probabilities (M,) of M ``worlds``, each by the policy that plays there."""
     opponents = opponent[worlds]
     if (opponents == CURRENT).all():
         return current.act(observation, rng)
@@ -277,10 +305,10 @@ def _empty_turns(num_steps: int, num: int, observation_size: int, value_size: in
 
 
 def _relabelled(turns: Turns, chosen: BoolArray, goal: StateArray) -> Demonstrations:
-    """The ``chosen`` worlds' turns, seen through Bob's inputs, as the way to the ``goal`` (N, 3)."""
+    """The turns of the ``chosen`` worlds (N,) with Bob's input, as demonstrations of how to reach ``goal`` (N, 3)."""
     active = turns.active & chosen
-    goals = np.broadcast_to(goal.astype(np.float32), (*active.shape, 3))[active]
-    observation = np.concatenate([turns.observation[active][:, :POSITIONS_SIZE], goals], axis=1)
+    goals = np.broadcast_to(goal, (*active.shape, 3))[active]
+    observation = bob_observation(turns.observation[active][:, :POSITIONS_SIZE], goals)
     return Demonstrations(observation, turns.action[active])
 
 

@@ -190,12 +190,7 @@ def coverage(
             for name, policy in ((bob.label, bob.primitives), ("random policy", RandomPolicy()))
         }
         shares = {name: visited_share(path, world.workspace) for name, path in paths.items()}
-        picture = plot_coverage(
-            list(paths[bob.label]),
-            world.workspace,
-            out,
-            f"{bob.label}, {shares[bob.label]:.0%} of the table's cells visited",
-        )
+        picture = plot_coverage(paths[bob.label], world.workspace, out, bob.label)
     if as_json:
         typer.echo(json.dumps({"share_of_table_cells_visited": shares, "picture": str(picture)}, indent=1))
         return
@@ -207,25 +202,25 @@ def coverage(
 @app.command()
 def render(
     primitives: _Primitives,
-    episodes: Annotated[int, typer.Option(help="Rounds, or episodes, to film.", min=1)] = 4,
+    episodes: Annotated[int, typer.Option(help="Rounds, or episodes, to record.", min=1)] = 4,
     seed: _Seed = 0,
     out: Annotated[Path, typer.Option(metavar="FILE", help="Video to write.")] = Path("video.mp4"),
     registry: _Registry = Path("registry"),
 ) -> None:
-    """Film a run's Alice beside its Bob, or published primitives on random goals."""
+    """Make a video of a run's Alice beside its Bob, or of published primitives on random goals."""
     with _user_errors():
         from service.io.run_directory import RunDirectory
-        from service.media import video
+        from service.media import recording, video
         from service.primitives.loading import load_bob, load_players
 
         if Path(primitives).is_dir():
             directory = RunDirectory(Path(primitives))
             config = directory.read_config()
-            takes = video.film_rounds(config, *load_players(directory), num_rounds=episodes, seed=seed)
-            video.write_video(takes, config.world, out)
+            rounds = recording.record_rounds(config, *load_players(directory), num_rounds=episodes, seed=seed)
+            video.write_video(rounds, config.world, out)
         else:
             bob = load_bob(primitives, registry)
-            filmed = video.film_episodes(
+            recorded = recording.record_episodes(
                 bob.policy,
                 bob.config.world,
                 "mixed",
@@ -234,7 +229,7 @@ def render(
                 success_distance_m=bob.config.game.success_distance_m,
                 seed=seed,
             )
-            video.write_episode_video(filmed, bob.config.world, out)
+            video.write_episode_video(recorded, bob.config.world, out)
     _say(f"video: {out}")
 
 
@@ -242,7 +237,7 @@ app.command()(serve)
 
 
 def _evaluate(bob: TrainedBob, goals: GoalKind, episodes: int, steps: int, seed: int) -> dict[str, Evaluation]:
-    from service.actors.evaluation import Idle
+    from service.actors.evaluation import IdlePolicy
     from service.actors.evaluation import evaluate as run
 
     return {
@@ -255,7 +250,7 @@ def _evaluate(bob: TrainedBob, goals: GoalKind, episodes: int, steps: int, seed:
             seed=seed,
             success_distance_m=bob.config.game.success_distance_m,
         )
-        for name, policy in ((bob.label, bob.policy), ("idle", Idle()))
+        for name, policy in ((bob.label, bob.policy), ("idle", IdlePolicy()))
     }
 
 

@@ -15,7 +15,7 @@ import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
-from service.actors.evaluation import Deterministic, Idle
+from service.actors.evaluation import DeterministicPolicy, IdlePolicy
 from service.downstream.compose import ComposePrimitivesVector, action_weights, check_primitives, check_robot
 from service.errors import TandemError
 
@@ -57,12 +57,12 @@ def _composed(trained: TrainedBob, positions: FloatArray, actions: FloatArray) -
     return np.clip(mean, -1.0, 1.0)
 
 
-def _bob(trained: TrainedBob) -> Deterministic:
+def _bob(trained: TrainedBob) -> DeterministicPolicy:
     return trained.policy
 
 
-def _idle(trained: TrainedBob) -> Deterministic:
-    return Idle()
+def _idle(trained: TrainedBob) -> DeterministicPolicy:
+    return IdlePolicy()
 
 
 @dataclass(frozen=True, slots=True)
@@ -84,7 +84,7 @@ class Method:
     between; None: no HER."""
     composes: bool = False
     """Whether it needs primitives that can be composed."""
-    player: Callable[[TrainedBob], Deterministic] | None = None
+    player: Callable[[TrainedBob], DeterministicPolicy] | None = None
     """Who plays, where nothing is learned."""
 
     @property

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from service.actors.evaluation import Deterministic, Evaluation, evaluate, wilson_interval
+from service.actors.evaluation import DeterministicPolicy, Evaluation, evaluate, wilson_interval
 from service.downstream.compose import parameters_digest
 from service.downstream.directory import FORMAT_VERSION, TrainingDirectory, read_json, write_json
 from service.downstream.methods import METHODS, Method, find_method
@@ -40,7 +40,7 @@ CURVE_SEED, FINAL_SEED = 1_000_000, 2_000_000
 _NUM_FILMED = 6
 _logger = logging.getLogger(__name__)
 OnIteration = Callable[[dict[str, float]], None]
-NewPlayer = Callable[[], Deterministic]
+NewPlayer = Callable[[], DeterministicPolicy]
 """Makes who plays a batch of episodes, from their start."""
 
 
@@ -164,7 +164,7 @@ class _Training:
         score = _score(self._cell, self._trained, self.new_player, self._running)
         return {**score, "env_steps": self._learner.num_timesteps, "wall_s": self._wall_s, "curve": self._curve}
 
-    def new_player(self) -> Deterministic:
+    def new_player(self) -> DeterministicPolicy:
         """What has been learned so far, ready for a batch of episodes."""
         from service.downstream.learner import LearnedPolicy
 
@@ -292,12 +292,13 @@ def _finish(
     return result
 
 
-def _film(cell: CellConfig, trained: TrainedBob, player: Deterministic, path: Path) -> Path:
-    from service.media.video import film_episodes, write_episode_video
+def _film(cell: CellConfig, trained: TrainedBob, player: DeterministicPolicy, path: Path) -> Path:
+    from service.media.recording import record_episodes
+    from service.media.video import write_episode_video
 
     task = find_task(cell.task)
     world = task.world_from(trained.config.world)
-    filmed = film_episodes(
+    recorded = record_episodes(
         player,
         world,
         task.goals,
@@ -306,4 +307,4 @@ def _film(cell: CellConfig, trained: TrainedBob, player: Deterministic, path: Pa
         success_distance_m=SUCCESS_DISTANCE_M,
         seed=cell.seed + FINAL_SEED,
     )
-    return write_episode_video(filmed, world, path)
+    return write_episode_video(recorded, world, path)

@@ -18,6 +18,7 @@ which is a signed permutation of each vector.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -65,6 +66,11 @@ def _mirror(layout: str) -> Mirror:
             source.append(start)
             sign.append(1.0)
     return Mirror(np.asarray(source), np.asarray(sign, dtype=np.float32))
+
+
+def bob_observation(positions: FloatArray, goal: NDArray[np.floating[Any]]) -> FloatArray:
+    """Bob's input (N, 14) for (N, 11) positions and (N, 3) goals, metres."""
+    return np.concatenate([positions, goal.astype(np.float32)], axis=1)
 
 
 MIRROR_ACTION = _mirror("vs")

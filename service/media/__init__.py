@@ -1,1 +1,1 @@
-"""Pictures of a run: recorded rounds, videos, plots."""
+"""Recorded rounds and episodes, their videos, and the plots of a run."""

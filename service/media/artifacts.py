@@ -1,4 +1,4 @@
-"""What a run leaves for a person to look at, made from its directory alone."""
+"""The pictures and the video of a run, made from its directory alone."""
 
 from __future__ import annotations
 
@@ -7,10 +7,11 @@ from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
-from service.actors.coverage import skill_trajectories, visited_share
+from service.actors.coverage import skill_trajectories
 from service.config import Config
 from service.errors import TandemError
 from service.io.run_directory import RunDirectory
+from service.media import recording, video
 from service.media.plots import plot_coverage, plot_curves, plot_goals
 from service.policies.numpy_policy import NumpyMCPPolicy
 from service.primitives.loading import load_players
@@ -18,13 +19,13 @@ from service.primitives.loading import load_players
 NUM_SKILLS = 32
 """Random compositions in the coverage picture (paper)."""
 COVERAGE_STEPS = 100
-NUM_FILMED_ROUNDS = 4
+NUM_RECORDED_ROUNDS = 4
 _SEED = 7
 _logger = logging.getLogger(__name__)
 
 
 def make_artifacts(directory: RunDirectory) -> dict[str, Path]:
-    """Draw the curves, the goals and the coverage, and film a few rounds.
+    """Draw the curves, the goals, the coverage and a video of a few rounds.
 
     Returns:
         Files by what they show. What cannot be made, for want of an OpenGL library or of room on the disk, is left
@@ -33,11 +34,9 @@ def make_artifacts(directory: RunDirectory) -> dict[str, Path]:
     config = directory.read_config()
     alice, bob = load_players(directory)
 
-    def film() -> Path:
-        from service.media.video import film_rounds, write_video
-
-        takes = film_rounds(config, alice, bob, num_rounds=NUM_FILMED_ROUNDS, seed=_SEED)
-        return write_video(takes, config.world, directory.path / "rounds.mp4")
+    def draw_video() -> Path:
+        rounds = recording.record_rounds(config, alice, bob, num_rounds=NUM_RECORDED_ROUNDS, seed=_SEED)
+        return video.write_video(rounds, config.world, directory.path / "rounds.mp4")
 
     makers: dict[str, Callable[[], Path]] = {
         "curves": partial(plot_curves, directory.path),
@@ -46,7 +45,7 @@ def make_artifacts(directory: RunDirectory) -> dict[str, Path]:
     if isinstance(bob, NumpyMCPPolicy):
         makers["coverage"] = partial(_draw_coverage, directory, config, bob)
     files = {}
-    for name, make in (makers | {"video": film}).items():
+    for name, make in (makers | {"video": draw_video}).items():
         try:
             files[name] = make()
         except TandemError as error:
@@ -56,10 +55,4 @@ def make_artifacts(directory: RunDirectory) -> dict[str, Path]:
 
 def _draw_coverage(directory: RunDirectory, config: Config, bob: NumpyMCPPolicy) -> Path:
     paths = skill_trajectories(bob, config.world, num_skills=NUM_SKILLS, num_steps=COVERAGE_STEPS, seed=_SEED)
-    share = visited_share(paths, config.world.workspace)
-    return plot_coverage(
-        list(paths),
-        config.world.workspace,
-        directory.path / "coverage.png",
-        f"{config.name}, {share:.0%} of the table's cells visited",
-    )
+    return plot_coverage(paths, config.world.workspace, directory.path / "coverage.png", config.name)

@@ -1,35 +1,49 @@
-"""Rounds and episodes played for the camera: the states a video is drawn from. Nothing is drawn or learned here."""
+"""Recorded rounds and episodes: the states from which a video is drawn.
+
+Rounds are played by ``SelfPlay`` and episodes by ``evaluate``, so a video obeys the rules of training and evaluation.
+Nothing is drawn or learned here.
+"""
 
 from __future__ import annotations
 
+import contextlib
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
 
-from service.actors.evaluation import Deterministic
-from service.actors.self_play import Acting
+from service.actors.evaluation import DeterministicPolicy, evaluate
+from service.actors.rollout import Rollout
+from service.actors.self_play import Players, SelfPlay, StochasticPolicy
 from service.config import Config, WorldConfig
 from service.envs.batch import WorldBatch
-from service.envs.goals import GoalKind, draw_goals
+from service.envs.goals import GoalKind
 from service.generator.difficulty import in_air
-from service.generator.validity import Verdict, judge
+from service.generator.generator import TaskGenerator
+from service.generator.validity import Verdict
 
+FloatArray = NDArray[np.float32]
 StateArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
 
 _NUM_WORLDS = 64
-_MAX_BATCHES = 3
+_MAX_ROLLOUTS = 3
 
 
 @dataclass(frozen=True, slots=True)
-class Take:
-    """One round: Alice's turn, and Bob's from the same start. Without a valid goal he has no turn."""
+class RecordedRound:
+    """One round in one world: Alice's turn, and Bob's from the same start. Without a valid goal he has no turn."""
 
     alice_states: StateArray
     """(T1 + 1, S) from the start to where she left the object; rows of ``WorldBatch.states``."""
+    alice_actions: FloatArray
+    """(T1, 4)."""
     bob_states: StateArray
-    """(T2 + 1, S) from the start until he solved it or ran out of time; the start alone when he had no turn."""
+    """(T2 + 1, S) from the start to the end of his turn; the start alone when he had no turn."""
+    bob_actions: FloatArray
+    """(T2, 4)."""
     goal: StateArray
     """(3,) metres."""
     solved: bool
@@ -37,7 +51,7 @@ class Take:
 
 
 @dataclass(frozen=True, slots=True)
-class Episodes:
+class RecordedEpisodes:
     """Bob on N random goals, each for T steps from a fresh reset."""
 
     states: StateArray
@@ -48,38 +62,39 @@ class Episodes:
     """(T + 1, N) the object is within the success distance."""
 
 
-@dataclass(frozen=True, slots=True)
-class _Proposals:
-    """What P of Alice's turns came to."""
+def record_rounds(
+    config: Config, alice: StochasticPolicy, bob: DeterministicPolicy, *, num_rounds: int, seed: int
+) -> list[RecordedRound]:
+    """Play rounds from fresh resets and keep the most interesting: valid goals, lifted ones first, far ones first.
 
-    states: StateArray
-    """(P, T + 1, S)."""
-    start: StateArray
-    """(P, 3) object position, metres."""
-    end: StateArray
-    """(P, 3) object position, metres: the goal where valid."""
-    verdict: NDArray[np.int8]
-    """(P,)."""
-
-
-def film_rounds(config: Config, alice: Acting, bob: Deterministic, *, num_rounds: int, seed: int) -> list[Take]:
-    """Play rounds from fresh resets and keep the most interesting ones: valid goals, lifted ones first, far ones first.
-
-    Alice samples her actions as in training; Bob acts without noise. An Alice who makes too few valid goals in a few
-    hundred turns is shown with those that are not.
+    Alice samples her actions as in training; Bob acts without noise. If Alice makes too few valid goals in about two
+    hundred turns, some of the others are kept.
 
     Returns:
-        ``num_rounds`` takes, the most interesting first.
+        ``num_rounds`` rounds, the most interesting first.
     """
     rng = np.random.default_rng(seed)
-    proposals = _propose(config, alice, num_rounds, rng)
-    order = _by_interest(proposals, config.world.object_size_m / 2)[:num_rounds]
-    chosen = _Proposals(proposals.states[order], proposals.start[order], proposals.end[order], proposals.verdict[order])
-    return _answer(config, bob, chosen)
+    game = config.game.model_copy(update={"num_worlds": max(_NUM_WORLDS, num_rounds)})
+    config = config.model_copy(update={"game": game})
+    players = Players(version=0, alice=alice, bob=_WithoutNoise(bob))
+    rounds: list[RecordedRound] = []
+    interest: list[tuple[float, ...]] = []
+    with contextlib.closing(SelfPlay(config, rng, num_threads=config.run.num_threads)) as self_play:
+        # It is never told of a goal, so it replays none: Bob plays those of this round's Alice.
+        generator = TaskGenerator(config, self_play.worlds.state_size)
+        for _ in range(_MAX_ROLLOUTS):
+            rollout, states = _play_round(self_play, players, generator, rng)
+            rounds += _split(rollout, states)
+            interest += _interest(rollout, config.world.object_size_m / 2)
+            if sum(played for played, *_ in interest) >= num_rounds:
+                break
+            self_play.start_over()
+    best = sorted(range(len(rounds)), key=interest.__getitem__, reverse=True)[:num_rounds]
+    return [rounds[index] for index in best]
 
 
-def film_episodes(
-    bob: Deterministic,
+def record_episodes(
+    bob: DeterministicPolicy,
     config: WorldConfig,
     kind: GoalKind,
     *,
@@ -87,90 +102,69 @@ def film_episodes(
     num_steps: int,
     success_distance_m: float,
     seed: int,
-) -> Episodes:
-    """Play random goals as ``actors.evaluation`` does, and keep every state."""
-    rng = np.random.default_rng(seed)
-    with WorldBatch(config, num_episodes) as worlds:
-        worlds.reset(rng)
-        start, box = worlds.object_position, worlds.box_place
-        goal = draw_goals(kind, rng, config, success_distance_m, start=start, box=box)
-        states, reached = [], []
-        for step in range(num_steps + 1):
-            if step:
-                worlds.step(bob.act_deterministic(_bob_input(worlds, goal)))
-            states.append(worlds.states.copy())
-            reached.append(np.linalg.norm(worlds.object_position - goal, axis=1) <= success_distance_m)
-    return Episodes(np.stack(states), goal, np.stack(reached))
+) -> RecordedEpisodes:
+    """Play the episodes that ``evaluate`` plays with these arguments, and keep every state."""
+    states: list[StateArray] = []
+    reached: list[BoolArray] = []
+    goals: list[StateArray] = []
 
-
-def _propose(config: Config, alice: Acting, num_rounds: int, rng: np.random.Generator) -> _Proposals:
-    """Let Alice play batches of turns until enough are valid, or a few batches are over."""
-    turns: list[_Proposals] = []
-    with WorldBatch(config.world, max(_NUM_WORLDS, num_rounds), num_threads=config.run.num_threads) as worlds:
-        for _ in range(_MAX_BATCHES):
-            turns.append(_play_alice(config, alice, worlds, rng))
-            if sum(int((turn.verdict == Verdict.VALID).sum()) for turn in turns) >= num_rounds:
-                break
-    return _Proposals(
-        states=np.concatenate([turn.states for turn in turns]),
-        start=np.concatenate([turn.start for turn in turns]),
-        end=np.concatenate([turn.end for turn in turns]),
-        verdict=np.concatenate([turn.verdict for turn in turns]),
-    )
-
-
-def _play_alice(config: Config, alice: Acting, worlds: WorldBatch, rng: np.random.Generator) -> _Proposals:
-    game = config.game
-    worlds.reset(rng)
-    start, states = worlds.object_position.copy(), [worlds.states.copy()]
-    broken = np.zeros(worlds.num_worlds, dtype=bool)
-    for step in range(game.alice_steps):
-        action, _ = alice.act(worlds.full(step / game.alice_steps), rng)
-        broken |= worlds.step(action)
+    def keep(worlds: WorldBatch, goal: StateArray) -> None:
         states.append(worlds.states.copy())
-    end = worlds.object_position.copy()
-    verdict = judge(start, end, config.world.workspace, game.success_distance_m)
-    verdict[broken] = Verdict.FALLEN
-    return _Proposals(np.stack(states, axis=1), start, end, verdict)
+        reached.append(np.linalg.norm(worlds.object_position - goal, axis=1) <= success_distance_m)
+        goals.append(goal)
+
+    evaluate(
+        bob,
+        config,
+        kind,
+        num_episodes=num_episodes,
+        num_steps=num_steps,
+        success_distance_m=success_distance_m,
+        seed=seed,
+        observe=keep,
+    )
+    return RecordedEpisodes(np.stack(states), goals[0], np.stack(reached))
 
 
-def _by_interest(proposals: _Proposals, rest_height_m: float) -> NDArray[np.int64]:
-    distance = np.linalg.norm(proposals.end - proposals.start, axis=1)
-    lifted = in_air(proposals.end, rest_height_m)
-    return np.lexsort((distance, lifted, proposals.verdict == Verdict.VALID))[::-1]
+class _WithoutNoise:
+    """A deterministic policy where one that samples is expected."""
+
+    def __init__(self, policy: DeterministicPolicy) -> None:
+        self._policy = policy
+
+    def act(self, observation: FloatArray, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
+        return self._policy.act_deterministic(observation), np.zeros(len(observation), dtype=np.float32)
 
 
-def _answer(config: Config, bob: Deterministic, proposals: _Proposals) -> list[Take]:
-    """Let Bob try the valid ones, all at once."""
-    game, num = config.game, len(proposals.verdict)
-    num_steps, solved = np.zeros(num, dtype=np.int64), np.zeros(num, dtype=bool)
-    with WorldBatch(config.world, num, num_threads=config.run.num_threads) as worlds:
-        worlds.restore(proposals.states[:, 0])
-        states = [worlds.states.copy()]
-        playing = proposals.verdict == Verdict.VALID
-        for _ in range(game.bob_steps):
-            index = np.flatnonzero(playing)
-            if not index.size:
-                break
-            broken = worlds.step(bob.act_deterministic(_bob_input(worlds, proposals.end)[index]), index)
-            states.append(worlds.states.copy())
-            num_steps[index] += 1
-            solved |= playing & (
-                np.linalg.norm(worlds.object_position - proposals.end, axis=1) <= game.success_distance_m
-            )
-            playing &= ~(solved | broken)
-    bob_states = np.stack(states, axis=1)
-    return [
-        Take(
-            alice_states=proposals.states[row],
-            bob_states=bob_states[row, : num_steps[row] + 1],
-            goal=proposals.end[row],
-            solved=bool(solved[row]),
-            verdict=Verdict(proposals.verdict[row]),
+def _play_round(
+    self_play: SelfPlay, players: Players, generator: TaskGenerator, rng: np.random.Generator
+) -> tuple[Rollout, list[StateArray]]:
+    """A rollout, and the (N, S) states of all worlds at each step of Alice's turn and then of Bob's."""
+    plan = generator.plan(self_play.worlds.num_worlds, rng)
+    choose_goals = partial(generator.choose_goals, plan, rng=rng)
+    states: list[StateArray] = []
+    rollout = self_play.play_round(players, plan, choose_goals, observe=lambda now: states.append(now.copy()))
+    return rollout, states
+
+
+def _split(rollout: Rollout, states: Sequence[StateArray]) -> Iterator[RecordedRound]:
+    """Each world's round, out of what ``_play_round`` gave."""
+    records, alice_steps = rollout.records, int(rollout.alice.active.any(axis=1).sum())
+    alice_states, bob_states = np.stack(states[: alice_steps + 1]), np.stack(states[alice_steps + 1 :])
+    for world, bob_steps in enumerate(records.num_bob_steps):
+        yield RecordedRound(
+            alice_states=alice_states[:, world],
+            alice_actions=rollout.alice.action[:alice_steps, world],
+            bob_states=bob_states[: bob_steps + 1, world],
+            bob_actions=rollout.bob.action[:bob_steps, world],
+            goal=records.goal[world],
+            solved=bool(records.solved[world]),
+            verdict=Verdict(records.verdict[world]),
         )
-        for row in range(num)
-    ]
 
 
-def _bob_input(worlds: WorldBatch, goal: StateArray) -> NDArray[np.float32]:
-    return np.concatenate([worlds.positions(), goal.astype(np.float32)], axis=1)
+def _interest(rollout: Rollout, rest_height_m: float) -> Iterator[tuple[float, ...]]:
+    """Sort keys of each world's round: Bob played it, its goal is in the air, its distance in metres."""
+    records = rollout.records
+    distance_m = np.linalg.norm(records.goal - records.start_position, axis=1)
+    return zip(records.played, in_air(records.goal, rest_height_m), distance_m, strict=True)

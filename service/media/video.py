@@ -1,7 +1,7 @@
-"""Videos for people: Alice's proposal beside Bob's attempt, and Bob on several goals at once.
+"""Videos of recorded rounds, Alice's turn beside Bob's, and of recorded episodes, several at once.
 
-H.264 at the world's own pace. Without a graphics card a picture takes a twentieth to a tenth of a second, so a slow
-machine's video shows every second state only.
+H.264 in real time. Without a graphics card a picture takes 50 to 100 ms to draw, so a slow machine's video shows only
+every second state.
 """
 
 from __future__ import annotations
@@ -23,9 +23,7 @@ from service.config import WorldConfig
 from service.envs.rendering.renderer import RenderError, SceneRenderer
 from service.generator.validity import Verdict
 from service.io.files import TEMPORARY_PREFIX, os_errors
-from service.media.recording import Episodes, StateArray, Take, film_episodes, film_rounds
-
-__all__ = ["Episodes", "Take", "film_episodes", "film_rounds", "write_episode_video", "write_video"]
+from service.media.recording import RecordedEpisodes, RecordedRound, StateArray
 
 Image = NDArray[np.uint8]
 Colour = tuple[int, int, int]
@@ -37,7 +35,7 @@ BAR_HEIGHT = 36
 """Height of the caption over each picture, pixels."""
 EPISODE_COLUMNS = 3
 MAX_DRAWING_S = 25.0
-"""Where drawing every state would take longer, every second one is drawn."""
+"""Only every second state is drawn if all of them would take longer."""
 GOAL_PAUSE_S, END_PAUSE_S = 0.4, 0.8
 
 _PAPER, _INK, _FAINT = (248, 248, 248), (34, 34, 34), (140, 140, 140)
@@ -49,11 +47,13 @@ _NO_GOAL = {
 }
 
 
-def write_video(takes: Sequence[Take], config: WorldConfig, path: Path, *, pane_size: int = PANE_SIZE) -> Path:
+def write_video(
+    rounds: Sequence[RecordedRound], config: WorldConfig, path: Path, *, pane_size: int = PANE_SIZE
+) -> Path:
     """Write rounds one after another, Alice on the left and Bob on the right.
 
     Args:
-        takes: at least one, from ``film_rounds``.
+        rounds: at least one, from ``record_rounds``.
         config: the world they were played in.
         path: where to; an mp4 that takes its name only when it is whole.
         pane_size: width and height of one player's picture, pixels, even.
@@ -65,25 +65,25 @@ def write_video(takes: Sequence[Take], config: WorldConfig, path: Path, *, pane_
         RenderError: no OpenGL or no ffmpeg here.
         TandemError: the disk is full or the file cannot be written.
     """
-    num_pictures = sum(len(take.alice_states) + len(take.bob_states) for take in takes)
+    num_pictures = sum(len(each.alice_states) + len(each.bob_states) for each in rounds)
+    step_s = _step_s(config)
     with SceneRenderer(config, pane_size, pane_size) as renderer:
-        every = _stride(renderer, takes[0].alice_states[0], num_pictures)
-        frame_s = every * _step_s(config)
+        stride = _stride(renderer, rounds[0].alice_states[0], num_pictures)
         frames = (
             frame
-            for index, take in enumerate(takes)
-            for frame in _round_frames(renderer, take, f"{index + 1}/{len(takes)}", every, _step_s(config))
+            for number, each in enumerate(rounds, start=1)
+            for frame in _round_frames(renderer, each, f"{number}/{len(rounds)}", stride, step_s)
         )
-        return _encode(frames, path, fps=1 / frame_s)
+        return _encode(frames, path, fps=1 / (stride * step_s))
 
 
 def write_episode_video(
-    episodes: Episodes, config: WorldConfig, path: Path, *, pane_size: int = EPISODE_PANE_SIZE
+    episodes: RecordedEpisodes, config: WorldConfig, path: Path, *, pane_size: int = EPISODE_PANE_SIZE
 ) -> Path:
     """Write episodes all at once, in rows of three.
 
     Args:
-        episodes: from ``film_episodes``.
+        episodes: from ``record_episodes``.
         config: the world they were played in.
         path: where to; an mp4 that takes its name only when it is whole.
         pane_size: width and height of one picture, pixels, even.
@@ -97,44 +97,48 @@ def write_episode_video(
     """
     num_steps, num_episodes = episodes.reached.shape
     with SceneRenderer(config, pane_size, pane_size) as renderer:
-        every = _stride(renderer, episodes.states[0, 0], num_steps * num_episodes)
-        frame_s = every * _step_s(config)
-        return _encode(_episode_frames(renderer, episodes, every, frame_s), path, fps=1 / frame_s)
+        stride = _stride(renderer, episodes.states[0, 0], num_steps * num_episodes)
+        frame_s = stride * _step_s(config)
+        return _encode(_episode_frames(renderer, episodes, stride, frame_s), path, fps=1 / frame_s)
 
 
 # --- what is shown -------------------------------------------------------------------------------------------------
 
 
-def _round_frames(renderer: SceneRenderer, take: Take, number: str, every: int, step_s: float) -> Iterator[Image]:
-    """Alice moves while Bob waits, then Bob moves, then both rest; ``number`` is shown with it."""
-    waiting = _caption(_faded(renderer.render(take.bob_states[0])), "Bob waits", _FAINT, number)
-    for step in _thinned(len(take.alice_states), every):
-        picture = renderer.render(take.alice_states[step])
-        yield _beside(_caption(picture, "Alice proposes a goal", _ORANGE), waiting)
-    if take.verdict != Verdict.VALID:
-        left = _caption(picture, f"Alice: no goal, {_NO_GOAL[take.verdict]}", _ORANGE)
-        yield from _hold(_beside(left, waiting), END_PAUSE_S, every * step_s)
+def _round_frames(
+    renderer: SceneRenderer, played: RecordedRound, number: str, stride: int, step_s: float
+) -> Iterator[Image]:
+    """Alice moves while Bob waits, then Bob moves, then both rest; ``number`` stands in the caption."""
+    frame_s = stride * step_s
+    right = _caption(_faded(renderer.render(played.bob_states[0])), "Bob waits", _FAINT, number)
+    for step in _thinned(len(played.alice_states), stride):
+        picture = renderer.render(played.alice_states[step])
+        yield _beside(_caption(picture, "Alice proposes a goal", _ORANGE), right)
+    if played.verdict != Verdict.VALID:
+        left = _caption(picture, f"Alice: no goal, {_NO_GOAL[played.verdict]}", _ORANGE)
+        yield from _hold(_beside(left, right), END_PAUSE_S, frame_s)
         return
     left = _caption(picture, "Alice proposed this goal", _INK)
-    picture = renderer.render(take.bob_states[0], take.goal)
-    yield from _hold(_beside(left, _caption(picture, "Bob's turn", _BLUE, number)), GOAL_PAUSE_S, every * step_s)
-    for step in _thinned(len(take.bob_states), every):
-        picture = renderer.render(take.bob_states[step], take.goal)
+    picture = renderer.render(played.bob_states[0], played.goal)
+    yield from _hold(_beside(left, _caption(picture, "Bob's turn", _BLUE, number)), GOAL_PAUSE_S, frame_s)
+    for step in _thinned(len(played.bob_states), stride):
+        picture = renderer.render(played.bob_states[step], played.goal)
         yield _beside(left, _caption(picture, f"Bob tries: {step * step_s:.1f} s", _BLUE, number))
-    right = _caption(picture, *_result(take, step_s), number)
-    yield from _hold(_beside(left, right), END_PAUSE_S, every * step_s)
+    yield from _hold(_beside(left, _caption(picture, *_result(played, step_s), number)), END_PAUSE_S, frame_s)
 
 
-def _result(take: Take, step_s: float) -> tuple[str, Colour]:
-    elapsed_s = (len(take.bob_states) - 1) * step_s
-    if take.solved:
+def _result(played: RecordedRound, step_s: float) -> tuple[str, Colour]:
+    elapsed_s = (len(played.bob_states) - 1) * step_s
+    if played.solved:
         return f"Bob: solved after {elapsed_s:.1f} s", _GREEN
     return f"Bob: not solved in {elapsed_s:.1f} s", _ORANGE
 
 
-def _episode_frames(renderer: SceneRenderer, episodes: Episodes, every: int, frame_s: float) -> Iterator[Image]:
+def _episode_frames(
+    renderer: SceneRenderer, episodes: RecordedEpisodes, stride: int, frame_s: float
+) -> Iterator[Image]:
     num = len(episodes.goal)
-    for step in _thinned(len(episodes.states), every):
+    for step in _thinned(len(episodes.states), stride):
         panes = []
         for episode in range(num):
             picture = renderer.render(episodes.states[step, episode], episodes.goal[episode])
@@ -157,14 +161,13 @@ def _stride(renderer: SceneRenderer, state: StateArray, num_pictures: int) -> in
     return 1 if num_pictures * (time.perf_counter() - start) <= MAX_DRAWING_S else 2
 
 
-def _thinned(num: int, every: int) -> list[int]:
-    """Every so many of ``num`` indices, and always the last."""
-    return [*range(0, num - 1, every), num - 1]
+def _thinned(num: int, stride: int) -> list[int]:
+    """Every ``stride``-th of ``num`` indices, and always the last."""
+    return [*range(0, num - 1, stride), num - 1]
 
 
-def _hold(frame: Image, pause_s: float, frame_s: float) -> Iterator[Image]:
-    for _ in range(max(round(pause_s / frame_s), 1)):
-        yield frame
+def _hold(frame: Image, pause_s: float, frame_s: float) -> list[Image]:
+    return [frame] * max(round(pause_s / frame_s), 1)
 
 
 # --- pictures ------------------------------------------------------------------------------------------------------
@@ -206,7 +209,7 @@ def _bar(width: int, text: str, colour: Colour, number: str) -> Image:
 
 
 def _encode(frames: Iterator[Image], path: Path, *, fps: float) -> Path:
-    """Send frames to ffmpeg; the file takes its name only when it is whole."""
+    """Write frames as H.264; the file takes its name only when it is whole."""
     temporary = path.parent / f"{TEMPORARY_PREFIX}{os.getpid()}-{path.name}"
     try:
         with os_errors("write", path):
@@ -220,6 +223,10 @@ def _encode(frames: Iterator[Image], path: Path, *, fps: float) -> Path:
 
 
 def _run_ffmpeg(frames: Iterator[Image], path: Path, fps: float) -> None:
+    """Send frames to ffmpeg.
+
+    ``imageio_ffmpeg.write_frames`` would be shorter, but ignores ffmpeg's exit status: a full disk would go unnoticed.
+    """
     first = next(frames)
     height, width = first.shape[:2]
     command = [
@@ -230,7 +237,7 @@ def _run_ffmpeg(frames: Iterator[Image], path: Path, fps: float) -> None:
     with subprocess.Popen(command, stdin=subprocess.PIPE, stderr=subprocess.PIPE) as ffmpeg:
         assert ffmpeg.stdin is not None
         try:
-            with contextlib.suppress(BrokenPipeError):  # it stopped early; its exit status and words follow
+            with contextlib.suppress(BrokenPipeError):  # it stopped early; its exit status says why
                 for frame in itertools.chain([first], frames):
                     ffmpeg.stdin.write(frame.tobytes())
             words = ffmpeg.communicate()[1].decode(errors="replace").strip()

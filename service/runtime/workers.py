@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from service.actors.evaluation import EVALUATION_SEED, success_metrics
 from service.actors.rollout import Broken, GoalRecords, Rollout
-from service.actors.self_play import Acting, Players, SelfPlay
+from service.actors.self_play import Players, SelfPlay, StochasticPolicy
 from service.config import Config
 from service.envs.goals import GoalKind
 from service.generator.generator import GoalChoice, TaskGenerator
@@ -122,7 +122,7 @@ class RolloutWorker:
         self.rng = np.random.default_rng(source)
         self.game = SelfPlay(config, self.rng, actor=actor, incarnation=incarnation, num_threads=num_threads)
         self.pool_version = -1
-        self._past: list[tuple[Acting, Acting]] = []
+        self._past: list[tuple[StochasticPolicy, StochasticPolicy]] = []
 
     def play(self, weights: Weights, assignment: Assignment, choose_goals: ChooseGoals) -> tuple[Rollout, RoundSummary]:
         """Play a round in every world.

@@ -103,10 +103,11 @@ def alices_own(start_state, start_position, round_index, proposal, verdict):
     )
 
 
-def play(game, alice=None, bob=None, *, plan=None, choose_goals=alices_own, version=0, **past):
+def play(game, alice=None, bob=None, *, plan=None, choose_goals=alices_own, version=0, observe=None, **past):
     """One round; players who are not given do nothing."""
     players = Players(version, alice or Constant(), bob or Constant(), **past)
-    return game.play_round(players, plan or everyone_current(game.worlds.num_worlds), choose_goals)
+    plan = plan or everyone_current(game.worlds.num_worlds)
+    return game.play_round(players, plan, choose_goals, observe=observe)
 
 
 def assert_same_rollout(one, other):

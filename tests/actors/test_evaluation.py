@@ -6,7 +6,7 @@ import math
 import numpy as np
 import pytest
 
-from service.actors.evaluation import Evaluation, Idle, evaluate, wilson_interval
+from service.actors.evaluation import Evaluation, IdlePolicy, evaluate, wilson_interval
 from service.config import WorldConfig
 from service.envs.batch import sample_on_table
 from service.envs.goals import GOAL_KINDS, sample_goals
@@ -37,7 +37,7 @@ class PickAndPlace:
         return action
 
 
-class Recorder(Idle):
+class Recorder(IdlePolicy):
     """Does nothing, and keeps what it was shown."""
 
     def __init__(self):
@@ -189,14 +189,29 @@ def test_ever_counts_what_was_left_again():
     assert result.success_last < result.success_ever < 1.0
 
 
+def test_an_observer_is_given_the_worlds_at_the_start_and_after_every_step():
+    steps = []
+    common = {"num_episodes": 16, "num_steps": 12, "success_distance_m": 0.12, "seed": 0, "num_threads": 1}
+    result = evaluate(
+        Sweep(), FAST, "mixed", **common,
+        observe=lambda worlds, goal: steps.append(np.linalg.norm(worlds.object_position - goal, axis=1)),
+    )  # fmt: skip
+    assert result == evaluate(Sweep(), FAST, "mixed", **common)
+    distance = np.stack(steps)
+    assert distance.shape == (13, 16)
+    assert result.mean_distance_m == distance[-1].mean() != distance[0].mean()
+    assert result.success_last == (distance[-1] <= 0.12).mean()
+    assert result.success_ever == (distance[1:].min(axis=0) <= 0.12).mean()
+
+
 def test_a_seed_determines_goals_and_starts():
-    one, same, other = (run(Idle(), num_episodes=20, seed=seed) for seed in (3, 3, 4))
+    one, same, other = (run(IdlePolicy(), num_episodes=20, seed=seed) for seed in (3, 3, 4))
     assert one == same
     assert one.mean_distance_m != other.mean_distance_m
 
 
 def test_as_dict_is_json():
-    result = run(Idle(), "mixed", num_episodes=3)
+    result = run(IdlePolicy(), "mixed", num_episodes=3)
     tree = json.loads(json.dumps(result.as_dict()))
     assert Evaluation(**tree) == result
     assert (tree["goals"], tree["num_episodes"], tree["num_steps"]) == ("mixed", 3, 2)

@@ -202,6 +202,30 @@ def test_observations_and_final_value_observations(rollout):
     assert np.array_equal(rollout.alice.value_observation, rollout.alice.observation)
 
 
+def test_an_observer_is_given_every_state_and_changes_nothing():
+    config = make_config(5, game={"bob_hold_steps": 3, "alice_steps_min": 6})
+    watched, alone = make_game(config, STARTS), make_game(config, STARTS)
+    for _ in range(2):
+        states = []
+        rollout = play(watched, Pusher(), Noise(), observe=lambda now, states=states: states.append(now.copy()))
+        assert_same_rollout(rollout, play(alone, Pusher(), Noise()))
+        records, num_alice_steps = rollout.records, int(rollout.alice.active[:, 0].sum())
+        assert len(states) == num_alice_steps + 1 + int(records.num_bob_steps.max()) + 1
+        with WorldBatch(config.world, 5, num_threads=1) as worlds:
+            worlds.restore(records.start_state)
+            for action, state in zip(rollout.alice.action, states[:num_alice_steps], strict=False):
+                assert np.array_equal(state, worlds.states)
+                worlds.step(action)
+            assert np.array_equal(states[num_alice_steps], worlds.states)
+            worlds.restore(records.start_state)
+            for step, state in enumerate(states[num_alice_steps + 1 :]):
+                assert np.array_equal(state, worlds.states)
+                if step < 7:
+                    playing = np.flatnonzero(rollout.bob.active[step])
+                    worlds.step(rollout.bob.action[step, playing], playing)
+    assert np.array_equal(watched.worlds.states, alone.worlds.states)
+
+
 def test_the_next_round_starts_where_alice_ended():
     game = make_game(make_config(2), [IN_FRONT, SLIDES])
     first = play(game, Pusher())

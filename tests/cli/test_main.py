@@ -50,7 +50,7 @@ def trained(tmp_path_factory):
     home = tmp_path_factory.mktemp("home")
     config = write_yaml(home / "tiny.yaml", TREE | {"run": TREE["run"] | {"total_env_steps": 900}})
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("service.media.artifacts.NUM_FILMED_ROUNDS", 1)
+        patch.setattr("service.media.artifacts.NUM_RECORDED_ROUNDS", 1)
         patch.setattr("service.media.artifacts.COVERAGE_STEPS", 20)
         result = tandem(
             "pretrain", "--config", config, "--run-dir", home / "run", "--registry", home / "registry",

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 import torch
 
-from service.actors.evaluation import Idle, evaluate
+from service.actors.evaluation import IdlePolicy, evaluate
 from service.downstream import worker
 from service.downstream.compose import parameters_digest
 from service.downstream.learner import make_learner
@@ -119,8 +119,8 @@ def test_the_same_5_cm_are_paid_and_counted(champion):
         task = TASKS["push"]
         world = task.world_from(champion.config.world)
         options = {"num_episodes": 300, "num_steps": 50, "success_distance_m": distance, "seed": 7}
-        counts.append(evaluate(Idle(), world, task.goals, **options).success_last)
-    assert play(cell, champion, Idle, 300, 7, Running()).success_last == counts[0] < counts[1]
+        counts.append(evaluate(IdlePolicy(), world, task.goals, **options).success_last)
+    assert play(cell, champion, IdlePolicy, 300, 7, Running()).success_last == counts[0] < counts[1]
     env = make_worlds(cell, find_method("ours"), champion, 1)
     achieved = np.float32([[0.0499, 0.0, 0.0], [0.0501, 0.0, 0.0], [0.0, 0.0, -0.0599]])
     (paid,) = env.env_method("compute_reward", achieved, np.zeros((3, 3), np.float32), {}, indices=0)

@@ -17,7 +17,7 @@ def directory(tmp_path_factory):
 def quick(monkeypatch):
     monkeypatch.setattr(artifacts, "NUM_SKILLS", 2)
     monkeypatch.setattr(artifacts, "COVERAGE_STEPS", 2)
-    monkeypatch.setattr("service.media.video.film_rounds", lambda *args, **kwargs: [])
+    monkeypatch.setattr("service.media.recording.record_rounds", lambda *args, **kwargs: [])
     monkeypatch.setattr("service.media.video.write_video", lambda takes, world, path: path)
 
 

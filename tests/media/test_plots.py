@@ -1,5 +1,8 @@
+"""Plots of a run: what they draw, and the numbers and words in them by hand."""
+
 import subprocess
 import sys
+from functools import partial
 
 import numpy as np
 import pytest
@@ -8,7 +11,7 @@ from service.config import WorkspaceConfig
 from service.errors import TandemError
 from service.io.jsonl import JsonlWriter
 from service.media.plots import plot_coverage, plot_curves, plot_goals
-from service.media.plots.coverage import _coverage_words, _inside
+from service.media.plots.coverage import _inside, _summary
 from service.media.plots.curves import _smooth
 from service.media.plots.figures import bounds, column, new_figure
 from service.media.plots.goals import _goals, _slice_title
@@ -79,7 +82,9 @@ def test_a_torn_last_line_does_not_change_the_picture(tmp_path):
     assert plot_curves(tmp_path).read_bytes() == before
 
 
-@pytest.mark.parametrize(("plot", "name"), [(plot_curves, "metrics.jsonl"), (plot_goals, "goals.jsonl")])
+@pytest.mark.parametrize(
+    ("plot", "name"), [(plot_curves, "metrics.jsonl"), (partial(plot_goals, workspace=WORKSPACE), "goals.jsonl")]
+)
 def test_an_empty_or_missing_file_is_an_error_that_names_it(tmp_path, plot, name):
     with pytest.raises(TandemError, match=f"cannot read .*{name}"):
         plot(tmp_path)
@@ -124,7 +129,7 @@ def test_goals_of_many_records_are_joined_and_broken_ones_left_out(tmp_path):
 def test_goals_of_another_layout_are_refused(tmp_path, goals):
     _append(tmp_path / "goals.jsonl", {"iteration": 0, "goals": goals})
     with pytest.raises(TandemError, match=r"goals\.jsonl: a goal is not 7 numbers"):
-        plot_goals(tmp_path)
+        plot_goals(tmp_path, WORKSPACE)
 
 
 def test_bounds_by_hand():
@@ -134,17 +139,20 @@ def test_bounds_by_hand():
 
 
 @pytest.mark.filterwarnings("error")
-def test_coverage_is_drawn_also_for_trajectories_that_leave_or_have_one_point(tmp_path):
+def test_coverage_is_drawn_also_for_trajectories_that_leave_or_stand_still(tmp_path):
     line = np.linspace([0.0, 0.0, 0.025], [0.05, 0.05, 0.15], 20)
     away = np.linspace([0.0, 0.0, 0.025], [2.0, 0.0, -1.0], 20)
-    path = plot_coverage([line, away, line[:1], away + np.nan], WORKSPACE, tmp_path / "new" / "coverage.png", "v1")
+    paths = np.stack([line, away, np.tile(line[:1], (20, 1)), 100.0 * away])
+    path = plot_coverage(paths, WORKSPACE, tmp_path / "new" / "coverage.png", "v1")
     assert _png_size(path) == (pytest.approx(120_000, rel=0.7), 1400)
 
 
 def test_coverage_counts_by_hand():
     still = np.full((3, 3), 0.01)
     moving = np.array([[0.01, 0.01, 0.01], [0.09, 0.01, 0.01], [5.0, 0.01, 0.01]])
-    assert _coverage_words([still, moving]) == "2 compositions, 1 move the object over 5 cm"
+    # One of 16 cells is entered, that of (0.09, 0.01); the one in which both start does not count.
+    words = "6% of the table's cells visited: 2 compositions, 1 move the object over 5 cm"
+    assert _summary(np.stack([still, moving]), WORKSPACE) == words
 
 
 def test_points_far_outside_break_the_line():
@@ -152,21 +160,10 @@ def test_points_far_outside_break_the_line():
     np.testing.assert_array_equal(np.isnan(_inside(points, WORKSPACE))[:, 0], [False, False, True])
 
 
-@pytest.mark.parametrize("shape", [(0, 3), (5, 2), (3,), (2, 5, 3)])
-def test_coverage_refuses_another_shape(tmp_path, shape):
-    with pytest.raises(TandemError, match="trajectory 1 has shape"):
-        plot_coverage([np.zeros((2, 3)), np.zeros(shape)], WORKSPACE, tmp_path / "coverage.png", "v1")
-
-
-def test_coverage_refuses_nothing(tmp_path):
-    with pytest.raises(TandemError, match="no trajectories"):
-        plot_coverage([], WORKSPACE, tmp_path / "coverage.png", "v1")
-
-
 def test_a_picture_that_cannot_be_written_is_one_line_for_the_user(tmp_path):
     (tmp_path / "taken").write_text("a file where a directory should be")
     with pytest.raises(TandemError, match="cannot write"):
-        plot_coverage([np.zeros((2, 3))], WORKSPACE, tmp_path / "taken" / "coverage.png", "v1")
+        plot_coverage(np.zeros((1, 2, 3)), WORKSPACE, tmp_path / "taken" / "coverage.png", "v1")
 
 
 def test_import_loads_no_matplotlib_and_drawing_no_pyplot():

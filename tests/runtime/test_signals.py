@@ -116,7 +116,7 @@ def uninterrupted(tmp_path_factory):
         ("service.runtime.pretrain.publish_run", signal.SIGTERM),
         ("service.media.artifacts.plot_curves", signal.SIGTERM),
         ("service.media.artifacts.skill_trajectories", signal.SIGINT),
-        ("service.media.video.film_rounds", signal.SIGTERM),
+        ("service.media.recording.record_rounds", signal.SIGTERM),
     ],
 )
 def test_a_signal_behind_the_learning(home, uninterrupted, where, number):

@@ -1,4 +1,4 @@
-"""The pictures of a run: its curves, where its goals are, and what random compositions of its primitives do.
+"""Plots of a run: its curves, its goals, and the coverage of random compositions of its primitives.
 
 matplotlib is loaded by the first call, not by the import.
 """

@@ -1,15 +1,14 @@
-"""Where random compositions of the primitives take the object: the paper's figure of a skill set."""
+"""Plot of where random compositions of the primitives take the object: the paper's figure of a skill set."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from service.actors.coverage import visited_share
 from service.config import WorkspaceConfig
-from service.errors import TandemError
 from service.media.plots.figures import (
     EDGE_STYLE,
     FAINT,
@@ -29,37 +28,34 @@ if TYPE_CHECKING:
 _MOVED_M = 0.05
 
 
-def plot_coverage(trajectories: Sequence[Array], workspace: WorkspaceConfig, path: Path, title: str) -> Path:
+def plot_coverage(trajectories: Array, workspace: WorkspaceConfig, path: Path, title: str) -> Path:
     """Draw where random compositions take the object, one colour each: in the workspace's box, and from above.
 
     Args:
-        trajectories: object positions in metres in the world's frame, one array (T, 3) per composition.
+        trajectories: (M, T, 3) object positions in metres in the world's frame, one row per composition.
         workspace: the box to draw; points more than a few centimetres outside it are left out.
         path: the PNG to write.
-        title: what the picture shows, for example the primitives' name and version.
+        title: whose compositions these are, for example the primitives' name and version.
 
     Raises:
-        TandemError: there is no trajectory, one is not (T, 3), or the picture cannot be written.
+        TandemError: the picture cannot be written.
     """
-    paths = [_trajectory(points, number) for number, points in enumerate(trajectories)]
-    if not paths:
-        raise TandemError(f"no trajectories to draw in {path}; ask for one composition or more")
-    figure = new_figure(14.0, 7.2, f"{title}: {_coverage_words(paths)}")
+    figure = new_figure(14.0, 7.2, f"{title}, {_summary(trajectories, workspace)}")
     box = figure.add_axes((0.0, 0.0, 0.57, 0.95), projection="3d", computed_zorder=False)
     above = figure.add_axes((0.62, 0.1, 0.36, 0.74))
-    draw_paths(box, above, paths, workspace)
+    draw_paths(box, above, trajectories, workspace)
     above.set_ylabel("y (m)", color=FAINT)
     above.set_title("From above; a dot is where the object ends", loc="left", fontsize=12, color=INK)
     return save(figure, path)
 
 
-def draw_paths(box: Any, above: Axes, paths: Sequence[Array], workspace: WorkspaceConfig) -> None:
-    """Draw paths of the object, (T, 3) metres and a colour each: in the workspace's box, and from above.
+def draw_paths(box: Any, above: Axes, paths: Array, workspace: WorkspaceConfig) -> None:
+    """Draw paths of the object, one colour each: in the workspace's box, and from above.
 
     Args:
         box: 3-D axes, made with ``computed_zorder=False``.
         above: plain axes.
-        paths: what to draw; points more than a few centimetres outside the workspace are left out.
+        paths: (M, T, 3) metres; points more than a few centimetres outside the workspace are left out.
         workspace: the box.
     """
     from matplotlib import colormaps
@@ -71,13 +67,6 @@ def draw_paths(box: Any, above: Axes, paths: Sequence[Array], workspace: Workspa
         _draw_trajectory(box, above, _inside(points, workspace), color)
 
 
-def _trajectory(points: Array, number: int) -> Array:
-    points = np.asarray(points, dtype=np.float64)
-    if points.ndim != 2 or points.shape[1] != 3 or not len(points):
-        raise TandemError(f"trajectory {number} has shape {points.shape}; give positions as (T, 3) with T of 1 or more")
-    return points
-
-
 def _inside(points: Array, workspace: WorkspaceConfig) -> Array:
     """``points`` with NaN, which breaks a line, where they leave the drawn surroundings of the workspace."""
     low, high = bounds(workspace)
@@ -85,9 +74,11 @@ def _inside(points: Array, workspace: WorkspaceConfig) -> Array:
     return np.where(near.all(axis=1, keepdims=True), points, np.nan)
 
 
-def _coverage_words(paths: Sequence[Array]) -> str:
-    moved = sum(bool((np.linalg.norm(points - points[0], axis=1) > _MOVED_M).any()) for points in paths)
-    return f"{counted(len(paths), 'composition')}, {moved} move the object over 5 cm"
+def _summary(trajectories: Array, workspace: WorkspaceConfig) -> str:
+    share = visited_share(trajectories, workspace)
+    moved = (np.linalg.norm(trajectories - trajectories[:, :1], axis=2) > _MOVED_M).any(axis=1).sum()
+    compositions = counted(len(trajectories), "composition")
+    return f"{share:.0%} of the table's cells visited: {compositions}, {moved} move the object over 5 cm"
 
 
 def _draw_box(axes: Any, workspace: WorkspaceConfig) -> None:

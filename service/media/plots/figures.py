@@ -1,4 +1,4 @@
-"""What the pictures share: their figure, axes, colours, and how they are read and saved.
+"""Common parts of the plots: figure, axes, colours, reading records and saving.
 
 A ``Figure`` is made without pyplot, so no window system and no global state is needed. Colours are Okabe and Ito's,
 which colour-blind readers tell apart.

@@ -1,4 +1,4 @@
-"""Where Alice's goals are, over time, and which of them Bob solves."""
+"""Plot of Alice's goals over time, and which of them Bob solves."""
 
 from __future__ import annotations
 
@@ -32,12 +32,10 @@ if TYPE_CHECKING:
 
 GOALS_FILE = "goals.jsonl"
 GOALS_PICTURE = "goals.png"
-
-_PAPER_WORKSPACE = WorkspaceConfig()
 _NUM_SLICES = 4
 
 
-def plot_goals(run_dir: Path, workspace: WorkspaceConfig = _PAPER_WORKSPACE) -> Path:
+def plot_goals(run_dir: Path, workspace: WorkspaceConfig) -> Path:
     """Draw ``goals.png`` from the run's ``goals.jsonl``: where valid goals are, in four slices of time, solved or not.
 
     The top row looks from above, with the workspace's outline; the bottom row shows how far a goal is from where the

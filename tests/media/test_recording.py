@@ -1,0 +1,185 @@
+"""Recorded rounds and episodes obey the rules of training and of evaluation: by the numbers of their states."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from service.actors.evaluation import evaluate
+from service.config import Config, GameConfig, WorldConfig
+from service.envs.batch import WorldBatch
+from service.generator.validity import Verdict
+from service.media import recording
+from service.media.recording import record_episodes, record_rounds
+
+PUSH = (-1.0, 0.0, -1.0, -1.0)
+OPEN_AND_PUSH = (-1.0, 0.0, -1.0, 1.0)
+NOTHING = (0.0, 0.0, 0.0, 0.0)
+FINGERS, OBJECT = slice(8, 10), slice(10, 13)
+"""Where they stand in a world's flat state: after time and seven joints."""
+DISTANCE_M = 0.05
+
+
+class Constant:
+    """Alice or Bob: the same action always."""
+
+    def __init__(self, action):
+        self.action = np.asarray(action, dtype=np.float32)
+
+    def act(self, observation, rng):
+        return self.act_deterministic(observation), np.zeros(len(observation), dtype=np.float32)
+
+    def act_deterministic(self, observation):
+        return np.tile(self.action, (len(observation), 1))
+
+
+def record(alice=PUSH, bob=PUSH, *, num_rounds=3, seed=0, **game):
+    config = Config(game=GameConfig(**{"alice_steps": 12, "bob_steps": 12} | game))
+    return record_rounds(config, Constant(alice), Constant(bob), num_rounds=num_rounds, seed=seed)
+
+
+def reached(played):
+    """(T2 + 1,) the object is within the success distance."""
+    return np.linalg.norm(played.bob_states[:, OBJECT] - played.goal, axis=1) <= DISTANCE_M
+
+
+# --- rounds ----------------------------------------------------------------------------------------------------------
+
+
+def test_recorded_rounds_are_rounds():
+    rounds = record()
+    assert len(rounds) == 3
+    for played in rounds:
+        assert played.verdict == Verdict.VALID
+        assert played.alice_states.shape[0] == 13
+        np.testing.assert_array_equal(played.alice_states[-1, OBJECT], played.goal)
+        np.testing.assert_array_equal(played.bob_states[0], played.alice_states[0])
+        # Bob does the same, so he comes by the same states, and stops as soon as he is near enough.
+        np.testing.assert_array_equal(played.bob_states, played.alice_states[: len(played.bob_states)])
+        assert played.solved
+        assert reached(played).tolist() == [False] * (len(played.bob_states) - 1) + [True]
+    moved = [np.linalg.norm(played.goal - played.alice_states[0, OBJECT]) for played in rounds]
+    assert moved == sorted(moved, reverse=True)
+
+
+def test_the_actions_lead_from_state_to_state():
+    for played in record(blocked_gripper_fraction=0.5):
+        with WorldBatch(WorldConfig(), 1, num_threads=1, blocked_fraction=0.5) as worlds:
+            for states, actions in (
+                (played.alice_states, played.alice_actions),
+                (played.bob_states, played.bob_actions),
+            ):
+                worlds.restore(states[:1])
+                for action, after in zip(actions, states[1:], strict=True):
+                    worlds.step(action[None])
+                    np.testing.assert_array_equal(worlds.states[0], after)
+
+
+def test_bobs_turn_lasts_until_he_has_held_the_object_at_the_goal():
+    once, held = (record(bob_hold_steps=steps) for steps in (1, 3))
+    for short, played in zip(once, held, strict=True):
+        # He does what Alice did and touches at the same step as before; two more steps follow.
+        assert len(played.bob_states) == len(short.bob_states) + 2
+        assert reached(played).tolist() == [False] * (len(short.bob_states) - 1) + [True] * 3
+        assert played.solved
+
+
+class Sweep(Constant):
+    """Moves forward close to the table, with closed fingers."""
+
+    def __init__(self):
+        super().__init__((1.0, 0.0, 0.0, -1.0))
+
+    def act_deterministic(self, observation):
+        action = super().act_deterministic(observation)
+        action[:, 2] = np.clip((0.03 - observation[:, 2]) / 0.05, -1.0, 1.0)
+        return action
+
+
+def test_a_bob_who_passes_the_goal_has_not_solved_it():
+    # He does what Alice did, but for 20 steps, not 8: where she left the object he does not stop.
+    config = Config(game=GameConfig(alice_steps=8, bob_steps=20, bob_hold_steps=20))
+    rounds = record_rounds(config, Sweep(), Sweep(), num_rounds=30, seed=0)
+    tried = [played for played in rounds if played.verdict == Verdict.VALID]
+    assert {len(played.bob_actions) for played in tried} == {20}
+    passed = [played for played in tried if not reached(played)[-1]]
+    assert passed
+    assert all(reached(played).any() for played in passed)
+    assert [played.solved for played in tried] == [bool(reached(played)[-1]) for played in tried]
+
+
+def test_the_length_of_alices_turn_is_drawn():
+    rounds = [record(alice_steps_min=9, num_rounds=1, seed=seed)[0] for seed in range(12)]
+    assert {len(played.alice_actions) for played in rounds} == {9, 10, 11, 12}
+    for played in rounds:
+        assert len(played.alice_states) == len(played.alice_actions) + 1
+        np.testing.assert_array_equal(played.alice_states[-1, OBJECT], played.goal)
+        np.testing.assert_array_equal(played.bob_states[0], played.alice_states[0])
+
+
+def test_blocked_grippers_stay_closed():
+    rounds = record(OPEN_AND_PUSH, OPEN_AND_PUSH, num_rounds=64, blocked_gripper_fraction=0.5)
+    blocked = [played for played in rounds if played.alice_states[0, -1] == 1.0]
+    assert 20 < len(blocked) < 44  # four standard deviations of 64 draws are 16
+    for played in rounds:
+        states = np.concatenate([played.alice_states, played.bob_states])
+        is_blocked = played.alice_states[0, -1] == 1.0
+        assert (states[:, -1] == is_blocked).all()
+        # Open fingers are at 4 cm; a blow against the table moves blocked ones by millimetres.
+        assert states[:, FINGERS].max() < 0.005 if is_blocked else states[:, FINGERS].max() > 0.039
+    assert any(len(played.bob_actions) for played in blocked)
+
+
+def test_a_bob_who_does_nothing_runs_out_of_time():
+    (played,) = record(bob=NOTHING, num_rounds=1)
+    assert not played.solved
+    assert len(played.bob_states) == 13
+
+
+def test_an_alice_who_does_nothing_is_shown_as_she_is():
+    rounds = record(NOTHING, num_rounds=2)
+    assert [played.verdict for played in rounds] == [Verdict.NOT_MOVED] * 2
+    assert [len(played.bob_states) for played in rounds] == [1, 1]
+
+
+def test_a_seed_determines_the_rounds():
+    one, same, other = (record(seed=seed, num_rounds=1)[0] for seed in (0, 0, 1))
+    np.testing.assert_array_equal(one.alice_states, same.alice_states)
+    assert not np.array_equal(one.goal, other.goal)
+
+
+def test_more_rounds_than_worlds_can_be_asked_for():
+    assert len(record(num_rounds=70)) == 70
+
+
+def test_played_before_lifted_before_far():
+    start = np.tile([0.0, 0.0, 0.025], (4, 1))
+    goal = start + np.array([[0.30, 0, 0], [0.12, 0, 0.06], [0.20, 0, 0], [0.50, 0, 0.10]])
+    records = SimpleNamespace(start_position=start, goal=goal, played=np.array([True, True, True, False]))
+    interest = list(recording._interest(SimpleNamespace(records=records), 0.025))
+    assert sorted(range(4), key=interest.__getitem__, reverse=True) == [1, 0, 2, 3]
+
+
+# --- episodes --------------------------------------------------------------------------------------------------------
+
+
+def test_recorded_episodes_keep_every_state():
+    episodes = record_episodes(
+        Constant(NOTHING), WorldConfig(), "table", num_episodes=5, num_steps=4, success_distance_m=0.15, seed=2
+    )
+    assert episodes.states.shape[:2] == episodes.reached.shape == (5, 5)
+    distance = np.linalg.norm(episodes.states[..., OBJECT] - episodes.goal, axis=2)
+    np.testing.assert_array_equal(episodes.reached, distance <= 0.15)
+    assert episodes.reached.any()
+    assert not episodes.reached.all()
+
+
+def test_recorded_episodes_are_those_of_the_evaluation():
+    common = {"num_episodes": 40, "num_steps": 20, "success_distance_m": 0.12, "seed": 3}
+    episodes = record_episodes(Constant(PUSH), WorldConfig(), "table", **common)
+    result = evaluate(Constant(PUSH), WorldConfig(), "table", **common)
+    assert 0.0 < result.success_last < result.success_ever
+    assert result.success_last == episodes.reached[-1].mean()
+    assert result.success_ever == episodes.reached[1:].any(axis=0).mean()
+    distance = np.linalg.norm(episodes.states[-1][:, OBJECT] - episodes.goal, axis=1)
+    assert result.mean_distance_m == pytest.approx(distance.mean(), abs=1e-12)
