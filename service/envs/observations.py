@@ -102,3 +102,8 @@ NORMALISATION_POSITIONS = _normalisation(*_POSITIONS)
 NORMALISATION_FULL = _normalisation(*_POSITIONS, *_PRIVILEGED, _ELAPSED)
 NORMALISATION_BOB = _normalisation(*_POSITIONS, _POSITION)
 NORMALISATION_BOB_VALUE = _normalisation(*_POSITIONS, *_PRIVILEGED, _POSITION, _RELATIVE)
+
+
+def bob_observation(positions: FloatArray, goal: NDArray[np.floating]) -> FloatArray:
+    """Bob's input (N, 14) from (N, 11) positions and (N, 3) goals, metres."""
+    return np.concatenate([positions, goal.astype(np.float32)], axis=1)
