@@ -14,6 +14,8 @@ import mujoco
 import numpy as np
 
 NUM_JOINTS = 7
+NUM_FINGERS = 2
+"""Left and right, in this order wherever there is one number for each."""
 BASE_POSITION = (-0.6, 0.0, 0.0)
 JOINT_LOWER = np.array([-2.8973, -1.7628, -2.8973, -3.0718, -2.8973, -0.0175, -2.8973])
 JOINT_UPPER = np.array([2.8973, 1.7628, 2.8973, -0.0698, 2.8973, 3.7525, 2.8973])

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.config import Config
+from service.envs.state_layout import StateLayout
 from service.generator.counts import SuccessCounts
 from service.generator.difficulty import DifficultyGrid, in_air
 from service.generator.metrics import alice_metrics, bob_metrics, current_goals, mean, own_goals, without_nan
@@ -72,13 +73,14 @@ class TaskGenerator:
     opponents: OpponentPool
     """Past versions of both players."""
 
-    def __init__(self, config: Config, state_size: int) -> None:
+    def __init__(self, config: Config, layout: StateLayout) -> None:
+        self._layout = layout
         self._config = config.generator
         self._success_distance_m = config.game.success_distance_m
         self._rest_height_m = config.world.object_size_m / 2
         self._some_blocked = config.game.blocked_gripper_fraction > 0.0
         self.grid = DifficultyGrid(config.world, config.generator.cell_size_m)
-        columns = {"start_state": state_size, "start_position": 3}
+        columns = {"start_state": layout.size, "start_position": 3}
         num_cells = self.grid.seen.size if config.generator.replay_over_cells else 1
         self.buffer = Ring(config.generator.replay_buffer_size, num_cells, **columns, goal=3)
         self.starts = Ring(NUM_STARTS, **columns)
@@ -237,8 +239,9 @@ class TaskGenerator:
         return bins + blocked * self._num_task_bins
 
     def _blocked(self, states: Floats) -> Bools:
-        """(M,) whether the gripper of (M, S) states is blocked; where some are, their last number says so."""
-        return states[:, -1] > 0.0 if self._some_blocked else np.zeros(len(states), dtype=np.bool_)
+        """(M,) whether the gripper of (M, S) states is blocked; none is where states have no such flag."""
+        blocked: Bools = (states[:, self._layout["gripper_blocked"]] > 0.0).any(axis=1)
+        return blocked
 
     def _blocked_metrics(self, records: GoalRecords, tried: Bools) -> dict[str, float]:
         if not self._some_blocked:

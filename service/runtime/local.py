@@ -63,7 +63,7 @@ class LocalRun:
         self.learner = Learner(config)
         self._incarnation = 0
         self.game = SelfPlay(config, self._rng, num_threads=config.run.num_threads)
-        self.generator = TaskGenerator(config, self.game.worlds.state_size)
+        self.generator = TaskGenerator(config, self.game.worlds.layout)
         self.books = Books(config, directory)
         self._stop_requested = False
         self._past: list[tuple[Acting, Acting]] = []

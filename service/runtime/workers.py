@@ -20,8 +20,8 @@ from service.actors.evaluation import evaluate
 from service.actors.rollout import Broken, GoalRecords, Rollout
 from service.actors.self_play import Acting, Players, SelfPlay
 from service.config import Config
-from service.envs.batch import WorldBatch
 from service.envs.goals import GoalKind
+from service.envs.scene import build_layout
 from service.generator.generator import GoalChoice, TaskGenerator
 from service.generator.opponents import RoundPlan
 from service.io.run_directory import sampled_goals
@@ -257,9 +257,8 @@ class GeneratorWorker:
     """
 
     def __init__(self, config: Config, state: Arrays | None) -> None:
-        blocked_fraction = config.game.blocked_gripper_fraction
-        with WorldBatch(config.world, 1, num_threads=1, blocked_fraction=blocked_fraction) as worlds:
-            self._generator = TaskGenerator(config, worlds.state_size)
+        layout = build_layout(config.world, blocked_fraction=config.game.blocked_gripper_fraction)
+        self._generator = TaskGenerator(config, layout)
         self._config = config
         self._pool_version = 0
         if state is not None:

@@ -16,10 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.config import WorldConfig
-from service.envs.fixtures import PLACE_SIZE
 from service.envs.rendering.decoration import OBJECT_RGB, decorate
 from service.envs.rendering.gl import RenderError, open_drawing
-from service.envs.scene import build_spec
+from service.envs.scene import build_layout, build_spec
 
 __all__ = ["DEFAULT_CAMERA", "TOP_CAMERA", "Camera", "Mark", "RenderError", "SceneRenderer", "decorate"]
 
@@ -80,7 +79,7 @@ class SceneRenderer:
         self.camera = camera
         self.model = _build_model(config, width, height)
         self._data = mujoco.MjData(self.model)
-        self._state_size = mujoco.mj_stateSize(self.model, mujoco.mjtState.mjSTATE_FULLPHYSICS)
+        self._layout = build_layout(config)  # a flag of blocked grippers would follow all that is read here
         self._half_m = config.object_size_m / 2
         self._goal_geom = mujoco.mjtGeom.mjGEOM_BOX if config.object == "cube" else mujoco.mjtGeom.mjGEOM_SPHERE
         self._rectangle = mujoco.MjrRect(0, 0, width, height)
@@ -117,9 +116,9 @@ class SceneRenderer:
             (H, W, 3), the top row first.
         """
         assert self._context is not None, "drawing after close"
-        mujoco.mj_setState(self.model, self._data, state[: self._state_size], mujoco.mjtState.mjSTATE_FULLPHYSICS)
+        mujoco.mj_setState(self.model, self._data, state[self._layout.physics], mujoco.mjtState.mjSTATE_FULLPHYSICS)
         if self.model.nmocap:
-            self._data.mocap_pos[0] = state[-PLACE_SIZE:]
+            self._data.mocap_pos[0] = state[self._layout["box_place"]]
         mujoco.mj_kinematics(self.model, self._data)
         mujoco.mj_camlight(self.model, self._data)
         camera, everything = _mujoco_camera(self.camera), mujoco.mjtCatBit.mjCAT_ALL

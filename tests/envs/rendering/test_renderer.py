@@ -165,6 +165,18 @@ def test_a_sphere_is_round():
     assert mask.sum() == pytest.approx(np.pi / 4 * height * width, rel=0.15)
 
 
+def test_the_flag_of_a_blocked_gripper_moves_no_box():
+    """Where some grippers are blocked, a state goes on behind the place of its box."""
+    config = WorldConfig(fixture="box")
+    pictures = []
+    with open_renderer(config) as renderer:
+        for blocked_fraction in (0.0, 0.5):
+            with WorldBatch(config, 1, num_threads=1, blocked_fraction=blocked_fraction) as worlds:
+                worlds.object_position[:], worlds.box_place[:] = [-0.9, 0.3, 0.025], [0.05, -0.12, 0.0]
+                pictures.append(renderer.render(worlds.states[0]))
+    np.testing.assert_array_equal(*pictures)
+
+
 def test_closed_is_closed():
     renderer = open_renderer()
     renderer.close()
