@@ -7,15 +7,13 @@ from collections.abc import Mapping
 import numpy as np
 from numpy.typing import NDArray
 
-from service.config import WorldConfig
+from service.config import Point, WorldConfig
 from service.generator.counts import SuccessCounts
 from service.generator.state import Array, State, prefixed, take, under
-from service.generator.validity import workspace_bounds
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 Bools = NDArray[np.bool_]
-Corner = tuple[float, float, float]
 
 AIR_ABOVE_REST_M = 0.05
 """A goal is in the air when the object's centre is higher than it rests on the table by more than this."""
@@ -44,7 +42,7 @@ class DifficultyGrid:
     All rates are decayed running ones (see ``counts.DECAY``), one ``record`` being one iteration, so they follow Bob.
     """
 
-    bounds_m: tuple[Corner, Corner]
+    bounds_m: tuple[Point, Point]
     """Lower and upper corner of the workspace, metres."""
     cell_size_m: float
     """Edge of a cell; the last ones may reach beyond the workspace."""
@@ -60,8 +58,8 @@ class DifficultyGrid:
     """(cells,) a valid goal was ever proposed there."""
 
     def __init__(self, world: WorldConfig, cell_size_m: float) -> None:
-        self._lower, upper = workspace_bounds(world.workspace)
-        self.bounds_m = _corner(self._lower), _corner(upper)
+        self.bounds_m = world.workspace.lower_m, world.workspace.upper_m
+        self._lower, upper = np.array(self.bounds_m)
         self.cell_size_m = cell_size_m
         self._rest_height_m = world.object_size_m / 2
         # Rounding may not add a cell: 0.45 / 0.03 is a little over 15.
@@ -179,8 +177,3 @@ class DifficultyGrid:
         self.cells.load_state(under("cells", state))
         self.heights.load_state(under("heights", state))
         self.distances.load_state(under("distances", state))
-
-
-def _corner(point: Floats) -> Corner:
-    x, y, z = (float(value) for value in point)
-    return x, y, z

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,13 +15,11 @@ from service.generator.difficulty import DifficultyGrid, in_air
 from service.generator.metrics import alice_metrics, bob_metrics, current_goals, mean, own_goals, without_nan
 from service.generator.opponents import OpponentPool, RoundPlan
 from service.generator.penalty import OutsidePenalty
+from service.generator.records import GoalRecords
 from service.generator.ring import Ring
 from service.generator.state import Array, State, prefixed, under
 from service.generator.stopping import StopCriterion
 from service.generator.validity import Verdict
-
-if TYPE_CHECKING:
-    from service.actors.rollout import GoalRecords
 
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]

@@ -2,16 +2,12 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 from numpy.typing import NDArray
 
 from service.generator.difficulty import HEIGHT_NAMES, height_bins, in_air
+from service.generator.records import GoalRecords
 from service.generator.validity import Verdict
-
-if TYPE_CHECKING:
-    from service.actors.rollout import GoalRecords
 
 Bools = NDArray[np.bool_]
 

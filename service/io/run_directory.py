@@ -43,7 +43,8 @@ from service.registry.errors import RegistryError
 from service.registry.manifest import git_commit
 
 if TYPE_CHECKING:
-    from service.actors.rollout import Broken, GoalRecords
+    from service.actors.rollout import Broken
+    from service.generator.records import GoalRecords
     from service.io.tensorboard import EventFile
 
 _logger = logging.getLogger(__name__)

@@ -13,7 +13,7 @@ from service.config import Config, WorldConfig
 from service.envs.batch import WorldBatch
 from service.envs.goals import GoalKind, draw_goals
 from service.generator.difficulty import in_air
-from service.generator.validity import Verdict, judge
+from service.generator.validity import Verdict, classify_goal
 
 StateArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
@@ -129,7 +129,7 @@ def _play_alice(config: Config, alice: Acting, worlds: WorldBatch, rng: np.rando
         broken |= worlds.step(action)
         states.append(worlds.states.copy())
     end = worlds.object_position.copy()
-    verdict = judge(start, end, config.world.workspace, game.success_distance_m)
+    verdict = classify_goal(start, end, config.world.workspace, game.success_distance_m)
     verdict[broken] = Verdict.FALLEN
     return _Proposals(np.stack(states, axis=1), start, end, verdict)
 

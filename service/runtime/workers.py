@@ -17,13 +17,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.actors.evaluation import evaluate
-from service.actors.rollout import Broken, GoalRecords, Rollout
+from service.actors.rollout import Broken, Rollout
 from service.actors.self_play import Acting, Players, SelfPlay
 from service.config import Config
 from service.envs.goals import GoalKind
 from service.envs.scene import build_layout
 from service.generator.generator import GoalChoice, TaskGenerator
 from service.generator.opponents import RoundPlan
+from service.generator.records import GoalRecords
 from service.io.run_directory import sampled_goals
 from service.policies.evaluator import GaussianEvaluator, bob_evaluator
 from service.policies.parameters import Parameters

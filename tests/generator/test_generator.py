@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from service.actors.rollout import GoalRecords
 from service.config import Config, ConfigError, parse_config
 from service.envs.state_layout import StateLayout
 from service.generator.generator import LEARNABILITY_FLOOR, MIN_REPLAY_GOALS, GoalChoice, TaskGenerator
 from service.generator.opponents import CURRENT, RoundPlan
+from service.generator.records import GoalRecords
 from service.generator.validity import Verdict
 
 FREE = StateLayout(positions={"object": 3}, velocities={}, measured={}, kept={"gripper_blocked": 0})

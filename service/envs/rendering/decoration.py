@@ -115,9 +115,7 @@ def _add_lights(spec: mujoco.MjSpec) -> None:
 
 def _add_workspace(spec: mujoco.MjSpec, workspace: WorkspaceConfig) -> None:
     """Its outline on the table, faint upright and upper edges, and a breath of colour inside."""
-    half = np.array([workspace.length_x_m, workspace.length_y_m]) / 2
-    center = np.array([workspace.center_x_m, workspace.center_y_m])
-    low, high = np.append(center - half, 0.001), np.append(center + half, workspace.height_m)
+    low, high = np.array([*workspace.lower_m[:2], 0.001]), np.array(workspace.upper_m)
     for ends in _box_edges(low, high):
         on_table = bool(ends[:, 2].max() == low[2])
         radius = 0.002 if on_table else 0.001

@@ -1,0 +1,44 @@
+"""What actors report to the task generator: the goals of a round, and how they went."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+Bools = NDArray[np.bool_]
+
+
+@dataclass(frozen=True, slots=True)
+class GoalRecords:
+    """What became of each world's goal in this round; all arrays have N rows."""
+
+    start_state: Floats
+    """(N, S) full physics state Bob started from; Alice too, unless ``replayed``."""
+    start_position: Floats
+    """(N, 3) object position there, metres."""
+    goal: Floats
+    """(N, 3) the goal Bob played, metres: Alice's proposal, or a replayed goal where ``replayed``."""
+    proposal: Floats
+    """(N, 3) object position at the end of Alice's turn, metres."""
+    verdict: NDArray[np.int8]
+    """(N,) ``Verdict`` of Alice's proposal."""
+    replayed: Bools
+    """(N,) Bob played a goal from the replay buffer (``start_state`` is then that goal's own)."""
+    from_reset: Bools
+    """(N,) Bob started where a game does, as he does whenever he is evaluated."""
+    played: Bools
+    """(N,) Bob had a whole turn: there was a goal, and the physics held."""
+    solved: Bools
+    """(N,) Bob came within the success distance."""
+    num_bob_steps: Ints
+    """(N,)."""
+    alice_past: Bools
+    """(N,) a past Alice proposed."""
+    bob_past: Bools
+    """(N,) a past Bob played."""
+    round_index: Ints
+    """(N,) 0 for the first round after a reset."""
