@@ -15,20 +15,9 @@ from service.config import WorldConfig
 from service.envs import kinematics
 from service.envs.observations import ACTION_SIZE, BOB_VALUE, FULL, POSITIONS, ObservationLayout
 from service.envs.panda import FINGER_STROKE_M, NUM_FINGERS, NUM_JOINTS
-from service.envs.sampling import draw_starts, sample_in_volume, sample_on_table
+from service.envs.sampling import draw_starts
 from service.envs.scene import build_layout, build_spec
 from service.errors import DivergedError
-
-__all__ = [
-    "DISPLACEMENT_M",
-    "LOWEST_TARGET_M",
-    "MAX_SPEED",
-    "MAX_TURN_RAD",
-    "WIDTH_CHANGE_M",
-    "WorldBatch",
-    "sample_in_volume",
-    "sample_on_table",
-]
 
 FloatArray = NDArray[np.float32]
 StateArray = NDArray[np.float64]

@@ -59,7 +59,7 @@ class TaskGenerator:
     """
 
     grid: DifficultyGrid
-    """Bob's success over goal cells, heights and distances."""
+    """Bob's success over goal cells."""
     buffer: Ring
     """Earlier valid goals and the states they were proposed from, drawn by learnability (Rutherford et al. 2024)."""
     starts: Ring
@@ -140,7 +140,7 @@ class TaskGenerator:
         tasks = records.goal[reset], records.start_position[reset], self._blocked(records.start_state[reset])
         self.from_reset.record(self._task_bins(*tasks), records.solved[reset])
         as_proposed = tried & ~(records.replayed & records.from_reset)
-        self.grid.record(records.goal[as_proposed], records.start_position[as_proposed], records.solved[as_proposed])
+        self.grid.record(records.goal[as_proposed], records.solved[as_proposed])
         own = own_goals(records)
         goal = records.goal[own]
         self.buffer.add(

@@ -224,9 +224,8 @@ def test_record_separates_who_learns_what(make_records: MakeRecords) -> None:
     assert metrics["bob/success_rate"] == 1.0  # the first world alone
     assert metrics["bob/success_rate_replayed"] == 0.0
     # The current Bob tried the first cell three times and the past Alice's once; the past Bob's try does not count.
-    rates = generator.grid.success_rate(
-        np.array([(-0.2, 0.0, 0.02), (-0.1, 0.0, 0.02), (0.0, 0.1, 0.02), (0.1, 0.1, 0.02)])
-    )
+    goals = np.array([(-0.2, 0.0, 0.02), (-0.1, 0.0, 0.02), (0.0, 0.1, 0.02), (0.1, 0.1, 0.02)])
+    rates = generator.grid.cells.success_rate()[generator.grid.cell_index(goals)]
     np.testing.assert_allclose(rates, [2 / 5, 2 / 3, 1 / 2, 1 / 2])
     expected = (6 / 25 + 2 / 9 + 1 / 4 + 1 / 4) / 4
     assert metrics["generator/mean_learnability"] == pytest.approx(expected)

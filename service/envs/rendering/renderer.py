@@ -20,7 +20,7 @@ from service.envs.rendering.decoration import OBJECT_RGB, decorate
 from service.envs.rendering.gl import RenderError, open_drawing
 from service.envs.scene import build_layout, build_spec
 
-__all__ = ["DEFAULT_CAMERA", "TOP_CAMERA", "Camera", "Mark", "RenderError", "SceneRenderer", "decorate"]
+__all__ = ["DEFAULT_CAMERA", "Camera", "Mark", "RenderError", "SceneRenderer"]
 
 Image = NDArray[np.uint8]
 Array = NDArray[np.float64]
@@ -56,8 +56,6 @@ class Mark:
 
 DEFAULT_CAMERA = Camera((-0.20, 0.0, 0.21), 1.95, 146.0, -21.0)
 """Three-quarter view from the front: arm, workspace and object."""
-TOP_CAMERA = Camera((-0.28, 0.0, 0.05), 2.4, 180.0, -72.0)
-"""From above, the robot at the top."""
 
 
 class SceneRenderer:
