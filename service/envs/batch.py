@@ -222,14 +222,14 @@ class WorldBatch:
         return self.observe(BOB_VALUE, goal=goal, goal_from_object=goal - self.object_position)
 
     def observe(self, layout: ObservationLayout, **given: StateArray | float) -> FloatArray:
-        """(N, O) vectors of any layout; entries that are no matter of a world, such as a goal, are ``given``."""
+        """(N, O) vectors of any layout; ``given`` are the (N, size) entries a world does not know, such as a goal."""
         out = np.empty((self.num_worlds, layout.size), dtype=np.float32)
         for name, part in layout.columns.items():
             out[:, part] = given[name] if name in given else self._measure(name)
         return out
 
     def _measure(self, name: str) -> StateArray:
-        """(N, size) an entry of an observation: computed here, or else a part of the state."""
+        """(N, size) one entry of an observation: computed here, or else a part of the state of the same name."""
         if name == "effector":
             return self.ee_position
         if name == "object_from_effector":
@@ -255,7 +255,7 @@ class WorldBatch:
 
 
 def _quieten_mujoco() -> None:
-    """``WorldBatch`` itself tells of diverged worlds; MuJoCo would also write to a file in the working directory."""
+    """Turn off MuJoCo's own log, a file in the working directory; ``WorldBatch`` itself reports diverged worlds."""
     log = mujoco.MjLogConfig.get()
     log.logto_file = log.logto_console = False
     log.set()

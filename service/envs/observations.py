@@ -1,4 +1,4 @@
-"""What the players see, as flat float32 vectors, and how those vectors reflect in y.
+"""Observations of both players as flat float32 vectors, with their reflection in y and their normalisation.
 
 Each layout is declared once, as a list of entries; sizes, slices, mirror and normalisation follow from it. Positions
 are in the world frame (origin: table top, 0.6 m in front of the robot's base). With the gripper down, the left finger
@@ -45,7 +45,7 @@ class Normalisation:
 
 
 class Kind(NamedTuple):
-    """How an entry reflects in y: number i becomes ``sign[i]`` times number ``source[i]``; its size is that of both."""
+    """Reflection of one entry in y: number i becomes ``sign[i]`` times number ``source[i]``."""
 
     source: tuple[int, ...]
     sign: tuple[float, ...]

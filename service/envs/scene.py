@@ -16,7 +16,7 @@ _STIFF = {"solref": (0.01, 1.0), "solimp": (0.95, 0.99, 0.001, 0.5, 2.0)}
 
 
 def build_spec(config: WorldConfig) -> mujoco.MjSpec:
-    """The physics of the scene; ``rendering.decoration`` adds what only eyes need.
+    """Physics of the scene; ``rendering.decoration`` adds what is there for pictures only.
 
     The contact cone is elliptic with ``impratio`` 100: a held cube creeps 0.4 mm in 5 s,
     against 1.7 mm at 10, and a held sphere stays at all (docs/decisions/0001).
@@ -53,7 +53,7 @@ def build_spec(config: WorldConfig) -> mujoco.MjSpec:
 
 
 def build_layout(config: WorldConfig, *, blocked_fraction: float = 0.0) -> StateLayout:
-    """The state of worlds that ``build_spec`` built.
+    """Layout of the state of worlds that ``build_spec`` built.
 
     Args:
         config: the world.

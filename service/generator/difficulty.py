@@ -55,11 +55,11 @@ class DifficultyGrid:
 
     def __init__(self, world: WorldConfig, cell_size_m: float) -> None:
         self.bounds_m = world.workspace.lower_m, world.workspace.upper_m
-        self._lower, upper = np.array(self.bounds_m)
+        self._lower: Floats = np.array(self.bounds_m[0])
         self.cell_size_m = cell_size_m
         self._rest_height_m = world.object_size_m / 2
         # Rounding may not add a cell: 0.45 / 0.03 is a little over 15.
-        counted = np.ceil((upper - self._lower) / cell_size_m - 1e-9).astype(int)
+        counted = np.ceil((self.bounds_m[1] - self._lower) / cell_size_m - 1e-9).astype(int)
         self.shape = (int(counted[0]), int(counted[1]), int(counted[2]))
         num_cells = int(np.prod(self.shape))
         self.cells = SuccessCounts(num_cells)

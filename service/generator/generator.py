@@ -1,4 +1,4 @@
-"""The task generator: which opponents and goals a round uses, what became of them, and when the run is over."""
+"""The task generator: the choice of opponents and goals for a round, their outcomes, and the end of a run."""
 
 from __future__ import annotations
 
@@ -88,7 +88,7 @@ class TaskGenerator:
         self._penalty = OutsidePenalty(config.game.alice_outside_from_valid_fraction)
 
     def plan(self, num_worlds: int, rng: np.random.Generator) -> RoundPlan:
-        """Choose who plays the next round; all current while there are no past versions."""
+        """Choose the players of the next round; all current while there are no past versions."""
         plan = self.opponents.plan(num_worlds, self._config.past_opponent_fraction, rng)
         return replace(plan, penalise_outside=self._penalty.active)
 
@@ -104,7 +104,7 @@ class TaskGenerator:
     ) -> GoalChoice:
         """Choose what Bob plays: Alice's valid goals, or replayed ones where the configuration says so.
 
-        Replayed goals go to the current Bob only: a past Bob plays to judge Alice's goals, not to learn.
+        Replayed goals go to the current Bob only: nobody learns from a past Bob, he shows how hard Alice's goals are.
 
         Args:
             plan: who plays.
@@ -126,7 +126,7 @@ class TaskGenerator:
         return choice
 
     def record(self, records: GoalRecords) -> dict[str, float]:
-        """Learn from what became of one iteration's goals.
+        """Take in the outcomes of one iteration's goals.
 
         Difficulty follows every try of the current Bob; the buffer takes the valid goals that Bob played straight from
         Alice; a cell is new when a valid proposal, a past Alice's included, is the first in it.
@@ -211,6 +211,7 @@ class TaskGenerator:
         Whatever is asked of Bob downstream begins with a reset, but Alice reaches far goals over several rounds, so few
         of her own do. Both kinds of task compete by learnability: far goals from a reset wait until Bob is ready.
         """
+        # Each goal of the buffer is a candidate from its own start and, behind all of these, from the start of a game.
         goal = self.buffer["goal"]
         tasks = {name: self.buffer[name] for name in ("start_state", "start_position")}
         share = self.buffer.part_share()
@@ -220,7 +221,7 @@ class TaskGenerator:
             position = start["start_position"]
             blocked = self._blocked(start["start_state"])
             far = np.linalg.norm(goal - position, axis=1) > self._success_distance_m  # nearer ones are no task
-            possible = ~(blocked & in_air(goal, self._rest_height_m))
+            possible = ~(blocked & in_air(goal, self._rest_height_m))  # a closed gripper lifts nothing
             learnability = self.from_reset.learnability()[self._task_bins(goal, position, blocked)]
             weight = np.concatenate([weight, np.where(far & possible, learnability + LEARNABILITY_FLOOR, 0.0) * share])
             tasks = {name: np.concatenate([rows, start[name]]) for name, rows in tasks.items()}
@@ -237,7 +238,7 @@ class TaskGenerator:
 
     def _blocked(self, states: Floats) -> Bools:
         """(M,) whether the gripper of (M, S) states is blocked; none is where states have no such flag."""
-        blocked: Bools = (states[:, self._layout["gripper_blocked"]] > 0.0).any(axis=1)
+        blocked: Bools = np.any(states[:, self._layout["gripper_blocked"]] > 0.0, axis=1)
         return blocked
 
     def _blocked_metrics(self, records: GoalRecords, tried: Bools) -> dict[str, float]:

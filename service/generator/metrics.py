@@ -1,4 +1,4 @@
-"""What one iteration's goals say about both players; metric names are an API."""
+"""Metrics of both players from the goals of one iteration; metric names are an API."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What actors report to the task generator: the goals of a round, and how they went."""
+"""Records of the goals of a round, as actors report them to the task generator."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ Bools = NDArray[np.bool_]
 
 @dataclass(frozen=True, slots=True)
 class GoalRecords:
-    """What became of each world's goal in this round; all arrays have N rows."""
+    """The goal of each world in a round and its outcome; all arrays have N rows."""
 
     start_state: Floats
     """(N, S) full physics state Bob started from; Alice too, unless ``replayed``."""

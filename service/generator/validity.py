@@ -14,7 +14,7 @@ FALLEN_BELOW_M = -0.02
 
 
 class Verdict(enum.IntEnum):
-    """What became of Alice's proposal; only a ``VALID`` one is a goal."""
+    """Outcome of Alice's proposal; only a ``VALID`` one is a goal."""
 
     VALID = 0
     NOT_MOVED = 1

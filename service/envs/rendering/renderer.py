@@ -1,7 +1,7 @@
 """Pictures of a world: MuJoCo's own renderer, offscreen, on states of a ``WorldBatch``.
 
-A second model is drawn, the physics with its decoration; states of one are states of the other. OpenGL is touched when
-a ``SceneRenderer`` is made and not before.
+The model that is drawn is the physics with its decoration; both have the same states. OpenGL is touched when a
+``SceneRenderer`` is made and not before.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ _NUM_SAMPLES = 4
 
 @dataclass(frozen=True, slots=True)
 class Camera:
-    """Where a picture is taken from: it looks at a point from a distance in a direction."""
+    """A camera that looks at a point from a distance in a direction."""
 
     target: tuple[float, float, float]
     """The point in the middle of the picture, metres."""
@@ -59,7 +59,7 @@ DEFAULT_CAMERA = Camera((-0.20, 0.0, 0.21), 1.95, 146.0, -21.0)
 
 
 class SceneRenderer:
-    """Draws states of a ``WorldBatch`` of the same configuration; for use in the thread that made it.
+    """Renderer of the states of a ``WorldBatch`` of the same configuration; for use in the thread that made it.
 
     Args:
         config: the world.
@@ -77,7 +77,7 @@ class SceneRenderer:
         self.camera = camera
         self.model = _build_model(config, width, height)
         self._data = mujoco.MjData(self.model)
-        self._layout = build_layout(config)  # a flag of blocked grippers would follow all that is read here
+        self._layout = build_layout(config)  # the flag of a blocked gripper follows everything that is read here
         self._half_m = config.object_size_m / 2
         self._goal_geom = mujoco.mjtGeom.mjGEOM_BOX if config.object == "cube" else mujoco.mjtGeom.mjGEOM_SPHERE
         self._rectangle = mujoco.MjrRect(0, 0, width, height)
@@ -136,7 +136,7 @@ class SceneRenderer:
         return np.ascontiguousarray(image[::-1])
 
     def _add_goal(self, goal: Array) -> None:
-        """A ghost of the object, and a line down to the table, which tells its height."""
+        """Add a transparent copy of the object, and a line down to the table, which shows its height."""
         self._add(self._goal_geom, (self._half_m, self._half_m, self._half_m), goal, _GOAL_RGBA)
         cylinder, foot = mujoco.mjtGeom.mjGEOM_CYLINDER, np.array([goal[0], goal[1], 0.0])
         self._add(cylinder, (_FOOT_RADIUS_M, _FOOT_HALF_HEIGHT_M, 0.0), foot, _DROP_RGBA)
