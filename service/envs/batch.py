@@ -65,6 +65,7 @@ class WorldBatch:
         self._pool = rollout.Rollout(nthread=num_threads if num_threads > 1 else 0)
         self._data = [mujoco.MjData(self.model) for _ in range(max(num_threads, 1))]
         self.layout = build_layout(config, blocked_fraction=blocked_fraction)
+        """Columns of ``states``."""
         assert (self.model.nq, self.model.nv) == (self.layout.num_positions, self.layout.num_velocities)
         assert mujoco.mj_stateSize(self.model, _PHYSICS) == self.layout.physics.stop
         self._blocked_fraction = blocked_fraction
@@ -72,6 +73,7 @@ class WorldBatch:
         self._widest_m = 2 * FINGER_STROKE_M if config.gripper == "free" else 0.0
         self._fresh_state = self._make_fresh_state()
         self.states: StateArray = np.tile(self._fresh_state, (num_worlds, 1))
+        """(N, S)."""
         self._kinematics = kinematics.forward(self.joints)
         self.num_broken = 0
         self.broken: list[tuple[StateArray, FloatArray]] = []
