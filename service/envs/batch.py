@@ -151,7 +151,7 @@ class WorldBatch:
             worlds: indices of the worlds that act; all by default. The others stand still.
 
         Returns:
-            (N,) true where the physics diverged. Such a world keeps its last finite state and is listed in ``broken``.
+            (N,) true where the physics diverged. Such a world keeps its last finite state; ``broken`` has it.
 
         Raises:
             ValueError: actions of the wrong shape.
