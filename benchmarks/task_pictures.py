@@ -48,16 +48,15 @@ def draw_task(name: str, seed: int) -> NDArray[np.uint8]:
 def _areas(task: Task, env: TabletopEnv, state: TabletopState) -> list[Mark]:
     """Where the object may start and where the goal may be."""
     workspace, object_m = env.config.workspace, env.config.object_size_m
-    half = np.array([workspace.length_x_m, workspace.length_y_m]) / 2
-    center = np.array([workspace.center_x_m, workspace.center_y_m])
-    low, high = center - half, center + half
+    low, high = np.array(workspace.lower_m[:2]), np.array(workspace.upper_m[:2])
     if env.config.fixture == "wall":
+        center_x = workspace.center_x_m
         near = fixtures.WALL_THICKNESS_M / 2 + fixtures.GAP_M + object_m / 2
         sides = [
-            (center[0] + near, center[0] + near + fixtures.AREA_LENGTH_M),
-            (center[0] - near - fixtures.AREA_LENGTH_M, center[0] - near),
+            (center_x + near, center_x + near + fixtures.AREA_LENGTH_M),
+            (center_x - near - fixtures.AREA_LENGTH_M, center_x - near),
         ]
-        goal, start = sides if state.goal[0] > center[0] else sides[::-1]
+        goal, start = sides if state.goal[0] > center_x else sides[::-1]
         return [
             _flat((start[0], low[1]), (start[1], high[1]), START_RGBA),
             _flat((goal[0], low[1]), (goal[1], high[1]), GOAL_RGBA),

@@ -32,6 +32,10 @@ class ConfigError(TandemError):
     """A configuration the user can mend; the message says what, where, which value, and what to do."""
 
 
+Point = tuple[float, float, float]
+"""x, y, z in the world frame."""
+
+
 class _Frozen(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
@@ -49,6 +53,16 @@ class WorkspaceConfig(_Frozen):
     length_x_m: float = Field(0.35, gt=0.0, le=0.8, description="paper: 35 cm")
     length_y_m: float = Field(0.35, gt=0.0, le=0.8, description="paper: 35 cm")
     height_m: float = Field(0.35, gt=0.0, le=0.8, description="paper: 35 cm")
+
+    @property
+    def lower_m(self) -> Point:
+        """Corner with the least coordinates, metres; the box stands on the table top."""
+        return self.center_x_m - self.length_x_m / 2, self.center_y_m - self.length_y_m / 2, 0.0
+
+    @property
+    def upper_m(self) -> Point:
+        """Corner with the greatest coordinates, metres."""
+        return self.center_x_m + self.length_x_m / 2, self.center_y_m + self.length_y_m / 2, self.height_m
 
 
 class WorldConfig(_Frozen):

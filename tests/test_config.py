@@ -7,7 +7,7 @@ import pytest
 import yaml
 from pydantic import ValidationError
 
-from service.config import Config, ConfigError, dump_config, load_config, parse_config
+from service.config import Config, ConfigError, WorkspaceConfig, dump_config, load_config, parse_config
 
 CONFIGS = Path(__file__).parents[1] / "configs"
 
@@ -27,6 +27,12 @@ def test_defaults_are_valid_and_the_papers():
     assert config.policy.bob.num_primitives == 4
     assert (config.game.alice_valid_reward, config.game.alice_difficult_reward) == (1.0, 5.0)
     assert config.game.success_distance_m == 0.05
+
+
+def test_corners_of_the_workspace_by_hand():
+    workspace = WorkspaceConfig(center_x_m=-0.05, center_y_m=0.1, length_x_m=0.3, length_y_m=0.2, height_m=0.4)
+    assert workspace.lower_m == pytest.approx((-0.2, 0.0, 0.0))
+    assert workspace.upper_m == pytest.approx((0.1, 0.2, 0.4))
 
 
 def test_every_default_lies_within_its_own_range():

@@ -11,7 +11,7 @@ from benchmarks.run_files import Run
 from benchmarks.stages import CELL_SIZE_M, RANDOM, STAGES, mean_share, paths_m
 from service.config import WorkspaceConfig
 from service.media.plots.coverage import draw_paths
-from service.media.plots.figures import FAINT, INK, bounds, new_figure, save
+from service.media.plots.figures import FAINT, INK, new_figure, save
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -46,7 +46,7 @@ def draw_coverage(run: Run, path: Path) -> Path:
 
 def _draw_cells(above: Axes, workspace: WorkspaceConfig) -> None:
     """The cells that are counted, as a grid."""
-    low, high = bounds(workspace)
+    low, high = workspace.lower_m, workspace.upper_m
     above.grid(False)
     x, y = (np.arange(low[axis], high[axis] + CELL_SIZE_M / 2, CELL_SIZE_M) for axis in (0, 1))
     above.vlines(x, low[1], high[1], color=CELL_COLOR, linewidth=0.8, zorder=0.5)

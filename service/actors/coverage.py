@@ -66,9 +66,8 @@ def visited_share(trajectories: StateArray, workspace: WorkspaceConfig, *, cell_
 
     The cell in which an object started does not count for its own trajectory.
     """
-    low = np.array([workspace.center_x_m - workspace.length_x_m / 2, workspace.center_y_m - workspace.length_y_m / 2])
     shape = np.array([round(workspace.length_x_m / cell_size_m), round(workspace.length_y_m / cell_size_m)])
-    cells = np.floor((trajectories[:, :, :2] - low) / cell_size_m).astype(np.int64)
+    cells = np.floor((trajectories[:, :, :2] - workspace.lower_m[:2]) / cell_size_m).astype(np.int64)
     inside = ((cells >= 0) & (cells < shape)).all(axis=2)
     moved = (cells != cells[:, :1]).any(axis=2)
     visited = cells[inside & moved]

@@ -12,10 +12,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from service.generator.records import GoalRecords
+
 FloatArray = NDArray[np.float32]
 StateArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
-IntArray = NDArray[np.int64]
 Broken = tuple[tuple[StateArray, FloatArray], ...]
 """(last finite state (S,), action (4,)) of each world whose physics diverged."""
 
@@ -56,38 +57,6 @@ class Demonstrations:
     """(D, O) Bob's own input: positions and Alice's goal."""
     action: FloatArray
     """(D, A) Alice's action."""
-
-
-@dataclass(frozen=True, slots=True)
-class GoalRecords:
-    """What became of each world's goal in this round; all arrays have N rows."""
-
-    start_state: StateArray
-    """(N, S) full physics state Bob started from; Alice too, unless ``replayed``."""
-    start_position: StateArray
-    """(N, 3) object position there, metres."""
-    goal: StateArray
-    """(N, 3) the goal Bob played, metres: Alice's proposal, or a replayed goal where ``replayed``."""
-    proposal: StateArray
-    """(N, 3) object position at the end of Alice's turn, metres."""
-    verdict: NDArray[np.int8]
-    """(N,) ``generator.validity.Verdict`` of Alice's proposal."""
-    replayed: BoolArray
-    """(N,) Bob played a goal from the replay buffer (``start_state`` is then that goal's own)."""
-    from_reset: BoolArray
-    """(N,) Bob started where a game does, as he does whenever he is evaluated."""
-    played: BoolArray
-    """(N,) Bob had a whole turn: there was a goal, and the physics held."""
-    solved: BoolArray
-    """(N,) Bob came within the success distance."""
-    num_bob_steps: IntArray
-    """(N,)."""
-    alice_past: BoolArray
-    """(N,) a past Alice proposed."""
-    bob_past: BoolArray
-    """(N,) a past Bob played."""
-    round_index: IntArray
-    """(N,) 0 for the first round after a reset."""
 
 
 @dataclass(frozen=True, slots=True)

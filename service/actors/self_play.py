@@ -14,7 +14,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from service.actors.rollout import Demonstrations, GoalRecords, Rollout, Turns
+from service.actors.rollout import Demonstrations, Rollout, Turns
 from service.config import Config
 from service.envs.batch import WorldBatch
 from service.envs.observations import (
@@ -27,7 +27,8 @@ from service.envs.observations import (
 )
 from service.generator.generator import GoalChoice
 from service.generator.opponents import CURRENT, RoundPlan
-from service.generator.validity import Verdict, judge
+from service.generator.records import GoalRecords
+from service.generator.validity import Verdict, classify_goal
 
 FloatArray = NDArray[np.float32]
 StateArray = NDArray[np.float64]
@@ -113,7 +114,7 @@ class SelfPlay:
         start_state, start_position = worlds.states.copy(), worlds.object_position.copy()
         alice, contacts, broken = self._play_alice(players, plan, observe)
         end_state, proposal = worlds.states.copy(), worlds.object_position.copy()
-        verdict = judge(start_position, proposal, self.config.world.workspace, game.success_distance_m)
+        verdict = classify_goal(start_position, proposal, self.config.world.workspace, game.success_distance_m)
         verdict[broken] = Verdict.FALLEN
         choice = choose_goals(start_state, start_position, self._round_index, proposal, verdict)
 
@@ -239,7 +240,7 @@ class SelfPlay:
         if not self.config.learner.abc.hindsight:
             return by_alice
         config = self.config
-        moved = judge(records.start_position, achieved, config.world.workspace, config.game.success_distance_m)
+        moved = classify_goal(records.start_position, achieved, config.world.workspace, config.game.success_distance_m)
         by_bob = _relabelled(bob, failed & (moved == Verdict.VALID), achieved)
         return Demonstrations(
             np.concatenate([by_alice.observation, by_bob.observation]), np.concatenate([by_alice.action, by_bob.action])

@@ -15,9 +15,9 @@ from service.downstream.previous import PREVIOUS
 from service.envs.observations import (
     BOB_SIZE,
     EFFECTOR_SLICE,
+    GOAL_FROM_OBJECT,
     GOAL_SLICE,
     NORMALISATION_BOB,
-    NORMALISATION_BOB_VALUE,
     OBJECT_SLICE,
 )
 from service.policies.layers import InputNormalisation
@@ -38,7 +38,7 @@ class GoalFeatures(BaseFeaturesExtractor):
     def __init__(self, observation_space: gymnasium.spaces.Dict) -> None:
         super().__init__(observation_space, BOB_SIZE + 9)
         self.normalise = InputNormalisation(NORMALISATION_BOB)
-        self.register_buffer("scale", torch.tensor(NORMALISATION_BOB_VALUE.scale[-3:]))
+        self.register_buffer("scale", torch.tensor(GOAL_FROM_OBJECT.normalisation.scale))
 
     def forward(self, observations: dict[str, Tensor]) -> Tensor:
         """From a batch of goal observations."""

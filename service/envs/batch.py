@@ -12,23 +12,12 @@ from mujoco import rollout
 from numpy.typing import NDArray
 
 from service.config import WorldConfig
-from service.envs import fixtures, kinematics
-from service.envs.observations import ACTION_SIZE, BOB_VALUE_SIZE, FULL_SIZE, POSITIONS_SIZE
-from service.envs.panda import FINGER_STROKE_M, NUM_JOINTS
-from service.envs.sampling import draw_starts, sample_in_volume, sample_on_table
-from service.envs.scene import build_spec
+from service.envs import kinematics
+from service.envs.observations import ACTION_SIZE, BOB_VALUE, FULL, POSITIONS, ObservationLayout
+from service.envs.panda import FINGER_STROKE_M, NUM_FINGERS, NUM_JOINTS
+from service.envs.sampling import draw_starts
+from service.envs.scene import build_layout, build_spec
 from service.errors import DivergedError
-
-__all__ = [
-    "DISPLACEMENT_M",
-    "LOWEST_TARGET_M",
-    "MAX_SPEED",
-    "MAX_TURN_RAD",
-    "WIDTH_CHANGE_M",
-    "WorldBatch",
-    "sample_in_volume",
-    "sample_on_table",
-]
 
 FloatArray = NDArray[np.float32]
 StateArray = NDArray[np.float64]
@@ -45,18 +34,18 @@ MAX_TURN_RAD = 0.5
 """Most a joint is asked to turn in one action; behind the base and near a straight arm the solution would ask for 2."""
 MAX_SPEED = 1e3
 """A joint (rad/s) or object (m/s, rad/s) faster than this has diverged; the arm reaches 3, a falling object 30."""
-_NUM_CONTACTS = 2
-_NUM_CONTROLS = NUM_JOINTS + 2
+_NUM_CONTROLS = NUM_JOINTS + NUM_FINGERS
+_PHYSICS = int(mujoco.mjtState.mjSTATE_FULLPHYSICS)
 _CONTROL_AND_BOX = int(mujoco.mjtState.mjSTATE_CTRL) | int(mujoco.mjtState.mjSTATE_MOCAP_POS)
 
 
 class WorldBatch:
     """N independent worlds with one flat state each.
 
-    The state of a world is MuJoCo's full physics state, the two finger-contact flags of the last action, where the
-    world has a box its place, and, as the last number, whether its gripper is blocked where only some are. A world is a
-    pure function of (state, action), because each action starts the constraint solver cold: saving is copying rows of
-    ``states``, restoring is ``restore``, and the continuation is bit-identical.
+    The state of a world, see ``layout``, is MuJoCo's full physics state, the finger contacts of the last action, the
+    place of a box, and whether the gripper is blocked where only some are. A world is a pure function of (state,
+    action), because each action starts the constraint solver cold: saving is copying rows of ``states``, restoring is
+    ``restore``, and the continuation is bit-identical.
 
     Args:
         config: the world.
@@ -75,18 +64,16 @@ class WorldBatch:
         num_threads = min(num_threads or os.cpu_count() or 1, num_worlds)
         self._pool = rollout.Rollout(nthread=num_threads if num_threads > 1 else 0)
         self._data = [mujoco.MjData(self.model) for _ in range(max(num_threads, 1))]
-        self._physics_size = mujoco.mj_stateSize(self.model, mujoco.mjtState.mjSTATE_FULLPHYSICS)
-        self._contacts = slice(self._physics_size, self._physics_size + _NUM_CONTACTS)
-        self._place = slice(self._contacts.stop, self._contacts.stop + fixtures.PLACE_SIZE * self.model.nmocap)
+        self.layout = build_layout(config, blocked_fraction=blocked_fraction)
+        """Columns of ``states``."""
+        assert (self.model.nq, self.model.nv) == (self.layout.num_positions, self.layout.num_velocities)
+        assert mujoco.mj_stateSize(self.model, _PHYSICS) == self.layout.physics.stop
         self._blocked_fraction = blocked_fraction
-        self._blocked = slice(self._place.stop, self._place.stop + (blocked_fraction > 0.0))
-        self._kept = slice(self._place.start, self._blocked.stop)
-        self.state_size = self._blocked.stop
         self._control_spec = _CONTROL_AND_BOX if self.model.nmocap else int(mujoco.mjtState.mjSTATE_CTRL)
         self._widest_m = 2 * FINGER_STROKE_M if config.gripper == "free" else 0.0
-        self._layout = _Layout.of(self.model)
         self._fresh_state = self._make_fresh_state()
         self.states: StateArray = np.tile(self._fresh_state, (num_worlds, 1))
+        """(N, S)."""
         self._kinematics = kinematics.forward(self.joints)
         self.num_broken = 0
         self.broken: list[tuple[StateArray, FloatArray]] = []
@@ -109,17 +96,17 @@ class WorldBatch:
     @property
     def joints(self) -> StateArray:
         """(N, 7) arm joint angles, rad."""
-        return self.states[:, self._layout.joints]
+        return self.states[:, self.layout["joints"]]
 
     @property
     def object_position(self) -> StateArray:
         """(N, 3) object centre, metres."""
-        return self.states[:, self._layout.object]
+        return self.states[:, self.layout["object"]]
 
     @property
     def box_place(self) -> StateArray:
         """(N, 3) middle of the bottom of each world's box, metres; (N, 0) in worlds without."""
-        return self.states[:, self._place]
+        return self.states[:, self.layout["box_place"]]
 
     @property
     def ee_position(self) -> StateArray:
@@ -138,11 +125,11 @@ class WorldBatch:
         workspace. Beside a wall or a box it is where ``sampling.draw_starts`` says, and a box is anywhere.
         """
         states = np.tile(self._fresh_state, (num, 1))
-        states[:, self._layout.object], states[:, self._place] = draw_starts(rng, num, self.config)
+        states[:, self.layout["object"]], states[:, self.layout["box_place"]] = draw_starts(rng, num, self.config)
         if self._blocked_fraction:
             blocked = rng.random(num) < self._blocked_fraction
-            states[blocked, self._layout.fingers] = 0.0
-            states[:, self._blocked] = blocked[:, None]
+            states[blocked, self.layout["fingers"]] = 0.0
+            states[:, self.layout["gripper_blocked"]] = blocked[:, None]
         return states
 
     def restore(self, states: StateArray, worlds: BoolArray | None = None) -> None:
@@ -164,7 +151,7 @@ class WorldBatch:
             worlds: indices of the worlds that act; all by default. The others stand still.
 
         Returns:
-            (N,) true where the physics diverged. Such a world keeps its last finite state and is listed in ``broken``.
+            (N,) true where the physics diverged. Such a world keeps its last finite state; ``broken`` has it.
 
         Raises:
             ValueError: actions of the wrong shape.
@@ -186,16 +173,16 @@ class WorldBatch:
         states, sensors = self._pool.rollout(
             self.model,
             self._data,
-            start[:, : self._physics_size],
+            start[:, self.layout.physics],
             control[:, None, :],
             control_spec=self._control_spec,
             nstep=self.config.num_substeps,
         )
         after = np.empty_like(start)
-        after[:, : self._physics_size] = states[:, -1]
-        after[:, self._contacts] = (sensors > 0).any(axis=1)
-        after[:, self._kept] = start[:, self._kept]
-        finite = (np.abs(after[:, self._layout.velocities]) < MAX_SPEED).all(axis=1) & np.isfinite(after).all(axis=1)
+        after[:, self.layout.physics] = states[:, -1]
+        after[:, self.layout["contacts"]] = (sensors > 0).any(axis=1)
+        after[:, self.layout.kept] = start[:, self.layout.kept]
+        finite = (np.abs(after[:, self.layout.velocities]) < MAX_SPEED).all(axis=1) & np.isfinite(after).all(axis=1)
         broken = np.zeros(self.num_worlds, dtype=bool)
         if not finite.all():
             after[~finite] = start[~finite]
@@ -212,91 +199,65 @@ class WorldBatch:
             self._kinematics.position[index], self._kinematics.rotation[index], self._kinematics.jacobian[index]
         )
         target = kinematics.clip_to_reach(here.position + DISPLACEMENT_M * actions[:, :3], LOWEST_TARGET_M)
-        width = start[:, self._layout.fingers].sum(axis=1) + WIDTH_CHANGE_M * actions[:, 3]
-        control = np.empty((start.shape[0], _NUM_CONTROLS + self._place.stop - self._place.start))
-        joints = start[:, self._layout.joints]
+        width = start[:, self.layout["fingers"]].sum(axis=1) + WIDTH_CHANGE_M * actions[:, 3]
+        joints, box_place = start[:, self.layout["joints"]], start[:, self.layout["box_place"]]
+        control = np.empty((start.shape[0], _NUM_CONTROLS + box_place.shape[1]))
         solution = kinematics.solve(joints, target, at=here)
         control[:, :NUM_JOINTS] = np.clip(solution, joints - MAX_TURN_RAD, joints + MAX_TURN_RAD)
-        widest_m = self._widest_m * ~(start[:, self._blocked] > 0.0).any(axis=1)
+        widest_m = self._widest_m * ~(start[:, self.layout["gripper_blocked"]] > 0.0).any(axis=1)
         control[:, NUM_JOINTS:_NUM_CONTROLS] = np.clip(width, 0.0, widest_m)[:, None] / 2
-        control[:, _NUM_CONTROLS:] = start[:, self._place]
+        control[:, _NUM_CONTROLS:] = box_place
         return control
 
     # --- observations ----------------------------------------------------------------------------------------------
 
     def positions(self) -> FloatArray:
-        """(N, 11) what Bob's primitives see; layout in ``observations``."""
-        out = np.empty((self.num_worlds, POSITIONS_SIZE), dtype=np.float32)
-        self._write_positions(out)
-        return out
+        """(N, 11) what Bob's primitives see: ``observations.POSITIONS``."""
+        return self.observe(POSITIONS)
 
     def full(self, elapsed: float) -> FloatArray:
-        """(N, 22) what Alice sees; ``elapsed`` is the share of her turn that has passed, in [0, 1]."""
-        out = np.empty((self.num_worlds, FULL_SIZE), dtype=np.float32)
-        self._write_full(out[:, : FULL_SIZE - 1])
-        out[:, FULL_SIZE - 1] = elapsed
-        return out
+        """(N, 22) what Alice sees: ``observations.FULL``; ``elapsed`` is the share of her turn gone by, in [0, 1]."""
+        return self.observe(FULL, elapsed=elapsed)
 
     def bob_value(self, goal: StateArray) -> FloatArray:
-        """(N, 27) what Bob's value network sees for (N, 3) goals, metres."""
-        out = np.empty((self.num_worlds, BOB_VALUE_SIZE), dtype=np.float32)
-        self._write_full(out[:, : FULL_SIZE - 1])
-        out[:, FULL_SIZE - 1 : FULL_SIZE + 2] = goal
-        out[:, FULL_SIZE + 2 :] = goal - self.object_position
+        """(N, 27) what Bob's value network sees, ``observations.BOB_VALUE``, for (N, 3) goals, metres."""
+        return self.observe(BOB_VALUE, goal=goal, goal_from_object=goal - self.object_position)
+
+    def observe(self, layout: ObservationLayout, **given: StateArray | float) -> FloatArray:
+        """(N, O) vectors of any layout; ``given`` are the (N, size) entries a world does not know, such as a goal."""
+        out = np.empty((self.num_worlds, layout.size), dtype=np.float32)
+        for name, part in layout.columns.items():
+            out[:, part] = given[name] if name in given else self._measure(name)
         return out
 
-    def _write_positions(self, out: FloatArray) -> None:
-        ee, obj = self._kinematics.position, self.object_position
-        out[:, 0:3] = ee
-        out[:, 3:5] = self.states[:, self._layout.fingers]
-        out[:, 5:8] = obj
-        out[:, 8:11] = obj - ee
-
-    def _write_full(self, out: FloatArray) -> None:
-        self._write_positions(out[:, :POSITIONS_SIZE])
-        velocity = self.states[:, self._layout.joint_velocities]
-        out[:, 11:14] = np.matmul(self._kinematics.jacobian[:, :3], velocity[:, :, None])[:, :, 0]
-        out[:, 14:16] = self.states[:, self._layout.finger_velocities]
-        out[:, 16:19] = self.states[:, self._layout.object_velocity]
-        out[:, 19:21] = self.contacts()
+    def _measure(self, name: str) -> StateArray:
+        """(N, size) one entry of an observation: computed here, or else a part of the state of the same name."""
+        if name == "effector":
+            return self.ee_position
+        if name == "object_from_effector":
+            return self.object_position - self.ee_position
+        if name == "effector_velocity":
+            velocity = self.states[:, self.layout["joint_velocities"]]
+            linear: StateArray = np.matmul(self._kinematics.jacobian[:, :3], velocity[:, :, None])[:, :, 0]
+            return linear
+        return self.states[:, self.layout[name]]
 
     def contacts(self) -> BoolArray:
         """(N, 2) left, right finger touched the object during the last action."""
-        return self.states[:, self._contacts] > 0
+        return self.states[:, self.layout["contacts"]] > 0
 
     def _make_fresh_state(self) -> StateArray:
         workspace = self.config.workspace
-        data = mujoco.MjData(self.model)
         home = np.array([[workspace.center_x_m, workspace.center_y_m, self.config.start_height_m]])
-        data.qpos[:NUM_JOINTS] = kinematics.solve(kinematics.NEUTRAL_JOINTS[None], home, num_iterations=30)[0]
-        data.qpos[NUM_JOINTS : NUM_JOINTS + 2] = self._widest_m / 2
-        state = np.zeros(self.state_size)
-        mujoco.mj_getState(self.model, data, state[: self._physics_size], int(mujoco.mjtState.mjSTATE_FULLPHYSICS))
+        state = np.zeros(self.layout.size)
+        mujoco.mj_getState(self.model, mujoco.MjData(self.model), state[self.layout.physics], _PHYSICS)
+        state[self.layout["joints"]] = kinematics.solve(kinematics.NEUTRAL_JOINTS[None], home, num_iterations=30)[0]
+        state[self.layout["fingers"]] = self._widest_m / 2
         return state
 
 
 def _quieten_mujoco() -> None:
-    """``WorldBatch`` itself tells of diverged worlds; MuJoCo would also write to a file in the working directory."""
+    """Turn off MuJoCo's own log, a file in the working directory; ``WorldBatch`` itself reports diverged worlds."""
     log = mujoco.MjLogConfig.get()
     log.logto_file = log.logto_console = False
     log.set()
-
-
-class _Layout:
-    """Where things stand in MuJoCo's full physics state: time, qpos, qvel."""
-
-    def __init__(self, num_positions: int) -> None:
-        velocity = 1 + num_positions
-        self.joints = slice(1, 1 + NUM_JOINTS)
-        self.fingers = slice(1 + NUM_JOINTS, 3 + NUM_JOINTS)
-        self.object = slice(3 + NUM_JOINTS, 6 + NUM_JOINTS)
-        self.joint_velocities = slice(velocity, velocity + NUM_JOINTS)
-        self.velocities = slice(velocity, velocity + NUM_JOINTS + 8)
-        self.finger_velocities = slice(velocity + NUM_JOINTS, velocity + NUM_JOINTS + 2)
-        self.object_velocity = slice(velocity + NUM_JOINTS + 2, velocity + NUM_JOINTS + 5)
-
-    @classmethod
-    def of(cls, model: mujoco.MjModel) -> _Layout:
-        assert model.nq == NUM_JOINTS + 2 + 7
-        assert model.na == 0
-        return cls(model.nq)

@@ -1,4 +1,4 @@
-"""What may stand on the table besides the object: a wall across the workspace, or an open box.
+"""Fixtures, which stand on the table besides the object: a wall across the workspace, or an open box.
 
 Neither can be moved. The wall is part of the table; the box is elsewhere in every world, so its place is part of a
 world's state (three numbers behind MuJoCo's own). Both are touched by the object, the hand and the fingers; the arm's
@@ -18,7 +18,7 @@ from service.envs import panda
 _Vector = tuple[float, float, float]
 
 PLACE_SIZE = 3
-"""Numbers in a state that say where the box is: the middle of its bottom, metres."""
+"""Size of a box's place in a state: the middle of its bottom, x, y, z, metres."""
 
 WALL_THICKNESS_M = 0.01
 WALL_HEIGHT_M = 0.07
@@ -59,7 +59,7 @@ def add_fixture(spec: mujoco.MjSpec, config: WorldConfig, contact: dict[str, Any
 
 
 def fixture_geoms(spec: mujoco.MjSpec) -> list[Any]:
-    """What ``add_fixture`` added."""
+    """The geoms that ``add_fixture`` added."""
     return [geom for geom in spec.geoms if geom.name.startswith(_PREFIX)]
 
 

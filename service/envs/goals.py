@@ -1,4 +1,4 @@
-"""Where random goals lie: what Bob is evaluated on, and the Gymnasium environments ask for."""
+"""Random goals, for the evaluation of Bob and for the Gymnasium environments."""
 
 from __future__ import annotations
 

@@ -76,7 +76,7 @@ def forward(joints: Array) -> Kinematics:
 
 
 def _cross(left: Array, right: Array) -> Array:
-    """np.cross without its generality: five times faster on small arrays."""
+    """Cross product of (..., 3) arrays, five times faster than ``np.cross`` on small ones."""
     out = np.empty_like(left)
     out[..., 0] = left[..., 1] * right[..., 2] - left[..., 2] * right[..., 1]
     out[..., 1] = left[..., 2] * right[..., 0] - left[..., 0] * right[..., 2]

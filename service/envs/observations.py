@@ -1,14 +1,8 @@
-"""What the players see, as flat float32 vectors, and how those vectors reflect in y.
+"""Observations of both players as flat float32 vectors, with their reflection in y and their normalisation.
 
-Positions are metres in the world frame (origin: table top, 0.6 m in front of the robot's base), velocities m/s. With
-the gripper down, the left finger is on the side of negative y.
-
-| vector | size | content |
-|---|---|---|
-| positions | 11 | end effector 3, fingers 2 (left, right), object 3, object relative to end effector 3 |
-| full | 22 | positions 11; velocities of end effector 3, fingers 2, object 3; finger contacts 2; share of turn |
-| bob | 14 | positions 11, goal 3 |
-| bob value | 27 | full without the elapsed share 21, goal 3, goal relative to object 3 |
+Each layout is declared once, as a list of entries; sizes, slices, mirror and normalisation follow from it. Positions
+are in the world frame (origin: table top, 0.6 m in front of the robot's base). With the gripper down, the left finger
+is on the side of negative y.
 
 The paper (appendix, *State*): Alice sees the full state, Bob only positions and the goal; a value network is never
 deployed and may see more. The task has no left and right: reflecting y swaps the fingers and negates every y component,
@@ -18,23 +12,15 @@ which is a signed permutation of each vector.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-FloatArray = NDArray[np.float32]
+from service.envs.state_layout import columns
 
-ACTION_SIZE = 4
-POSITIONS_SIZE = 11
-FULL_SIZE = 22
-BOB_SIZE = POSITIONS_SIZE + 3
-BOB_VALUE_SIZE = FULL_SIZE - 1 + 6
-EFFECTOR_SLICE = slice(0, 3)
-OBJECT_SLICE = slice(5, 8)
-GOAL_SLICE = slice(11, 14)
-SPACES = {"action": ACTION_SIZE, "positions": POSITIONS_SIZE, "observation": BOB_SIZE, "layout": __name__}
-"""What the manifest of primitives says they act by and see; those of another robot or layout say something else."""
+FloatArray = NDArray[np.float32]
 
 
 @dataclass(frozen=True)
@@ -50,35 +36,6 @@ class Mirror:
         return reflected
 
 
-def _mirror(layout: str) -> Mirror:
-    """Build from a layout string: ``v`` a 3-vector (x, y, z), ``p`` a left-right pair, ``s`` a scalar."""
-    source: list[int] = []
-    sign: list[float] = []
-    for kind in layout:
-        start = len(source)
-        if kind == "v":
-            source += [start, start + 1, start + 2]
-            sign += [1.0, -1.0, 1.0]
-        elif kind == "p":
-            source += [start + 1, start]
-            sign += [1.0, 1.0]
-        else:
-            source.append(start)
-            sign.append(1.0)
-    return Mirror(np.asarray(source), np.asarray(sign, dtype=np.float32))
-
-
-def bob_observation(positions: FloatArray, goal: NDArray[np.floating[Any]]) -> FloatArray:
-    """Bob's input (N, 14) for (N, 11) positions and (N, 3) goals, metres."""
-    return np.concatenate([positions, goal.astype(np.float32)], axis=1)
-
-
-MIRROR_ACTION = _mirror("vs")
-MIRROR_FULL = _mirror("vpvvvpvps")
-MIRROR_BOB = _mirror("vpvvv")
-MIRROR_BOB_VALUE = _mirror("vpvvvpvpvv")
-
-
 @dataclass(frozen=True)
 class Normalisation:
     """Fixed affine input scaling ``(v - offset) / scale``; constants, so a frozen primitive needs no statistics."""
@@ -87,24 +44,113 @@ class Normalisation:
     scale: FloatArray
 
 
-_POSITION = (0.0, 0.0, 0.15), (0.12, 0.12, 0.12)
-_FINGERS = (0.02, 0.02), (0.02, 0.02)
-_RELATIVE = (0.0, 0.0, 0.0), (0.1, 0.1, 0.1)
-_VELOCITY = (0.0, 0.0, 0.0), (0.5, 0.5, 0.5)
-_FINGER_VELOCITIES = (0.0, 0.0), (0.2, 0.2)
-_CONTACTS = (0.5, 0.5), (0.5, 0.5)
-_ELAPSED = (0.5,), (0.5,)
+class Kind(NamedTuple):
+    """Reflection of one entry in y: number i becomes ``sign[i]`` times number ``source[i]``."""
+
+    source: tuple[int, ...]
+    sign: tuple[float, ...]
 
 
-def _normalisation(*parts: tuple[tuple[float, ...], tuple[float, ...]]) -> Normalisation:
-    offset = np.concatenate([part[0] for part in parts]).astype(np.float32)
-    scale = np.concatenate([part[1] for part in parts]).astype(np.float32)
-    return Normalisation(offset, scale)
+VECTOR = Kind((0, 1, 2), (1.0, -1.0, 1.0))
+"""x, y, z."""
+PAIR = Kind((1, 0), (1.0, 1.0))
+"""One number for the left finger and one for the right."""
+SCALAR = Kind((0,), (1.0,))
 
 
-_POSITIONS = (_POSITION, _FINGERS, _POSITION, _RELATIVE)
-_PRIVILEGED = (_VELOCITY, _FINGER_VELOCITIES, _VELOCITY, _CONTACTS)
-NORMALISATION_POSITIONS = _normalisation(*_POSITIONS)
-NORMALISATION_FULL = _normalisation(*_POSITIONS, *_PRIVILEGED, _ELAPSED)
-NORMALISATION_BOB = _normalisation(*_POSITIONS, _POSITION)
-NORMALISATION_BOB_VALUE = _normalisation(*_POSITIONS, *_PRIVILEGED, _POSITION, _RELATIVE)
+@dataclass(frozen=True)
+class Entry:
+    """Part of a vector that has a name."""
+
+    name: str
+    """As ``WorldBatch.observe`` knows it."""
+    kind: Kind
+    unit: str
+    offset: float | tuple[float, ...]
+    """Subtracted to normalise; one number for all, or one each."""
+    scale: float
+    """Divided by to normalise."""
+
+
+class ObservationLayout:
+    """Entries that stand one after the other."""
+
+    def __init__(self, *entries: Entry) -> None:
+        self.entries = entries
+        self.columns = columns({entry.name: len(entry.kind.source) for entry in entries})
+        """Slices by the entries' names."""
+        assert len(self.columns) == len(entries), "two entries of the same name"
+        self.size = sum(len(entry.kind.source) for entry in entries)
+
+    def __add__(self, other: ObservationLayout) -> ObservationLayout:
+        """These entries, then those of ``other``."""
+        return ObservationLayout(*self.entries, *other.entries)
+
+    def __getitem__(self, name: str) -> slice:
+        """Columns of an entry."""
+        return self.columns[name]
+
+    @cached_property
+    def mirror(self) -> Mirror:
+        """Reflection of the whole vector."""
+        source = [self[entry.name].start + np.array(entry.kind.source) for entry in self.entries]
+        sign = [entry.kind.sign for entry in self.entries]
+        return Mirror(np.concatenate(source), np.concatenate(sign).astype(np.float32))
+
+    @cached_property
+    def normalisation(self) -> Normalisation:
+        """Scaling of the whole vector."""
+        offset, scale = np.empty(self.size, dtype=np.float32), np.empty(self.size, dtype=np.float32)
+        for entry in self.entries:
+            offset[self[entry.name]], scale[self[entry.name]] = entry.offset, entry.scale
+        return Normalisation(offset, scale)
+
+
+_MIDDLE_M = (0.0, 0.0, 0.15)
+
+ACTION = ObservationLayout(
+    Entry("displacement", VECTOR, "share of the greatest", 0.0, 1.0),
+    Entry("width_change", SCALAR, "share of the greatest", 0.0, 1.0),
+)
+"""What a player commands; as an input, what was commanded last."""
+POSITIONS = ObservationLayout(
+    Entry("effector", VECTOR, "m", _MIDDLE_M, 0.12),
+    Entry("fingers", PAIR, "m", 0.02, 0.02),
+    Entry("object", VECTOR, "m", _MIDDLE_M, 0.12),
+    Entry("object_from_effector", VECTOR, "m", 0.0, 0.1),
+)
+"""What Bob's primitives see."""
+_MOTION = ObservationLayout(
+    Entry("effector_velocity", VECTOR, "m/s", 0.0, 0.5),
+    Entry("finger_velocities", PAIR, "m/s", 0.0, 0.2),
+    Entry("object_velocity", VECTOR, "m/s", 0.0, 0.5),
+    Entry("contacts", PAIR, "0 or 1", 0.5, 0.5),
+)
+_GOAL = ObservationLayout(Entry("goal", VECTOR, "m", _MIDDLE_M, 0.12))
+GOAL_FROM_OBJECT = ObservationLayout(Entry("goal_from_object", VECTOR, "m", 0.0, 0.1))
+"""How far the object has to go."""
+FULL = POSITIONS + _MOTION + ObservationLayout(Entry("elapsed", SCALAR, "share of the turn", 0.5, 0.5))
+"""What Alice sees."""
+BOB = POSITIONS + _GOAL
+"""What Bob sees."""
+BOB_VALUE = POSITIONS + _MOTION + _GOAL + GOAL_FROM_OBJECT
+"""What Bob's value network sees."""
+GATE = BOB + GOAL_FROM_OBJECT
+"""What Bob's gate computes with."""
+
+ACTION_SIZE = ACTION.size
+POSITIONS_SIZE = POSITIONS.size
+FULL_SIZE = FULL.size
+BOB_SIZE = BOB.size
+BOB_VALUE_SIZE = BOB_VALUE.size
+EFFECTOR_SLICE, OBJECT_SLICE, GOAL_SLICE = BOB["effector"], BOB["object"], BOB["goal"]
+MIRROR_ACTION, MIRROR_FULL, MIRROR_BOB, MIRROR_BOB_VALUE = ACTION.mirror, FULL.mirror, BOB.mirror, BOB_VALUE.mirror
+NORMALISATION_POSITIONS, NORMALISATION_FULL = POSITIONS.normalisation, FULL.normalisation
+NORMALISATION_BOB, NORMALISATION_BOB_VALUE = BOB.normalisation, BOB_VALUE.normalisation
+SPACES = {"action": ACTION_SIZE, "positions": POSITIONS_SIZE, "observation": BOB_SIZE, "layout": __name__}
+"""What the manifest of primitives says they act by and see; those of another robot or layout say something else."""
+
+
+def bob_observation(positions: FloatArray, goal: NDArray[np.floating]) -> FloatArray:
+    """Bob's input (N, 14) from (N, 11) positions and (N, 3) goals, metres."""
+    return np.concatenate([positions, goal.astype(np.float32)], axis=1)

@@ -14,6 +14,8 @@ import mujoco
 import numpy as np
 
 NUM_JOINTS = 7
+NUM_FINGERS = 2
+"""Left and right, in this order wherever there is one number for each."""
 BASE_POSITION = (-0.6, 0.0, 0.0)
 JOINT_LOWER = np.array([-2.8973, -1.7628, -2.8973, -3.0718, -2.8973, -0.0175, -2.8973])
 JOINT_UPPER = np.array([2.8973, 1.7628, 2.8973, -0.0698, 2.8973, 3.7525, 2.8973])
@@ -61,7 +63,7 @@ _STOP_SOLIMP = (0.99, 0.9999, 0.001, 0.5, 2.0)
 GRIPPER_BIT, OBJECT_BIT, TABLE_BIT = 1, 2, 4
 
 
-def add_panda(spec: mujoco.MjSpec, *, pad_friction: float, physics_step_s: float) -> Any:
+def add_panda(spec: mujoco.MjSpec, *, pad_friction: float, physics_step_s: float) -> None:
     """Add the arm, its actuators and its collision shapes to a model under construction.
 
     Actuators: seven joint positions (rad), then left and right finger positions (m). Gravity on the arm is compensated,
@@ -71,13 +73,8 @@ def add_panda(spec: mujoco.MjSpec, *, pad_friction: float, physics_step_s: float
         spec: the model under construction.
         pad_friction: sliding friction of the fingertips.
         physics_step_s: time step; the fingers' end stops are as stiff as it allows.
-
-    Returns:
-        The bodies by name, for decoration.
     """
-    base = spec.worldbody.add_body(name="link0", pos=BASE_POSITION)
-    bodies = {"link0": base}
-    body = base
+    body = spec.worldbody.add_body(name="link0", pos=BASE_POSITION)
     for index, ((position, quaternion), (mass, centre, inertia)) in enumerate(
         zip(_FRAMES, _INERTIALS, strict=True), start=1
     ):
@@ -102,7 +99,6 @@ def add_panda(spec: mujoco.MjSpec, *, pad_friction: float, physics_step_s: float
             armature=_ARMATURE,
             damping=(_JOINT_DAMPING, 0, 0),
         )
-        bodies[body.name] = body
     hand = body.add_body(
         name="hand",
         pos=(0, 0, 0.107),
@@ -113,14 +109,11 @@ def add_panda(spec: mujoco.MjSpec, *, pad_friction: float, physics_step_s: float
         explicitinertial=True,
         gravcomp=1.0,
     )
-    bodies["hand"] = hand
     _collision(hand, "hand", 0.038, ((0, -0.062, 0.03), (0, 0.062, 0.03)))
     for side, quaternion in (("left", (1, 0, 0, 0)), ("right", (0, 0, 0, 1))):
         finger = _add_finger(hand, side, quaternion, physics_step_s)
         _add_pads(finger, side, pad_friction)
-        bodies[f"{side}_finger"] = finger
     _add_actuators(spec)
-    return bodies
 
 
 def _add_finger(hand: Any, side: str, quaternion: tuple[float, ...], physics_step_s: float) -> Any:

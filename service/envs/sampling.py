@@ -1,4 +1,4 @@
-"""Where random objects and goals lie, and where objects start beside a wall or a box."""
+"""Random positions of objects and goals, and of objects beside a wall or a box."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def sample_in_volume(
 
 
 def draw_starts(rng: np.random.Generator, num: int, config: WorldConfig) -> tuple[StateArray, StateArray]:
-    """Where objects start, and the box where there is one.
+    """Random starts of objects, and of the box where there is one.
 
     Without a fixture, anywhere on the table inside the workspace. Beside a wall, in one of its two areas, either with
     equal chance. With a box, the box's middle is anywhere in the workspace, and the object outside of it: so far that

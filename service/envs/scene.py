@@ -6,6 +6,7 @@ import mujoco
 
 from service.config import WorldConfig
 from service.envs import fixtures, panda
+from service.envs.state_layout import StateLayout
 
 TABLE_CENTER_X_M = -0.3
 TABLE_HALF_SIZE_M = (0.55, 0.45, 0.2)
@@ -15,7 +16,7 @@ _STIFF = {"solref": (0.01, 1.0), "solimp": (0.95, 0.99, 0.001, 0.5, 2.0)}
 
 
 def build_spec(config: WorldConfig) -> mujoco.MjSpec:
-    """The physics of the scene; ``render.decorate`` adds what only eyes need.
+    """Physics of the scene; ``rendering.decoration`` adds what is there for pictures only.
 
     The contact cone is elliptic with ``impratio`` 100: a held cube creeps 0.4 mm in 5 s,
     against 1.7 mm at 10, and a held sphere stays at all (docs/decisions/0001).
@@ -49,6 +50,29 @@ def build_spec(config: WorldConfig) -> mujoco.MjSpec:
     fixtures.add_fixture(spec, config, _STIFF)
     _add_contact_sensors(spec)
     return spec
+
+
+def build_layout(config: WorldConfig, *, blocked_fraction: float = 0.0) -> StateLayout:
+    """Layout of the state of worlds that ``build_spec`` built.
+
+    Args:
+        config: the world.
+        blocked_fraction: share of games with a blocked gripper; above 0, each world remembers whether its own is.
+    """
+    return StateLayout(
+        positions={"joints": panda.NUM_JOINTS, "fingers": panda.NUM_FINGERS, "object": 3, "object_quaternion": 4},
+        velocities={
+            "joint_velocities": panda.NUM_JOINTS,
+            "finger_velocities": panda.NUM_FINGERS,
+            "object_velocity": 3,
+            "object_spin": 3,
+        },
+        measured={"contacts": panda.NUM_FINGERS},
+        kept={
+            "box_place": fixtures.PLACE_SIZE if config.fixture == "box" else 0,
+            "gripper_blocked": int(blocked_fraction > 0.0),
+        },
+    )
 
 
 def _add_object(spec: mujoco.MjSpec, config: WorldConfig) -> None:

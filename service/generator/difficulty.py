@@ -1,4 +1,4 @@
-"""How difficult goals are for the present Bob: over a grid of goal cells, by height and by distance."""
+"""Difficulty of goals for the present Bob, over a grid of cells; heights and distances of goals, in bins."""
 
 from __future__ import annotations
 
@@ -7,15 +7,13 @@ from collections.abc import Mapping
 import numpy as np
 from numpy.typing import NDArray
 
-from service.config import WorldConfig
+from service.config import Point, WorldConfig
 from service.generator.counts import SuccessCounts
 from service.generator.state import Array, State, prefixed, take, under
-from service.generator.validity import workspace_bounds
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 Bools = NDArray[np.bool_]
-Corner = tuple[float, float, float]
 
 AIR_ABOVE_REST_M = 0.05
 """A goal is in the air when the object's centre is higher than it rests on the table by more than this."""
@@ -39,12 +37,12 @@ def height_bins(positions: Floats, rest_height_m: float) -> Ints:
 
 
 class DifficultyGrid:
-    """Bob's success over goal cells that cover the workspace, and over height and distance bins.
+    """Bob's success over goal cells that cover the workspace.
 
     All rates are decayed running ones (see ``counts.DECAY``), one ``record`` being one iteration, so they follow Bob.
     """
 
-    bounds_m: tuple[Corner, Corner]
+    bounds_m: tuple[Point, Point]
     """Lower and upper corner of the workspace, metres."""
     cell_size_m: float
     """Edge of a cell; the last ones may reach beyond the workspace."""
@@ -52,25 +50,19 @@ class DifficultyGrid:
     """Number of cells in x, y and z."""
     cells: SuccessCounts
     """Over the cells, x-major."""
-    heights: SuccessCounts
-    """Over ``HEIGHT_NAMES``."""
-    distances: SuccessCounts
-    """Over the bins between ``DISTANCE_EDGES_M``."""
     seen: Bools
     """(cells,) a valid goal was ever proposed there."""
 
     def __init__(self, world: WorldConfig, cell_size_m: float) -> None:
-        self._lower, upper = workspace_bounds(world.workspace)
-        self.bounds_m = _corner(self._lower), _corner(upper)
+        self.bounds_m = world.workspace.lower_m, world.workspace.upper_m
+        self._lower: Floats = np.array(self.bounds_m[0])
         self.cell_size_m = cell_size_m
         self._rest_height_m = world.object_size_m / 2
         # Rounding may not add a cell: 0.45 / 0.03 is a little over 15.
-        counted = np.ceil((upper - self._lower) / cell_size_m - 1e-9).astype(int)
+        counted = np.ceil((self.bounds_m[1] - self._lower) / cell_size_m - 1e-9).astype(int)
         self.shape = (int(counted[0]), int(counted[1]), int(counted[2]))
         num_cells = int(np.prod(self.shape))
         self.cells = SuccessCounts(num_cells)
-        self.heights = SuccessCounts(self.num_height_bins)
-        self.distances = SuccessCounts(self.num_distance_bins)
         self.seen = np.zeros(num_cells, dtype=np.bool_)
 
     num_height_bins = len(HEIGHT_NAMES)
@@ -93,18 +85,15 @@ class DifficultyGrid:
         self.seen[self.cell_index(goals)] = True
         return self.num_cells_seen - before
 
-    def record(self, goals: Floats, start_positions: Floats, solved: Bools) -> None:
+    def record(self, goals: Floats, solved: Bools) -> None:
         """Age all counts by one iteration, then add M tries of the present Bob.
 
         Args:
             goals: (M, 3) valid goals he played, metres.
-            start_positions: (M, 3) where the object started, metres.
             solved: (M,) whether he solved them.
         """
         self.mark_seen(goals)
         self.cells.record(self.cell_index(goals), solved)
-        self.heights.record(self.height_bin(goals), solved)
-        self.distances.record(self.distance_bin(goals, start_positions), solved)
 
     def height_bin(self, goals: Floats) -> Ints:
         """(M,) index into ``HEIGHT_NAMES`` of (M, 3) goals, metres."""
@@ -116,11 +105,6 @@ class DifficultyGrid:
         bins: Ints = np.digitize(distance, DISTANCE_EDGES_M).astype(np.int64)
         return bins
 
-    def success_rate(self, goals: Floats) -> Floats:
-        """(M,) estimated probability that Bob solves a goal in the cell of each of (M, 3) goals; 1/2 where untried."""
-        rate: Floats = self.cells.success_rate()[self.cell_index(goals)]
-        return rate
-
     def learnability(self, goals: Floats) -> Floats:
         """(M,) p (1 - p) of the cell of each of (M, 3) goals; 1/4, the most, where untried."""
         learnability: Floats = self.cells.learnability()[self.cell_index(goals)]
@@ -129,22 +113,6 @@ class DifficultyGrid:
     def mean_learnability(self) -> float:
         """Mean over the cells seen; not-a-number while there are none."""
         return float(self.cells.learnability()[self.seen].mean()) if self.seen.any() else float("nan")
-
-    def summary(self) -> dict[str, float]:
-        """Difficulty in a few numbers; a bin that was never tried is left out."""
-        summary = {"num_cells": float(self.seen.size), "num_cells_seen": float(self.num_cells_seen)}
-        if self.seen.any():
-            summary["mean_learnability"] = self.mean_learnability()
-        edges = [0.0, *DISTANCE_EDGES_M]
-        distance_names = [f"from_{round(100 * edge)}_cm" for edge in edges]
-        for group, names, counts in (
-            ("height", HEIGHT_NAMES, self.heights),
-            ("distance", distance_names, self.distances),
-        ):
-            for name, num_tries, rate in zip(names, counts.num_tries, counts.success_rate(), strict=True):
-                if num_tries:
-                    summary[f"success_rate_{group}_{name}"] = float(rate)
-        return summary
 
     def maps(self) -> dict[str, Array]:
         """Arrays over the cells for plots and REST: (X, Y, Z) each, and ``center`` (X, Y, Z, 3) in metres."""
@@ -161,26 +129,13 @@ class DifficultyGrid:
 
     def state(self) -> State:
         """All counts, copied."""
-        state = {"seen": self.seen.copy()}
-        return (
-            state
-            | prefixed("cells", self.cells.state())
-            | prefixed("heights", self.heights.state())
-            | prefixed("distances", self.distances.state())
-        )
+        return {"seen": self.seen.copy()} | prefixed("cells", self.cells.state())
 
     def load_state(self, state: Mapping[str, Array]) -> None:
-        """Take over what ``state`` gave.
+        """Take over what ``state`` gave, of this or an older version, which also counted heights and distances.
 
         Raises:
             ConfigError: of a grid of another size.
         """
         self.seen = take(state, "seen", self.seen)
         self.cells.load_state(under("cells", state))
-        self.heights.load_state(under("heights", state))
-        self.distances.load_state(under("distances", state))
-
-
-def _corner(point: Floats) -> Corner:
-    x, y, z = (float(value) for value in point)
-    return x, y, z

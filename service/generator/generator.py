@@ -1,26 +1,24 @@
-"""The task generator: which opponents and goals a round uses, what became of them, and when the run is over."""
+"""The task generator: the choice of opponents and goals for a round, their outcomes, and the end of a run."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from service.config import Config
+from service.envs.state_layout import StateLayout
 from service.generator.counts import SuccessCounts
 from service.generator.difficulty import DifficultyGrid, in_air
 from service.generator.metrics import alice_metrics, bob_metrics, current_goals, mean, own_goals, without_nan
 from service.generator.opponents import OpponentPool, RoundPlan
+from service.generator.records import GoalRecords
 from service.generator.ring import Ring
 from service.generator.state import Array, State, prefixed, under
 from service.generator.stopping import StopCriterion
 from service.generator.validity import Verdict
-
-if TYPE_CHECKING:
-    from service.actors.rollout import GoalRecords
 
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
@@ -60,7 +58,7 @@ class TaskGenerator:
     """
 
     grid: DifficultyGrid
-    """Bob's success over goal cells, heights and distances."""
+    """Bob's success over goal cells."""
     buffer: Ring
     """Earlier valid goals and the states they were proposed from, drawn by learnability (Rutherford et al. 2024)."""
     starts: Ring
@@ -71,13 +69,14 @@ class TaskGenerator:
     opponents: OpponentPool
     """Past versions of both players."""
 
-    def __init__(self, config: Config, state_size: int) -> None:
+    def __init__(self, config: Config, layout: StateLayout) -> None:
+        self._layout = layout
         self._config = config.generator
         self._success_distance_m = config.game.success_distance_m
         self._rest_height_m = config.world.object_size_m / 2
         self._some_blocked = config.game.blocked_gripper_fraction > 0.0
         self.grid = DifficultyGrid(config.world, config.generator.cell_size_m)
-        columns = {"start_state": state_size, "start_position": 3}
+        columns = {"start_state": layout.size, "start_position": 3}
         num_cells = self.grid.seen.size if config.generator.replay_over_cells else 1
         self.buffer = Ring(config.generator.replay_buffer_size, num_cells, **columns, goal=3)
         self.starts = Ring(NUM_STARTS, **columns)
@@ -87,7 +86,7 @@ class TaskGenerator:
         self._stop = StopCriterion(config.generator)
 
     def plan(self, num_worlds: int, rng: np.random.Generator) -> RoundPlan:
-        """Choose who plays the next round; all current while there are no past versions."""
+        """Choose the players of the next round; all current while there are no past versions."""
         return self.opponents.plan(num_worlds, self._config.past_opponent_fraction, rng)
 
     def choose_goals(
@@ -102,7 +101,7 @@ class TaskGenerator:
     ) -> GoalChoice:
         """Choose what Bob plays: Alice's valid goals, or replayed ones where the configuration says so.
 
-        Replayed goals go to the current Bob only: a past Bob plays to judge Alice's goals, not to learn.
+        Replayed goals go to the current Bob only: nobody learns from a past Bob, he shows how hard Alice's goals are.
 
         Args:
             plan: who plays.
@@ -124,7 +123,7 @@ class TaskGenerator:
         return choice
 
     def record(self, records: GoalRecords) -> dict[str, float]:
-        """Learn from what became of one iteration's goals.
+        """Take in the outcomes of one iteration's goals.
 
         Difficulty follows every try of the current Bob; the buffer takes the valid goals that Bob played straight from
         Alice; a cell is new when a valid proposal, a past Alice's included, is the first in it.
@@ -138,7 +137,7 @@ class TaskGenerator:
         tasks = records.goal[reset], records.start_position[reset], self._blocked(records.start_state[reset])
         self.from_reset.record(self._task_bins(*tasks), records.solved[reset])
         as_proposed = tried & ~(records.replayed & records.from_reset)
-        self.grid.record(records.goal[as_proposed], records.start_position[as_proposed], records.solved[as_proposed])
+        self.grid.record(records.goal[as_proposed], records.solved[as_proposed])
         own = own_goals(records)
         goal = records.goal[own]
         self.buffer.add(
@@ -206,6 +205,7 @@ class TaskGenerator:
         Whatever is asked of Bob downstream begins with a reset, but Alice reaches far goals over several rounds, so few
         of her own do. Both kinds of task compete by learnability: far goals from a reset wait until Bob is ready.
         """
+        # Each goal of the buffer is a candidate from its own start and, behind all of these, from the start of a game.
         goal = self.buffer["goal"]
         tasks = {name: self.buffer[name] for name in ("start_state", "start_position")}
         share = self.buffer.part_share()
@@ -215,7 +215,7 @@ class TaskGenerator:
             position = start["start_position"]
             blocked = self._blocked(start["start_state"])
             far = np.linalg.norm(goal - position, axis=1) > self._success_distance_m  # nearer ones are no task
-            possible = ~(blocked & in_air(goal, self._rest_height_m))
+            possible = ~(blocked & in_air(goal, self._rest_height_m))  # a closed gripper lifts nothing
             learnability = self.from_reset.learnability()[self._task_bins(goal, position, blocked)]
             weight = np.concatenate([weight, np.where(far & possible, learnability + LEARNABILITY_FLOOR, 0.0) * share])
             tasks = {name: np.concatenate([rows, start[name]]) for name, rows in tasks.items()}
@@ -231,8 +231,9 @@ class TaskGenerator:
         return bins + blocked * self._num_task_bins
 
     def _blocked(self, states: Floats) -> Bools:
-        """(M,) whether the gripper of (M, S) states is blocked; where some are, their last number says so."""
-        return states[:, -1] > 0.0 if self._some_blocked else np.zeros(len(states), dtype=np.bool_)
+        """(M,) whether the gripper of (M, S) states is blocked; none is where states have no such flag."""
+        blocked: Bools = np.any(states[:, self._layout["gripper_blocked"]] > 0.0, axis=1)
+        return blocked
 
     def _blocked_metrics(self, records: GoalRecords, tried: Bools) -> dict[str, float]:
         if not self._some_blocked:

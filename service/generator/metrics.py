@@ -1,17 +1,13 @@
-"""What one iteration's goals say about both players; metric names are an API."""
+"""Metrics of both players from the goals of one iteration; metric names are an API."""
 
 from __future__ import annotations
-
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from service.generator.difficulty import HEIGHT_NAMES, height_bins, in_air
+from service.generator.records import GoalRecords
 from service.generator.validity import Verdict
-
-if TYPE_CHECKING:
-    from service.actors.rollout import GoalRecords
 
 Bools = NDArray[np.bool_]
 

@@ -1,4 +1,4 @@
-"""Past versions of both players, and which worlds of a round play against them (OpenAI 2021: 20 % each way)."""
+"""Past versions of both players, and the choice of the worlds that play against them (OpenAI 2021: 20 % each way)."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ CURRENT = -1
 
 @dataclass(frozen=True, slots=True)
 class RoundPlan:
-    """How a round of N worlds is played; at most one of the two players of a world is a past version."""
+    """Players of a round of N worlds; at most one of the two players of a world is a past version."""
 
     alice_opponent: Ints
     """(N,) index of Alice in ``OpponentPool.alice``, or ``CURRENT``."""
@@ -102,7 +102,7 @@ class OpponentPool:
 
 
 def _round_at_random(count: float, rng: np.random.Generator) -> int:
-    """A whole number whose mean is ``count``, so that an actor of a few worlds meets past opponents, too."""
+    """Round up or down at random with mean ``count``, so that an actor of a few worlds meets past opponents, too."""
     whole = int(np.floor(count + 1e-9))
     rest = count - whole
     return whole + int(rest > 1e-9 and rng.random() < rest)

@@ -1,4 +1,4 @@
-"""The newest rows of a few arrays of equal length, and how a checkpoint keeps them."""
+"""Ring buffer: the newest rows of a few arrays of equal length."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ Ints = NDArray[np.int64]
 
 
 class Ring:
-    """The last rows added to named float columns, of each of ``num_parts`` kinds of rows equally many at most.
+    """The last rows added to named float columns; no part may hold more than its share.
 
     Args:
         capacity: rows held at most, all parts together; each part has an equal share, at least one.
@@ -33,7 +33,7 @@ class Ring:
         return int(self._num_held.sum())
 
     def __getitem__(self, column: str) -> Floats:
-        """(len, size) rows held, in the order that ``sample``, its weights and ``share`` mean; a copy."""
+        """(len, size) rows held, in the order of the weights of ``sample`` and of ``part_share``; a copy."""
         rows: Floats = self._columns[column][self._held]
         return rows
 
@@ -47,8 +47,9 @@ class Ring:
         assert rows.keys() == self._columns.keys(), (rows.keys(), self._columns.keys())
         num = len(next(iter(rows.values())))
         part = np.zeros(num, dtype=np.int64) if part is None else part
-        order = np.argsort(part, kind="stable")
+        order = np.argsort(part, kind="stable")  # part by part, oldest first
         counted = np.bincount(part, minlength=self._num_added.size)
+        # Number of each new row within its part, counted from 0.
         rank = np.arange(num) - np.repeat(np.cumsum(counted) - counted, counted)
         own = part[order]
         # Of more new rows than a part has room for, only the newest are written: each place is written once.
@@ -73,13 +74,13 @@ class Ring:
         return {name: column[rows] for name, column in self._columns.items()}
 
     def part_share(self) -> Floats:
-        """(len,) one over the number of rows held of each row's part: drawn by it, all parts are drawn alike."""
+        """(len,) weights under which ``sample`` draws all parts alike: one over the rows held of each row's part."""
         num = self._num_held
         share: Floats = 1.0 / np.repeat(num, num)
         return share
 
     def state(self) -> State:
-        """What is held, copied; rows never written are left out."""
+        """Everything held, copied; rows never written are left out."""
         state: State = {name: self[name] for name in self._columns}
         state["num_added"] = self._num_added.copy()
         return state

@@ -1,4 +1,4 @@
-"""When a run is over: Alice finds nothing new and Bob solves all (the paper, section on task generation)."""
+"""Stop criterion: Alice finds nothing new and Bob solves all (the paper, section on task generation)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Is Alice's proposal a goal? One verdict per world (OpenAI 2021, section 3; workspace: the paper)."""
+"""The verdict on Alice's proposals: whether each is a goal (OpenAI 2021, section 3; workspace: the paper)."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ FALLEN_BELOW_M = -0.02
 
 
 class Verdict(enum.IntEnum):
-    """What became of Alice's proposal; only a ``VALID`` one is a goal."""
+    """Outcome of Alice's proposal; only a ``VALID`` one is a goal."""
 
     VALID = 0
     NOT_MOVED = 1
@@ -22,27 +22,19 @@ class Verdict(enum.IntEnum):
     FALLEN = 3
 
 
-def workspace_bounds(workspace: WorkspaceConfig) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Lower and upper corner (3,) of the workspace box, metres; it stands on the table top."""
-    center = np.array([workspace.center_x_m, workspace.center_y_m])
-    half = np.array([workspace.length_x_m, workspace.length_y_m]) / 2
-    return np.append(center - half, 0.0), np.append(center + half, workspace.height_m)
-
-
 def in_workspace(position: NDArray[np.float64], workspace: WorkspaceConfig) -> NDArray[np.bool_]:
     """Whether each (..., 3) position in metres lies in the box, its faces included; not-a-number lies outside."""
-    lower, upper = workspace_bounds(workspace)
-    inside: NDArray[np.bool_] = np.all((position >= lower) & (position <= upper), axis=-1)
+    inside: NDArray[np.bool_] = np.all((position >= workspace.lower_m) & (position <= workspace.upper_m), axis=-1)
     return inside
 
 
-def judge(
+def classify_goal(
     start_position: NDArray[np.float64],
     end_position: NDArray[np.float64],
     workspace: WorkspaceConfig,
     success_distance_m: float,
 ) -> NDArray[np.int8]:
-    """Judge where the object lies at the end of Alice's turn; the first reason that applies is the verdict.
+    """Verdict on where the object lies at the end of Alice's turn: the first reason that applies.
 
     Fallen (under the table top, or not finite), then not moved by MORE than the success distance, then outside the
     workspace.

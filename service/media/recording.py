@@ -81,7 +81,7 @@ def record_rounds(
     interest: list[tuple[float, ...]] = []
     with contextlib.closing(SelfPlay(config, rng, num_threads=config.run.num_threads)) as self_play:
         # It is never told of a goal, so it replays none: Bob plays those of this round's Alice.
-        generator = TaskGenerator(config, self_play.worlds.state_size)
+        generator = TaskGenerator(config, self_play.worlds.layout)
         for _ in range(_MAX_ROLLOUTS):
             rollout, states = _play_round(self_play, players, generator, rng)
             rounds += _split(rollout, states)

@@ -20,6 +20,7 @@ from service.envs.observations import (
     BOB_SIZE,
     BOB_VALUE_SIZE,
     FULL_SIZE,
+    GATE,
     GOAL_SLICE,
     NORMALISATION_BOB,
     NORMALISATION_BOB_VALUE,
@@ -120,9 +121,8 @@ class Gate(nn.Module):
     def __init__(self, config: MCPConfig) -> None:
         """Build; initial weights scatter around one half."""
         super().__init__()
-        normalisation = _gate_normalisation()
-        self.input = InputNormalisation(normalisation)
-        self.hidden = HiddenLayers(len(normalisation.offset), config.gate_hidden_sizes)
+        self.input = InputNormalisation(GATE.normalisation)
+        self.hidden = HiddenLayers(GATE.size, config.gate_hidden_sizes)
         self.output = linear(self.hidden.output_size, config.num_primitives, gain=_GATE_GAIN)
         self.register_buffer("weight_floor", torch.tensor(config.weight_floor))
 
@@ -217,14 +217,6 @@ def _input(normalisation: Normalisation, input_size: int) -> InputNormalisation:
     if size != input_size:
         raise PolicyError(f"normalisation of {size} inputs for a network of {input_size}; take the layout's own")
     return InputNormalisation(normalisation)
-
-
-def _gate_normalisation() -> Normalisation:
-    """Bob's 14 inputs, then goal relative to object, which is how Bob's value layout ends."""
-    bob, relative = NORMALISATION_BOB, NORMALISATION_BOB_VALUE
-    return Normalisation(
-        np.concatenate((bob.offset, relative.offset[-3:])), np.concatenate((bob.scale, relative.scale[-3:]))
-    )
 
 
 def _check_log_std(low: float, high: float) -> None:

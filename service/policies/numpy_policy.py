@@ -11,7 +11,7 @@ from abc import ABC, abstractmethod
 
 import numpy as np
 
-from service.envs.observations import BOB_SIZE, GOAL_SLICE, OBJECT_SLICE, POSITIONS_SIZE
+from service.envs.observations import BOB_SIZE, GATE, GOAL_SLICE, OBJECT_SLICE, POSITIONS_SIZE
 from service.policies.composition import compose
 from service.policies.parameters import INPUT_CLIP, MEAN_BOUND, FloatArray, ParameterReader, Parameters, PolicyError
 
@@ -161,7 +161,7 @@ class _Gate:
     """Weights (N, K) at (N, 14) observations."""
 
     def __init__(self, reader: ParameterReader, num_primitives: int) -> None:
-        self._input = _Input(reader, "gate.input", BOB_SIZE + 3)
+        self._input = _Input(reader, "gate.input", GATE.size)
         self._hidden = _HiddenLayers(reader, "gate.hidden", self._input.size)
         self._output = _Layer(reader, "gate.output", num_primitives, self._hidden.output_size)
         self._floor = reader.take_scalar("gate.weight_floor", 0.0, 1.0)

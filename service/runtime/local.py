@@ -45,7 +45,7 @@ class LocalRun(Runner):
         self._pending: Rollout | None = None
         self._learner = LearnerWorker(config)
         self._actor = RolloutWorker(config, num_threads=config.run.num_threads)
-        self._generator = GeneratorWorker(config, self._actor.game.worlds.state_size)
+        self._generator = GeneratorWorker(config)
         self.learner, self.game, self.generator = self._learner.learner, self._actor.game, self._generator.generator
         self._executor = ThreadPoolExecutor(max_workers=1, thread_name_prefix="learner")
         if resume:

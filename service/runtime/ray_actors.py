@@ -17,10 +17,10 @@ import numpy as np
 import ray
 from ray.util.metrics import Counter, Histogram
 
-from service.actors.rollout import GoalRecords, Rollout
+from service.actors.rollout import Rollout
 from service.config import Config
-from service.envs.batch import WorldBatch
 from service.generator.generator import GoalChoice
+from service.generator.records import GoalRecords
 from service.runtime.workers import (
     Arrays,
     Assignment,
@@ -117,11 +117,6 @@ class RolloutActor(RolloutWorker):
 
 class GeneratorActor(GeneratorWorker):
     """A task generator that hands its whole state back with every record."""
-
-    def __init__(self, config: Config, state: Arrays | None) -> None:
-        fraction = config.game.blocked_gripper_fraction
-        with WorldBatch(config.world, 1, num_threads=1, blocked_fraction=fraction) as worlds:
-            super().__init__(config, worlds.state_size, state)
 
     def ping(self) -> Location:
         """Its location."""

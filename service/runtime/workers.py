@@ -15,12 +15,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.actors.evaluation import EVALUATION_SEED, success_metrics
-from service.actors.rollout import Broken, GoalRecords, Rollout
+from service.actors.rollout import Broken, Rollout
 from service.actors.self_play import Players, SelfPlay, StochasticPolicy
 from service.config import Config
 from service.envs.goals import GoalKind
+from service.envs.scene import build_layout
 from service.generator.generator import GoalChoice, TaskGenerator
 from service.generator.opponents import RoundPlan
+from service.generator.records import GoalRecords
 from service.generator.validity import Verdict
 from service.policies.numpy_policy import NumpyGaussianPolicy, numpy_bob
 from service.policies.parameters import Parameters
@@ -190,12 +192,12 @@ class GeneratorWorker:
 
     Args:
         config: the run.
-        state_size: of one world's state.
         state: to continue from; None to start.
     """
 
-    def __init__(self, config: Config, state_size: int, state: Mapping[str, NDArray[Any]] | None = None) -> None:
-        self.generator = TaskGenerator(config, state_size)
+    def __init__(self, config: Config, state: Mapping[str, NDArray[Any]] | None = None) -> None:
+        layout = build_layout(config.world, blocked_fraction=config.game.blocked_gripper_fraction)
+        self.generator = TaskGenerator(config, layout)
         self._pool_version = 0
         if state is not None:
             self.generator.load_state(state)

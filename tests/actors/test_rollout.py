@@ -2,7 +2,8 @@
 
 from dataclasses import fields, replace
 
-from service.actors.rollout import Demonstrations, GoalRecords, Rollout, Turns, from_arrays, to_arrays
+from service.actors.rollout import Demonstrations, Rollout, Turns, from_arrays, to_arrays
+from service.generator.records import GoalRecords
 from service.io import tensors
 from tests.actors.players import AT_REST, IN_FRONT, SLIDES, Pusher, assert_same_rollout, make_config, make_game, play
 

@@ -4,7 +4,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from service.envs.batch import DISPLACEMENT_M, WorldBatch, sample_in_volume
+from service.envs.batch import DISPLACEMENT_M, WorldBatch
+from service.envs.sampling import sample_in_volume
 
 OPEN, CLOSE = 1.0, -1.0
 _GRASP_HEIGHT_M = 0.022

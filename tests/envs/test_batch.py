@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 
 from service.config import WorkspaceConfig, WorldConfig
-from service.envs.batch import WorldBatch, sample_in_volume, sample_on_table
+from service.envs.batch import WorldBatch
 from service.envs.panda import FINGER_STROKE_M
+from service.envs.sampling import sample_in_volume, sample_on_table
 from service.errors import DivergedError
 
 CONFIG = WorldConfig(physics_step_s=0.004, num_substeps=10)

@@ -6,8 +6,9 @@ import pytest
 
 from service.config import WorkspaceConfig, WorldConfig
 from service.envs import kinematics
-from service.envs.batch import DISPLACEMENT_M, LOWEST_TARGET_M, sample_in_volume
+from service.envs.batch import DISPLACEMENT_M, LOWEST_TARGET_M
 from service.envs.panda import BASE_POSITION, JOINT_LOWER, JOINT_UPPER
+from service.envs.sampling import sample_in_volume
 from service.envs.scene import build_spec
 
 # Franka's table once more, as angles: a, d, alpha of each joint, modified DH.

@@ -82,6 +82,52 @@ def test_named_slices_are_where_the_table_says(worlds):
     np.testing.assert_array_equal(bob[:, observations.GOAL_SLICE], GOALS.astype(np.float32))
 
 
+def test_bobs_input_is_put_together(worlds):
+    expected = np.hstack([positions(worlds), GOALS])
+    found = observations.bob_observation(worlds.positions(), GOALS)
+    assert_layout(found, expected, observations.BOB_SIZE)
+    np.testing.assert_array_equal(found, worlds.observe(observations.BOB, goal=GOALS))
+
+
+def test_the_gate_computes_with_the_way_of_the_object(worlds):
+    relative = GOALS - [[0.2, -0.1, 0.3], [-0.15, 0.12, 0.025]]
+    found = worlds.observe(observations.GATE, goal=GOALS, goal_from_object=relative)
+    assert_layout(found, np.hstack([positions(worlds), GOALS, relative]), 17)
+
+
+def test_the_last_command_as_a_further_input(worlds):
+    layout = observations.BOB + observations.ACTION
+    assert (layout["goal"], layout["displacement"], layout["width_change"]) == (
+        slice(11, 14), slice(14, 17), slice(17, 18),
+    )  # fmt: skip
+    command = np.array([[0.1, 0.2, 0.3, 0.4], [-0.5, -0.6, -0.7, -0.8]])
+    found = worlds.observe(layout, goal=GOALS, displacement=command[:, :3], width_change=command[:, 3:])
+    assert_layout(found, np.hstack([positions(worlds), GOALS, command]), 18)
+    vector = np.array([*POSITIONS, 12, 13, 14, 15, 16, 17, 18], dtype=np.float32)
+    assert layout.mirror(vector).tolist() == [*MIRRORED_POSITIONS, 12, -13, 14, 15, -16, 17, 18]
+    assert (layout.normalisation.offset[14:] == 0.0).all()
+    assert (layout.normalisation.scale[14:] == 1.0).all()
+
+
+def test_a_name_means_one_entry():
+    with pytest.raises(AssertionError, match="same name"):
+        observations.BOB + observations.POSITIONS
+
+
+def test_normalisation_by_hand():
+    """Published primitives carry these constants."""
+    offset = [0, 0, 0.15, 0.02, 0.02, 0, 0, 0.15, 0, 0, 0]
+    scale = [0.12, 0.12, 0.12, 0.02, 0.02, 0.12, 0.12, 0.12, 0.1, 0.1, 0.1]
+    motion_scale = [0.5, 0.5, 0.5, 0.2, 0.2, 0.5, 0.5, 0.5, 0.5, 0.5]
+    goal_and_way = [0, 0, 0.15, 0, 0, 0], [0.12, 0.12, 0.12, 0.1, 0.1, 0.1]
+    value = observations.NORMALISATION_BOB_VALUE
+    np.testing.assert_array_equal(value.offset, np.float32([*offset, *[0] * 8, 0.5, 0.5, *goal_and_way[0]]))
+    np.testing.assert_array_equal(value.scale, np.float32([*scale, *motion_scale, *goal_and_way[1]]))
+    full = observations.NORMALISATION_FULL
+    np.testing.assert_array_equal(full.offset, np.float32([*offset, *[0] * 8, 0.5, 0.5, 0.5]))
+    np.testing.assert_array_equal(full.scale, np.float32([*scale, *motion_scale, 0.5]))
+
+
 @pytest.mark.parametrize(
     ("mirror", "vector", "expected"),
     [

@@ -303,7 +303,7 @@ class TestFixtures:
     def test_the_box_is_part_of_the_state(self):
         config = TASKS["box"].world_from(CONFIG)
         with WorldBatch(config, 3, num_threads=2) as worlds, WorldBatch(CONFIG, 1, num_threads=1) as plain:
-            assert worlds.state_size == plain.state_size + 3
+            assert worlds.layout.size == plain.layout.size + 3
             worlds.reset(np.random.default_rng(0))
             place = worlds.box_place.copy()
             worlds.step(np.zeros((3, 4), dtype=np.float32))

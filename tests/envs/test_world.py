@@ -7,8 +7,9 @@ import pytest
 from benchmarks.world_soak import soak
 from service.config import WorldConfig
 from service.envs import kinematics
-from service.envs.batch import LOWEST_TARGET_M, WorldBatch, sample_in_volume
+from service.envs.batch import LOWEST_TARGET_M, WorldBatch
 from service.envs.observations import MIRROR_ACTION, MIRROR_FULL
+from service.envs.sampling import sample_in_volume
 from tests.envs.scripted import CLOSE, OPEN, grasp, place_in_air
 
 FINE = {"physics_step_s": 0.002, "num_substeps": 20}

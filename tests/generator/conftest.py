@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from service.actors.rollout import GoalRecords
+from service.generator.records import GoalRecords
 
 STATE_SIZE = 4
 

@@ -10,11 +10,10 @@ from service.generator.counts import DECAY, SuccessCounts
 from service.generator.difficulty import DifficultyGrid, height_bins, in_air
 
 WORLD = WorldConfig(workspace=WorkspaceConfig(center_x_m=0.1, center_y_m=0.0))
-START = (0.1, 0.0, 0.025)
 
 
 def record(grid: DifficultyGrid, goals: list[tuple[float, ...]], solved: list[bool]) -> None:
-    grid.record(np.array(goals), np.tile(START, (len(goals), 1)), np.array(solved))
+    grid.record(np.array(goals), np.array(solved))
 
 
 def test_counts_by_hand() -> None:
@@ -86,7 +85,7 @@ def test_grid_rates_by_hand() -> None:
     easy, hard, untried = (0.1, 0.1, 0.025), (0.1, -0.1, 0.2), (0.2, 0.0, 0.3)
     record(grid, [easy, easy, easy, hard], [True, True, True, False])
     goals = np.array([easy, hard, untried])
-    np.testing.assert_allclose(grid.success_rate(goals), [4 / 5, 1 / 3, 1 / 2], rtol=1e-15)
+    np.testing.assert_allclose(grid.cells.success_rate()[grid.cell_index(goals)], [4 / 5, 1 / 3, 1 / 2], rtol=1e-15)
     np.testing.assert_allclose(grid.learnability(goals), [4 / 25, 2 / 9, 1 / 4], rtol=1e-15)
     np.testing.assert_allclose(grid.mean_learnability(), (4 / 25 + 2 / 9) / 2, rtol=1e-15)
     assert grid.num_cells_seen == 2
@@ -110,25 +109,23 @@ def test_height_bins_split_table_from_air() -> None:
     assert in_air(positions, 0.025).tolist() == [False, False] + 6 * [True]
 
 
-def test_summary_by_hand() -> None:
+def test_bins_of_distance_and_height_by_hand() -> None:
     grid = DifficultyGrid(WORLD, 0.05)
-    table, far, air = (0.1, 0.06, 0.025), (0.1, 0.17, 0.025), (0.1, 0.0, 0.205)  # 0.06, 0.17 and 0.18 m from the start
-    record(grid, [table, table, far, air], [True, True, False, False])
-    assert grid.summary() == pytest.approx(
-        {
-            "num_cells": 343.0,
-            "num_cells_seen": 3.0,
-            "mean_learnability": (3 / 16 + 2 / 9 + 2 / 9) / 3,
-            "success_rate_height_table": 3 / 5,
-            "success_rate_height_middle": 1 / 3,
-            "success_rate_distance_from_0_cm": 3 / 4,
-            "success_rate_distance_from_15_cm": 1 / 4,
-        }
-    )
+    goals = np.array([(0.1, 0.06, 0.025), (0.1, 0.12, 0.025), (0.1, 0.17, 0.025), (0.1, 0.0, 0.205), (0.1, 0.0, 0.33)])
+    starts = np.tile([0.1, 0.0, 0.025], (5, 1))  # 0.06, 0.12, 0.17, 0.18 and 0.305 m away
+    assert grid.distance_bin(goals, starts).tolist() == [0, 1, 2, 2, 4]
+    assert grid.height_bin(goals).tolist() == [0, 0, 0, 2, 3]
+    assert (grid.num_distance_bins, grid.num_height_bins) == (5, 4)
 
 
-def test_summary_of_nothing() -> None:
-    assert DifficultyGrid(WORLD, 0.05).summary() == {"num_cells": 343.0, "num_cells_seen": 0.0}
+def test_state_of_an_older_version_loads() -> None:
+    old = DifficultyGrid(WORLD, 0.05)
+    record(old, [(0.1, 0.06, 0.025)], [True])
+    counted = {f"heights/{name}": np.ones(4) for name in ("tries", "successes", "num_tries")}
+    grid = DifficultyGrid(WORLD, 0.05)
+    grid.load_state(old.state() | counted)
+    assert grid.num_cells_seen == 1
+    np.testing.assert_array_equal(grid.cells.tries, old.cells.tries)
 
 
 def test_state_of_another_grid_is_refused() -> None:

@@ -9,13 +9,18 @@ from typing import Any
 import numpy as np
 import pytest
 
-from service.actors.rollout import GoalRecords
 from service.config import Config, ConfigError, parse_config
+from service.envs.state_layout import StateLayout
 from service.generator.generator import LEARNABILITY_FLOOR, MIN_REPLAY_GOALS, GoalChoice, TaskGenerator
 from service.generator.opponents import CURRENT, RoundPlan
+from service.generator.records import GoalRecords
 from service.generator.validity import Verdict
 
-STATE_SIZE = 4
+FREE = StateLayout(positions={"object": 3}, velocities={}, measured={}, kept={"gripper_blocked": 0})
+SOME_BLOCKED = StateLayout(positions={}, velocities={}, measured={}, kept={"gripper_blocked": 1, "object_mass": 2})
+"""Two small worlds of four numbers; the flag is not the last of them."""
+STATE_SIZE = FREE.size
+BLOCKED = SOME_BLOCKED["gripper_blocked"].start
 OLD_GOAL = (0.0, 0.1, 0.025)
 VALID, OUTSIDE = int(Verdict.VALID), int(Verdict.OUTSIDE)
 MakeRecords = Callable[..., GoalRecords]
@@ -31,7 +36,7 @@ def all_current(num: int) -> RoundPlan:
 
 def filled(make_records: MakeRecords, num_goals: int = MIN_REPLAY_GOALS, **settings: Any) -> TaskGenerator:
     """A generator whose buffer holds ``num_goals`` times the same old goal, from a state of sevens."""
-    generator = TaskGenerator(config(**settings), STATE_SIZE)
+    generator = TaskGenerator(config(**settings), FREE)
     generator.record(make_records(np.tile(OLD_GOAL, (num_goals, 1)), start_state=np.full((num_goals, STATE_SIZE), 7.0)))
     return generator
 
@@ -124,16 +129,16 @@ def test_a_start_next_to_the_goal_is_no_task(make_records: MakeRecords) -> None:
 def test_no_goal_in_the_air_from_a_blocked_reset(make_records: MakeRecords) -> None:
     settings = {"generator": {"replay_fraction": 1.0, "replay_from_reset": True}}
     generator = TaskGenerator(
-        parse_config({**settings, "game": {"blocked_gripper_fraction": 0.2}}, where="t"), STATE_SIZE
+        parse_config({**settings, "game": {"blocked_gripper_fraction": 0.2}}, where="t"), SOME_BLOCKED
     )
     goals = np.tile([[0.0, 0.1, 0.025], [0.0, 0.1, 0.2]], (40, 1))
-    generator.record(make_records(goals, start_state=np.zeros((80, STATE_SIZE))))  # free: the last number is 0
+    generator.record(make_records(goals, start_state=np.zeros((80, STATE_SIZE))))  # none is blocked
     num = 400
     state, start = np.zeros((num, STATE_SIZE)), np.tile([0.0, 0.0, 0.025], (num, 1))
-    state[::2, -1] = 1.0
+    state[::2, BLOCKED] = 1.0
     index, verdict = np.zeros(num, dtype=np.int64), np.zeros(num, dtype=np.int8)
     choice = generator.choose_goals(all_current(num), state, start, index, start, verdict, np.random.default_rng(0))
-    blocked, in_air = choice.start_state[:, -1] == 1.0, choice.goal[:, 2] > 0.1
+    blocked, in_air = choice.start_state[:, BLOCKED] == 1.0, choice.goal[:, 2] > 0.1
     assert choice.from_reset[blocked].all()
     assert 0.1 < (blocked & ~in_air).mean() < 0.5
     assert (~blocked & in_air).mean() > 0.1
@@ -142,10 +147,10 @@ def test_no_goal_in_the_air_from_a_blocked_reset(make_records: MakeRecords) -> N
 
 def test_blocked_tasks_are_counted_apart(make_records: MakeRecords) -> None:
     config = parse_config({"game": {"blocked_gripper_fraction": 0.2}}, where="test")
-    generator = TaskGenerator(config, STATE_SIZE)
+    generator = TaskGenerator(config, SOME_BLOCKED)
     blocked = np.arange(40) % 4 == 0
     state = np.zeros((40, STATE_SIZE))
-    state[:, -1] = blocked
+    state[:, BLOCKED] = blocked
     records = make_records(
         np.tile(OLD_GOAL, (40, 1)), start_state=state, from_reset=np.ones(40, dtype=np.bool_), solved=~blocked
     )
@@ -177,7 +182,7 @@ def test_choice_does_not_alias_its_inputs(make_records: MakeRecords) -> None:
 
 
 def test_replay_prefers_learnable_goals(make_records: MakeRecords) -> None:
-    generator = TaskGenerator(config(replay_fraction=1.0), STATE_SIZE)
+    generator = TaskGenerator(config(replay_fraction=1.0), FREE)
     solved_always, solved_half = (0.1, 0.1, 0.025), (-0.1, -0.1, 0.025)
     goals = [solved_always] * 100 + [solved_half] * 100
     generator.record(make_records(goals, solved=[True] * 100 + [True, False] * 50))
@@ -190,7 +195,7 @@ def test_replay_prefers_learnable_goals(make_records: MakeRecords) -> None:
 def test_replay_over_cells_does_not_forget_what_alice_has_left(make_records: MakeRecords) -> None:
     left, crowded = (-0.2, 0.0, 0.325), [(0.1, y, 0.025) for y in (-0.15, -0.1, -0.05, 0.0, 0.05, 0.1, 0.15)]
     for over_cells, share in ((True, 1 / 8), (False, 0.0)):
-        generator = TaskGenerator(config(replay_fraction=1.0, replay_over_cells=over_cells), STATE_SIZE)
+        generator = TaskGenerator(config(replay_fraction=1.0, replay_over_cells=over_cells), FREE)
         generator.record(make_records([left] * 2, solved=[True, False]))
         for _ in range(5):
             generator.record(make_records(crowded * 200, solved=[True] * 700 + [False] * 700))
@@ -200,7 +205,7 @@ def test_replay_over_cells_does_not_forget_what_alice_has_left(make_records: Mak
 
 
 def test_record_separates_who_learns_what(make_records: MakeRecords) -> None:
-    generator = TaskGenerator(config(), STATE_SIZE)
+    generator = TaskGenerator(config(), FREE)
     metrics = generator.record(
         make_records(
             [(-0.2, 0.0, 0.02), (-0.1, 0.0, 0.02), (0.0, 0.1, 0.02), (0.1, 0.1, 0.02), (0.5, 0.0, 0.02)],
@@ -219,16 +224,15 @@ def test_record_separates_who_learns_what(make_records: MakeRecords) -> None:
     assert metrics["bob/success_rate"] == 1.0  # the first world alone
     assert metrics["bob/success_rate_replayed"] == 0.0
     # The current Bob tried the first cell three times and the past Alice's once; the past Bob's try does not count.
-    rates = generator.grid.success_rate(
-        np.array([(-0.2, 0.0, 0.02), (-0.1, 0.0, 0.02), (0.0, 0.1, 0.02), (0.1, 0.1, 0.02)])
-    )
+    goals = np.array([(-0.2, 0.0, 0.02), (-0.1, 0.0, 0.02), (0.0, 0.1, 0.02), (0.1, 0.1, 0.02)])
+    rates = generator.grid.cells.success_rate()[generator.grid.cell_index(goals)]
     np.testing.assert_allclose(rates, [2 / 5, 2 / 3, 1 / 2, 1 / 2])
     expected = (6 / 25 + 2 / 9 + 1 / 4 + 1 / 4) / 4
     assert metrics["generator/mean_learnability"] == pytest.approx(expected)
 
 
 def test_metric_names_are_an_api(make_records: MakeRecords) -> None:
-    metrics = TaskGenerator(config(), STATE_SIZE).record(
+    metrics = TaskGenerator(config(), FREE).record(
         make_records([(0.1, 0.0, 0.025), (0.0, 0.0, 0.2)], solved=[True, True])
     )
     assert set(metrics) == {
@@ -244,7 +248,7 @@ def test_metric_names_are_an_api(make_records: MakeRecords) -> None:
 def test_an_iteration_without_any_goal(make_records: MakeRecords) -> None:
     verdict = np.full(2, Verdict.FALLEN, dtype=np.int8)
     records = make_records(np.full((2, 3), np.nan), verdict=verdict, played=[False, False])
-    metrics = TaskGenerator(config(), STATE_SIZE).record(records)
+    metrics = TaskGenerator(config(), FREE).record(records)
     assert metrics["generator/iterations_without_new_cell"] == 1.0
     assert metrics["generator/buffer_size"] == 0.0
     assert not any(name.startswith("bob/") for name in metrics)
@@ -262,7 +266,7 @@ def test_stops_on_current_players_own_goals_only(make_records: MakeRecords) -> N
         ({"solved": past, "bob_past": past}, False),
         ({"solved": past, "alice_past": past}, False),
     ):
-        generator = TaskGenerator(config(novelty_window=2), STATE_SIZE)
+        generator = TaskGenerator(config(novelty_window=2), FREE)
         for _ in range(3):
             assert not generator.should_stop()
             generator.record(make_records(goals, **overrides))
@@ -270,12 +274,12 @@ def test_stops_on_current_players_own_goals_only(make_records: MakeRecords) -> N
 
 
 def test_snapshots_are_due_every_interval() -> None:
-    generator = TaskGenerator(config(opponent_interval=10), STATE_SIZE)
+    generator = TaskGenerator(config(opponent_interval=10), FREE)
     assert [iteration for iteration in range(35) if generator.snapshot_due(iteration)] == [10, 20, 30]
 
 
 def test_plan_uses_the_configured_share_of_the_pool() -> None:
-    generator = TaskGenerator(config(past_opponent_fraction=0.25, opponent_pool_size=2), STATE_SIZE)
+    generator = TaskGenerator(config(past_opponent_fraction=0.25, opponent_pool_size=2), FREE)
     assert not generator.plan(40, np.random.default_rng(0)).alice_past.any()
     for version in range(3):
         generator.add_opponents({"w": np.array([version])}, {"w": np.array([version])})
@@ -321,10 +325,10 @@ def test_exact_resume_through_a_file(make_records: MakeRecords, tmp_path: Path) 
         opponent_pool_size=2,
         novelty_window=5,
     )
-    generator, rng = TaskGenerator(settings, STATE_SIZE), np.random.default_rng(5)
+    generator, rng = TaskGenerator(settings, FREE), np.random.default_rng(5)
     play(generator, make_records, rng, range(12))
     np.savez(tmp_path / "state.npz", **generator.state())  # type: ignore[arg-type]
-    resumed, resumed_rng = TaskGenerator(settings, STATE_SIZE), np.random.default_rng()
+    resumed, resumed_rng = TaskGenerator(settings, FREE), np.random.default_rng()
     resumed_rng.bit_generator.state = rng.bit_generator.state
     with np.load(tmp_path / "state.npz", allow_pickle=False) as state:
         resumed.load_state({name: state[name] for name in state.files})
@@ -346,7 +350,7 @@ def test_state_is_a_copy(make_records: MakeRecords) -> None:
 def test_state_of_a_new_generator_loads(make_records: MakeRecords) -> None:
     generator = filled(make_records)
     generator.add_opponents({"w": np.ones(2)}, {"w": np.ones(2)})
-    generator.load_state(TaskGenerator(config(), STATE_SIZE).state())
+    generator.load_state(TaskGenerator(config(), FREE).state())
     assert len(generator.buffer) == len(generator.opponents) == generator.grid.num_cells_seen == 0
 
 
@@ -360,8 +364,8 @@ def test_state_of_version_0_1_0_loads(make_records: MakeRecords) -> None:
 
 
 def test_state_of_another_configuration_is_refused() -> None:
-    state = TaskGenerator(config(), STATE_SIZE).state()
+    state = TaskGenerator(config(), FREE).state()
     with pytest.raises(ConfigError, match="resume with the configuration of the checkpoint"):
-        TaskGenerator(config(novelty_window=7), STATE_SIZE).load_state(state)
+        TaskGenerator(config(novelty_window=7), FREE).load_state(state)
     with pytest.raises(ConfigError, match="missing"):
-        TaskGenerator(config(), STATE_SIZE).load_state({})
+        TaskGenerator(config(), FREE).load_state({})

@@ -7,8 +7,8 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from service.actors.rollout import GoalRecords
 from service.generator.metrics import alice_metrics, bob_metrics
+from service.generator.records import GoalRecords
 from service.generator.validity import Verdict
 
 REST = 0.025

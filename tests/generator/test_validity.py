@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from service.config import WorkspaceConfig
-from service.generator.validity import Verdict, in_workspace, judge
+from service.generator.validity import Verdict, classify_goal, in_workspace
 
 # Lengths and centres that are exact in binary, so a boundary is a boundary.
 BOX = WorkspaceConfig(center_x_m=0.0, center_y_m=0.0, length_x_m=0.5, length_y_m=0.5, height_m=0.375)
@@ -14,10 +14,10 @@ OFF_CENTRE = WorkspaceConfig(center_x_m=-0.125, center_y_m=0.25, length_x_m=0.25
 NAN = float("nan")
 
 
-def judge_one(
+def classify_one(
     end: tuple[float, ...], start: tuple[float, ...] = (0.0, 0.0, 0.0), box: WorkspaceConfig = BOX
 ) -> Verdict:
-    return Verdict(judge(np.array([start]), np.array([end]), box, 0.0625)[0])
+    return Verdict(classify_goal(np.array([start]), np.array([end]), box, 0.0625)[0])
 
 
 @pytest.mark.parametrize(
@@ -44,20 +44,20 @@ def judge_one(
     ],
 )
 def test_verdict(end: tuple[float, ...], verdict: Verdict) -> None:
-    assert judge_one(end) == verdict
+    assert classify_one(end) == verdict
 
 
 def test_not_moved_comes_before_outside() -> None:
-    assert judge_one((0.5, 0.0, 0.1), start=(0.5, 0.03, 0.1)) == Verdict.NOT_MOVED
+    assert classify_one((0.5, 0.0, 0.1), start=(0.5, 0.03, 0.1)) == Verdict.NOT_MOVED
 
 
 def test_a_start_that_is_not_finite_gives_no_valid_goal() -> None:
-    assert judge_one((0.125, 0.0, 0.0), start=(NAN, 0.0, 0.0)) == Verdict.NOT_MOVED
+    assert classify_one((0.125, 0.0, 0.0), start=(NAN, 0.0, 0.0)) == Verdict.NOT_MOVED
 
 
-def test_judge_is_per_world() -> None:
+def test_every_world_gets_its_own() -> None:
     end = np.array([[0.125, 0.0, 0.1], [0.0, 0.0, 0.0], [0.5, 0.0, 0.1], [0.0, 0.0, -1.0]])
-    verdicts = judge(np.zeros((4, 3)), end, BOX, 0.0625)
+    verdicts = classify_goal(np.zeros((4, 3)), end, BOX, 0.0625)
     assert verdicts.dtype == np.int8
     assert verdicts.tolist() == [Verdict.VALID, Verdict.NOT_MOVED, Verdict.OUTSIDE, Verdict.FALLEN]
 
@@ -76,5 +76,5 @@ def test_workspace_off_centre() -> None:
         [[-0.25, 0.0, 0.0], [0.0, 0.5, 0.25], [0.001, 0.25, 0.1], [-0.125, -0.001, 0.1], [-0.251, 0.25, 0.1]]
     )
     assert in_workspace(position, OFF_CENTRE).tolist() == [True, True, False, False, False]
-    assert judge_one((0.1, 0.1, 0.1), box=OFF_CENTRE) == Verdict.OUTSIDE
-    assert judge_one((-0.1, 0.1, 0.1), box=OFF_CENTRE) == Verdict.VALID
+    assert classify_one((0.1, 0.1, 0.1), box=OFF_CENTRE) == Verdict.OUTSIDE
+    assert classify_one((-0.1, 0.1, 0.1), box=OFF_CENTRE) == Verdict.VALID

@@ -8,9 +8,10 @@ from typing import Any
 import numpy as np
 import torch
 
-from service.actors.rollout import Demonstrations, GoalRecords, Rollout, Turns
+from service.actors.rollout import Demonstrations, Rollout, Turns
 from service.config import Config, parse_config
 from service.envs.observations import ACTION_SIZE, BOB_SIZE, BOB_VALUE_SIZE, FULL_SIZE
+from service.generator.records import GoalRecords
 from service.learner.learner import Learner
 from service.learner.player import Player
 

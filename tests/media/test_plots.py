@@ -13,7 +13,7 @@ from service.io.jsonl import JsonlWriter
 from service.media.plots import plot_coverage, plot_curves, plot_goals
 from service.media.plots.coverage import _inside, _summary
 from service.media.plots.curves import _smooth
-from service.media.plots.figures import bounds, column, new_figure
+from service.media.plots.figures import column, new_figure
 from service.media.plots.goals import _goals, _slice_title
 
 # x and y from -0.1 to 0.1, z from 0 to 0.2: 4 x 4 x 4 cells of 5 cm
@@ -130,12 +130,6 @@ def test_goals_of_another_layout_are_refused(tmp_path, goals):
     _append(tmp_path / "goals.jsonl", {"iteration": 0, "goals": goals})
     with pytest.raises(TandemError, match=r"goals\.jsonl: a goal is not 7 numbers"):
         plot_goals(tmp_path, WORKSPACE)
-
-
-def test_bounds_by_hand():
-    low, high = bounds(WorkspaceConfig(center_x_m=-0.05, center_y_m=0.1, length_x_m=0.3, length_y_m=0.2, height_m=0.4))
-    np.testing.assert_allclose(low, [-0.2, 0.0, 0.0])
-    np.testing.assert_allclose(high, [0.1, 0.2, 0.4])
 
 
 @pytest.mark.filterwarnings("error")

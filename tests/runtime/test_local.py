@@ -232,7 +232,7 @@ def test_a_world_whose_physics_breaks_is_counted_and_its_state_kept(tmp_path):
     assert rows[0]["alice/fallen_fraction"] == pytest.approx(1 / 24)
     (file,) = (tmp_path / "broken").iterdir()
     with np.load(file) as dump:
-        assert dump["states"].shape == (1, run.game.worlds.state_size)
+        assert dump["states"].shape == (1, run.game.worlds.layout.size)
         assert dump["actions"].shape == (1, 4)
         assert np.isfinite(dump["states"]).all()
 

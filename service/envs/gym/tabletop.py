@@ -30,7 +30,7 @@ _FURTHEST_M = 10.0
 
 @dataclass(frozen=True, slots=True)
 class Setting:
-    """What an environment of one world and one of many have in common: a world, and where its goals are."""
+    """A world and its goals: the part that an environment of one world shares with one of many."""
 
     config: WorldConfig
     goals: GoalKind
@@ -40,7 +40,7 @@ class Setting:
     def of(
         cls, config: WorldConfig | None, task: str | None, goals: GoalKind | None, success_distance_m: float
     ) -> Setting:
-        """From the arguments of an environment.
+        """Make a setting from the arguments of an environment.
 
         Raises:
             TandemError: unknown task or goals, goals that the world cannot have, a distance that is not positive.
@@ -83,7 +83,7 @@ def action_space() -> gymnasium.Space[FloatArray]:
 
 
 def observe(worlds: WorldBatch, goal: StateArray) -> Observation:
-    """What N worlds with (N, 3) goals show, (N, ...) each."""
+    """Observations of N worlds with (N, 3) goals, (N, ...) each."""
     positions = np.clip(worlds.positions(), -_FURTHEST_M, _FURTHEST_M)
     return {
         "observation": positions,

@@ -1,4 +1,4 @@
-"""Many worlds as one Gymnasium vector environment, stepped together: what a learner needs that wants many samples."""
+"""Many worlds as one Gymnasium vector environment, stepped together, for learners that want many samples."""
 
 from __future__ import annotations
 
@@ -137,7 +137,7 @@ class TabletopVectorEnv(gymnasium.vector.VectorEnv[Any, FloatArray, NDArray[Any]
         return observation, success.astype(np.float64), np.zeros_like(truncated), truncated, info
 
     def compute_reward(self, achieved_goal: NDArray[Any], desired_goal: NDArray[Any], info: Any) -> Any:
-        """As ``TabletopEnv.compute_reward``."""
+        """Reward as in ``TabletopEnv.compute_reward``."""
         return self._setting.reward(achieved_goal, desired_goal)
 
     def state(self) -> VectorState:
@@ -167,7 +167,7 @@ class TabletopVectorEnv(gymnasium.vector.VectorEnv[Any, FloatArray, NDArray[Any]
         self._worlds.close()
 
     def _start(self, worlds: BoolArray) -> None:
-        """New episodes, each from its own world's random numbers, so that no world depends on when others end."""
+        """Start new episodes, each from its own world's random numbers: no world depends on when others end."""
         index = np.flatnonzero(worlds)
         starts = [self._worlds.draw_starts(self._random[world], 1) for world in index]
         self._worlds.restore(np.concatenate(starts), worlds)
@@ -181,7 +181,7 @@ class TabletopVectorEnv(gymnasium.vector.VectorEnv[Any, FloatArray, NDArray[Any]
 
 
 def _with_masks(values: Info, mask: BoolArray | None = None) -> Info:
-    """Gymnasium's vector info: beside every ``key``, ``_key`` says for which worlds it holds; None: for all."""
+    """Vector info as Gymnasium has it: beside every ``key``, ``_key`` says for which worlds it holds; None: all."""
     masks = {
         f"_{key}": np.ones(len(value), dtype=bool) if mask is None else mask.copy() for key, value in values.items()
     }

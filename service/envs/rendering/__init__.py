@@ -1,1 +1,1 @@
-"""Pictures of a world."""
+"""Pictures of a world: the renderer, and what is drawn besides the physics."""

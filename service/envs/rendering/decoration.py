@@ -1,4 +1,4 @@
-"""What only eyes need: the Panda's shells, a wooden table, floor, sky and light, and the workspace's edges.
+"""Decoration of the scene for pictures: the Panda's covers, table, floor, sky, light, and the workspace's edges.
 
 Everything is made here from numbers, nothing is loaded. No part collides, weighs anything or moves by itself, so a
 state of the physics model is a state of the decorated one.
@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from service.config import WorkspaceConfig, WorldConfig
 from service.envs.fixtures import fixture_geoms
-from service.envs.rendering.panda_visuals import add_shells, only_seen
+from service.envs.rendering.panda_visuals import add_panda_visuals, make_visual
 from service.envs.scene import TABLE_CENTER_X_M, TABLE_HALF_SIZE_M
 
 Floats = NDArray[np.float64]
@@ -35,10 +35,10 @@ _MATERIALS: dict[str, dict[str, Any]] = {
 
 
 def decorate(spec: mujoco.MjSpec, config: WorldConfig) -> None:
-    """Add to the physics of ``scene.build_spec`` everything that makes it a picture; the layout of its state stays."""
-    for name, look in _MATERIALS.items():
-        spec.add_material(name=name, **look)
-    add_shells(spec)
+    """Add everything that is only drawn to the physics of ``scene.build_spec``; the layout of its state stays."""
+    for name, properties in _MATERIALS.items():
+        spec.add_material(name=name, **properties)
+    add_panda_visuals(spec)
     _add_table(spec)
     _add_floor_and_sky(spec)
     _add_lights(spec)
@@ -63,7 +63,7 @@ def _add_table(spec: mujoco.MjSpec) -> None:
 
 
 def _wood() -> NDArray[np.uint8]:
-    """(size, size, 3) of light maple: streaks along one direction that wander a little, and fine grain."""
+    """(size, size, 3) picture of light maple: streaks along one direction that wander a little, and fine grain."""
     rng = np.random.default_rng(7)
     unit = np.linspace(0.0, 1.0, _TEXTURE_SIZE)
     along, across = np.meshgrid(unit, unit)
@@ -87,7 +87,7 @@ def _add_floor_and_sky(spec: mujoco.MjSpec) -> None:
     )  # fmt: skip
     _textured(spec, "floor", texrepeat=(1.5, 1.5), texuniform=True, emission=0.12, specular=0.1, shininess=0.1)
     plane = spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_PLANE, size=(0, 0, 0.05), pos=(0, 0, _FLOOR_Z_M))
-    only_seen(plane, "floor", casts_shadow=False)
+    make_visual(plane, "floor", casts_shadow=False)
     visual = spec.visual
     visual.rgba.haze = (0.80, 0.84, 0.88, 1.0)
     visual.map.haze = 0.35
@@ -98,7 +98,7 @@ def _add_floor_and_sky(spec: mujoco.MjSpec) -> None:
 
 
 def _add_lights(spec: mujoco.MjSpec) -> None:
-    """A warm key light with shadow over the viewer's shoulder, a cool fill from the other side, and some ambient."""
+    """Add a warm light with shadow over the viewer's shoulder, a cool one from the other side, and some ambient."""
     spec.worldbody.add_light(
         pos=(0.9, -1.5, 2.6), dir=(-1.1, 1.5, -2.6), type=mujoco.mjtLightType.mjLIGHT_SPOT, cutoff=80, exponent=1,
         diffuse=(0.56, 0.55, 0.53), specular=(0.3, 0.3, 0.3), castshadow=True,
@@ -114,20 +114,18 @@ def _add_lights(spec: mujoco.MjSpec) -> None:
 
 
 def _add_workspace(spec: mujoco.MjSpec, workspace: WorkspaceConfig) -> None:
-    """Its outline on the table, faint upright and upper edges, and a breath of colour inside."""
-    half = np.array([workspace.length_x_m, workspace.length_y_m]) / 2
-    center = np.array([workspace.center_x_m, workspace.center_y_m])
-    low, high = np.append(center - half, 0.001), np.append(center + half, workspace.height_m)
+    """Add the workspace's outline on the table, its faint other edges, and a little colour inside."""
+    low, high = np.array([*workspace.lower_m[:2], 0.001]), np.array(workspace.upper_m)
     for ends in _box_edges(low, high):
         on_table = bool(ends[:, 2].max() == low[2])
         radius = 0.002 if on_table else 0.001
         line = spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_CAPSULE, size=(radius, 0, 0), fromto=ends.ravel())
-        only_seen(line, "outline" if on_table else "edge", casts_shadow=False)
+        make_visual(line, "outline" if on_table else "edge", casts_shadow=False)
     _box(spec, "volume", (low + high) / 2, (high - low) / 2, casts_shadow=False)
 
 
 def _box_edges(low: Floats, high: Floats) -> Iterator[Floats]:
-    """The twelve edges of a box, (2, 3) each."""
+    """The twelve edges of a box, each from end to end: (2, 3)."""
     for axis in range(3):
         for pick in np.ndindex(2, 2):
             upper = np.insert(np.asarray(pick, dtype=bool), axis, False)
@@ -137,9 +135,9 @@ def _box_edges(low: Floats, high: Floats) -> Iterator[Floats]:
             yield np.stack([start, end])
 
 
-def _textured(spec: mujoco.MjSpec, name: str, **look: Any) -> None:
-    """A material of the texture of the same name."""
-    spec.add_material(name=name, **look).textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = name
+def _textured(spec: mujoco.MjSpec, name: str, **properties: Any) -> None:
+    """Add a material of the texture of the same name."""
+    spec.add_material(name=name, **properties).textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = name
 
 
 def _box(
@@ -147,4 +145,4 @@ def _box(
     *, casts_shadow: bool = True,
 ) -> None:  # fmt: skip
     geom = spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_BOX, pos=center, size=half)
-    only_seen(geom, material, casts_shadow=casts_shadow)
+    make_visual(geom, material, casts_shadow=casts_shadow)

@@ -28,11 +28,11 @@ _INSTALL = (
     "MUJOCO_GL=osmesa); only pictures and videos need it, training works without"
 )
 _refused: list[str] = []
-"""The MUJOCO_GL that ``protect_import`` put aside, if any."""
+"""The value of MUJOCO_GL that ``protect_import`` put aside, if any."""
 
 
 class RenderError(TandemError):
-    """This machine cannot draw; the message says what is missing."""
+    """A machine that cannot draw; the message says what is missing."""
 
 
 def protect_import() -> None:

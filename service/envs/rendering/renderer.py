@@ -1,7 +1,7 @@
 """Pictures of a world: MuJoCo's own renderer, offscreen, on states of a ``WorldBatch``.
 
-A second model is drawn, the physics with its decoration; states of one are states of the other. OpenGL is touched when
-a ``SceneRenderer`` is made and not before.
+The model that is drawn is the physics with its decoration; both have the same states. OpenGL is touched when a
+``SceneRenderer`` is made and not before.
 """
 
 from __future__ import annotations
@@ -16,12 +16,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.config import WorldConfig
-from service.envs.fixtures import PLACE_SIZE
 from service.envs.rendering.decoration import OBJECT_RGB, decorate
 from service.envs.rendering.gl import RenderError, open_drawing
-from service.envs.scene import build_spec
+from service.envs.scene import build_layout, build_spec
 
-__all__ = ["DEFAULT_CAMERA", "TOP_CAMERA", "Camera", "Mark", "RenderError", "SceneRenderer", "decorate"]
+__all__ = ["DEFAULT_CAMERA", "Camera", "Mark", "RenderError", "SceneRenderer"]
 
 Image = NDArray[np.uint8]
 Array = NDArray[np.float64]
@@ -35,7 +34,7 @@ _NUM_SAMPLES = 4
 
 @dataclass(frozen=True, slots=True)
 class Camera:
-    """Where a picture is taken from: it looks at a point from a distance in a direction."""
+    """A camera that looks at a point from a distance in a direction."""
 
     target: tuple[float, float, float]
     """The point in the middle of the picture, metres."""
@@ -57,12 +56,10 @@ class Mark:
 
 DEFAULT_CAMERA = Camera((-0.20, 0.0, 0.21), 1.95, 146.0, -21.0)
 """Three-quarter view from the front: arm, workspace and object."""
-TOP_CAMERA = Camera((-0.28, 0.0, 0.05), 2.4, 180.0, -72.0)
-"""From above, the robot at the top."""
 
 
 class SceneRenderer:
-    """Draws states of a ``WorldBatch`` of the same configuration; for use in the thread that made it.
+    """Renderer of the states of a ``WorldBatch`` of the same configuration; for use in the thread that made it.
 
     Args:
         config: the world.
@@ -80,7 +77,7 @@ class SceneRenderer:
         self.camera = camera
         self.model = _build_model(config, width, height)
         self._data = mujoco.MjData(self.model)
-        self._state_size = mujoco.mj_stateSize(self.model, mujoco.mjtState.mjSTATE_FULLPHYSICS)
+        self._layout = build_layout(config)  # the flag of a blocked gripper follows everything that is read here
         self._half_m = config.object_size_m / 2
         self._goal_geom = mujoco.mjtGeom.mjGEOM_BOX if config.object == "cube" else mujoco.mjtGeom.mjGEOM_SPHERE
         self._rectangle = mujoco.MjrRect(0, 0, width, height)
@@ -117,9 +114,9 @@ class SceneRenderer:
             (H, W, 3), the top row first.
         """
         assert self._context is not None, "drawing after close"
-        mujoco.mj_setState(self.model, self._data, state[: self._state_size], mujoco.mjtState.mjSTATE_FULLPHYSICS)
+        mujoco.mj_setState(self.model, self._data, state[self._layout.physics], mujoco.mjtState.mjSTATE_FULLPHYSICS)
         if self.model.nmocap:
-            self._data.mocap_pos[0] = state[-PLACE_SIZE:]
+            self._data.mocap_pos[0] = state[self._layout["box_place"]]
         mujoco.mj_kinematics(self.model, self._data)
         mujoco.mj_camlight(self.model, self._data)
         camera, everything = _mujoco_camera(self.camera), mujoco.mjtCatBit.mjCAT_ALL
@@ -139,7 +136,7 @@ class SceneRenderer:
         return np.ascontiguousarray(image[::-1])
 
     def _add_goal(self, goal: Array) -> None:
-        """A ghost of the object, and a line down to the table, which tells its height."""
+        """Add a transparent copy of the object, and a line down to the table, which shows its height."""
         self._add(self._goal_geom, (self._half_m, self._half_m, self._half_m), goal, _GOAL_RGBA)
         cylinder, foot = mujoco.mjtGeom.mjGEOM_CYLINDER, np.array([goal[0], goal[1], 0.0])
         self._add(cylinder, (_FOOT_RADIUS_M, _FOOT_HALF_HEIGHT_M, 0.0), foot, _DROP_RGBA)

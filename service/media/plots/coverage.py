@@ -15,7 +15,6 @@ from service.media.plots.figures import (
     INK,
     MARGIN_M,
     Array,
-    bounds,
     counted,
     draw_outline,
     new_figure,
@@ -69,8 +68,8 @@ def draw_paths(box: Any, above: Axes, paths: Array, workspace: WorkspaceConfig) 
 
 def _inside(points: Array, workspace: WorkspaceConfig) -> Array:
     """``points`` with NaN, which breaks a line, where they leave the drawn surroundings of the workspace."""
-    low, high = bounds(workspace)
-    near = (points >= low - MARGIN_M) & (points <= high + MARGIN_M)
+    low, high = np.array(workspace.lower_m) - MARGIN_M, np.array(workspace.upper_m) + MARGIN_M
+    near = (points >= low) & (points <= high)
     return np.where(near.all(axis=1, keepdims=True), points, np.nan)
 
 
@@ -82,7 +81,7 @@ def _summary(trajectories: Array, workspace: WorkspaceConfig) -> str:
 
 
 def _draw_box(axes: Any, workspace: WorkspaceConfig) -> None:
-    low, high = bounds(workspace)
+    low, high = workspace.lower_m, workspace.upper_m
     corners = np.array(np.meshgrid(*zip(low, high, strict=True), indexing="ij")).reshape(3, -1).T
     for first in range(8):
         for second in (first ^ 1, first ^ 2, first ^ 4):

@@ -91,16 +91,9 @@ def counted(number: int, noun: str) -> str:
     return f"{number} {noun}" if number == 1 else f"{number} {noun}s"
 
 
-def bounds(workspace: WorkspaceConfig) -> tuple[Array, Array]:
-    """The lowest and the highest corner of the workspace's box, metres, (3,) each."""
-    half = np.array([workspace.length_x_m, workspace.length_y_m]) / 2
-    center = np.array([workspace.center_x_m, workspace.center_y_m])
-    return np.append(center - half, 0.0), np.append(center + half, workspace.height_m)
-
-
 def draw_outline(axes: Axes, workspace: WorkspaceConfig) -> None:
     """Set ``axes`` up as a view from above, with the edge of the workspace dashed."""
-    low, high = bounds(workspace)
+    low, high = np.array(workspace.lower_m), np.array(workspace.upper_m)
     style_axes(axes)
     corners = np.array([[0, 0], [1, 0], [1, 1], [0, 1], [0, 0]])
     axes.plot(*(low[:2] + corners * (high - low)[:2]).T, color=INK, linewidth=1.0, linestyle=EDGE_STYLE)

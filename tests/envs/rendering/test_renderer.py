@@ -9,8 +9,9 @@ import pytest
 
 from service.config import WorldConfig
 from service.envs.batch import WorldBatch
+from service.envs.rendering.decoration import decorate
 from service.envs.rendering.gl import open_drawing
-from service.envs.rendering.renderer import DEFAULT_CAMERA, TOP_CAMERA, RenderError, SceneRenderer, decorate
+from service.envs.rendering.renderer import DEFAULT_CAMERA, Camera, RenderError, SceneRenderer
 from service.envs.scene import build_spec
 
 WIDTH, HEIGHT = 200, 150
@@ -116,12 +117,12 @@ def test_the_object_is_red_and_where_it_should_be(renderer, position):
 
 def test_another_camera(renderer):
     position = (0.1, -0.1, 0.025)
-    renderer.camera = TOP_CAMERA
+    renderer.camera = from_above = Camera((-0.28, 0.0, 0.05), 2.4, 180.0, -72.0)
     try:
         mask = red(renderer.render(state_with_object_at(*position)))
     finally:
         renderer.camera = DEFAULT_CAMERA
-    assert middle(mask) == pytest.approx(project(position, TOP_CAMERA, renderer.model), abs=2.0)
+    assert middle(mask) == pytest.approx(project(position, from_above, renderer.model), abs=2.0)
 
 
 def test_the_arm_follows_its_joints(renderer):
@@ -163,6 +164,18 @@ def test_a_sphere_is_round():
     height, width = np.ptp(rows) + 1, np.ptp(columns) + 1
     assert abs(height - width) <= 2
     assert mask.sum() == pytest.approx(np.pi / 4 * height * width, rel=0.15)
+
+
+def test_the_flag_of_a_blocked_gripper_moves_no_box():
+    """Where some grippers are blocked, a state goes on behind the place of its box."""
+    config = WorldConfig(fixture="box")
+    pictures = []
+    with open_renderer(config) as renderer:
+        for blocked_fraction in (0.0, 0.5):
+            with WorldBatch(config, 1, num_threads=1, blocked_fraction=blocked_fraction) as worlds:
+                worlds.object_position[:], worlds.box_place[:] = [-0.9, 0.3, 0.025], [0.05, -0.12, 0.0]
+                pictures.append(renderer.render(worlds.states[0]))
+    np.testing.assert_array_equal(*pictures)
 
 
 def test_closed_is_closed():

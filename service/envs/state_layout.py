@@ -1,0 +1,60 @@
+"""The state of a world: which of its numbers means what, declared once."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+Sizes = Mapping[str, int]
+"""Number of columns by name, in their order."""
+
+
+def columns(sizes: Sizes) -> dict[str, slice]:
+    """Slices of columns that stand one after the other; one of no columns is an empty slice."""
+    slices, start = {}, 0
+    for name, size in sizes.items():
+        slices[name] = slice(start, start + size)
+        start += size
+    return slices
+
+
+class StateLayout:
+    """Columns of a world's state: MuJoCo's full physics state, then what a world remembers besides.
+
+    In this order: time, ``positions`` (qpos), ``velocities`` (qvel), ``measured``, ``kept``. ``layout[name]`` is the
+    slice of a part, which is empty where worlds have none of it.
+
+    Args:
+        positions: of joints and objects, as the model has them in qpos.
+        velocities: of the same, as the model has them in qvel.
+        measured: what each step writes anew, such as contacts.
+        kept: what no step changes, such as the place of a box, or parameters of the physics that differ by world.
+    """
+
+    num_positions: int
+    """Numbers in qpos."""
+    num_velocities: int
+    """Numbers in qvel."""
+    size: int
+    """S, all numbers of a state."""
+    physics: slice
+    """MuJoCo's full physics state."""
+    velocities: slice
+    """All velocities."""
+    kept: slice
+    """Everything that no step changes."""
+
+    def __init__(self, *, positions: Sizes, velocities: Sizes, measured: Sizes, kept: Sizes) -> None:
+        groups = ({"time": 1}, positions, velocities, measured, kept)
+        self._columns = columns({name: size for group in groups for name, size in group.items()})
+        assert len(self._columns) == sum(map(len, groups)), "two parts of the same name"
+        self.num_positions, self.num_velocities = sum(positions.values()), sum(velocities.values())
+        physics_size = 1 + self.num_positions + self.num_velocities
+        self.physics = slice(0, physics_size)
+        self.velocities = slice(1 + self.num_positions, physics_size)
+        first_kept = physics_size + sum(measured.values())
+        self.size = first_kept + sum(kept.values())
+        self.kept = slice(first_kept, self.size)
+
+    def __getitem__(self, name: str) -> slice:
+        """Columns of a part."""
+        return self._columns[name]
