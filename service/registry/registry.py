@@ -22,13 +22,12 @@ import numpy as np
 
 from service.io import tensors
 from service.io.errors import StorageError
-from service.io.files import os_errors, write_exclusive
+from service.io.files import os_errors, write_atomic, write_exclusive
 from service.io.git import git_commit
 from service.registry import names
 from service.registry.aliases import Aliases
 from service.registry.blobs import BlobStore, sha256_of
 from service.registry.errors import RegistryError, UnknownVersionError
-from service.registry.exported import write_exported
 from service.registry.manifest import Manifest, make_manifest, parse_manifest
 from service.registry.names import LATEST, Version
 
@@ -195,7 +194,7 @@ class Registry:
         return problems + [problem for name in self.names() for problem in self._alias_problems(name)]
 
     def export(self, reference: str, directory: Path) -> Manifest:
-        """Write a version into ``directory`` as two files that `exported.load_exported` reads without a registry.
+        """Write a version into ``directory``: ``primitives.safetensors`` and ``manifest.json``, which need no registry.
 
         Raises:
             UnknownVersionError: no such version.
@@ -204,7 +203,16 @@ class Registry:
             StorageError: it cannot be written.
         """
         manifest = self.manifest(reference)
-        write_exported(directory, manifest, self._blobs.get(manifest.blob_sha256))
+        files = {
+            directory / "primitives.safetensors": self._blobs.get(manifest.blob_sha256),
+            directory / "manifest.json": manifest.to_bytes(),
+        }
+        for path in files:
+            if path.exists():
+                raise RegistryError(f"cannot export {manifest.reference}: {path} exists; choose another directory")
+        with os_errors("write", directory):
+            for path, data in files.items():
+                write_atomic(path, data)
         return manifest
 
     def _publish_version(self, name: str, parameters: Mapping[str, np.ndarray], fields: dict[str, Any]) -> Version:
