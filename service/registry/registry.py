@@ -13,7 +13,7 @@ A publish writes the blob, then the manifest, then the aliases, each atomically:
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -67,9 +67,8 @@ class Registry:
         config: Mapping[str, Any],
         metrics: Mapping[str, float],
         parent: str | None = None,
-        aliases: Sequence[str] = (LATEST,),
     ) -> Version:
-        """Make the next version of ``name`` and move ``aliases`` to it.
+        """Make the next version of ``name`` and move ``latest`` to it.
 
         Of two publishers at the same time, the later version keeps the alias.
 
@@ -81,17 +80,14 @@ class Registry:
             config: configuration of the run, plain JSON values.
             metrics: finite numbers.
             parent: reference of the version this one was trained on from; it must exist.
-            aliases: moved to the new version.
 
         Raises:
-            RegistryError: a bad name, alias, array or value, or a registry that is only read; nothing is written.
+            RegistryError: a bad name, array or value, or a registry that is only read; nothing is written.
             UnknownVersionError: no such parent.
             StorageError: the disk cannot be written; what was there before is intact.
         """
         self.check_writable()
         names.check_name(name)
-        for alias in aliases:
-            names.check_alias(alias)
         fields: dict[str, Any] = {
             "name": name,
             "created": datetime.now(UTC).isoformat(timespec="seconds"),
@@ -104,8 +100,7 @@ class Registry:
             "git_commit": git_commit(),
         }
         version = self._publish_version(name, parameters, fields)
-        for alias in aliases:
-            self._aliases(name).move(alias, version.number, back=False)
+        self._aliases(name).move(LATEST, version.number, back=False)
         return version
 
     def resolve(self, reference: str) -> Version:
