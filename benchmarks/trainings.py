@@ -46,7 +46,7 @@ class Training:
     Args:
         home: directory for its run, its registry and Ray's files; its path has to be short.
         arguments: of ``tandem pretrain``, besides runtime, run id and status.
-        redis_url: of a Redis to use; None: a server of the run's own.
+        redis_url: of a Redis to use; None: no Redis.
         name: the run's id.
     """
 

@@ -146,7 +146,7 @@ class RunDirectory:
         with self._keep_running(self.metrics_file):
             self._metrics.append(metrics)
         if self._events is not None:
-            with self._keep_running(self.path / "tensorboard"):
+            with self._keep_running(self._events.path):
                 self._events.add(metrics)
 
     def record_goals(self, iteration: int, num_env_steps: int, goals: StateArray) -> None:
@@ -167,8 +167,8 @@ class RunDirectory:
 
     def sync(self) -> None:
         """Wait until the disk has every record; a checkpoint must not know more than they do."""
-        for writer, path in self._writers():
-            with self._keep_running(path):
+        for writer in self._writers():
+            with self._keep_running(writer.path):
                 writer.sync()
 
     def close(self) -> None:
@@ -176,7 +176,7 @@ class RunDirectory:
 
         What does not fit is lost, and a warning says so.
         """
-        for writer, _ in self._writers():
+        for writer in self._writers():
             try:
                 writer.sync()
             except StorageError as error:  # must not hide why the run ended
@@ -186,12 +186,8 @@ class RunDirectory:
             self._lock.release()
             self._lock = None
 
-    def _writers(self) -> list[tuple[JsonlWriter | EventFile, Path]]:
-        writers: list[tuple[JsonlWriter | EventFile, Path]] = [
-            (self._metrics, self.metrics_file),
-            (self._goals, self.goals_file),
-        ]
-        return writers if self._events is None else [*writers, (self._events, self.path / "tensorboard")]
+    def _writers(self) -> list[JsonlWriter | EventFile]:
+        return [self._metrics, self._goals, *([self._events] if self._events is not None else [])]
 
     @contextmanager
     def _keep_running(self, path: Path) -> Iterator[None]:

@@ -37,7 +37,8 @@ class EventFile:
             StorageError: the disk is full or the file cannot be written.
         """
         host, process = socket.gethostname(), os.getpid()
-        self._file = Appender(directory / f"events.out.tfevents.{_stamp(directory):010d}.{host}.{process}")
+        self.path = directory / f"events.out.tfevents.{_stamp(directory):010d}.{host}.{process}"
+        self._file = Appender(self.path)
         self._append(Event(wall_time=time.time(), file_version=_FILE_VERSION))
         if after_step is not None:
             start = SessionLog(status=SessionLog.START)

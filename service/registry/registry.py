@@ -13,7 +13,7 @@ A publish writes the blob, then the manifest, then the aliases, each atomically:
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -22,13 +22,12 @@ import numpy as np
 
 from service.io import tensors
 from service.io.errors import StorageError
-from service.io.files import os_errors, write_exclusive
+from service.io.files import os_errors, write_atomic, write_exclusive
 from service.io.git import git_commit
 from service.registry import names
 from service.registry.aliases import Aliases
 from service.registry.blobs import BlobStore, sha256_of
 from service.registry.errors import RegistryError, UnknownVersionError
-from service.registry.exported import write_exported
 from service.registry.manifest import Manifest, make_manifest, parse_manifest
 from service.registry.names import LATEST, Version
 
@@ -68,9 +67,8 @@ class Registry:
         config: Mapping[str, Any],
         metrics: Mapping[str, float],
         parent: str | None = None,
-        aliases: Sequence[str] = (LATEST,),
     ) -> Version:
-        """Make the next version of ``name`` and move ``aliases`` to it.
+        """Make the next version of ``name`` and move ``latest`` to it.
 
         Of two publishers at the same time, the later version keeps the alias.
 
@@ -82,17 +80,14 @@ class Registry:
             config: configuration of the run, plain JSON values.
             metrics: finite numbers.
             parent: reference of the version this one was trained on from; it must exist.
-            aliases: moved to the new version.
 
         Raises:
-            RegistryError: a bad name, alias, array or value, or a registry that is only read; nothing is written.
+            RegistryError: a bad name, array or value, or a registry that is only read; nothing is written.
             UnknownVersionError: no such parent.
             StorageError: the disk cannot be written; what was there before is intact.
         """
         self.check_writable()
         names.check_name(name)
-        for alias in aliases:
-            names.check_alias(alias)
         fields: dict[str, Any] = {
             "name": name,
             "created": datetime.now(UTC).isoformat(timespec="seconds"),
@@ -105,8 +100,7 @@ class Registry:
             "git_commit": git_commit(),
         }
         version = self._publish_version(name, parameters, fields)
-        for alias in aliases:
-            self._aliases(name).move(alias, version.number, back=False)
+        self._aliases(name).move(LATEST, version.number, back=False)
         return version
 
     def resolve(self, reference: str) -> Version:
@@ -195,7 +189,7 @@ class Registry:
         return problems + [problem for name in self.names() for problem in self._alias_problems(name)]
 
     def export(self, reference: str, directory: Path) -> Manifest:
-        """Write a version into ``directory`` as two files that `exported.load_exported` reads without a registry.
+        """Write a version into ``directory``: ``primitives.safetensors`` and ``manifest.json``, which need no registry.
 
         Raises:
             UnknownVersionError: no such version.
@@ -204,7 +198,16 @@ class Registry:
             StorageError: it cannot be written.
         """
         manifest = self.manifest(reference)
-        write_exported(directory, manifest, self._blobs.get(manifest.blob_sha256))
+        files = {
+            directory / "primitives.safetensors": self._blobs.get(manifest.blob_sha256),
+            directory / "manifest.json": manifest.to_bytes(),
+        }
+        for path in files:
+            if path.exists():
+                raise RegistryError(f"cannot export {manifest.reference}: {path} exists; choose another directory")
+        with os_errors("write", directory):
+            for path, data in files.items():
+                write_atomic(path, data)
         return manifest
 
     def _publish_version(self, name: str, parameters: Mapping[str, np.ndarray], fields: dict[str, Any]) -> Version:

@@ -10,7 +10,7 @@ from typer.testing import CliRunner
 
 from service.cli.registry import registry_app
 from service.primitives.bundled import BUNDLED
-from service.registry.exported import load_exported
+from service.registry.manifest import parse_manifest
 from service.registry.registry import Registry
 from tests.registry.helpers import Publish
 
@@ -81,7 +81,9 @@ def test_what_comes_with_tandem_is_listed_once_shown_verified_and_exported_but_n
     assert (tree["name"], tree["aliases"], tree["where"]) == ("panda-cube", ["champion", "latest"], "bundled")
     assert run("verify", "panda-cube", *own).exit_code == 0
     assert run("export", "panda-cube", tmp_path / "out", *own).exit_code == 0
-    assert load_exported(tmp_path / "out")[0] == Registry(BUNDLED).manifest("panda-cube")
+    assert parse_manifest((tmp_path / "out" / "manifest.json").read_bytes(), tmp_path) == Registry(BUNDLED).manifest(
+        "panda-cube"
+    )
     assert_user_error(run("alias", "panda-cube", "best", *own), "cannot write", str(BUNDLED), "only read")
     assert_user_error(run("verify", *own), "no registry at", "--registry")
 
@@ -111,7 +113,7 @@ def test_alias(run: Run, registry: Registry) -> None:
 
 def test_export(run: Run, tmp_path: Path) -> None:
     assert run("export", "panda-cube@1", str(tmp_path / "out")).exit_code == 0
-    assert load_exported(tmp_path / "out")[0].version == 1
+    assert parse_manifest((tmp_path / "out" / "manifest.json").read_bytes(), tmp_path).version == 1
 
 
 def test_verify(run: Run, registry: Registry) -> None:
