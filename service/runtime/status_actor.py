@@ -46,7 +46,7 @@ class StatusWorker:
             StatusError: the address cannot be had, or a public one without a token.
         """
         from service.registry.registry import Registry
-        from service.status.reading import open_reader
+        from service.status.run_reader import open_reader
         from service.status.server import StatusServer
         from service.store.registry_index import RegistryIndex
 

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from service.registry.registry import Registry
-from service.status import guard
+from service.status import auth
 from service.status.stream import EVENT_SCHEMA
 from tests.status.conftest import serve
 from tests.status.runs import TOKEN, VIDEO, append, grid, publish, record, write_status
@@ -75,5 +75,5 @@ def test_every_event_is_listed():
 
 
 def test_numbers():
-    assert f"more than {guard.BODY_TIMEOUT_S:g} s" in TEXT
-    assert f"more than {guard.MAX_BODY_BYTES // 1024} KiB" in TEXT
+    assert f"more than {auth.BODY_TIMEOUT_S:g} s" in TEXT
+    assert f"more than {auth.MAX_BODY_BYTES // 1024} KiB" in TEXT

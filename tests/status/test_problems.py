@@ -8,8 +8,8 @@ import httpx
 import pytest
 
 from service.registry.registry import Registry
-from service.status import guard
-from service.status.guard import MAX_BODY_BYTES
+from service.status import auth
+from service.status.auth import MAX_BODY_BYTES
 from service.status.server import StatusServer
 from service.store.disk_reader import DiskReader
 from tests.status.conftest import serve
@@ -130,7 +130,7 @@ def test_what_is_announced_is_refused_before_it_comes(server):
 
 
 def test_a_body_that_does_not_come(server, monkeypatch):
-    monkeypatch.setattr(guard, "BODY_TIMEOUT_S", 0.1)
+    monkeypatch.setattr(auth, "BODY_TIMEOUT_S", 0.1)
     head = f"POST /v1/runs/old/stop HTTP/1.1\r\nHost: localhost\r\nAuthorization: {BEARER['Authorization']}\r\n"
     with socket.create_connection(("127.0.0.1", server.port), timeout=10) as connection:
         connection.sendall(f"{head}Content-Length: 10\r\n\r\nhalf".encode())

@@ -7,7 +7,6 @@ import socket
 import subprocess
 import sys
 import threading
-import time
 from pathlib import Path
 
 import httpx
@@ -127,9 +126,7 @@ def test_the_foreground_ends_with_a_signal(home, number):
     answers = []
 
     def use_and_end():
-        while not server.started:
-            time.sleep(0.01)
-        answers.append(httpx.get(f"{server.url}/livez", trust_env=False).status_code)
+        answers.append(httpx.get(f"{server.url}/livez", trust_env=False, timeout=60).status_code)  # once it serves
         os.kill(os.getpid(), number)
 
     other = threading.Thread(target=use_and_end)

@@ -6,11 +6,17 @@ from contextlib import contextmanager
 
 import httpx
 import pytest
+from fastapi import routing
 
 from service.io.files import write_atomic
+from service.registry.registry import Registry
 from service.status import stream
+from service.status.server import StatusServer
+from service.store.redis_reader import RedisReader
+from service.store.redis_writer import RedisWriter
 from tests.status.conftest import serve
-from tests.status.runs import BEARER, append, record, write_status
+from tests.status.runs import BEARER, append, record, status, write_status
+from tests.store.stores import Killable
 
 
 @pytest.fixture
@@ -112,6 +118,26 @@ def test_a_browser_that_comes_back_after_that(root, service):
         assert next(event for event in heard if event[0] == "metrics") == ("metrics", record(4), "4")
 
 
+def test_a_run_that_is_only_in_redis(tmp_path):
+    redis = Killable(tmp_path)
+    try:
+        writer = RedisWriter(redis.address, "far")
+        writer.status(status("far", state="finished", iteration=5))
+        for iteration in range(1, 6):
+            writer.metrics(record(iteration))
+        writer.close()
+        with StatusServer(RedisReader(redis.address), Registry(tmp_path / "registry"), port=0) as server:
+            url = f"{server.url}/v1/runs/far/metrics/stream?after_iteration=3"
+            with httpx.stream("GET", url, timeout=10, trust_env=False) as answer:
+                first, second, known, last = events(answer)
+            missing = httpx.get(url.replace("far", "nobody"), trust_env=False)
+    finally:
+        redis.server.close()
+    assert [first, second] == [("metrics", record(4), "4"), ("metrics", record(5), "5")]
+    assert (known[0], last[0], last[1]["state"]) == ("status", "end", "finished")
+    assert missing.json()["type"] == "urn:tandem:unknown-run"
+
+
 def test_the_store_is_away_for_a_while(root, service):
     with listening(service[1]) as heard:
         take(heard, "metrics", "status")
@@ -122,10 +148,11 @@ def test_the_store_is_away_for_a_while(root, service):
         assert take(heard, "metrics") == [("metrics", record(4), "4")]
 
 
-def test_a_stream_says_that_it_lives(service, monkeypatch):
-    monkeypatch.setattr(stream, "KEEP_ALIVE_S", 0.05)
+def test_an_idle_stream_is_kept_alive(service, monkeypatch):
+    assert routing._PING_INTERVAL <= 15  # as the document says
+    monkeypatch.setattr(routing, "_PING_INTERVAL", 0.05)
     with service[1].stream("GET", "/v1/runs/cube/metrics/stream", timeout=10) as answer:
-        assert ": nothing new" in (line for line in answer.iter_lines())
+        assert next(line for line in answer.iter_lines() if line.startswith(":"))
 
 
 def test_there_are_not_too_many(root, service, monkeypatch):
@@ -137,8 +164,7 @@ def test_there_are_not_too_many(root, service, monkeypatch):
         assert (refused.status_code, refused.json()["type"]) == (503, "urn:tandem:too-many-streams")
         assert "tandem_http_streams 1.0" in client.get("/metrics").text
     deadline_s = time.monotonic() + 10
-    while server.app.streams.num_open and time.monotonic() < deadline_s:  # hears of the end when it next writes
-        append(root, "cube", record(4))
+    while server.app.streams.num_open and time.monotonic() < deadline_s:
         time.sleep(0.02)
     assert server.app.streams.num_open == 0
 
@@ -154,7 +180,7 @@ def test_the_service_stops_although_somebody_listens(root):
     assert time.monotonic() - begun_s < 1.9  # and not because uvicorn's patience ended, which is at 2 s
 
 
-def test_no_stream_is_for_ever(root, service):
-    service[0].app.streams._max_age_s = 0.0
+def test_no_stream_is_for_ever(service, monkeypatch):
+    monkeypatch.setattr(stream, "MAX_AGE_S", 0.0)
     with listening(service[1]) as heard:
         assert [kind for kind, _, _ in heard] == ["metrics", "status"]

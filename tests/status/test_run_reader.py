@@ -4,7 +4,7 @@ from datetime import UTC, datetime, timedelta
 
 import pytest
 
-from service.status.reading import LEAVE_ALONE_S, BothReader, open_reader
+from service.status.run_reader import RETRY_AFTER_S, CombinedReader, open_reader
 from service.store.disk_reader import DiskReader
 from service.store.errors import UnknownRunError
 from service.store.redis_reader import RedisReader
@@ -40,7 +40,7 @@ def time_s():
 
 @pytest.fixture
 def reader(redis, root, time_s):
-    return BothReader(DiskReader(root), RedisReader(redis.address), clock=lambda: time_s[0])
+    return CombinedReader(DiskReader(root), RedisReader(redis.address), clock=lambda: time_s[0])
 
 
 def test_runs_of_both(reader):
@@ -97,7 +97,7 @@ def test_redis_is_away_and_back(reader, redis, root, time_s, caplog):
     finally:
         redis.revive()
     assert {run.run_id for run in reader.runs()} == {"cube", "old"}  # it is left alone for a while
-    time_s[0] += LEAVE_ALONE_S
+    time_s[0] += RETRY_AFTER_S
     wait_until(lambda: {run.run_id for run in reader.runs()} == {"cube", "far", "old"})
     assert reader.run("cube").warnings == ()
 

@@ -4,7 +4,7 @@ import asyncio
 
 import pytest
 
-from service.status.answers import AGE_S, MAX_ANSWERS, MAX_BYTES, Answers
+from service.status.response_cache import AGE_S, MAX_ANSWERS, MAX_BYTES, ResponseCache
 
 JSON = b"application/json"
 
@@ -26,11 +26,11 @@ class Counting:
 
 
 class Asking:
-    """Asks through ``Answers``, at times of its own."""
+    """Asks through ``ResponseCache``, at times of its own."""
 
     def __init__(self, app):
         self.app, self.now_s = app, 100.0
-        self._answers = Answers(app, clock=lambda: self.now_s)
+        self._cache = ResponseCache(app, clock=lambda: self.now_s)
 
     def __call__(self, path="/v1/runs", *, method="GET", query=b"", headers=()):
         scope = {"type": "http", "method": method, "path": path, "query_string": query, "headers": list(headers)}
@@ -40,7 +40,7 @@ class Asking:
             message["headers" if "headers" in message else "seen"] = None  # whoever is before it may write into it
             sent.append(message)
 
-        asyncio.run(self._answers(scope, None, send))
+        asyncio.run(self._cache(scope, None, send))
         assert scope["route"] == f"route of {path}"
         assert sent[0]["status"] == self.app.status
         return int(sent[1]["body"])
@@ -112,5 +112,5 @@ def test_memory_is_bounded():
     ask = Asking(Counting())
     for number in range(2 * MAX_ANSWERS + 1):
         ask(query=str(number).encode())
-        assert len(ask._answers._answers) <= MAX_ANSWERS
+        assert len(ask._cache._answers) <= MAX_ANSWERS
     assert ask(query=b"0") == 2 * MAX_ANSWERS + 2
