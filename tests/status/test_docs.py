@@ -8,9 +8,10 @@ import subprocess
 from pathlib import Path
 
 import pytest
+from fastapi import routing
 
 from service.registry.registry import Registry
-from service.status import auth
+from service.status import auth, stream
 from service.status.stream import EVENT_SCHEMA
 from tests.status.conftest import serve
 from tests.status.runs import TOKEN, VIDEO, append, grid, publish, record, write_status
@@ -77,3 +78,5 @@ def test_every_event_is_listed():
 def test_numbers():
     assert f"more than {auth.BODY_TIMEOUT_S:g} s" in TEXT
     assert f"more than {auth.MAX_BODY_BYTES // 1024} KiB" in TEXT
+    assert f"At most {stream.MAX_STREAMS} streams" in TEXT
+    assert f"After {routing._PING_INTERVAL:g} seconds without an event" in TEXT
