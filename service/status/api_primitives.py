@@ -87,7 +87,7 @@ def primitives_router(registry: Registry) -> APIRouter:
         responses=problems(_UNKNOWN, INVALID, (409, "This registry is read-only.")),
     )
     def put_alias(name: _Name, alias: _Alias, change: AliasChange) -> AliasState:
-        """To any version, forward or back."""
+        """The alias may move to any version, newer or older."""
         try:
             registry.check_writable()
         except RegistryError as error:

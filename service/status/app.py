@@ -33,7 +33,7 @@ class StatusApp(FastAPI):
     """The app; made by ``create_app``."""
 
     streams: Streams
-    """To be closed at shutdown, or the server would wait for their clients."""
+    """Open event streams; the server has to close them at shutdown, or it would wait for their clients."""
     public: bool
 
     def openapi(self) -> dict[str, Any]:

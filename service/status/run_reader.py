@@ -56,7 +56,7 @@ class CombinedReader:
         """Combine two readers; nothing is read before the first call. ``clock`` counts seconds."""
         self._disk, self._redis, self._clock = disk, redis, clock
         self._failure: tuple[float, str] | None = None
-        """When and why Redis did not answer last; None while it answers."""
+        """Time and reason of the last failure of Redis; None while it answers."""
 
     def runs(self) -> list[RunStatus]:
         """All runs, newest start first."""

@@ -1,4 +1,4 @@
-"""docs/api.md: every curl in it is run, and what it says of errors and events is what there is."""
+"""docs/api.md: every curl in it is run, and its errors and events are complete."""
 
 import json
 import os
@@ -21,7 +21,7 @@ TEXT = (ROOT / "docs" / "api.md").read_text()
 
 
 def commands():
-    """What stands after "$ " in the examples, lines that go on put together."""
+    """The commands after "$ " in the examples, with continued lines joined."""
     blocks = re.findall(r"```console\n(.*?)```", TEXT, re.DOTALL)
     return [found for block in blocks for found in re.findall(r"^\$ ((?:.*\\\n)*.*)$", block, re.MULTILINE)]
 

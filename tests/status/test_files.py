@@ -1,4 +1,4 @@
-"""Videos and blobs in ranges, and with entity tags."""
+"""Ranges and entity tags of videos and blobs."""
 
 import hashlib
 
@@ -38,7 +38,7 @@ def test_a_range_beyond_the_file(client, asked):
 @pytest.mark.parametrize(
     "asked", ["bytes=-", "bytes=9-1", "lines=0-1", "bytes=a-b", "bytes=0-1,4-5", "", "bytes=0x1-2"]
 )
-def test_what_is_no_range_gives_the_whole_file(client, asked):
+def test_a_malformed_range_gives_the_whole_file(client, asked):
     answer = client.get(URL, headers={"Range": asked})
     assert (answer.status_code, answer.content) == (200, VIDEO)
 

@@ -1,4 +1,4 @@
-"""Metrics in columns: down-sampled by hand, read bit by bit, and made anew by a resumed run."""
+"""Metrics in columns: means computed by hand, incremental reading, and resumed runs."""
 
 from datetime import UTC, datetime
 
@@ -14,7 +14,7 @@ STARTED = datetime(2026, 1, 1, tzinfo=UTC)
 
 
 class CountingReader(DiskReader):
-    """Counts the records it hands out."""
+    """A reader that counts the records it returns."""
 
     handed_out = 0
 

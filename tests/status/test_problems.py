@@ -1,4 +1,4 @@
-"""Errors: one shape for all of them, one line that says what to do, and no more than that."""
+"""Errors: one format, one line that says what to do, and no internals."""
 
 import json
 import logging
@@ -19,7 +19,7 @@ JSON = {"Content-Type": "application/json"}
 
 
 def assert_problem(answer, status, kind, *parts):
-    """RFC 9457, and one line with these parts."""
+    """Check that an answer is a problem (RFC 9457) whose one-line detail has these parts."""
     assert answer.status_code == status
     assert answer.headers["content-type"] == "application/problem+json"
     problem = answer.json()
@@ -122,14 +122,14 @@ def test_a_body_as_long_as_it_may_be(client):
     assert_problem(client.put("/v1/primitives/tiny/aliases/best", content=body, headers=JSON), 404, "unknown-version")
 
 
-def test_what_is_announced_is_refused_before_it_comes(server):
+def test_a_long_body_is_refused_by_its_announced_length(server):
     head = f"POST /v1/runs/old/stop HTTP/1.1\r\nHost: localhost\r\nAuthorization: {BEARER['Authorization']}\r\n"
     with socket.create_connection(("127.0.0.1", server.port), timeout=10) as connection:
         connection.sendall(f"{head}Content-Length: {10**15}\r\n\r\n".encode())
         assert connection.recv(1000).startswith(b"HTTP/1.1 413")
 
 
-def test_a_body_that_does_not_come(server, monkeypatch):
+def test_a_body_that_does_not_arrive(server, monkeypatch):
     monkeypatch.setattr(auth, "BODY_TIMEOUT_S", 0.1)
     head = f"POST /v1/runs/old/stop HTTP/1.1\r\nHost: localhost\r\nAuthorization: {BEARER['Authorization']}\r\n"
     with socket.create_connection(("127.0.0.1", server.port), timeout=10) as connection:
@@ -174,13 +174,13 @@ def test_damaged_files(tmp_path):
 
 
 class BrokenReader(DiskReader):
-    """Has a mistake in it."""
+    """A reader with a bug."""
 
     def runs(self):
         raise ZeroDivisionError("a secret of its own")
 
 
-def test_a_mistake_of_ours_is_told_to_the_log_alone(tmp_path, caplog):
+def test_an_unexpected_error_is_only_in_the_log(tmp_path, caplog):
     caplog.set_level(logging.ERROR)
     with StatusServer(BrokenReader(tmp_path), Registry(tmp_path / "registry"), port=0) as server:
         answer = httpx.get(f"{server.url}/v1/runs", trust_env=False)

@@ -25,7 +25,7 @@ from tests.status.runs import BEARER, TOKEN, publish, write_runs
 ROOT = Path(__file__).parents[2]
 
 
-def test_a_free_port_is_told(home):
+def test_port_0_gives_a_free_port(home):
     with serve(home) as server:
         assert server.port != 0
         assert server.url == f"http://127.0.0.1:{server.port}"
@@ -76,7 +76,7 @@ def test_a_port_that_is_taken(home):
 
 
 @pytest.mark.parametrize("host", ["no-such-host.invalid", "203.0.113.7", "", "a b", "x" * 300])
-def test_a_host_that_is_not_here(home, host):
+def test_a_host_of_another_machine(home, host):
     with pytest.raises(StatusError) as error:
         serve(home, host=host, token=None)
     assert "\n" not in str(error.value)
