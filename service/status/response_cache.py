@@ -36,8 +36,8 @@ class _Answer:
 class ResponseCache:
     """ASGI middleware that caches answers to GET; any other request empties the cache.
 
-    It belongs behind ``AuthMiddleware``. Only ``/metrics`` and paths below ``/v1`` are cached, and only if the status is
-    200 and the body is one piece of JSON or plain text: no event streams and no downloads.
+    It belongs behind ``AuthMiddleware``. Only ``/metrics`` and paths below ``/v1`` are cached, if the status is 200
+    and the body is one piece of JSON or plain text: no event streams and no downloads.
     """
 
     def __init__(self, app: ASGIApp, *, clock: Callable[[], float] = time.monotonic) -> None:
