@@ -2,7 +2,7 @@
 
 import re
 
-import imageio.v2 as imageio
+import imageio_ffmpeg
 import numpy as np
 import pytest
 from playwright.sync_api import Error
@@ -230,8 +230,12 @@ def test_versions(visit):
 
 def test_the_newest_video_plays(own):
     visit, home, _ = own
-    film = [np.full((32, 64, 3), shade, np.uint8) for shade in range(0, 250, 10)]
-    imageio.mimwrite(home / "runs" / "old" / "rounds.mp4", film, fps=25, codec="libx264", macro_block_size=2)
+    path = str(home / "runs" / "old" / "rounds.mp4")
+    writer = imageio_ffmpeg.write_frames(path, (64, 32), fps=25, codec="libx264", macro_block_size=2)
+    writer.send(None)
+    for shade in range(0, 250, 10):
+        writer.send(np.full((32, 64, 3), shade, np.uint8))
+    writer.close()
     page = visit.go("#/runs/old").page
     visit.wait("document.querySelector('video')?.readyState >= 1")
     found = page.locator("video").evaluate("v => [v.videoWidth, v.videoHeight, v.duration]")

@@ -25,6 +25,7 @@ def assert_problem(answer, status, kind, *parts):
     problem = answer.json()
     assert (problem["status"], problem["type"]) == (status, kind if ":" in kind else f"urn:tandem:{kind}")
     assert problem["title"]
+    assert ("errors" in problem) == problem["type"].endswith(":invalid-request")
     assert "\n" not in problem["detail"]
     for part in parts:
         assert part in problem["detail"]

@@ -39,21 +39,21 @@ class RunPage {
   begin(run) {
     this.begun = true;
     const [curves, map] = [section("Curves", "wide"), section("Goal map", "wide")];
-    const [actors, film] = [section("Actors"), section("Newest video")];
+    const [actors, video] = [section("Actors"), section("Newest video")];
     this.primitives = new Versions(run.name, `Primitives ${run.name}`);
     curves.body.append(this.panels.root);
     this.actorsBody = actors.body;
-    film.body.append(this.media.root);
-    const parts = [curves, map, film, actors, this.primitives].map((part) => part.root);
+    video.body.append(this.media.root);
+    const parts = [curves, map, video, actors, this.primitives].map((part) => part.root);
     this.root.replaceChildren(this.summary.root, ...parts);
-    this.ask(map.body, film.body);
+    this.ask(map.body, video.body);
   }
 
-  ask(mapBody, filmBody) {
+  ask(mapBody, videoBody) {
     const { signal, runId } = this;
     const part = (name) => get(["v1", "runs", runId, name], [], signal);
     every(GOALS_MS, signal, () => shown(mapBody, this.goals, () => part("goals")));
-    every(FILES_MS, signal, () => shown(filmBody, this.media, () => part("files")));
+    every(FILES_MS, signal, () => shown(videoBody, this.media, () => part("files")));
     every(FILES_MS, signal, () => this.primitives.refresh(signal));
   }
 
@@ -216,14 +216,14 @@ class Media {
     const isVideo = (file) => file.media_type.startsWith("video/");
     const videos = files.filter(isVideo).sort((a, b) => Date.parse(b.modified) - Date.parse(a.modified));
     const pictures = files.filter((file) => !isVideo(file));
-    const video = videos.length ? this.video(videos[0]) : note("No video yet: a run films a few rounds at its end.");
+    const video = videos.length ? this.video(videos[0]) : note("No video yet: a run records a few rounds at its end.");
     this.root.replaceChildren(video, el("ul", { class: "pictures" }, ...pictures.map((file) => this.picture(file))));
   }
 
   video(file) {
-    const film = el("video", { controls: true, preload: "metadata", muted: true, loop: true, playsinline: true, src: `${this.url(file)}#t=0.1`, "aria-label": file.title });
+    const player = el("video", { controls: true, preload: "metadata", muted: true, loop: true, playsinline: true, src: `${this.url(file)}#t=0.1`, "aria-label": file.title });
     const words = [`${file.title}, ${bytes(file.num_bytes)}, `, age(file.modified), ". "];
-    return el("figure", { class: "film" }, film, el("figcaption", {}, ...words, el("a", { href: this.url(file), download: file.name }, "Download")));
+    return el("figure", { class: "recording" }, player, el("figcaption", {}, ...words, el("a", { href: this.url(file), download: file.name }, "Download")));
   }
 
   picture(file) {
