@@ -32,7 +32,7 @@ def serve(
 def _serve(runs: Path, registry: Path, host: str, port: int, token_file: Path | None) -> None:
     from service.registry.registry import Registry
     from service.status.errors import StatusError
-    from service.status.reading import open_reader
+    from service.status.run_reader import open_reader
     from service.status.token import VARIABLE, read_token
 
     try:

@@ -53,7 +53,7 @@ class StatusWorker:
             StatusError: the address cannot be had, or a public one without a token.
         """
         from service.registry.registry import Registry
-        from service.status.reading import open_reader
+        from service.status.run_reader import open_reader
         from service.status.server import StatusServer
 
         reader, options = open_reader(self._runs_dir, self._redis), self._options

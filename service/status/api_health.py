@@ -1,4 +1,4 @@
-"""``/livez``, ``/readyz``, ``/healthz`` and ``/metrics``."""
+"""Routes ``/livez``, ``/readyz``, ``/healthz`` and ``/metrics``."""
 
 from __future__ import annotations
 
@@ -6,28 +6,28 @@ from fastapi import APIRouter, Request, Response
 
 from service.errors import TandemError
 from service.registry.registry import Registry
-from service.status.guard import TRUSTED
+from service.status.auth import TRUSTED
 from service.status.metrics import CONTENT_TYPE, Telemetry
 from service.status.openapi import problems
 from service.status.problems import ProblemError
-from service.status.shapes import Alive, Ready
+from service.status.schemas import Alive, Ready
 from service.store.models import RunReader
 
-_NOT_READY = problems((503, "The runs or the registry cannot be read; who has the token is told why."))
+_NOT_READY = problems((503, "The runs or the registry cannot be read; the reason is given only with the token."))
 
 
 def health_router(runs: RunReader, registry: Registry, telemetry: Telemetry) -> APIRouter:
-    """Routes for machines that watch this one."""
+    """Make the routes for monitoring."""
     router = APIRouter(tags=["health"])
 
     @router.get("/livez", summary="Whether the service answers")
     def livez() -> Alive:
-        """Asks nothing of anybody: a service that answers this need not be restarted."""
+        """Needs no files and no Redis: a service that answers this need not be restarted."""
         return Alive()
 
     @router.get("/readyz", summary="Whether runs and registry can be read", responses=_NOT_READY)
     def readyz(request: Request) -> Ready:
-        """503 while something the service needs is away."""
+        """503 while something the service needs is unavailable."""
         try:
             runs.ready()
             registry.names()
@@ -40,7 +40,7 @@ def health_router(runs: RunReader, registry: Registry, telemetry: Telemetry) -> 
 
     @router.get("/healthz", summary="The same as /readyz", responses=_NOT_READY)
     def healthz(request: Request) -> Ready:
-        """An older name."""
+        """An older name of /readyz."""
         return readyz(request)
 
     @router.get(
@@ -52,7 +52,7 @@ def health_router(runs: RunReader, registry: Registry, telemetry: Telemetry) -> 
         },
     )
     def metrics() -> Response:
-        """Of active runs, the newest that ended, the registry, and this service; docs/operations.md lists them."""
+        """Metrics of active and recently ended runs, the registry, and this service; see docs/operations.md."""
         return Response(telemetry.page(), media_type=CONTENT_TYPE)
 
     return router

@@ -1,21 +1,23 @@
-"""``/v1/primitives`` and ``/v1/blobs``: the registry."""
+"""Routes ``/v1/primitives`` and ``/v1/blobs``: the registry."""
 
 from __future__ import annotations
 
+import os
+from pathlib import Path
 from typing import Annotated
 
 from fastapi import APIRouter, Query, Request, Response
 from fastapi import Path as InPath
 
 from service.io.errors import FormatVersionError
+from service.registry.blobs import BlobStore
 from service.registry.errors import DamagedBlobError, RegistryError
 from service.registry.names import NAME_PATTERN, Version
 from service.registry.registry import Registry
-from service.status.blobs import VerifiedBlobs
 from service.status.files import BYTES, PARTS, file_response
 from service.status.openapi import INVALID, problems
 from service.status.problems import ProblemError
-from service.status.shapes import (
+from service.status.schemas import (
     AliasChange,
     AliasState,
     ManifestDocument,
@@ -34,24 +36,24 @@ _UNKNOWN = (404, "There is no such name, version or alias.")
 
 
 def primitives_router(registry: Registry) -> APIRouter:
-    """Routes about frozen primitives."""
+    """Make the routes about frozen primitives; all answers come from the registry's files."""
     router = APIRouter(prefix="/v1", tags=["primitives"])
-    blobs = VerifiedBlobs(registry.root / "blobs")
+    blobs = _VerifiedBlobs(registry.root / "blobs")
 
     @router.get("/primitives", summary="All names")
     def list_primitives() -> PrimitiveList:
         """Sorted; empty before the first is published."""
-        found = (_summary(registry, name) for name in registry.names())
-        return PrimitiveList(primitives=tuple(found))
+        return PrimitiveList(primitives=tuple(_summary(registry, name) for name in registry.names()))
 
     @router.get("/primitives/{name}", summary="The versions of a name", responses=problems(_UNKNOWN, INVALID))
     def get_primitive(name: _Name, limit: Annotated[int, Query(ge=1, le=1000)] = 50) -> PrimitiveVersions:
         """Newest first, and the aliases."""
-        registry.resolve(f"{name}@{max((v.number for v in registry.versions(name)), default=1)}")  # or unknown
+        versions = registry.versions(name)
+        if not versions:
+            registry.resolve(f"{name}@1")  # raises the error that says which names there are
         summary = _summary(registry, name)
-        newest = registry.versions(name)[::-1][:limit]
-        versions = tuple(_version(registry, version, summary.aliases) for version in newest)
-        return PrimitiveVersions(**dict(summary), versions=versions)
+        newest = tuple(_version(registry, version, summary.aliases) for version in versions[::-1][:limit])
+        return PrimitiveVersions(**dict(summary), versions=newest)
 
     @router.get(
         "/primitives/{name}/versions/{version}",
@@ -61,7 +63,7 @@ def primitives_router(registry: Registry) -> APIRouter:
         responses={200: {"model": ManifestDocument, "description": "As published."}, **problems(_UNKNOWN, INVALID)},
     )
     def get_version(name: _Name, version: _Version) -> Response:
-        """Everything known about it; `/v1/blobs/sha256/{blob_sha256}` has its parameters, safetensors bytes."""
+        """The manifest; `/v1/blobs/sha256/{blob_sha256}` has the parameters, safetensors bytes."""
         manifest = registry.manifest(f"{name}@{version}")
         return Response(manifest.to_bytes(), media_type="application/json")
 
@@ -76,17 +78,17 @@ def primitives_router(registry: Registry) -> APIRouter:
         },
     )
     def get_blob(request: Request, digest: _Digest) -> Response:
-        """Checked against the digest, which is the entity tag, too: what was got once never changes."""
+        """Checked against the digest, which is also the entity tag; a blob never changes."""
         path = blobs.path(digest)
         return file_response(request, path, "application/octet-stream", etag=digest, cache=_FOREVER)
 
     @router.put(
         "/primitives/{name}/aliases/{alias}",
         summary="Make or move an alias",
-        responses=problems(_UNKNOWN, INVALID, (409, "This registry is only read.")),
+        responses=problems(_UNKNOWN, INVALID, (409, "This registry is read-only.")),
     )
     def put_alias(name: _Name, alias: _Alias, change: AliasChange) -> AliasState:
-        """To any version, forward or back."""
+        """The alias may move to any version, newer or older."""
         try:
             registry.check_writable()
         except RegistryError as error:
@@ -95,6 +97,31 @@ def primitives_router(registry: Registry) -> APIRouter:
         return AliasState(name=name, alias=alias, version=version.number)
 
     return router
+
+
+class _VerifiedBlobs:
+    """The blobs of a registry, each compared with its digest before it is first served and after its file changed.
+
+    Clients cache blobs for ever, so a damaged one must never be served.
+    """
+
+    def __init__(self, directory: Path) -> None:
+        self._store = BlobStore(directory)
+        self._verified: dict[str, tuple[int, int, int]] = {}
+
+    def path(self, digest: str) -> Path:
+        path = self._store.path(digest)
+        try:
+            status = os.stat(path)
+        except FileNotFoundError:
+            raise ProblemError(
+                404, "unknown-blob", f"no blob {digest} here; a manifest names the ones there are"
+            ) from None
+        stamp = (status.st_mtime_ns, status.st_size, status.st_ino)
+        if self._verified.get(digest) != stamp:
+            self._store.get(digest)
+            self._verified[digest] = stamp
+        return path
 
 
 def _summary(registry: Registry, name: str) -> PrimitiveSummary:
@@ -107,7 +134,7 @@ def _version(registry: Registry, version: Version, aliases: dict[str, int]) -> V
     names = tuple(alias for alias, number in aliases.items() if number == version.number)
     try:
         manifest = registry.manifest(str(version))
-    except (DamagedBlobError, FormatVersionError) as error:  # the others are as good as before
+    except (DamagedBlobError, FormatVersionError) as error:  # must not hide the other versions
         return VersionSummary(version=version.number, aliases=names, problem=str(error))
     shown = manifest.model_dump(include=set(VersionSummary.model_fields) - {"version"})
     return VersionSummary(version=version.number, aliases=names, **shown)

@@ -1,4 +1,4 @@
-"""Primitives over HTTP: fetched once, verified, and kept in a registry on this machine's disk. No torch."""
+"""Primitives over HTTP: fetched once, verified, and kept in a registry on disk. Does not import torch."""
 
 from __future__ import annotations
 
@@ -37,22 +37,22 @@ def fetch_primitives(
 ) -> tuple[Registry, Version]:
     """Fetch a version from a status service.
 
-    Which version an alias means is asked each time; parameters that are here already are not fetched again.
+    An alias is resolved by the service each time; parameters are fetched only once.
 
     Args:
-        url: of the service, such as ``http://lab:8321``.
+        url: URL of the service, such as ``http://lab:8321``.
         reference: NAME, NAME@VERSION or NAME@ALIAS.
-        token: of the service; ``TANDEM_TOKEN`` where left out.
-        cache_dir: where to keep what was fetched; ``~/.cache/tandem/registries`` where left out.
+        token: token of the service; None for that of ``TANDEM_TOKEN``.
+        cache_dir: directory of fetched registries; None for ``~/.cache/tandem/registries``.
 
     Returns:
-        A registry on this machine that has the version, and which one it is: ``registry.load(str(version))``.
+        A registry on this machine that has the version, and the version: ``registry.load(str(version))``.
 
     Raises:
         UnknownVersionError: the service has no such version.
-        DamagedBlobError: what came is not what was published; nothing of it is kept.
-        WrongTokenError: the service wants a token, or another one.
-        FetchError: the service cannot be reached, or there is something else at the URL.
+        DamagedBlobError: the received bytes do not match their digest, and are not kept.
+        WrongTokenError: the service needs a token, or another one.
+        FetchError: the service cannot be reached, or something else listens at the URL.
         RegistryError: not a reference, or the cache cannot be written.
     """
     base = _base_url(url)
@@ -69,13 +69,13 @@ def fetch_primitives(
             )
         _keep(client, manifest, registry)
     path = registry.root / "models" / name / "versions" / str(manifest.version)
-    with os_errors("write", path):  # after its parameters, as in every registry: who sees a version can load it
+    with os_errors("write", path):  # after its parameters: a version that is listed can be loaded
         write_atomic(path, manifest.to_bytes())
     return registry, Version(name, manifest.version)
 
 
 def _keep(client: httpx.Client, manifest: Manifest, registry: Registry) -> None:
-    """See to it that the parameters are in the cache, whole."""
+    """Fetch the parameters unless the cache has them undamaged."""
     digest = manifest.blob_sha256
     blobs = BlobStore(registry.root / "blobs")
     try:
@@ -87,20 +87,20 @@ def _keep(client: httpx.Client, manifest: Manifest, registry: Registry) -> None:
 
 
 def _named(what: str, client: httpx.Client) -> Path:
-    """What errors call a thing that is in no file: ``panda-cube@3 from lab:8321``."""
+    """A name for error messages, such as ``panda-cube@3 from lab:8321``."""
     return Path(f"{what} from {client.base_url.netloc.decode()}")
 
 
 def _get(client: httpx.Client, path: str, max_bytes: int) -> bytes:
-    """The body of an answer that is a success and not too long."""
+    """The body of a successful answer of at most ``max_bytes``."""
     base = str(client.base_url).rstrip("/")
-    with _reaching(base), client.stream("GET", path) as response:
-        most, data = max_bytes if response.is_success else _MAX_PROBLEM_BYTES, b""
+    with _connection_errors(base), client.stream("GET", path) as response:
+        limit, data = max_bytes if response.is_success else _MAX_PROBLEM_BYTES, b""
         for chunk in response.iter_bytes():
             data += chunk
-            if len(data) > most:
+            if len(data) > limit:
                 raise DamagedBlobError(
-                    f"{base}{path} gave more than {most} bytes, which is too long; check its registry"
+                    f"{base}{path} gave more than {limit} bytes, which is too long; check its registry"
                 )
     if response.status_code != httpx.codes.OK:
         raise _refusal(base, path, response, data)
@@ -108,7 +108,7 @@ def _get(client: httpx.Client, path: str, max_bytes: int) -> bytes:
 
 
 @contextmanager
-def _reaching(base: str) -> Iterator[None]:
+def _connection_errors(base: str) -> Iterator[None]:
     try:
         yield
     except httpx.TimeoutException:
@@ -150,10 +150,10 @@ def _problem(response: httpx.Response, data: bytes) -> dict[str, Any]:
 
 
 def _base_url(url: str) -> str:
-    """The URL without a slash at its end.
+    """Check a URL and remove the slash at its end.
 
     Raises:
-        StatusError: not the URL of a service; a password in it is not quoted.
+        StatusError: not the URL of a service; the message does not quote a password in it.
     """
     try:
         parsed = httpx.URL(url)
@@ -167,7 +167,7 @@ def _base_url(url: str) -> str:
 
 
 def _directory_of(base: str) -> str:
-    """One for each service: two of them may both have a version 1."""
+    """A directory for each service: two services may both have a version 1."""
     return hashlib.sha256(base.encode()).hexdigest()[:16]
 
 

@@ -1,4 +1,4 @@
-"""What can go wrong with starting the status service, and with asking one."""
+"""Errors of starting a status service and of using one."""
 
 from __future__ import annotations
 
@@ -6,16 +6,16 @@ from service.errors import TandemError
 
 
 class StatusError(TandemError):
-    """The service cannot be started as asked."""
+    """The service cannot be started with these options."""
 
 
 class FetchError(TandemError):
-    """A status service gave no usable answer: it is down, it is none, or something is wrong on its side."""
+    """No usable answer: the service is down or has an error, or something else listens at the URL."""
 
     exit_code = 1
 
 
 class WrongTokenError(FetchError):
-    """A status service wants a token, or another one."""
+    """The service needs a token, or another one than was sent."""
 
     exit_code = 2

@@ -1,4 +1,4 @@
-"""Files over HTTP: pictures and videos of runs, and blobs, in ranges and with entity tags."""
+"""Files over HTTP: pictures and videos of runs, and blobs, with ranges and entity tags."""
 
 from __future__ import annotations
 
@@ -11,10 +11,11 @@ from typing import Any
 
 from fastapi import Request
 from starlette.responses import FileResponse, Response
+from starlette.staticfiles import NotModifiedResponse, StaticFiles
 
 from service.status.openapi import problems
 from service.status.problems import ProblemError
-from service.status.shapes import RunFile
+from service.status.schemas import RunFile
 from service.store.disk_reader import run_id_of
 
 RUN_FILES = {
@@ -23,28 +24,31 @@ RUN_FILES = {
     "goals.png": ("Goals", "image/png"),
     "coverage.png": ("Where random compositions move the object", "image/png"),
 }
-"""Title and media type of what may leave a run directory; nothing else does."""
+"""Title and media type of the files of a run directory that are served; all others are not."""
 BYTES = {"schema": {"type": "string", "format": "binary"}}
-"""Of a file, in the OpenAPI document."""
+"""The content of a file in the OpenAPI document."""
 PARTS: dict[int | str, dict[str, Any]] = {
-    206: {"description": "The range that was asked for."},
-    304: {"description": "Not changed since the entity tag that was given."},
+    206: {"description": "The requested range."},
+    304: {"description": "Not changed since the given entity tag."},
     **problems((416, "The range lies beyond the file.")),
 }
-"""Answers of a route that gives a file, beside 200."""
-_RANGE = re.compile(r"bytes=([0-9]{0,18})-([0-9]{0,18})")
+"""Answers of a route that gives a file, in addition to 200."""
+_RANGE = re.compile(r"bytes=(?P<start>[0-9]{0,18})-(?P<end>[0-9]{0,18})")
+_CONDITIONS = StaticFiles()
+"""Only for its ``is_not_modified``."""
 
 
 class RunDirectories:
-    """The directories of runs, for their pictures and videos."""
+    """Pictures and videos in the directories of runs."""
 
     def __init__(self, root: Path | None) -> None:
-        """For ``root``/*/; None where runs have no directories here."""
+        """Use the directories ``root``/*/; None if runs have no directories on this machine."""
         self._root = root
 
     def files(self, run_id: str) -> list[RunFile]:
-        """What there is of ``RUN_FILES``; empty also where there is no such directory."""
-        found = ((name, self._stat(run_id, name)) for name in RUN_FILES)
+        """List those of ``RUN_FILES`` that exist; empty if the run has no directory."""
+        directory = self._directory(run_id)
+        found = ((name, _stat_file(directory / name)) for name in RUN_FILES) if directory is not None else ()
         return [
             RunFile(
                 name=name,
@@ -59,28 +63,19 @@ class RunDirectories:
         ]
 
     def path(self, run_id: str, name: str) -> Path:
-        """Where one of them is.
+        """Find one of them.
 
         Raises:
             ProblemError: the run has no such file.
         """
-        if name not in RUN_FILES or self._stat(run_id, name) is None:
+        directory = self._directory(run_id)
+        if directory is None or name not in RUN_FILES or _stat_file(directory / name) is None:
             there = ", ".join(file.name for file in self.files(run_id)) or "nothing yet"
             raise ProblemError(404, "no-such-file", f"run {run_id} has no {name[:64]!r} to show; it has: {there}")
-        directory = self._directory(run_id)
-        assert directory is not None
         return directory / name
 
-    def _stat(self, run_id: str, name: str) -> os.stat_result | None:
-        directory = self._directory(run_id)
-        try:
-            status = os.stat(directory / name) if directory is not None else None
-        except OSError:
-            return None
-        return status if status is not None and stat.S_ISREG(status.st_mode) else None
-
     def _directory(self, run_id: str) -> Path | None:
-        """Looked up and not put together, so that no id leads anywhere else."""
+        """Look the directory up instead of building its path from the id, so that no id leads outside the root."""
         try:
             found = sorted(self._root.iterdir()) if self._root is not None else []
         except OSError:
@@ -89,40 +84,44 @@ class RunDirectories:
 
 
 def file_response(request: Request, path: Path, media_type: str, *, etag: str | None = None, cache: str) -> Response:
-    """The file, the range of it that was asked for, or 304.
+    """Answer with the file, the requested range of it, or 304.
+
+    Starlette does all of it but two things that RFC 9110 wants (section 14): a Range that is malformed, or in another
+    unit, is ignored instead of refused; and 416 is a problem, as every other error is.
 
     Args:
-        request: its If-None-Match, If-Range and Range count.
-        path: of a regular file.
-        media_type: of its content.
-        etag: without quotation marks; made of size and time where left out.
+        request: If-None-Match, If-Modified-Since, Range, and If-Range with an entity tag count.
+        path: a regular file.
+        media_type: the file's.
+        etag: without quotation marks; made from time and size if None.
         cache: the header Cache-Control.
 
     Raises:
         ProblemError: 416, the range lies beyond the file.
     """
-    status = os.stat(path)
-    tag = f'"{etag or f"{status.st_mtime_ns:x}-{status.st_size:x}"}"'
-    headers = {"etag": tag, "cache-control": cache}
-    if tag in _tags(request.headers.get("if-none-match", "")):
-        return Response(status_code=304, headers=headers)
-    _check_range(request, tag, status.st_size)
-    return FileResponse(path, headers=headers, media_type=media_type, stat_result=status)
+    headers = {"cache-control": cache, **({"etag": f'"{etag}"'} if etag else {})}
+    response = FileResponse(path, headers=headers, media_type=media_type, stat_result=os.stat(path))
+    if _CONDITIONS.is_not_modified(response.headers, request.headers):
+        return NotModifiedResponse(response.headers)
+    _check_range(request, response)
+    return response
 
 
-def _tags(header: str) -> set[str]:
-    """The tags of an If-None-Match, which compares them weakly."""
-    return {tag.strip().removeprefix("W/") for tag in header.split(",")}
-
-
-def _check_range(request: Request, tag: str, size: int) -> None:
-    """Leave a Range to Starlette if it is one; take it away if it does not count, which gives the whole file."""
+def _check_range(request: Request, response: FileResponse) -> None:
+    """Drop a Range that does not count, so that Starlette sends the whole file."""
+    size = int(response.headers["content-length"])
     asked = _RANGE.fullmatch(request.headers.get("range", "").strip())
     start, end = asked.groups() if asked else ("", "")
-    counts = bool(start or end) and request.headers.get("if-range", tag).strip() == tag
-    if counts and start and end and int(end) < int(start):
-        counts = False
-    if not counts:
+    changed = request.headers.get("if-range", response.headers["etag"]).strip() != response.headers["etag"]
+    if changed or not (start or end) or (start and end and int(end) < int(start)):
         request.scope["headers"] = [pair for pair in request.scope["headers"] if pair[0] != b"range"]
     elif (start and int(start) >= size) or (not start and int(end) == 0):
         raise ProblemError(416, "no-such-range", f"the file has {size} bytes", {"Content-Range": f"bytes */{size}"})
+
+
+def _stat_file(path: Path) -> os.stat_result | None:
+    try:
+        status = os.stat(path)
+    except OSError:
+        return None
+    return status if stat.S_ISREG(status.st_mode) else None

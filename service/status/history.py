@@ -1,4 +1,4 @@
-"""A run's metrics in columns, kept between requests: pages ask again and again, and a long run has 100 MB of them."""
+"""Metrics of runs in columns, kept in memory between requests: the records of a long run are 100 MB."""
 
 from __future__ import annotations
 
@@ -11,36 +11,35 @@ from threading import Lock
 import numpy as np
 from numpy.typing import NDArray
 
-from service.status.shapes import MetricHistory
+from service.status.schemas import MetricHistory
 from service.store.models import Record, RunReader
 
 MAX_RUNS = 8
 _INDEX = ("iteration", "env_steps")
 
 
-class Histories:
-    """The metrics of the runs last asked for; any number of threads may ask at once."""
+class HistoryCache:
+    """A cache of the metrics of the last ``MAX_RUNS`` runs that were asked for; thread-safe."""
 
     def __init__(self, runs: RunReader) -> None:
-        """Nothing is read before the first call."""
         self._runs = runs
         self._known: OrderedDict[tuple[str, datetime], _Columns] = OrderedDict()
         self._lock = Lock()
 
     def history(self, run_id: str, names: Sequence[str] | None, after_iteration: int, max_points: int) -> MetricHistory:
-        """Metrics of a run.
+        """Metrics of a run, down-sampled.
 
         Args:
             run_id: the run.
-            names: of metrics, those the run does not have are left out; None for all.
+            names: metrics to return; those the run does not have are left out; None for all.
             after_iteration: only later iterations.
-            max_points: as many points are made of them, each the mean of neighbouring iterations.
+            max_points: greatest number of points; each is the mean of neighbouring iterations.
 
         Raises:
             UnknownRunError: there is no such run.
             StoreUnavailableError: the runs cannot be read.
         """
-        # a run that was resumed makes its last iterations anew, so what is known of it is known of one start
+        # the key has the start: a resumed run makes its last iterations again
         key = (run_id, self._runs.run(run_id).started)
         with self._lock:
             columns = self._known.setdefault(key, _Columns())
@@ -62,7 +61,7 @@ class _Columns:
         self._last = 0
 
     def update(self, runs: RunReader, run_id: str) -> None:
-        """Read what is new; the last record known is read again, for it is gone when the history was cut."""
+        """Read new records, and the last known one again: it is gone if the history was cut."""
         records = runs.metrics(run_id, after_iteration=max(0, self._last - 1))
         if self._last and (not records or records[0]["iteration"] != self._last):
             self._forget()
@@ -97,15 +96,15 @@ class _Columns:
         )
 
     def _column(self, name: str) -> NDArray[np.float64]:
-        """A copy, for an array cannot grow while a view of it lives; as long as all others."""
+        """A copy (an array cannot grow while a view of it exists), filled up to the length of the others."""
         column = np.array(self._columns[name])
         missing = len(self._columns["iteration"]) - len(column)
         return np.concatenate([column, np.full(missing, np.nan)])
 
 
 def _means(values: NDArray[np.float64], starts: NDArray[np.int_]) -> tuple[float | None, ...]:
-    """The mean of the numbers in each part that begins at ``starts``; None where it has none."""
-    there = ~np.isnan(values)
-    counts = np.add.reduceat(there.astype(int), starts)
-    sums = np.add.reduceat(np.where(there, values, 0.0), starts)
+    """The mean of the numbers in each part that begins at ``starts``; None if it has none."""
+    known = ~np.isnan(values)
+    counts = np.add.reduceat(known.astype(int), starts)
+    sums = np.add.reduceat(np.where(known, values, 0.0), starts)
     return tuple(total / count if count else None for total, count in zip(sums.tolist(), counts.tolist(), strict=True))

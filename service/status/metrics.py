@@ -1,7 +1,7 @@
-"""``/metrics``: what Prometheus is told, read from the runs and the registry when it asks.
+"""Prometheus metrics of ``/metrics``, read from the runs and the registry at each scrape.
 
-``RUN_METRICS``, ``SERVICE_METRICS`` and ``HTTP_METRICS`` are the reference: names, kinds, labels and meanings. A run is
-told of while it is active, and the newest few after they ended, so the number of series is bounded.
+``RUN_METRICS``, ``SERVICE_METRICS`` and ``HTTP_METRICS`` are the reference: names, kinds, labels and meanings. Only
+active runs and the newest few that ended have metrics, so the number of series is bounded.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ _Family = CounterMetricFamily | GaugeMetricFamily
 
 @dataclass(frozen=True, slots=True)
 class Metric:
-    """One metric of the reference; ``unit`` is part of the name, Prometheus' way."""
+    """One metric of the reference; its unit is part of the name, as usual in Prometheus."""
 
     name: str
     kind: Literal["counter", "gauge", "histogram"]
@@ -42,7 +42,7 @@ class Metric:
     help: str
 
     def family(self) -> _Family:
-        """An empty family to add samples to."""
+        """Make an empty family to add samples to."""
         if self.kind == "counter":
             return CounterMetricFamily(self.name, self.help, labels=self.labels)
         return GaugeMetricFamily(self.name, self.help, labels=self.labels)
@@ -50,7 +50,7 @@ class Metric:
 
 @dataclass(frozen=True, slots=True)
 class RunMetric(Metric):
-    """One number of a run; None where there is none at the moment."""
+    """One number of a run; None if it has none at the moment."""
 
     value: Callable[[RunStatus, Record], float | None]
 
@@ -78,17 +78,17 @@ def _actor_age_s(run: RunStatus) -> float | None:
 
 
 RUN_METRICS: tuple[RunMetric, ...] = (
-    _run("started_timestamp_seconds", "gauge", "When the process that runs it started, since 1970",
+    _run("started_timestamp_seconds", "gauge", "Start of the process that runs it, Unix time",
          lambda run, _: run.started.timestamp()),
-    _run("heartbeat_age_seconds", "gauge", "Since the run was last heard of",
+    _run("heartbeat_age_seconds", "gauge", "Seconds since the run's last heartbeat",
          lambda run, _: _age_s(run.heartbeat)),
     _run("stopping", "gauge", "1 while a stop is requested and the run has not ended", lambda run, _: run.stopping),
-    _run("warnings", "gauge", "What is not as it should be right now, such as Redis being away",
+    _run("warnings", "gauge", "Number of current warnings, such as Redis being unavailable",
          lambda run, _: len(run.warnings)),
     _run("iterations_total", "counter", "Finished iterations", lambda run, _: run.iteration),
     _run("env_steps_total", "counter", "Env steps, all worlds together", lambda run, _: run.num_env_steps),
     _run("env_steps_budget", "gauge", "Env steps at which the run ends", lambda run, _: run.total_env_steps),
-    _run("env_steps_per_second", "gauge", "Env steps a second, newest iteration",
+    _run("env_steps_per_second", "gauge", "Env steps per second, newest iteration",
          lambda run, _: run.env_steps_per_s),
     _run("policy_version", "gauge", "Updates of the policies so far", lambda run, _: run.policy_version),
     _run("policy_lag_versions", "gauge", "Policy versions between acting and learning, mean of the last update",
@@ -99,26 +99,26 @@ RUN_METRICS: tuple[RunMetric, ...] = (
          lambda run, _: run.num_rollouts_refused),
     _run("actor_replacements_total", "counter", "How often an actor, the learner or the generator was replaced",
          lambda run, _: sum(actor.incarnation for actor in run.actors)),
-    _run("actor_heartbeat_age_seconds", "gauge", "Since the most silent actor of an active run was last heard of",
+    _run("actor_heartbeat_age_seconds", "gauge", "Seconds since the oldest heartbeat of an active run's actors",
          lambda run, _: _actor_age_s(run)),
-    _of_record("valid_goals_ratio", "alice/valid_fraction", "Alice's goals that are valid"),
-    _of_record("lifted_goals_ratio", "alice/lifted_fraction", "Valid goals that are in the air"),
-    _of_record("bob_success_ratio", "bob/success_rate", "Valid goals that Bob reached"),
-    _of_record("bob_success_air_ratio", "bob/success_rate_air", "Valid goals in the air that Bob reached"),
+    _of_record("valid_goals_ratio", "alice/valid_fraction", "Fraction of Alice's goals that are valid"),
+    _of_record("lifted_goals_ratio", "alice/lifted_fraction", "Fraction of valid goals that are in the air"),
+    _of_record("bob_success_ratio", "bob/success_rate", "Fraction of valid goals that Bob reached"),
+    _of_record("bob_success_air_ratio", "bob/success_rate_air", "Fraction of valid goals in the air that Bob reached"),
     _of_record("learner_idle_ratio", "time/learner_idle_fraction",
-               "Of the wall time, the learner waiting for rollouts"),
-    _of_record("learn_seconds", "time/learn_s", "Learning from one iteration"),
-    _of_record("non_finite_steps", "learner/non_finite_steps", "Gradient steps left out, not finite"),
-    _of_record("rollbacks", "learner/rollbacks", "Players taken back to before the update"),
+               "Fraction of the wall time in which the learner waits for rollouts"),
+    _of_record("learn_seconds", "time/learn_s", "Seconds of learning in one iteration"),
+    _of_record("non_finite_steps", "learner/non_finite_steps", "Gradient steps skipped because they were not finite"),
+    _of_record("rollbacks", "learner/rollbacks", "Players reset to their state before the update"),
     _of_record("broken_worlds", "world/num_broken", "Worlds whose physics diverged so far"),
     _of_record("goal_cells", "generator/num_cells_seen", "Cells of the grid in which a valid goal was ever proposed"),
 )  # fmt: skip
-"""One sample a run."""
+"""Metrics with one sample for each run."""
 
-_RUN_INFO = Metric("tandem_run_info", "gauge", ("run", "name", "runtime"), "1; which primitives a run makes, and how")
+_RUN_INFO = Metric("tandem_run_info", "gauge", ("run", "name", "runtime"), "1; a run's primitives and its runtime")
 _RUN_STATE = Metric("tandem_run_state", "gauge", ("run", "state"), "1 for the state a run is in, 0 for the others")
 _RUN_ACTORS = Metric("tandem_run_actors", "gauge", ("run", "state"), "Actors, learner and generator of an active run")
-_RUNS = Metric("tandem_runs", "gauge", ("state",), "All runs there are by state")
+_RUNS = Metric("tandem_runs", "gauge", ("state",), "Number of runs by state")
 _STORE_UP = Metric("tandem_store_up", "gauge", (), "1 if the runs could be read for this answer")
 _REGISTRY_UP = Metric("tandem_registry_up", "gauge", (), "1 if the registry could be read for this answer")
 _VERSIONS = Metric("tandem_registry_versions", "gauge", ("name",), "Published versions")
@@ -126,22 +126,22 @@ _ALIAS = Metric("tandem_registry_alias_version", "gauge", ("name", "alias"), "Th
 SERVICE_METRICS: tuple[Metric, ...] = (
     _RUN_INFO, _RUN_STATE, _RUN_ACTORS, _RUNS, _STORE_UP, _REGISTRY_UP, _VERSIONS, _ALIAS,
 )  # fmt: skip
-"""The others that are read when Prometheus asks."""
+"""The other metrics that are read at each scrape."""
 
 _REQUESTS = Metric("tandem_http_requests_total", "counter", ("method", "route", "status"), "Answered requests")
-_DURATION = Metric("tandem_http_request_duration_seconds", "histogram", ("route",), "Until an answer begins")
+_DURATION = Metric("tandem_http_request_duration_seconds", "histogram", ("route",), "Seconds until an answer begins")
 _STREAMS = Metric("tandem_http_streams", "gauge", (), "Open event streams")
 HTTP_METRICS: tuple[Metric, ...] = (_REQUESTS, _DURATION, _STREAMS)
-"""What the service counts about itself; beside them are prometheus-client's ``tandem_process_...``."""
+"""Metrics that the service counts itself; prometheus-client adds ``tandem_process_...``."""
 _METHODS = frozenset({"GET", "HEAD", "POST", "PUT", "DELETE"})
 _BUCKETS = (0.001, 0.0025, 0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1.0, 2.5, 10.0)
 
 
 class Telemetry:
-    """The metrics of one app, in a Prometheus registry of its own."""
+    """The metrics of one app, in their own Prometheus registry."""
 
     def __init__(self, runs: RunReader, registry: Registry, num_streams: Callable[[], int]) -> None:
-        """Nothing is read before the first ``page``."""
+        """Register all metrics; nothing is read before the first ``page``."""
         self._registry = CollectorRegistry()
         self._registry.register(_Collector(runs, registry))
         ProcessCollector(namespace="tandem", registry=self._registry)
@@ -151,21 +151,18 @@ class Telemetry:
         Gauge(_STREAMS.name, _STREAMS.help, registry=into).set_function(num_streams)
 
     def observe(self, method: str, route: str, status: int, duration_s: float) -> None:
-        """Count one answer; ``route`` is its template, so that nobody can make series at will."""
+        """Count one answer; ``route`` is the template, not the path, so that clients cannot create series."""
         self._requests.labels(method if method in _METHODS else "other", route, str(status)).inc()
         self._duration.labels(route).observe(duration_s)
 
     def page(self) -> bytes:
-        """The text Prometheus reads, of ``CONTENT_TYPE``; what cannot be read at the moment is left out."""
+        """Make the text of a scrape, of ``CONTENT_TYPE``; what cannot be read at the moment is left out."""
         return generate_latest(self._registry)
 
 
 class _Collector(Collector):
     def __init__(self, runs: RunReader, registry: Registry) -> None:
         self._runs, self._registry = runs, registry
-
-    def describe(self) -> list[_Family]:
-        return []  # or else registering it would read the runs
 
     def collect(self) -> Iterator[_Family]:
         yield from self._about_runs()
@@ -176,7 +173,7 @@ class _Collector(Collector):
         try:
             runs = self._runs.runs()
         except StoreError as error:
-            _logger.warning("/metrics tells of no run: %s", error)
+            _logger.warning("/metrics has no run: %s", error)
             up.add_metric([], 0)
             yield up
             return
@@ -204,7 +201,7 @@ class _Collector(Collector):
                 for alias, number in list(self._registry.aliases(name).items())[:MAX_NAMES]:
                     aliases.add_metric([name, alias], number)
         except (StorageError, OSError) as error:
-            _logger.warning("/metrics tells not all of the registry: %s", error)
+            _logger.warning("/metrics has not all of the registry: %s", error)
             up.add_metric([], 0)
         else:
             up.add_metric([], 1)
@@ -212,7 +209,7 @@ class _Collector(Collector):
 
 
 def shown(runs: list[RunStatus]) -> list[RunStatus]:
-    """Of the runs, newest first: those that are active and the last ``NUM_ENDED_RUNS`` others, ``MAX_RUNS`` at most."""
+    """Select, newest first, active runs and the last ``NUM_ENDED_RUNS`` that ended; at most ``MAX_RUNS``."""
     active = [run for run in runs if run.state in ACTIVE]
     ended = [run for run in runs if run.state not in ACTIVE]
     return (active + ended[:NUM_ENDED_RUNS])[:MAX_RUNS]

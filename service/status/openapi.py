@@ -1,4 +1,4 @@
-"""The OpenAPI document: what every route has in common is written into it here, so that no route can leave it out."""
+"""The OpenAPI document; errors and security, which all routes share, are added here so that no route can omit them."""
 
 from __future__ import annotations
 
@@ -7,17 +7,17 @@ from typing import Any
 from fastapi import FastAPI
 from fastapi.openapi.utils import get_openapi
 
-from service.status.guard import OPEN, PROBES
+from service.status.auth import OPEN, PROBES
 from service.status.problems import MEDIA_TYPE, Problem
 
 _CONTENT = {MEDIA_TYPE: {"schema": {"$ref": "#/components/schemas/Problem"}}}
 _COMMON = {
-    "400": "The request is not HTTP as it should be.",
+    "400": "The request is malformed HTTP.",
     "401": "A token is needed, or it is the wrong one.",
-    "408": "The body did not come in time.",
+    "408": "The body did not arrive in time.",
     "413": "The body is too large.",
-    "421": "Asked for another host than localhost.",
-    "500": "Something on the service's side is damaged or failed.",
+    "421": "The host is not localhost.",
+    "500": "A file of the service is damaged, or the service failed.",
 }
 _CHANGING = {"403": "This service has no token and so changes nothing."}
 _SCHEMES = {
@@ -29,23 +29,23 @@ _SCHEMES = {
     },
 }
 DESCRIPTION = """
-What runs and primitives there are, and how runs go. Errors are `application/problem+json` (RFC 9457).
-On a public address everything but `/livez` needs the token; everywhere all that changes something does.
+Runs, their progress, and primitives. Errors are `application/problem+json` (RFC 9457).
+On a public address every request but `/livez` needs the token; on any address those that change something need it.
 """
 
 
 def problems(*texts: tuple[int, str]) -> dict[int | str, dict[str, Any]]:
-    """The ``responses=`` of a route: its own errors by status."""
+    """The ``responses=`` argument of a route for its own errors: (status, description) each."""
     return {status: {"description": text, "content": _CONTENT} for status, text in texts}
 
 
 UNKNOWN_RUN = (404, "There is no such run.")
-AWAY = (503, "The runs cannot be read at the moment.")
-INVALID = (422, "The request does not fit this document.")
+UNAVAILABLE = (503, "The runs cannot be read at the moment.")
+INVALID = (422, "The request does not match this document.")
 
 
 def document(app: FastAPI, *, public: bool) -> dict[str, Any]:
-    """The document of the app's routes; ``public``: reading needs the token, too."""
+    """Make the document of the app's routes; if ``public``, reading needs the token, too."""
     tree = get_openapi(
         title=app.title, version=app.version, summary=app.summary, description=app.description, routes=app.routes
     )
@@ -55,7 +55,7 @@ def document(app: FastAPI, *, public: bool) -> dict[str, Any]:
         ref_template="#/components/schemas/{model}"
     )
     components["schemas"] |= components["schemas"]["Problem"].pop("$defs", {})
-    for unused in ("HTTPValidationError", "ValidationError"):  # FastAPI's own shape of a 422
+    for unused in ("HTTPValidationError", "ValidationError"):  # FastAPI's own schemas of a 422
         components["schemas"].pop(unused, None)
     for path, methods in tree["paths"].items():
         for method, operation in methods.items():
@@ -70,7 +70,7 @@ def document(app: FastAPI, *, public: bool) -> dict[str, Any]:
 
 
 def _never_null(schema: dict[str, Any]) -> dict[str, Any]:
-    """A parameter can be left out, but there is no null in a URL or a header."""
+    """Drop null from a parameter's schema: it can be omitted, but a URL or a header cannot hold null."""
     options = [option for option in schema.get("anyOf", ()) if option != {"type": "null"}]
     if len(options) != 1:
         return schema

@@ -1,4 +1,4 @@
-"""Errors as RFC 9457 has them: ``application/problem+json`` for all that is not a success, and never a stack trace."""
+"""Errors in the format of RFC 9457: all that is not a success is ``application/problem+json``, without a trace."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _RETRY_AFTER_S = 5
 
 
 class FieldError(BaseModel):
-    """What is wrong with one part of a request."""
+    """An invalid field of a request."""
 
     model_config = ConfigDict(frozen=True)
     where: str = Field(description="such as query.max_points", examples=["query.max_points"])
@@ -40,39 +40,43 @@ class Problem(BaseModel):
     title: str = Field(description="the status in words", examples=["Not Found"])
     status: int = Field(ge=400, le=599, description="the HTTP status", examples=[404])
     detail: str = Field(description="one line for people: what, where, which value, what to do")
-    errors: tuple[FieldError, ...] = Field((), description="of a request that does not fit the schema")
+    errors: tuple[FieldError, ...] = Field((), description="if the request does not fit the schema")
 
 
 class ProblemError(Exception):
-    """Ends a request with a problem; ``kind`` is the end of its type, such as ``unknown-run``."""
+    """An error that ends a request with a problem.
 
-    def __init__(self, status: int, kind: str, detail: str, headers: Mapping[str, str] | None = None) -> None:
+    Args:
+        status: the HTTP status.
+        kind: end of the problem's type, such as ``unknown-run``; None if the status says it all.
+        detail: one line for people.
+        headers: additional headers of the answer.
+        errors: invalid fields of the request.
+    """
+
+    def __init__(
+        self,
+        status: int,
+        kind: str | None,
+        detail: str,
+        headers: Mapping[str, str] | None = None,
+        errors: Sequence[FieldError] = (),
+    ) -> None:
         super().__init__(detail)
-        self.status, self.kind, self.detail, self.headers = status, kind, detail, dict(headers or {})
+        self.problem = Problem(
+            type=f"urn:tandem:{kind}" if kind else _BLANK,
+            title=HTTPStatus(status).phrase,
+            status=status,
+            detail=detail,
+            errors=tuple(errors),
+        )
+        retry = {"Retry-After": str(_RETRY_AFTER_S)} if status == HTTPStatus.SERVICE_UNAVAILABLE else {}
+        self.headers = {**retry, **(headers or {})}
 
     def response(self) -> JSONResponse:
-        """As an answer."""
-        return problem_response(self.status, self.kind, self.detail, self.headers)
-
-
-def problem_response(
-    status: int,
-    kind: str | None,
-    detail: str,
-    headers: Mapping[str, str] | None = None,
-    errors: Sequence[FieldError] = (),
-) -> JSONResponse:
-    """An answer that is a problem; a ``kind`` of None says no more than the status does."""
-    problem = Problem(
-        type=f"urn:tandem:{kind}" if kind else _BLANK,
-        title=HTTPStatus(status).phrase,
-        status=status,
-        detail=detail,
-        errors=tuple(errors),
-    )
-    retry = {"Retry-After": str(_RETRY_AFTER_S)} if status == HTTPStatus.SERVICE_UNAVAILABLE else {}
-    content = problem.model_dump(mode="json", exclude={"errors"} if not errors else None)
-    return JSONResponse(content, status, {**retry, **(headers or {})}, MEDIA_TYPE)
+        """Make the answer."""
+        content = self.problem.model_dump(mode="json", exclude=None if self.problem.errors else {"errors"})
+        return JSONResponse(content, self.problem.status, self.headers, MEDIA_TYPE)
 
 
 _KINDS: tuple[tuple[type[TandemError], int, str], ...] = (
@@ -85,54 +89,39 @@ _KINDS: tuple[tuple[type[TandemError], int, str], ...] = (
     (StoreError, 409, "not-possible"),
     (TandemError, 500, "failed"),
 )
-"""Status and kind by error, the first that fits."""
-
-
-def problem_of(error: TandemError) -> ProblemError:
-    """The problem that tells of an error of ours, whose message is written for users."""
-    status, kind = next((status, kind) for known, status, kind in _KINDS if isinstance(error, known))
-    return ProblemError(status, kind, str(error))
+"""Status and kind by error; the first match counts."""
 
 
 def add_handlers(app: FastAPI) -> None:
-    """Make every error of the app's routes a problem; unforeseen ones are the guard's."""
-    app.add_exception_handler(ProblemError, _on_problem)
-    app.add_exception_handler(TandemError, _on_tandem_error)
-    app.add_exception_handler(RequestValidationError, _on_invalid)
-    app.add_exception_handler(HTTPException, _on_http)
+    """Turn every error of the app's routes into a problem; ``AuthMiddleware`` does it for unexpected ones."""
 
+    @app.exception_handler(ProblemError)
+    def on_problem(_: Request, error: ProblemError) -> JSONResponse:
+        return error.response()
 
-def _on_problem(_: Request, error: Exception) -> JSONResponse:
-    assert isinstance(error, ProblemError)
-    return error.response()
+    @app.exception_handler(TandemError)
+    def on_tandem_error(_: Request, error: TandemError) -> JSONResponse:
+        status, kind = next((status, kind) for known, status, kind in _KINDS if isinstance(error, known))
+        return ProblemError(status, kind, str(error)).response()
 
+    @app.exception_handler(RequestValidationError)
+    def on_invalid(_: Request, error: RequestValidationError) -> JSONResponse:
+        errors = [_field_error(each) for each in error.errors()[:20]]
+        detail = "; ".join(f"{each.where}: {each.message}" for each in errors[:3])
+        return ProblemError(422, "invalid-request", f"{detail}; see /openapi.json", errors=errors).response()
 
-def _on_tandem_error(_: Request, error: Exception) -> JSONResponse:
-    assert isinstance(error, TandemError)
-    return problem_of(error).response()
-
-
-def _on_invalid(_: Request, error: Exception) -> JSONResponse:
-    assert isinstance(error, RequestValidationError)
-    errors = [_field_error(each) for each in error.errors()[:20]]
-    detail = "; ".join(f"{each.where}: {each.message}" for each in errors[:3])
-    return problem_response(422, "invalid-request", f"{detail}; see /openapi.json", errors=errors)
+    @app.exception_handler(HTTPException)
+    def on_http(request: Request, error: HTTPException) -> JSONResponse:
+        path = request.url.path[:100]
+        details = {
+            404: f"there is nothing at {path!r}; /openapi.json lists every route",
+            405: f"{path!r} does not take {request.method[:16]!r}; the header Allow lists what it takes",
+        }
+        detail = details.get(error.status_code, str(error.detail))
+        return ProblemError(error.status_code, None, detail, error.headers).response()
 
 
 def _field_error(error: Mapping[str, Any]) -> FieldError:
     where = ".".join(str(part)[:64] for part in error["loc"])
     given = "" if error["type"] in ("missing", "json_invalid") else f", got {str(error['input'])[:64]!r}"
     return FieldError(where=where, message=f"{error['msg']}{given}")
-
-
-def _on_http(request: Request, error: Exception) -> JSONResponse:
-    assert isinstance(error, HTTPException)
-    path = request.url.path[:100]
-    details = {
-        404: f"there is nothing at {path!r}; /openapi.json lists every route",
-        405: f"{path!r} does not take {request.method[:16]!r}; the header Allow lists what it takes",
-    }
-    headers = dict(error.headers or {})
-    if error.status_code == HTTPStatus.METHOD_NOT_ALLOWED:
-        headers.setdefault("Allow", "GET, HEAD")  # of static files, the only ones that leave it out
-    return problem_response(error.status_code, None, details.get(error.status_code, str(error.detail)), headers)

@@ -1,7 +1,4 @@
-"""The status service on a port, in a thread or in the foreground.
-
-In a Ray actor: make a ``StatusServer`` and ``start`` it; ``port`` says where it listens. Nothing here knows Ray.
-"""
+"""The status service on a port, in a thread or in the foreground; independent of Ray."""
 
 from __future__ import annotations
 
@@ -18,8 +15,8 @@ import uvicorn
 
 from service.registry.registry import Registry
 from service.status.app import StatusApp, create_app
+from service.status.auth import is_loopback
 from service.status.errors import StatusError
-from service.status.guard import is_loopback
 from service.store.models import RunReader
 
 DEFAULT_PORT = 8321
@@ -30,18 +27,18 @@ _logger = logging.getLogger(__name__)
 
 
 class StatusServer:
-    """Serves until ``stop``, or until its process ends; also a context manager, which starts and stops it.
+    """Server in a thread, until ``stop`` or the end of the process; as a context manager it starts and stops.
 
     Args:
-        runs: where to read runs from.
+        runs: reader of the runs.
         registry: of primitives.
         token: see `create_app`.
         host: name or address to listen at.
-        port: 0 for one that is free, see ``port``.
+        port: 0 for a free one, which the attribute ``port`` gives.
         runs_dir: directory of run directories, for their pictures and videos.
 
     Raises:
-        StatusError: the address cannot be had, or a public one without a token.
+        StatusError: it cannot listen at the address, or the address is public and there is no token.
     """
 
     def __init__(
@@ -57,7 +54,7 @@ class StatusServer:
         self._socket = _bind(host, port)
         address, self.port = self._socket.getsockname()[:2]
         try:
-            # what counts is where the socket is, not what its host was called
+            # public or not depends on the bound address, not on the name of the host
             app = create_app(runs, registry, token=token, public=not is_loopback(address), runs_dir=runs_dir)
             self._socket.listen()
         except OSError as error:
@@ -67,16 +64,16 @@ class StatusServer:
             self._socket.close()
             raise
         self.url = f"http://{_reachable(address)}:{self.port}"
-        """Where this machine reaches it."""
+        """URL for clients on this machine."""
         self.app = app
         self._server = _Server(app)
         self._thread = threading.Thread(target=self._serve, name=f"status-{self.port}", daemon=True)
 
     def start(self) -> None:
-        """Answer requests from now on, in a thread.
+        """Start to answer requests, in a thread.
 
         Raises:
-            StatusError: it does not come up.
+            StatusError: it does not start.
         """
         self._thread.start()
         deadline_s = time.monotonic() + START_TIMEOUT_S
@@ -85,13 +82,8 @@ class StatusServer:
                 raise StatusError(f"the status service does not start at port {self.port}; the log says more")
             time.sleep(0.005)
 
-    @property
-    def started(self) -> bool:
-        """Whether it answers."""
-        return bool(self._server.started)
-
     def stop(self) -> None:
-        """Answer what was asked already, end event streams, and free the port."""
+        """Finish open requests, end event streams, and free the port."""
         self._server.should_exit = True
         if self._thread.is_alive():
             self._thread.join(STOP_TIMEOUT_S)
@@ -101,14 +93,14 @@ class StatusServer:
         """Serve in the foreground until SIGINT or SIGTERM; only in the main thread.
 
         Raises:
-            StatusError: it does not come up, or ends by itself.
+            StatusError: it does not start, or ends by itself.
         """
-        asked = threading.Event()
+        stop_requested = threading.Event()
         numbers = (signal.SIGINT, signal.SIGTERM)
-        previous = [signal.signal(number, lambda *_: asked.set()) for number in numbers]
+        previous = [signal.signal(number, lambda *_: stop_requested.set()) for number in numbers]
         try:
             self.start()
-            while not asked.wait(1.0):
+            while not stop_requested.wait(1.0):
                 if not self._thread.is_alive():
                     raise StatusError(f"the status service at port {self.port} ended by itself; the log says why")
         finally:
@@ -133,12 +125,12 @@ class StatusServer:
 
 
 class _Server(uvicorn.Server):
-    """Ends the event streams before it waits for open connections."""
+    """A uvicorn server that ends event streams before it waits for open connections."""
 
     def __init__(self, app: StatusApp) -> None:
         config = uvicorn.Config(
             app,
-            log_config=None,  # the program's own logging counts
+            log_config=None,  # keep the program's own logging
             log_level="warning",
             access_log=False,  # /metrics counts requests
             server_header=False,

@@ -1,67 +1,114 @@
-"""A run while it goes on, as server-sent events.
+"""Server-sent events of a run in progress.
 
-| event | data | when |
+| event | data | sent when |
 |---|---|---|
-| ``metrics`` | one record: ``iteration``, ``env_steps``, the metrics; its id is the iteration | an iteration is done |
+| ``metrics`` | one record; the event's id is its iteration | an iteration is done |
 | ``status`` | ``RunStatus`` | at the beginning, and when it changed |
-| ``reset`` | ``{"after_iteration": N}``: forget later ones, they are made anew | the run was resumed from before |
-| ``unavailable`` | ``{"detail": "..."}`` | the store is away; it is asked again |
-| ``end`` | ``RunStatus`` | the run has ended: the last event |
+| ``reset`` | ``{"after_iteration": N}``: drop later records, they come again | the run was resumed from before |
+| ``unavailable`` | ``{"detail": "..."}`` | the store cannot be read; the stream keeps trying |
+| ``end`` | ``RunStatus`` | the run has ended; this is the last event |
 
-Between events a comment is sent at least every ``KEEP_ALIVE_S``. A browser that lost the connection comes back by
-itself and says the id of the last record it has (``Last-Event-ID``), after which the stream goes on.
+FastAPI formats the events and sends a comment after 15 s without one. A browser that lost the connection reconnects by
+itself and sends the id of its last record (``Last-Event-ID``); the stream continues after it.
 """
 
 from __future__ import annotations
 
 import asyncio
-import json
 import time
 from collections.abc import AsyncIterator, Collection
-from typing import Any
 
 from anyio import to_thread
+from fastapi.sse import ServerSentEvent
 
 from service.status.problems import ProblemError
 from service.store.errors import StoreError, StoreUnavailableError
 from service.store.models import ACTIVE, Record, RunReader, RunStatus
 
-KEEP_ALIVE_S = 15.0
 POLL_S = 0.5
 MAX_STREAMS = 64
 MAX_AGE_S = 3600.0
-"""A stream ends then, and its browser comes back: one that is gone without a word does not stay for ever."""
+"""Streams end after this time and browsers reconnect, so a client that silently disappeared is not served for ever."""
 _RETRY_MS = 2000
 EVENT_SCHEMA = {
-    "type": "object",
-    "description": "one event",
     "properties": {
         "event": {"enum": ["metrics", "status", "reset", "unavailable", "end"]},
-        "data": {"type": "string", "contentMediaType": "application/json"},
-        "id": {"type": "string", "description": "the iteration, of metrics only"},
-        "retry": {"type": "integer", "description": "milliseconds, once at the beginning"},
+        "data": {"contentMediaType": "application/json"},
+        "id": {"description": "the iteration; only metrics have one"},
     },
 }
-"""Of the OpenAPI document."""
+"""Additions to FastAPI's schema of an event."""
+
+
+class RunFollower:
+    """One client's position in one run; made by ``Streams.follow``."""
+
+    def __init__(self, runs: RunReader, run: RunStatus, names: Collection[str] | None, after: int | None) -> None:
+        self._runs, self._run_id = runs, run.run_id
+        self._names = None if names is None else {*names, "iteration", "env_steps"}
+        self._last_iteration = max(0, run.iteration - 1) if after is None else after
+        self._status: RunStatus | None = None
+        self._unavailable = False
+        self.ended = False
+
+    def poll(self) -> list[ServerSentEvent]:
+        """Read the run and return the new events; store errors become events."""
+        try:
+            # the status first: if it says that the run has ended, no record may come after it
+            status = self._runs.run(self._run_id)
+            events = self._new_records()
+        except StoreError as error:
+            self.ended = not isinstance(error, StoreUnavailableError)  # deleted or damaged
+            repeated, self._unavailable = self._unavailable and not self.ended, True
+            return [] if repeated else [ServerSentEvent(event="unavailable", data={"detail": str(error)})]
+        self._unavailable = False
+        if status != self._status:
+            self._status = status
+            events.append(ServerSentEvent(event="status", data=status))
+        if status.state not in ACTIVE:
+            self.ended = True
+            events.append(ServerSentEvent(event="end", data=status))
+        return events
+
+    def _new_records(self) -> list[ServerSentEvent]:
+        # also read the last record that was sent: it is gone if the run was resumed from an earlier iteration
+        records = self._runs.metrics(self._run_id, after_iteration=max(0, self._last_iteration - 1))
+        events = []
+        if self._last_iteration and not records:
+            remaining = self._runs.metrics(self._run_id)
+            self._last_iteration = _iteration(remaining[-1]) if remaining else 0
+            events.append(ServerSentEvent(event="reset", data={"after_iteration": self._last_iteration}))
+        for record in records:
+            if (iteration := _iteration(record)) > self._last_iteration:
+                self._last_iteration = iteration
+                events.append(ServerSentEvent(event="metrics", data=self._select(record), id=str(iteration)))
+        return events
+
+    def _select(self, record: Record) -> Record:
+        if self._names is None:
+            return record
+        return {name: value for name, value in record.items() if name in self._names}
 
 
 class Streams:
-    """All streams of one service, so that they can be counted, bounded, and ended when it ends."""
+    """All event streams of one service: counts them, limits their number, and ends them at shutdown."""
 
-    def __init__(self, runs: RunReader, *, max_age_s: float = MAX_AGE_S) -> None:
-        """``max_age_s``: how long one may last."""
-        self._runs, self._max_age_s = runs, max_age_s
+    def __init__(self, runs: RunReader) -> None:
+        self._runs = runs
         self._closing = asyncio.Event()
         self.num_open = 0
 
     def close(self) -> None:
-        """End them all; to be called in the event loop they run in."""
+        """End all streams; call it in their event loop."""
         self._closing.set()
 
-    async def open(
-        self, run_id: str, names: Collection[str] | None, after_iteration: int | None
-    ) -> AsyncIterator[bytes]:
-        """The events of a run after an iteration; None for the newest record and those to come.
+    async def follow(self, run_id: str, names: Collection[str] | None, after_iteration: int | None) -> RunFollower:
+        """Check that a run can be streamed.
+
+        Args:
+            run_id: the run.
+            names: metrics to send; None for all.
+            after_iteration: the last iteration the client has; None to begin with the newest record.
 
         Raises:
             UnknownRunError: there is no such run.
@@ -73,27 +120,19 @@ class Streams:
                 503, "too-many-streams", f"{MAX_STREAMS} streams are open; close one, or ask for /metrics"
             )
         run = await to_thread.run_sync(self._runs.run, run_id)
-        follower = _Follower(self._runs, run, names, after_iteration)
-        first = await to_thread.run_sync(follower.poll)
-        return self._events(follower, first)
+        return RunFollower(self._runs, run, names, after_iteration)
 
-    async def _events(self, follower: _Follower, events: list[bytes]) -> AsyncIterator[bytes]:
+    async def events(self, follower: RunFollower) -> AsyncIterator[ServerSentEvent]:
+        """Yield events until the run ends, the stream is too old, or the service stops."""
         self.num_open += 1
+        end_s = time.monotonic() + MAX_AGE_S
         try:
-            yield f"retry: {_RETRY_MS}\n\n".encode()
-            end_s = time.monotonic() + self._max_age_s
-            spoke_s = time.monotonic()
+            yield ServerSentEvent(retry=_RETRY_MS)
             while True:
-                for event in events:
+                for event in await to_thread.run_sync(follower.poll):
                     yield event
-                if events:
-                    spoke_s = time.monotonic()
-                elif time.monotonic() - spoke_s > KEEP_ALIVE_S:
-                    yield b": nothing new\n\n"
-                    spoke_s = time.monotonic()
                 if follower.ended or time.monotonic() >= end_s or await self._closed_within(POLL_S):
                     return
-                events = await to_thread.run_sync(follower.poll)
         finally:
             self.num_open -= 1
 
@@ -105,61 +144,5 @@ class Streams:
         return True
 
 
-class _Follower:
-    """What one listener has heard of one run."""
-
-    def __init__(self, runs: RunReader, run: RunStatus, names: Collection[str] | None, after: int | None) -> None:
-        self._runs, self._run_id = runs, run.run_id
-        self._names = None if names is None else {*names, "iteration", "env_steps"}
-        self._heard = max(0, run.iteration - 1) if after is None else after
-        self._status: RunStatus | None = None
-        self._away = False
-        self.ended = False
-
-    def poll(self) -> list[bytes]:
-        """What is new, as events."""
-        try:
-            # the status first: records that come in between must not be missing when it says that the run has ended
-            status = self._runs.run(self._run_id)
-            events = self._new_records()
-        except StoreUnavailableError as error:
-            events = [] if self._away else [_event("unavailable", json.dumps({"detail": str(error)}))]
-            self._away = True
-            return events
-        except StoreError as error:  # deleted, or damaged
-            self.ended = True
-            return [_event("unavailable", json.dumps({"detail": str(error)}))]
-        self._away = False
-        if status != self._status:
-            self._status = status
-            events.append(_event("status", status.model_dump_json()))
-        if status.state not in ACTIVE:
-            self.ended = True
-            events.append(_event("end", status.model_dump_json()))
-        return events
-
-    def _new_records(self) -> list[bytes]:
-        # the last record heard of is read again, for it is gone when the run was resumed from before it
-        records = self._runs.metrics(self._run_id, after_iteration=max(0, self._heard - 1))
-        events = []
-        if self._heard and not records:
-            there = self._runs.metrics(self._run_id)
-            self._heard = int(there[-1]["iteration"] or 0) if there else 0
-            events.append(_event("reset", json.dumps({"after_iteration": self._heard})))
-        for record in records:
-            iteration = int(record["iteration"] or 0)
-            if iteration > self._heard:
-                self._heard = iteration
-                events.append(_event("metrics", json.dumps(self._chosen(record)), identity=iteration))
-        return events
-
-    def _chosen(self, record: Record) -> dict[str, Any]:
-        if self._names is None:
-            return record
-        return {name: value for name, value in record.items() if name in self._names}
-
-
-def _event(kind: str, data: str, *, identity: int | None = None) -> bytes:
-    """One event; ``data`` is JSON and so has no line ends."""
-    head = f"id: {identity}\n" if identity is not None else ""
-    return f"{head}event: {kind}\ndata: {data}\n\n".encode()
+def _iteration(record: Record) -> int:
+    return int(record["iteration"] or 0)

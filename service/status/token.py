@@ -1,4 +1,4 @@
-"""The bearer token: where it comes from, and whether a request has it."""
+"""The bearer token: reading it, and checking a request for it."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ Verdict = Literal["missing", "wrong", "right"]
 
 
 def read_token(file: Path | None = None) -> str | None:
-    """The token of a file or, where no file is named, of ``TANDEM_TOKEN``; None where that is not set or empty.
+    """Read the token from a file or, without a file, from ``TANDEM_TOKEN``; None if that is not set or empty.
 
     Raises:
-        StatusError: the file cannot be read, or its text is no token; the message does not quote it.
+        StatusError: the file cannot be read, or its text is not a token; the message does not quote it.
     """
     if file is None:
         text, source = os.environ.get(VARIABLE, ""), VARIABLE
@@ -36,10 +36,10 @@ def read_token(file: Path | None = None) -> str | None:
 
 
 def check_token(token: str, source: str) -> str:
-    """Return ``token``.
+    """Check and return a token that ``source`` gave.
 
     Raises:
-        StatusError: it is too short, or no header can hold it.
+        StatusError: it is too short, or cannot be sent in a header.
     """
     if len(token) < MIN_CHARACTERS:
         raise StatusError(f"{source} has {len(token)} characters, {MIN_CHARACTERS} are the least; {_MAKE}")
@@ -48,13 +48,13 @@ def check_token(token: str, source: str) -> str:
     return token
 
 
-def judge(authorization: str | None, token: str, *, basic: bool) -> Verdict:
-    """What an ``Authorization`` header says to a token.
+def check_authorization(authorization: str | None, token: str, *, basic: bool) -> Verdict:
+    """Compare an ``Authorization`` header with the token.
 
     Args:
-        authorization: the header; None where there was none.
+        authorization: the header; None if the request has none.
         token: the right one.
-        basic: also take the token as the password of HTTP Basic, which is how a browser can send it.
+        basic: also accept the token as the password of HTTP Basic, which is how a browser can send it.
     """
     if authorization is None:
         return "missing"
@@ -65,7 +65,7 @@ def judge(authorization: str | None, token: str, *, basic: bool) -> Verdict:
         given = _password(rest.strip())
     else:
         return "wrong"
-    # on bytes: text that is not ASCII is refused by compare_digest, and must only be wrong here
+    # as bytes: compare_digest raises for text that is not ASCII, which is only a wrong token here
     return "right" if hmac.compare_digest(given.encode(), token.encode()) else "wrong"
 
 

@@ -1,4 +1,4 @@
-"""A real Chromium without a window, and what it shows of a service."""
+"""A headless Chromium and the pages it shows."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ _TIMEOUT_MS = 300_000
 
 @contextmanager
 def chromium() -> Iterator[Browser]:
-    """The system's."""
+    """Start the system's Chromium."""
     with sync_playwright() as playwright:
         browser = playwright.chromium.launch(executable_path=CHROMIUM, args=list(_ARGUMENTS))
         yield browser
@@ -37,7 +37,7 @@ def chromium() -> Iterator[Browser]:
 
 
 class Visit:
-    """A page, and everything it asked for and complained of."""
+    """A page, with its requests and its error messages."""
 
     def __init__(self, browser: Browser, url: str, **options: Any) -> None:
         self.url = url
@@ -60,23 +60,23 @@ class Visit:
         dialog.dismiss()
 
     def go(self, place: str = "#/") -> Visit:
-        """To a view by its address: as from a bookmark at first, and later as by a link."""
+        """Open a view by its address: the first time like a bookmark, later like a link."""
         self.page.goto(f"{self.url}/{place}")
         return self
 
     def wait(self, condition: str) -> None:
-        """Until a JavaScript expression holds; Playwright's own way is not allowed by the page's policy for scripts."""
+        """Wait until a JavaScript expression holds; the page's policy for scripts forbids Playwright's own way."""
         deadline_s = time.monotonic() + _TIMEOUT_MS / 1000
         while not self.page.evaluate(condition):
             assert time.monotonic() < deadline_s, condition
             self.page.wait_for_timeout(30)
 
     def chart(self, title: str) -> Locator:
-        """The panel of that title."""
+        """The panel with a title."""
         return self.page.locator("figure.chart").filter(has=self.page.get_by_role("heading", name=title, exact=True))
 
     def raw(self, name: str) -> list[list[tuple[float, float]]]:
-        """(env steps, value) of the unbroken parts of a curve, read off its axes as a person would."""
+        """The points (env steps, value) of each unbroken part of a curve, read from its axes."""
         group = self.page.locator(f'g.curve[data-name="{name}"]')
         drawing = self.page.locator(".plot svg").filter(has=group)
         ticks = [

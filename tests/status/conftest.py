@@ -9,7 +9,7 @@ import pytest
 
 from service.registry.registry import Registry
 from service.status.server import StatusServer
-from service.store import liveness
+from service.store import models
 from service.store.disk_reader import DiskReader
 from tests.status.runs import BEARER, CLIENT, TOKEN, publish, write_runs
 
@@ -17,12 +17,12 @@ from tests.status.runs import BEARER, CLIENT, TOKEN, publish, write_runs
 @pytest.fixture(autouse=True)
 def slow_tests(monkeypatch: pytest.MonkeyPatch) -> None:
     """A run that was written when a module's tests began is heard of long enough for all of them."""
-    monkeypatch.setattr(liveness, "SILENT_AFTER", timedelta(hours=1))
+    monkeypatch.setattr(models, "SILENT_AFTER", timedelta(hours=1))
 
 
 @pytest.fixture(scope="module")
 def home(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Where ``runs`` and ``registry`` are."""
+    """The directory of ``runs`` and ``registry``."""
     home = tmp_path_factory.mktemp("status")
     write_runs(home / "runs")
     registry = Registry(home / "registry")
@@ -33,20 +33,20 @@ def home(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def serve(home: Path, *, token: str | None = TOKEN, host: str = "127.0.0.1") -> StatusServer:
-    """A service of what is at ``home``, not started."""
+    """Make a service of the runs and the registry in ``home``; it is not started."""
     runs = home / "runs"
     return StatusServer(DiskReader(runs), Registry(home / "registry"), token=token, host=host, port=0, runs_dir=runs)
 
 
 @pytest.fixture(scope="module")
 def server(home: Path) -> Iterator[StatusServer]:
-    """With a token, for this machine."""
+    """A service with a token, on loopback."""
     with serve(home) as server:
         yield server
 
 
 @pytest.fixture(scope="module")
 def client(server: StatusServer) -> Iterator[httpx.Client]:
-    """Of that service, with its token."""
+    """A client of that service, with its token."""
     with httpx.Client(base_url=server.url, headers=BEARER, **CLIENT) as client:
         yield client

@@ -1,4 +1,4 @@
-"""Run directories and a registry as a service finds them, written by hand: nothing is trained for these tests."""
+"""Run directories and a registry, written by hand: nothing is trained for these tests."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ BEARER = {"Authorization": f"Bearer {TOKEN}"}
 
 
 def status(run_id: str, **changes: Any) -> RunStatus:
-    """Of a run that is going on and was heard of just now."""
+    """The status of an active run with a heartbeat of now."""
     now = datetime.now(UTC)
     fields: dict[str, Any] = {
         "run_id": run_id,
@@ -49,7 +49,7 @@ def status(run_id: str, **changes: Any) -> RunStatus:
 
 
 def write_status(root: Path, run_id: str, **changes: Any) -> RunStatus:
-    """A run that is there from now on, or its new status."""
+    """Write a run, or its new status."""
     written = status(run_id, **changes)
     (root / run_id).mkdir(parents=True, exist_ok=True)
     (root / run_id / "status.json").write_text(written.model_dump_json())
@@ -57,7 +57,7 @@ def write_status(root: Path, run_id: str, **changes: Any) -> RunStatus:
 
 
 def record(iteration: int, **values: float | None) -> dict[str, Any]:
-    """What a run has to say of an iteration."""
+    """The metrics of an iteration."""
     return {
         "iteration": iteration,
         "env_steps": 1000 * iteration,
@@ -70,13 +70,13 @@ def record(iteration: int, **values: float | None) -> dict[str, Any]:
 
 
 def append(root: Path, run_id: str, *records: dict[str, Any]) -> None:
-    """Write records as a run does."""
+    """Append records as a run does."""
     with (root / run_id / "metrics.jsonl").open("a") as file:
         file.writelines(json.dumps(each) + "\n" for each in records)
 
 
 def grid() -> GoalGrid:
-    """Of two cells."""
+    """A goal grid of two cells."""
     return GoalGrid(
         iteration=3,
         num_env_steps=3000,
@@ -93,7 +93,7 @@ def grid() -> GoalGrid:
 
 
 def write_runs(root: Path) -> None:
-    """Two runs: "cube" goes on and has a grid, "old" has ended and has a video."""
+    """Write two runs: "cube" is active and has a goal grid, "old" has ended and has a video."""
     write_status(root, "old", state="finished", started=datetime(2026, 1, 1, tzinfo=UTC), actors=(), published="tiny@1")
     write_status(root, "cube")
     for run_id in ("old", "cube"):
@@ -104,7 +104,7 @@ def write_runs(root: Path) -> None:
 
 
 def publish(registry: Registry, name: str = "tiny", value: float = 0.0) -> Version:
-    """A small version."""
+    """Publish a small version."""
     return registry.publish(
         name,
         {"gate.weight": np.full((2, 3), value, np.float32)},

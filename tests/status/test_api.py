@@ -1,4 +1,4 @@
-"""What each route answers."""
+"""The answer of each route."""
 
 import json
 
@@ -26,12 +26,12 @@ def test_runs_newest_start_first(client):
 
 
 @pytest.mark.parametrize(("query", "ids", "num_runs"), [("active=true", ["cube"], 1), ("active=false", ["old"], 1)])
-def test_runs_that_go_on_or_do_not(client, query, ids, num_runs):
+def test_active_and_ended_runs(client, query, ids, num_runs):
     answer = client.get(f"/v1/runs?{query}").json()
     assert ([run["run_id"] for run in answer["runs"]], answer["num_runs"]) == (ids, num_runs)
 
 
-def test_the_limit_says_how_many_there_are(client):
+def test_a_limited_list_has_the_total_number(client):
     answer = client.get("/v1/runs?limit=1").json()
     assert ([run["run_id"] for run in answer["runs"]], answer["num_runs"]) == (["cube"], 2)
 
@@ -148,7 +148,7 @@ def test_aliases_move_forward_and_back(client, home):
         assert registry.aliases("moving")["best"] == number
 
 
-def test_the_registry_that_comes_with_tandem_is_only_read(tmp_path):
+def test_the_bundled_registry_is_read_only(tmp_path):
     with StatusServer(DiskReader(tmp_path), Registry(BUNDLED), token=TOKEN, port=0) as server:
         url = f"{server.url}/v1/primitives/panda-cube/aliases/mine"
         answer = httpx.put(url, json={"version": 2}, headers=BEARER, **CLIENT)

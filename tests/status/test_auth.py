@@ -1,4 +1,4 @@
-"""Who may ask what: every route there is, taken from the OpenAPI document and the app, so that none is forgotten."""
+"""Access to every route; the routes are taken from the OpenAPI document and the app, so that none is forgotten."""
 
 import base64
 
@@ -41,7 +41,7 @@ REFUSED = {
 
 
 def routes(server):
-    """Method and path of everything the app serves, and of something it does not."""
+    """Method and path of every route, and of one that does not exist."""
     documented = {
         (method, path.format(**PARAMETERS))
         for path, methods in server.app.openapi()["paths"].items()
@@ -64,7 +64,7 @@ def ask(client, method, path, authorization=None):
 
 @pytest.fixture(scope="module")
 def public(home):
-    """A service that other machines could reach; asked over loopback."""
+    """A service on a public address, and a client on loopback."""
     with serve(home, host="0.0.0.0") as server, httpx.Client(base_url=server.url, **CLIENT) as client:
         yield server, client
 
@@ -96,7 +96,7 @@ def test_a_public_service_refuses_what_is_not_its_token(public, kind):
 
 
 @pytest.mark.parametrize("kind", RIGHT)
-def test_a_public_service_answers_who_has_its_token(public, kind):
+def test_a_public_service_answers_with_its_token(public, kind):
     server, client = public
     for method, path in routes(server):
         answer = ask(client, method, path, RIGHT[kind])
@@ -104,7 +104,7 @@ def test_a_public_service_answers_who_has_its_token(public, kind):
         assert (answer.status_code == 401) == refused, (method, path)
 
 
-def test_what_changes_something_offers_no_login_to_a_browser(public):
+def test_requests_that_change_something_offer_no_browser_login(public):
     _, client = public
     assert "Basic" in client.get("/").headers["www-authenticate"]
     assert "Basic" not in client.post("/v1/runs/old/stop").headers["www-authenticate"]
@@ -141,31 +141,31 @@ def test_a_public_service_without_a_token_does_not_start(home):
 
 
 @pytest.mark.parametrize("token", ["short", "has spaces in its midst", "\u00e9" * 20])
-def test_no_token_that_is_none(home, token):
+def test_invalid_tokens(home, token):
     with pytest.raises(StatusError) as error:
         serve(home, token=token)
     assert token not in str(error.value)
 
 
 @pytest.mark.parametrize("host", ["evil.example", "evil.example:80", "127.0.0.1.evil.example", "10.0.0.1", "", "[::2]"])
-def test_on_loopback_a_name_that_leads_here_is_not_enough(server, host):
+def test_on_loopback_other_host_names_are_refused(server, host):
     with httpx.Client(base_url=server.url, **CLIENT) as client:
         answer = client.get("/v1/runs", headers={"Host": host, "Authorization": RIGHT["bearer"]})
     assert (answer.status_code, answer.json()["type"]) == (421, "urn:tandem:wrong-host")
 
 
 @pytest.mark.parametrize("host", ["localhost", "localhost:1", "LOCALHOST", "127.0.0.1:8321", "127.9.9.9", "[::1]:8321"])
-def test_names_of_this_machine(server, host):
+def test_loopback_host_names_are_accepted(server, host):
     with httpx.Client(base_url=server.url, **CLIENT) as client:
         assert client.get("/v1/runs", headers={"Host": host}).status_code == 200
 
 
-def test_a_public_service_has_whatever_name_it_is_given(public):
+def test_a_public_service_accepts_any_host_name(public):
     _, client = public
     assert client.get("/v1/runs", headers={"Host": "lab.example", "Authorization": RIGHT["bearer"]}).status_code == 200
 
 
-def test_only_who_has_the_token_is_told_why_it_is_not_ready(tmp_path):
+def test_the_reason_for_not_ready_needs_the_token(tmp_path):
     (tmp_path / "runs").mkdir()
     with serve(tmp_path, host="0.0.0.0") as server, httpx.Client(base_url=server.url, **CLIENT) as client:
         (tmp_path / "runs").rmdir()

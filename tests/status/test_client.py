@@ -1,4 +1,4 @@
-"""Primitives over HTTP, from real services: one that is well, and ones that are not."""
+"""Primitives over HTTP, from real services, correct and faulty ones."""
 
 import os
 import subprocess
@@ -38,7 +38,7 @@ print(bob.label)
 
 @pytest.fixture(autouse=True)
 def no_token(monkeypatch, tmp_path):
-    """What the environment of whoever runs the tests says does not count."""
+    """Remove the variables of the environment that the client reads."""
     for name in ("TANDEM_TOKEN", "HTTP_PROXY", "http_proxy", "ALL_PROXY", "all_proxy"):
         monkeypatch.delenv(name, raising=False)
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "xdg"))
@@ -46,7 +46,7 @@ def no_token(monkeypatch, tmp_path):
 
 @contextmanager
 def answering(answers, record=None):
-    """The URL of a server that gives these (status, content type, body) by path, whatever they are."""
+    """Run a server that gives fixed answers (status, content type, body) by path; yield its URL."""
 
     class Handler(BaseHTTPRequestHandler):
         def do_GET(self):
@@ -75,7 +75,7 @@ def answering(answers, record=None):
 
 @pytest.fixture
 def published(tmp_path):
-    """What a service of one version would answer, by path."""
+    """The answers of a service with one version, by path."""
     registry = Registry(tmp_path / "published")
     publish(registry, value=1.0)
     manifest = registry.manifest("tiny@1")
@@ -98,7 +98,7 @@ def assert_one_line(error, *parts):
 
 
 @pytest.mark.parametrize(("reference", "number"), [("tiny", 2), ("tiny@champion", 1), ("tiny@2", 2)])
-def test_a_version_comes_whole(server, home, tmp_path, reference, number):
+def test_a_fetched_version_is_complete(server, home, tmp_path, reference, number):
     registry, version = fetch_primitives(server.url, reference, cache_dir=tmp_path)
     assert version == ("tiny", number)
     own = Registry(home / "registry")
@@ -161,7 +161,7 @@ def test_a_blob_that_is_damaged_at_the_service(tmp_path):
     assert files_in(tmp_path / "cache") == {}
 
 
-def test_a_manifest_that_was_changed_on_the_way(published, tmp_path):
+def test_a_manifest_that_was_changed_in_transit(published, tmp_path):
     path = "/v1/primitives/tiny/versions/1"
     published[path] = (200, "application/json", published[path][2].replace(b'"seed": 3', b'"seed": 4'))
     with answering(published) as url, pytest.raises(DamagedBlobError) as error:
@@ -186,13 +186,13 @@ def test_the_manifest_of_another_version(published, tmp_path):
         ("tiny@best", ["'best'", "champion"]),
     ],
 )
-def test_what_the_service_does_not_have(server, tmp_path, reference, parts):
+def test_unknown_versions(server, tmp_path, reference, parts):
     with pytest.raises(UnknownVersionError) as error:
         fetch_primitives(server.url, reference, cache_dir=tmp_path)
     assert_one_line(error.value, server.url, *parts)
 
 
-def test_what_is_no_reference(server, tmp_path):
+def test_invalid_references(server, tmp_path):
     with pytest.raises(RegistryError, match=r"^bad reference 'Tiny!'"):
         fetch_primitives(server.url, "Tiny!", cache_dir=tmp_path)
 
@@ -211,7 +211,7 @@ def test_the_token(home, tmp_path, monkeypatch):
         assert fetch_primitives(server.url, "tiny", cache_dir=tmp_path)[1].number == 2
 
 
-def test_nobody_there(home, tmp_path):
+def test_no_service_at_the_url(home, tmp_path):
     server = serve(home)
     server.start()
     server.stop()
@@ -241,7 +241,7 @@ def test_something_else_at_the_url(tmp_path, answer, part):
 @pytest.mark.parametrize(
     "url", ["http://", "http://me:secret@host:1", "ftp://host", "http://host:port", "http://h/?q=1"]
 )
-def test_what_is_no_url_of_a_service(tmp_path, url):
+def test_invalid_urls(tmp_path, url):
     with pytest.raises(StatusError) as error:
         fetch_primitives(url, "tiny", cache_dir=tmp_path)
     assert_one_line(error.value)
@@ -256,7 +256,7 @@ def test_a_cache_that_cannot_be_written(server, tmp_path):
 
 @pytest.fixture(scope="module")
 def champions(tmp_path_factory):
-    """A service of what comes with tandem."""
+    """A service of the bundled registry."""
     runs = tmp_path_factory.mktemp("runs")
     with StatusServer(DiskReader(runs), Registry(BUNDLED), port=0) as server:
         yield server

@@ -1,4 +1,4 @@
-"""docs/api.md: every curl in it is run, and what it says of errors and events is what there is."""
+"""docs/api.md: every curl in it is run, and its errors and events are complete."""
 
 import json
 import os
@@ -8,9 +8,10 @@ import subprocess
 from pathlib import Path
 
 import pytest
+from fastapi import routing
 
 from service.registry.registry import Registry
-from service.status import guard
+from service.status import auth, stream
 from service.status.stream import EVENT_SCHEMA
 from tests.status.conftest import serve
 from tests.status.runs import TOKEN, VIDEO, append, grid, publish, record, write_status
@@ -20,7 +21,7 @@ TEXT = (ROOT / "docs" / "api.md").read_text()
 
 
 def commands():
-    """What stands after "$ " in the examples, lines that go on put together."""
+    """The commands after "$ " in the examples, with continued lines joined."""
     blocks = re.findall(r"```console\n(.*?)```", TEXT, re.DOTALL)
     return [found for block in blocks for found in re.findall(r"^\$ ((?:.*\\\n)*.*)$", block, re.MULTILINE)]
 
@@ -75,5 +76,7 @@ def test_every_event_is_listed():
 
 
 def test_numbers():
-    assert f"more than {guard.BODY_TIMEOUT_S:g} s" in TEXT
-    assert f"more than {guard.MAX_BODY_BYTES // 1024} KiB" in TEXT
+    assert f"more than {auth.BODY_TIMEOUT_S:g} s" in TEXT
+    assert f"more than {auth.MAX_BODY_BYTES // 1024} KiB" in TEXT
+    assert f"At most {stream.MAX_STREAMS} streams" in TEXT
+    assert f"After {routing._PING_INTERVAL:g} seconds without an event" in TEXT

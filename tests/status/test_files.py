@@ -1,4 +1,4 @@
-"""Videos and blobs in ranges, and with entity tags."""
+"""Ranges and entity tags of videos and blobs."""
 
 import hashlib
 
@@ -38,7 +38,7 @@ def test_a_range_beyond_the_file(client, asked):
 @pytest.mark.parametrize(
     "asked", ["bytes=-", "bytes=9-1", "lines=0-1", "bytes=a-b", "bytes=0-1,4-5", "", "bytes=0x1-2"]
 )
-def test_what_is_no_range_gives_the_whole_file(client, asked):
+def test_a_malformed_range_gives_the_whole_file(client, asked):
     answer = client.get(URL, headers={"Range": asked})
     assert (answer.status_code, answer.content) == (200, VIDEO)
 
@@ -51,6 +51,27 @@ def test_not_changed(client):
         answer = client.get(URL, headers={"If-None-Match": given})
         assert (answer.status_code, answer.content, answer.headers["etag"]) == (304, b"", tag)
     assert client.get(URL, headers={"If-None-Match": '"other"'}).content == VIDEO
+
+
+def test_not_modified_since(client):
+    modified = client.get(URL).headers["last-modified"]
+    assert client.get(URL, headers={"If-Modified-Since": modified}).status_code == 304
+    assert client.get(URL, headers={"If-Modified-Since": "Thu, 01 Jan 1970 00:00:00 GMT"}).content == VIDEO
+
+
+def test_a_conditional_request_for_a_range(client):
+    """The entity tag counts before the range (RFC 9110, section 13.2.2)."""
+    tag = client.get(URL).headers["etag"]
+    answer = client.get(URL, headers={"If-None-Match": tag, "Range": f"bytes={len(VIDEO)}-"})
+    assert (answer.status_code, answer.content) == (304, b"")
+
+
+@pytest.mark.parametrize("path", ["/", "/page/index.html", "/page/main.js"])
+def test_the_page_is_revalidated(client, path):
+    first = client.get(path)
+    assert (first.status_code, first.headers["cache-control"]) == (200, "no-cache")
+    again = client.get(path, headers={"If-None-Match": first.headers["etag"]})
+    assert (again.status_code, again.content, again.headers["cache-control"]) == (304, b"", "no-cache")
 
 
 def test_a_range_of_a_file_that_changed_meanwhile(client, home):

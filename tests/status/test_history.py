@@ -1,4 +1,4 @@
-"""Metrics in columns: down-sampled by hand, read bit by bit, and made anew by a resumed run."""
+"""Metrics in columns: means computed by hand, incremental reading, and resumed runs."""
 
 from datetime import UTC, datetime
 
@@ -6,7 +6,7 @@ import pytest
 
 from service.io.files import write_atomic
 from service.status import history
-from service.status.history import Histories
+from service.status.history import HistoryCache
 from service.store.disk_reader import DiskReader
 from tests.status.runs import append, record, write_status
 
@@ -14,7 +14,7 @@ STARTED = datetime(2026, 1, 1, tzinfo=UTC)
 
 
 class CountingReader(DiskReader):
-    """Counts the records it hands out."""
+    """A reader that counts the records it returns."""
 
     handed_out = 0
 
@@ -36,7 +36,7 @@ def ask(histories, names=("x",), after=0, points=1000, run_id="cube"):
 
 def test_a_point_is_the_mean_of_its_iterations(root):
     append(root, "cube", *(record(i, x=value) for i, value in enumerate((1, 2, None, 6, 10, 20, 60), start=1)))
-    answer = ask(Histories(DiskReader(root)), points=3)
+    answer = ask(HistoryCache(DiskReader(root)), points=3)
     # seven iterations in three parts begin at 0, 2 and 4
     assert answer.iteration == (2, 4, 7)
     assert answer.env_steps == (2000, 4000, 7000)
@@ -46,35 +46,35 @@ def test_a_point_is_the_mean_of_its_iterations(root):
 
 def test_a_point_without_a_number(root):
     append(root, "cube", *(record(i, x=value) for i, value in enumerate((1, 3, None, None), start=1)))
-    assert ask(Histories(DiskReader(root)), points=2).metrics == {"x": (2.0, None)}
+    assert ask(HistoryCache(DiskReader(root)), points=2).metrics == {"x": (2.0, None)}
 
 
 def test_a_metric_that_comes_later_and_goes_again(root):
     append(root, "cube", record(1), record(2, x=0.25), record(3))
-    assert ask(Histories(DiskReader(root))).metrics == {"x": (None, 0.25, None)}
+    assert ask(HistoryCache(DiskReader(root))).metrics == {"x": (None, 0.25, None)}
 
 
 @pytest.mark.parametrize(("after", "iterations"), [(0, (1, 2, 3)), (2, (3,)), (3, ()), (99, ())])
 def test_after_an_iteration(root, after, iterations):
     append(root, "cube", *(record(i, x=i) for i in (1, 2, 3)))
-    answer = ask(Histories(DiskReader(root)), after=after)
+    answer = ask(HistoryCache(DiskReader(root)), after=after)
     assert (answer.iteration, answer.num_iterations, answer.last_iteration) == (iterations, len(iterations), 3)
     assert answer.metrics == {"x": iterations}
 
 
 def test_before_the_first_record(root):
-    answer = ask(Histories(DiskReader(root)), names=None)
+    answer = ask(HistoryCache(DiskReader(root)), names=None)
     assert (answer.last_iteration, answer.iteration, answer.metrics, answer.names) == (0, (), {}, ())
 
 
 def test_iteration_and_env_steps_are_columns_of_their_own(root):
     append(root, "cube", record(1, x=0.5))
-    assert ask(Histories(DiskReader(root)), names=["env_steps", "x", "x", "iteration"]).metrics == {"x": (0.5,)}
+    assert ask(HistoryCache(DiskReader(root)), names=["env_steps", "x", "x", "iteration"]).metrics == {"x": (0.5,)}
 
 
 def test_only_what_is_new_is_read(root):
     reader = CountingReader(root)
-    histories = Histories(reader)
+    histories = HistoryCache(reader)
     append(root, "cube", *(record(i, x=i) for i in range(1, 101)))
     ask(histories)
     append(root, "cube", record(101, x=101))
@@ -84,7 +84,7 @@ def test_only_what_is_new_is_read(root):
 
 
 def test_a_history_that_was_cut(root):
-    histories = Histories(DiskReader(root))
+    histories = HistoryCache(DiskReader(root))
     append(root, "cube", *(record(i, x=i) for i in (1, 2, 3, 4)))
     ask(histories)
     path = root / "cube" / "metrics.jsonl"
@@ -95,7 +95,7 @@ def test_a_history_that_was_cut(root):
 
 
 def test_a_history_that_was_cut_and_grew_again_unseen(root):
-    histories = Histories(DiskReader(root))
+    histories = HistoryCache(DiskReader(root))
     append(root, "cube", *(record(i, x=i) for i in (1, 2, 3, 4)))
     ask(histories)
     path = root / "cube" / "metrics.jsonl"
@@ -108,7 +108,7 @@ def test_a_history_that_was_cut_and_grew_again_unseen(root):
 def test_few_runs_are_kept(root, monkeypatch):
     monkeypatch.setattr(history, "MAX_RUNS", 2)
     reader = CountingReader(root)
-    histories = Histories(reader)
+    histories = HistoryCache(reader)
     for run_id in ("a", "b", "c"):
         write_status(root, run_id, started=STARTED)
         append(root, run_id, record(1, x=1), record(2, x=2))

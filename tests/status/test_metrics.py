@@ -1,4 +1,4 @@
-"""The page Prometheus reads, parsed by Prometheus' own parser."""
+"""The text of ``/metrics``, parsed by Prometheus' own parser."""
 
 import re
 from datetime import UTC, datetime, timedelta
@@ -15,7 +15,7 @@ from tests.status.runs import BEARER, CLIENT, append, record, status, write_runs
 
 @pytest.fixture
 def service(tmp_path):
-    """(client, directory of runs), asked already for something."""
+    """The pair (client, directory of runs), after one request."""
     write_runs(tmp_path / "runs")
     with serve(tmp_path) as server, httpx.Client(base_url=server.url, headers=BEARER, **CLIENT) as client:
         client.get("/v1/runs/old")
@@ -34,7 +34,7 @@ def value(samples, name, /, **labels):
     return samples[(name, *sorted(labels.items()))]
 
 
-def test_what_a_run_tells(service):
+def test_metrics_of_a_run(service):
     samples = scrape(service[0])
     expected = {
         "tandem_run_iterations_total": 3,
@@ -63,7 +63,7 @@ def test_what_a_run_tells(service):
     assert value(samples, "tandem_runs", state="finished") == value(samples, "tandem_runs", state="running") == 1
 
 
-def test_what_an_iteration_does_not_have_is_left_out(service):
+def test_missing_metrics_are_left_out(service):
     client, runs = service
     append(runs, "cube", record(4, **{"bob/success_rate": None}))
     samples = scrape(client)
@@ -72,7 +72,7 @@ def test_what_an_iteration_does_not_have_is_left_out(service):
     assert ("tandem_run_bob_success_ratio", ("run", "old")) in samples
 
 
-def test_actors_of_a_run_that_has_ended_alert_nobody(service):
+def test_actors_of_an_ended_run_cause_no_alert(service):
     client, runs = service
     write_status(runs, "cube", state="failed")
     assert [

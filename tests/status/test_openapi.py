@@ -1,4 +1,4 @@
-"""The OpenAPI document is true: schemathesis asks a real service for what it allows, and for what it does not."""
+"""The OpenAPI document is correct: schemathesis sends a real service valid and invalid requests."""
 
 import subprocess
 import sys

@@ -1,4 +1,4 @@
-"""The web page in a real browser: what it draws, that it goes on by itself, and that no text it is told is markup."""
+"""The web page in a real browser: its content, its updates, and that text is never read as markup."""
 
 import re
 
@@ -35,7 +35,7 @@ def browser():
 
 @pytest.fixture
 def visit(browser, server):
-    """The service of all tests here, which nobody changes."""
+    """A visit to the shared service, which no test changes."""
     visit = Visit(browser, server.url)
     yield visit
     visit.context.close()
@@ -43,7 +43,7 @@ def visit(browser, server):
 
 @pytest.fixture
 def own(browser, tmp_path):
-    """(visit, home, server): a service for one test, which may change everything."""
+    """A service for one test, which may change everything: (visit, home, server)."""
     write_runs(tmp_path / "runs")
     publish(Registry(tmp_path / "registry"), "panda-cube")
     with serve(tmp_path) as server:
@@ -53,7 +53,7 @@ def own(browser, tmp_path):
 
 
 def num_points(visit, name, number):
-    """Until a curve has so many points."""
+    """Wait until a curve has a number of points."""
     d = f"document.querySelector('g.curve[data-name=\"{name}\"] path.raw')?.getAttribute('d')"
     visit.wait(f"({d} ?? '').split(/[ML]/).length - 1 === {number}")
 
@@ -114,7 +114,7 @@ def test_curves(visit):
     assert visit.chart("Bob on random goals").get_by_text("no values yet").count() == 1
 
 
-def test_what_is_missing_is_a_gap(own):
+def test_a_missing_value_is_a_gap(own):
     visit, home, _ = own
     append(home / "runs", "cube", record(4, **{"bob/success_rate": None}), record(5))
     visit.go("#/runs/cube")
@@ -230,11 +230,12 @@ def test_versions(visit):
 
 def test_the_newest_video_plays(own):
     visit, home, _ = own
-    video = imageio_ffmpeg.write_frames(home / "runs" / "old" / "rounds.mp4", (64, 32), fps=25)
-    video.send(None)
+    path = str(home / "runs" / "old" / "rounds.mp4")
+    writer = imageio_ffmpeg.write_frames(path, (64, 32), fps=25, codec="libx264", macro_block_size=2)
+    writer.send(None)
     for shade in range(0, 250, 10):
-        video.send(np.full((32, 64, 3), shade, np.uint8))
-    video.close()
+        writer.send(np.full((32, 64, 3), shade, np.uint8))
+    writer.close()
     page = visit.go("#/runs/old").page
     visit.wait("document.querySelector('video')?.readyState >= 1")
     found = page.locator("video").evaluate("v => [v.videoWidth, v.videoHeight, v.duration]")
@@ -246,7 +247,7 @@ def test_the_newest_video_plays(own):
 # --- how it goes on -------------------------------------------------------------------------------------------------
 
 
-def test_a_run_goes_on_before_ones_eyes(own):
+def test_a_run_is_updated_live(own):
     visit, home, _ = own
     page = visit.go("#/runs/cube").page
     num_points(visit, "alice/valid_fraction", 3)
@@ -260,7 +261,7 @@ def test_a_run_goes_on_before_ones_eyes(own):
     assert visit.complaints == []
 
 
-def test_a_run_that_was_resumed_from_before(own):
+def test_a_run_that_was_resumed_from_an_earlier_iteration(own):
     visit, home, _ = own
     visit.go("#/runs/cube")
     num_points(visit, "bob/success_rate", 3)
@@ -274,7 +275,7 @@ def test_a_run_that_was_resumed_from_before(own):
     assert visit.raw("bob/success_rate")[0][1] == pytest.approx((2000, 0.75), rel=0.002)
 
 
-def test_the_list_of_runs_goes_on(own):
+def test_the_list_of_runs_is_updated_live(own):
     visit, home, _ = own
     page = visit.go().page
     link = page.get_by_role("link", name="cube", exact=True)
@@ -317,7 +318,7 @@ def test_the_runs_go_away_and_come_back(own, place):
 # --- where one is ---------------------------------------------------------------------------------------------------
 
 
-def test_links_last(visit):
+def test_links_are_permanent(visit):
     page = visit.go().page
     page.get_by_role("link", name="old", exact=True).click()
     page.get_by_role("heading", name="old finished").wait_for()
@@ -336,7 +337,7 @@ def test_the_keyboard_skips_to_the_content(visit):
     assert page.url.endswith("#/runs/cube")
 
 
-def test_what_there_is_not(visit):
+def test_views_and_runs_that_do_not_exist(visit):
     for place, sentence in {
         "#/runs/nope": "No run 'nope' in",
         "#/runs/a/b": "This page has no such part.",
@@ -377,7 +378,7 @@ def test_nothing_yet(browser, tmp_path):
 
 
 def make_hostile(home):
-    """Every text of a run that may be anything is."""
+    """Put markup into every free text of a run."""
     long = f"{HOSTILE} {'x' * 300}"
     actor = ActorStatus(**{**RUNNING, "name": HOSTILE, "node": long, "last_error": long})
     write_status(
@@ -452,7 +453,7 @@ def test_light_and_dark(browser, server, scheme):
     visit.context.close()
 
 
-def test_for_other_machines_with_the_token_as_password(browser, tmp_path):
+def test_a_public_service_with_the_token_as_password(browser, tmp_path):
     write_runs(tmp_path / "runs")
     with serve(tmp_path, host="0.0.0.0") as server:
         stranger = Visit(browser, server.url)

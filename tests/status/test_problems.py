@@ -1,4 +1,4 @@
-"""Errors: one shape for all of them, one line that says what to do, and no more than that."""
+"""Errors: one format, one line that says what to do, and no internals."""
 
 import json
 import logging
@@ -8,8 +8,8 @@ import httpx
 import pytest
 
 from service.registry.registry import Registry
-from service.status import guard
-from service.status.guard import MAX_BODY_BYTES
+from service.status import auth
+from service.status.auth import MAX_BODY_BYTES
 from service.status.server import StatusServer
 from service.store.disk_reader import DiskReader
 from tests.status.conftest import serve
@@ -19,12 +19,13 @@ JSON = {"Content-Type": "application/json"}
 
 
 def assert_problem(answer, status, kind, *parts):
-    """RFC 9457, and one line with these parts."""
+    """Check that an answer is a problem (RFC 9457) whose one-line detail has these parts."""
     assert answer.status_code == status
     assert answer.headers["content-type"] == "application/problem+json"
     problem = answer.json()
     assert (problem["status"], problem["type"]) == (status, kind if ":" in kind else f"urn:tandem:{kind}")
     assert problem["title"]
+    assert ("errors" in problem) == problem["type"].endswith(":invalid-request")
     assert "\n" not in problem["detail"]
     for part in parts:
         assert part in problem["detail"]
@@ -122,15 +123,15 @@ def test_a_body_as_long_as_it_may_be(client):
     assert_problem(client.put("/v1/primitives/tiny/aliases/best", content=body, headers=JSON), 404, "unknown-version")
 
 
-def test_what_is_announced_is_refused_before_it_comes(server):
+def test_a_long_body_is_refused_by_its_announced_length(server):
     head = f"POST /v1/runs/old/stop HTTP/1.1\r\nHost: localhost\r\nAuthorization: {BEARER['Authorization']}\r\n"
     with socket.create_connection(("127.0.0.1", server.port), timeout=300) as connection:
         connection.sendall(f"{head}Content-Length: {10**15}\r\n\r\n".encode())
         assert connection.recv(1000).startswith(b"HTTP/1.1 413")
 
 
-def test_a_body_that_does_not_come(server, monkeypatch):
-    monkeypatch.setattr(guard, "BODY_TIMEOUT_S", 0.1)
+def test_a_body_that_does_not_arrive(server, monkeypatch):
+    monkeypatch.setattr(auth, "BODY_TIMEOUT_S", 0.1)
     head = f"POST /v1/runs/old/stop HTTP/1.1\r\nHost: localhost\r\nAuthorization: {BEARER['Authorization']}\r\n"
     with socket.create_connection(("127.0.0.1", server.port), timeout=300) as connection:
         connection.sendall(f"{head}Content-Length: 10\r\n\r\nhalf".encode())
@@ -174,13 +175,13 @@ def test_damaged_files(tmp_path):
 
 
 class BrokenReader(DiskReader):
-    """Has a mistake in it."""
+    """A reader with a bug."""
 
     def runs(self):
         raise ZeroDivisionError("a secret of its own")
 
 
-def test_a_mistake_of_ours_is_told_to_the_log_alone(tmp_path, caplog):
+def test_an_unexpected_error_is_only_in_the_log(tmp_path, caplog):
     caplog.set_level(logging.ERROR)
     with StatusServer(BrokenReader(tmp_path), Registry(tmp_path / "registry"), port=0) as server:
         answer = httpx.get(f"{server.url}/v1/runs", **CLIENT)

@@ -1,4 +1,4 @@
-"""The token is in no log, on no page and in no answer, whatever is asked and however wrong."""
+"""The token never appears in a log, a page or an answer."""
 
 import logging
 

@@ -7,7 +7,6 @@ import socket
 import subprocess
 import sys
 import threading
-import time
 from pathlib import Path
 
 import httpx
@@ -27,7 +26,7 @@ ROOT = Path(__file__).parents[2]
 pytestmark = pytest.mark.usefixtures("default_signals")
 
 
-def test_a_free_port_is_told(home):
+def test_port_0_gives_a_free_port(home):
     with serve(home) as server:
         assert server.port != 0
         assert server.url == f"http://127.0.0.1:{server.port}"
@@ -78,7 +77,7 @@ def test_a_port_that_is_taken(home):
 
 
 @pytest.mark.parametrize("host", ["no-such-host.invalid", "203.0.113.7", "", "a b", "x" * 300])
-def test_a_host_that_is_not_here(home, host):
+def test_a_host_of_another_machine(home, host):
     with pytest.raises(StatusError) as error:
         serve(home, host=host, token=None)
     assert "\n" not in str(error.value)
@@ -128,9 +127,7 @@ def test_the_foreground_ends_with_a_signal(home, number):
     answers = []
 
     def use_and_end():
-        while not server.started:
-            time.sleep(0.01)
-        answers.append(httpx.get(f"{server.url}/livez", **CLIENT).status_code)
+        answers.append(httpx.get(f"{server.url}/livez", **CLIENT).status_code)  # once it serves
         os.kill(os.getpid(), number)
 
     other = threading.Thread(target=use_and_end)

@@ -1,4 +1,4 @@
-"""Event streams over real connections, while a run writes its files."""
+"""Event streams over real connections."""
 
 import json
 import time
@@ -6,16 +6,24 @@ from contextlib import contextmanager
 
 import httpx
 import pytest
+from fastapi import routing
 
 from service.io.files import write_atomic
+from service.registry.registry import Registry
 from service.status import stream
+from service.status.server import StatusServer
+from service.status.stream import RunFollower
+from service.store.disk_reader import DiskReader
+from service.store.redis_reader import RedisReader
+from service.store.redis_writer import RedisWriter
 from tests.status.conftest import serve
-from tests.status.runs import BEARER, CLIENT, append, record, write_status
+from tests.status.runs import BEARER, CLIENT, append, record, status, write_status
+from tests.store.stores import Killable
 
 
 @pytest.fixture
 def root(tmp_path, monkeypatch):
-    """A directory of runs with one that goes on, three iterations so far."""
+    """A directory with one active run of three iterations."""
     monkeypatch.setattr(stream, "POLL_S", 0.02)
     write_status(tmp_path / "runs", "cube")
     append(tmp_path / "runs", "cube", record(1), record(2), record(3))
@@ -30,7 +38,7 @@ def service(root):
 
 @contextmanager
 def listening(client, query="", headers=None):
-    """Events of the run: (kind, data, id) one after the other."""
+    """Open a stream; yield an iterator over its events (kind, data, id)."""
     url = f"/v1/runs/cube/metrics/stream{query}"
     with client.stream("GET", url, headers=headers, timeout=300) as answer:
         assert answer.status_code == 200
@@ -52,13 +60,13 @@ def events(answer):
 
 
 def take(stream, *kinds):
-    """The next events, which have to be of these kinds."""
+    """The next events; asserts their kinds."""
     taken = [next(stream) for _ in kinds]
     assert [kind for kind, _, _ in taken] == list(kinds)
     return taken
 
 
-def test_what_is_new_comes_by_itself(root, service):
+def test_new_records_and_changes_are_sent(root, service):
     with listening(service[1]) as heard:
         newest, first_status = take(heard, "metrics", "status")
         assert newest == ("metrics", record(3), "3")
@@ -69,7 +77,7 @@ def test_what_is_new_comes_by_itself(root, service):
         assert take(heard, "status")[0][1]["iteration"] == 5
 
 
-def test_it_ends_with_the_run(root, service):
+def test_the_stream_ends_with_the_run(root, service):
     with listening(service[1]) as heard:
         take(heard, "metrics", "status")
         append(root, "cube", record(4))
@@ -88,7 +96,7 @@ def test_from_the_beginning(service):
         assert [identity for _, _, identity in take(heard, "metrics", "metrics", "metrics")] == ["1", "2", "3"]
 
 
-def test_a_browser_that_comes_back_goes_on_where_it_was(root, service):
+def test_a_browser_that_reconnects_gets_what_it_missed(root, service):
     append(root, "cube", record(4))
     with listening(service[1], "?after_iteration=0", {"Last-Event-ID": "2"}) as heard:
         assert [identity for _, _, identity in take(heard, "metrics", "metrics", "status")] == ["3", "4", None]
@@ -105,14 +113,34 @@ def test_a_resumed_run_makes_its_last_iterations_anew(root, service):
         assert take(heard, "metrics") == [("metrics", anew, "2")]
 
 
-def test_a_browser_that_comes_back_after_that(root, service):
+def test_a_browser_that_reconnects_after_a_resume(root, service):
     with listening(service[1], headers={"Last-Event-ID": "9"}) as heard:
         assert take(heard, "reset")[0][1] == {"after_iteration": 3}
         append(root, "cube", record(4))
         assert next(event for event in heard if event[0] == "metrics") == ("metrics", record(4), "4")
 
 
-def test_the_store_is_away_for_a_while(root, service):
+def test_a_run_that_is_only_in_redis(tmp_path):
+    redis = Killable(tmp_path)
+    try:
+        writer = RedisWriter(redis.address, "far")
+        writer.status(status("far", state="finished", iteration=5))
+        for iteration in range(1, 6):
+            writer.metrics(record(iteration))
+        writer.close()
+        with StatusServer(RedisReader(redis.address), Registry(tmp_path / "registry"), port=0) as server:
+            url = f"{server.url}/v1/runs/far/metrics/stream?after_iteration=3"
+            with httpx.stream("GET", url, **CLIENT) as answer:
+                first, second, known, last = events(answer)
+            missing = httpx.get(url.replace("far", "nobody"), **CLIENT)
+    finally:
+        redis.server.close()
+    assert [first, second] == [("metrics", record(4), "4"), ("metrics", record(5), "5")]
+    assert (known[0], last[0], last[1]["state"]) == ("status", "end", "finished")
+    assert missing.json()["type"] == "urn:tandem:unknown-run"
+
+
+def test_the_store_is_unavailable_for_a_while(root, service):
     with listening(service[1]) as heard:
         take(heard, "metrics", "status")
         root.rename(root.parent / "elsewhere")
@@ -122,13 +150,34 @@ def test_the_store_is_away_for_a_while(root, service):
         assert take(heard, "metrics") == [("metrics", record(4), "4")]
 
 
-def test_a_stream_says_that_it_lives(service, monkeypatch):
-    monkeypatch.setattr(stream, "KEEP_ALIVE_S", 0.05)
+def test_an_unavailable_store_is_reported_once(root):
+    reader, elsewhere = DiskReader(root), root.parent / "elsewhere"
+    follower = RunFollower(reader, reader.run("cube"), None, None)
+    assert [event.event for event in follower.poll()] == ["metrics", "status"]
+    for iteration in (4, 5):
+        root.rename(elsewhere)
+        assert [[event.event for event in follower.poll()] for _ in range(3)] == [["unavailable"], [], []]
+        elsewhere.rename(root)
+        append(root, "cube", record(iteration))
+        assert [(event.event, event.id) for event in follower.poll()] == [("metrics", str(iteration))]
+    assert not follower.ended
+
+
+def test_the_stream_ends_when_the_run_was_deleted(root, service):
+    with listening(service[1]) as heard:
+        take(heard, "metrics", "status")
+        (root / "cube").rename(root.parent / "cube")
+        assert [kind for kind, _, _ in heard] == ["unavailable"]
+
+
+def test_an_idle_stream_is_kept_alive(service, monkeypatch):
+    assert routing._PING_INTERVAL <= 15  # as the document says
+    monkeypatch.setattr(routing, "_PING_INTERVAL", 0.05)
     with service[1].stream("GET", "/v1/runs/cube/metrics/stream", timeout=300) as answer:
-        assert ": nothing new" in (line for line in answer.iter_lines())
+        assert next(line for line in answer.iter_lines() if line.startswith(":"))
 
 
-def test_there_are_not_too_many(root, service, monkeypatch):
+def test_the_number_of_streams_is_limited(root, service, monkeypatch):
     monkeypatch.setattr(stream, "MAX_STREAMS", 1)
     server, client = service
     with listening(client) as heard:
@@ -137,13 +186,12 @@ def test_there_are_not_too_many(root, service, monkeypatch):
         assert (refused.status_code, refused.json()["type"]) == (503, "urn:tandem:too-many-streams")
         assert "tandem_http_streams 1.0" in client.get("/metrics").text
     deadline_s = time.monotonic() + 300
-    while server.app.streams.num_open and time.monotonic() < deadline_s:  # hears of the end when it next writes
-        append(root, "cube", record(4))
+    while server.app.streams.num_open and time.monotonic() < deadline_s:
         time.sleep(0.02)
     assert server.app.streams.num_open == 0
 
 
-def test_the_service_stops_although_somebody_listens(root, monkeypatch):
+def test_the_service_stops_with_open_streams(root, monkeypatch):
     """And not because uvicorn's patience ended, or this test's."""
     monkeypatch.setattr("service.status.server._GRACE_S", 3600)
     monkeypatch.setattr("service.status.server.STOP_TIMEOUT_S", 300.0)
@@ -156,7 +204,7 @@ def test_the_service_stops_although_somebody_listens(root, monkeypatch):
         assert list(heard) == []
 
 
-def test_no_stream_is_for_ever(root, service):
-    service[0].app.streams._max_age_s = 0.0
+def test_a_stream_has_a_greatest_age(service, monkeypatch):
+    monkeypatch.setattr(stream, "MAX_AGE_S", 0.0)
     with listening(service[1]) as heard:
         assert [kind for kind, _, _ in heard] == ["metrics", "status"]

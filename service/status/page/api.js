@@ -1,13 +1,16 @@
-// The service's API: reading only. Addresses are relative to the page, so that it also works behind a proxy's prefix.
+// Reading the service's API, and the banner that says when the service does not answer. URLs are relative to the page,
+// so that it also works behind a proxy's prefix.
 
-import { answered, silent, troubled } from "./health.js";
+import { setText } from "./dom.js";
 
 const ROOT = new URL("../", import.meta.url);
 const TIMEOUT_MS = 10_000;
 const AWAY = new Set([502, 503, 504]);
 let serverAheadMs = 0;
+const troubles = new Map();
+let answeredAt = new Date();
 
-/** An answer that is a problem, or none at all (status 0). */
+/** A problem as answer, or no answer (status 0). */
 export class ApiError extends Error {
   constructor(status, detail) {
     super(detail);
@@ -15,12 +18,12 @@ export class ApiError extends Error {
   }
 }
 
-/** The address of a path below the service's root. */
+/** The URL of a path below the service's root. */
 export function address(...parts) {
   return new URL(parts.map(encodeURIComponent).join("/"), ROOT).href;
 }
 
-/** What the service says of a path; ``query`` is a list of pairs. */
+/** GET a path; ``query`` is a list of pairs. */
 export async function get(parts, query = [], signal = undefined) {
   const url = `${address(...parts)}${query.length ? `?${new URLSearchParams(query)}` : ""}`;
   const response = await ask(url, signal);
@@ -39,12 +42,12 @@ export async function get(parts, query = [], signal = undefined) {
   throw new ApiError(response.status, detail);
 }
 
-/** Now, by the service's clock: ages are right where this machine's clock is wrong. */
+/** The time by the service's clock, so that ages are right even if this machine's clock is wrong. */
 export function now() {
   return Date.now() + serverAheadMs;
 }
 
-/** A detail as a sentence. */
+/** Make a problem's detail a sentence. */
 export function sentence(detail) {
   const text = detail.trim();
   return `${text.charAt(0).toUpperCase()}${text.slice(1)}${/[.!?]$/.test(text) ? "" : "."}`;
@@ -79,6 +82,36 @@ function limited(signal) {
 
 function noteClock(response) {
   const there = Date.parse(response.headers.get("date") ?? "");
-  // the header has whole seconds: a smaller difference says nothing
+  // the header has whole seconds: a smaller difference means nothing
   if (Number.isFinite(there)) serverAheadMs = Math.abs(there - Date.now()) > 2000 ? there - Date.now() : 0;
+}
+
+/** Fires "recovered" when the service answers again. */
+export const connection = new EventTarget();
+
+/** Record an answer; ``about`` names the part of the API it came from. */
+export function answered(about) {
+  answeredAt = new Date();
+  if (troubles.delete("network")) connection.dispatchEvent(new Event("recovered"));
+  troubles.delete(about);
+  show();
+}
+
+/** Record that there was no answer. */
+function silent() {
+  troubles.set("network", `No answer from the service since ${answeredAt.toLocaleTimeString()}, trying again \u2026`);
+  show();
+}
+
+/** Record an answer that says why the service cannot read something. */
+export function troubled(about, message) {
+  troubles.set(about, `${message} Trying again \u2026`);
+  show();
+}
+
+function show() {
+  const banner = document.getElementById("banner");
+  const text = troubles.get("network") ?? [...troubles.values()].join(" ");
+  setText(banner, text);
+  banner.hidden = !text;
 }

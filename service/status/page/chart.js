@@ -1,6 +1,6 @@
-// One panel of curves: each value thin, smoothed thick; a legend with the numbers at the cursor, or else the newest.
+// One panel of curves: values as thin lines, smoothed as thick lines; a legend with the numbers at the cursor, or the
+// newest; and its axes.
 
-import { drawAxes, linear, roundUp, ticks } from "./axes.js";
 import { el, setText, svg } from "./dom.js";
 import { count } from "./format.js";
 
@@ -8,14 +8,15 @@ const HEIGHT = 190;
 const MARGIN = { left: 50, right: 22, top: 8, bottom: 24 };
 const NUM_Y_TICKS = 4;
 const PIXELS_PER_X_TICK = 80;
+const STEPS = [1, 2, 2.5, 5, 10];
 
 export class Chart {
-  /** ``point`` is called with the index of the point that is looked at, or null. */
+  /** ``point`` is called with the index of the point under the cursor, or null. */
   constructor(panel, series, point) {
     Object.assign(this, { panel, series, pointAt: point });
     this.where = el("span", { class: "where" });
     this.values = panel.curves.map(() => el("output", {}));
-    // a slider along the curve: a keyboard moves it, and a screen reader tells what is there
+    // a slider along the curve, for keyboards and screen readers
     this.plot = el("div", { class: "plot", tabindex: 0, role: "slider", "aria-label": panel.title, "aria-valuemin": 0 });
     const legend = panel.curves.map((curve, i) =>
       el("li", { class: `c${i}` }, el("span", { class: "swatch", "aria-hidden": "true" }), `${curve.label} `, this.values[i]),
@@ -49,7 +50,7 @@ export class Chart {
     return linear(this.frame.left, this.frame.right, 0, this.greatest)(event.clientX - left);
   }
 
-  /** Draw everything, in pixels, so that letters keep their size. */
+  /** Draw everything, in pixels, so that text keeps its size. */
   draw(cursor) {
     const width = this.plot.clientWidth;
     if (!width) return;
@@ -91,7 +92,7 @@ export class Chart {
     return group;
   }
 
-  /** [x, y] of each value, null where there is none. */
+  /** [x, y] of each value, null if there is none. */
   pixels(values) {
     return values.map((value, i) => (value === null ? null : [round(this.x(this.series.steps[i])), round(this.y(value))]));
   }
@@ -101,7 +102,7 @@ export class Chart {
     return svg("text", { class: "nothing", ...middle }, "no values yet");
   }
 
-  /** Show the numbers of one point; the newest for null. */
+  /** Show the numbers of one point; of the newest for null. */
   point(index) {
     this.cursor = index;
     const { series, panel } = this;
@@ -127,7 +128,7 @@ export class Chart {
   }
 }
 
-/** A line through points, with gaps where they are null. */
+/** A line through points, with gaps at null. */
 function line(className, points) {
   const parts = points.map((point, i) => (point ? `${points[i - 1] ? "L" : "M"}${point[0]} ${point[1]}` : ""));
   return svg("path", { class: className, d: parts.join("") });
@@ -135,4 +136,42 @@ function line(className, points) {
 
 function round(pixels) {
   return Math.round(100 * pixels) / 100;
+}
+
+/** Round numbers from ``low`` to ``high``, about ``number`` of them. */
+function ticks(low, high, number) {
+  const rough = (high - low) / Math.max(1, number);
+  if (!(rough > 0)) return [low];
+  const power = 10 ** Math.floor(Math.log10(rough));
+  const step = power * STEPS.find((factor) => factor * power >= rough * 0.999);
+  const first = Math.ceil(low / step - 1e-9);
+  const last = Math.floor(high / step + 1e-9);
+  return Array.from({ length: last - first + 1 }, (_, i) => Number(((first + i) * step).toPrecision(12)));
+}
+
+/** Round a maximum up to the next tick, so that the highest tick is the top. */
+function roundUp(value, number) {
+  if (!(value > 0)) return 1;
+  const [first, second = 2 * first] = ticks(0, value, number).slice(1);
+  const step = second - first || value;
+  return Math.ceil(value / step - 1e-9) * step;
+}
+
+/** A linear map from one interval to another. */
+function linear(from, to, low, high) {
+  const factor = from === to ? 0 : (high - low) / (to - from);
+  return (value) => low + (value - from) * factor;
+}
+
+/** Grid lines and numbers: ``frame`` has left, right, top, bottom in pixels; x and y are maps to pixels. */
+function drawAxes(frame, x, y, xTicks, yTicks, xText, yText) {
+  const horizontal = yTicks.flatMap((value) => [
+    svg("line", { class: "grid", x1: frame.left, x2: frame.right, y1: y(value), y2: y(value) }),
+    svg("text", { class: "tick y", x: frame.left - 6, y: y(value), dy: "0.32em", "data-value": value }, yText(value)),
+  ]);
+  const vertical = xTicks.map((value) =>
+    svg("text", { class: "tick x", x: x(value), y: frame.bottom + 16, "data-value": value }, xText(value)),
+  );
+  const base = svg("line", { class: "base", x1: frame.left, x2: frame.right, y1: frame.bottom, y2: frame.bottom });
+  return svg("g", { class: "axes" }, ...horizontal, base, ...vertical);
 }

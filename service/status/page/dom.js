@@ -1,13 +1,13 @@
-// Elements made by code. Text only ever becomes a text node, so no name or message can be markup.
+// Elements made by code. Text always becomes a text node, so that no name or message is read as markup.
 
 const SVG = "http://www.w3.org/2000/svg";
 
-/** An element with attributes (null and false leave one out) and children: nodes, or text. */
+/** An element with attributes (null and false omit one) and children: nodes or text. */
 export function el(tag, attributes = {}, ...children) {
   return fill(document.createElement(tag), attributes, children);
 }
 
-/** The same in SVG. */
+/** An SVG element with attributes and children. */
 export function svg(tag, attributes = {}, ...children) {
   return fill(document.createElementNS(SVG, tag), attributes, children);
 }
@@ -20,12 +20,12 @@ function fill(element, attributes, children) {
   return element;
 }
 
-/** Set text only where it changed: what a reader has selected stays selected. */
+/** Set text only if it changed, so that a selection stays. */
 export function setText(element, text) {
   if (element.textContent !== text) element.textContent = text;
 }
 
-/** A part of a page: a heading, and a body that its owner fills. */
+/** A part of a page: a heading and an empty body. */
 export function section(title, className = "") {
   const id = `s-${title.toLowerCase().replace(/[^a-z]+/g, "-")}`;
   const body = el("div", { class: "body" });
@@ -33,7 +33,7 @@ export function section(title, className = "") {
   return { root, body };
 }
 
-/** A sentence in place of what there is not. */
+/** A note in place of missing content. */
 export function note(...content) {
   return el("p", { class: "note" }, ...content);
 }

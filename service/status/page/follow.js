@@ -1,8 +1,6 @@
-// A run as it goes on: its history first, then what is new. When anything breaks, it begins again from the history.
+// Follow a run: first its history, then new events. After any failure it starts again with the history.
 
-import { address, get } from "./api.js";
-import { answered, connection, troubled } from "./health.js";
-import { sleep, visible } from "./times.js";
+import { address, answered, connection, get, troubled } from "./api.js";
 
 const ACTIVE = new Set(["starting", "running"]);
 const MAX_POINTS = 600;
@@ -11,15 +9,12 @@ const AGAIN_MS = 1000;
 const RETRY_MS = 2000;
 const ENDED_MS = 5000;
 
-/** Whether a run goes on. */
+/** Whether a run is in progress. */
 export function isActive(run) {
   return ACTIVE.has(run.state);
 }
 
-/**
- * Follow a run until the view is left. ``listener`` has status(run), history(history), record(record) and
- * failed(error).
- */
+/** Follow a run until the view is left. ``listener`` has status(run), history(history), record(record), failed(error). */
 export async function follow(runId, names, listener, signal) {
   while (!signal.aborted) {
     await visible(signal);
@@ -27,7 +22,7 @@ export async function follow(runId, names, listener, signal) {
   }
 }
 
-/** One try; returns after how long to try again. */
+/** Make one attempt; returns the milliseconds until the next. */
 async function once(runId, names, listener, signal) {
   try {
     const run = await get(["v1", "runs", runId], [], signal);
@@ -44,7 +39,7 @@ async function once(runId, names, listener, signal) {
   }
 }
 
-/** Resolve when a run that has ended is another one: it was resumed, or made anew. */
+/** Resolve when a run that has ended was resumed or replaced. */
 async function untilResumed(run, listener, signal) {
   while (!signal.aborted) {
     await sleep(ENDED_MS, signal);
@@ -55,7 +50,7 @@ async function untilResumed(run, listener, signal) {
   }
 }
 
-/** Resolve when the stream has ended, for whatever reason; the history is asked for again then. */
+/** Resolve when the stream has ended, for any reason; the history is then loaded again. */
 function listen(runId, names, history, listener, signal) {
   const query = new URLSearchParams([...names.map((name) => ["names", name]), ["after_iteration", history.last_iteration]]);
   const source = new EventSource(`${address("v1", "runs", runId, "metrics", "stream")}?${query}`);
@@ -71,7 +66,7 @@ function listen(runId, names, history, listener, signal) {
     on("metrics", (record) => {
       listener.record(record);
       answered("v1/runs");
-      if (++numRecords > MAX_RECORDS) done(); // the history has them in fewer points
+      if (++numRecords > MAX_RECORDS) done(); // the history has the same in fewer points
     });
     on("status", (run) => {
       listener.status(run);
@@ -80,10 +75,49 @@ function listen(runId, names, history, listener, signal) {
     on("unavailable", ({ detail }) => troubled("v1/runs", `The runs cannot be read: ${detail}.`));
     on("reset", done);
     on("end", done);
-    source.addEventListener("error", done); // not left to the browser, which gives up on some errors
+    source.addEventListener("error", done); // browsers do not reconnect after every error
     document.addEventListener("visibilitychange", () => document.hidden && done(), { signal: stopped.signal });
-    connection.addEventListener("recovered", done, { signal: stopped.signal }); // it may have died without a word
+    connection.addEventListener("recovered", done, { signal: stopped.signal }); // the stream may be dead without an error
     signal.addEventListener("abort", done, { signal: stopped.signal });
     if (signal.aborted) done();
   });
+}
+
+/** Resolve after some time, or when the view is left. */
+function sleep(milliseconds, signal) {
+  return new Promise((resolve) => {
+    if (signal.aborted) return resolve();
+    const timer = setTimeout(done, milliseconds);
+    signal.addEventListener("abort", done, { once: true });
+    function done() {
+      clearTimeout(timer);
+      signal.removeEventListener("abort", done);
+      resolve();
+    }
+  });
+}
+
+/** Resolve when the page is visible: a tab in the background makes no requests. */
+async function visible(signal) {
+  while (document.hidden && !signal.aborted) {
+    await new Promise((resolve) => {
+      const options = { once: true };
+      document.addEventListener("visibilitychange", resolve, options);
+      signal.addEventListener("abort", resolve, options);
+    });
+  }
+}
+
+/** Call an async function repeatedly until the view is left; its errors are logged. */
+export async function every(milliseconds, signal, task) {
+  while (!signal.aborted) {
+    await visible(signal);
+    if (signal.aborted) return;
+    try {
+      await task();
+    } catch (error) {
+      if (!signal.aborted) console.warn(error);
+    }
+    await sleep(milliseconds, signal);
+  }
 }

@@ -1,4 +1,4 @@
-// Numbers, times and sizes in words.
+// Numbers, times and sizes as text.
 
 const NBSP = "\u00a0";
 const PREFIXES = [[1e12, "T"], [1e9, "G"], [1e6, "M"], [1e3, "k"]];

@@ -1,11 +1,10 @@
-// The goal map: a picture from above for each layer of height, one square for each cell.
+// The goal map: a view from above for each layer of height, one square for each cell.
 
-import { colour, colourBar } from "./colours.js";
 import { el, setText, svg } from "./dom.js";
-import { count, percent } from "./format.js";
-import { cellText, heights, layers, meanSuccess, MEASURES } from "./grid.js";
+import { count, percent, quantity } from "./format.js";
 
 const IDLE = "Point at a cell, or move with the arrow keys and page up and down.";
+const STOPS = [[68, 1, 84], [59, 82, 139], [33, 145, 140], [94, 201, 98], [253, 231, 37]];
 const MOVES = {
   ArrowLeft: [-1, 0, 0], ArrowRight: [1, 0, 0], ArrowDown: [0, -1, 0], ArrowUp: [0, 1, 0], PageDown: [0, 0, -1], PageUp: [0, 0, 1],
 };
@@ -53,7 +52,7 @@ export class GoalMap {
     });
   }
 
-  /** To the next cell in a direction in which a goal was proposed. */
+  /** Move to the next cell, in one direction, in which a goal was proposed. */
   step(move) {
     const cells = this.layers.flatMap((layer) => layer.cells);
     let place = this.chosen ? [this.chosen.x, this.chosen.y, this.chosen.z] : null;
@@ -115,4 +114,89 @@ function lattice(columns, rows) {
   const vertical = Array.from({ length: columns + 1 }, (_, x) => `M${x} 0V${rows}`);
   const horizontal = Array.from({ length: rows + 1 }, (_, y) => `M0 ${y}H${columns}`);
   return [...vertical, ...horizontal].join("");
+}
+
+/** Quantities shown by colour: ``share`` is from 0 to 1, null if unknown. */
+const MEASURES = [
+  {
+    key: "success",
+    label: "Difficulty",
+    low: "hard: Bob never solves it",
+    high: "easy: he always does",
+    share: (cell) => (cell.num_tries ? cell.success_rate : null),
+  },
+  {
+    key: "learnability",
+    label: "Learnability",
+    low: "0: always or never solved",
+    high: "0.25: solved half the time",
+    share: (cell) => (cell.num_tries ? cell.learnability / 0.25 : null),
+  },
+  {
+    key: "tries",
+    label: "Tries",
+    low: "one",
+    high: "most, logarithmic",
+    share: (cell, most) => (cell.num_tries ? Math.log(cell.num_tries) / Math.max(1e-9, Math.log(most)) : null),
+  },
+];
+
+/** The layers of a grid from the table upwards: {low_m, high_m, cells}, cells with their column x and row y. */
+function layers(grid) {
+  const found = Array.from({ length: grid.shape[2] }, (_, z) => ({
+    low_m: grid.lower_m[2] + z * grid.cell_size_m,
+    high_m: grid.lower_m[2] + (z + 1) * grid.cell_size_m,
+    cells: [],
+  }));
+  for (const cell of grid.cells) {
+    const [x, y, z] = cell.center_m.map((at, axis) => place(grid, at, axis));
+    found[z].cells.push({ ...cell, x, y, z });
+  }
+  return found;
+}
+
+/** Bob's mean success over the cells he tried; null if there are none. */
+function meanSuccess(cells) {
+  const tried = cells.filter((cell) => cell.num_tries);
+  return tried.length ? tried.reduce((sum, cell) => sum + cell.success_rate, 0) / tried.length : null;
+}
+
+/** A layer's heights, in centimetres. */
+function heights(layer) {
+  return `${centimetres(layer.low_m)} to ${centimetres(layer.high_m)} cm`;
+}
+
+/** Text about a cell. */
+function cellText(cell) {
+  const where = ["x", "y", "z"].map((axis, i) => `${axis} ${quantity(Number(cell.center_m[i].toFixed(3)))}`).join(", ");
+  if (!cell.num_tries) return `${where} m: proposed, not tried yet`;
+  const learnability = quantity(Number(cell.learnability.toFixed(3)));
+  const tries = cell.num_tries === 1 ? "1 try" : `${count(cell.num_tries)} tries`;
+  return `${where} m: Bob solves ${percent(cell.success_rate)}, learnability ${learnability}, ${tries}`;
+}
+
+function place(grid, at, axis) {
+  const index = Math.floor((at - grid.lower_m[axis]) / grid.cell_size_m + 1e-9);
+  return Math.min(grid.shape[axis] - 1, Math.max(0, index));
+}
+
+function centimetres(metres) {
+  return Number((100 * metres).toFixed(1));
+}
+
+/** The colour of a number from 0 to 1, on the scale viridis by Smith and van der Walt. */
+function colour(fraction) {
+  const place = Math.min(1, Math.max(0, fraction)) * (STOPS.length - 1);
+  const first = Math.min(STOPS.length - 2, Math.floor(place));
+  const mixed = STOPS[first].map((from, i) => Math.round(from + (STOPS[first + 1][i] - from) * (place - first)));
+  return `rgb(${mixed.join(", ")})`;
+}
+
+/** The scale as a bar. */
+function colourBar(number = 32) {
+  const steps = Array.from({ length: number }, (_, i) =>
+    svg("rect", { x: i, y: 0, width: 1.05, height: 1, fill: colour(i / (number - 1)) }),
+  );
+  const box = { class: "bar", viewBox: `0 0 ${number} 1`, preserveAspectRatio: "none", "aria-hidden": "true" };
+  return svg("svg", box, ...steps);
 }

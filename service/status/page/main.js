@@ -1,10 +1,10 @@
-// The page: which view the address asks for. #/ has all runs, #/runs/ID one of them, #/primitives the registry.
+// Show the view of the address: #/ has all runs, #/runs/ID one run, #/primitives the registry.
 
 import { el, note } from "./dom.js";
 import { primitivesView } from "./primitives.js";
 import { runView } from "./run.js";
 import { runsView } from "./runs.js";
-import { startAges } from "./times.js";
+import { startAges } from "./widgets.js";
 
 const main = document.getElementById("main");
 let left = new AbortController();
@@ -39,7 +39,7 @@ function decoded(part) {
 }
 
 document.querySelector("a.skip").addEventListener("click", (event) => {
-  event.preventDefault(); // the address says which view is shown
+  event.preventDefault(); // a change of the address would change the view
   main.focus();
 });
 addEventListener("hashchange", () => {

@@ -1,20 +1,20 @@
-// The page of one run.
+// The page of one run: its state and numbers, curves, goal map, newest video, actors and primitives.
 
-import { ApiError, get, sentence } from "./api.js";
-import { ActorTable } from "./actors.js";
-import { el, note, section } from "./dom.js";
-import { follow } from "./follow.js";
+import { address, ApiError, get, sentence } from "./api.js";
+import { NAMES, Panels } from "./curves.js";
+import { el, note, section, setText } from "./dom.js";
+import { every, follow, isActive } from "./follow.js";
+import { bytes, count, percent, quantity } from "./format.js";
 import { GoalMap } from "./goals.js";
-import { Media } from "./media.js";
-import { NAMES, Panels } from "./panels.js";
 import { Versions } from "./primitives.js";
-import { Summary } from "./summary.js";
-import { every } from "./times.js";
+import { age, progressBar, secondsSince, share, stateChip, Table, timeLeft } from "./widgets.js";
 
 const GOALS_MS = 5000;
 const FILES_MS = 15_000;
+const SILENT_S = 30;
+const ORDER = ["lost", "starting", "alive"];
 
-/** Everything about a run; ends when ``signal`` says so. */
+/** Show a run until ``signal`` aborts. */
 export function runView(root, runId, signal) {
   const page = new RunPage(root, runId, signal);
   follow(runId, NAMES, page, signal);
@@ -35,25 +35,25 @@ class RunPage {
     return el("h1", {}, this.runId);
   }
 
-  /** Put the parts together, when it is known that there is such a run. */
+  /** Put the parts together, once the run is known to exist. */
   begin(run) {
     this.begun = true;
     const [curves, map] = [section("Curves", "wide"), section("Goal map", "wide")];
-    const [actors, film] = [section("Actors"), section("Newest video")];
+    const [actors, video] = [section("Actors"), section("Newest video")];
     this.primitives = new Versions(run.name, `Primitives ${run.name}`);
     curves.body.append(this.panels.root);
     this.actorsBody = actors.body;
-    film.body.append(this.media.root);
-    const parts = [curves, map, film, actors, this.primitives].map((part) => part.root);
+    video.body.append(this.media.root);
+    const parts = [curves, map, video, actors, this.primitives].map((part) => part.root);
     this.root.replaceChildren(this.summary.root, ...parts);
-    this.ask(map.body, film.body);
+    this.ask(map.body, video.body);
   }
 
-  ask(mapBody, filmBody) {
+  ask(mapBody, videoBody) {
     const { signal, runId } = this;
     const part = (name) => get(["v1", "runs", runId, name], [], signal);
     every(GOALS_MS, signal, () => shown(mapBody, this.goals, () => part("goals")));
-    every(FILES_MS, signal, () => shown(filmBody, this.media, () => part("files")));
+    every(FILES_MS, signal, () => shown(videoBody, this.media, () => part("files")));
     every(FILES_MS, signal, () => this.primitives.refresh(signal));
   }
 
@@ -80,7 +80,7 @@ class RunPage {
     this.summary.success(this.panels.series.latest("bob/success_rate"));
   }
 
-  /** No such run, or one that cannot be read; of a service that is away the banner tells. */
+  /** Say that the run does not exist or cannot be read; the banner says that the service does not answer. */
   failed(error) {
     if (!(error instanceof ApiError)) console.warn(error);
     if (!error.status || (this.begun && error.status === 503)) return;
@@ -89,7 +89,7 @@ class RunPage {
   }
 }
 
-/** Show what is found in a part's body, or why there is nothing. */
+/** Fill a part's body, or say why it is empty. */
 async function shown(body, part, find) {
   try {
     part.update(await find());
@@ -97,5 +97,142 @@ async function shown(body, part, find) {
   } catch (error) {
     if (!(error instanceof ApiError) || error.status === 0) throw error;
     body.replaceChildren(note(sentence(error.message)));
+  }
+}
+
+/** The head of the page: state, progress, and errors. */
+class Summary {
+  constructor(runId) {
+    this.chip = el("span", {});
+    this.sub = el("p", { class: "summary" });
+    this.troubles = el("div", { class: "troubles", role: "status" });
+    this.numbers = el("dl", { class: "tiles" });
+    this.bob = tile("Bob's success", "on Alice's goals");
+    const trail = el("nav", { class: "trail", "aria-label": "Where this is" }, el("a", { href: "#/" }, "Runs"), " / ");
+    this.root = el("div", {}, trail, el("h1", {}, runId, " ", this.chip), this.sub, this.troubles, this.numbers);
+    this.tiles = {
+      progress: tile("Progress"),
+      rate: tile("Env steps/s"),
+      iteration: tile("Iteration"),
+      lag: tile("Policy lag"),
+      rollouts: tile("Rollouts"),
+    };
+    const { progress, ...others } = this.tiles;
+    this.numbers.append(progress.root, this.bob.root, ...Object.values(others).map((each) => each.root));
+  }
+
+  update(run) {
+    this.run = run;
+    this.chip.replaceChildren(stateChip(run));
+    const published = run.published ? [`, published ${run.published}`] : [];
+    this.sub.replaceChildren(`${run.name}, ${run.runtime} runtime, started `, age(run.started), ", heard of ", age(run.heartbeat), ...published);
+    const { progress, rate, iteration, lag, rollouts } = this.tiles;
+    const left = timeLeft(run);
+    progress.set(percent(share(run)), left ? `about ${left} to go` : "");
+    progress.bar.replaceChildren(progressBar(run));
+    rate.set(count(run.env_steps_per_s), isActive(run) ? "newest iteration" : "last iteration");
+    iteration.set(count(run.iteration), `policy version ${count(run.policy_version)}`);
+    lag.set(quantity(run.policy_lag), "versions");
+    rollouts.set(count(run.num_rollouts_counted), `${count(run.num_rollouts_refused)} refused`);
+    this.show();
+  }
+
+  show() {
+    const run = this.run;
+    const silent = isActive(run) && secondsSince(run.heartbeat) > SILENT_S;
+    const warnings = [...run.warnings, ...(silent ? ["not heard of for a while; it may be busy, or gone"] : [])];
+    const boxes = [
+      ...(this.cannot ? [["error", "This run cannot be followed", this.cannot]] : []),
+      ...(run.last_error ? [["error", "Last error", run.last_error]] : []),
+      ...warnings.map((text) => ["warning", "Warning", text]),
+    ];
+    const key = JSON.stringify(boxes);
+    if (key === this.shown) return; // so that a screen reader says it once
+    this.shown = key;
+    this.troubles.replaceChildren(...boxes.map(([kind, title, text]) => el("p", { class: kind }, el("strong", {}, `${title}: `), text)));
+  }
+
+  /** Show Bob's success in the newest iteration. */
+  success(value) {
+    this.bob.set(percent(value), "on Alice's goals");
+  }
+
+  /** Say why there are no new values; null if there are again. */
+  trouble(text) {
+    this.cannot = text;
+    this.show();
+  }
+}
+
+function tile(label, small = "") {
+  const [value, more, bar] = [el("span", { class: "value" }, "\u2013"), el("small", {}, small), el("span", {})];
+  const root = el("div", { class: "tile" }, el("dt", {}, label), el("dd", {}, value, bar, more));
+  const set = (text, below) => {
+    setText(value, text);
+    setText(more, below);
+  };
+  return { root, bar, set };
+}
+
+/** The table of RunStatus.actors, lost ones first; if the run has ended, with their last values. */
+class ActorTable {
+  constructor() {
+    this.table = new Table(
+      "Actors",
+      [
+        { label: "Actor", text: (actor) => actor.name },
+        { label: "State", changed: (actor) => actor.state, node: (actor) => el("span", { class: `chip ${actor.state}` }, actor.state) },
+        { label: "Replaced", text: (actor) => count(actor.incarnation), number: true },
+        { label: "Node", text: (actor) => actor.node || "this machine" },
+        { label: "Heard of", changed: (actor) => actor.heartbeat, node: (actor) => age(actor.heartbeat) },
+        { label: "Rollouts", text: (actor) => count(actor.num_rollouts), number: true },
+        { label: "Env steps", text: (actor) => count(actor.num_env_steps), number: true },
+        { label: "Last error", text: (actor) => actor.last_error ?? "\u2013" },
+      ],
+      (actor) => actor.name,
+    );
+    this.root = el("div", { class: "scroll" }, this.table.root);
+  }
+
+  update(run) {
+    const byName = (a, b) => a.name.localeCompare(b.name, "en", { numeric: true });
+    const actors = run.actors.map((actor) => (isActive(run) ? actor : { ...actor, state: "ended" }));
+    this.table.update(actors.sort((a, b) => ORDER.indexOf(a.state) - ORDER.indexOf(b.state) || byName(a, b)));
+  }
+}
+
+/** The newest video and the pictures, from RunFiles; a video keeps playing until there is a newer one. */
+class Media {
+  constructor(runId) {
+    this.runId = runId;
+    this.shown = null;
+    this.root = el("div", { class: "media" });
+  }
+
+  update({ files }) {
+    const key = JSON.stringify(files);
+    if (key === this.shown) return;
+    this.shown = key;
+    const isVideo = (file) => file.media_type.startsWith("video/");
+    const videos = files.filter(isVideo).sort((a, b) => Date.parse(b.modified) - Date.parse(a.modified));
+    const pictures = files.filter((file) => !isVideo(file));
+    const video = videos.length ? this.video(videos[0]) : note("No video yet: a run records a few rounds at its end.");
+    this.root.replaceChildren(video, el("ul", { class: "pictures" }, ...pictures.map((file) => this.picture(file))));
+  }
+
+  video(file) {
+    const player = el("video", { controls: true, preload: "metadata", muted: true, loop: true, playsinline: true, src: `${this.url(file)}#t=0.1`, "aria-label": file.title });
+    const words = [`${file.title}, ${bytes(file.num_bytes)}, `, age(file.modified), ". "];
+    return el("figure", { class: "recording" }, player, el("figcaption", {}, ...words, el("a", { href: this.url(file), download: file.name }, "Download")));
+  }
+
+  picture(file) {
+    const image = el("img", { src: this.url(file), alt: "", loading: "lazy", decoding: "async" });
+    return el("li", {}, el("a", { href: this.url(file) }, image, file.title), ` ${bytes(file.num_bytes)}`);
+  }
+
+  /** The URL with the file's time, so that a browser does not show an older file from its cache. */
+  url(file) {
+    return `${address("v1", "runs", this.runId, "files", file.name)}?modified=${encodeURIComponent(file.modified)}`;
   }
 }

@@ -1,15 +1,16 @@
-// The page of all runs.
+// The page of all runs, with a small curve of Bob's success for each.
 
 import { ApiError, get, sentence } from "./api.js";
-import { el, note, runLink, setText } from "./dom.js";
-import { isActive } from "./follow.js";
-import { count, counted } from "./format.js";
-import { progressBar, stateChip } from "./progress.js";
-import { Sparks } from "./spark.js";
-import { Table } from "./table.js";
-import { age, every } from "./times.js";
+import { el, note, runLink, setText, svg } from "./dom.js";
+import { every, isActive } from "./follow.js";
+import { count, counted, percent } from "./format.js";
+import { age, progressBar, stateChip, Table } from "./widgets.js";
 
 const EVERY_MS = 2000;
+const NAME = "bob/success_rate";
+const NUM_POINTS = 40;
+const AGAIN_MS = 10_000;
+const [WIDTH, HEIGHT] = [96, 24];
 
 /** Runs, newest start first. */
 export function runsView(root, signal) {
@@ -27,7 +28,7 @@ export function runsView(root, signal) {
     if (list.firstChild !== shown) list.replaceChildren(shown);
     table.update(found.runs);
     if (asking) return;
-    asking = true; // not waited for: runs are shown while their curves are still read
+    asking = true; // not awaited: runs are shown while their curves are loaded
     sparks.refresh(found.runs, signal, () => table.update(found.runs)).finally(() => (asking = false));
   });
 }
@@ -70,4 +71,50 @@ function state(run) {
 function nothing() {
   const command = el("code", {}, "tandem pretrain --config configs/pretrain/panda_cube.yaml --run-dir runs/cube");
   return note("No runs yet. Start one with ", command, ": it is here as soon as it has begun.");
+}
+
+/** The small curves; asks for one run at a time, and again only for runs with new iterations. */
+class Sparks {
+  constructor() {
+    this.known = new Map();
+  }
+
+  /** Load new values; ``shown`` is called after each run. */
+  async refresh(runs, signal, shown) {
+    for (const run of runs) {
+      const known = this.known.get(run.run_id);
+      const same = known && known.iteration === run.iteration && known.started === run.started;
+      if (same || (known && isActive(run) && Date.now() - known.atMs < AGAIN_MS)) continue;
+      const query = [["names", NAME], ["max_points", NUM_POINTS]];
+      const history = await get(["v1", "runs", run.run_id, "metrics"], query, signal).catch(() => null);
+      if (signal.aborted) return;
+      const values = history?.metrics[NAME] ?? known?.values ?? [];
+      this.known.set(run.run_id, { iteration: run.iteration, started: run.started, values, atMs: Date.now() });
+      shown();
+    }
+  }
+
+  /** Key of the curve: `node` differs where it differs. */
+  changed(run) {
+    return this.values(run).join();
+  }
+
+  node(run) {
+    const values = this.values(run);
+    const newest = values.findLast((value) => value !== null);
+    return el("span", { class: "spark" }, curve(values), percent(newest));
+  }
+
+  values(run) {
+    return this.known.get(run.run_id)?.values ?? [];
+  }
+}
+
+function curve(values) {
+  const points = values
+    .map((value, i) => [(i / Math.max(1, values.length - 1)) * WIDTH, value])
+    .filter(([, value]) => value !== null)
+    .map(([x, value]) => `${x.toFixed(1)},${(HEIGHT - 2 - value * (HEIGHT - 4)).toFixed(1)}`);
+  const size = { viewBox: `0 0 ${WIDTH} ${HEIGHT}`, width: WIDTH, height: HEIGHT, "aria-hidden": "true" };
+  return svg("svg", size, svg("polyline", { points: points.join(" ") }));
 }

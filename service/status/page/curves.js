@@ -1,9 +1,8 @@
-// Which curves there are, and the one cursor that all of them share.
+// The curves of a run: which there are, their data, and the cursor that all of them share.
 
 import { Chart } from "./chart.js";
 import { el } from "./dom.js";
 import { percent, quantity } from "./format.js";
-import { Series } from "./series.js";
 
 const FRACTION = { text: percent, top: () => 1 };
 const PANELS = [
@@ -60,7 +59,7 @@ const PANELS = [
   },
 ];
 
-/** What the service is asked for. */
+/** Names of the metrics to ask for. */
 export const NAMES = PANELS.flatMap((panel) => panel.curves.map((curve) => curve.name));
 
 /** All curves of a run, over env steps. */
@@ -86,13 +85,13 @@ export class Panels {
     this.draw();
   }
 
-  /** Show the numbers of one point in every panel; the newest ones for null. */
+  /** Show the numbers of one point in every panel; of the newest for null. */
   point(index) {
     this.cursor = index;
     this.charts.forEach((chart) => chart.point(this.cursor));
   }
 
-  /** Once a frame, however many records came. */
+  /** Draw once per frame, however many records came. */
   draw() {
     if (this.pending) return;
     this.pending = true;
@@ -100,6 +99,77 @@ export class Panels {
       this.pending = false;
       if (this.cursor !== null && this.cursor >= this.series.size) this.cursor = null;
       this.charts.forEach((chart) => chart.draw(this.cursor));
+    });
+  }
+}
+
+/** A run's metrics over iterations: {iteration, steps, values: {name: [number or null]}}. */
+class Series {
+  constructor(names) {
+    this.names = names;
+    this.clear();
+  }
+
+  clear() {
+    this.iteration = [];
+    this.steps = [];
+    this.values = Object.fromEntries(this.names.map((name) => [name, []]));
+  }
+
+  get size() {
+    return this.steps.length;
+  }
+
+  /** Replace all points with the service's history. */
+  load(history) {
+    this.iteration = [...history.iteration];
+    this.steps = [...history.env_steps];
+    for (const name of this.names) this.values[name] = [...(history.metrics[name] ?? this.steps.map(() => null))];
+  }
+
+  /** Add an iteration unless it is known already. */
+  append(record) {
+    if (this.size && record.iteration <= this.iteration[this.size - 1]) return;
+    this.iteration.push(record.iteration);
+    this.steps.push(record.env_steps);
+    for (const name of this.names) this.values[name].push(record[name] ?? null);
+  }
+
+  /** The newest number at or before a point; null if there is none. */
+  valueAt(name, index) {
+    const values = this.values[name];
+    for (let i = Math.min(index, values.length - 1); i >= 0; i--) if (values[i] !== null) return values[i];
+    return null;
+  }
+
+  /** The newest number. */
+  latest(name) {
+    return this.valueAt(name, this.size - 1);
+  }
+
+  /** The point whose env steps are nearest. */
+  nearest(steps) {
+    let best = 0;
+    for (let i = 1; i < this.size; i++) if (Math.abs(this.steps[i] - steps) < Math.abs(this.steps[best] - steps)) best = i;
+    return best;
+  }
+
+  /**
+   * A moving average with exponential weights and Adam's correction for its start. The span counts iterations, not
+   * points: in a long history, a point is the mean over several iterations.
+   */
+  smoothed(name) {
+    const last = this.iteration[this.size - 1] ?? 0;
+    const span = Math.min(30, Math.max(1, last / 20));
+    const decay = 1 - 2 / (span + 1);
+    let [average, weight, before] = [0, 0, 0];
+    return this.values[name].map((value, i) => {
+      if (value === null) return null;
+      const kept = decay ** (this.iteration[i] - before);
+      before = this.iteration[i];
+      average = kept * average + (1 - kept) * value;
+      weight = kept * weight + (1 - kept);
+      return average / weight;
     });
   }
 }

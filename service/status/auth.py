@@ -1,16 +1,17 @@
-"""What stands before every route, those added later included: who may ask, from where, how much, and in which headers.
+"""ASGI middleware before every route: who may ask, from where, how large a body, and with which headers.
 
-A route cannot forget its token: here everything wants it but what ``OPEN`` lists.
+A new route cannot forget its token: everything needs it except what ``OPEN`` lists.
 
-| request | without a token in this service | with one, on loopback | with one, on a public address |
+| request | service without a token | with one, on loopback | with one, on a public address |
 |---|---|---|---|
 | GET ``/livez`` | answered | answered | answered |
-| GET ``/readyz``, ``/healthz`` | answered | answered | answered, without reasons for those who have no token |
-| any other GET | answered | answered; 401 if a wrong token is given | 401 without the token |
+| GET ``/readyz``, ``/healthz`` | answered | answered | answered; reasons only with the token |
+| any other GET | answered | answered; 401 with a wrong token | 401 without the token |
 | POST, PUT, ... | 403 | 401 without the token | 401 without the token |
 
-A service on a public address without a token does not start. GET takes the token as the password of HTTP Basic, too,
-so that a browser can show the page; what changes state does not, or any web site could make such a browser do it.
+A service on a public address does not start without a token. GET also takes the token as the password of HTTP Basic,
+so that a browser can show the page. Requests that change something do not: any web site could make such a browser
+send them.
 """
 
 from __future__ import annotations
@@ -26,15 +27,15 @@ from starlette.datastructures import Headers, MutableHeaders
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from service.status.problems import ProblemError
-from service.status.token import VARIABLE, judge
+from service.status.token import VARIABLE, check_authorization
 
 OPEN = frozenset({"/livez"})
 PROBES = frozenset({"/readyz", "/healthz"})
-"""Kubernetes asks these and can send no secret."""
+"""Paths for Kubernetes, which cannot send a secret."""
 MAX_BODY_BYTES = 64 * 1024
 BODY_TIMEOUT_S = 10.0
 TRUSTED = "tandem.trusted"
-"""Key of the scope: whether who asks may know why something is not well."""
+"""Key of the ASGI scope: whether the client may know why something is not ready."""
 _SAFE = frozenset({"GET", "HEAD", "OPTIONS"})
 _HEADERS = {
     "x-content-type-options": "nosniff",
@@ -44,30 +45,30 @@ _HEADERS = {
     "cross-origin-opener-policy": "same-origin",
     "cache-control": "no-store",
 }
-"""Set where an answer has none of its own."""
+"""Headers of every answer that does not set them itself."""
 _BASIC = 'Basic realm="tandem", charset="UTF-8"'
-"""In a header of its own: behind another challenge in the same header Chromium does not see it, and asks nobody."""
+"""Sent as a header of its own: Chromium ignores it behind another challenge in the same header."""
 _logger = logging.getLogger(__name__)
 
 Observer = Callable[[str, str, int, float], None]
-"""Is told method, route template, status, and seconds until the answer began."""
+"""Called with method, route template, status, and seconds until the answer began."""
 
 
-class Guard:
-    """ASGI middleware; see the module."""
+class AuthMiddleware:
+    """Authentication, limits, security headers and the last error handler; see the module."""
 
     def __init__(self, app: ASGIApp, *, token: str | None, public: bool, observe: Observer) -> None:
-        """``public``: this service can be reached from other machines, so there has to be a token."""
+        """Wrap ``app``; if ``public``, other machines can reach the service and there has to be a token."""
         assert token is not None or not public
         self._app, self._token, self._public, self._observe = app, token, public, observe
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Answer, or pass on what may be answered."""
+        """Answer the request, or pass it on if it is allowed."""
         if scope["type"] == "lifespan":
             await self._app(scope, receive, send)
         elif scope["type"] == "http":
             await self._http(scope, receive, send)
-        else:  # a web socket, of which there are none
+        else:  # the service has no web sockets
             await send({"type": "websocket.close", "code": 1008})
 
     async def _http(self, scope: Scope, receive: Receive, send: Send) -> None:
@@ -89,31 +90,32 @@ class Guard:
             await send(message)
 
         try:
-            await self._admitted(inner, receive, answer)
+            await self._pass_on(inner, receive, answer)
         except ProblemError as problem:
             await problem.response()(inner, receive, answer)
         except Exception:
-            # not the message: it may quote the request
+            # without the error's message, which may quote the request
             _logger.exception("%s %s failed", scope["method"], _template(inner))
-            if status:  # the answer has begun: breaking it off is all that is left
+            if status:  # the answer has begun; all that is left is to break it off
                 raise
-            unforeseen = ProblemError(500, "failed", "an unforeseen error; the log of the service has more")
-            await unforeseen.response()(inner, receive, answer)
+            unexpected = ProblemError(500, "failed", "an unforeseen error; the log of the service has more")
+            await unexpected.response()(inner, receive, answer)
 
-    async def _admitted(self, scope: Scope, receive: Receive, send: Send) -> None:
+    async def _pass_on(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Check a request and pass it on, or raise ``ProblemError``."""
         headers = Headers(scope=scope)
-        if not self._public and not is_loopback(_host_of(headers.get("host", ""))):
-            # a web site whose name leads to 127.0.0.1 must not read what is meant for this machine alone
+        if not self._public and not is_loopback(_host(headers.get("host", ""))):
+            # otherwise a web site whose name resolves to 127.0.0.1 could read this service
             raise ProblemError(
                 421, "wrong-host", "ask for localhost or 127.0.0.1: this service is for its machine alone"
             )
-        scope[TRUSTED] = self._check(scope["method"], scope["path"], headers.get("authorization"))
+        scope[TRUSTED] = self._is_trusted(scope["method"], scope["path"], headers.get("authorization"))
         if "content-length" in headers or "transfer-encoding" in headers:
             receive = _replay(await _read_body(headers, receive), receive)
         await self._app(scope, receive, send)
 
-    def _check(self, method: str, path: str, authorization: str | None) -> bool:
-        """Whether who asks is trusted, if he may ask at all."""
+    def _is_trusted(self, method: str, path: str, authorization: str | None) -> bool:
+        """Whether an allowed request may see everything; raises ``ProblemError`` for one that is not allowed."""
         safe = method in _SAFE
         if safe and path in OPEN:
             return False
@@ -123,7 +125,7 @@ class Guard:
             raise ProblemError(
                 403, "read-only", f"this service has no token and so changes nothing; start it with {VARIABLE} set"
             )
-        verdict = judge(authorization, self._token, basic=safe)
+        verdict = check_authorization(authorization, self._token, basic=safe)
         if verdict == "right" or (verdict == "missing" and safe and not self._public):
             return True
         if verdict == "missing" and safe and path in PROBES:
@@ -138,28 +140,27 @@ class Guard:
 
 
 def is_loopback(host: str) -> bool:
-    """Whether a host's name or address, without a port, means this machine alone."""
+    """Whether a host name or address, without a port, means this machine."""
     try:
         return ipaddress.ip_address(host).is_loopback
     except ValueError:
         return host.lower() == "localhost"
 
 
-def _host_of(header: str) -> str:
-    """``127.0.0.1:8321`` to ``127.0.0.1``, ``[::1]:8321`` to ``::1``."""
+def _host(header: str) -> str:
+    """The host of a Host header: ``127.0.0.1`` of ``127.0.0.1:8321``, ``::1`` of ``[::1]:8321``."""
     if header.startswith("["):
         return header[1:].partition("]")[0]
     return header.partition(":")[0]
 
 
 def _template(scope: Scope) -> str:
-    """A route such as ``/v1/runs/{run_id}``; one word for all that came to none."""
-    route = scope.get("route")
-    return str(getattr(route, "path", "")) or "other"
+    """The template of the request's route, such as ``/v1/runs/{run_id}``; "other" if there is no route."""
+    return str(getattr(scope.get("route"), "path", "")) or "other"
 
 
 async def _read_body(headers: Headers, receive: Receive) -> bytes:
-    """The whole body, so that no route can be made to take a longer one."""
+    """Read the whole body, so that the limits hold for every route."""
     declared = headers.get("content-length", "0")
     too_large = ProblemError(413, "too-large", f"a body may have {MAX_BODY_BYTES} bytes; this API needs far fewer")
     if not declared.isdecimal() or int(declared) > MAX_BODY_BYTES:
@@ -179,13 +180,10 @@ async def _read_body(headers: Headers, receive: Receive) -> bytes:
 
 
 def _replay(body: bytes, receive: Receive) -> Receive:
-    first = True
+    """A ``receive`` that gives a body that was read already."""
+    messages: list[Message] = [{"type": "http.request", "body": body, "more_body": False}]
 
-    async def again() -> Message:
-        nonlocal first
-        if first:
-            first = False
-            return {"type": "http.request", "body": body, "more_body": False}
-        return await receive()
+    async def replay() -> Message:
+        return messages.pop() if messages else await receive()
 
-    return again
+    return replay

@@ -1,7 +1,7 @@
-"""Who asks what somebody asked a moment ago gets the same answer.
+"""A cache of answers for half a second, shared by all clients.
 
-A run tells how it goes once a second, and a dashboard open in ten browsers asks the same as in one: reading files and
-Redis, merging and validating them for each would take cores from the training beside it.
+A run writes its status once a second, and a dashboard that is open in ten browsers asks ten times for the same. Reading
+files and Redis, merging and validating for each request would take CPU time from the training on the same machine.
 """
 
 from __future__ import annotations
@@ -16,14 +16,14 @@ from starlette.datastructures import Headers
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 AGE_S = 0.5
-"""How old an answer may be; runs write their status once a second."""
+"""Greatest age of a cached answer."""
 MAX_ANSWERS, MAX_BYTES = 64, 1 << 18
-"""How many are kept, and of how long a body: metrics of a whole run in 1,000 points have some 100 kB."""
+"""Number of cached answers, and length of a cached body: metrics of a whole run in 1,000 points are about 100 kB."""
 _TYPES = ("application/json", "text/plain", "application/openmetrics-text")
-_SINGULAR = {"range", "if-none-match"}
-"""Headers of a request to which the answer depends on what the client has."""
+_UNCACHED = {"range", "if-none-match"}
+"""Request headers that make the answer depend on what the client has."""
 _ROUTE = "route"
-"""Where the router says in a scope which route it was; requests are counted by it."""
+"""Key of the ASGI scope in which the router leaves the route; requests are counted by it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,28 +33,26 @@ class _Answer:
     messages: tuple[Message, ...]
 
 
-class Answers:
-    """ASGI middleware that keeps whole answers to GET for ``age_s``; one to anything else makes it forget them all.
+class ResponseCache:
+    """ASGI middleware that caches answers to GET; any other request empties the cache.
 
-    It belongs behind what decides who may ask. Only JSON and plain text below ``/v1`` and ``/metrics`` that came with
-    200 and in one piece is kept, so neither event streams nor downloads.
+    It belongs behind ``AuthMiddleware``. Only ``/metrics`` and paths below ``/v1`` are cached, if the status is 200
+    and the body is one piece of JSON or plain text: no event streams and no downloads.
     """
 
-    def __init__(self, app: ASGIApp, *, age_s: float = AGE_S, clock: Callable[[], float] = time.monotonic) -> None:
-        """``clock`` counts seconds."""
-        self._app, self._age_s, self._clock = app, age_s, clock
+    def __init__(self, app: ASGIApp, *, clock: Callable[[], float] = time.monotonic) -> None:
+        """Wrap ``app``; ``clock`` counts seconds."""
+        self._app, self._clock = app, clock
         self._answers: dict[tuple[str, bytes, str], _Answer] = {}
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Answer from memory, or pass on."""
-        if scope["type"] != "http":
-            await self._app(scope, receive, send)
-        elif scope["method"] != "GET":
+        """Answer from the cache, or pass the request on."""
+        if scope["type"] == "http" and scope["method"] != "GET":
             try:
                 await self._app(scope, receive, send)
             finally:
                 self._answers.clear()
-        elif _is_shared(scope):
+        elif scope["type"] == "http" and _may_be_cached(scope):
             await self._get(scope, receive, send)
         else:
             await self._app(scope, receive, send)
@@ -65,29 +63,29 @@ class Answers:
         if known is not None and self._clock() < known.until_s:
             scope[_ROUTE] = known.route
             for message in known.messages:
-                await send(dict(message))  # who counts and adds headers writes into it
+                await send(dict(message))  # a copy, because the middleware before this one adds headers to it
             return
         messages: list[Message] = []
 
         async def keep(message: Message) -> None:
-            if len(messages) < 2:  # more is a stream's or a file's
+            if len(messages) < 2:  # streams and files send more, and are not cached
                 messages.append(dict(message))
             await send(message)
 
         asked_s = self._clock()
         await self._app(scope, receive, keep)
-        if _is_whole(messages):
+        if _is_cacheable(messages):
             if len(self._answers) >= MAX_ANSWERS:
                 self._answers.clear()
-            self._answers[key] = _Answer(asked_s + self._age_s, scope.get(_ROUTE), tuple(messages))
+            self._answers[key] = _Answer(asked_s + AGE_S, scope.get(_ROUTE), tuple(messages))
 
 
-def _is_shared(scope: Scope) -> bool:
-    path = scope["path"]  # health depends on who asks
-    return (path == "/metrics" or path.startswith("/v1/")) and _SINGULAR.isdisjoint(Headers(scope=scope).keys())
+def _may_be_cached(scope: Scope) -> bool:
+    path = scope["path"]  # health checks are not here: their answer depends on who asks
+    return (path == "/metrics" or path.startswith("/v1/")) and _UNCACHED.isdisjoint(Headers(scope=scope).keys())
 
 
-def _is_whole(messages: list[Message]) -> bool:
+def _is_cacheable(messages: list[Message]) -> bool:
     if [message["type"] for message in messages] != ["http.response.start", "http.response.body"]:
         return False
     start, body = messages

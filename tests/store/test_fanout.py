@@ -1,15 +1,12 @@
-"""Several writers at once, and waiting for what comes."""
+"""Several writers at once."""
 
-import asyncio
 import json
 
 import pytest
 
 from service.io.errors import RunTakenError
 from service.store.disk import DiskWriter
-from service.store.errors import UnknownRunError
 from service.store.fanout import FanoutWriter, open_writer
-from service.store.following import follow
 from service.store.redis_reader import RedisReader
 from service.store.redis_writer import RedisWriter
 from tests.store.stores import a_grid, a_record, a_status, wait_until
@@ -64,57 +61,3 @@ def test_all_are_closed_though_one_fails(tmp_path):
     with pytest.raises(RuntimeError, match="cannot close"):
         writer.close()
     assert json.loads((tmp_path / "goals.json").read_text())["iteration"] == 2
-
-
-def test_records_come_until_the_run_has_ended(redis):
-    reader = RedisReader(redis.address)
-
-    async def watch():
-        writer = RedisWriter(redis.address, "cube")
-        writer.status(a_status())
-        writer.metrics(a_record(1))
-        while not reader.runs():
-            await asyncio.sleep(0.01)
-        seen = []
-        async for records in follow(reader, "cube", poll_s=0.01):
-            seen.append([each["iteration"] for each in records])
-            if seen[-1] == [1]:
-                writer.metrics(a_record(2))
-            if seen[-1] == [2]:
-                writer.metrics(a_record(3))
-                writer.status(a_status(state="finished"))
-                await asyncio.to_thread(writer.close)
-        return seen
-
-    seen = asyncio.run(asyncio.wait_for(watch(), 10.0))
-    assert [number for numbers in seen for number in numbers] == [1, 2, 3]
-
-
-def test_a_quiet_run_gives_signs_of_life(redis):
-    writer = RedisWriter(redis.address, "cube")
-    writer.status(a_status())
-    reader = RedisReader(redis.address)
-    wait_until(lambda: reader.runs() != [])
-
-    async def listen():
-        following = follow(reader, "cube", poll_s=0.01, quiet_s=0.05)
-        return [await anext(following) for _ in range(3)]
-
-    assert asyncio.run(asyncio.wait_for(listen(), 10.0)) == [[], [], []]
-    writer.close()
-
-
-def test_following_starts_after_what_is_known(redis):
-    writer = RedisWriter(redis.address, "cube")
-    writer.status(a_status(state="finished"))
-    for number in range(1, 6):
-        writer.metrics(a_record(number))
-    writer.close()
-    reader = RedisReader(redis.address)
-
-    async def collect(run_id):
-        return [each async for each in follow(reader, run_id, after_iteration=3)]
-
-    assert asyncio.run(collect("cube")) == [[a_record(4), a_record(5)]]
-    with pytest.raises(UnknownRunError):
-        asyncio.run(collect("nobody"))

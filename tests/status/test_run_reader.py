@@ -1,10 +1,10 @@
-"""Runs in directories and in a real Redis, and what is left of them while it is away."""
+"""Runs in directories and in a real Redis, also while Redis is unavailable."""
 
 from datetime import UTC, datetime, timedelta
 
 import pytest
 
-from service.status.reading import LEAVE_ALONE_S, BothReader, open_reader
+from service.status.run_reader import RETRY_AFTER_S, CombinedReader, open_reader
 from service.store.disk_reader import DiskReader
 from service.store.errors import UnknownRunError
 from service.store.redis_reader import RedisReader
@@ -15,7 +15,7 @@ from tests.store.stores import Killable, wait_until
 
 @pytest.fixture(scope="module")
 def redis(tmp_path_factory):
-    """A Redis that was told of "cube", which has a directory, and of "far", which has none."""
+    """A Redis with the runs "cube", which also has a directory, and "far", which has none."""
     killable = Killable(tmp_path_factory.mktemp("redis"))
     for run_id in ("cube", "far"):
         writer = RedisWriter(killable.address, run_id)
@@ -40,7 +40,7 @@ def time_s():
 
 @pytest.fixture
 def reader(redis, root, time_s):
-    return BothReader(DiskReader(root), RedisReader(redis.address), clock=lambda: time_s[0])
+    return CombinedReader(DiskReader(root), RedisReader(redis.address), clock=lambda: time_s[0])
 
 
 def test_runs_of_both(reader):
@@ -55,7 +55,7 @@ def test_a_directory_that_was_written_later(reader, root):
     assert reader.run("cube").iteration == 9
 
 
-def test_metrics_are_those_of_the_directory(reader, root):
+def test_metrics_come_from_the_directory(reader, root):
     append(root, "cube", record(4))
     assert [each["iteration"] for each in reader.metrics("cube", after_iteration=1)] == [2, 3, 4]
     assert [each["iteration"] for each in reader.metrics("far")] == [1]
@@ -74,12 +74,12 @@ def test_a_request_to_stop_goes_to_both(reader, redis, root):
 
 
 @pytest.mark.parametrize("call", ["run", "metrics", "goals", "request_stop"])
-def test_nobody_knows_it(reader, call):
+def test_an_unknown_run(reader, call):
     with pytest.raises(UnknownRunError, match=r"no run 'nobody'"):
         getattr(reader, call)("nobody")
 
 
-def test_redis_is_away_and_back(reader, redis, root, time_s, caplog):
+def test_redis_is_unavailable_and_comes_back(reader, redis, root, time_s, caplog):
     redis.kill()
     try:
         assert {run.run_id: run.iteration for run in reader.runs()} == {"cube": 3, "old": 3}
@@ -97,7 +97,7 @@ def test_redis_is_away_and_back(reader, redis, root, time_s, caplog):
     finally:
         redis.revive()
     assert {run.run_id for run in reader.runs()} == {"cube", "old"}  # it is left alone for a while
-    time_s[0] += LEAVE_ALONE_S
+    time_s[0] += RETRY_AFTER_S
     wait_until(lambda: {run.run_id for run in reader.runs()} == {"cube", "far", "old"})
     assert reader.run("cube").warnings == ()
 

@@ -1,16 +1,16 @@
-"""Answers that are given twice: by the numbers, on an application that counts how often it was asked."""
+"""The response cache, in front of an application that counts its requests."""
 
 import asyncio
 
 import pytest
 
-from service.status.answers import AGE_S, MAX_ANSWERS, MAX_BYTES, Answers
+from service.status.response_cache import AGE_S, MAX_ANSWERS, MAX_BYTES, ResponseCache
 
 JSON = b"application/json"
 
 
 class Counting:
-    """An ASGI application whose body is how often it was asked before."""
+    """An ASGI application whose body is the number of its requests."""
 
     def __init__(self, status=200, media_type=JSON, pieces=1, num_bytes=0):
         self.status, self.media_type, self.pieces, self.num_bytes, self.asked = status, media_type, pieces, num_bytes, 0
@@ -26,11 +26,11 @@ class Counting:
 
 
 class Asking:
-    """Asks through ``Answers``, at times of its own."""
+    """A client behind a ``ResponseCache``, with its own clock."""
 
     def __init__(self, app):
         self.app, self.now_s = app, 100.0
-        self._answers = Answers(app, clock=lambda: self.now_s)
+        self._cache = ResponseCache(app, clock=lambda: self.now_s)
 
     def __call__(self, path="/v1/runs", *, method="GET", query=b"", headers=()):
         scope = {"type": "http", "method": method, "path": path, "query_string": query, "headers": list(headers)}
@@ -40,13 +40,13 @@ class Asking:
             message["headers" if "headers" in message else "seen"] = None  # whoever is before it may write into it
             sent.append(message)
 
-        asyncio.run(self._answers(scope, None, send))
+        asyncio.run(self._cache(scope, None, send))
         assert scope["route"] == f"route of {path}"
         assert sent[0]["status"] == self.app.status
         return int(sent[1]["body"])
 
 
-def test_for_a_moment_all_get_the_same():
+def test_an_answer_is_cached_for_a_moment():
     ask = Asking(Counting())
     assert ask() == 1
     ask.now_s += 0.9 * AGE_S
@@ -64,25 +64,25 @@ def test_for_a_moment_all_get_the_same():
         {"headers": [(b"accept", b"text/plain")]},
     ],
 )
-def test_another_question_is_another(other):
+def test_another_request_has_its_own_answer(other):
     ask = Asking(Counting())
     assert [ask(), ask(**other), ask(), ask(**other)] == [1, 2, 1, 2]
 
 
 @pytest.mark.parametrize("method", ["POST", "PUT", "DELETE"])
-def test_who_changes_something_sees_it_at_once(method):
+def test_a_change_empties_the_cache(method):
     ask = Asking(Counting())
     assert [ask(), ask(), ask("/v1/runs/a/stop", method=method), ask()] == [1, 1, 2, 3]
 
 
 @pytest.mark.parametrize("path", ["/readyz", "/healthz", "/livez", "/", "/page/main.js"])
-def test_health_depends_on_who_asks(path):
+def test_health_and_the_page_are_not_cached(path):
     ask = Asking(Counting())
     assert [ask(path), ask(path)] == [1, 2]
 
 
 @pytest.mark.parametrize("header", [b"range", b"if-none-match"])
-def test_what_depends_on_what_the_client_has(header):
+def test_conditional_and_range_requests_are_not_cached(header):
     ask = Asking(Counting())
     assert [ask(headers=[(header, b"x")]), ask(headers=[(header, b"x")])] == [1, 2]
 
@@ -98,12 +98,12 @@ def test_what_depends_on_what_the_client_has(header):
         Counting(num_bytes=MAX_BYTES + 1),
     ],
 )
-def test_what_is_not_kept(app):
+def test_answers_that_are_not_cached(app):
     ask = Asking(app)
     assert [ask(), ask()] == [1, 2]
 
 
-def test_a_long_body_is_kept_up_to_the_limit():
+def test_a_long_body_is_cached_up_to_the_limit():
     ask = Asking(Counting(num_bytes=MAX_BYTES))
     assert [ask(), ask()] == [1, 1]
 
@@ -112,5 +112,5 @@ def test_memory_is_bounded():
     ask = Asking(Counting())
     for number in range(2 * MAX_ANSWERS + 1):
         ask(query=str(number).encode())
-        assert len(ask._answers._answers) <= MAX_ANSWERS
+        assert len(ask._cache._answers) <= MAX_ANSWERS
     assert ask(query=b"0") == 2 * MAX_ANSWERS + 2

@@ -1,4 +1,4 @@
-"""The JSON the API answers with, where the store and the registry have no model of it already."""
+"""JSON schemas of the API's answers, except those that the store and the registry define."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ class _Frozen(BaseModel):
 
 
 class Alive(_Frozen):
-    """The service answers."""
+    """Answer of a service that runs."""
 
     status: Literal["alive"] = "alive"
 
 
 class Ready(_Frozen):
-    """The runs and the registry can be read."""
+    """Answer of a service that can read the runs and the registry."""
 
     status: Literal["ready"] = "ready"
 
@@ -30,7 +30,7 @@ class RunList(_Frozen):
     """Runs, newest start first."""
 
     runs: tuple[RunStatus, ...]
-    num_runs: int = Field(ge=0, description="that fit what was asked, the ones over the limit included")
+    num_runs: int = Field(ge=0, description="that match the request, those over the limit included")
 
 
 class MetricHistory(_Frozen):
@@ -38,19 +38,19 @@ class MetricHistory(_Frozen):
 
     run_id: str
     last_iteration: int = Field(
-        ge=0, description="of the newest record; 0 before the first. Ask for those after it next"
+        ge=0, description="of the newest record; 0 before the first. The after_iteration of the next request"
     )
-    num_iterations: int = Field(ge=0, description="that fit what was asked, before down-sampling")
-    iteration: tuple[int, ...] = Field(description="the last of each point")
+    num_iterations: int = Field(ge=0, description="that match the request, before down-sampling")
+    iteration: tuple[int, ...] = Field(description="the last iteration of each point")
     env_steps: tuple[int, ...] = Field(description="at that iteration")
     metrics: dict[str, tuple[float | None, ...]] = Field(
-        description="by name, the mean over the iterations of a point; null where none of them has the metric"
+        description="by name, the mean over the iterations of a point; null if none of them has the metric"
     )
     names: tuple[str, ...] = Field(description="of all metrics the run has")
 
 
 class RunFile(_Frozen):
-    """A picture or a video that a run has made."""
+    """A picture or a video of a run."""
 
     name: str = Field(examples=["rounds.mp4"])
     title: str = Field(examples=["Alice beside Bob"])
@@ -61,7 +61,7 @@ class RunFile(_Frozen):
 
 
 class RunFiles(_Frozen):
-    """What a run has to look at."""
+    """The pictures and videos of a run."""
 
     files: tuple[RunFile, ...]
 
@@ -72,7 +72,7 @@ class PrimitiveSummary(_Frozen):
     name: str = Field(examples=["panda-cube"])
     num_versions: int = Field(ge=1)
     newest: int = Field(ge=1, description="the greatest version number")
-    aliases: dict[str, int] = Field(description="and the version each means", examples=[{"champion": 2, "latest": 3}])
+    aliases: dict[str, int] = Field(description="the version of each alias", examples=[{"champion": 2, "latest": 3}])
 
 
 class PrimitiveList(_Frozen):
@@ -91,7 +91,7 @@ class VersionSummary(_Frozen):
     git_commit: str | None = None
     blob_sha256: str | None = None
     blob_bytes: int | None = None
-    aliases: tuple[str, ...] = Field((), description="that mean this version now")
+    aliases: tuple[str, ...] = Field((), description="that point to this version now")
     problem: str | None = Field(None, description="why there is nothing else here: the manifest is damaged")
 
 
@@ -102,7 +102,7 @@ class PrimitiveVersions(PrimitiveSummary):
 
 
 class ManifestDocument(Manifest):
-    """Everything known about one immutable version, and a digest of it."""
+    """The manifest of one immutable version, with its digest."""
 
     manifest_sha256: str = Field(
         pattern=r"^[0-9a-f]{64}$",
@@ -111,13 +111,13 @@ class ManifestDocument(Manifest):
 
 
 class AliasChange(_Frozen):
-    """Where an alias shall lead."""
+    """The version an alias shall point to."""
 
     version: int = Field(ge=1, le=1_000_000_000, examples=[1])
 
 
 class AliasState(_Frozen):
-    """Where an alias leads now."""
+    """The version an alias points to now."""
 
     name: str
     alias: str

@@ -1,0 +1,137 @@
+"""Runs from their directories and, where there is one, from Redis.
+
+| information | source |
+|---|---|
+| status | the newer one; Redis if both are about equally old, because it knows which machines are alive |
+| metrics | the run's directory, which has all of them; Redis if there is no directory on this machine |
+| goals | the newer grid |
+| a request to stop | sent to both |
+
+If Redis is unavailable, everything in the directories can still be read, and each active run has a warning.
+"""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Callable
+from datetime import timedelta
+from pathlib import Path
+from typing import TypeVar
+
+from service.store.address import RedisAddress, address_from_environment
+from service.store.disk_reader import DiskReader
+from service.store.errors import StoreUnavailableError, UnknownRunError
+from service.store.models import ACTIVE, GoalGrid, Record, RunReader, RunStatus
+
+RETRY_AFTER_S = 5.0
+"""Pause after Redis did not answer, so that requests do not wait for it."""
+_ABOUT_EQUAL = timedelta(seconds=10)
+_Answer = TypeVar("_Answer")
+_logger = logging.getLogger(__name__)
+
+
+def open_reader(runs_dir: Path, redis: RedisAddress | None = None) -> RunReader:
+    """Make a reader of the runs in a directory and, if there is a Redis, of those in it.
+
+    Args:
+        runs_dir: directory of run directories.
+        redis: None for the one of ``TANDEM_REDIS_URL``, if that is set.
+
+    Raises:
+        StoreError: not a Redis URL, or the package redis is not installed.
+    """
+    address = redis or address_from_environment()
+    if address is None:
+        return DiskReader(runs_dir)
+    from service.store.redis_reader import RedisReader  # needs the package redis
+
+    return CombinedReader(DiskReader(runs_dir), RedisReader(address))
+
+
+class CombinedReader:
+    """The ``RunReader`` of run directories and a Redis; thread-safe."""
+
+    def __init__(self, disk: RunReader, redis: RunReader, *, clock: Callable[[], float] = time.monotonic) -> None:
+        """Combine two readers; nothing is read before the first call. ``clock`` counts seconds."""
+        self._disk, self._redis, self._clock = disk, redis, clock
+        self._failure: tuple[float, str] | None = None
+        """Time and reason of the last failure of Redis; None while it answers."""
+
+    def runs(self) -> list[RunStatus]:
+        """All runs, newest start first."""
+        on_disk = {run.run_id: run for run in self._disk.runs()}
+        in_redis = {run.run_id: run for run in self._ask_redis(self._redis.runs) or ()}
+        merged = [self._merge(on_disk.get(run_id), in_redis.get(run_id)) for run_id in on_disk.keys() | in_redis.keys()]
+        return sorted(merged, key=lambda run: (run.started, run.run_id), reverse=True)
+
+    def run(self, run_id: str) -> RunStatus:
+        """One run."""
+        in_redis = self._ask_redis(lambda: self._redis.run(run_id))
+        try:
+            return self._merge(self._disk.run(run_id), in_redis)
+        except UnknownRunError:
+            if in_redis is None:
+                raise
+            return in_redis
+
+    def metrics(self, run_id: str, *, after_iteration: int = 0) -> list[Record]:
+        """The records of iterations above ``after_iteration``, in order."""
+        try:
+            return self._disk.metrics(run_id, after_iteration=after_iteration)
+        except UnknownRunError:
+            in_redis = self._ask_redis(lambda: self._redis.metrics(run_id, after_iteration=after_iteration))
+            if in_redis is None:
+                raise
+            return in_redis
+
+    def goals(self, run_id: str) -> GoalGrid | None:
+        """The newest grid; None before the first."""
+        self.run(run_id)  # or raise UnknownRunError
+        grids = (_if_known(lambda: self._disk.goals(run_id)), self._ask_redis(lambda: self._redis.goals(run_id)))
+        return max((grid for grid in grids if grid is not None), key=lambda grid: grid.iteration, default=None)
+
+    def request_stop(self, run_id: str) -> None:
+        """Ask a run to end after its current iteration; nothing happens if it has ended."""
+        self.run(run_id)  # or raise UnknownRunError
+        self._ask_redis(lambda: self._redis.request_stop(run_id))
+        _if_known(lambda: self._disk.request_stop(run_id))
+
+    def ready(self) -> None:
+        """Return if the directories can be read; Redis is not needed."""
+        self._disk.ready()
+
+    def _merge(self, on_disk: RunStatus | None, in_redis: RunStatus | None) -> RunStatus:
+        if on_disk is None or in_redis is None:
+            (newer,) = (run for run in (on_disk, in_redis) if run is not None)
+        else:
+            newer = in_redis if in_redis.heartbeat > on_disk.heartbeat - _ABOUT_EQUAL else on_disk
+        failure = self._failure
+        if failure is None or newer.state not in ACTIVE:
+            return newer
+        warning = f"the status service reads no Redis: {failure[1]}"
+        return newer.model_copy(update={"warnings": (*newer.warnings, warning)})
+
+    def _ask_redis(self, question: Callable[[], _Answer]) -> _Answer | None:
+        """Ask Redis; None if it does not know the run, or is unavailable."""
+        failure = self._failure
+        if failure is not None and self._clock() - failure[0] < RETRY_AFTER_S:
+            return None
+        try:
+            answer = _if_known(question)
+        except StoreUnavailableError as error:
+            if failure is None:
+                _logger.warning("%s; what is in run directories is shown all the same", error)
+            self._failure = (self._clock(), str(error))
+            return None
+        if failure is not None:
+            _logger.warning("Redis is back")
+        self._failure = None
+        return answer
+
+
+def _if_known(question: Callable[[], _Answer]) -> _Answer | None:
+    try:
+        return question()
+    except UnknownRunError:
+        return None
