@@ -21,7 +21,9 @@ def make(task="push", num=NUM):
 
 
 def single():
-    return Monitor(gymnasium.make("tandem/Push-v0", config=CONFIG, max_episode_steps=LENGTH))
+    return Monitor(
+        gymnasium.make("service.envs.gym.registration:tandem/Push-v0", config=CONFIG, max_episode_steps=LENGTH)
+    )
 
 
 @pytest.fixture
@@ -42,8 +44,8 @@ def test_it_is_what_single_environments_are(ours):
     theirs = DummyVecEnv([single] * NUM)
     assert ours.observation_space == theirs.observation_space
     assert ours.action_space == theirs.action_space
-    ours.seed(5)
-    theirs.seed(5)
+    ours.seed(8)
+    theirs.seed(8)
     assert_same(ours.reset(), theirs.reset())
     rng, num_done, paid = np.random.default_rng(0), 0, 0.0
     for _ in range(3 * LENGTH):
@@ -65,7 +67,7 @@ def test_it_is_what_single_environments_are(ours):
                 assert info["episode"]["r"] == pytest.approx(expected["episode"]["r"])
                 assert info["episode"]["l"] == expected["episode"]["l"]
     assert num_done == 3 * NUM
-    assert sum(total for total, _ in ours.finished) == paid
+    assert sum(total for total, _ in ours.finished) == paid > 0.0
     theirs.close()
 
 

@@ -5,12 +5,16 @@ import numpy as np
 import pytest
 import torch
 
+from service.actors.evaluation import Idle, evaluate
+from service.downstream import worker
 from service.downstream.compose import parameters_digest
 from service.downstream.learner import make_learner
 from service.downstream.methods import find_method
-from service.downstream.worker import Running, make_worlds, run_cell
+from service.downstream.worker import Running, make_worlds, play, run_cell
+from service.envs.tasks import TASKS
 from service.errors import TandemError
 from service.io.jsonl import read_jsonl
+from service.io.lock import is_locked
 from tests.downstream.cells import small_cell
 
 
@@ -80,8 +84,11 @@ def test_what_a_training_leaves(champion, tmp_path):
     assert seen[-1]["train/n_updates"] == 2 * 50 * 2  # two iterations that learn, 50 steps each, two updates a step
     found = result["evaluation"]
     assert found["num_episodes"] == 6
-    assert found["success_last_low"] <= found["success_last"] <= found["success_last_high"]
-    assert found["success_last"] <= found["success_ever"] <= found["success_ever_high"]
+    for key in ("success_last", "success_ever"):
+        share = found[key]
+        for bound in (found[f"{key}_low"], found[f"{key}_high"]):  # Wilson's: where the share is 1.96 deviations away
+            assert (share - bound) ** 2 == pytest.approx(1.96**2 * bound * (1.0 - bound) / 6, abs=1e-12)
+        assert found[f"{key}_low"] < found[f"{key}_high"]
 
 
 def test_a_finished_training_is_not_run_again(champion, tmp_path):
@@ -103,6 +110,43 @@ def test_success_is_within_5_cm_whatever_primitives_were_trained_with(champion, 
     strict = dataclasses.replace(champion, config=champion.config.model_copy(update={"game": game}))
     cell = small_cell("asp-only", "inair", num_episodes=40)
     assert run(cell, strict, tmp_path / "strict")["evaluation"]["success_last"] > 0.8
+
+
+def test_the_same_5_cm_are_paid_and_counted(champion):
+    cell = small_cell("idle", num_episodes=300)
+    counts = []
+    for distance in (0.05, 0.06):
+        task = TASKS["push"]
+        world = task.world_from(champion.config.world)
+        options = {"num_episodes": 300, "num_steps": 50, "success_distance_m": distance, "seed": 7}
+        counts.append(evaluate(Idle(), world, task.goals, **options).success_last)
+    assert play(cell, champion, Idle, 300, 7, Running()).success_last == counts[0] < counts[1]
+    env = make_worlds(cell, find_method("ours"), champion, 1)
+    achieved = np.float32([[0.0499, 0.0, 0.0], [0.0501, 0.0, 0.0], [0.0, 0.0, -0.0599]])
+    (paid,) = env.env_method("compute_reward", achieved, np.zeros((3, 3), np.float32), {}, indices=0)
+    np.testing.assert_array_equal(paid, [1.0, 0.0, 0.0])
+    env.close()
+
+
+def test_goals_of_the_curve_of_the_end_and_of_learning_are_others(champion, tmp_path, monkeypatch):
+    seeds = []
+    monkeypatch.setattr(
+        worker, "evaluate", lambda *given, **named: seeds.append(named["seed"]) or evaluate(*given, **named)
+    )
+    run(small_cell(seed=3), champion, tmp_path)
+    assert seeds == [1_000_003, 1_000_003, 2_000_003]
+
+
+def test_a_training_keeps_others_out_until_it_ends(champion, tmp_path):
+    def try_another(metrics):
+        with pytest.raises(TandemError, match=r"is in use by .*; stop that one first, or name another"):
+            run(small_cell(), champion, tmp_path, resume=True)
+        refused.append(metrics["iteration"])
+
+    refused = []
+    run(small_cell(), champion, tmp_path, on_iteration=try_another)
+    assert refused == [1, 2, 3]
+    assert not is_locked(tmp_path)
 
 
 def test_seeds_share_no_episodes(champion):
