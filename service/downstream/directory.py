@@ -20,7 +20,7 @@ import pickle
 from pathlib import Path
 from typing import Any, Self
 
-from service.downstream.settings import differences
+from service.downstream.settings import differences, read_cell
 from service.errors import TandemError
 from service.io.files import TEMPORARY_PREFIX, os_errors, remove_temporaries, write_atomic
 from service.io.jsonl import JsonlWriter
@@ -99,6 +99,8 @@ class TrainingDirectory:
         if not resume:
             raise TandemError(f"{self.path} holds a training already; continue it with --resume, or {_ELSEWHERE}")
         recorded = read_json(self.cell_file)
+        if recorded.get("format_version") == FORMAT_VERSION:
+            recorded["cell"] = read_cell(recorded, self.cell_file).model_dump(mode="json")
         if wrong := differences(recorded, {"format_version": FORMAT_VERSION, **identity}):
             raise TandemError(f"{self.path} was begun with {'; '.join(wrong)}; {_ELSEWHERE}")
 

@@ -6,11 +6,9 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
-from pydantic import ValidationError
-
 from service.downstream.directory import FORMAT_VERSION, read_json, to_json
 from service.downstream.methods import METHODS
-from service.downstream.settings import CellConfig, differences, first_line
+from service.downstream.settings import CellConfig, differences, read_cell
 from service.downstream.worker import Described
 from service.errors import TandemError
 from service.io.files import os_errors, write_exclusive
@@ -40,7 +38,7 @@ class ResultsDirectory:
             return None
         result = _read(path)
         wanted = {"cell": _settings(cell), **described.of(cell.method)}
-        if wrong := differences({"cell": _settings(_cell(path, result)), **_made_with(result)}, wanted):
+        if wrong := differences({"cell": _settings(read_cell(result, path)), **_made_with(result)}, wanted):
             raise TandemError(f"{path} is of {'; '.join(wrong)}: give the same settings, or name another directory")
         return result
 
@@ -57,7 +55,7 @@ class ResultsDirectory:
         of_all_seeds = {(cell.method, cell.task): (f"{cell.name}, asked for,", _settings(cell)) for cell in missing}
         for path in self._files():
             result = _read(path)
-            cell = _cell(path, result)
+            cell = read_cell(result, path)
             if wrong := differences(_made_with(result), described.of(cell.method)):
                 raise TandemError(f"{path} is of {'; '.join(wrong)}: name another directory, or move it away")
             other, settings = of_all_seeds.setdefault((cell.method, cell.task), (str(path), _settings(cell)))
@@ -88,14 +86,6 @@ class ResultsDirectory:
 
     def _files(self) -> list[Path]:
         return sorted(self.path.glob("*.json"))
-
-
-def _cell(path: Path, result: Result) -> CellConfig:
-    """What a result is of; settings that are younger than it have their defaults."""
-    try:
-        return CellConfig.model_validate(result["cell"])
-    except ValidationError as error:
-        raise TandemError(f"{path}: {first_line(error)}; name another directory") from None
 
 
 def _made_with(result: Result) -> dict[str, Any]:

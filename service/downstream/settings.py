@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 from pydantic import BaseModel, ConfigDict, Field, PositiveInt, ValidationError
@@ -47,6 +48,7 @@ class CellConfig(_Frozen):
     curve_every: int = Field(4, ge=1, description="iterations between evaluations on the way; one is 50 steps a world")
     curve_episodes: int = Field(100, ge=1)
     num_episodes: int = Field(300, ge=1, description="of the final evaluation; paper: 16, likely")
+    task_version: int = Field(0, ge=0, description="of the task's Gymnasium name; what does not say it is of v0")
 
     @property
     def name(self) -> str:
@@ -60,10 +62,10 @@ def make_cell(**values: Any) -> CellConfig:
     Raises:
         TandemError: an unknown task or method, a value out of its range, or too few env steps to learn anything.
     """
-    find_task(values.get("task", ""))
+    task = find_task(values.get("task", ""))
     method = find_method(values.get("method", ""))
     try:
-        cell = CellConfig(**values)
+        cell = CellConfig(**values, task_version=task.version)
     except ValidationError as error:
         raise TandemError(first_line(error)) from None
     if method.player is None:
@@ -94,6 +96,18 @@ def make_sac(**values: Any) -> SACConfig:
         return SACConfig(**values)
     except ValidationError as error:
         raise TandemError(first_line(error)) from None
+
+
+def read_cell(recorded: dict[str, Any], path: Path) -> CellConfig:
+    """The settings in a file; those that are younger than it have their defaults.
+
+    Raises:
+        TandemError: they are not those of a cell.
+    """
+    try:
+        return CellConfig.model_validate(recorded.get("cell"))
+    except ValidationError as error:
+        raise TandemError(f"{path}: {first_line(error)}; name another directory") from None
 
 
 def differences(recorded: dict[str, Any], wanted: dict[str, Any], prefix: str = "") -> list[str]:

@@ -144,6 +144,18 @@ class TestBadInput:
         cells = [small_cell("idle", num_episodes=9)]
         self.refused(r"push-idle-0\.json is of cell\.num_episodes 6, not 9", cells, source, tmp_path)
 
+    def test_another_version_of_a_task(self, source, tmp_path):
+        """Files that say nothing are of version 0: of Box they are refused, of the other tasks they count."""
+        old = [small_cell("idle", task) for task in ("box", "wall")]
+        table(old, source, tmp_path)
+        for path in (tmp_path / "out" / "downstream").iterdir():
+            tree = json.loads(path.read_text())
+            del tree["cell"]["task_version"]
+            path.write_text(json.dumps(tree))
+        self.refused(r"box-idle-0\.json is of cell\.task_version 0, not 1", old[:1], source, tmp_path)
+        assert table(old[1:], source, tmp_path, counted(ran := []))
+        assert ran == []
+
     @pytest.fixture
     def played(self, source, tmp_path):
         table(CELLS[1:2], source, tmp_path)

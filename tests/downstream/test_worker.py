@@ -195,6 +195,18 @@ class TestBadInput:
         other = small_cell("idle", num_episodes=7)
         self.refused(r"begun with cell\.num_episodes 6, not 7", other, champion, tmp_path, resume=True)
 
+    def test_a_task_of_another_version(self, champion, tmp_path):
+        """A directory of before tasks had versions is of version 0, which Box no longer is."""
+        for task in ("wall", "box"):
+            run(small_cell("idle", task), champion, tmp_path / task)
+            (tmp_path / task / "result.json").unlink()
+            tree = json.loads((tmp_path / task / "cell.json").read_text())
+            del tree["cell"]["task_version"]
+            (tmp_path / task / "cell.json").write_text(json.dumps(tree))
+        run(small_cell("idle", "wall"), champion, tmp_path / "wall", resume=True)
+        words = r"begun with cell\.task_version 0, not 1"
+        self.refused(words, small_cell("idle", "box"), champion, tmp_path / "box", resume=True)
+
     def test_other_primitives(self, champion, tmp_path):
         run(small_cell(), champion, tmp_path, stop=Stop(1))
         manifest = champion.manifest.model_copy(update={"version": 99})
