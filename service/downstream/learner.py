@@ -13,8 +13,7 @@ from stable_baselines3.common.buffers import DictReplayBuffer
 from stable_baselines3.common.logger import Logger
 
 from service.downstream.networks import GoalFeatures
-from service.downstream.previous import PREVIOUS, PreviousState
-from service.downstream.vec_env import VecEnvState, WorldsVecEnv
+from service.downstream.vec_env import PREVIOUS, VecEnvState, WorldsVecEnv
 from service.envs.gym.vector import VectorState
 from service.envs.observations import GOAL_SLICE, OBJECT_SLICE, POSITIONS_SIZE
 
@@ -29,6 +28,7 @@ if TYPE_CHECKING:
     FloatArray = NDArray[np.float32]
 
 _ROWS = ("actions", "rewards", "dones", "timeouts", "ep_start", "ep_length")
+_WORLDS_ROWS = ("previous", "returns", "lengths")
 _COUNTERS = ("num_timesteps", "_n_updates", "_episode_num")
 
 
@@ -158,18 +158,16 @@ def _restore_replay(buffer: Any, saved: dict[str, Any]) -> None:
 
 
 def _save_worlds(state: VecEnvState) -> dict[str, Any]:
-    inside: PreviousState = state.worlds
-    worlds: VectorState = inside.worlds
-    tree = asdict(worlds) | {"previous": inside.previous, "returns": state.returns, "lengths": state.lengths}
+    worlds: VectorState = state.worlds
+    tree = asdict(worlds) | {name: getattr(state, name) for name in _WORLDS_ROWS}
     arrays = {name: torch.from_numpy(value) for name, value in tree.items() if name != "random"}
     return {"arrays": arrays, "random": json.dumps(worlds.random)}
 
 
 def _worlds_state(saved: dict[str, Any]) -> VecEnvState:
     arrays = {name: value.numpy() for name, value in saved["arrays"].items()}
-    previous, returns, lengths = (arrays.pop(name) for name in ("previous", "returns", "lengths"))
-    worlds = VectorState(**arrays, random=tuple(json.loads(saved["random"])))
-    return VecEnvState(PreviousState(worlds, previous), returns, lengths)
+    rows = {name: arrays.pop(name) for name in _WORLDS_ROWS}
+    return VecEnvState(VectorState(**arrays, random=tuple(json.loads(saved["random"]))), **rows)
 
 
 def _numpy_random() -> list[Any]:

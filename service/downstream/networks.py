@@ -11,7 +11,7 @@ from stable_baselines3.sac.policies import LOG_STD_MAX, LOG_STD_MIN, Actor, Mult
 from torch import Tensor
 
 from service.config import MCPConfig
-from service.downstream.previous import PREVIOUS
+from service.downstream.vec_env import PREVIOUS
 from service.envs.observations import (
     BOB_SIZE,
     EFFECTOR_SLICE,

@@ -226,7 +226,6 @@ class _Training:
 
 def make_worlds(cell: CellConfig, method: Method, trained: TrainedBob, num_threads: int) -> WorldsVecEnv:
     """The worlds that a method's learner acts in."""
-    from service.downstream.previous import PreviousPositionsVector
     from service.downstream.vec_env import WorldsVecEnv
 
     worlds = TabletopVectorEnv(
@@ -237,7 +236,7 @@ def make_worlds(cell: CellConfig, method: Method, trained: TrainedBob, num_threa
         max_episode_steps=EPISODE_STEPS,
         num_threads=num_threads,
     )
-    return WorldsVecEnv(method.wrap(PreviousPositionsVector(worlds), trained))
+    return WorldsVecEnv(method.wrap(worlds, trained))
 
 
 def play(

@@ -302,7 +302,7 @@ class TestFixtures:
             assert np.abs(worlds.object_position[:, 2] - 0.03).max() < 0.001
 
     def test_success_in_a_box_is_inside(self):
-        """A cube counts with its underside below the rim of 5 cm, anywhere on the bottom, and nowhere beside the box."""
+        """A cube counts with its underside below the rim, 5 cm up, anywhere on the bottom, and nowhere beside."""
         env = TabletopEnv(CONFIG, task="box")
         env.reset(seed=0)
         state = env.state()
