@@ -17,8 +17,8 @@ class Task:
 
     title: str
     """As the paper writes it."""
-    words: str
-    """What it asks for."""
+    description: str
+    """What it asks for, in a few words."""
     goals: GoalKind
     air_share: float
     """The paper's p: share of goals that are drawn anywhere in the volume; the others lie on the table."""
@@ -41,7 +41,7 @@ class Task:
 
 
 SUCCESS_DISTANCE_M = 0.05
-"""Of every task (paper), whatever primitives were trained with."""
+"""Greatest distance from object to goal that counts as success, in every task (paper)."""
 
 TASKS: Mapping[str, Task] = {
     "larger": Task(
@@ -70,11 +70,11 @@ TASKS: Mapping[str, Task] = {
         version=1,  # 0: a goal 5 mm higher, reached with the object's underside up to 5 mm above the rim
     ),
 }
-"""By the name that commands take, in the paper's order. Decisions behind the numbers: docs/decisions/0007."""
+"""The tasks by the names that commands take, in the paper's order. Decisions behind the numbers: docs/decisions/0007."""
 
 
 def find_task(name: str) -> Task:
-    """A task by its name.
+    """Find a task by its name.
 
     Raises:
         TandemError: no such task.

@@ -11,13 +11,13 @@ from service.envs.observations import NORMALISATION_BOB
 from service.policies.composition import compose
 from service.policies.evaluator import MCPEvaluator
 from service.policies.networks import export_parameters
-from tests.downstream.cells import small_cell
+from tests.downstream.trials import small_trial
 
 
 def learner_of(method, champion):
-    cell = small_cell(method)
-    env = make_worlds(cell, METHODS[method], champion, 1)
-    learner = make_learner(cell, METHODS[method], env)
+    trial = small_trial(method)
+    env = make_worlds(trial, METHODS[method], champion, 1)
+    learner = make_learner(trial, METHODS[method], env)
     return learner, env
 
 
