@@ -70,7 +70,7 @@ TASKS: Mapping[str, Task] = {
         version=1,  # 0: a goal 5 mm higher, reached with the object's underside up to 5 mm above the rim
     ),
 }
-"""The tasks by the names that commands take, in the paper's order. Decisions behind the numbers: docs/decisions/0007."""
+"""The tasks by the names that commands take, in the paper's order. Reasons for the numbers: docs/decisions/0007."""
 
 
 def find_task(name: str) -> Task:
