@@ -156,8 +156,7 @@ class TrainingDirectory:
 
 def _flat(identity: dict[str, Any]) -> dict[str, Any]:
     """An identity with the trial's settings beside everything else."""
-    rest = dict(identity)
-    return rest.pop(TRIAL, {}) | rest
+    return {**identity.get(TRIAL, {}), **{key: value for key, value in identity.items() if key != TRIAL}}
 
 
 def read_trial(tree: dict[str, Any], path: Path) -> TrialConfig:

@@ -144,10 +144,9 @@ def _cost(seeds: Seeds) -> str:
 
 def _efficiency(of: Mapping[tuple[str, str], Seeds]) -> Sequence[str]:
     """How soon methods that compose primitives are good, and when the first that learns from nothing is as good."""
-    composing, scratch = (
-        [name for name, method in METHODS.items() if chosen(method) and any(found == name for found, _ in of)]
-        for chosen in (lambda method: method.composes, lambda method: method.learns_from_nothing)
-    )
+    known = {name: method for name, method in METHODS.items() if any(found == name for found, _ in of)}
+    composing = [name for name, method in known.items() if method.composes]
+    scratch = [name for name, method in known.items() if method.learns_from_nothing]
     if not composing or not scratch:
         return ()
     rows = []
@@ -157,9 +156,9 @@ def _efficiency(of: Mapping[tuple[str, str], Seeds]) -> Sequence[str]:
             seeds = of.get((method, task), [])
             level = FINAL_SHARE * float(np.mean([each["evaluation"]["success_last"] for each in seeds] or [0.0]))
             until = _mean_until(seeds, level)
-            known = {name: of[name, task] for name in scratch if (name, task) in of}
+            rivals = {name: of[name, task] for name in scratch if (name, task) in of}
             own.append("" if until is None else f"{until / 1e3:.0f}")
-            others.append("" if until is None or not known else f"*{_soonest(known, level)}*")
+            others.append("" if until is None or not rivals else f"*{_soonest(rivals, level)}*")
         rows += [own, others]
     return (
         "\n## How soon\n",

@@ -105,12 +105,12 @@ def run_trial(trial: TrialConfig, trained: TrainedBob, path: Path, options: RunO
         if directory.result_file.exists():
             return read_json(directory.result_file)
         learned: dict[str, Any] | None = {"env_steps": 0, "wall_s": 0.0, "curve": []}
-        if method.player is not None:
-            new_player = functools.partial(method.player, trained)
-        else:
+        if method.player is None:
             training = _Training(trial, method, trained, directory, options)
             stack.callback(training.env.close)
             learned, new_player = training.run(saved), training.new_player
+        else:
+            new_player = functools.partial(method.player, trained)
         if learned is None:
             return None
         evaluation = _final_evaluation(trial, trained, new_player(), options.num_threads)
@@ -118,8 +118,9 @@ def run_trial(trial: TrialConfig, trained: TrainedBob, path: Path, options: RunO
             raise RuntimeError("the frozen primitives have changed while they were composed")
         made = {"git_commit": git_commit(), "num_cores": os.cpu_count(), "num_threads": options.num_threads}
         _draw(trial, trained, new_player, directory, video=options.video)
-        result = {"format_version": FORMAT_VERSION, **identity, "evaluation": evaluation, "made": made, **learned}
-        result = plain(result)
+        result: dict[str, Any] = plain(
+            {"format_version": FORMAT_VERSION, **identity, "evaluation": evaluation, "made": made, **learned}
+        )
         write_json(directory.result_file, result)  # last: where it is, nothing is left to do
         return result
 
