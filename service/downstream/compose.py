@@ -12,7 +12,7 @@ import hashlib
 import math
 import operator
 from collections.abc import Callable, Iterator
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import gymnasium
 import numpy as np
@@ -22,28 +22,15 @@ from service.envs.observations import POSITIONS_SIZE, SPACES
 from service.errors import TandemError
 from service.policies.evaluator import MCPEvaluator
 
+if TYPE_CHECKING:
+    from service.primitives.loading import TrainedBob
+
 FloatArray = NDArray[np.float32]
 Info = dict[str, Any]
 Positions = Callable[[Any], FloatArray]
 
 WEIGHT_RATIO = 100.0
 """Greatest weight over least. Bob's own gate has the same range, [0.01, 1]."""
-
-
-class Trained(Protocol):
-    """What ``service.load_primitives`` returns, as far as it matters here."""
-
-    @property
-    def label(self) -> str:
-        """Where it comes from."""
-
-    @property
-    def primitives(self) -> MCPEvaluator:
-        """What can be composed."""
-
-    @property
-    def manifest(self) -> Any:
-        """What the registry knows about it, or None."""
 
 
 def action_weights(actions: FloatArray) -> FloatArray:
@@ -57,7 +44,7 @@ def action_weights(actions: FloatArray) -> FloatArray:
     return weights
 
 
-def check_primitives(primitives: MCPEvaluator | Trained) -> MCPEvaluator:
+def check_primitives(primitives: MCPEvaluator | TrainedBob) -> MCPEvaluator:
     """Return what can be composed, once its manifest says that it is for this robot and layout.
 
     Raises:
@@ -69,7 +56,7 @@ def check_primitives(primitives: MCPEvaluator | Trained) -> MCPEvaluator:
     return primitives.primitives
 
 
-def check_robot(trained: Trained) -> None:
+def check_robot(trained: TrainedBob) -> None:
     """Assert that a policy, composable or not, is for this robot and layout, as far as its manifest says.
 
     Raises:
@@ -108,7 +95,7 @@ class ComposePrimitives(gymnasium.Wrapper[Any, FloatArray, Any, FloatArray], gym
     def __init__(
         self,
         env: gymnasium.Env[Any, FloatArray],
-        primitives: MCPEvaluator | Trained,
+        primitives: MCPEvaluator | TrainedBob,
         *,
         positions: Positions | None = None,
     ) -> None:
@@ -142,12 +129,12 @@ class ComposePrimitives(gymnasium.Wrapper[Any, FloatArray, Any, FloatArray], gym
 
 
 class ComposePrimitivesVector(gymnasium.vector.VectorWrapper[Any, FloatArray, Any, FloatArray, Any]):
-    """As ``ComposePrimitives``, for N environments at once: actions are (N, K), ``positions`` takes out (N, 11)."""
+    """N environments at once, as in ``ComposePrimitives``: actions are (N, K), ``positions`` takes out (N, 11)."""
 
     def __init__(
         self,
         env: gymnasium.vector.VectorEnv[Any, FloatArray, Any],
-        primitives: MCPEvaluator | Trained,
+        primitives: MCPEvaluator | TrainedBob,
         *,
         positions: Positions | None = None,
     ) -> None:
@@ -190,11 +177,11 @@ class ComposePrimitivesVector(gymnasium.vector.VectorWrapper[Any, FloatArray, An
 
 
 class _Composer:
-    """From weights and the last positions to actions; what both wrappers share."""
+    """The part that both wrappers share: turns weights and the last positions into actions."""
 
     def __init__(
         self,
-        primitives: MCPEvaluator | Trained,
+        primitives: MCPEvaluator | TrainedBob,
         observation_space: gymnasium.Space[Any],
         action_space: gymnasium.Space[Any],
         positions: Positions | None,
@@ -240,7 +227,7 @@ def _weights_space(num_primitives: int) -> gymnasium.Space[FloatArray]:
 
 
 def _arrays(owner: Any, prefix: str) -> Iterator[tuple[str, NDArray[Any]]]:
-    """Every array below an object, by the path to it."""
+    """Arrays below an object, by the paths to them."""
     if isinstance(owner, np.ndarray | np.generic):
         yield prefix, np.asarray(owner)
     elif isinstance(owner, list):

@@ -76,7 +76,7 @@ def _spread_seed(seed: int) -> int:
 
 
 class LearnedPolicy:
-    """What a learner has learned, as evaluations and videos take it: Bob's input to actions, without noise.
+    """The policy of a learner, as evaluations and videos take it: Bob's input to actions, without noise.
 
     Plays N episodes from their start; others need another one, since it keeps the positions of the step before.
     """

@@ -70,13 +70,13 @@ class Method:
     """One row of the table."""
 
     title: str
-    """As the table writes it."""
+    """Name in the table."""
     description: str
-    """What it is, in a few words."""
+    """A few words for ``tandem downstream methods``."""
     wrap: Callable[[Worlds, TrainedBob], Worlds] = _same
     """The worlds its learner acts in."""
     decode: Callable[[TrainedBob, FloatArray, FloatArray], FloatArray] = _act
-    """From (N, 11) positions and the learner's (N, A) actions to (N, 4) actions, as the wrapped worlds do it."""
+    """Turns (N, 11) positions and the learner's (N, A) actions into (N, 4) actions, as the wrapped worlds do."""
     policy: Callable[[], type[SACPolicy]] = _gaussian
     """Class of actor and critics; imports torch."""
     her_ratio: tuple[float, float] | None = None
@@ -85,7 +85,7 @@ class Method:
     composes: bool = False
     """Whether it needs primitives that can be composed."""
     player: Callable[[TrainedBob], Deterministic] | None = None
-    """Who plays, where nothing is learned."""
+    """Makes the policy that plays, where nothing is learned."""
 
     @property
     def takes_primitives(self) -> bool:

@@ -18,7 +18,7 @@ Seeds = Sequence[Result]
 """Results of one method on one task."""
 
 FINAL_SHARE = 0.9
-"""Of a method's own final success: how soon it is reached is compared."""
+"""Share of a method's own final success; compared is how soon it is reached."""
 
 PAPER: Mapping[str, Mapping[str, float]] = {
     method: dict(zip(("larger", "inair", "push", "sphere", "wall", "box"), rates, strict=True))
@@ -37,7 +37,7 @@ BEST: Mapping[str, float] = {"larger": 0.94, "inair": 1.00, "push": 0.92, "spher
 """The best of all the paper's methods, skill discovery included."""
 
 MARK = "Written by `tandem downstream table`"
-"""In every page, to tell it from one that a person wrote."""
+"""Words in every page, to tell it from one that a person wrote."""
 
 
 def write_page(results: Sequence[Result], picture: str) -> str:
@@ -143,7 +143,7 @@ def _cost(seeds: Seeds) -> str:
 
 
 def _efficiency(of: Mapping[tuple[str, str], Seeds]) -> Sequence[str]:
-    """How soon methods that compose primitives are good, and when the first that learns from nothing is as good."""
+    """The section on how soon methods that compose are good, and the first that learns from nothing is as good."""
     known = {name: method for name, method in METHODS.items() if any(found == name for found, _ in of)}
     composing = [name for name, method in known.items() if method.composes]
     scratch = [name for name, method in known.items() if method.learns_from_nothing]

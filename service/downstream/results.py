@@ -20,7 +20,7 @@ class ResultsDirectory:
     """The results of trials, by their names."""
 
     def __init__(self, path: Path) -> None:
-        """Nothing is read before it is asked for; the directory need not exist."""
+        """Name the directory, which need not exist; nothing is read before it is asked for."""
         self.path = path
 
     def find(self, trial: TrialConfig, provenance: Provenance) -> Result | None:
@@ -92,7 +92,7 @@ def _made_with(result: Result) -> dict[str, Any]:
 
 
 def _settings(trial: TrialConfig) -> dict[str, Any]:
-    """What a trial's result depends on: where nothing is learned, not on how."""
+    """Settings that a trial's result depends on; where nothing is learned, those of learning do not count."""
     method = METHODS.get(trial.method)
     learning = {"sac", "num_env_steps", "curve_every", "curve_episodes"}
     return trial.model_dump(mode="json", exclude=learning if method and method.player else None)

@@ -1,4 +1,4 @@
-"""What a trial is: a method on a task with a seed, how it learns, and how it is evaluated."""
+"""Settings of a trial: a method on a task with a seed, how it learns, and how it is evaluated."""
 
 from __future__ import annotations
 

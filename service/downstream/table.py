@@ -31,7 +31,7 @@ _POLL_S = 1.0
 
 @dataclass(frozen=True, slots=True)
 class Source:
-    """Where a worker, on whatever machine, takes primitives from and trains."""
+    """Places where a worker, on whatever machine, takes primitives from and trains."""
 
     primitives: str
     registry: str
@@ -162,7 +162,7 @@ def run_on_ray(
 
 
 def _run_remotely(trial: TrialConfig, primitives: Source | TrainedBob, path: Path, num_threads: int) -> Result:
-    """What a Ray task does, wherever it is."""
+    """Run a trial in a Ray task, wherever it is."""
     trained = primitives.load() if isinstance(primitives, Source) else primitives
     result = run_trial(trial, trained, path, RunOptions(resume=True, num_threads=num_threads))
     assert result is not None, "nobody asks a task to stop"

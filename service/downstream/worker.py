@@ -45,7 +45,7 @@ _logger = logging.getLogger(__name__)
 
 @dataclass(frozen=True, slots=True)
 class Callbacks:
-    """What the caller of a trial or a table wants to know, and when it wants to stop."""
+    """Functions of the caller: to be told how a trial or a table goes on, and to say when to stop."""
 
     stop: Callable[[], bool] = lambda: False
     """Asked between iterations, and between trials."""
@@ -55,11 +55,11 @@ class Callbacks:
 
 @dataclass(frozen=True, slots=True)
 class RunOptions:
-    """How a trial runs; no part of what it is."""
+    """Options of running a trial; its result does not depend on them, but for the last bits (threads)."""
 
     resume: bool = False
     num_threads: int = 0
-    """Of physics and torch; 0: as many as there are cores."""
+    """Threads of physics and torch; 0: as many as there are cores."""
     video: bool = False
     """Whether to make a video; half a minute without a graphics card."""
     callbacks: Callbacks = Callbacks()
@@ -67,15 +67,15 @@ class RunOptions:
 
 @dataclass(frozen=True, slots=True)
 class Provenance:
-    """What results are of, besides their trials: the primitives, and the world that they bring along."""
+    """Primitives, and the world that they bring along: what a result is of, besides its trial."""
 
     primitives: dict[str, str]
     """Name, and SHA-256 of the parameters as ``digest``."""
     world: dict[str, Any]
-    """Its settings, before a task replaces some."""
+    """Settings of the world, before a task replaces some."""
 
     def of(self, method: str) -> dict[str, Any]:
-        """What a method's result says of them: no primitives where it takes none."""
+        """The part that a method's result records: no primitives where it takes none."""
         known = METHODS.get(method)
         without = known is not None and not known.takes_primitives
         return {"primitives": None if without else self.primitives, "world": self.world}
@@ -175,13 +175,13 @@ class _Training:
         return {"env_steps": self._learner.num_timesteps, "wall_s": self._wall_s, "curve": self._curve}
 
     def new_player(self) -> Deterministic:
-        """What has been learned so far, ready for a batch of episodes."""
+        """The policy learned so far, ready for a batch of episodes."""
         from service.downstream.learner import LearnedPolicy
 
         return LearnedPolicy(self._learner, self._method, self._trained)
 
     def _iterate(self) -> None:
-        """An episode of every world, with its updates; now and then an evaluation, which is not counted as time."""
+        """Play an episode in every world, with its updates; now and then evaluate, which is not counted as time."""
         from service.downstream.learner import set_progress
 
         begun, before = time.perf_counter(), self._learner.num_timesteps

@@ -16,20 +16,20 @@ class Task:
     """Random goals in a world, which differs from the one that primitives were trained in."""
 
     title: str
-    """As the paper writes it."""
+    """Name in the paper."""
     description: str
-    """What it asks for, in a few words."""
+    """A few words on what it asks for."""
     goals: GoalKind
     air_share: float
     """The paper's p: share of goals that are drawn anywhere in the volume; the others lie on the table."""
     world: Mapping[str, Any] = field(default_factory=dict)
-    """What of a world is replaced."""
+    """Settings of a world that are replaced."""
     version: int = 0
-    """Of its Gymnasium name: results of different versions are not compared."""
+    """Version in its Gymnasium name; results of different ones are not compared."""
 
     @property
     def id(self) -> str:
-        """Its Gymnasium name."""
+        """Gymnasium name, such as ``tandem/InAir-v0``."""
         return f"tandem/{self.title}-v{self.version}"
 
     def world_from(self, world: WorldConfig) -> WorldConfig:
