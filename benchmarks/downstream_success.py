@@ -2,8 +2,8 @@
 
     python benchmarks/downstream_success.py --task wall --steps 200000 --out docs/results/downstream_success.json
 
-One environment, every default of ``SAC``, the same frozen primitives, and the goals that the cells of the table are
-evaluated on. A point of the curve has the wall-clock time of learning alone, as the cells count it.
+One environment, every default of ``SAC``, the same frozen primitives, and the goals that the trials of the table are
+evaluated on. A point of the curve has the wall-clock time of learning alone, as the trials count it.
 """
 
 from __future__ import annotations
@@ -25,36 +25,36 @@ from benchmarks.downstream_throughput import default_learner
 from benchmarks.measuring import machine, write_json
 from service.downstream.learner import LearnedPolicy
 from service.downstream.methods import METHODS
-from service.downstream.settings import CellConfig, make_cell
-from service.downstream.worker import CURVE_SEED, FINAL_SEED, Running, describe, play
+from service.downstream.settings import TrialConfig, make_trial
+from service.downstream.worker import CURVE_SEED, FINAL_SEED, find_provenance, play
 from service.errors import TandemError
 from service.primitives.loading import TrainedBob
 
 
-def learn(cell: CellConfig, trained: TrainedBob, *, every: int, threads: int) -> dict[str, Any]:
-    """Learn ``cell.num_env_steps``; evaluate after every ``every`` env steps and at the end."""
+def learn(trial: TrialConfig, trained: TrainedBob, *, every: int, threads: int) -> dict[str, Any]:
+    """Learn ``trial.num_env_steps``; evaluate after every ``every`` env steps and at the end."""
     torch.set_num_threads(threads)
-    learner, running = default_learner(cell, trained), Running(num_threads=threads)
+    learner = default_learner(trial, trained)
 
     def player() -> LearnedPolicy:
-        return LearnedPolicy(learner, METHODS[cell.method], trained)
+        return LearnedPolicy(learner, METHODS[trial.method], trained)
 
     curve: list[dict[str, float]] = []
     wall_s = 0.0
-    while learner.num_timesteps < cell.num_env_steps:
+    while learner.num_timesteps < trial.num_env_steps:
         begun = time.perf_counter()
-        num = min(every, cell.num_env_steps - learner.num_timesteps)
+        num = min(every, trial.num_env_steps - learner.num_timesteps)
         learner.learn(num, reset_num_timesteps=not curve, log_interval=None)  # type: ignore[arg-type]
         wall_s += time.perf_counter() - begun
-        found = play(cell, trained, player, cell.curve_episodes, cell.seed + CURVE_SEED, running)
+        found = play(trial, trained, player(), trial.curve_episodes, trial.seed + CURVE_SEED, threads)
         rates = {"success_last": found.success_last, "success_ever": found.success_ever}
         curve.append({"env_steps": learner.num_timesteps, "wall_s": wall_s, **rates})
         print(f"{learner.num_timesteps:10,} env steps, {wall_s:6.0f} s: {found.success_last:.0%}", flush=True)
-    final = play(cell, trained, player, cell.num_episodes, cell.seed + FINAL_SEED, running)
-    settings = cell.model_dump(mode="json", include={"task", "method", "seed", "num_env_steps"})
+    final = play(trial, trained, player(), trial.num_episodes, trial.seed + FINAL_SEED, threads)
+    settings = trial.model_dump(mode="json", include={"task", "method", "seed", "num_env_steps"})
     return {
         "machine": machine("torch", "mujoco", "stable-baselines3"),
-        "settings": {"cell": settings, **describe(trained).of(cell.method), "threads": threads},
+        "settings": {"cell": settings, **find_provenance(trained).of(trial.method), "threads": threads},
         "curve": curve,
         "evaluation": final.as_dict(),
         "wall_s": wall_s,
@@ -74,8 +74,8 @@ def main() -> int:
     parser.add_argument("--out", type=Path, metavar="FILE")
     given = parser.parse_args()
     try:
-        cell = make_cell(task=given.task, method=given.method, seed=given.seed, num_env_steps=given.steps)
-        result = learn(cell, service.load_primitives(given.primitives), every=given.every, threads=given.threads)
+        trial = make_trial(task=given.task, method=given.method, seed=given.seed, num_env_steps=given.steps)
+        result = learn(trial, service.load_primitives(given.primitives), every=given.every, threads=given.threads)
         if given.out is not None:
             write_json(given.out, result)
     except TandemError as error:

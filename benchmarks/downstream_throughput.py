@@ -30,7 +30,7 @@ from benchmarks.measuring import Sample, describe, describe_ratio, machine, meas
 from service.downstream.compose import ComposePrimitives
 from service.downstream.learner import make_learner
 from service.downstream.methods import METHODS
-from service.downstream.settings import CellConfig, make_cell
+from service.downstream.settings import TrialConfig, make_trial
 from service.downstream.worker import make_worlds
 from service.envs.gym.registration import EPISODE_STEPS
 from service.envs.tasks import find_task
@@ -45,26 +45,26 @@ _DEFAULT_WARM_UP = 200
 Play = Callable[[], int]
 
 
-def make_worker(cell: CellConfig, trained: TrainedBob, num_threads: int) -> Play:
+def make_worker(trial: TrialConfig, trained: TrainedBob, num_threads: int) -> Play:
     """Plays an episode of every world, learning; it has begun to learn."""
-    method = METHODS[cell.method]
-    env = make_worlds(cell, method, trained, num_threads)
-    learner, num = make_learner(cell, method, env), EPISODE_STEPS * cell.sac.num_worlds
-    learner.learn(cell.sac.learning_starts + num)
+    method = METHODS[trial.method]
+    env = make_worlds(trial, method, trained, num_threads)
+    learner, num = make_learner(trial, method, env), EPISODE_STEPS * trial.sac.num_worlds
+    learner.learn(trial.sac.learning_starts + num)
     return _player(learner, num)
 
 
-def default_learner(cell: CellConfig, trained: TrainedBob) -> SAC:
-    """SAC as it comes, in one environment of the cell's task."""
-    env = ComposePrimitives(gymnasium.make(find_task(cell.task).id, config=trained.config.world), trained)
-    learner = SAC("MultiInputPolicy", env, seed=cell.seed, device="cpu")
+def default_learner(trial: TrialConfig, trained: TrainedBob) -> SAC:
+    """SAC as it comes, in one environment of the trial's task."""
+    env = ComposePrimitives(gymnasium.make(find_task(trial.task).id, config=trained.config.world), trained)
+    learner = SAC("MultiInputPolicy", env, seed=trial.seed, device="cpu")
     learner.set_logger(Logger(folder=None, output_formats=[]))  # else every ``learn`` makes a directory in /tmp
     return learner
 
 
-def make_default(cell: CellConfig, trained: TrainedBob) -> Play:
+def make_default(trial: TrialConfig, trained: TrainedBob) -> Play:
     """Plays some steps of one environment, learning; it has begun to learn."""
-    learner = default_learner(cell, trained)
+    learner = default_learner(trial, trained)
     learner.learn(_DEFAULT_WARM_UP)
     return _player(learner, _DEFAULT_STEPS)
 
@@ -78,10 +78,10 @@ def _player(learner: SAC, num_steps: int) -> Play:
     return play
 
 
-def compare(cell: CellConfig, trained: TrainedBob, *, num_pairs: int, seconds: float, threads: int) -> dict[str, Any]:
+def compare(trial: TrialConfig, trained: TrainedBob, *, num_pairs: int, seconds: float, threads: int) -> dict[str, Any]:
     """Measure both in turn."""
     torch.set_num_threads(threads)
-    players = {WORKER: make_worker(cell, trained, threads), DEFAULT: make_default(cell, trained)}
+    players = {WORKER: make_worker(trial, trained, threads), DEFAULT: make_default(trial, trained)}
     samples: dict[str, list[Sample]] = {name: [] for name in players}
     for _ in range(num_pairs):
         for name, play in players.items():
@@ -89,7 +89,7 @@ def compare(cell: CellConfig, trained: TrainedBob, *, num_pairs: int, seconds: f
     return {
         "machine": machine("torch", "mujoco", "stable-baselines3"),
         "settings": {
-            "cell": cell.model_dump(mode="json"),
+            "cell": trial.model_dump(mode="json"),
             "num_pairs": num_pairs,
             "seconds": seconds,
             "threads": threads,
@@ -111,8 +111,8 @@ def main() -> int:
     parser.add_argument("--out", type=Path, metavar="FILE")
     given = parser.parse_args()
     try:
-        cell, trained = make_cell(task=given.task, method=given.method), service.load_primitives(given.primitives)
-        result = compare(cell, trained, num_pairs=given.pairs, seconds=given.seconds, threads=given.threads)
+        trial, trained = make_trial(task=given.task, method=given.method), service.load_primitives(given.primitives)
+        result = compare(trial, trained, num_pairs=given.pairs, seconds=given.seconds, threads=given.threads)
         if given.out is not None:
             write_json(given.out, result)
     except TandemError as error:

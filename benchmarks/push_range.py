@@ -20,7 +20,7 @@ import numpy as np
 import service
 from benchmarks.measuring import write_json
 from service.downstream.compose import action_weights, check_primitives
-from service.downstream.worker import describe
+from service.downstream.worker import find_provenance
 from service.errors import TandemError
 
 if TYPE_CHECKING:
@@ -98,7 +98,7 @@ def main() -> int:
         rows: dict[str, Any] = {}
         for name in given.primitives:
             trained = service.load_primitives(name, given.registry)
-            rows[name] = {**describe(trained).primitives, "impossible": measure(trained, **settings)}
+            rows[name] = {**find_provenance(trained).primitives, "impossible": measure(trained, **settings)}
         if given.out is not None:
             write_json(given.out, {"settings": settings, "rows": rows})
     except TandemError as error:

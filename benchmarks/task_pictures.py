@@ -88,7 +88,7 @@ def draw_tasks(path: Path) -> None:
         panel = Image.fromarray(draw_task(name, SEEDS[name])).crop((2, 0, WIDTH - 2, HEIGHT))
         sheet.paste(panel, (left + 2, top))
         pen.text((left + WIDTH / 2, top + HEIGHT + 4), task.title, INK, title, anchor="ma")
-        pen.text((left + WIDTH / 2, top + HEIGHT + 26), task.words, FAINT, words, anchor="ma")
+        pen.text((left + WIDTH / 2, top + HEIGHT + 26), task.description, FAINT, words, anchor="ma")
     path.parent.mkdir(parents=True, exist_ok=True)
     # the last two bits of a colour are a third of the file, and a palette of 256 has no room for the transparent goals
     sheet.point(lambda value: value | 3).save(path, optimize=True)

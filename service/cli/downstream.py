@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import json
 import sys
 import time
@@ -15,7 +16,9 @@ import typer
 from service.errors import TandemError
 
 if TYPE_CHECKING:
-    from service.downstream.table import Runner, Watching
+    from service.downstream.table import Runner
+    from service.downstream.worker import Callbacks
+    from service.runtime.signals import StopSignals
 
 downstream_app = typer.Typer(name="downstream", help="New tasks with frozen primitives.", no_args_is_help=True)
 
@@ -55,23 +58,23 @@ def train(
     with _user_errors():
         _check_installed()
         import service
-        from service.downstream.settings import make_cell
-        from service.downstream.worker import Running, run_cell
+        from service.downstream.settings import make_trial
+        from service.downstream.worker import RunOptions, run_trial
 
-        cell = make_cell(task=task, method=method, seed=seed, num_episodes=episodes, **_learning(steps, overrides))
-        path = run_dir or Path("runs") / "downstream" / cell.name
-        with _stopping() as watching:
-            running = Running(resume, threads or 0, True, watching.stop, watching.on_iteration)
-            result = run_cell(cell, service.load_primitives(primitives, registry), path, running)
+        trial = make_trial(task=task, method=method, seed=seed, num_episodes=episodes, **_learning(steps, overrides))
+        path = run_dir or Path("runs") / "downstream" / trial.name
+        with _stop_on_signals() as (callbacks, signals):
+            options = RunOptions(resume, threads or 0, video=True, callbacks=callbacks)
+            result = run_trial(trial, service.load_primitives(primitives, registry), path, options)
     if result is None:
         typer.echo(f"saved; continue with the same command and --resume --run-dir {path}", err=True)
-        raise typer.Exit(_signal_code(watching))
+        raise typer.Exit(_EXIT_SIGNAL + (signals.first or 0))
     if as_json:
         typer.echo(json.dumps(result, indent=1))
         return
     found = result["evaluation"]
     typer.echo(
-        f"{cell.name}: at the last step {found['success_last']:.1%} [{found['success_last_low']:.1%}, "
+        f"{trial.name}: at the last step {found['success_last']:.1%} [{found['success_last_low']:.1%}, "
         f"{found['success_last_high']:.1%}], ever {found['success_ever']:.1%}, of {found['num_episodes']} episodes"
     )
     typer.echo(f"{result['env_steps']:,} env steps in {result['wall_s']:.0f} s; {path}")
@@ -86,7 +89,7 @@ def table(
     steps: _Steps = None,
     episodes: _Episodes = 300,
     out: Annotated[
-        Path, typer.Option(metavar="DIR", help="Page and picture; in its downstream/ one file for each cell.")
+        Path, typer.Option(metavar="DIR", help="Page and picture; in its downstream/ one file for each trial.")
     ] = Path("docs/results"),
     runs: Annotated[Path, typer.Option(metavar="DIR", help="Trainings, to continue them.")] = Path("runs/downstream"),
     overrides: _Set = None,
@@ -98,28 +101,28 @@ def table(
     num_workers: Annotated[int | None, typer.Option(help="Trainings at once; default: one a core.", min=1)] = None,
     threads: _Threads = None,
 ) -> None:
-    """Run the cells that are missing, and write downstream.md."""
+    """Run the trials that are missing, and write downstream.md."""
     with _user_errors():
         _check_installed()
         from service.downstream.methods import METHODS
-        from service.downstream.settings import make_cell
+        from service.downstream.settings import make_trial
         from service.downstream.table import Source, make_table
         from service.envs.tasks import TASKS
 
         learning = _learning(steps, overrides)
-        cells = [
-            make_cell(task=task, method=method, seed=seed, num_episodes=episodes, **learning)
+        trials = [
+            make_trial(task=task, method=method, seed=seed, num_episodes=episodes, **learning)
             for seed in _numbers(seeds)
             for task in _names(tasks, TASKS)
             for method in _names(methods, METHODS)
         ]
-        cells = list(dict.fromkeys(cells))
+        trials = list(dict.fromkeys(trials))
         source = Source(primitives, registry, runs.absolute())
-        with _runtime(runtime, address, num_workers, threads) as runner, _stopping() as watching:
-            complete = make_table(cells, source, out, runner, watching)
+        with _make_runner(runtime, address, num_workers, threads) as runner, _stop_on_signals() as (callbacks, signals):
+            complete = make_table(trials, source, out, runner, callbacks)
     if not complete:
         typer.echo("stopped; the same command continues", err=True)
-        raise typer.Exit(_signal_code(watching))
+        raise typer.Exit(_EXIT_SIGNAL + (signals.first or 0))
 
 
 @downstream_app.command("methods")
@@ -128,14 +131,14 @@ def list_methods() -> None:
     from service.downstream.methods import METHODS
 
     for name, method in METHODS.items():
-        typer.echo(f"{name:<24} {method.words}")
+        typer.echo(f"{name:<24} {method.description}")
 
 
 def _learning(steps: int | None, overrides: list[str] | None) -> dict[str, Any]:
-    """Settings of a cell about learning, defaults where left out."""
+    """Settings of a trial about learning, defaults where left out."""
     import yaml
 
-    from service.downstream.settings import SACConfig, make_sac
+    from service.downstream.settings import SACConfig, validate
 
     values = {}
     for override in overrides or []:
@@ -146,7 +149,7 @@ def _learning(steps: int | None, overrides: list[str] | None) -> dict[str, Any]:
             values[key] = yaml.safe_load(text)
         except yaml.YAMLError:
             raise TandemError(f"--set {override}: the value is no YAML") from None
-    return {"sac": make_sac(**values)} | ({} if steps is None else {"num_env_steps": steps})
+    return {"sac": validate(SACConfig, values)} | ({} if steps is None else {"num_env_steps": steps})
 
 
 def _names(text: str, known: Any) -> list[str]:
@@ -161,7 +164,7 @@ def _numbers(text: str) -> list[int]:
 
 
 @contextmanager
-def _runtime(name: str, address: str | None, num_workers: int | None, threads: int | None) -> Iterator[Runner]:
+def _make_runner(name: str, address: str | None, num_workers: int | None, threads: int | None) -> Iterator[Runner]:
     from service.downstream.table import run_here, run_on_ray
 
     if name not in ("local", "ray"):
@@ -170,40 +173,30 @@ def _runtime(name: str, address: str | None, num_workers: int | None, threads: i
         for option, value in (("--address", address), ("--num-workers", num_workers)):
             if value is not None:
                 raise TandemError(f"{option} needs --runtime ray")
-        yield run_here(threads or 0)
+        yield functools.partial(run_here, num_threads=threads or 0)
         return
     from service.runtime.ray_connection import connected
 
     with connected(address):
-        yield run_on_ray(num_workers, threads or 1)
+        yield functools.partial(run_on_ray, num_workers=num_workers, num_threads=threads or 1)
 
 
 @contextmanager
-def _stopping() -> Iterator[Watching]:
+def _stop_on_signals() -> Iterator[tuple[Callbacks, StopSignals]]:
     """SIGINT and SIGTERM end it where it can be continued; progress goes to stderr."""
-    from service.downstream.table import Watching
+    from service.downstream.worker import Callbacks
     from service.runtime.signals import InterruptError, StopSignals
 
     asked: list[bool] = []
     with StopSignals() as signals, signals.asking(lambda: asked.append(True)):
         try:
-            yield Watching(
-                lambda: bool(asked),
-                _Line().show,
-                lambda text: typer.echo(text, err=True),
-                lambda: signals.first or 0,
-            )
+            yield Callbacks(lambda: bool(asked), _Progress().show, lambda text: typer.echo(text, err=True)), signals
         except InterruptError as interrupt:  # a second one
             typer.echo("stopped at once; what came after the last checkpoint is lost", err=True)
             raise typer.Exit(_EXIT_SIGNAL + interrupt.number) from None
 
 
-def _signal_code(watching: Watching) -> int:
-    """The exit code of a process that a signal ends."""
-    return _EXIT_SIGNAL + watching.signal()
-
-
-class _Line:
+class _Progress:
     """A line of progress now and then."""
 
     def __init__(self) -> None:

@@ -10,8 +10,9 @@ from __future__ import annotations
 
 import hashlib
 import math
-from collections.abc import Callable, Iterator, Mapping
-from typing import Any, Protocol
+import operator
+from collections.abc import Callable, Iterator
+from typing import TYPE_CHECKING, Any
 
 import gymnasium
 import numpy as np
@@ -21,6 +22,9 @@ from service.envs.observations import POSITIONS_SIZE, SPACES
 from service.errors import TandemError
 from service.policies.numpy_policy import NumpyMCPPolicy
 
+if TYPE_CHECKING:
+    from service.primitives.loading import TrainedBob
+
 FloatArray = NDArray[np.float32]
 Info = dict[str, Any]
 Positions = Callable[[Any], FloatArray]
@@ -29,35 +33,19 @@ WEIGHT_RATIO = 100.0
 """Greatest weight over least. Bob's own gate has the same range, [0.01, 1]."""
 
 
-class Trained(Protocol):
-    """What ``service.load_primitives`` returns, as far as it matters here."""
-
-    @property
-    def label(self) -> str:
-        """Where it comes from."""
-
-    @property
-    def primitives(self) -> NumpyMCPPolicy:
-        """What can be composed."""
-
-    @property
-    def manifest(self) -> Any:
-        """What the registry knows about it, or None."""
-
-
-def action_weights(actions: FloatArray, ratio: float = WEIGHT_RATIO) -> FloatArray:
-    """Weights ``ratio ** ((a - 1) / 2)`` of (..., K) actions: 1 / ratio at -1, 1 at 1; equal actions, equal weights.
+def action_weights(actions: FloatArray) -> FloatArray:
+    """Weights ``100 ** ((a - 1) / 2)`` of (..., K) actions: 0.01 at -1, 1 at 1; equal actions, equal weights.
 
     A linear scale would be its upper half nearly everywhere: a weight has to be 100 times another for its primitive to
     decide alone.
     """
     exponent = 0.5 * (np.clip(np.asarray(actions, dtype=np.float32), -1.0, 1.0) - 1.0)
-    weights: FloatArray = np.exp(np.float32(math.log(ratio)) * exponent)
+    weights: FloatArray = np.exp(np.float32(math.log(WEIGHT_RATIO)) * exponent)
     return weights
 
 
-def check_primitives(primitives: NumpyMCPPolicy | Trained) -> NumpyMCPPolicy:
-    """What can be composed, once its manifest says that it is for this robot and layout.
+def check_primitives(primitives: NumpyMCPPolicy | TrainedBob) -> NumpyMCPPolicy:
+    """Return what can be composed, once its manifest says that it is for this robot and layout.
 
     Raises:
         TandemError: a monolithic Bob, or primitives of another robot or layout.
@@ -68,7 +56,7 @@ def check_primitives(primitives: NumpyMCPPolicy | Trained) -> NumpyMCPPolicy:
     return primitives.primitives
 
 
-def check_robot(trained: Trained) -> None:
+def check_robot(trained: TrainedBob) -> None:
     """Assert that a policy, composable or not, is for this robot and layout, as far as its manifest says.
 
     Raises:
@@ -99,32 +87,30 @@ class ComposePrimitives(gymnasium.Wrapper[Any, FloatArray, Any, FloatArray], gym
         primitives: what ``service.load_primitives`` returns, or its ``.primitives``. Never changed.
         positions: takes the (11,) positions (``service.envs.observations``) out of an observation. By default they are
             the observation itself, or its entry ``observation``.
-        weight_ratio: greatest weight over least.
 
     Raises:
-        TandemError: primitives of another robot or layout, an environment that does not fit them, a ratio not above 1.
+        TandemError: primitives of another robot or layout, or an environment that does not fit them.
     """
 
     def __init__(
         self,
         env: gymnasium.Env[Any, FloatArray],
-        primitives: NumpyMCPPolicy | Trained,
+        primitives: NumpyMCPPolicy | TrainedBob,
         *,
         positions: Positions | None = None,
-        weight_ratio: float = WEIGHT_RATIO,
     ) -> None:
         gymnasium.utils.RecordConstructorArgs.__init__(
-            self, _disable_deepcopy=True, primitives=primitives, positions=positions, weight_ratio=weight_ratio
+            self, _disable_deepcopy=True, primitives=primitives, positions=positions
         )
         super().__init__(env)
-        self._mixer = _Mixer(primitives, env.observation_space, env.action_space, positions, weight_ratio)
-        self.primitives = self._mixer.primitives
+        self._composer = _Composer(primitives, env.observation_space, env.action_space, positions)
+        self.primitives = self._composer.primitives
         self.action_space = _weights_space(self.primitives.num_primitives)
 
     def reset(self, *, seed: int | None = None, options: Info | None = None) -> tuple[Any, Info]:
         """Reset the environment."""
         observation, info = self.env.reset(seed=seed, options=options)
-        self._mixer.see(observation)
+        self._composer.observe(observation)
         return observation, info
 
     def step(self, action: FloatArray) -> tuple[Any, Any, bool, bool, Info]:
@@ -133,8 +119,8 @@ class ComposePrimitives(gymnasium.Wrapper[Any, FloatArray, Any, FloatArray], gym
         Raises:
             TandemError: not one number per primitive.
         """
-        observation, *rest = self.env.step(self._mixer.act(action, ()))
-        self._mixer.see(observation)
+        observation, *rest = self.env.step(self._composer.act(action))
+        self._composer.observe(observation)
         return (observation, *rest)
 
     def compute_reward(self, achieved_goal: Any, desired_goal: Any, info: Any) -> Any:
@@ -143,27 +129,25 @@ class ComposePrimitives(gymnasium.Wrapper[Any, FloatArray, Any, FloatArray], gym
 
 
 class ComposePrimitivesVector(gymnasium.vector.VectorWrapper[Any, FloatArray, Any, FloatArray, Any]):
-    """As ``ComposePrimitives``, for N environments at once: actions are (N, K), ``positions`` takes out (N, 11)."""
+    """N environments at once, as in ``ComposePrimitives``: actions are (N, K), ``positions`` takes out (N, 11)."""
 
     def __init__(
         self,
         env: gymnasium.vector.VectorEnv[Any, FloatArray, Any],
-        primitives: NumpyMCPPolicy | Trained,
+        primitives: NumpyMCPPolicy | TrainedBob,
         *,
         positions: Positions | None = None,
-        weight_ratio: float = WEIGHT_RATIO,
     ) -> None:
         super().__init__(env)
-        spaces = env.single_observation_space, env.single_action_space
-        self._mixer = _Mixer(primitives, *spaces, positions, weight_ratio)
-        self.primitives = self._mixer.primitives
+        self._composer = _Composer(primitives, env.single_observation_space, env.single_action_space, positions)
+        self.primitives = self._composer.primitives
         self.single_action_space = _weights_space(self.primitives.num_primitives)
         self.action_space = gymnasium.vector.utils.batch_space(self.single_action_space, env.num_envs)
 
     def reset(self, *, seed: Any = None, options: Info | None = None) -> tuple[Any, Info]:
         """Reset the environments."""
         observation, info = self.env.reset(seed=seed, options=options)
-        self._mixer.see(observation)
+        self._composer.observe(observation)
         return observation, info
 
     def step(self, actions: FloatArray) -> tuple[Any, Any, Any, Any, Info]:
@@ -172,8 +156,8 @@ class ComposePrimitivesVector(gymnasium.vector.VectorWrapper[Any, FloatArray, An
         Raises:
             TandemError: not one number per environment and primitive.
         """
-        observation, *rest = self.env.step(self._mixer.act(actions, (self.num_envs,)))
-        self._mixer.see(observation)
+        observation, *rest = self.env.step(self._composer.act(actions))
+        self._composer.observe(observation)
         return (observation, *rest)
 
     def compute_reward(self, achieved_goal: Any, desired_goal: Any, info: Any) -> Any:
@@ -188,66 +172,54 @@ class ComposePrimitivesVector(gymnasium.vector.VectorWrapper[Any, FloatArray, An
     def restore(self, state: Any) -> Any:
         """Go back to a saved state; the observation there."""
         observation = getattr(self.env, "restore")(state)  # noqa: B009 - as above
-        self._mixer.see(observation)
+        self._composer.observe(observation)
         return observation
 
 
-class _Mixer:
-    """From weights and the last positions to actions; what both wrappers share."""
+class _Composer:
+    """The part that both wrappers share: turns weights and the last positions into actions."""
 
     def __init__(
         self,
-        primitives: NumpyMCPPolicy | Trained,
+        primitives: NumpyMCPPolicy | TrainedBob,
         observation_space: gymnasium.Space[Any],
         action_space: gymnasium.Space[Any],
         positions: Positions | None,
-        weight_ratio: float,
     ) -> None:
         self.primitives = check_primitives(primitives)
-        if not 1.0 < weight_ratio < math.inf:
-            raise TandemError(f"weight_ratio = {weight_ratio}; give a number above 1")
         if not isinstance(action_space, gymnasium.spaces.Box) or action_space.shape != (self.primitives.action_size,):
             raise TandemError(
                 f"the environment's actions are {action_space}; the primitives act by {self.primitives.action_size} "
                 "numbers: end-effector displacement 3, change of the finger width"
             )
-        if positions is None:
-            _check_positions(observation_space)
-        self._take = positions or _positions
+        shown: Any = observation_space
+        if named := isinstance(observation_space, gymnasium.spaces.Dict):
+            shown = observation_space.get("observation")
+        if positions is None and (not isinstance(shown, gymnasium.spaces.Box) or shown.shape != (POSITIONS_SIZE,)):
+            raise TandemError(
+                f"the environment's observations are {shown}; the primitives see the {POSITIONS_SIZE} positions of "
+                "service.envs.observations: give positions=, which takes them out of an observation"
+            )
+        self._take = positions or (operator.itemgetter("observation") if named else lambda observation: observation)
         self._low, self._high = action_space.low, action_space.high
-        self._ratio = weight_ratio
         self._seen: FloatArray | None = None
 
-    def see(self, observation: Any) -> None:
+    def observe(self, observation: Any) -> None:
         """Keep what the next composition acts on."""
         self._seen = np.array(self._take(observation), dtype=np.float32)
 
-    def act(self, actions: FloatArray, worlds: tuple[int, ...]) -> FloatArray:
-        """(*worlds, 4) the mean of each composition, inside the environment's range."""
+    def act(self, actions: FloatArray) -> FloatArray:
+        """Mean of the composition with (..., K) weights, (..., 4), inside the environment's range."""
         if self._seen is None:
             raise gymnasium.error.ResetNeeded("call reset before step")
-        expected = (*worlds, self.primitives.num_primitives)
+        expected = (*self._seen.shape[:-1], self.primitives.num_primitives)
         if np.shape(actions) != expected:
             raise TandemError(
                 f"action: expected shape {expected}, a number for each of {expected[-1]} primitives, "
                 f"got {np.shape(actions)}; an orchestrator acts with the primitives it was trained with"
             )
-        mean, _ = self.primitives.compose(self._seen, action_weights(actions, self._ratio))
+        mean, _ = self.primitives.compose(self._seen, action_weights(actions))
         return np.clip(mean, self._low, self._high)
-
-
-def _positions(observation: Any) -> FloatArray:
-    taken: FloatArray = observation["observation"] if isinstance(observation, Mapping) else observation
-    return taken
-
-
-def _check_positions(space: gymnasium.Space[Any]) -> None:
-    found = space.get("observation") if isinstance(space, gymnasium.spaces.Dict) else space
-    if not isinstance(found, gymnasium.spaces.Box) or found.shape != (POSITIONS_SIZE,):
-        raise TandemError(
-            f"the environment's observations are {found}; the primitives see the {POSITIONS_SIZE} positions of "
-            "service.envs.observations: give positions=, which takes them out of an observation"
-        )
 
 
 def _weights_space(num_primitives: int) -> gymnasium.Space[FloatArray]:
@@ -255,7 +227,7 @@ def _weights_space(num_primitives: int) -> gymnasium.Space[FloatArray]:
 
 
 def _arrays(owner: Any, prefix: str) -> Iterator[tuple[str, NDArray[Any]]]:
-    """Every array below an object, by the path to it."""
+    """Arrays below an object, by the paths to them."""
     if isinstance(owner, np.ndarray | np.generic):
         yield prefix, np.asarray(owner)
     elif isinstance(owner, list):

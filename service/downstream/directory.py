@@ -2,7 +2,7 @@
 
 | file | content |
 |---|---|
-| ``cell.json`` | settings, and which primitives (version and SHA-256 of their parameters) |
+| ``cell.json`` | settings of the trial, and which primitives (version and SHA-256 of their parameters) |
 | ``metrics.jsonl`` | an object per iteration, keyed by metric; only ``time/...`` differs between equal runs |
 | ``tensorboard/`` | the same metrics as TensorBoard events over env steps |
 | ``checkpoint.pt`` | everything the training continues from exactly, replay buffer included |
@@ -20,7 +20,7 @@ import pickle
 from pathlib import Path
 from typing import Any, Self
 
-from service.downstream.settings import differences
+from service.downstream.settings import TrialConfig, differences, validate
 from service.errors import TandemError
 from service.io.files import TEMPORARY_PREFIX, os_errors, remove_temporaries, write_atomic
 from service.io.jsonl import JsonlWriter
@@ -28,7 +28,9 @@ from service.io.lock import LOCK_FILE, DirectoryLock
 from service.io.tensorboard import EventFile
 
 FORMAT_VERSION = 1
-"""Of ``cell.json``, ``checkpoint.pt`` and ``result.json``, and of the table's files."""
+"""Version of ``cell.json``, ``checkpoint.pt`` and ``result.json``, and of the table's files."""
+TRIAL = "cell"
+"""Key of a trial's settings in these files, which call a trial a cell."""
 _ELSEWHERE = "name another directory (--run-dir, of a table --runs)"
 
 
@@ -36,9 +38,9 @@ class TrainingDirectory:
     """Reads and writes the files of one training."""
 
     def __init__(self, path: Path) -> None:
-        """Nothing is read or written before ``start``."""
+        """Name the files; nothing is read or written before ``start``."""
         self.path = path
-        self.cell_file = path / "cell.json"
+        self.trial_file = path / "cell.json"
         self.metrics_file = path / "metrics.jsonl"
         self.checkpoint_file = path / "checkpoint.pt"
         self.result_file = path / "result.json"
@@ -58,7 +60,7 @@ class TrainingDirectory:
     @property
     def exists(self) -> bool:
         """Whether a training has begun here."""
-        return self.cell_file.exists()
+        return self.trial_file.exists()
 
     def start(self, identity: dict[str, Any], *, resume: bool) -> dict[str, Any] | None:
         """Begin a training here, or continue one, and keep other processes out until the ``with`` block ends.
@@ -80,7 +82,7 @@ class TrainingDirectory:
         saved = self._read_checkpoint() if self.exists else None
         with os_errors("write", self.path):
             remove_temporaries(self.path)
-        write_json(self.cell_file, {"format_version": FORMAT_VERSION, **identity})  # first: it says whose the rest is
+        write_json(self.trial_file, {"format_version": FORMAT_VERSION, **identity})  # first: it says whose the rest is
         self._metrics.truncate_after(saved["iteration"] if saved else 0)
         with os_errors("write", self.path):
             self._events = EventFile(self.path / "tensorboard", after_step=saved["env_steps"] if saved else None)
@@ -98,8 +100,10 @@ class TrainingDirectory:
             return
         if not resume:
             raise TandemError(f"{self.path} holds a training already; continue it with --resume, or {_ELSEWHERE}")
-        recorded = read_json(self.cell_file)
-        if wrong := differences(recorded, {"format_version": FORMAT_VERSION, **identity}):
+        recorded = read_json(self.trial_file)
+        if recorded.get("format_version") == FORMAT_VERSION:
+            recorded[TRIAL] = read_trial(recorded, self.trial_file).model_dump(mode="json")
+        if wrong := differences(_flat(recorded), _flat({"format_version": FORMAT_VERSION, **identity})):
             raise TandemError(f"{self.path} was begun with {'; '.join(wrong)}; {_ELSEWHERE}")
 
     def _holds_something_else(self) -> bool:
@@ -150,8 +154,25 @@ class TrainingDirectory:
         return saved
 
 
+def _flat(identity: dict[str, Any]) -> dict[str, Any]:
+    """An identity with the trial's settings beside everything else."""
+    return {**identity.get(TRIAL, {}), **{key: value for key, value in identity.items() if key != TRIAL}}
+
+
+def read_trial(tree: dict[str, Any], path: Path) -> TrialConfig:
+    """The trial of what was read from a file; settings that are younger than the file have their defaults.
+
+    Raises:
+        TandemError: there is none, or its settings are no settings.
+    """
+    try:
+        return validate(TrialConfig, tree.get(TRIAL))
+    except TandemError as error:
+        raise TandemError(f"{path}: {error}; name another directory") from None
+
+
 def read_json(path: Path) -> dict[str, Any]:
-    """The object in a file.
+    """Read the object in a file.
 
     Raises:
         TandemError: there is none.
@@ -179,5 +200,5 @@ def write_json(path: Path, tree: dict[str, Any]) -> None:
 
 
 def to_json(tree: dict[str, Any]) -> bytes:
-    """As the files have it."""
+    """An object as the files have it."""
     return (json.dumps(tree, indent=1, allow_nan=False) + "\n").encode()

@@ -13,8 +13,7 @@ from stable_baselines3.common.buffers import DictReplayBuffer
 from stable_baselines3.common.logger import Logger
 
 from service.downstream.networks import GoalFeatures
-from service.downstream.previous import PREVIOUS, PreviousState
-from service.downstream.vec_env import VecEnvState, WorldsVecEnv
+from service.downstream.vec_env import PREVIOUS, VecEnvState, WorldsVecEnv
 from service.envs.gym.vector import VectorState
 from service.envs.observations import GOAL_SLICE, OBJECT_SLICE, POSITIONS_SIZE
 
@@ -23,23 +22,24 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from service.downstream.methods import Method
-    from service.downstream.settings import CellConfig
+    from service.downstream.settings import TrialConfig
     from service.primitives.loading import TrainedBob
 
     FloatArray = NDArray[np.float32]
 
 _ROWS = ("actions", "rewards", "dones", "timeouts", "ep_start", "ep_length")
+_WORLDS_ROWS = ("previous", "returns", "lengths")
 _COUNTERS = ("num_timesteps", "_n_updates", "_episode_num")
 
 
-def make_learner(cell: CellConfig, method: Method, env: WorldsVecEnv) -> SAC:
-    """A new learner; draws from the global random numbers of torch and NumPy, which its seed restarts."""
-    sac = cell.sac
+def make_learner(trial: TrialConfig, method: Method, env: WorldsVecEnv) -> SAC:
+    """Make a new learner; draws from the global random numbers of torch and NumPy, which its seed restarts."""
+    sac = trial.sac
     learner = SAC(
         method.policy(),
         env,
         learning_rate=sac.learning_rate,
-        buffer_size=-(-cell.num_env_steps // sac.num_worlds) * sac.num_worlds,  # everything is kept
+        buffer_size=-(-trial.num_env_steps // sac.num_worlds) * sac.num_worlds,  # everything is kept
         learning_starts=sac.learning_starts,
         batch_size=sac.batch_size,
         tau=sac.tau,
@@ -47,14 +47,14 @@ def make_learner(cell: CellConfig, method: Method, env: WorldsVecEnv) -> SAC:
         train_freq=1,
         gradient_steps=sac.gradient_steps,
         ent_coef=f"auto_{sac.initial_entropy_coefficient}",
-        replay_buffer_class=HerReplayBuffer if method.relabelled else DictReplayBuffer,
-        replay_buffer_kwargs={"goal_selection_strategy": "future"} if method.relabelled else None,
+        replay_buffer_class=HerReplayBuffer if method.her_ratio else DictReplayBuffer,
+        replay_buffer_kwargs={"goal_selection_strategy": "future"} if method.her_ratio else None,
         policy_kwargs={
             "features_extractor_class": GoalFeatures,
             "net_arch": list(sac.hidden_sizes),
             "optimizer_kwargs": {"fused": True},  # a tenth of an update's time
         },
-        seed=_spread(cell.seed),
+        seed=_spread_seed(trial.seed),
         device="cpu",
     )
     learner.set_logger(Logger(folder=None, output_formats=[]))  # else every ``learn`` makes a directory in /tmp
@@ -62,24 +62,23 @@ def make_learner(cell: CellConfig, method: Method, env: WorldsVecEnv) -> SAC:
 
 
 def set_progress(learner: SAC, method: Method, progress: float) -> None:
-    """What changes while a method learns, from 0 at the beginning to 1 at the end: the share of relabelled goals."""
-    if method.relabelled is None:
+    """Set the share of relabelled goals for a progress from 0, when learning begins, to 1, when it ends."""
+    if method.her_ratio is None:
         return
-    first, last = method.relabelled
+    first, last = method.her_ratio
     assert isinstance(learner.replay_buffer, HerReplayBuffer)
     learner.replay_buffer.her_ratio = first + (last - first) * progress
 
 
-def _spread(seed: int) -> int:
-    """A seed far from those of other cells: world i gets it plus i, so neighbours would share nearly all episodes."""
+def _spread_seed(seed: int) -> int:
+    """A seed far from those of other trials: world i gets it plus i, so neighbours would share nearly all episodes."""
     return int(np.random.SeedSequence(seed).generate_state(1)[0]) >> 1
 
 
 class LearnedPolicy:
-    """What a learner has learned, as evaluation and films take it: Bob's input to actions, without noise.
+    """The policy of a learner, as evaluations and videos take it: Bob's input to actions, without noise.
 
-    Plays N episodes from their start; others need another one, since it keeps the positions of the step before, which
-    it shows to learners whose worlds do.
+    Plays N episodes from their start; others need another one, since it keeps the positions of the step before.
     """
 
     def __init__(self, learner: SAC, method: Method, trained: TrainedBob) -> None:
@@ -90,19 +89,20 @@ class LearnedPolicy:
         """(N, 14) Bob's input to actions (N, 4)."""
         positions = observation[:, :POSITIONS_SIZE]
         previous, self._previous = self._previous, positions.copy()
-        seen = {
+        seen: dict[str, Any] = {
             "observation": positions,
             "achieved_goal": observation[:, OBJECT_SLICE],
             "desired_goal": observation[:, GOAL_SLICE],
             PREVIOUS: positions if previous is None else previous,
         }
-        known = {name: seen[name] for name in cast("Dict", self._learner.observation_space)}
-        actions, _ = self._learner.predict(cast("dict[str, Any]", known), deterministic=True)
+        actions, _ = self._learner.predict(
+            {name: seen[name] for name in cast("Dict", self._learner.observation_space)}, deterministic=True
+        )
         return self._method.decode(self._trained, positions, actions)
 
 
 def save_learner(learner: SAC, env: WorldsVecEnv) -> dict[str, Any]:
-    """Everything the learner continues from, as tensors and plain values; its chance and its worlds, too."""
+    """Everything the learner continues from, as tensors and plain values: its random numbers and worlds, too."""
     buffer, entropy = learner.replay_buffer, learner.log_ent_coef
     assert buffer is not None
     assert entropy is not None
@@ -158,21 +158,19 @@ def _restore_replay(buffer: Any, saved: dict[str, Any]) -> None:
 
 
 def _save_worlds(state: VecEnvState) -> dict[str, Any]:
-    inside: PreviousState = state.worlds
-    worlds: VectorState = inside.worlds
-    tree = asdict(worlds) | {"previous": inside.previous, "returns": state.returns, "lengths": state.lengths}
+    worlds: VectorState = state.worlds
+    tree = asdict(worlds) | {name: getattr(state, name) for name in _WORLDS_ROWS}
     arrays = {name: torch.from_numpy(value) for name, value in tree.items() if name != "random"}
     return {"arrays": arrays, "random": json.dumps(worlds.random)}
 
 
 def _worlds_state(saved: dict[str, Any]) -> VecEnvState:
     arrays = {name: value.numpy() for name, value in saved["arrays"].items()}
-    previous, returns, lengths = (arrays.pop(name) for name in ("previous", "returns", "lengths"))
-    worlds = VectorState(**arrays, random=tuple(json.loads(saved["random"])))
-    return VecEnvState(PreviousState(worlds, previous), returns, lengths)
+    rows = {name: arrays.pop(name) for name in _WORLDS_ROWS}
+    return VecEnvState(VectorState(**arrays, random=tuple(json.loads(saved["random"]))), **rows)
 
 
 def _numpy_random() -> list[Any]:
-    """Of the global generator, from which Stable-Baselines3 draws its batches."""
+    """State of the global generator, from which Stable-Baselines3 draws its batches."""
     kind, keys, *rest = cast("tuple[Any, ...]", np.random.get_state())
     return [kind, torch.from_numpy(keys.copy()), *rest]

@@ -70,22 +70,22 @@ class Method:
     """One row of the table."""
 
     title: str
-    """As the table writes it."""
-    words: str
-    """What it is."""
+    """Name in the table."""
+    description: str
+    """A few words for ``tandem downstream methods``."""
     wrap: Callable[[Worlds, TrainedBob], Worlds] = _same
     """The worlds its learner acts in."""
     decode: Callable[[TrainedBob, FloatArray, FloatArray], FloatArray] = _act
-    """From (N, 11) positions and the learner's (N, A) actions to (N, 4) actions, as the wrapped worlds do it."""
+    """Turns (N, 11) positions and the learner's (N, A) actions into (N, 4) actions, as the wrapped worlds do."""
     policy: Callable[[], type[SACPolicy]] = _gaussian
     """Class of actor and critics; imports torch."""
-    relabelled: tuple[float, float] | None = None
+    her_ratio: tuple[float, float] | None = None
     """Share of a batch whose goals are relabelled (HER, ``future``), when learning begins and when it ends, linear in
     between; None: no HER."""
     composes: bool = False
     """Whether it needs primitives that can be composed."""
     player: Callable[[TrainedBob], DeterministicPolicy] | None = None
-    """Who plays, where nothing is learned."""
+    """Makes the policy that plays, where nothing is learned."""
 
     @property
     def takes_primitives(self) -> bool:
@@ -120,27 +120,27 @@ METHODS: Mapping[str, Method] = {
         _compose,
         _composed,
         composes=True,
-        relabelled=(_USUAL_SHARE, 0.0),
+        her_ratio=(_USUAL_SHARE, 0.0),
     ),
     "asp-only": Method("ASP only", "Bob as he is", player=_bob),
     "scratch-monolithic-her": Method(
-        "scratch monolithic + HER", "SAC alone, with relabelled goals", relabelled=_USUAL_SHARES
+        "scratch monolithic + HER", "SAC alone, with relabelled goals", her_ratio=_USUAL_SHARES
     ),
     "scratch-mcp-her": Method(
         "scratch MCP + HER",
         "primitives and gate learned together, with relabelled goals",
         policy=_mcp,
-        relabelled=_USUAL_SHARES,
+        her_ratio=_USUAL_SHARES,
     ),
     "scratch-monolithic": Method("scratch monolithic", "SAC alone"),
     "scratch-mcp": Method("scratch MCP", "primitives and gate learned together by SAC", policy=_mcp),
     "idle": Method("idle", "does nothing", player=_idle),
 }
-"""By the name that commands take, in the order of the table's rows."""
+"""The methods by the names that commands take, in the order of the table's rows."""
 
 
 def find_method(name: str) -> Method:
-    """A method by its name.
+    """Find a method by its name.
 
     Raises:
         TandemError: no such method.

@@ -11,7 +11,7 @@ from stable_baselines3.sac.policies import LOG_STD_MAX, LOG_STD_MIN, Actor, Mult
 from torch import Tensor
 
 from service.config import MCPConfig
-from service.downstream.previous import PREVIOUS
+from service.downstream.vec_env import PREVIOUS
 from service.envs.observations import (
     BOB_SIZE,
     EFFECTOR_SLICE,
@@ -24,7 +24,7 @@ from service.policies.layers import InputNormalisation
 from service.policies.networks import MCPPolicy
 
 STEP_SCALE_M = 0.02
-"""Of movements in a step, as inputs: the hand's full speed is two to three times as much."""
+"""Scale of movements in a step, as inputs: the hand's full speed is two to three times as much."""
 
 
 class GoalFeatures(BaseFeaturesExtractor):
@@ -41,7 +41,7 @@ class GoalFeatures(BaseFeaturesExtractor):
         self.register_buffer("scale", torch.tensor(GOAL_FROM_OBJECT.normalisation.scale))
 
     def forward(self, observations: dict[str, Tensor]) -> Tensor:
-        """From a batch of goal observations."""
+        """Features of a batch of goal observations."""
         rows = bob_input(observations)
         relative = (rows[:, GOAL_SLICE] - rows[:, OBJECT_SLICE]) / self.scale
         moved = (observations["observation"] - observations[PREVIOUS]) / STEP_SCALE_M

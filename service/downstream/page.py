@@ -1,4 +1,4 @@
-"""The page of results: tables in Markdown from the recorded cells, beside the paper's figures."""
+"""The page of results: tables in Markdown from the recorded trials, beside the paper's figures."""
 
 from __future__ import annotations
 
@@ -9,173 +9,204 @@ from typing import Any
 import numpy as np
 
 from service.actors.evaluation import wilson_interval
+from service.downstream.directory import TRIAL
 from service.downstream.methods import METHODS
-from service.downstream.paper import BEST, PAPER
 from service.envs.tasks import TASKS
 
 Result = dict[str, Any]
-Cell = Sequence[Result]
+Seeds = Sequence[Result]
+"""Results of one method on one task."""
+
 FINAL_SHARE = 0.9
-"""Of a method's own final success: how soon it is reached is compared."""
+"""Share of a method's own final success; compared is how soon it is reached."""
+
+PAPER: Mapping[str, Mapping[str, float]] = {
+    method: dict(zip(("larger", "inair", "push", "sphere", "wall", "box"), rates, strict=True))
+    for method, rates in {
+        "ours": (0.83, 1.00, 0.52, 1.00, 0.98, 0.98),
+        "asp-only": (0.94, 0.94, 0.02, 0.85, 0.00, 0.27),
+        "scratch-monolithic-her": (0.58, 0.94, 0.85, 1.00, 0.00, 0.36),
+        "scratch-mcp-her": (0.85, 0.52, 0.92, 0.98, 0.00, 0.00),
+        "scratch-monolithic": (0.02, 0.00, 0.00, 0.00, 0.00, 0.00),
+        "scratch-mcp": (0.00, 0.00, 0.04, 0.00, 0.02, 0.00),
+    }.items()
+}
+"""The paper's success rates (its table of downstream success rates; 16 episodes x 3 seeds, likely)."""
+
+BEST: Mapping[str, float] = {"larger": 0.94, "inair": 1.00, "push": 0.92, "sphere": 1.00, "wall": 0.98, "box": 0.98}
+"""The best of all the paper's methods, skill discovery included."""
 
 MARK = "Written by `tandem downstream table`"
-"""In every page, to tell it from one that a person wrote."""
-_HEAD = f"""# Downstream
-
-{MARK} from the files in `downstream/`, one for each cell and run; [what the tasks and
-methods are](../downstream.md).
-"""
+"""Words in every page, to tell it from one that a person wrote."""
 
 
 def write_page(results: Sequence[Result], picture: str) -> str:
-    """The whole page.
+    """Write the whole page.
 
     Args:
-        results: of cells.
+        results: of trials.
         picture: file name of the learning curves, beside the page.
     """
-    table = _Table(results)
+    of: dict[tuple[str, str], list[Result]] = {}
+    for result in sorted(results, key=lambda each: int(each[TRIAL]["seed"])):
+        of.setdefault((result[TRIAL]["method"], result[TRIAL]["task"]), []).append(result)
     parts = [
-        _HEAD,
+        f"# Downstream\n\n{MARK} from the files in `downstream/`, one for each trial, a method on a task with a "
+        "seed;\n[what the tasks and methods are](../downstream.md).\n",
         "## Success at the last step\n",
-        "Share of episodes, all seeds together, with its 95 % Wilson interval; in brackets the number of seeds. Below "
-        "each, the paper's.\n",
-        table.rates("success_last", paper=True),
+        "Share of episodes, all seeds together; in brackets the number of seeds. The interval is Wilson's of 95 % over "
+        "episodes: it says how far the share may be off because episodes were few, not how far another seed would "
+        "differ. Below each method, the paper's figures: they are of another world, likely a harder one "
+        "([what differs](../downstream.md#beside-the-papers-table)). Tasks and methods may have had different numbers "
+        "of env steps: they are below, and [there](../downstream.md#the-table) is why.\n",
+        *_old_versions(results),
+        _table(of, _rate("success_last"), paper=True),
         "\n## Success at any step\n",
-        table.rates("success_ever"),
+        _table(of, _rate("success_ever")),
         "\n## Each seed, at the last step\n",
-        table.of(_seeds),
+        _table(of, _each_seed),
         "\n## Learning curves\n",
         f"![Success at the last step over env steps; bands from the least to the greatest seed]({picture})\n",
         "Without noise, 100 goals a point; dotted: what learns nothing. Where a curve still rises, the tables say what "
         "the method has after so many env steps, not what it would come to.\n",
         "## Env steps and time\n",
-        "Learning alone, without evaluations: env steps in thousands, minutes of wall-clock time.\n",
-        table.of(_cost),
-        *table.efficiency(),
+        "Learning alone, without evaluations: env steps in thousands, minutes of wall-clock time. What primitives took "
+        "to learn is not counted.\n",
+        _table(of, _cost),
+        *_efficiency(of),
         "\n" + _origin(results),
     ]
     return "\n".join(parts)
 
 
-class _Table:
-    """Results by method and task."""
-
-    def __init__(self, results: Sequence[Result]) -> None:
-        self._cells: dict[tuple[str, str], list[Result]] = {}
-        for result in sorted(results, key=lambda each: int(each["cell"]["seed"])):
-            key = result["cell"]["method"], result["cell"]["task"]
-            self._cells.setdefault(key, []).append(result)
-
-    def of(self, text: Callable[[Cell], str]) -> str:
-        """A row per method that has a result."""
-        return _markdown([self._row(method, text) for method in METHODS if self._has(method)])
-
-    def rates(self, key: str, *, paper: bool = False) -> str:
-        """Pooled rates, below each method the paper's."""
-        rows = []
-        for method in METHODS:
-            if self._has(method):
-                rows.append(self._row(method, lambda cell: _rate(cell, key)))
-                if paper and method in PAPER:
-                    rows.append(("*the paper's*", *(f"*{100 * PAPER[method][task]:.0f} %*" for task in TASKS)))
-        if paper:
-            rows.append(("*best of the paper*", *(f"*{100 * BEST[task]:.0f} %*" for task in TASKS)))
-        return _markdown(rows)
-
-    def efficiency(self) -> Sequence[str]:
-        """How soon methods that compose primitives are good, and when the first that learns from nothing is as good."""
-        composing = [name for name, method in METHODS.items() if method.composes and self._has(name)]
-        scratch = [name for name, method in METHODS.items() if method.learns_from_nothing and self._has(name)]
-        if not composing or not scratch:
-            return ()
-        rows = []
-        for method in composing:
-            own, others = [METHODS[method].title], ["*best from scratch*"]
-            for task in TASKS:
-                cell = self._cells.get((method, task), [])
-                level = _level(cell)
-                until = _mean_until(cell, level)
-                known = {name: self._cells[name, task] for name in scratch if (name, task) in self._cells}
-                own.append("" if until is None else f"{until / 1e3:.0f}")
-                others.append("" if until is None or not known else f"*{_soonest(known, level)}*")
-            rows += [own, others]
-        return (
-            "\n## How soon\n",
-            f"Env steps in thousands until {FINAL_SHARE:.0%} of the row's own final success, below it until the first "
-            "method that learns from nothing is as good; in brackets how many of them were run on the task.\n",
-            _markdown(rows),
-        )
-
-    def _has(self, method: str) -> bool:
-        return any(found == method for found, _ in self._cells)
-
-    def _row(self, method: str, text: Callable[[Cell], str]) -> Sequence[str]:
-        cells = (self._cells.get((method, task)) for task in TASKS)
-        return METHODS[method].title, *(text(cell) if cell else "" for cell in cells)
+def _old_versions(results: Sequence[Result]) -> Sequence[str]:
+    """A line for each task that has results of another version of it than today's."""
+    lines = []
+    for name, task in TASKS.items():
+        trials = [result[TRIAL] for result in results if result[TRIAL]["task"] == name]
+        old = {each["method"] for each in trials if each.get("task_version", 0) != task.version}
+        if old:
+            methods = ", ".join(METHODS[method].title for method in METHODS if method in old)
+            who = "all methods" if old == {each["method"] for each in trials} else methods
+            lines.append(
+                f"*{task.title}*, {who}: recorded before `{task.id}`, with another rule of success "
+                "([which](../decisions/0007-the-downstream-tasks.md)).\n"
+            )
+    return lines
 
 
-def steps_until(curve: Sequence[dict[str, float]], level: float) -> float | None:
-    """Env steps of the first evaluation from which two in a row are at ``level`` on average; None: never.
-
-    Two, since one of 100 goals is a noisy thing, and first passages pick the luckiest.
-    """
-    for first, second in pairwise(curve):
-        if (first["success_last"] + second["success_last"]) / 2 >= level > 0.0:
-            return first["env_steps"]
-    return None
-
-
-def _rate(cell: Cell, key: str) -> str:
-    """``97 % [96, 98] (3)``."""
-    num = sum(result["evaluation"]["num_episodes"] for result in cell)
-    successes = sum(round(result["evaluation"][key] * result["evaluation"]["num_episodes"]) for result in cell)
-    low, high = wilson_interval(successes, num)
-    return f"{100 * successes / num:.1f} % [{100 * low:.0f}, {100 * high:.0f}] ({len(cell)})"
+def _table(of: Mapping[tuple[str, str], Seeds], text: Callable[[Seeds], str], *, paper: bool = False) -> str:
+    """A row per method that has a result, and a text per task; below it, if asked for, the paper's."""
+    rows: list[Sequence[str]] = []
+    for method, described in METHODS.items():
+        found = [of.get((method, task), []) for task in TASKS]
+        if any(found):
+            rows.append((described.title, *(text(seeds) if seeds else "" for seeds in found)))
+            if paper and method in PAPER:
+                rows.append(_paper_row("*the paper's*", PAPER[method]))
+    if paper:
+        rows.append(_paper_row("*best of the paper*", BEST))
+    return _markdown(rows)
 
 
-def _seeds(cell: Cell) -> str:
-    return ", ".join(f"{100 * result['evaluation']['success_last']:.1f}" for result in cell)
-
-
-def _cost(cell: Cell) -> str:
-    if not cell[0]["curve"]:
-        return "0"
-    steps, minutes = (float(np.mean([result[key] for result in cell])) for key in ("env_steps", "wall_s"))
-    return f"{steps / 1e3:.0f}, {minutes / 60:.0f} min"
-
-
-def _level(cell: Cell) -> float:
-    """``FINAL_SHARE`` of the final success, all seeds together."""
-    return FINAL_SHARE * float(np.mean([result["evaluation"]["success_last"] for result in cell])) if cell else 0.0
-
-
-def _mean_until(cell: Cell, level: float) -> float | None:
-    """Env steps until a level, mean of the seeds; None: not every seed reaches it."""
-    soon = [steps_until(result["curve"], level) for result in cell]
-    known = [each for each in soon if each is not None]
-    return float(np.mean(known)) if known and len(known) == len(cell) else None
-
-
-def _soonest(cells: Mapping[str, Cell], level: float) -> str:
-    """``128, scratch monolithic + HER (4)``, or ``> 200 (4)`` where no method reaches the level."""
-    found = {name: _mean_until(cell, level) for name, cell in cells.items()}
-    reached = {name: until for name, until in found.items() if until is not None}
-    if not reached:
-        longest = max(result["env_steps"] for cell in cells.values() for result in cell)
-        return f"> {longest / 1e3:.0f} ({len(cells)})"
-    first = min(reached, key=lambda name: reached[name])
-    return f"{reached[first] / 1e3:.0f}, {METHODS[first].title} ({len(cells)})"
+def _paper_row(title: str, rates: Mapping[str, float]) -> Sequence[str]:
+    return title, *(f"*{100 * rates[task]:.0f} %*" for task in TASKS)
 
 
 def _markdown(rows: Sequence[Sequence[str]]) -> str:
     head = ("", *(task.title for task in TASKS.values()))
-    lines = [head, ("---",) * len(head), *rows]
-    return "\n".join("| " + " | ".join(line) + " |" for line in lines) + "\n"
+    return "\n".join("| " + " | ".join(line) + " |" for line in (head, ("---",) * len(head), *rows)) + "\n"
+
+
+def _rate(key: str) -> Callable[[Seeds], str]:
+    """Pooled rates, such as ``97.0 % [96, 98] (3)``."""
+
+    def text(seeds: Seeds) -> str:
+        found = [result["evaluation"] for result in seeds]
+        num = sum(each["num_episodes"] for each in found)
+        successes = sum(round(each[key] * each["num_episodes"]) for each in found)
+        low, high = wilson_interval(successes, num)
+        return f"{100 * successes / num:.1f} % [{100 * low:.0f}, {100 * high:.0f}] ({len(seeds)})"
+
+    return text
+
+
+def _each_seed(seeds: Seeds) -> str:
+    return ", ".join(f"{100 * result['evaluation']['success_last']:.1f}" for result in seeds)
+
+
+def _cost(seeds: Seeds) -> str:
+    if not seeds[0]["curve"]:
+        return "0"
+    steps, minutes = (float(np.mean([result[key] for result in seeds])) for key in ("env_steps", "wall_s"))
+    return f"{steps / 1e3:.0f}, {minutes / 60:.0f} min"
+
+
+def _efficiency(of: Mapping[tuple[str, str], Seeds]) -> Sequence[str]:
+    """The section on how soon methods that compose are good, and the first that learns from nothing is as good."""
+    known = {name: method for name, method in METHODS.items() if any(found == name for found, _ in of)}
+    composing = [name for name, method in known.items() if method.composes]
+    scratch = [name for name, method in known.items() if method.learns_from_nothing]
+    if not composing or not scratch:
+        return ()
+    rows = []
+    for method in composing:
+        own, others = [METHODS[method].title], ["*best from scratch*"]
+        for task in TASKS:
+            seeds = of.get((method, task), [])
+            level = FINAL_SHARE * float(np.mean([each["evaluation"]["success_last"] for each in seeds] or [0.0]))
+            until = _mean_until(seeds, level)
+            rivals = {name: of[name, task] for name in scratch if (name, task) in of}
+            own.append("" if until is None else f"{until / 1e3:.0f}")
+            others.append("" if until is None or not rivals else f"*{_soonest(rivals, level)}*")
+        rows += [own, others]
+    return (
+        "\n## How soon\n",
+        f"Env steps in thousands until {FINAL_SHARE:.0%} of the row's own final success is reached, which is at the "
+        "second of the first two evaluations in a row that have it on average; below it until the first method that "
+        "learns from nothing is as good. In brackets how many of them were run on the task. Mean of the seeds.\n",
+        _markdown(rows),
+    )
+
+
+def _mean_until(seeds: Seeds, level: float) -> float | None:
+    """Env steps until a level, mean of the seeds; None: not every seed reaches it."""
+    soon = [steps_until(result["curve"], level) for result in seeds]
+    known = [each for each in soon if each is not None]
+    return float(np.mean(known)) if known and len(known) == len(seeds) else None
+
+
+def steps_until(curve: Sequence[dict[str, float]], level: float) -> float | None:
+    """Env steps of the second of the first two evaluations in a row that are at ``level`` on average; None: never.
+
+    Two, since one of 100 goals is noisy, and first passages pick the luckiest; the second, since before it nothing was
+    known.
+    """
+    for first, second in pairwise(curve):
+        if (first["success_last"] + second["success_last"]) / 2 >= level > 0.0:
+            return second["env_steps"]
+    return None
+
+
+def _soonest(of: Mapping[str, Seeds], level: float) -> str:
+    """``128, scratch monolithic + HER (4)``, or ``> 200 (4)`` where no method reaches the level."""
+    found = {name: _mean_until(seeds, level) for name, seeds in of.items()}
+    reached = {name: until for name, until in found.items() if until is not None}
+    if not reached:
+        longest = max(result["env_steps"] for seeds in of.values() for result in seeds)
+        return f"> {longest / 1e3:.0f} ({len(of)})"
+    first = min(reached, key=lambda name: reached[name])
+    return f"{reached[first] / 1e3:.0f}, {METHODS[first].title} ({len(of)})"
 
 
 def _origin(results: Sequence[Result]) -> str:
     taken = [each["primitives"] for each in results if each["primitives"]]
     primitives = sorted({f"{each['name']} ({each['digest'][:12]})" for each in taken})
-    commits = sorted({each["made"]["git_commit"][:12] for each in results if each["made"]["git_commit"]})
+    commits = sorted({_short(each["made"]["git_commit"]) for each in results if each["made"]["git_commit"]})
     return f"Primitives: {', '.join(primitives) or 'none'}. Commits: {', '.join(commits) or 'unknown'}.\n"
+
+
+def _short(commit: str) -> str:
+    """Twelve characters of a commit, and whether it had local changes."""
+    name, dirty, _ = commit.partition("-dirty")
+    return name[:12] + dirty

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from service.downstream.directory import TRIAL
 from service.downstream.methods import METHODS
 from service.envs.tasks import TASKS
 from service.media.plots.figures import BLUE, FAINT, GREEN, ORANGE, column, new_figure, read_records, save, style_axes
@@ -54,16 +55,16 @@ def draw_table(results: Results, path: Path) -> Path:
     figure = new_figure(14.0, 8.0, "Success at the last step, over thousands of env steps")
     longest = max((each["env_steps"] for each in results), default=0) / 1e3
     for axes, (name, task) in zip(figure.subplots(2, 3).flat, TASKS.items(), strict=True):
-        for (method, words), colour in zip(METHODS.items(), cycle(_COLOURS), strict=False):
-            chosen = [each for each in results if each["cell"]["task"] == name and each["cell"]["method"] == method]
-            _draw_method(axes, chosen, words.title, colour)
+        for (method, described), colour in zip(METHODS.items(), cycle(_COLOURS), strict=False):
+            chosen = [each for each in results if each[TRIAL]["task"] == name and each[TRIAL]["method"] == method]
+            _draw_method(axes, chosen, described.title, colour)
         _finish(axes, task.title)
         axes.set_ylim(-0.02, 1.02)
         axes.set_xlim(0.0, 1.02 * longest or 1.0)
     handles: dict[str, Any] = {}
     for axes in figure.axes:
         handles |= dict(zip(*reversed(axes.get_legend_handles_labels()), strict=True))
-    titles = [words.title for words in METHODS.values() if words.title in handles]
+    titles = [described.title for described in METHODS.values() if described.title in handles]
     if titles:
         lines = [handles[title] for title in titles]
         figure.legend(lines, titles, loc="upper right", ncols=4, fontsize=9, frameon=False)

@@ -1,8 +1,8 @@
-"""What a cell of the table is: a method on a task with a seed, how it learns, and how it is evaluated."""
+"""Settings of a trial: a method on a task with a seed, how it learns, and how it is evaluated."""
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Field, PositiveInt, ValidationError
 
@@ -16,6 +16,9 @@ _MAX_SEED = 2**32 - 1
 
 class _Frozen(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+
+_Settings = TypeVar("_Settings", bound=_Frozen)
 
 
 class SACConfig(_Frozen):
@@ -36,7 +39,7 @@ class SACConfig(_Frozen):
     learning_starts: int = Field(6_400, ge=0, description="env steps of uniform actions first; more than an episode")
 
 
-class CellConfig(_Frozen):
+class TrialConfig(_Frozen):
     """One run of a method on a task."""
 
     task: str
@@ -47,53 +50,49 @@ class CellConfig(_Frozen):
     curve_every: int = Field(4, ge=1, description="iterations between evaluations on the way; one is 50 steps a world")
     curve_episodes: int = Field(100, ge=1)
     num_episodes: int = Field(300, ge=1, description="of the final evaluation; paper: 16, likely")
+    task_version: int = Field(0, ge=0, description="of the task's Gymnasium name; what does not say it is of v0")
 
     @property
     def name(self) -> str:
-        """Of its files."""
+        """Name of its files."""
         return f"{self.task}-{self.method}-{self.seed}"
 
 
-def make_cell(**values: Any) -> CellConfig:
-    """A cell, checked.
+def make_trial(**values: Any) -> TrialConfig:
+    """Make a trial, checked.
 
     Raises:
         TandemError: an unknown task or method, a value out of its range, or too few env steps to learn anything.
     """
-    find_task(values.get("task", ""))
-    method = find_method(values.get("method", ""))
-    try:
-        cell = CellConfig(**values)
-    except ValidationError as error:
-        raise TandemError(first_line(error)) from None
-    if method.player is None:
-        _check_learning(cell.sac, cell.num_env_steps, hindsight=method.relabelled is not None)
-    return cell
-
-
-def _check_learning(sac: SACConfig, num_env_steps: int, *, hindsight: bool) -> None:
-    if num_env_steps <= sac.learning_starts:
+    task, method = find_task(values.get("task", "")), find_method(values.get("method", ""))
+    trial = validate(TrialConfig, {**values, "task_version": task.version})
+    sac = trial.sac
+    if method.player is None and trial.num_env_steps <= sac.learning_starts:
         raise TandemError(
-            f"{num_env_steps} env steps are all uniform actions: give more than learning_starts, {sac.learning_starts}"
+            f"{trial.num_env_steps} env steps are all uniform actions: give more than learning_starts, "
+            f"{sac.learning_starts}"
         )
     episodes = EPISODE_STEPS * sac.num_worlds
-    if hindsight and sac.learning_starts < episodes:
+    if method.her_ratio is not None and sac.learning_starts < episodes:
         raise TandemError(
             f"learning_starts = {sac.learning_starts}: goals are relabelled from whole episodes, so give at least "
             f"{episodes}, one of each of {sac.num_worlds} worlds"
         )
+    return trial
 
 
-def make_sac(**values: Any) -> SACConfig:
-    """How to learn, checked.
+def validate(kind: type[_Settings], values: Any) -> _Settings:
+    """Settings from plain values.
 
     Raises:
-        TandemError: a value out of its range.
+        TandemError: the first thing that is wrong, as ``key = value: why``.
     """
     try:
-        return SACConfig(**values)
+        return kind.model_validate(values)
     except ValidationError as error:
-        raise TandemError(first_line(error)) from None
+        first = error.errors()[0]
+        where = ".".join(str(part) for part in first["loc"])
+        raise TandemError(f"{where} = {first['input']!r}: {first['msg'][:1].lower()}{first['msg'][1:]}") from None
 
 
 def differences(recorded: dict[str, Any], wanted: dict[str, Any], prefix: str = "") -> list[str]:
@@ -106,10 +105,3 @@ def differences(recorded: dict[str, Any], wanted: dict[str, Any], prefix: str = 
         elif old != new:
             found.append(f"{prefix}{key} {old!r}, not {new!r}")
     return found
-
-
-def first_line(error: ValidationError) -> str:
-    """What is wrong first, as ``key = value: why``."""
-    first = error.errors()[0]
-    where = ".".join(str(part) for part in first["loc"])
-    return f"{where} = {first['input']!r}: {first['msg'][:1].lower()}{first['msg'][1:]}"

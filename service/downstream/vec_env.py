@@ -11,8 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 from stable_baselines3.common.vec_env import VecEnv
 
-Observation = dict[str, NDArray[np.float32]]
+FloatArray = NDArray[np.float32]
+Observation = dict[str, FloatArray]
 Info = dict[str, Any]
+
+PREVIOUS = "previous"
+"""Name of what is added to an observation: the positions one step ago."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -21,6 +25,8 @@ class VecEnvState:
 
     worlds: Any
     """State of the vector environment."""
+    previous: FloatArray
+    """(N, 11) positions as last shown."""
     returns: NDArray[np.float64]
     """(N,) rewards of the episodes that go on."""
     lengths: NDArray[np.int64]
@@ -34,8 +40,13 @@ class WorldsVecEnv(VecEnv):
     limit, with monitors: at an episode's end ``terminal_observation``, ``TimeLimit.truncated`` and ``episode`` (its
     return r and length l). As there, a world starts anew within the step that ends its episode.
 
+    An observation has one entry more, ``previous`` (11,): the positions one step ago, at an episode's start those of
+    now. Positions alone do not say how fast the arm and the object move: the arm lags behind its commands, and what was
+    pushed slides on. A second set does, and a real robot has it, too; no velocity is measured.
+
     Args:
-        env: restarts episodes in the same step (``gymnasium.vector.AutoresetMode.SAME_STEP``), and observes a mapping.
+        env: restarts episodes in the same step (``gymnasium.vector.AutoresetMode.SAME_STEP``), and observes a mapping
+            with the positions as ``observation``.
     """
 
     def __init__(self, env: gymnasium.vector.VectorEnv[Any, Any, Any]) -> None:
@@ -44,8 +55,13 @@ class WorldsVecEnv(VecEnv):
         """Return and success at the last step of the episodes that ended since this list was last cleared."""
         self._returns = np.zeros(env.num_envs)
         self._lengths = np.zeros(env.num_envs, dtype=np.int64)
-        self._actions: NDArray[np.float32] | None = None
-        super().__init__(env.num_envs, env.single_observation_space, env.single_action_space)
+        self._actions: FloatArray | None = None
+        self._now: FloatArray | None = None
+        self._previous: FloatArray | None = None
+        assert isinstance(env.single_observation_space, gymnasium.spaces.Dict)
+        spaces = dict(env.single_observation_space.spaces)
+        space = gymnasium.spaces.Dict({**spaces, PREVIOUS: spaces["observation"]})
+        super().__init__(env.num_envs, space, env.single_action_space)
 
     def reset(self) -> Any:
         """Start an episode in every world, from the seeds given by ``seed``."""
@@ -54,25 +70,37 @@ class WorldsVecEnv(VecEnv):
         self._returns[:], self._lengths[:] = 0.0, 0
         self._reset_seeds()
         self._reset_options()
-        return observation
+        return self._show(observation, observation["observation"])
 
-    def step_async(self, actions: NDArray[np.float32]) -> None:
-        """Keep what ``step_wait`` does."""
+    def step_async(self, actions: FloatArray) -> None:
+        """Keep the actions for ``step_wait``."""
         self._actions = actions
 
     def step_wait(self) -> Any:
-        """Observations, float32 rewards, dones and infos, (N, ...) each."""
+        """Step every world.
+
+        Returns:
+            Observations, float32 rewards, dones and infos, (N, ...) each.
+        """
         assert self._actions is not None, "step_async comes first"
+        assert self._now is not None, "reset comes first"
         observation, rewards, terminated, truncated, info = self.env.step(self._actions)
-        done = terminated | truncated
+        before, done = self._now, terminated | truncated
         self._returns += rewards
         self._lengths += 1
         infos: list[Info] = [{"TimeLimit.truncated": False} for _ in range(self.num_envs)]
         for world, success in enumerate(info["is_success"]):
             infos[world]["is_success"] = bool(success)
         for world in np.flatnonzero(done).tolist():
+            info["final_obs"][world][PREVIOUS] = before[world].copy()
             infos[world] = self._last_info(world, info, only_time=bool(truncated[world] and not terminated[world]))
-        return observation, rewards.astype(np.float32), done, infos
+        shown = self._show(observation, np.where(done[:, None], observation["observation"], before))
+        return shown, rewards.astype(np.float32), done, infos
+
+    def _show(self, observation: Observation, previous: FloatArray) -> Observation:
+        """The observation with the previous positions, of which copies are kept."""
+        self._now, self._previous = observation["observation"].copy(), previous.copy()
+        return {**observation, PREVIOUS: previous.copy()}
 
     def _last_info(self, world: int, info: Info, *, only_time: bool) -> Info:
         """The info of a world whose episode has ended; its sums begin again."""
@@ -89,13 +117,19 @@ class WorldsVecEnv(VecEnv):
 
     def state(self) -> VecEnvState:
         """Copy everything that :meth:`restore` needs."""
-        return VecEnvState(getattr(self.env, "state")(), self._returns.copy(), self._lengths.copy())  # noqa: B009
+        assert self._previous is not None, "reset comes first"
+        worlds = getattr(self.env, "state")()  # noqa: B009 - only ``TabletopVectorEnv`` has it
+        return VecEnvState(worlds, self._previous.copy(), self._returns.copy(), self._lengths.copy())
 
     def restore(self, state: VecEnvState) -> Observation:
-        """Go back to a saved state; continues bit-identically. The observation there."""
+        """Go back to a saved state; continues bit-identically.
+
+        Returns:
+            The observation there.
+        """
         self._returns, self._lengths = state.returns.copy(), state.lengths.copy()
-        observation: Observation = getattr(self.env, "restore")(state.worlds)  # noqa: B009
-        return observation
+        observation: Observation = getattr(self.env, "restore")(state.worlds)  # noqa: B009 - as above
+        return self._show(observation, state.previous)
 
     def close(self) -> None:
         """Stop the worlds' threads."""
@@ -106,7 +140,7 @@ class WorldsVecEnv(VecEnv):
         return [getattr(self.env, attr_name)] * self._num_asked(indices)
 
     def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
-        """Refused: the worlds share everything.
+        """Refuse: the worlds share everything.
 
         Raises:
             AttributeError: always.

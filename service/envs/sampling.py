@@ -63,8 +63,11 @@ def behind_wall(rng: np.random.Generator, start: StateArray, config: WorldConfig
 
 
 def in_box(place: StateArray, config: WorldConfig) -> StateArray:
-    """(num, 3) goals in the middle of boxes at (num, 3) places: the object's centre when it lies on the bottom."""
-    goal: StateArray = place + np.array([0.0, 0.0, fixtures.BOX_SHELL_M + config.object_size_m / 2])
+    """(num, 3) goals in the middle of boxes at (num, 3) places, as high as an object on the table.
+
+    An object within 5 cm, the height of a box, has its underside below the rim; one on the bottom is 5 mm too high.
+    """
+    goal: StateArray = place + np.array([0.0, 0.0, config.object_size_m / 2])
     return goal
 
 

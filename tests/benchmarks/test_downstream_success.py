@@ -8,7 +8,7 @@ from service.downstream.learner import LearnedPolicy
 from service.downstream.methods import METHODS
 from service.downstream.worker import FINAL_SEED
 from service.envs.tasks import SUCCESS_DISTANCE_M, find_task
-from tests.downstream.cells import small_cell
+from tests.downstream.trials import small_trial
 
 
 @pytest.fixture(scope="module")
@@ -22,8 +22,8 @@ def test_learns_and_is_evaluated_as_the_cells_are(trained, monkeypatch):
     monkeypatch.setattr(
         downstream_success, "default_learner", lambda *given: learners.append(make(*given)) or learners[-1]
     )
-    cell = small_cell(num_env_steps=201, task="larger")
-    result = downstream_success.learn(cell, trained, every=150, threads=1)
+    trial = small_trial(num_env_steps=201, task="larger")
+    result = downstream_success.learn(trial, trained, every=150, threads=1)
     (learner,) = learners
     assert [point["env_steps"] for point in result["curve"]] == [150, 201]
     assert learner._n_updates == 201 - 100  # one after every step but the first hundred
@@ -42,8 +42,8 @@ def test_learns_and_is_evaluated_as_the_cells_are(trained, monkeypatch):
 
 
 def test_acts_as_the_environment_that_it_learned_in(trained):
-    cell = small_cell(task="wall")
-    learner = downstream_success.default_learner(cell, trained)
+    trial = small_trial(task="wall")
+    learner = downstream_success.default_learner(trial, trained)
     env = learner.get_env()
     seen = env.reset()
     weights, _ = learner.predict(seen, deterministic=True)

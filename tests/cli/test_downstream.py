@@ -9,7 +9,7 @@ from typer.testing import CliRunner
 from service.cli import downstream as commands
 from service.cli.main import app
 from service.primitives.bundled import BUNDLED
-from tests.downstream.cells import SETS
+from tests.downstream.trials import SETS
 from tests.status.conftest import serve
 
 
@@ -28,9 +28,9 @@ def nowhere(tmp_path, monkeypatch):
 
 
 def test_a_signal_saves_and_the_same_command_continues(tmp_path, monkeypatch):
-    show = commands._Line.show
+    show = commands._Progress.show
     monkeypatch.setattr(
-        commands._Line, "show", lambda line, metrics: show(line, metrics) or os.kill(os.getpid(), signal.SIGTERM)
+        commands._Progress, "show", lambda line, metrics: show(line, metrics) or os.kill(os.getpid(), signal.SIGTERM)
     )
     cut = train("--task", "wall")
     assert cut.exit_code == 128 + signal.SIGTERM
@@ -39,8 +39,8 @@ def test_a_signal_saves_and_the_same_command_continues(tmp_path, monkeypatch):
     path = tmp_path / "runs" / "downstream" / "wall-ours-0"
     assert (path / "checkpoint.pt").exists()
     assert not (path / "result.json").exists()
-    monkeypatch.setattr(commands._Line, "show", lambda line, metrics: None)
-    monkeypatch.setattr("service.downstream.worker._film", lambda *arguments: path)
+    monkeypatch.setattr(commands._Progress, "show", lambda line, metrics: None)
+    monkeypatch.setattr("service.downstream.worker._record_video", lambda *arguments: path)
     done = train("--task", "wall", "--resume", "--json")
     assert done.exit_code == 0, done.output
     assert json.loads(done.stdout)["env_steps"] == 600
@@ -49,10 +49,10 @@ def test_a_signal_saves_and_the_same_command_continues(tmp_path, monkeypatch):
 def test_a_table_from_the_command_line(tmp_path):
     made = invoke("table", "--methods", "idle", "--tasks", "push,box", "--seeds", "0,1", "--episodes", 4, "--out", "o")
     assert made.exit_code == 0, made.output
-    assert "0 of 4 cells are there, 4 to run" in made.stderr
+    assert "0 of 4 trials are there, 4 to run" in made.stderr
     assert len(list((tmp_path / "o" / "downstream").iterdir())) == 4
     again = invoke("table", "--methods", "idle", "--tasks", "push,box", "--seeds", "0,1", "--episodes", 4, "--out", "o")
-    assert "4 of 4 cells are there, 0 to run" in again.stderr
+    assert "4 of 4 trials are there, 0 to run" in again.stderr
 
 
 def test_methods_are_listed():

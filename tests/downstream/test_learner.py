@@ -3,9 +3,9 @@ import pytest
 
 from service.downstream.learner import make_learner, set_progress
 from service.downstream.methods import METHODS
-from service.downstream.settings import make_cell, make_sac
+from service.downstream.settings import SACConfig, make_trial
 from service.downstream.worker import make_worlds
-from tests.downstream.cells import SMALL, small_cell
+from tests.downstream.trials import SMALL, small_trial
 
 
 def test_every_setting_reaches_the_learner(champion):
@@ -20,11 +20,10 @@ def test_every_setting_reaches_the_learner(champion):
         "hidden_sizes": (12, 7),
         "learning_starts": 160,
     }
-    sac = make_sac(**settings)
-    assert all(getattr(sac, name) != field.default for name, field in type(sac).model_fields.items())
-    cell = make_cell(task="push", method="ours", num_env_steps=500, sac=sac)
-    env = make_worlds(cell, METHODS["ours"], champion, 1)
-    learner = make_learner(cell, METHODS["ours"], env)
+    assert all(settings[name] != field.default for name, field in SACConfig.model_fields.items())
+    trial = make_trial(task="push", method="ours", num_env_steps=500, sac=settings)
+    env = make_worlds(trial, METHODS["ours"], champion, 1)
+    learner = make_learner(trial, METHODS["ours"], env)
     assert learner.n_envs == 3
     assert learner.gradient_steps == 5
     assert learner.batch_size == 24
@@ -43,9 +42,9 @@ def test_the_critics_learn_from_discounted_values_and_entropy_by_hand(champion):
     """One update: the critics' loss is that of r + gamma (min Q(s', a') - alpha log p(a'|s')), no episode ending."""
     import torch
 
-    cell = small_cell("ours")
-    env = make_worlds(cell, METHODS["ours"], champion, 1)
-    learner = make_learner(cell, METHODS["ours"], env)
+    trial = small_trial("ours")
+    env = make_worlds(trial, METHODS["ours"], champion, 1)
+    learner = make_learner(trial, METHODS["ours"], env)
     learner.learn(SMALL["learning_starts"])
     np_state, torch_state = np.random.get_state(), torch.get_rng_state()
     batch = learner.replay_buffer.sample(SMALL["batch_size"])
@@ -66,9 +65,9 @@ def test_the_critics_learn_from_discounted_values_and_entropy_by_hand(champion):
 
 
 def test_relabelled_goals_are_where_the_object_came_to_later_in_the_episode(champion):
-    cell = small_cell("ours-her")
-    env = make_worlds(cell, METHODS["ours-her"], champion, 1)
-    learner = make_learner(cell, METHODS["ours-her"], env)
+    trial = small_trial("ours-her")
+    env = make_worlds(trial, METHODS["ours-her"], champion, 1)
+    learner = make_learner(trial, METHODS["ours-her"], env)
     learner.learn(SMALL["learning_starts"])  # an episode of 50 steps in each of four worlds
     buffer = learner.replay_buffer
     places = buffer.next_observations["achieved_goal"]
@@ -91,9 +90,9 @@ def test_relabelled_goals_are_where_the_object_came_to_later_in_the_episode(cham
     ("method", "shares"), [("ours-her", (0.8, 0.4, 0.0)), ("scratch-monolithic-her", (0.8, 0.8, 0.8)), ("ours", None)]
 )
 def test_the_share_of_relabelled_goals(champion, method, shares):
-    cell = small_cell(method)
-    env = make_worlds(cell, METHODS[method], champion, 1)
-    learner = make_learner(cell, METHODS[method], env)
+    trial = small_trial(method)
+    env = make_worlds(trial, METHODS[method], champion, 1)
+    learner = make_learner(trial, METHODS[method], env)
     learner.learn(SMALL["learning_starts"])
     buffer, relabelled = learner.replay_buffer, []
     if shares is not None:

@@ -11,13 +11,13 @@ from service.envs.observations import NORMALISATION_BOB
 from service.policies.composition import compose
 from service.policies.networks import export_parameters
 from service.policies.numpy_policy import NumpyMCPPolicy
-from tests.downstream.cells import small_cell
+from tests.downstream.trials import small_trial
 
 
 def learner_of(method, champion):
-    cell = small_cell(method)
-    env = make_worlds(cell, METHODS[method], champion, 1)
-    learner = make_learner(cell, METHODS[method], env)
+    trial = small_trial(method)
+    env = make_worlds(trial, METHODS[method], champion, 1)
+    learner = make_learner(trial, METHODS[method], env)
     return learner, env
 
 
@@ -30,12 +30,12 @@ def observations(env, num_steps=3):
 
 
 def test_the_mcp_actor_is_the_composition_squashed(champion):
-    """Against the torch-free policy of the same parameters, and the tanh's Jacobian by hand."""
+    """Against the torch-free evaluator of the same parameters, and the tanh's Jacobian by hand."""
     learner, env = learner_of("scratch-mcp", champion)
     seen, actor = observations(env), learner.actor
-    policy = NumpyMCPPolicy(export_parameters(actor.mcp))
+    evaluator = NumpyMCPPolicy(export_parameters(actor.mcp))
     rows = torch.cat((seen["observation"], seen["desired_goal"]), 1).numpy()
-    weights, (means, variances) = policy.gate(rows), policy.primitives(rows[:, :11])
+    weights, (means, variances) = evaluator.gate(rows), evaluator.primitives(rows[:, :11])
     assert weights.shape == (4, 4)
     mean, variance = compose(weights, means, variances)
     with torch.no_grad():

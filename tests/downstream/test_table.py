@@ -1,16 +1,20 @@
 import dataclasses
+import functools
 import json
+from pathlib import Path
 
 import pytest
 
 from service.downstream.page import steps_until, write_page
 from service.downstream.results import ResultsDirectory
-from service.downstream.table import Source, Watching, make_table, run_here, run_on_ray
-from service.downstream.worker import describe
+from service.downstream.table import Source, make_table, run_here, run_on_ray
+from service.downstream.worker import Callbacks, find_provenance
 from service.errors import TandemError
-from tests.downstream.cells import small_cell
+from tests.downstream.trials import small_trial
 
-CELLS = [small_cell(method, task) for task in ("push", "box") for method in ("idle", "asp-only")]
+DOCS = Path(__file__).parents[2] / "docs" / "results"
+HERE, ON_RAY = functools.partial(run_here, num_threads=1), functools.partial(run_on_ray, num_workers=2)
+TRIALS = [small_trial(method, task) for task in ("push", "box") for method in ("idle", "asp-only")]
 
 
 @pytest.fixture
@@ -20,20 +24,19 @@ def source(tmp_path):
 
 def counted(ran, before=None):
     """A runner that keeps the names of what it ran, and calls ``before`` before each."""
-    here = run_here(1)
 
-    def run(cells, *rest):
-        for cell, result in here(cells, *rest):
-            ran.append(cell.name)
-            yield cell, result
+    def run(trials, *rest):
+        for trial, result in HERE(trials, *rest):
+            ran.append(trial.name)
+            yield trial, result
             if before is not None:
                 before()
 
     return run
 
 
-def table(cells, source, tmp_path, runner=None, **watching):
-    return make_table(cells, source, tmp_path / "out", runner or run_here(1), Watching(**watching))
+def table(trials, source, tmp_path, runner=None, **watching):
+    return make_table(trials, source, tmp_path / "out", runner or HERE, Callbacks(**watching))
 
 
 def test_a_table_runs_what_is_missing_and_nothing_else(source, tmp_path):
@@ -47,12 +50,12 @@ def test_a_table_runs_what_is_missing_and_nothing_else(source, tmp_path):
             raise KilledError
 
     with pytest.raises(KilledError):
-        table(CELLS, source, tmp_path, counted(ran, kill))
+        table(TRIALS, source, tmp_path, counted(ran, kill))
     results = tmp_path / "out" / "downstream"
     assert sorted(path.name for path in results.iterdir()) == ["push-asp-only-0.json", "push-idle-0.json"]
     stamps = {path: path.stat().st_mtime_ns for path in results.iterdir()}
-    assert table(CELLS, source, tmp_path, counted(ran))
-    assert ran == [cell.name for cell in CELLS]
+    assert table(TRIALS, source, tmp_path, counted(ran))
+    assert ran == [trial.name for trial in TRIALS]
     assert all(path.stat().st_mtime_ns == stamp for path, stamp in stamps.items())
     page = (tmp_path / "out" / "downstream.md").read_text()
     assert "| ASP only |" in page
@@ -67,127 +70,139 @@ def test_a_stopped_table_says_so_and_continues_its_training(source, tmp_path):
         asked.append(True)
         return len(asked) > 2
 
-    cells = [small_cell(), small_cell("idle")]
-    assert not table(cells, source, tmp_path, stop=stop)
+    trials = [small_trial(), small_trial("idle")]
+    assert not table(trials, source, tmp_path, stop=stop)
     assert (source.runs / "push-ours-0" / "checkpoint.pt").exists()
     assert not (tmp_path / "out" / "downstream").exists()
-    assert table(cells, source, tmp_path)
+    assert table(trials, source, tmp_path)
     lines = (source.runs / "push-ours-0" / "metrics.jsonl").read_text().splitlines()
     assert [json.loads(line)["iteration"] for line in lines] == [1, 2, 3]
 
 
 def test_how_to_learn_is_nothing_to_what_does_not(source, tmp_path):
-    table(CELLS[:1], source, tmp_path)
+    table(TRIALS[:1], source, tmp_path)
     ran = []
-    assert table([small_cell("idle", num_env_steps=9000)], source, tmp_path, counted(ran))
+    assert table([small_trial("idle", num_env_steps=9000)], source, tmp_path, counted(ran))
     assert ran == []
 
 
 def test_new_primitives_leave_what_takes_none(source, tmp_path):
-    scratch = small_cell("scratch-monolithic")
-    table([scratch, *CELLS[:2]], source, tmp_path)
-    described = describe(source.load())
-    newer = dataclasses.replace(described, primitives={"name": "panda-cube@99", "digest": "0" * 64})
+    scratch = small_trial("scratch-monolithic")
+    table([scratch, *TRIALS[:2]], source, tmp_path)
+    provenance = find_provenance(source.load())
+    newer = dataclasses.replace(provenance, primitives={"name": "panda-cube@99", "digest": "0" * 64})
     results = ResultsDirectory(tmp_path / "out" / "downstream")
     assert results.find(scratch, newer)["primitives"] is None
-    assert results.find(CELLS[0], newer)["world"] == described.world
-    with pytest.raises(TandemError, match=rf"primitives\.name '{described.primitives['name']}', not 'panda-cube@99'"):
-        results.find(CELLS[1], newer)
+    assert results.find(TRIALS[0], newer)["world"] == provenance.world
+    with pytest.raises(TandemError, match=rf"primitives\.name '{provenance.primitives['name']}', not 'panda-cube@99'"):
+        results.find(TRIALS[1], newer)
 
 
 def test_a_stop_between_cells_that_do_not_learn(source, tmp_path):
     ran = []
-    assert not table(CELLS, source, tmp_path, counted(ran), stop=lambda: len(ran) >= 1)
-    assert ran == [CELLS[0].name]
+    assert not table(TRIALS, source, tmp_path, counted(ran), stop=lambda: len(ran) >= 1)
+    assert ran == [TRIALS[0].name]
 
 
 def test_many_at_once_on_ray(source, tmp_path):
     from service.runtime.ray_connection import connected
 
     with connected(None, num_cpus=2):
-        assert table(CELLS[:2], source, tmp_path, run_on_ray(2))
-        other = [small_cell("idle", num_episodes=9)]  # where a training directory of that name is of other settings
+        assert table(TRIALS[:2], source, tmp_path, ON_RAY)
+        other = [small_trial("idle", num_episodes=9)]  # where a training directory of that name is of other settings
         with pytest.raises(TandemError, match="num_episodes 6, not 9") as caught:
-            make_table(other, source, tmp_path / "other", run_on_ray(2), Watching())
+            make_table(other, source, tmp_path / "other", ON_RAY, Callbacks())
     assert "\n" not in str(caught.value)
     assert not list((tmp_path / "other").rglob("*.json"))
     found = ResultsDirectory(tmp_path / "out" / "downstream").read_all()
     assert [each["cell"]["method"] for each in found] == ["asp-only", "idle"]
-    assert table(CELLS[:2], Source("panda-cube@champion", "no registry here", tmp_path / "elsewhere"), tmp_path)
+    assert table(TRIALS[:2], Source("panda-cube@champion", "no registry here", tmp_path / "elsewhere"), tmp_path)
 
 
 class TestBadInput:
-    def refused(self, words, cells, source, tmp_path):
+    def refused(self, words, trials, source, tmp_path):
         def never(*arguments):
             raise AssertionError("ran")
 
         before = {file: file.read_bytes() for file in (tmp_path / "out").rglob("*") if file.is_file()}
         with pytest.raises(TandemError, match=words) as caught:
-            table(cells, source, tmp_path, never)
+            table(trials, source, tmp_path, never)
         assert "\n" not in str(caught.value)
         assert {file: file.read_bytes() for file in (tmp_path / "out").rglob("*") if file.is_file()} == before
 
     @pytest.fixture
     def file(self, source, tmp_path):
-        table(CELLS[:1], source, tmp_path)
+        table(TRIALS[:1], source, tmp_path)
         return tmp_path / "out" / "downstream" / "push-idle-0.json"
 
     def test_another_version(self, file, source, tmp_path):
         file.write_text(json.dumps({**json.loads(file.read_text()), "format_version": 9}))
-        self.refused(r"push-idle-0\.json: format version 9, this program reads 1", CELLS, source, tmp_path)
+        self.refused(r"push-idle-0\.json: format version 9, this program reads 1", TRIALS, source, tmp_path)
 
     def test_another_version_of_a_cell_that_is_not_asked_for(self, file, source, tmp_path):
         file.write_text(json.dumps({**json.loads(file.read_text()), "format_version": 9}))
-        self.refused(r"push-idle-0\.json: format version 9", CELLS[3:], source, tmp_path)
+        self.refused(r"push-idle-0\.json: format version 9", TRIALS[3:], source, tmp_path)
 
     def test_other_settings(self, file, source, tmp_path):
-        cells = [small_cell("idle", num_episodes=9)]
-        self.refused(r"push-idle-0\.json is of cell\.num_episodes 6, not 9", cells, source, tmp_path)
+        trials = [small_trial("idle", num_episodes=9)]
+        self.refused(r"push-idle-0\.json is of num_episodes 6, not 9", trials, source, tmp_path)
+
+    def test_another_version_of_a_task(self, source, tmp_path):
+        """Files that say nothing are of version 0: of Box they are refused, of the other tasks they count."""
+        old = [small_trial("idle", task) for task in ("box", "wall")]
+        table(old, source, tmp_path)
+        for path in (tmp_path / "out" / "downstream").iterdir():
+            tree = json.loads(path.read_text())
+            del tree["cell"]["task_version"]
+            path.write_text(json.dumps(tree))
+        self.refused(r"box-idle-0\.json is of task_version 0, not 1", old[:1], source, tmp_path)
+        assert table(old[1:], source, tmp_path, counted(ran := []))
+        assert ran == []
 
     @pytest.fixture
     def played(self, source, tmp_path):
-        table(CELLS[1:2], source, tmp_path)
+        table(TRIALS[1:2], source, tmp_path)
         return tmp_path / "out" / "downstream" / "push-asp-only-0.json"
 
     def test_other_primitives(self, played, source, tmp_path):
         tree = json.loads(played.read_text())
         tree["primitives"]["digest"] = "0" * 64
         played.write_text(json.dumps(tree))
-        self.refused(r"push-asp-only-0\.json is of primitives\.digest '000", CELLS, source, tmp_path)
+        self.refused(r"push-asp-only-0\.json is of primitives\.digest '000", TRIALS, source, tmp_path)
 
     def test_a_page_that_a_person_wrote(self, source, tmp_path):
         (tmp_path / "out").mkdir()
         (tmp_path / "out" / "downstream.md").write_text("# How to learn downstream\n")
-        self.refused(r"downstream\.md was not written by this command", CELLS, source, tmp_path)
+        self.refused(r"downstream\.md was not written by this command", TRIALS, source, tmp_path)
 
     def test_seeds_of_other_settings(self, file, source, tmp_path):
-        cells = [small_cell("idle", seed=1, num_episodes=9)]
+        trials = [small_trial("idle", seed=1, num_episodes=9)]
         words = r"push-idle-0\.json and push-idle-1, asked for, are seeds of one method, but of num_episodes 6, not 9"
-        self.refused(words, cells, source, tmp_path)
+        self.refused(words, trials, source, tmp_path)
 
     def test_other_primitives_of_a_cell_that_is_not_asked_for(self, played, source, tmp_path):
         tree = json.loads(played.read_text())
         tree["primitives"]["name"] = "panda-cube@3"
         played.write_text(json.dumps(tree))
         words = r"push-asp-only-0\.json is of primitives\.name 'panda-cube@3', not"
-        self.refused(words, CELLS[3:], source, tmp_path)
+        self.refused(words, TRIALS[3:], source, tmp_path)
 
     def test_another_world(self, file, source, tmp_path):
         tree = json.loads(file.read_text())
         tree["world"]["friction"] = 0.5
         file.write_text(json.dumps(tree))
-        self.refused(r"push-idle-0\.json is of world\.friction 0\.5, not 1\.0", CELLS[2:], source, tmp_path)
+        self.refused(r"push-idle-0\.json is of world\.friction 0\.5, not 1\.0", TRIALS[2:], source, tmp_path)
 
     def test_a_training_directory_of_other_settings(self, source, tmp_path):
-        table([small_cell("idle", "box", num_episodes=9)], source, tmp_path)
+        table([small_trial("idle", "box", num_episodes=9)], source, tmp_path)
         ran = []
         with pytest.raises(TandemError, match=r"num_episodes 9, not 6.* of a table --runs"):
-            make_table(CELLS, source, tmp_path / "other", counted(ran), Watching())
+            make_table(TRIALS, source, tmp_path / "other", counted(ran), Callbacks())
         assert ran == []
 
     def test_no_json(self, file, source, tmp_path):
         file.write_text("{")
-        self.refused(r"push-idle-0\.json is no JSON", CELLS, source, tmp_path)
+        self.refused(r"push-idle-0\.json is no JSON", TRIALS, source, tmp_path)
 
 
 def result(method, task, seed, last, ever, curve=(), num=100):
@@ -218,6 +233,25 @@ def test_the_page_by_hand():
     assert "scratch" not in page
 
 
+def test_what_a_page_says_of_its_origin_by_hand():
+    first, second = result("ours", "box", 0, 0.5, 0.5), result("idle", "box", 0, 0.0, 0.0)
+    first["made"]["git_commit"] = "d" * 40 + "-dirty"
+    second["primitives"] = None
+    lines = write_page([first, second], "picture.png").splitlines()
+    assert lines[-1] == f"Primitives: panda-cube@4 (abababababab). Commits: {'c' * 12}, {'d' * 12}-dirty."
+    (old,) = [line for line in lines if "recorded before" in line]
+    assert old.startswith("*Box*, all methods: recorded before `tandem/Box-v1`, with another rule")
+    second["cell"]["task_version"] = 1
+    assert "*Box*, ours: recorded before" in write_page([first, second], "picture.png")
+    first["cell"]["task_version"] = 1
+    assert "recorded before" not in write_page([first, second], "picture.png")
+
+
+def test_the_recorded_page_is_what_its_files_give():
+    results = ResultsDirectory(DOCS / "downstream").read_all()
+    assert (DOCS / "downstream.md").read_text() == write_page(results, "downstream.png")
+
+
 def test_how_soon_beside_what_learns_from_nothing_by_hand():
     def learned(method, task, seed, last, *rates):
         points = [{"env_steps": 1000 * step, "success_last": rate} for step, rate in enumerate(rates, 1)]
@@ -225,10 +259,10 @@ def test_how_soon_beside_what_learns_from_nothing_by_hand():
 
     page = write_page(
         [
-            learned("ours", "wall", 0, 0.9, 0.0, 0.9, 0.9),  # 0.9 x 0.8, the mean of the seeds: 2,000 env steps
-            learned("ours", "wall", 1, 0.7, 0.1, 0.2, 0.3, 0.9, 0.7),  # 4,000
+            learned("ours", "wall", 0, 0.9, 0.0, 0.9, 0.9),  # 0.9 x 0.8, the mean of the seeds: 3,000 env steps
+            learned("ours", "wall", 1, 0.7, 0.1, 0.2, 0.3, 0.9, 0.7),  # 5,000
             learned("scratch-monolithic", "wall", 0, 0.3, 0.1, 0.3, 0.3),
-            learned("scratch-monolithic-her", "wall", 0, 0.8, 0.1, 0.3, 0.5, 0.8, 0.8),  # 4,000
+            learned("scratch-monolithic-her", "wall", 0, 0.8, 0.1, 0.3, 0.5, 0.8, 0.8),  # 5,000
             learned("ours", "box", 0, 0.9, 0.0, 0.9, 0.9),
             learned("scratch-monolithic", "box", 0, 0.3, 0.1, 0.3, 0.3),  # never
             learned("ours", "push", 0, 0.9, 0.0, 0.9, 0.9),  # nothing to compare with
@@ -238,13 +272,13 @@ def test_how_soon_beside_what_learns_from_nothing_by_hand():
         "picture.png",
     )
     lines = page.splitlines()
-    assert "| ours |  |  | 2 |  | 3 | 2 |" in lines
-    assert "| *best from scratch* |  |  |  |  | *4, scratch monolithic + HER (2)* | *> 2 (1)* |" in lines
+    assert "| ours |  |  | 3 |  | 4 | 3 |" in lines
+    assert "| *best from scratch* |  |  |  |  | *5, scratch monolithic + HER (2)* | *> 2 (1)* |" in lines
 
 
 def test_how_soon_by_hand():
     curve = [{"env_steps": step, "success_last": rate} for step, rate in [(1, 0.9), (2, 0.1), (3, 0.8), (4, 0.9)]]
-    assert steps_until(curve, 0.5) == 1
-    assert steps_until(curve, 0.6) == 3
+    assert steps_until(curve, 0.5) == 2  # of the two that are good enough on average, the last
+    assert steps_until(curve, 0.6) == 4
     assert steps_until(curve, 0.9) is None
     assert steps_until(curve, 0.0) is None

@@ -9,7 +9,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 
 from service.config import WorldConfig
 from service.downstream.compose import ComposePrimitivesVector
-from service.downstream.vec_env import WorldsVecEnv
+from service.downstream.vec_env import PREVIOUS, WorldsVecEnv
 from service.envs.gym.vector import TabletopVectorEnv
 
 CONFIG = WorldConfig(physics_step_s=0.005, num_substeps=8)
@@ -33,6 +33,11 @@ def ours():
     env.close()
 
 
+def known(observation):
+    """What single environments show as well."""
+    return {key: value for key, value in observation.items() if key != PREVIOUS}
+
+
 def assert_same(ours, theirs):
     assert ours.keys() == theirs.keys()
     for key in ours:
@@ -42,17 +47,17 @@ def assert_same(ours, theirs):
 
 def test_it_is_what_single_environments_are(ours):
     theirs = DummyVecEnv([single] * NUM)
-    assert ours.observation_space == theirs.observation_space
+    assert dict(ours.observation_space) == {**theirs.observation_space, PREVIOUS: ours.observation_space["observation"]}
     assert ours.action_space == theirs.action_space
     ours.seed(8)
     theirs.seed(8)
-    assert_same(ours.reset(), theirs.reset())
+    assert_same(known(ours.reset()), theirs.reset())
     rng, num_done, paid = np.random.default_rng(0), 0, 0.0
     for _ in range(3 * LENGTH):
         actions = rng.uniform(-1.0, 1.0, (NUM, 4)).astype(np.float32)
         observation, reward, done, infos = ours.step(actions)
         expected_observation, expected_reward, expected_done, expected_infos = theirs.step(actions)
-        assert_same(observation, expected_observation)
+        assert_same(known(observation), expected_observation)
         np.testing.assert_array_equal(reward, expected_reward)
         assert reward.dtype == expected_reward.dtype
         np.testing.assert_array_equal(done, expected_done)
@@ -63,12 +68,46 @@ def test_it_is_what_single_environments_are(ours):
             assert ("terminal_observation" in info) == ("terminal_observation" in expected)
             if "terminal_observation" in info:
                 num_done += 1
-                assert_same(info["terminal_observation"], expected["terminal_observation"])
+                assert_same(known(info["terminal_observation"]), expected["terminal_observation"])
                 assert info["episode"]["r"] == pytest.approx(expected["episode"]["r"])
                 assert info["episode"]["l"] == expected["episode"]["l"]
     assert num_done == 3 * NUM
     assert sum(total for total, _ in ours.finished) == paid > 0.0
     theirs.close()
+
+
+def test_it_shows_the_positions_of_the_step_before(ours):
+    rng = np.random.default_rng(0)
+    ours.seed(1)
+    observation = ours.reset()
+    np.testing.assert_array_equal(observation[PREVIOUS], observation["observation"])
+    for step in range(1, 2 * LENGTH + 1):
+        before = observation["observation"].copy()
+        observation, _, done, infos = ours.step(rng.uniform(-1.0, 1.0, (NUM, 4)).astype(np.float32))
+        assert {key: rows[0] for key, rows in observation.items()} in ours.observation_space
+        assert not np.array_equal(before, observation["observation"])
+        if step % LENGTH:
+            np.testing.assert_array_equal(observation[PREVIOUS], before)
+            continue
+        assert done.all()
+        np.testing.assert_array_equal(observation[PREVIOUS], observation["observation"])
+        for world in range(NUM):
+            last = infos[world]["terminal_observation"]
+            np.testing.assert_array_equal(last[PREVIOUS], before[world])
+            assert not np.array_equal(last["observation"], observation["observation"][world])
+
+
+def test_a_world_that_ends_alone_begins_alone(ours):
+    """Where physics diverged, one world starts anew in the middle of the others' episodes."""
+    ours.seed(1)
+    observation = ours.reset()
+    for _ in range(2):
+        before = observation["observation"]
+        ours.env._elapsed[1] = LENGTH - 1
+        observation, _, done, _ = ours.step(np.full((NUM, 4), 0.5, dtype=np.float32))
+        assert done.tolist() == [False, True, False]
+        np.testing.assert_array_equal(observation[PREVIOUS][1], observation["observation"][1])
+        np.testing.assert_array_equal(observation[PREVIOUS][::2], before[::2])
 
 
 def test_without_seeds_it_goes_on_with_the_random_numbers(ours):
@@ -87,9 +126,8 @@ def test_a_restored_environment_goes_on_bit_for_bit(champion):
     first.reset()
     rng = np.random.default_rng(0)
     for _ in range(LENGTH + 2):  # into the second episode
-        first.step(rng.uniform(-1.0, 1.0, (NUM, 4)).astype(np.float32))
-    observation = second.restore(first.state())
-    assert_same(observation, first.restore(first.state()))
+        expected = first.step(rng.uniform(-1.0, 1.0, (NUM, 4)).astype(np.float32))[0]
+    assert_same(second.restore(first.state()), expected)
     for _ in range(2 * LENGTH):
         actions = rng.uniform(-1.0, 1.0, (NUM, 4)).astype(np.float32)
         one, other = first.step(actions), second.step(actions)
@@ -101,6 +139,7 @@ def test_a_restored_environment_goes_on_bit_for_bit(champion):
 
 def test_a_state_of_other_worlds_is_refused(ours):
     other = make(num=2)
+    other.reset()
     with pytest.raises(ValueError, match=r"expected shape \(3, "):
         ours.restore(other.state())
     other.close()

@@ -10,12 +10,12 @@ from service.downstream import worker
 from service.downstream.compose import parameters_digest
 from service.downstream.learner import make_learner
 from service.downstream.methods import find_method
-from service.downstream.worker import Running, make_worlds, play, run_cell
+from service.downstream.worker import Callbacks, RunOptions, make_worlds, play, run_trial
 from service.envs.tasks import TASKS
 from service.errors import TandemError
 from service.io.jsonl import read_jsonl
 from service.io.lock import is_locked
-from tests.downstream.cells import small_cell
+from tests.downstream.trials import small_trial
 
 
 class Stop:
@@ -29,8 +29,8 @@ class Stop:
         return self.left < 0
 
 
-def run(cell, champion, path, **options):
-    return run_cell(cell, champion, path, Running(**{"num_threads": 1, **options}))
+def run(trial, champion, path, *, resume=False, **callbacks):
+    return run_trial(trial, champion, path, RunOptions(resume, num_threads=1, callbacks=Callbacks(**callbacks)))
 
 
 def without_times(records):
@@ -39,14 +39,14 @@ def without_times(records):
 
 @pytest.mark.parametrize("method", ["ours-her", "scratch-mcp"])
 def test_a_resumed_training_is_the_uninterrupted_one(champion, tmp_path, method):
-    cell = small_cell(method)
-    whole = run(cell, champion, tmp_path / "whole")
-    assert run(cell, champion, tmp_path / "cut", stop=Stop(2)) is None
+    trial = small_trial(method)
+    whole = run(trial, champion, tmp_path / "whole")
+    assert run(trial, champion, tmp_path / "cut", stop=Stop(2)) is None
     assert len(read_jsonl(tmp_path / "cut" / "metrics.jsonl")) == 2
     assert not (tmp_path / "cut" / "result.json").exists()
     torch.manual_seed(99)
     np.random.seed(99)
-    resumed = run(cell, champion, tmp_path / "cut", resume=True)
+    resumed = run(trial, champion, tmp_path / "cut", resume=True)
     records = [without_times(read_jsonl(tmp_path / name / "metrics.jsonl")) for name in ("whole", "cut")]
     assert records[0] == records[1]
     assert resumed["evaluation"] == whole["evaluation"]
@@ -58,11 +58,11 @@ def test_a_resumed_training_is_the_uninterrupted_one(champion, tmp_path, method)
 
 
 def test_a_training_killed_between_checkpoints_makes_the_rest_again(champion, tmp_path):
-    cell = small_cell()
-    run(cell, champion, tmp_path, stop=Stop(1))
+    trial = small_trial()
+    run(trial, champion, tmp_path, stop=Stop(1))
     with (tmp_path / "metrics.jsonl").open("a") as file:
         file.write('{"iteration": 2, "env_steps": 400, "made": "after the checkpoint"}\n{"iterat')
-    run(cell, champion, tmp_path, resume=True)
+    run(trial, champion, tmp_path, resume=True)
     records = read_jsonl(tmp_path / "metrics.jsonl")
     assert [each["iteration"] for each in records] == [1, 2, 3]
     assert not any("made" in each for each in records)
@@ -71,7 +71,7 @@ def test_a_training_killed_between_checkpoints_makes_the_rest_again(champion, tm
 def test_what_a_training_leaves(champion, tmp_path):
     before = parameters_digest(champion.primitives)
     seen = []
-    result = run(small_cell(), champion, tmp_path, on_iteration=seen.append)
+    result = run(small_trial(), champion, tmp_path, on_iteration=seen.append)
     files = {path.name for path in tmp_path.iterdir()} - {".lock"}
     assert files == {
         "cell.json", "metrics.jsonl", "tensorboard", "checkpoint.pt", "result.json", "model.zip", "curves.png"
@@ -92,36 +92,36 @@ def test_what_a_training_leaves(champion, tmp_path):
 
 
 def test_a_finished_training_is_not_run_again(champion, tmp_path):
-    first = run(small_cell("idle"), champion, tmp_path)
+    first = run(small_trial("idle"), champion, tmp_path)
     stamp = (tmp_path / "result.json").stat().st_mtime_ns
-    assert run(small_cell("idle"), champion, tmp_path, resume=True) == first
+    assert run(small_trial("idle"), champion, tmp_path, resume=True) == first
     assert (tmp_path / "result.json").stat().st_mtime_ns == stamp
 
 
 def test_what_a_killed_process_left_before_its_first_file_is_no_training(champion, tmp_path):
     for name in (".lock", ".tmp-1-cell"):
         (tmp_path / name).touch()
-    run(small_cell("idle"), champion, tmp_path)
+    run(small_trial("idle"), champion, tmp_path)
     assert not list(tmp_path.glob(".tmp-*"))
 
 
 def test_success_is_within_5_cm_whatever_primitives_were_trained_with(champion, tmp_path):
     game = champion.config.game.model_copy(update={"success_distance_m": 0.001})
     strict = dataclasses.replace(champion, config=champion.config.model_copy(update={"game": game}))
-    cell = small_cell("asp-only", "inair", num_episodes=40)
-    assert run(cell, strict, tmp_path / "strict")["evaluation"]["success_last"] > 0.8
+    trial = small_trial("asp-only", "inair", num_episodes=40)
+    assert run(trial, strict, tmp_path / "strict")["evaluation"]["success_last"] > 0.8
 
 
 def test_the_same_5_cm_are_paid_and_counted(champion):
-    cell = small_cell("idle", num_episodes=300)
+    trial = small_trial("idle", num_episodes=300)
     counts = []
     for distance in (0.05, 0.06):
         task = TASKS["push"]
         world = task.world_from(champion.config.world)
         options = {"num_episodes": 300, "num_steps": 50, "success_distance_m": distance, "seed": 7}
         counts.append(evaluate(IdlePolicy(), world, task.goals, **options).success_last)
-    assert play(cell, champion, IdlePolicy, 300, 7, Running()).success_last == counts[0] < counts[1]
-    env = make_worlds(cell, find_method("ours"), champion, 1)
+    assert play(trial, champion, IdlePolicy(), 300, 7, 1).success_last == counts[0] < counts[1]
+    env = make_worlds(trial, find_method("ours"), champion, 1)
     achieved = np.float32([[0.0499, 0.0, 0.0], [0.0501, 0.0, 0.0], [0.0, 0.0, -0.0599]])
     (paid,) = env.env_method("compute_reward", achieved, np.zeros((3, 3), np.float32), {}, indices=0)
     np.testing.assert_array_equal(paid, [1.0, 0.0, 0.0])
@@ -133,18 +133,18 @@ def test_goals_of_the_curve_of_the_end_and_of_learning_are_others(champion, tmp_
     monkeypatch.setattr(
         worker, "evaluate", lambda *given, **named: seeds.append(named["seed"]) or evaluate(*given, **named)
     )
-    run(small_cell(seed=3), champion, tmp_path)
+    run(small_trial(seed=3), champion, tmp_path)
     assert seeds == [1_000_003, 1_000_003, 2_000_003]
 
 
 def test_a_training_keeps_others_out_until_it_ends(champion, tmp_path):
     def try_another(metrics):
         with pytest.raises(TandemError, match=r"is in use by .*; stop that one first, or name another"):
-            run(small_cell(), champion, tmp_path, resume=True)
+            run(small_trial(), champion, tmp_path, resume=True)
         refused.append(metrics["iteration"])
 
     refused = []
-    run(small_cell(), champion, tmp_path, on_iteration=try_another)
+    run(small_trial(), champion, tmp_path, on_iteration=try_another)
     assert refused == [1, 2, 3]
     assert not is_locked(tmp_path)
 
@@ -152,9 +152,9 @@ def test_a_training_keeps_others_out_until_it_ends(champion, tmp_path):
 def test_seeds_share_no_episodes(champion):
     streams = []
     for seed in (0, 1):
-        cell = small_cell(seed=seed)
-        env = make_worlds(cell, find_method("ours"), champion, 1)
-        make_learner(cell, find_method("ours"), env)
+        trial = small_trial(seed=seed)
+        env = make_worlds(trial, find_method("ours"), champion, 1)
+        make_learner(trial, find_method("ours"), env)
         streams.append(env.reset()["desired_goal"])
         env.close()
     distance = np.linalg.norm(streams[0][:, None] - streams[1][None], axis=2)
@@ -163,59 +163,71 @@ def test_seeds_share_no_episodes(champion):
 
 def test_methods_without_learning_play_as_they_are(champion, tmp_path):
     """Bob is good in the air; who does nothing is at the goal at times, at the last step as at any."""
-    cells = [small_cell(method, "inair", num_episodes=60) for method in ("asp-only", "idle")]
-    bob, idle = (run(cell, champion, tmp_path / cell.method)["evaluation"] for cell in cells)
+    trials = [small_trial(method, "inair", num_episodes=60) for method in ("asp-only", "idle")]
+    bob, idle = (run(trial, champion, tmp_path / trial.method)["evaluation"] for trial in trials)
     assert bob["success_last"] > 0.8
     assert idle["success_last"] == idle["success_ever"] < 0.1
     assert json.loads((tmp_path / "idle" / "result.json").read_text())["env_steps"] == 0
 
 
 class TestBadInput:
-    def refused(self, words, cell, trained, path, **options):
+    def refused(self, words, trial, trained, path, **options):
         before = {file: file.read_bytes() for file in path.rglob("*") if file.is_file()}
         with pytest.raises(TandemError, match=words) as caught:
-            run(cell, trained, path, **options)
+            run(trial, trained, path, **options)
         assert "\n" not in str(caught.value)
         assert {file: file.read_bytes() for file in path.rglob("*") if file.is_file()} == before
 
     def test_a_directory_with_a_training(self, champion, tmp_path):
-        run(small_cell("idle"), champion, tmp_path)
-        self.refused("holds a training already; continue it with --resume", small_cell("idle"), champion, tmp_path)
+        run(small_trial("idle"), champion, tmp_path)
+        self.refused("holds a training already; continue it with --resume", small_trial("idle"), champion, tmp_path)
 
     def test_a_directory_of_something_else(self, champion, tmp_path):
         (tmp_path / "metrics.jsonl").write_text('{"iteration": 1}\n')
         (tmp_path / "config.yaml").write_text("name: cube\n")
         for resume in (False, True):
             self.refused(
-                "something else than a downstream training", small_cell("idle"), champion, tmp_path, resume=resume
+                "something else than a downstream training", small_trial("idle"), champion, tmp_path, resume=resume
             )
 
     def test_another_training(self, champion, tmp_path):
-        run(small_cell("idle"), champion, tmp_path)
-        other = small_cell("idle", num_episodes=7)
-        self.refused(r"begun with cell\.num_episodes 6, not 7", other, champion, tmp_path, resume=True)
+        run(small_trial("idle"), champion, tmp_path)
+        other = small_trial("idle", num_episodes=7)
+        self.refused(r"begun with num_episodes 6, not 7", other, champion, tmp_path, resume=True)
+
+    def test_a_task_of_another_version(self, champion, tmp_path):
+        """A directory of before tasks had versions is of version 0, which Box no longer is."""
+        for task in ("wall", "box"):
+            run(small_trial("idle", task), champion, tmp_path / task)
+            (tmp_path / task / "result.json").unlink()
+            tree = json.loads((tmp_path / task / "cell.json").read_text())
+            del tree["cell"]["task_version"]
+            (tmp_path / task / "cell.json").write_text(json.dumps(tree))
+        run(small_trial("idle", "wall"), champion, tmp_path / "wall", resume=True)
+        words = r"begun with task_version 0, not 1"
+        self.refused(words, small_trial("idle", "box"), champion, tmp_path / "box", resume=True)
 
     def test_other_primitives(self, champion, tmp_path):
-        run(small_cell(), champion, tmp_path, stop=Stop(1))
+        run(small_trial(), champion, tmp_path, stop=Stop(1))
         manifest = champion.manifest.model_copy(update={"version": 99})
         other = dataclasses.replace(champion, manifest=manifest)
         words = rf"primitives\.name '{champion.manifest.reference}', not .*@99"
-        self.refused(words, small_cell(), other, tmp_path, resume=True)
+        self.refused(words, small_trial(), other, tmp_path, resume=True)
 
     def test_primitives_of_another_robot(self, champion, tmp_path):
         spaces = {**champion.manifest.spaces, "action": 7}
         other = dataclasses.replace(champion, manifest=champion.manifest.model_copy(update={"spaces": spaces}))
         for method in ("ours", "asp-only", "idle", "scratch-mcp"):
-            self.refused("another robot or layout: action 7", small_cell(method), other, tmp_path / "new")
+            self.refused("another robot or layout: action 7", small_trial(method), other, tmp_path / "new")
 
     def test_a_damaged_checkpoint(self, champion, tmp_path):
-        run(small_cell(), champion, tmp_path, stop=Stop(1))
+        run(small_trial(), champion, tmp_path, stop=Stop(1))
         file = tmp_path / "checkpoint.pt"
         file.write_bytes(file.read_bytes()[:1000])
-        self.refused(r"checkpoint\.pt is damaged", small_cell(), champion, tmp_path, resume=True)
+        self.refused(r"checkpoint\.pt is damaged", small_trial(), champion, tmp_path, resume=True)
 
     def test_a_checkpoint_of_another_version(self, champion, tmp_path):
-        run(small_cell(), champion, tmp_path, stop=Stop(1))
+        run(small_trial(), champion, tmp_path, stop=Stop(1))
         saved = torch.load(tmp_path / "checkpoint.pt", weights_only=True)
         torch.save({**saved, "format_version": 9}, tmp_path / "checkpoint.pt")
-        self.refused("format version 9, this program reads 1", small_cell(), champion, tmp_path, resume=True)
+        self.refused("format version 9, this program reads 1", small_trial(), champion, tmp_path, resume=True)

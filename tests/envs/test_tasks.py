@@ -54,6 +54,7 @@ class TestTable:
         assert [task.title for task in TASKS.values()] == ["Larger", "InAir", "Push", "Sphere", "Wall", "Box"]
         assert [task.air_share for task in TASKS.values()] == [0.7, 1.0, 0.0, 0.7, 0.0, 0.0]
         assert TASKS["inair"].id == "tandem/InAir-v0"
+        assert [task.version for task in TASKS.values()] == [0, 0, 0, 0, 0, 1]
 
     def test_each_replaces_its_part_of_a_world_and_no_other(self):
         trained = WorldConfig(object_mass_kg=0.2, physics_step_s=0.005, num_substeps=8)
@@ -133,7 +134,7 @@ class TestDraws:
 
     def test_a_box_is_anywhere_and_the_object_beside_it_with_room_for_a_finger(self):
         start, goal, box = draw("box", 2000)
-        np.testing.assert_allclose(goal - box, np.tile([0.0, 0.0, 0.03], (2000, 1)), rtol=0, atol=1e-12)
+        np.testing.assert_allclose(goal - box, np.tile([0.0, 0.0, 0.025], (2000, 1)), rtol=0, atol=1e-12)
         offset = np.abs(box[:, :2] - CENTER)
         assert (offset.max(axis=0) > 0.99 * HALF).all()
         assert (offset <= HALF).all()
@@ -299,6 +300,25 @@ class TestFixtures:
             away = worlds.ee_position + np.array([0.0, 0.0, 0.3])
             drive(worlds, lambda: away, 25)
             assert np.abs(worlds.object_position[:, 2] - 0.03).max() < 0.001
+
+    def test_success_in_a_box_is_inside(self):
+        """A cube counts with its underside below the rim, 5 cm up, anywhere on the bottom, and nowhere beside."""
+        env = TabletopEnv(CONFIG, task="box")
+        env.reset(seed=0)
+        state = env.state()
+        place = state.world[-3:].copy()
+        for offset, inside in [
+            ([0.0, 0.0, 0.0749], True),  # half a cube above 4.99 cm
+            ([0.0, 0.0, 0.0751], False),
+            ([0.02, -0.02, 0.03], True),  # in a corner of the bottom, which is 9 cm wide and 5 mm thick
+            ([0.02, -0.02, 0.075], False),  # on the rim
+            ([0.075, 0.0, 0.025], False),  # on the table, at the wall
+        ]:
+            state.world[10:13] = place + offset
+            observation = env.restore(state)
+            reached = env.compute_reward(observation["achieved_goal"], observation["desired_goal"], {})
+            assert reached == float(inside), offset
+        env.close()
 
     def test_the_box_is_part_of_the_state(self):
         config = TASKS["box"].world_from(CONFIG)
