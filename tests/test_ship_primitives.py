@@ -1,5 +1,7 @@
 """Putting a champion into a bundled registry, which here is another directory."""
 
+import json
+import shutil
 import sys
 
 import numpy as np
@@ -7,12 +9,16 @@ import pytest
 
 from benchmarks import ship_primitives
 from benchmarks.ship_primitives import publish_newest, ship
+from service.actors.evaluation import evaluate
+from service.config import dump_config, parse_config
 from service.errors import TandemError
 from service.io.run_directory import RunDirectory
+from service.policies.evaluator import bob_evaluator
 from service.primitives import publishing
 from service.primitives.loading import load_bob, read_parameters
 from service.primitives.publishing import publish_bob
 from service.registry.registry import Registry
+from service.runtime.runner import EVALUATION_SEED
 from tests.registry.helpers import assert_identical, files_in
 from tests.runtime.runs import TREE, assert_one_line, play, tiny_config
 
@@ -95,13 +101,30 @@ def test_what_nobody_else_could_use_is_not_shipped(run, registry, target, change
 
 
 def test_the_newest_bob_of_a_run_is_measured(run, tmp_path, monkeypatch):
-    monkeypatch.setattr(publishing, "FINAL_EVALUATION_EPISODES", 4)
-    registry = Registry(tmp_path)
-    assert str(publish_newest(run, registry)) == "tiny@1"
+    monkeypatch.setattr(publishing, "FINAL_EVALUATION_EPISODES", 40)
+    registry, near = Registry(tmp_path / "registry"), RunDirectory(tmp_path / "run")
+    shutil.copytree(run.path, near.path)
+    game = {"success_distance_m": 0.05}  # this Bob solves nothing by less
+    near.config_file.write_text(dump_config(parse_config(TREE | {"game": TREE["game"] | game}, where="a test")))
+    assert str(publish_newest(near, registry)) == "tiny@1"
     manifest, parameters = registry.load("tiny")
     assert_identical(parameters, read_parameters(run, "bob"))
-    assert manifest.metrics["env_steps"] >= 400
-    assert 0.0 <= manifest.metrics["evaluation/mixed_success_last"] <= 1.0
+    env_steps = json.loads(run.metrics_file.read_text().splitlines()[-1])["env_steps"]
+    config = near.read_config()
+    for kind in ("mixed", "air", "table"):
+        found = evaluate(
+            bob_evaluator(parameters),
+            config.world,
+            kind,
+            num_episodes=40,
+            num_steps=config.run.evaluation_steps,
+            success_distance_m=config.game.success_distance_m,
+            seed=EVALUATION_SEED + 1,
+        )
+        assert manifest.metrics[f"evaluation/{kind}_success_last"] == found.success_last
+        assert manifest.metrics[f"evaluation/{kind}_success_ever"] == found.success_ever
+    assert manifest.metrics["env_steps"] == env_steps
+    assert 0.0 < manifest.metrics["evaluation/mixed_success_last"] < 1.0  # else any goals would do
 
 
 def test_one_command(run, registry, target, monkeypatch, capsys):

@@ -1,8 +1,16 @@
+import json
+from pathlib import Path
+
 import numpy as np
 import pytest
 
 import service
 from benchmarks.push_range import DIRECTIONS, best_pushes, measure, positions_behind
+from service.config import load_config
+from service.downstream.compose import parameters_digest
+from service.learner.learner import Learner
+from service.policies.evaluator import bob_evaluator
+from service.primitives.loading import TrainedBob
 
 
 def test_the_fastest_of_those_that_go_straight():
@@ -34,9 +42,21 @@ def test_the_gripper_stands_closed_behind_the_object(name):
     assert np.abs(relative[:, :2] @ direction[::-1]).max() <= 0.0151
 
 
-def test_champion_pushes_less_well_where_it_has_fewer_weights():
+def test_what_no_composition_does_is_impossible():
+    """Two primitives, one moves by +x and one by +y, wherever the object is: they push that way and no other."""
+    parameters = dict(Learner(load_config(None, ["policy.bob.num_primitives=2"])).weights().bob)
+    parameters["primitives.output_weight"] = np.zeros_like(parameters["primitives.output_weight"])
+    bias = np.zeros_like(parameters["primitives.output_bias"])
+    bias[0, 0] = bias[1, 1] = 3.0
+    parameters["primitives.output_bias"] = bias
+    bob = TrainedBob("by hand", bob_evaluator(parameters), load_config())
+    found = measure(bob, num_places=7, num_weights=40, seed=0)
+    assert found == {"+x": 0.0, "-x": 1.0, "+y": 0.0, "-y": 1.0}
+
+
+def test_the_champions_recorded_ranges_are_measured_again():
+    recorded = json.loads((Path(__file__).parents[2] / "docs" / "results" / "push_range.json").read_text())
     trained = service.load_primitives("panda-cube@champion", registry="no registry here")
-    many, few = (measure(trained, num_places=40, num_weights=num, seed=0) for num in (400, 4))
-    assert set(many) == set(DIRECTIONS)
-    assert sum(many.values()) < sum(few.values())
-    assert measure(trained, num_places=40, num_weights=400, seed=0) == many
+    row = recorded["rows"]["panda-cube@champion"]
+    assert parameters_digest(trained.primitives) == row["digest"]
+    assert measure(trained, **recorded["settings"]) == pytest.approx(row["impossible"], abs=0.005)

@@ -1,0 +1,43 @@
+"""The committed pages and pictures are what their recorded files give."""
+
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from benchmarks import cluster_figures, figures
+
+DOCS = Path(__file__).parents[2] / "docs"
+PAGES = ("results/pretraining.md", "results/cluster.md", "scaling.md")
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    """A copy of the documents with all that the report writes made anew."""
+    docs = tmp_path_factory.mktemp("report") / "docs"
+    shutil.copytree(DOCS, docs)
+    figures.pretraining(sorted((docs / "results" / "runs").glob("*.json")), docs / "results")
+    found = cluster_figures.read_results(docs / "results")
+    cluster_figures.cluster(docs, found)
+    cluster_figures.scaling(docs, found)
+    return docs
+
+
+@pytest.mark.parametrize("page", PAGES)
+def test_the_committed_page_is_what_the_recorded_files_give(made, page):
+    assert (made / page).read_text() == (DOCS / page).read_text()
+
+
+def test_the_committed_pictures_show_what_the_recorded_files_give(made):
+    pictures = sorted((made / "results").glob("pretraining*.png")) + sorted((made / "results").glob("cluster*.png"))
+    assert len(pictures) == 14
+    for picture in pictures:
+        ours, theirs = (
+            np.asarray(Image.open(path).convert("RGB"), dtype=np.int16)
+            for path in (picture, DOCS / "results" / picture.name)
+        )
+        assert ours.shape == theirs.shape, picture.name
+        # another version of the fonts may move the edges of letters
+        assert np.mean(np.abs(ours - theirs).max(axis=2) > 64) < 0.005, picture.name
