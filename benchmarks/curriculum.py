@@ -1,4 +1,4 @@
-"""How high and how far Alice's goals were over a run, and how many of them Bob solved: counts of every goal kept.
+"""Counts of a run's goals by time, height and distance, and of those that Bob solved.
 
 A goal of ``goals.jsonl`` is 7 numbers: start x y z, goal x y z in metres, solved 0 or 1.
 """
@@ -14,7 +14,7 @@ from benchmarks.run_files import Records
 from service.media.plots.figures import Array
 
 NUM_SLICES = 30
-"""Of env steps."""
+"""Equal parts of a run's env steps."""
 BIN_M = 0.025
 NUM_BINS = {"height": 13, "distance": 16}
 """The last one also holds what is beyond it."""

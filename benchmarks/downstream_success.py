@@ -1,6 +1,6 @@
-"""How well Stable-Baselines3's SAC learns a task as it comes: the other half of ``downstream_throughput.py``.
+"""Success of Stable-Baselines3's SAC as it comes: the other half of ``downstream_throughput.py``.
 
-    python benchmarks/downstream_success.py --task wall --steps 200000 --out docs/results/downstream_success.json
+    python -m benchmarks.downstream_success --task wall --json docs/results/downstream_success.json
 
 One environment, every default of ``SAC``, the same frozen primitives, and the goals that the cells of the table are
 evaluated on. A point of the curve has the wall-clock time of learning alone, as the cells count it.
@@ -8,33 +8,41 @@ evaluated on. A point of the curve has the wall-clock time of learning alone, as
 
 from __future__ import annotations
 
-import argparse
 import os
-import sys
 import time
-from pathlib import Path
+from dataclasses import asdict, dataclass
 from typing import Any
-
-sys.path.insert(0, str(Path(__file__).parents[1]))
-os.environ.update(dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"), "1"))
 
 import torch
 
 import service
-from benchmarks.downstream_throughput import default_learner
-from benchmarks.measuring import machine, write_json
+from benchmarks.downstream_throughput import PACKAGES, default_learner, parser_for_primitives
+from benchmarks.measuring import run_benchmark
 from service.downstream.learner import LearnedPolicy
 from service.downstream.methods import METHODS
 from service.downstream.settings import CellConfig, make_cell
 from service.downstream.worker import CURVE_SEED, FINAL_SEED, Running, describe, play
-from service.errors import TandemError
 from service.primitives.loading import TrainedBob
 
 
-def learn(cell: CellConfig, trained: TrainedBob, *, every: int, threads: int) -> dict[str, Any]:
-    """Learn ``cell.num_env_steps``; evaluate after every ``every`` env steps and at the end."""
-    torch.set_num_threads(threads)
-    learner, running = default_learner(cell, trained), Running(num_threads=threads)
+@dataclass(frozen=True, slots=True)
+class Settings:
+    """Amount of learning, and of what."""
+
+    task: str = "wall"
+    method: str = "ours"
+    seed: int = 0
+    num_env_steps: int = 200_000
+    every: int = 10_000
+    """Env steps between two points of the curve."""
+    threads: int = os.cpu_count() or 1
+    """Of physics and torch."""
+
+
+def learn(cell: CellConfig, trained: TrainedBob, settings: Settings) -> dict[str, Any]:
+    """Learn ``cell.num_env_steps``; evaluate after every ``settings.every`` env steps and at the end."""
+    torch.set_num_threads(settings.threads)
+    learner, running = default_learner(cell, trained), Running(num_threads=settings.threads)
 
     def player() -> LearnedPolicy:
         return LearnedPolicy(learner, METHODS[cell.method], trained)
@@ -43,7 +51,7 @@ def learn(cell: CellConfig, trained: TrainedBob, *, every: int, threads: int) ->
     wall_s = 0.0
     while learner.num_timesteps < cell.num_env_steps:
         begun = time.perf_counter()
-        num = min(every, cell.num_env_steps - learner.num_timesteps)
+        num = min(settings.every, cell.num_env_steps - learner.num_timesteps)
         learner.learn(num, reset_num_timesteps=not curve, log_interval=None)  # type: ignore[arg-type]
         wall_s += time.perf_counter() - begun
         found = play(cell, trained, player, cell.curve_episodes, cell.seed + CURVE_SEED, running)
@@ -51,40 +59,31 @@ def learn(cell: CellConfig, trained: TrainedBob, *, every: int, threads: int) ->
         curve.append({"env_steps": learner.num_timesteps, "wall_s": wall_s, **rates})
         print(f"{learner.num_timesteps:10,} env steps, {wall_s:6.0f} s: {found.success_last:.0%}", flush=True)
     final = play(cell, trained, player, cell.num_episodes, cell.seed + FINAL_SEED, running)
-    settings = cell.model_dump(mode="json", include={"task", "method", "seed", "num_env_steps"})
     return {
-        "machine": machine("torch", "mujoco", "stable-baselines3"),
-        "settings": {"cell": settings, **describe(trained).of(cell.method), "threads": threads},
+        "settings": {**asdict(settings), **describe(trained).of(cell.method)},
         "curve": curve,
         "evaluation": final.as_dict(),
         "wall_s": wall_s,
     }
 
 
-def main() -> int:
-    """Parse the command line, learn, print, write."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--task", default="wall")
-    parser.add_argument("--method", default="ours", choices=[name for name, each in METHODS.items() if each.composes])
-    parser.add_argument("--primitives", default="panda-cube@champion")
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--steps", type=int, default=200_000, help="env steps of learning")
-    parser.add_argument("--every", type=int, default=10_000, help="env steps between two points of the curve")
-    parser.add_argument("--threads", type=int, default=os.cpu_count(), help="of physics and torch")
-    parser.add_argument("--out", type=Path, metavar="FILE")
-    given = parser.parse_args()
-    try:
-        cell = make_cell(task=given.task, method=given.method, seed=given.seed, num_env_steps=given.steps)
-        result = learn(cell, service.load_primitives(given.primitives), every=given.every, threads=given.threads)
-        if given.out is not None:
-            write_json(given.out, result)
-    except TandemError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
+def report(result: dict[str, Any]) -> str:
+    """A result for people."""
     found = result["evaluation"]
     low, high = found["success_last_low"], found["success_last_high"]
-    print(f"{found['success_last']:.1%} at the last step [{low:.0%}, {high:.0%}] after {result['wall_s'] / 60:.0f} min")
-    return 0
+    minutes = result["wall_s"] / 60
+    return f"{found['success_last']:.1%} at the last step [{low:.0%}, {high:.0%}] after {minutes:.0f} min"
+
+
+def main() -> int:
+    """Parse the command line, learn, print, write."""
+    given = parser_for_primitives(__doc__, Settings()).parse_args()
+
+    def benchmark(settings: Settings) -> dict[str, Any]:
+        chosen = {name: getattr(settings, name) for name in ("task", "method", "seed", "num_env_steps")}
+        return learn(make_cell(**chosen), service.load_primitives(given.primitives), settings)
+
+    return run_benchmark("downstream_success", PACKAGES, given, Settings, benchmark, report)
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Make the small file of a run that ``docs/results`` keeps and ``figures.py`` draws from.
+"""Make the small file of a run that ``docs/results`` keeps and the report is made from.
 
     python -m benchmarks.record_run runs/cube --out docs/results/runs/cube-0.json
 
@@ -11,14 +11,9 @@ from __future__ import annotations
 
 import argparse
 import json
-import os
 import sys
 from pathlib import Path
 from typing import Any
-
-# before NumPy is imported: as the command line does
-os.environ.update(dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1"))
-sys.path.insert(0, str(Path(__file__).parents[1]))
 
 import numpy as np
 
@@ -34,12 +29,12 @@ from service.policies.evaluator import bob_evaluator
 from service.primitives.loading import read_stages
 
 GOAL_RECORDS, GOALS_EACH = 60, 10
-"""Stages of the run of which goals are kept, and how many of each."""
+"""Stages of the run of which goals are kept, and the number of goals of each."""
 PACKAGES = ("mujoco", "numpy", "torch")
 
 
 def record_run(directory: RunDirectory, name: str, note: str = "") -> Run:
-    """Everything that is kept of a run without measuring.
+    """Everything that is kept of a run without measuring anything.
 
     Args:
         directory: the run.
@@ -65,7 +60,7 @@ def record_run(directory: RunDirectory, name: str, note: str = "") -> Run:
 
 
 def measure_run(directory: RunDirectory) -> dict[str, Any]:
-    """What is measured of a run's Bobs: the newest on every task, the coverage at all stages.
+    """Evaluations of a run's newest Bob on every task, and the coverage at all stages.
 
     Raises:
         TandemError: not a run, or without a usable checkpoint.

@@ -23,7 +23,7 @@ def test_learns_and_is_evaluated_as_the_cells_are(trained, monkeypatch):
         downstream_success, "default_learner", lambda *given: learners.append(make(*given)) or learners[-1]
     )
     cell = small_cell(num_env_steps=201, task="larger")
-    result = downstream_success.learn(cell, trained, every=150, threads=1)
+    result = downstream_success.learn(cell, trained, downstream_success.Settings(every=150, threads=1))
     (learner,) = learners
     assert [point["env_steps"] for point in result["curve"]] == [150, 201]
     assert learner._n_updates == 201 - 100  # one after every step but the first hundred

@@ -1,4 +1,4 @@
-"""Whether a run counted everything once: its records, its ledger and what its actors handed over, compared.
+"""Audit of a run's rollouts: its records, its ledger and what its actors handed over, compared.
 
 The ledger in a checkpoint has the highest sequence number learned from, of each incarnation of each actor; numbers
 begin at 0 and an actor's rollouts come in order. So
@@ -15,7 +15,6 @@ from dataclasses import asdict, dataclass
 from itertools import pairwise
 from typing import Any
 
-from benchmarks.strikes import Seen
 from service.store.models import RunStatus
 
 Ledger = Mapping[tuple[int, int], int]
@@ -24,19 +23,27 @@ Ledger = Mapping[tuple[int, int], int]
 
 @dataclass(frozen=True, slots=True)
 class Stretch:
-    """An actor's seat from when one incarnation was first seen until another was, or until the end."""
+    """An actor from when one incarnation was first seen until another was, or until the end."""
 
     actor: int
     first: int
-    """Incarnation, and all before ``next``."""
+    """Incarnation; those up to ``next`` belong to it, too."""
     next: int | None
     """Incarnation; None: it lived at the end."""
     num_handed: int
 
+    def num_counted(self, ledger: Ledger) -> int:
+        """Rollouts of the stretch that were learned from."""
+        return sum(
+            highest + 1
+            for (actor, incarnation), highest in ledger.items()
+            if actor == self.actor and self.first <= incarnation and (self.next is None or incarnation < self.next)
+        )
+
 
 @dataclass(frozen=True, slots=True)
-class Account:
-    """What was found; all is well if ``complete``."""
+class RolloutAudit:
+    """Numbers to compare; all is well if ``complete``."""
 
     num_iterations: int
     iterations_contiguous: bool
@@ -50,7 +57,7 @@ class Account:
     """Rollouts that killed incarnations had handed over."""
     num_counted_of_the_dead: int
     num_left_at_the_end: int
-    """Handed over, and too late for the last update."""
+    """Rollouts handed over too late for the last update."""
 
     @property
     def complete(self) -> bool:
@@ -75,57 +82,47 @@ def ledger_of(rows: Sequence[Sequence[int]]) -> dict[tuple[int, int], int]:
     return {(int(actor), int(incarnation)): int(highest) for actor, incarnation, highest in rows}
 
 
-def handed(seen: Sequence[Seen]) -> list[Stretch]:
-    """What the incarnations of every rollout actor handed over, from a run's statuses in order."""
+def stretches_of(statuses: Sequence[RunStatus]) -> list[Stretch]:
+    """Stretches of every rollout actor, from a run's statuses in order."""
+    told: dict[str, list[tuple[int, int]]] = {}
+    for status in statuses:
+        for actor in status.actors:
+            if actor.name.startswith("rollout-"):
+                told.setdefault(actor.name, []).append((actor.incarnation, actor.num_rollouts))
     result = []
-    names = dict.fromkeys(actor.name for each in seen for actor in each.status.actors)
-    for name in names:
-        if not name.startswith("rollout-"):
-            continue
-        index, told = int(name.partition("-")[2]), [actor for each in seen if (actor := each.actor(name)) is not None]
-        turns = [0, *(i for i in range(1, len(told)) if told[i].incarnation > told[i - 1].incarnation)]
-        bases = [0, *(told[i].num_rollouts for i in turns[1:])]
-        for place, (turn, base) in enumerate(zip(turns, bases, strict=True)):
-            last = place + 1 == len(turns)
-            end = told[-1].num_rollouts if last else bases[place + 1]
-            after = None if last else told[turns[place + 1]].incarnation
-            first = 0 if place == 0 else told[turn].incarnation
-            result.append(Stretch(index, first, after, end - base))
+    for name, each in told.items():
+        actor_index, first, base = int(name.partition("-")[2]), 0, 0
+        for (before, _), (incarnation, num_rollouts) in pairwise(each):
+            if incarnation > before:
+                result.append(Stretch(actor_index, first, incarnation, num_rollouts - base))
+                first, base = incarnation, num_rollouts
+        result.append(Stretch(actor_index, first, None, each[-1][1] - base))
     return result
 
 
-def account(rows: Sequence[Mapping[str, Any]], ledger: Ledger, end: RunStatus, stretches: Sequence[Stretch]) -> Account:
+def audit_rollouts(
+    rows: Sequence[Mapping[str, Any]], ledger: Ledger, end: RunStatus, stretches: Sequence[Stretch]
+) -> RolloutAudit:
     """Compare all of them, of a run that one driver ran from its beginning to its end.
 
     Args:
         rows: of ``metrics.jsonl``.
         ledger: in the last checkpoint.
         end: the last status.
-        stretches: see ``handed``.
+        stretches: see ``stretches_of``.
     """
     versions = [int(row["learner/version"]) for row in rows if "learner/version" in row]
-    steps = [int(row["env_steps"]) for row in rows]
     dead = [each for each in stretches if each.next is not None]
     living = [each for each in stretches if each.next is None]
-    return Account(
+    return RolloutAudit(
         num_iterations=len(rows),
         iterations_contiguous=[int(row["iteration"]) for row in rows] == list(range(1, len(rows) + 1)),
         versions_contiguous=versions == list(range(1, len(versions) + 1)),
-        env_steps_rise=all(a < b for a, b in pairwise(steps)),
+        env_steps_rise=all(a["env_steps"] < b["env_steps"] for a, b in pairwise(rows)),
         num_counted=end.num_rollouts_counted,
         num_in_ledger=sum(highest + 1 for highest in ledger.values()),
         num_refused=end.num_rollouts_refused,
         num_handed_by_the_dead=sum(each.num_handed for each in dead),
-        num_counted_of_the_dead=sum(_counted(ledger, each) for each in dead),
-        num_left_at_the_end=sum(each.num_handed - _counted(ledger, each) for each in living),
-    )
-
-
-def _counted(ledger: Ledger, stretch: Stretch) -> int:
-    return sum(
-        highest + 1
-        for (actor, incarnation), highest in ledger.items()
-        if actor == stretch.actor
-        and incarnation >= stretch.first
-        and (stretch.next is None or incarnation < stretch.next)
+        num_counted_of_the_dead=sum(each.num_counted(ledger) for each in dead),
+        num_left_at_the_end=sum(each.num_handed - each.num_counted(ledger) for each in living),
     )

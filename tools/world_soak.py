@@ -1,22 +1,19 @@
-"""A million rough random steps: does anything in the world break?
+"""Make a million rough random steps, and see whether anything in the world breaks.
 
-Prints the worst that was seen; exits 1 if that is out of bounds.
+    python -m tools.world_soak --json docs/results/world_soak.json
+
+Prints the worst that was seen, and whether it is within bounds.
 """
 
 from __future__ import annotations
 
-import argparse
-import json
-import sys
-import time
 from dataclasses import asdict, dataclass
-from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-sys.path.insert(0, str(Path(__file__).parents[1]))
-
+from benchmarks.measuring import Stopwatch, parser_of, run_benchmark
 from service.config import WorldConfig
 from service.envs.batch import DISPLACEMENT_M, WorldBatch
 from service.envs.panda import FINGER_STROKE_M, JOINT_LOWER, JOINT_UPPER
@@ -33,9 +30,22 @@ TABLE_TOLERANCE_M = 12.5e-3
 FloatArray = NDArray[np.float32]
 
 
+@dataclass(frozen=True, slots=True)
+class Settings:
+    """Amount of what is tried, and in which world."""
+
+    steps: int = 1_000_000
+    """Of all worlds together."""
+    worlds: int = 200
+    object: str = "cube"
+    physics_step_s: float = 0.002
+    substeps: int = 20
+    seed: int = 0
+
+
 @dataclass
 class Extremes:
-    """The worst that was seen; every excess is positive outside its range."""
+    """The worst values seen; every excess is positive outside its range."""
 
     num_steps: int = 0
     num_broken: int = 0
@@ -44,7 +54,7 @@ class Extremes:
     joint_excess_rad: float = -np.inf
     finger_excess_m: float = -np.inf
     sunk_m: float = -np.inf
-    """How far an object's centre came below its resting height while over the table."""
+    """Greatest depth of an object's centre below its resting height while over the table."""
 
     def within_bounds(self) -> bool:
         """No world diverged, no joint or finger past its limit, no object through the table."""
@@ -108,32 +118,25 @@ def _note(extremes: Extremes, worlds: WorldBatch) -> None:
     extremes.sunk_m = max(extremes.sunk_m, float(sunk.max(initial=-np.inf)))
 
 
+def benchmark(settings: Settings) -> dict[str, Any]:
+    """Step all worlds, for JSON."""
+    world = {"object": settings.object, "physics_step_s": settings.physics_step_s, "num_substeps": settings.substeps}
+    watch, num_steps = Stopwatch(), -(-settings.steps // settings.worlds)
+    config = WorldConfig.model_validate(world)
+    extremes = soak(config, num_worlds=settings.worlds, num_steps=num_steps, seed=settings.seed)
+    return {**asdict(extremes), "within_bounds": extremes.within_bounds(), "wall_s": round(watch.wall_s(), 1)}
+
+
+def report(result: dict[str, Any]) -> str:
+    """A result for people."""
+    values = {name: value for name, value in result.items() if isinstance(value, (int, float))}
+    return "\n".join(f"{name:18} {value:.6g}" for name, value in values.items())
+
+
 def main() -> int:
     """Parse the command line, run, print."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument(
-        "--steps", type=int, default=1_000_000, help="steps of all worlds together (default: a million)"
-    )
-    parser.add_argument("--worlds", type=int, default=200)
-    parser.add_argument("--object", choices=("cube", "sphere"), default="cube")
-    parser.add_argument("--physics-step-s", type=float, default=0.002)
-    parser.add_argument("--substeps", type=int, default=20)
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--json", action="store_true", help="print one JSON object")
-    given = parser.parse_args()
-    config = WorldConfig(object=given.object, physics_step_s=given.physics_step_s, num_substeps=given.substeps)
-    start = time.perf_counter()
-    extremes = soak(config, num_worlds=given.worlds, num_steps=-(-given.steps // given.worlds), seed=given.seed)
-    result = {
-        **asdict(extremes),
-        "within_bounds": extremes.within_bounds(),
-        "wall_s": round(time.perf_counter() - start, 1),
-    }
-    if given.json:
-        print(json.dumps(result))
-    else:
-        print("\n".join(f"{name:18} {value:.6g}" for name, value in result.items()))
-    return 0 if extremes.within_bounds() else 1
+    given = parser_of(__doc__, Settings()).parse_args()
+    return run_benchmark("world_soak", ("mujoco", "numpy"), given, Settings, benchmark, report)
 
 
 if __name__ == "__main__":
