@@ -54,9 +54,6 @@ def ablated_config(recipe: Path, name: str, settings: list[str]) -> Config | Non
         recipe: a YAML file.
         name: of the ablation.
         settings: ``a.b=c`` of all ablations, such as the seed.
-
-    Raises:
-        TandemError: no such ablation, or the configuration is not valid.
     """
     if name not in ABLATIONS:
         raise TandemError(f"no ablation {name!r}; choose from {', '.join(ABLATIONS)}")
@@ -65,11 +62,7 @@ def ablated_config(recipe: Path, name: str, settings: list[str]) -> Config | Non
 
 
 def learn(config: Config, directory: RunDirectory) -> None:
-    """Run to the end, or go on from where a run with this configuration stopped.
-
-    Raises:
-        TandemError: another run is there.
-    """
+    """Run to the end, or go on from where a run with this configuration stopped."""
     if directory.exists and directory.read_config() != config:
         raise TandemError(
             f"{directory.path} holds a run of another configuration; remove it, or name another --run-dir"

@@ -60,9 +60,6 @@ def measure_run(
         num_iterations: one of them has an evaluation.
         num_actors: of a run on Ray; 1 otherwise.
         plain: without evaluations and checkpoints.
-
-    Raises:
-        TandemError: the run ended before.
     """
     copy = copy_run(source, home)
     settings = ENDLESS | PLAIN | ({} if plain else {"run.evaluation_interval": num_iterations})
@@ -74,11 +71,7 @@ def measure_run(
 
 
 def benchmark(source: RunDirectory, settings: Settings) -> dict[str, Any]:
-    """Measure both runners in turn, from the newest checkpoint of ``source``, and how long weights take to all actors.
-
-    Raises:
-        TandemError: no run there with a checkpoint, or it does not go on.
-    """
+    """Measure both runners in turn, from the newest checkpoint of ``source``, and the time of weights to all actors."""
     num_actors = settings.num_actors or os.cpu_count() or 1
     found: dict[Runtime, list[Measured]] = {runtime: [] for runtime in get_args(Runtime)}
     with scratch() as home:

@@ -51,11 +51,7 @@ class Settings:
 
 @contextmanager
 def worktree(commit: str, repository: Path = ROOT) -> Iterator[Path]:
-    """The files of a commit in a directory that is there as long as the block is.
-
-    Raises:
-        TandemError: no such commit, or git cannot make the directory.
-    """
+    """The files of a commit in a directory that is there as long as the block is."""
     with tempfile.TemporaryDirectory() as above:
         path = Path(above) / "tree"
         _git(repository, "worktree", "add", "--quiet", "--detach", str(path), commit)
@@ -66,11 +62,7 @@ def worktree(commit: str, repository: Path = ROOT) -> Iterator[Path]:
 
 
 def full_name(commit: str, repository: Path = ROOT) -> str:
-    """The hash of a commit.
-
-    Raises:
-        TandemError: there is none of that name.
-    """
+    """The hash of a commit."""
     return _git(repository, "rev-parse", "--verify", f"{commit}^{{commit}}")
 
 
@@ -85,23 +77,15 @@ def _git(repository: Path, *arguments: str) -> str:
 
 
 def train(tree: Path, home: Path, num_env_steps: int, config: Path) -> RunDirectory:
-    """Train with the code of a checkout until ``num_env_steps`` are made, and save.
-
-    Raises:
-        TandemError: the run ended before.
-    """
+    """Train with the code of a checkout until ``num_env_steps`` are made, and save."""
     arguments = ["--config", str(config), *overrides(ENDLESS)]
     with Training(home, arguments, runtime="local", tree=tree) as training:
-        training.wait_for_steps(num_env_steps)
+        training.wait_until("env_steps", num_env_steps)
         return training.directory
 
 
 def measure_commit(tree: Path, source: RunDirectory, home: Path, num_iterations: int) -> Sample:
-    """Go on from the newest checkpoint of ``source`` with the code of a checkout, in a copy that is deleted afterwards.
-
-    Raises:
-        TandemError: the run ended before.
-    """
+    """Go on from the newest checkpoint of ``source``, in a copy, with the code of a checkout."""
     copy = copy_run(source, home)
     with Training(home, overrides(ENDLESS), runtime="local", tree=tree) as training:
         sample = measure_training(training, num_iterations).sample
@@ -116,9 +100,6 @@ def compare(trees: Mapping[str, Path], home: Path, settings: Settings) -> dict[s
         trees: checkouts by name.
         home: an empty directory for the runs.
         settings: how much.
-
-    Raises:
-        TandemError: a run ended before it was measured.
     """
     runs = {}
     for name, tree in trees.items():
@@ -139,9 +120,6 @@ def benchmark(old: str, new: str, settings: Settings) -> dict[str, Any]:
         old: a commit.
         new: what it is compared with; the ratio is how many times as fast this one is.
         settings: how much.
-
-    Raises:
-        TandemError: no two commits, or a run failed.
     """
     commits = [full_name(commit) for commit in (old, new)]
     if commits[0] == commits[1]:

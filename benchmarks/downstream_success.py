@@ -2,8 +2,8 @@
 
     python -m benchmarks.downstream_success --task wall --json docs/results/downstream_success.json
 
-One environment, every default of ``SAC``, the same frozen primitives, and the goals that the cells of the table are
-evaluated on. A point of the curve has the wall-clock time of learning alone, as the cells count it.
+One environment, every default of ``SAC``, the same frozen primitives, and the goals that the trials of the table are
+evaluated on. A point of the curve has the wall-clock time of learning alone, as the trials count it.
 """
 
 from __future__ import annotations
@@ -16,8 +16,8 @@ from typing import Any
 import torch
 
 import service
-from benchmarks.downstream_throughput import PACKAGES, default_learner, parser_for_primitives
-from benchmarks.measuring import run_benchmark
+from benchmarks.downstream_throughput import PACKAGES, default_learner
+from benchmarks.measuring import parser_of, run_benchmark
 from service.downstream.learner import LearnedPolicy
 from service.downstream.methods import METHODS
 from service.downstream.settings import CellConfig, make_cell
@@ -31,6 +31,8 @@ class Settings:
 
     task: str = "wall"
     method: str = "ours"
+    """One that composes."""
+    primitives: str = "panda-cube@champion"
     seed: int = 0
     num_env_steps: int = 200_000
     every: int = 10_000
@@ -39,28 +41,28 @@ class Settings:
     """Of physics and torch."""
 
 
-def learn(cell: CellConfig, trained: TrainedBob, settings: Settings) -> dict[str, Any]:
-    """Learn ``cell.num_env_steps``; evaluate after every ``settings.every`` env steps and at the end."""
+def learn(trial: CellConfig, trained: TrainedBob, settings: Settings) -> dict[str, Any]:
+    """Learn ``trial.num_env_steps``; evaluate after every ``settings.every`` env steps and at the end."""
     torch.set_num_threads(settings.threads)
-    learner, running = default_learner(cell, trained), Running(num_threads=settings.threads)
+    learner, running = default_learner(trial, trained), Running(num_threads=settings.threads)
 
     def player() -> LearnedPolicy:
-        return LearnedPolicy(learner, METHODS[cell.method], trained)
+        return LearnedPolicy(learner, METHODS[trial.method], trained)
 
     curve: list[dict[str, float]] = []
     wall_s = 0.0
-    while learner.num_timesteps < cell.num_env_steps:
+    while learner.num_timesteps < trial.num_env_steps:
         begun = time.perf_counter()
-        num = min(settings.every, cell.num_env_steps - learner.num_timesteps)
+        num = min(settings.every, trial.num_env_steps - learner.num_timesteps)
         learner.learn(num, reset_num_timesteps=not curve, log_interval=None)  # type: ignore[arg-type]
         wall_s += time.perf_counter() - begun
-        found = play(cell, trained, player, cell.curve_episodes, cell.seed + CURVE_SEED, running)
+        found = play(trial, trained, player, trial.curve_episodes, trial.seed + CURVE_SEED, running)
         rates = {"success_last": found.success_last, "success_ever": found.success_ever}
         curve.append({"env_steps": learner.num_timesteps, "wall_s": wall_s, **rates})
         print(f"{learner.num_timesteps:10,} env steps, {wall_s:6.0f} s: {found.success_last:.0%}", flush=True)
-    final = play(cell, trained, player, cell.num_episodes, cell.seed + FINAL_SEED, running)
+    final = play(trial, trained, player, trial.num_episodes, trial.seed + FINAL_SEED, running)
     return {
-        "settings": {**asdict(settings), **describe(trained).of(cell.method)},
+        "settings": {**asdict(settings), **describe(trained).of(trial.method)},
         "curve": curve,
         "evaluation": final.as_dict(),
         "wall_s": wall_s,
@@ -75,14 +77,15 @@ def report(result: dict[str, Any]) -> str:
     return f"{found['success_last']:.1%} at the last step [{low:.0%}, {high:.0%}] after {minutes:.0f} min"
 
 
+def benchmark(settings: Settings) -> dict[str, Any]:
+    """Everything measured, for JSON."""
+    chosen = {name: getattr(settings, name) for name in ("task", "method", "seed", "num_env_steps")}
+    return learn(make_cell(**chosen), service.load_primitives(settings.primitives), settings)
+
+
 def main() -> int:
     """Parse the command line, learn, print, write."""
-    given = parser_for_primitives(__doc__, Settings()).parse_args()
-
-    def benchmark(settings: Settings) -> dict[str, Any]:
-        chosen = {name: getattr(settings, name) for name in ("task", "method", "seed", "num_env_steps")}
-        return learn(make_cell(**chosen), service.load_primitives(given.primitives), settings)
-
+    given = parser_of(__doc__, Settings()).parse_args()
     return run_benchmark("downstream_success", PACKAGES, given, Settings, benchmark, report)
 
 

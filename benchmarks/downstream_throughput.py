@@ -9,7 +9,6 @@ worlds, several large updates after a step of all), the other with one environme
 
 from __future__ import annotations
 
-import argparse
 import os
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
@@ -22,15 +21,7 @@ from stable_baselines3.common.logger import Logger
 
 import service
 import service.envs.gym.registration
-from benchmarks.measuring import (
-    describe_ratio,
-    measure_in_turn,
-    parser_of,
-    rates,
-    rates_table,
-    ratio,
-    run_benchmark,
-)
+from benchmarks.measuring import describe_ratio, measure_in_turn, parser_of, rates, rates_table, ratio, run_benchmark
 from service.downstream.compose import ComposePrimitives
 from service.downstream.learner import make_learner
 from service.downstream.methods import METHODS
@@ -55,6 +46,8 @@ class Settings:
 
     task: str = "wall"
     method: str = "ours"
+    """One that composes."""
+    primitives: str = "panda-cube@champion"
     num_pairs: int = 5
     seconds: float = 20.0
     """Of each sample, at least."""
@@ -62,26 +55,26 @@ class Settings:
     """Of physics and torch, for both."""
 
 
-def make_worker(cell: CellConfig, trained: TrainedBob, num_threads: int) -> Play:
-    """Plays an episode of every world, learning; it has begun to learn."""
-    method = METHODS[cell.method]
-    env = make_worlds(cell, method, trained, num_threads)
-    learner, num = make_learner(cell, method, env), EPISODE_STEPS * cell.sac.num_worlds
-    learner.learn(cell.sac.learning_starts + num)
+def make_worker(trial: CellConfig, trained: TrainedBob, num_threads: int) -> Play:
+    """A function that plays an episode of every world, learning; it has begun to learn."""
+    method = METHODS[trial.method]
+    env = make_worlds(trial, method, trained, num_threads)
+    learner, num = make_learner(trial, method, env), EPISODE_STEPS * trial.sac.num_worlds
+    learner.learn(trial.sac.learning_starts + num)
     return _player(learner, num)
 
 
-def default_learner(cell: CellConfig, trained: TrainedBob) -> SAC:
-    """SAC as it comes, in one environment of the cell's task."""
-    env = ComposePrimitives(gymnasium.make(find_task(cell.task).id, config=trained.config.world), trained)
-    learner = SAC("MultiInputPolicy", env, seed=cell.seed, device="cpu")
+def default_learner(trial: CellConfig, trained: TrainedBob) -> SAC:
+    """SAC as it comes, in one environment of the trial's task."""
+    env = ComposePrimitives(gymnasium.make(find_task(trial.task).id, config=trained.config.world), trained)
+    learner = SAC("MultiInputPolicy", env, seed=trial.seed, device="cpu")
     learner.set_logger(Logger(folder=None, output_formats=[]))  # else every ``learn`` makes a directory in /tmp
     return learner
 
 
-def make_default(cell: CellConfig, trained: TrainedBob) -> Play:
-    """Plays some steps of one environment, learning; it has begun to learn."""
-    learner = default_learner(cell, trained)
+def make_default(trial: CellConfig, trained: TrainedBob) -> Play:
+    """A function that plays some steps of one environment, learning; it has begun to learn."""
+    learner = default_learner(trial, trained)
     learner.learn(_DEFAULT_WARM_UP)
     return _player(learner, _DEFAULT_STEPS)
 
@@ -95,23 +88,16 @@ def _player(learner: SAC, num_steps: int) -> Play:
     return play
 
 
-def compare(cell: CellConfig, trained: TrainedBob, settings: Settings) -> dict[str, Any]:
+def compare(trial: CellConfig, trained: TrainedBob, settings: Settings) -> dict[str, Any]:
     """Measure both in turn."""
     torch.set_num_threads(settings.threads)
-    players = {WORKER: make_worker(cell, trained, settings.threads), DEFAULT: make_default(cell, trained)}
+    players = {WORKER: make_worker(trial, trained, settings.threads), DEFAULT: make_default(trial, trained)}
     samples = measure_in_turn(players, settings.num_pairs, settings.seconds)
     return {
-        "settings": {**asdict(settings), "cell": cell.model_dump(mode="json")},
+        "settings": {**asdict(settings), "trial": trial.model_dump(mode="json")},
         "rows": {name: rates(each) for name, each in samples.items()},
         "ratio": ratio(samples[WORKER], samples[DEFAULT]),
     }
-
-
-def parser_for_primitives(doc: str | None, settings: Any) -> argparse.ArgumentParser:
-    """The command line of a benchmark that composes primitives."""
-    parser = parser_of(doc, settings)
-    parser.add_argument("--primitives", default="panda-cube@champion")
-    return parser
 
 
 def report(result: dict[str, Any]) -> str:
@@ -119,14 +105,15 @@ def report(result: dict[str, Any]) -> str:
     return f"{rates_table(result['rows'])}\n\n{describe_ratio('worker / default', result['ratio'])}"
 
 
+def benchmark(settings: Settings) -> dict[str, Any]:
+    """Everything measured, for JSON."""
+    trial = make_cell(task=settings.task, method=settings.method)
+    return compare(trial, service.load_primitives(settings.primitives), settings)
+
+
 def main() -> int:
     """Parse the command line, measure, print, write."""
-    given = parser_for_primitives(__doc__, Settings()).parse_args()
-
-    def benchmark(settings: Settings) -> dict[str, Any]:
-        cell = make_cell(task=settings.task, method=settings.method)
-        return compare(cell, service.load_primitives(given.primitives), settings)
-
+    given = parser_of(__doc__, Settings()).parse_args()
     return run_benchmark("downstream_throughput", PACKAGES, given, Settings, benchmark, report)
 
 

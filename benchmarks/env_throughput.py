@@ -16,22 +16,13 @@ import sys
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any
 
 import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.measuring import (
-    Sample,
-    describe_ratio,
-    measure_in_turn,
-    parser_of,
-    rates,
-    rates_table,
-    ratio,
-    run_benchmark,
-)
+from benchmarks.measuring import describe_ratio, measure_in_turn, parser_of, rates, rates_table, ratio, run_benchmark
 from service.config import WorldConfig
 from service.envs.batch import DISPLACEMENT_M, WorldBatch
 from service.envs.goals import sample_goals
@@ -73,16 +64,6 @@ class Settings:
     """In our batch."""
 
 
-class Contender(Protocol):
-    """Something that plays whole episodes."""
-
-    def episode(self) -> int:
-        """Reset, play one episode, return the env steps made."""
-
-    def close(self) -> None:
-        """Free what it holds."""
-
-
 class BatchContender:
     """Our worlds as an actor uses them: stepped together, by one thread."""
 
@@ -107,10 +88,6 @@ class BatchContender:
             worlds.full(step / self._num_steps)
             np.linalg.norm(worlds.object_position - goal, axis=1) <= _SUCCESS_M  # noqa: B015 - only its time matters
         return self._num_steps * num
-
-    def close(self) -> None:
-        """Free the worlds."""
-        self._worlds.close()
 
 
 class GymnasiumContender:
@@ -140,10 +117,6 @@ class GymnasiumContender:
                 return step
         return self._num_steps
 
-    def close(self) -> None:
-        """Free the environment."""
-        self._environment.close()
-
 
 def reach(action: FloatArray, towards: NDArray[Any], step: int) -> None:
     """Turn random actions (..., 4) into noisy ones that go to the object, ``towards`` metres off, and close."""
@@ -151,13 +124,9 @@ def reach(action: FloatArray, towards: NDArray[Any], step: int) -> None:
     action[..., 3] = 1.0 if step <= _OPEN_STEPS else -1.0
 
 
-def contenders(num_worlds: int) -> dict[str, Contender]:
-    """Every row of the table by its name, ours first.
-
-    Raises:
-        TandemError: panda-gym is not installed.
-    """
-    rows: dict[str, Contender] = {BATCH: BatchContender(WorldConfig(), num_worlds)}
+def contenders(num_worlds: int) -> dict[str, BatchContender | GymnasiumContender]:
+    """Every row of the table by its name, ours first."""
+    rows: dict[str, BatchContender | GymnasiumContender] = {BATCH: BatchContender(WorldConfig(), num_worlds)}
     rows |= {name: panda_gym(name) for name in PANDA_GYM_IDS}
     coarse = WorldConfig(physics_step_s=0.004, num_substeps=10)
     return rows | {
@@ -168,12 +137,8 @@ def contenders(num_worlds: int) -> dict[str, Contender]:
     }
 
 
-def panda_gym(name: str, *, grasping: bool = False) -> Contender:
-    """An environment of panda-gym.
-
-    Raises:
-        TandemError: panda-gym is not installed.
-    """
+def panda_gym(name: str, *, grasping: bool = False) -> GymnasiumContender:
+    """An environment of panda-gym."""
     with _silent_stdout():  # PyBullet prints its arguments
         try:
             import panda_gym  # noqa: F401 - registers its environments
@@ -183,24 +148,16 @@ def panda_gym(name: str, *, grasping: bool = False) -> Contender:
 
 
 def benchmark(settings: Settings) -> dict[str, Any]:
-    """Measure all rows in turn, after an episode each to warm up.
-
-    Raises:
-        TandemError: panda-gym is not installed.
-    """
+    """Measure all rows in turn, after an episode each to warm up."""
     return measure_rows(contenders(settings.num_worlds), settings)
 
 
-def measure_rows(rows: Mapping[str, Contender], settings: Settings) -> dict[str, Any]:
-    """Measure the given rows in turn, after an episode each to warm up; for JSON."""
+def measure_rows(rows: Mapping[str, BatchContender | GymnasiumContender], settings: Settings) -> dict[str, Any]:
+    """Median rates of the given rows, and how many times as fast as panda-gym ours are; for JSON."""
     plays = {name: row.episode for name, row in rows.items()}
     for play in plays.values():
         play()
-    return summarise(measure_in_turn(plays, settings.num_pairs, settings.seconds))
-
-
-def summarise(samples: Mapping[str, list[Sample]]) -> dict[str, Any]:
-    """Median rates by row, and how many times as fast as panda-gym ours are."""
+    samples = measure_in_turn(plays, settings.num_pairs, settings.seconds)
     ratios = {
         f"{ours} / {theirs}": ratio(samples[ours], samples[theirs])
         for ours, theirs in COMPARED

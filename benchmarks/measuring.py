@@ -1,7 +1,8 @@
 """Tools that all benchmarks share: samples taken in turn, their ratios, the machine, and one command line.
 
 A rate alone says little where others use the machine, too. So what is compared is measured in turn within one run, and
-the ratio of each turn is what counts.
+the ratio of each turn is what counts. Functions of benchmarks raise ``TandemError`` where a run, a file or a program
+that they need is not there or fails; ``run_benchmark`` prints its one line.
 """
 
 from __future__ import annotations
@@ -22,6 +23,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, TypeVar
 
+from benchmarks.report.markdown import table
 from service.errors import TandemError
 from service.io.files import os_errors, write_atomic
 from service.registry.manifest import git_commit
@@ -140,13 +142,9 @@ def describe(where: dict[str, Any]) -> str:
 
 def rates_table(rows: dict[str, dict[str, Any]]) -> str:
     """The median rates of each named row, as Markdown."""
-    width = max(len(name) for name in rows)
-    head = f"| {'':<{width}} | env steps/s | per CPU second |\n|{'-' * (width + 2)}|------------:|---------------:|"
-    lines = [
-        f"| {name:<{width}} | {row['env_steps_per_s']:>11,.0f} | {row['env_steps_per_cpu_s']:>14,.0f} |"
-        for name, row in rows.items()
-    ]
-    return "\n".join([head, *lines])
+    keys = ("env_steps_per_s", "env_steps_per_cpu_s")
+    cells = ((name, *(f"{row[key]:,.0f}" for key in keys)) for name, row in rows.items())
+    return table(("", "env steps/s", "per CPU second"), cells)
 
 
 def describe_ratio(name: str, each: dict[str, float]) -> str:

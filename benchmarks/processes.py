@@ -1,10 +1,10 @@
-"""The processes of a run, from /proc: their roles, their memory and their CPU time. Linux only."""
+"""The processes of a run, from /proc: their roles and their CPU time. Linux only."""
 
 from __future__ import annotations
 
 import os
-from collections import Counter, defaultdict
-from collections.abc import Iterator, Mapping
+from collections import defaultdict
+from collections.abc import Iterator
 from pathlib import Path
 
 PROC = Path("/proc")
@@ -46,32 +46,6 @@ def descendants(root: int) -> dict[int, str]:
     return found
 
 
-def named(processes: Mapping[int, str]) -> dict[int, str]:
-    """Names by pid: the role, with a number in the order of pids where several share it (actor-0, actor-1, ...)."""
-    count, seen = Counter(processes.values()), Counter[str]()
-    names = {}
-    for pid, name in sorted(processes.items()):
-        names[pid] = f"{name}-{seen[name]}" if count[name] > 1 else name
-        seen[name] += 1
-    return names
-
-
-def own_memory_mb(pid: int) -> float | None:
-    """Anonymous memory of a process in MB, swapped or not; None if it has ended.
-
-    It is what a leak adds to. Files and shared memory are left out: what a process pays of a library depends on who
-    else uses it, so that all others seem to shrink when a program starts.
-    """
-    try:
-        lines = (PROC / str(pid) / "smaps_rollup").read_text().splitlines()[1:]
-    except OSError:
-        return None
-    kilobytes = {name: int(rest.split()[0]) for name, _, rest in (line.partition(":") for line in lines)}
-    if not kilobytes:  # ending just now
-        return None
-    return (kilobytes.get("Pss_Anon", 0) + kilobytes.get("SwapPss", 0)) / 1024
-
-
 def cpu_s(pid: int) -> float:
     """CPU seconds of a process and its dead children; 0 if it has ended."""
     fields = _stat(pid)
@@ -84,12 +58,6 @@ def cpu_s_by_role(root: int) -> dict[str, float]:
     for pid, name in descendants(root).items():
         seconds[name] += cpu_s(pid)
     return dict(seconds)
-
-
-def parent(pid: int) -> int | None:
-    """Pid of the process that started ``pid``; None if that has ended."""
-    fields = _stat(pid)
-    return int(fields[1]) if fields else None
 
 
 def is_running(pid: int) -> bool:

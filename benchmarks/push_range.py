@@ -73,11 +73,7 @@ def best_pushes(means: NDArray[np.float32], direction: tuple[float, float]) -> N
 
 
 def measure(trained: TrainedBob, *, num_places: int, num_weights: int, seed: int) -> dict[str, float]:
-    """Share of places in which no composition pushes straight, for each direction.
-
-    Raises:
-        TandemError: primitives that cannot be composed.
-    """
+    """Share of places in which no composition pushes straight, for each direction."""
     primitives, rng = check_primitives(trained), np.random.default_rng(seed)
     k = primitives.num_primitives
     drawn, corners = rng.uniform(-1.0, 1.0, (num_weights, k)), rng.choice([-1.0, 1.0], (num_weights // 4, k))
@@ -91,11 +87,7 @@ def measure(trained: TrainedBob, *, num_places: int, num_weights: int, seed: int
 
 
 def benchmark(references: list[str], registry: str, settings: Settings) -> dict[str, Any]:
-    """Measure primitives of a registry or of run directories; a row for each.
-
-    Raises:
-        TandemError: one of them cannot be loaded or composed.
-    """
+    """Measure primitives of a registry or of run directories; a row for each."""
     rows = {}
     for name in references:
         trained = service.load_primitives(name, registry)

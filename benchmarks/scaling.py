@@ -24,7 +24,7 @@ from benchmarks.cluster_throughput import measure_run
 from benchmarks.measuring import ask_module, parser_of, run_benchmark
 from benchmarks.report.scaling import box_block, limits_block, model_block
 from benchmarks.scaling_model import ACTORS, Cost, Model, Prediction, limit, line, predict
-from benchmarks.training_process import ENDLESS, TINY, Measured, Training, copy_run, environment, overrides, scratch
+from benchmarks.training_process import ENDLESS, Measured, Training, copy_run, environment, overrides, scratch
 from service.io.run_directory import RunDirectory
 
 PACKAGES = ("ray", "redis", "mujoco", "numpy", "torch")
@@ -35,6 +35,28 @@ LEARNER, GENERATOR, DRIVER, GCS = "learner", "task generator", "driver", "GCS"
 ROLLOUTS_IN, WEIGHTS_OUT = "rollouts to the learner's node", "weights to the nodes"
 ROLES = {LEARNER: "learner", GENERATOR: "generator", DRIVER: "driver", GCS: "gcs"}
 """Processes that there are one of, and their roles in ``processes.py``."""
+
+
+TINY = {
+    "name": "tiny",
+    "game.num_goals": 2,
+    "game.alice_steps": 2,
+    "game.bob_steps": 2,
+    "game.success_distance_m": 0.0005,
+    "world.physics_step_s": 0.01,
+    "world.num_substeps": 1,
+    "generator.replay_buffer_size": 256,
+    "policy.alice.hidden_sizes": "[8]",
+    "policy.value.hidden_sizes": "[8]",
+    "policy.bob.trunk_hidden_sizes": "[8]",
+    "policy.bob.primitive_hidden_size": 8,
+    "policy.bob.gate_hidden_sizes": "[8]",
+    "learner.alice.num_epochs": 1,
+    "learner.bob.num_epochs": 1,
+    "run.checkpoint_interval": 200,
+    "run.evaluation_interval": 0,
+}
+"""Games of milliseconds. Nothing is learned; all that handles rounds, updates, records and states is as in any run."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,7 +104,7 @@ def costs(
         rest = spent - update_s - last.num_rollouts / last.num_iterations * rollout_s
         world_s = max(0.0, rest / num_worlds) if name in (LEARNER, GENERATOR) else 0.0
         parts[name] = Cost(update_s, rollout_s, world_s)
-    few, many = zip(wakes["num_actors"], wakes["wait_s"], strict=True)
+    few, *_, many = zip(wakes["num_actors"], wakes["wait_s"], strict=True)
     _, pair_s = line(few, many)
     parts[DRIVER] = Cost(parts[DRIVER].update_s, parts[DRIVER].rollout_s, pair_s=pair_s)
     bytes_per_s = assumed.network_mb_per_s * 1e6
@@ -137,23 +159,15 @@ def _row(each: Prediction) -> dict[str, Any]:
 
 
 def make_tiny(home: Path) -> RunDirectory:
-    """A run of tiny games, some iterations old, with a world for each of ``NUM_TINY_ACTORS``.
-
-    Raises:
-        TandemError: it did not begin.
-    """
+    """A run of tiny games, some iterations old, with a world for each of ``NUM_TINY_ACTORS``."""
     settings = overrides(TINY | ENDLESS | {"game.num_worlds": NUM_TINY_ACTORS})
     with Training(home, settings, name="tiny", runtime="local") as training:
-        training.wait_for(lambda: any(row["iteration"] >= 3 for row in training.records.new()))
+        training.wait_until("iteration", 3)
     return training.directory
 
 
 def benchmark(source: RunDirectory, settings: Settings) -> dict[str, Any]:
-    """Everything, in directories that are deleted at the end.
-
-    Raises:
-        TandemError: no run there with a checkpoint, or a process failed.
-    """
+    """Everything, in directories that are deleted at the end."""
     with scratch() as home:
         numbers = (1, *range(2, settings.max_actors + 1))
         real = _measure(source, home, numbers, settings.num_iterations)

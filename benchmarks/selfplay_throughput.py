@@ -15,7 +15,6 @@ from __future__ import annotations
 
 import shutil
 import statistics
-import time
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -56,31 +55,15 @@ class Settings:
     """Of a run that is begun; past opponents play from the 12th on."""
 
 
-def begin_run(config: Path, home: Path, num_iterations: int) -> tuple[RunDirectory, float]:
-    """Begin a run and stop it after ``num_iterations``.
-
-    Returns:
-        The run, and the seconds from its start to the end of its first update.
-
-    Raises:
-        TandemError: it ended before that.
-    """
+def begin_run(config: Path, home: Path, num_iterations: int) -> RunDirectory:
+    """Begin a run and stop it after ``num_iterations``."""
     with Training(home, ["--config", str(config), *overrides(ENDLESS)], name="begun", runtime="local") as training:
-        learned_s, done = 0.0, 0.0
-        while done < num_iterations or not learned_s:
-            for row in training.wait_for(training.records.new):
-                done = row["iteration"]
-                if "learner/version" in row and not learned_s:
-                    learned_s = time.perf_counter() - training.began_s
-    return training.directory, learned_s
+        training.wait_until("iteration", num_iterations)
+    return training.directory
 
 
 def compare(source: RunDirectory, home: Path, settings: Settings) -> dict[str, Any]:
-    """Measure everything in turn, from the newest checkpoint of ``source``; for JSON.
-
-    Raises:
-        TandemError: no run there with a checkpoint.
-    """
+    """Measure everything in turn, from the newest checkpoint of ``source``; for JSON."""
     samples: dict[str, list[Sample]] = {name: [] for name in (BARE, BARE_RANDOM, ROLLOUT, LOOP)}
     loops: list[Measured] = []
     contacts: list[float] = []
@@ -120,16 +103,10 @@ def compare(source: RunDirectory, home: Path, settings: Settings) -> dict[str, A
 
 
 def benchmark(config: Path, run_dir: Path | None, settings: Settings) -> dict[str, Any]:
-    """Everything, in directories that are deleted at the end.
-
-    Raises:
-        TandemError: no run there with a checkpoint, or a run ended before it was measured.
-    """
+    """Everything, in directories that are deleted at the end."""
     with scratch() as home:
-        source = None if run_dir is None else RunDirectory(run_dir)
-        num_iterations = settings.num_warmup_iterations if source is None else 2
-        begun, first_update_s = begin_run(config if source is None else source.config_file, home, num_iterations)
-        return {**compare(source or begun, home, settings), "start_to_first_update_s": first_update_s}
+        begun = begin_run(config, home, settings.num_warmup_iterations) if run_dir is None else RunDirectory(run_dir)
+        return compare(begun, home, settings)
 
 
 def report(result: dict[str, Any]) -> str:
@@ -140,7 +117,6 @@ def report(result: dict[str, Any]) -> str:
     lines += [
         f"learner idle: {result['learner_idle_share']:.1%} of the whole loop",
         f"policy lag: mean {lag['mean']:.2f}, max {lag['max']:.0f}",
-        f"start to first update: {result['start_to_first_update_s']:.1f} s",
         f"Alice touched the object in {result['alice_contact_fraction']:.0%} of her turns",
         *(f"of a round, {name}: {spent[name] / spent['total']:.1%}" for name in ("physics", "policies")),
     ]

@@ -38,27 +38,6 @@ from service.store.models import RunStatus
 ENDLESS = {"run.total_env_steps": 1_000_000_000_000}
 PLAIN = {"run.checkpoint_interval": 1_000_000_000, "run.evaluation_interval": 0}
 """Neither evaluations nor checkpoints."""
-TINY = {
-    "name": "tiny",
-    "game.num_worlds": 2,
-    "game.num_goals": 2,
-    "game.alice_steps": 2,
-    "game.bob_steps": 2,
-    "game.success_distance_m": 0.0005,
-    "world.physics_step_s": 0.01,
-    "world.num_substeps": 1,
-    "generator.replay_buffer_size": 256,
-    "policy.alice.hidden_sizes": "[8]",
-    "policy.value.hidden_sizes": "[8]",
-    "policy.bob.trunk_hidden_sizes": "[8]",
-    "policy.bob.primitive_hidden_size": 8,
-    "policy.bob.gate_hidden_sizes": "[8]",
-    "learner.alice.num_epochs": 1,
-    "learner.bob.num_epochs": 1,
-    "run.checkpoint_interval": 200,
-    "run.evaluation_interval": 0,
-}
-"""Games of milliseconds. Nothing is learned; all that handles rounds, updates, records and states is as in any run."""
 NUM_WARMUP_ITERATIONS = 4
 """After a start, before it is measured: by then the learner and all actors are busy."""
 START_S = 240.0
@@ -77,7 +56,6 @@ class Training:
         arguments: of ``tandem pretrain``, besides runtime, run directory and status.
         name: of the run directory.
         runtime: which runner; ``ray`` has a status service.
-        redis_url: of a Redis to use.
         tree: checkout whose code runs.
     """
 
@@ -88,14 +66,12 @@ class Training:
         *,
         name: str = "run",
         runtime: Literal["local", "ray"] = "ray",
-        redis_url: str | None = None,
         tree: Path = ROOT,
     ) -> None:
         self.name, self.directory, self.log_file = name, RunDirectory(home / "runs" / name), home / f"{name}.log"
         self.address = ("127.0.0.1", _free_port())
         """Host and port of the status service."""
         home.mkdir(parents=True, exist_ok=True)
-        self.began_s = time.perf_counter()
         command = [sys.executable, "-m", "service", "pretrain", "--run-dir", str(self.directory.path)]
         command += ["--registry", str(home / "registry"), *(["--resume"] if self.directory.exists else [])]
         if runtime == "ray":
@@ -105,7 +81,7 @@ class Training:
             self._process = subprocess.Popen(
                 [*command, *arguments],
                 cwd=tree,
-                env={**environment(home, tree), **({"TANDEM_REDIS_URL": redis_url} if redis_url else {})},
+                env=environment(home, tree),
                 stdin=subprocess.DEVNULL,
                 stdout=log,
                 stderr=log,
@@ -129,25 +105,19 @@ class Training:
         """The exit code; None while it goes on."""
         return self._process.poll()
 
-    def get(self, path: str, timeout_s: float = 5.0) -> Any:
-        """Answer of the status service, parsed; None if there is none within ``timeout_s``."""
-        body = self.text(path, timeout_s)
-        return None if body is None else json.loads(body)
-
-    def text(self, path: str, timeout_s: float = 5.0) -> bytes | None:
-        """Answer of the status service as it is; None if there is none within ``timeout_s``."""
+    def get(self, path: str, timeout_s: float = 5.0) -> bytes:
+        """Answer of the status service; empty if there is none within ``timeout_s``."""
         try:
             with _DIRECT.open("http://{}:{}{}".format(*self.address, path), timeout=timeout_s) as response:
                 return bytes(response.read())
         except (OSError, HTTPException):
-            return None
+            return b""
 
     def status(self) -> RunStatus | None:
         """The run's status by the status service, else from its directory; None before there is one."""
-        if (told := self.get(f"/v1/runs/{self.name}", timeout_s=2.0)) is not None:
-            return RunStatus.model_validate(told)
         try:
-            return RunStatus.model_validate_json((self.directory.path / STATUS_FILE).read_bytes())
+            told = self.get(f"/v1/runs/{self.name}", 2.0) or (self.directory.path / STATUS_FILE).read_bytes()
+            return RunStatus.model_validate_json(told)
         except (OSError, ValidationError):
             return None
 
@@ -165,32 +135,13 @@ class Training:
         why = f"not within {seconds:.0f} s" if self.ended is None else f"it ended with code {self.ended}"
         raise TandemError(f"the run does not do what is waited for: {why}; its last words: {self.last_words()}")
 
-    def wait_for_iterations(self, num: int) -> None:
-        """Wait until the status service says that ``num`` iterations are finished.
+    def wait_until(self, key: str, value: float) -> None:
+        """Wait, a day at most, until a record has at least ``value`` under ``key``.
 
         Raises:
             TandemError: see ``wait_for``.
         """
-        self.wait_for(lambda: (told := self.get(f"/v1/runs/{self.name}")) and told["iteration"] >= num)
-
-    def wait_for_steps(self, num: int) -> None:
-        """Wait, a day at most, until the run has made ``num`` env steps.
-
-        Raises:
-            TandemError: see ``wait_for``.
-        """
-        self.wait_for(lambda: any(row["env_steps"] >= num for row in self.records.new()), 86_400.0)
-
-    def wait(self, seconds: float) -> int:
-        """The exit code, when it ends by itself.
-
-        Raises:
-            TandemError: it does not within ``seconds``.
-        """
-        try:
-            return self._process.wait(seconds)
-        except subprocess.TimeoutExpired:
-            raise TandemError(f"the run has not ended within {seconds:.0f} s; see its log") from None
+        self.wait_for(lambda: any(row[key] >= value for row in self.records.new()), 86_400.0)
 
     def stop(self) -> None:
         """End the run as ``ray job stop`` does: SIGTERM, which saves; what is left after a minute is killed."""

@@ -12,7 +12,6 @@ import service
 from benchmarks import (
     ablations,
     compare_commits,
-    curriculum,
     env_throughput,
     measuring,
     record_run,
@@ -115,8 +114,6 @@ def test_env_throughput_measures_all_rows_in_turn():
     }
     assert [row.episode() for row in rows.values()] == [6, 2]
     result = env_throughput.measure_rows(rows, env_throughput.Settings(num_pairs=2, seconds=0.0))
-    for row in rows.values():
-        row.close()
     assert [row["num_steps"] for row in result["rows"].values()] == [12, 4]
     assert list(result["ratios"]) == ["tandem / PandaPickAndPlace-v3"]
     assert all(value > 0.0 for value in result["ratios"]["tandem / PandaPickAndPlace-v3"].values())
@@ -138,7 +135,6 @@ def test_only_grasping_arms_lift_the_object():
         batch = env_throughput.BatchContender(WorldConfig(), 48, grasping=grasping)
         batch.episode()
         heights.append(batch._worlds.object_position[:, 2].max())
-        batch.close()
     assert heights[0] < 0.04  # at rest the centre of the cube is 0.025 m high
     assert heights[1] > 0.06
 
@@ -146,7 +142,6 @@ def test_only_grasping_arms_lift_the_object():
 def test_an_episode_ends_with_the_environments_time_limit():
     contender = env_throughput.GymnasiumContender(TABLETOP_ID, num_steps=60, grasping=True)
     assert contender.episode() == env_throughput.EPISODE_STEPS
-    contender.close()
 
 
 def test_without_panda_gym_one_line_says_how_to_get_it(monkeypatch, capsys):
@@ -162,7 +157,6 @@ def test_panda_gym_plays_where_it_is_installed():
     pytest.importorskip("panda_gym", reason="panda-gym, to compare with, comes with make bench only")
     contender = env_throughput.panda_gym(env_throughput.PANDA_GYM_IDS[0])
     assert contender.episode() == env_throughput.EPISODE_STEPS
-    contender.close()
 
 
 # --- self-play throughput ---------------------------------------------------------------------------------------------
@@ -200,11 +194,8 @@ def test_repeated_physics_ends_in_the_same_bits(config, tmp_path):
 
 def test_selfplay_throughput_measures_all_three_and_leaves_the_run_alone(config, tmp_path):
     (tmp_path / "tiny.yaml").write_text(dump_config(config))
-    run, first_update_s = selfplay_throughput.begin_run(tmp_path / "tiny.yaml", tmp_path, 3)
-    records = [json.loads(line) for line in run.metrics_file.read_text().splitlines()]
-    learned = [row["time/wall_s"] for row in records if "learner/version" in row]
-    assert len(records) >= 3
-    assert first_update_s > learned[0]  # it counts from the start of the process
+    run = selfplay_throughput.begin_run(tmp_path / "tiny.yaml", tmp_path, 3)
+    assert len(run.metrics_file.read_text().splitlines()) >= 3
     before = {path: path.read_bytes() for path in run.path.rglob("*") if path.is_file()}
     settings = selfplay_throughput.Settings(num_pairs=1, seconds=0.0, num_iterations=2)
     result = selfplay_throughput.compare(run, tmp_path, settings)
@@ -215,7 +206,7 @@ def test_selfplay_throughput_measures_all_three_and_leaves_the_run_alone(config,
     assert result["ratios"]["whole loop / bare world"]["median"] == pytest.approx(loop / bare)
     assert result["policy_lag"] == {"mean": 1.0, "max": 1.0}
     assert result["rollout_s"]["policies"] < result["rollout_s"]["total"]
-    assert "whole loop / bare world" in selfplay_throughput.report(result | {"start_to_first_update_s": 1.0})
+    assert "whole loop / bare world" in selfplay_throughput.report(result)
     json.loads(measuring.to_text(result))
 
 
@@ -359,10 +350,10 @@ def test_goals_are_counted_by_hand():
         # 7.6 cm up; as high and far as can be; and one that is not finite
         {"env_steps": 300, "goals": [[0, 0, rest, 0, 0, rest + 0.076, 1], [0, 0, rest, 9, 0, 9, 0], [None] * 7]},
     ]
-    counts = curriculum.count_goals(records, rest)
+    counts = record_run.count_goals(records, rest)
     height, distance = counts["height"], counts["distance"]
-    assert np.shape(height["goals"]) == (curriculum.NUM_SLICES, curriculum.NUM_BINS["height"])
-    assert np.shape(distance["solved"]) == (curriculum.NUM_SLICES, curriculum.NUM_BINS["distance"])
+    assert np.shape(height["goals"]) == (record_run.NUM_SLICES, record_run.NUM_BINS["height"])
+    assert np.shape(distance["solved"]) == (record_run.NUM_SLICES, record_run.NUM_BINS["distance"])
     assert {place: height["goals"][place[0]][place[1]] for place in zip(*np.nonzero(height["goals"]), strict=True)} == {
         (3, 0): 2,
         (29, 3): 1,

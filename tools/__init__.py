@@ -1,3 +1,3 @@
-"""Tools beside the benchmarks: faults, load and long runs against a real run, pictures for the documents, shipping."""
+"""Tools beside the benchmarks: faults and load for a real run, and shipping primitives."""
 
 import benchmarks  # noqa: F401 - sets the number of threads before NumPy is imported

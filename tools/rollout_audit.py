@@ -11,7 +11,7 @@ begin at 0 and an actor's rollouts come in order. So
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any
 
@@ -41,42 +41,6 @@ class Stretch:
         )
 
 
-@dataclass(frozen=True, slots=True)
-class RolloutAudit:
-    """Numbers to compare; all is well if ``complete``."""
-
-    num_iterations: int
-    iterations_contiguous: bool
-    versions_contiguous: bool
-    env_steps_rise: bool
-    num_counted: int
-    """Rollouts that the driver says the learner counted."""
-    num_in_ledger: int
-    num_refused: int
-    num_handed_by_the_dead: int
-    """Rollouts that killed incarnations had handed over."""
-    num_counted_of_the_dead: int
-    num_left_at_the_end: int
-    """Rollouts handed over too late for the last update."""
-
-    @property
-    def complete(self) -> bool:
-        """Nothing lost, nothing counted twice, nothing missing in the records."""
-        return (
-            self.iterations_contiguous
-            and self.versions_contiguous
-            and self.env_steps_rise
-            and self.num_counted == self.num_in_ledger
-            and self.num_refused == 0
-            and self.num_handed_by_the_dead == self.num_counted_of_the_dead
-            and self.num_left_at_the_end >= 0
-        )
-
-    def as_dict(self) -> dict[str, Any]:
-        """For JSON."""
-        return {**asdict(self), "complete": self.complete}
-
-
 def ledger_of(rows: Sequence[Sequence[int]]) -> dict[tuple[int, int], int]:
     """The ledger from its rows in a checkpoint: actor, incarnation, highest sequence."""
     return {(int(actor), int(incarnation)): int(highest) for actor, incarnation, highest in rows}
@@ -102,7 +66,7 @@ def stretches_of(statuses: Sequence[RunStatus]) -> list[Stretch]:
 
 def audit_rollouts(
     rows: Sequence[Mapping[str, Any]], ledger: Ledger, end: RunStatus, stretches: Sequence[Stretch]
-) -> RolloutAudit:
+) -> dict[str, Any]:
     """Compare all of them, of a run that one driver ran from its beginning to its end.
 
     Args:
@@ -110,19 +74,33 @@ def audit_rollouts(
         ledger: in the last checkpoint.
         end: the last status.
         stretches: see ``stretches_of``.
+
+    Returns:
+        For JSON: what was compared, and whether it is ``complete``: nothing lost, nothing counted twice, nothing
+        missing in the records. Rollouts left at the end were handed over too late for the last update.
     """
     versions = [int(row["learner/version"]) for row in rows if "learner/version" in row]
     dead = [each for each in stretches if each.next is not None]
     living = [each for each in stretches if each.next is None]
-    return RolloutAudit(
-        num_iterations=len(rows),
-        iterations_contiguous=[int(row["iteration"]) for row in rows] == list(range(1, len(rows) + 1)),
-        versions_contiguous=versions == list(range(1, len(versions) + 1)),
-        env_steps_rise=all(a["env_steps"] < b["env_steps"] for a, b in pairwise(rows)),
-        num_counted=end.num_rollouts_counted,
-        num_in_ledger=sum(highest + 1 for highest in ledger.values()),
-        num_refused=end.num_rollouts_refused,
-        num_handed_by_the_dead=sum(each.num_handed for each in dead),
-        num_counted_of_the_dead=sum(each.num_counted(ledger) for each in dead),
-        num_left_at_the_end=sum(each.num_handed - each.num_counted(ledger) for each in living),
+    found = {
+        "num_iterations": len(rows),
+        "iterations_contiguous": [int(row["iteration"]) for row in rows] == list(range(1, len(rows) + 1)),
+        "versions_contiguous": versions == list(range(1, len(versions) + 1)),
+        "env_steps_rise": all(a["env_steps"] < b["env_steps"] for a, b in pairwise(rows)),
+        "num_counted": end.num_rollouts_counted,
+        "num_in_ledger": sum(highest + 1 for highest in ledger.values()),
+        "num_refused": end.num_rollouts_refused,
+        "num_handed_by_the_dead": sum(each.num_handed for each in dead),
+        "num_counted_of_the_dead": sum(each.num_counted(ledger) for each in dead),
+        "num_left_at_the_end": sum(each.num_handed - each.num_counted(ledger) for each in living),
+    }
+    complete = (
+        found["iterations_contiguous"]
+        and found["versions_contiguous"]
+        and found["env_steps_rise"]
+        and found["num_counted"] == found["num_in_ledger"]
+        and found["num_refused"] == 0
+        and found["num_handed_by_the_dead"] == found["num_counted_of_the_dead"]
+        and found["num_left_at_the_end"] >= 0
     )
+    return {**found, "complete": complete}

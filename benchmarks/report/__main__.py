@@ -12,7 +12,9 @@ from __future__ import annotations
 import argparse
 import json
 import sys
-from collections.abc import Mapping, Sequence
+from collections import defaultdict
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -35,7 +37,7 @@ PROGRAMS = {
     "cluster_throughput": "benchmarks.cluster_throughput",
     "chaos": "benchmarks.chaos of commit ddd0770",
     "rest_load": "benchmarks.rest_load of commit ddd0770",
-    "soak": "tools.soak",
+    "soak": "benchmarks.soak of commit ddd0770",
     "scaling": "benchmarks.scaling",
 }
 """Modules by the name of the recorded file that they make."""
@@ -45,6 +47,10 @@ PAGES = {
     "scaling.md": ("bottleneck", "box", "nodes", "model", "constants"),
 }
 """Blocks of every page."""
+Results = Mapping[str, Mapping[str, Any]]
+"""Recorded files by the name of their benchmark."""
+Blocks = Mapping[str, Sequence[str]]
+"""Parts of the text of each block."""
 _NOTHING = "Not recorded yet."
 
 
@@ -59,11 +65,7 @@ def end(block: str) -> str:
 
 
 def replace_blocks(path: Path, blocks: Mapping[str, str]) -> str:
-    """The page at ``path`` with the text of every block anew; an empty one says that nothing is recorded yet.
-
-    Raises:
-        TandemError: the page cannot be read, or lacks a marker.
-    """
+    """The page at ``path`` with the text of every block anew; an empty one says that nothing is recorded yet."""
     with os_errors("read", path):
         page = path.read_text(encoding="utf-8")
     for block, text in blocks.items():
@@ -76,11 +78,7 @@ def replace_blocks(path: Path, blocks: Mapping[str, str]) -> str:
 
 
 def read_results(results: Path) -> dict[str, dict[str, Any]]:
-    """Recorded files by the name of their benchmark; what is not there is left out.
-
-    Raises:
-        TandemError: one cannot be read, or is another benchmark's.
-    """
+    """Recorded files by the name of their benchmark; what is not there is left out."""
     found = {}
     for name, program in PROGRAMS.items():
         path = results / f"{name}.json"
@@ -97,11 +95,7 @@ def read_results(results: Path) -> dict[str, dict[str, Any]]:
 
 
 def read_runs(directory: Path) -> tuple[list[Run], list[Run]]:
-    """Recorded runs in the order of their names, and recorded ablations in that of their list.
-
-    Raises:
-        TandemError: a file cannot be read.
-    """
+    """Recorded runs in the order of their names, and recorded ablations in that of their list."""
     from benchmarks.ablations import ABLATIONS
 
     runs = [read_run(path) for path in sorted(directory.glob("*.json"))]
@@ -112,7 +106,7 @@ def read_runs(directory: Path) -> tuple[list[Run], list[Run]]:
 
 
 class Report:
-    """Draws pictures into ``docs/results``, and collects the text of the blocks.
+    """Draws pictures into ``docs/results``, and writes the pages.
 
     Args:
         docs: directory of the pages.
@@ -124,85 +118,67 @@ class Report:
         """Everything written."""
 
     def write(self) -> None:
-        """Write all pages and pictures.
-
-        Raises:
-            TandemError: a recorded file or a page cannot be read, or something cannot be written.
-        """
+        """Write all pages and pictures."""
         found, (runs, ablations) = read_results(self._results), read_runs(self._results / "runs")
         for page, names in PAGES.items():  # a page that lacks a marker is found before anything is drawn
             replace_blocks(self._docs / page, dict.fromkeys(names, ""))
-        blocks = (
-            self.pretraining_blocks(runs, ablations, found.get("throughput")),
-            self.cluster_blocks(found),
-            scaling_blocks(found.get("scaling")),
-        )
-        for page, texts in zip(PAGES, blocks, strict=True):
-            text = replace_blocks(self._docs / page, texts)
-            with os_errors("write", self._docs / page):
-                write_atomic(self._docs / page, text.encode())
-            self.files.append(self._docs / page)
+        made = (self.pretraining_blocks(runs, ablations, found), self.cluster_blocks(found), scaling_blocks(found))
+        for (page, names), blocks in zip(PAGES.items(), made, strict=True):
+            path = self._docs / page
+            text = replace_blocks(path, {name: "\n\n".join(blocks.get(name, ())) for name in names})
+            with os_errors("write", path):
+                write_atomic(path, text.encode())
+            self.files.append(path)
 
-    def pretraining_blocks(
-        self, runs: Sequence[Run], ablations: Sequence[Run], throughput: Mapping[str, Any] | None
-    ) -> dict[str, str]:
-        """Text of the blocks about pre-training."""
-        covered = [run for run in runs if run.get("coverage")]
-        counted = [run for run in runs if "curriculum" in run]  # older files have only a sample of the goals
-        curves, curriculum, coverage, ablated = [], [], [], []
+    def pretraining_blocks(self, runs: Sequence[Run], ablations: Sequence[Run], found: Results) -> Blocks:
+        """Parts of the blocks about pre-training."""
+        show, blocks = self._show, defaultdict[str, list[str]](list)
         if runs:
-            curves = [
-                self._show("Over env steps", draw_curves(runs, self._at(""))),
-                self._show("Over wall-clock time", draw_curves(runs, self._at("-time"), over_time=True)),
+            blocks["tasks"] = [pretraining.tasks_table(runs)]
+            blocks["curves"] = [
+                show("Over env steps", "pretraining", draw_curves, runs),
+                show("Over wall-clock time", "pretraining-time", partial(draw_curves, over_time=True), runs),
                 pretraining.training_table(runs),
             ]
-        if counted:
-            curriculum.append(self._show("The curriculum", draw_curriculum(counted, self._at("-curriculum"))))
+        if counted := [run for run in runs if "curriculum" in run]:  # older files have only a sample of the goals
+            blocks["curriculum"].append(show("The curriculum", "pretraining-curriculum", draw_curriculum, counted))
         for run in runs:
-            picture = draw_goals(run, self._at(f"-goals-{run['name']}"))
-            curriculum.append(self._show(f"Where the goals of {run['name']} were", picture))
-        if covered:
-            coverage.append(pretraining.coverage_table(covered))
+            words, picture = f"Where the goals of {run['name']} were", f"pretraining-goals-{run['name']}"
+            blocks["curriculum"].append(show(words, picture, draw_goals, run))
+        if covered := [run for run in runs if run.get("coverage")]:
+            blocks["coverage"].append(pretraining.coverage_table(covered))
         for run in covered:
-            picture = draw_coverage(run, self._at(f"-coverage-{run['name']}"))
-            coverage.append(self._show(f"Random compositions of {run['name']}", picture))
+            words, picture = f"Random compositions of {run['name']}", f"pretraining-coverage-{run['name']}"
+            blocks["coverage"].append(show(words, picture, draw_coverage, run))
         if ablations:
-            ablated.append(self._show("Ablations", draw_ablations(ablations, self._at("-ablations"))))
-            ablated.append(pretraining.ablations_table(ablations))
-        return {
-            "tasks": pretraining.tasks_table(runs) if runs else "",
-            "curves": "\n\n".join(curves),
-            "curriculum": "\n\n".join(curriculum),
-            "coverage": "\n\n".join(coverage),
-            "ablations": "\n\n".join(ablated),
-            "throughput": pretraining.throughput_words(throughput) if throughput is not None else "",
-        }
-
-    def cluster_blocks(self, found: Mapping[str, Mapping[str, Any]]) -> dict[str, str]:
-        """Text of the blocks about running on a cluster."""
-        blocks = {"targets": cluster.targets_table(found), "throughput": "", "chaos": "", "rest": "", "soak": ""}
-        if "cluster_throughput" in found:
-            blocks["throughput"] = cluster.throughput_block(found["cluster_throughput"])
-        if (chaos := found.get("chaos")) is not None:
-            picture = self._show("Success, shot at and not", draw_chaos(chaos, self._results / "cluster-chaos.png"))
-            blocks["chaos"] = "\n\n".join((cluster.chaos_words(chaos), picture, cluster.faults_table(chaos)))
-        if "rest_load" in found:
-            blocks["rest"] = cluster.rest_block(found["rest_load"])
-        if (soak := found.get("soak")) is not None:
-            picture = self._show("Memory of every process", draw_soak(soak, self._results / "cluster-soak.png"))
-            blocks["soak"] = "\n\n".join((cluster.soak_words(soak), picture, cluster.soak_table(soak)))
+            picture = show("Ablations", "pretraining-ablations", draw_ablations, ablations)
+            blocks["ablations"] = [picture, pretraining.ablations_table(ablations)]
+        if "throughput" in found:
+            blocks["throughput"] = [pretraining.throughput_words(found["throughput"])]
         return blocks
 
-    def _at(self, name: str) -> Path:
-        return self._results / f"pretraining{name}.png"
+    def cluster_blocks(self, found: Results) -> Blocks:
+        """Parts of the blocks about running on a cluster."""
+        blocks = {"targets": [cluster.targets_table(found)]}
+        if (throughput := found.get("cluster_throughput")) is not None:
+            blocks["throughput"] = [cluster.throughput_block(throughput)]
+        if (chaos := found.get("chaos")) is not None:
+            picture = self._show("Success, shot at and not", "cluster-chaos", draw_chaos, chaos)
+            blocks["chaos"] = [cluster.chaos_words(chaos), picture, cluster.faults_table(chaos)]
+        if (rest := found.get("rest_load")) is not None:
+            blocks["rest"] = [cluster.latency_table(rest), cluster.rest_words(rest)]
+        if (soak := found.get("soak")) is not None:
+            picture = self._show("Memory of every process", "cluster-soak", draw_soak, soak)
+            blocks["soak"] = [cluster.soak_words(soak), picture, cluster.soak_table(soak)]
+        return blocks
 
-    def _show(self, words: str, picture: Path) -> str:
-        self.files.append(picture)
-        return f"![{words}]({picture.name})"
+    def _show(self, words: str, name: str, draw: Callable[[Any, Path], Path], recorded: Any) -> str:
+        self.files.append(draw(recorded, self._results / f"{name}.png"))
+        return f"![{words}]({name}.png)"
 
 
-def scaling_blocks(result: Mapping[str, Any] | None) -> dict[str, str]:
-    """Text of the blocks about scaling."""
+def scaling_blocks(found: Results) -> Blocks:
+    """Parts of the blocks about scaling."""
     makers = {
         "bottleneck": scaling.limits_block,
         "box": scaling.box_block,
@@ -210,7 +186,7 @@ def scaling_blocks(result: Mapping[str, Any] | None) -> dict[str, str]:
         "model": scaling.model_block,
         "constants": scaling.constants_block,
     }
-    return {name: maker(result) if result is not None else "" for name, maker in makers.items()}
+    return {name: [maker(found["scaling"])] for name, maker in makers.items() if "scaling" in found}
 
 
 def main() -> int:

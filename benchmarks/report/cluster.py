@@ -203,11 +203,11 @@ def latency_table(result: Result) -> str:
     return table(head, rows)
 
 
-def rest_block(result: Result) -> str:
-    """Latencies by route, and what the load cost."""
+def rest_words(result: Result) -> str:
+    """Cost of the load for the training."""
     slow, cores, settings = result["slow_down"], result["cores"], result["settings"]
     error = f", standard error {percent(slow['standard_error'], 1)}" if slow["standard_error"] is not None else ""
-    words = (
+    return (
         f"{settings['num_windows']} windows of {settings['window_s']:g} s with requests, each between two without. The "
         f"training made {_spread(slow)} fewer env steps a second with them (mean {percent(slow['mean'], 1)}{error}); "
         f"windows without, next to each other, differ by {percent(slow['between_calm_neighbours'], 1)}. The client "
@@ -215,9 +215,9 @@ def rest_block(result: Result) -> str:
         f"{cores['client']:.2f} of a core on the same machine; the service and Redis took {cores['service_more']:.2f} "
         f"of a core more than without load, {percent(result['service_share_of_cores'], 1)} of all cores: what it would "
         f"cost a training with every core busy, were the client elsewhere. The client itself sent 99 % of requests "
-        f"within {result['sent_late_p99_ms']:.1f} ms of their schedule; that counts in the table."
+        f"within {result['sent_late_p99_ms']:.1f} ms of their schedule; that counts in the "
+        f"table.{measured_on(result['machine'])}"
     )
-    return f"{latency_table(result)}\n\n{words}{measured_on(result['machine'])}"
 
 
 def soak_words(result: Result) -> str:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import numpy as np
 
-from benchmarks.curriculum import BIN_M, NUM_BINS, NUM_SLICES
+from benchmarks.record_run import BIN_M, NUM_BINS, NUM_SLICES
 from benchmarks.run_files import Records, Run, binned, unthin
 from benchmarks.stages import CELL_SIZE_M, RANDOM, STAGES, mean_share, paths_m
 from benchmarks.tasks import ASKED

@@ -1,184 +1,76 @@
-"""A hand-written policy for each downstream task: what must be possible before anything can learn it.
-
-It sees what a learner's policy does not, exact positions at any time and where the box is, and acts as one does: four
-numbers in [-1, 1] a step. Success counts as in the paper's table, within 5 cm of the goal at the last step.
-"""
-
-from __future__ import annotations
+"""A hand-written pick-and-place for many worlds: what must be possible before anything can learn it."""
 
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from service.config import WorldConfig
-from service.envs import fixtures, kinematics
-from service.envs.batch import DISPLACEMENT_M, LOWEST_TARGET_M, WorldBatch
-from service.envs.gym.registration import EPISODE_STEPS
-from service.envs.gym.tabletop import Setting
-from service.envs.observations import ACTION_SIZE
-
-Array = NDArray[np.float64]
-Bools = NDArray[np.bool_]
+from service.envs.batch import DISPLACEMENT_M, WorldBatch, sample_in_volume
 
 OPEN, CLOSE = 1.0, -1.0
-_GRASP_HEIGHT_M, _PUSH_HEIGHT_M = 0.022, 0.02
-_ABOVE_M = 0.025
-"""Least space between what is carried and what it is carried over."""
-_NEAR_M = 0.012
-_CLOSE_STEPS = 3
-_DROPPED_M = 0.03
-_BEHIND_M = 0.068
-"""From the object to where the closed gripper is lowered: half a cube's diagonal, half a gripper, and some space."""
-_PRESS_M = 0.012
-"""While it pushes, the gripper is sent to a place behind the object that is this near: it never gets there."""
-_ARRIVED_M, _LEFT_M = 0.03, 0.045
-_LOST_M = 0.022
-"""A gripper that is so far beside the line to the goal goes round again."""
+_GRASP_HEIGHT_M = 0.022
+_LOWEST_GOAL_M = 0.08
+_APPROACH_STEPS, _DESCENT_STEPS, _CLOSE_STEPS, _CARRY_STEPS = 12, 6, 3, 18
+_HOLD_S = 5.0
 
 
-@dataclass
-class Scripted:
-    """Picks and places, or pushes where the gripper is blocked; keeps the phase of each world."""
+@dataclass(frozen=True)
+class Placement:
+    """How N placements went."""
 
-    worlds: WorldBatch
-    goal: Array
-    """(N, 3) metres."""
-
-    def __post_init__(self) -> None:
-        self.phase = np.zeros(self.worlds.num_worlds, dtype=np.int64)
-        self.waited = np.zeros(self.worlds.num_worlds, dtype=np.int64)
-        self.travel_m = self.worlds.config.start_height_m
-
-    def act(self) -> NDArray[np.float32]:
-        """(N, 4) the next actions."""
-        target, grip = self._push() if self.worlds.config.gripper == "blocked" else self._pick()
-        actions = np.empty((self.worlds.num_worlds, 4), dtype=np.float32)
-        actions[:, :3] = np.clip((target - self.worlds.ee_position) / DISPLACEMENT_M, -1.0, 1.0)
-        actions[:, 3] = grip
-        return actions
-
-    def _pick(self) -> tuple[Array, Array]:
-        """Above the object, down, close, up where something is in the way, across, down, and open over a box."""
-        ee, obj = self.worlds.ee_position, self.worlds.object_position
-        hold = ee - obj
-        self.phase[(self.phase > 2) & (self.phase < 6) & (np.linalg.norm(hold, axis=1) > _DROPPED_M)] = 0
-        self.waited[self.phase < 2] = 0
-        carry_m = self._carry_height()
-        over = np.linalg.norm((obj - self.goal)[:, :2], axis=1) < _NEAR_M
-        above_object = kinematics.clip_to_reach(_at_height(obj, self.travel_m), LOWEST_TARGET_M)
-        at_object = _at_height(obj, _GRASP_HEIGHT_M)
-        up, across = _at_height(obj, carry_m) + hold, _at_height(self.goal, carry_m) + hold
-        # a box is entered no deeper than the fingers need to stay above its rim
-        place = np.maximum(self.goal, [-np.inf, -np.inf, self._release_height()]) + hold
-        targets = np.stack([above_object, at_object, at_object, up, across, place, ee])
-        grips = np.array([OPEN, OPEN, CLOSE, CLOSE, CLOSE, CLOSE, OPEN])
-        self.waited[self.phase == 2] += 1
-        done = np.stack(
-            [
-                np.linalg.norm((ee - above_object)[:, :2], axis=1) < _NEAR_M,
-                ee[:, 2] < _GRASP_HEIGHT_M + 0.006,
-                self.waited >= _CLOSE_STEPS,
-                obj[:, 2] > carry_m - 0.01,
-                over,
-                np.full(len(obj), self.worlds.config.fixture == "box") & (obj[:, 2] < self._release_height() + 0.01),
-                np.zeros(len(obj), dtype=bool),
-            ]
-        )
-        if self.worlds.config.fixture == "none":
-            done[3] = done[4] = True
-        return self._advance(targets, grips, done)
-
-    def _push(self) -> tuple[Array, Array]:
-        """Above a place behind the object, down, then towards the goal; where the object slips aside, round again."""
-        ee, obj = self.worlds.ee_position, self.worlds.object_position
-        way = (self.goal - obj) * [1.0, 1.0, 0.0]
-        distance = np.linalg.norm(way, axis=1)
-        way /= np.maximum(distance, 1e-9)[:, None]
-        behind = kinematics.clip_to_reach(obj - _BEHIND_M * way, LOWEST_TARGET_M)
-        pressing = obj - _PRESS_M * way
-        arrived = distance < np.where(self.waited > 0, _LEFT_M, _ARRIVED_M)
-        self.waited[:] = arrived
-        offset = (ee - obj)[:, :2]
-        beside = np.abs(offset[:, 0] * way[:, 1] - offset[:, 1] * way[:, 0])
-        lost = (self.phase == 2) & ((beside > _LOST_M) | ((offset * way[:, :2]).sum(axis=1) > 0)) & ~arrived
-        self.phase[lost] = 0
-        low = np.where(arrived[:, None], ee, _at_height(pressing, _PUSH_HEIGHT_M))
-        targets = np.stack([_at_height(behind, self.travel_m), _at_height(behind, _PUSH_HEIGHT_M), low])
-        done = np.stack(
-            [
-                np.linalg.norm((ee - behind)[:, :2], axis=1) < _NEAR_M,
-                ee[:, 2] < _PUSH_HEIGHT_M + 0.01,
-                np.zeros(len(obj), dtype=bool),
-            ]
-        )
-        return self._advance(targets, np.zeros(3), done)
-
-    def _advance(self, targets: Array, grips: Array, done: Bools) -> tuple[Array, Array]:
-        """Go on to the next phase where one is done, through several at once; what the phase then asks for."""
-        worlds = np.arange(self.worlds.num_worlds)
-        for _ in range(len(done)):
-            self.phase += done[self.phase, worlds]
-        return targets[self.phase, worlds], grips[self.phase]
-
-    def _carry_height(self) -> float:
-        """Of the object's centre."""
-        highest = {"none": 0.0, "wall": fixtures.WALL_HEIGHT_M, "box": fixtures.BOX_HEIGHT_M}
-        return highest[self.worlds.config.fixture] + self.worlds.config.object_size_m / 2 + _ABOVE_M
-
-    def _release_height(self) -> float:
-        """Of the object's centre; the fingertips are 1 cm below it when they hold it at its middle."""
-        return fixtures.BOX_HEIGHT_M + 0.015 if self.worlds.config.fixture == "box" else -np.inf
+    grasped: np.ndarray
+    """(N,) both fingers touched the object after closing."""
+    distance_m: np.ndarray
+    """(N,) object to goal on arrival."""
+    distance_after_hold_m: np.ndarray
+    """(N,) the same after the hold."""
+    slip_m: np.ndarray
+    """(N,) how far the object moved relative to the end effector during the hold, at most."""
 
 
-def _at_height(position: Array, height_m: float) -> Array:
-    return np.column_stack([position[:, :2], np.full(len(position), height_m)])
+def drive(worlds, target, grip, num_steps):
+    """Servo every end effector towards ``target()`` (N, 3), metres, with one finger command."""
+    actions = np.full((worlds.num_worlds, 4), grip, dtype=np.float32)
+    for _ in range(num_steps):
+        actions[:, :3] = (target() - worlds.ee_position) / DISPLACEMENT_M
+        yield worlds.step(actions)
 
 
-@dataclass(frozen=True, slots=True)
-class Played:
-    """How N episodes of one task went."""
+def grasp(worlds):
+    """From a fresh reset: above the object, down, close."""
 
-    start: Array
-    """(N, 3) where the objects were at first, metres."""
-    goal: Array
-    """(N, 3) metres."""
-    distance_m: Array
-    """(T, N) object to goal after each step."""
-    success_distance_m: float
+    def above_object(height):
+        return lambda: np.column_stack([worlds.object_position[:, :2], np.full(worlds.num_worlds, height)])
 
-    @property
-    def success_last(self) -> Bools:
-        """(N,) on the goal after the last step."""
-        return np.asarray(self.distance_m[-1] <= self.success_distance_m)
-
-    @property
-    def first_step(self) -> NDArray[np.int64]:
-        """(M,) steps until the object was on the goal, of the episodes in which it ever was."""
-        reached = self.distance_m <= self.success_distance_m
-        first: NDArray[np.int64] = np.argmax(reached, axis=0)[reached.any(axis=0)] + 1
-        return first
+    travel = worlds.config.start_height_m
+    for stage in (
+        drive(worlds, above_object(travel), OPEN, _APPROACH_STEPS),
+        drive(worlds, above_object(_GRASP_HEIGHT_M), OPEN, _DESCENT_STEPS),
+        drive(worlds, above_object(_GRASP_HEIGHT_M), CLOSE, _CLOSE_STEPS),
+    ):
+        for _ in stage:
+            pass
 
 
-def play_task(
-    task: str,
-    config: WorldConfig,
-    *,
-    num_episodes: int,
-    seed: int,
-    num_steps: int = EPISODE_STEPS,
-    idle: bool = False,
-    num_threads: int = 0,
-) -> Played:
-    """Play random episodes of a task by the script, or doing nothing."""
-    setting = Setting.of(config, task, None, success_distance_m=0.05)
+def place_in_air(config, num_worlds, *, seed, num_threads=2):
+    """Pick the object up from a random place, carry it to a random point in the air, hold it there for 5 s."""
     rng = np.random.default_rng(seed)
-    with WorldBatch(setting.config, num_episodes, num_threads=num_threads) as worlds:
+    with WorldBatch(config, num_worlds, num_threads=num_threads) as worlds:
         worlds.reset(rng)
-        start, goal = worlds.object_position.copy(), setting.draw_goals(rng, worlds)
-        script = Scripted(worlds, goal)
-        distances = []
-        for _ in range(num_steps):
-            worlds.step(np.zeros((num_episodes, ACTION_SIZE), dtype=np.float32) if idle else script.act())
-            distances.append(np.linalg.norm(worlds.object_position - goal, axis=1))
-    return Played(start, goal, np.array(distances), setting.success_distance_m)
+        goal = sample_in_volume(rng, num_worlds, config.workspace, config.object_size_m, lowest_m=_LOWEST_GOAL_M)
+        grasp(worlds)
+        grasped = worlds.contacts().all(axis=1)
+
+        def carry():
+            return goal + worlds.ee_position - worlds.object_position
+
+        def distance():
+            return np.linalg.norm(worlds.object_position - goal, axis=1)
+
+        for _ in drive(worlds, carry, CLOSE, _CARRY_STEPS):
+            pass
+        arrived = distance()
+        held = worlds.object_position - worlds.ee_position
+        slip = np.zeros(num_worlds)
+        for _ in drive(worlds, carry, CLOSE, round(_HOLD_S / (config.physics_step_s * config.num_substeps))):
+            slip = np.maximum(slip, np.linalg.norm(worlds.object_position - worlds.ee_position - held, axis=1))
+        return Placement(grasped, arrived, distance(), slip)

@@ -21,7 +21,7 @@ from service.envs.gym.vector import TabletopVectorEnv
 from service.envs.rendering.renderer import Mark, RenderError, SceneRenderer
 from service.envs.tasks import TASKS, find_task
 from service.errors import TandemError
-from tests.envs.scripted import play_task
+from tests.envs.scripted_tasks import play_task
 
 CONFIG = WorldConfig(physics_step_s=0.005, num_substeps=8)
 RECORDED = Path(__file__).parents[2] / "docs" / "results" / "scripted_tasks.json"

@@ -9,7 +9,7 @@ from service.envs import kinematics
 from service.envs.batch import LOWEST_TARGET_M, WorldBatch, sample_in_volume
 from service.envs.observations import MIRROR_ACTION, MIRROR_FULL
 from tests.envs.scripted import CLOSE, OPEN, grasp, place_in_air
-from tools.world_soak import soak
+from tests.envs.world_soak import soak
 
 FINE = {"physics_step_s": 0.002, "num_substeps": 20}
 COARSE = {"physics_step_s": 0.005, "num_substeps": 8}

@@ -1,19 +1,12 @@
-"""Make a million rough random steps, and see whether anything in the world breaks.
-
-    python -m tools.world_soak --json docs/results/world_soak.json
-
-Prints the worst that was seen, and whether it is within bounds.
-"""
+"""Rough random steps, and the worst values that they lead to: does anything in the world break?"""
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
-from typing import Any
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.measuring import Stopwatch, parser_of, run_benchmark
 from service.config import WorldConfig
 from service.envs.batch import DISPLACEMENT_M, WorldBatch
 from service.envs.panda import FINGER_STROKE_M, JOINT_LOWER, JOINT_UPPER
@@ -28,19 +21,6 @@ TABLE_TOLERANCE_M = 12.5e-3
 """A quarter of the object: dropped from 0.7 m it dips in by 1 cm for one step."""
 
 FloatArray = NDArray[np.float32]
-
-
-@dataclass(frozen=True, slots=True)
-class Settings:
-    """Amount of what is tried, and in which world."""
-
-    steps: int = 1_000_000
-    """Of all worlds together."""
-    worlds: int = 200
-    object: str = "cube"
-    physics_step_s: float = 0.002
-    substeps: int = 20
-    seed: int = 0
 
 
 @dataclass
@@ -116,28 +96,3 @@ def _note(extremes: Extremes, worlds: WorldBatch) -> None:
     over_table &= np.abs(position[:, 1]) <= TABLE_HALF_SIZE_M[1]
     sunk = worlds.config.object_size_m / 2 - position[over_table, 2]
     extremes.sunk_m = max(extremes.sunk_m, float(sunk.max(initial=-np.inf)))
-
-
-def benchmark(settings: Settings) -> dict[str, Any]:
-    """Step all worlds, for JSON."""
-    world = {"object": settings.object, "physics_step_s": settings.physics_step_s, "num_substeps": settings.substeps}
-    watch, num_steps = Stopwatch(), -(-settings.steps // settings.worlds)
-    config = WorldConfig.model_validate(world)
-    extremes = soak(config, num_worlds=settings.worlds, num_steps=num_steps, seed=settings.seed)
-    return {**asdict(extremes), "within_bounds": extremes.within_bounds(), "wall_s": round(watch.wall_s(), 1)}
-
-
-def report(result: dict[str, Any]) -> str:
-    """A result for people."""
-    values = {name: value for name, value in result.items() if isinstance(value, (int, float))}
-    return "\n".join(f"{name:18} {value:.6g}" for name, value in values.items())
-
-
-def main() -> int:
-    """Parse the command line, run, print."""
-    given = parser_of(__doc__, Settings()).parse_args()
-    return run_benchmark("world_soak", ("mujoco", "numpy"), given, Settings, benchmark, report)
-
-
-if __name__ == "__main__":
-    raise SystemExit(main())
