@@ -75,13 +75,7 @@ def learn(config: Config, directory: RunDirectory) -> None:
 
 
 def record_ablation(directory: RunDirectory, name: str, ablation: str) -> Run:
-    """Record of an ablation: fewer points than of other runs, and none of the paths.
-
-    Args:
-        directory: the run.
-        name: of the recorded run.
-        ablation: which of ``ABLATIONS`` it is.
-    """
+    """Record ``name`` of a run that was one of ``ABLATIONS``: fewer points than of other runs, and no paths."""
     run = record_run(directory, name) | measure_run(directory)
     kept = [
         {key: value for key, value in record.items() if key in COUNTERS or key.startswith(KEPT_ROOMS)}

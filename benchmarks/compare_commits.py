@@ -94,13 +94,7 @@ def measure_commit(tree: Path, source: RunDirectory, home: Path, num_iterations:
 
 
 def compare(trees: Mapping[str, Path], home: Path, settings: Settings) -> dict[str, list[Sample]]:
-    """Train with the code of every tree, then measure all in turn.
-
-    Args:
-        trees: checkouts by name.
-        home: an empty directory for the runs.
-        settings: how much.
-    """
+    """Train with the code of every tree, checkouts by name, then measure all in turn; runs are below ``home``."""
     runs = {}
     for name, tree in trees.items():
         print(f"{name}: training for {settings.trained_steps:,} env steps", flush=True)
@@ -114,13 +108,7 @@ def compare(trees: Mapping[str, Path], home: Path, settings: Settings) -> dict[s
 
 
 def benchmark(old: str, new: str, settings: Settings) -> dict[str, Any]:
-    """Everything, in directories that are deleted at the end.
-
-    Args:
-        old: a commit.
-        new: what it is compared with; the ratio is how many times as fast this one is.
-        settings: how much.
-    """
+    """Compare two commits in directories that are deleted at the end; the ratio is the new one's speed by the old's."""
     commits = [full_name(commit) for commit in (old, new)]
     if commits[0] == commits[1]:
         raise TandemError(f"{old} and {new} are the same commit; name two")

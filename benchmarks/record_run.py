@@ -39,13 +39,7 @@ NUM_BINS = {"height": 13, "distance": 16}
 
 
 def record_run(directory: RunDirectory, name: str, note: str = "") -> Run:
-    """Everything that is kept of a run without measuring anything.
-
-    Args:
-        directory: the run.
-        name: what tables and pictures call it.
-        note: for people.
-    """
+    """Everything that is kept of a run without measuring anything; ``name`` is for tables, ``note`` for people."""
     config = directory.read_config()
     goals = read_records(directory.goals_file)
     return {

@@ -36,13 +36,12 @@ def sizes(directory: RunDirectory) -> dict[str, Any]:
         rollout = rounds.played[-1].rollout
         found = {
             "rollout": num_bytes(rollout),
-            "records": num_bytes(rollout.records),
             "weights": num_bytes(run.learner.weights()),
             "learner_state": num_bytes(run.learner.state()),
             "generator_state": num_bytes(run.generator.state()),
         }
     directory.close()
-    return {**found, "num_worlds": run.config.game.num_worlds, "num_env_steps": rollout.num_env_steps}
+    return {**found, "num_worlds": run.config.game.num_worlds}
 
 
 def num_bytes(value: Any) -> int:

@@ -28,7 +28,6 @@ from benchmarks.measuring import (
     rates_table,
     ratio,
     run_benchmark,
-    total,
 )
 from benchmarks.rounds import Rounds
 from benchmarks.training_process import ENDLESS, Measured, Training, copy_run, measure_training, overrides, scratch
@@ -84,7 +83,6 @@ def compare(source: RunDirectory, home: Path, settings: Settings) -> dict[str, A
     run.close()
     copy.close()
     learn_s = sum(each.num_iterations * each.learn_s for each in loops)
-    played, repeated = total(samples[ROLLOUT]), total(samples[BARE])
     return {
         "rows": {name: rates(each) for name, each in samples.items()},
         "ratios": {
@@ -98,7 +96,6 @@ def compare(source: RunDirectory, home: Path, settings: Settings) -> dict[str, A
             "max": max(each.max_policy_lag for each in loops),
         },
         "alice_contact_fraction": statistics.fmean(contacts),
-        "rollout_s": {"total": played.wall_s, "physics": repeated.wall_s, **rounds.timing.seconds},
     }
 
 
@@ -113,12 +110,11 @@ def report(result: dict[str, Any]) -> str:
     """A result for people."""
     lines = [rates_table(result["rows"])]
     lines += [describe_ratio(name, each) for name, each in result["ratios"].items()]
-    lag, spent = result["policy_lag"], result["rollout_s"]
+    lag = result["policy_lag"]
     lines += [
         f"learner idle: {result['learner_idle_share']:.1%} of the whole loop",
         f"policy lag: mean {lag['mean']:.2f}, max {lag['max']:.0f}",
         f"Alice touched the object in {result['alice_contact_fraction']:.0%} of her turns",
-        *(f"of a round, {name}: {spent[name] / spent['total']:.1%}" for name in ("physics", "policies")),
     ]
     return "\n".join(lines)
 

@@ -171,7 +171,6 @@ def test_repeated_physics_ends_in_the_same_bits(config, tmp_path):
         whole, bare = subject.play_and_repeat(0.0)
         made.extend(subject.played)
         assert whole.num_steps == bare.num_steps == made[-1].rollout.num_env_steps
-        assert subject.timing.seconds["policies"] > 0.0
         subject.close()
         if len(made) == 3:  # by then past opponents play
             run.request_stop()
@@ -205,7 +204,6 @@ def test_selfplay_throughput_measures_all_three_and_leaves_the_run_alone(config,
     loop, bare = (result["rows"][name]["env_steps_per_s"] for name in ("whole loop", "bare world"))
     assert result["ratios"]["whole loop / bare world"]["median"] == pytest.approx(loop / bare)
     assert result["policy_lag"] == {"mean": 1.0, "max": 1.0}
-    assert result["rollout_s"]["policies"] < result["rollout_s"]["total"]
     assert "whole loop / bare world" in selfplay_throughput.report(result)
     json.loads(measuring.to_text(result))
 

@@ -87,11 +87,6 @@ def plan_faults(duration_s: float, actor_every_s: float) -> list[tuple[float, Ta
     return sorted(faults)
 
 
-def find_actor(status: RunStatus, name: str) -> ActorStatus | None:
-    """The part of a run with that name."""
-    return next((actor for actor in status.actors if actor.name == name), None)
-
-
 def recovery(fault: Fault, seen: Sequence[tuple[float, RunStatus]]) -> Recovery:
     """Seconds until the killed worker's place was taken, and until the next one's work was done.
 
@@ -99,8 +94,12 @@ def recovery(fault: Fault, seen: Sequence[tuple[float, RunStatus]]) -> Recovery:
         fault: at a rollout actor, the learner or the generator.
         seen: (time, status) in order, more often than a worker takes to come up.
     """
-    later = [(status, find_actor(status, fault.name)) for at, status in seen if at >= fault.at]
-    new = [(status, actor) for status, actor in later if actor is not None and actor.incarnation > fault.incarnation]
+    new = [
+        (status, actor)
+        for at, status in seen
+        for actor in status.actors
+        if at >= fault.at and actor.name == fault.name and actor.incarnation > fault.incarnation
+    ]
     if not new:
         return Recovery(None, None)
     before, base = new[0]
@@ -184,12 +183,7 @@ class FaultInjection:
 
 
 def benchmark(config: Path, settings: Settings) -> dict[str, Any]:
-    """Inject faults into a run, in a directory that is deleted at the end; for JSON.
-
-    Args:
-        config: of the run.
-        settings: how much.
-    """
+    """Inject faults into a run with that configuration, in a directory that is deleted at the end; for JSON."""
     arguments = ["--config", str(config), "--num-actors", str(settings.num_actors), *overrides(ENDLESS)]
     seconds = 60.0 * settings.minutes
     plan = plan_faults(seconds, settings.actor_every_s)
