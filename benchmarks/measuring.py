@@ -191,18 +191,10 @@ def run_benchmark(
     benchmark: Callable[[_Settings], dict[str, Any]],
     report: Callable[[dict[str, Any]], str],
 ) -> int:
-    """Measure, write ``--json``, print the report.
+    """Measure, write ``--json`` under the benchmark's name, print the report; the exit code.
 
-    Args:
-        name: of the benchmark, which the file gets, too.
-        packages: whose versions matter.
-        given: the parsed command line, see ``parser_of``.
-        settings: the dataclass of settings, which ``benchmark`` takes.
-        benchmark: everything measured, for JSON.
-        report: a result for people.
-
-    Returns:
-        The exit code.
+    ``settings`` is the dataclass that ``parser_of`` had, and what ``benchmark`` takes; ``packages`` are those whose
+    versions matter.
     """
     try:
         where = machine(*packages)

@@ -39,6 +39,7 @@ ROLES = {LEARNER: "learner", GENERATOR: "generator", DRIVER: "driver", GCS: "gcs
 
 TINY = {
     "name": "tiny",
+    "game.num_worlds": NUM_TINY_ACTORS,
     "game.num_goals": 2,
     "game.alice_steps": 2,
     "game.bob_steps": 2,
@@ -160,7 +161,7 @@ def _row(each: Prediction) -> dict[str, Any]:
 
 def make_tiny(home: Path) -> RunDirectory:
     """A run of tiny games, some iterations old, with a world for each of ``NUM_TINY_ACTORS``."""
-    settings = overrides(TINY | ENDLESS | {"game.num_worlds": NUM_TINY_ACTORS})
+    settings = overrides(TINY | ENDLESS)
     with Training(home, settings, name="tiny", runtime="local") as training:
         training.wait_until("iteration", 3)
     return training.directory
@@ -196,11 +197,10 @@ def _measure(source: RunDirectory, home: Path, numbers: Sequence[int], num_itera
 
 
 def _box(each: Measured) -> dict[str, Any]:
-    rollouts = each.num_rollouts / each.num_iterations
     return {
         "env_steps_per_s": each.num_steps / each.wall_s,
         "iteration_s": each.wall_s / each.num_iterations,
-        "rollouts_per_iteration": rollouts,
+        "rollouts_per_iteration": each.num_rollouts / each.num_iterations,
         "num_worlds": each.num_worlds,
         "play_s": each.play_s,
         "learn_s": each.learn_s,

@@ -268,11 +268,11 @@ def summarise_rows(
     rows: Sequence[Mapping[str, float]], num_before: int, wall_s: float, role_cpu_s: Mapping[str, float],
     num_actors: int, num_worlds: int,
 ) -> Measured:  # fmt: skip
-    """Costs of the iterations of ``rows`` after the first ``num_before``.
+    """Costs of the iterations of ``rows`` after the first ``num_before``, at least 1.
 
     Args:
         rows: records of iterations.
-        num_before: of them, made before ``wall_s`` began; at least 1.
+        num_before: of them, made before ``wall_s`` and ``role_cpu_s`` began.
         wall_s: seconds that the others took together.
         role_cpu_s: CPU seconds by role in that time.
         num_actors: of the run.

@@ -1,4 +1,7 @@
-"""All pictures of recorded results: learning curves, ablations, goals, coverage, the curriculum, faults, memory."""
+"""All pictures of recorded results: learning curves, ablations, goals, coverage, the curriculum, faults, memory.
+
+A drawing takes what was recorded and the path of the PNG to write, which it returns.
+"""
 
 from __future__ import annotations
 
@@ -107,13 +110,7 @@ _CURVE_PANELS = (
 
 
 def draw_curves(runs: Sequence[Run], path: Path, *, over_time: bool = False) -> Path:
-    """Draw Bob's success and Alice's goals over env steps, or over wall-clock time.
-
-    Args:
-        runs: recorded ones, at least one; a colour each.
-        path: the PNG to write.
-        over_time: over the wall clock.
-    """
+    """Draw Bob's success and Alice's goals over env steps, or over wall-clock time; a colour for each run."""
     records = {str(run["name"]): unthin(run["series"]) for run in runs}
     clock = _wall_clock(list(records.values())) if over_time else MILLIONS
     end = max(_end(each, clock) for each in records.values())
@@ -163,13 +160,7 @@ _ABLATION_CURVES = (
 
 
 def draw_ablations(runs: Sequence[Run], path: Path, recipe: str = "recipe") -> Path:
-    """Draw a panel for each ablation: Bob's success on random goals, and dashed that of the whole recipe.
-
-    Args:
-        runs: recorded ablations; those of the recipe itself are drawn into every panel.
-        path: the PNG to write.
-        recipe: name of the ablation that changes nothing.
-    """
+    """Draw a panel for each ablation: Bob's success on random goals, and dashed that of the whole recipe."""
     names = list(dict.fromkeys(run["ablation"]["name"] for run in runs if run["ablation"]["name"] != recipe))
     num_rows = max(-(-len(names) // NUM_COLUMNS), 1)
     height = 1.6 + 2.9 * num_rows
@@ -296,12 +287,7 @@ CELL_COLOR = "#e2e2e2"
 
 
 def draw_coverage(run: Run, path: Path) -> Path:
-    """Draw random compositions: a column for the random policy and for each stage, in the box and from above.
-
-    Args:
-        run: one that has a coverage.
-        path: the PNG to write.
-    """
+    """Draw random compositions: a column for the random policy and for each stage, in the box and from above."""
     coverage, workspace = run["coverage"], WorkspaceConfig.model_validate(run["config"]["world"]["workspace"])
     stages = coverage["stages"]
     figure = new_figure(WIDTH, 8.4, f"{run['name']}: where random compositions of Bob's primitives take the object")
