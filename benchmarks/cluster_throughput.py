@@ -43,7 +43,7 @@ class Settings:
 
     num_pairs: int = 5
     num_iterations: int = 25
-    """Of each measurement; they hold one evaluation and a checkpoint, twice as often as the rest of a run does."""
+    """Iterations of each measurement; they hold one evaluation and a checkpoint, twice as often as other runs."""
     num_actors: int = 0
     """0: as many as there are cores."""
 

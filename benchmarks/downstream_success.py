@@ -38,7 +38,7 @@ class Settings:
     every: int = 10_000
     """Env steps between two points of the curve."""
     threads: int = os.cpu_count() or 1
-    """Of physics and torch."""
+    """Threads of physics and torch."""
 
 
 def learn(trial: CellConfig, trained: TrainedBob, settings: Settings) -> dict[str, Any]:

@@ -50,9 +50,9 @@ class Settings:
     primitives: str = "panda-cube@champion"
     num_pairs: int = 5
     seconds: float = 20.0
-    """Of each sample, at least."""
+    """Least length of each sample."""
     threads: int = os.cpu_count() or 1
-    """Of physics and torch, for both."""
+    """Threads of physics and torch, for both."""
 
 
 def make_worker(trial: CellConfig, trained: TrainedBob, num_threads: int) -> Play:

@@ -31,7 +31,7 @@ from service.envs.observations import ACTION_SIZE
 from service.errors import TandemError
 
 EPISODE_STEPS = 50
-"""Of panda-gym's registration, and of ours."""
+"""Length of an episode in panda-gym's registration, and in ours."""
 PICK_AND_PLACE, PUSH = PANDA_GYM_IDS = ("PandaPickAndPlace-v3", "PandaPush-v3")
 BATCH = "tandem"
 ONE_WORLD = "tandem, one world, Gymnasium"
@@ -59,9 +59,9 @@ class Settings:
 
     num_pairs: int = 5
     seconds: float = 2.0
-    """Of each measurement."""
+    """Length of each measurement."""
     num_worlds: int = 64
-    """In our batch."""
+    """Worlds of our batch."""
 
 
 class BatchContender:

@@ -44,9 +44,9 @@ class Settings:
     """Amount of what is measured."""
 
     num_places: int = 600
-    """Of the object, for each direction."""
+    """Places of the object, for each direction."""
     num_weights: int = 800
-    """From the whole range; a quarter more at its ends."""
+    """Weights from the whole range; a quarter more at its ends."""
     seed: int = 0
 
 

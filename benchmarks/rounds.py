@@ -17,7 +17,7 @@ from service.policies.evaluator import GaussianEvaluator, bob_evaluator
 from service.runtime.local import LocalRun
 
 RANDOM_STEPS = 50
-"""Of an episode of random actions."""
+"""Length of an episode of random actions."""
 
 FloatArray = NDArray[np.float32]
 StateArray = NDArray[np.float64]

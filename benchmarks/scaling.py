@@ -68,7 +68,7 @@ class Assumed:
     """Between two nodes, one receiver: pulls of 1 MB between two Ray nodes on this box, pipelined. A cluster's
     network is faster."""
     actors_per_node: int = 16
-    """They share a copy of the weights."""
+    """Actors that share a copy of the weights."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,7 +76,7 @@ class Settings:
     """Amount of what is measured."""
 
     max_actors: int = os.cpu_count() or 1
-    """On this box, beside one."""
+    """Most actors on this box."""
     num_iterations: int = 25
     num_tiny_iterations: int = 400
 

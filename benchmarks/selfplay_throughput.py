@@ -47,11 +47,11 @@ class Settings:
 
     num_pairs: int = 5
     seconds: float = 12.0
-    """Of each measurement of rounds and, after each round, its physics; half as long for random actions."""
+    """Length of each measurement of rounds and, after each round, its physics; half as long for random actions."""
     num_iterations: int = 20
-    """Of each measurement of the whole loop; 20 hold one evaluation and one checkpoint, as the rest of a run does."""
+    """Length of each measurement of the whole loop; 20 hold one evaluation and one checkpoint, as in any run."""
     num_warmup_iterations: int = 12
-    """Of a run that is begun; past opponents play from the 12th on."""
+    """Iterations of a run that is begun; past opponents play from the 12th on."""
 
 
 def begin_run(config: Path, home: Path, num_iterations: int) -> RunDirectory:

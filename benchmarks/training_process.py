@@ -192,12 +192,12 @@ class Measured:
     num_steps: int
     wall_s: float
     cpu_s: float
-    """Of all processes of the run, Ray's and the status service's included."""
+    """CPU seconds of all processes of the run, Ray's and the status service's included."""
     num_iterations: int
     num_rollouts: int
     num_actors: int
     num_worlds: int
-    """Of each actor."""
+    """Worlds of each actor."""
     play_s: float
     """Mean duration of a round; 0 where play and learning share a process."""
     hand_over_s: float

@@ -45,7 +45,7 @@ class Settings:
     actor_every_s: float = 30.0
     num_actors: int = 2
     seed: int = 0
-    """Of what is killed."""
+    """Seed of the choice of actors."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,7 +59,7 @@ class Fault:
     incarnation: int = 0
     pid: int = 0
     num_env_steps: int = 0
-    """Of the run so far."""
+    """Env steps of the run so far."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -48,7 +48,7 @@ def targets_table(found: Mapping[str, Result]) -> str:
 
 
 def verdict(reached: bool | None) -> str:
-    """For a cell."""
+    """Verdict for a cell."""
     return "not measured" if reached is None else "reached" if reached else "**missed**"
 
 

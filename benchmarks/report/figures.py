@@ -43,7 +43,7 @@ if TYPE_CHECKING:
 
 COLORS = (BLUE, ORANGE, GREEN, "#CC79A7", "#E69F00", "#56B4E9", INK, "#999999")
 WIDTH = 14.0
-"""Of every picture, in hundreds of pixels."""
+"""Width of every picture, in hundreds of pixels."""
 TITLE_SIZE = 12.5
 _LegendLine = tuple[str, Mapping[str, Any]]
 """A label and the keywords of its line."""
@@ -87,7 +87,7 @@ def _end(records: Records, clock: Clock) -> float:
 # --- learning curves --------------------------------------------------------------------------------------------------
 
 NUM_SPANS = 60
-"""Of a run's length; a curve shows the mean in each."""
+"""Equal parts of a run's length; a curve shows the mean in each."""
 IDLE_STYLE, ASKED_STYLE = (0, (4, 3)), (0, (1, 2))
 MILLIONS, THOUSANDS = Clock("env_steps", "million env steps", 1e6), Clock("env_steps", "thousand env steps", 1e3)
 
@@ -187,7 +187,7 @@ def draw_ablations(runs: Sequence[Run], path: Path, recipe: str = "recipe") -> P
 
 
 def _top(runs: Sequence[Run]) -> float:
-    """A little over the highest success, for a common scale."""
+    """Upper end of a common scale, a little over the highest success."""
     values = [column(unthin(run["series"]), key) for run in runs for key, _, _ in _ABLATION_CURVES]
     return min(1.0, 1.15 * float(np.nanmax(np.concatenate(values), initial=0.1)))
 
@@ -210,7 +210,7 @@ def draw_goals(run: Run, path: Path) -> Path:
 
 
 COLOR_MAP = "cividis"
-"""As even to colour-blind readers as to others."""
+"""Colours that are as even to colour-blind readers as to others."""
 LEAST_GOALS = 5
 """A share of fewer is not drawn."""
 QUANTILE_COLOR = "#D81B60"
