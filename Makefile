@@ -60,9 +60,9 @@ $(VENV)/.bench-installed: $(STAMP)
 	@touch $@
 
 bench: $(VENV)/.bench-installed
-	$(PY) benchmarks/env_throughput.py
-	$(PY) benchmarks/selfplay_throughput.py
+	$(PY) -m benchmarks.env_throughput
+	$(PY) -m benchmarks.selfplay_throughput
 
 clean:
 	rm -rf $(VENV) .mypy_cache .pytest_cache .ruff_cache build dist *.egg-info
-	find service tests benchmarks -name __pycache__ -prune -exec rm -rf {} +
+	find service tests benchmarks tools -name __pycache__ -prune -exec rm -rf {} +

@@ -10,15 +10,10 @@ recipe does not have on cannot be switched off, and is skipped as well.
 from __future__ import annotations
 
 import argparse
-import os
 import sys
 from pathlib import Path
 
-# before NumPy is imported: as the command line does
-os.environ.update(dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1"))
-sys.path.insert(0, str(Path(__file__).parents[1]))
-
-from benchmarks.measuring import write_json
+from benchmarks.measuring import RECIPE_FILE, ROOT, write_json
 from benchmarks.record_run import measure_run, record_run
 from benchmarks.run_files import COUNTERS, Run, thin
 from service.config import Config, load_config
@@ -27,8 +22,6 @@ from service.io.run_directory import RunDirectory
 from service.media.plots.figures import read_records
 from service.runtime.local import LocalRun
 
-ROOT = Path(__file__).parents[1]
-CONFIG = ROOT / "configs" / "pretrain" / "panda_cube.yaml"
 RECIPE = "recipe"
 ABLATIONS: dict[str, tuple[str, ...]] = {
     RECIPE: (),
@@ -48,9 +41,9 @@ ABLATIONS: dict[str, tuple[str, ...]] = {
     "no-hindsight": ("learner.abc.hindsight=false",),
     "decoupled-alice": ("learner.alice.decoupled=true",),
 }
-"""What each changes of the recipe."""
+"""Overrides of the recipe by name of the ablation."""
 MAX_POINTS = 100
-"""Of a series; these are small pictures."""
+"""Points of a series; these are small pictures."""
 KEPT_ROOMS = ("alice/", "bob/", "evaluation/")
 
 
@@ -61,9 +54,6 @@ def ablated_config(recipe: Path, name: str, settings: list[str]) -> Config | Non
         recipe: a YAML file.
         name: of the ablation.
         settings: ``a.b=c`` of all ablations, such as the seed.
-
-    Raises:
-        TandemError: no such ablation, or the configuration is not valid.
     """
     if name not in ABLATIONS:
         raise TandemError(f"no ablation {name!r}; choose from {', '.join(ABLATIONS)}")
@@ -72,11 +62,7 @@ def ablated_config(recipe: Path, name: str, settings: list[str]) -> Config | Non
 
 
 def learn(config: Config, directory: RunDirectory) -> None:
-    """Run to the end, or go on from where a run with this configuration stopped.
-
-    Raises:
-        TandemError: another run is there.
-    """
+    """Run to the end, or go on from where a run with this configuration stopped."""
     if directory.exists and directory.read_config() != config:
         raise TandemError(
             f"{directory.path} holds a run of another configuration; remove it, or name another --run-dir"
@@ -89,13 +75,7 @@ def learn(config: Config, directory: RunDirectory) -> None:
 
 
 def record_ablation(directory: RunDirectory, name: str, ablation: str) -> Run:
-    """What is kept of an ablation: less than of other runs, and none of the paths.
-
-    Args:
-        directory: the run.
-        name: of the recorded run.
-        ablation: which of ``ABLATIONS`` it is.
-    """
+    """Record ``name`` of a run that was one of ``ABLATIONS``: fewer points than of other runs, and no paths."""
     run = record_run(directory, name) | measure_run(directory)
     kept = [
         {key: value for key, value in record.items() if key in COUNTERS or key.startswith(KEPT_ROOMS)}
@@ -143,7 +123,7 @@ def _parser() -> argparse.ArgumentParser:
     add("names", metavar="NAME", nargs="*", help=f"default: all of {', '.join(ABLATIONS)}")
     add("--steps", type=int, required=True, help="env steps of each run")
     add("--seed", type=int, default=0, help="of each run (default: %(default)s)")
-    add("--config", type=Path, metavar="FILE", default=CONFIG)
+    add("--config", type=Path, metavar="FILE", default=RECIPE_FILE)
     add("--set", dest="overrides", metavar="A.B=C", action="append", default=[], help="for all of them; repeatable")
     add("--run-dir", type=Path, metavar="DIR", default=Path("runs") / "ablations", help="default: %(default)s")
     add("--out", type=Path, metavar="DIR", default=ROOT / "docs" / "results" / "runs", help="for the recorded files")

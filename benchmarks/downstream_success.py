@@ -1,6 +1,6 @@
-"""How well Stable-Baselines3's SAC learns a task as it comes: the other half of ``downstream_throughput.py``.
+"""Success of Stable-Baselines3's SAC as it comes: the other half of ``downstream_throughput.py``.
 
-    python benchmarks/downstream_success.py --task wall --steps 200000 --out docs/results/downstream_success.json
+    python -m benchmarks.downstream_success --task wall --json docs/results/downstream_success.json
 
 One environment, every default of ``SAC``, the same frozen primitives, and the goals that the trials of the table are
 evaluated on. A point of the curve has the wall-clock time of learning alone, as the trials count it.
@@ -8,32 +8,42 @@ evaluated on. A point of the curve has the wall-clock time of learning alone, as
 
 from __future__ import annotations
 
-import argparse
 import os
-import sys
 import time
-from pathlib import Path
+from dataclasses import asdict, dataclass
 from typing import Any
-
-sys.path.insert(0, str(Path(__file__).parents[1]))
-os.environ.update(dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"), "1"))
 
 import torch
 
 import service
-from benchmarks.downstream_throughput import default_learner
-from benchmarks.measuring import machine, write_json
+from benchmarks.downstream_throughput import PACKAGES, default_learner
+from benchmarks.measuring import parser_of, run_benchmark
 from service.downstream.learner import LearnedPolicy
 from service.downstream.methods import METHODS
 from service.downstream.settings import TrialConfig, make_trial
 from service.downstream.worker import CURVE_SEED, FINAL_SEED, find_provenance, play
-from service.errors import TandemError
 from service.primitives.loading import TrainedBob
 
 
-def learn(trial: TrialConfig, trained: TrainedBob, *, every: int, threads: int) -> dict[str, Any]:
-    """Learn ``trial.num_env_steps``; evaluate after every ``every`` env steps and at the end."""
-    torch.set_num_threads(threads)
+@dataclass(frozen=True, slots=True)
+class Settings:
+    """Amount of learning, and of what."""
+
+    task: str = "wall"
+    method: str = "ours"
+    """One that composes."""
+    primitives: str = "panda-cube@champion"
+    seed: int = 0
+    num_env_steps: int = 200_000
+    every: int = 10_000
+    """Env steps between two points of the curve."""
+    threads: int = os.cpu_count() or 1
+    """Threads of physics and torch."""
+
+
+def learn(trial: TrialConfig, trained: TrainedBob, settings: Settings) -> dict[str, Any]:
+    """Learn ``trial.num_env_steps``; evaluate after every ``settings.every`` env steps and at the end."""
+    torch.set_num_threads(settings.threads)
     learner = default_learner(trial, trained)
 
     def player() -> LearnedPolicy:
@@ -43,48 +53,40 @@ def learn(trial: TrialConfig, trained: TrainedBob, *, every: int, threads: int) 
     wall_s = 0.0
     while learner.num_timesteps < trial.num_env_steps:
         begun = time.perf_counter()
-        num = min(every, trial.num_env_steps - learner.num_timesteps)
+        num = min(settings.every, trial.num_env_steps - learner.num_timesteps)
         learner.learn(num, reset_num_timesteps=not curve, log_interval=None)  # type: ignore[arg-type]
         wall_s += time.perf_counter() - begun
-        found = play(trial, trained, player(), trial.curve_episodes, trial.seed + CURVE_SEED, threads)
+        found = play(trial, trained, player(), trial.curve_episodes, trial.seed + CURVE_SEED, settings.threads)
         rates = {"success_last": found.success_last, "success_ever": found.success_ever}
         curve.append({"env_steps": learner.num_timesteps, "wall_s": wall_s, **rates})
         print(f"{learner.num_timesteps:10,} env steps, {wall_s:6.0f} s: {found.success_last:.0%}", flush=True)
-    final = play(trial, trained, player(), trial.num_episodes, trial.seed + FINAL_SEED, threads)
-    settings = trial.model_dump(mode="json", include={"task", "method", "seed", "num_env_steps"})
+    final = play(trial, trained, player(), trial.num_episodes, trial.seed + FINAL_SEED, settings.threads)
     return {
-        "machine": machine("torch", "mujoco", "stable-baselines3"),
-        "settings": {"cell": settings, **find_provenance(trained).of(trial.method), "threads": threads},
+        "settings": {**asdict(settings), **find_provenance(trained).of(trial.method)},
         "curve": curve,
         "evaluation": final.as_dict(),
         "wall_s": wall_s,
     }
 
 
-def main() -> int:
-    """Parse the command line, learn, print, write."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--task", default="wall")
-    parser.add_argument("--method", default="ours", choices=[name for name, each in METHODS.items() if each.composes])
-    parser.add_argument("--primitives", default="panda-cube@champion")
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--steps", type=int, default=200_000, help="env steps of learning")
-    parser.add_argument("--every", type=int, default=10_000, help="env steps between two points of the curve")
-    parser.add_argument("--threads", type=int, default=os.cpu_count(), help="of physics and torch")
-    parser.add_argument("--out", type=Path, metavar="FILE")
-    given = parser.parse_args()
-    try:
-        trial = make_trial(task=given.task, method=given.method, seed=given.seed, num_env_steps=given.steps)
-        result = learn(trial, service.load_primitives(given.primitives), every=given.every, threads=given.threads)
-        if given.out is not None:
-            write_json(given.out, result)
-    except TandemError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
+def report(result: dict[str, Any]) -> str:
+    """A result for people."""
     found = result["evaluation"]
     low, high = found["success_last_low"], found["success_last_high"]
-    print(f"{found['success_last']:.1%} at the last step [{low:.0%}, {high:.0%}] after {result['wall_s'] / 60:.0f} min")
-    return 0
+    minutes = result["wall_s"] / 60
+    return f"{found['success_last']:.1%} at the last step [{low:.0%}, {high:.0%}] after {minutes:.0f} min"
+
+
+def benchmark(settings: Settings) -> dict[str, Any]:
+    """Everything measured, for JSON."""
+    chosen = {name: getattr(settings, name) for name in ("task", "method", "seed", "num_env_steps")}
+    return learn(make_trial(**chosen), service.load_primitives(settings.primitives), settings)
+
+
+def main() -> int:
+    """Parse the command line, learn, print, write."""
+    given = parser_of(__doc__, Settings()).parse_args()
+    return run_benchmark("downstream_success", PACKAGES, given, Settings, benchmark, report)
 
 
 if __name__ == "__main__":

@@ -1,5 +1,7 @@
 """Env steps per second on one core: our world against PyBullet panda-gym, measured in turn in one process.
 
+    python -m benchmarks.env_throughput --json docs/results/env_throughput.json
+
 Both sides do the same: episodes of 50 random actions with their resets, 20 physics steps of 2 ms an action, the
 observation and the test for success of every step. Random arms rarely meet the object, and contact is dear, so each
 side also plays episodes that reach for the object and squeeze it. panda-gym steps one world with one thread, so ours
@@ -9,23 +11,18 @@ is the physics of pre-training, half as many steps of 4 ms; panda-gym is not com
 
 from __future__ import annotations
 
-import argparse
 import os
 import sys
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager
-from pathlib import Path
-from typing import Any, Protocol
-
-# before NumPy is imported: the comparison is about one core
-os.environ.update(dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1"))
-sys.path.insert(0, str(Path(__file__).parents[1]))
+from dataclasses import dataclass
+from typing import Any
 
 import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.measuring import Sample, describe, describe_ratio, machine, measure, rates, ratio, table, write_json
+from benchmarks.measuring import describe_ratio, measure_in_turn, parser_of, rates, rates_table, ratio, run_benchmark
 from service.config import WorldConfig
 from service.envs.batch import DISPLACEMENT_M, WorldBatch
 from service.envs.goals import sample_goals
@@ -34,7 +31,7 @@ from service.envs.observations import ACTION_SIZE
 from service.errors import TandemError
 
 EPISODE_STEPS = 50
-"""Of panda-gym's registration, and of ours."""
+"""Length of an episode in panda-gym's registration, and in ours."""
 PICK_AND_PLACE, PUSH = PANDA_GYM_IDS = ("PandaPickAndPlace-v3", "PandaPush-v3")
 BATCH = "tandem"
 ONE_WORLD = "tandem, one world, Gymnasium"
@@ -56,14 +53,15 @@ _OPEN_STEPS = 8
 FloatArray = NDArray[np.float32]
 
 
-class Contender(Protocol):
-    """Something that plays whole episodes."""
+@dataclass(frozen=True, slots=True)
+class Settings:
+    """Amount of what is measured."""
 
-    def episode(self) -> int:
-        """Reset, play one episode, return the env steps made."""
-
-    def close(self) -> None:
-        """Free what it holds."""
+    num_pairs: int = 5
+    seconds: float = 2.0
+    """Length of each measurement."""
+    num_worlds: int = 64
+    """Worlds of our batch."""
 
 
 class BatchContender:
@@ -90,10 +88,6 @@ class BatchContender:
             worlds.full(step / self._num_steps)
             np.linalg.norm(worlds.object_position - goal, axis=1) <= _SUCCESS_M  # noqa: B015 - only its time matters
         return self._num_steps * num
-
-    def close(self) -> None:
-        """Free the worlds."""
-        self._worlds.close()
 
 
 class GymnasiumContender:
@@ -123,10 +117,6 @@ class GymnasiumContender:
                 return step
         return self._num_steps
 
-    def close(self) -> None:
-        """Free the environment."""
-        self._environment.close()
-
 
 def reach(action: FloatArray, towards: NDArray[Any], step: int) -> None:
     """Turn random actions (..., 4) into noisy ones that go to the object, ``towards`` metres off, and close."""
@@ -134,13 +124,9 @@ def reach(action: FloatArray, towards: NDArray[Any], step: int) -> None:
     action[..., 3] = 1.0 if step <= _OPEN_STEPS else -1.0
 
 
-def contenders(num_worlds: int) -> dict[str, Contender]:
-    """Every row of the table by its name, ours first.
-
-    Raises:
-        TandemError: panda-gym is not installed.
-    """
-    rows: dict[str, Contender] = {BATCH: BatchContender(WorldConfig(), num_worlds)}
+def contenders(num_worlds: int) -> dict[str, BatchContender | GymnasiumContender]:
+    """Every row of the table by its name, ours first."""
+    rows: dict[str, BatchContender | GymnasiumContender] = {BATCH: BatchContender(WorldConfig(), num_worlds)}
     rows |= {name: panda_gym(name) for name in PANDA_GYM_IDS}
     coarse = WorldConfig(physics_step_s=0.004, num_substeps=10)
     return rows | {
@@ -151,12 +137,8 @@ def contenders(num_worlds: int) -> dict[str, Contender]:
     }
 
 
-def panda_gym(name: str, *, grasping: bool = False) -> Contender:
-    """An environment of panda-gym.
-
-    Raises:
-        TandemError: panda-gym is not installed.
-    """
+def panda_gym(name: str, *, grasping: bool = False) -> GymnasiumContender:
+    """An environment of panda-gym."""
     with _silent_stdout():  # PyBullet prints its arguments
         try:
             import panda_gym  # noqa: F401 - registers its environments
@@ -165,19 +147,17 @@ def panda_gym(name: str, *, grasping: bool = False) -> Contender:
         return GymnasiumContender(name, grasping=grasping)
 
 
-def compare(rows: Mapping[str, Contender], *, num_pairs: int, seconds: float) -> dict[str, list[Sample]]:
-    """Measure every row ``num_pairs`` times for about ``seconds``, all in turn, after an episode each to warm up."""
-    for row in rows.values():
-        row.episode()
-    samples: dict[str, list[Sample]] = {name: [] for name in rows}
-    for _ in range(num_pairs):
-        for name, row in rows.items():
-            samples[name].append(measure(row.episode, seconds))
-    return samples
+def benchmark(settings: Settings) -> dict[str, Any]:
+    """Measure all rows in turn, after an episode each to warm up."""
+    return measure_rows(contenders(settings.num_worlds), settings)
 
 
-def summarise(samples: Mapping[str, list[Sample]]) -> dict[str, Any]:
-    """Median rates by row, and how many times as fast as panda-gym ours are."""
+def measure_rows(rows: Mapping[str, BatchContender | GymnasiumContender], settings: Settings) -> dict[str, Any]:
+    """Median rates of the given rows, and how many times as fast as panda-gym ours are; for JSON."""
+    plays = {name: row.episode for name, row in rows.items()}
+    for play in plays.values():
+        play()
+    samples = measure_in_turn(plays, settings.num_pairs, settings.seconds)
     ratios = {
         f"{ours} / {theirs}": ratio(samples[ours], samples[theirs])
         for ours, theirs in COMPARED
@@ -198,28 +178,16 @@ def _silent_stdout() -> Iterator[None]:
         yield
 
 
+def report(result: dict[str, Any]) -> str:
+    """A result for people."""
+    ratios = [describe_ratio(name, each) for name, each in result["ratios"].items()]
+    return "\n".join([rates_table(result["rows"]), *ratios])
+
+
 def main() -> int:
     """Parse the command line, measure, print."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--pairs", type=int, default=5, help="measurements of every row (default: %(default)s)")
-    parser.add_argument("--seconds", type=float, default=2.0, help="of each measurement (default: %(default)s)")
-    parser.add_argument("--worlds", type=int, default=64, help="in our batch (default: %(default)s)")
-    parser.add_argument("--json", type=Path, metavar="FILE", help="write everything measured")
-    given = parser.parse_args()
-    try:
-        rows = contenders(given.worlds)
-        where = machine(*PACKAGES)
-        print(describe(where), flush=True)
-        result = summarise(compare(rows, num_pairs=given.pairs, seconds=given.seconds))
-        if given.json:
-            settings = {"pairs": given.pairs, "seconds": given.seconds, "worlds": given.worlds, "steps": EPISODE_STEPS}
-            write_json(given.json, {"benchmark": "env_throughput", "machine": where, "settings": settings, **result})
-    except TandemError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
-    print(table(result["rows"]))
-    print("\n".join(describe_ratio(name, each) for name, each in result["ratios"].items()))
-    return 0
+    given = parser_of(__doc__, Settings()).parse_args()
+    return run_benchmark("env_throughput", PACKAGES, given, Settings, benchmark, report)
 
 
 if __name__ == "__main__":

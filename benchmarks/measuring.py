@@ -1,28 +1,37 @@
-"""What the throughput benchmarks share: samples taken in turn, their ratios, and the machine they were taken on.
+"""Tools that all benchmarks share: samples taken in turn, their ratios, the machine, and one command line.
 
 A rate alone says little where others use the machine, too. So what is compared is measured in turn within one run, and
-the ratio of each turn is what counts.
+the ratio of each turn is what counts. Functions of benchmarks raise ``TandemError`` where a run, a file or a program
+that they need is not there or fails; ``run_benchmark`` prints its one line.
 """
 
 from __future__ import annotations
 
+import argparse
 import importlib.metadata
 import json
 import os
 import platform
 import re
 import statistics
+import subprocess
+import sys
 import time
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, fields
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
+from benchmarks.report.markdown import table
+from service.errors import TandemError
 from service.io.files import os_errors, write_atomic
 from service.io.git import git_commit
 
+ROOT = Path(__file__).parents[1]
+RECIPE_FILE = ROOT / "configs" / "pretrain" / "panda_cube.yaml"
 _PLAIN_LIST = re.compile(r"\[[^\[\]{}]*\]")
+_Settings = TypeVar("_Settings")
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,7 +41,7 @@ class Sample:
     num_steps: int
     wall_s: float
     cpu_s: float
-    """CPU seconds of the whole process, all its threads together."""
+    """CPU seconds of all threads and processes together."""
 
     @property
     def steps_per_s(self) -> float:
@@ -46,7 +55,7 @@ class Sample:
 
 
 class Stopwatch:
-    """Wall-clock and CPU time since it was made."""
+    """Wall-clock and CPU time of this process since the stopwatch was made."""
 
     def __init__(self) -> None:
         self._wall, self._cpu = time.perf_counter(), time.process_time()
@@ -69,8 +78,17 @@ def measure(play: Callable[[], int], seconds: float) -> Sample:
     return watch.sample(num_steps)
 
 
+def measure_in_turn(plays: Mapping[str, Callable[[], int]], num_pairs: int, seconds: float) -> dict[str, list[Sample]]:
+    """Measure each of ``plays`` for about ``seconds``, all of them in turn, ``num_pairs`` times."""
+    samples: dict[str, list[Sample]] = {name: [] for name in plays}
+    for _ in range(num_pairs):
+        for name, play in plays.items():
+            samples[name].append(measure(play, seconds))
+    return samples
+
+
 def total(samples: Sequence[Sample]) -> Sample:
-    """Several stretches of time as one."""
+    """Sum of several stretches of time."""
     return Sample(sum(s.num_steps for s in samples), sum(s.wall_s for s in samples), sum(s.cpu_s for s in samples))
 
 
@@ -87,7 +105,7 @@ def rates(samples: Sequence[Sample]) -> dict[str, Any]:
 
 
 def ratio(ours: Sequence[Sample], theirs: Sequence[Sample]) -> dict[str, float]:
-    """How many times as fast ``ours`` is as ``theirs``: median, least and greatest over the pairs, by wall-clock time.
+    """Speed of ``ours`` over that of ``theirs``: median, least and greatest over the pairs, by wall-clock time.
 
     ``cpu`` is the median by CPU time, on which other programs of the machine bear less.
     """
@@ -97,15 +115,22 @@ def ratio(ours: Sequence[Sample], theirs: Sequence[Sample]) -> dict[str, float]:
 
 
 def machine(*packages: str) -> dict[str, Any]:
-    """The processor, how busy it is with everything that runs on it, and the versions of what is measured."""
+    """The commit, the processor, how busy it is with everything that runs on it, and versions of ``packages``.
+
+    Raises:
+        TandemError: one of them is not installed.
+    """
+    try:
+        versions = {name: importlib.metadata.version(name) for name in packages}
+    except importlib.metadata.PackageNotFoundError as error:
+        raise TandemError(f"{error.name} is not installed: run `make bench`, which installs it") from None
     return {
         "time": datetime.now(UTC).isoformat(timespec="seconds"),
         "git_commit": git_commit(),
         "cpu": _cpu_model(),
         "num_cpus": os.cpu_count(),
         "load_average": [round(load, 2) for load in os.getloadavg()],
-        "versions": {"python": platform.python_version()}
-        | {name: importlib.metadata.version(name) for name in packages},
+        "versions": {"python": platform.python_version(), **versions},
     }
 
 
@@ -115,19 +140,15 @@ def describe(where: dict[str, Any]) -> str:
     return f"{where['cpu']}, {where['num_cpus']} cpus, load {where['load_average'][0]}; {versions}"
 
 
-def table(rows: dict[str, dict[str, Any]]) -> str:
+def rates_table(rows: dict[str, dict[str, Any]]) -> str:
     """The median rates of each named row, as Markdown."""
-    width = max(len(name) for name in rows)
-    head = f"| {'':<{width}} | env steps/s | per CPU second |\n|{'-' * (width + 2)}|------------:|---------------:|"
-    lines = [
-        f"| {name:<{width}} | {row['env_steps_per_s']:>11,.0f} | {row['env_steps_per_cpu_s']:>14,.0f} |"
-        for name, row in rows.items()
-    ]
-    return "\n".join([head, *lines])
+    keys = ("env_steps_per_s", "env_steps_per_cpu_s")
+    cells = ((name, *(f"{row[key]:,.0f}" for key in keys)) for name, row in rows.items())
+    return table(("", "env steps/s", "per CPU second"), cells)
 
 
 def describe_ratio(name: str, each: dict[str, float]) -> str:
-    """One of ``ratio`` in one line."""
+    """A result of ``ratio`` in one line."""
     return (
         f"{name}: {each['median']:.2f} ({each['least']:.2f} to {each['greatest']:.2f}; by CPU time {each['cpu']:.2f})"
     )
@@ -147,6 +168,61 @@ def to_text(value: Any) -> str:
     """JSON for people and for ``git diff``: indented, with every list of plain values on a single line."""
     text = json.dumps(value, indent=1, allow_nan=False)
     return _PLAIN_LIST.sub(lambda found: " ".join(found[0].split()), text) + "\n"
+
+
+# --- the command line of a benchmark ----------------------------------------------------------------------------------
+
+
+def parser_of(doc: str | None, settings: Any) -> argparse.ArgumentParser:
+    """A parser with an option for every field of ``settings``, a dataclass whose values are the defaults."""
+    parser = argparse.ArgumentParser(description=doc, formatter_class=argparse.RawDescriptionHelpFormatter)
+    for field in fields(settings):
+        value, option = getattr(settings, field.name), f"--{field.name.replace('_', '-')}"
+        parser.add_argument(option, type=type(value), default=value, help="default: %(default)s")
+    parser.add_argument("--json", type=Path, metavar="FILE", help="write everything measured")
+    return parser
+
+
+def run_benchmark(
+    name: str,
+    packages: Sequence[str],
+    given: argparse.Namespace,
+    settings: type[_Settings],
+    benchmark: Callable[[_Settings], dict[str, Any]],
+    report: Callable[[dict[str, Any]], str],
+) -> int:
+    """Measure, write ``--json`` under the benchmark's name, print the report; the exit code.
+
+    ``settings`` is the dataclass that ``parser_of`` had, and what ``benchmark`` takes; ``packages`` are those whose
+    versions matter.
+    """
+    try:
+        where = machine(*packages)
+        print(describe(where), flush=True)
+        chosen = settings(**{field.name: getattr(given, field.name) for field in fields(settings)})  # type: ignore[arg-type]
+        head = {"benchmark": name, "machine": where, "settings": asdict(chosen)}  # type: ignore[call-overload]
+        result = head | benchmark(chosen)
+        if given.json is not None:
+            write_json(given.json, result)
+    except TandemError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+    print(report(result))
+    return 0
+
+
+def ask_module(module: str, *arguments: object, environment: Mapping[str, str] | None = None) -> dict[str, Any]:
+    """Run a module of this repository in a process of its own; the last line it printed, parsed.
+
+    Raises:
+        TandemError: it failed.
+    """
+    command = [sys.executable, "-m", module, *map(str, arguments)]
+    result = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True)
+    if result.returncode:
+        last = (result.stderr.strip().splitlines() or ["no message"])[-1]
+        raise TandemError(f"python -m {module} failed: {last}; try it by hand")
+    return dict(json.loads(result.stdout.strip().splitlines()[-1]))
 
 
 def _cpu_model() -> str:

@@ -1,15 +1,14 @@
-"""The processes of a run, from /proc: which one is which, the memory and the CPU time they take. Linux only."""
+"""The processes of a run, from /proc: their roles and their CPU time. Linux only."""
 
 from __future__ import annotations
 
 import os
-from collections import Counter
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from collections import defaultdict
+from collections.abc import Iterator
 from pathlib import Path
 
 PROC = Path("/proc")
-_TITLES = (
+_ROLES = (
     ("ray::RolloutWorker", "actor"),
     ("ray::LearnerWorker", "learner"),
     ("ray::GeneratorWorker", "generator"),
@@ -25,33 +24,20 @@ _TITLES = (
     ("log_monitor", "log monitor"),
     ("autoscaler", "autoscaler"),
 )
-"""What a command line contains, first match counts, and what the process is called here."""
+"""Part of a command line and the role it shows; the first match counts."""
 _TICKS = os.sysconf("SC_CLK_TCK")
 
 
-@dataclass(frozen=True, slots=True)
-class Memory:
-    """Of one process, in MB."""
-
-    pss: float
-    """Its own memory and its share of what it shares with others."""
-    shared_pss: float
-    """Of it, in shared memory: rollouts and weights in Ray's object store."""
-    own: float
-    """What a leak would add to: neither shared memory nor files, also where it was swapped out. What a process pays of
-    a library depends on who else uses it, so that all others seem to shrink when a program starts."""
-
-
 def role(command_line: str) -> str:
-    """What a process of a run is, from its command line; ``other`` for what is none of ours."""
-    return next((name for part, name in _TITLES if part in command_line), "other")
+    """Role of a process of a run by its command line; ``other`` for what is none of ours."""
+    return next((name for part, name in _ROLES if part in command_line), "other")
 
 
 def descendants(root: int) -> dict[int, str]:
-    """Roles of all living processes that ``root`` started, and they in turn, by pid; ``root`` is the ``driver``."""
+    """Roles by pid of ``root``, the ``driver``, and of all living processes below it."""
     children: dict[int, list[int]] = {}
-    for pid, parent in _parents():
-        children.setdefault(parent, []).append(pid)
+    for pid, parent_pid in _parents():
+        children.setdefault(parent_pid, []).append(pid)
     found, line = {root: "driver"}, [root]
     while line:
         for pid in children.get(line.pop(), ()):
@@ -60,43 +46,22 @@ def descendants(root: int) -> dict[int, str]:
     return found
 
 
-def named(processes: Mapping[int, str]) -> dict[int, str]:
-    """``processes`` with a number, in the order of their pids, where several have one role: actor-0, actor-1, ..."""
-    count, seen = Counter(processes.values()), Counter[str]()
-    names = {}
-    for pid, name in sorted(processes.items()):
-        names[pid] = f"{name}-{seen[name]}" if count[name] > 1 else name
-        seen[name] += 1
-    return names
-
-
-def memory(pid: int) -> Memory | None:
-    """Of a process; None if it has ended."""
-    try:
-        lines = (PROC / str(pid) / "smaps_rollup").read_text().splitlines()[1:]
-    except OSError:
-        return None
-    kilobytes = {name: int(rest.split()[0]) for name, _, rest in (line.partition(":") for line in lines)}
-    if not kilobytes:  # ending just now
-        return None
-    pss, shared, own, swapped = (kilobytes.get(name, 0) / 1024 for name in ("Pss", "Pss_Shmem", "Pss_Anon", "SwapPss"))
-    return Memory(pss, shared, own + swapped)
-
-
 def cpu_s(pid: int) -> float:
-    """CPU seconds a process has taken, its dead children's included; 0 if it has ended."""
+    """CPU seconds of a process and its dead children; 0 if it has ended."""
     fields = _stat(pid)
     return sum(map(int, fields[11:15])) / _TICKS if fields else 0.0
 
 
-def parent(pid: int) -> int | None:
-    """Who started a process; None if it has ended."""
-    fields = _stat(pid)
-    return int(fields[1]) if fields else None
+def cpu_s_by_role(root: int) -> dict[str, float]:
+    """CPU seconds of ``root`` and all below it, summed by role."""
+    seconds = defaultdict[str, float](float)
+    for pid, name in descendants(root).items():
+        seconds[name] += cpu_s(pid)
+    return dict(seconds)
 
 
 def is_running(pid: int) -> bool:
-    """Whether a process is there and no zombie."""
+    """Whether a process exists and is no zombie."""
     fields = _stat(pid)
     return bool(fields) and fields[0] != "Z"
 

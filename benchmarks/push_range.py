@@ -1,6 +1,6 @@
-"""In which directions can compositions of frozen primitives push an object straight?
+"""Directions in which compositions of frozen primitives cannot push an object straight.
 
-    python benchmarks/push_range.py panda-cube@champion runs/cube-1 --out docs/results/push_range.json
+    python -m benchmarks.push_range panda-cube@champion runs/cube-1 --json docs/results/push_range.json
 
 No simulator: the closed gripper stands behind the object, in random places, and of the means of many compositions some
 push straight or none does. What none can do has to be planned round downstream, which is hard to learn (decision 8).
@@ -8,39 +8,46 @@ push straight or none does. What none can do has to be planned round downstream,
 
 from __future__ import annotations
 
-import argparse
-import sys
-from pathlib import Path
+from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any
-
-sys.path.insert(0, str(Path(__file__).parents[1]))
 
 import numpy as np
 
 import service
-from benchmarks.measuring import write_json
+from benchmarks.measuring import parser_of, run_benchmark
 from service.downstream.compose import action_weights, check_primitives
 from service.downstream.worker import find_provenance
-from service.errors import TandemError
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from service.primitives.loading import TrainedBob
 
+PACKAGES = ("numpy",)
 DIRECTIONS = {"+x": (1.0, 0.0), "-x": (-1.0, 0.0), "+y": (0.0, 1.0), "-y": (0.0, -1.0)}
 _RESTING_HEIGHT_M = 0.025
-"""Of the middle of a cube of 5 cm."""
+"""Height of the middle of a cube of 5 cm."""
 _PLACES_M = 0.15
-"""How far from the origin places reach, along x and along y."""
+"""Farthest places from the origin, along x and along y."""
 _BEHIND_M, _BESIDE_M, _HEIGHT_M = (0.055, 0.075), (-0.015, 0.015), (0.015, 0.035)
-"""Where the end effector stands, from the object's middle against and across the push; and its height."""
+"""Place of the end effector, from the object's middle against and across the push; and its height."""
 _LEAST = 0.1
-"""Of the greatest displacement in a step, along the push."""
+"""Least displacement along the push, as a share of the greatest in a step."""
 _ASIDE = 0.35
 """Greatest displacement across, as a share of that along the push; and up or down, as one of the greatest in a step."""
 _ASIDE_OF = 0.3
 """Slow pushes may go aside as those of this speed."""
+
+
+@dataclass(frozen=True, slots=True)
+class Settings:
+    """Amount of what is measured."""
+
+    num_places: int = 600
+    """Places of the object, for each direction."""
+    num_weights: int = 800
+    """Weights from the whole range; a quarter more at its ends."""
+    seed: int = 0
 
 
 def positions_behind(rng: np.random.Generator, direction: tuple[float, float], num: int) -> NDArray[np.float32]:
@@ -66,11 +73,7 @@ def best_pushes(means: NDArray[np.float32], direction: tuple[float, float]) -> N
 
 
 def measure(trained: TrainedBob, *, num_places: int, num_weights: int, seed: int) -> dict[str, float]:
-    """Share of places in which no composition pushes straight, for each direction.
-
-    Raises:
-        TandemError: primitives that cannot be composed.
-    """
+    """Share of places in which no composition pushes straight, for each direction."""
     primitives, rng = check_primitives(trained), np.random.default_rng(seed)
     k = primitives.num_primitives
     drawn, corners = rng.uniform(-1.0, 1.0, (num_weights, k)), rng.choice([-1.0, 1.0], (num_weights // 4, k))
@@ -83,30 +86,32 @@ def measure(trained: TrainedBob, *, num_places: int, num_weights: int, seed: int
     return shares
 
 
+def benchmark(references: list[str], registry: str, settings: Settings) -> dict[str, Any]:
+    """Measure primitives of a registry or of run directories; a row for each."""
+    rows = {}
+    for name in references:
+        trained = service.load_primitives(name, registry)
+        rows[name] = {**find_provenance(trained).primitives, "impossible": measure(trained, **asdict(settings))}
+    return {"rows": rows}
+
+
+def report(result: dict[str, Any]) -> str:
+    """A result for people."""
+    return "\n".join(
+        "  ".join([name, *(f"{direction} {share:.0%}" for direction, share in row["impossible"].items())])
+        for name, row in result["rows"].items()
+    )
+
+
 def main() -> int:
     """Parse the command line, measure, print, write."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = parser_of(__doc__, Settings())
     parser.add_argument("primitives", nargs="+", metavar="NAME@ALIAS|RUN_DIR")
     parser.add_argument("--registry", default="registry")
-    parser.add_argument("--places", type=int, default=600, help="of the object, for each direction")
-    parser.add_argument("--weights", type=int, default=800, help="from the whole range; a quarter more at its ends")
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--out", type=Path, metavar="FILE")
     given = parser.parse_args()
-    settings = {"num_places": given.places, "num_weights": given.weights, "seed": given.seed}
-    try:
-        rows: dict[str, Any] = {}
-        for name in given.primitives:
-            trained = service.load_primitives(name, given.registry)
-            rows[name] = {**find_provenance(trained).primitives, "impossible": measure(trained, **settings)}
-        if given.out is not None:
-            write_json(given.out, {"settings": settings, "rows": rows})
-    except TandemError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
-    for name, row in rows.items():
-        print(name, *(f"{direction} {share:.0%}" for direction, share in row["impossible"].items()), sep="  ")
-    return 0
+    return run_benchmark(
+        "push_range", PACKAGES, given, Settings, lambda each: benchmark(given.primitives, given.registry, each), report
+    )
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Make the small file of a run that ``docs/results`` keeps and ``figures.py`` draws from.
+"""Make the small file of a run that ``docs/results`` keeps and the report is made from.
 
     python -m benchmarks.record_run runs/cube --out docs/results/runs/cube-0.json
 
@@ -11,44 +11,35 @@ from __future__ import annotations
 
 import argparse
 import json
-import os
 import sys
 from pathlib import Path
 from typing import Any
 
-# before NumPy is imported: as the command line does
-os.environ.update(dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1"))
-sys.path.insert(0, str(Path(__file__).parents[1]))
-
 import numpy as np
+from numpy.typing import NDArray
 
-from benchmarks.curriculum import count_goals
 from benchmarks.measuring import machine, write_json
 from benchmarks.run_files import FORMAT_VERSION, Records, Run, blocks, thin
 from benchmarks.stages import measure_coverage
 from benchmarks.tasks import measure_tasks
 from service.errors import TandemError
 from service.io.run_directory import RunDirectory
-from service.media.plots.figures import read_records
+from service.media.plots.figures import Array, read_records
 from service.policies.numpy_policy import numpy_bob
 from service.primitives.loading import read_stages
 
 GOAL_RECORDS, GOALS_EACH = 60, 10
-"""Stages of the run of which goals are kept, and how many of each."""
+"""Stages of the run of which goals are kept, and the number of goals of each."""
 PACKAGES = ("mujoco", "numpy", "torch")
+NUM_SLICES = 30
+"""Equal parts of a run's env steps."""
+BIN_M = 0.025
+NUM_BINS = {"height": 13, "distance": 16}
+"""The last one also holds what is beyond it."""
 
 
 def record_run(directory: RunDirectory, name: str, note: str = "") -> Run:
-    """Everything that is kept of a run without measuring.
-
-    Args:
-        directory: the run.
-        name: what tables and pictures call it.
-        note: for people.
-
-    Raises:
-        TandemError: not a run, or one that has no iteration yet, or damaged.
-    """
+    """Everything that is kept of a run without measuring anything; ``name`` is for tables, ``note`` for people."""
     config = directory.read_config()
     goals = read_records(directory.goals_file)
     return {
@@ -65,14 +56,39 @@ def record_run(directory: RunDirectory, name: str, note: str = "") -> Run:
 
 
 def measure_run(directory: RunDirectory) -> dict[str, Any]:
-    """What is measured of a run's Bobs: the newest on every task, the coverage at all stages.
-
-    Raises:
-        TandemError: not a run, or without a usable checkpoint.
-    """
+    """Evaluations of a run's newest Bob on every task, and the coverage at all stages."""
     config, bobs = directory.read_config(), read_stages(directory)
     newest = numpy_bob(bobs[max(bobs)])
     return {"evaluations": measure_tasks(newest, config), "coverage": measure_coverage(bobs, config)}
+
+
+def count_goals(records: Records, rest_height_m: float) -> dict[str, Any]:
+    """Goals and solved goals by time, by height above where the object rests, and by distance from its start.
+
+    Args:
+        records: of ``goals.jsonl``, each goal 7 numbers: start x y z, goal x y z in metres, solved 0 or 1.
+        rest_height_m: of the object's centre on the table.
+
+    Returns:
+        For JSON: ``env_steps``, the end of the last slice of time, and of height and distance ``goals`` and ``solved``,
+        for each slice a list of counts, one for each bin of 2.5 cm.
+    """
+    end = records[-1]["env_steps"]
+    rows = [(record["env_steps"], *goal) for record in records for goal in record["goals"]]
+    goals = np.array(rows, dtype=np.float64).reshape(len(rows), 8)
+    goals = goals[np.isfinite(goals).all(axis=1)]
+    time, start, goal, solved = goals[:, 0], goals[:, 1:4], goals[:, 4:7], goals[:, 7]
+    slices = np.minimum((time / end * NUM_SLICES).astype(int), NUM_SLICES - 1)
+    values = {"height": goal[:, 2] - rest_height_m, "distance": np.linalg.norm(goal - start, axis=1)}
+    return {"env_steps": end} | {name: _count(slices, value, solved, name) for name, value in values.items()}
+
+
+def _count(slices: NDArray[np.int64], values: Array, solved: Array, name: str) -> dict[str, list[list[int]]]:
+    num_bins = NUM_BINS[name]
+    bins = np.clip(np.floor(values / BIN_M).astype(int), 0, num_bins - 1)  # contact lets an object rest a hair lower
+    place, num_places = slices * num_bins + bins, NUM_SLICES * num_bins
+    counts = {"goals": np.bincount(place, minlength=num_places), "solved": np.bincount(place, solved, num_places)}
+    return {key: count.astype(int).reshape(NUM_SLICES, num_bins).tolist() for key, count in counts.items()}
 
 
 def sample_goals(records: Records) -> list[dict[str, Any]]:

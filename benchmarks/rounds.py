@@ -10,15 +10,14 @@ from numpy.typing import NDArray
 
 from benchmarks.measuring import Sample, Stopwatch, measure, total
 from service.actors.rollout import Rollout
-from service.actors.self_play import Players, StochasticPolicy
+from service.actors.self_play import Players
 from service.envs.batch import WorldBatch
 from service.envs.observations import ACTION_SIZE
 from service.policies.numpy_policy import NumpyGaussianPolicy, numpy_bob
 from service.runtime.local import LocalRun
-from service.runtime.timing import Timing
 
 RANDOM_STEPS = 50
-"""Of an episode of random actions."""
+"""Length of an episode of random actions."""
 
 FloatArray = NDArray[np.float32]
 StateArray = NDArray[np.float64]
@@ -43,8 +42,6 @@ class Rounds:
         self._run = run
         self._rng = np.random.default_rng(0)
         self._worlds = WorldBatch(run.config.world, run.config.game.num_worlds, num_threads=run.config.run.num_threads)
-        self.timing = Timing()
-        """Seconds in the policies during all rounds."""
         self.played: list[Round] = []
         """The rounds of the last ``play_and_repeat``."""
 
@@ -73,10 +70,10 @@ class Rounds:
         weights, pool = self._run.learner.weights(), self._run.generator.opponents
         return Players(
             version=weights.version,
-            alice=_Timed(NumpyGaussianPolicy(weights.alice), self.timing),
-            bob=_Timed(numpy_bob(weights.bob), self.timing),
-            past_alice=[_Timed(NumpyGaussianPolicy(each), self.timing) for each in pool.alice],
-            past_bob=[_Timed(numpy_bob(each), self.timing) for each in pool.bob],
+            alice=NumpyGaussianPolicy(weights.alice),
+            bob=numpy_bob(weights.bob),
+            past_alice=[NumpyGaussianPolicy(each) for each in pool.alice],
+            past_bob=[numpy_bob(each) for each in pool.bob],
         )
 
     def _play_round(self, players: Players) -> int:
@@ -111,14 +108,3 @@ def repeat_physics(worlds: WorldBatch, played: Round) -> int:
         if playing.size:
             worlds.step(action[playing], playing)
     return len(alice.action) * worlds.num_worlds + int(bob.active.sum())
-
-
-class _Timed:
-    """Acts as the given policy does, and counts the time."""
-
-    def __init__(self, policy: StochasticPolicy, timing: Timing) -> None:
-        self._policy, self._timing = policy, timing
-
-    def act(self, observation: FloatArray, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
-        with self._timing("policies"):
-            return self._policy.act(observation, rng)

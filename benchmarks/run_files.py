@@ -20,7 +20,7 @@ from service.media.plots.figures import Array, column
 
 FORMAT_VERSION = 1
 MAX_POINTS = 300
-"""Of every series."""
+"""Most points of a series."""
 COUNTERS = ("iteration", "env_steps", "time/wall_s")
 _DIGITS = 5
 

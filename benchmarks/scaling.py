@@ -1,13 +1,12 @@
-"""How far a run on Ray scales: one box, several nodes on it, and on paper beyond that.
+"""Scaling of a run on Ray: measured on one box, and on paper beyond that.
 
     python -m benchmarks.scaling --run-dir runs/cube --json docs/results/scaling.json
 
 - On this box: env steps a second of a trained run with 1, 2, ... rollout actors, and the CPU time of every process.
-- Several nodes: the same on Ray's test cluster, whose nodes are processes here and send each other everything.
 - On paper: ``scaling_model.py`` with what was measured. Tiny games, whose physics and networks cost nearly nothing,
-  with 1 and with 8 actors tell what an update and what a rollout costs by itself in driver, learner, generator, GCS
-  and Redis; the trained run tells what a world costs on top. Costs are CPU seconds, so that cores which all share do
-  not count as work. Looking after many actors is measured with as many that do nothing.
+  with 1 and with 8 actors tell what an update and what a rollout costs by itself in driver, learner, generator and
+  GCS; the trained run tells what a world costs on top. Costs are CPU seconds, so that cores which all share do not
+  count as work. Waiting for many actors is measured with as many that do nothing.
 
 What cannot be measured on one box is assumed, and is in the result: how fast a node's network is and how many actors
 a node has.
@@ -15,76 +14,71 @@ a node has.
 
 from __future__ import annotations
 
-import argparse
-import json
 import os
-import shutil
-import subprocess
-import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-sys.path.insert(0, str(Path(__file__).parents[1]))
-
-from benchmarks.cluster_throughput import probe
-from benchmarks.measuring import describe, machine, write_json
-from benchmarks.runner_probe import Measured
+from benchmarks.cluster_throughput import measure_run
+from benchmarks.measuring import ask_module, parser_of, run_benchmark
+from benchmarks.report.scaling import box_block, limits_block, model_block
 from benchmarks.scaling_model import ACTORS, Cost, Model, Prediction, limit, line, predict
-from benchmarks.soak import TINY
-from benchmarks.trainings import ROOT, copy_run, environment, scratch
-from service.config import load_config
-from service.errors import TandemError
+from benchmarks.training_process import ENDLESS, Measured, Training, copy_run, environment, overrides, scratch
 from service.io.run_directory import RunDirectory
-from service.runtime.local import LocalRun
 
 PACKAGES = ("ray", "redis", "mujoco", "numpy", "torch")
 PREDICTED = (1, 2, 4, 16, 256, 4096)
 WAKES = (16, 256, 4096)
 NUM_TINY_ACTORS = 8
-LEARNER, GENERATOR, DRIVER, ROLLOUTS_IN, WEIGHTS_OUT, GCS, REDIS = (
-    "learner", "task generator", "driver", "rollouts to the learner's node", "weights to the nodes", "GCS", "Redis",
-)  # fmt: skip
-ROLES = {LEARNER: "learner", GENERATOR: "generator", DRIVER: "driver", GCS: "gcs", REDIS: "redis"}
+LEARNER, GENERATOR, DRIVER, GCS = "learner", "task generator", "driver", "GCS"
+ROLLOUTS_IN, WEIGHTS_OUT = "rollouts to the learner's node", "weights to the nodes"
+ROLES = {LEARNER: "learner", GENERATOR: "generator", DRIVER: "driver", GCS: "gcs"}
 """Processes that there are one of, and their roles in ``processes.py``."""
+
+
+TINY = {
+    "name": "tiny",
+    "game.num_worlds": NUM_TINY_ACTORS,
+    "game.num_goals": 2,
+    "game.alice_steps": 2,
+    "game.bob_steps": 2,
+    "game.success_distance_m": 0.0005,
+    "world.physics_step_s": 0.01,
+    "world.num_substeps": 1,
+    "generator.replay_buffer_size": 256,
+    "policy.alice.hidden_sizes": "[8]",
+    "policy.value.hidden_sizes": "[8]",
+    "policy.bob.trunk_hidden_sizes": "[8]",
+    "policy.bob.primitive_hidden_size": 8,
+    "policy.bob.gate_hidden_sizes": "[8]",
+    "learner.alice.num_epochs": 1,
+    "learner.bob.num_epochs": 1,
+    "run.checkpoint_interval": 200,
+    "run.evaluation_interval": 0,
+}
+"""Games of milliseconds. Nothing is learned; all that handles rounds, updates, records and states is as in any run."""
 
 
 @dataclass(frozen=True, slots=True)
 class Assumed:
-    """What one box cannot tell."""
+    """Numbers that one box cannot tell."""
 
     network_mb_per_s: float = 152.0
     """Between two nodes, one receiver: pulls of 1 MB between two Ray nodes on this box, pipelined. A cluster's
     network is faster."""
-    redis_mb_per_s: float = 213.0
-    """Values of 1 MB set over loopback."""
     actors_per_node: int = 16
-    """They share a copy of the weights."""
+    """Actors that share a copy of the weights."""
 
 
 @dataclass(frozen=True, slots=True)
 class Settings:
-    """How much is measured."""
+    """Amount of what is measured."""
 
-    num_actors: tuple[int, ...] = (1, 2)
+    max_actors: int = os.cpu_count() or 1
+    """Most actors on this box."""
     num_iterations: int = 25
     num_tiny_iterations: int = 400
-    num_node_iterations: int = 12
-
-
-def ask(home: Path, *arguments: object) -> dict[str, Any]:
-    """What ``scaling_probe.py`` found, in a process of its own.
-
-    Raises:
-        TandemError: it failed.
-    """
-    command = [sys.executable, "-m", "benchmarks.scaling_probe", *map(str, arguments)]
-    result = subprocess.run(command, cwd=ROOT, env=environment(home), capture_output=True, text=True)
-    if result.returncode:
-        last = (result.stderr.strip().splitlines() or ["no message"])[-1]
-        raise TandemError(f"scaling_probe {arguments[0]} failed: {last}; try it by hand")
-    return dict(json.loads(result.stdout.strip().splitlines()[-1]))
 
 
 def costs(
@@ -111,12 +105,9 @@ def costs(
         rest = spent - update_s - last.num_rollouts / last.num_iterations * rollout_s
         world_s = max(0.0, rest / num_worlds) if name in (LEARNER, GENERATOR) else 0.0
         parts[name] = Cost(update_s, rollout_s, world_s)
-    turn = [a + b for a, b in zip(wakes["wait_s"], wakes["look_s"], strict=True)]
-    _, pair_s = line((wakes["num_actors"][0], turn[0]), (wakes["num_actors"][-1], turn[-1]))
+    few, *_, many = zip(wakes["num_actors"], wakes["wait_s"], strict=True)
+    _, pair_s = line(few, many)
     parts[DRIVER] = Cost(parts[DRIVER].update_s, parts[DRIVER].rollout_s, pair_s=pair_s)
-    status_bytes = wakes["status_bytes"][-1] / wakes["num_actors"][-1]
-    told_s = status_bytes / 1e6 / assumed.redis_mb_per_s
-    parts[REDIS] = Cost(parts[REDIS].update_s, parts[REDIS].rollout_s + told_s)
     bytes_per_s = assumed.network_mb_per_s * 1e6
     parts[ROLLOUTS_IN] = Cost(world_s=sizes["rollout"] / sizes["num_worlds"] / bytes_per_s)
     parts[WEIGHTS_OUT] = Cost(rollout_s=sizes["weights"] / assumed.actors_per_node / bytes_per_s)
@@ -168,39 +159,28 @@ def _row(each: Prediction) -> dict[str, Any]:
     }
 
 
-def make_tiny(directory: RunDirectory) -> None:
+def make_tiny(home: Path) -> RunDirectory:
     """A run of tiny games, some iterations old, with a world for each of ``NUM_TINY_ACTORS``."""
-    config = load_config(None, [f"{key}={value}" for key, value in TINY.items()])
-    game = config.game.model_copy(update={"num_worlds": NUM_TINY_ACTORS})
-    run = LocalRun(config.model_copy(update={"game": game}), directory)
-    run.run(lambda metrics: run.request_stop() if metrics["iteration"] >= 3 else None)
-    directory.close()
+    settings = overrides(TINY | ENDLESS)
+    with Training(home, settings, name="tiny", runtime="local") as training:
+        training.wait_until("iteration", 3)
+    return training.directory
 
 
 def benchmark(source: RunDirectory, settings: Settings) -> dict[str, Any]:
-    """Everything, in directories that are deleted at the end.
-
-    Raises:
-        TandemError: no run there with a checkpoint, or a process failed.
-    """
+    """Everything, in directories that are deleted at the end."""
     with scratch() as home:
-        make_tiny(tiny := RunDirectory(home / "tiny"))
-        real = _probes(source, home, settings.num_actors, settings.num_iterations)
-        small = _probes(tiny, home, (1, NUM_TINY_ACTORS), settings.num_tiny_iterations)
-        copy = RunDirectory(home / "copy")
-        copy_run(source, copy)
-        shutil.copy(source.metrics_file, copy.metrics_file)  # a record's size
-        sizes = ask(home, "sizes", copy.path)
-        print("nodes", flush=True)
-        nodes = ask(home, "nodes", copy.path, settings.num_node_iterations)
-        print("the driver's loop", flush=True)
-        wakes = ask(home, "wakes", *WAKES)
+        numbers = (1, *range(2, settings.max_actors + 1))
+        real = _measure(source, home, numbers, settings.num_iterations)
+        small = _measure(make_tiny(home), home, (1, NUM_TINY_ACTORS), settings.num_tiny_iterations)
+        probe, ray, copy = "benchmarks.scaling_probe", environment(home), copy_run(source, home, "copy")
+        sizes = ask_module(probe, "sizes", copy.path, environment=ray)
+        wakes = ask_module(probe, "wakes", *WAKES, environment=ray)
     model = costs(list(small.values()), list(real.values()), wakes, sizes)
     most = real[max(real)]
     return {
         "one_box": {str(num): _box(each) for num, each in real.items()},
         "tiny": {str(num): _box(each) for num, each in small.items()},
-        "nodes": nodes,
         "sizes": sizes,
         "wakes": wakes,
         "assumed": asdict(Assumed()),
@@ -208,20 +188,19 @@ def benchmark(source: RunDirectory, settings: Settings) -> dict[str, Any]:
     }
 
 
-def _probes(source: RunDirectory, home: Path, numbers: Sequence[int], num_iterations: int) -> dict[int, Measured]:
+def _measure(source: RunDirectory, home: Path, numbers: Sequence[int], num_iterations: int) -> dict[int, Measured]:
     found = {}
     for num in numbers:
-        found[num] = probe(source, home, "ray", num_iterations, num, plain=True).measured
-        print(f"{num} actors: {found[num].num_steps / found[num].wall_s:,.0f} env steps/s", flush=True)
+        found[num] = measure_run(source, home, "ray", num_iterations, num, plain=True)
+        print(f"{num} actors: {found[num].sample.steps_per_s:,.0f} env steps/s", flush=True)
     return found
 
 
 def _box(each: Measured) -> dict[str, Any]:
-    rollouts = each.num_rollouts / each.num_iterations
     return {
         "env_steps_per_s": each.num_steps / each.wall_s,
         "iteration_s": each.wall_s / each.num_iterations,
-        "rollouts_per_iteration": rollouts,
+        "rollouts_per_iteration": each.num_rollouts / each.num_iterations,
         "num_worlds": each.num_worlds,
         "play_s": each.play_s,
         "learn_s": each.learn_s,
@@ -232,43 +211,18 @@ def _box(each: Measured) -> dict[str, Any]:
     }
 
 
-def report(result: Mapping[str, Any]) -> str:
-    """A result for people."""
-    lines = [f"{num} actors: {each['env_steps_per_s']:,.0f} env steps/s" for num, each in result["one_box"].items()]
-    lines.append(f"nodes: {result['nodes']}")
-    lines += [
-        f"{row['num_actors']:>5} actors: {row['env_steps_per_s']:>9,.0f} env steps/s, an update "
-        f"{row['update_s']:.2f} s: {row['bottleneck']}"
-        for row in result["model"]["worlds_each"]
-    ]
-    return "\n".join([*lines, f"limits: {result['model']['limits']}"])
+def report(result: dict[str, Any]) -> str:
+    """A result for people: the blocks of the page."""
+    return "\n\n".join(block(result) for block in (box_block, model_block, limits_block))
 
 
 def main() -> int:
     """Parse the command line, measure, print."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    add, shown = parser.add_argument, Settings()
-    cores = tuple(range(1, (os.cpu_count() or 1) + 1))
-    add("--run-dir", type=Path, metavar="DIR", required=True, help="go on from this run, with its configuration")
-    add("--num-actors", type=int, nargs="+", default=cores, metavar="N", help="default: 1 to as many as cores")
-    add("--iterations", type=int, default=shown.num_iterations, help="of each (default: %(default)s)")
-    add("--tiny-iterations", type=int, default=shown.num_tiny_iterations, help="(default: %(default)s)")
-    add("--node-iterations", type=int, default=shown.num_node_iterations, help="(default: %(default)s)")
-    add("--json", type=Path, metavar="FILE", help="write everything measured")
+    parser = parser_of(__doc__, Settings())
+    parser.add_argument("--run-dir", type=Path, metavar="DIR", required=True, help="go on from this run")
     given = parser.parse_args()
-    numbers = tuple(sorted(set(given.num_actors)))
-    settings = Settings(numbers, given.iterations, given.tiny_iterations, given.node_iterations)
-    try:
-        where = machine(*PACKAGES)
-        print(describe(where), flush=True)
-        result = benchmark(RunDirectory(given.run_dir), settings)
-        if given.json:
-            write_json(given.json, {"benchmark": "scaling", "machine": where, "settings": asdict(settings)} | result)
-    except TandemError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
-    print(report(result))
-    return 0
+    source = RunDirectory(given.run_dir)
+    return run_benchmark("scaling", PACKAGES, given, Settings, lambda settings: benchmark(source, settings), report)
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""How many rollout actors a run can use, from what each of its parts costs: arithmetic only, nothing is measured here.
+"""Number of rollout actors that a run can use, from the costs of its parts: arithmetic only, nothing is measured here.
 
 An update takes one rollout of each of N actors, and all parts work side by side: while actors play, the learner
 learns from the rollouts before. So the slowest part sets the pace, and what it costs is
@@ -25,14 +25,14 @@ class Cost:
 
     update_s: float = 0.0
     rollout_s: float = 0.0
-    """For each rollout, whatever its size."""
+    """Seconds for each rollout, whatever its size."""
     world_s: float = 0.0
-    """For each world of each rollout."""
+    """Seconds for each world of each rollout."""
     pair_s: float = 0.0
-    """For each rollout and each actor there is: what looks at all actors whenever one of them is done."""
+    """Seconds for each rollout and each actor there is: looking at all actors whenever one of them is done."""
 
     def seconds(self, num_actors: int, num_worlds: float) -> float:
-        """Of an update.
+        """Seconds of an update.
 
         Args:
             num_actors: so many rollouts.
@@ -44,14 +44,14 @@ class Cost:
 
 @dataclass(frozen=True, slots=True)
 class Model:
-    """What every part costs."""
+    """Costs of every part."""
 
     actor: Cost
-    """Of one actor for its own rollout."""
+    """Cost of one actor for its own rollout."""
     parts: Mapping[str, Cost]
     """Everything there is only one of, by name."""
     env_steps: float
-    """Of one world in a round."""
+    """Env steps of one world in a round."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,7 +60,7 @@ class Prediction:
 
     num_actors: int
     num_worlds: float
-    """Of each."""
+    """Worlds of each actor."""
     seconds: Mapping[str, float]
     """That each part is busy for an update, by name; the actors beside the others."""
     env_steps_per_s: float
@@ -81,7 +81,7 @@ class Prediction:
 
 
 def predict(model: Model, num_actors: int, num_worlds: float) -> Prediction:
-    """What a run with ``num_actors`` of ``num_worlds`` each does."""
+    """Predict a run with ``num_actors`` of ``num_worlds`` each."""
     seconds = {ACTORS: model.actor.seconds(1, num_worlds)}
     seconds |= {name: cost.seconds(num_actors, num_worlds) for name, cost in model.parts.items()}
     steps = num_actors * num_worlds * model.env_steps

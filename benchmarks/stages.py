@@ -1,4 +1,4 @@
-"""What random compositions of the primitives do at three stages of training, beside a random policy.
+"""Coverage of random compositions of the primitives at three stages of training, beside a random policy.
 
 The paper's figure shows 32 compositions at the beginning, in the middle and at the end. One such set visits few cells
 of the table, so the share of visited cells is taken as the mean over several sets; the first is kept to be drawn.
@@ -28,7 +28,7 @@ RANDOM = "random policy"
 
 
 def pick_stages(env_steps: Collection[int]) -> dict[str, int]:
-    """Which snapshots of Bob show the stages of a run: those nearest to the stages' shares of its env steps.
+    """Snapshots of Bob that show the stages of a run: those nearest to the stages' shares of its env steps.
 
     Args:
         env_steps: of training at each snapshot; where one is nearest to several stages, it shows the last of them.
@@ -62,7 +62,7 @@ def measure_coverage(
 
 
 def mean_share(stage: Mapping[str, Any]) -> float:
-    """Of the cells visited, over all sets of a stage."""
+    """Mean share of the cells visited, over all sets of a stage."""
     return float(np.mean(stage["shares"]))
 
 

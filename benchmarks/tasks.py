@@ -1,4 +1,4 @@
-"""What a trained Bob is measured on: random goals that nobody proposed, also in worlds he was not trained in."""
+"""Evaluation of a trained Bob: random goals that nobody proposed, also in worlds he was not trained in."""
 
 from __future__ import annotations
 
@@ -11,10 +11,9 @@ from service.envs.tasks import Task
 
 NUM_EPISODES, NUM_STEPS = 300, 50
 ASKED, ASKED_STEPS = 0.90, 30e6
-"""Of mixed goals, at the last step, after at most so many env steps from scratch."""
+"""Success on mixed goals at the last step, after at most so many env steps from scratch."""
 SEED = 0
-"""Of the goals; those evaluated during a run are others."""
-
+"""Seed of the goals; those evaluated during a run are others."""
 
 TASKS = {
     "mixed": Task("Mixed", "anywhere in the workspace with probability 0.7, else on the table", "mixed", 0.7),

@@ -12,21 +12,21 @@ import service
 from benchmarks import (
     ablations,
     compare_commits,
-    curriculum,
     env_throughput,
-    figures,
-    loop_probe,
     measuring,
     record_run,
     rounds,
     run_files,
     selfplay_throughput,
     stages,
-    tables,
     tasks,
 )
 from benchmarks.measuring import Sample
-from benchmarks.pictures.curriculum import quantiles
+from benchmarks.report.__main__ import PAGES, Report, begin, end
+from benchmarks.report.figures import quantiles
+from benchmarks.report.markdown import commit, duration
+from benchmarks.report.pretraining import throughput_words
+from benchmarks.training_process import copy_run
 from service.actors.coverage import RandomPolicy, skill_trajectories, visited_share
 from service.actors.evaluation import IdlePolicy, evaluate
 from service.config import WorldConfig, dump_config, load_config
@@ -37,8 +37,9 @@ from service.io.jsonl import JsonlWriter
 from service.io.run_directory import RunDirectory
 from service.learner.learner import Learner
 from service.policies.numpy_policy import numpy_bob
+from service.primitives.bundled import BUNDLED
 from service.primitives.loading import read_parameters, read_stages
-from service.registry.registry import BUNDLED, Registry
+from service.registry.registry import Registry
 from service.runtime.local import LocalRun
 from tests.runtime.runs import tiny_config
 
@@ -113,13 +114,11 @@ def test_env_throughput_measures_all_rows_in_turn():
         env_throughput.PANDA_GYM_IDS[0]: env_throughput.GymnasiumContender(TABLETOP_ID, num_steps=2),
     }
     assert [row.episode() for row in rows.values()] == [6, 2]
-    result = env_throughput.summarise(env_throughput.compare(rows, num_pairs=2, seconds=0.0))
-    for row in rows.values():
-        row.close()
+    result = env_throughput.measure_rows(rows, env_throughput.Settings(num_pairs=2, seconds=0.0))
     assert [row["num_steps"] for row in result["rows"].values()] == [12, 4]
     assert list(result["ratios"]) == ["tandem / PandaPickAndPlace-v3"]
     assert all(value > 0.0 for value in result["ratios"]["tandem / PandaPickAndPlace-v3"].values())
-    assert measuring.table(result["rows"]).count("\n") == 3
+    assert measuring.rates_table(result["rows"]).count("\n") == 3
     json.loads(measuring.to_text(result))
 
 
@@ -137,7 +136,6 @@ def test_only_grasping_arms_lift_the_object():
         batch = env_throughput.BatchContender(WorldConfig(), 48, grasping=grasping)
         batch.episode()
         heights.append(batch._worlds.object_position[:, 2].max())
-        batch.close()
     assert heights[0] < 0.04  # at rest the centre of the cube is 0.025 m high
     assert heights[1] > 0.06
 
@@ -145,12 +143,11 @@ def test_only_grasping_arms_lift_the_object():
 def test_an_episode_ends_with_the_environments_time_limit():
     contender = env_throughput.GymnasiumContender(TABLETOP_ID, num_steps=60, grasping=True)
     assert contender.episode() == env_throughput.EPISODE_STEPS
-    contender.close()
 
 
 def test_without_panda_gym_one_line_says_how_to_get_it(monkeypatch, capsys):
     monkeypatch.setitem(sys.modules, "panda_gym", None)
-    monkeypatch.setattr(sys, "argv", ["env_throughput.py", "--worlds", "1"])
+    monkeypatch.setattr(sys, "argv", ["env_throughput.py", "--num-worlds", "1"])
     assert env_throughput.main() == 2
     error = capsys.readouterr().err
     assert error.count("\n") == 1
@@ -161,7 +158,6 @@ def test_panda_gym_plays_where_it_is_installed():
     pytest.importorskip("panda_gym", reason="panda-gym, to compare with, comes with make bench only")
     contender = env_throughput.panda_gym(env_throughput.PANDA_GYM_IDS[0])
     assert contender.episode() == env_throughput.EPISODE_STEPS
-    contender.close()
 
 
 # --- self-play throughput ---------------------------------------------------------------------------------------------
@@ -176,7 +172,6 @@ def test_repeated_physics_ends_in_the_same_bits(config, tmp_path):
         whole, bare = subject.play_and_repeat(0.0)
         made.extend(subject.played)
         assert whole.num_steps == bare.num_steps == made[-1].rollout.num_env_steps
-        assert subject.timing.seconds["policies"] > 0.0
         subject.close()
         if len(made) == 3:  # by then past opponents play
             run.request_stop()
@@ -197,45 +192,29 @@ def test_repeated_physics_ends_in_the_same_bits(config, tmp_path):
     assert num_bob_steps > 0
 
 
-def test_selfplay_throughput_measures_all_three(config, tmp_path):
-    settings = selfplay_throughput.Settings(num_pairs=2, seconds=0.0, num_iterations=2, num_warmup_iterations=2)
-    result = selfplay_throughput.compare(config, tmp_path / "run", settings)
-    assert all(len(row["env_steps_per_s_each"]) == 2 for row in result["rows"].values())
-    assert result["rows"]["rollout with policies"]["num_steps"] == result["rows"]["bare world"]["num_steps"]
+def test_selfplay_throughput_measures_all_three_and_leaves_the_run_alone(config, tmp_path):
+    (tmp_path / "tiny.yaml").write_text(dump_config(config))
+    run = selfplay_throughput.begin_run(tmp_path / "tiny.yaml", tmp_path, 3)
+    assert len(run.metrics_file.read_text().splitlines()) >= 3
+    before = {path: path.read_bytes() for path in run.path.rglob("*") if path.is_file()}
+    settings = selfplay_throughput.Settings(num_pairs=1, seconds=0.0, num_iterations=2)
+    result = selfplay_throughput.compare(run, tmp_path, settings)
+    assert {path: path.read_bytes() for path in run.path.rglob("*") if path.is_file()} == before
+    assert [len(row["env_steps_per_s_each"]) for row in result["rows"].values()] == [1] * 4
+    assert result["rows"]["rollout with policies"]["num_steps"] == result["rows"]["bare world"]["num_steps"] > 0
+    loop, bare = (result["rows"][name]["env_steps_per_s"] for name in ("whole loop", "bare world"))
+    assert result["ratios"]["whole loop / bare world"]["median"] == pytest.approx(loop / bare)
     assert result["policy_lag"] == {"mean": 1.0, "max": 1.0}
-    loop = result["timing"]["loop"]
-    assert 0.0 < loop["play"] < loop["total"]
-    assert sum(spent for name, spent in loop.items() if name != "total") <= 1.001 * loop["total"]
-    assert {"total", "physics", "policies"} <= set(result["timing"]["rollout"])
-    assert "whole loop / bare world" in selfplay_throughput.report(result | {"start_to_first_update_s": 1.0})
+    assert "whole loop / bare world" in selfplay_throughput.report(result)
     json.loads(measuring.to_text(result))
-
-
-def test_selfplay_throughput_goes_on_from_a_run_and_leaves_it_alone(config, tmp_path):
-    run = LocalRun(config, RunDirectory(tmp_path / "source"))
-    run.run(lambda metrics: run.request_stop())
-    run.directory.close()
-    before = {path: path.read_bytes() for path in (tmp_path / "source").rglob("*") if path.is_file()}
-    copied = selfplay_throughput.copy_run(RunDirectory(tmp_path / "source"), tmp_path / "copy")
-    assert copied.game == config.game
-    assert copied.run.total_env_steps > 10**9
-    settings = selfplay_throughput.Settings(num_pairs=1, seconds=0.0, num_iterations=1, num_warmup_iterations=1)
-    assert selfplay_throughput.compare(copied, tmp_path / "copy", settings, resume=True)["rows"]
-    assert {path: path.read_bytes() for path in (tmp_path / "source").rglob("*") if path.is_file()} == before
 
 
 def test_only_a_run_with_a_checkpoint_can_be_gone_on_from(config, tmp_path):
     with pytest.raises(TandemError, match="no run in"):
-        selfplay_throughput.copy_run(RunDirectory(tmp_path / "none"), tmp_path / "copy")
+        copy_run(RunDirectory(tmp_path / "none"), tmp_path / "copy")
     (tmp_path / "config.yaml").write_text(dump_config(config))
     with pytest.raises(TandemError, match="no checkpoint in"):
-        selfplay_throughput.copy_run(RunDirectory(tmp_path), tmp_path / "copy")
-
-
-def test_the_first_update_of_the_command_line_is_awaited(config, tmp_path):
-    assert selfplay_throughput.first_update_s(config, tmp_path / "start") > 0.0
-    recorded = RunDirectory(tmp_path / "start" / "run").metrics_file.read_text()
-    assert "learner/version" in recorded
+        copy_run(RunDirectory(tmp_path), tmp_path / "copy")
 
 
 # --- recorded runs ----------------------------------------------------------------------------------------------------
@@ -370,10 +349,10 @@ def test_goals_are_counted_by_hand():
         # 7.6 cm up; as high and far as can be; and one that is not finite
         {"env_steps": 300, "goals": [[0, 0, rest, 0, 0, rest + 0.076, 1], [0, 0, rest, 9, 0, 9, 0], [None] * 7]},
     ]
-    counts = curriculum.count_goals(records, rest)
+    counts = record_run.count_goals(records, rest)
     height, distance = counts["height"], counts["distance"]
-    assert np.shape(height["goals"]) == (curriculum.NUM_SLICES, curriculum.NUM_BINS["height"])
-    assert np.shape(distance["solved"]) == (curriculum.NUM_SLICES, curriculum.NUM_BINS["distance"])
+    assert np.shape(height["goals"]) == (record_run.NUM_SLICES, record_run.NUM_BINS["height"])
+    assert np.shape(distance["solved"]) == (record_run.NUM_SLICES, record_run.NUM_BINS["distance"])
     assert {place: height["goals"][place[0]][place[1]] for place in zip(*np.nonzero(height["goals"]), strict=True)} == {
         (3, 0): 2,
         (29, 3): 1,
@@ -487,20 +466,36 @@ def test_a_run_is_measured_from_its_snapshots_and_its_checkpoint(tmp_path, monke
 # --- the page ---------------------------------------------------------------------------------------------------------
 
 
+def _documents(path):
+    """A directory of documents whose pages have blocks and no words."""
+    (path / "results" / "runs").mkdir(parents=True)
+    for page, names in PAGES.items():
+        (path / page).write_text("\n".join(f"## {name}\n\n{begin(name)}\n{end(name)}\n" for name in names))
+    return path
+
+
+def _write_report(docs):
+    report = Report(docs)
+    report.write()
+    return [file for file in report.files if file.name.startswith("pretraining")]
+
+
 @pytest.mark.filterwarnings("error")
 def test_the_page_and_its_pictures_are_made_again_and_again(tmp_path):
-    runs = [
+    docs = _documents(tmp_path / "docs")
+    for file in (
         _record(tmp_path / "0", "cube-0", evaluations=EVALUATIONS, coverage=COVERAGE),
         _record(tmp_path / "1", "cube-1", evaluations=[_evaluation("runs/cube", "air", 0.0, num_steps=60)]),
         _record_ablation(tmp_path / "2", "no-abc", ["learner.abc.weight=0"], seed=1),
         _record_ablation(tmp_path / "3", "recipe"),
-    ]
-    files = figures.pretraining(runs, tmp_path / "out")
+    ):
+        file.rename(docs / "results" / "runs" / file.name)
+    *pictures, page_file = _write_report(docs)
     names = ["", "-time", "-curriculum", "-goals-cube-0", "-goals-cube-1", "-coverage-cube-0", "-ablations"]
-    assert [path.name for path in files] == ["pretraining.md", *(f"pretraining{name}.png" for name in names)]
-    assert all(path.read_bytes().startswith(b"\x89PNG") for path in files[1:])
-    page = files[0].read_text()
-    assert all(f"]({path.name})" in page for path in files[1:])
+    assert [path.name for path in pictures] == [f"pretraining{name}.png" for name in names]
+    assert all(path.read_bytes().startswith(b"\x89PNG") for path in pictures)
+    page = page_file.read_text()
+    assert all(f"]({path.name})" in page for path in pictures)
     # evaluated every 20 of 700 iterations: (620 + 640 + 660) / 3 / 700 = 0.91, and 0.89 one evaluation before
     assert "| cube-0 | 91 % [86, 96] | 88 % [83, 93] | 95 % [90, 100] | 70 % [65, 75] | 66 % [61, 71] | 6.6 M |" in page
     assert "| cube-1 (60 steps) |  | 0 % [-5, 5] |  |  |  | 6.6 M |" in page
@@ -511,48 +506,53 @@ def test_the_page_and_its_pictures_are_made_again_and_again(tmp_path):
     recipe, ablated = (page.index(row) for row in ("| recipe, seed 0 | nothing |", "| no-abc, seed 1 | `learner.abc"))
     assert recipe < ablated
     assert "Not recorded yet." in page  # the throughput
-    files[0].write_text(f"Words before.\n{page}Words after.\n")
-    figures.pretraining(runs, tmp_path / "out")
-    assert files[0].read_text() == f"Words before.\n{page}Words after.\n"
+    page_file.write_text(f"Words before.\n{page}Words after.\n")
+    _write_report(docs)
+    assert page_file.read_text() == f"Words before.\n{page}Words after.\n"
 
 
 def test_the_page_shows_the_throughput(tmp_path):
     side = {"env_steps_per_s": 2000.4}
     result = {
+        "benchmark": "throughput",
         "settings": {"trained_steps": 500_000, "num_pairs": 5},
         "rows": {"10399f0": side, "abcdef0": {"env_steps_per_s": 5000.0}},
         "ratio": {"median": 2.5, "least": 2.375, "greatest": 2.625, "cpu": 2.0},
     }
-    words = tables.throughput_words(result)
+    words = throughput_words(result)
     assert "5,000 env steps/s (abcdef0) instead of 2,000 env steps/s (10399f0)" in words
     assert "2.50 times as many (2.38 to 2.62 in 5 pairs" in words
-    (tmp_path / "throughput.json").write_text(json.dumps(result))
-    run = _record(tmp_path / "0")
-    assert words in figures.pretraining([run], tmp_path)[0].read_text()
+    docs = _documents(tmp_path)
+    (docs / "results" / "throughput.json").write_text(json.dumps(result))
+    (page,) = _write_report(docs)
+    assert words in page.read_text()
 
 
 def test_a_bob_without_primitives_is_shown_without_coverage(tmp_path):
+    docs = _documents(tmp_path)
     run = json.loads((ROOT / "docs" / "results" / "runs" / "cube-3.json").read_text())
     run |= {"coverage": None, "evaluations": [row for row in run["evaluations"] if row["goals"] != "sphere"]}
-    (tmp_path / "cube-3.json").write_text(json.dumps(run))
-    files = figures.pretraining([tmp_path / "cube-3.json"], tmp_path)
+    (docs / "results" / "runs" / "cube-3.json").write_text(json.dumps(run))
+    files = _write_report(docs)
     assert "pretraining-goals-cube-3.png" in {path.name for path in files}
     assert not [path.name for path in files if "coverage" in path.name]
-    assert "| cube-3 | 98 % [96, 99] | 98 % [96, 99] | 97 % [95, 99] | 93 % [89, 95] |  |" in files[0].read_text()
+    assert "| cube-3 | 98 % [96, 99] | 98 % [96, 99] | 97 % [95, 99] | 93 % [89, 95] |  |" in files[-1].read_text()
 
 
 def test_a_page_without_markers_is_left_alone(tmp_path):
-    run = _record(tmp_path)
-    page = figures.empty_page().replace(figures.end("coverage"), "")
-    (tmp_path / "pretraining.md").write_text(page)
+    docs = _documents(tmp_path)
+    page = docs / "results" / "pretraining.md"
+    page.write_text(page.read_text().replace(end("coverage"), ""))
+    before = {path: path.read_bytes() for path in docs.rglob("*.md")}
     with pytest.raises(TandemError, match="no markers for coverage"):
-        figures.pretraining([run], tmp_path)
-    assert (tmp_path / "pretraining.md").read_text() == page
-    assert not (tmp_path / "pretraining.png").exists()
+        Report(docs).write()
+    assert {path: path.read_bytes() for path in docs.rglob("*.*")} == before
 
 
-def test_durations_by_hand():
-    assert [tables.duration(seconds) for seconds in (90, 5400, 7200, 37_800)] == ["2 min", "90 min", "2.0 h", "10.5 h"]
+def test_words_of_the_pages_by_hand():
+    assert [duration(seconds) for seconds in (90, 5400, 7200, 37_800)] == ["2 min", "90 min", "2.0 h", "10.5 h"]
+    assert commit("f3c0f7898cd36eea") == "commit `f3c0f78`"
+    assert commit("f3c0f7898cd36eea-dirty") == "commit `f3c0f78` with local changes"
 
 
 # --- ablations --------------------------------------------------------------------------------------------------------
@@ -569,7 +569,7 @@ EVERYTHING_ON = [
 @pytest.mark.parametrize("name", ablations.ABLATIONS)
 def test_an_ablation_changes_what_it_says_and_nothing_else(name):
     recipe, ablated = (
-        _leaves(ablations.ablated_config(ablations.CONFIG, each, EVERYTHING_ON).model_dump(mode="json"))
+        _leaves(ablations.ablated_config(measuring.RECIPE_FILE, each, EVERYTHING_ON).model_dump(mode="json"))
         for each in (ablations.RECIPE, name)
     )
     changed = {key for key in recipe.keys() | ablated.keys() if recipe.get(key) != ablated.get(key)}
@@ -584,10 +584,10 @@ def _leaves(tree, prefix=""):
 
 
 def test_what_is_off_already_is_no_ablation():
-    assert ablations.ablated_config(ablations.CONFIG, "no-mirror", ["learner.mirror=false"]) is None
-    assert ablations.ablated_config(ablations.CONFIG, ablations.RECIPE, []) == load_config(ablations.CONFIG)
+    assert ablations.ablated_config(measuring.RECIPE_FILE, "no-mirror", ["learner.mirror=false"]) is None
+    assert ablations.ablated_config(measuring.RECIPE_FILE, ablations.RECIPE, []) == load_config(measuring.RECIPE_FILE)
     with pytest.raises(TandemError, match="no ablation 'no-such'; choose from recipe, no-abc"):
-        ablations.ablated_config(ablations.CONFIG, "no-such", [])
+        ablations.ablated_config(measuring.RECIPE_FILE, "no-such", [])
 
 
 def test_ablations_are_run_recorded_and_then_skipped(tmp_path, monkeypatch, capsys):
@@ -652,49 +652,31 @@ def test_a_commit_is_checked_out_for_as_long_as_it_is_needed(tmp_path):
             use("no-such-commit", tmp_path)
 
 
-def test_two_commits_are_measured_in_turn_from_the_same_checkpoint(tmp_path, monkeypatch):
-    calls = []
+def test_two_commits_are_measured_in_turn_from_the_same_checkpoint(config, tmp_path, monkeypatch):
+    """This checkout stands for both; its recipe is replaced by tiny games."""
+    (tmp_path / "tiny.yaml").write_text(dump_config(config))
+    source = compare_commits.train(ROOT, tmp_path / "trained", 100, tmp_path / "tiny.yaml")
+    steps = [json.loads(line)["env_steps"] for line in source.metrics_file.read_text().splitlines()]
+    assert steps[-1] >= 100
+    calls, measured = [], []
+    measure_commit = compare_commits.measure_commit
+    monkeypatch.setattr(compare_commits, "train", lambda tree, home, num, file: calls.append(("train", num)) or source)
 
-    def probe(tree, verb, run_dir, *arguments):
-        calls.append((tree.name, verb, *arguments[-1:]))
-        if verb == "train":
-            run_dir.mkdir()
-            (run_dir / "checkpoint").write_text(tree.name)
-            return ""
-        assert (run_dir / "checkpoint").read_text() == tree.name
-        (run_dir / "checkpoint").write_text("changed")
-        return json.dumps({"num_steps": 1000.0, "wall_s": 1.0 if tree.name == "old" else 0.5, "cpu_s": 2.0})
+    def measure(*arguments):
+        calls.append(("measure", arguments[-1]))
+        measured.append(measure_commit(*arguments))
+        return measured[-1]
 
-    monkeypatch.setattr(compare_commits, "probe", probe)
-    trees = {"a": tmp_path / "old", "b": tmp_path / "new"}
-    samples = compare_commits.compare(trees, tmp_path, compare_commits.Settings(300, num_pairs=2, num_iterations=7))
-    assert calls == [("old", "train", 300), ("new", "train", 300), *[("old", "measure", 7), ("new", "measure", 7)] * 2]
-    assert samples == {"a": [Sample(1000, 1.0, 2.0)] * 2, "b": [Sample(1000, 0.5, 2.0)] * 2}
+    monkeypatch.setattr(compare_commits, "measure_commit", measure)
+    settings = compare_commits.Settings(300, num_pairs=1, num_iterations=7)
+    samples = compare_commits.compare({"a": ROOT, "b": ROOT}, tmp_path, settings)
+    assert calls == [("train", 300), ("train", 300), ("measure", 7), ("measure", 7)]
+    assert samples == {"a": [measured[0]], "b": [measured[1]]}
+    assert all(sample.num_steps > 0 and sample.cpu_s > 0.0 for sample in measured)
+    assert not (tmp_path / "runs" / "run").exists()
 
 
 def test_a_commit_is_not_compared_with_itself(monkeypatch):
     monkeypatch.setattr(compare_commits, "full_name", lambda name: "0" * 40)
     with pytest.raises(TandemError, match="the same commit"):
         compare_commits.benchmark("HEAD", "main", compare_commits.Settings())
-
-
-def test_the_loop_is_measured_after_some_iterations_to_warm_up(config, tmp_path):
-    (tmp_path / "tiny.yaml").write_text(dump_config(config))
-    directory = RunDirectory(tmp_path / "run")
-    loop_probe.train(directory, tmp_path / "tiny.yaml", 100)
-    directory.close()
-    before = [json.loads(line)["env_steps"] for line in directory.metrics_file.read_text().splitlines()]
-    taken = loop_probe.measure(directory, 3)
-    directory.close()
-    steps = [json.loads(line)["env_steps"] for line in directory.metrics_file.read_text().splitlines()]
-    assert len(steps) == len(before) + loop_probe.NUM_WARMUP_ITERATIONS + 3
-    assert taken["num_steps"] == steps[-1] - steps[-4]
-    assert taken["wall_s"] > 0.0
-    assert taken["cpu_s"] > 0.0
-
-
-def test_a_loop_that_fails_says_why(tmp_path):
-    with pytest.raises(TandemError, match=r"failed: .*no-run"):
-        compare_commits.probe(ROOT, "measure", tmp_path / "no-run", 1)
-    with pytest.raises(TandemError, match="failed: AssertionError: service is"):
-        compare_commits.probe(tmp_path, "measure", tmp_path / "no-run", 1)

@@ -30,7 +30,7 @@ ROOMS_WITHOUT_TORCH = ("actors", "envs", "generator", "registry", "status")
 ROOMS_BELOW_RUNTIME = ("envs", "policies", "actors", "generator", "learner", "registry")
 VERBS = ("demo", "pretrain", "evaluate", "render", "coverage", "registry", "serve", "downstream")
 DOCUMENTS = [*sorted(ROOT.glob("*.md")), *sorted((ROOT / "docs").rglob("*.md")), ROOT / "deploy" / "README.md"]
-FOLDERS = (".ci", "benchmarks", "configs", "deploy", "docs", "service", "tests")
+FOLDERS = (".ci", "benchmarks", "configs", "deploy", "docs", "service", "tests", "tools")
 TEXT = {".cfg", ".json", ".jsonl", ".md", ".py", ".toml", ".txt", ".yaml", ".yml", ""}
 
 IMPORT_ALL = """

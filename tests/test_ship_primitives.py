@@ -7,8 +7,6 @@ import sys
 import numpy as np
 import pytest
 
-from benchmarks import ship_primitives
-from benchmarks.ship_primitives import publish_newest, ship
 from service.actors.evaluation import evaluate
 from service.config import dump_config, parse_config
 from service.errors import TandemError
@@ -21,6 +19,8 @@ from service.registry.registry import Registry
 from service.runtime.runner import EVALUATION_SEED
 from tests.registry.helpers import assert_identical, files_in
 from tests.runtime.runs import TREE, assert_one_line, play, tiny_config
+from tools import ship_primitives
+from tools.ship_primitives import publish_newest, ship
 
 
 @pytest.fixture(scope="module")

@@ -1,7 +1,8 @@
-"""The benchmarks of runs on a cluster: arithmetic by hand, and parts on tiny settings. No time is asserted."""
+"""The benchmarks of runs on a cluster, and the tools: arithmetic by hand, and parts on tiny settings."""
 
 import json
 import os
+import subprocess
 import threading
 from datetime import UTC, datetime
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
@@ -9,31 +10,18 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 import numpy as np
 import pytest
 
-from benchmarks import (
-    cluster_figures,
-    cluster_tables,
-    cluster_throughput,
-    estimates,
-    measuring,
-    open_loop,
-    processes,
-    rest_load,
-    scaling,
-    scaling_probe,
-    scaling_tables,
-    soak,
-    strikes,
-    trainings,
-)
-from benchmarks.accounts import Stretch, account, handed, ledger_of
-from benchmarks.cluster_throughput import Probed
-from benchmarks.pages import Page
-from benchmarks.runner_probe import Measured, Watch
+from benchmarks import cluster_throughput, measuring, processes, scaling, scaling_probe, training_process
+from benchmarks.report import __main__ as report
+from benchmarks.report import cluster as cluster_blocks
+from benchmarks.report import scaling as scaling_blocks
 from benchmarks.scaling_model import ACTORS, Cost, Model, limit, line, predict
-from benchmarks.strikes import Recovery, Seen, Strike
+from benchmarks.training_process import Measured, Records, Training, copy_run, measure_training, summarise_rows
 from service.errors import TandemError
 from service.io.run_directory import RunDirectory
 from service.store.models import ActorStatus, RunStatus
+from tools import fault_injection, rest_load
+from tools.fault_injection import Fault, Recovery
+from tools.rollout_audit import Stretch, audit_rollouts, ledger_of, stretches_of
 
 WHERE = {"cpu": "Xeon", "num_cpus": 2, "git_commit": "abcdef0123", "time": "2026-11-21T12:00:00+00:00"}
 
@@ -51,93 +39,27 @@ def actor(name, incarnation=0, num_rollouts=0, heartbeat=0.0, state="alive", pid
 def seen(at, *actors, iteration=0, **status):
     now = moment(at)
     told = {"run_id": "run", "name": "run", "runtime": "ray", "state": "running", "started": now, "heartbeat": now}
-    return Seen(at, RunStatus(**told, total_env_steps=9, iteration=iteration, actors=actors, **status))
+    return at, RunStatus(**told, total_env_steps=9, iteration=iteration, actors=actors, **status)
 
 
-# --- estimates --------------------------------------------------------------------------------------------------------
+# --- processes --------------------------------------------------------------------------------------------------------
 
 
-def test_a_percentile_is_a_value_that_was_measured():
-    values = list(range(100, 0, -1))
-    assert [estimates.percentile(values, share) for share in (0.0, 0.5, 0.99, 0.991, 1.0)] == [1, 50, 99, 100, 100]
-    assert estimates.percentile([3.0], 0.99) == 3.0
-    with pytest.raises(ValueError, match="no values"):
-        estimates.percentile([], 0.5)
-
-
-def test_the_slope_of_a_line_is_exact_and_of_noise_uncertain():
-    x = np.arange(400.0)
-    exact = estimates.slope(x, 3.0 + 0.25 * x)
-    np.testing.assert_allclose([exact.value, exact.low, exact.high], 0.25, atol=1e-9)
-    noise = np.random.default_rng(0).normal(size=400)
-    flat = estimates.slope(x, noise)
-    assert flat.low < 0.0 < flat.high
-    with pytest.raises(ValueError, match="too few"):
-        estimates.slope(x[:39], x[:39])
-
-
-def test_blocks_of_noise_with_a_memory_count_once():
-    x = np.arange(400.0)
-    steps = np.repeat(np.random.default_rng(1).normal(size=20), 20)  # each number twenty times
-    alone = estimates.slope(np.arange(40.0) * 10, np.repeat(steps[::20], 2))
-    repeated = estimates.slope(x, steps)
-    np.testing.assert_allclose(repeated.high - repeated.low, alone.high - alone.low, rtol=0.01)
-
-
-# --- memory -----------------------------------------------------------------------------------------------------------
-
-
-def test_memory_is_judged_by_its_second_half():
-    iteration = np.arange(200.0) * 10
-    still = soak.judge(iteration, np.full(200, 80.0), per_day=25_000)
-    assert (still.growth_mb, still.per_day_mb, still.flat) == (0.0, 0.0, True)
-    warm = soak.judge(iteration, np.where(np.arange(200) < 90, 20.0, 80.0), per_day=25_000)
-    assert warm.flat  # what it takes in the first half does not count
-    # 0.001 MB an iteration are 25 MB a day; from the middle (1000..1190) to the end (1800..1990) 0.8 MB
-    leak = soak.judge(iteration, 80.0 + 0.001 * iteration, per_day=25_000)
-    np.testing.assert_allclose([leak.growth_mb, leak.per_day_mb], [0.8, 25.0])
-    assert not leak.flat
-    jump = soak.judge(iteration, np.where(np.arange(200) < 175, 80.0, 86.0), per_day=10)
-    assert jump.per_day_mb < 10.0
-    assert not jump.flat
-    large = soak.judge(iteration, np.where(np.arange(200) < 175, 800.0, 806.0), per_day=10)
-    assert large.flat  # less than 5 %
-
-
-def test_descriptors_may_swing_and_not_climb():
-    assert soak._steady([3, 9, 4, 8, 5, 9, 4, 9, 8, 9] * 4)
-    assert not soak._steady(list(range(40)))
-
-
-def test_a_soak_keeps_who_lived_to_the_end():
-    settings = soak.Settings(real_iteration_s=86.4)
-    long, died = soak.Series("learner", 1), soak.Series("actor", 2)
-    for index in range(100):
-        for each in (long, died)[: 2 if index < 60 else 1]:
-            each.iteration.append(index)
-            each.own_mb.append(50.0)
-            each.history_mb.append(0.0)
-            each.shared_mb.append(1.0)
-            each.num_files.append(9)
-            each.num_threads.append(4)
-    found = soak.summarise({1: long, 2: died}, {1: "learner", 2: "actor"}, settings)
-    assert (list(found["processes"]), found["left_out"]) == (["learner"], ["actor"])
-    assert found["iterations_a_day"] == pytest.approx(1000.0)
-    assert found["all_flat"]
-    assert found["processes"]["learner"]["series"]["own_mb"] == [50.0] * 100
-    json.loads(measuring.to_text(found))
-
-
-def test_this_process_has_memory_and_a_name():
-    found = processes.memory(os.getpid())
-    assert found.own > 10.0
-    assert processes.parent(os.getpid()) == os.getppid()
-    assert processes.descendants(os.getpid())[os.getpid()] == "driver"
+def test_this_process_and_its_children_have_roles_and_times():
+    before = processes.cpu_s(os.getpid())
+    while processes.cpu_s(os.getpid()) < before + 0.05:
+        pass
+    with subprocess.Popen(["sleep", "60"]) as child:
+        found = processes.descendants(os.getpid())
+        seconds = processes.cpu_s_by_role(os.getpid())
+        child.kill()
+    assert (found[os.getpid()], found[child.pid]) == ("driver", "other")
+    assert seconds["driver"] >= before + 0.05
+    assert not processes.is_running(child.pid)
     assert processes.role("ray::RolloutWorker.play") == "actor"
-    assert processes.named({5: "actor", 3: "actor", 4: "learner"}) == {3: "actor-0", 4: "learner", 5: "actor-1"}
 
 
-# --- the account ------------------------------------------------------------------------------------------------------
+# --- the audit --------------------------------------------------------------------------------------------------------
 
 
 def test_nothing_was_lost_or_counted_twice():
@@ -146,32 +68,36 @@ def test_nothing_was_lost_or_counted_twice():
         seen(2, actor("rollout-0", 1, 5), actor("rollout-1", 0, 4)),  # incarnation 0 had handed over 5
         seen(3, actor("rollout-0", 1, 8), actor("rollout-1", 0, 6)),
     ]
-    stretches = handed(told)
+    stretches = stretches_of([status for _, status in told])
     assert stretches == [Stretch(0, 0, 1, 5), Stretch(0, 1, None, 3), Stretch(1, 0, None, 6)]
     rows = [{"iteration": i, "env_steps": 10 * i, "learner/version": i} for i in (1, 2, 3)]
     ledger = ledger_of([[0, 0, 4], [0, 1, 2], [1, 0, 4]])  # 5 + 3 + 5 rollouts
-    end = seen(4, num_rollouts_counted=13).status
-    fine = account(rows, ledger, end, stretches)
-    assert fine.complete
-    assert (fine.num_handed_by_the_dead, fine.num_counted_of_the_dead, fine.num_left_at_the_end) == (5, 5, 1)
-    lost = account(rows, ledger_of([[0, 0, 3], [0, 1, 2], [1, 0, 5]]), end, stretches)
-    assert (lost.num_counted_of_the_dead, lost.complete) == (4, False)
-    twice = account(rows, ledger, seen(4, num_rollouts_counted=14).status, stretches)
-    assert not twice.complete
-    torn = account(rows[::2], ledger, end, stretches)
-    assert (torn.iterations_contiguous, torn.versions_contiguous, torn.complete) == (False, False, False)
+    end = seen(4, num_rollouts_counted=13)[1]
+    fine = audit_rollouts(rows, ledger, end, stretches)
+    assert fine["complete"]
+    assert tuple(fine[f"num_{key}"] for key in ("handed_by_the_dead", "counted_of_the_dead", "left_at_the_end")) == (
+        5,
+        5,
+        1,
+    )
+    lost = audit_rollouts(rows, ledger_of([[0, 0, 3], [0, 1, 2], [1, 0, 5]]), end, stretches)
+    assert (lost["num_counted_of_the_dead"], lost["complete"]) == (4, False)
+    twice = audit_rollouts(rows, ledger, seen(4, num_rollouts_counted=14)[1], stretches)
+    assert not twice["complete"]
+    torn = audit_rollouts(rows[::2], ledger, end, stretches)
+    assert (torn["iterations_contiguous"], torn["versions_contiguous"], torn["complete"]) == (False, False, False)
 
 
-def test_strikes_are_spread_and_end_early_enough():
-    planned = strikes.plan(600.0)
-    at = {target: [each.at_s for each in planned if each.target == target] for target in strikes.Target.__args__}
+def test_faults_are_spread_and_end_early_enough():
+    planned = fault_injection.plan_faults(600.0, 30.0)
+    at = {name: [at for at, target in planned if target == name] for name in fault_injection.Target.__args__}
     assert at["actor"] == [30.0 * num for num in range(1, 20)]
-    assert (at["learner"], at["generator"], at["status"], at["redis"]) == ([135.0, 375.0], [255.0], [315.0], [435.0])
-    assert planned == sorted(planned, key=lambda each: each.at_s)
+    assert (at["learner"], at["generator"], at["status"]) == ([135.0, 375.0], [255.0], [315.0])
+    assert planned == sorted(planned)
 
 
 def test_recoveries_by_hand():
-    strike = Strike(100.0, "actor", "rollout-0", incarnation=0)
+    fault = Fault(100.0, "actor", "rollout-0", incarnation=0)
     told = [
         seen(99, actor("rollout-0", 0, 5)),
         seen(101, actor("rollout-0", 0, 5)),
@@ -179,15 +105,10 @@ def test_recoveries_by_hand():
         seen(105, actor("rollout-0", 1, 5, heartbeat=104.0)),
         seen(109, actor("rollout-0", 1, 6, heartbeat=108.0)),
     ]
-    assert strikes.recovery(strike, told) == Recovery(4.0, 8.0)
-    assert strikes.recovery(strike, told[:2]) == Recovery(None, None)
+    assert fault_injection.recovery(fault, told) == Recovery(4.0, 8.0)
+    assert fault_injection.recovery(fault, told[:2]) == Recovery(None, None)
     answers = [(9.0, True), (10.1, True), (10.5, False), (11.0, False), (11.6, True)]
-    assert strikes.answering_again(10.0, answers).up_s == pytest.approx(1.6)
-    summed = strikes.summary([strike] * 3, [Recovery(4.0, 8.0), Recovery(2.0, None), Recovery(9.0, 9.0)])
-    assert summed["actor"] == {
-        "killed": 3, "back": 3, "up_s": {"median": 4.0, "worst": 9.0},
-        "working": 2, "working_s": {"median": 9.0, "worst": 9.0},
-    }  # fmt: skip
+    assert fault_injection.answering_again(10.0, answers).up_s == pytest.approx(1.6)
 
 
 # --- throughput -------------------------------------------------------------------------------------------------------
@@ -196,7 +117,7 @@ def test_recoveries_by_hand():
 def measured(**changed):
     given = {
         "num_steps": 1000, "wall_s": 10.0, "cpu_s": 15.0, "num_iterations": 4, "num_rollouts": 8, "num_actors": 2,
-        "num_worlds": 10, "play_s": 2.0, "hand_over_s": 0.25, "learn_s": 1.5, "checkpoint_s": 0.5,
+        "num_worlds": 10, "play_s": 2.0, "hand_over_s": 0.25, "learn_s": 1.5,
         "mean_policy_lag": 1.0, "max_policy_lag": 2.0, "role_cpu_s": {},
     }  # fmt: skip
     return Measured(**(given | changed))
@@ -208,76 +129,91 @@ def test_what_is_idle_and_what_is_overlapped_by_hand():
     assert ray.actor_idle_share == pytest.approx(0.2)  # 16 of 20 s
     assert ray.slot_wait_s == pytest.approx(2.0)  # 20 - 8 (2 + 0.25)
     broadcast = {"put_s": 0.1, "delivered_s": 0.5, "idle_call_s": 0.05}
-    found = cluster_throughput.summarise(
-        {"ray": [Probed(ray, broadcast)], "local": [Probed(measured(play_s=0.0, wall_s=8.0), {})]}
-    )
+    found = cluster_throughput.summarise([ray], [measured(play_s=0.0, wall_s=8.0)], broadcast)
     assert found["ratio"]["median"] == pytest.approx(0.8)
     # every actor would wait 8 times for 1.5 + 0.5 s and waits 2 of these 16; an iteration takes 2.5 s
     assert found["broadcast"]["overlapped_share"] == pytest.approx(1 - 2 / 16)
     assert found["broadcast"]["share_of_iteration"] == pytest.approx(0.6 / 2.5)
-    assert (found["ray"]["slot_wait_share"], found["local"]["slot_wait_share"]) == (pytest.approx(0.1), None)
+    assert found["ray"]["slot_wait_share"] == pytest.approx(0.1)
     json.loads(measuring.to_text(found))
 
 
-def test_it_is_measured_from_when_all_actors_are_up():
-    class Run:
-        timing = type("Timing", (), {"seconds": {"checkpoint": 0.0}})
-        stopped = False
-
-        def request_stop(self):
-            self.stopped = True
-
-    run = Run()
-    watch = Watch(run, num_iterations=2, num_warmup=1, num_actors=2)
-    for index, num_alive in enumerate((0, 1, 2, 2, 1)):  # one that dies later is measured, too
-        assert not run.stopped
-        row = {"env_steps": 10.0 * index, "learner/policy_lag": float(index), "time/learn_s": 0.5}
-        watch.on_iteration({**row, "actor/num_alive": num_alive, "actor/num_rollouts": 2.0, "time/play_s": 1.0})
-    assert run.stopped
-    found = watch.measured(2, 5)
+def test_costs_of_some_iterations_by_hand():
+    rows = [
+        {"env_steps": 10.0 * index, "learner/policy_lag": float(index), "actor/num_rollouts": float(num),
+         "time/learn_s": 0.5, "time/play_s": float(index)}
+        for index, num in enumerate((2, 2, 2, 1, 3))
+    ]  # fmt: skip
+    found = summarise_rows(rows, 3, 5.0, {"driver": 1.5, "actor": 2.0}, num_actors=2, num_worlds=7)
     assert (found.num_steps, found.num_iterations, found.num_rollouts) == (20, 2, 4)
-    assert (found.mean_policy_lag, found.max_policy_lag, found.play_s) == (3.5, 4.0, 1.0)
+    assert (found.wall_s, found.cpu_s, found.num_worlds) == (5.0, 3.5, 7)
+    assert (found.mean_policy_lag, found.max_policy_lag, found.learn_s) == (3.5, 4.0, 0.5)
+    assert found.play_s == pytest.approx((3.0 + 3 * 4.0) / 4)  # weighted by rounds
+
+
+class Scripted:
+    """A run whose records come in given portions; it has the directory of a real one."""
+
+    pid = os.getpid()
+
+    def __init__(self, directory, portions):
+        self.directory, self.records, self._portions, self.stopped = directory, self, list(portions), False
+
+    def new(self):
+        return self._portions.pop(0)
+
+    def wait_for(self, what):
+        return what()
+
+    def stop(self):
+        self.stopped = True
+
+
+def test_it_is_measured_from_when_all_actors_are_up(tiny):
+    def row(index, num_alive):
+        return {"env_steps": 10.0 * index, "learner/policy_lag": 1.0, "actor/num_alive": num_alive}
+
+    portions = [[row(0, 0)], [row(1, 1), row(2, 2)], [row(3, 2), row(4, 1)]]  # one that dies later is measured, too
+    run = Scripted(tiny, portions)
+    found = measure_training(run, 2, num_actors=2, num_warmup=1)
+    assert run.stopped
+    assert (found.num_steps, found.num_iterations, found.num_actors, found.num_worlds) == (20, 2, 2, 4)
+
+
+def test_a_run_is_measured_and_ended(tiny, tmp_path):
+    copy = copy_run(tiny, tmp_path)
+    before = len(tiny.metrics_file.read_text().splitlines())
+    arguments = training_process.overrides(training_process.ENDLESS)
+    with Training(tmp_path, arguments, runtime="local") as training:
+        found = measure_training(training, 3, num_warmup=2)
+        assert training.ended is not None
+    steps = [json.loads(line)["env_steps"] for line in copy.metrics_file.read_text().splitlines()]
+    assert len(steps) >= 5
+    assert found.num_steps in {b - a for i, a in enumerate(steps) for b in steps[i + 3 :]}
+    assert found.role_cpu_s.keys() >= {"driver"}
+    assert before >= 3
+
+
+def test_records_are_read_as_they_come(tmp_path):
+    file = tmp_path / "metrics.jsonl"
+    file.write_text('{"env_steps": 5}\n')
+    records = Records(file)
+    assert records.new() == []
+    with file.open("a") as out:
+        out.write('{"env_steps": 10}\n{"env_st')
+        out.flush()
+        assert records.new() == [{"env_steps": 10}]
+        out.write('eps": 30}\n')
+    assert records.new() == [{"env_steps": 30}]
 
 
 # --- many requests ----------------------------------------------------------------------------------------------------
 
 
-def test_a_window_is_compared_with_its_neighbours():
-    # 90 / 100, 114 / 120: 10 % and 5 %
-    found = rest_load.slow_down([100.0, 90.0, 100.0, 114.0, 140.0])
-    assert found["each"] == pytest.approx([0.1, 0.05])
-    assert (found["median"], found["least"], found["greatest"]) == pytest.approx((0.075, 0.05, 0.1))
-    assert found["standard_error"] == pytest.approx(0.025)
-    assert found["between_calm_neighbours"] == pytest.approx(0.2)
-
-
-def test_progress_reads_records_as_they_come(tmp_path):
-    file = tmp_path / "metrics.jsonl"
-    file.write_text('{"env_steps": 5}\n')
-    progress = rest_load.Progress(file)
-    with file.open("a") as out:
-        out.write('{"env_steps": 10}\n{"env_st')
-        out.flush()
-        while not progress.steps:
-            pass
-        out.write('eps": 30}\n')
-    while len(progress.steps) < 2:
-        pass
-    progress.close()
-    assert progress.steps == [10.0, 30.0]
-    progress.times = [100.0, 110.0]
-    assert progress.rate(102.0, 107.0) == pytest.approx(2.0)
-
-
-def test_what_a_load_cost_is_summarised():
-    told = {"took_ms": {"run": [1.0, 2.0], "goals": [9.0]}, "late_ms": [0.1, 0.2, 0.3], "num_failed": 1, "cpu_s": 1.5}
-    calm = rest_load.Window(0.0, 10.0, {"status": 0.1, "redis": 0.1})
-    busy = rest_load.Window(10.0, 20.0, {"status": 0.4, "redis": 0.2}, told)
-    found = rest_load.summarise([calm, busy, calm], [100.0, 90.0, 100.0], num_cpus=2)
-    assert (found["requests_per_s"], found["num_failed"]) == (0.3, 1)
-    assert found["answered"]["all"] == {"num": 3, "p50_ms": 2.0, "p90_ms": 9.0, "p99_ms": 9.0, "max_ms": 9.0}
-    assert (found["cores"]["client"], found["cores"]["service_more"]) == (0.15, pytest.approx(0.4))
-    assert found["service_share_of_cores"] == pytest.approx(0.2)
+def test_a_percentile_is_a_value_that_was_measured():
+    found = rest_load.percentiles([float(value) for value in range(200, 0, -1)])
+    assert found == {"num": 200, "p50_ms": 100.0, "p90_ms": 180.0, "p99_ms": 198.0, "max_ms": 200.0}
+    assert rest_load.percentiles([3.0])["p99_ms"] == 3.0
 
 
 def test_requests_keep_their_schedule():
@@ -297,15 +233,18 @@ def test_requests_keep_their_schedule():
     server = ThreadingHTTPServer(("127.0.0.1", 0), Answer)
     server.daemon_threads = True
     threading.Thread(target=server.serve_forever, daemon=True).start()
-    load = open_loop.Load(f"127.0.0.1:{server.server_port}", "cube", rate=200.0, seconds=0.2)
+    load = rest_load.Load(f"127.0.0.1:{server.server_port}", "cube", rest_load.Settings(rate=200.0, seconds=0.2))
     load.run()
     server.shutdown()
     server.server_close()
     assert {route: len(took) for route, took in load.took.items()} == {
-        route: 4 * open_loop.MIX.count(route) for route in open_loop.ROUTES
+        route: 4 * rest_load.MIX.count(route) for route in rest_load.ROUTES
     }
     assert load.num_failed == 4  # the goals
-    assert load.end - load.start >= 39 / 200
+    assert load.seconds >= 39 / 200
+    found = load.result()
+    assert (found["num_failed"], found["answered"]["all"]["num"]) == (4, 40)
+    assert found["requests_per_s"] == pytest.approx(40 / load.seconds)
 
 
 # --- scaling ----------------------------------------------------------------------------------------------------------
@@ -345,18 +284,18 @@ def test_a_line_does_not_fall():
     assert line((2, 1.0), (4, 9.0)) == (0.0, 4.0)
 
 
-WAKES = {"num_actors": [10, 110], "wait_s": [0.1, 0.2], "look_s": [0.0, 0.1], "status_bytes": [1, 11_000]}
+WAKES = {"num_actors": [10, 60, 110], "wait_s": [0.1, 9.0, 0.3]}  # the first and the last count
 SIZES = {
     "rollout": 20e6, "num_worlds": 20, "weights": 16e6, "learner_state": 1e6, "generator_state": 1e6,
 }  # fmt: skip
 
 
 def model_of_scaling():
-    few = measured(num_rollouts=4, role_cpu_s={"learner": 4 * 0.3, "driver": 4 * 0.2, "gcs": 0.0, "redis": 0.4})
-    many = measured(num_rollouts=32, role_cpu_s={"learner": 4 * 1.0, "driver": 4 * 0.9, "gcs": 2.8, "redis": 0.4})
+    few = measured(num_rollouts=4, role_cpu_s={"learner": 4 * 0.3, "driver": 4 * 0.2, "gcs": 0.0})
+    many = measured(num_rollouts=32, role_cpu_s={"learner": 4 * 1.0, "driver": 4 * 0.9, "gcs": 2.8})
     one = measured(num_rollouts=4, num_worlds=20, num_steps=3200, role_cpu_s={"actor": 4 * 5.0})
     two = measured(num_rollouts=8, num_worlds=10, num_steps=3200, role_cpu_s={"actor": 8 * 3.0, "learner": 4 * 2.4})
-    assumed = scaling.Assumed(network_mb_per_s=100.0, redis_mb_per_s=100.0, actors_per_node=16)
+    assumed = scaling.Assumed(network_mb_per_s=100.0, actors_per_node=16)
     return scaling.costs([few, many], [one, two], WAKES, SIZES, assumed)
 
 
@@ -368,7 +307,6 @@ def test_the_models_constants_by_hand():
     driver = model.parts[scaling.DRIVER]
     assert (driver.update_s, driver.rollout_s, driver.pair_s) == pytest.approx((0.1, 0.1, 0.002))
     assert model.parts[scaling.GCS] == Cost(0.0, pytest.approx(0.1))
-    assert model.parts[scaling.REDIS] == Cost(pytest.approx(0.1), pytest.approx(1e-6))  # 100 bytes of status each
     assert model.parts[scaling.ROLLOUTS_IN].world_s == pytest.approx(0.01)
     assert model.parts[scaling.WEIGHTS_OUT].rollout_s == pytest.approx(0.01)
     assert model.actor == Cost(rollout_s=pytest.approx(1.0), world_s=pytest.approx(0.2))
@@ -383,38 +321,28 @@ def test_what_is_on_paper_goes_onto_the_page():
     assert paper["limits"][scaling.LEARNER] == 2
     assert next(iter(paper["limits"])) == scaling.LEARNER
     result = {"machine": WHERE, "model": paper, "sizes": SIZES}
-    assert "**The first bottleneck is the learner**: it keeps up with 2 actors" in scaling_tables.limits_block(result)
-    assert "| 16 | 10 |" in scaling_tables.model_block(result)
+    assert "**The first bottleneck is the learner**: it keeps up with 2 actors" in scaling_blocks.limits_block(result)
+    assert "| 16 | 10 |" in scaling_blocks.model_block(result)
 
 
 @pytest.fixture(scope="module")
 def tiny(tmp_path_factory):
-    directory = RunDirectory(tmp_path_factory.mktemp("tiny"))
-    scaling.make_tiny(directory)
-    return directory
+    return scaling.make_tiny(tmp_path_factory.mktemp("tiny"))
 
 
 def test_sizes_are_those_of_what_travels(tiny, tmp_path):
-    copy = RunDirectory(tmp_path / "copy")
-    trainings.copy_run(tiny, copy)
-    copy.metrics_file.write_bytes(tiny.metrics_file.read_bytes())
-    found = scaling_probe.sizes(copy)
+    found = scaling_probe.sizes(copy_run(tiny, tmp_path))
     assert found["num_worlds"] == scaling.NUM_TINY_ACTORS
-    assert found["rollout"] > found["records"] > 0
-    assert found["metrics_record"] > 100
+    assert found["rollout"] > 8 * 4 * 14  # at least an observation of each world
+    assert found["weights"] > 1000
     assert scaling_probe.num_bytes(np.zeros(1000)) in range(8000, 8400)
-
-
-def test_looking_around_needs_no_ray():
-    assert scaling_probe._look_s(3) > 0.0
-    assert scaling_probe._status(40)[1] > 2 * scaling_probe._status(10)[1]
 
 
 def test_a_run_without_a_checkpoint_is_not_copied(tiny, tmp_path):
     (tmp_path / "none").mkdir()
     (tmp_path / "none" / "config.yaml").write_bytes(tiny.config_file.read_bytes())
     with pytest.raises(TandemError, match="no checkpoint"):
-        trainings.copy_run(RunDirectory(tmp_path / "none"), RunDirectory(tmp_path / "copy"))
+        copy_run(RunDirectory(tmp_path / "none"), tmp_path)
 
 
 # --- the pages --------------------------------------------------------------------------------------------------------
@@ -436,16 +364,16 @@ def soaked(flat=True):
 
 
 def test_targets_are_judged_by_their_numbers():
-    found = {each.what: cluster_tables.verdict(each.reached) for each in cluster_tables.targets({"soak": soaked()})}
+    found = {each.what: cluster_blocks.verdict(each.reached) for each in cluster_blocks.targets({"soak": soaked()})}
     assert found == dict.fromkeys(
         ("rounds of tiny games", "memory flat", "file descriptors and threads flat"), "reached"
     )
-    grows = {each.what: each for each in cluster_tables.targets({"soak": soaked(flat=False)})}["memory flat"]
-    assert (grows.measured, cluster_tables.verdict(grows.reached)) == ("all but learner, gcs", "**missed**")
-    table = cluster_tables.targets_table({"cluster_throughput": throughput(0.849)})
+    grows = {each.what: each for each in cluster_blocks.targets({"soak": soaked(flat=False)})}["memory flat"]
+    assert (grows.measured, cluster_blocks.verdict(grows.reached)) == ("all but learner, gcs", "**missed**")
+    table = cluster_blocks.targets_table({"cluster_throughput": throughput(0.849)})
     assert "| env steps/s, Ray / local | >= 85 % | 84.9 % (80.0 % to 90.0 %) | **missed** |" in table
     assert "| learner idle | < 10 % | 9 % | reached |" in table
-    assert "85.0 % (80.0 % to 90.0 %) | reached |" in cluster_tables.targets_table(
+    assert "85.0 % (80.0 % to 90.0 %) | reached |" in cluster_blocks.targets_table(
         {"cluster_throughput": throughput(0.85)}
     )
 
@@ -461,40 +389,29 @@ def throughput(median):
 
 def test_within_noise_is_what_undisturbed_runs_differ_by():
     near, far = (
-        cluster_tables._curve({"disturbed_from_undisturbed": [0.02, away], "undisturbed_from_each_other": [0.02]})
+        cluster_blocks._curve({"disturbed_from_undisturbed": [0.02, away], "undisturbed_from_each_other": [0.02]})
         for away in (0.03, 0.05)
     )
     assert (near.reached, far.reached) == (True, False)  # 0.025 and 0.035 against 0.03
-    alone = cluster_tables._curve({"disturbed_from_undisturbed": [0.5], "undisturbed_from_each_other": []})
+    alone = cluster_blocks._curve({"disturbed_from_undisturbed": [0.5], "undisturbed_from_each_other": []})
     assert alone.reached is None
-
-
-def test_pages_are_written_again_and_again(tmp_path):
-    results = tmp_path / "results"
-    results.mkdir()
-    docs = trainings.ROOT / "docs"
-    for page in (results / "cluster.md", tmp_path / "scaling.md"):
-        page.write_bytes((docs / page.relative_to(tmp_path)).read_bytes())
-    (results / "soak.json").write_text(json.dumps(soaked()))
-    found = cluster_figures.read_results(results)
-    files = cluster_figures.cluster(tmp_path, found)
-    assert [file.name for file in files] == ["cluster.md", "cluster-soak.png"]
-    assert files[1].read_bytes().startswith(b"\x89PNG")
-    first = files[0].read_text()
-    assert "| rounds of tiny games | >= 50,000 | 50,001 | reached |" in first
-    assert "## Shot at" in first
-    cluster_figures.cluster(tmp_path, found)
-    assert files[0].read_text() == first
-    cluster_figures.scaling(tmp_path, found)
-    assert "Not recorded yet." in (tmp_path / "scaling.md").read_text()
 
 
 def test_a_page_without_markers_and_a_wrong_file_are_left_alone(tmp_path):
     page = tmp_path / "page.md"
     page.write_text("words")
     with pytest.raises(TandemError, match="no markers for chaos"):
-        Page(page, "x.py").rewrite({"chaos": "text"})
+        report.replace_blocks(page, {"chaos": "text"})
     assert page.read_text() == "words"
-    (tmp_path / "chaos.json").write_text('{"benchmark": "soak"}')
-    with pytest.raises(TandemError, match=r"not what benchmarks/chaos\.py writes"):
-        cluster_figures.read_results(tmp_path)
+    (tmp_path / "scaling.json").write_text('{"benchmark": "chaos"}')
+    with pytest.raises(TandemError, match=r"not what python -m benchmarks\.scaling writes"):
+        report.read_results(tmp_path)
+
+
+def test_what_is_not_recorded_is_said(tmp_path):
+    page = tmp_path / "page.md"
+    page.write_text(f"a {report.begin('box')} old {report.end('box')} b")
+    assert report.replace_blocks(page, {"box": ""}) == (
+        f"a {report.begin('box')}\n\nNot recorded yet.\n\n{report.end('box')} b"
+    )
+    assert report.scaling_blocks({}) == {}

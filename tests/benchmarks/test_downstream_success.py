@@ -22,8 +22,8 @@ def test_learns_and_is_evaluated_as_the_cells_are(trained, monkeypatch):
     monkeypatch.setattr(
         downstream_success, "default_learner", lambda *given: learners.append(make(*given)) or learners[-1]
     )
-    trial = small_trial(num_env_steps=201, task="larger")
-    result = downstream_success.learn(trial, trained, every=150, threads=1)
+    cell = small_trial(num_env_steps=201, task="larger")
+    result = downstream_success.learn(cell, trained, downstream_success.Settings(every=150, threads=1))
     (learner,) = learners
     assert [point["env_steps"] for point in result["curve"]] == [150, 201]
     assert learner._n_updates == 201 - 100  # one after every step but the first hundred
@@ -42,8 +42,8 @@ def test_learns_and_is_evaluated_as_the_cells_are(trained, monkeypatch):
 
 
 def test_acts_as_the_environment_that_it_learned_in(trained):
-    trial = small_trial(task="wall")
-    learner = downstream_success.default_learner(trial, trained)
+    cell = small_trial(task="wall")
+    learner = downstream_success.default_learner(cell, trained)
     env = learner.get_env()
     seen = env.reset()
     weights, _ = learner.predict(seen, deterministic=True)

@@ -17,7 +17,9 @@ def test_both_learn_while_they_are_measured(monkeypatch):
         train(learner, gradient_steps, batch_size)
 
     monkeypatch.setattr(downstream_throughput.SAC, "train", counted)
-    result = downstream_throughput.compare(small_trial(), trained, num_pairs=1, seconds=0.01, threads=1)
+    result = downstream_throughput.compare(
+        small_trial(), trained, downstream_throughput.Settings(num_pairs=1, seconds=0.01, threads=1)
+    )
     worker, default = (result["rows"][name] for name in (downstream_throughput.WORKER, downstream_throughput.DEFAULT))
     assert worker["num_steps"] == 200  # an episode of each of four worlds
     assert default["num_steps"] == 4

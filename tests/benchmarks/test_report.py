@@ -7,10 +7,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from benchmarks import cluster_figures, figures
+from benchmarks.report.__main__ import PAGES, Report
 
 DOCS = Path(__file__).parents[2] / "docs"
-PAGES = ("results/pretraining.md", "results/cluster.md", "scaling.md")
 
 
 @pytest.fixture(scope="module")
@@ -18,10 +17,7 @@ def made(tmp_path_factory):
     """A copy of the documents with all that the report writes made anew."""
     docs = tmp_path_factory.mktemp("report") / "docs"
     shutil.copytree(DOCS, docs)
-    figures.pretraining(sorted((docs / "results" / "runs").glob("*.json")), docs / "results")
-    found = cluster_figures.read_results(docs / "results")
-    cluster_figures.cluster(docs, found)
-    cluster_figures.scaling(docs, found)
+    Report(docs).write()
     return docs
 
 

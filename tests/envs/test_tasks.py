@@ -12,7 +12,6 @@ from gymnasium.utils.env_checker import data_equivalence
 from gymnasium.vector import AutoresetMode
 from stable_baselines3.common.env_checker import check_env as check_stable_baselines
 
-from benchmarks.scripted import play_task
 from service.config import WorldConfig
 from service.envs import fixtures
 from service.envs.batch import DISPLACEMENT_M, WorldBatch
@@ -22,6 +21,7 @@ from service.envs.gym.vector import TabletopVectorEnv
 from service.envs.rendering.renderer import Mark, RenderError, SceneRenderer
 from service.envs.tasks import TASKS, find_task
 from service.errors import TandemError
+from tests.envs.scripted_tasks import play_task
 
 CONFIG = WorldConfig(physics_step_s=0.005, num_substeps=8)
 DOCS = Path(__file__).parents[2] / "docs"

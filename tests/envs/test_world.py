@@ -4,13 +4,13 @@ import mujoco
 import numpy as np
 import pytest
 
-from benchmarks.world_soak import soak
 from service.config import WorldConfig
 from service.envs import kinematics
 from service.envs.batch import LOWEST_TARGET_M, WorldBatch
 from service.envs.observations import MIRROR_ACTION, MIRROR_FULL
 from service.envs.sampling import sample_in_volume
 from tests.envs.scripted import CLOSE, OPEN, grasp, place_in_air
+from tests.envs.world_soak import soak
 
 FINE = {"physics_step_s": 0.002, "num_substeps": 20}
 COARSE = {"physics_step_s": 0.005, "num_substeps": 8}

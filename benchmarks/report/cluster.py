@@ -1,4 +1,4 @@
-"""The blocks of ``docs/results/cluster.md``, in Markdown, from recorded files. Nothing is judged by hand."""
+"""Blocks of ``docs/results/cluster.md``, in Markdown, from recorded files. Verdicts are computed from the numbers."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from benchmarks.tables import duration, markdown
+from benchmarks.report.markdown import duration, measured_on, percent, table
 
 Result = Mapping[str, Any]
 
@@ -21,7 +21,7 @@ _NAMES = {"actor": "rollout actor", "generator": "task generator", "status": "st
 
 @dataclass(frozen=True, slots=True)
 class Target:
-    """What was asked, beside what was measured."""
+    """A number that was asked for, beside what was measured."""
 
     what: str
     asked: str
@@ -31,7 +31,7 @@ class Target:
 
 
 def targets(found: Mapping[str, Result]) -> list[Target]:
-    """All of them.
+    """All targets.
 
     Args:
         found: recorded results by the name of their benchmark; those that are missing were not measured.
@@ -42,13 +42,13 @@ def targets(found: Mapping[str, Result]) -> list[Target]:
 
 
 def targets_table(found: Mapping[str, Result]) -> str:
-    """What was asked and whether it was reached."""
+    """All targets, and whether they were reached."""
     rows = [(each.what, each.asked, each.measured, verdict(each.reached)) for each in targets(found)]
-    return markdown(("", "asked", "measured", ""), rows) if rows else ""
+    return table(("", "asked", "measured", ""), rows) if rows else ""
 
 
 def verdict(reached: bool | None) -> str:
-    """For a cell."""
+    """Verdict for a cell."""
     return "not measured" if reached is None else "reached" if reached else "**missed**"
 
 
@@ -56,12 +56,12 @@ def _throughput_targets(result: Result) -> list[Target]:
     ratio, ray, sent = result["ratio"], result["ray"], result["broadcast"]
     lag, idle = ray["policy_lag"], ray["learner_idle_share"]
     return [
-        Target("env steps/s, Ray / local", f">= {share(MIN_RATIO)}", _spread(ratio), ratio["median"] >= MIN_RATIO),
-        Target("learner idle", f"< {share(MAX_IDLE)}", share(idle), idle < MAX_IDLE),
+        Target("env steps/s, Ray / local", f">= {percent(MIN_RATIO)}", _spread(ratio), ratio["median"] >= MIN_RATIO),
+        Target("learner idle", f"< {percent(MAX_IDLE)}", percent(idle), idle < MAX_IDLE),
         Target("mean policy lag", f"<= {MAX_MEAN_LAG:g}", f"{lag['mean']:.2f}", lag["mean"] <= MAX_MEAN_LAG),
         Target("greatest policy lag", f"<= {MAX_LAG:g}", f"{lag['max']:g}", lag["max"] <= MAX_LAG),
-        Target("updates and broadcasts overlapped with acting", f">= {share(MIN_OVERLAPPED)}",
-               share(sent["overlapped_share"]), sent["overlapped_share"] >= MIN_OVERLAPPED),
+        Target("updates and broadcasts overlapped with acting", f">= {percent(MIN_OVERLAPPED)}",
+               percent(sent["overlapped_share"]), sent["overlapped_share"] >= MIN_OVERLAPPED),
     ]  # fmt: skip
 
 
@@ -111,7 +111,7 @@ def _rest_targets(result: Result) -> list[Target]:
         Target("requests a second, all answered", f"{REQUESTS_PER_S:.0f}", f"{rate:.0f}, {result['num_failed']} failed",
                rate >= 0.98 * asked and asked >= REQUESTS_PER_S and result["num_failed"] == 0),
         Target("p99 of all routes", f"< {MAX_P99_MS:g} ms", f"{p99:.1f} ms", p99 < MAX_P99_MS),
-        Target("the training slows by", f"< {share(MAX_SLOW_DOWN)}", _spread(slow), slow["median"] < MAX_SLOW_DOWN),
+        Target("the training slows by", f"< {percent(MAX_SLOW_DOWN)}", _spread(slow), slow["median"] < MAX_SLOW_DOWN),
     ]  # fmt: skip
 
 
@@ -126,17 +126,12 @@ def _soak_targets(result: Result) -> list[Target]:
     ]  # fmt: skip
 
 
-def share(value: float, digits: int = 0) -> str:
-    """A share for a cell or a sentence."""
-    return f"{100.0 * value:.{digits}f} %"
-
-
 def _but(exceptions: list[str]) -> str:
     return f"all but {', '.join(exceptions)}" if exceptions else "all"
 
 
 def _spread(each: Mapping[str, Any]) -> str:
-    return f"{share(each['median'], 1)} ({share(each['least'], 1)} to {share(each['greatest'], 1)})"
+    return f"{percent(each['median'], 1)} ({percent(each['least'], 1)} to {percent(each['greatest'], 1)})"
 
 
 # --- blocks -----------------------------------------------------------------------------------------------------------
@@ -145,7 +140,7 @@ def _spread(each: Mapping[str, Any]) -> str:
 def throughput_block(result: Result) -> str:
     """Rates and shares of both runners, and what weights take."""
     ray, local, rows, sent = result["ray"], result["local"], result["rows"], result["broadcast"]
-    table = markdown(
+    rates = table(
         ("", "Ray", "local"),
         [
             ("env steps/s", *(f"{rows[name]['env_steps_per_s']:,.0f}" for name in ("ray", "local"))),
@@ -153,9 +148,9 @@ def throughput_block(result: Result) -> str:
             ("actors", str(ray["num_actors"]), "one process"),
             ("an iteration", f"{ray['iteration_s']:.2f} s", f"{local['iteration_s']:.2f} s"),
             ("of it, an update", f"{ray['learn_s']:.2f} s", f"{local['learn_s']:.2f} s"),
-            ("learner idle", share(ray["learner_idle_share"]), share(local["learner_idle_share"])),
-            ("actors idle", share(ray["actor_idle_share"]), ""),
-            ("of it, waiting for the learner", share(ray["slot_wait_share"]), ""),
+            ("learner idle", percent(ray["learner_idle_share"]), percent(local["learner_idle_share"])),
+            ("actors idle", percent(ray["actor_idle_share"]), ""),
+            ("of it, waiting for the learner", percent(ray["slot_wait_share"]), ""),
             ("policy lag, mean (max)", *(f"{each['policy_lag']['mean']:.2f} ({each['policy_lag']['max']:g})"
                                          for each in (ray, local))),
         ],
@@ -164,22 +159,17 @@ def throughput_block(result: Result) -> str:
         f"{len(rows['ray']['env_steps_per_s_each'])} pairs of measurements in turn, "
         f"{result['settings']['num_iterations']} iterations each. One `ray.put` of the weights takes "
         f"{1000 * sent['put_s']:.1f} ms and all actors have them {1000 * sent['delivered_s']:.1f} ms later, together "
-        f"{share(sent['share_of_iteration'], 2)} of an iteration (a call without them: "
+        f"{percent(sent['share_of_iteration'], 2)} of an iteration (a call without them: "
         f"{1000 * sent['idle_call_s']:.1f} ms)."
     )
-    return f"{table}\n\n{words}{_where(result)}"
+    return f"{rates}\n\n{words}{measured_on(result['machine'])}"
 
 
-def chaos_block(result: Result, picture: str) -> str:
-    """Every strike with its recovery, the account, and the curve."""
+def chaos_words(result: Result) -> str:
+    """End of the run that was shot at, and its account of rollouts."""
     account, redis, calm = result["account"], result["redis"], result["curves"]["undisturbed"][0]
-    rows = [
-        (f"{each['at']:.0f} s", each["name"] if each["target"] == "actor" else _NAMES.get(each["target"], each["name"]),
-         f"{each['num_env_steps']:,}", _seconds(each["up_s"]), _seconds(each["working_s"]))
-        for each in result["strikes"]
-    ]  # fmt: skip
     shot = result["curves"]["disturbed"]
-    words = (
+    return (
         f"{len(result['strikes'])} of {result['num_planned']} planned strikes. The run took {duration(shot['wall_s'])} "
         f"for {shot['env_steps']:,} env steps, undisturbed {duration(calm['wall_s'])}, and published "
         f"`{result['ended']['published']}`. The driver counted {account['num_counted']:,} rollouts, the learner's "
@@ -189,34 +179,59 @@ def chaos_block(result: Result, picture: str) -> str:
         f"{account['num_left_at_the_end']} came too late for the last update. Redis was away for "
         f"{_seconds(redis['away_s'])}: {redis['iterations_meanwhile']} iterations meanwhile, status "
         f"{'said so' if redis['status_said_so'] else 'did not say so'}, told again "
-        f"{_seconds(redis['told_again_s'])} after its return."
+        f"{_seconds(redis['told_again_s'])} after its return.{measured_on(result['machine'])}"
     )
-    table = markdown(("at", "killed", "env steps so far", "another is up after", "and has done its work after"), rows)
-    return f"{words}{_where(result)}\n\n![Success, shot at and not]({picture})\n\n{table}"
 
 
-def rest_block(result: Result) -> str:
-    """Latencies by route, and what the load cost."""
+def faults_table(result: Result) -> str:
+    """Every fault with its recovery."""
+    rows = [
+        (f"{each['at']:.0f} s", each["name"] if each["target"] == "actor" else _NAMES.get(each["target"], each["name"]),
+         f"{each['num_env_steps']:,}", _seconds(each["up_s"]), _seconds(each["working_s"]))
+        for each in result["strikes"]
+    ]  # fmt: skip
+    return table(("at", "killed", "env steps so far", "another is up after", "and has done its work after"), rows)
+
+
+def latency_table(result: Result) -> str:
+    """Latencies by route."""
     head = ("route", "requests", "p50", "p90", "p99", "max")
     rows = [
         (route, f"{each['num']:,}", *(f"{each[key]:.1f} ms" for key in ("p50_ms", "p90_ms", "p99_ms", "max_ms")))
         for route, each in result["answered"].items()
     ]
+    return table(head, rows)
+
+
+def rest_words(result: Result) -> str:
+    """Cost of the load for the training."""
     slow, cores, settings = result["slow_down"], result["cores"], result["settings"]
-    error = f", standard error {share(slow['standard_error'], 1)}" if slow["standard_error"] is not None else ""
-    words = (
+    error = f", standard error {percent(slow['standard_error'], 1)}" if slow["standard_error"] is not None else ""
+    return (
         f"{settings['num_windows']} windows of {settings['window_s']:g} s with requests, each between two without. The "
-        f"training made {_spread(slow)} fewer env steps a second with them (mean {share(slow['mean'], 1)}{error}); "
-        f"windows without, next to each other, differ by {share(slow['between_calm_neighbours'], 1)}. The client took "
+        f"training made {_spread(slow)} fewer env steps a second with them (mean {percent(slow['mean'], 1)}{error}); "
+        f"windows without, next to each other, differ by {percent(slow['between_calm_neighbours'], 1)}. The client "
+        "took "
         f"{cores['client']:.2f} of a core on the same machine; the service and Redis took {cores['service_more']:.2f} "
-        f"of a core more than without load, {share(result['service_share_of_cores'], 1)} of all cores: what it would "
+        f"of a core more than without load, {percent(result['service_share_of_cores'], 1)} of all cores: what it would "
         f"cost a training with every core busy, were the client elsewhere. The client itself sent 99 % of requests "
-        f"within {result['sent_late_p99_ms']:.1f} ms of their schedule; that counts in the table."
+        f"within {result['sent_late_p99_ms']:.1f} ms of their schedule; that counts in the "
+        f"table.{measured_on(result['machine'])}"
     )
-    return f"{markdown(head, rows)}\n\n{words}{_where(result)}"
 
 
-def soak_block(result: Result, picture: str) -> str:
+def soak_words(result: Result) -> str:
+    """Length of the soak."""
+    asked = result["asked"]
+    return (
+        f"{result['num_rounds']:,} rounds and {result['num_iterations']:,} updates in {duration(result['seconds'])}; "
+        f"{result['num_replaced']} workers replaced, {result['num_refused']} rollouts refused, the status service "
+        f"asked {asked['num']:,} times ({asked['unanswered']} unanswered). A day of a real run has "
+        f"{result['iterations_a_day']:,.0f} updates.{measured_on(result['machine'])}"
+    )
+
+
+def soak_table(result: Result) -> str:
     """Memory of every process in the middle, at the end, and by the day."""
     head = ("process", "in the middle", "at the end", "in a day, 95 % interval", "its history", "files", "")
     rows = [
@@ -227,20 +242,8 @@ def soak_block(result: Result, picture: str) -> str:
          "flat" if each["flat"] and each["descriptors_flat"] else "**grows**")
         for name, each in result["processes"].items()
     ]  # fmt: skip
-    asked = result["asked"]
-    words = (
-        f"{result['num_rounds']:,} rounds and {result['num_iterations']:,} updates in {duration(result['seconds'])}; "
-        f"{result['num_replaced']} workers replaced, {result['num_refused']} rollouts refused, the status service "
-        f"asked {asked['num']:,} times ({asked['unanswered']} unanswered). A day of a real run has "
-        f"{result['iterations_a_day']:,.0f} updates."
-    )
-    return f"{words}{_where(result)}\n\n![Memory of every process]({picture})\n\n{markdown(head, rows)}"
+    return table(head, rows)
 
 
 def _seconds(value: float | None) -> str:
     return "not within the run" if value is None else f"{value:.1f} s"
-
-
-def _where(result: Result) -> str:
-    where = result["machine"]
-    return f" On {where['num_cpus']} cores of {where['cpu']}, commit `{where['git_commit'][:7]}`, {where['time'][:10]}."

@@ -1,21 +1,11 @@
-"""A million rough random steps: does anything in the world break?
-
-Prints the worst that was seen; exits 1 if that is out of bounds.
-"""
+"""Rough random steps, and the worst values that they lead to: does anything in the world break?"""
 
 from __future__ import annotations
 
-import argparse
-import json
-import sys
-import time
-from dataclasses import asdict, dataclass
-from pathlib import Path
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-
-sys.path.insert(0, str(Path(__file__).parents[1]))
 
 from service.config import WorldConfig
 from service.envs.batch import DISPLACEMENT_M, WorldBatch
@@ -35,7 +25,7 @@ FloatArray = NDArray[np.float32]
 
 @dataclass
 class Extremes:
-    """The worst that was seen; every excess is positive outside its range."""
+    """The worst values seen; every excess is positive outside its range."""
 
     num_steps: int = 0
     num_broken: int = 0
@@ -44,7 +34,7 @@ class Extremes:
     joint_excess_rad: float = -np.inf
     finger_excess_m: float = -np.inf
     sunk_m: float = -np.inf
-    """How far an object's centre came below its resting height while over the table."""
+    """Greatest depth of an object's centre below its resting height while over the table."""
 
     def within_bounds(self) -> bool:
         """No world diverged, no joint or finger past its limit, no object through the table."""
@@ -106,35 +96,3 @@ def _note(extremes: Extremes, worlds: WorldBatch) -> None:
     over_table &= np.abs(position[:, 1]) <= TABLE_HALF_SIZE_M[1]
     sunk = worlds.config.object_size_m / 2 - position[over_table, 2]
     extremes.sunk_m = max(extremes.sunk_m, float(sunk.max(initial=-np.inf)))
-
-
-def main() -> int:
-    """Parse the command line, run, print."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument(
-        "--steps", type=int, default=1_000_000, help="steps of all worlds together (default: a million)"
-    )
-    parser.add_argument("--worlds", type=int, default=200)
-    parser.add_argument("--object", choices=("cube", "sphere"), default="cube")
-    parser.add_argument("--physics-step-s", type=float, default=0.002)
-    parser.add_argument("--substeps", type=int, default=20)
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--json", action="store_true", help="print one JSON object")
-    given = parser.parse_args()
-    config = WorldConfig(object=given.object, physics_step_s=given.physics_step_s, num_substeps=given.substeps)
-    start = time.perf_counter()
-    extremes = soak(config, num_worlds=given.worlds, num_steps=-(-given.steps // given.worlds), seed=given.seed)
-    result = {
-        **asdict(extremes),
-        "within_bounds": extremes.within_bounds(),
-        "wall_s": round(time.perf_counter() - start, 1),
-    }
-    if given.json:
-        print(json.dumps(result))
-    else:
-        print("\n".join(f"{name:18} {value:.6g}" for name, value in result.items()))
-    return 0 if extremes.within_bounds() else 1
-
-
-if __name__ == "__main__":
-    raise SystemExit(main())

@@ -1,7 +1,7 @@
 """A hand-written policy for each downstream task: what must be possible before anything can learn it.
 
 It sees what a learner's policy does not, exact positions at any time and where the box is, and acts as one does: four
-numbers in [-1, 1] a step.
+numbers in [-1, 1] a step. Success counts as in the paper's table, within 5 cm of the goal at the last step.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Put a champion into the package: the primitives that come with ``pip install``.
 
-    python -m benchmarks.ship_primitives runs/cube                           # the newest Bob of a run, measured here
-    python -m benchmarks.ship_primitives panda-cube@7 --registry registry    # a published version
+    python -m tools.ship_primitives runs/cube                           # the newest Bob of a run, measured here
+    python -m tools.ship_primitives panda-cube@7 --registry registry    # a published version
 
 ``service/primitives`` is a registry like any other, except that only this script writes there. What it ships gets the
 next number and the aliases champion and latest; older versions of its name are removed: the package stays small.
@@ -10,16 +10,11 @@ next number and the aliases champion and latest; older versions of its name are 
 from __future__ import annotations
 
 import argparse
-import os
 import shutil
 import sys
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
-
-# before NumPy is imported: as the command line does
-os.environ.update(dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1"))
-sys.path.insert(0, str(Path(__file__).parents[1]))
 
 from pydantic import JsonValue
 

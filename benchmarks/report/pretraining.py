@@ -1,20 +1,17 @@
-"""The tables of ``docs/results/pretraining.md``, in Markdown, from recorded runs."""
+"""Tables of ``docs/results/pretraining.md``, in Markdown, from recorded runs."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
-import numpy as np
-
+from benchmarks.report.markdown import Row, duration, millions, percent, table
 from benchmarks.run_files import Records, Run, binned, steps_until, unthin
 from benchmarks.stages import RANDOM, STAGES, mean_share
 from benchmarks.tasks import ASKED, ASKED_RATES, ASKED_STEPS, NUM_STEPS, TASKS
 
 NUM_BINS = 10
-"""Of a run's env steps; rates are those of the last, distances and heights also those of the first."""
-
-Row = Sequence[str]
+"""Equal parts of a run's env steps; rates are those of the last, distances and heights also those of the first."""
 
 
 def tasks_table(runs: Sequence[Run]) -> str:
@@ -23,7 +20,7 @@ def tasks_table(runs: Sequence[Run]) -> str:
     rows = [(_label(run), *tasks_cells(run["evaluations"]), _steps_to_asked(run)) for run in runs]
     idle = max((tasks_cells(run["evaluations"], idle=True) for run in runs), key=lambda cells: sum(map(bool, cells)))
     asked = (percent(ASKED_RATES[task]) for task in TASKS)
-    return markdown(head, [*rows, ("asked for", *asked, millions(ASKED_STEPS)), ("doing nothing", *idle, "")])
+    return table(head, [*rows, ("asked for", *asked, millions(ASKED_STEPS)), ("doing nothing", *idle, "")])
 
 
 def tasks_cells(evaluations: Records, tasks: Iterable[str] = TASKS, *, idle: bool = False) -> list[str]:
@@ -33,10 +30,10 @@ def tasks_cells(evaluations: Records, tasks: Iterable[str] = TASKS, *, idle: boo
 
 
 def training_table(runs: Sequence[Run]) -> str:
-    """How long each run took, and what its Alice and Bob did in the last tenth of it."""
+    """Time of each run, and rates of its Alice and Bob in the last tenth of it."""
     head = ("run", "env steps", "time", "valid goals", "of those, lifted", "Bob on valid goals", "goal distance",
             "goal height, 9 of 10 below")  # fmt: skip
-    return markdown(head, [_training_row(run) for run in runs])
+    return table(head, [_training_row(run) for run in runs])
 
 
 def _training_row(run: Run) -> Row:
@@ -50,7 +47,7 @@ def _training_row(run: Run) -> Row:
         str(run["name"]),
         millions(records[-1]["env_steps"]),
         duration(records[-1]["time/wall_s"]),
-        *(at_end(records, key) for key in ("alice/valid_fraction", "alice/lifted_fraction", "bob/success_rate")),
+        *(_at_end(records, key) for key in ("alice/valid_fraction", "alice/lifted_fraction", "bob/success_rate")),
         change("alice/goal_distance_m"),
         change("alice/goal_height_p90_m"),
     )
@@ -59,7 +56,7 @@ def _training_row(run: Run) -> Row:
 def coverage_table(runs: Sequence[Run]) -> str:
     """Share of the table's cells that random compositions visit at each stage, beside the random policy."""
     head = ("run", RANDOM, *STAGES, f"end / {RANDOM}")
-    return markdown(head, [_coverage_row(run) for run in runs if run.get("coverage")])
+    return table(head, [_coverage_row(run) for run in runs if run.get("coverage")])
 
 
 def _coverage_row(run: Run) -> Row:
@@ -73,7 +70,7 @@ def ablations_table(runs: Sequence[Run]) -> str:
     """A row for each ablation that was run, the whole recipe first."""
     tasks = ("mixed", "air", "table")
     head = ("run", "changed", "env steps", *tasks, "valid goals", "of those, lifted", "Bob on valid goals", "coverage")
-    return markdown(head, [_ablation_row(run, tasks) for run in runs])
+    return table(head, [_ablation_row(run, tasks) for run in runs])
 
 
 def _ablation_row(run: Run, tasks: Iterable[str]) -> Row:
@@ -84,12 +81,12 @@ def _ablation_row(run: Run, tasks: Iterable[str]) -> Row:
         changed or "nothing",
         millions(records[-1]["env_steps"]),
         *tasks_cells(run["evaluations"], tasks),
-        *(at_end(records, key) for key in ("alice/valid_fraction", "alice/lifted_fraction", "bob/success_rate")),
+        *(_at_end(records, key) for key in ("alice/valid_fraction", "alice/lifted_fraction", "bob/success_rate")),
         percent(mean_share(run["coverage"]["stages"]["end"])) if run.get("coverage") else "",
     )
 
 
-def throughput_words(result: dict[str, Any]) -> str:
+def throughput_words(result: Mapping[str, Any]) -> str:
     """A sentence from what ``compare_commits.py`` measured."""
     before, now = (f"{row['env_steps_per_s']:,.0f} env steps/s ({name})" for name, row in result["rows"].items())
     ratio, settings = result["ratio"], result["settings"]
@@ -101,27 +98,7 @@ def throughput_words(result: dict[str, Any]) -> str:
     )
 
 
-def markdown(head: Row, rows: Iterable[Row]) -> str:
-    """A table."""
-    return "\n".join("| " + " | ".join(row) + " |" for row in (head, ("---",) * len(head), *rows))
-
-
-def percent(share: float) -> str:
-    """A share for a cell; nothing for not-a-number."""
-    return f"{100 * share:.0f} %" if np.isfinite(share) else ""
-
-
-def millions(env_steps: float) -> str:
-    """Env steps for a cell."""
-    return f"{env_steps / 1e6:.3g} M"
-
-
-def duration(seconds: float) -> str:
-    """Minutes, or hours from two on."""
-    return f"{seconds / 3600:.1f} h" if seconds >= 7200 else f"{seconds / 60:.0f} min"
-
-
-def at_end(records: Records, key: str) -> str:
+def _at_end(records: Records, key: str) -> str:
     """A rate in the last tenth of a run."""
     return percent(binned(records, key, NUM_BINS)[-1])
 

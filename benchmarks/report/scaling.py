@@ -1,35 +1,36 @@
-"""The blocks of ``docs/scaling.md``, in Markdown, from ``scaling.json``."""
+"""Blocks of ``docs/scaling.md``, in Markdown, from ``scaling.json``."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from typing import Any
 
-from benchmarks.cluster_tables import share
-from benchmarks.tables import markdown
+from benchmarks.report.markdown import commit, percent, table
 from service.media.plots.figures import counted
 
 Result = Mapping[str, Any]
 NAMED = (16, 256, 4096)
-"""Numbers of actors for which every part is told."""
+"""Numbers of actors for which the time of every part is shown."""
 
 
 def box_block(result: Result) -> str:
     """One box, and several nodes on it."""
     rows = [
         (num, f"{each['num_worlds']}", f"{each['env_steps_per_s']:,.0f}", f"{each['iteration_s']:.2f} s",
-         share(each["learner_idle_share"]), share(each["actor_idle_share"]),
+         percent(each["learner_idle_share"]), percent(each["actor_idle_share"]),
          f"{sum(each['cores'].values()):.2f} of {result['machine']['num_cpus']}")
         for num, each in result["one_box"].items()
     ]  # fmt: skip
     head = ("actors", "worlds of each", "env steps/s", "an iteration", "learner idle", "actors idle", "cores busy")
     where = result["machine"]
-    words = f"{where['cpu']}, {where['num_cpus']} cores, commit `{where['git_commit'][:7]}`, {where['time'][:10]}."
-    return f"{words}\n\n{markdown(head, rows)}"
+    words = f"{where['cpu']}, {where['num_cpus']} cores, {commit(where['git_commit'])}, {where['time'][:10]}."
+    return f"{words}\n\n{table(head, rows)}"
 
 
 def nodes_block(result: Result) -> str:
-    """The test cluster."""
+    """Runs on the test cluster, which were measured once."""
+    if "nodes" not in result:
+        return ""
     nodes, sizes = result["nodes"], result["sizes"]
     placed = ", ".join(f"{name} on node {place}" for name, place in sorted(nodes["places"].items()))
     return (
@@ -44,19 +45,19 @@ def nodes_block(result: Result) -> str:
 
 
 def constants_block(result: Result) -> str:
-    """What everything costs."""
+    """Costs of every part."""
     head = ("", "an update", "and each rollout", "and each world of it", "and each actor at each rollout")
     rows = [
         (name, *(_time(cost[key]) for key in ("update_s", "rollout_s", "world_s", "pair_s")))
         for name, cost in result["model"]["constants"].items()
     ]
     assumed = result["assumed"]
+    redis = f"Redis takes {assumed['redis_mb_per_s']:g} MB/s, " if "redis_mb_per_s" in assumed else ""
     words = (
         f"Assumed, not measured: a node receives {assumed['network_mb_per_s']:g} MB/s (two Ray nodes on one box do, so "
-        f"a cluster does better), Redis takes {assumed['redis_mb_per_s']:g} MB/s, a node has "
-        f"{assumed['actors_per_node']} actors."
+        f"a cluster does better), {redis}a node has {assumed['actors_per_node']} actors."
     )
-    return f"{markdown(head, rows)}\n\n{words}"
+    return f"{table(head, rows)}\n\n{words}"
 
 
 def model_block(result: Result) -> str:
@@ -74,11 +75,11 @@ def model_block(result: Result) -> str:
 
 def _predictions(rows: list[Mapping[str, Any]]) -> str:
     head = ("actors", "worlds of each", "env steps/s", "an update every", "actors busy", "learner idle", "bottleneck")
-    return markdown(
+    return table(
         head,
         [
             (f"{row['num_actors']:,}", f"{row['num_worlds']:g}", f"{row['env_steps_per_s']:,.0f}",
-             f"{_seconds(row['update_s'])} s", share(row["actors_busy"], 1), share(row["learner_idle"]),
+             f"{_seconds(row['update_s'])} s", percent(row["actors_busy"], 1), percent(row["learner_idle"]),
              row["bottleneck"])
             for row in rows
         ],
@@ -92,7 +93,7 @@ def limits_block(result: Result) -> str:
     first, most = next(iter(limits.items()))
     rows = {row["num_actors"]: row for row in model["worlds_each"]}
     head = ("part", "keeps up with", *(f"seconds an update, {num:,} actors" for num in NAMED))
-    table = markdown(
+    parts = table(
         head,
         [
             (name, _actors(most_actors), *(_seconds(rows[num]["seconds"][name]) for num in NAMED))
@@ -105,7 +106,7 @@ def limits_block(result: Result) -> str:
     held = ", ".join(f"{_mb(num * rows[num]['num_worlds'] * world)} with {num:,}" for num in NAMED)
     return (
         f"{words}, whose rounds take {playing:.2f} s. The rollouts of one update, which the learner holds in memory, "
-        f"have {held}. In the order in which parts become one:\n\n{table}"
+        f"have {held}. In the order in which parts become one:\n\n{parts}"
     )
 
 

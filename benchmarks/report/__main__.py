@@ -1,0 +1,208 @@
+"""Make the pages and pictures of recorded results anew.
+
+    python -m benchmarks.report --docs docs
+
+Every block between two markers of ``results/pretraining.md``, ``results/cluster.md`` and ``scaling.md`` is written
+anew, and all pictures; the words around the blocks stay. Whether a target was reached is computed. A block about
+something that was not recorded says so. The downstream page is made by ``tandem downstream table``.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from collections import defaultdict
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from benchmarks.report import cluster, pretraining, scaling
+from benchmarks.report.figures import (
+    draw_ablations,
+    draw_chaos,
+    draw_coverage,
+    draw_curriculum,
+    draw_curves,
+    draw_goals,
+    draw_soak,
+)
+from benchmarks.run_files import Run, read_run
+from service.errors import TandemError
+from service.io.files import os_errors, write_atomic
+
+PROGRAMS = {
+    "throughput": "benchmarks.compare_commits",
+    "cluster_throughput": "benchmarks.cluster_throughput",
+    "chaos": "benchmarks.chaos of commit ddd0770",
+    "rest_load": "benchmarks.rest_load of commit ddd0770",
+    "soak": "benchmarks.soak of commit ddd0770",
+    "scaling": "benchmarks.scaling",
+}
+"""Modules by the name of the recorded file that they make."""
+PAGES = {
+    "results/pretraining.md": ("tasks", "curves", "curriculum", "coverage", "ablations", "throughput"),
+    "results/cluster.md": ("targets", "throughput", "chaos", "rest", "soak"),
+    "scaling.md": ("bottleneck", "box", "nodes", "model", "constants"),
+}
+"""Blocks of every page."""
+Results = Mapping[str, Mapping[str, Any]]
+"""Recorded files by the name of their benchmark."""
+Blocks = Mapping[str, Sequence[str]]
+"""Parts of the text of each block."""
+_NOTHING = "Not recorded yet."
+
+
+def begin(block: str) -> str:
+    """The marker above a block."""
+    return f"<!-- {block}: begin, written by benchmarks/report -->"
+
+
+def end(block: str) -> str:
+    """The marker below a block."""
+    return f"<!-- {block}: end -->"
+
+
+def replace_blocks(path: Path, blocks: Mapping[str, str]) -> str:
+    """The page at ``path`` with the text of every block anew; an empty one says that nothing is recorded yet."""
+    with os_errors("read", path):
+        page = path.read_text(encoding="utf-8")
+    for block, text in blocks.items():
+        before, found, rest = page.partition(begin(block))
+        _, found_end, after = rest.partition(end(block))
+        if not found or not found_end:
+            raise TandemError(f"{path}: no markers for {block}: it needs a line {begin(block)} and a line {end(block)}")
+        page = f"{before}{found}\n\n{text or _NOTHING}\n\n{found_end}{after}"
+    return page
+
+
+def read_results(results: Path) -> dict[str, dict[str, Any]]:
+    """Recorded files by the name of their benchmark; what is not there is left out."""
+    found = {}
+    for name, program in PROGRAMS.items():
+        path = results / f"{name}.json"
+        if not path.exists():
+            continue
+        try:
+            result = json.loads(path.read_text(encoding="utf-8"))
+        except (OSError, ValueError) as error:
+            raise TandemError(f"cannot read {path}: {error}; make it with python -m {program}") from error
+        if not isinstance(result, dict) or result.get("benchmark") != name:
+            raise TandemError(f"{path} is not what python -m {program} writes; make it anew")
+        found[name] = result
+    return found
+
+
+def read_runs(directory: Path) -> tuple[list[Run], list[Run]]:
+    """Recorded runs in the order of their names, and recorded ablations in that of their list."""
+    from benchmarks.ablations import ABLATIONS
+
+    runs = [read_run(path) for path in sorted(directory.glob("*.json"))]
+    order = {name: place for place, name in enumerate(ABLATIONS)}
+    ablations = [run for run in runs if "ablation" in run]
+    ablations.sort(key=lambda run: (order.get(run["ablation"]["name"], len(order)), run["config"]["seed"]))
+    return [run for run in runs if "ablation" not in run], ablations
+
+
+class Report:
+    """Draws pictures into ``docs/results``, and writes the pages.
+
+    Args:
+        docs: directory of the pages.
+    """
+
+    def __init__(self, docs: Path) -> None:
+        self._docs, self._results = docs, docs / "results"
+        self.files: list[Path] = []
+        """Everything written."""
+
+    def write(self) -> None:
+        """Write all pages and pictures."""
+        found, (runs, ablations) = read_results(self._results), read_runs(self._results / "runs")
+        for page, names in PAGES.items():  # a page that lacks a marker is found before anything is drawn
+            replace_blocks(self._docs / page, dict.fromkeys(names, ""))
+        made = (self.pretraining_blocks(runs, ablations, found), self.cluster_blocks(found), scaling_blocks(found))
+        for (page, names), blocks in zip(PAGES.items(), made, strict=True):
+            path = self._docs / page
+            text = replace_blocks(path, {name: "\n\n".join(blocks.get(name, ())) for name in names})
+            with os_errors("write", path):
+                write_atomic(path, text.encode())
+            self.files.append(path)
+
+    def pretraining_blocks(self, runs: Sequence[Run], ablations: Sequence[Run], found: Results) -> Blocks:
+        """Parts of the blocks about pre-training."""
+        show, blocks = self._show, defaultdict[str, list[str]](list)
+        if runs:
+            blocks["tasks"] = [pretraining.tasks_table(runs)]
+            blocks["curves"] = [
+                show("Over env steps", "pretraining", draw_curves, runs),
+                show("Over wall-clock time", "pretraining-time", partial(draw_curves, over_time=True), runs),
+                pretraining.training_table(runs),
+            ]
+        if counted := [run for run in runs if "curriculum" in run]:  # older files have only a sample of the goals
+            blocks["curriculum"].append(show("The curriculum", "pretraining-curriculum", draw_curriculum, counted))
+        for run in runs:
+            words, picture = f"Where the goals of {run['name']} were", f"pretraining-goals-{run['name']}"
+            blocks["curriculum"].append(show(words, picture, draw_goals, run))
+        if covered := [run for run in runs if run.get("coverage")]:
+            blocks["coverage"].append(pretraining.coverage_table(covered))
+        for run in covered:
+            words, picture = f"Random compositions of {run['name']}", f"pretraining-coverage-{run['name']}"
+            blocks["coverage"].append(show(words, picture, draw_coverage, run))
+        if ablations:
+            picture = show("Ablations", "pretraining-ablations", draw_ablations, ablations)
+            blocks["ablations"] = [picture, pretraining.ablations_table(ablations)]
+        if "throughput" in found:
+            blocks["throughput"] = [pretraining.throughput_words(found["throughput"])]
+        return blocks
+
+    def cluster_blocks(self, found: Results) -> Blocks:
+        """Parts of the blocks about running on a cluster."""
+        blocks = {"targets": [cluster.targets_table(found)]}
+        if (throughput := found.get("cluster_throughput")) is not None:
+            blocks["throughput"] = [cluster.throughput_block(throughput)]
+        if (chaos := found.get("chaos")) is not None:
+            picture = self._show("Success, shot at and not", "cluster-chaos", draw_chaos, chaos)
+            blocks["chaos"] = [cluster.chaos_words(chaos), picture, cluster.faults_table(chaos)]
+        if (rest := found.get("rest_load")) is not None:
+            blocks["rest"] = [cluster.latency_table(rest), cluster.rest_words(rest)]
+        if (soak := found.get("soak")) is not None:
+            picture = self._show("Memory of every process", "cluster-soak", draw_soak, soak)
+            blocks["soak"] = [cluster.soak_words(soak), picture, cluster.soak_table(soak)]
+        return blocks
+
+    def _show(self, words: str, name: str, draw: Callable[[Any, Path], Path], recorded: Any) -> str:
+        self.files.append(draw(recorded, self._results / f"{name}.png"))
+        return f"![{words}]({name}.png)"
+
+
+def scaling_blocks(found: Results) -> Blocks:
+    """Parts of the blocks about scaling."""
+    makers = {
+        "bottleneck": scaling.limits_block,
+        "box": scaling.box_block,
+        "nodes": scaling.nodes_block,
+        "model": scaling.model_block,
+        "constants": scaling.constants_block,
+    }
+    return {name: [maker(found["scaling"])] for name, maker in makers.items() if "scaling" in found}
+
+
+def main() -> int:
+    """Parse the command line, draw, say what was written."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--docs", type=Path, metavar="DIR", default=Path("docs"), help="default: %(default)s")
+    given = parser.parse_args()
+    report = Report(given.docs)
+    try:
+        report.write()
+    except TandemError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+    print("\n".join(map(str, report.files)))
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

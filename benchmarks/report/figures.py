@@ -1,0 +1,371 @@
+"""All pictures of recorded results: learning curves, ablations, goals, coverage, the curriculum, faults, memory.
+
+A drawing takes what was recorded and the path of the PNG to write, which it returns.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+
+import numpy as np
+
+from benchmarks.record_run import BIN_M, NUM_BINS, NUM_SLICES
+from benchmarks.run_files import Records, Run, binned, unthin
+from benchmarks.stages import CELL_SIZE_M, RANDOM, STAGES, mean_share, paths_m
+from benchmarks.tasks import ASKED
+from service.config import WorkspaceConfig
+from service.io.files import os_errors, write_atomic
+from service.io.jsonl import JsonlWriter
+from service.io.run_directory import RunDirectory
+from service.media.plots import plot_goals
+from service.media.plots.coverage import draw_paths
+from service.media.plots.figures import (
+    BLUE,
+    FAINT,
+    GREEN,
+    INK,
+    ORANGE,
+    Array,
+    column,
+    counted,
+    new_figure,
+    save,
+    style_axes,
+)
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+COLORS = (BLUE, ORANGE, GREEN, "#CC79A7", "#E69F00", "#56B4E9", INK, "#999999")
+WIDTH = 14.0
+"""Width of every picture, in hundreds of pixels."""
+TITLE_SIZE = 12.5
+_LegendLine = tuple[str, Mapping[str, Any]]
+"""A label and the keywords of its line."""
+
+
+class Clock(NamedTuple):
+    """Horizontal axis of a curve."""
+
+    key: str
+    unit: str
+    scale: float
+
+
+def _panel(axes: Axes, title: str, x: str, y: str, *, size: float = TITLE_SIZE) -> None:
+    style_axes(axes)
+    axes.set_title(title, loc="left", fontsize=size, weight="bold", color=INK)
+    axes.set_xlabel(x, color=FAINT)
+    axes.set_ylabel(y, color=FAINT)
+
+
+def _tall_figure(height: float, title: str) -> Figure:
+    """A figure whose title keeps its distance from the top, whatever the height."""
+    figure = new_figure(WIDTH, height, "")
+    figure.text(0.02, 1.0 - 0.35 / height, title, fontsize=15, weight="bold", color=INK, va="center")
+    return figure
+
+
+def _legend(figure: Figure, lines: Sequence[_LegendLine], y: float, num_columns: int) -> None:
+    """A legend at the upper left with a line, by its keywords, for each label."""
+    from matplotlib.lines import Line2D
+
+    handles = [Line2D([], [], label=label, **keywords) for label, keywords in lines]
+    figure.legend(handles=handles, loc="upper left", ncols=num_columns, frameon=False, bbox_to_anchor=(0.015, y))
+
+
+def _end(records: Records, clock: Clock) -> float:
+    values: Array = column(records, clock.key)
+    return float(np.nanmax(values)) / clock.scale
+
+
+# --- learning curves --------------------------------------------------------------------------------------------------
+
+NUM_SPANS = 60
+"""Equal parts of a run's length; a curve shows the mean in each."""
+IDLE_STYLE, ASKED_STYLE = (0, (4, 3)), (0, (1, 2))
+MILLIONS, THOUSANDS = Clock("env_steps", "million env steps", 1e6), Clock("env_steps", "thousand env steps", 1e3)
+
+
+class _CurvePanel(NamedTuple):
+    key: str
+    title: str
+    share_of: str
+    task: str | None = None
+
+
+_CURVE_PANELS = (
+    _CurvePanel("evaluation/mixed_success_last", "Random goals, mixed", "solved at the last step", "mixed"),
+    _CurvePanel("evaluation/air_success_last", "Random goals in the air", "solved at the last step", "air"),
+    _CurvePanel("evaluation/table_success_last", "Random goals on the table", "solved at the last step", "table"),
+    _CurvePanel("bob/success_rate", "Bob on Alice's goals", "solved, of her valid goals"),
+    _CurvePanel("alice/valid_fraction", "Alice's goals: valid", "of all her goals"),
+    _CurvePanel("alice/lifted_fraction", "Alice's goals: lifted", "over 5 cm up, of her valid goals"),
+)
+
+
+def draw_curves(runs: Sequence[Run], path: Path, *, over_time: bool = False) -> Path:
+    """Draw Bob's success and Alice's goals over env steps, or over wall-clock time; a colour for each run."""
+    records = {str(run["name"]): unthin(run["series"]) for run in runs}
+    clock = _wall_clock(list(records.values())) if over_time else MILLIONS
+    end = max(_end(each, clock) for each in records.values())
+    figure = new_figure(WIDTH, 8.2, f"Pre-training from scratch: {counted(len(runs), 'run')}, {end:.3g} {clock.unit}")
+    idle = {row["goals"]: row for run in runs for row in run["evaluations"] if row["policy"] == "idle"}
+    for place, (axes, panel) in enumerate(zip(figure.subplots(2, 3).flat, _CURVE_PANELS, strict=True)):
+        _panel(axes, panel.title, clock.unit if place >= 3 else "", panel.share_of)
+        for color, each in zip(COLORS, records.values(), strict=False):
+            draw_curve(axes, each, panel.key, clock, color)
+        if panel.task in idle:
+            axes.axhline(idle[panel.task]["success_last"], color=FAINT, linewidth=1.2, linestyle=IDLE_STYLE)
+        if panel.task == "mixed":
+            axes.axhline(ASKED, color=INK, linewidth=1.2, linestyle=ASKED_STYLE)
+        axes.set_xlim(0.0, end)
+        axes.set_ylim(0.0, 1.0)
+    lines: list[_LegendLine] = [(name, {"color": color}) for color, name in zip(COLORS, records, strict=False)]
+    if idle:
+        lines.append(("doing nothing", {"color": FAINT, "linestyle": IDLE_STYLE, "linewidth": 1.2}))
+    lines.append((f"asked: {ASKED:.0%}", {"color": INK, "linestyle": ASKED_STYLE, "linewidth": 1.2}))
+    _legend(figure, lines, 0.935, 6)
+    figure.subplots_adjust(left=0.055, right=0.985, top=0.83, bottom=0.075, wspace=0.22, hspace=0.28)
+    return save(figure, path)
+
+
+def draw_curve(axes: Axes, records: Records, key: str, clock: Clock, color: str, **line: Any) -> None:
+    """Draw the means of a metric in equal spans of ``clock``, joined over spans without a value."""
+    end = _end(records, clock)
+    middle = (np.arange(NUM_SPANS) + 0.5) / NUM_SPANS * end
+    values = binned(records, key, NUM_SPANS, over=clock.key)
+    known = np.isfinite(values)
+    axes.plot(middle[known], values[known], color=color, clip_on=False, **{"linewidth": 2.0} | line)
+
+
+def _wall_clock(records: Sequence[Records]) -> Clock:
+    hours = Clock("time/wall_s", "hours", 3600.0)
+    return hours if max(_end(each, hours) for each in records) >= 2.0 else Clock("time/wall_s", "minutes", 60.0)
+
+
+# --- ablations --------------------------------------------------------------------------------------------------------
+
+NUM_COLUMNS = 4
+RECIPE_LINE = {"linestyle": (0, (2, 1.5)), "linewidth": 1.3}
+_ABLATION_CURVES = (
+    ("evaluation/mixed_success_last", "mixed goals", BLUE),
+    ("evaluation/table_success_last", "goals on the table", GREEN),
+)
+
+
+def draw_ablations(runs: Sequence[Run], path: Path, recipe: str = "recipe") -> Path:
+    """Draw a panel for each ablation: Bob's success on random goals, and dashed that of the whole recipe."""
+    names = list(dict.fromkeys(run["ablation"]["name"] for run in runs if run["ablation"]["name"] != recipe))
+    num_rows = max(-(-len(names) // NUM_COLUMNS), 1)
+    height = 1.6 + 2.9 * num_rows
+    figure = _tall_figure(height, "Ablations: Bob on random goals, solved at the last step")
+    panels = list(figure.subplots(num_rows, NUM_COLUMNS, squeeze=False).flat)
+    for axes in panels[len(names) :]:
+        axes.set_visible(False)
+    end = max(run["series"]["env_steps"][-1] for run in runs) / 1e6
+    for axes, name in zip(panels, names, strict=False):
+        _panel(axes, name, "", "", size=12)
+        for shown, line in ((recipe, RECIPE_LINE), (name, {"linewidth": 2.2})):  # the recipe below
+            for run in (run for run in runs if run["ablation"]["name"] == shown):
+                for key, _, color in _ABLATION_CURVES:
+                    draw_curve(axes, unthin(run["series"]), key, MILLIONS, color, **line)
+        axes.set_xlim(0.0, end)
+        axes.set_ylim(0.0, _top(runs))
+    figure.supxlabel(MILLIONS.unit, y=0.12 / height, color=FAINT, fontsize=10)
+    figure.subplots_adjust(
+        left=0.04, right=0.985, top=1.0 - 1.25 / height, bottom=0.7 / height, wspace=0.16, hspace=0.34
+    )
+    lines = [(label, {"color": color, "linewidth": 2.2}) for _, label, color in _ABLATION_CURVES]
+    _legend(figure, [*lines, ("the whole recipe", {"color": INK, **RECIPE_LINE})], 1.0 - 0.5 / height, 3)
+    return save(figure, path)
+
+
+def _top(runs: Sequence[Run]) -> float:
+    """Upper end of a common scale, a little over the highest success."""
+    values = [column(unthin(run["series"]), key) for run in runs for key, _, _ in _ABLATION_CURVES]
+    return min(1.0, 1.15 * float(np.nanmax(np.concatenate(values), initial=0.1)))
+
+
+# --- goals ------------------------------------------------------------------------------------------------------------
+
+
+def draw_goals(run: Run, path: Path) -> Path:
+    """Draw where a run's goals were, over time."""
+    workspace = WorkspaceConfig.model_validate(run["config"]["world"]["workspace"])
+    with tempfile.TemporaryDirectory() as scratch:
+        directory = Path(scratch) / run["name"]  # the picture's title names it
+        goals = JsonlWriter(RunDirectory(directory).goals_file)
+        for record in run["goals"]:
+            goals.append(record)
+        picture = plot_goals(directory, workspace).read_bytes()
+    with os_errors("write", path):
+        write_atomic(path, picture)
+    return path
+
+
+COLOR_MAP = "cividis"
+"""Colours that are as even to colour-blind readers as to others."""
+LEAST_GOALS = 5
+"""A share of fewer is not drawn."""
+QUANTILE_COLOR = "#D81B60"
+
+
+class _QuantileLine(NamedTuple):
+    quantile: float
+    words: str
+    style: tuple[float, tuple[float, ...]] | Literal["solid"]
+
+
+_QUANTILE_LINES = (
+    _QuantileLine(0.5, "half of the goals are below", (0.0, (4.0, 2.0))),
+    _QuantileLine(0.9, "nine in ten are below", "solid"),
+)
+_GOAL_WORDS = {"height": "height above where it rests (m)", "distance": "distance from the start (m)"}
+
+
+def draw_curriculum(runs: Sequence[Run], path: Path) -> Path:
+    """Draw heights and distances of goals over env steps, a row for each run, coloured by Bob's success."""
+    from matplotlib.cm import ScalarMappable
+    from matplotlib.colors import Normalize
+
+    height = 1.3 + 3.6 * len(runs)
+    figure = _tall_figure(height, "The curriculum: Alice's valid goals, and what Bob solves of them")
+    for run, pair in zip(runs, figure.subplots(len(runs), len(_GOAL_WORDS), squeeze=False), strict=True):
+        for axes, name in zip(pair, _GOAL_WORDS, strict=True):
+            unit = MILLIONS.unit if run is runs[-1] else ""
+            _panel(axes, f"{run['name']}: {name} of goals", unit, _GOAL_WORDS[name])
+            _draw_goal_cells(axes, run["curriculum"], name)
+    figure.subplots_adjust(left=0.055, right=0.9, top=1.0 - 1.2 / height, bottom=0.55 / height, wspace=0.16, hspace=0.3)
+    bar = figure.add_axes((0.93, 0.55 / height, 0.013, 1.0 - 1.75 / height))
+    figure.colorbar(ScalarMappable(Normalize(0.0, 1.0), COLOR_MAP), cax=bar)
+    bar.set_ylabel(f"solved by Bob (white: under {LEAST_GOALS} goals)", color=FAINT)
+    bar.tick_params(colors="#555555", labelsize=9, length=3)
+    lines = [
+        (line.words, {"color": QUANTILE_COLOR, "linewidth": 2.0, "linestyle": line.style}) for line in _QUANTILE_LINES
+    ]
+    _legend(figure, lines, 1.0 - 0.5 / height, 2)
+    return save(figure, path)
+
+
+def _draw_goal_cells(axes: Axes, curriculum: dict[str, Any], name: str) -> None:
+    goals, solved = (np.array(curriculum[name][key], dtype=np.float64) for key in ("goals", "solved"))
+    share = np.where(goals >= LEAST_GOALS, solved / np.maximum(goals, 1.0), np.nan)
+    times = np.linspace(0.0, curriculum["env_steps"] / 1e6, NUM_SLICES + 1)
+    axes.pcolormesh(times, BIN_M * np.arange(NUM_BINS[name] + 1), share.T, cmap=COLOR_MAP, vmin=0.0, vmax=1.0)
+    middle = (times[1:] + times[:-1]) / 2
+    for line in _QUANTILE_LINES:
+        values = quantiles(goals, line.quantile)
+        axes.plot(middle, values, color="white", linewidth=3.6)
+        axes.plot(middle, values, color=QUANTILE_COLOR, linewidth=2.0, linestyle=line.style)
+    axes.set_ylim(0.0, BIN_M * NUM_BINS[name])
+
+
+def quantiles(counts: Array, quantile: float) -> Array:
+    """Metres below which a share of each row's goals lie, straight within a bin, NaN in a row without goals.
+
+    Args:
+        counts: (rows, bins) goals in bins of 2.5 cm from 0 up.
+        quantile: the share.
+    """
+    found = np.full(len(counts), np.nan)
+    for row, count in enumerate(counts):
+        if count.sum():
+            below = np.append(0.0, np.cumsum(count))
+            found[row] = BIN_M * np.interp(quantile * below[-1], below, np.arange(len(below)))
+    return found
+
+
+# --- coverage ---------------------------------------------------------------------------------------------------------
+
+CELL_COLOR = "#e2e2e2"
+
+
+def draw_coverage(run: Run, path: Path) -> Path:
+    """Draw random compositions: a column for the random policy and for each stage, in the box and from above."""
+    coverage, workspace = run["coverage"], WorkspaceConfig.model_validate(run["config"]["world"]["workspace"])
+    stages = coverage["stages"]
+    figure = new_figure(WIDTH, 8.4, f"{run['name']}: where random compositions of Bob's primitives take the object")
+    words = f"{coverage['num_skills']} compositions of {coverage['num_steps']} steps; a dot is where the object ends"
+    figure.text(0.98, 0.955, words, ha="right", va="center", color=FAINT)
+    width = 0.98 / (1 + len(STAGES))
+    for place, (name, stage) in enumerate(stages.items()):
+        left = 0.015 + place * width
+        box = figure.add_axes((left - 0.01, 0.47, width - 0.025, 0.4), projection="3d", computed_zorder=False)
+        above = figure.add_axes((left + 0.035, 0.075, width - 0.05, 0.38))
+        draw_paths(box, above, paths_m(stage), workspace)
+        box.set(xlabel="", ylabel="", zlabel="")  # the view from above has them
+        figure.text(left, 0.905, _stage_words(name, stage, stages[RANDOM]), fontsize=11, color=INK, va="top")
+        above.set_ylabel("y (m)" if place == 0 else "", color=FAINT)
+        _draw_table_cells(above, workspace)
+    return save(figure, path)
+
+
+def _draw_table_cells(above: Axes, workspace: WorkspaceConfig) -> None:
+    """Draw the cells that are counted, as a grid."""
+    low, high = workspace.lower_m, workspace.upper_m
+    above.grid(False)
+    x, y = (np.arange(low[axis], high[axis] + CELL_SIZE_M / 2, CELL_SIZE_M) for axis in (0, 1))
+    above.vlines(x, low[1], high[1], color=CELL_COLOR, linewidth=0.8, zorder=0.5)
+    above.hlines(y, low[0], high[0], color=CELL_COLOR, linewidth=0.8, zorder=0.5)
+
+
+def _stage_words(name: str, stage: dict[str, Any], random: dict[str, Any]) -> str:
+    share = f"{mean_share(stage):.0%} of the table's cells"
+    if name == RANDOM:
+        return f"{name}\n{share}"
+    when = f"{stage['env_steps'] / 1e6:.3g} M env steps" if stage["env_steps"] else "untrained"
+    return f"{name}: {when}\n{share}, {mean_share(stage) / mean_share(random):.1f} x random"
+
+
+# --- a cluster --------------------------------------------------------------------------------------------------------
+
+FAULT_COLORS = {"actor": FAINT, "learner": ORANGE, "generator": GREEN, "status": "#CC79A7", "redis": "#E69F00"}
+UNDISTURBED_COLOR = "#9ecae1"
+_PLAYER_CURVES = (
+    ("bob/success_rate", "Bob on Alice's valid goals", "solved, share"),
+    ("alice/valid_fraction", "Alice", "valid, share"),
+)
+_OUR_ROLES = ("driver", "actor", "learner", "generator", "status", "redis")
+
+
+def draw_chaos(result: Mapping[str, Any], path: Path) -> Path:
+    """Draw both players' success over env steps, and every fault."""
+    figure = new_figure(WIDTH, 5.2, "A run that is shot at, beside undisturbed ones")
+    curves = result["curves"]
+    for axes, (key, title, label) in zip(figure.subplots(1, 2), _PLAYER_CURVES, strict=True):
+        _panel(axes, title, THOUSANDS.unit, label)
+        for each in curves["undisturbed"]:
+            draw_curve(axes, unthin(each["series"]), key, THOUSANDS, UNDISTURBED_COLOR)
+        draw_curve(axes, unthin(curves["disturbed"]["series"]), key, THOUSANDS, BLUE)
+        for fault in result["strikes"]:
+            axes.axvline(fault["num_env_steps"] / 1e3, color=FAULT_COLORS[fault["target"]], linewidth=0.9, alpha=0.7)
+        axes.set_ylim(0.0, 1.0)
+        axes.set_xlim(0.0, curves["disturbed"]["env_steps"] / 1e3)
+    lines: list[_LegendLine] = [("shot at", {"color": BLUE}), ("undisturbed", {"color": UNDISTURBED_COLOR})]
+    lines += [(f"{name} killed", {"color": color, "linewidth": 0.9}) for name, color in FAULT_COLORS.items()]
+    _legend(figure, lines, 0.92, 7)
+    figure.subplots_adjust(left=0.055, right=0.985, top=0.76, bottom=0.11, wspace=0.18)
+    return save(figure, path)
+
+
+def draw_soak(result: Mapping[str, Any], path: Path) -> Path:
+    """Draw the own memory of the run's processes, and of Ray's."""
+    figure = new_figure(WIDTH, 5.6, "Memory of every process, without files, shared memory and history")
+    found = result["processes"]
+    for axes, title, ours in zip(figure.subplots(1, 2), ("The run", "Ray's own"), (True, False), strict=True):
+        _panel(axes, title, "thousand updates", "MB")
+        shown = {name: each["series"] for name, each in found.items() if (each["role"] in _OUR_ROLES) == ours}
+        for index, (name, series) in enumerate(shown.items()):
+            x, color = [iteration / 1e3 for iteration in series["iteration"]], COLORS[index % len(COLORS)]
+            style = "-" if index < len(COLORS) else "--"
+            axes.plot(x, series["own_mb"], style, color=color, linewidth=1.6, label=name)
+        axes.set_ylim(bottom=0.0)
+        axes.set_xlim(0.0, result["num_iterations"] / 1e3)
+        axes.legend(loc="upper left", bbox_to_anchor=(0.0, -0.14), ncols=4, frameon=False, fontsize=9)
+    figure.subplots_adjust(left=0.05, right=0.985, top=0.85, bottom=0.26, wspace=0.14)
+    return save(figure, path)

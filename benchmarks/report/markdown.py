@@ -1,0 +1,42 @@
+"""Words and tables that all pages share."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+Row = Sequence[str]
+
+
+def table(head: Row, rows: Iterable[Row]) -> str:
+    """A table in Markdown."""
+    return "\n".join("| " + " | ".join(row) + " |" for row in (head, ("---",) * len(head), *rows))
+
+
+def percent(share: float, digits: int = 0) -> str:
+    """A share for a cell or a sentence; nothing for not-a-number."""
+    return f"{100 * share:.{digits}f} %" if np.isfinite(share) else ""
+
+
+def millions(env_steps: float) -> str:
+    """Env steps for a cell."""
+    return f"{env_steps / 1e6:.3g} M"
+
+
+def duration(seconds: float) -> str:
+    """Minutes, or hours from two on."""
+    return f"{seconds / 3600:.1f} h" if seconds >= 7200 else f"{seconds / 60:.0f} min"
+
+
+def commit(name: str) -> str:
+    """A commit for a sentence, cut to 7 characters; local changes are told beside it."""
+    short = f"commit `{name[:7]}`"
+    return f"{short} with local changes" if name.endswith("-dirty") else short
+
+
+def measured_on(machine: Mapping[str, Any]) -> str:
+    """The last sentence of a block: machine, commit and day of a measurement."""
+    where = f"{machine['num_cpus']} cores of {machine['cpu']}"
+    return f" On {where}, {commit(machine['git_commit'])}, {machine['time'][:10]}."

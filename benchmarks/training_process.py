@@ -1,0 +1,359 @@
+"""A ``tandem pretrain`` in a process of its own, seen from outside as an operator sees it: pids, REST, files.
+
+Only the command line and the files of a run are used, so the runs of other commits can be measured, too.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import secrets
+import shutil
+import signal
+import socket
+import statistics
+import subprocess
+import sys
+import time
+import urllib.request
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from http.client import HTTPException
+from pathlib import Path
+from tempfile import mkdtemp
+from types import TracebackType
+from typing import Any, Literal, Self, TypeVar
+
+from pydantic import ValidationError
+
+from benchmarks.measuring import ROOT, Sample
+from benchmarks.processes import cpu_s_by_role, descendants, is_running
+from service.errors import TandemError
+from service.io.checkpoints import CheckpointStore
+from service.io.run_directory import RunDirectory
+from service.store.disk import STATUS_FILE
+from service.store.models import RunStatus
+
+ENDLESS = {"run.total_env_steps": 1_000_000_000_000}
+PLAIN = {"run.checkpoint_interval": 1_000_000_000, "run.evaluation_interval": 0}
+"""Neither evaluations nor checkpoints."""
+NUM_WARMUP_ITERATIONS = 4
+"""After a start, before it is measured: by then the learner and all actors are busy."""
+START_S = 240.0
+"""Until the first iteration, on a machine that may be busy."""
+STOP_S = 60.0
+_LOOK_S = 0.005
+_DIRECT = urllib.request.build_opener(urllib.request.ProxyHandler({}))
+_Answer = TypeVar("_Answer")
+
+
+class Training:
+    """A run of its own on this machine; ends with the block. A run directory that is there already is resumed.
+
+    Args:
+        home: directory for its run, its registry and Ray's files; its path has to be short.
+        arguments: of ``tandem pretrain``, besides runtime, run directory and status.
+        name: of the run directory.
+        runtime: which runner; ``ray`` has a status service.
+        tree: checkout whose code runs.
+    """
+
+    def __init__(
+        self,
+        home: Path,
+        arguments: Sequence[str],
+        *,
+        name: str = "run",
+        runtime: Literal["local", "ray"] = "ray",
+        tree: Path = ROOT,
+    ) -> None:
+        self.name, self.directory, self.log_file = name, RunDirectory(home / "runs" / name), home / f"{name}.log"
+        self.address = ("127.0.0.1", _free_port())
+        """Host and port of the status service."""
+        home.mkdir(parents=True, exist_ok=True)
+        command = [sys.executable, "-m", "service", "pretrain", "--run-dir", str(self.directory.path)]
+        command += ["--registry", str(home / "registry"), *(["--resume"] if self.directory.exists else [])]
+        if runtime == "ray":
+            command += ["--runtime", "ray", "--status", "{}:{}".format(*self.address)]
+        self.records = Records(self.directory.metrics_file)
+        with self.log_file.open("ab") as log:
+            self._process = subprocess.Popen(
+                [*command, *arguments],
+                cwd=tree,
+                env=environment(home, tree),
+                stdin=subprocess.DEVNULL,
+                stdout=log,
+                stderr=log,
+            )
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.stop()
+
+    @property
+    def pid(self) -> int:
+        """Pid of the driver."""
+        return self._process.pid
+
+    @property
+    def ended(self) -> int | None:
+        """The exit code; None while it goes on."""
+        return self._process.poll()
+
+    def get(self, path: str, timeout_s: float = 5.0) -> bytes:
+        """Answer of the status service; empty if there is none within ``timeout_s``."""
+        try:
+            with _DIRECT.open("http://{}:{}{}".format(*self.address, path), timeout=timeout_s) as response:
+                return bytes(response.read())
+        except (OSError, HTTPException):
+            return b""
+
+    def status(self) -> RunStatus | None:
+        """The run's status by the status service, else from its directory; None before there is one."""
+        try:
+            told = self.get(f"/v1/runs/{self.name}", 2.0) or (self.directory.path / STATUS_FILE).read_bytes()
+            return RunStatus.model_validate_json(told)
+        except (OSError, ValidationError):
+            return None
+
+    def wait_for(self, what: Callable[[], _Answer | None], seconds: float = START_S) -> _Answer:
+        """The first answer of ``what`` that is true.
+
+        Raises:
+            TandemError: the run ended, or there was none in time.
+        """
+        deadline_s = time.monotonic() + seconds
+        while self.ended is None and time.monotonic() < deadline_s:
+            if answer := what():
+                return answer
+            time.sleep(_LOOK_S)
+        why = f"not within {seconds:.0f} s" if self.ended is None else f"it ended with code {self.ended}"
+        raise TandemError(f"the run does not do what is waited for: {why}; its last words: {self.last_words()}")
+
+    def wait_until(self, key: str, value: float) -> None:
+        """Wait, a day at most, until a record has at least ``value`` under ``key``.
+
+        Raises:
+            TandemError: see ``wait_for``.
+        """
+        self.wait_for(lambda: any(row[key] >= value for row in self.records.new()), 86_400.0)
+
+    def stop(self) -> None:
+        """End the run as ``ray job stop`` does: SIGTERM, which saves; what is left after a minute is killed."""
+        if self.ended is None:
+            before = descendants(self.pid)
+            self._process.send_signal(signal.SIGTERM)
+            try:
+                self._process.wait(STOP_S)
+            except subprocess.TimeoutExpired:
+                self._process.kill()
+                self._process.wait()
+            for pid in before:
+                _end(pid)
+
+    def last_words(self) -> str:
+        """The last line of its log."""
+        lines = self.log_file.read_text(errors="replace").strip().splitlines()
+        return lines[-1] if lines else "none"
+
+
+class Records:
+    """Reads the records of a run as they are written.
+
+    Args:
+        file: ``metrics.jsonl``; what it holds already is passed over.
+    """
+
+    def __init__(self, file: Path) -> None:
+        self._file, self._torn = file, b""
+        self._offset = file.stat().st_size if file.exists() else 0
+
+    def new(self) -> list[dict[str, Any]]:
+        """The records written since the last call."""
+        if not self._file.exists() or self._file.stat().st_size == self._offset:
+            return []
+        with self._file.open("rb") as file:
+            file.seek(self._offset)
+            added = file.read()
+        self._offset += len(added)
+        *lines, self._torn = (self._torn + added).split(b"\n")
+        return [json.loads(line) for line in lines]
+
+
+@dataclass(frozen=True, slots=True)
+class Measured:
+    """Costs of some iterations of a run."""
+
+    num_steps: int
+    wall_s: float
+    cpu_s: float
+    """CPU seconds of all processes of the run, Ray's and the status service's included."""
+    num_iterations: int
+    num_rollouts: int
+    num_actors: int
+    num_worlds: int
+    """Worlds of each actor."""
+    play_s: float
+    """Mean duration of a round; 0 where play and learning share a process."""
+    hand_over_s: float
+    """Mean of what a round costs its actor beside playing it: weights, assignment, results, a driver that is busy."""
+    learn_s: float
+    """Mean duration of an update."""
+    mean_policy_lag: float
+    max_policy_lag: float
+    role_cpu_s: dict[str, float]
+    """CPU seconds by role of process, several of one role together."""
+
+    @property
+    def sample(self) -> Sample:
+        """Its env steps and times."""
+        return Sample(self.num_steps, self.wall_s, self.cpu_s)
+
+    @property
+    def learner_idle_share(self) -> float:
+        """Share of the wall time without an update."""
+        return 1.0 - self.num_iterations * self.learn_s / self.wall_s
+
+    @property
+    def actor_idle_share(self) -> float:
+        """Share of the actors' wall time without a round; evaluations, which actors make too, count as idle."""
+        return 1.0 - self.num_rollouts * self.play_s / (self.num_actors * self.wall_s)
+
+    @property
+    def slot_wait_s(self) -> float:
+        """Seconds, of all actors together, in which they had handed everything over and were given nothing.
+
+        They wait for a slot, which an update frees: it is what acting and learning do not overlap.
+        """
+        busy_s = self.num_rollouts * (self.play_s + self.hand_over_s)
+        return max(0.0, self.num_actors * self.wall_s - busy_s)
+
+
+def measure_training(
+    training: Training, num_iterations: int, num_actors: int = 1, num_warmup: int = NUM_WARMUP_ITERATIONS
+) -> Measured:
+    """Measure about ``num_iterations`` iterations of a run, then end it.
+
+    Args:
+        training: a run that has just been started.
+        num_iterations: at least 1; more are measured where they are shorter than it takes to see them.
+        num_actors: it is measured from when so many are alive.
+        num_warmup: iterations before, at least 1.
+
+    Raises:
+        TandemError: the run ended before.
+    """
+    rows: list[dict[str, Any]] = []
+    marks = []
+    for num in (num_warmup, num_warmup + num_iterations):
+        while len(rows) < num:
+            for row in training.wait_for(training.records.new):
+                # an actor that dies later is measured, too
+                if rows or row.get("actor/num_alive", num_actors) >= num_actors:
+                    rows.append(row)
+        marks.append((len(rows), time.perf_counter(), cpu_s_by_role(training.pid)))
+    training.stop()
+    (num_before, first_s, before), (_, last_s, after) = marks
+    role_cpu_s = {role: seconds - before.get(role, 0.0) for role, seconds in after.items()}
+    num_worlds = training.directory.read_config().game.num_worlds
+    return summarise_rows(rows, num_before, last_s - first_s, role_cpu_s, num_actors, -(-num_worlds // num_actors))
+
+
+def summarise_rows(
+    rows: Sequence[Mapping[str, float]], num_before: int, wall_s: float, role_cpu_s: Mapping[str, float],
+    num_actors: int, num_worlds: int,
+) -> Measured:  # fmt: skip
+    """Costs of the iterations of ``rows`` after the first ``num_before``, at least 1.
+
+    Args:
+        rows: records of iterations.
+        num_before: of them, made before ``wall_s`` and ``role_cpu_s`` began.
+        wall_s: seconds that the others took together.
+        role_cpu_s: CPU seconds by role in that time.
+        num_actors: of the run.
+        num_worlds: of each actor.
+    """
+    measured = rows[num_before:]
+    rollouts = [row.get("actor/num_rollouts", 1.0) for row in measured]
+    lags = [row["learner/policy_lag"] for row in measured if "learner/policy_lag" in row]
+
+    def mean_of_rounds(key: str) -> float:
+        return sum(row.get(key, 0.0) * num for row, num in zip(measured, rollouts, strict=True)) / sum(rollouts)
+
+    return Measured(
+        num_steps=int(measured[-1]["env_steps"] - rows[num_before - 1]["env_steps"]),
+        wall_s=wall_s,
+        cpu_s=sum(role_cpu_s.values()),
+        num_iterations=len(measured),
+        num_rollouts=int(sum(rollouts)),
+        num_actors=num_actors,
+        num_worlds=num_worlds,
+        play_s=mean_of_rounds("time/play_s"),
+        hand_over_s=mean_of_rounds("time/hand_over_s"),
+        learn_s=statistics.fmean(row.get("time/learn_s", 0.0) for row in measured),
+        mean_policy_lag=statistics.fmean(lags),
+        max_policy_lag=max(
+            lags + [row["learner/max_policy_lag"] for row in measured if "learner/max_policy_lag" in row]
+        ),
+        role_cpu_s=dict(role_cpu_s),
+    )
+
+
+def environment(home: Path, tree: Path = ROOT) -> dict[str, str]:
+    """Variables for a process with a Ray of its own: its files under ``home``, its own token, no other setting."""
+    unset = ("RAY_ADDRESS", "TANDEM_REDIS_URL", "TANDEM_TOKEN", "TANDEM_RUNS", "TANDEM_REGISTRY")
+    ray = {"RAY_TMPDIR": str(home), "RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN": secrets.token_hex(32)}
+    kept = {name: value for name, value in os.environ.items() if name not in unset}
+    return {**kept, **ray, "RAY_USAGE_STATS_ENABLED": "0", "PYTHONPATH": str(tree)}
+
+
+@contextmanager
+def scratch() -> Iterator[Path]:
+    """A directory with a short path, as Ray's sockets need, deleted at the end."""
+    path = Path(mkdtemp(prefix="td-", dir="/tmp"))
+    try:
+        yield path
+    finally:
+        shutil.rmtree(path, ignore_errors=True)
+
+
+def copy_run(source: RunDirectory, home: Path, name: str = "run") -> RunDirectory:
+    """Copy what a ``Training`` in ``home`` needs to go on from the newest checkpoint of ``source``.
+
+    Raises:
+        TandemError: no run there, or one without a checkpoint.
+    """
+    source.read_config()
+    store, target = CheckpointStore(source.checkpoints, keep=1), RunDirectory(home / "runs" / name)
+    if not store.steps():
+        raise TandemError(f"no checkpoint in {source.checkpoints}; name a run that has one")
+    target.checkpoints.mkdir(parents=True)
+    shutil.copy(store.path(store.steps()[-1]), target.checkpoints)
+    shutil.copy(source.config_file, target.config_file)
+    return target
+
+
+def overrides(settings: Mapping[str, object]) -> list[str]:
+    """``--set`` arguments of the command line."""
+    return [part for key, value in settings.items() for part in ("--set", f"{key}={value}")]
+
+
+def _end(pid: int) -> None:
+    """Kill what a stopped run left behind, after a moment to end by itself."""
+    for _ in range(100):
+        if not is_running(pid):
+            return
+        time.sleep(0.05)
+    with suppress(ProcessLookupError):
+        os.kill(pid, signal.SIGKILL)
+
+
+def _free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
