@@ -9,9 +9,9 @@ from pathlib import Path
 
 PROC = Path("/proc")
 _ROLES = (
-    ("ray::RolloutWorker", "actor"),
-    ("ray::LearnerWorker", "learner"),
-    ("ray::GeneratorWorker", "generator"),
+    ("ray::RolloutActor", "actor"),
+    ("ray::LearnerActor", "learner"),
+    ("ray::GeneratorActor", "generator"),
     ("ray::StatusWorker", "status"),
     ("ray::IDLE", "idle worker"),
     ("ray::", "other worker"),

@@ -24,9 +24,10 @@ from benchmarks.stages import measure_coverage
 from benchmarks.tasks import measure_tasks
 from service.errors import TandemError
 from service.io.run_directory import RunDirectory
-from service.media.plots.figures import Array, read_records
+from service.media.plots.figures import read_records
 from service.policies.numpy_policy import numpy_bob
 from service.primitives.loading import read_stages
+from service.types import StateArray
 
 GOAL_RECORDS, GOALS_EACH = 60, 10
 """Stages of the run of which goals are kept, and the number of goals of each."""
@@ -83,7 +84,7 @@ def count_goals(records: Records, rest_height_m: float) -> dict[str, Any]:
     return {"env_steps": end} | {name: _count(slices, value, solved, name) for name, value in values.items()}
 
 
-def _count(slices: NDArray[np.int64], values: Array, solved: Array, name: str) -> dict[str, list[list[int]]]:
+def _count(slices: NDArray[np.int64], values: StateArray, solved: StateArray, name: str) -> dict[str, list[list[int]]]:
     num_bins = NUM_BINS[name]
     bins = np.clip(np.floor(values / BIN_M).astype(int), 0, num_bins - 1)  # contact lets an object rest a hair lower
     place, num_places = slices * num_bins + bins, NUM_SLICES * num_bins

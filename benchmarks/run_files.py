@@ -16,7 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.errors import TandemError
-from service.media.plots.figures import Array, column
+from service.media.plots.figures import column
+from service.types import StateArray
 
 FORMAT_VERSION = 1
 MAX_POINTS = 300
@@ -67,7 +68,7 @@ def blocks(num: int, max_blocks: int) -> list[NDArray[np.int64]]:
     return np.array_split(np.arange(num), min(num, max_blocks))
 
 
-def binned(records: Records, key: str, num_bins: int, *, over: str = "env_steps") -> Array:
+def binned(records: Records, key: str, num_bins: int, *, over: str = "env_steps") -> StateArray:
     """Means of a metric in ``num_bins`` equal spans of a counter from 0 to its end, NaN where a span has none."""
     at, values = column(records, over), column(records, key)
     known = np.isfinite(values) & np.isfinite(at)
@@ -89,7 +90,7 @@ def steps_until(records: Records, key: str, level: float, *, num_in_a_row: int =
     return None
 
 
-def _rounded(values: Array, key: str) -> float | None:
+def _rounded(values: StateArray, key: str) -> float | None:
     if not values.size:
         return None
     mean = float(values.mean())

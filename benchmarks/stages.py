@@ -14,9 +14,9 @@ import numpy as np
 from service.actors.coverage import Composable, RandomPolicy, skill_trajectories, visited_share
 from service.config import Config
 from service.media.artifacts import COVERAGE_STEPS, NUM_SKILLS
-from service.media.plots.figures import Array
 from service.policies.numpy_policy import NumpyMCPPolicy, numpy_bob
 from service.policies.parameters import Parameters
+from service.types import StateArray
 
 NUM_SETS = 10
 CELL_SIZE_M = 0.05
@@ -66,7 +66,7 @@ def mean_share(stage: Mapping[str, Any]) -> float:
     return float(np.mean(stage["shares"]))
 
 
-def paths_m(stage: Mapping[str, Any]) -> Array:
+def paths_m(stage: Mapping[str, Any]) -> StateArray:
     """The kept paths of a stage, (number, points, 3) metres."""
     flat = np.array(stage["paths_mm"], dtype=np.float64) / 1000
     return flat.reshape(len(flat), -1, 3)

@@ -13,9 +13,10 @@ from pathlib import Path
 from typing import Any, Literal, Self
 
 import yaml
-from pydantic import BaseModel, ConfigDict, Field, PositiveInt, ValidationError, model_validator
+from pydantic import BaseModel, Field, PositiveInt, ValidationError, model_validator
 
 from service.errors import TandemError
+from service.frozen import FrozenModel
 
 _RENAMED = {"learner.bob_average_decay": "learner.bob_ema_decay"}
 """Keys that had another name in version 0.1.0."""
@@ -36,11 +37,7 @@ Point = tuple[float, float, float]
 """x, y, z in the world frame."""
 
 
-class _Frozen(BaseModel):
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
-
-
-class WorkspaceConfig(_Frozen):
+class WorkspaceConfig(FrozenModel):
     """The box in which goals are valid. Origin of the world: the table top, 0.6 m in front of the robot's base."""
 
     center_x_m: float = Field(
@@ -65,7 +62,7 @@ class WorkspaceConfig(_Frozen):
         return self.center_x_m + self.length_x_m / 2, self.center_y_m + self.length_y_m / 2, self.height_m
 
 
-class WorldConfig(_Frozen):
+class WorldConfig(FrozenModel):
     """The MuJoCo world: robot, table, one rigid object."""
 
     object: Literal["cube", "sphere"] = "cube"
@@ -88,7 +85,7 @@ class WorldConfig(_Frozen):
     num_substeps: int = Field(20, ge=1, le=200, description="physics steps per action; 20 x 2 ms = 25 Hz as panda-gym")
 
 
-class GameConfig(_Frozen):
+class GameConfig(FrozenModel):
     """Asymmetric self-play: who plays how long, for which rewards."""
 
     num_worlds: int = Field(160, ge=1, description="worlds stepped together by one actor")
@@ -128,7 +125,7 @@ class GameConfig(_Frozen):
         return self
 
 
-class GeneratorConfig(_Frozen):
+class GeneratorConfig(FrozenModel):
     """The task generator: which goals and opponents a round uses, and when the run is over."""
 
     past_opponent_fraction: float = Field(
@@ -152,13 +149,13 @@ class GeneratorConfig(_Frozen):
     stop_success_rate: float = Field(0.95, gt=0.0, le=1.0)
 
 
-class MLPConfig(_Frozen):
+class MLPConfig(FrozenModel):
     """A multi-layer perceptron with ELU."""
 
     hidden_sizes: tuple[PositiveInt, ...] = Field((256, 256), min_length=1)
 
 
-class MCPConfig(_Frozen):
+class MCPConfig(FrozenModel):
     """Bob's Multiplicative Compositional Policy."""
 
     num_primitives: int = Field(4, ge=1, description="K; paper: 4")
@@ -176,7 +173,7 @@ class MCPConfig(_Frozen):
         return self
 
 
-class PolicyConfig(_Frozen):
+class PolicyConfig(FrozenModel):
     """Networks of both players."""
 
     alice: MLPConfig = MLPConfig()
@@ -197,7 +194,7 @@ class PolicyConfig(_Frozen):
         return self
 
 
-class PPOConfig(_Frozen):
+class PPOConfig(FrozenModel):
     """One player's PPO (Schulman et al. 2017)."""
 
     learning_rate: float = Field(3e-4, gt=0.0)
@@ -216,7 +213,7 @@ class PPOConfig(_Frozen):
     target_kl: float = Field(0.02, gt=0.0, description="an update stops early once its mean KL passes 1.5 x this")
 
 
-class ABCConfig(_Frozen):
+class ABCConfig(FrozenModel):
     """Alice behavioural cloning (OpenAI 2021): PPO-clipped cloning of Alice's turns whose goal Bob failed."""
 
     weight: float = Field(0.5, ge=0.0, description="beta")
@@ -231,7 +228,7 @@ class ABCConfig(_Frozen):
     )
 
 
-class LearnerConfig(_Frozen):
+class LearnerConfig(FrozenModel):
     """Central learner."""
 
     device: Literal["cpu", "cuda", "auto"] = Field(
@@ -259,7 +256,7 @@ class LearnerConfig(_Frozen):
     mirror: bool = Field(False, description="learn from every Bob sample also reflected in y; the task is symmetric")
 
 
-class RunConfig(_Frozen):
+class RunConfig(FrozenModel):
     """Length and bookkeeping of a run."""
 
     total_env_steps: int = Field(3_000_000, ge=1, description="both players' steps together")
@@ -271,7 +268,7 @@ class RunConfig(_Frozen):
     num_threads: int = Field(0, ge=0, description="threads that step worlds; 0: one per core")
 
 
-class Config(_Frozen):
+class Config(FrozenModel):
     """A whole pre-training run."""
 
     name: str = Field(

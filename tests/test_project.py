@@ -26,8 +26,13 @@ HEAVY = (
     "uvicorn",
     "httpx",
 )
+CLUSTER_MODULES = ("actor_pool", "cluster", "ray_actors", "ray_connection", "remote_worker", "status_actor")
 ROOMS_WITHOUT_TORCH = ("actors", "envs", "generator", "registry", "status")
-ROOMS_BELOW_RUNTIME = ("envs", "policies", "actors", "generator", "learner", "registry")
+ROOMS = (
+    *("errors", "frozen", "types", "config", "io", "envs", "policies", "generator", "actors", "learner", "registry"),
+    *("primitives", "media", "downstream", "store", "status", "runtime", "cli", "__main__"),
+)
+"""Each room may import itself and those before it."""
 VERBS = ("demo", "pretrain", "evaluate", "render", "coverage", "registry", "serve", "downstream")
 DOCUMENTS = [*sorted(ROOT.glob("*.md")), *sorted((ROOT / "docs").rglob("*.md")), ROOT / "deploy" / "README.md"]
 FOLDERS = (".ci", "benchmarks", "configs", "deploy", "docs", "service", "tests", "tools")
@@ -113,16 +118,46 @@ def test_acting_needs_no_torch(room):
     run_python(IMPORT_ALL, "torch", ",".join(modules))
 
 
-def test_nothing_below_the_runners_knows_which_one_runs_it():
-    above = re.compile(r"(service\.(runtime|status|cli)|ray|redis)(\.|$)")
-    offenders = []
-    for path in (path for room in ROOMS_BELOW_RUNTIME for path in (ROOT / "service" / room).rglob("*.py")):
+def imports_of_modules():
+    """Every import in service, those inside functions and for types included: (importing, imported module) by name."""
+    modules = {name: path for name, path in zip(modules_in(""), sorted((ROOT / "service").rglob("*.py")), strict=True)}
+    for name, path in modules.items():
         for node in ast.walk(ast.parse(path.read_text())):
-            names = [alias.name for alias in node.names] if isinstance(node, ast.Import) else []
-            if isinstance(node, ast.ImportFrom):
-                names = [f"{node.module}.{alias.name}" for alias in node.names]
-            offenders += [f"{path.relative_to(ROOT)} imports {name}" for name in names if above.match(name)]
-    assert offenders == []
+            if isinstance(node, ast.Import):
+                yield from ((name, alias.name) for alias in node.names)
+            elif isinstance(node, ast.ImportFrom):
+                assert not node.level, f"{path} line {node.lineno}: relative import"
+                whole = [f"{node.module}.{alias.name}" for alias in node.names]
+                yield from ((name, each if each in modules else node.module) for each in whole)
+
+
+def room_of(module):
+    return module.split(".")[1]
+
+
+def test_imports_run_only_down():
+    """``service`` itself, the public API, stands outside: it may import any room, and any room its version."""
+    ours = [pair for pair in imports_of_modules() if pair[0] != "service" and pair[1].startswith("service.")]
+    assert {room_of(module) for pair in ours for module in pair} == set(ROOMS)
+    upwards = {(one, other) for one, other in ours if ROOMS.index(room_of(other)) > ROOMS.index(room_of(one))}
+    assert upwards == set()
+
+
+def test_no_import_circle():
+    waiting = {}
+    for one, other in imports_of_modules():
+        if one != "service" and other.startswith("service.") and one != other:
+            waiting.setdefault(one, set()).add(other)
+    while free := {module for module, imported in waiting.items() if not imported & waiting.keys()}:
+        waiting = {module: imported for module, imported in waiting.items() if module not in free}
+    assert waiting == {}
+
+
+def test_only_the_cluster_knows_ray_and_only_the_store_knows_redis():
+    users = {(other.split(".")[0], one) for one, other in imports_of_modules()}
+    with_ray = {f"service.runtime.{name}" for name in CLUSTER_MODULES} | {"service.downstream.table"}
+    assert {one for package, one in users if package == "ray"} == with_ray
+    assert {room_of(one) for package, one in users if package == "redis"} == {"store"}
 
 
 def test_no_module_is_long():

@@ -28,13 +28,13 @@ from service.media.plots.figures import (
     GREEN,
     INK,
     ORANGE,
-    Array,
     column,
     counted,
     new_figure,
     save,
     style_axes,
 )
+from service.types import StateArray
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -79,7 +79,7 @@ def _legend(figure: Figure, lines: Sequence[_LegendLine], y: float, num_columns:
 
 
 def _end(records: Records, clock: Clock) -> float:
-    values: Array = column(records, clock.key)
+    values: StateArray = column(records, clock.key)
     return float(np.nanmax(values)) / clock.scale
 
 
@@ -265,7 +265,7 @@ def _draw_goal_cells(axes: Axes, curriculum: dict[str, Any], name: str) -> None:
     axes.set_ylim(0.0, BIN_M * NUM_BINS[name])
 
 
-def quantiles(counts: Array, quantile: float) -> Array:
+def quantiles(counts: StateArray, quantile: float) -> StateArray:
     """Metres below which a share of each row's goals lie, straight within a bin, NaN in a row without goals.
 
     Args:

@@ -8,14 +8,11 @@ from __future__ import annotations
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
 from service.config import WorkspaceConfig, WorldConfig
 from service.envs.batch import WorldBatch
 from service.envs.observations import ACTION_SIZE
-
-FloatArray = NDArray[np.float32]
-StateArray = NDArray[np.float64]
+from service.types import FloatArray, StateArray
 
 
 class Composable(Protocol):

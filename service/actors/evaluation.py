@@ -7,15 +7,13 @@ from dataclasses import asdict, dataclass
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
 from service.config import Config, WorldConfig
 from service.envs.batch import WorldBatch
 from service.envs.goals import GoalKind, draw_goals
 from service.envs.observations import ACTION_SIZE, bob_observation
+from service.types import FloatArray, StateArray
 
-FloatArray = NDArray[np.float32]
-StateArray = NDArray[np.float64]
 Observer = Callable[[WorldBatch, StateArray], None]
 """Called with the worlds and their (N, 3) goals, metres, at the start and after each step."""
 

@@ -13,11 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.generator.records import GoalRecords
+from service.types import BoolArray, FloatArray, StateArray
 
-FloatArray = NDArray[np.float32]
-StateArray = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
-Broken = tuple[tuple[StateArray, FloatArray], ...]
+Diverged = tuple[tuple[StateArray, FloatArray], ...]
 """(last finite state (S,), action (4,)) of each world whose physics diverged."""
 
 
@@ -46,7 +44,7 @@ class Turns:
     terminated: BoolArray
     """(T, N) the turn truly ended with this step: no bootstrap."""
     learn: BoolArray
-    """(N,) played by the current policy version; not a past opponent's turn, a broken world's, or an untried goal's."""
+    """(N,) played by the current policy version; not a past opponent's, a diverged world's, or of an untried goal."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,7 +74,7 @@ class Rollout:
     metrics: dict[str, float]
     """Counters of this round, e.g. ``alice/contact_fraction``."""
 
-    broken: Broken = ()
+    diverged: Diverged = ()
     """Not part of a checkpoint."""
 
     @property

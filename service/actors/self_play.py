@@ -29,11 +29,8 @@ from service.generator.generator import GoalChoice
 from service.generator.opponents import CURRENT, RoundPlan
 from service.generator.records import GoalRecords
 from service.generator.validity import Verdict, classify_goal
+from service.types import BoolArray, FloatArray, IntArray, StateArray
 
-FloatArray = NDArray[np.float32]
-StateArray = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
-IntArray = NDArray[np.int64]
 VerdictArray = NDArray[np.int8]
 
 
@@ -112,17 +109,17 @@ class SelfPlay:
         """
         game, worlds = self.config.game, self.worlds
         start_state, start_position = worlds.states.copy(), worlds.object_position.copy()
-        alice, contacts, broken = self._play_alice(players, plan, observe)
+        alice, contacts, diverged = self._play_alice(players, plan, observe)
         end_state, proposal = worlds.states.copy(), worlds.object_position.copy()
         verdict = classify_goal(start_position, proposal, self.config.world.workspace, game.success_distance_m)
-        verdict[broken] = Verdict.FALLEN
+        verdict[diverged] = Verdict.FALLEN
         choice = choose_goals(start_state, start_position, self._round_index, proposal, verdict)
 
         worlds.restore(choice.start_state)
-        bob, solved, broken = self._play_bob(players, plan, choice, observe)
+        bob, solved, diverged = self._play_bob(players, plan, choice, observe)
         achieved = worlds.object_position.copy()
-        played = choice.played & ~broken  # a turn in which the physics broke says nothing about either player
-        bob.learn[broken] = False
+        played = choice.played & ~diverged  # a turn in which the physics diverged says nothing about either player
+        bob.learn[diverged] = False
         self._reward_alice(alice, verdict, played & ~choice.replayed, solved)
         records = GoalRecords(
             start_state=choice.start_state,
@@ -151,22 +148,22 @@ class SelfPlay:
             records=records,
             num_env_steps=int(alice.active.sum() + bob.active.sum()),
             metrics=_contact_metrics(contacts),
-            broken=tuple(worlds.broken),
+            diverged=tuple(worlds.diverged),
         )
-        worlds.broken = []
+        worlds.diverged = []
         self._sequence += 1
         return rollout
 
     def _play_alice(
         self, players: Players, plan: RoundPlan, observe: Observer | None
     ) -> tuple[Turns, BoolArray, BoolArray]:
-        """Her turns (without the reward of her goal), (N, 2) finger contacts, (N,) worlds whose physics broke."""
+        """Her turns (without the reward of her goal), (N, 2) finger contacts, (N,) worlds whose physics diverged."""
         game, worlds = self.config.game, self.worlds
         num_steps = int(self._rng.integers(game.alice_steps_min or game.alice_steps, game.alice_steps + 1))
         turns = _empty_turns(game.alice_steps, worlds.num_worlds, FULL_SIZE, FULL_SIZE, learn=~plan.alice_past)
         all_worlds = np.arange(worlds.num_worlds)
         contacts = np.zeros((worlds.num_worlds, 2), dtype=bool)
-        broken = np.zeros(worlds.num_worlds, dtype=bool)
+        diverged = np.zeros(worlds.num_worlds, dtype=bool)
         if observe:
             observe(worlds.states)
         for step in range(num_steps):
@@ -175,7 +172,9 @@ class SelfPlay:
                 players.alice, players.past_alice, plan.alice_opponent, observation, all_worlds, self._rng
             )
             turns.observation[step], turns.action[step], turns.log_prob[step] = observation, action, log_prob
-            broken |= worlds.step(action) if not broken.any() else worlds.step(action[~broken], np.flatnonzero(~broken))
+            diverged |= (
+                worlds.step(action) if not diverged.any() else worlds.step(action[~diverged], np.flatnonzero(~diverged))
+            )
             if observe:
                 observe(worlds.states)
             contacts |= worlds.contacts()
@@ -183,13 +182,13 @@ class SelfPlay:
         turns.final_value_observation[:] = worlds.full(1.0)
         turns.active[:num_steps] = True
         turns.terminated[num_steps - 1] = True
-        turns.learn[broken] = False
-        return turns, contacts, broken
+        turns.learn[diverged] = False
+        return turns, contacts, diverged
 
     def _play_bob(
         self, players: Players, plan: RoundPlan, choice: GoalChoice, observe: Observer | None
     ) -> tuple[Turns, BoolArray, BoolArray]:
-        """His turns, (N,) solved, (N,) worlds whose physics broke.
+        """His turns, (N,) solved, (N,) worlds whose physics diverged.
 
         A world's turn ends when its object has been at the goal for ``bob_hold_steps`` steps in a row, or its physics
         broke. The others go on; ``playing`` holds their indices.
@@ -197,7 +196,7 @@ class SelfPlay:
         game, worlds = self.config.game, self.worlds
         num = worlds.num_worlds
         turns = _empty_turns(game.bob_steps, num, BOB_SIZE, BOB_VALUE_SIZE, learn=choice.played & ~plan.bob_past)
-        solved, broken = np.zeros(num, dtype=bool), np.zeros(num, dtype=bool)
+        solved, diverged = np.zeros(num, dtype=bool), np.zeros(num, dtype=bool)
         num_held: IntArray = np.zeros(num, dtype=np.int64)
         playing = np.flatnonzero(choice.played)
         if observe:
@@ -210,7 +209,7 @@ class SelfPlay:
             turns.observation[step, playing], turns.action[step, playing] = observation, action
             turns.value_observation[step, playing] = worlds.bob_value(choice.goal)[playing]
             turns.log_prob[step, playing], turns.active[step, playing] = log_prob, True
-            broken |= worlds.step(action, playing)
+            diverged |= worlds.step(action, playing)
             if observe:
                 observe(worlds.states)
             reached = np.linalg.norm(worlds.object_position - choice.goal, axis=1) <= game.success_distance_m
@@ -220,9 +219,9 @@ class SelfPlay:
             num_held = np.where(reached, num_held + 1, 0)
             over = num_held >= game.bob_hold_steps
             turns.terminated[step, playing] = over[playing]
-            playing = playing[~(over | broken)[playing]]
+            playing = playing[~(over | diverged)[playing]]
         turns.final_value_observation[:] = worlds.bob_value(choice.goal)
-        return turns, solved, broken
+        return turns, solved, diverged
 
     def _reward_alice(self, alice: Turns, verdict: VerdictArray, tried: BoolArray, solved: BoolArray) -> None:
         game = self.config.game
@@ -259,7 +258,7 @@ class SelfPlay:
             "worlds": self.worlds.states.copy(),
             "round_index": self._round_index.copy(),
             "sequence": np.array(self._sequence),
-            "num_broken": np.array(self.worlds.num_broken),
+            "num_broken": np.array(self.worlds.num_diverged),
         }
 
     def load_state(self, state: dict[str, NDArray[np.generic]]) -> None:
@@ -267,7 +266,7 @@ class SelfPlay:
         self.worlds.restore(np.asarray(state["worlds"], dtype=np.float64))
         self._round_index = np.asarray(state["round_index"], dtype=np.int64).copy()
         self._sequence = int(state["sequence"])
-        self.worlds.num_broken = int(state["num_broken"])
+        self.worlds.num_diverged = int(state["num_broken"])
 
 
 def _act(

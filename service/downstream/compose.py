@@ -21,11 +21,11 @@ from numpy.typing import NDArray
 from service.envs.observations import POSITIONS_SIZE, SPACES
 from service.errors import TandemError
 from service.policies.numpy_policy import NumpyMCPPolicy
+from service.types import FloatArray
 
 if TYPE_CHECKING:
     from service.primitives.loading import TrainedBob
 
-FloatArray = NDArray[np.float32]
 Info = dict[str, Any]
 Positions = Callable[[Any], FloatArray]
 

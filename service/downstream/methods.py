@@ -13,18 +13,17 @@ from typing import TYPE_CHECKING, Any
 
 import gymnasium
 import numpy as np
-from numpy.typing import NDArray
 
 from service.actors.evaluation import DeterministicPolicy, IdlePolicy
 from service.downstream.compose import ComposePrimitivesVector, action_weights, check_primitives, check_robot
 from service.errors import TandemError
+from service.types import FloatArray
 
 if TYPE_CHECKING:
     from stable_baselines3.sac.policies import SACPolicy
 
     from service.primitives.loading import TrainedBob
 
-FloatArray = NDArray[np.float32]
 Worlds = gymnasium.vector.VectorEnv[Any, Any, Any]
 
 

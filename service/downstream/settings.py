@@ -4,24 +4,21 @@ from __future__ import annotations
 
 from typing import Any, TypeVar
 
-from pydantic import BaseModel, ConfigDict, Field, PositiveInt, ValidationError
+from pydantic import Field, PositiveInt, ValidationError
 
 from service.downstream.methods import find_method
 from service.envs.gym.registration import EPISODE_STEPS
 from service.envs.tasks import find_task
 from service.errors import TandemError
+from service.frozen import FrozenModel
 
 _MAX_SEED = 2**32 - 1
 
 
-class _Frozen(BaseModel):
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+_Settings = TypeVar("_Settings", bound=FrozenModel)
 
 
-_Settings = TypeVar("_Settings", bound=_Frozen)
-
-
-class SACConfig(_Frozen):
+class SACConfig(FrozenModel):
     """Soft actor-critic on many worlds: every world makes a step, then there are several large updates."""
 
     num_worlds: int = Field(64, ge=1)
@@ -39,7 +36,7 @@ class SACConfig(_Frozen):
     learning_starts: int = Field(6_400, ge=0, description="env steps of uniform actions first; more than an episode")
 
 
-class TrialConfig(_Frozen):
+class TrialConfig(FrozenModel):
     """One run of a method on a task."""
 
     task: str

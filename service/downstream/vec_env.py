@@ -11,7 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 from stable_baselines3.common.vec_env import VecEnv
 
-FloatArray = NDArray[np.float32]
+from service.types import FloatArray
+
 Observation = dict[str, FloatArray]
 Info = dict[str, Any]
 

@@ -9,7 +9,6 @@ from typing import Self
 import mujoco
 import numpy as np
 from mujoco import rollout
-from numpy.typing import NDArray
 
 from service.config import WorldConfig
 from service.envs import kinematics
@@ -18,11 +17,7 @@ from service.envs.panda import FINGER_STROKE_M, NUM_FINGERS, NUM_JOINTS
 from service.envs.sampling import draw_starts
 from service.envs.scene import build_layout, build_spec
 from service.errors import DivergedError
-
-FloatArray = NDArray[np.float32]
-StateArray = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
-IntArray = NDArray[np.int64]
+from service.types import BoolArray, FloatArray, IntArray, StateArray
 
 DISPLACEMENT_M = 0.05
 """End-effector displacement of a full action (paper)."""
@@ -75,8 +70,8 @@ class WorldBatch:
         self.states: StateArray = np.tile(self._fresh_state, (num_worlds, 1))
         """(N, S)."""
         self._kinematics = kinematics.forward(self.joints)
-        self.num_broken = 0
-        self.broken: list[tuple[StateArray, FloatArray]] = []
+        self.num_diverged = 0
+        self.diverged: list[tuple[StateArray, FloatArray]] = []
         """(last finite state, action) of every world whose physics diverged; whoever reports them clears the list."""
 
     def __enter__(self) -> Self:
@@ -151,7 +146,7 @@ class WorldBatch:
             worlds: indices of the worlds that act; all by default. The others stand still.
 
         Returns:
-            (N,) true where the physics diverged. Such a world keeps its last finite state; ``broken`` has it.
+            (N,) true where the physics diverged. Such a world keeps its last finite state; ``diverged`` has it.
 
         Raises:
             ValueError: actions of the wrong shape.
@@ -183,15 +178,15 @@ class WorldBatch:
         after[:, self.layout["contacts"]] = (sensors > 0).any(axis=1)
         after[:, self.layout.kept] = start[:, self.layout.kept]
         finite = (np.abs(after[:, self.layout.velocities]) < MAX_SPEED).all(axis=1) & np.isfinite(after).all(axis=1)
-        broken = np.zeros(self.num_worlds, dtype=bool)
+        diverged = np.zeros(self.num_worlds, dtype=bool)
         if not finite.all():
             after[~finite] = start[~finite]
-            broken[index] = ~finite
-            self.num_broken += int((~finite).sum())
-            self.broken += [(start[row].copy(), actions[row].copy()) for row in np.flatnonzero(~finite)]
+            diverged[index] = ~finite
+            self.num_diverged += int((~finite).sum())
+            self.diverged += [(start[row].copy(), actions[row].copy()) for row in np.flatnonzero(~finite)]
         self.states[index] = after
         self._kinematics = kinematics.forward(self.joints)
-        return broken
+        return diverged
 
     def _control(self, start: StateArray, actions: StateArray, index: slice | IntArray) -> StateArray:
         actions = np.clip(actions, -1.0, 1.0)

@@ -5,13 +5,12 @@ from __future__ import annotations
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from service.config import WorldConfig
 from service.envs.sampling import behind_wall, in_box, sample_in_volume, sample_on_table
 from service.errors import TandemError
+from service.types import StateArray
 
-StateArray = NDArray[np.float64]
 GoalKind = Literal["table", "air", "mixed", "volume"]
 GOAL_KINDS: tuple[GoalKind, ...] = ("table", "air", "mixed", "volume")
 

@@ -9,11 +9,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from service.envs.panda import BASE_POSITION, FLANGE_TO_TIP_M, JOINT_LOWER, JOINT_UPPER, NUM_JOINTS
-
-Array = NDArray[np.float64]
+from service.types import StateArray
 
 # (a, d, quarter turns about x) of each joint, modified DH (Craig): twist, then offset a along x and d along the new z.
 _DH = (
@@ -40,15 +38,15 @@ NEUTRAL_JOINTS = np.array([0.0, 0.41, 0.0, -1.85, 0.0, 2.26, np.pi / 4])
 class Kinematics:
     """Pose of N end effectors and how joints move them."""
 
-    position: Array
+    position: StateArray
     """(N, 3) end effector in the world frame, metres."""
-    rotation: Array
+    rotation: StateArray
     """(N, 3, 3) of the last link; columns are its axes."""
-    jacobian: Array
+    jacobian: StateArray
     """(N, 6, 7) linear then angular velocity per joint velocity."""
 
 
-def forward(joints: Array) -> Kinematics:
+def forward(joints: StateArray) -> Kinematics:
     """Forward kinematics of (N, 7) joint angles, rad."""
     num = joints.shape[0]
     x_axis, y_axis, z_axis = (np.tile(axis, (num, 1)) for axis in np.eye(3))
@@ -75,7 +73,7 @@ def forward(joints: Array) -> Kinematics:
     return Kinematics(position, np.stack([x_axis, y_axis, z_axis], axis=-1), jacobian)
 
 
-def _cross(left: Array, right: Array) -> Array:
+def _cross(left: StateArray, right: StateArray) -> StateArray:
     """Cross product of (..., 3) arrays, five times faster than ``np.cross`` on small ones."""
     out = np.empty_like(left)
     out[..., 0] = left[..., 1] * right[..., 2] - left[..., 2] * right[..., 1]
@@ -90,13 +88,13 @@ DOWN = np.array([[_HALF, -_HALF, 0.0], [-_HALF, -_HALF, 0.0], [0.0, 0.0, -1.0]])
 """Rotation of the last link when the gripper points down."""
 
 
-def _orientation_error(rotation: Array) -> Array:
+def _orientation_error(rotation: StateArray) -> StateArray:
     """(N, 3) small rotation vector that takes ``rotation`` to DOWN: half the sum of the axes' cross products."""
-    error: Array = 0.5 * _cross(rotation.transpose(0, 2, 1), np.broadcast_to(DOWN.T, rotation.shape)).sum(axis=1)
+    error: StateArray = 0.5 * _cross(rotation.transpose(0, 2, 1), np.broadcast_to(DOWN.T, rotation.shape)).sum(axis=1)
     return error
 
 
-def clip_to_reach(target: Array, lowest_z_m: float) -> Array:
+def clip_to_reach(target: StateArray, lowest_z_m: float) -> StateArray:
     """Nearest point a gripper-down arm can reach: height first, then horizontal distance from the base.
 
     The wrist sits 0.2104 m above the end effector and 0.088 m nearer to the base; its distance from the shoulder is at
@@ -118,7 +116,9 @@ def clip_to_reach(target: Array, lowest_z_m: float) -> Array:
     return clipped
 
 
-def solve(joints: Array, target: Array, *, at: Kinematics | None = None, num_iterations: int = 2) -> Array:
+def solve(
+    joints: StateArray, target: StateArray, *, at: Kinematics | None = None, num_iterations: int = 2
+) -> StateArray:
     """Joint angles that bring the end effector to ``target`` with the gripper pointing down.
 
     Damped least squares (Wampler 1986) with the posture drawn to neutral in the null space.

@@ -19,8 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.envs.state_layout import columns
-
-FloatArray = NDArray[np.float32]
+from service.types import FloatArray
 
 
 @dataclass(frozen=True)

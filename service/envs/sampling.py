@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from service.config import WorkspaceConfig, WorldConfig
 from service.envs import fixtures
-
-StateArray = NDArray[np.float64]
+from service.types import StateArray
 
 _TABLE_TOP_M = 0.0
 

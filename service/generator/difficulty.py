@@ -5,15 +5,11 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 import numpy as np
-from numpy.typing import NDArray
 
 from service.config import Point, WorldConfig
 from service.generator.counts import SuccessCounts
-from service.generator.state import Array, State, prefixed, take, under
-
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
-Bools = NDArray[np.bool_]
+from service.generator.state import prefixed, take, under
+from service.types import Array, Arrays, BoolArray, IntArray, StateArray
 
 AIR_ABOVE_REST_M = 0.05
 """A goal is in the air when the object's centre is higher than it rests on the table by more than this."""
@@ -24,13 +20,13 @@ DISTANCE_EDGES_M = (0.10, 0.15, 0.20, 0.30)
 """Distances from the start that part the distance bins."""
 
 
-def in_air(positions: Floats, rest_height_m: float) -> Bools:
+def in_air(positions: StateArray, rest_height_m: float) -> BoolArray:
     """Whether an object at each (..., 3) position is lifted rather than lying (or tilting) on the table."""
-    lifted: Bools = positions[..., 2] > rest_height_m + AIR_ABOVE_REST_M
+    lifted: BoolArray = positions[..., 2] > rest_height_m + AIR_ABOVE_REST_M
     return lifted
 
 
-def height_bins(positions: Floats, rest_height_m: float) -> Ints:
+def height_bins(positions: StateArray, rest_height_m: float) -> IntArray:
     """(M,) index into ``HEIGHT_NAMES`` of (M, 3) positions; bin 0 is exactly what is not ``in_air``."""
     edges = rest_height_m + np.array([AIR_ABOVE_REST_M, *HEIGHT_EDGES_M])
     return np.digitize(positions[:, 2], edges, right=True).astype(np.int64)
@@ -50,12 +46,12 @@ class DifficultyGrid:
     """Number of cells in x, y and z."""
     cells: SuccessCounts
     """Over the cells, x-major."""
-    seen: Bools
+    seen: BoolArray
     """(cells,) a valid goal was ever proposed there."""
 
     def __init__(self, world: WorldConfig, cell_size_m: float) -> None:
         self.bounds_m = world.workspace.lower_m, world.workspace.upper_m
-        self._lower: Floats = np.array(self.bounds_m[0])
+        self._lower: StateArray = np.array(self.bounds_m[0])
         self.cell_size_m = cell_size_m
         self._rest_height_m = world.object_size_m / 2
         # Rounding may not add a cell: 0.45 / 0.03 is a little over 15.
@@ -73,19 +69,19 @@ class DifficultyGrid:
         """Cells in which a valid goal was ever proposed."""
         return int(np.count_nonzero(self.seen))
 
-    def cell_index(self, goals: Floats) -> Ints:
+    def cell_index(self, goals: StateArray) -> IntArray:
         """(M,) flat cell of each of (M, 3) goals inside the workspace, metres; upper faces belong to the last cells."""
         index = np.floor((goals - self._lower) / self.cell_size_m).astype(np.int64)
         index = np.clip(index, 0, np.array(self.shape) - 1)
         return np.ravel_multi_index((index[:, 0], index[:, 1], index[:, 2]), self.shape).astype(np.int64)
 
-    def mark_seen(self, goals: Floats) -> int:
+    def mark_seen(self, goals: StateArray) -> int:
         """Note where (M, 3) valid goals were proposed, tried or not; returns how many cells were new."""
         before = self.num_cells_seen
         self.seen[self.cell_index(goals)] = True
         return self.num_cells_seen - before
 
-    def record(self, goals: Floats, solved: Bools) -> None:
+    def record(self, goals: StateArray, solved: BoolArray) -> None:
         """Age all counts by one iteration, then add M tries of the present Bob.
 
         Args:
@@ -95,19 +91,19 @@ class DifficultyGrid:
         self.mark_seen(goals)
         self.cells.record(self.cell_index(goals), solved)
 
-    def height_bin(self, goals: Floats) -> Ints:
+    def height_bin(self, goals: StateArray) -> IntArray:
         """(M,) index into ``HEIGHT_NAMES`` of (M, 3) goals, metres."""
         return height_bins(goals, self._rest_height_m)
 
-    def distance_bin(self, goals: Floats, start_positions: Floats) -> Ints:
+    def distance_bin(self, goals: StateArray, start_positions: StateArray) -> IntArray:
         """(M,) bin between ``DISTANCE_EDGES_M`` of the way from (M, 3) starts to (M, 3) goals, metres."""
         distance = np.linalg.norm(goals - start_positions, axis=-1)
-        bins: Ints = np.digitize(distance, DISTANCE_EDGES_M).astype(np.int64)
+        bins: IntArray = np.digitize(distance, DISTANCE_EDGES_M).astype(np.int64)
         return bins
 
-    def learnability(self, goals: Floats) -> Floats:
+    def learnability(self, goals: StateArray) -> StateArray:
         """(M,) p (1 - p) of the cell of each of (M, 3) goals; 1/4, the most, where untried."""
-        learnability: Floats = self.cells.learnability()[self.cell_index(goals)]
+        learnability: StateArray = self.cells.learnability()[self.cell_index(goals)]
         return learnability
 
     def mean_learnability(self) -> float:
@@ -127,7 +123,7 @@ class DifficultyGrid:
         maps["center"] = self._lower + (index + 0.5) * self.cell_size_m
         return maps
 
-    def state(self) -> State:
+    def state(self) -> Arrays:
         """All counts, copied."""
         return {"seen": self.seen.copy()} | prefixed("cells", self.cells.state())
 

@@ -16,12 +16,10 @@ from service.generator.metrics import alice_metrics, bob_metrics, current_goals,
 from service.generator.opponents import OpponentPool, RoundPlan
 from service.generator.records import GoalRecords
 from service.generator.ring import Ring
-from service.generator.state import Array, State, prefixed, under
+from service.generator.state import prefixed, under
 from service.generator.stopping import StopCriterion
 from service.generator.validity import Verdict
-
-Floats = NDArray[np.float64]
-Bools = NDArray[np.bool_]
+from service.types import Array, Arrays, BoolArray, StateArray
 
 LEARNABILITY_FLOOR = 0.01
 """Added to p (1 - p), which is at most 1/4, so goals of a solved or hopeless cell stay drawable and measured."""
@@ -35,17 +33,17 @@ MIN_REPLAY_GOALS = 64
 class GoalChoice:
     """The goals Bob plays in a round of N worlds, and where both he and the object start."""
 
-    goal: Floats
+    goal: StateArray
     """(N, 3) metres; where not ``played`` it is Alice's proposal as it came."""
-    start_state: Floats
+    start_state: StateArray
     """(N, S) full physics state."""
-    start_position: Floats
+    start_position: StateArray
     """(N, 3) object position there, metres."""
-    replayed: Bools
+    replayed: BoolArray
     """(N,) the goal and its start come from the buffer, not from this round's Alice."""
-    from_reset: Bools
+    from_reset: BoolArray
     """(N,) the start is that of a game."""
-    played: Bools
+    played: BoolArray
     """(N,) there is a goal for Bob to play."""
 
 
@@ -92,10 +90,10 @@ class TaskGenerator:
     def choose_goals(
         self,
         plan: RoundPlan,
-        start_state: Floats,
-        start_position: Floats,
+        start_state: StateArray,
+        start_position: StateArray,
         round_index: NDArray[np.int64],
-        proposal: Floats,
+        proposal: StateArray,
         verdict: NDArray[np.int8],
         rng: np.random.Generator,
     ) -> GoalChoice:
@@ -114,7 +112,7 @@ class TaskGenerator:
         """
         reset = round_index == 0
         self.starts.add(start_state=start_state[reset], start_position=start_position[reset])
-        valid: Bools = verdict == Verdict.VALID
+        valid: BoolArray = verdict == Verdict.VALID
         replayed = self._choose_replayed(valid, plan.bob_past, rng)
         starts = start_state.copy(), start_position.copy()
         choice = GoalChoice(proposal.copy(), *starts, replayed, reset & ~replayed, valid | replayed)
@@ -167,7 +165,7 @@ class TaskGenerator:
         """Whether, over ``novelty_window`` iterations, Alice found no new goal cell and Bob solved her goals."""
         return self._stop.should_stop()
 
-    def state(self) -> State:
+    def state(self) -> Arrays:
         """Everything an exact resume needs, copied: flat named arrays."""
         return (
             prefixed("grid", self.grid.state())
@@ -191,12 +189,12 @@ class TaskGenerator:
         self.opponents.load_state(under("opponents", state))
         self._stop.load_state(under("stop", state))
 
-    def _choose_replayed(self, valid: Bools, bob_past: Bools, rng: np.random.Generator) -> Bools:
+    def _choose_replayed(self, valid: BoolArray, bob_past: BoolArray, rng: np.random.Generator) -> BoolArray:
         """(N,) worlds whose goal comes from the buffer."""
         if len(self.buffer) < MIN_REPLAY_GOALS:
             return np.zeros(len(valid), dtype=np.bool_)
-        replaced: Bools = valid & (rng.random(len(valid)) < self._config.replay_fraction)
-        filled: Bools = ~valid & self._config.replay_invalid
+        replaced: BoolArray = valid & (rng.random(len(valid)) < self._config.replay_fraction)
+        filled: BoolArray = ~valid & self._config.replay_invalid
         return (replaced | filled) & ~bob_past
 
     def _replay(self, choice: GoalChoice, worlds: NDArray[np.int64], rng: np.random.Generator) -> None:
@@ -225,17 +223,17 @@ class TaskGenerator:
         choice.start_state[worlds] = tasks["start_state"][drawn]
         choice.start_position[worlds] = tasks["start_position"][drawn]
 
-    def _task_bins(self, goals: Floats, starts: Floats, blocked: Bools) -> NDArray[np.int64]:
+    def _task_bins(self, goals: StateArray, starts: StateArray, blocked: BoolArray) -> NDArray[np.int64]:
         """(M,) bin of tasks by the goal's height, its distance from the object's start, and (M,) blocked grippers."""
         bins = self.grid.height_bin(goals) * self.grid.num_distance_bins + self.grid.distance_bin(goals, starts)
         return bins + blocked * self._num_task_bins
 
-    def _blocked(self, states: Floats) -> Bools:
+    def _blocked(self, states: StateArray) -> BoolArray:
         """(M,) whether the gripper of (M, S) states is blocked; none is where states have no such flag."""
-        blocked: Bools = np.any(states[:, self._layout["gripper_blocked"]] > 0.0, axis=1)
+        blocked: BoolArray = np.any(states[:, self._layout["gripper_blocked"]] > 0.0, axis=1)
         return blocked
 
-    def _blocked_metrics(self, records: GoalRecords, tried: Bools) -> dict[str, float]:
+    def _blocked_metrics(self, records: GoalRecords, tried: BoolArray) -> dict[str, float]:
         if not self._some_blocked:
             return {}
         blocked = self._blocked(records.start_state)

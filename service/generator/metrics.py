@@ -8,17 +8,16 @@ from numpy.typing import NDArray
 from service.generator.difficulty import HEIGHT_NAMES, height_bins, in_air
 from service.generator.records import GoalRecords
 from service.generator.validity import Verdict
+from service.types import BoolArray
 
-Bools = NDArray[np.bool_]
 
-
-def own_goals(records: GoalRecords) -> Bools:
+def own_goals(records: GoalRecords) -> BoolArray:
     """(N,) Bob played the valid goal that this world's Alice had just proposed."""
-    own: Bools = (records.verdict == Verdict.VALID) & records.played & ~records.replayed
+    own: BoolArray = (records.verdict == Verdict.VALID) & records.played & ~records.replayed
     return own
 
 
-def current_goals(records: GoalRecords) -> Bools:
+def current_goals(records: GoalRecords) -> BoolArray:
     """(N,) the current Bob played the current Alice's goal: what success statistics are about."""
     return own_goals(records) & ~records.alice_past & ~records.bob_past
 

@@ -8,9 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from service.generator.state import Array, State
+from service.types import Array, Arrays, IntArray
 
-Ints = NDArray[np.int64]
 Parameters = dict[str, Array]
 
 CURRENT = -1
@@ -21,9 +20,9 @@ CURRENT = -1
 class RoundPlan:
     """Players of a round of N worlds; at most one of the two players of a world is a past version."""
 
-    alice_opponent: Ints
+    alice_opponent: IntArray
     """(N,) index of Alice in ``OpponentPool.alice``, or ``CURRENT``."""
-    bob_opponent: Ints
+    bob_opponent: IntArray
     """(N,) index of Bob in ``OpponentPool.bob``, or ``CURRENT``."""
 
     @property
@@ -81,7 +80,7 @@ class OpponentPool:
         plan.bob_opponent[worlds[num_past : 2 * num_past]] = rng.integers(len(self))
         return plan
 
-    def state(self) -> State:
+    def state(self) -> Arrays:
         """All parameters, copied, as ``SNAPSHOT/PLAYER/NAME``."""
         return {
             f"{index}/{player}/{name}": array.copy()

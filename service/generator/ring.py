@@ -5,13 +5,10 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 import numpy as np
-from numpy.typing import NDArray
 
 from service.config import ConfigError
-from service.generator.state import Array, State, take
-
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
+from service.generator.state import take
+from service.types import Array, Arrays, IntArray, StateArray
 
 
 class Ring:
@@ -32,12 +29,12 @@ class Ring:
         """Number of rows held."""
         return int(self._num_held.sum())
 
-    def __getitem__(self, column: str) -> Floats:
+    def __getitem__(self, column: str) -> StateArray:
         """(len, size) rows held, in the order of the weights of ``sample`` and of ``part_share``; a copy."""
-        rows: Floats = self._columns[column][self._held]
+        rows: StateArray = self._columns[column][self._held]
         return rows
 
-    def add(self, part: Ints | None = None, **rows: Floats) -> None:
+    def add(self, part: IntArray | None = None, **rows: StateArray) -> None:
         """Add M rows to every column; the oldest of their part are overwritten.
 
         Args:
@@ -59,7 +56,7 @@ class Ring:
             self._columns[name][where[newest]] = new[order[newest]]
         self._num_added += counted
 
-    def sample(self, rng: np.random.Generator, num: int, weight: Floats | None = None) -> dict[str, Floats]:
+    def sample(self, rng: np.random.Generator, num: int, weight: StateArray | None = None) -> dict[str, StateArray]:
         """Draw ``num`` whole rows with replacement, as copies.
 
         Args:
@@ -73,15 +70,15 @@ class Ring:
         rows = held[rng.choice(held.size, size=num, p=None if weight is None else weight / weight.sum())]
         return {name: column[rows] for name, column in self._columns.items()}
 
-    def part_share(self) -> Floats:
+    def part_share(self) -> StateArray:
         """(len,) weights under which ``sample`` draws all parts alike: one over the rows held of each row's part."""
         num = self._num_held
-        share: Floats = 1.0 / np.repeat(num, num)
+        share: StateArray = 1.0 / np.repeat(num, num)
         return share
 
-    def state(self) -> State:
+    def state(self) -> Arrays:
         """Everything held, copied; rows never written are left out."""
-        state: State = {name: self[name] for name in self._columns}
+        state: Arrays = {name: self[name] for name in self._columns}
         state["num_added"] = self._num_added.copy()
         return state
 
@@ -104,10 +101,10 @@ class Ring:
             column[self._held] = loaded[name]
 
     @property
-    def _num_held(self) -> Ints:
+    def _num_held(self) -> IntArray:
         return np.minimum(self._num_added, self._share)
 
     @property
-    def _held(self) -> Ints:
+    def _held(self) -> IntArray:
         """Places that have been written, part by part."""
         return np.flatnonzero(np.arange(self._share) < self._num_held[:, None])

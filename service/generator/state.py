@@ -3,22 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
-
-from numpy.typing import NDArray
 
 from service.config import ConfigError
-
-Array = NDArray[Any]
-State = dict[str, Array]
+from service.types import Array, Arrays
 
 
-def prefixed(prefix: str, state: Mapping[str, Array]) -> State:
+def prefixed(prefix: str, state: Mapping[str, Array]) -> Arrays:
     """The same arrays, named ``prefix/name``."""
     return {f"{prefix}/{name}": array for name, array in state.items()}
 
 
-def under(prefix: str, state: Mapping[str, Array]) -> State:
+def under(prefix: str, state: Mapping[str, Array]) -> Arrays:
     """The arrays named ``prefix/name``, named ``name``: the inverse of ``prefixed``."""
     head = f"{prefix}/"
     return {name[len(head) :]: array for name, array in state.items() if name.startswith(head)}

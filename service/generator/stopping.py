@@ -7,7 +7,8 @@ from collections.abc import Mapping
 import numpy as np
 
 from service.config import GeneratorConfig
-from service.generator.state import Array, State, take
+from service.generator.state import take
+from service.types import Array, Arrays
 
 MIN_NUM_GOALS = 100
 """Goals the window must hold before Bob's success rate says anything: its 95 % interval is then below +-10 points."""
@@ -37,7 +38,7 @@ class StopCriterion:
         saturated = self.num_iterations_without_new_cell >= len(self._window)
         return bool(saturated and num_tried >= MIN_NUM_GOALS and num_solved >= self._stop_success_rate * num_tried)
 
-    def state(self) -> State:
+    def state(self) -> Arrays:
         """Everything, copied."""
         counters = np.array([self._num_iterations, self.num_iterations_without_new_cell])
         return {"window": self._window.copy(), "counters": counters}

@@ -29,7 +29,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from service.config import Config, ConfigError, dump_config, load_config
 from service.errors import TandemError
@@ -39,15 +38,14 @@ from service.io.files import os_errors, remove_temporaries, write_atomic
 from service.io.git import git_commit
 from service.io.jsonl import JsonlWriter
 from service.io.lock import DirectoryLock
+from service.types import FloatArray, StateArray
 
 if TYPE_CHECKING:
     from service.io.tensorboard import EventFile
 
-StateArray = NDArray[np.float64]
-FloatArray = NDArray[np.float32]
 
 _logger = logging.getLogger(__name__)
-MAX_BROKEN_FILES = 100
+MAX_DIVERGED_FILES = 100
 
 
 class RunDirectory:
@@ -62,7 +60,7 @@ class RunDirectory:
         self.checkpoints = path / "checkpoints"
         self.snapshots = path / "snapshots"
         self.published_file = path / "published.json"
-        self.broken = path / "broken"
+        self.diverged = path / "broken"
         self._metrics = JsonlWriter(self.metrics_file)
         self._goals = JsonlWriter(self.goals_file)
         self._events: EventFile | None = None
@@ -154,15 +152,15 @@ class RunDirectory:
         with self._keep_running(self.goals_file):
             self._goals.append({"iteration": iteration, "env_steps": num_env_steps, "goals": np.round(goals, 4)})
 
-    def dump_broken(self, name: str, broken: Sequence[tuple[StateArray, FloatArray]]) -> None:
+    def dump_diverged(self, name: str, diverged: Sequence[tuple[StateArray, FloatArray]]) -> None:
         """Save the (state, action) pairs of a round whose physics diverged, under the round's name, for 100 rounds."""
-        if not broken or (self.broken.is_dir() and len(list(self.broken.iterdir())) >= MAX_BROKEN_FILES):
+        if not diverged or (self.diverged.is_dir() and len(list(self.diverged.iterdir())) >= MAX_DIVERGED_FILES):
             return
-        states, actions = zip(*broken, strict=True)
-        path, data = self.broken / f"round-{name}.npz", io.BytesIO()
+        states, actions = zip(*diverged, strict=True)
+        path, data = self.diverged / f"round-{name}.npz", io.BytesIO()
         np.savez(data, states=np.stack(states), actions=np.stack(actions))
         _logger.warning("physics diverged in %d worlds, which go on from sound states; see %s", len(states), path)
-        with self._keep_running(self.broken), os_errors("write", path):
+        with self._keep_running(self.diverged), os_errors("write", path):
             write_atomic(path, data.getvalue())
 
     def sync(self) -> None:

@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 
 from service.actors.rollout import Demonstrations
 from service.envs.observations import ACTION_SIZE, BOB_SIZE
-
-Arrays = dict[str, NDArray[Any]]
+from service.types import Arrays
 
 
 class DemonstrationHistory:

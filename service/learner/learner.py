@@ -21,9 +21,7 @@ from service.learner.player import LearnerError, Player
 from service.learner.samples import Cloning, Samples, augment_by_symmetry
 from service.learner.weights import Weights
 from service.policies import networks
-
-Arrays = dict[str, NDArray[Any]]
-Metrics = dict[str, float]
+from service.types import Arrays, Metrics
 
 MAX_POLICY_LAG = 2
 """A rollout of a version further behind is not learned from."""

@@ -14,8 +14,7 @@ from service.config import PPOConfig
 from service.errors import TandemError
 from service.learner.adam import Adam
 from service.policies import gaussian
-
-Arrays = dict[str, NDArray[Any]]
+from service.types import Arrays
 
 LEARNING_RATE_BOUNDS = 0.03, 2.0
 """The KL-adaptive learning rate stays within these multiples of the configured one."""

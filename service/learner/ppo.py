@@ -26,9 +26,9 @@ from service.learner.diagnostics import explained_variance, probes
 from service.learner.player import LEARNING_RATE_BOUNDS, Player
 from service.learner.samples import Cloning, Samples, minibatches
 from service.policies import gaussian
+from service.types import BoolArray
 
 FloatArray = NDArray[np.floating]
-BoolArray = NDArray[np.bool_]
 Scalars = dict[str, Tensor]
 
 MAX_IMPORTANCE_WEIGHT = 2.0

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from service.policies.parameters import FloatArray
+from service.types import FloatArray
 
 
 @dataclass(frozen=True, slots=True)

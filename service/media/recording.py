@@ -12,7 +12,6 @@ from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
-from numpy.typing import NDArray
 
 from service.actors.evaluation import DeterministicPolicy, evaluate
 from service.actors.rollout import Rollout
@@ -23,10 +22,7 @@ from service.envs.goals import GoalKind
 from service.generator.difficulty import in_air
 from service.generator.generator import TaskGenerator
 from service.generator.validity import Verdict
-
-FloatArray = NDArray[np.float32]
-StateArray = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
+from service.types import BoolArray, FloatArray, StateArray
 
 _NUM_WORLDS = 64
 _MAX_ROLLOUTS = 3

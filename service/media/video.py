@@ -23,7 +23,8 @@ from service.config import WorldConfig
 from service.envs.rendering.renderer import RenderError, SceneRenderer
 from service.generator.validity import Verdict
 from service.io.files import TEMPORARY_PREFIX, os_errors
-from service.media.recording import RecordedEpisodes, RecordedRound, StateArray
+from service.media.recording import RecordedEpisodes, RecordedRound
+from service.types import StateArray
 
 Image = NDArray[np.uint8]
 Colour = tuple[int, int, int]

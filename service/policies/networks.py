@@ -32,7 +32,8 @@ from service.envs.observations import (
 )
 from service.policies.composition import compose
 from service.policies.layers import GaussianSquash, HiddenLayers, InputNormalisation, linear, log_std_bias
-from service.policies.parameters import FloatArray, PolicyError
+from service.policies.parameters import PolicyError
+from service.types import FloatArray
 
 INITIAL_LOG_STD = -0.1
 """Log-std of a new policy's actions. The std is 0.9: chance has to find the object."""

@@ -13,7 +13,8 @@ import numpy as np
 
 from service.envs.observations import BOB_SIZE, GATE, GOAL_SLICE, OBJECT_SLICE, POSITIONS_SIZE
 from service.policies.composition import compose
-from service.policies.parameters import INPUT_CLIP, MEAN_BOUND, FloatArray, ParameterReader, Parameters, PolicyError
+from service.policies.parameters import INPUT_CLIP, MEAN_BOUND, ParameterReader, Parameters, PolicyError
+from service.types import FloatArray
 
 _HALF_LOG_TWO_PI = np.float32(0.5 * math.log(2.0 * math.pi))
 

@@ -6,11 +6,10 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from service.errors import TandemError
+from service.types import FloatArray
 
-FloatArray = NDArray[np.float32]
 Parameters = Mapping[str, FloatArray]
 
 INPUT_CLIP = 5.0

@@ -8,8 +8,9 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from pydantic import BaseModel, ConfigDict, Field, JsonValue, ValidationError
+from pydantic import Field, JsonValue, ValidationError
 
+from service.frozen import FrozenModel
 from service.io.errors import FormatVersionError
 from service.registry.errors import DamagedBlobError, RegistryError
 
@@ -18,18 +19,14 @@ _DIGEST_KEY = "manifest_sha256"
 _MEND = "restore the file from a copy, or publish the version again"
 
 
-class _Frozen(BaseModel):
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
-
-
-class TensorDescription(_Frozen):
+class TensorDescription(FrozenModel):
     """Shape and dtype of one tensor."""
 
     shape: tuple[int, ...]
     dtype: str
 
 
-class Manifest(_Frozen):
+class Manifest(FrozenModel):
     """Everything known about one immutable version."""
 
     format_version: int = FORMAT_VERSION

@@ -17,9 +17,8 @@ from service.io.checkpoints import CheckpointStore
 from service.io.errors import CheckpointError
 from service.io.run_directory import RunDirectory
 from service.policies.parameters import Parameters, PolicyError
+from service.types import Arrays
 
-Arrays = dict[str, NDArray[Any]]
-Metrics = dict[str, float]
 _logger = logging.getLogger(__name__)
 
 NUM_SNAPSHOTS = 10

@@ -38,8 +38,9 @@ from service.runtime.ray_connection import ClusterOptions
 from service.runtime.remote_worker import RemoteWorker, one_line
 from service.runtime.runner import ClusterError, Health, IterationResult, OnBeat, Runner
 from service.runtime.slots import RolloutSlots
-from service.runtime.workers import GeneratorResult, Metrics, RoundSummary, UpdateResult
+from service.runtime.workers import GeneratorResult, RoundSummary, UpdateResult
 from service.store.models import GoalGrid
+from service.types import Metrics
 
 _logger = logging.getLogger(__name__)
 
@@ -213,7 +214,7 @@ class ClusterRun(Runner):
         self._pool.record_duration(summary.play_s)
         self._slots.finish(ticket)
         self._pending.append(pending(summary, time.monotonic() - slot.round_started - summary.play_s))
-        self.directory.dump_broken("-".join(map(str, summary.id)), summary.broken)
+        self.directory.dump_diverged("-".join(map(str, summary.id)), summary.diverged)
 
     def _on_failed_round(self, slot: ActorSlot, ticket: int, error: Exception) -> None:
         """Replace the worker that failed: the actor, or the generator it waited for."""

@@ -18,8 +18,9 @@ from service.config import Config
 from service.io.run_directory import RunDirectory
 from service.policies.parameters import Parameters
 from service.runtime.runner import Health, IterationResult, OnBeat, Runner
-from service.runtime.workers import GeneratorWorker, LearnerWorker, Metrics, RolloutWorker
+from service.runtime.workers import GeneratorWorker, LearnerWorker, RolloutWorker
 from service.store.models import ActorStatus, GoalGrid
+from service.types import Metrics
 
 if TYPE_CHECKING:
     pass
@@ -100,7 +101,7 @@ class LocalRun(Runner):
             rollout, summary = self._actor.play(weights, assignment, self._generator.choose_goals)
         with self.timing("generator"):
             recorded = self._generator.record(self.iteration, weights, [rollout.records])
-            self.directory.dump_broken(f"{rollout.sequence:06d}", rollout.broken)
+            self.directory.dump_diverged(f"{rollout.sequence:06d}", rollout.diverged)
         with self.timing("wait for learner"):
             updated = learning.result() if learning is not None else None
         self._pending = rollout

@@ -22,7 +22,6 @@ from service.config import Config
 from service.generator.generator import GoalChoice
 from service.generator.records import GoalRecords
 from service.runtime.workers import (
-    Arrays,
     Assignment,
     GeneratorResult,
     GeneratorWorker,
@@ -32,6 +31,7 @@ from service.runtime.workers import (
     UpdateResult,
 )
 from service.store.models import GoalGrid
+from service.types import Arrays
 
 if TYPE_CHECKING:
     from service.learner.weights import Weights

@@ -14,8 +14,9 @@ from service.io.run_directory import RunDirectory
 from service.policies.parameters import Parameters
 from service.runtime.bookkeeping import Bookkeeper
 from service.runtime.timing import Timing
-from service.runtime.workers import GeneratorResult, Metrics, RoundSummary, UpdateResult
+from service.runtime.workers import GeneratorResult, RoundSummary, UpdateResult
 from service.store.models import ActorStatus, GoalGrid
+from service.types import Metrics
 
 OnIteration = Callable[[Metrics], None]
 OnBeat = Callable[[], None]
@@ -212,7 +213,7 @@ def _round_metrics(rounds: Sequence[RoundSummary]) -> Metrics:
     shares = num_worlds / num_worlds.sum()
     means = {name: float(shares @ [each.metrics[name] for each in rounds]) for name in rounds[0].metrics}
     return means | {
-        "world/num_broken": float(sum(each.num_broken for each in rounds)),
+        "world/num_broken": float(sum(each.num_diverged for each in rounds)),
         "time/play_s": float(np.mean([each.play_s for each in rounds])),
         "time/wait_for_generator_s": float(np.mean([each.generator_s for each in rounds])),
     }

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.actors.evaluation import EVALUATION_SEED, success_metrics
-from service.actors.rollout import Broken, Rollout
+from service.actors.rollout import Diverged, Rollout
 from service.actors.self_play import Players, SelfPlay, StochasticPolicy
 from service.config import Config
 from service.envs.goals import GoalKind
@@ -27,13 +27,12 @@ from service.generator.validity import Verdict
 from service.policies.numpy_policy import NumpyGaussianPolicy, numpy_bob
 from service.policies.parameters import Parameters
 from service.store.models import GoalCell, GoalGrid
+from service.types import Arrays, Metrics
 
 if TYPE_CHECKING:
     from service.learner.weights import Weights
 
-Arrays = dict[str, NDArray[Any]]
 RolloutId = tuple[int, int, int]
-Metrics = dict[str, float]
 
 GOALS_PER_ITERATION = 32
 """Valid proposals kept for the run directory per iteration, at most."""
@@ -72,9 +71,9 @@ class RoundSummary:
     policy_version: int
     num_env_steps: int
     num_worlds: int
-    num_broken: int
+    num_diverged: int
     """Worlds whose physics diverged, in this incarnation."""
-    broken: Broken
+    diverged: Diverged
     """Those of this round."""
     play_s: float
     generator_s: float
@@ -155,8 +154,8 @@ class RolloutWorker:
             policy_version=rollout.policy_version,
             num_env_steps=rollout.num_env_steps,
             num_worlds=self._config.game.num_worlds,
-            num_broken=self.game.worlds.num_broken,
-            broken=rollout.broken,
+            num_diverged=self.game.worlds.num_diverged,
+            diverged=rollout.diverged,
             play_s=time.perf_counter() - start,
             generator_s=generator_s,
             pool_version=self.pool_version,

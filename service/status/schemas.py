@@ -4,36 +4,33 @@ from __future__ import annotations
 
 from typing import Literal
 
-from pydantic import AwareDatetime, BaseModel, ConfigDict, Field
+from pydantic import AwareDatetime, Field
 
+from service.frozen import FrozenModel
 from service.registry.manifest import Manifest
 from service.store.models import RunStatus
 
 
-class _Frozen(BaseModel):
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-
-class Alive(_Frozen):
+class Alive(FrozenModel):
     """Answer of a service that runs."""
 
     status: Literal["alive"] = "alive"
 
 
-class Ready(_Frozen):
+class Ready(FrozenModel):
     """Answer of a service that can read the runs and the registry."""
 
     status: Literal["ready"] = "ready"
 
 
-class RunList(_Frozen):
+class RunList(FrozenModel):
     """Runs, newest start first."""
 
     runs: tuple[RunStatus, ...]
     num_runs: int = Field(ge=0, description="that match the request, those over the limit included")
 
 
-class MetricHistory(_Frozen):
+class MetricHistory(FrozenModel):
     """Metrics over iterations, in columns of equal length."""
 
     run_id: str
@@ -49,7 +46,7 @@ class MetricHistory(_Frozen):
     names: tuple[str, ...] = Field(description="of all metrics the run has")
 
 
-class RunFile(_Frozen):
+class RunFile(FrozenModel):
     """A picture or a video of a run."""
 
     name: str = Field(examples=["rounds.mp4"])
@@ -60,13 +57,13 @@ class RunFile(_Frozen):
     url: str = Field(description="path on this service", examples=["/v1/runs/cube/files/rounds.mp4"])
 
 
-class RunFiles(_Frozen):
+class RunFiles(FrozenModel):
     """The pictures and videos of a run."""
 
     files: tuple[RunFile, ...]
 
 
-class PrimitiveSummary(_Frozen):
+class PrimitiveSummary(FrozenModel):
     """A name in the registry."""
 
     name: str = Field(examples=["panda-cube"])
@@ -75,18 +72,18 @@ class PrimitiveSummary(_Frozen):
     aliases: dict[str, int] = Field(description="the version of each alias", examples=[{"champion": 2, "latest": 3}])
 
 
-class PrimitiveList(_Frozen):
+class PrimitiveList(FrozenModel):
     """All names, sorted."""
 
     primitives: tuple[PrimitiveSummary, ...]
 
 
-class VersionSummary(_Frozen):
+class VersionSummary(FrozenModel):
     """One version; the manifest has more."""
 
     version: int = Field(ge=1)
     created: str | None = Field(None, description="UTC, ISO 8601")
-    metrics: dict[str, float] = {}
+    metrics: dict[str, float] = Field(default_factory=dict)
     parent: str | None = Field(None, description="NAME@VERSION this one was trained on from")
     git_commit: str | None = None
     blob_sha256: str | None = None
@@ -110,13 +107,13 @@ class ManifestDocument(Manifest):
     )
 
 
-class AliasChange(_Frozen):
+class AliasChange(FrozenModel):
     """The version an alias shall point to."""
 
     version: int = Field(ge=1, le=1_000_000_000, examples=[1])
 
 
-class AliasState(_Frozen):
+class AliasState(FrozenModel):
     """The version an alias points to now."""
 
     name: str

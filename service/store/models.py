@@ -5,7 +5,9 @@ from __future__ import annotations
 from datetime import UTC, datetime, timedelta
 from typing import Literal, Protocol, Self
 
-from pydantic import AwareDatetime, BaseModel, ConfigDict, Field
+from pydantic import AwareDatetime, Field
+
+from service.frozen import FrozenModel
 
 RunState = Literal["starting", "running", "finished", "converged", "interrupted", "failed"]
 ACTIVE: frozenset[RunState] = frozenset({"starting", "running"})
@@ -15,11 +17,7 @@ Record = dict[str, float | None]
 """One iteration's metrics; ``iteration`` and ``env_steps`` are always there. Null: JSON has no number for it."""
 
 
-class _Frozen(BaseModel):
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-
-class ActorStatus(_Frozen):
+class ActorStatus(FrozenModel):
     """One rollout actor, the learner or the task generator, as its run sees it."""
 
     name: str = Field(description="rollout-0, rollout-1, ..., learner, generator")
@@ -33,7 +31,7 @@ class ActorStatus(_Frozen):
     last_error: str | None = Field(None, description="why its last incarnation was replaced")
 
 
-class RunStatus(_Frozen):
+class RunStatus(FrozenModel):
     """The state of a run right now."""
 
     run_id: str = Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]{0,127}$")
@@ -70,7 +68,7 @@ class RunStatus(_Frozen):
         return self.model_copy(update={"state": "interrupted", "stopping": False, "last_error": error})
 
 
-class GoalCell(_Frozen):
+class GoalCell(FrozenModel):
     """One cell of the task generator's grid in which a valid goal was ever proposed."""
 
     center_m: tuple[float, float, float]
@@ -79,7 +77,7 @@ class GoalCell(_Frozen):
     learnability: float = Field(ge=0, le=0.25, description="p (1 - p)")
 
 
-class GoalGrid(_Frozen):
+class GoalGrid(FrozenModel):
     """The task generator's estimates of goals."""
 
     iteration: int = Field(ge=0)

@@ -502,7 +502,7 @@ def test_a_world_that_breaks_in_alices_turn_ends_as_fallen():
     assert rollout.records.played.tolist() == [True, False, True]
     assert len(rollout.demonstrations.action) == 9
     assert_fresh(game, [1])
-    assert game.worlds.num_broken == 1
+    assert game.worlds.num_diverged == 1
     for turns in (rollout.alice, rollout.bob):
         assert np.isfinite(turns.observation).all()
         assert np.isfinite(turns.value_observation).all()
@@ -527,10 +527,10 @@ def test_a_broken_world_is_reported_with_state_and_action_once():
     before = game.worlds.states.copy()
     game.worlds._pool = Diverging(game.worlds._pool, call=0, row=1)
     rollout = play(game, Constant((0.5, 0.0, 0.0, -1.0)))
-    ((state, action),) = rollout.broken
+    ((state, action),) = rollout.diverged
     assert np.array_equal(state, before[1])
     assert action.tolist() == [0.5, 0.0, 0.0, -1.0]
-    assert play(game).broken == ()
+    assert play(game).diverged == ()
 
 
 def test_numbers_too_large_to_be_physics_are_broken_too():
@@ -542,7 +542,7 @@ def test_numbers_too_large_to_be_physics_are_broken_too():
     rollout = play(game)
     assert rollout.records.verdict.tolist() == [Verdict.FALLEN, Verdict.NOT_MOVED]
     assert rollout.alice.learn.tolist() == [False, True]
-    assert game.worlds.num_broken == 1
+    assert game.worlds.num_diverged == 1
 
 
 def test_a_turn_of_alice_may_be_shorter():

@@ -56,7 +56,7 @@ def test_this_process_and_its_children_have_roles_and_times():
     assert (found[os.getpid()], found[child.pid]) == ("driver", "other")
     assert seconds["driver"] >= before + 0.05
     assert not processes.is_running(child.pid)
-    assert processes.role("ray::RolloutWorker.play") == "actor"
+    assert processes.role("ray::RolloutActor.play") == "actor"
 
 
 # --- the audit --------------------------------------------------------------------------------------------------------

@@ -179,12 +179,12 @@ class TestDivergence:
     def test_the_world_is_reported_and_keeps_its_last_finite_state(self, diverging):
         before = diverging.states.copy()
         actions = np.full((NUM_WORLDS, 4), 0.5, dtype=np.float32)
-        broken = diverging.step(actions)
-        assert np.flatnonzero(broken).tolist() == [self.BAD]
-        assert diverging.num_broken == 1
+        diverged = diverging.step(actions)
+        assert np.flatnonzero(diverged).tolist() == [self.BAD]
+        assert diverging.num_diverged == 1
         np.testing.assert_array_equal(diverging.states[self.BAD], before[self.BAD])
         assert np.isfinite(diverging.full(0.0)).all()
-        ((state, action),) = diverging.broken
+        ((state, action),) = diverging.diverged
         np.testing.assert_array_equal(state, before[self.BAD])
         np.testing.assert_array_equal(action, actions[self.BAD])
 
@@ -205,19 +205,19 @@ class TestDivergence:
 
     def test_it_is_reported_by_its_number_when_few_step(self, diverging):
         index = np.array([6, self.BAD])
-        broken = diverging.step(np.zeros((2, 4), dtype=np.float32), index)
-        assert np.flatnonzero(broken).tolist() == [self.BAD]
+        diverged = diverging.step(np.zeros((2, 4), dtype=np.float32), index)
+        assert np.flatnonzero(diverged).tolist() == [self.BAD]
 
     def test_a_state_that_is_not_a_number_is_reported(self, worlds):
         states = worlds.states.copy()
         states[self.BAD, 1] = np.nan
         worlds.restore(states)
-        broken = worlds.step(np.zeros((NUM_WORLDS, 4), dtype=np.float32))
-        assert np.flatnonzero(broken).tolist() == [self.BAD]
+        diverged = worlds.step(np.zeros((NUM_WORLDS, 4), dtype=np.float32))
+        assert np.flatnonzero(diverged).tolist() == [self.BAD]
 
     def test_it_goes_on_after_a_reset(self, diverging):
-        broken = diverging.step(np.zeros((NUM_WORLDS, 4), dtype=np.float32))
-        diverging.reset(np.random.default_rng(0), broken)
+        diverged = diverging.step(np.zeros((NUM_WORLDS, 4), dtype=np.float32))
+        diverging.reset(np.random.default_rng(0), diverged)
         assert not diverging.step(np.zeros((NUM_WORLDS, 4), dtype=np.float32)).any()
         assert np.isfinite(diverging.states).all()
 

@@ -5,7 +5,7 @@ import pytest
 
 from service.config import ConfigError, load_config
 from service.errors import TandemError
-from service.io.run_directory import MAX_BROKEN_FILES, RunDirectory
+from service.io.run_directory import MAX_DIVERGED_FILES, RunDirectory
 from tests.runtime.runs import assert_one_line, no_room_above, read_lines, tiny_config
 
 
@@ -128,13 +128,13 @@ def test_goals_are_start_goal_and_result(directory):
 
 
 def test_broken_worlds_are_kept_but_not_without_end(directory):
-    broken = ((np.arange(4.0), np.zeros(4, dtype=np.float32)), (np.arange(4.0) + 1, np.ones(4, dtype=np.float32)))
-    directory.dump_broken("000000", ())
+    diverged = ((np.arange(4.0), np.zeros(4, dtype=np.float32)), (np.arange(4.0) + 1, np.ones(4, dtype=np.float32)))
+    directory.dump_diverged("000000", ())
     assert not (directory.path / "broken").exists()
-    for sequence in range(MAX_BROKEN_FILES + 5):
-        directory.dump_broken(f"{sequence:06d}", broken)
+    for sequence in range(MAX_DIVERGED_FILES + 5):
+        directory.dump_diverged(f"{sequence:06d}", diverged)
     files = sorted((directory.path / "broken").iterdir())
-    assert len(files) == MAX_BROKEN_FILES
+    assert len(files) == MAX_DIVERGED_FILES
     with np.load(files[0]) as dump:
         assert dump["states"].tolist() == [[0.0, 1.0, 2.0, 3.0], [1.0, 2.0, 3.0, 4.0]]
         assert dump["actions"].tolist() == [[0.0] * 4, [1.0] * 4]
@@ -168,7 +168,7 @@ def test_a_disk_that_fills_up_again_is_said_again(directory, caplog):
 def test_goals_and_broken_worlds_on_a_full_disk_do_not_end_a_run(directory, caplog):
     with no_room_above(0):
         directory.record_goals(1, 100, np.zeros((1, 7)))
-        directory.dump_broken("000000", ((np.arange(4.0), np.zeros(4)),))
+        directory.dump_diverged("000000", ((np.arange(4.0), np.zeros(4)),))
     directory.record_goals(2, 200, np.zeros((1, 7)))
     assert [row["iteration"] for row in read_lines(directory.goals_file)] == [1, 2]
     assert list((directory.path / "broken").iterdir()) == []

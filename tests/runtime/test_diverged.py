@@ -114,9 +114,9 @@ def test_a_world_that_breaks_is_said_recorded_and_starts_anew(tmp_path, caplog):
     assert result.reason == "finished"
     assert np.isfinite(run.game.worlds.states).all()
     assert np.abs(run.game.worlds.states).max() < 1e3
-    broken = [row["world/num_broken"] for row in read_lines(tmp_path / "metrics.jsonl")]
-    assert broken[:2] == [0.0, 0.0]
-    assert set(broken[2:]) == {1.0}
+    diverged = [row["world/num_broken"] for row in read_lines(tmp_path / "metrics.jsonl")]
+    assert diverged[:2] == [0.0, 0.0]
+    assert set(diverged[2:]) == {1.0}
     (file,) = (tmp_path / "broken").iterdir()
     assert_one_line(caplog.messages[0], "physics diverged", file)
     state = run.learner.state()

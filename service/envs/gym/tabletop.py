@@ -16,12 +16,11 @@ from service.envs.goals import GoalKind, check_goals, draw_goals
 from service.envs.observations import ACTION_SIZE, OBJECT_SLICE, POSITIONS_SIZE
 from service.envs.tasks import find_task
 from service.errors import TandemError
+from service.types import FloatArray, StateArray
 
 if TYPE_CHECKING:
     from service.envs.rendering.renderer import SceneRenderer
 
-FloatArray = NDArray[np.float32]
-StateArray = NDArray[np.float64]
 Observation = dict[str, FloatArray]
 
 _FURTHEST_M = 10.0

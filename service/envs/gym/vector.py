@@ -19,10 +19,8 @@ from service.envs.batch import WorldBatch
 from service.envs.goals import GoalKind
 from service.envs.gym.tabletop import Observation, Setting, action_space, goal_space, observe
 from service.errors import TandemError
+from service.types import BoolArray, FloatArray, StateArray
 
-FloatArray = NDArray[np.float32]
-BoolArray = NDArray[np.bool_]
-StateArray = NDArray[np.float64]
 Info = dict[str, Any]
 
 

@@ -17,8 +17,7 @@ from service.config import WorkspaceConfig, WorldConfig
 from service.envs.fixtures import fixture_geoms
 from service.envs.rendering.panda_visuals import add_panda_visuals, make_visual
 from service.envs.scene import TABLE_CENTER_X_M, TABLE_HALF_SIZE_M
-
-Floats = NDArray[np.float64]
+from service.types import StateArray
 
 OBJECT_RGB = (0.86, 0.13, 0.11)
 _FLOOR_Z_M = -0.74
@@ -124,7 +123,7 @@ def _add_workspace(spec: mujoco.MjSpec, workspace: WorkspaceConfig) -> None:
     _box(spec, "volume", (low + high) / 2, (high - low) / 2, casts_shadow=False)
 
 
-def _box_edges(low: Floats, high: Floats) -> Iterator[Floats]:
+def _box_edges(low: StateArray, high: StateArray) -> Iterator[StateArray]:
     """The twelve edges of a box, each from end to end: (2, 3)."""
     for axis in range(3):
         for pick in np.ndindex(2, 2):
@@ -141,7 +140,7 @@ def _textured(spec: mujoco.MjSpec, name: str, **properties: Any) -> None:
 
 
 def _box(
-    spec: mujoco.MjSpec, material: str, center: Sequence[float] | Floats, half: Sequence[float] | Floats,
+    spec: mujoco.MjSpec, material: str, center: Sequence[float] | StateArray, half: Sequence[float] | StateArray,
     *, casts_shadow: bool = True,
 ) -> None:  # fmt: skip
     geom = spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_BOX, pos=center, size=half)

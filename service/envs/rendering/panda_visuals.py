@@ -10,9 +10,9 @@ from typing import Any
 
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
 
-Points = NDArray[np.float64]
+from service.types import StateArray
+
 Vector = tuple[float, float, float]
 
 MATERIALS: dict[str, dict[str, Any]] = {
@@ -105,20 +105,20 @@ def _add_gripper(spec: mujoco.MjSpec) -> None:
         _hull(spec, finger, "rubber", _box((-0.0095, 0.0002, 0.032), (0.0095, 0.005, 0.0518), 0.001))
 
 
-def _hull(spec: mujoco.MjSpec, body: str, material: str, *clouds: Points) -> None:
+def _hull(spec: mujoco.MjSpec, body: str, material: str, *clouds: StateArray) -> None:
     """Add the convex hull of point clouds to a body."""
     name = f"visual{len(spec.meshes)}"
     spec.add_mesh(name=name, uservert=np.concatenate(clouds).ravel())
     make_visual(spec.body(body).add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname=name), material)
 
 
-def _sphere(center: Vector, radius: float) -> Points:
+def _sphere(center: Vector, radius: float) -> StateArray:
     polar, around = np.meshgrid(_POLAR, _AROUND, indexing="ij")
     unit = np.stack([np.sin(polar) * np.cos(around), np.sin(polar) * np.sin(around), np.cos(polar)], axis=-1)
     return np.asarray(center) + radius * unit.reshape(-1, 3)
 
 
-def _disc(center: Vector, axis: Vector, radius: float, half_length: float, rounding: float = 0.008) -> Points:
+def _disc(center: Vector, axis: Vector, radius: float, half_length: float, rounding: float = 0.008) -> StateArray:
     """Points of a flat cylinder with rounded rims."""
     along, side = np.asarray(axis), np.roll(axis, 1)
     rim = np.cos(_AROUND)[:, None] * side + np.sin(_AROUND)[:, None] * np.cross(along, side)
@@ -130,7 +130,7 @@ def _disc(center: Vector, axis: Vector, radius: float, half_length: float, round
     return np.concatenate(rings)
 
 
-def _box(lower: Vector, upper: Vector, bevel: float) -> Points:
+def _box(lower: Vector, upper: Vector, bevel: float) -> StateArray:
     """Points of a box with bevelled edges."""
     center, half = np.add(lower, upper) / 2, np.subtract(upper, lower) / 2
     return np.concatenate([center + _CORNERS * (half - bevel * (1 - np.eye(3)[axis])) for axis in range(3)])

@@ -19,11 +19,11 @@ from service.config import WorldConfig
 from service.envs.rendering.decoration import OBJECT_RGB, decorate
 from service.envs.rendering.gl import RenderError, open_drawing
 from service.envs.scene import build_layout, build_spec
+from service.types import StateArray
 
 __all__ = ["DEFAULT_CAMERA", "Camera", "Mark", "RenderError", "SceneRenderer"]
 
 Image = NDArray[np.uint8]
-Array = NDArray[np.float64]
 
 _GOAL_RGBA = (*OBJECT_RGB, 0.30)
 _DROP_RGBA = (*OBJECT_RGB, 0.55)
@@ -102,7 +102,7 @@ class SceneRenderer:
             self._context.free()
             self._context = None
 
-    def render(self, state: Array, goal: Array | None = None, marks: Sequence[Mark] = ()) -> Image:
+    def render(self, state: StateArray, goal: StateArray | None = None, marks: Sequence[Mark] = ()) -> Image:
         """Draw one world.
 
         Args:
@@ -135,7 +135,7 @@ class SceneRenderer:
         mujoco.mjr_readPixels(image, None, self._rectangle, self._drawing)
         return np.ascontiguousarray(image[::-1])
 
-    def _add_goal(self, goal: Array) -> None:
+    def _add_goal(self, goal: StateArray) -> None:
         """Add a transparent copy of the object, and a line down to the table, which shows its height."""
         self._add(self._goal_geom, (self._half_m, self._half_m, self._half_m), goal, _GOAL_RGBA)
         cylinder, foot = mujoco.mjtGeom.mjGEOM_CYLINDER, np.array([goal[0], goal[1], 0.0])
@@ -145,7 +145,7 @@ class SceneRenderer:
             middle = np.array([goal[0], goal[1], half_drop])
             self._add(cylinder, (_DROP_RADIUS_M, half_drop, 0.0), middle, _DROP_RGBA)
 
-    def _add(self, kind: Any, size: tuple[float, ...], position: Array, rgba: tuple[float, ...]) -> None:
+    def _add(self, kind: Any, size: tuple[float, ...], position: StateArray, rgba: tuple[float, ...]) -> None:
         geom = self._scene.geoms[self._scene.ngeom]
         mujoco.mjv_initGeom(
             geom, kind, np.asarray(size), position, np.eye(3).ravel(), np.asarray(rgba, dtype=np.float32)

@@ -14,12 +14,12 @@ from service.media.plots.figures import (
     FAINT,
     INK,
     MARGIN_M,
-    Array,
     counted,
     draw_outline,
     new_figure,
     save,
 )
+from service.types import StateArray
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 _MOVED_M = 0.05
 
 
-def plot_coverage(trajectories: Array, workspace: WorkspaceConfig, path: Path, title: str) -> Path:
+def plot_coverage(trajectories: StateArray, workspace: WorkspaceConfig, path: Path, title: str) -> Path:
     """Draw where random compositions take the object, one colour each: in the workspace's box, and from above.
 
     Args:
@@ -48,7 +48,7 @@ def plot_coverage(trajectories: Array, workspace: WorkspaceConfig, path: Path, t
     return save(figure, path)
 
 
-def draw_paths(box: Any, above: Axes, paths: Array, workspace: WorkspaceConfig) -> None:
+def draw_paths(box: Any, above: Axes, paths: StateArray, workspace: WorkspaceConfig) -> None:
     """Draw paths of the object, one colour each: in the workspace's box, and from above.
 
     Args:
@@ -66,14 +66,14 @@ def draw_paths(box: Any, above: Axes, paths: Array, workspace: WorkspaceConfig) 
         _draw_trajectory(box, above, _inside(points, workspace), color)
 
 
-def _inside(points: Array, workspace: WorkspaceConfig) -> Array:
+def _inside(points: StateArray, workspace: WorkspaceConfig) -> StateArray:
     """``points`` with NaN, which breaks a line, where they leave the drawn surroundings of the workspace."""
     low, high = np.array(workspace.lower_m) - MARGIN_M, np.array(workspace.upper_m) + MARGIN_M
     near = (points >= low) & (points <= high)
     return np.where(near.all(axis=1, keepdims=True), points, np.nan)
 
 
-def _summary(trajectories: Array, workspace: WorkspaceConfig) -> str:
+def _summary(trajectories: StateArray, workspace: WorkspaceConfig) -> str:
     share = visited_share(trajectories, workspace)
     moved = (np.linalg.norm(trajectories - trajectories[:, :1], axis=2) > _MOVED_M).any(axis=1).sum()
     compositions = counted(len(trajectories), "composition")
@@ -99,7 +99,7 @@ def _draw_box(axes: Any, workspace: WorkspaceConfig) -> None:
         axis._axinfo["grid"]["color"] = "#ececec"
 
 
-def _draw_trajectory(box: Any, above: Axes, points: Array, color: Any) -> None:
+def _draw_trajectory(box: Any, above: Axes, points: StateArray, color: Any) -> None:
     box.plot(*points.T, color=color, linewidth=1.5)
     above.plot(points[:, 0], points[:, 1], color=color, linewidth=1.5)
     if np.isfinite(points[-1]).all():

@@ -14,7 +14,6 @@ from service.media.plots.figures import (
     GREEN,
     INK,
     ORANGE,
-    Array,
     column,
     counted,
     new_figure,
@@ -22,6 +21,7 @@ from service.media.plots.figures import (
     save,
     style_axes,
 )
+from service.types import StateArray
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -133,7 +133,7 @@ def _progress(records: Sequence[dict[str, Any]]) -> str:
     return ", ".join(words)
 
 
-def _smooth(values: Array, span: float) -> Array:
+def _smooth(values: StateArray, span: float) -> StateArray:
     """The exponential moving average with Adam's correction for its start, so the first value is not favoured."""
     decay = 1.0 - 2.0 / (span + 1.0)
     average = weight = 0.0
@@ -145,7 +145,7 @@ def _smooth(values: Array, span: float) -> Array:
     return smoothed
 
 
-def _draw_panel(axes: Axes, panel: _Panel, steps: Array, records: Sequence[dict[str, Any]]) -> None:
+def _draw_panel(axes: Axes, panel: _Panel, steps: StateArray, records: Sequence[dict[str, Any]]) -> None:
     style_axes(axes)
     axes.set_title(panel.title, loc="left", fontsize=12, weight="bold", color=INK, pad=20)
     axes.text(0.0, 1.03, panel.look_for, transform=axes.transAxes, fontsize=9.5, color="#666666")
@@ -161,7 +161,7 @@ def _draw_panel(axes: Axes, panel: _Panel, steps: Array, records: Sequence[dict[
     _label_ends(axes, drawn)
 
 
-def _draw_curve(axes: Axes, curve: _Curve, steps: Array, values: Array) -> float | None:
+def _draw_curve(axes: Axes, curve: _Curve, steps: StateArray, values: StateArray) -> float | None:
     """Draw one curve; the height at which it ends, None when it has no values."""
     known = np.isfinite(values) & np.isfinite(steps)
     x, y = steps[known], values[known]

@@ -12,18 +12,17 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from service.config import WorkspaceConfig
 from service.errors import TandemError
 from service.io.files import os_errors, write_atomic
 from service.io.jsonl import read_jsonl
+from service.types import StateArray
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-Array = NDArray[np.float64]
 
 BLUE, ORANGE, GREEN = "#0072B2", "#D55E00", "#009E73"
 INK, FAINT = "#222222", "#777777"
@@ -44,7 +43,7 @@ def read_records(path: Path) -> list[dict[str, Any]]:
     return records
 
 
-def column(records: Sequence[dict[str, Any]], key: str) -> Array:
+def column(records: Sequence[dict[str, Any]], key: str) -> StateArray:
     """The values of ``key``, NaN where a record lacks it or its value is not finite, (len(records),)."""
     values = np.array([_number(record.get(key)) for record in records])
     return np.where(np.isfinite(values), values, np.nan)

@@ -16,7 +16,6 @@ from service.media.plots.figures import (
     FAINT,
     INK,
     ORANGE,
-    Array,
     column,
     counted,
     draw_outline,
@@ -25,6 +24,7 @@ from service.media.plots.figures import (
     save,
     style_axes,
 )
+from service.types import StateArray
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -61,7 +61,7 @@ def plot_goals(run_dir: Path, workspace: WorkspaceConfig) -> Path:
     return save(figure, run_dir / GOALS_PICTURE)
 
 
-def _goals(records: Sequence[dict[str, Any]], path: Path) -> Array:
+def _goals(records: Sequence[dict[str, Any]], path: Path) -> StateArray:
     """The records' goals, (number, 7): start xyz, goal xyz, solved; any that is not finite is left out."""
     try:
         rows = [row for record in records for row in record.get("goals") or ()]
@@ -73,14 +73,14 @@ def _goals(records: Sequence[dict[str, Any]], path: Path) -> Array:
     return goals[np.isfinite(goals).all(axis=1)]
 
 
-def _slice_title(records: Sequence[dict[str, Any]], goals: Array) -> str:
+def _slice_title(records: Sequence[dict[str, Any]], goals: StateArray) -> str:
     steps = column(records, "env_steps") / 1e6
     when = f"{np.nanmin(steps):.2f} to {np.nanmax(steps):.2f} M env steps" if np.isfinite(steps).any() else ""
     rate = f"{counted(len(goals), 'goal')}, {goals[:, 6].mean():.0%} solved" if len(goals) else "no goals yet"
     return f"{when}\n{rate}"
 
 
-def _draw_goals(above: Axes, side: Axes, goals: Array, workspace: WorkspaceConfig) -> None:
+def _draw_goals(above: Axes, side: Axes, goals: StateArray, workspace: WorkspaceConfig) -> None:
     start, goal, solved = goals[:, :3], goals[:, 3:6], goals[:, 6] > 0.5
     # one scatter in the order of play: drawn per outcome, the later one would hide the earlier
     colors = np.where(solved, BLUE, ORANGE)
