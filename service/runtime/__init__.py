@@ -1,1 +1,1 @@
-"""What puts the parts together into a run: the local runner, its directory, its pictures."""
+"""Runs: the two runners, and the signals, bookkeeping and reporting around them."""

@@ -90,7 +90,7 @@ class ActorSlot:
         return True
 
     def status(self) -> ActorStatus:
-        """Its state for the status service."""
+        """The slot's state for the status service."""
         return ActorStatus(
             name=f"rollout-{self.index}",
             incarnation=self.incarnation,

@@ -158,7 +158,7 @@ class ClusterRun(Runner):
         return Health(actors, self._num_counted, self._num_refused, lack, self._last_error)
 
     def grid(self) -> GoalGrid:
-        """What the task generator knew about goals after the last iteration."""
+        """The task generator's goal grid after the last iteration."""
         assert self._grid is not None
         return self._grid
 

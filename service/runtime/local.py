@@ -73,7 +73,7 @@ class LocalRun(Runner):
         return Health((actor,), num_rollouts_counted=max(0, self.iteration - 1))  # the newest is learned from next
 
     def grid(self) -> GoalGrid:
-        """What the task generator knows about goals."""
+        """The task generator's goal grid."""
         return self._generator.grid(self.iteration, self.num_env_steps)
 
     def close(self) -> None:

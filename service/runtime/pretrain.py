@@ -37,7 +37,7 @@ _logger = logging.getLogger(__name__)
 
 @dataclass(frozen=True, slots=True)
 class Pretrained:
-    """What a run made."""
+    """Results of a run."""
 
     result: RunResult
     files: dict[str, Path]
@@ -67,7 +67,7 @@ def pretrain(
     on_iteration: OnIteration,
     cluster: ClusterOptions | None = None,
 ) -> Pretrained:
-    """Run to the end, then evaluate, publish, draw and film.
+    """Run to the end, then evaluate, publish, draw and record a video.
 
     SIGINT and SIGTERM end the run after the current iteration, saved, and what follows it at once: a resumed run does
     that again. A second signal ends an iteration, too. A stop request ends it as a signal does.
@@ -154,7 +154,7 @@ def _run(
 
 
 def _finish(done: Pretrained, config: Config, directory: RunDirectory, registry: Registry, run: Runner) -> Pretrained:
-    _logger.info("learning is over; now evaluating, publishing, drawing and filming")
+    _logger.info("learning is over; now evaluating, publishing, drawing and recording a video")
     bob = run.bob()
     run.close()
     metrics, version = measure_bob(config, bob), None

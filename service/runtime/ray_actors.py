@@ -55,7 +55,7 @@ class Location:
 
     @classmethod
     def here(cls) -> Location:
-        """This process."""
+        """The location of this process."""
         return cls(socket.gethostname(), os.getpid())
 
 
@@ -77,7 +77,7 @@ class RolloutActor(RolloutWorker):
         self._count = _round_counters(actor)
 
     def ping(self) -> tuple[Location, np.random.Generator]:
-        """Its location, and the state of its random numbers, which the first assignment advances."""
+        """The worker's location and random numbers; the first assignment advances them."""
         return Location.here(), self.rng
 
     def play_round(
@@ -99,8 +99,9 @@ class RolloutActor(RolloutWorker):
         """
 
         def choose_goals(*arguments: Any) -> tuple[GoalChoice, np.random.Generator]:
+            asked = generator.choose_goals.remote(*arguments)
             try:
-                choice, rng = ray.get(generator.choose_goals.remote(*arguments), timeout=GENERATOR_TIMEOUT_S)
+                choice, rng = ray.get(asked, timeout=GENERATOR_TIMEOUT_S)
             except (ray.exceptions.RayActorError, ray.exceptions.GetTimeoutError) as error:
                 # A RayActorError of the generator must not be taken for the end of this worker.
                 raise GeneratorGoneError(f"the task generator did not answer: {type(error).__name__}") from None
@@ -119,11 +120,11 @@ class GeneratorActor(GeneratorWorker):
     """A task generator that hands its whole state back with every record."""
 
     def ping(self) -> Location:
-        """Its location."""
+        """The worker's location."""
         return Location.here()
 
     def begin(self) -> Arrays:
-        """Its state before the first iteration."""
+        """The generator's state before the first iteration."""
         return self.generator.state()
 
     def record_from(
@@ -146,7 +147,7 @@ class LearnerActor(LearnerWorker):
         super().__init__(config, state, pending)
 
     def ping(self) -> Location:
-        """Its location."""
+        """The worker's location."""
         return Location.here()
 
     def begin(self) -> tuple[Weights, Arrays]:

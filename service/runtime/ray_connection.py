@@ -1,4 +1,4 @@
-"""This process and a Ray cluster: one that is there, or one of its own on this machine."""
+"""Connection of this process to a Ray cluster: one that runs, or a new one on this machine."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ START_ATTEMPTS = 3
 
 @dataclass(frozen=True, slots=True)
 class StatusOptions:
-    """Where the status service of a run on a cluster listens."""
+    """Address and token of the status service of a run on a cluster."""
 
     host: str = "127.0.0.1"
     port: int = 8321
@@ -31,7 +31,7 @@ class StatusOptions:
 
 @dataclass(frozen=True, slots=True)
 class ClusterOptions:
-    """What a run uses of a cluster; no part of the experiment, and free to change when it is resumed."""
+    """Resources of a run on a cluster; no part of the experiment, and free to change when it is resumed."""
 
     num_actors: int | None = None
     """Rollout actors; None: as many as there are cores for, following the cluster as it grows and shrinks."""
@@ -44,7 +44,7 @@ class ClusterOptions:
 
 
 def parse_status(text: str, token: str | None) -> StatusOptions | None:
-    """``HOST:PORT`` or ``off``.
+    """Parse ``HOST:PORT`` or ``off``.
 
     Raises:
         ClusterError: neither.
@@ -96,7 +96,7 @@ def connected(address: str | None, num_cpus: int | None = None) -> Iterator[None
 
 
 def _check_reachable(address: str | None) -> None:
-    """Ray itself would end the whole process where nobody answers."""
+    """Check that something answers; Ray itself would end the whole process where nothing does."""
     host, separator, port = (address or "").removeprefix("ray://").rpartition(":")
     if not separator:
         return

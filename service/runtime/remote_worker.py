@@ -94,7 +94,7 @@ class RemoteWorker:
         ray.kill(self.handle, no_restart=True)
 
     def status(self) -> ActorStatus:
-        """Its state for the status service."""
+        """The worker's state for the status service."""
         return ActorStatus(
             name=self.name,
             incarnation=self.incarnation,

@@ -1,4 +1,4 @@
-"""What a run tells about itself while it goes on, to whoever shows it."""
+"""Reporting of a run while it goes on: its status, its metrics, its goal grid."""
 
 from __future__ import annotations
 

@@ -34,7 +34,7 @@ class StateLostError(ClusterError):
 
 @dataclass(frozen=True, slots=True)
 class RunResult:
-    """How a run ended."""
+    """Reason and length of a run that has ended."""
 
     reason: str
     """``finished`` (budget), ``converged`` (the paper's stop criterion) or ``interrupted``."""
@@ -56,7 +56,7 @@ class Health:
 
 @dataclass(frozen=True, slots=True)
 class IterationResult:
-    """What the workers made of one iteration."""
+    """Results of all workers for one iteration."""
 
     rounds: Sequence[RoundSummary]
     recorded: GeneratorResult
@@ -129,7 +129,7 @@ class Runner(ABC):
 
     @abstractmethod
     def grid(self) -> GoalGrid:
-        """What its task generator knows about goals."""
+        """The task generator's goal grid."""
 
     @abstractmethod
     def close(self) -> None:

@@ -1,4 +1,4 @@
-"""SIGINT and SIGTERM while a run goes on: it ends where it can be resumed, and the process says which signal it was."""
+"""Handling of SIGINT and SIGTERM: a run ends where it can be resumed, and the process says which signal it was."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ STOPPING = (signal.SIGINT, signal.SIGTERM)
 
 
 class InterruptError(BaseException):
-    """A signal ends what is going on at once. No ``Exception``: nothing may take it for an error of its own."""
+    """A signal that ends everything at once. No ``Exception``, so that nothing takes it for an error of its own."""
 
     def __init__(self, number: int) -> None:
-        """Of the signal."""
+        """Keep the signal's number."""
         super().__init__(signal.Signals(number).name)
         self.number = number
 
@@ -45,7 +45,7 @@ class StopSignals:
 
     @contextmanager
     def asking(self, ask: Callable[[], None]) -> Iterator[None]:
-        """Inside, the first signal only calls ``ask``; a second one raises ``InterruptError``."""
+        """Make the first signal of the block only call ``ask``; a second one raises ``InterruptError``."""
         if self.first is not None:  # what it raised was swallowed, as by the imports of some packages
             ask()
         self._ask = ask

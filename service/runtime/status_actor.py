@@ -1,4 +1,4 @@
-"""The status service in an actor of its own: it costs the driver nothing, and Ray restarts it when it dies."""
+"""The status service as a Ray actor: it costs the driver nothing, and Ray restarts it when it dies."""
 
 from __future__ import annotations
 

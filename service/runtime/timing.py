@@ -1,4 +1,4 @@
-"""Where a run's wall-clock time goes: named, nested, printed as a tree at the end."""
+"""Wall-clock time of a run by named section, printed as a tree at the end."""
 
 from __future__ import annotations
 

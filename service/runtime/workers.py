@@ -21,13 +21,12 @@ from service.config import Config
 from service.envs.goals import GoalKind
 from service.envs.scene import build_layout
 from service.generator.generator import GoalChoice, TaskGenerator
-from service.generator.opponents import RoundPlan
+from service.generator.opponents import OpponentPool, RoundPlan
 from service.generator.records import GoalRecords
 from service.generator.validity import Verdict
 from service.policies.numpy_policy import NumpyGaussianPolicy, numpy_bob
-from service.policies.parameters import Parameters
 from service.store.models import GoalCell, GoalGrid
-from service.types import Arrays, Metrics
+from service.types import Arrays, IntArray, Metrics, StateArray
 
 if TYPE_CHECKING:
     from service.learner.weights import Weights
@@ -39,15 +38,6 @@ GOALS_PER_ITERATION = 32
 
 
 @dataclass(frozen=True, slots=True)
-class Pool:
-    """The generator's past opponents, as of its ``version``."""
-
-    version: int
-    alice: Sequence[Parameters]
-    bob: Sequence[Parameters]
-
-
-@dataclass(frozen=True, slots=True)
 class Assignment:
     """The opponents and the random numbers of a round."""
 
@@ -55,11 +45,13 @@ class Assignment:
     rng: np.random.Generator
     """The actor's, advanced by the plan."""
     pool_version: int
-    pool: Pool | None
-    """None where the actor has this version."""
+    pool: OpponentPool | None
+    """Past opponents; None where the actor has this version of them."""
 
 
-ChooseGoals = Callable[..., tuple[GoalChoice, np.random.Generator]]
+Proposals = tuple[StateArray, StateArray, IntArray, StateArray, NDArray[np.int8]]
+"""The arguments of ``TaskGenerator.choose_goals`` between the plan and the random numbers."""
+ChooseGoals = Callable[[RoundPlan, Proposals, np.random.Generator], tuple[GoalChoice, np.random.Generator]]
 """``GeneratorWorker.choose_goals``, or a call of it in another process."""
 
 
@@ -68,7 +60,6 @@ class RoundSummary:
     """A played round in a few numbers; its rollout travels on its own."""
 
     id: RolloutId
-    policy_version: int
     num_env_steps: int
     num_worlds: int
     num_diverged: int
@@ -84,7 +75,7 @@ class RoundSummary:
 
 @dataclass(frozen=True, slots=True)
 class GeneratorResult:
-    """What the task generator makes of an iteration's goals."""
+    """The task generator's result for an iteration."""
 
     metrics: Metrics
     should_stop: bool
@@ -94,7 +85,7 @@ class GeneratorResult:
 
 @dataclass(frozen=True, slots=True)
 class UpdateResult:
-    """What the learner makes of an iteration's rollouts."""
+    """The learner's result for an iteration."""
 
     version: int
     metrics: Metrics
@@ -143,7 +134,7 @@ class RolloutWorker:
         def choose(*proposals: Any) -> GoalChoice:
             nonlocal generator_s
             asked = time.perf_counter()
-            choice, rng = choose_goals(assignment.plan, *proposals, self.rng)
+            choice, rng = choose_goals(assignment.plan, proposals, self.rng)
             self.rng.bit_generator.state = rng.bit_generator.state
             generator_s = time.perf_counter() - asked
             return choice
@@ -151,7 +142,6 @@ class RolloutWorker:
         rollout = self.game.play_round(self._players(weights), assignment.plan, choose)
         return rollout, RoundSummary(
             id=rollout.id,
-            policy_version=rollout.policy_version,
             num_env_steps=rollout.num_env_steps,
             num_worlds=self._config.game.num_worlds,
             num_diverged=self.game.worlds.num_diverged,
@@ -206,27 +196,18 @@ class GeneratorWorker:
         """Choose the opponents in the next round of an actor with ``num_worlds``, whose random numbers these are."""
         rng = _copy(rng)
         plan = self.generator.plan(num_worlds, rng)
-        opponents = self.generator.opponents
-        pool = Pool(self._pool_version, list(opponents.alice), list(opponents.bob))
-        return Assignment(plan, rng, self._pool_version, pool if known_pool != self._pool_version else None)
+        pool = self.generator.opponents if known_pool != self._pool_version else None
+        return Assignment(plan, rng, self._pool_version, pool)
 
     def choose_goals(
-        self,
-        plan: RoundPlan,
-        start_state: NDArray[np.float64],
-        start_position: NDArray[np.float64],
-        round_index: NDArray[np.int64],
-        proposal: NDArray[np.float64],
-        verdict: NDArray[np.int8],
-        rng: np.random.Generator,
+        self, plan: RoundPlan, proposals: Proposals, rng: np.random.Generator
     ) -> tuple[GoalChoice, np.random.Generator]:
-        """Choose what Bob plays in a round; see ``TaskGenerator.choose_goals``.
+        """Choose what Bob plays in a round, as ``TaskGenerator.choose_goals`` does.
 
         Returns:
             The choice, and the actor's random numbers after it.
         """
         rng = _copy(rng)
-        proposals = start_state, start_position, round_index, proposal, verdict
         return self.generator.choose_goals(plan, *proposals, rng), rng
 
     def record(self, iteration: int, weights: Weights, records: Sequence[GoalRecords]) -> GeneratorResult:
@@ -328,7 +309,7 @@ def sampled_goals(records: GoalRecords) -> NDArray[np.float64]:
 
 
 def _copy(rng: np.random.Generator) -> np.random.Generator:
-    """A copy: what comes as an argument of a call that is tried again must not have moved."""
+    """Copy random numbers: the arguments of a call that may be tried again must not change."""
     copy = np.random.default_rng()
     copy.bit_generator.state = rng.bit_generator.state
     return copy
