@@ -4,7 +4,7 @@
 
 Every block between two markers of ``results/pretraining.md``, ``results/cluster.md`` and ``scaling.md`` is written
 anew, and all pictures; the words around the blocks stay. Whether a target was reached is computed. A block about
-something that was not recorded says so. The downstream page is made by ``tandem downstream table``.
+something that was not recorded says so. ``results/downstream.md`` is written whole, as by ``tandem downstream table``.
 """
 
 from __future__ import annotations
@@ -29,6 +29,7 @@ from benchmarks.report.figures import (
     draw_soak,
 )
 from benchmarks.run_files import Run, read_run
+from service.downstream.table import write_results
 from service.errors import TandemError
 from service.io.files import os_errors, write_atomic
 
@@ -129,6 +130,7 @@ class Report:
             with os_errors("write", path):
                 write_atomic(path, text.encode())
             self.files.append(path)
+        self.files += write_results(self._results)
 
     def pretraining_blocks(self, runs: Sequence[Run], ablations: Sequence[Run], found: Results) -> Blocks:
         """Parts of the blocks about pre-training."""
