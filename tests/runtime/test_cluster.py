@@ -86,6 +86,8 @@ def test_one_actor_plays_and_learns_what_the_local_runner_does(tmp_path):
         assert cluster[index]["env_steps"] == local[index]["env_steps"]
         learned = {name: value for name, value in local[index + 1].items() if name.startswith("learner/")}
         assert {name: cluster[index][name] for name in learned} == learned
+        others = {name for name in local[index] if not name.startswith("learner/")}
+        assert set(cluster[index]) == others | set(learned) | {"time/learn_s"}
 
 
 def test_worlds_are_shared_out_and_every_rollout_counts_once(tmp_path):
