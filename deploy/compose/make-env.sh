@@ -1,6 +1,6 @@
 #!/bin/sh
 # Writes .env beside this file, readable by its owner only: .env.example with a random secret for every empty value.
-# An .env that is there already is left alone, because volumes remember the passwords they were made with.
+# An existing .env is not changed, because volumes keep the passwords they were made with.
 set -eu
 cd "$(dirname "$0")"
 umask 077

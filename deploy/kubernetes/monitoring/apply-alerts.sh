@@ -1,5 +1,5 @@
 #!/bin/sh
-# The alert rules of ../../prometheus/alerts.yml as a PrometheusRule, so that they are written down once:
+# The alert rules of ../../prometheus/alerts.yml as a PrometheusRule, so that they exist only once:
 #   sh deploy/kubernetes/monitoring/apply-alerts.sh | kubectl apply -f -
 set -eu
 cat <<'END'
