@@ -8,21 +8,10 @@ from numpy.typing import NDArray
 from service.generator.difficulty import HEIGHT_NAMES, height_bins, in_air
 from service.generator.records import GoalRecords
 from service.generator.validity import Verdict
-from service.types import BoolArray
+from service.types import Metrics
 
 
-def own_goals(records: GoalRecords) -> BoolArray:
-    """(N,) Bob played the valid goal that this world's Alice had just proposed."""
-    own: BoolArray = (records.verdict == Verdict.VALID) & records.played & ~records.replayed
-    return own
-
-
-def current_goals(records: GoalRecords) -> BoolArray:
-    """(N,) the current Bob played the current Alice's goal: what success statistics are about."""
-    return own_goals(records) & ~records.alice_past & ~records.bob_past
-
-
-def alice_metrics(records: GoalRecords, rest_height_m: float) -> dict[str, float]:
+def alice_metrics(records: GoalRecords, rest_height_m: float) -> Metrics:
     """The current Alice's proposals; a mean over no cases is left out.
 
     Verdict fractions are over all her proposals; lifted, heights and distance over the valid ones. The distance leaves
@@ -44,18 +33,18 @@ def alice_metrics(records: GoalRecords, rest_height_m: float) -> dict[str, float
     return without_nan(metrics)
 
 
-def bob_metrics(records: GoalRecords, rest_height_m: float) -> dict[str, float]:
+def bob_metrics(records: GoalRecords, rest_height_m: float) -> Metrics:
     """The current Bob's success by kind of goal; a mean over no cases is left out.
 
     No suffix, table and air: the current Alice's valid goals. ``past_alice`` and ``replayed`` stand apart.
     """
-    current = current_goals(records)
+    current = records.current
     air = in_air(records.goal, rest_height_m)
     kinds = {
         "": current,
         "_table": current & ~air,
         "_air": current & air,
-        "_past_alice": own_goals(records) & records.alice_past & ~records.bob_past,
+        "_past_alice": records.own & records.alice_past & ~records.bob_past,
         "_from_reset": records.played & records.from_reset & ~records.bob_past,
         "_replayed": records.played & records.replayed & ~records.bob_past,
     }
@@ -69,6 +58,6 @@ def mean(values: NDArray[np.bool_] | NDArray[np.float64] | NDArray[np.int64]) ->
     return float(values.mean()) if len(values) else float("nan")
 
 
-def without_nan(metrics: dict[str, float]) -> dict[str, float]:
+def without_nan(metrics: Metrics) -> Metrics:
     """Metrics that have a value."""
     return {name: value for name, value in metrics.items() if not np.isnan(value)}
