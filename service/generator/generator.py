@@ -19,9 +19,8 @@ from service.generator.difficulty import (
     height_bins,
     in_air,
 )
-from service.generator.metrics import alice_metrics, bob_metrics, mean, without_nan
 from service.generator.opponents import OpponentPool, RoundPlan
-from service.generator.records import GoalRecords
+from service.generator.records import GoalRecords, alice_metrics, bob_metrics, mean, without_nan
 from service.generator.ring import Ring
 from service.generator.stopping import StopCriterion
 from service.generator.validity import Verdict
@@ -165,8 +164,7 @@ class TaskGenerator:
         return (
             alice_metrics(records, self._rest_height_m)
             | bob_metrics(records, self._rest_height_m)
-            | self._blocked_metrics(records, tried)
-            | self._own_metrics(num_new_cells)
+            | without_nan(self._blocked_metrics(records, tried) | self._own_metrics(num_new_cells))
         )
 
     def snapshot_due(self, iteration: int) -> bool:
@@ -244,18 +242,16 @@ class TaskGenerator:
             return {}
         blocked = self._blocked(records.start_state)
         valid = records.verdict[blocked & ~records.alice_past & ~records.replayed] == Verdict.VALID
-        rates = {
+        return {
             "alice/valid_fraction_blocked": mean(valid),
             "bob/success_rate_blocked": mean(records.solved[tried & blocked]),
         }
-        return without_nan(rates)
 
     def _own_metrics(self, num_new_cells: int) -> Metrics:
-        metrics = {
+        return {
             "generator/num_cells_seen": float(self.grid.num_cells_seen),
             "generator/new_cells": float(num_new_cells),
             "generator/iterations_without_new_cell": float(self._stop.num_iterations_without_new_cell),
             "generator/buffer_size": float(len(self.buffer)),
             "generator/mean_learnability": self.grid.mean_learnability(),
         }
-        return without_nan(metrics)

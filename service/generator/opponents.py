@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from service.io.tensors import split_parts
 from service.types import Array, Arrays, BoolArray, IntArray
 
 CURRENT = -1
@@ -86,13 +87,10 @@ class OpponentPool:
 
     def load_state(self, state: Mapping[str, Array]) -> None:
         """Take over what ``state`` gave; a smaller pool keeps the newest."""
-        snapshots: dict[int, dict[str, Arrays]] = {}
-        for key, array in state.items():
-            index, player, name = key.split("/", maxsplit=2)
-            snapshots.setdefault(int(index), {"alice": {}, "bob": {}})[player][name] = array
         self.alice, self.bob = [], []
-        for _, snapshot in sorted(snapshots.items()):
-            self.add(**snapshot)
+        snapshots = split_parts(state)
+        for index in sorted(snapshots, key=int):
+            self.add(**split_parts(snapshots[index]))
 
 
 def _round_at_random(count: float, rng: np.random.Generator) -> int:

@@ -12,12 +12,12 @@ from numpy.typing import NDArray
 
 from service.actors.rollout import Rollout, Turns, turns_to_arrays
 from service.config import Config
-from service.envs.observations import MIRROR_ACTION, MIRROR_BOB, MIRROR_BOB_VALUE
+from service.envs.observations import MIRROR_ACTION, MIRROR_BOB
 from service.io.tensors import join_parts, split_parts
 from service.learner import ppo
 from service.learner.diagnostics import cloning_metrics, composition_metrics, probes
 from service.learner.player import LearnerError, Player
-from service.learner.samples import Cloning, DemonstrationHistory, Samples, augment_by_symmetry
+from service.learner.samples import Cloning, DemonstrationHistory, augment_by_symmetry
 from service.learner.weights import MAX_POLICY_LAG, Weights
 from service.policies import networks
 from service.types import Array, Arrays, Metrics
@@ -152,8 +152,8 @@ class Learner:
 
     def _load_players(self, states: Mapping[str, Arrays]) -> None:
         players = {"alice": self._alice, "bob": self._bob}
-        for part in states.keys() - players.keys():
-            raise LearnerError(f"learner state {part!r}: no such part; take a checkpoint of this format version")
+        if unknown := sorted(states.keys() - players.keys()):
+            raise LearnerError(f"learner state {unknown[0]!r}: no such part; take a checkpoint of this format version")
         for key, player in players.items():
             player.check_state(states.get(key, {}), where=key)
         for key, player in players.items():
@@ -162,17 +162,17 @@ class Learner:
     def _update_alice(self, rollouts: Sequence[Rollout]) -> Metrics:
         samples = ppo.collect([rollout.alice for rollout in rollouts], self._alice)
         metrics = ppo.update(self._alice, samples, None, self.config.learner.abc, self._rng)
-        return _prefixed("alice", metrics) | {"num_alice_samples": float(_length(samples))}
+        return _prefixed("alice", metrics) | {"num_alice_samples": float(len(samples or ()))}
 
     def _update_bob(self, rollouts: Sequence[Rollout]) -> Metrics:
         config, bob = self.config.learner, self._bob
         self._window.append([rollout.bob for rollout in rollouts])
         samples = ppo.collect([turns for iteration in self._window for turns in iteration], bob)
-        metrics = {"num_bob_samples": float(_length(samples))}
+        metrics = {"num_bob_samples": float(len(samples or ()))}
         if samples is not None and config.mirror:
-            samples = augment_by_symmetry(samples, bob, MIRROR_BOB, MIRROR_BOB_VALUE, MIRROR_ACTION)
+            samples = augment_by_symmetry(samples, bob)
         cloning = self._cloning(rollouts)
-        metrics["num_demonstrations"] = float(_length(cloning) // (2 if config.mirror else 1))
+        metrics["num_demonstrations"] = float(len(cloning or ()) // (2 if config.mirror else 1))
         metrics |= _prefixed("bob", ppo.update(bob, samples, cloning, config.abc, self._rng))
         rows = samples if samples is not None else cloning
         if rows is not None and isinstance(self._bob_policy, networks.MCPPolicy):
@@ -211,19 +211,15 @@ def _rng_to_array(rng: np.random.Generator) -> NDArray[np.uint64]:
 
 def _rng_from_array(words: NDArray[np.uint64]) -> np.random.Generator:
     """The generator that ``_rng_to_array`` made these (6,) words of."""
-    values = [int(word) for word in words]
+    high, low, inc_high, inc_low, has_half, half = words.tolist()
     rng = np.random.Generator(np.random.PCG64())
     rng.bit_generator.state = {
         "bit_generator": "PCG64",
-        "state": {"state": values[0] << 64 | values[1], "inc": values[2] << 64 | values[3]},
-        "has_uint32": values[4],
-        "uinteger": values[5],
+        "state": {"state": high << 64 | low, "inc": inc_high << 64 | inc_low},
+        "has_uint32": has_half,
+        "uinteger": half,
     }
     return rng
-
-
-def _length(rows: Samples | Cloning | None) -> int:
-    return 0 if rows is None else len(rows)
 
 
 def torch_device(name: str) -> torch.device:

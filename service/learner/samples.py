@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from service.actors.rollout import Demonstrations
-from service.envs.observations import ACTION_SIZE, BOB_SIZE, Mirror
+from service.envs.observations import ACTION_SIZE, BOB_SIZE, MIRROR_ACTION, MIRROR_BOB, MIRROR_BOB_VALUE, Mirror
 from service.learner.player import Player
 from service.policies import gaussian
 from service.types import Array, Arrays
@@ -113,30 +113,19 @@ class DemonstrationHistory:
             self._iterations.append(Demonstrations(state["observation"][rows].copy(), state["action"][rows].copy()))
 
 
-def augment_by_symmetry(
-    samples: Samples, player: Player, observation: Mirror, value_observation: Mirror, action: Mirror
-) -> Samples:
-    """Append the samples' reflections in y.
+def augment_by_symmetry(samples: Samples, player: Player) -> Samples:
+    """Append the reflections in y of Bob's samples, which have the originals' advantages and values.
 
-    Nobody acted a reflection, so its behaviour log-probability is that of the policy at the start of the update.
-
-    Args:
-        samples: B of them.
-        player: has the policy at the start of the update.
-        observation: reflects the column of that name.
-        value_observation: reflects the column of that name.
-        action: reflects the column of that name.
-
-    Returns:
-        2B samples; the reflections have the originals' advantages and values.
+    Nobody acted a reflection, so its behaviour log-probability is that of the policy at the start of the update, which
+    is ``player``'s.
     """
-    observations, actions = _reflect(samples.observation, observation), _reflect(samples.action, action)
+    observations, actions = _reflect(samples.observation, MIRROR_BOB), _reflect(samples.action, MIRROR_ACTION)
     with torch.no_grad():
         mean, std = player.policy(observations)
     reflections = replace(
         samples,
         observation=observations,
-        value_observation=_reflect(samples.value_observation, value_observation),
+        value_observation=_reflect(samples.value_observation, MIRROR_BOB_VALUE),
         action=actions,
         behaviour_log_prob=gaussian.log_prob(actions, mean, std),
         proximal_mean=mean,
