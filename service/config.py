@@ -7,6 +7,7 @@ description. ``load_config`` reads YAML and applies ``--set a.b=c`` overrides.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from contextlib import suppress
 from copy import deepcopy
 from pathlib import Path
@@ -40,12 +41,7 @@ Point = tuple[float, float, float]
 class WorkspaceConfig(FrozenModel):
     """The box in which goals are valid. Origin of the world: the table top, 0.6 m in front of the robot's base."""
 
-    center_x_m: float = Field(
-        -0.05,
-        ge=-0.3,
-        le=0.2,
-        description="-0.05 keeps the downstream Larger task reachable",
-    )
+    center_x_m: float = Field(-0.05, ge=-0.3, le=0.2, description="-0.05 keeps the downstream Larger task reachable")
     center_y_m: float = Field(0.0, ge=-0.3, le=0.3)
     length_x_m: float = Field(0.35, gt=0.0, le=0.8, description="paper: 35 cm")
     length_y_m: float = Field(0.35, gt=0.0, le=0.8, description="paper: 35 cm")
@@ -283,9 +279,7 @@ class Config(FrozenModel):
     run: RunConfig = RunConfig()
 
 
-def load_config(
-    path: Path | str | None = None, overrides: list[str] | tuple[str, ...] = (), *, recorded: bool = False
-) -> Config:
+def load_config(path: Path | str | None = None, overrides: Sequence[str] = (), *, recorded: bool = False) -> Config:
     """Read a run's configuration.
 
     Args:
@@ -296,9 +290,7 @@ def load_config(
     Raises:
         ConfigError: file missing or not YAML, unknown key, value out of range; one line a user can act on.
     """
-    tree: dict[str, Any] = {}
-    if path is not None:
-        tree = _read_yaml(Path(path))
+    tree = _read_yaml(Path(path)) if path is not None else {}
     if recorded:
         tree = _updated(tree, where=str(path))
     for override in overrides:

@@ -151,6 +151,7 @@ def test_unknown_key_lists_the_known_ones(override, key, known):
         ("name=../escape", "name", "../escape"),
         ("policy.alice.hidden_sizes=[64,0]", "policy.alice.hidden_sizes.1", "0"),
         ("policy.bob.log_std_min=0.5", "policy.bob", "0.5"),
+        ("policy.alice_log_std_min=0.5", "policy", "0.5"),
         ("game=3", "game", "3"),
     ],
 )

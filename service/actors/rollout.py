@@ -84,13 +84,8 @@ class Rollout:
 
 
 def turns_to_arrays(turns: Turns) -> dict[str, NDArray[Any]]:
-    """The arrays by name; ``turns_from_arrays`` gives equal turns back."""
+    """The arrays by name."""
     return {field.name: getattr(turns, field.name) for field in fields(turns)}
-
-
-def turns_from_arrays(arrays: dict[str, NDArray[Any]]) -> Turns:
-    """The turns that ``turns_to_arrays`` took apart."""
-    return Turns(**arrays)
 
 
 def to_arrays(rollout: Rollout) -> dict[str, NDArray[Any]]:

@@ -20,8 +20,7 @@ from service.envs.observations import (
     NORMALISATION_BOB,
     OBJECT_SLICE,
 )
-from service.policies.layers import InputNormalisation
-from service.policies.networks import MCPPolicy
+from service.policies.networks import InputNormalisation, MCPPolicy
 
 STEP_SCALE_M = 0.02
 """Scale of movements in a step, as inputs: the hand's full speed is two to three times as much."""

@@ -1,4 +1,4 @@
-"""Difficulty of goals for the present Bob, over a grid of cells; heights and distances of goals, in bins."""
+"""Difficulty of goals for the present Bob: his successes in bins of goals, and over a grid of cells."""
 
 from __future__ import annotations
 
@@ -7,10 +7,14 @@ from collections.abc import Mapping
 import numpy as np
 
 from service.config import Point, WorldConfig
-from service.generator.counts import SuccessCounts
-from service.generator.state import prefixed, take, under
+from service.generator.state import take
+from service.io.tensors import join_parts, split_parts
 from service.types import Array, Arrays, BoolArray, IntArray, StateArray
 
+DECAY = 0.95
+"""Weight that a try keeps from one record to the next: half after 13.5 iterations, so the rates follow Bob."""
+PRIOR_TRIES = 2.0
+"""Beta(1, 1), uniform: one success and one failure are added to every bin, so an untried one has rate 1/2."""
 AIR_ABOVE_REST_M = 0.05
 """A goal is in the air when the object's centre is higher than it rests on the table by more than this."""
 HEIGHT_EDGES_M = (0.10, 0.20)
@@ -32,10 +36,62 @@ def height_bins(positions: StateArray, rest_height_m: float) -> IntArray:
     return np.digitize(positions[:, 2], edges, right=True).astype(np.int64)
 
 
+def distance_bins(goals: StateArray, start_positions: StateArray) -> IntArray:
+    """(M,) bin between ``DISTANCE_EDGES_M`` of the way from (M, 3) starts to (M, 3) goals, metres."""
+    distance = np.linalg.norm(goals - start_positions, axis=-1)
+    bins: IntArray = np.digitize(distance, DISTANCE_EDGES_M).astype(np.int64)
+    return bins
+
+
+class SuccessCounts:
+    """Exponentially decayed tries and successes of ``num_bins`` bins."""
+
+    tries: StateArray
+    """(B,) decayed number of tries."""
+    successes: StateArray
+    """(B,) decayed number of successes."""
+    num_tries: IntArray
+    """(B,) tries ever, not decayed."""
+
+    def __init__(self, num_bins: int) -> None:
+        self.tries = np.zeros(num_bins)
+        self.successes = np.zeros(num_bins)
+        self.num_tries = np.zeros(num_bins, dtype=np.int64)
+
+    def record(self, bins: IntArray, solved: BoolArray) -> None:
+        """Age all counts by one iteration, then add M tries at bins (M,) with results (M,)."""
+        num_bins = self.tries.size
+        counted = np.bincount(bins, minlength=num_bins)
+        self.tries = DECAY * self.tries + counted
+        self.successes = DECAY * self.successes + np.bincount(bins[solved], minlength=num_bins)
+        self.num_tries += counted
+
+    def success_rate(self) -> StateArray:
+        """(B,) posterior mean (s + 1) / (n + 2) of the success probability."""
+        return (self.successes + PRIOR_TRIES / 2) / (self.tries + PRIOR_TRIES)
+
+    def learnability(self) -> StateArray:
+        """(B,) p (1 - p) of the posterior mean (Rutherford et al. 2024); 1/4, the most, in an untried bin."""
+        rate = self.success_rate()
+        return rate * (1.0 - rate)
+
+    def state(self) -> Arrays:
+        """All counts, copied."""
+        return {name: array.copy() for name, array in vars(self).items()}
+
+    def load_state(self, state: Mapping[str, Array]) -> None:
+        """Take over what ``state`` gave.
+
+        Raises:
+            ConfigError: another number of bins.
+        """
+        vars(self).update({name: take(state, name, like) for name, like in vars(self).items()})
+
+
 class DifficultyGrid:
     """Bob's success over goal cells that cover the workspace.
 
-    All rates are decayed running ones (see ``counts.DECAY``), one ``record`` being one iteration, so they follow Bob.
+    All rates are decayed running ones (see ``DECAY``), one ``record`` being one iteration, so they follow Bob.
     """
 
     bounds_m: tuple[Point, Point]
@@ -53,16 +109,12 @@ class DifficultyGrid:
         self.bounds_m = world.workspace.lower_m, world.workspace.upper_m
         self._lower: StateArray = np.array(self.bounds_m[0])
         self.cell_size_m = cell_size_m
-        self._rest_height_m = world.object_size_m / 2
         # Rounding may not add a cell: 0.45 / 0.03 is a little over 15.
         counted = np.ceil((self.bounds_m[1] - self._lower) / cell_size_m - 1e-9).astype(int)
         self.shape = (int(counted[0]), int(counted[1]), int(counted[2]))
         num_cells = int(np.prod(self.shape))
         self.cells = SuccessCounts(num_cells)
         self.seen = np.zeros(num_cells, dtype=np.bool_)
-
-    num_height_bins = len(HEIGHT_NAMES)
-    num_distance_bins = len(DISTANCE_EDGES_M) + 1
 
     @property
     def num_cells_seen(self) -> int:
@@ -91,16 +143,6 @@ class DifficultyGrid:
         self.mark_seen(goals)
         self.cells.record(self.cell_index(goals), solved)
 
-    def height_bin(self, goals: StateArray) -> IntArray:
-        """(M,) index into ``HEIGHT_NAMES`` of (M, 3) goals, metres."""
-        return height_bins(goals, self._rest_height_m)
-
-    def distance_bin(self, goals: StateArray, start_positions: StateArray) -> IntArray:
-        """(M,) bin between ``DISTANCE_EDGES_M`` of the way from (M, 3) starts to (M, 3) goals, metres."""
-        distance = np.linalg.norm(goals - start_positions, axis=-1)
-        bins: IntArray = np.digitize(distance, DISTANCE_EDGES_M).astype(np.int64)
-        return bins
-
     def learnability(self, goals: StateArray) -> StateArray:
         """(M,) p (1 - p) of the cell of each of (M, 3) goals; 1/4, the most, where untried."""
         learnability: StateArray = self.cells.learnability()[self.cell_index(goals)]
@@ -125,7 +167,7 @@ class DifficultyGrid:
 
     def state(self) -> Arrays:
         """All counts, copied."""
-        return {"seen": self.seen.copy()} | prefixed("cells", self.cells.state())
+        return {"seen": self.seen.copy()} | join_parts({"cells": self.cells.state()})
 
     def load_state(self, state: Mapping[str, Array]) -> None:
         """Take over what ``state`` gave, of this or an older version, which also counted heights and distances.
@@ -134,4 +176,4 @@ class DifficultyGrid:
             ConfigError: of a grid of another size.
         """
         self.seen = take(state, "seen", self.seen)
-        self.cells.load_state(under("cells", state))
+        self.cells.load_state(split_parts(state).get("cells", {}))

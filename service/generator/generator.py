@@ -10,16 +10,22 @@ from numpy.typing import NDArray
 
 from service.config import Config
 from service.envs.state_layout import StateLayout
-from service.generator.counts import SuccessCounts
-from service.generator.difficulty import DifficultyGrid, in_air
-from service.generator.metrics import alice_metrics, bob_metrics, current_goals, mean, own_goals, without_nan
+from service.generator.difficulty import (
+    DISTANCE_EDGES_M,
+    HEIGHT_NAMES,
+    DifficultyGrid,
+    SuccessCounts,
+    distance_bins,
+    height_bins,
+    in_air,
+)
 from service.generator.opponents import OpponentPool, RoundPlan
-from service.generator.records import GoalRecords
+from service.generator.records import GoalRecords, alice_metrics, bob_metrics, mean, without_nan
 from service.generator.ring import Ring
-from service.generator.state import prefixed, under
 from service.generator.stopping import StopCriterion
 from service.generator.validity import Verdict
-from service.types import Array, Arrays, BoolArray, StateArray
+from service.io.tensors import join_parts, split_parts
+from service.types import Array, Arrays, BoolArray, IntArray, Metrics, StateArray
 
 LEARNABILITY_FLOOR = 0.01
 """Added to p (1 - p), which is at most 1/4, so goals of a solved or hopeless cell stay drawable and measured."""
@@ -27,6 +33,8 @@ NUM_STARTS = 1024
 """Starts of games kept for ``replay_from_reset``."""
 MIN_REPLAY_GOALS = 64
 """Goals the buffer must hold before any is replayed: fewer would be played over and over."""
+NUM_DISTANCE_BINS = len(DISTANCE_EDGES_M) + 1
+NUM_TASK_BINS = len(HEIGHT_NAMES) * NUM_DISTANCE_BINS
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,9 +87,16 @@ class TaskGenerator:
         self.buffer = Ring(config.generator.replay_buffer_size, num_cells, **columns, goal=3)
         self.starts = Ring(NUM_STARTS, **columns)
         self.opponents = OpponentPool(config.generator.opponent_pool_size)
-        self._num_task_bins = self.grid.num_height_bins * self.grid.num_distance_bins
-        self.from_reset = SuccessCounts(self._num_task_bins * (1 + self._some_blocked))
+        self.from_reset = SuccessCounts(NUM_TASK_BINS * (1 + self._some_blocked))
         self._stop = StopCriterion(config.generator)
+        self._parts: dict[str, DifficultyGrid | Ring | SuccessCounts | OpponentPool | StopCriterion] = {
+            "grid": self.grid,
+            "buffer": self.buffer,
+            "starts": self.starts,
+            "from_reset": self.from_reset,
+            "opponents": self.opponents,
+            "stop": self._stop,
+        }
 
     def plan(self, num_worlds: int, rng: np.random.Generator) -> RoundPlan:
         """Choose the players of the next round; all current while there are no past versions."""
@@ -92,7 +107,7 @@ class TaskGenerator:
         plan: RoundPlan,
         start_state: StateArray,
         start_position: StateArray,
-        round_index: NDArray[np.int64],
+        round_index: IntArray,
         proposal: StateArray,
         verdict: NDArray[np.int8],
         rng: np.random.Generator,
@@ -120,7 +135,7 @@ class TaskGenerator:
             self._replay(choice, np.flatnonzero(replayed), rng)
         return choice
 
-    def record(self, records: GoalRecords) -> dict[str, float]:
+    def record(self, records: GoalRecords) -> Metrics:
         """Take in the outcomes of one iteration's goals.
 
         Difficulty follows every try of the current Bob; the buffer takes the valid goals that Bob played straight from
@@ -136,7 +151,7 @@ class TaskGenerator:
         self.from_reset.record(self._task_bins(*tasks), records.solved[reset])
         as_proposed = tried & ~(records.replayed & records.from_reset)
         self.grid.record(records.goal[as_proposed], records.solved[as_proposed])
-        own = own_goals(records)
+        own = records.own
         goal = records.goal[own]
         self.buffer.add(
             self.grid.cell_index(goal) if self._config.replay_over_cells else None,
@@ -144,13 +159,12 @@ class TaskGenerator:
             start_position=records.start_position[own],
             goal=goal,
         )
-        current = current_goals(records)
-        self._stop.record(num_new_cells, int(current.sum()), int(records.solved[current].sum()))
+        solved = records.solved[records.current]
+        self._stop.record(num_new_cells, len(solved), int(solved.sum()))
         return (
             alice_metrics(records, self._rest_height_m)
             | bob_metrics(records, self._rest_height_m)
-            | self._blocked_metrics(records, tried)
-            | self._own_metrics(num_new_cells)
+            | without_nan(self._blocked_metrics(records, tried) | self._own_metrics(num_new_cells))
         )
 
     def snapshot_due(self, iteration: int) -> bool:
@@ -167,14 +181,7 @@ class TaskGenerator:
 
     def state(self) -> Arrays:
         """Everything an exact resume needs, copied: flat named arrays."""
-        return (
-            prefixed("grid", self.grid.state())
-            | prefixed("buffer", self.buffer.state())
-            | prefixed("starts", self.starts.state())
-            | prefixed("from_reset", self.from_reset.state())
-            | prefixed("opponents", self.opponents.state())
-            | prefixed("stop", self._stop.state())
-        )
+        return join_parts({name: part.state() for name, part in self._parts.items()})
 
     def load_state(self, state: Mapping[str, Array]) -> None:
         """Take over what ``state`` gave.
@@ -182,12 +189,9 @@ class TaskGenerator:
         Raises:
             ConfigError: an array is missing, or of another configuration.
         """
-        self.grid.load_state(under("grid", state))
-        self.buffer.load_state(under("buffer", state))
-        self.starts.load_state(under("starts", state))
-        self.from_reset.load_state(under("from_reset", state))
-        self.opponents.load_state(under("opponents", state))
-        self._stop.load_state(under("stop", state))
+        states = split_parts(state)
+        for name, part in self._parts.items():
+            part.load_state(states.get(name, {}))
 
     def _choose_replayed(self, valid: BoolArray, bob_past: BoolArray, rng: np.random.Generator) -> BoolArray:
         """(N,) worlds whose goal comes from the buffer."""
@@ -197,7 +201,7 @@ class TaskGenerator:
         filled: BoolArray = ~valid & self._config.replay_invalid
         return (replaced | filled) & ~bob_past
 
-    def _replay(self, choice: GoalChoice, worlds: NDArray[np.int64], rng: np.random.Generator) -> None:
+    def _replay(self, choice: GoalChoice, worlds: IntArray, rng: np.random.Generator) -> None:
         """Give ``worlds`` earlier goals, from the start each was proposed from or from that of some game.
 
         Whatever is asked of Bob downstream begins with a reset, but Alice reaches far goals over several rounds, so few
@@ -223,33 +227,31 @@ class TaskGenerator:
         choice.start_state[worlds] = tasks["start_state"][drawn]
         choice.start_position[worlds] = tasks["start_position"][drawn]
 
-    def _task_bins(self, goals: StateArray, starts: StateArray, blocked: BoolArray) -> NDArray[np.int64]:
+    def _task_bins(self, goals: StateArray, starts: StateArray, blocked: BoolArray) -> IntArray:
         """(M,) bin of tasks by the goal's height, its distance from the object's start, and (M,) blocked grippers."""
-        bins = self.grid.height_bin(goals) * self.grid.num_distance_bins + self.grid.distance_bin(goals, starts)
-        return bins + blocked * self._num_task_bins
+        bins = height_bins(goals, self._rest_height_m) * NUM_DISTANCE_BINS + distance_bins(goals, starts)
+        return bins + blocked * NUM_TASK_BINS
 
     def _blocked(self, states: StateArray) -> BoolArray:
         """(M,) whether the gripper of (M, S) states is blocked; none is where states have no such flag."""
         blocked: BoolArray = np.any(states[:, self._layout["gripper_blocked"]] > 0.0, axis=1)
         return blocked
 
-    def _blocked_metrics(self, records: GoalRecords, tried: BoolArray) -> dict[str, float]:
+    def _blocked_metrics(self, records: GoalRecords, tried: BoolArray) -> Metrics:
         if not self._some_blocked:
             return {}
         blocked = self._blocked(records.start_state)
         valid = records.verdict[blocked & ~records.alice_past & ~records.replayed] == Verdict.VALID
-        rates = {
+        return {
             "alice/valid_fraction_blocked": mean(valid),
             "bob/success_rate_blocked": mean(records.solved[tried & blocked]),
         }
-        return without_nan(rates)
 
-    def _own_metrics(self, num_new_cells: int) -> dict[str, float]:
-        metrics = {
+    def _own_metrics(self, num_new_cells: int) -> Metrics:
+        return {
             "generator/num_cells_seen": float(self.grid.num_cells_seen),
             "generator/new_cells": float(num_new_cells),
             "generator/iterations_without_new_cell": float(self._stop.num_iterations_without_new_cell),
             "generator/buffer_size": float(len(self.buffer)),
             "generator/mean_learnability": self.grid.mean_learnability(),
         }
-        return without_nan(metrics)

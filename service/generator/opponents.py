@@ -6,11 +6,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from service.types import Array, Arrays, IntArray
-
-Parameters = dict[str, Array]
+from service.io.tensors import split_parts
+from service.types import Array, Arrays, BoolArray, IntArray
 
 CURRENT = -1
 """Opponent index of the current policy version."""
@@ -26,30 +24,29 @@ class RoundPlan:
     """(N,) index of Bob in ``OpponentPool.bob``, or ``CURRENT``."""
 
     @property
-    def alice_past(self) -> NDArray[np.bool_]:
+    def alice_past(self) -> BoolArray:
         """(N,) a past Alice proposes."""
-        past: NDArray[np.bool_] = self.alice_opponent != CURRENT
+        past: BoolArray = self.alice_opponent != CURRENT
         return past
 
     @property
-    def bob_past(self) -> NDArray[np.bool_]:
+    def bob_past(self) -> BoolArray:
         """(N,) a past Bob plays."""
-        past: NDArray[np.bool_] = self.bob_opponent != CURRENT
+        past: BoolArray = self.bob_opponent != CURRENT
         return past
 
 
 class OpponentPool:
     """The last ``capacity`` snapshots of both players, oldest first."""
 
-    alice: list[Parameters]
+    alice: list[Arrays]
     """Alice's parameters by name, one dict a snapshot."""
-    bob: list[Parameters]
+    bob: list[Arrays]
     """Bob's parameters by name, one dict a snapshot."""
 
     def __init__(self, capacity: int) -> None:
         self._capacity = capacity
-        self.alice = []
-        self.bob = []
+        self.alice, self.bob = [], []
 
     def __len__(self) -> int:
         """Number of snapshots held."""
@@ -72,8 +69,7 @@ class OpponentPool:
         plan = RoundPlan(np.full(num_worlds, CURRENT), np.full(num_worlds, CURRENT))
         if not self.alice or fraction == 0.0:
             return plan
-        num_past = _round_at_random(fraction * num_worlds, rng)
-        num_past = min(num_past, num_worlds // 2)
+        num_past = min(_round_at_random(fraction * num_worlds, rng), num_worlds // 2)
         worlds = rng.permutation(num_worlds)
         # One past version each a round: every further one would cost another batch of inference in every step.
         plan.alice_opponent[worlds[:num_past]] = rng.integers(len(self))
@@ -91,13 +87,10 @@ class OpponentPool:
 
     def load_state(self, state: Mapping[str, Array]) -> None:
         """Take over what ``state`` gave; a smaller pool keeps the newest."""
-        snapshots: dict[int, dict[str, Parameters]] = {}
-        for key, array in state.items():
-            index, player, name = key.split("/", maxsplit=2)
-            snapshots.setdefault(int(index), {"alice": {}, "bob": {}})[player][name] = array
         self.alice, self.bob = [], []
-        for _, snapshot in sorted(snapshots.items()):
-            self.add(**snapshot)
+        snapshots = split_parts(state)
+        for index in sorted(snapshots, key=int):
+            self.add(**split_parts(snapshots[index]))
 
 
 def _round_at_random(count: float, rng: np.random.Generator) -> int:

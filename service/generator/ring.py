@@ -30,7 +30,7 @@ class Ring:
         return int(self._num_held.sum())
 
     def __getitem__(self, column: str) -> StateArray:
-        """(len, size) rows held, in the order of the weights of ``sample`` and of ``part_share``; a copy."""
+        """(len, size) rows held, in the order of ``part_share``; a copy."""
         rows: StateArray = self._columns[column][self._held]
         return rows
 
@@ -56,22 +56,13 @@ class Ring:
             self._columns[name][where[newest]] = new[order[newest]]
         self._num_added += counted
 
-    def sample(self, rng: np.random.Generator, num: int, weight: StateArray | None = None) -> dict[str, StateArray]:
-        """Draw ``num`` whole rows with replacement, as copies.
-
-        Args:
-            rng: source of the draw.
-            num: how many.
-            weight: (len,) what each row's probability is proportional to; None for all alike.
-        """
-        held = self._held
-        assert held.size > 0, "sampled before anything was added"
-        assert weight is None or weight.shape == held.shape, (held.size, weight)
-        rows = held[rng.choice(held.size, size=num, p=None if weight is None else weight / weight.sum())]
+    def sample(self, rng: np.random.Generator, num: int) -> dict[str, StateArray]:
+        """Draw ``num`` whole rows with replacement, all alike, as copies; something must have been added."""
+        rows = self._held[rng.choice(len(self), size=num)]
         return {name: column[rows] for name, column in self._columns.items()}
 
     def part_share(self) -> StateArray:
-        """(len,) weights under which ``sample`` draws all parts alike: one over the rows held of each row's part."""
+        """(len,) weights that make all parts equally likely: one over the rows held of each row's part."""
         num = self._num_held
         share: StateArray = 1.0 / np.repeat(num, num)
         return share

@@ -1,22 +1,11 @@
-"""The generator's state as flat named arrays, so that a checkpoint needs no pickles."""
+"""The check of arrays that a checkpoint gives back."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 
 from service.config import ConfigError
-from service.types import Array, Arrays
-
-
-def prefixed(prefix: str, state: Mapping[str, Array]) -> Arrays:
-    """The same arrays, named ``prefix/name``."""
-    return {f"{prefix}/{name}": array for name, array in state.items()}
-
-
-def under(prefix: str, state: Mapping[str, Array]) -> Arrays:
-    """The arrays named ``prefix/name``, named ``name``: the inverse of ``prefixed``."""
-    head = f"{prefix}/"
-    return {name[len(head) :]: array for name, array in state.items() if name.startswith(head)}
+from service.types import Array
 
 
 def take(state: Mapping[str, Array], name: str, like: Array, *, any_rows: bool = False) -> Array:

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.config import WorkspaceConfig
+from service.types import BoolArray, StateArray
 
 FALLEN_BELOW_M = -0.02
 """Height of the object's centre under which it has left the table; the table top is at 0."""
@@ -22,17 +23,14 @@ class Verdict(enum.IntEnum):
     FALLEN = 3
 
 
-def in_workspace(position: NDArray[np.float64], workspace: WorkspaceConfig) -> NDArray[np.bool_]:
+def in_workspace(position: StateArray, workspace: WorkspaceConfig) -> BoolArray:
     """Whether each (..., 3) position in metres lies in the box, its faces included; not-a-number lies outside."""
-    inside: NDArray[np.bool_] = np.all((position >= workspace.lower_m) & (position <= workspace.upper_m), axis=-1)
+    inside: BoolArray = np.all((position >= workspace.lower_m) & (position <= workspace.upper_m), axis=-1)
     return inside
 
 
 def classify_goal(
-    start_position: NDArray[np.float64],
-    end_position: NDArray[np.float64],
-    workspace: WorkspaceConfig,
-    success_distance_m: float,
+    start_position: StateArray, end_position: StateArray, workspace: WorkspaceConfig, success_distance_m: float
 ) -> NDArray[np.int8]:
     """Verdict on where the object lies at the end of Alice's turn: the first reason that applies.
 

@@ -1,4 +1,4 @@
-"""Named arrays to safetensors bytes and back, bit-exactly and without torch."""
+"""Named arrays: nested by their names, and to safetensors bytes and back, bit-exactly and without torch."""
 
 from __future__ import annotations
 
@@ -74,3 +74,17 @@ def digest_of(text: str, arrays: Mapping[str, np.ndarray]) -> str:
 def describe(arrays: Mapping[str, np.ndarray]) -> dict[str, Any]:
     """Shape and dtype of each array, as a manifest lists them."""
     return {name: {"shape": list(arrays[name].shape), "dtype": arrays[name].dtype.name} for name in sorted(arrays)}
+
+
+def join_parts(parts: Mapping[str, Mapping[str, np.ndarray]]) -> dict[str, np.ndarray]:
+    """The arrays of several parts, each named ``PART/NAME``."""
+    return {f"{part}/{name}": array for part, arrays in parts.items() for name, array in arrays.items()}
+
+
+def split_parts(arrays: Mapping[str, np.ndarray]) -> dict[str, dict[str, np.ndarray]]:
+    """The arrays of each part by their names in it: the inverse of ``join_parts``."""
+    parts: dict[str, dict[str, np.ndarray]] = {}
+    for key, array in arrays.items():
+        part, _, name = key.partition("/")
+        parts.setdefault(part, {})[name] = array
+    return parts

@@ -5,26 +5,23 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from service.actors.rollout import Rollout, Turns, turns_from_arrays, turns_to_arrays
+from service.actors.rollout import Rollout, Turns, turns_to_arrays
 from service.config import Config
-from service.envs.observations import MIRROR_ACTION, MIRROR_BOB, MIRROR_BOB_VALUE
+from service.envs.observations import MIRROR_ACTION, MIRROR_BOB
+from service.io.tensors import join_parts, split_parts
 from service.learner import ppo
-from service.learner.demonstrations import DemonstrationHistory
 from service.learner.diagnostics import cloning_metrics, composition_metrics, probes
 from service.learner.player import LearnerError, Player
-from service.learner.samples import Cloning, Samples, augment_by_symmetry
-from service.learner.weights import Weights
+from service.learner.samples import Cloning, DemonstrationHistory, augment_by_symmetry
+from service.learner.weights import MAX_POLICY_LAG, Weights
 from service.policies import networks
-from service.types import Arrays, Metrics
+from service.types import Array, Arrays, Metrics
 
-MAX_POLICY_LAG = 2
-"""A rollout of a version further behind is not learned from."""
 _LOW_WORD = (1 << 64) - 1
 _BOB_EMA = "steady_bob"
 """The name of Bob's moving average in a checkpoint, which it has had since version 0.1.0."""
@@ -108,15 +105,14 @@ class Learner:
         parts |= {_BOB_EMA: {name: array.copy() for name, array in self._bob_ema.items()}}
         for index, iteration in enumerate(self._used_again()):
             parts |= {f"window/{index:04}/{place:04}": turns_to_arrays(each) for place, each in enumerate(iteration)}
-        nested = {f"{part}/{name}": array for part, arrays in parts.items() for name, array in arrays.items()}
         counted = [(*source, sequence) for source, sequence in sorted(self._counted.items())]
-        return nested | {
+        return join_parts(parts) | {
             "version": np.array(self.version, dtype=np.int64),
             "rng": _rng_to_array(self._rng),
             "counted": np.array(counted, dtype=np.int64).reshape(-1, 3),
         }
 
-    def load_state(self, state: Mapping[str, NDArray[Any]]) -> None:
+    def load_state(self, state: Mapping[str, Array]) -> None:
         """Continue exactly where ``state`` was taken, by a learner of the same configuration.
 
         Raises:
@@ -129,12 +125,13 @@ class Learner:
             history = {name: state.pop(f"demonstrations/{name}") for name in ("observation", "action", "num_steps")}
         except KeyError as error:
             raise LearnerError(f"learner state: no array {error}; take an undamaged checkpoint") from None
-        window = {name: state.pop(name) for name in list(state) if name.startswith("window/")}
-        self._load_players(state)
+        parts = split_parts(state)
+        window = split_parts(parts.pop("window", {}))
+        self._load_players(parts)
         self._bob_ema = bob_ema
         self._window.clear()
-        for iteration in _parts(_part(window, "window")):
-            self._window.append([turns_from_arrays(arrays) for arrays in _parts(iteration)])
+        for _, iteration in sorted(window.items()):
+            self._window.append([Turns(**arrays) for _, arrays in sorted(split_parts(iteration).items())])
         self.version = int(own["version"])
         self._rng = _rng_from_array(own["rng"])
         self._counted = {(int(actor), int(incarnation)): int(last) for actor, incarnation, last in own["counted"]}
@@ -153,31 +150,29 @@ class Learner:
         window = list(self._window)
         return window[1:] if len(window) == self.config.learner.bob_window else window
 
-    def _load_players(self, state: Arrays) -> None:
+    def _load_players(self, states: Mapping[str, Arrays]) -> None:
         players = {"alice": self._alice, "bob": self._bob}
-        for name in state:
-            if name.partition("/")[0] not in players:
-                raise LearnerError(f"learner state {name!r}: no such part; take a checkpoint of this format version")
-        states = {key: _part(state, key) for key in players}
+        if unknown := sorted(states.keys() - players.keys()):
+            raise LearnerError(f"learner state {unknown[0]!r}: no such part; take a checkpoint of this format version")
         for key, player in players.items():
-            player.check_state(states[key], where=key)
+            player.check_state(states.get(key, {}), where=key)
         for key, player in players.items():
             player.load_state(states[key])
 
     def _update_alice(self, rollouts: Sequence[Rollout]) -> Metrics:
         samples = ppo.collect([rollout.alice for rollout in rollouts], self._alice)
         metrics = ppo.update(self._alice, samples, None, self.config.learner.abc, self._rng)
-        return _prefixed("alice", metrics) | {"num_alice_samples": float(_length(samples))}
+        return _prefixed("alice", metrics) | {"num_alice_samples": float(len(samples or ()))}
 
     def _update_bob(self, rollouts: Sequence[Rollout]) -> Metrics:
         config, bob = self.config.learner, self._bob
         self._window.append([rollout.bob for rollout in rollouts])
         samples = ppo.collect([turns for iteration in self._window for turns in iteration], bob)
-        metrics = {"num_bob_samples": float(_length(samples))}
+        metrics = {"num_bob_samples": float(len(samples or ()))}
         if samples is not None and config.mirror:
-            samples = augment_by_symmetry(samples, bob, MIRROR_BOB, MIRROR_BOB_VALUE, MIRROR_ACTION)
+            samples = augment_by_symmetry(samples, bob)
         cloning = self._cloning(rollouts)
-        metrics["num_demonstrations"] = float(_length(cloning) // (2 if config.mirror else 1))
+        metrics["num_demonstrations"] = float(len(cloning or ()) // (2 if config.mirror else 1))
         metrics |= _prefixed("bob", ppo.update(bob, samples, cloning, config.abc, self._rng))
         rows = samples if samples is not None else cloning
         if rows is not None and isinstance(self._bob_policy, networks.MCPPolicy):
@@ -207,15 +202,6 @@ def _prefixed(player: str, metrics: Metrics) -> Metrics:
     return {name if name in shared else f"{player}_{name}": value for name, value in metrics.items()}
 
 
-def _part(state: Arrays, key: str) -> Arrays:
-    return {name.removeprefix(f"{key}/"): array for name, array in state.items() if name.startswith(f"{key}/")}
-
-
-def _parts(state: Arrays) -> list[Arrays]:
-    """The numbered parts of a state, in their order."""
-    return [_part(state, number) for number in sorted({name.partition("/")[0] for name in state})]
-
-
 def _rng_to_array(rng: np.random.Generator) -> NDArray[np.uint64]:
     """A PCG64 generator as six words (6,): its 128-bit state and increment in halves, then its buffered half-draw."""
     state = rng.bit_generator.state
@@ -225,19 +211,15 @@ def _rng_to_array(rng: np.random.Generator) -> NDArray[np.uint64]:
 
 def _rng_from_array(words: NDArray[np.uint64]) -> np.random.Generator:
     """The generator that ``_rng_to_array`` made these (6,) words of."""
-    values = [int(word) for word in words]
+    high, low, inc_high, inc_low, has_half, half = words.tolist()
     rng = np.random.Generator(np.random.PCG64())
     rng.bit_generator.state = {
         "bit_generator": "PCG64",
-        "state": {"state": values[0] << 64 | values[1], "inc": values[2] << 64 | values[3]},
-        "has_uint32": values[4],
-        "uinteger": values[5],
+        "state": {"state": high << 64 | low, "inc": inc_high << 64 | inc_low},
+        "has_uint32": has_half,
+        "uinteger": half,
     }
     return rng
-
-
-def _length(rows: Samples | Cloning | None) -> int:
-    return 0 if rows is None else len(rows)
 
 
 def torch_device(name: str) -> torch.device:

@@ -3,25 +3,68 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor, nn
+from torch.optim.adam import adam
 
 from service.config import PPOConfig
 from service.errors import TandemError
-from service.learner.adam import Adam
 from service.policies import gaussian
-from service.types import Arrays
+from service.types import Array, Arrays
 
+ADAM_EPSILON = 1e-5
 LEARNING_RATE_BOUNDS = 0.03, 2.0
 """The KL-adaptive learning rate stays within these multiples of the configured one."""
 
 
 class LearnerError(TandemError):
     """A device that is not there, or a state that does not fit; the message says what to do."""
+
+
+class Adam:
+    """Adam (Kingma and Ba 2015) on torch's fused kernel, through torch's functional form of it.
+
+    ``torch.optim.Adam`` computes the same, but making one imports torch's compiler: seconds at every start, for
+    nothing. The state exists from the start, so it has the same names at any time.
+    """
+
+    def __init__(self, parameters: Mapping[str, nn.Parameter], learning_rate: float) -> None:
+        """Start with moments of zero; ``learning_rate`` may be changed between steps."""
+        self.learning_rate = learning_rate
+        self._parameters = parameters
+        self._state = {
+            "first_moment": {name: torch.zeros_like(each, requires_grad=False) for name, each in parameters.items()},
+            "second_moment": {name: torch.zeros_like(each, requires_grad=False) for name, each in parameters.items()},
+            "step": {name: torch.zeros((), device=each.device) for name, each in parameters.items()},
+        }
+
+    @torch.no_grad()
+    def step(self) -> None:
+        """Move the parameters that have a gradient; the others and their moments stay."""
+        gradients = {name: each.grad for name, each in self._parameters.items() if each.grad is not None}
+        first, second, steps = ([tensors[name] for name in gradients] for tensors in self._state.values())
+        adam(
+            [self._parameters[name] for name in gradients],
+            list(gradients.values()),
+            first,
+            second,
+            [],
+            steps,
+            fused=True,
+            amsgrad=False,
+            beta1=0.9,
+            beta2=0.999,
+            lr=self.learning_rate,
+            weight_decay=0.0,
+            eps=ADAM_EPSILON,
+            maximize=False,
+        )
+
+    def tensors(self) -> dict[str, Tensor]:
+        """Moments and step counts by name: the tensors themselves."""
+        return {f"{part}/{name}": tensor for part, tensors in self._state.items() for name, tensor in tensors.items()}
 
 
 class Player:
@@ -56,7 +99,7 @@ class Player:
         arrays: Arrays = {name: tensor.detach().cpu().numpy().copy() for name, tensor in self._tensors().items()}
         return arrays | {"learning_rate": np.array(self.optimizer.learning_rate)}
 
-    def check_state(self, state: Mapping[str, NDArray[Any]], *, where: str) -> None:
+    def check_state(self, state: Mapping[str, Array], *, where: str) -> None:
         """Compare names and shapes of a state's arrays with this player's; ``where`` names the player in errors.
 
         Raises:
@@ -71,7 +114,7 @@ class Player:
                     f"learner state {where}/{name}: expected {wanted}, got {found}; use the configuration of that run"
                 )
 
-    def load_state(self, state: Mapping[str, NDArray[Any]]) -> None:
+    def load_state(self, state: Mapping[str, Array]) -> None:
         """Continue exactly where ``state``, which has been checked, was taken.
 
         Where a lower or higher learning rate is configured by now, the saved one is moved within its bounds.

@@ -12,7 +12,6 @@ import math
 from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
 import torch
@@ -26,7 +25,7 @@ from service.learner.diagnostics import explained_variance, probes
 from service.learner.player import LEARNING_RATE_BOUNDS, Player
 from service.learner.samples import Cloning, Samples, minibatches
 from service.policies import gaussian
-from service.types import BoolArray
+from service.types import Array, BoolArray, Metrics
 
 FloatArray = NDArray[np.floating]
 Scalars = dict[str, Tensor]
@@ -57,7 +56,7 @@ def collect(turns: Sequence[Turns], player: Player) -> Samples | None:
     if not active.any():
         return None
 
-    def tensor(array: NDArray[Any]) -> Tensor:
+    def tensor(array: Array) -> Tensor:
         return torch.from_numpy(array).to(player.device)
 
     names = "observation", "value_observation", "action", "log_prob"
@@ -130,7 +129,7 @@ def advantages(
 
 def update(
     player: Player, samples: Samples | None, cloning: Cloning | None, abc: ABCConfig, rng: np.random.Generator
-) -> dict[str, float]:
+) -> Metrics:
     """Learn from samples, demonstrations or both; go back to the parameters before if that fails.
 
     An update fails when three minibatches were not finite, or when it moved the policy by ten times the target KL.
@@ -190,7 +189,7 @@ class UpdateStats:
         for name, value in scalars.items():
             self.scalars[name].append(value.detach())
 
-    def means(self) -> dict[str, float]:
+    def means(self) -> Metrics:
         """Average each scalar over the minibatches."""
         return {name: float(torch.stack(values).mean()) for name, values in self.scalars.items()}
 
@@ -223,7 +222,8 @@ def _step(player: Player, samples: Samples | None, cloning: Cloning | None, abc:
         scalars["value_loss"] = value_loss(player.value(samples.value_observation), samples.value_target)
         parts.append(config.value_weight * scalars["value_loss"])
     total = torch.stack(parts).sum()
-    player.optimizer.zero_grad()
+    player.policy.zero_grad()
+    player.value.zero_grad()
     total.backward()
     norm = clip_grad_norm_(player.policy_parameters, config.max_grad_norm)
     value_norm = clip_grad_norm_(player.value_parameters, config.max_grad_norm)
@@ -326,7 +326,7 @@ def _adapted_learning_rate(player: Player, kl: float) -> float:
     return player.optimizer.learning_rate
 
 
-def _join(turns: Sequence[Turns], name: str) -> NDArray[Any]:
+def _join(turns: Sequence[Turns], name: str) -> Array:
     """A (T, N, ...) field of all turns, worlds that ``learn`` only."""
-    joined: NDArray[Any] = np.concatenate([getattr(part, name)[:, part.learn] for part in turns], axis=1)
+    joined: Array = np.concatenate([getattr(part, name)[:, part.learn] for part in turns], axis=1)
     return joined

@@ -1,7 +1,9 @@
-"""The data a player learns from, as flat tensors: B samples of turns, D steps of demonstrations."""
+"""The data a player learns from: B samples of turns, D steps of demonstrations."""
 
 from __future__ import annotations
 
+from collections import deque
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, fields, replace
 from typing import Self, TypeVar
 
@@ -9,9 +11,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from service.envs.observations import Mirror
+from service.actors.rollout import Demonstrations
+from service.envs.observations import ACTION_SIZE, BOB_SIZE, MIRROR_ACTION, MIRROR_BOB, MIRROR_BOB_VALUE, Mirror
 from service.learner.player import Player
 from service.policies import gaussian
+from service.types import Array, Arrays
+
+Rows = TypeVar("Rows", "Samples", "Cloning")
 
 
 class _Rows:
@@ -75,33 +81,51 @@ class Cloning(_Rows):
     """(D,) of the action under the policy at the start of the update."""
 
 
-Rows = TypeVar("Rows", Samples, Cloning)
+class DemonstrationHistory:
+    """Demonstrations of the last ``num_iterations`` iterations; one without demonstrations counts too."""
+
+    def __init__(self, num_iterations: int) -> None:
+        """Start empty."""
+        self._iterations: deque[Demonstrations] = deque(maxlen=num_iterations)
+
+    def append(self, demonstrations: Iterable[Demonstrations]) -> None:
+        """Add one iteration, without steps that are not finite; the oldest one goes if there are too many."""
+        new = _join(demonstrations)
+        finite = np.isfinite(new.observation).all(1) & np.isfinite(new.action).all(1)
+        self._iterations.append(Demonstrations(new.observation[finite], new.action[finite]))
+
+    def joined(self) -> Demonstrations:
+        """Join all that is kept, oldest first."""
+        return _join(self._iterations)
+
+    def state(self) -> Arrays:
+        """Everything that a resumed run needs, by name."""
+        everything = self.joined()
+        sizes = np.array([len(each.action) for each in self._iterations], dtype=np.int64)
+        return {"observation": everything.observation, "action": everything.action, "num_steps": sizes}
+
+    def load_state(self, state: Mapping[str, Array]) -> None:
+        """Continue where ``state`` was taken; a shorter history keeps the newest."""
+        self._iterations.clear()
+        ends = np.cumsum(state["num_steps"])
+        for start, end in zip(ends - state["num_steps"], ends, strict=True):
+            rows = slice(int(start), int(end))
+            self._iterations.append(Demonstrations(state["observation"][rows].copy(), state["action"][rows].copy()))
 
 
-def augment_by_symmetry(
-    samples: Samples, player: Player, observation: Mirror, value_observation: Mirror, action: Mirror
-) -> Samples:
-    """Append the samples' reflections in y.
+def augment_by_symmetry(samples: Samples, player: Player) -> Samples:
+    """Append the reflections in y of Bob's samples, which have the originals' advantages and values.
 
-    Nobody acted a reflection, so its behaviour log-probability is that of the policy at the start of the update.
-
-    Args:
-        samples: B of them.
-        player: has the policy at the start of the update.
-        observation: reflects the column of that name.
-        value_observation: reflects the column of that name.
-        action: reflects the column of that name.
-
-    Returns:
-        2B samples; the reflections have the originals' advantages and values.
+    Nobody acted a reflection, so its behaviour log-probability is that of the policy at the start of the update, which
+    is ``player``'s.
     """
-    observations, actions = _reflect(samples.observation, observation), _reflect(samples.action, action)
+    observations, actions = _reflect(samples.observation, MIRROR_BOB), _reflect(samples.action, MIRROR_ACTION)
     with torch.no_grad():
         mean, std = player.policy(observations)
     reflections = replace(
         samples,
         observation=observations,
-        value_observation=_reflect(samples.value_observation, value_observation),
+        value_observation=_reflect(samples.value_observation, MIRROR_BOB_VALUE),
         action=actions,
         behaviour_log_prob=gaussian.log_prob(actions, mean, std),
         proximal_mean=mean,
@@ -134,6 +158,12 @@ def minibatches(
     own = [None] * num if samples is None else _draw(samples, len(samples), rng).split(num)
     drawn = [None] * num if cloning is None else _draw(cloning, num * min(half, len(cloning)), rng).split(num)
     return list(zip(own, drawn, strict=True))
+
+
+def _join(parts: Iterable[Demonstrations]) -> Demonstrations:
+    observations = [np.zeros((0, BOB_SIZE), dtype=np.float32), *(part.observation for part in parts)]
+    actions = [np.zeros((0, ACTION_SIZE), dtype=np.float32), *(part.action for part in parts)]
+    return Demonstrations(np.concatenate(observations), np.concatenate(actions))
 
 
 def _draw(rows: Rows, num: int, rng: np.random.Generator) -> Rows:

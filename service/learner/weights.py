@@ -1,10 +1,13 @@
-"""The parameters that actors get. They unpickle them without torch, so nothing here may import it."""
+"""Parameters for actors, and how old they may be. Actors unpickle them without torch, so this may not import it."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
 from service.types import FloatArray
+
+MAX_POLICY_LAG = 2
+"""Policy versions between the one that acted and the one that learns from it, at most; 1 where all are equally fast."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -8,6 +8,8 @@ Shapes: (...) any batch axes, O observation size, K primitives, A action compone
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
+from itertools import pairwise
 
 import numpy as np
 import torch
@@ -17,9 +19,6 @@ from torch.nn.functional import elu
 from service.config import MCPConfig, MLPConfig, PolicyConfig
 from service.envs.observations import (
     ACTION_SIZE,
-    BOB_SIZE,
-    BOB_VALUE_SIZE,
-    FULL_SIZE,
     GATE,
     GOAL_SLICE,
     NORMALISATION_BOB,
@@ -31,8 +30,7 @@ from service.envs.observations import (
     Normalisation,
 )
 from service.policies.composition import compose
-from service.policies.layers import GaussianSquash, HiddenLayers, InputNormalisation, linear, log_std_bias
-from service.policies.parameters import PolicyError
+from service.policies.parameters import INPUT_CLIP, MEAN_BOUND
 from service.types import FloatArray
 
 INITIAL_LOG_STD = -0.1
@@ -44,30 +42,84 @@ _PRIMITIVE_MEAN_GAIN = 0.3  # the primitives must differ from the start, or the 
 _GATE_GAIN = 1.0
 
 
+class InputNormalisation(nn.Module):
+    """Fixed normalisation, clipped to +- ``INPUT_CLIP``; its constants travel with the parameters."""
+
+    offset: Tensor
+    scale: Tensor
+
+    def __init__(self, normalisation: Normalisation) -> None:
+        """Copy the constants into buffers."""
+        super().__init__()
+        self.register_buffer("offset", torch.tensor(normalisation.offset))
+        self.register_buffer("scale", torch.tensor(normalisation.scale))
+
+    def forward(self, values: Tensor) -> Tensor:
+        """Normalise (..., O)."""
+        return ((values - self.offset) / self.scale).clamp(-INPUT_CLIP, INPUT_CLIP)
+
+
+class HiddenLayers(nn.ModuleList):
+    """Linear layers, each followed by ELU; orthogonal with gain sqrt(2)."""
+
+    def __init__(self, input_size: int, hidden_sizes: Sequence[int]) -> None:
+        """Build one layer per hidden size; ``output_size`` is the last."""
+        sizes = [input_size, *hidden_sizes]
+        super().__init__(linear(*pair, gain=_HIDDEN_GAIN) for pair in pairwise(sizes))
+        self.output_size = sizes[-1]
+
+    def forward(self, values: Tensor) -> Tensor:
+        """Map (..., input_size) to (..., output_size)."""
+        for layer in self:
+            values = elu(layer(values), inplace=True)
+        return values
+
+
+class GaussianSquash(nn.Module):
+    """Bounded outputs (..., 2A): ``MEAN_BOUND * tanh(x / MEAN_BOUND)`` for the mean, a sigmoid for the log-std."""
+
+    log_std_min: Tensor
+    log_std_max: Tensor
+
+    def __init__(self, log_std_min: float, log_std_max: float) -> None:
+        """Keep the bounds as buffers."""
+        super().__init__()
+        self.register_buffer("log_std_min", torch.tensor(log_std_min))
+        self.register_buffer("log_std_max", torch.tensor(log_std_max))
+
+    def forward(self, output: Tensor) -> tuple[Tensor, Tensor]:
+        """Mean and log-std, (..., A) each."""
+        mean, log_std = output.chunk(2, dim=-1)
+        bounded = self.log_std_min + (self.log_std_max - self.log_std_min) * log_std.sigmoid()
+        return MEAN_BOUND * torch.tanh(mean / MEAN_BOUND), bounded
+
+
+def linear(inputs: int, outputs: int, *, gain: float) -> nn.Linear:
+    """A linear layer, orthogonal, with zero bias."""
+    layer = nn.Linear(inputs, outputs)
+    nn.init.orthogonal_(layer.weight, gain)
+    nn.init.zeros_(layer.bias)
+    return layer
+
+
+def log_std_bias(log_std: float, log_std_min: float, log_std_max: float) -> float:
+    """The raw output that squashes to ``log_std``, or to the nearest value not saturated (2 % inside the bounds)."""
+    share = (log_std - log_std_min) / (log_std_max - log_std_min)
+    share = min(max(share, 0.02), 0.98)
+    return math.log(share / (1.0 - share))
+
+
 class GaussianPolicy(nn.Module):
     """Alice, or a monolithic Bob: a diagonal Gaussian with bounded mean and bounded, state-dependent std."""
 
-    def __init__(
-        self,
-        input_size: int,
-        action_size: int,
-        config: MLPConfig,
-        log_std_min: float,
-        log_std_max: float,
-        normalisation: Normalisation,
-    ) -> None:
-        """Build with orthogonal weights; initially the mean is near 0 and the std ``exp(INITIAL_LOG_STD)``.
-
-        Raises:
-            PolicyError: the normalisation is not of ``input_size``, or the log-std bounds are not in order.
-        """
+    def __init__(self, normalisation: Normalisation, config: MLPConfig, log_std_min: float, log_std_max: float) -> None:
+        """Build with orthogonal weights; initially the mean is near 0 and the std ``exp(INITIAL_LOG_STD)``."""
         super().__init__()
-        _check_log_std(log_std_min, log_std_max)
-        self.input = _input(normalisation, input_size)
-        self.hidden = HiddenLayers(input_size, config.hidden_sizes)
-        self.output = linear(self.hidden.output_size, 2 * action_size, gain=_SMALL_GAIN)
+        self.input = InputNormalisation(normalisation)
+        self.hidden = HiddenLayers(len(normalisation.offset), config.hidden_sizes)
+        self.output = linear(self.hidden.output_size, 2 * ACTION_SIZE, gain=_SMALL_GAIN)
         self.squash = GaussianSquash(log_std_min, log_std_max)
-        nn.init.constant_(self.output.bias[action_size:], log_std_bias(INITIAL_LOG_STD, log_std_min, log_std_max))
+        nn.init.constant_(self.output.bias[ACTION_SIZE:], log_std_bias(INITIAL_LOG_STD, log_std_min, log_std_max))
 
     def forward(self, observation: Tensor) -> tuple[Tensor, Tensor]:
         """Mean and std, (..., A) each, at (..., O) observations."""
@@ -82,7 +134,7 @@ class Primitives(nn.Module):
         """Build; the initial std gives the composition ``exp(INITIAL_LOG_STD)`` under a new gate's weights."""
         super().__init__()
         self.num_primitives, self.action_size = config.num_primitives, action_size
-        self.input = _input(NORMALISATION_POSITIONS, POSITIONS_SIZE)
+        self.input = InputNormalisation(NORMALISATION_POSITIONS)
         self.trunk = HiddenLayers(POSITIONS_SIZE, config.trunk_hidden_sizes)
         self.hidden = nn.Linear(self.trunk.output_size, config.num_primitives * config.primitive_hidden_size)
         heads = config.num_primitives, config.primitive_hidden_size, 2 * action_size
@@ -143,13 +195,8 @@ class MCPPolicy(nn.Module):
     """
 
     def __init__(self, config: MCPConfig, action_size: int = ACTION_SIZE) -> None:
-        """Build both parts.
-
-        Raises:
-            PolicyError: the log-std bounds are not in order.
-        """
+        """Build both parts."""
         super().__init__()
-        _check_log_std(config.log_std_min, config.log_std_max)
         self.primitives = Primitives(config, action_size)
         self.gate = Gate(config)
 
@@ -163,15 +210,11 @@ class MCPPolicy(nn.Module):
 class ValueNetwork(nn.Module):
     """The expected return at (..., V) value observations."""
 
-    def __init__(self, input_size: int, config: MLPConfig, normalisation: Normalisation) -> None:
-        """Build; initial values are near 0.
-
-        Raises:
-            PolicyError: the normalisation is not of ``input_size``.
-        """
+    def __init__(self, normalisation: Normalisation, config: MLPConfig) -> None:
+        """Build; initial values are near 0."""
         super().__init__()
-        self.input = _input(normalisation, input_size)
-        self.hidden = HiddenLayers(input_size, config.hidden_sizes)
+        self.input = InputNormalisation(normalisation)
+        self.hidden = HiddenLayers(len(normalisation.offset), config.hidden_sizes)
         self.output = linear(self.hidden.output_size, 1, gain=_SMALL_GAIN)
 
     def forward(self, observation: Tensor) -> Tensor:
@@ -181,45 +224,27 @@ class ValueNetwork(nn.Module):
 
 
 def make_alice(config: PolicyConfig) -> GaussianPolicy:
-    """A new Alice; draws from torch's global generator.
-
-    Raises:
-        PolicyError: her log-std bounds are not in order.
-    """
-    bounds = config.alice_log_std_min, config.alice_log_std_max
-    return GaussianPolicy(FULL_SIZE, ACTION_SIZE, config.alice, *bounds, NORMALISATION_FULL)
+    """A new Alice; draws from torch's global generator."""
+    return GaussianPolicy(NORMALISATION_FULL, config.alice, config.alice_log_std_min, config.alice_log_std_max)
 
 
 def make_bob(config: PolicyConfig) -> MCPPolicy | GaussianPolicy:
     """A new Bob; draws from torch's global generator."""
     if config.monolithic_bob is None:
         return MCPPolicy(config.bob)
-    bounds = config.bob.log_std_min, config.bob.log_std_max
-    return GaussianPolicy(BOB_SIZE, ACTION_SIZE, config.monolithic_bob, *bounds, NORMALISATION_BOB)
+    return GaussianPolicy(NORMALISATION_BOB, config.monolithic_bob, config.bob.log_std_min, config.bob.log_std_max)
 
 
 def make_alice_value(config: PolicyConfig) -> ValueNetwork:
     """A new value network for Alice; draws from torch's global generator."""
-    return ValueNetwork(FULL_SIZE, config.value, NORMALISATION_FULL)
+    return ValueNetwork(NORMALISATION_FULL, config.value)
 
 
 def make_bob_value(config: PolicyConfig) -> ValueNetwork:
     """A new value network for Bob; draws from torch's global generator."""
-    return ValueNetwork(BOB_VALUE_SIZE, config.value, NORMALISATION_BOB_VALUE)
+    return ValueNetwork(NORMALISATION_BOB_VALUE, config.value)
 
 
 def export_parameters(module: nn.Module) -> dict[str, FloatArray]:
     """Parameters and buffers by their state-dict names, as float32 copies: all that a NumPy policy needs."""
     return {name: tensor.detach().cpu().numpy().astype(np.float32) for name, tensor in module.state_dict().items()}
-
-
-def _input(normalisation: Normalisation, input_size: int) -> InputNormalisation:
-    size = len(normalisation.offset)
-    if size != input_size:
-        raise PolicyError(f"normalisation of {size} inputs for a network of {input_size}; take the layout's own")
-    return InputNormalisation(normalisation)
-
-
-def _check_log_std(low: float, high: float) -> None:
-    if not low < high:
-        raise PolicyError(f"log_std_min {low} must be below log_std_max {high}; set both in the policy's configuration")

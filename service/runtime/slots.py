@@ -5,8 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from itertools import count
 
-MAX_LAG = 2
-"""Policy versions between the one that acted and the one that learns from it, at most; 1 where all are equally fast."""
+from service.learner.weights import MAX_POLICY_LAG
 
 
 @dataclass(slots=True)
@@ -16,7 +15,7 @@ class RolloutSlots:
     A rollout holds a slot from when its round begins until the version that learned from it is out, or until it is
     lost. There are twice as many slots as an update takes rollouts: one update's worth is learned from while the next
     is played. So a round never begins more than one update ahead of the learner, and the lag of equally fast actors is
-    1. An update that would leave the slowest round more than ``MAX_LAG`` behind waits for it instead.
+    1. An update that would leave the slowest round more than ``MAX_POLICY_LAG`` behind waits for it instead.
     """
 
     _began: dict[int, int] = field(default_factory=dict)
@@ -56,7 +55,7 @@ class RolloutSlots:
         The update after it is the first that can learn from such a round; by then ``version + 1`` is out. What was
         played already is learned from by this one.
         """
-        return all(version + 1 - began <= MAX_LAG for began in self._began.values())
+        return all(version + 1 - began <= MAX_POLICY_LAG for began in self._began.values())
 
     def publish(self, tickets: list[int]) -> None:
         """Free the slots of rollouts whose version is out."""

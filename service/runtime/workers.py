@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -22,8 +22,7 @@ from service.envs.goals import GoalKind
 from service.envs.scene import build_layout
 from service.generator.generator import GoalChoice, TaskGenerator
 from service.generator.opponents import OpponentPool, RoundPlan
-from service.generator.records import GoalRecords
-from service.generator.validity import Verdict
+from service.generator.records import GoalRecords, join_records, sampled_goals
 from service.policies.numpy_policy import NumpyGaussianPolicy, numpy_bob
 from service.store.models import GoalCell, GoalGrid
 from service.types import Arrays, IntArray, Metrics, StateArray
@@ -32,9 +31,6 @@ if TYPE_CHECKING:
     from service.learner.weights import Weights
 
 RolloutId = tuple[int, int, int]
-
-GOALS_PER_ITERATION = 32
-"""Valid proposals kept for the run directory per iteration, at most."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -290,22 +286,6 @@ class LearnerWorker:
         counted = tuple(rollout.id for rollout in taken)
         refused = tuple(rollout.id for rollout in rollouts if rollout.id not in counted)
         return UpdateResult(self.learner.version, metrics, counted, refused, time.perf_counter() - start)
-
-
-def join_records(records: Sequence[GoalRecords]) -> GoalRecords:
-    """Records of several rounds as one of all their worlds."""
-    if len(records) == 1:
-        return records[0]
-    names = [field.name for field in fields(GoalRecords)]
-    return GoalRecords(**{name: np.concatenate([getattr(each, name) for each in records]) for name in names})
-
-
-def sampled_goals(records: GoalRecords) -> NDArray[np.float64]:
-    """Valid proposals that the current Bob played, not too many, as ``GeneratorResult.goals``."""
-    chosen = (records.verdict == Verdict.VALID) & records.played & ~records.replayed & ~records.bob_past
-    rows = np.flatnonzero(chosen)[:GOALS_PER_ITERATION]
-    solved = records.solved[rows, None].astype(float)
-    return np.concatenate([records.start_position[rows], records.goal[rows], solved], axis=1)
 
 
 def _copy(rng: np.random.Generator) -> np.random.Generator:

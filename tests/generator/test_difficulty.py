@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from service.config import ConfigError, WorkspaceConfig, WorldConfig
-from service.generator.counts import DECAY, SuccessCounts
-from service.generator.difficulty import DifficultyGrid, height_bins, in_air
+from service.generator.difficulty import DECAY, DifficultyGrid, SuccessCounts, distance_bins, height_bins, in_air
+from service.generator.generator import NUM_DISTANCE_BINS, NUM_TASK_BINS
 
 WORLD = WorldConfig(workspace=WorkspaceConfig(center_x_m=0.1, center_y_m=0.0))
 
@@ -110,12 +110,11 @@ def test_height_bins_split_table_from_air() -> None:
 
 
 def test_bins_of_distance_and_height_by_hand() -> None:
-    grid = DifficultyGrid(WORLD, 0.05)
     goals = np.array([(0.1, 0.06, 0.025), (0.1, 0.12, 0.025), (0.1, 0.17, 0.025), (0.1, 0.0, 0.205), (0.1, 0.0, 0.33)])
     starts = np.tile([0.1, 0.0, 0.025], (5, 1))  # 0.06, 0.12, 0.17, 0.18 and 0.305 m away
-    assert grid.distance_bin(goals, starts).tolist() == [0, 1, 2, 2, 4]
-    assert grid.height_bin(goals).tolist() == [0, 0, 0, 2, 3]
-    assert (grid.num_distance_bins, grid.num_height_bins) == (5, 4)
+    assert distance_bins(goals, starts).tolist() == [0, 1, 2, 2, 4]
+    assert height_bins(goals, 0.025).tolist() == [0, 0, 0, 2, 3]
+    assert (NUM_DISTANCE_BINS, NUM_TASK_BINS) == (5, 20)
 
 
 def test_state_of_an_older_version_loads() -> None:

@@ -356,7 +356,7 @@ def test_state_of_a_new_generator_loads(make_records: MakeRecords) -> None:
 
 def test_state_of_version_0_1_0_loads(make_records: MakeRecords) -> None:
     """It also held when goals outside the workspace began to cost something."""
-    generator, resumed = filled(make_records), TaskGenerator(config(), STATE_SIZE)
+    generator, resumed = filled(make_records), TaskGenerator(config(), FREE)
     state = generator.state()
     resumed.load_state(state | {"penalty/valid_fraction": np.array(0.4), "penalty/active": np.array(True)})
     assert state.keys() == resumed.state().keys()

@@ -7,8 +7,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from service.generator.metrics import alice_metrics, bob_metrics
-from service.generator.records import GoalRecords
+from service.generator.records import GoalRecords, alice_metrics, bob_metrics
 from service.generator.validity import Verdict
 
 REST = 0.025

@@ -115,7 +115,7 @@ def test_equal_advantages_become_zero():
 def test_samples_are_augmented_by_their_reflections():
     samples = collect([make_bob_turns()], PLAYER)
     mirrors = MIRROR_BOB, MIRROR_BOB_VALUE, MIRROR_ACTION
-    doubled = augment_by_symmetry(samples, PLAYER, *mirrors)
+    doubled = augment_by_symmetry(samples, PLAYER)
     num = len(samples)
     assert len(doubled) == 2 * num
     for before, after in zip(samples.tensors(), doubled.tensors(), strict=True):

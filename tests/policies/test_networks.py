@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from service.config import MCPConfig, MLPConfig, PolicyConfig
+from service.config import MCPConfig, PolicyConfig
 from service.envs.observations import (
     ACTION_SIZE,
     BOB_SIZE,
@@ -30,7 +30,7 @@ from service.policies.networks import (
     make_bob,
     make_bob_value,
 )
-from service.policies.parameters import FloatArray, PolicyError
+from service.policies.parameters import FloatArray
 
 Observe = Callable[[int, int], FloatArray]
 ULP = 1e-6
@@ -196,13 +196,3 @@ def test_same_seed_same_players() -> None:
         twins.append(export_parameters(make_bob(PolicyConfig())))
     for name, value in twins[0].items():
         np.testing.assert_array_equal(value, twins[1][name])
-
-
-def test_unordered_log_std_bounds_are_refused() -> None:
-    with pytest.raises(PolicyError, match=r"log_std_min 1\.0 must be below log_std_max 0\.5"):
-        GaussianPolicy(FULL_SIZE, ACTION_SIZE, MLPConfig(), 1.0, 0.5, NORMALISATION_FULL)
-
-
-def test_a_normalisation_of_another_layout_is_refused() -> None:
-    with pytest.raises(PolicyError, match="normalisation of 22 inputs for a network of 14"):
-        GaussianPolicy(BOB_SIZE, ACTION_SIZE, MLPConfig(), -1.0, 0.0, NORMALISATION_FULL)
