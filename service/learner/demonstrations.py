@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.actors.rollout import Demonstrations
-from service.envs.observations import ACTION_SIZE, BOB_SIZE
+from service.envs.observations import ACTION, BOB
 from service.types import Arrays
 
 
@@ -47,6 +47,6 @@ class DemonstrationHistory:
 
 
 def _join(parts: Iterable[Demonstrations]) -> Demonstrations:
-    observations = [np.zeros((0, BOB_SIZE), dtype=np.float32), *(part.observation for part in parts)]
-    actions = [np.zeros((0, ACTION_SIZE), dtype=np.float32), *(part.action for part in parts)]
+    observations = [np.zeros((0, BOB.size), dtype=np.float32), *(part.observation for part in parts)]
+    actions = [np.zeros((0, ACTION.size), dtype=np.float32), *(part.action for part in parts)]
     return Demonstrations(np.concatenate(observations), np.concatenate(actions))

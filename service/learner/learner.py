@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from service.actors.rollout import Rollout, Turns, turns_from_arrays, turns_to_arrays
 from service.config import Config
-from service.envs.observations import MIRROR_ACTION, MIRROR_BOB, MIRROR_BOB_VALUE
+from service.envs.observations import ACTION, BOB, BOB_VALUE
 from service.learner import ppo
 from service.learner.demonstrations import DemonstrationHistory
 from service.learner.diagnostics import cloning_metrics, composition_metrics, probes
@@ -175,7 +175,7 @@ class Learner:
         samples = ppo.collect([turns for iteration in self._window for turns in iteration], bob)
         metrics = {"num_bob_samples": float(_length(samples))}
         if samples is not None and config.mirror:
-            samples = augment_by_symmetry(samples, bob, MIRROR_BOB, MIRROR_BOB_VALUE, MIRROR_ACTION)
+            samples = augment_by_symmetry(samples, bob, BOB.mirror, BOB_VALUE.mirror, ACTION.mirror)
         cloning = self._cloning(rollouts)
         metrics["num_demonstrations"] = float(_length(cloning) // (2 if config.mirror else 1))
         metrics |= _prefixed("bob", ppo.update(bob, samples, cloning, config.abc, self._rng))
@@ -194,8 +194,8 @@ class Learner:
         if len(action) == 0 or self.config.learner.abc.weight == 0.0:
             return None
         if self.config.learner.mirror:
-            observation = np.concatenate((observation, MIRROR_BOB(observation)))
-            action = np.concatenate((action, MIRROR_ACTION(action)))
+            observation = np.concatenate((observation, BOB.mirror(observation)))
+            action = np.concatenate((action, ACTION.mirror(action)))
         rows, actions = (torch.from_numpy(array).to(self._device) for array in (observation, action))
         with torch.no_grad():
             return Cloning(rows, actions, self._bob.log_prob(rows, actions))

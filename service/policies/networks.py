@@ -15,21 +15,7 @@ from torch import Tensor, nn
 from torch.nn.functional import elu
 
 from service.config import MCPConfig, MLPConfig, PolicyConfig
-from service.envs.observations import (
-    ACTION_SIZE,
-    BOB_SIZE,
-    BOB_VALUE_SIZE,
-    FULL_SIZE,
-    GATE,
-    GOAL_SLICE,
-    NORMALISATION_BOB,
-    NORMALISATION_BOB_VALUE,
-    NORMALISATION_FULL,
-    NORMALISATION_POSITIONS,
-    OBJECT_SLICE,
-    POSITIONS_SIZE,
-    Normalisation,
-)
+from service.envs.observations import ACTION, BOB, BOB_VALUE, FULL, GATE, POSITIONS, Normalisation
 from service.policies.composition import compose
 from service.policies.layers import GaussianSquash, HiddenLayers, InputNormalisation, linear, log_std_bias
 from service.policies.parameters import PolicyError
@@ -82,8 +68,8 @@ class Primitives(nn.Module):
         """Build; the initial std gives the composition ``exp(INITIAL_LOG_STD)`` under a new gate's weights."""
         super().__init__()
         self.num_primitives, self.action_size = config.num_primitives, action_size
-        self.input = _input(NORMALISATION_POSITIONS, POSITIONS_SIZE)
-        self.trunk = HiddenLayers(POSITIONS_SIZE, config.trunk_hidden_sizes)
+        self.input = _input(POSITIONS.normalisation, POSITIONS.size)
+        self.trunk = HiddenLayers(POSITIONS.size, config.trunk_hidden_sizes)
         self.hidden = nn.Linear(self.trunk.output_size, config.num_primitives * config.primitive_hidden_size)
         heads = config.num_primitives, config.primitive_hidden_size, 2 * action_size
         self.output_weight = nn.Parameter(torch.empty(heads))
@@ -129,7 +115,7 @@ class Gate(nn.Module):
 
     def forward(self, observation: Tensor) -> Tensor:
         """Weights; not normalised to sum to one, as in the paper."""
-        goal_from_object = observation[..., GOAL_SLICE] - observation[..., OBJECT_SLICE]
+        goal_from_object = observation[..., BOB["goal"]] - observation[..., BOB["object"]]
         features = torch.cat((observation, goal_from_object), dim=-1)
         openness: Tensor = self.output(self.hidden(self.input(features))).sigmoid()
         return self.weight_floor + (1.0 - self.weight_floor) * openness
@@ -142,7 +128,7 @@ class MCPPolicy(nn.Module):
     only widen or narrow a policy blind to the goal; the monolithic Bob of the ablation is a ``GaussianPolicy``.
     """
 
-    def __init__(self, config: MCPConfig, action_size: int = ACTION_SIZE) -> None:
+    def __init__(self, config: MCPConfig, action_size: int = ACTION.size) -> None:
         """Build both parts.
 
         Raises:
@@ -155,7 +141,7 @@ class MCPPolicy(nn.Module):
 
     def forward(self, observation: Tensor) -> tuple[Tensor, Tensor]:
         """Mean and std, (..., A) each, of the composition at (..., 14) observations."""
-        means, variances = self.primitives(observation[..., :POSITIONS_SIZE])
+        means, variances = self.primitives(observation[..., : POSITIONS.size])
         mean, variance = compose(self.gate(observation), means, variances)
         return mean, variance.sqrt()
 
@@ -187,7 +173,7 @@ def make_alice(config: PolicyConfig) -> GaussianPolicy:
         PolicyError: her log-std bounds are not in order.
     """
     bounds = config.alice_log_std_min, config.alice_log_std_max
-    return GaussianPolicy(FULL_SIZE, ACTION_SIZE, config.alice, *bounds, NORMALISATION_FULL)
+    return GaussianPolicy(FULL.size, ACTION.size, config.alice, *bounds, FULL.normalisation)
 
 
 def make_bob(config: PolicyConfig) -> MCPPolicy | GaussianPolicy:
@@ -195,17 +181,17 @@ def make_bob(config: PolicyConfig) -> MCPPolicy | GaussianPolicy:
     if config.monolithic_bob is None:
         return MCPPolicy(config.bob)
     bounds = config.bob.log_std_min, config.bob.log_std_max
-    return GaussianPolicy(BOB_SIZE, ACTION_SIZE, config.monolithic_bob, *bounds, NORMALISATION_BOB)
+    return GaussianPolicy(BOB.size, ACTION.size, config.monolithic_bob, *bounds, BOB.normalisation)
 
 
 def make_alice_value(config: PolicyConfig) -> ValueNetwork:
     """A new value network for Alice; draws from torch's global generator."""
-    return ValueNetwork(FULL_SIZE, config.value, NORMALISATION_FULL)
+    return ValueNetwork(FULL.size, config.value, FULL.normalisation)
 
 
 def make_bob_value(config: PolicyConfig) -> ValueNetwork:
     """A new value network for Bob; draws from torch's global generator."""
-    return ValueNetwork(BOB_VALUE_SIZE, config.value, NORMALISATION_BOB_VALUE)
+    return ValueNetwork(BOB_VALUE.size, config.value, BOB_VALUE.normalisation)
 
 
 def export_parameters(module: nn.Module) -> dict[str, FloatArray]:

@@ -11,7 +11,7 @@ from abc import ABC, abstractmethod
 
 import numpy as np
 
-from service.envs.observations import BOB_SIZE, GATE, GOAL_SLICE, OBJECT_SLICE, POSITIONS_SIZE
+from service.envs.observations import BOB, GATE, POSITIONS
 from service.policies.composition import compose
 from service.policies.parameters import INPUT_CLIP, MEAN_BOUND, ParameterReader, Parameters, PolicyError
 from service.types import FloatArray
@@ -89,7 +89,7 @@ class NumpyMCPPolicy(NumpyPolicy):
         Raises:
             PolicyError: the last axis is not 11.
         """
-        means, variances = self._primitives(_rows(positions, POSITIONS_SIZE, "positions"))
+        means, variances = self._primitives(_rows(positions, POSITIONS.size, "positions"))
         shape = (*np.shape(positions)[:-1], self.num_primitives, self.action_size)
         return means.reshape(shape), variances.reshape(shape)
 
@@ -99,7 +99,7 @@ class NumpyMCPPolicy(NumpyPolicy):
         Raises:
             PolicyError: the last axis is not 14.
         """
-        weights = self._gate(_rows(observation, BOB_SIZE, "observation"))
+        weights = self._gate(_rows(observation, BOB.size, "observation"))
         return weights.reshape((*np.shape(observation)[:-1], self.num_primitives))
 
     def compose(self, positions: FloatArray, weights: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -121,7 +121,7 @@ class NumpyMCPPolicy(NumpyPolicy):
             PolicyError: the observation's last axis is not 14.
         """
         weights = self.gate(observation)
-        return self.compose(np.asarray(observation)[..., :POSITIONS_SIZE], weights)
+        return self.compose(np.asarray(observation)[..., : POSITIONS.size], weights)
 
 
 def numpy_bob(parameters: Parameters) -> NumpyPolicy:
@@ -138,8 +138,8 @@ class _Primitives:
     """Means and variances (N, K, A) at (N, 11) positions; the K heads share one matrix product per layer."""
 
     def __init__(self, reader: ParameterReader) -> None:
-        self._input = _Input(reader, "primitives.input", POSITIONS_SIZE)
-        self._trunk = _HiddenLayers(reader, "primitives.trunk", POSITIONS_SIZE)
+        self._input = _Input(reader, "primitives.input", POSITIONS.size)
+        self._trunk = _HiddenLayers(reader, "primitives.trunk", POSITIONS.size)
         self._weight = reader.take("primitives.output_weight", (None, None, None))
         self.num_primitives, self._head_size, outputs = self._weight.shape
         self._bias = reader.take("primitives.output_bias", (self.num_primitives, outputs))[:, None]
@@ -168,7 +168,7 @@ class _Gate:
         self._floor = reader.take_scalar("gate.weight_floor", 0.0, 1.0)
 
     def __call__(self, rows: FloatArray) -> FloatArray:
-        goal_from_object = rows[:, GOAL_SLICE] - rows[:, OBJECT_SLICE]
+        goal_from_object = rows[:, BOB["goal"]] - rows[:, BOB["object"]]
         features = np.concatenate((rows, goal_from_object), axis=1)
         output = self._output(self._hidden(self._input(features)))
         return _squash(output, self._floor, np.float32(1.0) - self._floor)
