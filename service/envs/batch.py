@@ -201,15 +201,15 @@ class WorldBatch:
     # --- observations ----------------------------------------------------------------------------------------------
 
     def positions(self) -> FloatArray:
-        """(N, 11) what Bob's primitives see: ``observations.POSITIONS``."""
+        """(N, 11) input of Bob's primitives: ``observations.POSITIONS``."""
         return self.observe(POSITIONS)
 
     def full(self, elapsed: float) -> FloatArray:
-        """(N, 22) what Alice sees: ``observations.FULL``; ``elapsed`` is the share of her turn gone by, in [0, 1]."""
+        """(N, 22) input of Alice: ``observations.FULL``; ``elapsed`` is the share of her turn gone by, in [0, 1]."""
         return self.observe(FULL, elapsed=elapsed)
 
     def bob_value(self, goal: StateArray) -> FloatArray:
-        """(N, 27) what Bob's value network sees, ``observations.BOB_VALUE``, for (N, 3) goals, metres."""
+        """(N, 27) input of Bob's value network, ``observations.BOB_VALUE``, for (N, 3) goals, metres."""
         return self.observe(BOB_VALUE, goal=goal, goal_from_object=goal - self.object_position)
 
     def observe(self, layout: ObservationLayout, **given: StateArray | float) -> FloatArray:

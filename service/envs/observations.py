@@ -62,7 +62,7 @@ class Entry:
     """Named part of a vector."""
 
     name: str
-    """As ``WorldBatch.observe`` knows it."""
+    """Name by which ``WorldBatch.observe`` measures it or is given it."""
     kind: Kind
     unit: str
     offset: float | tuple[float, ...]

@@ -123,12 +123,12 @@ class Scripted:
         return targets[self.phase, worlds], grips[self.phase]
 
     def _carry_height(self) -> float:
-        """Of the object's centre."""
+        """Height of the object's centre on its way."""
         highest = {"none": 0.0, "wall": scene.WALL_HEIGHT_M, "box": scene.BOX_HEIGHT_M}
         return highest[self.worlds.config.fixture] + self.worlds.config.object_size_m / 2 + _ABOVE_M
 
     def _release_height(self) -> float:
-        """Of the object's centre; the fingertips are 1 cm below it when they hold it at its middle."""
+        """Height of the object's centre; the fingertips are 1 cm below it when they hold it at its middle."""
         return scene.BOX_HEIGHT_M + 0.015 if self.worlds.config.fixture == "box" else -np.inf
 
 
@@ -138,7 +138,7 @@ def _at_height(position: Array, height_m: float) -> Array:
 
 @dataclass(frozen=True, slots=True)
 class Played:
-    """How N episodes of one task went."""
+    """Outcome of N episodes of one task."""
 
     start: Array
     """(N, 3) where the objects were at first, metres."""

@@ -29,7 +29,7 @@ DOCS = Path(__file__).parents[2] / "docs"
 RECORDED, DECISION = DOCS / "results" / "scripted_tasks.json", DOCS / "decisions" / "0007-the-downstream-tasks.md"
 CENTER = np.array([-0.05, 0.0])
 HALF = 0.175
-"""Of the workspace."""
+"""Half of the workspace's length and width, metres."""
 
 
 def draw(task, num, seed=0):
@@ -252,12 +252,12 @@ def assert_touched(distance):
 
 
 class TestFixtures:
-    """What stands on the table stops what it must, and only that."""
+    """Fixtures stop what they must, and only that."""
 
     SIDES = np.array([-1.0, 1.0])
 
     def pushed(self, task, place):
-        """How near an object's centre comes to the middle of ``place`` along x, pushed from either side."""
+        """Least distance from an object's centre to the middle of ``place`` along x, pushed from either side."""
         config = TASKS[task].world_from(CONFIG)
         with WorldBatch(config, 2, num_threads=1) as worlds:
             worlds.reset(np.random.default_rng(0))

@@ -171,7 +171,7 @@ def test_a_sphere_is_round():
 
 
 def test_the_flag_of_a_blocked_gripper_moves_no_box():
-    """Where some grippers are blocked, a state goes on behind the place of its box."""
+    """The flag of a blocked gripper stands behind the box's place in a state."""
     config = WorldConfig(fixture="box")
     pictures = []
     with open_renderer(config) as renderer:
