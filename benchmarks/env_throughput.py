@@ -25,9 +25,9 @@ from numpy.typing import NDArray
 from benchmarks.measuring import describe_ratio, measure_in_turn, parser_of, rates, rates_table, ratio, run_benchmark
 from service.config import WorldConfig
 from service.envs.batch import DISPLACEMENT_M, WorldBatch
-from service.envs.goals import sample_goals
 from service.envs.gym.registration import TABLETOP_ID
-from service.envs.observations import ACTION_SIZE
+from service.envs.observations import ACTION
+from service.envs.sampling import sample_goals
 from service.errors import TandemError
 
 EPISODE_STEPS = 50
@@ -80,7 +80,7 @@ class BatchContender:
         worlds, num = self._worlds, self._worlds.num_worlds
         worlds.reset(self._rng)
         goal = sample_goals("mixed", self._rng, num, worlds.config, _SUCCESS_M)
-        actions = self._rng.uniform(-1.0, 1.0, (self._num_steps, num, ACTION_SIZE)).astype(np.float32)
+        actions = self._rng.uniform(-1.0, 1.0, (self._num_steps, num, ACTION.size)).astype(np.float32)
         for step, action in enumerate(actions, start=1):
             if self._grasping:
                 reach(action, worlds.object_position - worlds.ee_position, step)

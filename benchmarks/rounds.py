@@ -12,7 +12,7 @@ from benchmarks.measuring import Sample, Stopwatch, measure, total
 from service.actors.rollout import Rollout
 from service.actors.self_play import Players
 from service.envs.batch import WorldBatch
-from service.envs.observations import ACTION_SIZE
+from service.envs.observations import ACTION
 from service.policies.numpy_policy import NumpyGaussianPolicy, numpy_bob
 from service.runtime.local import LocalRun
 
@@ -86,7 +86,7 @@ class Rounds:
 
     def _random_episode(self) -> int:
         self._worlds.reset(self._rng)
-        shape = (RANDOM_STEPS, self._worlds.num_worlds, ACTION_SIZE)
+        shape = (RANDOM_STEPS, self._worlds.num_worlds, ACTION.size)
         for action in self._rng.uniform(-1.0, 1.0, shape).astype(np.float32):
             self._worlds.step(action)
         return shape[0] * shape[1]

@@ -16,9 +16,9 @@ SEED = 0
 """Seed of the goals; those evaluated during a run are others."""
 
 TASKS = {
-    "mixed": Task("Mixed", "anywhere in the workspace with probability 0.7, else on the table", "mixed", 0.7),
-    "air": Task("Air", "more than 5 cm above an object that rests on the table", "air", 1.0),
-    "table": Task("Table", "on the table", "table", 0.0),
+    "mixed": Task("Mixed", "anywhere in the workspace with probability 0.7, else on the table", "mixed"),
+    "air": Task("Air", "more than 5 cm above an object that rests on the table", "air"),
+    "table": Task("Table", "on the table", "table"),
     "larger": DOWNSTREAM["larger"],
     "sphere": DOWNSTREAM["sphere"],
 }

@@ -120,7 +120,7 @@ def test_acting_needs_no_torch(room):
 
 def imports_of_modules():
     """Every import in service, those inside functions and for types included: (importing, imported module) by name."""
-    modules = {name: path for name, path in zip(modules_in(""), sorted((ROOT / "service").rglob("*.py")), strict=True)}
+    modules = dict(zip(modules_in(""), sorted((ROOT / "service").rglob("*.py")), strict=True))
     for name, path in modules.items():
         for node in ast.walk(ast.parse(path.read_text())):
             if isinstance(node, ast.Import):

@@ -11,7 +11,7 @@ import numpy as np
 
 from service.config import WorkspaceConfig, WorldConfig
 from service.envs.batch import WorldBatch
-from service.envs.observations import ACTION_SIZE
+from service.envs.observations import ACTION
 from service.types import FloatArray, StateArray
 
 
@@ -31,7 +31,7 @@ class RandomPolicy:
 
     def compose(self, positions: FloatArray, weights: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Zero mean and unit std."""
-        shape = (positions.shape[0], ACTION_SIZE)
+        shape = (positions.shape[0], ACTION.size)
         return np.zeros(shape, dtype=np.float32), np.ones(shape, dtype=np.float32)
 
 

@@ -10,8 +10,8 @@ import numpy as np
 
 from service.config import Config, WorldConfig
 from service.envs.batch import WorldBatch
-from service.envs.goals import GoalKind, draw_goals
-from service.envs.observations import ACTION_SIZE, bob_observation
+from service.envs.observations import ACTION, bob_observation
+from service.envs.sampling import GoalKind, draw_goals
 from service.types import FloatArray, StateArray
 
 Observer = Callable[[WorldBatch, StateArray], None]
@@ -35,7 +35,7 @@ class IdlePolicy:
 
     def act_deterministic(self, observation: FloatArray) -> FloatArray:
         """Zero actions (N, 4)."""
-        return np.zeros((observation.shape[0], ACTION_SIZE), dtype=np.float32)
+        return np.zeros((observation.shape[0], ACTION.size), dtype=np.float32)
 
 
 @dataclass(frozen=True, slots=True)

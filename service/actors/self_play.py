@@ -17,14 +17,7 @@ from numpy.typing import NDArray
 from service.actors.rollout import Demonstrations, Rollout, Turns
 from service.config import Config
 from service.envs.batch import WorldBatch
-from service.envs.observations import (
-    ACTION_SIZE,
-    BOB_SIZE,
-    BOB_VALUE_SIZE,
-    FULL_SIZE,
-    POSITIONS_SIZE,
-    bob_observation,
-)
+from service.envs.observations import ACTION, BOB, BOB_VALUE, FULL, POSITIONS, bob_observation
 from service.generator.generator import GoalChoice
 from service.generator.opponents import CURRENT, RoundPlan
 from service.generator.records import GoalRecords
@@ -160,7 +153,7 @@ class SelfPlay:
         """Her turns (without the reward of her goal), (N, 2) finger contacts, (N,) worlds whose physics diverged."""
         game, worlds = self.config.game, self.worlds
         num_steps = int(self._rng.integers(game.alice_steps_min or game.alice_steps, game.alice_steps + 1))
-        turns = _empty_turns(game.alice_steps, worlds.num_worlds, FULL_SIZE, FULL_SIZE, learn=~plan.alice_past)
+        turns = _empty_turns(game.alice_steps, worlds.num_worlds, FULL.size, FULL.size, learn=~plan.alice_past)
         all_worlds = np.arange(worlds.num_worlds)
         contacts = np.zeros((worlds.num_worlds, 2), dtype=bool)
         diverged = np.zeros(worlds.num_worlds, dtype=bool)
@@ -195,7 +188,7 @@ class SelfPlay:
         """
         game, worlds = self.config.game, self.worlds
         num = worlds.num_worlds
-        turns = _empty_turns(game.bob_steps, num, BOB_SIZE, BOB_VALUE_SIZE, learn=choice.played & ~plan.bob_past)
+        turns = _empty_turns(game.bob_steps, num, BOB.size, BOB_VALUE.size, learn=choice.played & ~plan.bob_past)
         solved, diverged = np.zeros(num, dtype=bool), np.zeros(num, dtype=bool)
         num_held: IntArray = np.zeros(num, dtype=np.int64)
         playing = np.flatnonzero(choice.played)
@@ -281,7 +274,7 @@ def _act(
     opponents = opponent[worlds]
     if (opponents == CURRENT).all():
         return current.act(observation, rng)
-    action = np.empty((worlds.size, ACTION_SIZE), dtype=np.float32)
+    action = np.empty((worlds.size, ACTION.size), dtype=np.float32)
     log_prob = np.empty(worlds.size, dtype=np.float32)
     for index in np.unique(opponents):
         rows = opponents == index
@@ -295,7 +288,7 @@ def _empty_turns(num_steps: int, num: int, observation_size: int, value_size: in
         observation=np.zeros((num_steps, num, observation_size), dtype=np.float32),
         value_observation=np.zeros((num_steps, num, value_size), dtype=np.float32),
         final_value_observation=np.zeros((num, value_size), dtype=np.float32),
-        action=np.zeros((num_steps, num, ACTION_SIZE), dtype=np.float32),
+        action=np.zeros((num_steps, num, ACTION.size), dtype=np.float32),
         log_prob=np.zeros((num_steps, num), dtype=np.float32),
         reward=np.zeros((num_steps, num), dtype=np.float32),
         active=np.zeros((num_steps, num), dtype=bool),
@@ -308,7 +301,7 @@ def _relabelled(turns: Turns, chosen: BoolArray, goal: StateArray) -> Demonstrat
     """The turns of the ``chosen`` worlds (N,) with Bob's input, as demonstrations of how to reach ``goal`` (N, 3)."""
     active = turns.active & chosen
     goals = np.broadcast_to(goal, (*active.shape, 3))[active]
-    observation = bob_observation(turns.observation[active][:, :POSITIONS_SIZE], goals)
+    observation = bob_observation(turns.observation[active][:, : POSITIONS.size], goals)
     return Demonstrations(observation, turns.action[active])
 
 

@@ -21,7 +21,7 @@ from service.errors import TandemError
 if TYPE_CHECKING:
     from service.actors.evaluation import Evaluation
     from service.config import Config
-    from service.envs.goals import GoalKind
+    from service.envs.sampling import GoalKind
     from service.primitives.loading import TrainedBob
     from service.runtime.pretrain import Pretrained
     from service.runtime.ray_connection import ClusterOptions
@@ -154,7 +154,7 @@ def evaluate(
 ) -> None:
     """Bob on random goals from fresh resets, without noise, beside a policy that does nothing."""
     with _user_errors():
-        from service.envs.goals import GOAL_KINDS
+        from service.envs.sampling import GOAL_KINDS
         from service.primitives.loading import load_bob
 
         if goals not in GOAL_KINDS:

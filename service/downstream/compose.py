@@ -18,7 +18,7 @@ import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
-from service.envs.observations import POSITIONS_SIZE, SPACES
+from service.envs.observations import POSITIONS, SPACES
 from service.errors import TandemError
 from service.policies.numpy_policy import NumpyMCPPolicy
 from service.types import FloatArray
@@ -195,9 +195,9 @@ class _Composer:
         shown: Any = observation_space
         if named := isinstance(observation_space, gymnasium.spaces.Dict):
             shown = observation_space.get("observation")
-        if positions is None and (not isinstance(shown, gymnasium.spaces.Box) or shown.shape != (POSITIONS_SIZE,)):
+        if positions is None and (not isinstance(shown, gymnasium.spaces.Box) or shown.shape != (POSITIONS.size,)):
             raise TandemError(
-                f"the environment's observations are {shown}; the primitives see the {POSITIONS_SIZE} positions of "
+                f"the environment's observations are {shown}; the primitives see the {POSITIONS.size} positions of "
                 "service.envs.observations: give positions=, which takes them out of an observation"
             )
         self._take = positions or (operator.itemgetter("observation") if named else lambda observation: observation)

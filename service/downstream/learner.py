@@ -15,7 +15,7 @@ from stable_baselines3.common.logger import Logger
 from service.downstream.networks import GoalFeatures
 from service.downstream.vec_env import PREVIOUS, VecEnvState, WorldsVecEnv
 from service.envs.gym.vector import VectorState
-from service.envs.observations import GOAL_SLICE, OBJECT_SLICE, POSITIONS_SIZE
+from service.envs.observations import BOB, POSITIONS
 
 if TYPE_CHECKING:
     from gymnasium.spaces import Dict
@@ -87,12 +87,12 @@ class LearnedPolicy:
 
     def act_deterministic(self, observation: FloatArray) -> FloatArray:
         """(N, 14) Bob's input to actions (N, 4)."""
-        positions = observation[:, :POSITIONS_SIZE]
+        positions = observation[:, : POSITIONS.size]
         previous, self._previous = self._previous, positions.copy()
         seen: dict[str, Any] = {
             "observation": positions,
-            "achieved_goal": observation[:, OBJECT_SLICE],
-            "desired_goal": observation[:, GOAL_SLICE],
+            "achieved_goal": observation[:, BOB["object"]],
+            "desired_goal": observation[:, BOB["goal"]],
             PREVIOUS: positions if previous is None else previous,
         }
         actions, _ = self._learner.predict(

@@ -12,14 +12,7 @@ from torch import Tensor
 
 from service.config import MCPConfig
 from service.downstream.vec_env import PREVIOUS
-from service.envs.observations import (
-    BOB_SIZE,
-    EFFECTOR_SLICE,
-    GOAL_FROM_OBJECT,
-    GOAL_SLICE,
-    NORMALISATION_BOB,
-    OBJECT_SLICE,
-)
+from service.envs.observations import BOB, GOAL_FROM_OBJECT
 from service.policies.networks import InputNormalisation, MCPPolicy
 
 STEP_SCALE_M = 0.02
@@ -35,16 +28,16 @@ class GoalFeatures(BaseFeaturesExtractor):
     scale: Tensor
 
     def __init__(self, observation_space: gymnasium.spaces.Dict) -> None:
-        super().__init__(observation_space, BOB_SIZE + 9)
-        self.normalise = InputNormalisation(NORMALISATION_BOB)
+        super().__init__(observation_space, BOB.size + 9)
+        self.normalise = InputNormalisation(BOB.normalisation)
         self.register_buffer("scale", torch.tensor(GOAL_FROM_OBJECT.normalisation.scale))
 
     def forward(self, observations: dict[str, Tensor]) -> Tensor:
         """Features of a batch of goal observations."""
         rows = bob_input(observations)
-        relative = (rows[:, GOAL_SLICE] - rows[:, OBJECT_SLICE]) / self.scale
+        relative = (rows[:, BOB["goal"]] - rows[:, BOB["object"]]) / self.scale
         moved = (observations["observation"] - observations[PREVIOUS]) / STEP_SCALE_M
-        moved = torch.cat((moved[:, EFFECTOR_SLICE], moved[:, OBJECT_SLICE]), dim=1)
+        moved = torch.cat((moved[:, BOB["effector"]], moved[:, BOB["object"]]), dim=1)
         return torch.cat((self.normalise(rows), relative.clamp(-5.0, 5.0), moved.clamp(-5.0, 5.0)), dim=1)
 
 

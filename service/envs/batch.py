@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-from types import TracebackType
 from typing import Self
 
 import mujoco
@@ -12,7 +11,7 @@ from mujoco import rollout
 
 from service.config import WorldConfig
 from service.envs import kinematics
-from service.envs.observations import ACTION_SIZE, BOB_VALUE, FULL, POSITIONS, ObservationLayout
+from service.envs.observations import ACTION, BOB_VALUE, FULL, POSITIONS, ObservationLayout
 from service.envs.panda import FINGER_STROKE_M, NUM_FINGERS, NUM_JOINTS
 from service.envs.sampling import draw_starts
 from service.envs.scene import build_layout, build_spec
@@ -77,9 +76,7 @@ class WorldBatch:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         self.close()
 
     def close(self) -> None:
@@ -129,10 +126,7 @@ class WorldBatch:
 
     def restore(self, states: StateArray, worlds: BoolArray | None = None) -> None:
         """Overwrite the states of all worlds, or of those where ``worlds`` is true, with (N or count, S) rows."""
-        if worlds is None:
-            self.states[:] = states
-        else:
-            self.states[worlds] = states
+        self.states[slice(None) if worlds is None else worlds] = states
         self._kinematics = kinematics.forward(self.joints)
 
     # --- stepping --------------------------------------------------------------------------------------------------
@@ -156,8 +150,8 @@ class WorldBatch:
         if worlds is not None and not worlds.size:
             return np.zeros(self.num_worlds, dtype=bool)  # MuJoCo's rollout of no states is a segmentation fault
         start = self.states[index]
-        if actions.shape != (start.shape[0], ACTION_SIZE):
-            raise ValueError(f"actions: expected shape {(start.shape[0], ACTION_SIZE)}, got {actions.shape}")
+        if actions.shape != (start.shape[0], ACTION.size):
+            raise ValueError(f"actions: expected shape {(start.shape[0], ACTION.size)}, got {actions.shape}")
         if not np.isfinite(actions).all():
             num = int((~np.isfinite(actions).all(axis=1)).sum())
             raise DivergedError(
@@ -207,15 +201,15 @@ class WorldBatch:
     # --- observations ----------------------------------------------------------------------------------------------
 
     def positions(self) -> FloatArray:
-        """(N, 11) what Bob's primitives see: ``observations.POSITIONS``."""
+        """(N, 11) input of Bob's primitives: ``observations.POSITIONS``."""
         return self.observe(POSITIONS)
 
     def full(self, elapsed: float) -> FloatArray:
-        """(N, 22) what Alice sees: ``observations.FULL``; ``elapsed`` is the share of her turn gone by, in [0, 1]."""
+        """(N, 22) input of Alice: ``observations.FULL``; ``elapsed`` is the share of her turn gone by, in [0, 1]."""
         return self.observe(FULL, elapsed=elapsed)
 
     def bob_value(self, goal: StateArray) -> FloatArray:
-        """(N, 27) what Bob's value network sees, ``observations.BOB_VALUE``, for (N, 3) goals, metres."""
+        """(N, 27) input of Bob's value network, ``observations.BOB_VALUE``, for (N, 3) goals, metres."""
         return self.observe(BOB_VALUE, goal=goal, goal_from_object=goal - self.object_position)
 
     def observe(self, layout: ObservationLayout, **given: StateArray | float) -> FloatArray:

@@ -59,10 +59,10 @@ SCALAR = Kind((0,), (1.0,))
 
 @dataclass(frozen=True)
 class Entry:
-    """Part of a vector that has a name."""
+    """Named part of a vector."""
 
     name: str
-    """As ``WorldBatch.observe`` knows it."""
+    """Name by which ``WorldBatch.observe`` measures it or is given it."""
     kind: Kind
     unit: str
     offset: float | tuple[float, ...]
@@ -72,7 +72,7 @@ class Entry:
 
 
 class ObservationLayout:
-    """Entries that stand one after the other."""
+    """Named entries, one after the other, of an observation or action vector."""
 
     def __init__(self, *entries: Entry) -> None:
         self.entries = entries
@@ -111,14 +111,14 @@ ACTION = ObservationLayout(
     Entry("displacement", VECTOR, "share of the greatest", 0.0, 1.0),
     Entry("width_change", SCALAR, "share of the greatest", 0.0, 1.0),
 )
-"""What a player commands; as an input, what was commanded last."""
+"""Command of a player."""
 POSITIONS = ObservationLayout(
     Entry("effector", VECTOR, "m", _MIDDLE_M, 0.12),
     Entry("fingers", PAIR, "m", 0.02, 0.02),
     Entry("object", VECTOR, "m", _MIDDLE_M, 0.12),
     Entry("object_from_effector", VECTOR, "m", 0.0, 0.1),
 )
-"""What Bob's primitives see."""
+"""Input of Bob's primitives."""
 _MOTION = ObservationLayout(
     Entry("effector_velocity", VECTOR, "m/s", 0.0, 0.5),
     Entry("finger_velocities", PAIR, "m/s", 0.0, 0.2),
@@ -127,27 +127,18 @@ _MOTION = ObservationLayout(
 )
 _GOAL = ObservationLayout(Entry("goal", VECTOR, "m", _MIDDLE_M, 0.12))
 GOAL_FROM_OBJECT = ObservationLayout(Entry("goal_from_object", VECTOR, "m", 0.0, 0.1))
-"""How far the object has to go."""
+"""Way that the object has to go."""
 FULL = POSITIONS + _MOTION + ObservationLayout(Entry("elapsed", SCALAR, "share of the turn", 0.5, 0.5))
-"""What Alice sees."""
+"""Input of Alice's policy and of her value network."""
 BOB = POSITIONS + _GOAL
-"""What Bob sees."""
+"""Input of Bob's policy."""
 BOB_VALUE = POSITIONS + _MOTION + _GOAL + GOAL_FROM_OBJECT
-"""What Bob's value network sees."""
+"""Input of Bob's value network."""
 GATE = BOB + GOAL_FROM_OBJECT
-"""What Bob's gate computes with."""
+"""Input of Bob's gate: his observation and what follows from it."""
 
-ACTION_SIZE = ACTION.size
-POSITIONS_SIZE = POSITIONS.size
-FULL_SIZE = FULL.size
-BOB_SIZE = BOB.size
-BOB_VALUE_SIZE = BOB_VALUE.size
-EFFECTOR_SLICE, OBJECT_SLICE, GOAL_SLICE = BOB["effector"], BOB["object"], BOB["goal"]
-MIRROR_ACTION, MIRROR_FULL, MIRROR_BOB, MIRROR_BOB_VALUE = ACTION.mirror, FULL.mirror, BOB.mirror, BOB_VALUE.mirror
-NORMALISATION_POSITIONS, NORMALISATION_FULL = POSITIONS.normalisation, FULL.normalisation
-NORMALISATION_BOB, NORMALISATION_BOB_VALUE = BOB.normalisation, BOB_VALUE.normalisation
-SPACES = {"action": ACTION_SIZE, "positions": POSITIONS_SIZE, "observation": BOB_SIZE, "layout": __name__}
-"""What the manifest of primitives says they act by and see; those of another robot or layout say something else."""
+SPACES = {"action": ACTION.size, "positions": POSITIONS.size, "observation": BOB.size, "layout": __name__}
+"""Sizes and layout in the manifest of primitives; they differ for another robot or another layout."""
 
 
 def bob_observation(positions: FloatArray, goal: NDArray[np.floating]) -> FloatArray:

@@ -169,20 +169,18 @@ def _collision(body: Any, name: str, radius: float, ends: tuple[tuple[float, ...
 
 
 def _add_actuators(spec: mujoco.MjSpec) -> None:
-    for index in range(NUM_JOINTS):
-        actuator = spec.add_actuator(
-            name=f"joint{index + 1}", target=f"joint{index + 1}", trntype=mujoco.mjtTrn.mjTRN_JOINT
-        )
-        actuator.set_to_position(kp=_STIFFNESS[index], kv=_DAMPING[index])
-        _limit(actuator, JOINT_TORQUE[index], JOINT_LOWER[index], JOINT_UPPER[index])
+    for index, (stiffness, damping, torque) in enumerate(zip(_STIFFNESS, _DAMPING, JOINT_TORQUE, strict=True)):
+        limits = JOINT_LOWER[index], JOINT_UPPER[index]
+        _add_actuator(spec, f"joint{index + 1}", stiffness, damping, torque, limits)
     for side in ("left", "right"):
-        actuator = spec.add_actuator(name=f"{side}_finger", target=f"{side}_finger", trntype=mujoco.mjtTrn.mjTRN_JOINT)
-        actuator.set_to_position(kp=_FINGER_STIFFNESS, kv=_FINGER_DAMPING)
-        _limit(actuator, _FINGER_FORCE, 0.0, FINGER_STROKE_M)
+        limits = 0.0, FINGER_STROKE_M
+        _add_actuator(spec, f"{side}_finger", _FINGER_STIFFNESS, _FINGER_DAMPING, _FINGER_FORCE, limits)
 
 
-def _limit(actuator: Any, force: float, lower: float, upper: float) -> None:
-    actuator.forcelimited = True
-    actuator.forcerange = (-force, force)
-    actuator.ctrllimited = True
-    actuator.ctrlrange = (lower, upper)
+def _add_actuator(
+    spec: mujoco.MjSpec, joint: str, stiffness: float, damping: float, force: float, limits: tuple[float, float]
+) -> None:
+    actuator = spec.add_actuator(name=joint, target=joint, trntype=mujoco.mjtTrn.mjTRN_JOINT)
+    actuator.set_to_position(kp=stiffness, kv=damping)
+    actuator.forcelimited = actuator.ctrllimited = True
+    actuator.forcerange, actuator.ctrlrange = (-force, force), limits

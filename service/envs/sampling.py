@@ -1,14 +1,21 @@
-"""Random positions of objects and goals, and of objects beside a wall or a box."""
+"""Random starts of objects and boxes, and random goals, for self-play, evaluation and the Gymnasium environments."""
 
 from __future__ import annotations
+
+from typing import Literal
 
 import numpy as np
 
 from service.config import WorkspaceConfig, WorldConfig
-from service.envs import fixtures
+from service.envs import scene
+from service.errors import TandemError
 from service.types import StateArray
 
-_TABLE_TOP_M = 0.0
+GoalKind = Literal["table", "air", "mixed", "volume"]
+GOAL_KINDS: tuple[GoalKind, ...] = ("table", "air", "mixed", "volume")
+
+MIXED_AIR_SHARE = 0.7
+"""Share of mixed goals drawn anywhere in the workspace's volume; the rest lie on the table (paper: p = 0.7)."""
 
 
 def sample_on_table(rng: np.random.Generator, num: int, workspace: WorkspaceConfig, object_size_m: float) -> StateArray:
@@ -17,22 +24,16 @@ def sample_on_table(rng: np.random.Generator, num: int, workspace: WorkspaceConf
     half = np.array([workspace.length_x_m, workspace.length_y_m]) / 2
     position = np.empty((num, 3))
     position[:, :2] = center + rng.uniform(-half, half, (num, 2))
-    position[:, 2] = _TABLE_TOP_M + object_size_m / 2
+    position[:, 2] = object_size_m / 2
     return position
 
 
 def sample_in_volume(
-    rng: np.random.Generator,
-    num: int,
-    workspace: WorkspaceConfig,
-    object_size_m: float,
-    *,
-    lowest_m: float | None = None,
+    rng: np.random.Generator, num: int, workspace: WorkspaceConfig, object_size_m: float, *, lowest_m: float
 ) -> StateArray:
-    """(num, 3) object centres, uniform in the workspace above ``lowest_m`` (default: resting height)."""
+    """(num, 3) object centres, uniform in the workspace above ``lowest_m``."""
     position = sample_on_table(rng, num, workspace, object_size_m)
-    low = _TABLE_TOP_M + object_size_m / 2 if lowest_m is None else lowest_m
-    position[:, 2] = rng.uniform(low, workspace.height_m, num)
+    position[:, 2] = rng.uniform(lowest_m, workspace.height_m, num)
     return position
 
 
@@ -55,33 +56,78 @@ def draw_starts(rng: np.random.Generator, num: int, config: WorldConfig) -> tupl
     return anywhere, np.empty((num, 0))
 
 
-def behind_wall(rng: np.random.Generator, start: StateArray, config: WorldConfig) -> StateArray:
-    """(num, 3) goals on the table, in the area on the other side of the wall than the (num, 3) objects' start."""
-    return _beside_wall(rng, np.where(start[:, 0] < config.workspace.center_x_m, 1.0, -1.0), config)
+def sample_goals(
+    kind: GoalKind, rng: np.random.Generator, num: int, config: WorldConfig, success_distance_m: float
+) -> StateArray:
+    """(num, 3) goals, metres.
 
-
-def in_box(place: StateArray, config: WorldConfig) -> StateArray:
-    """(num, 3) goals in the middle of boxes at (num, 3) places, as high as an object on the table.
-
-    An object within 5 cm, the height of a box, has its underside below the rim; one on the bottom is 5 mm too high.
+    ``table``: on it. ``air``: out of reach of an object that rests on the table. ``volume``: anywhere in the workspace
+    (p = 1 in the paper's words). ``mixed``: as most of the paper's downstream tasks, anywhere in the volume with
+    probability 0.7, else on the table.
     """
-    goal: StateArray = place + np.array([0.0, 0.0, config.object_size_m / 2])
-    return goal
+    table = sample_on_table(rng, num, config.workspace, config.object_size_m)
+    if kind == "table":
+        return table
+    lowest = config.object_size_m / 2 + (success_distance_m if kind == "air" else 0.0)
+    volume = sample_in_volume(rng, num, config.workspace, config.object_size_m, lowest_m=lowest)
+    if kind != "mixed":
+        return volume
+    return np.where(rng.random((num, 1)) < MIXED_AIR_SHARE, volume, table)
+
+
+def draw_goals(
+    kind: GoalKind,
+    rng: np.random.Generator,
+    config: WorldConfig,
+    success_distance_m: float,
+    *,
+    start: StateArray,
+    box: StateArray,
+) -> StateArray:
+    """(num, 3) goals for worlds whose (num, 3) objects and boxes are at ``start`` and ``box``, metres.
+
+    With a wall, they are on the table in the area on the other side of it than the object. With a box, in its middle,
+    as high as an object on the table: one within 5 cm has its underside below the rim; one on the bottom is 5 mm too
+    high. Else ``sample_goals`` draws them, and ``box`` is (num, 0).
+
+    Raises:
+        TandemError: goals off the table in a world with a fixture.
+    """
+    check_goals(kind, config)
+    if config.fixture == "wall":
+        return _beside_wall(rng, np.where(start[:, 0] < config.workspace.center_x_m, 1.0, -1.0), config)
+    if config.fixture == "box":
+        in_box: StateArray = box + np.array([0.0, 0.0, config.object_size_m / 2])
+        return in_box
+    return sample_goals(kind, rng, len(start), config, success_distance_m)
+
+
+def check_goals(kind: GoalKind, config: WorldConfig) -> None:
+    """Refuse goals that a world cannot have.
+
+    Raises:
+        TandemError: an unknown kind, or goals off the table in a world with a fixture.
+    """
+    if kind not in GOAL_KINDS:
+        raise TandemError(f"goals = {kind!r}; choose one of {', '.join(GOAL_KINDS)}")
+    if config.fixture != "none" and kind != "table":
+        where = {"wall": "behind it", "box": "in it"}[config.fixture]
+        raise TandemError(f"goals = {kind!r} with a {config.fixture}: its goals lie {where}; choose table")
 
 
 def _beside_wall(rng: np.random.Generator, side: StateArray, config: WorldConfig) -> StateArray:
     """(num, 3) object centres in the area on each (num,) side: -1 is nearer to the robot, 1 farther."""
     position = sample_on_table(rng, len(side), config.workspace, config.object_size_m)
-    nearest = fixtures.WALL_THICKNESS_M / 2 + fixtures.GAP_M + config.object_size_m / 2
-    distance = nearest + rng.uniform(0.0, fixtures.AREA_LENGTH_M, len(side))
+    nearest = scene.WALL_THICKNESS_M / 2 + scene.GAP_M + config.object_size_m / 2
+    distance = nearest + rng.uniform(0.0, scene.AREA_LENGTH_M, len(side))
     position[:, 0] = config.workspace.center_x_m + side * distance
     return position
 
 
 def _outside_boxes(rng: np.random.Generator, place: StateArray, config: WorldConfig) -> StateArray:
     """(num, 3) object centres in the workspace, each drawn again until it is clear of its box."""
-    apart = fixtures.BOX_SIZE_M / 2 + config.object_size_m / 2
-    least = np.array([apart + fixtures.GAP_M, apart + fixtures.FINGER_GAP_M])
+    apart = scene.BOX_SIZE_M / 2 + config.object_size_m / 2
+    least = np.array([apart + scene.GAP_M, apart + scene.FINGER_GAP_M])
     position = sample_on_table(rng, len(place), config.workspace, config.object_size_m)
     while (inside := (np.abs(position - place)[:, :2] < least).all(axis=1)).any():
         position[inside] = sample_on_table(rng, int(inside.sum()), config.workspace, config.object_size_m)

@@ -1,15 +1,38 @@
-"""The scene: a Panda at a table with one rigid object, and a wall or a box where a task wants one."""
+"""The scene: a Panda at a table with one rigid object, and a fixture where a task wants one.
+
+A fixture, a wall across the workspace or an open box, cannot be moved. The wall is part of the table; the box is
+elsewhere in every world, so its place is part of a world's state. Both are touched by the object, the hand and the
+fingers; the arm's links collide with nothing, and a gripper that points down keeps them far above (its flange is at
+least 21 cm up). Sizes and where objects and goals are drawn: docs/decisions/0007.
+"""
 
 from __future__ import annotations
+
+from typing import Any
 
 import mujoco
 
 from service.config import WorldConfig
-from service.envs import fixtures, panda
+from service.envs import panda
 from service.envs.state_layout import StateLayout
 
 TABLE_CENTER_X_M = -0.3
 TABLE_HALF_SIZE_M = (0.55, 0.45, 0.2)
+WALL_THICKNESS_M = 0.01
+WALL_HEIGHT_M = 0.07
+"""Higher than the cube, and so low that the hand does not touch it while the fingers hold a cube beside it."""
+AREA_LENGTH_M = 0.15
+"""Extent of each area beside the wall, away from it; along it they are as wide as the workspace (paper: 15 x 35 cm)."""
+BOX_SIZE_M = 0.10
+BOX_HEIGHT_M = 0.05
+BOX_SHELL_M = 0.005
+"""Thickness of its walls and bottom; paper: 10 x 10 x 5 cm, taken as the outside."""
+GAP_M = 0.005
+"""Least distance of a new object from wall or box."""
+FINGER_GAP_M = 0.04
+"""The same where a finger has to go in between: fingers open along y, and reach 3.7 cm beyond a 5 cm cube."""
+FIXTURE_PREFIX = "fixture_"
+"""Beginning of the names of a fixture's geoms."""
 # MuJoCo's default contact yields more the lighter the object: an arm leaning on the cube pressed it 11 mm down.
 # These let it give 1 mm.
 _STIFF = {"solref": (0.01, 1.0), "solimp": (0.95, 0.99, 0.001, 0.5, 2.0)}
@@ -47,7 +70,7 @@ def build_spec(config: WorldConfig) -> mujoco.MjSpec:
         **_STIFF,
     )
     _add_object(spec, config)
-    fixtures.add_fixture(spec, config, _STIFF)
+    _add_fixture(spec, config)
     _add_contact_sensors(spec)
     return spec
 
@@ -69,7 +92,7 @@ def build_layout(config: WorldConfig, *, blocked_fraction: float = 0.0) -> State
         },
         measured={"contacts": panda.NUM_FINGERS},
         kept={
-            "box_place": fixtures.PLACE_SIZE if config.fixture == "box" else 0,
+            "box_place": 3 if config.fixture == "box" else 0,  # the middle of its bottom
             "gripper_blocked": int(blocked_fraction > 0.0),
         },
     )
@@ -90,6 +113,37 @@ def _add_object(spec: mujoco.MjSpec, config: WorldConfig) -> None:
         conaffinity=panda.GRIPPER_BIT,
         group=2,
         rgba=(0.86, 0.18, 0.15, 1.0),
+        **_STIFF,
+    )
+
+
+def _add_fixture(spec: mujoco.MjSpec, config: WorldConfig) -> None:
+    """Add the wall, or the box's bottom and walls."""
+    workspace = config.workspace
+    if config.fixture == "wall":
+        half = (WALL_THICKNESS_M / 2, workspace.length_y_m / 2, WALL_HEIGHT_M / 2)
+        _add_plate(spec.worldbody, "wall", (workspace.center_x_m, workspace.center_y_m, half[2]), half, config)
+    elif config.fixture == "box":
+        box = spec.worldbody.add_body(name="box", pos=(workspace.center_x_m, workspace.center_y_m, 0.0), mocap=True)
+        outer, half_shell, half_height = BOX_SIZE_M / 2, BOX_SHELL_M / 2, BOX_HEIGHT_M / 2
+        side, inner = outer - half_shell, outer - BOX_SHELL_M
+        _add_plate(box, "bottom", (0.0, 0.0, half_shell), (outer, outer, half_shell), config)
+        _add_plate(box, "near", (-side, 0.0, half_height), (half_shell, outer, half_height), config)
+        _add_plate(box, "far", (side, 0.0, half_height), (half_shell, outer, half_height), config)
+        _add_plate(box, "left", (0.0, -side, half_height), (inner, half_shell, half_height), config)
+        _add_plate(box, "right", (0.0, side, half_height), (inner, half_shell, half_height), config)
+
+
+def _add_plate(body: Any, name: str, middle: tuple[float, ...], half: tuple[float, ...], config: WorldConfig) -> None:
+    body.add_geom(
+        name=FIXTURE_PREFIX + name,
+        type=mujoco.mjtGeom.mjGEOM_BOX,
+        pos=middle,
+        size=half,
+        contype=0,
+        conaffinity=panda.GRIPPER_BIT | panda.OBJECT_BIT,
+        friction=(config.friction, 0.005, 0.0001),
+        group=2,
         **_STIFF,
     )
 

@@ -30,30 +30,21 @@ class StateLayout:
         kept: what no step changes, such as the place of a box, or parameters of the physics that differ by world.
     """
 
-    num_positions: int
-    """Numbers in qpos."""
-    num_velocities: int
-    """Numbers in qvel."""
-    size: int
-    """S, all numbers of a state."""
-    physics: slice
-    """MuJoCo's full physics state."""
-    velocities: slice
-    """All velocities."""
-    kept: slice
-    """Everything that no step changes."""
-
     def __init__(self, *, positions: Sizes, velocities: Sizes, measured: Sizes, kept: Sizes) -> None:
         groups = ({"time": 1}, positions, velocities, measured, kept)
         self._columns = columns({name: size for group in groups for name, size in group.items()})
         assert len(self._columns) == sum(map(len, groups)), "two parts of the same name"
         self.num_positions, self.num_velocities = sum(positions.values()), sum(velocities.values())
-        physics_size = 1 + self.num_positions + self.num_velocities
-        self.physics = slice(0, physics_size)
-        self.velocities = slice(1 + self.num_positions, physics_size)
-        first_kept = physics_size + sum(measured.values())
+        """Numbers in qpos and in qvel."""
+        self.physics = slice(0, 1 + self.num_positions + self.num_velocities)
+        """MuJoCo's full physics state."""
+        self.velocities = slice(1 + self.num_positions, self.physics.stop)
+        """All velocities."""
+        first_kept: int = self.physics.stop + sum(measured.values())
         self.size = first_kept + sum(kept.values())
+        """S, all numbers of a state."""
         self.kept = slice(first_kept, self.size)
+        """Everything that no step changes."""
 
     def __getitem__(self, name: str) -> slice:
         """Columns of a part."""

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from service.config import WorldConfig
-from service.envs.goals import GoalKind
+from service.envs.sampling import GoalKind
 from service.errors import TandemError
 
 
@@ -20,8 +20,6 @@ class Task:
     description: str
     """A few words on what it asks for."""
     goals: GoalKind
-    air_share: float
-    """The paper's p: share of goals that are drawn anywhere in the volume; the others lie on the table."""
     world: Mapping[str, Any] = field(default_factory=dict)
     """Settings of a world that are replaced."""
     version: int = 0
@@ -48,24 +46,16 @@ TASKS: Mapping[str, Task] = {
         "Larger",
         "objects and goals in a larger workspace, 45 x 45 x 40 cm",
         "mixed",
-        0.7,
         {"workspace": {"length_x_m": 0.45, "length_y_m": 0.45, "height_m": 0.40}},
     ),
-    "inair": Task("InAir", "goals anywhere in the volume", "volume", 1.0),
-    "push": Task("Push", "the gripper stays closed; goals on the table", "table", 0.0, {"gripper": "blocked"}),
-    "sphere": Task("Sphere", "a sphere of 5 cm instead of the cube", "mixed", 0.7, {"object": "sphere"}),
-    "wall": Task(
-        "Wall",
-        "from one side of a wall to the other",
-        "table",
-        0.0,
-        {"fixture": "wall", "start_height_m": 0.12},
-    ),
+    "inair": Task("InAir", "goals anywhere in the volume", "volume"),
+    "push": Task("Push", "the gripper stays closed; goals on the table", "table", {"gripper": "blocked"}),
+    "sphere": Task("Sphere", "a sphere of 5 cm instead of the cube", "mixed", {"object": "sphere"}),
+    "wall": Task("Wall", "from one side of a wall to the other", "table", {"fixture": "wall", "start_height_m": 0.12}),
     "box": Task(
         "Box",
         "into an open box, which is elsewhere in every episode",
         "table",
-        0.0,
         {"fixture": "box"},
         version=1,  # 0: a goal 5 mm higher, reached with the object's underside up to 5 mm above the rim
     ),

@@ -7,7 +7,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from service.envs.observations import POSITIONS_SIZE
+from service.envs.observations import POSITIONS
 from service.learner.player import Player
 from service.learner.samples import Cloning
 from service.policies import gaussian
@@ -37,7 +37,7 @@ def composition_metrics(bob: MCPPolicy, observation: Tensor) -> dict[str, float]
         observation: (P, O).
     """
     weights = bob.gate(observation)
-    _, variances = bob.primitives(observation[:, :POSITIONS_SIZE])
+    _, variances = bob.primitives(observation[:, : POSITIONS.size])
     precisions = weights[..., None] / variances
     total = precisions.sum(1, keepdim=True)
     metrics = {"bob_std": float(total.rsqrt().mean())}

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from service.actors.rollout import Rollout, Turns, turns_to_arrays
 from service.config import Config
-from service.envs.observations import MIRROR_ACTION, MIRROR_BOB
+from service.envs.observations import ACTION, BOB
 from service.io.tensors import join_parts, split_parts
 from service.learner import ppo
 from service.learner.diagnostics import cloning_metrics, composition_metrics, probes
@@ -189,8 +189,8 @@ class Learner:
         if len(action) == 0 or self.config.learner.abc.weight == 0.0:
             return None
         if self.config.learner.mirror:
-            observation = np.concatenate((observation, MIRROR_BOB(observation)))
-            action = np.concatenate((action, MIRROR_ACTION(action)))
+            observation = np.concatenate((observation, BOB.mirror(observation)))
+            action = np.concatenate((action, ACTION.mirror(action)))
         rows, actions = (torch.from_numpy(array).to(self._device) for array in (observation, action))
         with torch.no_grad():
             return Cloning(rows, actions, self._bob.log_prob(rows, actions))

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from service.actors.rollout import Demonstrations
-from service.envs.observations import ACTION_SIZE, BOB_SIZE, MIRROR_ACTION, MIRROR_BOB, MIRROR_BOB_VALUE, Mirror
+from service.envs.observations import ACTION, BOB, BOB_VALUE, Mirror
 from service.learner.player import Player
 from service.policies import gaussian
 from service.types import Array, Arrays
@@ -119,13 +119,13 @@ def augment_by_symmetry(samples: Samples, player: Player) -> Samples:
     Nobody acted a reflection, so its behaviour log-probability is that of the policy at the start of the update, which
     is ``player``'s.
     """
-    observations, actions = _reflect(samples.observation, MIRROR_BOB), _reflect(samples.action, MIRROR_ACTION)
+    observations, actions = _reflect(samples.observation, BOB.mirror), _reflect(samples.action, ACTION.mirror)
     with torch.no_grad():
         mean, std = player.policy(observations)
     reflections = replace(
         samples,
         observation=observations,
-        value_observation=_reflect(samples.value_observation, MIRROR_BOB_VALUE),
+        value_observation=_reflect(samples.value_observation, BOB_VALUE.mirror),
         action=actions,
         behaviour_log_prob=gaussian.log_prob(actions, mean, std),
         proximal_mean=mean,
@@ -161,8 +161,8 @@ def minibatches(
 
 
 def _join(parts: Iterable[Demonstrations]) -> Demonstrations:
-    observations = [np.zeros((0, BOB_SIZE), dtype=np.float32), *(part.observation for part in parts)]
-    actions = [np.zeros((0, ACTION_SIZE), dtype=np.float32), *(part.action for part in parts)]
+    observations = [np.zeros((0, BOB.size), dtype=np.float32), *(part.observation for part in parts)]
+    actions = [np.zeros((0, ACTION.size), dtype=np.float32), *(part.action for part in parts)]
     return Demonstrations(np.concatenate(observations), np.concatenate(actions))
 
 

@@ -18,7 +18,7 @@ from service.actors.rollout import Rollout
 from service.actors.self_play import Players, SelfPlay, StochasticPolicy
 from service.config import Config, WorldConfig
 from service.envs.batch import WorldBatch
-from service.envs.goals import GoalKind
+from service.envs.sampling import GoalKind
 from service.generator.difficulty import in_air
 from service.generator.generator import TaskGenerator
 from service.generator.validity import Verdict

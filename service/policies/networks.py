@@ -17,18 +17,7 @@ from torch import Tensor, nn
 from torch.nn.functional import elu
 
 from service.config import MCPConfig, MLPConfig, PolicyConfig
-from service.envs.observations import (
-    ACTION_SIZE,
-    GATE,
-    GOAL_SLICE,
-    NORMALISATION_BOB,
-    NORMALISATION_BOB_VALUE,
-    NORMALISATION_FULL,
-    NORMALISATION_POSITIONS,
-    OBJECT_SLICE,
-    POSITIONS_SIZE,
-    Normalisation,
-)
+from service.envs.observations import ACTION, BOB, BOB_VALUE, FULL, GATE, POSITIONS, Normalisation
 from service.policies.composition import compose
 from service.policies.parameters import INPUT_CLIP, MEAN_BOUND
 from service.types import FloatArray
@@ -117,9 +106,9 @@ class GaussianPolicy(nn.Module):
         super().__init__()
         self.input = InputNormalisation(normalisation)
         self.hidden = HiddenLayers(len(normalisation.offset), config.hidden_sizes)
-        self.output = linear(self.hidden.output_size, 2 * ACTION_SIZE, gain=_SMALL_GAIN)
+        self.output = linear(self.hidden.output_size, 2 * ACTION.size, gain=_SMALL_GAIN)
         self.squash = GaussianSquash(log_std_min, log_std_max)
-        nn.init.constant_(self.output.bias[ACTION_SIZE:], log_std_bias(INITIAL_LOG_STD, log_std_min, log_std_max))
+        nn.init.constant_(self.output.bias[ACTION.size :], log_std_bias(INITIAL_LOG_STD, log_std_min, log_std_max))
 
     def forward(self, observation: Tensor) -> tuple[Tensor, Tensor]:
         """Mean and std, (..., A) each, at (..., O) observations."""
@@ -134,8 +123,8 @@ class Primitives(nn.Module):
         """Build; the initial std gives the composition ``exp(INITIAL_LOG_STD)`` under a new gate's weights."""
         super().__init__()
         self.num_primitives, self.action_size = config.num_primitives, action_size
-        self.input = InputNormalisation(NORMALISATION_POSITIONS)
-        self.trunk = HiddenLayers(POSITIONS_SIZE, config.trunk_hidden_sizes)
+        self.input = InputNormalisation(POSITIONS.normalisation)
+        self.trunk = HiddenLayers(POSITIONS.size, config.trunk_hidden_sizes)
         self.hidden = nn.Linear(self.trunk.output_size, config.num_primitives * config.primitive_hidden_size)
         heads = config.num_primitives, config.primitive_hidden_size, 2 * action_size
         self.output_weight = nn.Parameter(torch.empty(heads))
@@ -181,7 +170,7 @@ class Gate(nn.Module):
 
     def forward(self, observation: Tensor) -> Tensor:
         """Weights; not normalised to sum to one, as in the paper."""
-        goal_from_object = observation[..., GOAL_SLICE] - observation[..., OBJECT_SLICE]
+        goal_from_object = observation[..., BOB["goal"]] - observation[..., BOB["object"]]
         features = torch.cat((observation, goal_from_object), dim=-1)
         openness: Tensor = self.output(self.hidden(self.input(features))).sigmoid()
         return self.weight_floor + (1.0 - self.weight_floor) * openness
@@ -194,7 +183,7 @@ class MCPPolicy(nn.Module):
     only widen or narrow a policy blind to the goal; the monolithic Bob of the ablation is a ``GaussianPolicy``.
     """
 
-    def __init__(self, config: MCPConfig, action_size: int = ACTION_SIZE) -> None:
+    def __init__(self, config: MCPConfig, action_size: int = ACTION.size) -> None:
         """Build both parts."""
         super().__init__()
         self.primitives = Primitives(config, action_size)
@@ -202,7 +191,7 @@ class MCPPolicy(nn.Module):
 
     def forward(self, observation: Tensor) -> tuple[Tensor, Tensor]:
         """Mean and std, (..., A) each, of the composition at (..., 14) observations."""
-        means, variances = self.primitives(observation[..., :POSITIONS_SIZE])
+        means, variances = self.primitives(observation[..., : POSITIONS.size])
         mean, variance = compose(self.gate(observation), means, variances)
         return mean, variance.sqrt()
 
@@ -225,24 +214,24 @@ class ValueNetwork(nn.Module):
 
 def make_alice(config: PolicyConfig) -> GaussianPolicy:
     """A new Alice; draws from torch's global generator."""
-    return GaussianPolicy(NORMALISATION_FULL, config.alice, config.alice_log_std_min, config.alice_log_std_max)
+    return GaussianPolicy(FULL.normalisation, config.alice, config.alice_log_std_min, config.alice_log_std_max)
 
 
 def make_bob(config: PolicyConfig) -> MCPPolicy | GaussianPolicy:
     """A new Bob; draws from torch's global generator."""
     if config.monolithic_bob is None:
         return MCPPolicy(config.bob)
-    return GaussianPolicy(NORMALISATION_BOB, config.monolithic_bob, config.bob.log_std_min, config.bob.log_std_max)
+    return GaussianPolicy(BOB.normalisation, config.monolithic_bob, config.bob.log_std_min, config.bob.log_std_max)
 
 
 def make_alice_value(config: PolicyConfig) -> ValueNetwork:
     """A new value network for Alice; draws from torch's global generator."""
-    return ValueNetwork(NORMALISATION_FULL, config.value)
+    return ValueNetwork(FULL.normalisation, config.value)
 
 
 def make_bob_value(config: PolicyConfig) -> ValueNetwork:
     """A new value network for Bob; draws from torch's global generator."""
-    return ValueNetwork(NORMALISATION_BOB_VALUE, config.value)
+    return ValueNetwork(BOB_VALUE.normalisation, config.value)
 
 
 def export_parameters(module: nn.Module) -> dict[str, FloatArray]:

@@ -11,7 +11,7 @@ from abc import ABC, abstractmethod
 
 import numpy as np
 
-from service.envs.observations import BOB_SIZE, GATE, GOAL_SLICE, OBJECT_SLICE, POSITIONS_SIZE
+from service.envs.observations import BOB, GATE, POSITIONS
 from service.policies.composition import compose
 from service.policies.parameters import INPUT_CLIP, MEAN_BOUND, ParameterReader, Parameters, PolicyError
 from service.types import FloatArray
@@ -77,8 +77,8 @@ class NumpyMCPPolicy(NumpyPolicy):
             PolicyError: a parameter is missing, left over, of a wrong shape or not finite.
         """
         reader = ParameterReader(parameters)
-        self._input = _Input(reader, "primitives.input", POSITIONS_SIZE)
-        self._trunk = _HiddenLayers(reader, "primitives.trunk", POSITIONS_SIZE)
+        self._input = _Input(reader, "primitives.input", POSITIONS.size)
+        self._trunk = _HiddenLayers(reader, "primitives.trunk", POSITIONS.size)
         self._output_weight = reader.take("primitives.output_weight", (None, None, None))
         self.num_primitives, head_size, outputs = self._output_weight.shape
         self._output_bias = reader.take("primitives.output_bias", (self.num_primitives, outputs))[:, None]
@@ -97,7 +97,7 @@ class NumpyMCPPolicy(NumpyPolicy):
         Raises:
             PolicyError: the last axis is not 11.
         """
-        rows = _rows(positions, POSITIONS_SIZE, "positions")
+        rows = _rows(positions, POSITIONS.size, "positions")
         hidden = _elu(self._head(self._trunk(self._input(rows))))
         # All primitives share one matrix product per layer.
         heads = hidden.reshape(-1, self.num_primitives, self._output_weight.shape[1])
@@ -115,8 +115,8 @@ class NumpyMCPPolicy(NumpyPolicy):
         Raises:
             PolicyError: the last axis is not 14.
         """
-        rows = _rows(observation, BOB_SIZE, "observation")
-        features = np.concatenate((rows, rows[:, GOAL_SLICE] - rows[:, OBJECT_SLICE]), axis=1)
+        rows = _rows(observation, BOB.size, "observation")
+        features = np.concatenate((rows, rows[:, BOB["goal"]] - rows[:, BOB["object"]]), axis=1)
         output = self._gate_output(self._gate_hidden(self._gate_input(features)))
         weights = _squash(output, self._weight_floor, np.float32(1.0) - self._weight_floor)
         return weights.reshape((*np.shape(observation)[:-1], self.num_primitives))
@@ -140,7 +140,7 @@ class NumpyMCPPolicy(NumpyPolicy):
             PolicyError: the observation's last axis is not 14.
         """
         weights = self.gate(observation)
-        return self.compose(np.asarray(observation)[..., :POSITIONS_SIZE], weights)
+        return self.compose(np.asarray(observation)[..., : POSITIONS.size], weights)
 
 
 def numpy_bob(parameters: Parameters) -> NumpyPolicy:

@@ -7,7 +7,7 @@ import json
 
 from service.actors.evaluation import EVALUATED_GOALS, EVALUATION_SEED, success_metrics
 from service.config import Config
-from service.envs.observations import NORMALISATION_BOB, SPACES
+from service.envs.observations import BOB, SPACES
 from service.io import tensors
 from service.io.errors import StorageError
 from service.io.files import os_errors, write_atomic
@@ -78,7 +78,7 @@ def publish_bob(
         config.name,
         parameters,
         spaces=SPACES,
-        normalisation={"offset": NORMALISATION_BOB.offset.tolist(), "scale": NORMALISATION_BOB.scale.tolist()},
+        normalisation={"offset": BOB.normalisation.offset.tolist(), "scale": BOB.normalisation.scale.tolist()},
         config=config.model_dump(mode="json"),
         metrics=metrics,
         parent=parent,

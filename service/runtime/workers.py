@@ -18,7 +18,7 @@ from service.actors.evaluation import EVALUATION_SEED, success_metrics
 from service.actors.rollout import Diverged, Rollout
 from service.actors.self_play import Players, SelfPlay, StochasticPolicy
 from service.config import Config
-from service.envs.goals import GoalKind
+from service.envs.sampling import GoalKind
 from service.envs.scene import build_layout
 from service.generator.generator import GoalChoice, TaskGenerator
 from service.generator.opponents import OpponentPool, RoundPlan

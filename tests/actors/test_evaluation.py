@@ -8,8 +8,7 @@ import pytest
 
 from service.actors.evaluation import Evaluation, IdlePolicy, evaluate, wilson_interval
 from service.config import WorldConfig
-from service.envs.goals import GOAL_KINDS, sample_goals
-from service.envs.sampling import sample_on_table
+from service.envs.sampling import GOAL_KINDS, sample_goals, sample_on_table
 
 WORLD = WorldConfig()
 FAST = WorldConfig(physics_step_s=0.004, num_substeps=10)

@@ -7,7 +7,7 @@ from service.downstream.learner import make_learner
 from service.downstream.methods import METHODS
 from service.downstream.networks import GoalFeatures
 from service.downstream.worker import make_worlds
-from service.envs.observations import NORMALISATION_BOB
+from service.envs.observations import BOB
 from service.policies.composition import compose
 from service.policies.networks import export_parameters
 from service.policies.numpy_policy import NumpyMCPPolicy
@@ -74,7 +74,7 @@ def test_features_by_hand():
     assert found.shape == (1, 23)
     rows = np.concatenate((observation, goal), 1)
     np.testing.assert_allclose(
-        found[:, :14], np.clip((rows - NORMALISATION_BOB.offset) / NORMALISATION_BOB.scale, -5, 5)
+        found[:, :14], np.clip((rows - BOB.normalisation.offset) / BOB.normalisation.scale, -5, 5)
     )
     np.testing.assert_allclose(found[0, 14:17], [0.5, -1.0, 0.0], atol=1e-6)
     np.testing.assert_allclose(found[0, 17:], [1.0, 0.0, -0.5, 0.0, 5.0, -2.0], atol=1e-5)  # of 2 cm, at most five

@@ -16,7 +16,7 @@ _HOLD_S = 5.0
 
 @dataclass(frozen=True)
 class Placement:
-    """How N placements went."""
+    """Outcome of N placements."""
 
     grasped: np.ndarray
     """(N,) both fingers touched the object after closing."""

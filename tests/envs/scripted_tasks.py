@@ -12,11 +12,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.config import WorldConfig
-from service.envs import fixtures, kinematics
+from service.envs import kinematics, scene
 from service.envs.batch import DISPLACEMENT_M, LOWEST_TARGET_M, WorldBatch
 from service.envs.gym.registration import EPISODE_STEPS
-from service.envs.gym.tabletop import Setting
-from service.envs.observations import ACTION_SIZE
+from service.envs.observations import ACTION
+from service.envs.sampling import draw_goals
+from service.envs.tasks import SUCCESS_DISTANCE_M, find_task
 
 Array = NDArray[np.float64]
 Bools = NDArray[np.bool_]
@@ -122,13 +123,13 @@ class Scripted:
         return targets[self.phase, worlds], grips[self.phase]
 
     def _carry_height(self) -> float:
-        """Of the object's centre."""
-        highest = {"none": 0.0, "wall": fixtures.WALL_HEIGHT_M, "box": fixtures.BOX_HEIGHT_M}
+        """Height of the object's centre on its way."""
+        highest = {"none": 0.0, "wall": scene.WALL_HEIGHT_M, "box": scene.BOX_HEIGHT_M}
         return highest[self.worlds.config.fixture] + self.worlds.config.object_size_m / 2 + _ABOVE_M
 
     def _release_height(self) -> float:
-        """Of the object's centre; the fingertips are 1 cm below it when they hold it at its middle."""
-        return fixtures.BOX_HEIGHT_M + 0.015 if self.worlds.config.fixture == "box" else -np.inf
+        """Height of the object's centre; the fingertips are 1 cm below it when they hold it at its middle."""
+        return scene.BOX_HEIGHT_M + 0.015 if self.worlds.config.fixture == "box" else -np.inf
 
 
 def _at_height(position: Array, height_m: float) -> Array:
@@ -137,7 +138,7 @@ def _at_height(position: Array, height_m: float) -> Array:
 
 @dataclass(frozen=True, slots=True)
 class Played:
-    """How N episodes of one task went."""
+    """Outcome of N episodes of one task."""
 
     start: Array
     """(N, 3) where the objects were at first, metres."""
@@ -171,14 +172,15 @@ def play_task(
     num_threads: int = 0,
 ) -> Played:
     """Play random episodes of a task by the script, or doing nothing."""
-    setting = Setting.of(config, task, None, success_distance_m=0.05)
+    config = find_task(task).world_from(config)
     rng = np.random.default_rng(seed)
-    with WorldBatch(setting.config, num_episodes, num_threads=num_threads) as worlds:
+    with WorldBatch(config, num_episodes, num_threads=num_threads) as worlds:
         worlds.reset(rng)
-        start, goal = worlds.object_position.copy(), setting.draw_goals(rng, worlds)
+        start = worlds.object_position.copy()
+        goal = draw_goals(find_task(task).goals, rng, config, SUCCESS_DISTANCE_M, start=start, box=worlds.box_place)
         script = Scripted(worlds, goal)
         distances = []
         for _ in range(num_steps):
-            worlds.step(np.zeros((num_episodes, ACTION_SIZE), dtype=np.float32) if idle else script.act())
+            worlds.step(np.zeros((num_episodes, ACTION.size), dtype=np.float32) if idle else script.act())
             distances.append(np.linalg.norm(worlds.object_position - goal, axis=1))
-    return Played(start, goal, np.array(distances), setting.success_distance_m)
+    return Played(start, goal, np.array(distances), SUCCESS_DISTANCE_M)

@@ -158,7 +158,7 @@ class TestClipToReach:
         return np.random.default_rng(4).uniform((-0.5, -1.0, -0.5), (1.0, 1.0, 1.5), (5000, 3))
 
     def test_leaves_what_is_reachable(self):
-        target = sample_in_volume(np.random.default_rng(5), 2000, WorkspaceConfig(), 0.05)
+        target = sample_in_volume(np.random.default_rng(5), 2000, WorkspaceConfig(), 0.05, lowest_m=0.025)
         clipped = kinematics.clip_to_reach(target, LOWEST_TARGET_M)
         np.testing.assert_allclose(clipped, target, rtol=0, atol=1e-12)
 

@@ -61,31 +61,31 @@ def assert_layout(found, expected, size):
 
 
 def test_positions(worlds):
-    assert_layout(worlds.positions(), positions(worlds), observations.POSITIONS_SIZE)
+    assert_layout(worlds.positions(), positions(worlds), observations.POSITIONS.size)
 
 
 def test_full(worlds):
     expected = np.hstack([positions(worlds), privileged(worlds), np.full((2, 1), 0.25)])
-    assert_layout(worlds.full(0.25), expected, observations.FULL_SIZE)
+    assert_layout(worlds.full(0.25), expected, observations.FULL.size)
 
 
 def test_bob_value(worlds):
     relative = GOALS - [[0.2, -0.1, 0.3], [-0.15, 0.12, 0.025]]
     expected = np.hstack([positions(worlds), privileged(worlds), GOALS, relative])
-    assert_layout(worlds.bob_value(GOALS), expected, observations.BOB_VALUE_SIZE)
+    assert_layout(worlds.bob_value(GOALS), expected, observations.BOB_VALUE.size)
 
 
 def test_named_slices_are_where_the_table_says(worlds):
     bob = np.hstack([worlds.positions(), GOALS.astype(np.float32)])
-    assert bob.shape[1] == observations.BOB_SIZE
-    np.testing.assert_array_equal(bob[:, observations.OBJECT_SLICE], worlds.object_position.astype(np.float32))
-    np.testing.assert_array_equal(bob[:, observations.GOAL_SLICE], GOALS.astype(np.float32))
+    assert bob.shape[1] == observations.BOB.size
+    np.testing.assert_array_equal(bob[:, observations.BOB["object"]], worlds.object_position.astype(np.float32))
+    np.testing.assert_array_equal(bob[:, observations.BOB["goal"]], GOALS.astype(np.float32))
 
 
 def test_bobs_input_is_put_together(worlds):
     expected = np.hstack([positions(worlds), GOALS])
     found = observations.bob_observation(worlds.positions(), GOALS)
-    assert_layout(found, expected, observations.BOB_SIZE)
+    assert_layout(found, expected, observations.BOB.size)
     np.testing.assert_array_equal(found, worlds.observe(observations.BOB, goal=GOALS))
 
 
@@ -120,10 +120,10 @@ def test_normalisation_by_hand():
     scale = [0.12, 0.12, 0.12, 0.02, 0.02, 0.12, 0.12, 0.12, 0.1, 0.1, 0.1]
     motion_scale = [0.5, 0.5, 0.5, 0.2, 0.2, 0.5, 0.5, 0.5, 0.5, 0.5]
     goal_and_way = [0, 0, 0.15, 0, 0, 0], [0.12, 0.12, 0.12, 0.1, 0.1, 0.1]
-    value = observations.NORMALISATION_BOB_VALUE
+    value = observations.BOB_VALUE.normalisation
     np.testing.assert_array_equal(value.offset, np.float32([*offset, *[0] * 8, 0.5, 0.5, *goal_and_way[0]]))
     np.testing.assert_array_equal(value.scale, np.float32([*scale, *motion_scale, *goal_and_way[1]]))
-    full = observations.NORMALISATION_FULL
+    full = observations.FULL.normalisation
     np.testing.assert_array_equal(full.offset, np.float32([*offset, *[0] * 8, 0.5, 0.5, 0.5]))
     np.testing.assert_array_equal(full.scale, np.float32([*scale, *motion_scale, 0.5]))
 
@@ -131,11 +131,11 @@ def test_normalisation_by_hand():
 @pytest.mark.parametrize(
     ("mirror", "vector", "expected"),
     [
-        (observations.MIRROR_ACTION, ACTION, [1, -2, 3, 4]),
-        (observations.MIRROR_BOB, [*POSITIONS, 12, 13, 14], [*MIRRORED_POSITIONS, 12, -13, 14]),
-        (observations.MIRROR_FULL, [*POSITIONS, *PRIVILEGED, 22], [*MIRRORED_POSITIONS, *MIRRORED_PRIVILEGED, 22]),
+        (observations.ACTION.mirror, ACTION, [1, -2, 3, 4]),
+        (observations.BOB.mirror, [*POSITIONS, 12, 13, 14], [*MIRRORED_POSITIONS, 12, -13, 14]),
+        (observations.FULL.mirror, [*POSITIONS, *PRIVILEGED, 22], [*MIRRORED_POSITIONS, *MIRRORED_PRIVILEGED, 22]),
         (
-            observations.MIRROR_BOB_VALUE,
+            observations.BOB_VALUE.mirror,
             [*POSITIONS, *PRIVILEGED, 22, 23, 24, 25, 26, 27],
             [*MIRRORED_POSITIONS, *MIRRORED_PRIVILEGED, 22, -23, 24, 25, -26, 27],
         ),
@@ -152,10 +152,10 @@ def test_mirror_swaps_fingers_and_negates_y(mirror, vector, expected):
 @pytest.mark.parametrize(
     ("normalisation", "size"),
     [
-        (observations.NORMALISATION_POSITIONS, observations.POSITIONS_SIZE),
-        (observations.NORMALISATION_FULL, observations.FULL_SIZE),
-        (observations.NORMALISATION_BOB, observations.BOB_SIZE),
-        (observations.NORMALISATION_BOB_VALUE, observations.BOB_VALUE_SIZE),
+        (observations.POSITIONS.normalisation, observations.POSITIONS.size),
+        (observations.FULL.normalisation, observations.FULL.size),
+        (observations.BOB.normalisation, observations.BOB.size),
+        (observations.BOB_VALUE.normalisation, observations.BOB_VALUE.size),
     ],
     ids=["positions", "full", "bob", "bob value"],
 )
@@ -164,23 +164,23 @@ def test_normalisation_fits_its_vector(normalisation, size):
         assert part.shape == (size,)
         assert part.dtype == np.float32
     assert (normalisation.scale > 0).all()
-    shared = observations.NORMALISATION_POSITIONS
-    np.testing.assert_array_equal(normalisation.offset[: observations.POSITIONS_SIZE], shared.offset)
-    np.testing.assert_array_equal(normalisation.scale[: observations.POSITIONS_SIZE], shared.scale)
+    shared = observations.POSITIONS.normalisation
+    np.testing.assert_array_equal(normalisation.offset[: observations.POSITIONS.size], shared.offset)
+    np.testing.assert_array_equal(normalisation.scale[: observations.POSITIONS.size], shared.scale)
 
 
 def test_goal_and_object_are_normalised_alike():
-    bob = observations.NORMALISATION_BOB
+    bob = observations.BOB.normalisation
     for part in (bob.offset, bob.scale):
-        np.testing.assert_array_equal(part[observations.GOAL_SLICE], part[observations.OBJECT_SLICE])
+        np.testing.assert_array_equal(part[observations.BOB["goal"]], part[observations.BOB["object"]])
 
 
 @pytest.mark.parametrize(
     ("normalisation", "mirror"),
     [
-        (observations.NORMALISATION_FULL, observations.MIRROR_FULL),
-        (observations.NORMALISATION_BOB, observations.MIRROR_BOB),
-        (observations.NORMALISATION_BOB_VALUE, observations.MIRROR_BOB_VALUE),
+        (observations.FULL.normalisation, observations.FULL.mirror),
+        (observations.BOB.normalisation, observations.BOB.mirror),
+        (observations.BOB_VALUE.normalisation, observations.BOB_VALUE.mirror),
     ],
     ids=["full", "bob", "bob value"],
 )

@@ -7,7 +7,7 @@ import pytest
 from service.config import WorldConfig
 from service.envs import kinematics
 from service.envs.batch import LOWEST_TARGET_M, WorldBatch
-from service.envs.observations import MIRROR_ACTION, MIRROR_FULL
+from service.envs.observations import ACTION, FULL
 from service.envs.sampling import sample_in_volume
 from tests.envs.scripted import CLOSE, OPEN, grasp, place_in_air
 from tests.envs.world_soak import soak
@@ -184,13 +184,13 @@ def mirrored_runs(symmetric, num_steps):
             make_symmetric(reflected.model)
         worlds.reset(rng)
         reflected.restore(mirror_state(worlds.states))
-        np.testing.assert_array_equal(reflected.full(0.5), MIRROR_FULL(worlds.full(0.5)))
+        np.testing.assert_array_equal(reflected.full(0.5), FULL.mirror(worlds.full(0.5)))
         differences = []
         for _ in range(num_steps):
             actions = rng.uniform(-1.0, 1.0, (40, 4)).astype(np.float32)
             worlds.step(actions)
-            reflected.step(MIRROR_ACTION(actions))
-            differences.append(np.abs(MIRROR_FULL(worlds.full(0.5)) - reflected.full(0.5)).max(axis=0))
+            reflected.step(ACTION.mirror(actions))
+            differences.append(np.abs(FULL.mirror(worlds.full(0.5)) - reflected.full(0.5)).max(axis=0))
     return np.array(differences)
 
 

@@ -10,7 +10,7 @@ import torch
 
 from service.actors.rollout import Demonstrations, Rollout, Turns
 from service.config import Config, parse_config
-from service.envs.observations import ACTION_SIZE, BOB_SIZE, BOB_VALUE_SIZE, FULL_SIZE
+from service.envs.observations import ACTION, BOB, BOB_VALUE, FULL
 from service.generator.records import GoalRecords
 from service.learner.learner import Learner
 from service.learner.player import Player
@@ -43,7 +43,7 @@ def make_turns(rng: np.random.Generator, observation_size: int, value_size: int,
         observation=_normal(rng, 0.1, *shape, observation_size),
         value_observation=_normal(rng, 0.1, *shape, value_size),
         final_value_observation=_normal(rng, 0.1, NUM_WORLDS, value_size),
-        action=_normal(rng, 0.7, *shape, ACTION_SIZE),
+        action=_normal(rng, 0.7, *shape, ACTION.size),
         log_prob=_normal(rng, 0.01, *shape),
         reward=terminated.astype(np.float32),
         active=steps < lengths,
@@ -56,8 +56,8 @@ def make_turns(rng: np.random.Generator, observation_size: int, value_size: int,
 def make_rollout(learner: Learner, sequence: int, *, seed: int = 0, num_demonstrations: int = 12) -> Rollout:
     """A rollout whose actions the learner's present policies could have drawn."""
     rng = np.random.default_rng([seed, sequence])
-    alice = make_turns(rng, FULL_SIZE, FULL_SIZE)
-    bob = make_turns(rng, BOB_SIZE, BOB_VALUE_SIZE)
+    alice = make_turns(rng, FULL.size, FULL.size)
+    bob = make_turns(rng, BOB.size, BOB_VALUE.size)
     return Rollout(
         actor=0,
         incarnation=0,
@@ -73,7 +73,7 @@ def make_rollout(learner: Learner, sequence: int, *, seed: int = 0, num_demonstr
 
 
 def make_demonstrations(rng: np.random.Generator, num: int) -> Demonstrations:
-    return Demonstrations(_normal(rng, 0.1, num, BOB_SIZE), _normal(rng, 0.3, num, ACTION_SIZE))
+    return Demonstrations(_normal(rng, 0.1, num, BOB.size), _normal(rng, 0.3, num, ACTION.size))
 
 
 def acted_by(player: Player, turns: Turns) -> Turns:

@@ -5,7 +5,7 @@ import pytest
 import torch
 from safetensors.numpy import load, save
 
-from service.envs.observations import MIRROR_ACTION, MIRROR_BOB
+from service.envs.observations import ACTION, BOB
 from service.learner.learner import Learner, _rng_from_array, _rng_to_array, torch_device
 from service.learner.player import LearnerError
 from tests.learner.rollouts import make_config, make_rollout, nobody_learns
@@ -312,8 +312,8 @@ def test_mirroring_doubles_what_bob_learns_from():
     learner = Learner(make_config(mirror=True))
     rollout = make_rollout(learner, 0)
     cloning = learner._cloning([rollout])
-    np.testing.assert_array_equal(cloning.observation[12:], MIRROR_BOB(rollout.demonstrations.observation))
-    np.testing.assert_array_equal(cloning.action[12:], MIRROR_ACTION(rollout.demonstrations.action))
+    np.testing.assert_array_equal(cloning.observation[12:], BOB.mirror(rollout.demonstrations.observation))
+    np.testing.assert_array_equal(cloning.action[12:], ACTION.mirror(rollout.demonstrations.action))
     metrics, plain = updated(learner, 0), updated(Learner(make_config()), 0)
     for name in ("num_bob_samples", "num_demonstrations", "num_alice_samples"):
         assert metrics[f"learner/{name}"] == plain[f"learner/{name}"]

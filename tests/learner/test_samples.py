@@ -6,14 +6,7 @@ import torch
 from torch import nn
 
 from service.config import PPOConfig
-from service.envs.observations import (
-    ACTION_SIZE,
-    BOB_SIZE,
-    BOB_VALUE_SIZE,
-    MIRROR_ACTION,
-    MIRROR_BOB,
-    MIRROR_BOB_VALUE,
-)
+from service.envs.observations import ACTION, BOB, BOB_VALUE
 from service.learner.player import Player
 from service.learner.ppo import advantages, collect
 from service.learner.samples import Cloning, Samples, augment_by_symmetry, minibatches
@@ -24,7 +17,7 @@ CONFIG = PPOConfig()
 
 
 def make_bob_turns(seed=0, **overrides):
-    return make_turns(np.random.default_rng(seed), BOB_SIZE, BOB_VALUE_SIZE, **overrides)
+    return make_turns(np.random.default_rng(seed), BOB.size, BOB_VALUE.size, **overrides)
 
 
 class Estimate(nn.Module):
@@ -39,7 +32,7 @@ class Zero(nn.Module):
 
 class Policy(nn.Module):
     def forward(self, observation):
-        mean = observation[:, 1:2].expand(-1, ACTION_SIZE)
+        mean = observation[:, 1:2].expand(-1, ACTION.size)
         return mean, torch.full_like(mean, 2.0)
 
 
@@ -114,7 +107,7 @@ def test_equal_advantages_become_zero():
 
 def test_samples_are_augmented_by_their_reflections():
     samples = collect([make_bob_turns()], PLAYER)
-    mirrors = MIRROR_BOB, MIRROR_BOB_VALUE, MIRROR_ACTION
+    mirrors = BOB.mirror, BOB_VALUE.mirror, ACTION.mirror
     doubled = augment_by_symmetry(samples, PLAYER)
     num = len(samples)
     assert len(doubled) == 2 * num

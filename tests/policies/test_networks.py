@@ -10,16 +10,7 @@ import pytest
 import torch
 
 from service.config import MCPConfig, PolicyConfig
-from service.envs.observations import (
-    ACTION_SIZE,
-    BOB_SIZE,
-    BOB_VALUE_SIZE,
-    FULL_SIZE,
-    GOAL_SLICE,
-    NORMALISATION_BOB,
-    NORMALISATION_FULL,
-    POSITIONS_SIZE,
-)
+from service.envs.observations import ACTION, BOB, BOB_VALUE, FULL, POSITIONS
 from service.policies.gaussian import log_prob
 from service.policies.networks import (
     GaussianPolicy,
@@ -42,21 +33,21 @@ def seeded() -> None:
 
 
 def test_shapes(alice: GaussianPolicy, bob: MCPPolicy, config: PolicyConfig) -> None:
-    for policy, size in ((alice, FULL_SIZE), (bob, BOB_SIZE)):
+    for policy, size in ((alice, FULL.size), (bob, BOB.size)):
         for batch in ((), (5,), (2, 5)):
             mean, std = policy(torch.zeros(*batch, size))
-            assert mean.shape == std.shape == (*batch, ACTION_SIZE)
+            assert mean.shape == std.shape == (*batch, ACTION.size)
             assert mean.dtype == torch.float32
-    means, variances = bob.primitives(torch.zeros(2, 5, POSITIONS_SIZE))
-    assert means.shape == variances.shape == (2, 5, config.bob.num_primitives, ACTION_SIZE)
-    assert make_alice_value(config)(torch.zeros(2, 5, FULL_SIZE)).shape == (2, 5)
-    assert make_bob_value(config)(torch.zeros(2, 5, BOB_VALUE_SIZE)).shape == (2, 5)
+    means, variances = bob.primitives(torch.zeros(2, 5, POSITIONS.size))
+    assert means.shape == variances.shape == (2, 5, config.bob.num_primitives, ACTION.size)
+    assert make_alice_value(config)(torch.zeros(2, 5, FULL.size)).shape == (2, 5)
+    assert make_bob_value(config)(torch.zeros(2, 5, BOB_VALUE.size)).shape == (2, 5)
 
 
 def test_goal_reaches_only_the_gate(bob: MCPPolicy, observe: Observe) -> None:
-    rows = torch.tensor(observe(20, BOB_SIZE), requires_grad=True)
+    rows = torch.tensor(observe(20, BOB.size), requires_grad=True)
     moved = rows.detach().clone()
-    moved[:, GOAL_SLICE] += 0.1
+    moved[:, BOB["goal"]] += 0.1
     parts: list[tuple[torch.Tensor, torch.Tensor]] = []
     bob.primitives.register_forward_hook(lambda _module, _inputs, output: parts.append(output))
     bob(rows)
@@ -64,15 +55,15 @@ def test_goal_reaches_only_the_gate(bob: MCPPolicy, observe: Observe) -> None:
     for before, after in zip(*parts, strict=True):
         assert torch.equal(before, after)
         (gradient,) = torch.autograd.grad(before.sum(), rows, retain_graph=True)
-        assert (gradient[:, GOAL_SLICE] == 0.0).all()
-        assert (gradient[:, :POSITIONS_SIZE] != 0.0).any()
+        assert (gradient[:, BOB["goal"]] == 0.0).all()
+        assert (gradient[:, : POSITIONS.size] != 0.0).any()
     assert (bob.gate(rows) - bob.gate(moved)).abs().max() > 1e-3
 
 
 def test_gate_sees_the_goal_relative_to_the_object_on_its_own_scale(bob: MCPPolicy) -> None:
     seen: list[torch.Tensor] = []
     bob.gate.input.register_forward_hook(lambda _module, _inputs, output: seen.append(output))
-    row = torch.zeros(BOB_SIZE)
+    row = torch.zeros(BOB.size)
     row[5:8] = torch.tensor([0.01, 0.02, 0.03])
     row[11:14] = torch.tensor([0.06, -0.03, 0.03])
     bob.gate(row)
@@ -80,7 +71,7 @@ def test_gate_sees_the_goal_relative_to_the_object_on_its_own_scale(bob: MCPPoli
 
 
 def test_every_primitive_is_the_network_written_out(bob: MCPPolicy, config: PolicyConfig, observe: Observe) -> None:
-    positions = torch.tensor(observe(20, POSITIONS_SIZE))
+    positions = torch.tensor(observe(20, POSITIONS.size))
     means, variances = bob.primitives(positions)
     head = config.bob.primitive_hidden_size
     for index in range(config.bob.num_primitives):
@@ -100,14 +91,14 @@ def test_every_primitive_is_the_network_written_out(bob: MCPPolicy, config: Poli
 def test_outputs_are_bounded_for_any_input(
     alice: GaussianPolicy, bob: MCPPolicy, config: PolicyConfig, magnitude: float
 ) -> None:
-    signs = torch.tensor(np.random.default_rng(0).choice([-1.0, 1.0], (64, FULL_SIZE)), dtype=torch.float32)
+    signs = torch.tensor(np.random.default_rng(0).choice([-1.0, 1.0], (64, FULL.size)), dtype=torch.float32)
     mean, std = alice(magnitude * signs)
     assert (mean.abs() <= 2.0).all()
     assert (std.log() >= config.alice_log_std_min - ULP).all()
     assert (std.log() <= config.alice_log_std_max + ULP).all()
     if math.isinf(magnitude):
         return  # goal - object of two infinities is no number
-    rows = magnitude * signs[:, :BOB_SIZE]
+    rows = magnitude * signs[:, : BOB.size]
     weights = bob.gate(rows)
     assert (weights >= config.bob.weight_floor - ULP).all()
     assert (weights <= 1.0 + ULP).all()
@@ -124,10 +115,10 @@ def test_saturated_outputs_reach_their_bounds_and_no_further() -> None:
     with torch.no_grad():
         policy.primitives.output_bias.fill_(1e6)
         policy.gate.output.bias.fill_(-1e6)
-    means, variances = policy.primitives(torch.zeros(POSITIONS_SIZE))
+    means, variances = policy.primitives(torch.zeros(POSITIONS.size))
     np.testing.assert_allclose(means.detach(), 2.0)
     np.testing.assert_allclose(variances.detach(), math.exp(2 * 0.5), rtol=1e-6)
-    np.testing.assert_allclose(policy.gate(torch.zeros(BOB_SIZE)).detach(), 0.01, rtol=1e-6)
+    np.testing.assert_allclose(policy.gate(torch.zeros(BOB.size)).detach(), 0.01, rtol=1e-6)
 
 
 @pytest.mark.parametrize("num_primitives", [1, 2, 4])  # more would need wider primitives than log_std_max allows
@@ -137,7 +128,7 @@ def test_initial_players_explore_with_the_stated_std(num_primitives: int) -> Non
     rng = np.random.default_rng(0)
     full, bob_rows = (
         torch.tensor(layout.offset + layout.scale * rng.standard_normal((500, len(layout.offset))), dtype=torch.float32)
-        for layout in (NORMALISATION_FULL, NORMALISATION_BOB)
+        for layout in (FULL.normalisation, BOB.normalisation)
     )
     mean, std = make_alice(config)(full)
     assert mean.abs().max() < 0.1
@@ -154,8 +145,8 @@ def test_initial_players_explore_with_the_stated_std(num_primitives: int) -> Non
 @pytest.mark.usefixtures("seeded")
 def test_initial_primitives_and_weights_differ() -> None:
     bob = make_bob(PolicyConfig())
-    rows = torch.tensor(NORMALISATION_BOB.offset) + torch.randn(500, BOB_SIZE) * torch.tensor(NORMALISATION_BOB.scale)
-    means, _ = bob.primitives(rows[:, :POSITIONS_SIZE])
+    rows = torch.tensor(BOB.normalisation.offset) + torch.randn(500, BOB.size) * torch.tensor(BOB.normalisation.scale)
+    means, _ = bob.primitives(rows[:, : POSITIONS.size])
     weights = bob.gate(rows)
     assert means.std(dim=1).mean() > 0.05
     assert weights.std(dim=1).mean() > 0.05
@@ -164,12 +155,12 @@ def test_initial_primitives_and_weights_differ() -> None:
 
 @pytest.mark.usefixtures("seeded")
 def test_initial_values_are_near_zero() -> None:
-    assert make_alice_value(PolicyConfig())(torch.randn(100, FULL_SIZE)).abs().max() < 0.1
-    assert make_bob_value(PolicyConfig())(torch.randn(100, BOB_VALUE_SIZE)).abs().max() < 0.1
+    assert make_alice_value(PolicyConfig())(torch.randn(100, FULL.size)).abs().max() < 0.1
+    assert make_bob_value(PolicyConfig())(torch.randn(100, BOB_VALUE.size)).abs().max() < 0.1
 
 
 def test_log_prob_has_a_gradient_for_every_parameter(alice: GaussianPolicy, bob: MCPPolicy, observe: Observe) -> None:
-    for policy, size in ((alice, FULL_SIZE), (bob, BOB_SIZE)):
+    for policy, size in ((alice, FULL.size), (bob, BOB.size)):
         mean, std = policy(torch.tensor(observe(50, size)))
         log_prob(mean.detach() + 0.5, mean, std).mean().backward()
         for name, parameter in policy.named_parameters():

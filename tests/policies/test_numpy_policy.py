@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from service.config import PolicyConfig
-from service.envs.observations import BOB_SIZE, FULL_SIZE, POSITIONS_SIZE
+from service.envs.observations import BOB, FULL, POSITIONS
 from service.policies import gaussian
 from service.policies.networks import GaussianPolicy, MCPPolicy, export_parameters, make_alice, make_bob
 from service.policies.numpy_policy import NumpyGaussianPolicy, NumpyMCPPolicy
@@ -25,8 +25,8 @@ Players = list[tuple[NumpyGaussianPolicy | NumpyMCPPolicy, GaussianPolicy | MCPP
 def players(alice: GaussianPolicy, bob: MCPPolicy) -> Players:
     """NumPy policy, network and observation size of both players."""
     return [
-        (NumpyGaussianPolicy(export_parameters(alice)), alice, FULL_SIZE),
-        (NumpyMCPPolicy(export_parameters(bob)), bob, BOB_SIZE),
+        (NumpyGaussianPolicy(export_parameters(alice)), alice, FULL.size),
+        (NumpyMCPPolicy(export_parameters(bob)), bob, BOB.size),
     ]
 
 
@@ -49,8 +49,8 @@ def test_distribution_equals_torch(players: Players, observe: Observe) -> None:
 def test_primitives_gate_and_compose_equal_torch(bob: MCPPolicy, config: PolicyConfig, observe: Observe) -> None:
     numpy_policy = NumpyMCPPolicy(export_parameters(bob))
     assert numpy_policy.num_primitives == config.bob.num_primitives
-    rows = observe(60, BOB_SIZE).reshape(3, 20, BOB_SIZE)
-    positions = rows[..., :POSITIONS_SIZE]
+    rows = observe(60, BOB.size).reshape(3, 20, BOB.size)
+    positions = rows[..., : POSITIONS.size]
     means, variances = numpy_policy.primitives(positions)
     expected_means, expected_variances = bob.primitives(torch.tensor(positions))
     _close(means, expected_means)
@@ -96,7 +96,7 @@ def test_a_row_does_not_depend_on_the_others(players: Players, observe: Observe)
 def test_evaluating_leaves_observations_and_parameters_alone(bob: MCPPolicy, observe: Observe) -> None:
     parameters = export_parameters(bob)
     numpy_policy = NumpyMCPPolicy(parameters)
-    rows = observe(30, BOB_SIZE)
+    rows = observe(30, BOB.size)
     kept = rows.copy()
     before = np.stack(numpy_policy.distribution(rows))
     for value in parameters.values():

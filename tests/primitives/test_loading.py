@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from service.envs.observations import BOB_SIZE, FULL_SIZE
+from service.envs.observations import BOB, FULL
 from service.errors import TandemError
 from service.io import checkpoints
 from service.io.run_directory import RunDirectory
@@ -44,7 +44,7 @@ def test_the_newest_bob_of_a_run_directory(run, tmp_path):
     assert bob.label == str(path)
     assert bob.manifest is None
     assert bob.config == tiny_config(total_env_steps=400, checkpoint_interval=1)
-    rows = observations(BOB_SIZE)
+    rows = observations(BOB.size)
     expected = NumpyMCPPolicy(learner.weights().bob).act_deterministic(rows)
     assert np.array_equal(bob.policy.act_deterministic(rows), expected)
 
@@ -76,7 +76,7 @@ def test_a_published_bob(run, registry, reference):
     assert bob.label == "tiny@1"
     assert bob.config == tiny_config()
     assert bob.manifest == Registry(registry).manifest("tiny@1")
-    rows = observations(BOB_SIZE)
+    rows = observations(BOB.size)
     expected = NumpyMCPPolicy(run[1].weights().bob).act_deterministic(rows)
     assert np.array_equal(bob.policy.act_deterministic(rows), expected)
 
@@ -92,9 +92,9 @@ def test_both_players(run):
     path, learner = run
     alice, bob = load_players(RunDirectory(path))
     weights = learner.weights()
-    rows = observations(FULL_SIZE)
+    rows = observations(FULL.size)
     assert np.array_equal(alice.act_deterministic(rows), NumpyGaussianPolicy(weights.alice).act_deterministic(rows))
-    rows = observations(BOB_SIZE)
+    rows = observations(BOB.size)
     assert np.array_equal(bob.act_deterministic(rows), NumpyMCPPolicy(weights.bob).act_deterministic(rows))
 
 

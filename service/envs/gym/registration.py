@@ -18,19 +18,14 @@ EPISODE_STEPS = 50
 
 def register_all() -> None:
     """Register every environment; a second call changes nothing."""
-    _register(TABLETOP_ID)
-    for name, task in TASKS.items():
-        _register(task.id, task=name)
-
-
-def _register(name: str, **options: str) -> None:
-    if name not in gymnasium.registry:
+    options: dict[str, dict[str, str]] = {TABLETOP_ID: {}, **{task.id: {"task": name} for name, task in TASKS.items()}}
+    for name in [name for name in options if name not in gymnasium.registry]:
         gymnasium.register(
             id=name,
             entry_point="service.envs.gym.tabletop:TabletopEnv",
             vector_entry_point="service.envs.gym.vector:TabletopVectorEnv",
             max_episode_steps=EPISODE_STEPS,
-            kwargs=options,
+            kwargs=options[name],
         )
 
 

@@ -12,11 +12,11 @@ from numpy.typing import NDArray
 
 from service.config import WorldConfig
 from service.envs.batch import WorldBatch
-from service.envs.goals import GoalKind, check_goals, draw_goals
-from service.envs.observations import ACTION_SIZE, OBJECT_SLICE, POSITIONS_SIZE
+from service.envs.observations import ACTION, POSITIONS
+from service.envs.sampling import GoalKind, check_goals, draw_goals
 from service.envs.tasks import find_task
 from service.errors import TandemError
-from service.types import FloatArray, StateArray
+from service.types import BoolArray, FloatArray, StateArray
 
 if TYPE_CHECKING:
     from service.envs.rendering.renderer import SceneRenderer
@@ -27,68 +27,71 @@ _FURTHEST_M = 10.0
 """Bound of every position: an object off the table falls for ever, a space needs an end."""
 
 
-@dataclass(frozen=True, slots=True)
-class Setting:
-    """A world and its goals: the part that an environment of one world shares with one of many."""
+class GoalWorlds:
+    """Worlds with a goal for the object of each: the part that the environments of one world and of many share.
 
-    config: WorldConfig
-    goals: GoalKind
-    success_distance_m: float
+    Args: those of ``TabletopEnv`` and of ``WorldBatch``.
 
-    @classmethod
-    def of(
-        cls, config: WorldConfig | None, task: str | None, goals: GoalKind | None, success_distance_m: float
-    ) -> Setting:
-        """Make a setting from the arguments of an environment.
+    Raises:
+        TandemError: unknown task or goals, goals that the world cannot have, a distance that is not positive.
+    """
 
-        Raises:
-            TandemError: unknown task or goals, goals that the world cannot have, a distance that is not positive.
-        """
-        config = config or WorldConfig()
+    def __init__(
+        self,
+        num_worlds: int,
+        num_threads: int,
+        config: WorldConfig | None,
+        task: str | None,
+        goals: GoalKind | None,
+        success_distance_m: float,
+    ) -> None:
+        self.config = config or WorldConfig()
         if task is not None:
             if goals is not None:
                 raise TandemError(
                     f"goals = {goals!r} beside task = {task!r}: the task has its own; give one of the two"
                 )
-            config, goals = find_task(task).world_from(config), find_task(task).goals
-        goals = goals or ("mixed" if config.fixture == "none" else "table")
-        check_goals(goals, config)
+            self.config, goals = find_task(task).world_from(self.config), find_task(task).goals
+        self.goals: GoalKind = goals or ("mixed" if self.config.fixture == "none" else "table")
+        check_goals(self.goals, self.config)
         if not success_distance_m > 0.0:
             raise TandemError(f"success_distance_m = {success_distance_m}; give a distance above 0 m")
-        return cls(config, goals, success_distance_m)
+        self.success_distance_m = success_distance_m
+        self._worlds = WorldBatch(self.config, num_worlds, num_threads=num_threads)
+        self._goal = self._worlds.object_position.copy()
 
-    def draw_goals(self, rng: np.random.Generator, worlds: WorldBatch, index: slice = slice(None)) -> StateArray:
-        """(num, 3) goals for worlds at their start, metres."""
-        start, box = worlds.object_position[index], worlds.box_place[index]
-        return draw_goals(self.goals, rng, self.config, self.success_distance_m, start=start, box=box)
+    def compute_reward(self, achieved_goal: NDArray[Any], desired_goal: NDArray[Any], info: Any) -> Any:
+        """Reward of (..., 3) achieved for (..., 3) desired goals, metres: (...) float64, 1 where reached, else 0.
 
-    def reward(self, achieved_goal: NDArray[Any], desired_goal: NDArray[Any]) -> Any:
-        """(...) 1 where (..., 3) achieved goals are within the success distance of (..., 3) desired ones, else 0."""
+        ``info`` is there for the convention of goal environments and is not read.
+        """
         distance = np.linalg.norm(np.asarray(achieved_goal) - np.asarray(desired_goal), axis=-1)
         return (distance <= self.success_distance_m).astype(np.float64)
 
+    def _draw_goals(self, rng: np.random.Generator, worlds: slice) -> None:
+        """Give new goals to worlds at their start."""
+        start, box = self._worlds.object_position[worlds], self._worlds.box_place[worlds]
+        self._goal[worlds] = draw_goals(self.goals, rng, self.config, self.success_distance_m, start=start, box=box)
+
+    def _observe(self) -> tuple[Observation, BoolArray]:
+        """(N, ...) observations, and (N,) true where the object is at its goal."""
+        positions = np.clip(self._worlds.positions(), -_FURTHEST_M, _FURTHEST_M)
+        achieved, desired = positions[:, POSITIONS["object"]].copy(), self._goal.astype(np.float32)
+        observation = {"observation": positions, "achieved_goal": achieved, "desired_goal": desired}
+        return observation, self.compute_reward(achieved, desired, {}) > 0.0
+
 
 def goal_space() -> gymnasium.spaces.Dict:
-    """The observations of one world."""
-    sizes = {"observation": POSITIONS_SIZE, "achieved_goal": 3, "desired_goal": 3}
+    """Make the space of the observations of one world."""
+    sizes = {"observation": POSITIONS.size, "achieved_goal": 3, "desired_goal": 3}
     return gymnasium.spaces.Dict(
         {name: gymnasium.spaces.Box(-_FURTHEST_M, _FURTHEST_M, (size,), np.float32) for name, size in sizes.items()}
     )
 
 
 def action_space() -> gymnasium.Space[FloatArray]:
-    """The actions of one world."""
-    return gymnasium.spaces.Box(-1.0, 1.0, (ACTION_SIZE,), np.float32)
-
-
-def observe(worlds: WorldBatch, goal: StateArray) -> Observation:
-    """Observations of N worlds with (N, 3) goals, (N, ...) each."""
-    positions = np.clip(worlds.positions(), -_FURTHEST_M, _FURTHEST_M)
-    return {
-        "observation": positions,
-        "achieved_goal": positions[:, OBJECT_SLICE].copy(),
-        "desired_goal": goal.astype(np.float32),
-    }
+    """Make the space of the actions of one world."""
+    return gymnasium.spaces.Box(-1.0, 1.0, (ACTION.size,), np.float32)
 
 
 @dataclass(frozen=True, slots=True)
@@ -103,7 +106,7 @@ class TabletopState:
     """State of the bit generator that draws object and goal at the next reset."""
 
 
-class TabletopEnv(gymnasium.Env[Any, FloatArray]):
+class TabletopEnv(GoalWorlds, gymnasium.Env[Any, FloatArray]):
     """A Panda at a table, one rigid object, and a goal for the object's centre.
 
     - observation: ``observation`` (11,) positions as Bob's primitives see them (``service.envs.observations``),
@@ -144,17 +147,12 @@ class TabletopEnv(gymnasium.Env[Any, FloatArray]):
     ) -> None:
         if render_mode not in (None, *self.metadata["render_modes"]):
             raise TandemError(f"TabletopEnv: render_mode = {render_mode!r}; choose rgb_array or None")
-        self._setting = Setting.of(config, task, goals, success_distance_m)
-        self.config = self._setting.config
-        self.goals = self._setting.goals
-        self.success_distance_m = success_distance_m
+        super().__init__(1, 1, config, task, goals, success_distance_m)
         self.render_mode = render_mode
         self.observation_space = goal_space()
         self.action_space = action_space()
         self._image_size = (width, height)
         self._renderer: SceneRenderer | None = None
-        self._worlds = WorldBatch(self.config, 1, num_threads=1)
-        self._goal = self._worlds.object_position[0].copy()
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -167,9 +165,9 @@ class TabletopEnv(gymnasium.Env[Any, FloatArray]):
         """
         super().reset(seed=seed, options=options)
         self._worlds.reset(self.np_random)
-        self._goal = self._setting.draw_goals(self.np_random, self._worlds)[0]
-        observation = self._observe()
-        return observation, {"is_success": self._is_success(observation)}
+        self._draw_goals(self.np_random, slice(None))
+        observation, success = self._observe_first()
+        return observation, {"is_success": success}
 
     def step(self, action: FloatArray) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
         """Act for one control step.
@@ -178,21 +176,13 @@ class TabletopEnv(gymnasium.Env[Any, FloatArray]):
             ValueError: action of the wrong shape or not finite.
         """
         diverged = bool(self._worlds.step(np.asarray(action, dtype=np.float32)[None])[0])
-        observation = self._observe()
-        success = self._is_success(observation)
+        observation, success = self._observe_first()
         return observation, float(success), False, diverged, {"is_success": success, "diverged": diverged}
-
-    def compute_reward(self, achieved_goal: NDArray[Any], desired_goal: NDArray[Any], info: Any) -> Any:
-        """Reward of (..., 3) achieved for (..., 3) desired goals, metres: (...) float64, 1 where reached, else 0.
-
-        ``info`` is there for the convention of goal environments and is not read.
-        """
-        return self._setting.reward(achieved_goal, desired_goal)
 
     def state(self) -> TabletopState:
         """Copy everything that :meth:`restore` needs; the elapsed steps of a time limit belong to its wrapper."""
         random = deepcopy(self.np_random.bit_generator.state)
-        return TabletopState(self._worlds.states[0].copy(), self._goal.copy(), dict(random))
+        return TabletopState(self._worlds.states[0].copy(), self._goal[0].copy(), dict(random))
 
     def restore(self, state: TabletopState) -> Observation:
         """Go back to a saved state, of this or another environment of the same config; continues bit-identically.
@@ -201,9 +191,9 @@ class TabletopEnv(gymnasium.Env[Any, FloatArray]):
             The observation there.
         """
         self._worlds.restore(state.world[None])
-        self._goal = state.goal.copy()
+        self._goal[0] = state.goal
         self.np_random.bit_generator.state = deepcopy(state.random)
-        return self._observe()
+        return self._observe_first()[0]
 
     def render(self) -> Any:
         """(height, width, 3) uint8 picture of the world and its goal; None without a render mode."""
@@ -213,7 +203,7 @@ class TabletopEnv(gymnasium.Env[Any, FloatArray]):
             from service.envs.rendering.renderer import SceneRenderer
 
             self._renderer = SceneRenderer(self.config, *self._image_size)
-        return self._renderer.render(self._worlds.states[0], self._goal)
+        return self._renderer.render(self._worlds.states[0], self._goal[0])
 
     def close(self) -> None:
         """Free the renderer and the physics; the environment cannot step afterwards."""
@@ -222,8 +212,6 @@ class TabletopEnv(gymnasium.Env[Any, FloatArray]):
             self._renderer = None
         self._worlds.close()
 
-    def _observe(self) -> Observation:
-        return {name: value[0] for name, value in observe(self._worlds, self._goal[None]).items()}
-
-    def _is_success(self, observation: Observation) -> bool:
-        return bool(self.compute_reward(observation["achieved_goal"], observation["desired_goal"], {}))
+    def _observe_first(self) -> tuple[Observation, bool]:
+        observation, success = self._observe()
+        return {name: value[0] for name, value in observation.items()}, bool(success[0])

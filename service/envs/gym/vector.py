@@ -15,9 +15,8 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
 from service.config import WorldConfig
-from service.envs.batch import WorldBatch
-from service.envs.goals import GoalKind
-from service.envs.gym.tabletop import Observation, Setting, action_space, goal_space, observe
+from service.envs.gym.tabletop import GoalWorlds, Observation, action_space, goal_space
+from service.envs.sampling import GoalKind
 from service.errors import TandemError
 from service.types import BoolArray, FloatArray, StateArray
 
@@ -38,7 +37,7 @@ class VectorState:
     """State of each world's bit generator."""
 
 
-class TabletopVectorEnv(gymnasium.vector.VectorEnv[Any, FloatArray, NDArray[Any]]):
+class TabletopVectorEnv(GoalWorlds, gymnasium.vector.VectorEnv[Any, FloatArray, NDArray[Any]]):
     """N environments like ``TabletopEnv``, whose worlds are stepped in native threads.
 
     World i of a reset with seed s plays the very episodes, bit for bit, of a ``TabletopEnv`` that was reset with seed
@@ -76,15 +75,12 @@ class TabletopVectorEnv(gymnasium.vector.VectorEnv[Any, FloatArray, NDArray[Any]
         for name, value in {"num_envs": num_envs, "max_episode_steps": max_episode_steps}.items():
             if value < 1:
                 raise TandemError(f"TabletopVectorEnv: {name} = {value}; give at least 1")
-        self._setting = Setting.of(config, task, goals, success_distance_m)
-        self.config = self._setting.config
+        super().__init__(num_envs, num_threads, config, task, goals, success_distance_m)
         self.num_envs = num_envs
         self.max_episode_steps = max_episode_steps
         self.single_observation_space, self.single_action_space = goal_space(), action_space()
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
-        self._worlds = WorldBatch(self.config, num_envs, num_threads=num_threads)
-        self._goal = self._worlds.object_position.copy()
         self._elapsed = np.zeros(num_envs, dtype=np.int64)
         self._random = [seeding.np_random()[0] for _ in range(num_envs)]
 
@@ -108,8 +104,8 @@ class TabletopVectorEnv(gymnasium.vector.VectorEnv[Any, FloatArray, NDArray[Any]
                 if each is not None:
                     self._random[world] = seeding.np_random(each)[0]
         self._start(np.ones(self.num_envs, dtype=bool))
-        observation = observe(self._worlds, self._goal)
-        return observation, _with_masks({"is_success": self._is_success(observation)})
+        observation, success = self._observe()
+        return observation, _with_masks({"is_success": success})
 
     def step(self, actions: FloatArray) -> tuple[Observation, NDArray[Any], BoolArray, BoolArray, Info]:
         """Act for one control step in every world; see the class for what happens where an episode ends.
@@ -119,8 +115,8 @@ class TabletopVectorEnv(gymnasium.vector.VectorEnv[Any, FloatArray, NDArray[Any]
         """
         diverged = self._worlds.step(np.asarray(actions, dtype=np.float32))
         self._elapsed += 1
-        observation = observe(self._worlds, self._goal)
-        success = self._is_success(observation)
+        observation, success = self._observe()
+        reward = success.astype(np.float64)
         truncated = diverged | (self._elapsed >= self.max_episode_steps)
         info: Info = {}
         if truncated.any():
@@ -128,15 +124,11 @@ class TabletopVectorEnv(gymnasium.vector.VectorEnv[Any, FloatArray, NDArray[Any]
             last = {"is_success": success & truncated, "diverged": diverged}
             info |= _with_masks({"final_info": _with_masks(last, truncated)}, truncated)
             self._start(truncated)
-            observation = observe(self._worlds, self._goal)
-        info |= _with_masks({"is_success": self._is_success(observation)})
+            observation, success = self._observe()
+        info |= _with_masks({"is_success": success})
         if not truncated.all():
             info |= _with_masks({"diverged": diverged & ~truncated}, ~truncated)
-        return observation, success.astype(np.float64), np.zeros_like(truncated), truncated, info
-
-    def compute_reward(self, achieved_goal: NDArray[Any], desired_goal: NDArray[Any], info: Any) -> Any:
-        """Reward as in ``TabletopEnv.compute_reward``."""
-        return self._setting.reward(achieved_goal, desired_goal)
+        return observation, reward, np.zeros_like(truncated), truncated, info
 
     def state(self) -> VectorState:
         """Copy everything that :meth:`restore` needs."""
@@ -158,7 +150,7 @@ class TabletopVectorEnv(gymnasium.vector.VectorEnv[Any, FloatArray, NDArray[Any]
         self._goal, self._elapsed = state.goal.copy(), state.elapsed.copy()
         for generator, random in zip(self._random, state.random, strict=True):
             generator.bit_generator.state = deepcopy(random)
-        return observe(self._worlds, self._goal)
+        return self._observe()[0]
 
     def close_extras(self, **kwargs: Any) -> None:
         """Stop the native threads."""
@@ -170,12 +162,8 @@ class TabletopVectorEnv(gymnasium.vector.VectorEnv[Any, FloatArray, NDArray[Any]
         starts = [self._worlds.draw_starts(self._random[world], 1) for world in index]
         self._worlds.restore(np.concatenate(starts), worlds)
         for world in index:
-            self._goal[world] = self._setting.draw_goals(self._random[world], self._worlds, slice(world, world + 1))[0]
+            self._draw_goals(self._random[world], slice(world, world + 1))
         self._elapsed[worlds] = 0
-
-    def _is_success(self, observation: Observation) -> BoolArray:
-        success: BoolArray = self._setting.reward(observation["achieved_goal"], observation["desired_goal"]) > 0.0
-        return success
 
 
 def _with_masks(values: Info, mask: BoolArray | None = None) -> Info:

@@ -6,7 +6,8 @@ state of the physics model is a state of the decorated one.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
+from itertools import combinations
 from typing import Any
 
 import mujoco
@@ -14,9 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.config import WorkspaceConfig, WorldConfig
-from service.envs.fixtures import fixture_geoms
 from service.envs.rendering.panda_visuals import add_panda_visuals, make_visual
-from service.envs.scene import TABLE_CENTER_X_M, TABLE_HALF_SIZE_M
+from service.envs.scene import FIXTURE_PREFIX, TABLE_CENTER_X_M, TABLE_HALF_SIZE_M
 from service.types import StateArray
 
 OBJECT_RGB = (0.86, 0.13, 0.11)
@@ -43,8 +43,9 @@ def decorate(spec: mujoco.MjSpec, config: WorldConfig) -> None:
     _add_lights(spec)
     _add_workspace(spec, config.workspace)
     spec.geom("object").material = "object"
-    for geom in fixture_geoms(spec):
-        geom.material = "fixture"
+    for geom in spec.geoms:
+        if geom.name.startswith(FIXTURE_PREFIX):
+            geom.material = "fixture"
 
 
 def _add_table(spec: mujoco.MjSpec) -> None:
@@ -115,23 +116,15 @@ def _add_lights(spec: mujoco.MjSpec) -> None:
 def _add_workspace(spec: mujoco.MjSpec, workspace: WorkspaceConfig) -> None:
     """Add the workspace's outline on the table, its faint other edges, and a little colour inside."""
     low, high = np.array([*workspace.lower_m[:2], 0.001]), np.array(workspace.upper_m)
-    for ends in _box_edges(low, high):
-        on_table = bool(ends[:, 2].max() == low[2])
-        radius = 0.002 if on_table else 0.001
-        line = spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_CAPSULE, size=(radius, 0, 0), fromto=ends.ravel())
+    corners = [np.where(pick, high, low) for pick in np.ndindex(2, 2, 2)]
+    for start, end in combinations(corners, 2):
+        if np.count_nonzero(start != end) > 1:
+            continue  # a diagonal, not an edge
+        on_table = bool(end[2] == low[2])
+        size, fromto = (0.002 if on_table else 0.001, 0, 0), np.concatenate((start, end))
+        line = spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_CAPSULE, size=size, fromto=fromto)
         make_visual(line, "outline" if on_table else "edge", casts_shadow=False)
     _box(spec, "volume", (low + high) / 2, (high - low) / 2, casts_shadow=False)
-
-
-def _box_edges(low: StateArray, high: StateArray) -> Iterator[StateArray]:
-    """The twelve edges of a box, each from end to end: (2, 3)."""
-    for axis in range(3):
-        for pick in np.ndindex(2, 2):
-            upper = np.insert(np.asarray(pick, dtype=bool), axis, False)
-            start = np.where(upper, high, low)
-            end = start.copy()
-            end[axis] = high[axis]
-            yield np.stack([start, end])
 
 
 def _textured(spec: mujoco.MjSpec, name: str, **properties: Any) -> None:

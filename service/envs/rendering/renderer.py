@@ -6,9 +6,6 @@ The model that is drawn is the physics with its decoration; both have the same s
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
-from types import TracebackType
 from typing import Any, Self
 
 import mujoco
@@ -21,7 +18,7 @@ from service.envs.rendering.gl import RenderError, open_drawing
 from service.envs.scene import build_layout, build_spec
 from service.types import StateArray
 
-__all__ = ["DEFAULT_CAMERA", "Camera", "Mark", "RenderError", "SceneRenderer"]
+__all__ = ["RenderError", "SceneRenderer"]
 
 Image = NDArray[np.uint8]
 
@@ -32,32 +29,6 @@ _MAX_GEOMS = 200
 _NUM_SAMPLES = 4
 
 
-@dataclass(frozen=True, slots=True)
-class Camera:
-    """A camera that looks at a point from a distance in a direction."""
-
-    target: tuple[float, float, float]
-    """The point in the middle of the picture, metres."""
-    distance_m: float
-    azimuth_deg: float
-    """Direction of the view in the table's plane: 0 looks along x, 90 along y."""
-    elevation_deg: float
-    """-90 looks straight down."""
-
-
-@dataclass(frozen=True, slots=True)
-class Mark:
-    """A transparent box in a picture, such as the area where goals may be."""
-
-    low: tuple[float, float, float]
-    high: tuple[float, float, float]
-    rgba: tuple[float, float, float, float]
-
-
-DEFAULT_CAMERA = Camera((-0.20, 0.0, 0.21), 1.95, 146.0, -21.0)
-"""Three-quarter view from the front: arm, workspace and object."""
-
-
 class SceneRenderer:
     """Renderer of the states of a ``WorldBatch`` of the same configuration; for use in the thread that made it.
 
@@ -65,16 +36,14 @@ class SceneRenderer:
         config: the world.
         width: of the pictures, pixels.
         height: of the pictures, pixels.
-        camera: where they are taken from; may be replaced at any time.
 
     Raises:
         RenderError: this machine has no OpenGL that works without a window.
     """
 
-    def __init__(
-        self, config: WorldConfig, width: int = 640, height: int = 480, camera: Camera = DEFAULT_CAMERA
-    ) -> None:
-        self.camera = camera
+    def __init__(self, config: WorldConfig, width: int = 640, height: int = 480) -> None:
+        self.camera = _three_quarter_view()
+        """Place the pictures are taken from; it may be moved at any time."""
         self.model = _build_model(config, width, height)
         self._data = mujoco.MjData(self.model)
         self._layout = build_layout(config)  # the flag of a blocked gripper follows everything that is read here
@@ -89,9 +58,7 @@ class SceneRenderer:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         self.close()
 
     def close(self) -> None:
@@ -102,13 +69,12 @@ class SceneRenderer:
             self._context.free()
             self._context = None
 
-    def render(self, state: StateArray, goal: StateArray | None = None, marks: Sequence[Mark] = ()) -> Image:
+    def render(self, state: StateArray, goal: StateArray | None = None) -> Image:
         """Draw one world.
 
         Args:
             state: (S,) row of ``WorldBatch.states``.
             goal: (3,) metres, shown as a transparent copy of the object; None for none.
-            marks: transparent boxes.
 
         Returns:
             (H, W, 3), the top row first.
@@ -119,16 +85,10 @@ class SceneRenderer:
             self._data.mocap_pos[0] = state[self._layout["box_place"]]
         mujoco.mj_kinematics(self.model, self._data)
         mujoco.mj_camlight(self.model, self._data)
-        camera, everything = _mujoco_camera(self.camera), mujoco.mjtCatBit.mjCAT_ALL
-        mujoco.mjv_updateScene(self.model, self._data, self._option, None, camera, everything, self._scene)
-        for mark in marks:
-            low, high = np.asarray(mark.low), np.asarray(mark.high)
-            self._add(mujoco.mjtGeom.mjGEOM_BOX, tuple((high - low) / 2), (low + high) / 2, mark.rgba)
+        everything = mujoco.mjtCatBit.mjCAT_ALL
+        mujoco.mjv_updateScene(self.model, self._data, self._option, None, self.camera, everything, self._scene)
         if goal is not None:
             self._add_goal(np.asarray(goal, dtype=np.float64))
-        return self._draw()
-
-    def _draw(self) -> Image:
         self._context.make_current()
         image = np.empty((self._rectangle.height, self._rectangle.width, 3), dtype=np.uint8)
         mujoco.mjr_render(self._rectangle, self._scene, self._drawing)
@@ -165,9 +125,10 @@ def _build_model(config: WorldConfig, width: int, height: int) -> mujoco.MjModel
     return spec.compile()
 
 
-def _mujoco_camera(camera: Camera) -> Any:
-    out = mujoco.MjvCamera()
-    out.type = mujoco.mjtCamera.mjCAMERA_FREE
-    out.lookat, out.distance = camera.target, camera.distance_m
-    out.azimuth, out.elevation = camera.azimuth_deg, camera.elevation_deg
-    return out
+def _three_quarter_view() -> mujoco.MjvCamera:
+    """Camera in front of the table, which sees arm, workspace and object."""
+    camera = mujoco.MjvCamera()
+    camera.type = mujoco.mjtCamera.mjCAMERA_FREE
+    camera.lookat, camera.distance = (-0.20, 0.0, 0.21), 1.95
+    camera.azimuth, camera.elevation = 146.0, -21.0
+    return camera

@@ -2,6 +2,7 @@ import os
 import platform
 import subprocess
 import sys
+from copy import copy
 
 import mujoco
 import numpy as np
@@ -11,7 +12,7 @@ from service.config import WorldConfig
 from service.envs.batch import WorldBatch
 from service.envs.rendering.decoration import decorate
 from service.envs.rendering.gl import open_drawing
-from service.envs.rendering.renderer import DEFAULT_CAMERA, Camera, RenderError, SceneRenderer
+from service.envs.rendering.renderer import RenderError, SceneRenderer
 from service.envs.scene import build_spec
 
 WIDTH, HEIGHT = 200, 150
@@ -55,10 +56,10 @@ def state_with_object_at(*position, config=None):
 
 def project(position, camera, model):
     """(column, row) of a point, by the pinhole model: forward from azimuth and elevation, z up."""
-    azimuth, elevation = np.radians([camera.azimuth_deg, camera.elevation_deg])
+    azimuth, elevation = np.radians([camera.azimuth, camera.elevation])
     forward = np.array([np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)])
     right = np.array([np.sin(azimuth), -np.cos(azimuth), 0.0])
-    offset = np.asarray(position) - (np.asarray(camera.target) - camera.distance_m * forward)
+    offset = np.asarray(position) - (np.asarray(camera.lookat) - camera.distance * forward)
     focal = HEIGHT / 2 / np.tan(np.radians(model.vis.global_.fovy) / 2)
     depth = offset @ forward
     return WIDTH / 2 + focal * (offset @ right) / depth, HEIGHT / 2 - focal * (
@@ -112,16 +113,19 @@ def test_the_object_is_red_and_where_it_should_be(renderer, position):
     mask = red(image)
     # A 5 cm cube is 2.9 times its focal length over its distance: about 7 pixels a side here.
     assert 25 < mask.sum() < 150
-    assert middle(mask) == pytest.approx(project(position, DEFAULT_CAMERA, renderer.model), abs=2.0)
+    assert middle(mask) == pytest.approx(project(position, renderer.camera, renderer.model), abs=2.0)
 
 
 def test_another_camera(renderer):
     position = (0.1, -0.1, 0.025)
-    renderer.camera = from_above = Camera((-0.28, 0.0, 0.05), 2.4, 180.0, -72.0)
+    usual = renderer.camera
+    renderer.camera = from_above = copy(usual)
+    from_above.lookat, from_above.distance = (-0.28, 0.0, 0.05), 2.4
+    from_above.azimuth, from_above.elevation = 180.0, -72.0
     try:
         mask = red(renderer.render(state_with_object_at(*position)))
     finally:
-        renderer.camera = DEFAULT_CAMERA
+        renderer.camera = usual
     assert middle(mask) == pytest.approx(project(position, from_above, renderer.model), abs=2.0)
 
 
@@ -136,8 +140,8 @@ def test_the_goal_is_a_ghost_where_it_should_be(renderer):
     state = state_with_object_at(0.1, 0.1, 0.025)
     without, with_goal = renderer.render(state), renderer.render(state, GOAL)
     changed = np.abs(with_goal.astype(int) - without).max(axis=2) > 12
-    column, row = project(GOAL, DEFAULT_CAMERA, renderer.model)
-    _, foot_row = project((*GOAL[:2], 0.0), DEFAULT_CAMERA, renderer.model)
+    column, row = project(GOAL, renderer.camera, renderer.model)
+    _, foot_row = project((*GOAL[:2], 0.0), renderer.camera, renderer.model)
     assert changed[round(row) - 2 : round(row) + 3, round(column) - 2 : round(column) + 3].all()
     rows, columns = np.nonzero(changed)
     assert np.abs(columns - column).max() < 9
@@ -167,7 +171,7 @@ def test_a_sphere_is_round():
 
 
 def test_the_flag_of_a_blocked_gripper_moves_no_box():
-    """Where some grippers are blocked, a state goes on behind the place of its box."""
+    """The flag of a blocked gripper stands behind the box's place in a state."""
     config = WorldConfig(fixture="box")
     pictures = []
     with open_renderer(config) as renderer:
