@@ -15,19 +15,19 @@ class Appender:
     """Appends pieces to one file; a piece that does not fit waits, and comes before the next one.
 
     Args:
-        path: the file; what is there already stays, and nothing is made before the first `append`.
+        path: the file; what is there already stays, and nothing is made before the first piece.
     """
 
     def __init__(self, path: Path) -> None:
         self.path = path
         self._waiting: deque[bytes] = deque()
 
-    def append(self, piece: bytes) -> None:
+    def append_bytes(self, piece: bytes) -> None:
         """Put ``piece`` at the file's end and hand it to the operating system.
 
         Raises:
             StorageError: the disk is full or the file cannot be written; the file ends with a whole piece, and
-                ``piece`` waits for the next `append` or `sync`.
+                ``piece`` waits for the next call or `sync`.
         """
         self._waiting.append(piece)
         self._flush()
@@ -36,7 +36,7 @@ class Appender:
         """Write what waits, and wait until the disk has it.
 
         Raises:
-            StorageError: as for `append`.
+            StorageError: as for `append_bytes`.
         """
         self._flush()
         if self.path.exists():

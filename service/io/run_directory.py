@@ -32,6 +32,7 @@ import numpy as np
 
 from service.config import Config, ConfigError, dump_config, load_config
 from service.errors import TandemError
+from service.io.append_file import Appender
 from service.io.checkpoints import CheckpointStore
 from service.io.errors import StorageError
 from service.io.files import os_errors, remove_temporaries, write_atomic
@@ -184,7 +185,7 @@ class RunDirectory:
             self._lock.release()
             self._lock = None
 
-    def _writers(self) -> list[JsonlWriter | EventFile]:
+    def _writers(self) -> list[Appender]:
         return [self._metrics, self._goals, *([self._events] if self._events is not None else [])]
 
     @contextmanager

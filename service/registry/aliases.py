@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import contextlib
 import fcntl
-import os
-from collections.abc import Iterator
 from pathlib import Path
 
 from service.io.files import os_errors, write_atomic
@@ -60,16 +57,9 @@ class Aliases:
             StorageError: the disk cannot be written.
         """
         path = self._directory / check_alias(alias)
-        with os_errors("write", path), self._lock():
-            if back or (self.read(alias) or 0) < number:
-                write_atomic(path, f"{number}\n".encode())
-
-    @contextlib.contextmanager
-    def _lock(self) -> Iterator[None]:
-        self._directory.mkdir(parents=True, exist_ok=True)
-        descriptor = os.open(self._directory / ".lock", os.O_RDWR | os.O_CREAT, 0o666)
-        try:
-            fcntl.flock(descriptor, fcntl.LOCK_EX)  # the kernel frees it when the process dies
-            yield
-        finally:
-            os.close(descriptor)
+        with os_errors("write", path):
+            self._directory.mkdir(parents=True, exist_ok=True)
+            with (self._directory / ".lock").open("a") as lock:
+                fcntl.flock(lock, fcntl.LOCK_EX)  # closing the file frees it, and so does the process's death
+                if back or (self.read(alias) or 0) < number:
+                    write_atomic(path, f"{number}\n".encode())

@@ -24,15 +24,13 @@ class RedisAddress:
 
     url: str = field(repr=False)
     """With the password: for a client, never for people."""
-    source: str = VARIABLE
-    """Setting to mend when it is wrong."""
 
     def __post_init__(self) -> None:
         try:
             from redis.connection import parse_url
         except ImportError:
             raise StoreError(
-                f"{self.source} is set, but the package redis is not installed: pip install 'tandem-skills[cluster]'"
+                f"{VARIABLE} is set, but the package redis is not installed: pip install 'tandem-skills[cluster]'"
             ) from None
         try:
             parse_url(self.url)  # type: ignore[no-untyped-call]
@@ -40,7 +38,7 @@ class RedisAddress:
         except ValueError:
             usable = False
         if not usable:  # from None, and no quotation: a "/" in a password makes parts of it look like the port
-            raise StoreError(f"{self.source} is no Redis URL (not shown, for its password); write {_FORM}") from None
+            raise StoreError(f"{VARIABLE} is no Redis URL (not shown, for its password); write {_FORM}") from None
 
     def __str__(self) -> str:
         parts = urlsplit(self.url)
@@ -48,9 +46,6 @@ class RedisAddress:
             return f"unix://{parts.path}"
         host = f"[{parts.hostname}]" if ":" in (parts.hostname or "") else parts.hostname
         return f"{parts.scheme}://{host}:{parts.port or 6379}{parts.path}"
-
-    def __repr__(self) -> str:
-        return f"RedisAddress({self})"
 
     def client(self, timeout_s: float, on_connect: Callable[[], None] = lambda: None) -> Any:
         """A ``redis.Redis``, annotated as Any: redis-py's annotations name the returns of all its modes at once.
@@ -78,7 +73,7 @@ class RedisAddress:
 
     def unavailable(self, error: Exception) -> StoreUnavailableError:
         """The error for a user that stands for a client's ``error``."""
-        return StoreUnavailableError(f"Redis at {self}: {reason_of(error)}; check {self.source} and the server")
+        return StoreUnavailableError(f"Redis at {self}: {reason_of(error)}; check {VARIABLE} and the server")
 
 
 def address_from_environment() -> RedisAddress | None:

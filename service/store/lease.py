@@ -10,8 +10,6 @@ import time
 from datetime import UTC, datetime
 from typing import Any
 
-from redis.exceptions import WatchError
-
 from service.io.errors import RunTakenError
 from service.store import keys
 
@@ -28,7 +26,7 @@ class Lease:
     """
 
     def __init__(self, client: Any, run_id: str, duration_s: float = keys.LEASE_S) -> None:
-        self._client, self._run_id, self._key = client, run_id, keys.lease(run_id)
+        self._client, self._run_id, self._key = client, run_id, keys.run_key(run_id, "lease")
         self._duration_ms = int(1000 * duration_s)
         now = datetime.now(UTC).isoformat(timespec="seconds")
         holder = {"token": secrets.token_hex(16), "host": socket.gethostname(), "pid": os.getpid(), "since": now}
@@ -73,18 +71,14 @@ class Lease:
         """Give the claim up, if it is ours.
 
         Raises:
-            redis.exceptions.RedisError: Redis is away; the claim expires by itself.
+            redis.exceptions.RedisError: Redis is away, or the claim has expired just now; it expires by itself.
         """
         with self._client.pipeline() as pipe:
             pipe.watch(self._key)
-            if pipe.get(self._key) != self._mine:
-                return
-            pipe.multi()
-            pipe.delete(self._key)
-            try:
+            if pipe.get(self._key) == self._mine:
+                pipe.multi()
+                pipe.delete(self._key)
                 pipe.execute()
-            except WatchError:  # it has expired just now
-                return
 
 
 def _describe(holder: object) -> str:

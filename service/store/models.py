@@ -90,28 +90,6 @@ class GoalGrid(FrozenModel):
     cells: tuple[GoalCell, ...]
 
 
-class RunWriter(Protocol):
-    """A place a runner reports to. No method may raise for a store that is away or full: training goes on."""
-
-    def status(self, status: RunStatus) -> None:
-        """Replace what is known about the run."""
-
-    def metrics(self, record: Record) -> None:
-        """Append one iteration's metrics."""
-
-    def goals(self, grid: GoalGrid) -> None:
-        """Replace the grid."""
-
-    def stop_requested(self) -> bool:
-        """Whether somebody asked the run to stop since it was started."""
-
-    def warnings(self) -> list[str]:
-        """Problems at the moment, in one sentence each; empty when all is well."""
-
-    def close(self) -> None:
-        """Write what still waits, for a bounded time."""
-
-
 class RunReader(Protocol):
     """A place the status service reads runs from.
 
