@@ -12,9 +12,8 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from service.io.append_file import Appender
 from service.io.errors import StorageError
-from service.io.files import os_errors, write_atomic
+from service.io.files import Appender, os_errors, write_atomic
 
 
 def plain(value: Any) -> Any:

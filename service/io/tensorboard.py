@@ -16,7 +16,7 @@ from tensorboard.compat.proto.event_pb2 import Event, SessionLog
 from tensorboard.compat.proto.summary_pb2 import Summary
 from tensorboard.summary.writer.record_writer import RecordWriter
 
-from service.io.append_file import Appender
+from service.io.files import Appender
 
 _FILE_VERSION = "brain.Event:2"
 _FILE_PATTERN = re.compile(r"events\.out\.tfevents\.([0-9]{10,})\..*")

@@ -77,11 +77,7 @@ class RedisAddress:
 
 
 def address_from_environment() -> RedisAddress | None:
-    """The Redis of ``TANDEM_REDIS_URL``; None where it is not set or empty.
-
-    Raises:
-        StoreError: not a Redis URL, or the package redis is not installed.
-    """
+    """The Redis of ``TANDEM_REDIS_URL``; None where it is not set or empty; see `RedisAddress` for errors."""
     url = os.environ.get(VARIABLE, "").strip()
     return RedisAddress(url) if url else None
 
@@ -90,10 +86,9 @@ def reason_of(error: Exception) -> str:
     """A client's error in one line that names no password."""
     from redis import exceptions
 
-    if isinstance(error, (exceptions.AuthenticationError, exceptions.AuthorizationError)):
-        return "wrong or missing password"
     text = " ".join(str(error).split()) or type(error).__name__
-    if "NOAUTH" in text or "WRONGPASS" in text:
+    refused = isinstance(error, (exceptions.AuthenticationError, exceptions.AuthorizationError))
+    if refused or "NOAUTH" in text or "WRONGPASS" in text:
         return "wrong or missing password"
     if isinstance(error, (exceptions.TimeoutError, TimeoutError)):
         return "no answer in time"

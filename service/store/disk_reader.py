@@ -26,7 +26,7 @@ def run_id_of(directory: Path) -> str:
 
 
 class DiskReader:
-    """The ``RunReader`` of a directory of run directories; any number of threads may use it at once."""
+    """The ``RunReader``, which see for errors, of a directory of run directories; for any number of threads at once."""
 
     def __init__(self, root: Path) -> None:
         self.root = root
@@ -39,16 +39,11 @@ class DiskReader:
         return sorted(statuses, key=lambda status: status.started, reverse=True)
 
     def run(self, run_id: str) -> RunStatus:
-        """One run.
-
-        Raises:
-            UnknownRunError: there is no such run.
-            StoreUnavailableError: the directory cannot be read.
-        """
+        """One run."""
         return _status(run_id, *self._find(run_id))
 
     def metrics(self, run_id: str, *, after_iteration: int = 0) -> list[Record]:
-        """The records of iterations above ``after_iteration``, in order; see `run` for errors."""
+        """The records of iterations above ``after_iteration``, in order."""
         path, records = self._find(run_id)
         try:
             return records.after(after_iteration)
@@ -56,11 +51,7 @@ class DiskReader:
             raise _unavailable(path / "metrics.jsonl", error) from error
 
     def goals(self, run_id: str) -> GoalGrid | None:
-        """The newest grid; None before the first; see `run` for errors.
-
-        Raises:
-            DamagedStoreError: its file holds something else.
-        """
+        """The newest grid; None before the first."""
         path = self._find(run_id)[0] / GOALS_FILE
         try:
             return GoalGrid.model_validate_json(path.read_bytes())
@@ -72,7 +63,7 @@ class DiskReader:
             raise DamagedStoreError(f"{path} is no goal grid; delete it, a run writes it anew every few s") from None
 
     def request_stop(self, run_id: str) -> None:
-        """Ask a run to end after its current iteration; nothing happens if it has ended; see `run` for errors.
+        """Ask a run to end after its current iteration; nothing happens if it has ended.
 
         Raises:
             StoreError: a tandem runs it that takes no requests.
@@ -88,11 +79,7 @@ class DiskReader:
             raise _unavailable(path / STOP_FILE, error) from error
 
     def ready(self) -> None:
-        """Return if the directory can be read.
-
-        Raises:
-            StoreUnavailableError: it cannot.
-        """
+        """Return if the directory can be read."""
         self._list()
 
     def _find(self, run_id: str) -> tuple[Path, RecordFile]:

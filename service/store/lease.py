@@ -13,11 +13,13 @@ from typing import Any
 from service.io.errors import RunTakenError
 from service.store import keys
 
-_LOOK_S = 0.1
+_POLL_S = 0.1
 
 
 class Lease:
     """One driver's claim on a run id; nobody has it before `acquire`.
+
+    Every method raises ``redis.exceptions.RedisError`` while Redis is away.
 
     Args:
         client: of the Redis; see ``RedisAddress.client``.
@@ -37,7 +39,6 @@ class Lease:
 
         Raises:
             RunTakenError: another driver renews its claim.
-            redis.exceptions.RedisError: Redis is away.
         """
         previous_ms, deadline_s = None, time.monotonic() + 1.5 * self._duration_ms / 1000
         while not self._client.set(self._key, self._mine, nx=True, px=self._duration_ms):
@@ -49,7 +50,7 @@ class Lease:
                     "give this run another id"
                 )
             previous_ms = left_ms
-            time.sleep(_LOOK_S)
+            time.sleep(_POLL_S)
 
     def renew(self, pipe: Any) -> None:
         """Begin a transaction, on a fresh pipe, that renews the claim and fails where another has taken it meanwhile.
@@ -58,7 +59,6 @@ class Lease:
 
         Raises:
             RunTakenError: another driver has it.
-            redis.exceptions.RedisError: Redis is away.
         """
         pipe.watch(self._key)
         holder = pipe.get(self._key)
@@ -68,11 +68,7 @@ class Lease:
         pipe.set(self._key, self._mine, px=self._duration_ms)
 
     def release(self) -> None:
-        """Give the claim up, if it is ours.
-
-        Raises:
-            redis.exceptions.RedisError: Redis is away, or the claim has expired just now; it expires by itself.
-        """
+        """Give the claim up, if it is ours; after an error it expires by itself."""
         with self._client.pipeline() as pipe:
             pipe.watch(self._key)
             if pipe.get(self._key) == self._mine:

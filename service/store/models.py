@@ -93,8 +93,8 @@ class GoalGrid(FrozenModel):
 class RunReader(Protocol):
     """A place the status service reads runs from.
 
-    Every method may raise ``StoreUnavailableError``; those that take a run id raise ``UnknownRunError`` where there is
-    no such run.
+    Every method may raise ``StoreUnavailableError``, and ``DamagedStoreError`` where the store holds what no run has
+    written. Those that take a run id raise ``UnknownRunError`` where there is no such run.
     """
 
     def runs(self) -> list[RunStatus]:
@@ -110,7 +110,10 @@ class RunReader(Protocol):
         """The newest grid; None before the first."""
 
     def request_stop(self, run_id: str) -> None:
-        """Ask a run to end after its current iteration, saved; nothing happens if it has ended."""
+        """Ask a run to end after its current iteration, saved; nothing happens if it has ended.
+
+        May raise ``StoreError``: an older tandem runs it, which takes no requests.
+        """
 
     def ready(self) -> None:
         """Return if reads work right now."""

@@ -20,14 +20,12 @@ _logger = logging.getLogger(__name__)
 
 
 class RedisReader:
-    """The ``RunReader`` of a Redis; any number of threads may use it at once.
+    """The ``RunReader``, which see for errors, of a Redis; for any number of threads at once.
 
-    Every method raises ``StoreUnavailableError`` while Redis is away, after ``TIMEOUT_S`` at the latest, and
-    ``DamagedStoreError`` where a key holds what no run has written.
+    ``StoreUnavailableError`` is raised after ``TIMEOUT_S`` at the latest.
     """
 
     def __init__(self, address: RedisAddress) -> None:
-        """Take the address of a Redis; nothing is sent before the first call."""
         self._address = address
         self._client = address.client(TIMEOUT_S)
 
@@ -44,18 +42,14 @@ class RedisReader:
         return sorted(statuses, key=lambda status: status.started, reverse=True)
 
     def run(self, run_id: str) -> RunStatus:
-        """One run.
-
-        Raises:
-            UnknownRunError: there is no such run.
-        """
+        """One run."""
         with self._errors():
             ((text, *flags),) = self._look_up([run_id])
             self._check_known(run_id, text is not None)
             return _status(run_id, text, *flags)
 
     def metrics(self, run_id: str, *, after_iteration: int = 0) -> list[Record]:
-        """The records of iterations above ``after_iteration``, in order; see `run` for errors."""
+        """The records of iterations above ``after_iteration``, in order."""
         with self._errors(), self._client.pipeline(transaction=False) as pipe:
             pipe.exists(keys.run_key(run_id, "status"))
             pipe.zrangebyscore(keys.run_key(run_id, "metrics"), f"({after_iteration}", "+inf")
@@ -71,7 +65,7 @@ class RedisReader:
         return list(by_iteration.values())
 
     def goals(self, run_id: str) -> GoalGrid | None:
-        """The newest grid; None before the first; see `run` for errors."""
+        """The newest grid; None before the first."""
         with self._errors(), self._client.pipeline(transaction=False) as pipe:
             pipe.exists(keys.run_key(run_id, "status"))
             pipe.get(keys.run_key(run_id, "goals"))
@@ -83,7 +77,7 @@ class RedisReader:
             raise _damaged(keys.run_key(run_id, "goals"), "goal grid") from None
 
     def request_stop(self, run_id: str) -> None:
-        """Ask a run to end after its current iteration; nothing happens if it has ended; see `run` for errors."""
+        """Ask a run to end after its current iteration; nothing happens if it has ended."""
         if self.run(run_id).state in ACTIVE:
             with self._errors():
                 self._client.set(keys.run_key(run_id, "stop"), b"1")

@@ -20,16 +20,16 @@ from service.store.lease import Lease
 from service.store.models import GoalGrid, Record, RunStatus
 
 TICK_S = 0.5
-"""Between two messages to Redis; a stop request is noticed within it."""
+"""Time between two messages to Redis; a stop request is noticed within it."""
 RETRY_S = 1.0
-"""At most, between two tries to reach it."""
+"""Longest time between two tries to reach it."""
 TIMEOUT_S = 2.0
 MAX_WAITING = 20_000
 """Records that wait for Redis to come back, about 60 MB; of more, the oldest are left out, and a warning says so."""
 BATCH = 500
 KEPT_S = 5.0
-"""Redis writes and flushes its file every second, so one that is killed may forget what it said it had. What is younger
-than this is sent again over every new connection."""
+"""Age of the oldest report that is sent again over a new connection: Redis flushes its file every second, so one that is
+killed may forget what it confirmed."""
 _logger = logging.getLogger(__name__)
 
 
@@ -46,7 +46,7 @@ class RedisWriter:
 
     Args:
         address: of a Redis that has to be there now; later it may go and come.
-        run_id: of the run.
+        run_id: id of the run.
         lease_s: how long after this process died another may take the run over.
 
     Raises:
@@ -139,12 +139,12 @@ class RedisWriter:
             except WatchError:  # the lease has expired or was taken in this very moment; the next try tells which
                 pause_s = 0.0
             except (RedisError, OSError) as error:
-                self._went_away(reason_of(error))
+                self._note_failure(reason_of(error))
                 pause_s = min(2 * pause_s + 0.05, RETRY_S)
                 if ending:
                     time.sleep(0.05)
             else:
-                self._came_back()
+                self._note_recovery()
                 pause_s = 0.0 if more else TICK_S
                 if ending and not self._pending():
                     break
@@ -203,12 +203,12 @@ class RedisWriter:
     def _pending(self) -> bool:
         return bool(self._waiting) or self._status is not self._sent_status or self._grid is not self._sent_grid
 
-    def _went_away(self, reason: str) -> None:
+    def _note_failure(self, reason: str) -> None:
         if self._away is None:
             _logger.warning("Redis at %s: %s; the run goes on", self._address, reason)
         self._away = (self._away[0] if self._away else time.monotonic(), reason)
 
-    def _came_back(self) -> None:
+    def _note_recovery(self) -> None:
         if self._away is not None:
             _logger.info("Redis at %s is back after %.0f s", self._address, time.monotonic() - self._away[0])
         self._away = None

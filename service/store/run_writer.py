@@ -18,8 +18,8 @@ class RunWriter:
     """The place a runner reports to. No method raises for a store that is away or full: training goes on.
 
     Args:
-        directory: of the run; the caller has its lock.
-        run_id: of the run.
+        directory: the run's; the caller has its lock.
+        run_id: id of the run.
         redis: a Redis to report to as well.
 
     Raises:

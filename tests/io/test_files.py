@@ -2,8 +2,8 @@ import os
 
 import pytest
 
-from service.io.append_file import Appender
 from service.io.errors import StorageError
+from service.io.files import Appender
 from tests.runtime.runs import assert_one_line, no_room_above
 
 
