@@ -28,8 +28,8 @@ MAX_WAITING = 20_000
 """Records that wait for Redis to come back, about 60 MB; of more, the oldest are left out, and a warning says so."""
 BATCH = 500
 KEPT_S = 5.0
-"""Age of the oldest report that is sent again over a new connection: Redis flushes its file every second, so one that is
-killed may forget what it confirmed."""
+"""Age of the oldest report that is sent again over a new connection. Redis flushes its file every second, so one that
+is killed may forget what it confirmed."""
 _logger = logging.getLogger(__name__)
 
 
