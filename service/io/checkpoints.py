@@ -37,7 +37,6 @@ class CheckpointStore:
     """The newest ``keep`` checkpoints of one run in a directory; one writer, any number of readers."""
 
     def __init__(self, directory: Path, keep: int) -> None:
-        """Take the directory; nothing is read or written before the first call."""
         assert keep >= 1
         self.directory = directory
         self.keep = keep
@@ -75,7 +74,12 @@ class CheckpointStore:
         """
         assert step >= 0
         path = self.path(step)
-        data = _encode(path, step, arrays, meta)
+        content = {"format_version": FORMAT_VERSION, "step": step, "meta": dict(meta)}
+        try:
+            digest = tensors.digest_of(json.dumps(content, sort_keys=True), arrays)
+            data = tensors.encode(arrays, {_HEADER_KEY: json.dumps({**content, "sha256": digest}, sort_keys=True)})
+        except (TypeError, ValueError) as error:
+            raise CheckpointError(f"cannot write {path}: {error}; give plain arrays and JSON values") from None
         with os_errors("write", path, CheckpointError):
             write_atomic(path, data)
         self._prune(step)
@@ -128,20 +132,6 @@ def read_checkpoint(path: Path) -> Checkpoint:
         raise CheckpointError(f"{path} is damaged: its header cannot be read") from None
     if format_version != FORMAT_VERSION:
         raise FormatVersionError.of(path, found=format_version, supported=FORMAT_VERSION)
-    return _decode(path, data, header)
-
-
-def _encode(path: Path, step: int, arrays: Mapping[str, np.ndarray], meta: Mapping[str, Any]) -> bytes:
-    content = {"format_version": FORMAT_VERSION, "step": step, "meta": dict(meta)}
-    try:
-        text = json.dumps(content, sort_keys=True)
-        digest = tensors.digest_of(text, arrays)
-        return tensors.encode(arrays, {_HEADER_KEY: json.dumps({**content, "sha256": digest}, sort_keys=True)})
-    except (TypeError, ValueError) as error:
-        raise CheckpointError(f"cannot write {path}: {error}; give plain arrays and JSON values") from None
-
-
-def _decode(path: Path, data: bytes, header: dict[str, Any]) -> Checkpoint:
     expected = header.pop("sha256", None)
     try:
         arrays = tensors.decode(data)

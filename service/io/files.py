@@ -1,7 +1,8 @@
-"""Files that are wholly there or not at all, also after a kill or a power cut.
+"""Files that are wholly there or not at all, and files that grow by whole pieces.
 
-Every write goes to a temporary file beside its target, is flushed to the disk, and then takes its name in one step. A
-temporary file's name starts with ``.tmp-``, which no name or alias can, so readers never meet one.
+A whole file is written to a temporary file beside its target, flushed to the disk, and then takes its name in one step,
+so a kill or a power cut leaves the old one or the new one. A temporary file's name starts with ``.tmp-``, which no name
+or alias can, so readers never meet one. A full disk leaves no torn piece at the end of a growing file.
 """
 
 from __future__ import annotations
@@ -10,7 +11,9 @@ import contextlib
 import os
 import secrets
 import shutil
+from collections import deque
 from collections.abc import Iterator
+from io import FileIO
 from pathlib import Path
 from typing import Literal
 
@@ -22,10 +25,7 @@ TEMPORARY_PREFIX = ".tmp-"
 def write_atomic(path: Path, data: bytes, *, flush: bool = True) -> None:
     """Put ``data`` at ``path``, replacing what was there in one step; the directory is made when missing.
 
-    Args:
-        path: where to.
-        data: its new content.
-        flush: wait for the disk. Without, it is quick, and a power cut may leave an older content or none.
+    Without ``flush``, it does not wait for the disk, and a power cut may leave an older content or none.
 
     Raises:
         OSError: the disk is full, or the directory cannot be written; ``path`` is then as it was.
@@ -55,13 +55,7 @@ def write_exclusive(path: Path, data: bytes) -> bool:
 def os_errors(
     action: Literal["read", "write"], path: Path, error_type: type[StorageError] = StorageError
 ) -> Iterator[None]:
-    """Turn an operating-system error of the block into ``error_type`` with one line for the user.
-
-    Args:
-        action: what was being done.
-        path: the file it was done to.
-        error_type: what to raise.
-    """
+    """Turn an operating-system error of the block into ``error_type`` with one line for the user."""
     try:
         yield
     except OSError as error:
@@ -78,6 +72,49 @@ def remove_temporaries(directory: Path) -> None:
     """Delete what killed writers left in ``directory``; only where no other writer can be at work."""
     for path in directory.glob(f"{TEMPORARY_PREFIX}*"):
         path.unlink(missing_ok=True)
+
+
+class Appender:
+    """Appends pieces to one file; a piece that does not fit waits, and comes before the next one.
+
+    Args:
+        path: the file; what is there already stays, and nothing is made before the first piece.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self._waiting: deque[bytes] = deque()
+
+    def append_bytes(self, piece: bytes) -> None:
+        """Put ``piece`` at the file's end and hand it to the operating system.
+
+        Raises:
+            StorageError: the disk is full or the file cannot be written; the file ends with a whole piece, and
+                ``piece`` waits for the next call or `sync`.
+        """
+        self._waiting.append(piece)
+        self._flush()
+
+    def sync(self) -> None:
+        """Write what waits, and wait until the disk has it.
+
+        Raises:
+            StorageError: as for `append_bytes`.
+        """
+        self._flush()
+        if self.path.exists():
+            with os_errors("write", self.path), self.path.open("rb") as file:
+                os.fsync(file.fileno())
+
+    def _flush(self) -> None:
+        if not self._waiting:
+            return
+        with os_errors("write", self.path):
+            self.path.parent.mkdir(parents=True, exist_ok=True)
+            with self.path.open("ab", buffering=0) as file:
+                while self._waiting:
+                    _write_whole(file, self._waiting[0])
+                    self._waiting.popleft()
 
 
 @contextlib.contextmanager
@@ -117,3 +154,15 @@ def _flush_directory(directory: Path) -> None:
 def _free_bytes(path: Path) -> int:
     existing = next(parent for parent in path.absolute().parents if parent.exists())
     return shutil.disk_usage(existing).free
+
+
+def _write_whole(file: FileIO, piece: bytes) -> None:
+    end = file.seek(0, os.SEEK_END)
+    try:
+        view = memoryview(piece)
+        while view:
+            view = view[file.write(view) :]
+    except BaseException:  # a signal's, too
+        with contextlib.suppress(OSError):  # the first error is the one the user has to know
+            file.truncate(end)
+        raise

@@ -12,9 +12,8 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from service.io.append_file import Appender
 from service.io.errors import StorageError
-from service.io.files import os_errors, write_atomic
+from service.io.files import Appender, os_errors, write_atomic
 
 
 def plain(value: Any) -> Any:
@@ -37,30 +36,17 @@ def read_jsonl(path: Path) -> list[dict[str, Any]]:
     return [record for _, record in _lines(path)]
 
 
-class JsonlWriter:
+class JsonlWriter(Appender):
     """Appends records to one file, a line each, so that a kill loses no record already written."""
-
-    def __init__(self, path: Path) -> None:
-        """Take ``path``; what is there already stays, and nothing is made before the first `append`."""
-        self.path = path
-        self._file = Appender(path)
 
     def append(self, record: Mapping[str, Any]) -> None:
         """Write ``record``, made `plain`, as the file's last line and hand it to the operating system.
 
         Raises:
-            StorageError: the disk is full or the file cannot be written; the record waits, see `Appender.append`.
+            StorageError: the disk is full or the file cannot be written; the record waits, see `append_bytes`.
         """
         line = json.dumps(plain(record), allow_nan=False) + "\n"
-        self._file.append(line.encode())
-
-    def sync(self) -> None:
-        """Write the records that wait, and wait until the disk has them all.
-
-        Raises:
-            StorageError: as for `append`.
-        """
-        self._file.sync()
+        self.append_bytes(line.encode())
 
     def truncate_after(self, iteration: int) -> None:
         """Drop the records whose ``iteration`` is above the given one, and a torn last line, in one atomic step.

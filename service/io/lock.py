@@ -71,12 +71,11 @@ def _take(file: FileIO, kind: int, wait_s: float) -> bool:
     while True:
         try:
             fcntl.flock(file, kind | fcntl.LOCK_NB)
+            return True
         except BlockingIOError:
             if time.monotonic() >= deadline_s:
                 return False
             time.sleep(0.02)
-        else:
-            return True
 
 
 def _read_holder(file: FileIO) -> str:

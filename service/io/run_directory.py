@@ -34,7 +34,7 @@ from service.config import Config, ConfigError, dump_config, load_config
 from service.errors import TandemError
 from service.io.checkpoints import CheckpointStore
 from service.io.errors import StorageError
-from service.io.files import os_errors, remove_temporaries, write_atomic
+from service.io.files import Appender, os_errors, remove_temporaries, write_atomic
 from service.io.git import git_commit
 from service.io.jsonl import JsonlWriter
 from service.io.lock import DirectoryLock
@@ -43,16 +43,14 @@ from service.types import FloatArray, StateArray
 if TYPE_CHECKING:
     from service.io.tensorboard import EventFile
 
-
 _logger = logging.getLogger(__name__)
 MAX_DIVERGED_FILES = 100
 
 
 class RunDirectory:
-    """Reads and writes the files of one run."""
+    """Reads and writes the files of one run; nothing is written before `claim` or `start`."""
 
     def __init__(self, path: Path) -> None:
-        """Take ``path``; nothing is read or written before `claim` or `start`."""
         self.path = path
         self.config_file = path / "config.yaml"
         self.metrics_file = path / "metrics.jsonl"
@@ -184,7 +182,7 @@ class RunDirectory:
             self._lock.release()
             self._lock = None
 
-    def _writers(self) -> list[JsonlWriter | EventFile]:
+    def _writers(self) -> list[Appender]:
         return [self._metrics, self._goals, *([self._events] if self._events is not None else [])]
 
     @contextmanager

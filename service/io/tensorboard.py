@@ -16,13 +16,13 @@ from tensorboard.compat.proto.event_pb2 import Event, SessionLog
 from tensorboard.compat.proto.summary_pb2 import Summary
 from tensorboard.summary.writer.record_writer import RecordWriter
 
-from service.io.append_file import Appender
+from service.io.files import Appender
 
 _FILE_VERSION = "brain.Event:2"
 _FILE_PATTERN = re.compile(r"events\.out\.tfevents\.([0-9]{10,})\..*")
 
 
-class EventFile:
+class EventFile(Appender):
     """The events of one process; a directory holds a file for every time the run was started or resumed."""
 
     def __init__(self, directory: Path, *, after_step: int | None = None) -> None:
@@ -37,8 +37,7 @@ class EventFile:
             StorageError: the disk is full or the file cannot be written.
         """
         host, process = socket.gethostname(), os.getpid()
-        self.path = directory / f"events.out.tfevents.{_stamp(directory):010d}.{host}.{process}"
-        self._file = Appender(self.path)
+        super().__init__(directory / f"events.out.tfevents.{_stamp(directory):010d}.{host}.{process}")
         self._append(Event(wall_time=time.time(), file_version=_FILE_VERSION))
         if after_step is not None:
             start = SessionLog(status=SessionLog.START)
@@ -48,7 +47,7 @@ class EventFile:
         """Append one iteration's metrics, over its env steps.
 
         Raises:
-            StorageError: the disk is full; the event waits, see `Appender.append`.
+            StorageError: the disk is full; the event waits, see `append_bytes`.
         """
         values = [
             Summary.Value(tag=name, simple_value=value)
@@ -57,18 +56,10 @@ class EventFile:
         ]
         self._append(Event(wall_time=time.time(), step=int(metrics["env_steps"]), summary=Summary(value=values)))
 
-    def sync(self) -> None:
-        """Write the events that wait, and wait until the disk has them all.
-
-        Raises:
-            StorageError: as for `add`.
-        """
-        self._file.sync()
-
     def _append(self, event: Event) -> None:
         framed = io.BytesIO()
         RecordWriter(framed).write(event.SerializeToString())
-        self._file.append(framed.getvalue())
+        self.append_bytes(framed.getvalue())
 
 
 def _stamp(directory: Path) -> int:

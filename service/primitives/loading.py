@@ -60,12 +60,8 @@ def load_bob(reference: str, registry: Path) -> TrainedBob:
     config = parse_config(manifest.config, where=f"the manifest of {reference}", recorded=True)
     # two registries may both have a version 1: which one was meant must be seen
     label = f"{version} (bundled)" if is_bundled(found) else str(version)
-    return TrainedBob(label, _primitives(label, tensors), config, manifest)
-
-
-def _primitives(label: str, parameters: Parameters) -> NumpyMCPPolicy:
     try:
-        return NumpyMCPPolicy(parameters)
+        return TrainedBob(label, NumpyMCPPolicy(tensors), config, manifest)
     except PolicyError as error:
         raise TandemError(f"{label} holds no primitives: {error}") from None
 
@@ -76,10 +72,8 @@ def load_players(directory: RunDirectory) -> tuple[NumpyGaussianPolicy, NumpyPol
     Raises:
         TandemError: no usable checkpoint.
     """
-    return (
-        NumpyGaussianPolicy(read_parameters(directory, "alice")),
-        numpy_bob(read_parameters(directory, "bob")),
-    )
+    checkpoint = CheckpointStore(directory.checkpoints, keep=1).load_latest()
+    return NumpyGaussianPolicy(_parameters(checkpoint, "alice")), numpy_bob(_parameters(checkpoint, "bob"))
 
 
 def read_parameters(directory: RunDirectory, player: str) -> Parameters:

@@ -38,13 +38,6 @@ def publish_run(
 ) -> Version:
     """Publish a run's Bob, and note it in the run directory: of what the run publishes next, this is the parent.
 
-    Args:
-        directory: of the run.
-        registry: where to.
-        config: the run's.
-        parameters: Bob's.
-        metrics: finite numbers for the manifest.
-
     Returns:
         The new version, or the newest one of that name where it has the same parameters already.
 

@@ -13,7 +13,6 @@ class BlobStore:
     """Content-addressed files ``sha256/<digest>`` under a directory; safe for many processes at once."""
 
     def __init__(self, directory: Path) -> None:
-        """Take the directory; nothing is written before the first `put`."""
         self._directory = directory
 
     def path(self, digest: str) -> Path:

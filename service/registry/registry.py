@@ -25,7 +25,7 @@ from service.io.errors import StorageError
 from service.io.files import os_errors, write_atomic, write_exclusive
 from service.io.git import git_commit
 from service.registry import names
-from service.registry.aliases import Aliases
+from service.registry.aliases import move_alias, read_alias, read_aliases
 from service.registry.blobs import BlobStore, sha256_of
 from service.registry.errors import RegistryError, UnknownVersionError
 from service.registry.manifest import Manifest, make_manifest, parse_manifest
@@ -35,11 +35,7 @@ READ_ONLY_FILE = "READ_ONLY"
 
 
 class Registry:
-    """Named, versioned parameters in a directory; any number of processes may publish and read at once.
-
-    Args:
-        root: the directory; nothing is read or written before the first call.
-    """
+    """Named, versioned parameters in the directory ``root``; any number of processes may publish and read at once."""
 
     def __init__(self, root: Path) -> None:
         self.root = root
@@ -100,7 +96,7 @@ class Registry:
             "git_commit": git_commit(),
         }
         version = self._publish_version(name, parameters, fields)
-        self._aliases(name).move(LATEST, version.number, back=False)
+        move_alias(self._alias_directory(name), LATEST, version.number, back=False)
         return version
 
     def resolve(self, reference: str) -> Version:
@@ -111,9 +107,9 @@ class Registry:
             RegistryError: not a reference, or a damaged alias.
         """
         name, target = names.split_reference(reference)
-        number = target if isinstance(target, int) else self._aliases(name).read(target)
+        number = target if isinstance(target, int) else read_alias(self._alias_directory(name), target)
         if number is None or not self._manifest_path(Version(name, number)).exists():
-            raise UnknownVersionError(self._what_exists(name, target))
+            raise UnknownVersionError(self._describe_missing(name, target))
         return Version(name, number)
 
     def manifest(self, reference: str) -> Manifest:
@@ -133,9 +129,7 @@ class Registry:
         """The verified manifest and parameters of a version.
 
         Raises:
-            UnknownVersionError: no such version.
-            DamagedBlobError: its manifest or parameters are damaged.
-            FormatVersionError: it is of another format.
+            StorageError: as for `manifest`; DamagedBlobError also for damaged parameters.
         """
         manifest = self.manifest(reference)
         return manifest, tensors.decode(self._blobs.get(manifest.blob_sha256))
@@ -158,7 +152,7 @@ class Registry:
         Raises:
             RegistryError: an alias file is damaged.
         """
-        return self._aliases(name).read_all()
+        return read_aliases(self._alias_directory(name))
 
     def set_alias(self, name: str, alias: str, version: int) -> Version:
         """Make or move ``alias`` of ``name`` to ``version``, forward or back.
@@ -170,7 +164,7 @@ class Registry:
         """
         self.check_writable()
         target = self.resolve(f"{name}@{version}")
-        self._aliases(name).move(alias, version)
+        move_alias(self._alias_directory(name), alias, version)
         return target
 
     def verify(self, reference: str | None = None) -> list[str]:
@@ -228,12 +222,11 @@ class Registry:
 
     def _problems_of(self, version: Version) -> list[str]:
         try:
-            manifest, parameters = self.load(str(version))
+            manifest, _ = self.load(str(version))
         except StorageError as error:
             return [f"{version}: {error}"]
         if (manifest.name, manifest.version) != version:
             return [f"{version}: its manifest is that of {manifest.reference}; restore the file from a copy"]
-        assert set(parameters) == set(manifest.tensors)
         return []
 
     def _alias_problems(self, name: str) -> list[str]:
@@ -248,7 +241,7 @@ class Registry:
             if number not in numbers
         ]
 
-    def _what_exists(self, name: str, target: int | str) -> str:
+    def _describe_missing(self, name: str, target: int | str) -> str:
         versions = self.versions(name)
         if not versions:
             known = ", ".join(self.names()) or "nothing yet"
@@ -264,5 +257,5 @@ class Registry:
     def _manifest_path(self, version: Version) -> Path:
         return self._directory(version.name) / "versions" / str(version.number)
 
-    def _aliases(self, name: str) -> Aliases:
-        return Aliases(self._directory(name) / "aliases")
+    def _alias_directory(self, name: str) -> Path:
+        return self._directory(name) / "aliases"

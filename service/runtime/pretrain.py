@@ -24,7 +24,7 @@ from service.runtime.runner import OnIteration, Runner, RunResult, StateLostErro
 from service.runtime.signals import InterruptError, StopSignals
 from service.store.address import address_from_environment
 from service.store.disk_reader import run_id_of
-from service.store.fanout import open_writer
+from service.store.run_writer import RunWriter
 
 if TYPE_CHECKING:
     from service.runtime.ray_connection import ClusterOptions
@@ -95,7 +95,7 @@ def pretrain(
         directory.claim(resume=resume)
         run_id = run_id_of(directory.path)
         redis = address_from_environment()
-        writer = open_writer(directory.path, run_id, redis)
+        writer = RunWriter(directory.path, run_id, redis)
         report = stack.enter_context(Report(config, run_id, runtime, writer, published=directory.read_published()))
         if cluster is not None and cluster.status is not None:
             from service.runtime.status_actor import serving

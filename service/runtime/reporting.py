@@ -11,7 +11,8 @@ from typing import Any, Literal, Self
 from service.config import Config
 from service.runtime.runner import Runner
 from service.store.disk import GOALS_INTERVAL_S
-from service.store.models import RunState, RunStatus, RunWriter
+from service.store.models import RunState, RunStatus
+from service.store.run_writer import RunWriter
 
 
 class Report:

@@ -24,15 +24,13 @@ class RedisAddress:
 
     url: str = field(repr=False)
     """With the password: for a client, never for people."""
-    source: str = VARIABLE
-    """Setting to mend when it is wrong."""
 
     def __post_init__(self) -> None:
         try:
             from redis.connection import parse_url
         except ImportError:
             raise StoreError(
-                f"{self.source} is set, but the package redis is not installed: pip install 'tandem-skills[cluster]'"
+                f"{VARIABLE} is set, but the package redis is not installed: pip install 'tandem-skills[cluster]'"
             ) from None
         try:
             parse_url(self.url)  # type: ignore[no-untyped-call]
@@ -40,7 +38,7 @@ class RedisAddress:
         except ValueError:
             usable = False
         if not usable:  # from None, and no quotation: a "/" in a password makes parts of it look like the port
-            raise StoreError(f"{self.source} is no Redis URL (not shown, for its password); write {_FORM}") from None
+            raise StoreError(f"{VARIABLE} is no Redis URL (not shown, for its password); write {_FORM}") from None
 
     def __str__(self) -> str:
         parts = urlsplit(self.url)
@@ -48,9 +46,6 @@ class RedisAddress:
             return f"unix://{parts.path}"
         host = f"[{parts.hostname}]" if ":" in (parts.hostname or "") else parts.hostname
         return f"{parts.scheme}://{host}:{parts.port or 6379}{parts.path}"
-
-    def __repr__(self) -> str:
-        return f"RedisAddress({self})"
 
     def client(self, timeout_s: float, on_connect: Callable[[], None] = lambda: None) -> Any:
         """A ``redis.Redis``, annotated as Any: redis-py's annotations name the returns of all its modes at once.
@@ -78,15 +73,11 @@ class RedisAddress:
 
     def unavailable(self, error: Exception) -> StoreUnavailableError:
         """The error for a user that stands for a client's ``error``."""
-        return StoreUnavailableError(f"Redis at {self}: {reason_of(error)}; check {self.source} and the server")
+        return StoreUnavailableError(f"Redis at {self}: {reason_of(error)}; check {VARIABLE} and the server")
 
 
 def address_from_environment() -> RedisAddress | None:
-    """The Redis of ``TANDEM_REDIS_URL``; None where it is not set or empty.
-
-    Raises:
-        StoreError: not a Redis URL, or the package redis is not installed.
-    """
+    """The Redis of ``TANDEM_REDIS_URL``; None where it is not set or empty; see `RedisAddress` for errors."""
     url = os.environ.get(VARIABLE, "").strip()
     return RedisAddress(url) if url else None
 
@@ -95,10 +86,9 @@ def reason_of(error: Exception) -> str:
     """A client's error in one line that names no password."""
     from redis import exceptions
 
-    if isinstance(error, (exceptions.AuthenticationError, exceptions.AuthorizationError)):
-        return "wrong or missing password"
     text = " ".join(str(error).split()) or type(error).__name__
-    if "NOAUTH" in text or "WRONGPASS" in text:
+    refused = isinstance(error, (exceptions.AuthenticationError, exceptions.AuthorizationError))
+    if refused or "NOAUTH" in text or "WRONGPASS" in text:
         return "wrong or missing password"
     if isinstance(error, (exceptions.TimeoutError, TimeoutError)):
         return "no answer in time"

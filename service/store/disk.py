@@ -30,7 +30,7 @@ _logger = logging.getLogger(__name__)
 
 
 class DiskWriter:
-    """The ``RunWriter`` of one run directory; its caller has the directory's lock.
+    """Writes reports into one run directory; its caller has the directory's lock.
 
     A few small files a second are written without waiting for the disk, so the training thread does it by the way.
     """

@@ -15,32 +15,14 @@ a resumed run's takes the place of the earlier one.
 
 from __future__ import annotations
 
+from typing import Literal
+
 RUNS = "tandem:runs"
 MAX_RECORDS = 20_000
 """Of one run, about 60 MB; ``metrics.jsonl`` has them all."""
 LEASE_S = 10.0
 
 
-def status(run_id: str) -> str:
-    """Key of a run's status."""
-    return f"tandem:run:{run_id}:status"
-
-
-def metrics(run_id: str) -> str:
-    """Key of a run's records."""
-    return f"tandem:run:{run_id}:metrics"
-
-
-def goals(run_id: str) -> str:
-    """Key of a run's goal grid."""
-    return f"tandem:run:{run_id}:goals"
-
-
-def stop(run_id: str) -> str:
-    """Key of a stop request."""
-    return f"tandem:run:{run_id}:stop"
-
-
-def lease(run_id: str) -> str:
-    """Key of the claim of the process that runs it."""
-    return f"tandem:run:{run_id}:lease"
+def run_key(run_id: str, content: Literal["status", "metrics", "goals", "stop", "lease"]) -> str:
+    """Key of one value of a run."""
+    return f"tandem:run:{run_id}:{content}"

@@ -10,16 +10,16 @@ import time
 from datetime import UTC, datetime
 from typing import Any
 
-from redis.exceptions import WatchError
-
 from service.io.errors import RunTakenError
 from service.store import keys
 
-_LOOK_S = 0.1
+_POLL_S = 0.1
 
 
 class Lease:
     """One driver's claim on a run id; nobody has it before `acquire`.
+
+    Every method raises ``redis.exceptions.RedisError`` while Redis is away.
 
     Args:
         client: of the Redis; see ``RedisAddress.client``.
@@ -28,7 +28,7 @@ class Lease:
     """
 
     def __init__(self, client: Any, run_id: str, duration_s: float = keys.LEASE_S) -> None:
-        self._client, self._run_id, self._key = client, run_id, keys.lease(run_id)
+        self._client, self._run_id, self._key = client, run_id, keys.run_key(run_id, "lease")
         self._duration_ms = int(1000 * duration_s)
         now = datetime.now(UTC).isoformat(timespec="seconds")
         holder = {"token": secrets.token_hex(16), "host": socket.gethostname(), "pid": os.getpid(), "since": now}
@@ -39,7 +39,6 @@ class Lease:
 
         Raises:
             RunTakenError: another driver renews its claim.
-            redis.exceptions.RedisError: Redis is away.
         """
         previous_ms, deadline_s = None, time.monotonic() + 1.5 * self._duration_ms / 1000
         while not self._client.set(self._key, self._mine, nx=True, px=self._duration_ms):
@@ -51,7 +50,7 @@ class Lease:
                     "give this run another id"
                 )
             previous_ms = left_ms
-            time.sleep(_LOOK_S)
+            time.sleep(_POLL_S)
 
     def renew(self, pipe: Any) -> None:
         """Begin a transaction, on a fresh pipe, that renews the claim and fails where another has taken it meanwhile.
@@ -60,7 +59,6 @@ class Lease:
 
         Raises:
             RunTakenError: another driver has it.
-            redis.exceptions.RedisError: Redis is away.
         """
         pipe.watch(self._key)
         holder = pipe.get(self._key)
@@ -70,21 +68,13 @@ class Lease:
         pipe.set(self._key, self._mine, px=self._duration_ms)
 
     def release(self) -> None:
-        """Give the claim up, if it is ours.
-
-        Raises:
-            redis.exceptions.RedisError: Redis is away; the claim expires by itself.
-        """
+        """Give the claim up, if it is ours; after an error it expires by itself."""
         with self._client.pipeline() as pipe:
             pipe.watch(self._key)
-            if pipe.get(self._key) != self._mine:
-                return
-            pipe.multi()
-            pipe.delete(self._key)
-            try:
+            if pipe.get(self._key) == self._mine:
+                pipe.multi()
+                pipe.delete(self._key)
                 pipe.execute()
-            except WatchError:  # it has expired just now
-                return
 
 
 def _describe(holder: object) -> str:

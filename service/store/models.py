@@ -90,33 +90,11 @@ class GoalGrid(FrozenModel):
     cells: tuple[GoalCell, ...]
 
 
-class RunWriter(Protocol):
-    """A place a runner reports to. No method may raise for a store that is away or full: training goes on."""
-
-    def status(self, status: RunStatus) -> None:
-        """Replace what is known about the run."""
-
-    def metrics(self, record: Record) -> None:
-        """Append one iteration's metrics."""
-
-    def goals(self, grid: GoalGrid) -> None:
-        """Replace the grid."""
-
-    def stop_requested(self) -> bool:
-        """Whether somebody asked the run to stop since it was started."""
-
-    def warnings(self) -> list[str]:
-        """Problems at the moment, in one sentence each; empty when all is well."""
-
-    def close(self) -> None:
-        """Write what still waits, for a bounded time."""
-
-
 class RunReader(Protocol):
     """A place the status service reads runs from.
 
-    Every method may raise ``StoreUnavailableError``; those that take a run id raise ``UnknownRunError`` where there is
-    no such run.
+    Every method may raise ``StoreUnavailableError``, and ``DamagedStoreError`` where the store holds what no run has
+    written. Those that take a run id raise ``UnknownRunError`` where there is no such run.
     """
 
     def runs(self) -> list[RunStatus]:
@@ -132,7 +110,10 @@ class RunReader(Protocol):
         """The newest grid; None before the first."""
 
     def request_stop(self, run_id: str) -> None:
-        """Ask a run to end after its current iteration, saved; nothing happens if it has ended."""
+        """Ask a run to end after its current iteration, saved; nothing happens if it has ended.
+
+        May raise ``StoreError``: an older tandem runs it, which takes no requests.
+        """
 
     def ready(self) -> None:
         """Return if reads work right now."""

@@ -20,14 +20,12 @@ _logger = logging.getLogger(__name__)
 
 
 class RedisReader:
-    """The ``RunReader`` of a Redis; any number of threads may use it at once.
+    """The ``RunReader``, which see for errors, of a Redis; for any number of threads at once.
 
-    Every method raises ``StoreUnavailableError`` while Redis is away, after ``TIMEOUT_S`` at the latest, and
-    ``DamagedStoreError`` where a key holds what no run has written.
+    ``StoreUnavailableError`` is raised after ``TIMEOUT_S`` at the latest.
     """
 
     def __init__(self, address: RedisAddress) -> None:
-        """Take the address of a Redis; nothing is sent before the first call."""
         self._address = address
         self._client = address.client(TIMEOUT_S)
 
@@ -44,49 +42,45 @@ class RedisReader:
         return sorted(statuses, key=lambda status: status.started, reverse=True)
 
     def run(self, run_id: str) -> RunStatus:
-        """One run.
-
-        Raises:
-            UnknownRunError: there is no such run.
-        """
+        """One run."""
         with self._errors():
             ((text, *flags),) = self._look_up([run_id])
             self._check_known(run_id, text is not None)
             return _status(run_id, text, *flags)
 
     def metrics(self, run_id: str, *, after_iteration: int = 0) -> list[Record]:
-        """The records of iterations above ``after_iteration``, in order; see `run` for errors."""
+        """The records of iterations above ``after_iteration``, in order."""
         with self._errors(), self._client.pipeline(transaction=False) as pipe:
-            pipe.exists(keys.status(run_id))
-            pipe.zrangebyscore(keys.metrics(run_id), f"({after_iteration}", "+inf")
+            pipe.exists(keys.run_key(run_id, "status"))
+            pipe.zrangebyscore(keys.run_key(run_id, "metrics"), f"({after_iteration}", "+inf")
             known, lines = pipe.execute()
             self._check_known(run_id, bool(known))
         by_iteration: dict[int, Record] = {}
         for line in lines:
             record = parse_record(line)
             if record is None:
-                _logger.warning("%s: passing over what is no record: %r", keys.metrics(run_id), line[:60])
+                _logger.warning("%s: passing over what is no record: %r", keys.run_key(run_id, "metrics"), line[:60])
             else:
                 by_iteration[int(record["iteration"] or 0)] = record
         return list(by_iteration.values())
 
     def goals(self, run_id: str) -> GoalGrid | None:
-        """The newest grid; None before the first; see `run` for errors."""
+        """The newest grid; None before the first."""
         with self._errors(), self._client.pipeline(transaction=False) as pipe:
-            pipe.exists(keys.status(run_id))
-            pipe.get(keys.goals(run_id))
+            pipe.exists(keys.run_key(run_id, "status"))
+            pipe.get(keys.run_key(run_id, "goals"))
             known, text = pipe.execute()
             self._check_known(run_id, bool(known))
         try:
             return GoalGrid.model_validate_json(text) if text is not None else None
         except ValidationError:
-            raise _damaged(keys.goals(run_id), "goal grid") from None
+            raise _damaged(keys.run_key(run_id, "goals"), "goal grid") from None
 
     def request_stop(self, run_id: str) -> None:
-        """Ask a run to end after its current iteration; nothing happens if it has ended; see `run` for errors."""
+        """Ask a run to end after its current iteration; nothing happens if it has ended."""
         if self.run(run_id).state in ACTIVE:
             with self._errors():
-                self._client.set(keys.stop(run_id), b"1")
+                self._client.set(keys.run_key(run_id, "stop"), b"1")
 
     def ready(self) -> None:
         """Return if Redis answers."""
@@ -97,9 +91,9 @@ class RedisReader:
         """Status of each run, whether a process runs it, and whether it was asked to stop."""
         with self._client.pipeline(transaction=False) as pipe:
             for run_id in run_ids:
-                pipe.get(keys.status(run_id))
-                pipe.exists(keys.lease(run_id))
-                pipe.exists(keys.stop(run_id))
+                pipe.get(keys.run_key(run_id, "status"))
+                pipe.exists(keys.run_key(run_id, "lease"))
+                pipe.exists(keys.run_key(run_id, "stop"))
             replies = iter(pipe.execute(raise_on_error=False) if run_ids else [])
         for text in replies:
             if isinstance(text, ResponseError):  # another type: of one run only, the others are well
@@ -128,12 +122,13 @@ class RedisReader:
 
 
 def _status(run_id: str, text: bytes | None, leased: bool, stop: bool) -> RunStatus:
+    key = keys.run_key(run_id, "status")
     if text is None:
-        raise UnknownRunError(f"run {run_id} is in {keys.RUNS}, but {keys.status(run_id)} is missing; start it again")
+        raise UnknownRunError(f"run {run_id} is in {keys.RUNS}, but {key} is missing; start it again")
     try:
         status = RunStatus.model_validate_json(text)
     except ValidationError:
-        raise _damaged(keys.status(run_id), "run's status") from None
+        raise _damaged(key, "run's status") from None
     if not leased and status.is_silent:
         return status.vanished()
     return status.model_copy(update={"stopping": status.state in ACTIVE and (status.stopping or stop)})

@@ -6,9 +6,9 @@ import json
 import logging
 import time
 from collections import deque
-from dataclasses import dataclass
+from contextlib import suppress
 from threading import Event, Lock, Thread
-from typing import Any
+from typing import NamedTuple
 
 from redis.exceptions import RedisError, WatchError
 
@@ -20,34 +20,33 @@ from service.store.lease import Lease
 from service.store.models import GoalGrid, Record, RunStatus
 
 TICK_S = 0.5
-"""Between two messages to Redis; a stop request is noticed within it."""
+"""Time between two messages to Redis; a stop request is noticed within it."""
 RETRY_S = 1.0
-"""At most, between two tries to reach it."""
+"""Longest time between two tries to reach it."""
 TIMEOUT_S = 2.0
 MAX_WAITING = 20_000
 """Records that wait for Redis to come back, about 60 MB; of more, the oldest are left out, and a warning says so."""
 BATCH = 500
 KEPT_S = 5.0
-"""Redis writes and flushes its file every second, so one that is killed may forget what it said it had. What is younger
-than this is sent again over every new connection."""
+"""Age of the oldest report that is sent again over a new connection. Redis flushes its file every second, so one that
+is killed may forget what it confirmed."""
 _logger = logging.getLogger(__name__)
 
 
-@dataclass(frozen=True, slots=True)
-class _Line:
+class _Line(NamedTuple):
     iteration: int
     text: str
 
 
 class RedisWriter:
-    """The ``RunWriter`` of one run in Redis. While it lives, no other driver can write the same run id.
+    """Reports of one run to Redis. While it lives, no other driver can write the same run id.
 
     One thread consumes what the methods leave behind and produces transactions; it waits for ``TICK_S`` and is
     unblocked by ``close``. Status and grid that were not sent yet are replaced by newer ones, records wait in line.
 
     Args:
         address: of a Redis that has to be there now; later it may go and come.
-        run_id: of the run.
+        run_id: id of the run.
         lease_s: how long after this process died another may take the run over.
 
     Raises:
@@ -57,12 +56,12 @@ class RedisWriter:
 
     def __init__(self, address: RedisAddress, run_id: str, *, lease_s: float = keys.LEASE_S) -> None:
         self._address, self._run_id = address, run_id
-        self._connected_anew = False
-        self._client = address.client(TIMEOUT_S, self._on_connect)
+        self._connected_anew = Event()
+        self._client = address.client(TIMEOUT_S, self._connected_anew.set)
         self._lease = Lease(self._client, run_id, lease_s)
         try:
             self._lease.acquire()
-            self._client.delete(keys.stop(run_id))
+            self._client.delete(keys.run_key(run_id, "stop"))
         except (RedisError, OSError) as error:
             raise address.unavailable(error) from None
         self._lock = Lock()
@@ -140,18 +139,20 @@ class RedisWriter:
             except WatchError:  # the lease has expired or was taken in this very moment; the next try tells which
                 pause_s = 0.0
             except (RedisError, OSError) as error:
-                self._went_away(reason_of(error))
+                self._note_failure(reason_of(error))
                 pause_s = min(2 * pause_s + 0.05, RETRY_S)
                 if ending:
                     time.sleep(0.05)
             else:
-                self._came_back()
+                self._note_recovery()
                 pause_s = 0.0 if more else TICK_S
                 if ending and not self._pending():
                     break
             if time.monotonic() > self._deadline_s:
                 break
-        self._release()
+        with suppress(RedisError, OSError):  # the lease expires by itself
+            self._lease.release()
+            self._client.close()
 
     def _send(self) -> bool:
         """Send one transaction; True when records are left for another."""
@@ -162,23 +163,20 @@ class RedisWriter:
             self._lease.renew(pipe)
             if status is not None and status is not self._sent_status:
                 pipe.zadd(keys.RUNS, {self._run_id: status.started.timestamp()})
-                pipe.set(keys.status(self._run_id), status.model_dump_json())
+                pipe.set(keys.run_key(self._run_id, "status"), status.model_dump_json())
             if grid is not None and grid is not self._sent_grid:
-                pipe.set(keys.goals(self._run_id), grid.model_dump_json())
+                pipe.set(keys.run_key(self._run_id, "goals"), grid.model_dump_json())
+            key = keys.run_key(self._run_id, "metrics")
+            for line in batch:
+                pipe.zremrangebyscore(key, line.iteration, "+inf")
+                pipe.zadd(key, {line.text: line.iteration})
             if batch:
-                self._append(pipe, batch)
-            pipe.exists(keys.stop(self._run_id))
+                pipe.zremrangebyrank(key, 0, -keys.MAX_RECORDS - 1)
+            pipe.exists(keys.run_key(self._run_id, "stop"))
             self._stop = bool(pipe.execute()[-1])
         self._sent_status, self._sent_grid = status, grid
         more = self._count(batch)
         return self._send_again() or more
-
-    def _append(self, pipe: Any, batch: list[_Line]) -> None:
-        key = keys.metrics(self._run_id)
-        for line in batch:
-            pipe.zremrangebyscore(key, line.iteration, "+inf")
-            pipe.zadd(key, {line.text: line.iteration})
-        pipe.zremrangebyrank(key, 0, -keys.MAX_RECORDS - 1)
 
     def _count(self, batch: list[_Line]) -> bool:
         now_s = time.monotonic()
@@ -191,14 +189,11 @@ class RedisWriter:
                 self._sent.popleft()
             return bool(self._waiting)
 
-    def _on_connect(self) -> None:
-        self._connected_anew = True
-
     def _send_again(self) -> bool:
         """Queue the newest reports again after a reconnect: a Redis that was killed has forgotten what came last."""
-        if not self._connected_anew:
+        if not self._connected_anew.is_set():
             return False
-        self._connected_anew = False
+        self._connected_anew.clear()
         with self._lock:
             self._waiting.extendleft(line for _, line in reversed(self._sent))
             self._sent.clear()
@@ -208,19 +203,12 @@ class RedisWriter:
     def _pending(self) -> bool:
         return bool(self._waiting) or self._status is not self._sent_status or self._grid is not self._sent_grid
 
-    def _went_away(self, reason: str) -> None:
+    def _note_failure(self, reason: str) -> None:
         if self._away is None:
             _logger.warning("Redis at %s: %s; the run goes on", self._address, reason)
         self._away = (self._away[0] if self._away else time.monotonic(), reason)
 
-    def _came_back(self) -> None:
+    def _note_recovery(self) -> None:
         if self._away is not None:
             _logger.info("Redis at %s is back after %.0f s", self._address, time.monotonic() - self._away[0])
         self._away = None
-
-    def _release(self) -> None:
-        try:
-            self._lease.release()
-            self._client.close()
-        except (RedisError, OSError):
-            pass  # it expires by itself

@@ -16,13 +16,12 @@ _logger = logging.getLogger(__name__)
 
 
 class RecordFile:
-    """The iterations of one ``metrics.jsonl``; any number of threads may read at once.
+    """The iterations of one ``metrics.jsonl``; any number of threads may read at once. A missing file is empty.
 
     A resumed run cuts the file and goes on: where an iteration comes again, it and all after it are made anew.
     """
 
     def __init__(self, path: Path) -> None:
-        """Nothing is read before the first call; a missing file is an empty one."""
         self._path = path
         self._lock = Lock()
         self._forget()

@@ -10,7 +10,6 @@ import time
 
 import pytest
 
-from service.io import append_file as appending
 from service.io import files, tensors
 from service.io.checkpoints import CheckpointStore
 from service.io.jsonl import JsonlWriter
@@ -89,7 +88,7 @@ def before_old_ones_are_deleted(patch):
 
 
 def in_half_a_line(patch):
-    write = appending._write_whole
+    write = files._write_whole
 
     def half(file, piece):
         if piece.startswith(b'{"iteration": 5, "env_steps"') and b'"goals"' not in piece:
@@ -97,11 +96,11 @@ def in_half_a_line(patch):
             die()
         write(file, piece)
 
-    patch.setattr(appending, "_write_whole", half)
+    patch.setattr(files, "_write_whole", half)
 
 
 def in_half_an_event(patch):
-    write, calls = appending._write_whole, []
+    write, calls = files._write_whole, []
 
     def half(file, piece):
         calls.append(piece)
@@ -110,7 +109,7 @@ def in_half_an_event(patch):
             die()
         write(file, piece)
 
-    patch.setattr(appending, "_write_whole", half)
+    patch.setattr(files, "_write_whole", half)
 
 
 def _is_checkpoint(temporary, step):

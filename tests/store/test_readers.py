@@ -9,7 +9,7 @@ from service.io.lock import DirectoryLock
 from service.store.disk import DiskWriter
 from service.store.disk_reader import DiskReader
 from service.store.errors import DamagedStoreError, StoreUnavailableError, UnknownRunError
-from service.store.keys import goals, metrics, status
+from service.store.keys import run_key
 from service.store.models import SILENT_AFTER
 from service.store.redis_reader import RedisReader
 from service.store.redis_writer import RedisWriter
@@ -61,11 +61,12 @@ class InRedis:
         return RedisWriter(self._redis.address, run_id, lease_s=5.0)
 
     def damage(self, run_id, what):
-        key = {"status": status, "goals": goals}[what](run_id)
-        self._redis.address.client(1.0).set(key, b'{"a": 1}')
+        self._redis.address.client(1.0).set(run_key(run_id, what), b'{"a": 1}')
 
     def damage_records(self, run_id):
-        self._redis.address.client(1.0).zadd(metrics(run_id), {b"\x00{]": 3, b"[1]": 3, b'{"iteration": "x"}': 3})
+        self._redis.address.client(1.0).zadd(
+            run_key(run_id, "metrics"), {b"\x00{]": 3, b"[1]": 3, b'{"iteration": "x"}': 3}
+        )
 
     def lose(self):
         self._redis.kill()

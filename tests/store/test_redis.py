@@ -105,8 +105,8 @@ def test_what_redis_forgot_that_it_had_is_sent_again(redis, writer, reader):
     """A machine that loses power takes the last second with it, and all that was answered in it."""
     train(writer, range(1, 11))
     wait_until(lambda: reader.runs() and iterations(reader)[-1:] == [10])
-    redis.address.client(1.0).zremrangebyscore(keys.metrics("cube"), 6, "+inf")
-    redis.address.client(1.0).delete(keys.status("cube"), keys.goals("cube"))
+    redis.address.client(1.0).zremrangebyscore(keys.run_key("cube", "metrics"), 6, "+inf")
+    redis.address.client(1.0).delete(keys.run_key("cube", "status"), keys.run_key("cube", "goals"))
     redis.kill()
     wait_until(writer.warnings)
     redis.revive()
@@ -209,7 +209,7 @@ def test_no_thread_and_no_lease_is_left(redis):
     writer = RedisWriter(redis.address, "cube")
     writer.close()
     assert not writer._thread.is_alive()
-    assert redis.address.client(1.0).exists(keys.lease("cube")) == 0
+    assert redis.address.client(1.0).exists(keys.run_key("cube", "lease")) == 0
 
 
 # --- who runs it -----------------------------------------------------------------------------------------------------
@@ -268,17 +268,17 @@ def test_a_driver_that_was_taken_over_is_silent(redis, reader, caplog):
     writer.status(a_status(iteration=1))
     wait_until(lambda: reader.runs() != [])
     theirs = b'{"token": "x", "host": "elsewhere", "pid": 7, "since": "today"}'
-    redis.address.client(1.0).set(keys.lease("cube"), theirs)
+    redis.address.client(1.0).set(keys.run_key("cube", "lease"), theirs)
     (warning,) = wait_until(writer.warnings)
     assert_one_line(warning, "run cube was taken over by process 7 on elsewhere", "no longer")
     writer.status(a_status(iteration=2))
     writer.close()
     assert reader.run("cube").iteration == 1
-    assert redis.address.client(1.0).get(keys.lease("cube")) == theirs
+    assert redis.address.client(1.0).get(keys.run_key("cube", "lease")) == theirs
 
 
 def test_a_lease_that_never_expires_is_no_endless_wait(redis):
-    redis.address.client(1.0).set(keys.lease("cube"), b"\xff nobody")
+    redis.address.client(1.0).set(keys.run_key("cube", "lease"), b"\xff nobody")
     with pytest.raises(RunTakenError, match="another process"):
         RedisWriter(redis.address, "cube", lease_s=0.2)
 
@@ -304,27 +304,27 @@ def test_a_damaged_status_hides_only_its_own_run(redis, reader, caplog, content)
         writer = RedisWriter(redis.address, run_id)
         writer.status(a_status(run_id))
         writer.close()
-    redis.address.client(1.0).set(keys.status("cube"), content)
+    redis.address.client(1.0).set(keys.run_key("cube", "status"), content)
     assert [run.run_id for run in reader.runs()] == ["sound"]
     with pytest.raises(DamagedStoreError) as error:
         reader.run("cube")
-    assert_one_line(error.value, keys.status("cube"), "delete that key")
-    assert_one_line(caplog.messages[-1], keys.status("cube"))
+    assert_one_line(error.value, keys.run_key("cube", "status"), "delete that key")
+    assert_one_line(caplog.messages[-1], keys.run_key("cube", "status"))
 
 
 def test_keys_of_another_type(redis, reader, writer):
     writer.status(a_status())
     wait_until(lambda: reader.runs() != [])
     client = redis.address.client(1.0)
-    client.delete(keys.metrics("cube"))
-    client.rpush(keys.metrics("cube"), 1)
+    client.delete(keys.run_key("cube", "metrics"))
+    client.rpush(keys.run_key("cube", "metrics"), 1)
     with pytest.raises(DamagedStoreError) as error:
         reader.metrics("cube")
     assert_one_line(error.value, f"Redis at {redis.address}", "another type", "delete tandem:*")
     writer.metrics(a_record(1))
     (warning,) = wait_until(writer.warnings)
     assert_one_line(warning, "WRONGTYPE", "1 records wait")
-    client.delete(keys.metrics("cube"))
+    client.delete(keys.run_key("cube", "metrics"))
     wait_until(lambda: iterations(reader) == [1])
 
 

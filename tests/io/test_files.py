@@ -2,8 +2,8 @@ import os
 
 import pytest
 
-from service.io.append_file import Appender
 from service.io.errors import StorageError
+from service.io.files import Appender
 from tests.runtime.runs import assert_one_line, no_room_above
 
 
@@ -15,20 +15,20 @@ def path(tmp_path):
 def test_pieces_come_one_after_the_other_behind_what_is_there(path):
     appender = Appender(path)
     assert not path.parent.exists()
-    appender.append(b"ab")
-    Appender(path).append(b"c")
-    appender.append(b"d")
+    appender.append_bytes(b"ab")
+    Appender(path).append_bytes(b"c")
+    appender.append_bytes(b"d")
     assert path.read_bytes() == b"abcd"
 
 
 def test_a_piece_that_does_not_fit_leaves_no_part_and_comes_before_the_next(path):
     appender = Appender(path)
-    appender.append(b"aaa")
+    appender.append_bytes(b"aaa")
     with no_room_above(5), pytest.raises(StorageError) as error:
-        appender.append(b"bbb")  # the kernel takes two of its bytes
+        appender.append_bytes(b"bbb")  # the kernel takes two of its bytes
     assert_one_line(error.value, "cannot write", path, "File too large")
     assert path.read_bytes() == b"aaa"
-    appender.append(b"cc")
+    appender.append_bytes(b"cc")
     assert path.read_bytes() == b"aaabbbcc"
     appender.sync()
     assert path.read_bytes() == b"aaabbbcc"
@@ -55,12 +55,12 @@ def test_a_part_is_taken_back_when_a_signal_comes_between_two_writes(path, monke
             return self._file.write(data[:2])
 
     appender = Appender(path)
-    appender.append(b"aaa")
+    appender.append_bytes(b"aaa")
     with monkeypatch.context() as patch:
         unbuffered = type(path).open
         patch.setattr(type(path), "open", lambda *args, **kwargs: Interrupted(unbuffered(*args, **kwargs)))
         with pytest.raises(KeyboardInterrupt):
-            appender.append(b"bbb")
+            appender.append_bytes(b"bbb")
     assert path.read_bytes() == b"aaa"
 
 
@@ -69,5 +69,5 @@ def test_a_device_that_is_always_full(tmp_path):
     path = tmp_path / "pieces"
     path.symlink_to("/dev/full")
     with pytest.raises(StorageError) as error:
-        Appender(path).append(b"a")
+        Appender(path).append_bytes(b"a")
     assert_one_line(error.value, "cannot write", path, "No space left on device")

@@ -6,14 +6,15 @@ import pytest
 
 from service.io.errors import RunTakenError
 from service.store.disk import DiskWriter
-from service.store.fanout import FanoutWriter, open_writer
+from service.store.keys import run_key
 from service.store.redis_reader import RedisReader
 from service.store.redis_writer import RedisWriter
+from service.store.run_writer import RunWriter
 from tests.store.stores import a_grid, a_record, a_status, wait_until
 
 
 def test_a_writer_to_disk_and_redis(redis, tmp_path):
-    writer = open_writer(tmp_path / "run", "cube", redis.address)
+    writer = RunWriter(tmp_path / "run", "cube", redis.address)
     reader = RedisReader(redis.address)
     writer.status(a_status(iteration=1))
     writer.metrics(a_record(1))
@@ -32,7 +33,7 @@ def test_a_writer_to_disk_and_redis(redis, tmp_path):
 
 
 def test_a_stop_file_stops_a_run_that_tells_redis_too(redis, tmp_path):
-    writer = open_writer(tmp_path, "cube", redis.address)
+    writer = RunWriter(tmp_path, "cube", redis.address)
     (tmp_path / "stop").touch()
     assert writer.stop_requested()
     writer.close()
@@ -44,20 +45,28 @@ def test_a_run_that_another_driver_has_leaves_the_directory_alone(redis, tmp_pat
     directory.mkdir()
     (directory / "stop").touch()
     with pytest.raises(RunTakenError):
-        open_writer(directory, "cube", redis.address)
+        RunWriter(directory, "cube", redis.address)
     assert [path.name for path in directory.iterdir()] == ["stop"]
     other.close()
 
 
-def test_all_are_closed_though_one_fails(tmp_path):
-    class Failing(DiskWriter):
-        def close(self):
-            raise RuntimeError("cannot close")
+def test_all_are_closed_though_one_fails(redis, tmp_path, monkeypatch):
+    writer = RunWriter(tmp_path, "cube", redis.address)
+    writer.goals(a_grid(1))
+    writer.goals(a_grid(2))
+    close = RedisWriter.close
 
-    last = DiskWriter(tmp_path)
-    writer = FanoutWriter([Failing(tmp_path / "a"), last])
-    last.goals(a_grid(1))
-    last.goals(a_grid(2))
+    def fail(self):
+        close(self)
+        raise RuntimeError("cannot close")
+
+    monkeypatch.setattr(RedisWriter, "close", fail)
     with pytest.raises(RuntimeError, match="cannot close"):
         writer.close()
     assert json.loads((tmp_path / "goals.json").read_text())["iteration"] == 2
+    monkeypatch.undo()
+    other, close_on_disk = RunWriter(tmp_path, "cube", redis.address), DiskWriter.close
+    monkeypatch.setattr(DiskWriter, "close", lambda self: [close_on_disk(self), 1 / 0])
+    with pytest.raises(ZeroDivisionError):
+        other.close()
+    assert redis.address.client(1.0).exists(run_key("cube", "lease")) == 0
