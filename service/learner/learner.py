@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from service.actors.rollout import Rollout, Turns, turns_from_arrays, turns_to_arrays
+from service.actors.rollout import Rollout, Turns, part_to_arrays
 from service.config import Config
 from service.envs.observations import MIRROR_ACTION, MIRROR_BOB, MIRROR_BOB_VALUE
 from service.learner import ppo
@@ -107,7 +107,7 @@ class Learner:
         parts = {"alice": self._alice.state(), "bob": self._bob.state(), "demonstrations": self._history.state()}
         parts |= {_BOB_EMA: {name: array.copy() for name, array in self._bob_ema.items()}}
         for index, iteration in enumerate(self._used_again()):
-            parts |= {f"window/{index:04}/{place:04}": turns_to_arrays(each) for place, each in enumerate(iteration)}
+            parts |= {f"window/{index:04}/{place:04}": part_to_arrays(each) for place, each in enumerate(iteration)}
         nested = {f"{part}/{name}": array for part, arrays in parts.items() for name, array in arrays.items()}
         counted = [(*source, sequence) for source, sequence in sorted(self._counted.items())]
         return nested | {
@@ -134,7 +134,7 @@ class Learner:
         self._bob_ema = bob_ema
         self._window.clear()
         for iteration in _parts(_part(window, "window")):
-            self._window.append([turns_from_arrays(arrays) for arrays in _parts(iteration)])
+            self._window.append([Turns(**arrays) for arrays in _parts(iteration)])
         self.version = int(own["version"])
         self._rng = _rng_from_array(own["rng"])
         self._counted = {(int(actor), int(incarnation)): int(last) for actor, incarnation, last in own["counted"]}
