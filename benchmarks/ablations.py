@@ -19,7 +19,7 @@ from benchmarks.run_files import COUNTERS, Run, thin
 from service.config import Config, load_config
 from service.errors import TandemError
 from service.io.run_directory import RunDirectory
-from service.media.plots.figures import read_records
+from service.media.figures import read_records
 from service.runtime.local import LocalRun
 
 RECIPE = "recipe"

@@ -24,7 +24,7 @@ from benchmarks.stages import measure_coverage
 from benchmarks.tasks import measure_tasks
 from service.errors import TandemError
 from service.io.run_directory import RunDirectory
-from service.media.plots.figures import read_records
+from service.media.figures import read_records
 from service.policies.numpy_policy import numpy_bob
 from service.primitives.loading import read_stages
 from service.types import StateArray

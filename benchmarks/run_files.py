@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.errors import TandemError
-from service.media.plots.figures import column
+from service.media.figures import column
 from service.types import StateArray
 
 FORMAT_VERSION = 1

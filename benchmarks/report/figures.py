@@ -20,9 +20,7 @@ from service.config import WorkspaceConfig
 from service.io.files import os_errors, write_atomic
 from service.io.jsonl import JsonlWriter
 from service.io.run_directory import RunDirectory
-from service.media.plots import plot_goals
-from service.media.plots.coverage import draw_paths
-from service.media.plots.figures import (
+from service.media.figures import (
     BLUE,
     FAINT,
     GREEN,
@@ -34,6 +32,7 @@ from service.media.plots.figures import (
     save,
     style_axes,
 )
+from service.media.plots import draw_paths, plot_goals
 from service.types import StateArray
 
 if TYPE_CHECKING:

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from benchmarks.report.markdown import commit, percent, table
-from service.media.plots.figures import counted
+from service.media.figures import counted
 
 Result = Mapping[str, Any]
 NAMED = (16, 256, 4096)

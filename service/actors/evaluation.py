@@ -12,7 +12,7 @@ from service.config import Config, WorldConfig
 from service.envs.batch import WorldBatch
 from service.envs.observations import ACTION, bob_observation
 from service.envs.sampling import GoalKind, draw_goals
-from service.types import FloatArray, StateArray
+from service.types import FloatArray, Metrics, StateArray
 
 Observer = Callable[[WorldBatch, StateArray], None]
 """Called with the worlds and their (N, 3) goals, metres, at the start and after each step."""
@@ -46,15 +46,15 @@ class Evaluation:
     num_episodes: int
     num_steps: int
     success_last: float
-    """Within the success distance at the last step."""
+    """Share within the success distance at the last step."""
     success_last_low: float
     """Lower end of the 95 % Wilson interval of ``success_last``."""
     success_last_high: float
-    """Upper end."""
+    """Upper end of that interval."""
     success_ever: float
-    """Within the success distance after any step."""
+    """Share within the success distance after any step."""
     mean_distance_m: float
-    """Distance to the goal at the last step."""
+    """Mean distance to the goal at the last step."""
 
     def as_dict(self) -> dict[str, float | int | str]:
         """The rates by name, for JSON."""
@@ -114,7 +114,7 @@ def success_metrics(
     *,
     seed: int,
     num_threads: int,
-) -> dict[str, float]:
+) -> Metrics:
     """Success rates on several kinds of goals in a run's world, as metrics ``evaluation/KIND_success_...``."""
     metrics = {}
     for kind in kinds:

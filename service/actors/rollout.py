@@ -10,10 +10,9 @@ from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from service.generator.records import GoalRecords
-from service.types import BoolArray, FloatArray, StateArray
+from service.types import Arrays, BoolArray, FloatArray, Metrics, StateArray
 
 Diverged = tuple[tuple[StateArray, FloatArray], ...]
 """(last finite state (S,), action (4,)) of each world whose physics diverged."""
@@ -71,7 +70,7 @@ class Rollout:
     records: GoalRecords
     num_env_steps: int
     """Both players' steps, only those simulated."""
-    metrics: dict[str, float]
+    metrics: Metrics
     """Counters of this round, e.g. ``alice/contact_fraction``."""
 
     diverged: Diverged = ()
@@ -83,23 +82,20 @@ class Rollout:
         return self.actor, self.incarnation, self.sequence
 
 
-def turns_to_arrays(turns: Turns) -> dict[str, NDArray[Any]]:
-    """The arrays by name."""
-    return {field.name: getattr(turns, field.name) for field in fields(turns)}
+def part_to_arrays(part: Turns | Demonstrations | GoalRecords) -> Arrays:
+    """The arrays of one part by name; ``type(part)(**arrays)`` gives an equal part back."""
+    return {field.name: getattr(part, field.name) for field in fields(part)}
 
 
-def to_arrays(rollout: Rollout) -> dict[str, NDArray[Any]]:
+def to_arrays(rollout: Rollout) -> Arrays:
     """Flat named arrays, for a checkpoint; ``from_arrays`` gives an equal rollout back."""
-    arrays = {
-        f"{part}/{field.name}": getattr(getattr(rollout, part), field.name)
-        for part, kind in _PARTS.items()
-        for field in fields(kind)
-    }
+    parts = {part: part_to_arrays(getattr(rollout, part)) for part in _PARTS}
+    arrays = {f"{part}/{name}": array for part, own in parts.items() for name, array in own.items()}
     numbers = {name: np.array(getattr(rollout, name)) for name in _NUMBERS}
     return arrays | numbers | {f"metrics/{name}": np.array(value) for name, value in rollout.metrics.items()}
 
 
-def from_arrays(arrays: dict[str, NDArray[Any]]) -> Rollout:
+def from_arrays(arrays: Arrays) -> Rollout:
     """The rollout that ``to_arrays`` flattened."""
     values: dict[str, Any] = {
         part: kind(**{field.name: arrays[f"{part}/{field.name}"] for field in fields(kind)})

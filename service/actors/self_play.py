@@ -22,7 +22,7 @@ from service.generator.generator import GoalChoice
 from service.generator.opponents import CURRENT, RoundPlan
 from service.generator.records import GoalRecords
 from service.generator.validity import Verdict, classify_goal
-from service.types import BoolArray, FloatArray, IntArray, StateArray
+from service.types import Arrays, BoolArray, FloatArray, IntArray, Metrics, StateArray
 
 VerdictArray = NDArray[np.int8]
 
@@ -150,7 +150,7 @@ class SelfPlay:
     def _play_alice(
         self, players: Players, plan: RoundPlan, observe: Observer | None
     ) -> tuple[Turns, BoolArray, BoolArray]:
-        """Her turns (without the reward of her goal), (N, 2) finger contacts, (N,) worlds whose physics diverged."""
+        """Alice's turns, without the reward of her goal; (N, 2) finger contacts; (N,) worlds whose physics diverged."""
         game, worlds = self.config.game, self.worlds
         num_steps = int(self._rng.integers(game.alice_steps_min or game.alice_steps, game.alice_steps + 1))
         turns = _empty_turns(game.alice_steps, worlds.num_worlds, FULL.size, FULL.size, learn=~plan.alice_past)
@@ -165,9 +165,7 @@ class SelfPlay:
                 players.alice, players.past_alice, plan.alice_opponent, observation, all_worlds, self._rng
             )
             turns.observation[step], turns.action[step], turns.log_prob[step] = observation, action, log_prob
-            diverged |= (
-                worlds.step(action) if not diverged.any() else worlds.step(action[~diverged], np.flatnonzero(~diverged))
-            )
+            diverged |= worlds.step(action[~diverged], np.flatnonzero(~diverged))
             if observe:
                 observe(worlds.states)
             contacts |= worlds.contacts()
@@ -181,10 +179,10 @@ class SelfPlay:
     def _play_bob(
         self, players: Players, plan: RoundPlan, choice: GoalChoice, observe: Observer | None
     ) -> tuple[Turns, BoolArray, BoolArray]:
-        """His turns, (N,) solved, (N,) worlds whose physics diverged.
+        """Bob's turns; (N,) solved; (N,) worlds whose physics diverged.
 
         A world's turn ends when its object has been at the goal for ``bob_hold_steps`` steps in a row, or its physics
-        broke. The others go on; ``playing`` holds their indices.
+        diverged. The others go on; ``playing`` holds their indices.
         """
         game, worlds = self.config.game, self.worlds
         num = worlds.num_worlds
@@ -245,7 +243,7 @@ class SelfPlay:
         self.worlds.reset(self._rng, over)
         self._round_index[over] = 0
 
-    def state(self) -> dict[str, NDArray[np.generic]]:
+    def state(self) -> Arrays:
         """Everything later rounds depend on, except the random generator, which its owner saves."""
         return {
             "worlds": self.worlds.states.copy(),
@@ -254,7 +252,7 @@ class SelfPlay:
             "num_broken": np.array(self.worlds.num_diverged),
         }
 
-    def load_state(self, state: dict[str, NDArray[np.generic]]) -> None:
+    def load_state(self, state: Arrays) -> None:
         """Continue exactly where ``state`` was taken."""
         self.worlds.restore(np.asarray(state["worlds"], dtype=np.float64))
         self._round_index = np.asarray(state["round_index"], dtype=np.int64).copy()
@@ -305,7 +303,7 @@ def _relabelled(turns: Turns, chosen: BoolArray, goal: StateArray) -> Demonstrat
     return Demonstrations(observation, turns.action[active])
 
 
-def _contact_metrics(contacts: BoolArray) -> dict[str, float]:
+def _contact_metrics(contacts: BoolArray) -> Metrics:
     return {
         "alice/contact_fraction": float(contacts.any(axis=1).mean()),
         "alice/both_contact_fraction": float(contacts.all(axis=1).mean()),

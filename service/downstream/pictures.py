@@ -12,7 +12,7 @@ import numpy as np
 from service.downstream.directory import TRIAL
 from service.downstream.methods import METHODS
 from service.envs.tasks import TASKS
-from service.media.plots.figures import BLUE, FAINT, GREEN, ORANGE, column, new_figure, read_records, save, style_axes
+from service.media.figures import BLUE, FAINT, GREEN, ORANGE, column, new_figure, read_records, save, style_axes
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from service.actors.rollout import Rollout, Turns, turns_to_arrays
+from service.actors.rollout import Rollout, Turns, part_to_arrays
 from service.config import Config
 from service.envs.observations import ACTION, BOB
 from service.io.tensors import join_parts, split_parts
@@ -104,7 +104,7 @@ class Learner:
         parts = {"alice": self._alice.state(), "bob": self._bob.state(), "demonstrations": self._history.state()}
         parts |= {_BOB_EMA: {name: array.copy() for name, array in self._bob_ema.items()}}
         for index, iteration in enumerate(self._used_again()):
-            parts |= {f"window/{index:04}/{place:04}": turns_to_arrays(each) for place, each in enumerate(iteration)}
+            parts |= {f"window/{index:04}/{place:04}": part_to_arrays(each) for place, each in enumerate(iteration)}
         counted = [(*source, sequence) for source, sequence in sorted(self._counted.items())]
         return join_parts(parts) | {
             "version": np.array(self.version, dtype=np.int64),

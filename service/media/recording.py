@@ -7,25 +7,26 @@ Nothing is drawn or learned here.
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
 
 from service.actors.evaluation import DeterministicPolicy, evaluate
-from service.actors.rollout import Rollout
 from service.actors.self_play import Players, SelfPlay, StochasticPolicy
 from service.config import Config, WorldConfig
 from service.envs.batch import WorldBatch
 from service.envs.sampling import GoalKind
 from service.generator.difficulty import in_air
 from service.generator.generator import TaskGenerator
+from service.generator.records import GoalRecords
 from service.generator.validity import Verdict
 from service.types import BoolArray, FloatArray, StateArray
 
 _NUM_WORLDS = 64
 _MAX_ROLLOUTS = 3
+_Interest = tuple[bool, bool, float]
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,20 +74,18 @@ def record_rounds(
     game = config.game.model_copy(update={"num_worlds": max(_NUM_WORLDS, num_rounds)})
     config = config.model_copy(update={"game": game})
     players = Players(version=0, alice=alice, bob=_WithoutNoise(bob))
-    rounds: list[RecordedRound] = []
-    interest: list[tuple[float, ...]] = []
+    rounds: list[tuple[_Interest, RecordedRound]] = []
     with contextlib.closing(SelfPlay(config, rng, num_threads=config.run.num_threads)) as self_play:
         # It is never told of a goal, so it replays none: Bob plays those of this round's Alice.
         generator = TaskGenerator(config, self_play.worlds.layout)
         for _ in range(_MAX_ROLLOUTS):
-            rollout, states = _play_round(self_play, players, generator, rng)
-            rounds += _split(rollout, states)
-            interest += _interest(rollout, config.world.object_size_m / 2)
-            if sum(played for played, *_ in interest) >= num_rounds:
+            records, recorded = _record(self_play, players, generator, rng)
+            rounds += zip(_interest(records, config.world.object_size_m / 2), recorded, strict=True)
+            if sum(played for (played, *_), _ in rounds) >= num_rounds:
                 break
             self_play.start_over()
-    best = sorted(range(len(rounds)), key=interest.__getitem__, reverse=True)[:num_rounds]
-    return [rounds[index] for index in best]
+    rounds.sort(key=lambda pair: pair[0], reverse=True)
+    return [each for _, each in rounds[:num_rounds]]
 
 
 def record_episodes(
@@ -100,14 +99,11 @@ def record_episodes(
     seed: int,
 ) -> RecordedEpisodes:
     """Play the episodes that ``evaluate`` plays with these arguments, and keep every state."""
-    states: list[StateArray] = []
-    reached: list[BoolArray] = []
-    goals: list[StateArray] = []
+    kept: list[tuple[StateArray, StateArray, BoolArray]] = []
 
     def keep(worlds: WorldBatch, goal: StateArray) -> None:
-        states.append(worlds.states.copy())
-        reached.append(np.linalg.norm(worlds.object_position - goal, axis=1) <= success_distance_m)
-        goals.append(goal)
+        reached = np.linalg.norm(worlds.object_position - goal, axis=1) <= success_distance_m
+        kept.append((worlds.states.copy(), goal, reached))
 
     evaluate(
         bob,
@@ -119,7 +115,8 @@ def record_episodes(
         seed=seed,
         observe=keep,
     )
-    return RecordedEpisodes(np.stack(states), goals[0], np.stack(reached))
+    states, goals, reached = map(np.stack, zip(*kept, strict=True))
+    return RecordedEpisodes(states, goals[0], reached)
 
 
 class _WithoutNoise:
@@ -132,23 +129,18 @@ class _WithoutNoise:
         return self._policy.act_deterministic(observation), np.zeros(len(observation), dtype=np.float32)
 
 
-def _play_round(
+def _record(
     self_play: SelfPlay, players: Players, generator: TaskGenerator, rng: np.random.Generator
-) -> tuple[Rollout, list[StateArray]]:
-    """A rollout, and the (N, S) states of all worlds at each step of Alice's turn and then of Bob's."""
+) -> tuple[GoalRecords, list[RecordedRound]]:
+    """Play a round in every world and take each world's states and actions out of it."""
     plan = generator.plan(self_play.worlds.num_worlds, rng)
     choose_goals = partial(generator.choose_goals, plan, rng=rng)
     states: list[StateArray] = []
     rollout = self_play.play_round(players, plan, choose_goals, observe=lambda now: states.append(now.copy()))
-    return rollout, states
-
-
-def _split(rollout: Rollout, states: Sequence[StateArray]) -> Iterator[RecordedRound]:
-    """Each world's round, out of what ``_play_round`` gave."""
     records, alice_steps = rollout.records, int(rollout.alice.active.any(axis=1).sum())
     alice_states, bob_states = np.stack(states[: alice_steps + 1]), np.stack(states[alice_steps + 1 :])
-    for world, bob_steps in enumerate(records.num_bob_steps):
-        yield RecordedRound(
+    return records, [
+        RecordedRound(
             alice_states=alice_states[:, world],
             alice_actions=rollout.alice.action[:alice_steps, world],
             bob_states=bob_states[: bob_steps + 1, world],
@@ -157,10 +149,11 @@ def _split(rollout: Rollout, states: Sequence[StateArray]) -> Iterator[RecordedR
             solved=bool(records.solved[world]),
             verdict=Verdict(records.verdict[world]),
         )
+        for world, bob_steps in enumerate(records.num_bob_steps)
+    ]
 
 
-def _interest(rollout: Rollout, rest_height_m: float) -> Iterator[tuple[float, ...]]:
+def _interest(records: GoalRecords, rest_height_m: float) -> Iterator[_Interest]:
     """Sort keys of each world's round: Bob played it, its goal is in the air, its distance in metres."""
-    records = rollout.records
     distance_m = np.linalg.norm(records.goal - records.start_position, axis=1)
     return zip(records.played, in_air(records.goal, rest_height_m), distance_m, strict=True)

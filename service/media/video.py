@@ -1,7 +1,7 @@
 """Videos of recorded rounds, Alice's turn beside Bob's, and of recorded episodes, several at once.
 
-H.264 in real time. Without a graphics card a picture takes 50 to 100 ms to draw, so a slow machine's video shows only
-every second state.
+A video is H.264 and plays in real time. Without a graphics card a picture takes 50 to 100 ms to draw, so a slow
+machine's video shows only every second state.
 """
 
 from __future__ import annotations
@@ -17,21 +17,18 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from service.config import WorldConfig
-from service.envs.rendering.renderer import RenderError, SceneRenderer
+from service.envs.rendering.renderer import Image, RenderError, SceneRenderer
 from service.generator.validity import Verdict
 from service.io.files import TEMPORARY_PREFIX, os_errors
 from service.media.recording import RecordedEpisodes, RecordedRound
 from service.types import StateArray
 
-Image = NDArray[np.uint8]
 Colour = tuple[int, int, int]
 
-PANE_SIZE = 400
-"""Width and height of one player's picture, pixels."""
-EPISODE_PANE_SIZE = 272
+PANE_SIZE, EPISODE_PANE_SIZE = 400, 272
+"""Width and height of one player's, and of one episode's picture, pixels, even."""
 BAR_HEIGHT = 36
 """Height of the caption over each picture, pixels."""
 EPISODE_COLUMNS = 3
@@ -48,16 +45,13 @@ _NO_GOAL = {
 }
 
 
-def write_video(
-    rounds: Sequence[RecordedRound], config: WorldConfig, path: Path, *, pane_size: int = PANE_SIZE
-) -> Path:
+def write_video(rounds: Sequence[RecordedRound], config: WorldConfig, path: Path) -> Path:
     """Write rounds one after another, Alice on the left and Bob on the right.
 
     Args:
         rounds: at least one, from ``record_rounds``.
         config: the world they were played in.
         path: where to; an mp4 that takes its name only when it is whole.
-        pane_size: width and height of one player's picture, pixels, even.
 
     Returns:
         ``path``.
@@ -68,7 +62,7 @@ def write_video(
     """
     num_pictures = sum(len(each.alice_states) + len(each.bob_states) for each in rounds)
     step_s = _step_s(config)
-    with SceneRenderer(config, pane_size, pane_size) as renderer:
+    with SceneRenderer(config, PANE_SIZE, PANE_SIZE) as renderer:
         stride = _stride(renderer, rounds[0].alice_states[0], num_pictures)
         frames = (
             frame
@@ -78,26 +72,10 @@ def write_video(
         return _encode(frames, path, fps=1 / (stride * step_s))
 
 
-def write_episode_video(
-    episodes: RecordedEpisodes, config: WorldConfig, path: Path, *, pane_size: int = EPISODE_PANE_SIZE
-) -> Path:
-    """Write episodes all at once, in rows of three.
-
-    Args:
-        episodes: from ``record_episodes``.
-        config: the world they were played in.
-        path: where to; an mp4 that takes its name only when it is whole.
-        pane_size: width and height of one picture, pixels, even.
-
-    Returns:
-        ``path``.
-
-    Raises:
-        RenderError: no OpenGL or no ffmpeg here.
-        TandemError: the disk is full or the file cannot be written.
-    """
+def write_episode_video(episodes: RecordedEpisodes, config: WorldConfig, path: Path) -> Path:
+    """Write episodes all at once, in rows of three; arguments and errors are those of ``write_video``."""
     num_steps, num_episodes = episodes.reached.shape
-    with SceneRenderer(config, pane_size, pane_size) as renderer:
+    with SceneRenderer(config, EPISODE_PANE_SIZE, EPISODE_PANE_SIZE) as renderer:
         stride = _stride(renderer, episodes.states[0, 0], num_steps * num_episodes)
         frame_s = stride * _step_s(config)
         return _encode(_episode_frames(renderer, episodes, stride, frame_s), path, fps=1 / frame_s)
@@ -111,21 +89,22 @@ def _round_frames(
 ) -> Iterator[Image]:
     """Alice moves while Bob waits, then Bob moves, then both rest; ``number`` stands in the caption."""
     frame_s = stride * step_s
-    right = _caption(_faded(renderer.render(played.bob_states[0])), "Bob waits", _FAINT, number)
+    faded = (0.45 * renderer.render(played.bob_states[0]) + 0.55 * 235).astype(np.uint8)
+    right = _caption(faded, "Bob waits", _FAINT, number)
     for step in _thinned(len(played.alice_states), stride):
         picture = renderer.render(played.alice_states[step])
-        yield _beside(_caption(picture, "Alice proposes a goal", _ORANGE), right)
+        yield np.hstack([_caption(picture, "Alice proposes a goal", _ORANGE), right])
     if played.verdict != Verdict.VALID:
         left = _caption(picture, f"Alice: no goal, {_NO_GOAL[played.verdict]}", _ORANGE)
-        yield from _hold(_beside(left, right), END_PAUSE_S, frame_s)
+        yield from _hold(np.hstack([left, right]), END_PAUSE_S, frame_s)
         return
     left = _caption(picture, "Alice proposed this goal", _INK)
     picture = renderer.render(played.bob_states[0], played.goal)
-    yield from _hold(_beside(left, _caption(picture, "Bob's turn", _BLUE, number)), GOAL_PAUSE_S, frame_s)
+    yield from _hold(np.hstack([left, _caption(picture, "Bob's turn", _BLUE, number)]), GOAL_PAUSE_S, frame_s)
     for step in _thinned(len(played.bob_states), stride):
         picture = renderer.render(played.bob_states[step], played.goal)
-        yield _beside(left, _caption(picture, f"Bob tries: {step * step_s:.1f} s", _BLUE, number))
-    yield from _hold(_beside(left, _caption(picture, *_result(played, step_s), number)), END_PAUSE_S, frame_s)
+        yield np.hstack([left, _caption(picture, f"Bob tries: {step * step_s:.1f} s", _BLUE, number)])
+    yield from _hold(np.hstack([left, _caption(picture, *_result(played, step_s), number)]), END_PAUSE_S, frame_s)
 
 
 def _result(played: RecordedRound, step_s: float) -> tuple[str, Colour]:
@@ -174,24 +153,15 @@ def _hold(frame: Image, pause_s: float, frame_s: float) -> list[Image]:
 # --- pictures ------------------------------------------------------------------------------------------------------
 
 
-def _faded(image: Image) -> Image:
-    faded: Image = (0.45 * image + 0.55 * 235).astype(np.uint8)
-    return faded
-
-
-def _beside(*panes: Image) -> Image:
-    return np.concatenate(panes, axis=1)
-
-
 def _grid(panes: list[Image]) -> Image:
     """Panes in rows of three, the last row filled up with paper."""
     columns = min(len(panes), EPISODE_COLUMNS)
     panes = panes + [np.full_like(panes[0], _PAPER)] * (-len(panes) % columns)
-    return np.concatenate([_beside(*panes[first : first + columns]) for first in range(0, len(panes), columns)])
+    return np.vstack([np.hstack(panes[first : first + columns]) for first in range(0, len(panes), columns)])
 
 
 def _caption(image: Image, text: str, colour: Colour, number: str = "") -> Image:
-    return np.concatenate([_bar(image.shape[1], text, colour, number), image])
+    return np.vstack([_bar(image.shape[1], text, colour, number), image])
 
 
 @functools.lru_cache(maxsize=64)
@@ -212,13 +182,12 @@ def _bar(width: int, text: str, colour: Colour, number: str) -> Image:
 def _encode(frames: Iterator[Image], path: Path, *, fps: float) -> Path:
     """Write frames as H.264; the file takes its name only when it is whole."""
     temporary = path.parent / f"{TEMPORARY_PREFIX}{os.getpid()}-{path.name}"
-    try:
-        with os_errors("write", path):
-            path.parent.mkdir(parents=True, exist_ok=True)
+    with os_errors("write", path):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        try:
             _run_ffmpeg(frames, temporary, fps)
             temporary.replace(path)
-    finally:
-        with contextlib.suppress(OSError):
+        finally:
             temporary.unlink(missing_ok=True)
     return path
 

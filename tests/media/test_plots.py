@@ -10,11 +10,17 @@ import pytest
 from service.config import WorkspaceConfig
 from service.errors import TandemError
 from service.io.jsonl import JsonlWriter
-from service.media.plots import plot_coverage, plot_curves, plot_goals
-from service.media.plots.coverage import _inside, _summary
-from service.media.plots.curves import _smooth
-from service.media.plots.figures import column, new_figure
-from service.media.plots.goals import _goals, _slice_title
+from service.media.figures import column, new_figure
+from service.media.plots import (
+    _goals,
+    _inside,
+    _slice_title,
+    _smooth,
+    _summary,
+    plot_coverage,
+    plot_curves,
+    plot_goals,
+)
 
 # x and y from -0.1 to 0.1, z from 0 to 0.2: 4 x 4 x 4 cells of 5 cm
 WORKSPACE = WorkspaceConfig(center_x_m=0.0, length_x_m=0.2, length_y_m=0.2, height_m=0.2)
@@ -164,7 +170,7 @@ def test_import_loads_no_matplotlib_and_drawing_no_pyplot():
     new_figure(1.0, 1.0, "")
     code = (
         "import sys, service.media.plots as p; assert 'matplotlib' not in sys.modules; "
-        "from service.media.plots.figures import new_figure; new_figure(1, 1, ''); "
+        "from service.media.figures import new_figure; new_figure(1, 1, ''); "
         "assert 'matplotlib.pyplot' not in sys.modules and 'torch' not in sys.modules"
     )
     subprocess.run([sys.executable, "-c", code], check=True)

@@ -9,7 +9,7 @@ from service.actors.evaluation import evaluate
 from service.config import Config, GameConfig, WorldConfig
 from service.envs.batch import WorldBatch
 from service.generator.validity import Verdict
-from service.media import recording
+from service.media import recording, video
 from service.media.recording import record_episodes, record_rounds
 
 PUSH = (-1.0, 0.0, -1.0, -1.0)
@@ -108,6 +108,23 @@ def test_a_bob_who_passes_the_goal_has_not_solved_it():
     assert [played.solved for played in tried] == [bool(reached(played)[-1]) for played in tried]
 
 
+@pytest.mark.parametrize("distance_m", [0.03, 0.06])
+def test_the_caption_says_solved_where_the_runs_own_rule_does(monkeypatch, distance_m):
+    config = Config(game=GameConfig(alice_steps=8, bob_steps=11, bob_hold_steps=11, success_distance_m=distance_m))
+    rounds = record_rounds(config, Sweep(), Sweep(), num_rounds=30, seed=0)
+    blank = SimpleNamespace(render=lambda state, goal=None: np.zeros((8, 8, 3), dtype=np.uint8))
+    words, bar = [], video._bar
+    monkeypatch.setattr(video, "_bar", lambda width, text, *more: words.append(text) or bar(width, text, *more))
+    said, near = [], []
+    for played in (played for played in rounds if played.verdict == Verdict.VALID):
+        list(video._round_frames(blank, played, "", 1, 0.04))
+        said.append(words[-1])
+        near.append(np.linalg.norm(played.bob_states[-1, OBJECT] - played.goal) <= distance_m)
+    assert said == ["Bob: solved after 0.4 s" if solved else "Bob: not solved in 0.4 s" for solved in near]
+    assert any(near)
+    assert not all(near)
+
+
 def test_the_length_of_alices_turn_is_drawn():
     rounds = [record(alice_steps_min=9, num_rounds=1, seed=seed)[0] for seed in range(12)]
     assert {len(played.alice_actions) for played in rounds} == {9, 10, 11, 12}
@@ -156,7 +173,7 @@ def test_played_before_lifted_before_far():
     start = np.tile([0.0, 0.0, 0.025], (4, 1))
     goal = start + np.array([[0.30, 0, 0], [0.12, 0, 0.06], [0.20, 0, 0], [0.50, 0, 0.10]])
     records = SimpleNamespace(start_position=start, goal=goal, played=np.array([True, True, True, False]))
-    interest = list(recording._interest(SimpleNamespace(records=records), 0.025))
+    interest = list(recording._interest(records, 0.025))
     assert sorted(range(4), key=interest.__getitem__, reverse=True) == [1, 0, 2, 3]
 
 

@@ -24,6 +24,12 @@ def _needs_opengl():
         pytest.skip(str(error))
 
 
+@pytest.fixture(autouse=True)
+def _small_panes(monkeypatch):
+    monkeypatch.setattr(video, "PANE_SIZE", PANE)
+    monkeypatch.setattr(video, "EPISODE_PANE_SIZE", PANE)
+
+
 def still(num_steps):
     """(T + 1, S) states in which nothing moves."""
     with WorldBatch(WorldConfig(), 1, num_threads=1) as worlds:
@@ -48,9 +54,7 @@ def read_video(path):
 
 
 def test_a_video_has_every_state_and_its_pauses(tmp_path):
-    path = write_video(
-        [recorded(), recorded(solved=False)], WorldConfig(), tmp_path / "new" / "rounds.mp4", pane_size=PANE
-    )
+    path = write_video([recorded(), recorded(solved=False)], WorldConfig(), tmp_path / "new" / "rounds.mp4")
     frames, fps = read_video(path)
     # 25 fps: 4 of Alice, 0.4 s, 3 of Bob, 0.8 s; twice.
     assert frames.shape == (2 * (4 + 10 + 3 + 20), PANE + BAR_HEIGHT, 2 * PANE, 3)
@@ -64,13 +68,13 @@ def test_a_video_has_every_state_and_its_pauses(tmp_path):
 
 def test_without_a_goal_bob_has_no_turn(tmp_path):
     played = recorded(num_bob_steps=0, solved=False, verdict=Verdict.OUTSIDE)
-    path = write_video([played], WorldConfig(), tmp_path / "rounds.mp4", pane_size=PANE)
+    path = write_video([played], WorldConfig(), tmp_path / "rounds.mp4")
     assert len(read_video(path)[0]) == 4 + 20
 
 
 def test_on_a_slow_machine_every_second_state_is_drawn(tmp_path, monkeypatch):
     monkeypatch.setattr(video, "MAX_DRAWING_S", 0.0)
-    path = write_video([recorded()], WorldConfig(), tmp_path / "rounds.mp4", pane_size=PANE)
+    path = write_video([recorded()], WorldConfig(), tmp_path / "rounds.mp4")
     # 12.5 fps: states 0, 2, 3 of Alice, 0.4 s, 0 and 2 of Bob, 0.8 s.
     frames, fps = read_video(path)
     assert len(frames) == 3 + 5 + 2 + 10
@@ -88,7 +92,7 @@ def test_episodes_stand_in_rows_of_three(tmp_path):
     states = np.tile(still(1)[:, None], (1, 4, 1))
     goal = np.tile([0.0, 0.1, 0.2], (4, 1))
     episodes = RecordedEpisodes(states, goal, np.zeros((2, 4), dtype=bool))
-    frames, _ = read_video(write_episode_video(episodes, WorldConfig(), tmp_path / "bob.mp4", pane_size=PANE))
+    frames, _ = read_video(write_episode_video(episodes, WorldConfig(), tmp_path / "bob.mp4"))
     assert frames.shape == (2 + 20, 2 * (PANE + BAR_HEIGHT), 3 * PANE, 3)
     assert frames[0, -PANE:, PANE + 8 :].min() > 230  # two of six places are empty
 

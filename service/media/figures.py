@@ -1,4 +1,4 @@
-"""Common parts of the plots: figure, axes, colours, reading records and saving.
+"""Common parts of all pictures: figure, axes, colours, reading records and saving.
 
 A ``Figure`` is made without pyplot, so no window system and no global state is needed. Colours are Okabe and Ito's,
 which colour-blind readers tell apart.
@@ -7,13 +7,13 @@ which colour-blind readers tell apart.
 from __future__ import annotations
 
 import io
+import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from service.config import WorkspaceConfig
 from service.errors import TandemError
 from service.io.files import os_errors, write_atomic
 from service.io.jsonl import read_jsonl
@@ -26,9 +26,6 @@ if TYPE_CHECKING:
 
 BLUE, ORANGE, GREEN = "#0072B2", "#D55E00", "#009E73"
 INK, FAINT = "#222222", "#777777"
-MARGIN_M = 0.03
-EDGE_STYLE = (0, (4, 3))
-_DPI = 100
 
 
 def read_records(path: Path) -> list[dict[str, Any]]:
@@ -45,19 +42,15 @@ def read_records(path: Path) -> list[dict[str, Any]]:
 
 def column(records: Sequence[dict[str, Any]], key: str) -> StateArray:
     """The values of ``key``, NaN where a record lacks it or its value is not finite, (len(records),)."""
-    values = np.array([_number(record.get(key)) for record in records])
-    return np.where(np.isfinite(values), values, np.nan)
-
-
-def _number(value: Any) -> float:
-    return float(value) if isinstance(value, (int, float)) else np.nan
+    values = [record.get(key) for record in records]
+    return np.array([v if isinstance(v, (int, float)) and math.isfinite(v) else np.nan for v in values], dtype=float)
 
 
 def new_figure(width: float, height: float, title: str) -> Figure:
     """An empty figure of ``width`` by ``height`` hundred pixels with its title at the top left."""
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(width, height), dpi=_DPI, facecolor="white")
+    figure = Figure(figsize=(width, height), dpi=100, facecolor="white")
     figure.text(0.02, 0.955, title, fontsize=15, weight="bold", color=INK, va="center")
     return figure
 
@@ -88,15 +81,3 @@ def style_axes(axes: Axes) -> None:
 def counted(number: int, noun: str) -> str:
     """``number`` and ``noun``, with the plural's s where it belongs."""
     return f"{number} {noun}" if number == 1 else f"{number} {noun}s"
-
-
-def draw_outline(axes: Axes, workspace: WorkspaceConfig) -> None:
-    """Set ``axes`` up as a view from above, with the edge of the workspace dashed."""
-    low, high = np.array(workspace.lower_m), np.array(workspace.upper_m)
-    style_axes(axes)
-    corners = np.array([[0, 0], [1, 0], [1, 1], [0, 1], [0, 0]])
-    axes.plot(*(low[:2] + corners * (high - low)[:2]).T, color=INK, linewidth=1.0, linestyle=EDGE_STYLE)
-    axes.set_aspect("equal", adjustable="box")
-    axes.set_xlim(low[0] - MARGIN_M, high[0] + MARGIN_M)
-    axes.set_ylim(low[1] - MARGIN_M, high[1] + MARGIN_M)
-    axes.set_xlabel("x (m), away from the robot", color=FAINT)
