@@ -15,7 +15,7 @@ from service.registry.errors import DamagedBlobError, RegistryError
 from service.registry.names import NAME_PATTERN, Version
 from service.registry.registry import Registry
 from service.status.files import BYTES, PARTS, file_response
-from service.status.openapi import INVALID, problems
+from service.status.openapi import INVALID, READ_ONLY, problems
 from service.status.problems import ProblemError
 from service.status.schemas import (
     AliasChange,
@@ -85,7 +85,7 @@ def primitives_router(registry: Registry) -> APIRouter:
     @router.put(
         "/primitives/{name}/aliases/{alias}",
         summary="Make or move an alias",
-        responses=problems(_UNKNOWN, INVALID, (409, "This registry is read-only.")),
+        responses=problems(READ_ONLY, _UNKNOWN, INVALID, (409, "This registry is read-only.")),
     )
     def put_alias(name: _Name, alias: _Alias, change: AliasChange) -> AliasState:
         """The alias may move to any version, newer or older."""

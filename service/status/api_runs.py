@@ -10,7 +10,7 @@ from fastapi.sse import EventSourceResponse, ServerSentEvent
 
 from service.status.files import BYTES, PARTS, RUN_FILES, RunDirectories, file_response
 from service.status.history import HistoryCache
-from service.status.openapi import INVALID, UNAVAILABLE, UNKNOWN_RUN, problems
+from service.status.openapi import INVALID, READ_ONLY, UNAVAILABLE, UNKNOWN_RUN, problems
 from service.status.problems import ProblemError
 from service.status.schemas import MetricHistory, RunFiles, RunList
 from service.status.stream import EVENT_SCHEMA, RunFollower, Streams
@@ -102,7 +102,7 @@ def runs_router(runs: RunReader, histories: HistoryCache, streams: Streams, dire
         "/{run_id}/stop",
         summary="Ask a run to end",
         status_code=202,
-        responses={**errors, **problems((409, "The run takes no requests."))},
+        responses={**errors, **problems(READ_ONLY, (409, "The run takes no requests."))},
     )
     def stop_run(run_id: _Run) -> RunStatus:
         """The run ends after its current iteration, saved, and can be resumed. No effect on one that has ended."""

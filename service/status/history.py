@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 from array import array
-from collections import OrderedDict
 from collections.abc import Sequence
-from datetime import datetime
+from functools import lru_cache
 from threading import Lock
 
 import numpy as np
@@ -23,8 +22,7 @@ class HistoryCache:
 
     def __init__(self, runs: RunReader) -> None:
         self._runs = runs
-        self._known: OrderedDict[tuple[str, datetime], _Columns] = OrderedDict()
-        self._lock = Lock()
+        self._columns = lru_cache(MAX_RUNS)(lambda *_: _Columns())
 
     def history(self, run_id: str, names: Sequence[str] | None, after_iteration: int, max_points: int) -> MetricHistory:
         """Metrics of a run, down-sampled.
@@ -40,12 +38,7 @@ class HistoryCache:
             StoreUnavailableError: the runs cannot be read.
         """
         # the key has the start: a resumed run makes its last iterations again
-        key = (run_id, self._runs.run(run_id).started)
-        with self._lock:
-            columns = self._known.setdefault(key, _Columns())
-            self._known.move_to_end(key)
-            while len(self._known) > MAX_RUNS:
-                self._known.popitem(last=False)
+        columns = self._columns(run_id, self._runs.run(run_id).started)
         with columns.lock:
             columns.update(self._runs, run_id)
             return columns.select(run_id, names, after_iteration, max_points)

@@ -9,7 +9,6 @@ import socket
 import threading
 import time
 from pathlib import Path
-from types import TracebackType
 
 import uvicorn
 
@@ -56,10 +55,6 @@ class StatusServer:
         try:
             # public or not depends on the bound address, not on the name of the host
             app = create_app(runs, registry, token=token, public=not is_loopback(address), runs_dir=runs_dir)
-            self._socket.listen()
-        except OSError as error:
-            self._socket.close()
-            raise _cannot_bind(host, port, error) from None
         except StatusError:
             self._socket.close()
             raise
@@ -112,9 +107,7 @@ class StatusServer:
         self.start()
         return self
 
-    def __exit__(
-        self, _type: type[BaseException] | None, _error: BaseException | None, _at: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.stop()
 
     def _serve(self) -> None:
@@ -157,6 +150,7 @@ def _bind(host: str, port: int) -> socket.socket:
     try:
         bound.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)  # a restart need not wait for old connections
         bound.bind(address)
+        bound.listen()
     except OSError as error:
         bound.close()
         raise _cannot_bind(host, port, error) from None

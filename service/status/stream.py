@@ -1,12 +1,4 @@
-"""Server-sent events of a run in progress.
-
-| event | data | sent when |
-|---|---|---|
-| ``metrics`` | one record; the event's id is its iteration | an iteration is done |
-| ``status`` | ``RunStatus`` | at the beginning, and when it changed |
-| ``reset`` | ``{"after_iteration": N}``: drop later records, they come again | the run was resumed from before |
-| ``unavailable`` | ``{"detail": "..."}`` | the store cannot be read; the stream keeps trying |
-| ``end`` | ``RunStatus`` | the run has ended; this is the last event |
+"""Server-sent events of a run in progress; docs/api.md lists them.
 
 FastAPI formats the events and sends a comment after 15 s without one. A browser that lost the connection reconnects by
 itself and sends the id of its last record (``Last-Event-ID``); the stream continues after it.
