@@ -38,14 +38,10 @@ def health_router(runs: RunReader, registry: Registry, telemetry: Telemetry) -> 
             ) from None
         return Ready()
 
-    older_name = router.get(
-        "/healthz",
-        name="healthz",
-        summary="The same as /readyz",
-        description="An older name of /readyz.",
-        responses=_NOT_READY,
-    )
-    older_name(readyz)
+    @router.get("/healthz", summary="The same as /readyz", responses=_NOT_READY)
+    def healthz(request: Request) -> Ready:
+        """An older name of /readyz."""
+        return readyz(request)
 
     @router.get(
         "/metrics",

@@ -17,7 +17,6 @@ from service.status.stream import EVENT_SCHEMA, RunFollower, Streams
 from service.store.models import ACTIVE, GoalGrid, RunReader, RunStatus
 
 MAX_ITERATION = 2**53 - 1
-_VIDEO = "rounds.mp4"
 _Run = Annotated[
     str,
     InPath(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]{0,127}$", description="id of a run", examples=["cube"]),
@@ -143,6 +142,6 @@ def runs_router(runs: RunReader, histories: HistoryCache, streams: Streams, dire
     )
     def get_video(request: Request, run_id: _Run) -> Response:
         """Alice beside Bob; the same as `files/rounds.mp4`."""
-        return get_file(request, run_id, _VIDEO)
+        return get_file(request, run_id, "rounds.mp4")
 
     return router

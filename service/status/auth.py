@@ -41,20 +41,19 @@ _BASIC = 'Basic realm="tandem", charset="UTF-8"'
 """Sent as a header of its own: Chromium ignores it behind another challenge in the same header."""
 _logger = logging.getLogger(__name__)
 
-Observer = Callable[[str, str, int, float], None]
-"""Called with method, route template, status, and seconds until the answer began."""
-
 
 class AuthMiddleware:
-    """Authentication, limits, security headers and the last error handler; see the module."""
+    """Authentication, limits, security headers and the last error handler.
 
-    def __init__(self, app: ASGIApp, *, token: str | None, public: bool, observe: Observer) -> None:
-        """Wrap ``app``; if ``public``, other machines can reach the service and there has to be a token."""
+    A ``public`` service has a token. ``observe`` is `Telemetry.observe`.
+    """
+
+    def __init__(self, app: ASGIApp, *, token: str | None, public: bool, observe: Callable[..., None]) -> None:
         assert token is not None or not public
         self._app, self._token, self._public, self._observe = app, token, public, observe
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Answer the HTTP request, or pass it on if it is allowed; the server sends neither lifespan nor web sockets."""
+        """Answer the HTTP request, or pass it on if it is allowed; the server passes on nothing else."""
         inner = dict(scope)  # uvicorn and the router both write into theirs
         if scope["method"] == "HEAD" and not scope["path"].endswith("/stream"):
             inner["method"] = "GET"  # uvicorn leaves the body out

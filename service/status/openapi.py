@@ -4,9 +4,6 @@ from __future__ import annotations
 
 from typing import Any
 
-from fastapi import FastAPI
-from fastapi.openapi.utils import get_openapi
-
 from service.status.auth import OPEN, PROBES
 from service.status.problems import MEDIA_TYPE, Problem
 
@@ -44,11 +41,8 @@ INVALID = (422, "The request does not match this document.")
 READ_ONLY = (403, "This service has no token and so changes nothing.")
 
 
-def document(app: FastAPI, *, public: bool) -> dict[str, Any]:
-    """Make the document of the app's routes; if ``public``, reading needs the token, too."""
-    tree = get_openapi(
-        title=app.title, version=app.version, summary=app.summary, description=app.description, routes=app.routes
-    )
+def complete(tree: dict[str, Any], *, public: bool) -> None:
+    """Add what all routes share to FastAPI's document; if ``public``, reading needs the token, too."""
     tree["components"]["securitySchemes"] = _SCHEMES
     problem = Problem.model_json_schema(ref_template="#/components/schemas/{model}")
     tree["components"]["schemas"] |= {"Problem": problem, **problem.pop("$defs")}
@@ -62,7 +56,6 @@ def document(app: FastAPI, *, public: bool) -> dict[str, Any]:
             for status, text in _COMMON.items():
                 operation["responses"].setdefault(status, {"description": text, "content": _CONTENT})
             operation["responses"] = dict(sorted(operation["responses"].items()))
-    return tree
 
 
 def _security(path: str, *, reading: bool, public: bool) -> list[dict[str, list[str]]]:

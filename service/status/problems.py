@@ -44,12 +44,7 @@ class Problem(BaseModel):
 class ProblemError(Exception):
     """An error that ends a request with a problem.
 
-    Args:
-        status: the HTTP status.
-        kind: end of the problem's type, such as ``unknown-run``; None if the status says it all.
-        detail: one line for people.
-        headers: additional headers of the answer.
-        errors: invalid fields of the request.
+    ``kind`` is the end of the problem's type, such as ``unknown-run``; None if the HTTP status says it all.
     """
 
     def __init__(
@@ -91,7 +86,7 @@ _KINDS: tuple[tuple[type[TandemError], int, str], ...] = (
 
 
 def add_handlers(app: FastAPI) -> None:
-    """Turn errors of the app's routes into problems; ``AuthMiddleware`` answers ``ProblemError`` and unexpected ones."""
+    """Turn errors of the routes into problems; ``AuthMiddleware`` answers ``ProblemError`` and unexpected ones."""
 
     @app.exception_handler(TandemError)
     def on_tandem_error(_: Request, error: TandemError) -> JSONResponse:

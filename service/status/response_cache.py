@@ -36,6 +36,7 @@ class ResponseCache:
         """Time until which it counts, route and messages of each answer, by path, query and accepted media types."""
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Answer from the cache, or pass the request on."""
         if scope["method"] != "GET":
             try:
                 await self._app(scope, receive, send)
