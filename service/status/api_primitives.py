@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from pathlib import Path
+from functools import lru_cache
 from typing import Annotated
 
 from fastapi import APIRouter, Query, Request, Response
@@ -15,7 +15,7 @@ from service.registry.errors import DamagedBlobError, RegistryError
 from service.registry.names import NAME_PATTERN, Version
 from service.registry.registry import Registry
 from service.status.files import BYTES, PARTS, file_response
-from service.status.openapi import INVALID, problems
+from service.status.openapi import INVALID, READ_ONLY, problems
 from service.status.problems import ProblemError
 from service.status.schemas import (
     AliasChange,
@@ -27,6 +27,7 @@ from service.status.schemas import (
     VersionSummary,
 )
 
+MAX_VERIFIED = 4096
 _FOREVER = "private, max-age=31536000, immutable"
 _Name = Annotated[str, InPath(pattern=NAME_PATTERN, examples=["panda-cube"])]
 _Alias = Annotated[str, InPath(pattern=r"^([a-z]|[0-9]+[a-z._-])[a-z0-9._-]*$", max_length=64, examples=["champion"])]
@@ -38,7 +39,12 @@ _UNKNOWN = (404, "There is no such name, version or alias.")
 def primitives_router(registry: Registry) -> APIRouter:
     """Make the routes about frozen primitives; all answers come from the registry's files."""
     router = APIRouter(prefix="/v1", tags=["primitives"])
-    blobs = _VerifiedBlobs(registry.root / "blobs")
+    blobs = BlobStore(registry.root / "blobs")
+
+    @lru_cache(MAX_VERIFIED)
+    def verify(digest: str, *_stamp: int) -> None:
+        # once for each state of the file: clients cache blobs for ever, so a damaged one must never be served
+        blobs.get(digest)
 
     @router.get("/primitives", summary="All names")
     def list_primitives() -> PrimitiveList:
@@ -80,12 +86,19 @@ def primitives_router(registry: Registry) -> APIRouter:
     def get_blob(request: Request, digest: _Digest) -> Response:
         """Checked against the digest, which is also the entity tag; a blob never changes."""
         path = blobs.path(digest)
+        try:
+            status = os.stat(path)
+        except FileNotFoundError:
+            raise ProblemError(
+                404, "unknown-blob", f"no blob {digest} here; a manifest names the ones there are"
+            ) from None
+        verify(digest, status.st_mtime_ns, status.st_size, status.st_ino)
         return file_response(request, path, "application/octet-stream", etag=digest, cache=_FOREVER)
 
     @router.put(
         "/primitives/{name}/aliases/{alias}",
         summary="Make or move an alias",
-        responses=problems(_UNKNOWN, INVALID, (409, "This registry is read-only.")),
+        responses=problems(READ_ONLY, _UNKNOWN, INVALID, (409, "This registry is read-only.")),
     )
     def put_alias(name: _Name, alias: _Alias, change: AliasChange) -> AliasState:
         """The alias may move to any version, newer or older."""
@@ -97,31 +110,6 @@ def primitives_router(registry: Registry) -> APIRouter:
         return AliasState(name=name, alias=alias, version=version.number)
 
     return router
-
-
-class _VerifiedBlobs:
-    """The blobs of a registry, each compared with its digest before it is first served and after its file changed.
-
-    Clients cache blobs for ever, so a damaged one must never be served.
-    """
-
-    def __init__(self, directory: Path) -> None:
-        self._store = BlobStore(directory)
-        self._verified: dict[str, tuple[int, int, int]] = {}
-
-    def path(self, digest: str) -> Path:
-        path = self._store.path(digest)
-        try:
-            status = os.stat(path)
-        except FileNotFoundError:
-            raise ProblemError(
-                404, "unknown-blob", f"no blob {digest} here; a manifest names the ones there are"
-            ) from None
-        stamp = (status.st_mtime_ns, status.st_size, status.st_ino)
-        if self._verified.get(digest) != stamp:
-            self._store.get(digest)
-            self._verified[digest] = stamp
-        return path
 
 
 def _summary(registry: Registry, name: str) -> PrimitiveSummary:

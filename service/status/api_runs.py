@@ -10,14 +10,13 @@ from fastapi.sse import EventSourceResponse, ServerSentEvent
 
 from service.status.files import BYTES, PARTS, RUN_FILES, RunDirectories, file_response
 from service.status.history import HistoryCache
-from service.status.openapi import INVALID, UNAVAILABLE, UNKNOWN_RUN, problems
+from service.status.openapi import INVALID, READ_ONLY, UNAVAILABLE, UNKNOWN_RUN, problems
 from service.status.problems import ProblemError
 from service.status.schemas import MetricHistory, RunFiles, RunList
 from service.status.stream import EVENT_SCHEMA, RunFollower, Streams
 from service.store.models import ACTIVE, GoalGrid, RunReader, RunStatus
 
 MAX_ITERATION = 2**53 - 1
-_VIDEO = "rounds.mp4"
 _Run = Annotated[
     str,
     InPath(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]{0,127}$", description="id of a run", examples=["cube"]),
@@ -102,7 +101,7 @@ def runs_router(runs: RunReader, histories: HistoryCache, streams: Streams, dire
         "/{run_id}/stop",
         summary="Ask a run to end",
         status_code=202,
-        responses={**errors, **problems((409, "The run takes no requests."))},
+        responses={**errors, **problems(READ_ONLY, (409, "The run takes no requests."))},
     )
     def stop_run(run_id: _Run) -> RunStatus:
         """The run ends after its current iteration, saved, and can be resumed. No effect on one that has ended."""
@@ -143,6 +142,6 @@ def runs_router(runs: RunReader, histories: HistoryCache, streams: Streams, dire
     )
     def get_video(request: Request, run_id: _Run) -> Response:
         """Alice beside Bob; the same as `files/rounds.mp4`."""
-        return get_file(request, run_id, _VIDEO)
+        return get_file(request, run_id, "rounds.mp4")
 
     return router

@@ -33,14 +33,14 @@ class StatusApp(FastAPI):
     """The app; made by ``create_app``."""
 
     streams: Streams
-    """Open event streams; the server has to close them at shutdown, or it would wait for their clients."""
+    """Open event streams; the server closes them when it stops."""
     public: bool
 
     def openapi(self) -> dict[str, Any]:
         """The OpenAPI document."""
-        if self.openapi_schema is None:
-            self.openapi_schema = openapi.document(self, public=self.public)
-        return self.openapi_schema
+        if self.openapi_schema is None:  # FastAPI keeps the document that it makes here
+            openapi.complete(super().openapi(), public=self.public)
+        return super().openapi()
 
 
 def create_app(
@@ -53,12 +53,8 @@ def create_app(
 ) -> StatusApp:
     """Make the app with the REST API, ``/metrics`` and the web page.
 
-    Args:
-        runs: reader of the runs.
-        registry: of primitives; its root need not exist.
-        token: needed by requests that change something and, if ``public``, by all.
-        public: whether other machines can reach the service. If not, only requests for localhost are answered.
-        runs_dir: directory of run directories, for their pictures and videos; None if there is none.
+    Requests that change something need the token; if ``public``, so that other machines can reach the service, all do.
+    If not public, only requests for localhost are answered. ``runs_dir`` has the pictures and videos of runs.
 
     Raises:
         StatusError: public without a token, or a token that is too short.
@@ -85,19 +81,16 @@ def create_app(
     app.include_router(health_router(runs, registry, telemetry))
     app.include_router(runs_router(runs, HistoryCache(runs), streams, RunDirectories(runs_dir)))
     app.include_router(primitives_router(registry))
-    _add_page(app)
-    problems.add_handlers(app)
-    app.add_middleware(ResponseCache)
-    app.add_middleware(AuthMiddleware, token=token, public=public, observe=telemetry.observe)
-    return app
 
-
-def _add_page(app: FastAPI) -> None:
     @app.get("/", include_in_schema=False)
     def page(request: Request) -> Response:
         return file_response(request, PAGE / "index.html", "text/html", cache="no-cache")
 
     app.mount("/page", _PageFiles(directory=PAGE))
+    problems.add_handlers(app)
+    app.add_middleware(ResponseCache)
+    app.add_middleware(AuthMiddleware, token=token, public=public, observe=telemetry.observe)
+    return app
 
 
 class _PageFiles(StaticFiles):

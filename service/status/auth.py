@@ -1,17 +1,8 @@
 """ASGI middleware before every route: who may ask, from where, how large a body, and with which headers.
 
-A new route cannot forget its token: everything needs it except what ``OPEN`` lists.
-
-| request | service without a token | with one, on loopback | with one, on a public address |
-|---|---|---|---|
-| GET ``/livez`` | answered | answered | answered |
-| GET ``/readyz``, ``/healthz`` | answered | answered | answered; reasons only with the token |
-| any other GET | answered | answered; 401 with a wrong token | 401 without the token |
-| POST, PUT, ... | 403 | 401 without the token | 401 without the token |
-
-A service on a public address does not start without a token. GET also takes the token as the password of HTTP Basic,
-so that a browser can show the page. Requests that change something do not: any web site could make such a browser
-send them.
+A new route cannot forget its token: everything needs it except what ``OPEN`` lists. The table "Access" of docs/api.md
+says who may do what. GET also takes the token as the password of HTTP Basic, so that a browser can show the page.
+Requests that change something do not: any web site could make such a browser send them.
 """
 
 from __future__ import annotations
@@ -50,28 +41,19 @@ _BASIC = 'Basic realm="tandem", charset="UTF-8"'
 """Sent as a header of its own: Chromium ignores it behind another challenge in the same header."""
 _logger = logging.getLogger(__name__)
 
-Observer = Callable[[str, str, int, float], None]
-"""Called with method, route template, status, and seconds until the answer began."""
-
 
 class AuthMiddleware:
-    """Authentication, limits, security headers and the last error handler; see the module."""
+    """Authentication, limits, security headers and the last error handler.
 
-    def __init__(self, app: ASGIApp, *, token: str | None, public: bool, observe: Observer) -> None:
-        """Wrap ``app``; if ``public``, other machines can reach the service and there has to be a token."""
+    A ``public`` service has a token. ``observe`` is `Telemetry.observe`.
+    """
+
+    def __init__(self, app: ASGIApp, *, token: str | None, public: bool, observe: Callable[..., None]) -> None:
         assert token is not None or not public
         self._app, self._token, self._public, self._observe = app, token, public, observe
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Answer the request, or pass it on if it is allowed."""
-        if scope["type"] == "lifespan":
-            await self._app(scope, receive, send)
-        elif scope["type"] == "http":
-            await self._http(scope, receive, send)
-        else:  # the service has no web sockets
-            await send({"type": "websocket.close", "code": 1008})
-
-    async def _http(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Answer the HTTP request, or pass it on if it is allowed; the server passes on nothing else."""
         inner = dict(scope)  # uvicorn and the router both write into theirs
         if scope["method"] == "HEAD" and not scope["path"].endswith("/stream"):
             inner["method"] = "GET"  # uvicorn leaves the body out

@@ -5,8 +5,6 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -57,7 +55,8 @@ def fetch_primitives(
     """
     base = _base_url(url)
     name, target = split_reference(reference)
-    registry = Registry((cache_dir or _default_cache()) / _directory_of(base))
+    directory = hashlib.sha256(base.encode()).hexdigest()[:16]  # one for each service: two may both have a version 1
+    registry = Registry((cache_dir or _default_cache()) / directory)
     token = read_token() if token is None else token
     headers = {"Authorization": f"Bearer {token}"} if token else {}
     with httpx.Client(base_url=base, headers=headers, timeout=_TIMEOUT) as client:
@@ -94,28 +93,23 @@ def _named(what: str, client: httpx.Client) -> Path:
 def _get(client: httpx.Client, path: str, max_bytes: int) -> bytes:
     """The body of a successful answer of at most ``max_bytes``."""
     base = str(client.base_url).rstrip("/")
-    with _connection_errors(base), client.stream("GET", path) as response:
-        limit, data = max_bytes if response.is_success else _MAX_PROBLEM_BYTES, b""
-        for chunk in response.iter_bytes():
-            data += chunk
-            if len(data) > limit:
-                raise DamagedBlobError(
-                    f"{base}{path} gave more than {limit} bytes, which is too long; check its registry"
-                )
-    if response.status_code != httpx.codes.OK:
-        raise _refusal(base, path, response, data)
-    return data
-
-
-@contextmanager
-def _connection_errors(base: str) -> Iterator[None]:
     try:
-        yield
+        with client.stream("GET", path) as response:
+            limit, data = max_bytes if response.is_success else _MAX_PROBLEM_BYTES, b""
+            for chunk in response.iter_bytes():
+                data += chunk
+                if len(data) > limit:
+                    raise DamagedBlobError(
+                        f"{base}{path} gave more than {limit} bytes, which is too long; check its registry"
+                    )
     except httpx.TimeoutException:
         raise FetchError(f"{base} does not answer in time; is `tandem serve` well there? Try again") from None
     except httpx.RequestError as error:
         reason = " ".join(str(error).split()) or type(error).__name__
         raise FetchError(f"cannot reach {base}: {reason}; is `tandem serve` running there?") from None
+    if response.status_code != httpx.codes.OK:
+        raise _refusal(base, path, response, data)
+    return data
 
 
 def _refusal(base: str, path: str, response: httpx.Response, data: bytes) -> TandemError:
@@ -140,13 +134,13 @@ def _refusal(base: str, path: str, response: httpx.Response, data: bytes) -> Tan
 
 
 def _problem(response: httpx.Response, data: bytes) -> dict[str, Any]:
-    if not response.headers.get("content-type", "").startswith("application/problem+json"):
-        return {}
+    """The problem in the answer; empty if it is something else."""
     try:
         tree = json.loads(data)
     except ValueError:
         return {}
-    return tree if isinstance(tree, dict) else {}
+    is_problem = response.headers.get("content-type", "").startswith("application/problem+json")
+    return tree if is_problem and isinstance(tree, dict) else {}
 
 
 def _base_url(url: str) -> str:
@@ -164,11 +158,6 @@ def _base_url(url: str) -> str:
     if parsed.scheme not in ("http", "https") or not parsed.host or parsed.query or parsed.fragment:
         raise StatusError(f"{url!r} is not the URL of a status service; write http://HOST:PORT")
     return str(parsed).rstrip("/")
-
-
-def _directory_of(base: str) -> str:
-    """A directory for each service: two services may both have a version 1."""
-    return hashlib.sha256(base.encode()).hexdigest()[:16]
 
 
 def _default_cache() -> Path:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import re
-import stat
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -39,27 +38,23 @@ _CONDITIONS = StaticFiles()
 
 
 class RunDirectories:
-    """Pictures and videos in the directories of runs."""
+    """Pictures and videos in the directories ``root``/*/; None if runs have no directories on this machine."""
 
     def __init__(self, root: Path | None) -> None:
-        """Use the directories ``root``/*/; None if runs have no directories on this machine."""
         self._root = root
 
     def files(self, run_id: str) -> list[RunFile]:
         """List those of ``RUN_FILES`` that exist; empty if the run has no directory."""
-        directory = self._directory(run_id)
-        found = ((name, _stat_file(directory / name)) for name in RUN_FILES) if directory is not None else ()
         return [
             RunFile(
                 name=name,
                 title=RUN_FILES[name][0],
                 media_type=RUN_FILES[name][1],
-                num_bytes=status.st_size,
-                modified=datetime.fromtimestamp(status.st_mtime, UTC),
+                num_bytes=path.stat().st_size,
+                modified=datetime.fromtimestamp(path.stat().st_mtime, UTC),
                 url=f"/v1/runs/{run_id}/files/{name}",
             )
-            for name, status in found
-            if status is not None
+            for name, path in self._paths(run_id).items()
         ]
 
     def path(self, run_id: str, name: str) -> Path:
@@ -68,19 +63,21 @@ class RunDirectories:
         Raises:
             ProblemError: the run has no such file.
         """
-        directory = self._directory(run_id)
-        if directory is None or name not in RUN_FILES or _stat_file(directory / name) is None:
-            there = ", ".join(file.name for file in self.files(run_id)) or "nothing yet"
+        paths = self._paths(run_id)
+        if name not in paths:
+            there = ", ".join(paths) or "nothing yet"
             raise ProblemError(404, "no-such-file", f"run {run_id} has no {name[:64]!r} to show; it has: {there}")
-        return directory / name
+        return paths[name]
 
-    def _directory(self, run_id: str) -> Path | None:
-        """Look the directory up instead of building its path from the id, so that no id leads outside the root."""
+    def _paths(self, run_id: str) -> dict[str, Path]:
         try:
             found = sorted(self._root.iterdir()) if self._root is not None else []
         except OSError:
-            return None
-        return next((path for path in found if path.is_dir() and run_id_of(path) == run_id), None)
+            return {}
+        # looked up instead of built from the id, so that no id leads outside the root
+        directory = next((path for path in found if path.is_dir() and run_id_of(path) == run_id), None)
+        paths = {name: directory / name for name in RUN_FILES} if directory is not None else {}
+        return {name: path for name, path in paths.items() if os.path.isfile(path)}
 
 
 def file_response(request: Request, path: Path, media_type: str, *, etag: str | None = None, cache: str) -> Response:
@@ -89,12 +86,8 @@ def file_response(request: Request, path: Path, media_type: str, *, etag: str | 
     Starlette does all of it but two things that RFC 9110 wants (section 14): a Range that is malformed, or in another
     unit, is ignored instead of refused; and 416 is a problem, as every other error is.
 
-    Args:
-        request: If-None-Match, If-Modified-Since, Range, and If-Range with an entity tag count.
-        path: a regular file.
-        media_type: the file's.
-        etag: without quotation marks; made from time and size if None.
-        cache: the header Cache-Control.
+    If-None-Match, If-Modified-Since, Range, and If-Range with an entity tag count. ``etag`` has no quotation marks and
+    is made from time and size if None; ``cache`` is the header Cache-Control.
 
     Raises:
         ProblemError: 416, the range lies beyond the file.
@@ -117,11 +110,3 @@ def _check_range(request: Request, response: FileResponse) -> None:
         request.scope["headers"] = [pair for pair in request.scope["headers"] if pair[0] != b"range"]
     elif (start and int(start) >= size) or (not start and int(end) == 0):
         raise ProblemError(416, "no-such-range", f"the file has {size} bytes", {"Content-Range": f"bytes */{size}"})
-
-
-def _stat_file(path: Path) -> os.stat_result | None:
-    try:
-        status = os.stat(path)
-    except OSError:
-        return None
-    return status if stat.S_ISREG(status.st_mode) else None

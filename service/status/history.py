@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 from array import array
-from collections import OrderedDict
 from collections.abc import Sequence
-from datetime import datetime
+from functools import lru_cache
 from threading import Lock
 
 import numpy as np
@@ -23,29 +22,19 @@ class HistoryCache:
 
     def __init__(self, runs: RunReader) -> None:
         self._runs = runs
-        self._known: OrderedDict[tuple[str, datetime], _Columns] = OrderedDict()
-        self._lock = Lock()
+        self._columns = lru_cache(MAX_RUNS)(lambda *_: _Columns())
 
     def history(self, run_id: str, names: Sequence[str] | None, after_iteration: int, max_points: int) -> MetricHistory:
-        """Metrics of a run, down-sampled.
+        """Metrics of a run after an iteration, down-sampled to points that are the mean of neighbouring iterations.
 
-        Args:
-            run_id: the run.
-            names: metrics to return; those the run does not have are left out; None for all.
-            after_iteration: only later iterations.
-            max_points: greatest number of points; each is the mean of neighbouring iterations.
+        Names that the run does not have are left out; None for all metrics.
 
         Raises:
             UnknownRunError: there is no such run.
             StoreUnavailableError: the runs cannot be read.
         """
         # the key has the start: a resumed run makes its last iterations again
-        key = (run_id, self._runs.run(run_id).started)
-        with self._lock:
-            columns = self._known.setdefault(key, _Columns())
-            self._known.move_to_end(key)
-            while len(self._known) > MAX_RUNS:
-                self._known.popitem(last=False)
+        columns = self._columns(run_id, self._runs.run(run_id).started)
         with columns.lock:
             columns.update(self._runs, run_id)
             return columns.select(run_id, names, after_iteration, max_points)
@@ -71,35 +60,32 @@ class _Columns:
 
     def _append(self, record: Record) -> None:
         size = len(self._columns["iteration"])
-        for name, value in record.items():
-            column = self._columns.setdefault(name, array("d"))
-            column.extend([np.nan] * (size - len(column)))
+        for name in record:
+            if name not in self._columns:
+                self._columns[name] = array("d", [np.nan] * size)
+        for name, column in self._columns.items():
+            value = record.get(name)
             column.append(np.nan if value is None else value)
         self._last = int(record["iteration"] or 0)
 
     def select(self, run_id: str, names: Sequence[str] | None, after: int, max_points: int) -> MetricHistory:
-        iterations = self._column("iteration")
+        # copies, because an array cannot grow while a view of it exists
+        iterations, env_steps = (np.array(self._columns[name]) for name in _INDEX)
         first = int(np.searchsorted(iterations, after, side="right"))
         size = len(iterations) - first
         starts = np.linspace(0, size, min(size, max_points), endpoint=False).astype(int)
         ends = np.append(starts[1:], size)[: len(starts)] - 1
         known = [name for name in self._columns if name not in _INDEX]
-        wanted = known if names is None else [name for name in dict.fromkeys(names) if name in self._columns]
+        wanted = known if names is None else [name for name in dict.fromkeys(names) if name in known]
         return MetricHistory(
             run_id=run_id,
             last_iteration=self._last,
             num_iterations=size,
             iteration=tuple(iterations[first:][ends].astype(int).tolist()),
-            env_steps=tuple(np.nan_to_num(self._column("env_steps")[first:][ends]).astype(int).tolist()),
-            metrics={name: _means(self._column(name)[first:], starts) for name in wanted if name not in _INDEX},
+            env_steps=tuple(np.nan_to_num(env_steps[first:][ends]).astype(int).tolist()),
+            metrics={name: _means(np.array(self._columns[name])[first:], starts) for name in wanted},
             names=tuple(sorted(known)),
         )
-
-    def _column(self, name: str) -> NDArray[np.float64]:
-        """A copy (an array cannot grow while a view of it exists), filled up to the length of the others."""
-        column = np.array(self._columns[name])
-        missing = len(self._columns["iteration"]) - len(column)
-        return np.concatenate([column, np.full(missing, np.nan)])
 
 
 def _means(values: NDArray[np.float64], starts: NDArray[np.int_]) -> tuple[float | None, ...]:

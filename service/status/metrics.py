@@ -43,9 +43,8 @@ class Metric:
 
     def family(self) -> _Family:
         """Make an empty family to add samples to."""
-        if self.kind == "counter":
-            return CounterMetricFamily(self.name, self.help, labels=self.labels)
-        return GaugeMetricFamily(self.name, self.help, labels=self.labels)
+        family = CounterMetricFamily if self.kind == "counter" else GaugeMetricFamily
+        return family(self.name, self.help, labels=self.labels)
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,17 +54,13 @@ class RunMetric(Metric):
     value: Callable[[RunStatus, Record], float | None]
 
 
-def _run(
-    name: str,
-    kind: Literal["counter", "gauge"],
-    text: str,
-    value: Callable[[RunStatus, Record], float | None],
-) -> RunMetric:
+def _run(name: str, text: str, value: Callable[[RunStatus, Record], float | None]) -> RunMetric:
+    kind: Literal["counter", "gauge"] = "counter" if name.endswith("_total") else "gauge"
     return RunMetric(f"tandem_run_{name}", kind, ("run",), text, value)
 
 
 def _of_record(name: str, key: str, text: str) -> RunMetric:
-    return _run(name, "gauge", f"{text} ({key}, newest iteration)", lambda _, record: record.get(key))
+    return _run(name, f"{text} ({key}, newest iteration)", lambda _, record: record.get(key))
 
 
 def _age_s(when: datetime) -> float:
@@ -73,33 +68,27 @@ def _age_s(when: datetime) -> float:
 
 
 def _actor_age_s(run: RunStatus) -> float | None:
-    ages = [_age_s(actor.heartbeat) for actor in run.actors]
-    return max(ages) if ages and run.state in ACTIVE else None
+    return max((_age_s(actor.heartbeat) for actor in run.actors), default=None) if run.state in ACTIVE else None
 
 
 RUN_METRICS: tuple[RunMetric, ...] = (
-    _run("started_timestamp_seconds", "gauge", "Start of the process that runs it, Unix time",
+    _run("started_timestamp_seconds", "Start of the process that runs it, Unix time",
          lambda run, _: run.started.timestamp()),
-    _run("heartbeat_age_seconds", "gauge", "Seconds since the run's last heartbeat",
-         lambda run, _: _age_s(run.heartbeat)),
-    _run("stopping", "gauge", "1 while a stop is requested and the run has not ended", lambda run, _: run.stopping),
-    _run("warnings", "gauge", "Number of current warnings, such as Redis being unavailable",
-         lambda run, _: len(run.warnings)),
-    _run("iterations_total", "counter", "Finished iterations", lambda run, _: run.iteration),
-    _run("env_steps_total", "counter", "Env steps, all worlds together", lambda run, _: run.num_env_steps),
-    _run("env_steps_budget", "gauge", "Env steps at which the run ends", lambda run, _: run.total_env_steps),
-    _run("env_steps_per_second", "gauge", "Env steps per second, newest iteration",
-         lambda run, _: run.env_steps_per_s),
-    _run("policy_version", "gauge", "Updates of the policies so far", lambda run, _: run.policy_version),
-    _run("policy_lag_versions", "gauge", "Policy versions between acting and learning, mean of the last update",
+    _run("heartbeat_age_seconds", "Seconds since the run's last heartbeat", lambda run, _: _age_s(run.heartbeat)),
+    _run("stopping", "1 while a stop is requested and the run has not ended", lambda run, _: run.stopping),
+    _run("warnings", "Number of current warnings, such as Redis being unavailable", lambda run, _: len(run.warnings)),
+    _run("iterations_total", "Finished iterations", lambda run, _: run.iteration),
+    _run("env_steps_total", "Env steps, all worlds together", lambda run, _: run.num_env_steps),
+    _run("env_steps_budget", "Env steps at which the run ends", lambda run, _: run.total_env_steps),
+    _run("env_steps_per_second", "Env steps per second, newest iteration", lambda run, _: run.env_steps_per_s),
+    _run("policy_version", "Updates of the policies so far", lambda run, _: run.policy_version),
+    _run("policy_lag_versions", "Policy versions between acting and learning, mean of the last update",
          lambda run, _: run.policy_lag),
-    _run("rollouts_counted_total", "counter", "Rollouts learned from, each once",
-         lambda run, _: run.num_rollouts_counted),
-    _run("rollouts_refused_total", "counter", "Rollouts seen before, or too old",
-         lambda run, _: run.num_rollouts_refused),
-    _run("actor_replacements_total", "counter", "How often an actor, the learner or the generator was replaced",
+    _run("rollouts_counted_total", "Rollouts learned from, each once", lambda run, _: run.num_rollouts_counted),
+    _run("rollouts_refused_total", "Rollouts seen before, or too old", lambda run, _: run.num_rollouts_refused),
+    _run("actor_replacements_total", "How often an actor, the learner or the generator was replaced",
          lambda run, _: sum(actor.incarnation for actor in run.actors)),
-    _run("actor_heartbeat_age_seconds", "gauge", "Seconds since the oldest heartbeat of an active run's actors",
+    _run("actor_heartbeat_age_seconds", "Seconds since the oldest heartbeat of an active run's actors",
          lambda run, _: _actor_age_s(run)),
     _of_record("valid_goals_ratio", "alice/valid_fraction", "Fraction of Alice's goals that are valid"),
     _of_record("lifted_goals_ratio", "alice/lifted_fraction", "Fraction of valid goals that are in the air"),
@@ -137,18 +126,17 @@ _METHODS = frozenset({"GET", "HEAD", "POST", "PUT", "DELETE"})
 _BUCKETS = (0.001, 0.0025, 0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1.0, 2.5, 10.0)
 
 
-class Telemetry:
-    """The metrics of one app, in their own Prometheus registry."""
+class Telemetry(Collector):
+    """The metrics of one app, in their own Prometheus registry; nothing is read before the first ``page``."""
 
     def __init__(self, runs: RunReader, registry: Registry, num_streams: Callable[[], int]) -> None:
-        """Register all metrics; nothing is read before the first ``page``."""
-        self._registry = CollectorRegistry()
-        self._registry.register(_Collector(runs, registry))
-        ProcessCollector(namespace="tandem", registry=self._registry)
-        labels, into = _REQUESTS.labels, self._registry
-        self._requests = Counter(_REQUESTS.name, _REQUESTS.help, labels, registry=into)
-        self._duration = Histogram(_DURATION.name, _DURATION.help, _DURATION.labels, registry=into, buckets=_BUCKETS)
-        Gauge(_STREAMS.name, _STREAMS.help, registry=into).set_function(num_streams)
+        self._runs, self._registry = runs, registry
+        self._all = all_ = CollectorRegistry()
+        all_.register(self)
+        ProcessCollector(namespace="tandem", registry=all_)
+        self._requests = Counter(_REQUESTS.name, _REQUESTS.help, _REQUESTS.labels, registry=all_)
+        self._duration = Histogram(_DURATION.name, _DURATION.help, _DURATION.labels, registry=all_, buckets=_BUCKETS)
+        Gauge(_STREAMS.name, _STREAMS.help, registry=all_).set_function(num_streams)
 
     def observe(self, method: str, route: str, status: int, duration_s: float) -> None:
         """Count one answer; ``route`` is the template, not the path, so that clients cannot create series."""
@@ -157,14 +145,10 @@ class Telemetry:
 
     def page(self) -> bytes:
         """Make the text of a scrape, of ``CONTENT_TYPE``; what cannot be read at the moment is left out."""
-        return generate_latest(self._registry)
-
-
-class _Collector(Collector):
-    def __init__(self, runs: RunReader, registry: Registry) -> None:
-        self._runs, self._registry = runs, registry
+        return generate_latest(self._all)
 
     def collect(self) -> Iterator[_Family]:
+        """Read the runs and the registry; prometheus-client calls it at each scrape."""
         yield from self._about_runs()
         yield from self._about_registry()
 

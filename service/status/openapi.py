@@ -4,9 +4,6 @@ from __future__ import annotations
 
 from typing import Any
 
-from fastapi import FastAPI
-from fastapi.openapi.utils import get_openapi
-
 from service.status.auth import OPEN, PROBES
 from service.status.problems import MEDIA_TYPE, Problem
 
@@ -19,7 +16,6 @@ _COMMON = {
     "421": "The host is not localhost.",
     "500": "A file of the service is damaged, or the service failed.",
 }
-_CHANGING = {"403": "This service has no token and so changes nothing."}
 _SCHEMES = {
     "bearer": {"type": "http", "scheme": "bearer", "description": "The token the service was started with."},
     "basic": {
@@ -42,39 +38,24 @@ def problems(*texts: tuple[int, str]) -> dict[int | str, dict[str, Any]]:
 UNKNOWN_RUN = (404, "There is no such run.")
 UNAVAILABLE = (503, "The runs cannot be read at the moment.")
 INVALID = (422, "The request does not match this document.")
+READ_ONLY = (403, "This service has no token and so changes nothing.")
 
 
-def document(app: FastAPI, *, public: bool) -> dict[str, Any]:
-    """Make the document of the app's routes; if ``public``, reading needs the token, too."""
-    tree = get_openapi(
-        title=app.title, version=app.version, summary=app.summary, description=app.description, routes=app.routes
-    )
-    components = tree.setdefault("components", {})
-    components["securitySchemes"] = _SCHEMES
-    components.setdefault("schemas", {})["Problem"] = Problem.model_json_schema(
-        ref_template="#/components/schemas/{model}"
-    )
-    components["schemas"] |= components["schemas"]["Problem"].pop("$defs", {})
-    for unused in ("HTTPValidationError", "ValidationError"):  # FastAPI's own schemas of a 422
-        components["schemas"].pop(unused, None)
+def complete(tree: dict[str, Any], *, public: bool) -> None:
+    """Add what all routes share to FastAPI's document; if ``public``, reading needs the token, too."""
+    tree["components"]["securitySchemes"] = _SCHEMES
+    problem = Problem.model_json_schema(ref_template="#/components/schemas/{model}")
+    tree["components"]["schemas"] |= {"Problem": problem, **problem.pop("$defs")}
     for path, methods in tree["paths"].items():
         for method, operation in methods.items():
             reading = method in ("get", "head")
             for parameter in operation.get("parameters", ()):
-                parameter["schema"] = _never_null(parameter["schema"])
+                schema = parameter["schema"]  # one that can be left out is X or null; a URL cannot hold null
+                schema |= schema.pop("anyOf", [{}])[0]
             operation["security"] = _security(path, reading=reading, public=public)
-            for status, text in {**_COMMON, **({} if reading else _CHANGING)}.items():
+            for status, text in _COMMON.items():
                 operation["responses"].setdefault(status, {"description": text, "content": _CONTENT})
             operation["responses"] = dict(sorted(operation["responses"].items()))
-    return tree
-
-
-def _never_null(schema: dict[str, Any]) -> dict[str, Any]:
-    """Drop null from a parameter's schema: it can be omitted, but a URL or a header cannot hold null."""
-    options = [option for option in schema.get("anyOf", ()) if option != {"type": "null"}]
-    if len(options) != 1:
-        return schema
-    return {**{key: value for key, value in schema.items() if key != "anyOf"}, **options[0]}
 
 
 def _security(path: str, *, reading: bool, public: bool) -> list[dict[str, list[str]]]:

@@ -8,7 +8,7 @@ from typing import Any
 
 from fastapi import FastAPI, Request
 from fastapi.exceptions import RequestValidationError
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, Field
 from starlette.exceptions import HTTPException
 from starlette.responses import JSONResponse
 
@@ -25,7 +25,6 @@ _RETRY_AFTER_S = 5
 class FieldError(BaseModel):
     """An invalid field of a request."""
 
-    model_config = ConfigDict(frozen=True)
     where: str = Field(description="such as query.max_points", examples=["query.max_points"])
     message: str = Field(examples=["Input should be greater than or equal to 2"])
 
@@ -33,7 +32,6 @@ class FieldError(BaseModel):
 class Problem(BaseModel):
     """An error, after RFC 9457."""
 
-    model_config = ConfigDict(frozen=True)
     type: str = Field(
         _BLANK, description="what kind of error: programs branch on it", examples=["urn:tandem:unknown-run"]
     )
@@ -46,12 +44,7 @@ class Problem(BaseModel):
 class ProblemError(Exception):
     """An error that ends a request with a problem.
 
-    Args:
-        status: the HTTP status.
-        kind: end of the problem's type, such as ``unknown-run``; None if the status says it all.
-        detail: one line for people.
-        headers: additional headers of the answer.
-        errors: invalid fields of the request.
+    ``kind`` is the end of the problem's type, such as ``unknown-run``; None if the HTTP status says it all.
     """
 
     def __init__(
@@ -93,11 +86,7 @@ _KINDS: tuple[tuple[type[TandemError], int, str], ...] = (
 
 
 def add_handlers(app: FastAPI) -> None:
-    """Turn every error of the app's routes into a problem; ``AuthMiddleware`` does it for unexpected ones."""
-
-    @app.exception_handler(ProblemError)
-    def on_problem(_: Request, error: ProblemError) -> JSONResponse:
-        return error.response()
+    """Turn errors of the routes into problems; ``AuthMiddleware`` answers ``ProblemError`` and unexpected ones."""
 
     @app.exception_handler(TandemError)
     def on_tandem_error(_: Request, error: TandemError) -> JSONResponse:

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
 from http import HTTPStatus
 from typing import Any
 
@@ -22,15 +21,6 @@ MAX_ANSWERS, MAX_BYTES = 64, 1 << 18
 _TYPES = ("application/json", "text/plain", "application/openmetrics-text")
 _UNCACHED = {"range", "if-none-match"}
 """Request headers that make the answer depend on what the client has."""
-_ROUTE = "route"
-"""Key of the ASGI scope in which the router leaves the route; requests are counted by it."""
-
-
-@dataclass(frozen=True, slots=True)
-class _Answer:
-    until_s: float
-    route: Any
-    messages: tuple[Message, ...]
 
 
 class ResponseCache:
@@ -41,31 +31,31 @@ class ResponseCache:
     """
 
     def __init__(self, app: ASGIApp, *, clock: Callable[[], float] = time.monotonic) -> None:
-        """Wrap ``app``; ``clock`` counts seconds."""
         self._app, self._clock = app, clock
-        self._answers: dict[tuple[str, bytes, str], _Answer] = {}
+        self._answers: dict[tuple[str, bytes, str], tuple[float, Any, list[Message]]] = {}
+        """Time until which it counts, route and messages of each answer, by path, query and accepted media types."""
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Answer from the cache, or pass the request on."""
-        if scope["type"] == "http" and scope["method"] != "GET":
+        if scope["method"] != "GET":
             try:
                 await self._app(scope, receive, send)
             finally:
                 self._answers.clear()
-        elif scope["type"] == "http" and _may_be_cached(scope):
+        elif _may_be_cached(scope):
             await self._get(scope, receive, send)
         else:
             await self._app(scope, receive, send)
 
     async def _get(self, scope: Scope, receive: Receive, send: Send) -> None:
         key = (scope["path"], scope["query_string"], Headers(scope=scope).get("accept", ""))
-        known = self._answers.get(key)
-        if known is not None and self._clock() < known.until_s:
-            scope[_ROUTE] = known.route
-            for message in known.messages:
+        until_s, route, messages = self._answers.get(key, (0.0, None, []))
+        if self._clock() < until_s:
+            scope["route"] = route  # where the router leaves it: requests are counted by it
+            for message in messages:
                 await send(dict(message))  # a copy, because the middleware before this one adds headers to it
             return
-        messages: list[Message] = []
+        messages = []
 
         async def keep(message: Message) -> None:
             if len(messages) < 2:  # streams and files send more, and are not cached
@@ -77,7 +67,7 @@ class ResponseCache:
         if _is_cacheable(messages):
             if len(self._answers) >= MAX_ANSWERS:
                 self._answers.clear()
-            self._answers[key] = _Answer(asked_s + AGE_S, scope.get(_ROUTE), tuple(messages))
+            self._answers[key] = (asked_s + AGE_S, scope.get("route"), messages)
 
 
 def _may_be_cached(scope: Scope) -> bool:

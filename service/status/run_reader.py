@@ -32,11 +32,7 @@ _logger = logging.getLogger(__name__)
 
 
 def open_reader(runs_dir: Path, redis: RedisAddress | None = None) -> RunReader:
-    """Make a reader of the runs in a directory and, if there is a Redis, of those in it.
-
-    Args:
-        runs_dir: directory of run directories.
-        redis: None for the one of ``TANDEM_REDIS_URL``, if that is set.
+    """Make a reader of run directories and of ``redis``, or else of the Redis in ``TANDEM_REDIS_URL`` if that is set.
 
     Raises:
         StoreError: not a Redis URL, or the package redis is not installed.
@@ -50,10 +46,9 @@ def open_reader(runs_dir: Path, redis: RedisAddress | None = None) -> RunReader:
 
 
 class CombinedReader:
-    """The ``RunReader`` of run directories and a Redis; thread-safe."""
+    """The ``RunReader`` of run directories and a Redis; thread-safe. Nothing is read before the first call."""
 
     def __init__(self, disk: RunReader, redis: RunReader, *, clock: Callable[[], float] = time.monotonic) -> None:
-        """Combine two readers; nothing is read before the first call. ``clock`` counts seconds."""
         self._disk, self._redis, self._clock = disk, redis, clock
         self._failure: tuple[float, str] | None = None
         """Time and reason of the last failure of Redis; None while it answers."""

@@ -8,13 +8,13 @@ import signal
 import socket
 import threading
 import time
+from contextlib import ExitStack
 from pathlib import Path
-from types import TracebackType
 
 import uvicorn
 
 from service.registry.registry import Registry
-from service.status.app import StatusApp, create_app
+from service.status.app import create_app
 from service.status.auth import is_loopback
 from service.status.errors import StatusError
 from service.store.models import RunReader
@@ -29,13 +29,8 @@ _logger = logging.getLogger(__name__)
 class StatusServer:
     """Server in a thread, until ``stop`` or the end of the process; as a context manager it starts and stops.
 
-    Args:
-        runs: reader of the runs.
-        registry: of primitives.
-        token: see `create_app`.
-        host: name or address to listen at.
-        port: 0 for a free one, which the attribute ``port`` gives.
-        runs_dir: directory of run directories, for their pictures and videos.
+    It listens at ``host``, a name or an address, and ``port``; 0 is a free one, which the attribute ``port`` gives. The
+    other arguments are those of `create_app`.
 
     Raises:
         StatusError: it cannot listen at the address, or the address is public and there is no token.
@@ -56,17 +51,24 @@ class StatusServer:
         try:
             # public or not depends on the bound address, not on the name of the host
             app = create_app(runs, registry, token=token, public=not is_loopback(address), runs_dir=runs_dir)
-            self._socket.listen()
-        except OSError as error:
-            self._socket.close()
-            raise _cannot_bind(host, port, error) from None
         except StatusError:
             self._socket.close()
             raise
         self.url = f"http://{_reachable(address)}:{self.port}"
         """URL for clients on this machine."""
         self.app = app
-        self._server = _Server(app)
+        config = uvicorn.Config(
+            app,
+            log_config=None,  # keep the program's own logging
+            log_level="warning",
+            access_log=False,  # /metrics counts requests
+            server_header=False,
+            proxy_headers=False,
+            lifespan="off",
+            ws="none",
+            timeout_graceful_shutdown=_GRACE_S,
+        )
+        self._server = uvicorn.Server(config)
         self._thread = threading.Thread(target=self._serve, name=f"status-{self.port}", daemon=True)
 
     def start(self) -> None:
@@ -84,6 +86,7 @@ class StatusServer:
 
     def stop(self) -> None:
         """Finish open requests, end event streams, and free the port."""
+        self.app.streams.close()  # or the server would wait for their clients
         self._server.should_exit = True
         if self._thread.is_alive():
             self._thread.join(STOP_TIMEOUT_S)
@@ -112,9 +115,7 @@ class StatusServer:
         self.start()
         return self
 
-    def __exit__(
-        self, _type: type[BaseException] | None, _error: BaseException | None, _at: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.stop()
 
     def _serve(self) -> None:
@@ -124,52 +125,26 @@ class StatusServer:
             _logger.exception("the status service at port %d ended", self.port)
 
 
-class _Server(uvicorn.Server):
-    """A uvicorn server that ends event streams before it waits for open connections."""
-
-    def __init__(self, app: StatusApp) -> None:
-        config = uvicorn.Config(
-            app,
-            log_config=None,  # keep the program's own logging
-            log_level="warning",
-            access_log=False,  # /metrics counts requests
-            server_header=False,
-            proxy_headers=False,
-            lifespan="off",
-            ws="none",
-            timeout_graceful_shutdown=_GRACE_S,
-        )
-        super().__init__(config)
-        self._app = app
-
-    async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
-        self._app.streams.close()
-        await super().shutdown(sockets)
-
-
 def _bind(host: str, port: int) -> socket.socket:
     try:
         found = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)
         family, kind, protocol, _, address = found[0]
-        bound = socket.socket(family, kind, protocol)
+        with ExitStack() as on_error:
+            bound = on_error.enter_context(socket.socket(family, kind, protocol))
+            bound.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)  # a restart need not wait for old connections
+            bound.bind(address)
+            bound.listen()
+            on_error.pop_all()
+        return bound
     except (OSError, OverflowError, UnicodeError) as error:
-        raise _cannot_bind(host, port, error) from None
-    try:
-        bound.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)  # a restart need not wait for old connections
-        bound.bind(address)
-    except OSError as error:
-        bound.close()
-        raise _cannot_bind(host, port, error) from None
-    return bound
-
-
-def _cannot_bind(host: str, port: int, error: Exception) -> StatusError:
-    number = error.errno if isinstance(error, OSError) else None
-    if number == errno.EADDRINUSE:
-        return StatusError(f"port {port} of {host} is taken; stop what listens there, or choose another with --port")
-    if number == errno.EACCES:
-        return StatusError(f"port {port} of {host}: {error}; choose one above 1023 with --port")
-    return StatusError(f"cannot listen at {host!r} port {port}: {error}; --host is a name or address of this machine")
+        match getattr(error, "errno", None):
+            case errno.EADDRINUSE:
+                reason = f"port {port} of {host} is taken; stop what listens there, or choose another with --port"
+            case errno.EACCES:
+                reason = f"port {port} of {host}: {error}; choose one above 1023 with --port"
+            case _:
+                reason = f"cannot listen at {host!r} port {port}: {error}; --host is a name or address of this machine"
+        raise StatusError(reason) from None
 
 
 def _reachable(address: str) -> str:

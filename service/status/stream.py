@@ -1,12 +1,4 @@
-"""Server-sent events of a run in progress.
-
-| event | data | sent when |
-|---|---|---|
-| ``metrics`` | one record; the event's id is its iteration | an iteration is done |
-| ``status`` | ``RunStatus`` | at the beginning, and when it changed |
-| ``reset`` | ``{"after_iteration": N}``: drop later records, they come again | the run was resumed from before |
-| ``unavailable`` | ``{"detail": "..."}`` | the store cannot be read; the stream keeps trying |
-| ``end`` | ``RunStatus`` | the run has ended; this is the last event |
+"""Server-sent events of a run in progress; docs/api.md lists them.
 
 FastAPI formats the events and sends a comment after 15 s without one. A browser that lost the connection reconnects by
 itself and sends the id of its last record (``Last-Event-ID``); the stream continues after it.
@@ -23,7 +15,7 @@ from fastapi.sse import ServerSentEvent
 
 from service.status.problems import ProblemError
 from service.store.errors import StoreError, StoreUnavailableError
-from service.store.models import ACTIVE, Record, RunReader, RunStatus
+from service.store.models import ACTIVE, RunReader, RunStatus
 
 POLL_S = 0.5
 MAX_STREAMS = 64
@@ -76,18 +68,15 @@ class RunFollower:
         events = []
         if self._last_iteration and not records:
             remaining = self._runs.metrics(self._run_id)
-            self._last_iteration = _iteration(remaining[-1]) if remaining else 0
+            self._last_iteration = int(remaining[-1]["iteration"] or 0) if remaining else 0
             events.append(ServerSentEvent(event="reset", data={"after_iteration": self._last_iteration}))
         for record in records:
-            if (iteration := _iteration(record)) > self._last_iteration:
+            iteration = int(record["iteration"] or 0)
+            if iteration > self._last_iteration:
                 self._last_iteration = iteration
-                events.append(ServerSentEvent(event="metrics", data=self._select(record), id=str(iteration)))
+                selected = {name: record[name] for name in record if self._names is None or name in self._names}
+                events.append(ServerSentEvent(event="metrics", data=selected, id=str(iteration)))
         return events
-
-    def _select(self, record: Record) -> Record:
-        if self._names is None:
-            return record
-        return {name: value for name, value in record.items() if name in self._names}
 
 
 class Streams:
@@ -95,20 +84,15 @@ class Streams:
 
     def __init__(self, runs: RunReader) -> None:
         self._runs = runs
-        self._closing = asyncio.Event()
+        self._closed = False
         self.num_open = 0
 
     def close(self) -> None:
-        """End all streams; call it in their event loop."""
-        self._closing.set()
+        """End all streams, within ``POLL_S``."""
+        self._closed = True
 
     async def follow(self, run_id: str, names: Collection[str] | None, after_iteration: int | None) -> RunFollower:
-        """Check that a run can be streamed.
-
-        Args:
-            run_id: the run.
-            names: metrics to send; None for all.
-            after_iteration: the last iteration the client has; None to begin with the newest record.
+        """Begin to follow a run after the last iteration that the client has; None to begin with the newest record.
 
         Raises:
             UnknownRunError: there is no such run.
@@ -128,21 +112,11 @@ class Streams:
         end_s = time.monotonic() + MAX_AGE_S
         try:
             yield ServerSentEvent(retry=_RETRY_MS)
-            while True:
+            while not self._closed:
                 for event in await to_thread.run_sync(follower.poll):
                     yield event
-                if follower.ended or time.monotonic() >= end_s or await self._closed_within(POLL_S):
+                if follower.ended or time.monotonic() >= end_s:
                     return
+                await asyncio.sleep(POLL_S)
         finally:
             self.num_open -= 1
-
-    async def _closed_within(self, seconds: float) -> bool:
-        try:
-            await asyncio.wait_for(self._closing.wait(), seconds)
-        except TimeoutError:
-            return False
-        return True
-
-
-def _iteration(record: Record) -> int:
-    return int(record["iteration"] or 0)

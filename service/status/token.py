@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import base64
-import binascii
 import hmac
 import os
 from pathlib import Path
@@ -14,8 +13,6 @@ from service.status.errors import StatusError
 VARIABLE = "TANDEM_TOKEN"
 MIN_CHARACTERS = 16
 _MAKE = "make one with: openssl rand -hex 32"
-
-Verdict = Literal["missing", "wrong", "right"]
 
 
 def read_token(file: Path | None = None) -> str | None:
@@ -48,29 +45,18 @@ def check_token(token: str, source: str) -> str:
     return token
 
 
-def check_authorization(authorization: str | None, token: str, *, basic: bool) -> Verdict:
-    """Compare an ``Authorization`` header with the token.
-
-    Args:
-        authorization: the header; None if the request has none.
-        token: the right one.
-        basic: also accept the token as the password of HTTP Basic, which is how a browser can send it.
-    """
+def check_authorization(authorization: str | None, token: str, *, basic: bool) -> Literal["missing", "wrong", "right"]:
+    """Compare an ``Authorization`` header with the token; if ``basic``, it may also be the password of HTTP Basic."""
     if authorization is None:
         return "missing"
     scheme, _, rest = authorization.strip().partition(" ")
-    if scheme.lower() == "bearer":
-        given = rest.strip()
-    elif scheme.lower() == "basic" and basic:
-        given = _password(rest.strip())
-    else:
+    given = rest.strip()
+    if scheme.lower() == "basic" and basic:
+        try:
+            given = base64.b64decode(given, validate=True).decode("latin-1").partition(":")[2]
+        except ValueError:
+            return "wrong"
+    elif scheme.lower() != "bearer":
         return "wrong"
     # as bytes: compare_digest raises for text that is not ASCII, which is only a wrong token here
     return "right" if hmac.compare_digest(given.encode(), token.encode()) else "wrong"
-
-
-def _password(text: str) -> str:
-    try:
-        return base64.b64decode(text, validate=True).decode("latin-1").partition(":")[2]
-    except (binascii.Error, ValueError):
-        return ""

@@ -340,11 +340,11 @@ def test_the_keyboard_skips_to_the_content(visit):
 def test_views_and_runs_that_do_not_exist(visit):
     for place, sentence in {
         "#/runs/nope": "No run 'nope' in",
-        "#/runs/a/b": "This page has no such part.",
+        "#/runs/a/b": "There is no page at this address.",
         "#/runs/-bad-": "Path.run_id",
-        "#/%": "This page has no such part.",
+        "#/%": "There is no page at this address.",
         f"#/runs/{HOSTILE.replace('/', '%2F')}": "/openapi.json lists every route",
-        f"#/runs/{HOSTILE}": "This page has no such part.",
+        f"#/runs/{HOSTILE}": "There is no page at this address.",
     }.items():
         page = visit.go(place).page
         page.locator("main").get_by_text(sentence).wait_for()

@@ -36,7 +36,7 @@ export async function get(parts, query = [], signal = undefined) {
   }
   const problem = await response.json().catch(() => ({}));
   const detail = problem.detail ?? `the service answers ${response.status} ${response.statusText}`;
-  if (response.status === 401) troubled(about, `${sentence(detail)} Reload the page to be asked for it.`);
+  if (response.status === 401) troubled(about, `${sentence(detail)} Reload the page to enter it.`);
   else if (AWAY.has(response.status)) troubled(about, sentence(detail));
   else answered(about);
   throw new ApiError(response.status, detail);

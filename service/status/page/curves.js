@@ -8,7 +8,7 @@ const FRACTION = { text: percent, top: () => 1 };
 const PANELS = [
   {
     title: "Alice's proposals",
-    hint: "valid settles high, lifted grows",
+    hint: "valid stays high, lifted grows",
     ...FRACTION,
     curves: [
       { name: "alice/valid_fraction", label: "valid" },
@@ -17,7 +17,7 @@ const PANELS = [
   },
   {
     title: "Bob on Alice's goals",
-    hint: "holds up while the goals get harder",
+    hint: "stays high while the goals get harder",
     ...FRACTION,
     curves: [
       { name: "bob/success_rate", label: "all" },
@@ -27,7 +27,7 @@ const PANELS = [
   },
   {
     title: "Bob on random goals",
-    hint: "evaluations, there at the last step: grows",
+    hint: "success at the last step of an evaluation; grows",
     ...FRACTION,
     curves: [
       { name: "evaluation/mixed_success_last", label: "mixed", sparse: true },
@@ -37,7 +37,7 @@ const PANELS = [
   },
   {
     title: "Goals",
-    hint: "Alice raises the bar",
+    hint: "grow while Alice proposes harder goals",
     text: (value) => quantity(value, "m"),
     curves: [
       { name: "alice/goal_distance_m", label: "distance" },
@@ -46,7 +46,7 @@ const PANELS = [
   },
   {
     title: "Throughput",
-    hint: "env steps a second",
+    hint: "env steps per second",
     text: (value) => quantity(value),
     curves: [{ name: "time/env_steps_per_s", label: "env steps/s" }],
   },

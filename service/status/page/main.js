@@ -19,7 +19,7 @@ function show() {
   if (page === "runs" && id && parts.length === 2) runView(main, id, left.signal);
   else if (page === "primitives" && parts.length === 1) primitivesView(main, left.signal);
   else if (page === "" || (page === "runs" && !id)) runsView(main, left.signal);
-  else main.replaceChildren(el("h1", {}, "Nothing here"), note("This page has no such part. ", el("a", { href: "#/" }, "All runs")));
+  else main.replaceChildren(el("h1", {}, "Nothing here"), note("There is no page at this address. ", el("a", { href: "#/" }, "All runs")));
 }
 
 function markCurrent(page) {

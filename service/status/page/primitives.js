@@ -65,7 +65,7 @@ class VersionTable {
       ...rates,
       { label: "Published", changed: (version) => version.created, node: created },
       { label: "Commit", text: (version) => version.git_commit?.slice(0, 8) ?? "\u2013" },
-      { label: "Trained on from", text: (version) => version.parent ?? "\u2013" },
+      { label: "Trained further from", text: (version) => version.parent ?? "\u2013" },
       { label: "Size", text: (version) => bytes(version.blob_bytes), number: true },
       { label: "Download", changed: (version) => version.blob_sha256, node: (version) => downloads(name, version) },
     ];

@@ -61,7 +61,7 @@ class RunPage {
     if (!this.begun) this.begin(run);
     this.summary.update(run);
     this.actors.update(run);
-    const there = run.actors.length ? this.actors.root : note("No actors are known of this run.");
+    const there = run.actors.length ? this.actors.root : note("No actors of this run are known.");
     if (this.actorsBody.firstChild !== there) this.actorsBody.replaceChildren(there);
   }
 
@@ -108,7 +108,7 @@ class Summary {
     this.troubles = el("div", { class: "troubles", role: "status" });
     this.numbers = el("dl", { class: "tiles" });
     this.bob = tile("Bob's success", "on Alice's goals");
-    const trail = el("nav", { class: "trail", "aria-label": "Where this is" }, el("a", { href: "#/" }, "Runs"), " / ");
+    const trail = el("nav", { class: "trail", "aria-label": "Breadcrumb" }, el("a", { href: "#/" }, "Runs"), " / ");
     this.root = el("div", {}, trail, el("h1", {}, runId, " ", this.chip), this.sub, this.troubles, this.numbers);
     this.tiles = {
       progress: tile("Progress"),
@@ -140,7 +140,7 @@ class Summary {
   show() {
     const run = this.run;
     const silent = isActive(run) && secondsSince(run.heartbeat) > SILENT_S;
-    const warnings = [...run.warnings, ...(silent ? ["not heard of for a while; it may be busy, or gone"] : [])];
+    const warnings = [...run.warnings, ...(silent ? ["no heartbeat for a while; the run may be busy, or its process may have ended"] : [])];
     const boxes = [
       ...(this.cannot ? [["error", "This run cannot be followed", this.cannot]] : []),
       ...(run.last_error ? [["error", "Last error", run.last_error]] : []),

@@ -70,7 +70,7 @@ function state(run) {
 
 function nothing() {
   const command = el("code", {}, "tandem pretrain --config configs/pretrain/panda_cube.yaml --run-dir runs/cube");
-  return note("No runs yet. Start one with ", command, ": it is here as soon as it has begun.");
+  return note("No runs yet. Start one with ", command, ": it appears here when it has started.");
 }
 
 /** The small curves; asks for one run at a time, and again only for runs with new iterations. */
