@@ -24,14 +24,14 @@ downstream_app = typer.Typer(
 )
 
 _LINE_EVERY_S = 10.0
-_Primitives = Annotated[str, typer.Option("--primitives", metavar="NAME@ALIAS|RUN_DIR", help="What is composed.")]
+_Primitives = Annotated[str, typer.Option(metavar="NAME@ALIAS|RUN_DIR", help="What is composed.")]
 _Registry = Annotated[
-    str, typer.Option("--registry", envvar="TANDEM_REGISTRY", metavar="DIR|URL", help="Where primitives come from.")
+    str, typer.Option(envvar="TANDEM_REGISTRY", metavar="DIR|URL", help="Where primitives come from.")
 ]
 _Set = Annotated[
     list[str] | None, typer.Option("--set", metavar="A=B", help="How SAC learns, such as gamma=0.9; repeatable.")
 ]
-_Steps = Annotated[int | None, typer.Option("--steps", help="Env steps of learning.", min=1)]
+_Steps = Annotated[int | None, typer.Option(help="Env steps of learning.", min=1)]
 _Episodes = Annotated[int, typer.Option(help="Of the final evaluation.", min=1)]
 _Threads = Annotated[int | None, typer.Option(help="Cores of one training; default: all, on a cluster one.", min=1)]
 
@@ -45,7 +45,7 @@ def train(
     steps: _Steps = None,
     episodes: _Episodes = 300,
     run_dir: Annotated[
-        Path | None, typer.Option("--run-dir", metavar="DIR", help="Default: runs/downstream/TASK-METHOD-SEED.")
+        Path | None, typer.Option(metavar="DIR", help="Default: runs/downstream/TASK-METHOD-SEED.")
     ] = None,
     resume: Annotated[bool, typer.Option("--resume", help="Continue the training in the directory exactly.")] = False,
     overrides: _Set = None,
@@ -113,10 +113,9 @@ def table(
         for task in _names(tasks, TASKS)
         for method in _names(methods, METHODS)
     ]
-    trials = list(dict.fromkeys(trials))
     source = Source(primitives, registry, runs.absolute())
     with _make_runner(runtime, address, num_workers, threads) as runner, _stop_on_signals() as (callbacks, signals):
-        complete = make_table(trials, source, out, runner, callbacks)
+        complete = make_table(list(dict.fromkeys(trials)), source, out, runner, callbacks)
     if not complete:
         typer.echo("stopped; the same command continues", err=True)
         raise typer.Exit(EXIT_SIGNAL + (signals.first or 0))
@@ -180,16 +179,14 @@ def _make_runner(name: str, address: str | None, num_workers: int | None, thread
 
 @contextmanager
 def _stop_on_signals() -> Iterator[tuple[Callbacks, StopSignals]]:
-    """SIGINT and SIGTERM end it where it can be continued; progress goes to stderr."""
+    """Let SIGINT and SIGTERM end the block where it can be continued; progress goes to stderr."""
     from service.downstream.worker import Callbacks
     from service.runtime.signals import InterruptError, StopSignals
 
-    def is_stopping() -> bool:
-        return signals.first is not None
-
     with StopSignals() as signals, signals.asking(lambda: None):
+        say = functools.partial(typer.echo, err=True)
         try:
-            yield Callbacks(is_stopping, _Progress().show, lambda text: typer.echo(text, err=True)), signals
+            yield Callbacks(lambda: signals.first is not None, _Progress().show, say), signals
         except InterruptError as interrupt:  # a second one
             typer.echo("stopped at once; what came after the last checkpoint is lost", err=True)
             raise typer.Exit(EXIT_SIGNAL + interrupt.number) from None

@@ -10,7 +10,7 @@ import typer
 from service.cli.common import REGISTRY, JsonOption, RegistryOption, print_json
 from service.errors import TandemError
 
-_Primitives = Annotated[str, typer.Option("--primitives", metavar="NAME@ALIAS|RUN_DIR", help="Whose Bob.")]
+_Primitives = Annotated[str, typer.Option(metavar="NAME@ALIAS|RUN_DIR", help="Whose Bob.")]
 _Seed = Annotated[int, typer.Option(help="Of the episodes.", min=0)]
 
 
@@ -34,16 +34,10 @@ def evaluate(
     if goals not in GOAL_KINDS:
         raise TandemError(f"--goals {goals!r}: choose one of {', '.join(GOAL_KINDS)}")
     bob = load_bob(primitives, registry)
-    distance_m = bob.config.game.success_distance_m
+    world, distance_m = bob.config.world, bob.config.game.success_distance_m
     rows = {
         name: run(
-            policy,
-            bob.config.world,
-            goals,
-            num_episodes=episodes,
-            num_steps=steps,
-            seed=seed,
-            success_distance_m=distance_m,
+            policy, world, goals, num_episodes=episodes, num_steps=steps, seed=seed, success_distance_m=distance_m
         )
         for name, policy in ((bob.label, bob.policy), ("idle", IdlePolicy()))
     }

@@ -15,6 +15,7 @@ from service.errors import TandemError
 
 if TYPE_CHECKING:
     from service.config import Config
+    from service.io.run_directory import RunDirectory
     from service.runtime.ray_connection import ClusterOptions
 
 _DEMO_CONFIG = Path(__file__).parents[2] / "configs" / "pretrain" / "panda_cube.yaml"
@@ -23,16 +24,14 @@ _DEMO_CONFIG = Path(__file__).parents[2] / "configs" / "pretrain" / "panda_cube.
 
 def pretrain(
     config: Annotated[
-        Path | None,
-        typer.Option("--config", metavar="FILE", help="YAML; defaults where left out. Not needed to resume."),
+        Path | None, typer.Option(metavar="FILE", help="YAML; defaults where left out. Not needed to resume.")
     ] = None,
-    run_dir: Annotated[Path | None, typer.Option("--run-dir", metavar="DIR", help="Default: RUNS/NAME.")] = None,
+    run_dir: Annotated[Path | None, typer.Option(metavar="DIR", help="Default: RUNS/NAME.")] = None,
     run_id: Annotated[
-        str | None,
-        typer.Option("--run-id", metavar="ID", help="Run in RUNS/ID, and continue it if it has begun: for jobs."),
+        str | None, typer.Option(metavar="ID", help="Run in RUNS/ID, and continue it if it has begun: for jobs.")
     ] = None,
     runs: Annotated[
-        Path, typer.Option("--runs", envvar="TANDEM_RUNS", metavar="DIR", help="Directory of run directories.")
+        Path, typer.Option(envvar="TANDEM_RUNS", metavar="DIR", help="Directory of run directories.")
     ] = Path("runs"),
     resume: Annotated[bool, typer.Option("--resume", help="Continue the run in --run-dir exactly.")] = False,
     overrides: Annotated[
@@ -52,12 +51,10 @@ def pretrain(
         float, typer.Option(help="Cores reserved for the learner; 0: it shares the actors'.", min=0)
     ] = 0.0,
     status: Annotated[
-        str,
-        typer.Option(metavar="HOST:PORT|off", help="Where the status service of a run on a cluster listens."),
+        str, typer.Option(metavar="HOST:PORT|off", help="Where the status service of a run on a cluster listens.")
     ] = "127.0.0.1:8321",
     token_file: Annotated[
-        Path | None,
-        typer.Option("--token-file", metavar="FILE", help="Its token; default: TANDEM_TOKEN. See tandem serve."),
+        Path | None, typer.Option(metavar="FILE", help="Its token; default: TANDEM_TOKEN. See tandem serve.")
     ] = None,
 ) -> None:
     """Pre-train primitives by self-play, in this process or on a Ray cluster, and publish them."""
@@ -67,9 +64,9 @@ def pretrain(
 
     if runtime not in ("local", "ray"):
         raise TandemError(f"--runtime {runtime!r}: choose one of local, ray")
-    if run_id is not None and (resume or run_dir is not None):
-        raise TandemError("--run-id names the run directory, and continues what is there: leave out the other two")
     if run_id is not None:
+        if resume or run_dir is not None:
+            raise TandemError("--run-id names the run directory, and continues what is there: leave out the other two")
         run_dir = runs / run_id
         resume = RunDirectory(run_dir).exists
     if resume:
@@ -93,7 +90,7 @@ def pretrain(
 
 
 def demo(
-    run_dir: Annotated[Path | None, typer.Option("--run-dir", metavar="DIR", help="Default: runs/demo-N.")] = None,
+    run_dir: Annotated[Path | None, typer.Option(metavar="DIR", help="Default: runs/demo-N.")] = None,
     env_steps: Annotated[
         int, typer.Option(help="Budget; the default takes about three minutes on 2 cores.", min=1)
     ] = 1_000_000,
@@ -124,18 +121,18 @@ def _pretrain(
     from service.runtime.progress import Progress
     from service.runtime.signals import InterruptError
 
+    directory = RunDirectory(path)
     try:
         with Progress(config.run.total_env_steps, Console()) as progress:
-            directory = RunDirectory(path)
             done = run(config, directory, registry, resume=resume, on_iteration=progress.show, cluster=cluster)
     except InterruptError as interrupt:
-        _say_stopped("stopped at once", interrupt.number, path, registry)
+        _say_stopped("stopped at once", interrupt.number, directory, registry)
     result = done.result
     typer.echo(f"\n{result.reason} after {result.num_env_steps:,} env steps, {result.iteration} iterations")
     typer.echo(done.timing)
     if done.signal is not None:
         rest = "" if result.reason == "interrupted" else ", but not evaluated, published and drawn to the end"
-        _say_stopped(f"saved{rest}", done.signal, path, registry)
+        _say_stopped(f"saved{rest}", done.signal, directory, registry)
     for name, value in done.metrics.items():
         typer.echo(f"{name:<36} {value:.1%}")
     for name, file in done.files.items():
@@ -145,11 +142,8 @@ def _pretrain(
         typer.echo(f"{'primitives':<12} {done.version} in {registry}")
 
 
-def _say_stopped(what: str, number: int, path: Path, registry: Path) -> NoReturn:
+def _say_stopped(what: str, number: int, directory: RunDirectory, registry: Path) -> NoReturn:
     """Say how to go on, and exit as a process that a signal ends."""
-    from service.io.run_directory import RunDirectory
-
-    begun = RunDirectory(path).exists
-    how = f"continue with: tandem pretrain --resume --run-dir {path} --registry {registry}"
-    typer.echo(f"{what}; {how if begun else 'nothing was saved yet'}")
+    how = f"continue with: tandem pretrain --resume --run-dir {directory.path} --registry {registry}"
+    typer.echo(f"{what}; {how if directory.exists else 'nothing was saved yet'}")
     raise typer.Exit(EXIT_SIGNAL + number)

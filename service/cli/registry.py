@@ -31,7 +31,7 @@ def list_versions(directory: RegistryOption = REGISTRY, as_json: JsonOption = Fa
     if not own.names():
         typer.echo(f"nothing published in {directory} yet", err=True)
     rows = [
-        _row(registry, registry.manifest(str(version)))
+        _summary(registry, registry.manifest(str(version)))
         for registry in ([own] if is_bundled(own) else [own, bundled])
         for name in registry.names()
         for version in registry.versions(name)
@@ -49,19 +49,19 @@ def show(reference: _Reference, directory: RegistryOption = REGISTRY, as_json: J
 
     registry, version = find_version(reference, directory)
     manifest = registry.manifest(str(version))
-    aliases, where = _aliases_of(registry, manifest), _where(registry)
+    summary = _summary(registry, manifest)
     tree = manifest.model_dump(mode="json")
     if as_json:
-        print_json({**tree, "aliases": aliases, "where": where})
+        print_json({**tree, "aliases": summary["aliases"], "where": summary["where"]})
         return
     tree["tensors"] = {name: f"{tensor.dtype} {list(tensor.shape)}" for name, tensor in manifest.tensors.items()}
-    rows = [["reference", manifest.reference], ["aliases", _text(aliases)]]
+    rows = [["reference", manifest.reference], ["aliases", _text(summary["aliases"])]]
     for key, value in tree.items():
         if isinstance(value, dict):
             rows += [[f"{key}.{inner}", _text(item)] for inner, item in value.items()]
         else:
             rows.append([key, _text(value)])
-    print_table(["key", "value"], [*rows, ["where", where]])
+    print_table(["key", "value"], [*rows, ["where", summary["where"]]])
 
 
 @registry_app.command()
@@ -116,27 +116,19 @@ def export(
     typer.echo(f"{manifest.reference} is in {target}")
 
 
-def _row(registry: Registry, manifest: Manifest) -> dict[str, Any]:
+def _summary(registry: Registry, manifest: Manifest) -> dict[str, Any]:
+    """A version's row in the list; two registries may both have a version 1, so it says where this one is."""
+    from service.primitives.bundled import is_bundled
+
     return {
         "name": manifest.name,
         "version": manifest.version,
-        "where": _where(registry),
+        "where": "bundled" if is_bundled(registry) else "yours",
         "created": manifest.created,
         "bytes": manifest.blob_bytes,
-        "aliases": _aliases_of(registry, manifest),
+        "aliases": [name for name, number in registry.aliases(manifest.name).items() if number == manifest.version],
         "parent": manifest.parent,
     }
-
-
-def _where(registry: Registry) -> str:
-    """Two registries may both have a version 1: the reader must see which one is meant."""
-    from service.primitives.bundled import is_bundled
-
-    return "bundled" if is_bundled(registry) else "yours"
-
-
-def _aliases_of(registry: Registry, manifest: Manifest) -> list[str]:
-    return [alias for alias, number in registry.aliases(manifest.name).items() if number == manifest.version]
 
 
 def _text(value: Any) -> str:
