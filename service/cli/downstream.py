@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import functools
-import json
-import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -13,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from service.cli.common import CHAMPION, EXIT_SIGNAL, CommandGroup, print_json
 from service.errors import TandemError
 
 if TYPE_CHECKING:
@@ -20,33 +19,33 @@ if TYPE_CHECKING:
     from service.downstream.worker import Callbacks
     from service.runtime.signals import StopSignals
 
-downstream_app = typer.Typer(name="downstream", help="New tasks with frozen primitives.", no_args_is_help=True)
+downstream_app = typer.Typer(
+    name="downstream", help="New tasks with frozen primitives.", cls=CommandGroup, no_args_is_help=True
+)
 
-_EXIT_SIGNAL = 128
 _LINE_EVERY_S = 10.0
-_Primitives = Annotated[str, typer.Option("--primitives", metavar="NAME@ALIAS|RUN_DIR", help="What is composed.")]
+_Primitives = Annotated[str, typer.Option(metavar="NAME@ALIAS|RUN_DIR", help="What is composed.")]
 _Registry = Annotated[
-    str, typer.Option("--registry", envvar="TANDEM_REGISTRY", metavar="DIR|URL", help="Where primitives come from.")
+    str, typer.Option(envvar="TANDEM_REGISTRY", metavar="DIR|URL", help="Where primitives come from.")
 ]
 _Set = Annotated[
     list[str] | None, typer.Option("--set", metavar="A=B", help="How SAC learns, such as gamma=0.9; repeatable.")
 ]
-_Steps = Annotated[int | None, typer.Option("--steps", help="Env steps of learning.", min=1)]
+_Steps = Annotated[int | None, typer.Option(help="Env steps of learning.", min=1)]
 _Episodes = Annotated[int, typer.Option(help="Of the final evaluation.", min=1)]
 _Threads = Annotated[int | None, typer.Option(help="Cores of one training; default: all, on a cluster one.", min=1)]
-_CHAMPION = "panda-cube@champion"
 
 
 @downstream_app.command()
 def train(
     task: Annotated[str, typer.Option(help="larger, inair, push, sphere, wall or box.")],
     method: Annotated[str, typer.Option(help="See tandem downstream methods.")] = "ours",
-    primitives: _Primitives = _CHAMPION,
+    primitives: _Primitives = CHAMPION,
     seed: Annotated[int, typer.Option(min=0)] = 0,
     steps: _Steps = None,
     episodes: _Episodes = 300,
     run_dir: Annotated[
-        Path | None, typer.Option("--run-dir", metavar="DIR", help="Default: runs/downstream/TASK-METHOD-SEED.")
+        Path | None, typer.Option(metavar="DIR", help="Default: runs/downstream/TASK-METHOD-SEED.")
     ] = None,
     resume: Annotated[bool, typer.Option("--resume", help="Continue the training in the directory exactly.")] = False,
     overrides: _Set = None,
@@ -55,22 +54,21 @@ def train(
     as_json: Annotated[bool, typer.Option("--json", help="Print the result as JSON.")] = False,
 ) -> None:
     """Learn one task, evaluate, film."""
-    with _user_errors():
-        _check_installed()
-        import service
-        from service.downstream.settings import make_trial
-        from service.downstream.worker import RunOptions, run_trial
+    _check_installed()
+    import service
+    from service.downstream.settings import make_trial
+    from service.downstream.worker import RunOptions, run_trial
 
-        trial = make_trial(task=task, method=method, seed=seed, num_episodes=episodes, **_learning(steps, overrides))
-        path = run_dir or Path("runs") / "downstream" / trial.name
-        with _stop_on_signals() as (callbacks, signals):
-            options = RunOptions(resume, threads or 0, video=True, callbacks=callbacks)
-            result = run_trial(trial, service.load_primitives(primitives, registry), path, options)
+    trial = make_trial(task=task, method=method, seed=seed, num_episodes=episodes, **_learning(steps, overrides))
+    path = run_dir or Path("runs") / "downstream" / trial.name
+    with _stop_on_signals() as (callbacks, signals):
+        options = RunOptions(resume, threads or 0, video=True, callbacks=callbacks)
+        result = run_trial(trial, service.load_primitives(primitives, registry), path, options)
     if result is None:
         typer.echo(f"saved; continue with the same command and --resume --run-dir {path}", err=True)
-        raise typer.Exit(_EXIT_SIGNAL + (signals.first or 0))
+        raise typer.Exit(EXIT_SIGNAL + (signals.first or 0))
     if as_json:
-        typer.echo(json.dumps(result, indent=1))
+        print_json(result)
         return
     found = result["evaluation"]
     typer.echo(
@@ -85,7 +83,7 @@ def table(
     methods: Annotated[str, typer.Option(help="Names with commas between, or all.")] = "all",
     tasks: Annotated[str, typer.Option(help="Names with commas between, or all.")] = "all",
     seeds: Annotated[str, typer.Option(help="Numbers with commas between.")] = "0",
-    primitives: _Primitives = _CHAMPION,
+    primitives: _Primitives = CHAMPION,
     steps: _Steps = None,
     episodes: _Episodes = 300,
     out: Annotated[
@@ -102,27 +100,25 @@ def table(
     threads: _Threads = None,
 ) -> None:
     """Run the trials that are missing, and write downstream.md."""
-    with _user_errors():
-        _check_installed()
-        from service.downstream.methods import METHODS
-        from service.downstream.settings import make_trial
-        from service.downstream.table import Source, make_table
-        from service.envs.tasks import TASKS
+    _check_installed()
+    from service.downstream.methods import METHODS
+    from service.downstream.settings import make_trial
+    from service.downstream.table import Source, make_table
+    from service.envs.tasks import TASKS
 
-        learning = _learning(steps, overrides)
-        trials = [
-            make_trial(task=task, method=method, seed=seed, num_episodes=episodes, **learning)
-            for seed in _numbers(seeds)
-            for task in _names(tasks, TASKS)
-            for method in _names(methods, METHODS)
-        ]
-        trials = list(dict.fromkeys(trials))
-        source = Source(primitives, registry, runs.absolute())
-        with _make_runner(runtime, address, num_workers, threads) as runner, _stop_on_signals() as (callbacks, signals):
-            complete = make_table(trials, source, out, runner, callbacks)
+    learning = _learning(steps, overrides)
+    trials = [
+        make_trial(task=task, method=method, seed=seed, num_episodes=episodes, **learning)
+        for seed in _numbers(seeds)
+        for task in _names(tasks, TASKS)
+        for method in _names(methods, METHODS)
+    ]
+    source = Source(primitives, registry, runs.absolute())
+    with _make_runner(runtime, address, num_workers, threads) as runner, _stop_on_signals() as (callbacks, signals):
+        complete = make_table(list(dict.fromkeys(trials)), source, out, runner, callbacks)
     if not complete:
         typer.echo("stopped; the same command continues", err=True)
-        raise typer.Exit(_EXIT_SIGNAL + (signals.first or 0))
+        raise typer.Exit(EXIT_SIGNAL + (signals.first or 0))
 
 
 @downstream_app.command("methods")
@@ -183,17 +179,17 @@ def _make_runner(name: str, address: str | None, num_workers: int | None, thread
 
 @contextmanager
 def _stop_on_signals() -> Iterator[tuple[Callbacks, StopSignals]]:
-    """SIGINT and SIGTERM end it where it can be continued; progress goes to stderr."""
+    """Let SIGINT and SIGTERM end the block where it can be continued; progress goes to stderr."""
     from service.downstream.worker import Callbacks
     from service.runtime.signals import InterruptError, StopSignals
 
-    asked: list[bool] = []
-    with StopSignals() as signals, signals.asking(lambda: asked.append(True)):
+    with StopSignals() as signals, signals.asking(lambda: None):
+        say = functools.partial(typer.echo, err=True)
         try:
-            yield Callbacks(lambda: bool(asked), _Progress().show, lambda text: typer.echo(text, err=True)), signals
+            yield Callbacks(lambda: signals.first is not None, _Progress().show, say), signals
         except InterruptError as interrupt:  # a second one
             typer.echo("stopped at once; what came after the last checkpoint is lost", err=True)
-            raise typer.Exit(_EXIT_SIGNAL + interrupt.number) from None
+            raise typer.Exit(EXIT_SIGNAL + interrupt.number) from None
 
 
 class _Progress:
@@ -224,13 +220,3 @@ def _check_installed() -> None:
 
     if find_spec("stable_baselines3") is None:
         raise TandemError("learning needs the package stable-baselines3: pip install 'tandem-skills[downstream]'")
-
-
-@contextmanager
-def _user_errors() -> Iterator[None]:
-    """One line on stderr for an error the user can mend."""
-    try:
-        yield
-    except TandemError as error:
-        print(f"error: {error}", file=sys.stderr)
-        raise typer.Exit(error.exit_code) from None

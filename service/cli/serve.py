@@ -7,29 +7,19 @@ from typing import Annotated
 
 import typer
 
-from service.errors import TandemError
+from service.cli.common import REGISTRY, RegistryOption
 
 
 def serve(
-    runs: Annotated[Path, typer.Option("--runs", metavar="DIR", help="Directory of run directories.")] = Path("runs"),
-    registry: Annotated[
-        Path, typer.Option("--registry", envvar="TANDEM_REGISTRY", metavar="DIR", help="Directory of the registry.")
-    ] = Path("registry"),
+    runs: Annotated[Path, typer.Option(metavar="DIR", help="Directory of run directories.")] = Path("runs"),
+    registry: RegistryOption = REGISTRY,
     host: Annotated[str, typer.Option(help="Where to listen; others than this machine need a token.")] = "127.0.0.1",
     port: Annotated[int, typer.Option(help="0 for any that is free.", min=0, max=65535)] = 8321,
     token_file: Annotated[
-        Path | None, typer.Option("--token-file", metavar="FILE", help="Holds the token; else TANDEM_TOKEN does.")
+        Path | None, typer.Option(metavar="FILE", help="Holds the token; else TANDEM_TOKEN does.")
     ] = None,
 ) -> None:
     """Show finished and running runs and the registry over REST, to Prometheus, and to a browser."""
-    try:
-        _serve(runs, registry, host, port, token_file)
-    except TandemError as error:
-        typer.echo(f"error: {error}", err=True)
-        raise typer.Exit(error.exit_code) from None
-
-
-def _serve(runs: Path, registry: Path, host: str, port: int, token_file: Path | None) -> None:
     from service.registry.registry import Registry
     from service.status.errors import StatusError
     from service.status.run_reader import open_reader

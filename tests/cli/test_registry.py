@@ -1,6 +1,7 @@
 """tandem registry, as typed."""
 
 import json
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -100,10 +101,15 @@ def test_show(run: Run) -> None:
     assert (tree["version"], tree["aliases"], tree["metrics"]) == (1, [], {"bob/success_rate": 0.5})
 
 
-def test_tables_on_a_terminal(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("service.cli.registry._is_terminal", lambda: True)
-    assert "panda-cube" in run("list").stdout
-    assert "\t" not in run("list").stdout
+@pytest.mark.parametrize("terminal", [True, False])
+def test_tables_on_a_terminal(
+    terminal: bool, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(sys.stdout, "isatty", lambda: terminal)
+    registry_app(["list", "--registry", str(BUNDLED)], standalone_mode=False)
+    shown = capsys.readouterr().out
+    assert "panda-cube" in shown
+    assert ("\t" in shown) is not terminal
 
 
 def test_alias(run: Run, registry: Registry) -> None:

@@ -75,7 +75,7 @@ def test_pretrain_begins_with_it_and_goes_on_with_it(arguments, monkeypatch, tmp
         (path / "config.yaml").write_text(dump_config(config))
 
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("service.cli.main._pretrain", pretrain)
+    monkeypatch.setattr("service.cli.pretrain._pretrain", pretrain)
     monkeypatch.setattr("service.runtime.ray_connection.connected", lambda *_: nullcontext())
     here = [re.sub(r"^(/usr/local/share/tandem/)?configs/", f"{ROOT}/configs/", word) for word in arguments]
     for resumed in (False, True):

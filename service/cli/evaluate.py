@@ -1,0 +1,115 @@
+"""``tandem evaluate``, ``coverage`` and ``render``: how good trained primitives are, and what they do."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from service.cli.common import REGISTRY, JsonOption, RegistryOption, print_json
+from service.errors import TandemError
+
+_Primitives = Annotated[str, typer.Option(metavar="NAME@ALIAS|RUN_DIR", help="Whose Bob.")]
+_Seed = Annotated[int, typer.Option(help="Of the episodes.", min=0)]
+
+
+def evaluate(
+    primitives: _Primitives,
+    goals: Annotated[
+        str, typer.Option(help="table, air, volume or mixed (70 % anywhere in the volume, else table).")
+    ] = "mixed",
+    episodes: Annotated[int, typer.Option(help="Number of random goals.", min=1)] = 300,
+    steps: Annotated[int, typer.Option(help="Steps an episode, 25 a second.", min=1)] = 50,
+    seed: _Seed = 0,
+    as_json: JsonOption = False,
+    registry: RegistryOption = REGISTRY,
+) -> None:
+    """Bob on random goals from fresh resets, without noise, beside a policy that does nothing."""
+    from service.actors.evaluation import IdlePolicy
+    from service.actors.evaluation import evaluate as run
+    from service.envs.sampling import GOAL_KINDS
+    from service.primitives.loading import load_bob
+
+    if goals not in GOAL_KINDS:
+        raise TandemError(f"--goals {goals!r}: choose one of {', '.join(GOAL_KINDS)}")
+    bob = load_bob(primitives, registry)
+    world, distance_m = bob.config.world, bob.config.game.success_distance_m
+    rows = {
+        name: run(
+            policy, world, goals, num_episodes=episodes, num_steps=steps, seed=seed, success_distance_m=distance_m
+        )
+        for name, policy in ((bob.label, bob.policy), ("idle", IdlePolicy()))
+    }
+    if as_json:
+        print_json({name: row.as_dict() for name, row in rows.items()})
+        return
+    typer.echo(f"{episodes} random goals ({goals}), {steps} steps, within {100 * distance_m:g} cm")
+    for name, row in rows.items():
+        typer.echo(
+            f"  {name:<24} at the last step {row.success_last:6.1%}"
+            f"  [{row.success_last_low:.1%}, {row.success_last_high:.1%}]"
+            f"   ever {row.success_ever:6.1%}   mean distance {row.mean_distance_m:.3f} m"
+        )
+
+
+def coverage(
+    primitives: _Primitives,
+    skills: Annotated[int, typer.Option(help="Number of random compositions.", min=1)] = 32,
+    steps: Annotated[int, typer.Option(help="Steps each.", min=1)] = 100,
+    seed: _Seed = 0,
+    out: Annotated[Path, typer.Option(metavar="FILE", help="Picture to write.")] = Path("coverage.png"),
+    as_json: JsonOption = False,
+    registry: RegistryOption = REGISTRY,
+) -> None:
+    """Where random compositions of the primitives move the object, beside a random policy."""
+    from service.actors.coverage import RandomPolicy, skill_trajectories, visited_share
+    from service.media.plots import plot_coverage
+    from service.primitives.loading import load_bob
+
+    bob = load_bob(primitives, registry)
+    world = bob.config.world
+    paths = {
+        name: skill_trajectories(policy, world, num_skills=skills, num_steps=steps, seed=seed)
+        for name, policy in ((bob.label, bob.primitives), ("random policy", RandomPolicy()))
+    }
+    shares = {name: visited_share(path, world.workspace) for name, path in paths.items()}
+    picture = plot_coverage(paths[bob.label], world.workspace, out, bob.label)
+    if as_json:
+        print_json({"share_of_table_cells_visited": shares, "picture": str(picture)})
+        return
+    for name, share in shares.items():
+        typer.echo(f"  {name:<24} {share:.0%} of the workspace's table cells visited")
+    typer.echo(f"picture: {picture}")
+
+
+def render(
+    primitives: _Primitives,
+    episodes: Annotated[int, typer.Option(help="Rounds, or episodes, to record.", min=1)] = 4,
+    seed: _Seed = 0,
+    out: Annotated[Path, typer.Option(metavar="FILE", help="Video to write.")] = Path("video.mp4"),
+    registry: RegistryOption = REGISTRY,
+) -> None:
+    """Make a video of a run's Alice beside its Bob, or of published primitives on random goals."""
+    from service.io.run_directory import RunDirectory
+    from service.media import recording, video
+    from service.primitives.loading import load_bob, load_players
+
+    if Path(primitives).is_dir():
+        directory = RunDirectory(Path(primitives))
+        config = directory.read_config()
+        rounds = recording.record_rounds(config, *load_players(directory), num_rounds=episodes, seed=seed)
+        video.write_video(rounds, config.world, out)
+    else:
+        bob = load_bob(primitives, registry)
+        recorded = recording.record_episodes(
+            bob.policy,
+            bob.config.world,
+            "mixed",
+            num_episodes=episodes,
+            num_steps=bob.config.run.evaluation_steps,
+            success_distance_m=bob.config.game.success_distance_m,
+            seed=seed,
+        )
+        video.write_episode_video(recorded, bob.config.world, out)
+    typer.echo(f"video: {out}")

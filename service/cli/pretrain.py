@@ -1,0 +1,149 @@
+"""``tandem pretrain`` and ``tandem demo``."""
+
+from __future__ import annotations
+
+from itertools import count
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, NoReturn
+
+import typer
+from rich.console import Console
+
+from service.cli.common import CHAMPION, EXIT_SIGNAL, REGISTRY, RegistryOption
+from service.cli.evaluate import evaluate
+from service.errors import TandemError
+
+if TYPE_CHECKING:
+    from service.config import Config
+    from service.io.run_directory import RunDirectory
+    from service.runtime.ray_connection import ClusterOptions
+
+_DEMO_CONFIG = Path(__file__).parents[2] / "configs" / "pretrain" / "panda_cube.yaml"
+"""The shipped recipe, in a clone; an installed wheel has none, and the defaults do."""
+
+
+def pretrain(
+    config: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="YAML; defaults where left out. Not needed to resume.")
+    ] = None,
+    run_dir: Annotated[Path | None, typer.Option(metavar="DIR", help="Default: RUNS/NAME.")] = None,
+    run_id: Annotated[
+        str | None, typer.Option(metavar="ID", help="Run in RUNS/ID, and continue it if it has begun: for jobs.")
+    ] = None,
+    runs: Annotated[
+        Path, typer.Option(envvar="TANDEM_RUNS", metavar="DIR", help="Directory of run directories.")
+    ] = Path("runs"),
+    resume: Annotated[bool, typer.Option("--resume", help="Continue the run in --run-dir exactly.")] = False,
+    overrides: Annotated[
+        list[str] | None,
+        typer.Option("--set", metavar="A.B=C", help="Override a key of the configuration; repeatable."),
+    ] = None,
+    registry: RegistryOption = REGISTRY,
+    runtime: Annotated[str, typer.Option(help="local: in this process; ray: on a cluster.")] = "local",
+    address: Annotated[
+        str | None,
+        typer.Option(metavar="auto|HOST:PORT", help="Ray cluster; default: the job's, or a new one on this machine."),
+    ] = None,
+    num_actors: Annotated[
+        int | None, typer.Option(help="Rollout actors; default: as many as the cluster has cores.", min=1)
+    ] = None,
+    learner_cpus: Annotated[
+        float, typer.Option(help="Cores reserved for the learner; 0: it shares the actors'.", min=0)
+    ] = 0.0,
+    status: Annotated[
+        str, typer.Option(metavar="HOST:PORT|off", help="Where the status service of a run on a cluster listens.")
+    ] = "127.0.0.1:8321",
+    token_file: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Its token; default: TANDEM_TOKEN. See tandem serve.")
+    ] = None,
+) -> None:
+    """Pre-train primitives by self-play, in this process or on a Ray cluster, and publish them."""
+    from service.config import load_config
+    from service.io.run_directory import RunDirectory
+    from service.runtime.pretrain import resumed_config
+
+    if runtime not in ("local", "ray"):
+        raise TandemError(f"--runtime {runtime!r}: choose one of local, ray")
+    if run_id is not None:
+        if resume or run_dir is not None:
+            raise TandemError("--run-id names the run directory, and continues what is there: leave out the other two")
+        run_dir = runs / run_id
+        resume = RunDirectory(run_dir).exists
+    if resume:
+        if run_dir is None:
+            raise TandemError("--resume needs --run-dir, the directory of the run to continue")
+        resolved = resumed_config(RunDirectory(run_dir), overrides or [], config)
+    else:
+        resolved = load_config(config, overrides or [])
+        run_dir = run_dir or runs / resolved.name
+    if runtime == "local":
+        _pretrain(resolved, run_dir, registry, resume=resume)
+        return
+    from service.runtime.ray_connection import ClusterOptions, connected, parse_status
+    from service.status.token import read_token
+
+    options = ClusterOptions(
+        num_actors=num_actors, learner_cpus=learner_cpus, status=parse_status(status, read_token(token_file))
+    )
+    with connected(address):
+        _pretrain(resolved, run_dir, registry, resume=resume, cluster=options)
+
+
+def demo(
+    run_dir: Annotated[Path | None, typer.Option(metavar="DIR", help="Default: runs/demo-N.")] = None,
+    env_steps: Annotated[
+        int, typer.Option(help="Budget; the default takes about three minutes on 2 cores.", min=1)
+    ] = 1_000_000,
+) -> None:
+    """Watch a robot arm teach itself: a small pre-training from scratch, with pictures and a video."""
+    from service.config import load_config
+    from service.primitives.bundled import BUNDLED
+
+    paths = (Path("runs") / f"demo-{number}" for number in count(1))
+    path = run_dir or next(path for path in paths if not path.exists())
+    Console().print("A robot arm is about to teach itself: Alice proposes goals, Bob learns to reach them.")
+    overrides = [f"run.total_env_steps={env_steps}", "name=panda-cube-demo"]
+    config = load_config(_DEMO_CONFIG if _DEMO_CONFIG.exists() else None, overrides)
+    _pretrain(config, path, path / "registry", resume=False)
+    typer.echo(f"\nThat was a beginning. Primitives that have learned for longer come with tandem; {CHAMPION}:")
+    evaluate(CHAMPION, registry=BUNDLED)  # prints what the first of the next commands prints
+    typer.echo("\nnext:")
+    typer.echo(f"  tandem evaluate --primitives {CHAMPION} --goals mixed --episodes 300")
+    typer.echo(f"  tandem render   --primitives {CHAMPION} --out champion.mp4")
+    typer.echo(f"  tandem coverage --primitives {CHAMPION} --out champion.png")
+
+
+def _pretrain(
+    config: Config, path: Path, registry: Path, *, resume: bool, cluster: ClusterOptions | None = None
+) -> None:
+    from service.io.run_directory import RunDirectory
+    from service.runtime.pretrain import pretrain as run
+    from service.runtime.progress import Progress
+    from service.runtime.signals import InterruptError
+
+    directory = RunDirectory(path)
+    try:
+        with Progress(config.run.total_env_steps, Console()) as progress:
+            done = run(config, directory, registry, resume=resume, on_iteration=progress.show, cluster=cluster)
+    except InterruptError as interrupt:
+        _say_stopped("stopped at once", interrupt.number, directory, registry)
+    result = done.result
+    typer.echo(f"\n{result.reason} after {result.num_env_steps:,} env steps, {result.iteration} iterations")
+    typer.echo(done.timing)
+    if done.signal is not None:
+        rest = "" if result.reason == "interrupted" else ", but not evaluated, published and drawn to the end"
+        _say_stopped(f"saved{rest}", done.signal, directory, registry)
+    for name, value in done.metrics.items():
+        typer.echo(f"{name:<36} {value:.1%}")
+    for name, file in done.files.items():
+        typer.echo(f"{name:<12} {file}")
+    typer.echo(f"{'checkpoint':<12} {path / 'checkpoints'}")
+    if done.version is not None:
+        typer.echo(f"{'primitives':<12} {done.version} in {registry}")
+
+
+def _say_stopped(what: str, number: int, directory: RunDirectory, registry: Path) -> NoReturn:
+    """Say how to go on, and exit as a process that a signal ends."""
+    how = f"continue with: tandem pretrain --resume --run-dir {directory.path} --registry {registry}"
+    typer.echo(f"{what}; {how if directory.exists else 'nothing was saved yet'}")
+    raise typer.Exit(EXIT_SIGNAL + number)
