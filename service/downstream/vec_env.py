@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict
 from typing import Any
 
 import gymnasium
 import numpy as np
-from numpy.typing import NDArray
 from stable_baselines3.common.vec_env import VecEnv
 
+from service.envs.gym.vector import VectorState
 from service.types import FloatArray
 
 Observation = dict[str, FloatArray]
@@ -18,20 +18,6 @@ Info = dict[str, Any]
 
 PREVIOUS = "previous"
 """Name of what is added to an observation: the positions one step ago."""
-
-
-@dataclass(frozen=True, slots=True)
-class VecEnvState:
-    """Everything a :class:`WorldsVecEnv` continues from."""
-
-    worlds: Any
-    """State of the vector environment."""
-    previous: FloatArray
-    """(N, 11) positions as last shown."""
-    returns: NDArray[np.float64]
-    """(N,) rewards of the episodes that go on."""
-    lengths: NDArray[np.int64]
-    """(N,) their steps."""
 
 
 class WorldsVecEnv(VecEnv):
@@ -51,7 +37,7 @@ class WorldsVecEnv(VecEnv):
     """
 
     def __init__(self, env: gymnasium.vector.VectorEnv[Any, Any, Any]) -> None:
-        self.env = env
+        self.env: Any = env
         self.finished: list[tuple[float, bool]] = []
         """Return and success at the last step of the episodes that ended since this list was last cleared."""
         self._returns = np.zeros(env.num_envs)
@@ -116,21 +102,27 @@ class WorldsVecEnv(VecEnv):
             "episode": {"r": total, "l": length},
         }
 
-    def state(self) -> VecEnvState:
-        """Copy everything that :meth:`restore` needs."""
-        assert self._previous is not None, "reset comes first"
-        worlds = getattr(self.env, "state")()  # noqa: B009 - only ``TabletopVectorEnv`` has it
-        return VecEnvState(worlds, self._previous.copy(), self._returns.copy(), self._lengths.copy())
+    def state(self) -> dict[str, Any]:
+        """Copy everything that :meth:`restore` needs.
 
-    def restore(self, state: VecEnvState) -> Observation:
+        Returns:
+            The entries of ``VectorState``, (N, 11) ``previous`` positions as last shown, and of the episodes that go on
+            (N,) ``returns`` and (N,) ``lengths``.
+        """
+        assert self._previous is not None, "reset comes first"
+        own = {"previous": self._previous, "returns": self._returns, "lengths": self._lengths}
+        return asdict(self.env.state()) | {name: array.copy() for name, array in own.items()}
+
+    def restore(self, state: dict[str, Any]) -> Observation:
         """Go back to a saved state; continues bit-identically.
 
         Returns:
             The observation there.
         """
-        self._returns, self._lengths = state.returns.copy(), state.lengths.copy()
-        observation: Observation = getattr(self.env, "restore")(state.worlds)  # noqa: B009 - as above
-        return self._show(observation, state.previous)
+        worlds = dict(state)
+        previous = worlds.pop("previous")
+        self._returns, self._lengths = worlds.pop("returns").copy(), worlds.pop("lengths").copy()
+        return self._show(self.env.restore(VectorState(**worlds)), previous)
 
     def close(self) -> None:
         """Stop the worlds' threads."""
