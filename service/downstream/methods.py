@@ -1,8 +1,8 @@
 """The methods of the paper's table, by name. The harness knows nothing of a method but what is here.
 
 A method that learns says what its learner acts by (``wrap`` and ``decode``), which actor and replay buffer it has; one
-with nothing to learn says which policy plays. A skill-discovery baseline joins as one more entry: its ``wrap`` hands the
-environment the actions of its frozen skill policy, with skill vectors as actions.
+with nothing to learn says which policy plays. A skill-discovery baseline would be one more entry: its ``wrap`` hands
+the environment the actions of its frozen skill policy, with skill vectors as actions.
 """
 
 from __future__ import annotations
@@ -15,7 +15,13 @@ import gymnasium
 import numpy as np
 
 from service.actors.evaluation import DeterministicPolicy, IdlePolicy
-from service.downstream.compose import ComposePrimitivesVector, action_weights, check_primitives, check_robot
+from service.downstream.compose import (
+    ComposePrimitivesVector,
+    action_weights,
+    check_primitives,
+    check_robot,
+    parameters_digest,
+)
 from service.errors import TandemError
 from service.types import FloatArray
 
@@ -118,3 +124,16 @@ def find_method(name: str) -> Method:
     if name not in METHODS:
         raise TandemError(f"unknown method {name!r}; choose one of {', '.join(METHODS)}")
     return METHODS[name]
+
+
+def provenance(trained: TrainedBob, method: str = "ours") -> dict[str, Any]:
+    """Primitives and world that a method's result is of, besides its trial.
+
+    Returns:
+        ``primitives``: their name, and SHA-256 of their parameters as ``digest``; None where the method takes none.
+        ``world``: settings of the world that they bring along, before a task replaces some.
+    """
+    name = trained.label if trained.manifest is None else trained.manifest.reference  # the same wherever it came from
+    primitives = {"name": name, "digest": parameters_digest(trained.policy)}
+    without = method in METHODS and not METHODS[method].takes_primitives
+    return {"primitives": None if without else primitives, "world": trained.config.world.model_dump(mode="json")}

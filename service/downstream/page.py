@@ -4,16 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from itertools import pairwise
-from typing import Any
 
 import numpy as np
 
 from service.actors.evaluation import wilson_interval
 from service.downstream.directory import TRIAL
 from service.downstream.methods import METHODS
+from service.downstream.results import Result
 from service.envs.tasks import TASKS
 
-Result = dict[str, Any]
 Seeds = Sequence[Result]
 """Results of one method on one task."""
 
@@ -172,8 +171,7 @@ def _efficiency(of: Mapping[tuple[str, str], Seeds]) -> Sequence[str]:
 def _mean_until(seeds: Seeds, level: float) -> float | None:
     """Env steps until a level, mean of the seeds; None: not every seed reaches it."""
     soon = [steps_until(result["curve"], level) for result in seeds]
-    known = [each for each in soon if each is not None]
-    return float(np.mean(known)) if known and len(known) == len(seeds) else None
+    return None if not soon or None in soon else float(np.mean(soon))  # type: ignore[arg-type]
 
 
 def steps_until(curve: Sequence[dict[str, float]], level: float) -> float | None:
@@ -202,11 +200,6 @@ def _soonest(of: Mapping[str, Seeds], level: float) -> str:
 def _origin(results: Sequence[Result]) -> str:
     taken = [each["primitives"] for each in results if each["primitives"]]
     primitives = sorted({f"{each['name']} ({each['digest'][:12]})" for each in taken})
-    commits = sorted({_short(each["made"]["git_commit"]) for each in results if each["made"]["git_commit"]})
+    made = [each["made"]["git_commit"].partition("-dirty") for each in results if each["made"]["git_commit"]]
+    commits = sorted({name[:12] + dirty for name, dirty, _ in made})
     return f"Primitives: {', '.join(primitives) or 'none'}. Commits: {', '.join(commits) or 'unknown'}.\n"
-
-
-def _short(commit: str) -> str:
-    """Twelve characters of a commit, and whether it had local changes."""
-    name, dirty, _ = commit.partition("-dirty")
-    return name[:12] + dirty

@@ -16,6 +16,7 @@ from service.media.plots.figures import BLUE, FAINT, GREEN, ORANGE, column, new_
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.lines import Line2D
 
 _COLOURS = (BLUE, "#56B4E9", "#000000", GREEN, ORANGE, "#CC79A7", "#E69F00", "#999999")
 Results = Sequence[Mapping[str, Any]]
@@ -53,40 +54,35 @@ def draw_table(results: Results, path: Path) -> Path:
         TandemError: the picture cannot be written.
     """
     figure = new_figure(14.0, 8.0, "Success at the last step, over thousands of env steps")
+    lines: dict[str, Line2D] = {}
     longest = max((each["env_steps"] for each in results), default=0) / 1e3
     for axes, (name, task) in zip(figure.subplots(2, 3).flat, TASKS.items(), strict=True):
         for (method, described), colour in zip(METHODS.items(), cycle(_COLOURS), strict=False):
             chosen = [each for each in results if each[TRIAL]["task"] == name and each[TRIAL]["method"] == method]
-            _draw_method(axes, chosen, described.title, colour)
+            if chosen:
+                lines[described.title] = _draw_method(axes, chosen, colour)
         _finish(axes, task.title)
         axes.set_ylim(-0.02, 1.02)
         axes.set_xlim(0.0, 1.02 * longest or 1.0)
-    handles: dict[str, Any] = {}
-    for axes in figure.axes:
-        handles |= dict(zip(*reversed(axes.get_legend_handles_labels()), strict=True))
-    titles = [described.title for described in METHODS.values() if described.title in handles]
-    if titles:
-        lines = [handles[title] for title in titles]
-        figure.legend(lines, titles, loc="upper right", ncols=4, fontsize=9, frameon=False)
+    titles = [described.title for described in METHODS.values() if described.title in lines]
+    figure.legend([lines[title] for title in titles], titles, loc="upper right", ncols=4, fontsize=9, frameon=False)
     figure.subplots_adjust(left=0.05, right=0.98, top=0.86, bottom=0.07, hspace=0.3)
     return save(figure, path)
 
 
-def _draw_method(axes: Axes, results: Results, label: str, colour: str) -> None:
-    """Lines of several seeds as their mean and range; what learns nothing is a level."""
-    if not results:
-        return
+def _draw_method(axes: Axes, results: Results, colour: str) -> Line2D:
+    """Mean line of several seeds and their range; a level for a method that learns nothing. Returns the line."""
     curves = [result["curve"] for result in results]
     if not all(curves):
         level = float(np.mean([result["evaluation"]["success_last"] for result in results]))
-        axes.axhline(level, color=colour, linewidth=1.0, linestyle=":", label=label)
-        return
+        return axes.axhline(level, color=colour, linewidth=1.0, linestyle=":")
     num = min(len(curve) for curve in curves)
     steps = np.array([point["env_steps"] for point in curves[0][:num]]) / 1e3
     values = np.array([[point["success_last"] for point in curve[:num]] for curve in curves])
-    axes.plot(steps, values.mean(0), color=colour, linewidth=1.6, label=label)
+    (line,) = axes.plot(steps, values.mean(0), color=colour, linewidth=1.6)
     if len(curves) > 1:
         axes.fill_between(steps, values.min(0), values.max(0), color=colour, alpha=0.18, linewidth=0)
+    return line
 
 
 def _finish(axes: Axes, title: str) -> None:

@@ -4,14 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from service.downstream.directory import FORMAT_VERSION, read_json, read_trial, to_json
-from service.downstream.methods import METHODS
+from service.downstream.directory import made_with, read_json, read_trial, to_json
+from service.downstream.methods import METHODS, provenance
 from service.downstream.settings import TrialConfig, differences
-from service.downstream.worker import Provenance
 from service.errors import TandemError
 from service.io.files import os_errors, write_exclusive
+
+if TYPE_CHECKING:
+    from service.primitives.loading import TrainedBob
 
 Result = dict[str, Any]
 
@@ -23,8 +25,8 @@ class ResultsDirectory:
         """Name the directory, which need not exist; nothing is read before it is asked for."""
         self.path = path
 
-    def find(self, trial: TrialConfig, provenance: Provenance) -> Result | None:
-        """Find the result of a trial; None where it has not been run.
+    def find(self, trial: TrialConfig, trained: TrainedBob) -> Result | None:
+        """Find the result of a trial with these primitives; None where it has not been run.
 
         Raises:
             TandemError: the file is damaged, of another format version, or of other settings or primitives.
@@ -32,13 +34,13 @@ class ResultsDirectory:
         path = self._file(trial)
         if not path.exists():
             return None
-        result = _read(path)
-        wanted = _settings(trial) | provenance.of(trial.method)
-        if wrong := differences(_settings(read_trial(result, path)) | _made_with(result), wanted):
+        result = read_json(path)
+        wanted = _settings(trial) | provenance(trained, trial.method)
+        if wrong := differences(_settings(read_trial(result, path)) | made_with(result), wanted):
             raise TandemError(f"{path} is of {'; '.join(wrong)}: give the same settings, or name another directory")
         return result
 
-    def missing(self, trials: Iterable[TrialConfig], provenance: Provenance) -> list[TrialConfig]:
+    def missing(self, trials: Iterable[TrialConfig], trained: TrainedBob) -> list[TrialConfig]:
         """List the trials that have to be run; every file is checked before any is.
 
         What is in the directory and what is asked for comes onto one page: of the same world, of the same primitives
@@ -47,12 +49,12 @@ class ResultsDirectory:
         Raises:
             TandemError: as for ``find``; or the page would mix what cannot be compared.
         """
-        missing = [trial for trial in trials if self.find(trial, provenance) is None]
+        missing = [trial for trial in trials if self.find(trial, trained) is None]
         of_all_seeds = {(each.method, each.task): (f"{each.name}, asked for,", _settings(each)) for each in missing}
         for path in self._files():
-            result = _read(path)
+            result = read_json(path)
             trial = read_trial(result, path)
-            if wrong := differences(_made_with(result), provenance.of(trial.method)):
+            if wrong := differences(made_with(result), provenance(trained, trial.method)):
                 raise TandemError(f"{path} is of {'; '.join(wrong)}: name another directory, or move it away")
             other, settings = of_all_seeds.setdefault((trial.method, trial.task), (str(path), _settings(trial)))
             if wrong := differences(_settings(trial) | {"seed": 0}, settings | {"seed": 0}):
@@ -78,7 +80,7 @@ class ResultsDirectory:
         Raises:
             TandemError: a file is damaged or of another format version.
         """
-        return [_read(path) for path in self._files()]
+        return [read_json(path) for path in self._files()]
 
     def _file(self, trial: TrialConfig) -> Path:
         return self.path / f"{trial.name}.json"
@@ -87,22 +89,8 @@ class ResultsDirectory:
         return sorted(self.path.glob("*.json"))
 
 
-def _made_with(result: Result) -> dict[str, Any]:
-    return {key: result.get(key) for key in ("primitives", "world")}
-
-
 def _settings(trial: TrialConfig) -> dict[str, Any]:
     """Settings that a trial's result depends on; where nothing is learned, those of learning do not count."""
     method = METHODS.get(trial.method)
     learning = {"sac", "num_env_steps", "curve_every", "curve_episodes"}
     return trial.model_dump(mode="json", exclude=learning if method and method.player else None)
-
-
-def _read(path: Path) -> Result:
-    result = read_json(path)
-    found = result.get("format_version")
-    if found != FORMAT_VERSION:
-        raise TandemError(
-            f"{path}: format version {found!r}, this program reads {FORMAT_VERSION}; name another directory"
-        )
-    return result

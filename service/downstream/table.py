@@ -13,12 +13,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import service
-from service.downstream.methods import find_method
+from service.downstream.directory import made_with
+from service.downstream.methods import find_method, provenance
 from service.downstream.page import MARK, write_page
 from service.downstream.pictures import draw_table
 from service.downstream.results import Result, ResultsDirectory
 from service.downstream.settings import TrialConfig
-from service.downstream.worker import Callbacks, RunOptions, check_trial, find_provenance, run_trial
+from service.downstream.worker import Callbacks, RunOptions, check_trial, run_trial
 from service.errors import TandemError
 from service.io.files import os_errors, write_atomic
 
@@ -38,14 +39,6 @@ class Source:
     """A directory, or the URL of a status service."""
     runs: Path
     """Training directories are made here."""
-
-    def load(self) -> TrainedBob:
-        """Load the primitives.
-
-        Raises:
-            TandemError: as of ``service.load_primitives``.
-        """
-        return service.load_primitives(self.primitives, self.registry)
 
 
 Results = Iterator[tuple[TrialConfig, Result]]
@@ -68,13 +61,13 @@ def make_table(trials: Sequence[TrialConfig], source: Source, out: Path, runner:
         ours = not page.exists() or MARK in page.read_text(encoding="utf-8")
     if not ours:
         raise TandemError(f"{page} was not written by this command; name another directory with --out")
-    trained = source.load()
-    results, provenance = ResultsDirectory(out / RESULTS), find_provenance(trained)
-    missing = results.missing(trials, provenance)
+    trained = service.load_primitives(source.primitives, source.registry)
+    results = ResultsDirectory(out / RESULTS)
+    missing = results.missing(trials, trained)
     callbacks.say(f"{len(trials) - len(missing)} of {len(trials)} trials are there, {len(missing)} to run")
     done = 0
     for trial, result in runner(missing, trained, source, callbacks):
-        if any(result[key] != value for key, value in provenance.of(trial.method).items()):
+        if made_with(result) != provenance(trained, trial.method):
             raise TandemError(f"{source.primitives} has changed in {source.registry} meanwhile; give NAME@VERSION")
         results.add(trial, result)
         done += 1
@@ -163,8 +156,9 @@ def run_on_ray(
 
 def _run_remotely(trial: TrialConfig, primitives: Source | TrainedBob, path: Path, num_threads: int) -> Result:
     """Run a trial in a Ray task, wherever it is."""
-    trained = primitives.load() if isinstance(primitives, Source) else primitives
-    result = run_trial(trial, trained, path, RunOptions(resume=True, num_threads=num_threads))
+    if isinstance(primitives, Source):
+        primitives = service.load_primitives(primitives.primitives, primitives.registry)
+    result = run_trial(trial, primitives, path, RunOptions(resume=True, num_threads=num_threads))
     assert result is not None, "nobody asks a task to stop"
     return result
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
 from dataclasses import asdict
 from typing import Any
 
@@ -110,8 +109,9 @@ class WorldsVecEnv(VecEnv):
             (N,) ``returns`` and (N,) ``lengths``.
         """
         assert self._previous is not None, "reset comes first"
-        own = {"previous": self._previous, "returns": self._returns, "lengths": self._lengths}
-        return asdict(self.env.state()) | {name: array.copy() for name, array in own.items()}
+        worlds = asdict(self.env.state())
+        returns, lengths = self._returns.copy(), self._lengths.copy()
+        return {**worlds, "previous": self._previous.copy(), "returns": returns, "lengths": lengths}
 
     def restore(self, state: dict[str, Any]) -> Observation:
         """Go back to a saved state; continues bit-identically.
@@ -130,7 +130,7 @@ class WorldsVecEnv(VecEnv):
 
     def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
         """The environments' common attribute, once per world asked for."""
-        return [getattr(self.env, attr_name)] * self._num_asked(indices)
+        return [getattr(self.env, attr_name) for _ in self._get_indices(indices)]
 
     def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
         """Refuse: the worlds share everything.
@@ -143,11 +143,8 @@ class WorldsVecEnv(VecEnv):
     def env_method(self, method_name: str, *method_args: Any, indices: Any = None, **method_kwargs: Any) -> list[Any]:
         """The common method's answer, once per world asked for; hindsight relabelling asks for ``compute_reward``."""
         answer = getattr(self.env, method_name)(*method_args, **method_kwargs)
-        return [answer] * self._num_asked(indices)
+        return [answer for _ in self._get_indices(indices)]
 
     def env_is_wrapped(self, wrapper_class: type[gymnasium.Wrapper[Any, Any, Any, Any]], indices: Any = None) -> Any:
         """False for each: wrappers of single environments have no place here."""
-        return [False] * self._num_asked(indices)
-
-    def _num_asked(self, indices: int | Sequence[int] | Iterable[int] | None) -> int:
-        return len(list(self._get_indices(indices)))
+        return [False for _ in self._get_indices(indices)]
