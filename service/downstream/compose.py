@@ -12,7 +12,7 @@ import hashlib
 import math
 import operator
 from collections.abc import Callable, Iterator
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import gymnasium
 import numpy as np
@@ -21,10 +21,8 @@ from numpy.typing import NDArray
 from service.envs.observations import POSITIONS_SIZE, SPACES
 from service.errors import TandemError
 from service.policies.numpy_policy import NumpyMCPPolicy
+from service.primitives.loading import TrainedBob
 from service.types import FloatArray
-
-if TYPE_CHECKING:
-    from service.primitives.loading import TrainedBob
 
 Info = dict[str, Any]
 Positions = Callable[[Any], FloatArray]

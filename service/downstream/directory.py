@@ -45,7 +45,6 @@ class TrainingDirectory:
         self.checkpoint_file = path / "checkpoint.pt"
         self.result_file = path / "result.json"
         self._metrics = JsonlWriter(self.metrics_file)
-        self._events: EventFile | None = None
         self._lock: DirectoryLock | None = None
 
     def __enter__(self) -> Self:
@@ -106,8 +105,7 @@ class TrainingDirectory:
     def record(self, metrics: dict[str, float]) -> None:
         """Append one iteration's metrics to metrics.jsonl and TensorBoard."""
         self._metrics.append(metrics)
-        if self._events is not None:
-            self._events.add(metrics)
+        self._events.add(metrics)
 
     def write_checkpoint(self, saved: dict[str, Any]) -> None:
         """Replace the checkpoint in one step; the records it knows of are on the disk before.
@@ -163,11 +161,9 @@ def read_json(path: Path) -> dict[str, Any]:
     with os_errors("read", path):
         data = path.read_bytes()
     try:
-        tree = json.loads(data)
-    except ValueError as error:
-        raise TandemError(f"{path} is no JSON: {error}; remove it, or name another directory") from None
-    if not isinstance(tree, dict):
-        raise TandemError(f"{path} holds no JSON object; remove it, or name another directory")
+        tree = dict(json.loads(data))
+    except (ValueError, TypeError) as error:
+        raise TandemError(f"{path} is no JSON object: {error}; remove it, or name another directory") from None
     _check_version(tree, path)
     return tree
 

@@ -3,26 +3,23 @@
 from __future__ import annotations
 
 import json
-from typing import TYPE_CHECKING, Any, cast
+from typing import Any, cast
 
 import numpy as np
 import torch
+from gymnasium.spaces import Dict
 from stable_baselines3 import SAC, HerReplayBuffer
 from stable_baselines3.common.buffers import DictReplayBuffer
 from stable_baselines3.common.logger import Logger
 from stable_baselines3.sac.policies import MultiInputPolicy
 
+from service.downstream.methods import Method
 from service.downstream.networks import GoalFeatures, MCPSACPolicy
+from service.downstream.settings import TrialConfig
 from service.downstream.vec_env import PREVIOUS, WorldsVecEnv
 from service.envs.observations import GOAL_SLICE, OBJECT_SLICE, POSITIONS_SIZE
+from service.primitives.loading import TrainedBob
 from service.types import FloatArray
-
-if TYPE_CHECKING:
-    from gymnasium.spaces import Dict
-
-    from service.downstream.methods import Method
-    from service.downstream.settings import TrialConfig
-    from service.primitives.loading import TrainedBob
 
 _ROWS = ("actions", "rewards", "dones", "timeouts", "ep_start", "ep_length")
 _COUNTERS = ("num_timesteps", "_n_updates", "_episode_num")
@@ -92,24 +89,22 @@ class LearnedPolicy:
             PREVIOUS: positions if previous is None else previous,
         }
         actions, _ = self._learner.predict(
-            {name: seen[name] for name in cast("Dict", self._learner.observation_space)}, deterministic=True
+            {name: seen[name] for name in cast(Dict, self._learner.observation_space)}, deterministic=True
         )
         return self._method.decode(self._trained, positions, actions)
 
 
 def save_learner(learner: SAC, env: WorldsVecEnv) -> dict[str, Any]:
     """Everything the learner continues from, as tensors and plain values: its random numbers and worlds, too."""
-    buffer, entropy = learner.replay_buffer, learner.log_ent_coef
-    assert buffer is not None
+    entropy, worlds = learner.log_ent_coef, env.state()
     assert entropy is not None
-    worlds = env.state()
     random = json.dumps(worlds.pop("random"))
     kind, keys, *rest = cast("tuple[Any, ...]", np.random.get_state())  # Stable-Baselines3 draws its batches from it
     return {
         "parameters": learner.get_parameters(),
         "log_ent_coef": entropy.detach().clone(),
         "counters": {name: getattr(learner, name) for name in _COUNTERS},
-        "replay": _save_replay(buffer),
+        "replay": _save_replay(learner.replay_buffer),
         "worlds": {"arrays": {name: torch.from_numpy(rows) for name, rows in worlds.items()}, "random": random},
         "torch_random": torch.get_rng_state(),
         "numpy_random": [kind, torch.from_numpy(keys.copy()), *rest],
@@ -119,15 +114,14 @@ def save_learner(learner: SAC, env: WorldsVecEnv) -> dict[str, Any]:
 
 def restore_learner(learner: SAC, env: WorldsVecEnv, saved: dict[str, Any]) -> None:
     """Go back to what ``save_learner`` gave, in a new learner and worlds of the same settings."""
-    buffer, entropy = learner.replay_buffer, learner.log_ent_coef
-    assert buffer is not None
+    entropy = learner.log_ent_coef
     assert entropy is not None
     learner.set_parameters(saved["parameters"], exact_match=True, device="cpu")
     with torch.no_grad():
         entropy.copy_(saved["log_ent_coef"])  # in place: its optimiser holds it
     for name, value in saved["counters"].items():
         setattr(learner, name, value)
-    _restore_replay(buffer, saved["replay"])
+    _restore_replay(learner.replay_buffer, saved["replay"])
     worlds = {name: rows.numpy() for name, rows in saved["worlds"]["arrays"].items()}
     learner._last_obs = env.restore({**worlds, "random": tuple(json.loads(saved["worlds"]["random"]))})
     learner._last_episode_starts = np.zeros(env.num_envs, dtype=bool)

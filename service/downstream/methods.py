@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import gymnasium
 import numpy as np
@@ -23,10 +23,8 @@ from service.downstream.compose import (
     parameters_digest,
 )
 from service.errors import TandemError
+from service.primitives.loading import TrainedBob
 from service.types import FloatArray
-
-if TYPE_CHECKING:
-    from service.primitives.loading import TrainedBob
 
 Worlds = gymnasium.vector.VectorEnv[Any, Any, Any]
 
@@ -66,11 +64,6 @@ class Method:
     def takes_primitives(self) -> bool:
         """Whether its result depends on them; else they only say in which world it plays."""
         return self.composes or self.player is _bob
-
-    @property
-    def learns_from_nothing(self) -> bool:
-        """Whether it learns, and takes nothing that was learned before."""
-        return self.player is None and not self.takes_primitives
 
     def check(self, trained: TrainedBob) -> None:
         """Assert that these primitives are for this method.

@@ -4,16 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from service.downstream.directory import made_with, read_json, read_trial, to_json
 from service.downstream.methods import METHODS, provenance
 from service.downstream.settings import TrialConfig, differences
 from service.errors import TandemError
 from service.io.files import os_errors, write_exclusive
-
-if TYPE_CHECKING:
-    from service.primitives.loading import TrainedBob
+from service.primitives.loading import TrainedBob
 
 Result = dict[str, Any]
 
@@ -31,7 +29,7 @@ class ResultsDirectory:
         Raises:
             TandemError: the file is damaged, of another format version, or of other settings or primitives.
         """
-        path = self._file(trial)
+        path = self.path / f"{trial.name}.json"
         if not path.exists():
             return None
         result = read_json(path)
@@ -51,7 +49,7 @@ class ResultsDirectory:
         """
         missing = [trial for trial in trials if self.find(trial, trained) is None]
         of_all_seeds = {(each.method, each.task): (f"{each.name}, asked for,", _settings(each)) for each in missing}
-        for path in self._files():
+        for path in sorted(self.path.glob("*.json")):
             result = read_json(path)
             trial = read_trial(result, path)
             if wrong := differences(made_with(result), provenance(trained, trial.method)):
@@ -67,7 +65,7 @@ class ResultsDirectory:
         Raises:
             TandemError: there is one already, or the disk is full.
         """
-        path = self._file(trial)
+        path = self.path / f"{trial.name}.json"
         with os_errors("write", path):
             path.parent.mkdir(parents=True, exist_ok=True)
             kept = write_exclusive(path, to_json(result))
@@ -80,13 +78,7 @@ class ResultsDirectory:
         Raises:
             TandemError: a file is damaged or of another format version.
         """
-        return [read_json(path) for path in self._files()]
-
-    def _file(self, trial: TrialConfig) -> Path:
-        return self.path / f"{trial.name}.json"
-
-    def _files(self) -> list[Path]:
-        return sorted(self.path.glob("*.json"))
+        return [read_json(path) for path in sorted(self.path.glob("*.json"))]
 
 
 def _settings(trial: TrialConfig) -> dict[str, Any]:

@@ -41,9 +41,6 @@ class WorldsVecEnv(VecEnv):
         """Return and success at the last step of the episodes that ended since this list was last cleared."""
         self._returns = np.zeros(env.num_envs)
         self._lengths = np.zeros(env.num_envs, dtype=np.int64)
-        self._actions: FloatArray | None = None
-        self._now: FloatArray | None = None
-        self._previous: FloatArray | None = None
         assert isinstance(env.single_observation_space, gymnasium.spaces.Dict)
         spaces = dict(env.single_observation_space.spaces)
         space = gymnasium.spaces.Dict({**spaces, PREVIOUS: spaces["observation"]})
@@ -68,8 +65,6 @@ class WorldsVecEnv(VecEnv):
         Returns:
             Observations, float32 rewards, dones and infos, (N, ...) each.
         """
-        assert self._actions is not None, "step_async comes first"
-        assert self._now is not None, "reset comes first"
         observation, rewards, terminated, truncated, info = self.env.step(self._actions)
         before, done = self._now, terminated | truncated
         self._returns += rewards
@@ -108,7 +103,6 @@ class WorldsVecEnv(VecEnv):
             The entries of ``VectorState``, (N, 11) ``previous`` positions as last shown, and of the episodes that go on
             (N,) ``returns`` and (N,) ``lengths``.
         """
-        assert self._previous is not None, "reset comes first"
         worlds = asdict(self.env.state())
         returns, lengths = self._returns.copy(), self._lengths.copy()
         return {**worlds, "previous": self._previous.copy(), "returns": returns, "lengths": lengths}

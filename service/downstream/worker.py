@@ -15,7 +15,7 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
@@ -24,7 +24,7 @@ from service.actors.evaluation import DeterministicPolicy, Evaluation, evaluate,
 from service.downstream.directory import FORMAT_VERSION, TRIAL, TrainingDirectory, read_json, write_json
 from service.downstream.learner import LearnedPolicy, make_learner, restore_learner, save_learner, set_progress
 from service.downstream.methods import Method, find_method, provenance
-from service.downstream.pictures import draw_training
+from service.downstream.page import draw_training
 from service.downstream.settings import TrialConfig
 from service.downstream.vec_env import WorldsVecEnv
 from service.envs.gym.registration import EPISODE_STEPS
@@ -33,9 +33,7 @@ from service.envs.tasks import SUCCESS_DISTANCE_M, find_task
 from service.errors import TandemError
 from service.io.git import git_commit
 from service.io.jsonl import plain
-
-if TYPE_CHECKING:
-    from service.primitives.loading import TrainedBob
+from service.primitives.loading import TrainedBob
 
 CHECKPOINT_EVERY_S = 120.0
 CURVE_SEED, FINAL_SEED = 1_000_000, 2_000_000
@@ -138,11 +136,14 @@ class _Training:
         self._directory, self._num_threads, self._callbacks = directory, options.num_threads, options.callbacks
         self._iteration, self._wall_s, self._saved_s = 0, 0.0, time.monotonic()
         self._curve: list[dict[str, float]] = []
+        self.new_player: Callable[[], DeterministicPolicy] = lambda: LearnedPolicy(self._learner, method, trained)
+        """Makes the policy learned so far, ready for a batch of episodes."""
 
     def run(self, saved: dict[str, Any] | None) -> dict[str, Any] | None:
         """Learn to the end; None where stopped before."""
         if saved is not None:
-            self._restore(saved)
+            restore_learner(self._learner, self.env, saved["learner"])
+            self._iteration, self._wall_s, self._curve = saved["iteration"], saved["wall_s"], saved["curve"]
         while self._learner.num_timesteps < self._trial.num_env_steps:
             if self._callbacks.stop():
                 self._save()
@@ -155,10 +156,6 @@ class _Training:
             return None
         self._learner.save(self._directory.path / "model.zip")
         return {"env_steps": self._learner.num_timesteps, "wall_s": self._wall_s, "curve": self._curve}
-
-    def new_player(self) -> DeterministicPolicy:
-        """The policy learned so far, ready for a batch of episodes."""
-        return LearnedPolicy(self._learner, self._method, self._trained)
 
     def _iterate(self) -> None:
         """Play an episode in every world, with its updates; now and then evaluate, which is not counted as time."""
@@ -189,9 +186,8 @@ class _Training:
         return {f"rollout/{name}": float(value) for name, value in means.items()}
 
     def _evaluate(self) -> dict[str, float]:
-        trial, player = self._trial, self.new_player()
-        seed = trial.seed + CURVE_SEED
-        found = play(trial, self._trained, player, trial.curve_episodes, seed, self._num_threads)
+        trial, seed = self._trial, self._trial.seed + CURVE_SEED
+        found = play(trial, self._trained, self.new_player(), trial.curve_episodes, seed, self._num_threads)
         point = {"success_last": found.success_last, "success_ever": found.success_ever}
         self._curve.append({"env_steps": self._learner.num_timesteps, "wall_s": self._wall_s, **point})
         return {f"evaluation/{name}": value for name, value in point.items()}
@@ -203,10 +199,6 @@ class _Training:
         learner = save_learner(self._learner, self.env)
         self._directory.write_checkpoint({**counters, "curve": self._curve, "learner": learner})
         self._saved_s = time.monotonic()
-
-    def _restore(self, saved: dict[str, Any]) -> None:
-        restore_learner(self._learner, self.env, saved["learner"])
-        self._iteration, self._wall_s, self._curve = saved["iteration"], saved["wall_s"], saved["curve"]
 
 
 def make_worlds(trial: TrialConfig, method: Method, trained: TrainedBob, num_threads: int) -> WorldsVecEnv:
