@@ -19,9 +19,9 @@ import service
 from benchmarks.downstream_throughput import PACKAGES, default_learner
 from benchmarks.measuring import parser_of, run_benchmark
 from service.downstream.learner import LearnedPolicy
-from service.downstream.methods import METHODS
+from service.downstream.methods import METHODS, provenance
 from service.downstream.settings import TrialConfig, make_trial
-from service.downstream.worker import CURVE_SEED, FINAL_SEED, find_provenance, play
+from service.downstream.worker import CURVE_SEED, FINAL_SEED, play
 from service.primitives.loading import TrainedBob
 
 
@@ -62,7 +62,7 @@ def learn(trial: TrialConfig, trained: TrainedBob, settings: Settings) -> dict[s
         print(f"{learner.num_timesteps:10,} env steps, {wall_s:6.0f} s: {found.success_last:.0%}", flush=True)
     final = play(trial, trained, player(), trial.num_episodes, trial.seed + FINAL_SEED, settings.threads)
     return {
-        "settings": {**asdict(settings), **find_provenance(trained).of(trial.method)},
+        "settings": {**asdict(settings), **provenance(trained, trial.method)},
         "curve": curve,
         "evaluation": final.as_dict(),
         "wall_s": wall_s,

@@ -16,7 +16,7 @@ import numpy as np
 import service
 from benchmarks.measuring import parser_of, run_benchmark
 from service.downstream.compose import action_weights, check_primitives
-from service.downstream.worker import find_provenance
+from service.downstream.methods import provenance
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -91,7 +91,7 @@ def benchmark(references: list[str], registry: str, settings: Settings) -> dict[
     rows = {}
     for name in references:
         trained = service.load_primitives(name, registry)
-        rows[name] = {**find_provenance(trained).primitives, "impossible": measure(trained, **asdict(settings))}
+        rows[name] = {**provenance(trained)["primitives"], "impossible": measure(trained, **asdict(settings))}
     return {"rows": rows}
 
 

@@ -12,7 +12,7 @@ import hashlib
 import math
 import operator
 from collections.abc import Callable, Iterator
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import gymnasium
 import numpy as np
@@ -21,10 +21,8 @@ from numpy.typing import NDArray
 from service.envs.observations import POSITIONS, SPACES
 from service.errors import TandemError
 from service.policies.numpy_policy import NumpyMCPPolicy
+from service.primitives.loading import TrainedBob
 from service.types import FloatArray
-
-if TYPE_CHECKING:
-    from service.primitives.loading import TrainedBob
 
 Info = dict[str, Any]
 Positions = Callable[[Any], FloatArray]
@@ -79,7 +77,77 @@ def parameters_digest(primitives: object) -> str:
     return digest.hexdigest()
 
 
-class ComposePrimitives(gymnasium.Wrapper[Any, FloatArray, Any, FloatArray], gymnasium.utils.RecordConstructorArgs):
+class _ComposingWrapper:
+    """The part that both wrappers share: turns weights and the last positions into actions."""
+
+    env: Any
+    _last_positions: FloatArray | None = None
+
+    def _compose_with(
+        self,
+        primitives: NumpyMCPPolicy | TrainedBob,
+        observation_space: gymnasium.Space[Any],
+        action_space: gymnasium.Space[Any],
+        positions: Positions | None,
+    ) -> gymnasium.Space[FloatArray]:
+        """Check that these primitives fit an environment with these spaces; the space of its new actions."""
+        self.primitives = check_primitives(primitives)
+        if not isinstance(action_space, gymnasium.spaces.Box) or action_space.shape != (self.primitives.action_size,):
+            raise TandemError(
+                f"the environment's actions are {action_space}; the primitives act by {self.primitives.action_size} "
+                "numbers: end-effector displacement 3, change of the finger width"
+            )
+        shown: Any = observation_space
+        if named := isinstance(observation_space, gymnasium.spaces.Dict):
+            shown = observation_space.get("observation")
+        if positions is None and (not isinstance(shown, gymnasium.spaces.Box) or shown.shape != (POSITIONS.size,)):
+            raise TandemError(
+                f"the environment's observations are {shown}; the primitives see the {POSITIONS.size} positions of "
+                "service.envs.observations: give positions=, which takes them out of an observation"
+            )
+        self._take = positions or (operator.itemgetter("observation") if named else lambda observation: observation)
+        self._low, self._high = action_space.low, action_space.high
+        return gymnasium.spaces.Box(-1.0, 1.0, (self.primitives.num_primitives,), np.float32)
+
+    def reset(self, *, seed: Any = None, options: Info | None = None) -> tuple[Any, Info]:
+        """Reset what is wrapped."""
+        observation, info = self.env.reset(seed=seed, options=options)
+        return self._observe(observation), info
+
+    def step(self, action: FloatArray) -> Any:
+        """Act by the composition with these weights.
+
+        Args:
+            action: (K,), or (N, K) for N environments.
+
+        Raises:
+            TandemError: not one number per environment and primitive.
+        """
+        observation, *rest = self.env.step(self._compose(action))
+        return (self._observe(observation), *rest)
+
+    def _observe(self, observation: Any) -> Any:
+        """Keep the positions that the next composition acts on; gives the observation back."""
+        self._last_positions = np.array(self._take(observation), dtype=np.float32)
+        return observation
+
+    def _compose(self, weights: FloatArray) -> FloatArray:
+        """Mean of the composition with weights (..., K), (..., 4), inside the environment's range."""
+        if self._last_positions is None:
+            raise gymnasium.error.ResetNeeded("call reset before step")
+        expected = (*self._last_positions.shape[:-1], self.primitives.num_primitives)
+        if np.shape(weights) != expected:
+            raise TandemError(
+                f"action: expected shape {expected}, a number for each of {expected[-1]} primitives, "
+                f"got {np.shape(weights)}; an orchestrator acts with the primitives it was trained with"
+            )
+        mean, _ = self.primitives.compose(self._last_positions, action_weights(weights))
+        return np.clip(mean, self._low, self._high)
+
+
+class ComposePrimitives(
+    _ComposingWrapper, gymnasium.Wrapper[Any, FloatArray, Any, FloatArray], gymnasium.utils.RecordConstructorArgs
+):
     """An environment whose action is K weights in [-1, 1]; everything else stays.
 
     Args:
@@ -103,32 +171,14 @@ class ComposePrimitives(gymnasium.Wrapper[Any, FloatArray, Any, FloatArray], gym
             self, _disable_deepcopy=True, primitives=primitives, positions=positions
         )
         super().__init__(env)
-        self._composer = _Composer(primitives, env.observation_space, env.action_space, positions)
-        self.primitives = self._composer.primitives
-        self.action_space = _weights_space(self.primitives.num_primitives)
-
-    def reset(self, *, seed: int | None = None, options: Info | None = None) -> tuple[Any, Info]:
-        """Reset the environment."""
-        observation, info = self.env.reset(seed=seed, options=options)
-        self._composer.observe(observation)
-        return observation, info
-
-    def step(self, action: FloatArray) -> tuple[Any, Any, bool, bool, Info]:
-        """Act by the composition with these (K,) weights.
-
-        Raises:
-            TandemError: not one number per primitive.
-        """
-        observation, *rest = self.env.step(self._composer.act(action))
-        self._composer.observe(observation)
-        return (observation, *rest)
+        self.action_space = self._compose_with(primitives, env.observation_space, env.action_space, positions)
 
     def compute_reward(self, achieved_goal: Any, desired_goal: Any, info: Any) -> Any:
         """The environment's own, where it has goals: hindsight relabelling asks for it here."""
         return self.env.get_wrapper_attr("compute_reward")(achieved_goal, desired_goal, info)
 
 
-class ComposePrimitivesVector(gymnasium.vector.VectorWrapper[Any, FloatArray, Any, FloatArray, Any]):
+class ComposePrimitivesVector(_ComposingWrapper, gymnasium.vector.VectorWrapper[Any, FloatArray, Any, FloatArray, Any]):
     """N environments at once, as in ``ComposePrimitives``: actions are (N, K), ``positions`` takes out (N, 11)."""
 
     def __init__(
@@ -139,91 +189,22 @@ class ComposePrimitivesVector(gymnasium.vector.VectorWrapper[Any, FloatArray, An
         positions: Positions | None = None,
     ) -> None:
         super().__init__(env)
-        self._composer = _Composer(primitives, env.single_observation_space, env.single_action_space, positions)
-        self.primitives = self._composer.primitives
-        self.single_action_space = _weights_space(self.primitives.num_primitives)
+        self.single_action_space = self._compose_with(
+            primitives, env.single_observation_space, env.single_action_space, positions
+        )
         self.action_space = gymnasium.vector.utils.batch_space(self.single_action_space, env.num_envs)
-
-    def reset(self, *, seed: Any = None, options: Info | None = None) -> tuple[Any, Info]:
-        """Reset the environments."""
-        observation, info = self.env.reset(seed=seed, options=options)
-        self._composer.observe(observation)
-        return observation, info
-
-    def step(self, actions: FloatArray) -> tuple[Any, Any, Any, Any, Info]:
-        """Act by the compositions with these (N, K) weights.
-
-        Raises:
-            TandemError: not one number per environment and primitive.
-        """
-        observation, *rest = self.env.step(self._composer.act(actions))
-        self._composer.observe(observation)
-        return (observation, *rest)
 
     def compute_reward(self, achieved_goal: Any, desired_goal: Any, info: Any) -> Any:
         """The environments' own, where they have goals."""
-        compute: Callable[..., Any] = getattr(self.env, "compute_reward")  # noqa: B009 - only goal environments have it
-        return compute(achieved_goal, desired_goal, info)
+        return self.env.compute_reward(achieved_goal, desired_goal, info)
 
     def state(self) -> Any:
         """The environments' own, where they can be saved; composing has none."""
-        return getattr(self.env, "state")()  # noqa: B009 - only ``TabletopVectorEnv`` has it
+        return self.env.state()
 
     def restore(self, state: Any) -> Any:
         """Go back to a saved state; the observation there."""
-        observation = getattr(self.env, "restore")(state)  # noqa: B009 - as above
-        self._composer.observe(observation)
-        return observation
-
-
-class _Composer:
-    """The part that both wrappers share: turns weights and the last positions into actions."""
-
-    def __init__(
-        self,
-        primitives: NumpyMCPPolicy | TrainedBob,
-        observation_space: gymnasium.Space[Any],
-        action_space: gymnasium.Space[Any],
-        positions: Positions | None,
-    ) -> None:
-        self.primitives = check_primitives(primitives)
-        if not isinstance(action_space, gymnasium.spaces.Box) or action_space.shape != (self.primitives.action_size,):
-            raise TandemError(
-                f"the environment's actions are {action_space}; the primitives act by {self.primitives.action_size} "
-                "numbers: end-effector displacement 3, change of the finger width"
-            )
-        shown: Any = observation_space
-        if named := isinstance(observation_space, gymnasium.spaces.Dict):
-            shown = observation_space.get("observation")
-        if positions is None and (not isinstance(shown, gymnasium.spaces.Box) or shown.shape != (POSITIONS.size,)):
-            raise TandemError(
-                f"the environment's observations are {shown}; the primitives see the {POSITIONS.size} positions of "
-                "service.envs.observations: give positions=, which takes them out of an observation"
-            )
-        self._take = positions or (operator.itemgetter("observation") if named else lambda observation: observation)
-        self._low, self._high = action_space.low, action_space.high
-        self._seen: FloatArray | None = None
-
-    def observe(self, observation: Any) -> None:
-        """Keep what the next composition acts on."""
-        self._seen = np.array(self._take(observation), dtype=np.float32)
-
-    def act(self, actions: FloatArray) -> FloatArray:
-        """Mean of the composition with (..., K) weights, (..., 4), inside the environment's range."""
-        if self._seen is None:
-            raise gymnasium.error.ResetNeeded("call reset before step")
-        expected = (*self._seen.shape[:-1], self.primitives.num_primitives)
-        if np.shape(actions) != expected:
-            raise TandemError(
-                f"action: expected shape {expected}, a number for each of {expected[-1]} primitives, "
-                f"got {np.shape(actions)}; an orchestrator acts with the primitives it was trained with"
-            )
-        mean, _ = self.primitives.compose(self._seen, action_weights(actions))
-        return np.clip(mean, self._low, self._high)
-
-
-def _weights_space(num_primitives: int) -> gymnasium.Space[FloatArray]:
-    return gymnasium.spaces.Box(-1.0, 1.0, (num_primitives,), np.float32)
+        return self._observe(self.env.restore(state))
 
 
 def _arrays(owner: Any, prefix: str) -> Iterator[tuple[str, NDArray[Any]]]:

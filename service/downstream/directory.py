@@ -45,7 +45,6 @@ class TrainingDirectory:
         self.checkpoint_file = path / "checkpoint.pt"
         self.result_file = path / "result.json"
         self._metrics = JsonlWriter(self.metrics_file)
-        self._events: EventFile | None = None
         self._lock: DirectoryLock | None = None
 
     def __enter__(self) -> Self:
@@ -56,11 +55,6 @@ class TrainingDirectory:
         if self._lock is not None:
             self._lock.release()
             self._lock = None
-
-    @property
-    def exists(self) -> bool:
-        """Whether a training has begun here."""
-        return self.trial_file.exists()
 
     def start(self, identity: dict[str, Any], *, resume: bool) -> dict[str, Any] | None:
         """Begin a training here, or continue one, and keep other processes out until the ``with`` block ends.
@@ -79,7 +73,7 @@ class TrainingDirectory:
         self.check(identity, resume=resume)
         self._lock = DirectoryLock(self.path, f"stop that one first, or {_ELSEWHERE}")
         self.check(identity, resume=resume)  # of two that begin at once, the second sees here what the first has made
-        saved = self._read_checkpoint() if self.exists else None
+        saved = self._read_checkpoint() if self.checkpoint_file.exists() else None
         with os_errors("write", self.path):
             remove_temporaries(self.path)
         write_json(self.trial_file, {"format_version": FORMAT_VERSION, **identity})  # first: it says whose the rest is
@@ -94,31 +88,24 @@ class TrainingDirectory:
         Raises:
             TandemError: it cannot; nothing was written.
         """
-        if not self.exists:
-            if self._holds_something_else():
+        if not self.trial_file.exists():
+            with os_errors("read", self.path):
+                names = [file.name for file in self.path.iterdir()] if self.path.exists() else []
+            # a process that was killed before it wrote its first file leaves a lock and temporary files
+            if any(name != LOCK_FILE and not name.startswith(TEMPORARY_PREFIX) for name in names):
                 raise TandemError(f"{self.path} holds something else than a downstream training; {_ELSEWHERE}")
             return
         if not resume:
             raise TandemError(f"{self.path} holds a training already; continue it with --resume, or {_ELSEWHERE}")
         recorded = read_json(self.trial_file)
-        if recorded.get("format_version") == FORMAT_VERSION:
-            recorded[TRIAL] = read_trial(recorded, self.trial_file).model_dump(mode="json")
-        if wrong := differences(_flat(recorded), _flat({"format_version": FORMAT_VERSION, **identity})):
+        trial = read_trial(recorded, self.trial_file).model_dump(mode="json")
+        if wrong := differences(trial | made_with(recorded), identity[TRIAL] | made_with(identity)):
             raise TandemError(f"{self.path} was begun with {'; '.join(wrong)}; {_ELSEWHERE}")
-
-    def _holds_something_else(self) -> bool:
-        """Whether anything is here but what a process leaves that was killed before it wrote its first file."""
-        if not self.path.exists():
-            return False
-        with os_errors("read", self.path):
-            names = [file.name for file in self.path.iterdir()]
-        return any(name != LOCK_FILE and not name.startswith(TEMPORARY_PREFIX) for name in names)
 
     def record(self, metrics: dict[str, float]) -> None:
         """Append one iteration's metrics to metrics.jsonl and TensorBoard."""
         self._metrics.append(metrics)
-        if self._events is not None:
-            self._events.add(metrics)
+        self._events.add(metrics)
 
     def write_checkpoint(self, saved: dict[str, Any]) -> None:
         """Replace the checkpoint in one step; the records it knows of are on the disk before.
@@ -134,9 +121,7 @@ class TrainingDirectory:
         with os_errors("write", self.checkpoint_file):
             write_atomic(self.checkpoint_file, data.getvalue())
 
-    def _read_checkpoint(self) -> dict[str, Any] | None:
-        if not self.checkpoint_file.exists():
-            return None
+    def _read_checkpoint(self) -> dict[str, Any]:
         import torch
 
         try:
@@ -146,17 +131,13 @@ class TrainingDirectory:
             raise TandemError(
                 f"{self.checkpoint_file} is damaged ({str(error).splitlines()[0][:80]}); remove it to begin anew"
             ) from None
-        if saved.get("format_version") != FORMAT_VERSION:
-            raise TandemError(
-                f"{self.checkpoint_file}: format version {saved.get('format_version')!r}, this program reads "
-                f"{FORMAT_VERSION}; {_ELSEWHERE}"
-            )
+        _check_version(saved, self.checkpoint_file)
         return saved
 
 
-def _flat(identity: dict[str, Any]) -> dict[str, Any]:
-    """An identity with the trial's settings beside everything else."""
-    return {**identity.get(TRIAL, {}), **{key: value for key, value in identity.items() if key != TRIAL}}
+def made_with(tree: dict[str, Any]) -> dict[str, Any]:
+    """Primitives and world in what was read from a file, as of ``methods.provenance``."""
+    return {key: tree.get(key) for key in ("primitives", "world")}
 
 
 def read_trial(tree: dict[str, Any], path: Path) -> TrialConfig:
@@ -175,18 +156,24 @@ def read_json(path: Path) -> dict[str, Any]:
     """Read the object in a file.
 
     Raises:
-        TandemError: there is none.
+        TandemError: there is none, or it is of another format version.
     """
+    with os_errors("read", path):
+        data = path.read_bytes()
     try:
-        with os_errors("read", path):
-            tree = json.loads(path.read_text(encoding="utf-8"))
-    except ValueError as error:
-        if isinstance(error, TandemError):
-            raise
-        raise TandemError(f"{path} is no JSON: {error}; remove it, or name another directory") from None
-    if not isinstance(tree, dict):
-        raise TandemError(f"{path} holds no JSON object; remove it, or name another directory")
+        tree = dict(json.loads(data))
+    except (ValueError, TypeError) as error:
+        raise TandemError(f"{path} is no JSON object: {error}; remove it, or name another directory") from None
+    _check_version(tree, path)
     return tree
+
+
+def _check_version(tree: dict[str, Any], path: Path) -> None:
+    found = tree.get("format_version")
+    if found != FORMAT_VERSION:
+        raise TandemError(
+            f"{path}: format version {found!r}, this program reads {FORMAT_VERSION}; name another directory"
+        )
 
 
 def write_json(path: Path, tree: dict[str, Any]) -> None:

@@ -3,32 +3,25 @@
 from __future__ import annotations
 
 import json
-from dataclasses import asdict
-from typing import TYPE_CHECKING, Any, cast
+from typing import Any, cast
 
 import numpy as np
 import torch
+from gymnasium.spaces import Dict
 from stable_baselines3 import SAC, HerReplayBuffer
 from stable_baselines3.common.buffers import DictReplayBuffer
 from stable_baselines3.common.logger import Logger
+from stable_baselines3.sac.policies import MultiInputPolicy
 
-from service.downstream.networks import GoalFeatures
-from service.downstream.vec_env import PREVIOUS, VecEnvState, WorldsVecEnv
-from service.envs.gym.vector import VectorState
+from service.downstream.methods import Method
+from service.downstream.networks import GoalFeatures, MCPSACPolicy
+from service.downstream.settings import TrialConfig
+from service.downstream.vec_env import PREVIOUS, WorldsVecEnv
 from service.envs.observations import BOB, POSITIONS
-
-if TYPE_CHECKING:
-    from gymnasium.spaces import Dict
-    from numpy.typing import NDArray
-
-    from service.downstream.methods import Method
-    from service.downstream.settings import TrialConfig
-    from service.primitives.loading import TrainedBob
-
-    FloatArray = NDArray[np.float32]
+from service.primitives.loading import TrainedBob
+from service.types import FloatArray
 
 _ROWS = ("actions", "rewards", "dones", "timeouts", "ep_start", "ep_length")
-_WORLDS_ROWS = ("previous", "returns", "lengths")
 _COUNTERS = ("num_timesteps", "_n_updates", "_episode_num")
 
 
@@ -36,7 +29,7 @@ def make_learner(trial: TrialConfig, method: Method, env: WorldsVecEnv) -> SAC:
     """Make a new learner; draws from the global random numbers of torch and NumPy, which its seed restarts."""
     sac = trial.sac
     learner = SAC(
-        method.policy(),
+        MCPSACPolicy if method.mcp_actor else MultiInputPolicy,
         env,
         learning_rate=sac.learning_rate,
         buffer_size=-(-trial.num_env_steps // sac.num_worlds) * sac.num_worlds,  # everything is kept
@@ -96,40 +89,41 @@ class LearnedPolicy:
             PREVIOUS: positions if previous is None else previous,
         }
         actions, _ = self._learner.predict(
-            {name: seen[name] for name in cast("Dict", self._learner.observation_space)}, deterministic=True
+            {name: seen[name] for name in cast(Dict, self._learner.observation_space)}, deterministic=True
         )
         return self._method.decode(self._trained, positions, actions)
 
 
 def save_learner(learner: SAC, env: WorldsVecEnv) -> dict[str, Any]:
     """Everything the learner continues from, as tensors and plain values: its random numbers and worlds, too."""
-    buffer, entropy = learner.replay_buffer, learner.log_ent_coef
-    assert buffer is not None
+    entropy, worlds = learner.log_ent_coef, env.state()
     assert entropy is not None
+    random = json.dumps(worlds.pop("random"))
+    kind, keys, *rest = cast("tuple[Any, ...]", np.random.get_state())  # Stable-Baselines3 draws its batches from it
     return {
         "parameters": learner.get_parameters(),
         "log_ent_coef": entropy.detach().clone(),
         "counters": {name: getattr(learner, name) for name in _COUNTERS},
-        "replay": _save_replay(buffer),
-        "worlds": _save_worlds(env.state()),
+        "replay": _save_replay(learner.replay_buffer),
+        "worlds": {"arrays": {name: torch.from_numpy(rows) for name, rows in worlds.items()}, "random": random},
         "torch_random": torch.get_rng_state(),
-        "numpy_random": _numpy_random(),
+        "numpy_random": [kind, torch.from_numpy(keys.copy()), *rest],
         "action_random": json.dumps(learner.action_space.np_random.bit_generator.state),
     }
 
 
 def restore_learner(learner: SAC, env: WorldsVecEnv, saved: dict[str, Any]) -> None:
     """Go back to what ``save_learner`` gave, in a new learner and worlds of the same settings."""
-    buffer, entropy = learner.replay_buffer, learner.log_ent_coef
-    assert buffer is not None
+    entropy = learner.log_ent_coef
     assert entropy is not None
     learner.set_parameters(saved["parameters"], exact_match=True, device="cpu")
     with torch.no_grad():
         entropy.copy_(saved["log_ent_coef"])  # in place: its optimiser holds it
     for name, value in saved["counters"].items():
         setattr(learner, name, value)
-    _restore_replay(buffer, saved["replay"])
-    learner._last_obs = env.restore(_worlds_state(saved["worlds"]))
+    _restore_replay(learner.replay_buffer, saved["replay"])
+    worlds = {name: rows.numpy() for name, rows in saved["worlds"]["arrays"].items()}
+    learner._last_obs = env.restore({**worlds, "random": tuple(json.loads(saved["worlds"]["random"]))})
     learner._last_episode_starts = np.zeros(env.num_envs, dtype=bool)
     torch.set_rng_state(saved["torch_random"])
     kind, keys, *rest = saved["numpy_random"]
@@ -155,22 +149,3 @@ def _restore_replay(buffer: Any, saved: dict[str, Any]) -> None:
     buffer.pos, buffer.full = saved["pos"], saved["full"]
     if saved["starts"] is not None:
         buffer._current_ep_start[:] = saved["starts"]
-
-
-def _save_worlds(state: VecEnvState) -> dict[str, Any]:
-    worlds: VectorState = state.worlds
-    tree = asdict(worlds) | {name: getattr(state, name) for name in _WORLDS_ROWS}
-    arrays = {name: torch.from_numpy(value) for name, value in tree.items() if name != "random"}
-    return {"arrays": arrays, "random": json.dumps(worlds.random)}
-
-
-def _worlds_state(saved: dict[str, Any]) -> VecEnvState:
-    arrays = {name: value.numpy() for name, value in saved["arrays"].items()}
-    rows = {name: arrays.pop(name) for name in _WORLDS_ROWS}
-    return VecEnvState(VectorState(**arrays, random=tuple(json.loads(saved["random"]))), **rows)
-
-
-def _numpy_random() -> list[Any]:
-    """State of the global generator, from which Stable-Baselines3 draws its batches."""
-    kind, keys, *rest = cast("tuple[Any, ...]", np.random.get_state())
-    return [kind, torch.from_numpy(keys.copy()), *rest]

@@ -1,67 +1,41 @@
 """The methods of the paper's table, by name. The harness knows nothing of a method but what is here.
 
-A method that learns says what its learner acts by (``wrap`` and ``decode``), which network and replay buffer it has;
-one with nothing to learn says who plays. A skill-discovery baseline joins as one more entry: its ``wrap`` hands the
-environment the actions of its frozen skill policy, with skill vectors as actions.
+A method that learns says what its learner acts by (``wrap`` and ``decode``), which actor and replay buffer it has; one
+with nothing to learn says which policy plays. A skill-discovery baseline would be one more entry: its ``wrap`` hands
+the environment the actions of its frozen skill policy, with skill vectors as actions.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import gymnasium
 import numpy as np
 
 from service.actors.evaluation import DeterministicPolicy, IdlePolicy
-from service.downstream.compose import ComposePrimitivesVector, action_weights, check_primitives, check_robot
+from service.downstream.compose import (
+    ComposePrimitivesVector,
+    action_weights,
+    check_primitives,
+    check_robot,
+    parameters_digest,
+)
 from service.errors import TandemError
+from service.primitives.loading import TrainedBob
 from service.types import FloatArray
-
-if TYPE_CHECKING:
-    from stable_baselines3.sac.policies import SACPolicy
-
-    from service.primitives.loading import TrainedBob
 
 Worlds = gymnasium.vector.VectorEnv[Any, Any, Any]
 
 
-def _same(env: Worlds, trained: TrainedBob) -> Worlds:
-    return env
-
-
-def _act(trained: TrainedBob, positions: FloatArray, actions: FloatArray) -> FloatArray:
-    return actions
-
-
-def _gaussian() -> type[SACPolicy]:
-    from stable_baselines3.sac.policies import MultiInputPolicy
-
-    return MultiInputPolicy
-
-
-def _mcp() -> type[SACPolicy]:
-    from service.downstream.networks import MCPSACPolicy
-
-    return MCPSACPolicy
-
-
-def _compose(env: Worlds, trained: TrainedBob) -> Worlds:
-    return ComposePrimitivesVector(env, trained)
-
-
-def _composed(trained: TrainedBob, positions: FloatArray, actions: FloatArray) -> FloatArray:
+def _compose(trained: TrainedBob, positions: FloatArray, actions: FloatArray) -> FloatArray:
     mean, _ = trained.primitives.compose(positions, action_weights(actions))
     return np.clip(mean, -1.0, 1.0)
 
 
 def _bob(trained: TrainedBob) -> DeterministicPolicy:
     return trained.policy
-
-
-def _idle(trained: TrainedBob) -> DeterministicPolicy:
-    return IdlePolicy()
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,12 +46,12 @@ class Method:
     """Name in the table."""
     description: str
     """A few words for ``tandem downstream methods``."""
-    wrap: Callable[[Worlds, TrainedBob], Worlds] = _same
+    wrap: Callable[[Worlds, TrainedBob], Worlds] = lambda env, trained: env
     """The worlds its learner acts in."""
-    decode: Callable[[TrainedBob, FloatArray, FloatArray], FloatArray] = _act
+    decode: Callable[[TrainedBob, FloatArray, FloatArray], FloatArray] = lambda trained, positions, actions: actions
     """Turns (N, 11) positions and the learner's (N, A) actions into (N, 4) actions, as the wrapped worlds do."""
-    policy: Callable[[], type[SACPolicy]] = _gaussian
-    """Class of actor and critics; imports torch."""
+    mcp_actor: bool = False
+    """Whether the actor is a Multiplicative Compositional Policy, learned end to end; else SAC's own network."""
     her_ratio: tuple[float, float] | None = None
     """Share of a batch whose goals are relabelled (HER, ``future``), when learning begins and when it ends, linear in
     between; None: no HER."""
@@ -91,11 +65,6 @@ class Method:
         """Whether its result depends on them; else they only say in which world it plays."""
         return self.composes or self.player is _bob
 
-    @property
-    def learns_from_nothing(self) -> bool:
-        """Whether it learns, and takes nothing that was learned before."""
-        return self.player is None and not self.takes_primitives
-
     def check(self, trained: TrainedBob) -> None:
         """Assert that these primitives are for this method.
 
@@ -107,33 +76,34 @@ class Method:
             check_primitives(trained)
 
 
-_USUAL_SHARE = 0.8
+_HER_SHARE = 0.8
 """1 - 1 / (k + 1) for the usual k = 4 (Andrychowicz et al. 2017)."""
-_USUAL_SHARES = (_USUAL_SHARE, _USUAL_SHARE)
 
 METHODS: Mapping[str, Method] = {
-    "ours": Method("ours", "SAC sets the weights of the frozen primitives", _compose, _composed, composes=True),
+    "ours": Method(
+        "ours", "SAC sets the weights of the frozen primitives", ComposePrimitivesVector, _compose, composes=True
+    ),
     "ours-her": Method(
         "ours + HER",
         "the same, with relabelled goals, fewer and fewer",
+        ComposePrimitivesVector,
         _compose,
-        _composed,
         composes=True,
-        her_ratio=(_USUAL_SHARE, 0.0),
+        her_ratio=(_HER_SHARE, 0.0),
     ),
     "asp-only": Method("ASP only", "Bob as he is", player=_bob),
     "scratch-monolithic-her": Method(
-        "scratch monolithic + HER", "SAC alone, with relabelled goals", her_ratio=_USUAL_SHARES
+        "scratch monolithic + HER", "SAC alone, with relabelled goals", her_ratio=(_HER_SHARE, _HER_SHARE)
     ),
     "scratch-mcp-her": Method(
         "scratch MCP + HER",
         "primitives and gate learned together, with relabelled goals",
-        policy=_mcp,
-        her_ratio=_USUAL_SHARES,
+        mcp_actor=True,
+        her_ratio=(_HER_SHARE, _HER_SHARE),
     ),
     "scratch-monolithic": Method("scratch monolithic", "SAC alone"),
-    "scratch-mcp": Method("scratch MCP", "primitives and gate learned together by SAC", policy=_mcp),
-    "idle": Method("idle", "does nothing", player=_idle),
+    "scratch-mcp": Method("scratch MCP", "primitives and gate learned together by SAC", mcp_actor=True),
+    "idle": Method("idle", "does nothing", player=lambda trained: IdlePolicy()),
 }
 """The methods by the names that commands take, in the order of the table's rows."""
 
@@ -147,3 +117,16 @@ def find_method(name: str) -> Method:
     if name not in METHODS:
         raise TandemError(f"unknown method {name!r}; choose one of {', '.join(METHODS)}")
     return METHODS[name]
+
+
+def provenance(trained: TrainedBob, method: str = "ours") -> dict[str, Any]:
+    """Primitives and world that a method's result is of, besides its trial.
+
+    Returns:
+        ``primitives``: their name, and SHA-256 of their parameters as ``digest``; None where the method takes none.
+        ``world``: settings of the world that they bring along, before a task replaces some.
+    """
+    name = trained.label if trained.manifest is None else trained.manifest.reference  # the same wherever it came from
+    primitives = {"name": name, "digest": parameters_digest(trained.policy)}
+    without = method in METHODS and not METHODS[method].takes_primitives
+    return {"primitives": None if without else primitives, "world": trained.config.world.model_dump(mode="json")}

@@ -1,19 +1,26 @@
-"""The page of results: tables in Markdown from the recorded trials, beside the paper's figures."""
+"""The page of results: tables from the recorded trials, beside the paper's figures, and learning curves."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from itertools import pairwise
-from typing import Any
+from itertools import cycle, pairwise
+from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from service.actors.evaluation import wilson_interval
 from service.downstream.directory import TRIAL
 from service.downstream.methods import METHODS
+from service.downstream.results import Result
 from service.envs.tasks import TASKS
+from service.media.figures import BLUE, FAINT, GREEN, ORANGE, column, new_figure, read_records, save, style_axes
 
-Result = dict[str, Any]
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.lines import Line2D
+
+_COLOURS = (BLUE, "#56B4E9", "#000000", GREEN, ORANGE, "#CC79A7", "#E69F00", "#999999")
 Seeds = Sequence[Result]
 """Results of one method on one task."""
 
@@ -47,9 +54,7 @@ def write_page(results: Sequence[Result], picture: str) -> str:
         results: of trials.
         picture: file name of the learning curves, beside the page.
     """
-    of: dict[tuple[str, str], list[Result]] = {}
-    for result in sorted(results, key=lambda each: int(each[TRIAL]["seed"])):
-        of.setdefault((result[TRIAL]["method"], result[TRIAL]["task"]), []).append(result)
+    of = _by_method_and_task(results)
     parts = [
         f"# Downstream\n\n{MARK} from the files in `downstream/`, one for each trial, a method on a task with a "
         "seed;\n[what the tasks and methods are](../downstream.md).\n",
@@ -77,6 +82,13 @@ def write_page(results: Sequence[Result], picture: str) -> str:
         "\n" + _origin(results),
     ]
     return "\n".join(parts)
+
+
+def _by_method_and_task(results: Sequence[Result]) -> dict[tuple[str, str], list[Result]]:
+    found: dict[tuple[str, str], list[Result]] = {}
+    for result in sorted(results, key=lambda each: int(each[TRIAL]["seed"])):
+        found.setdefault((result[TRIAL]["method"], result[TRIAL]["task"]), []).append(result)
+    return found
 
 
 def _old_versions(results: Sequence[Result]) -> Sequence[str]:
@@ -146,7 +158,7 @@ def _efficiency(of: Mapping[tuple[str, str], Seeds]) -> Sequence[str]:
     """The section on how soon methods that compose are good, and the first that learns from nothing is as good."""
     known = {name: method for name, method in METHODS.items() if any(found == name for found, _ in of)}
     composing = [name for name, method in known.items() if method.composes]
-    scratch = [name for name, method in known.items() if method.learns_from_nothing]
+    scratch = [name for name, method in known.items() if method.player is None and not method.takes_primitives]
     if not composing or not scratch:
         return ()
     rows = []
@@ -172,8 +184,7 @@ def _efficiency(of: Mapping[tuple[str, str], Seeds]) -> Sequence[str]:
 def _mean_until(seeds: Seeds, level: float) -> float | None:
     """Env steps until a level, mean of the seeds; None: not every seed reaches it."""
     soon = [steps_until(result["curve"], level) for result in seeds]
-    known = [each for each in soon if each is not None]
-    return float(np.mean(known)) if known and len(known) == len(seeds) else None
+    return None if not soon or None in soon else float(np.mean(soon))  # type: ignore[arg-type]
 
 
 def steps_until(curve: Sequence[dict[str, float]], level: float) -> float | None:
@@ -202,11 +213,74 @@ def _soonest(of: Mapping[str, Seeds], level: float) -> str:
 def _origin(results: Sequence[Result]) -> str:
     taken = [each["primitives"] for each in results if each["primitives"]]
     primitives = sorted({f"{each['name']} ({each['digest'][:12]})" for each in taken})
-    commits = sorted({_short(each["made"]["git_commit"]) for each in results if each["made"]["git_commit"]})
+    made = [each["made"]["git_commit"].partition("-dirty") for each in results if each["made"]["git_commit"]]
+    commits = sorted({name[:12] + dirty for name, dirty, _ in made})
     return f"Primitives: {', '.join(primitives) or 'none'}. Commits: {', '.join(commits) or 'unknown'}.\n"
 
 
-def _short(commit: str) -> str:
-    """Twelve characters of a commit, and whether it had local changes."""
-    name, dirty, _ = commit.partition("-dirty")
-    return name[:12] + dirty
+def draw_training(path: Path) -> Path:
+    """Draw ``curves.png`` of a training from its ``metrics.jsonl``: success, return, and how fast.
+
+    Raises:
+        TandemError: no metrics yet, or the picture cannot be written.
+    """
+    records = read_records(path / "metrics.jsonl")
+    steps = column(records, "env_steps") / 1e3
+    figure = new_figure(12.0, 4.2, path.resolve().name)
+    panels = (
+        ("success", ("evaluation/success_last", "evaluation/success_ever", "rollout/success_last")),
+        ("return of an episode, with noise", ("rollout/return",)),
+        ("entropy coefficient", ("train/ent_coef",)),
+    )
+    for axes, (title, keys) in zip(figure.subplots(1, 3), panels, strict=True):
+        for key, colour in zip(keys, (BLUE, GREEN, FAINT), strict=False):
+            values = column(records, key)
+            known = np.isfinite(values)
+            axes.plot(steps[known], values[known], color=colour, linewidth=1.4, label=key)
+        _finish(axes, title)
+        axes.legend(fontsize=8, frameon=False)
+    figure.subplots_adjust(left=0.06, right=0.98, top=0.82, bottom=0.15)
+    return save(figure, path / "curves.png")
+
+
+def draw_table(results: Sequence[Result], path: Path) -> Path:
+    """Draw success at the last step over env steps: a panel per task, a line per method, a band from least to greatest.
+
+    Raises:
+        TandemError: the picture cannot be written.
+    """
+    figure = new_figure(14.0, 8.0, "Success at the last step, over thousands of env steps")
+    of, lines = _by_method_and_task(results), dict[str, "Line2D"]()
+    longest = max((each["env_steps"] for each in results), default=0) / 1e3
+    for axes, (name, task) in zip(figure.subplots(2, 3).flat, TASKS.items(), strict=True):
+        for (method, described), colour in zip(METHODS.items(), cycle(_COLOURS), strict=False):
+            if (method, name) in of:
+                lines[described.title] = _draw_method(axes, of[method, name], colour)
+        _finish(axes, task.title)
+        axes.set_ylim(-0.02, 1.02)
+        axes.set_xlim(0.0, 1.02 * longest or 1.0)
+    titles = [described.title for described in METHODS.values() if described.title in lines]
+    figure.legend([lines[title] for title in titles], titles, loc="upper right", ncols=4, fontsize=9, frameon=False)
+    figure.subplots_adjust(left=0.05, right=0.98, top=0.86, bottom=0.07, hspace=0.3)
+    return save(figure, path)
+
+
+def _draw_method(axes: Axes, results: Seeds, colour: str) -> Line2D:
+    """Mean line of several seeds and their range; a level for a method that learns nothing. Returns the line."""
+    curves = [result["curve"] for result in results]
+    if not all(curves):
+        level = float(np.mean([result["evaluation"]["success_last"] for result in results]))
+        return axes.axhline(level, color=colour, linewidth=1.0, linestyle=":")
+    num = min(len(curve) for curve in curves)
+    steps = np.array([point["env_steps"] for point in curves[0][:num]]) / 1e3
+    values = np.array([[point["success_last"] for point in curve[:num]] for curve in curves])
+    (line,) = axes.plot(steps, values.mean(0), color=colour, linewidth=1.6)
+    if len(curves) > 1:
+        axes.fill_between(steps, values.min(0), values.max(0), color=colour, alpha=0.18, linewidth=0)
+    return line
+
+
+def _finish(axes: Axes, title: str) -> None:
+    style_axes(axes)
+    axes.set_title(title, loc="left", fontsize=11)
+    axes.set_xlabel("env steps, thousands", color=FAINT, fontsize=9)

@@ -6,12 +6,12 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
-from service.downstream.directory import FORMAT_VERSION, read_json, read_trial, to_json
-from service.downstream.methods import METHODS
+from service.downstream.directory import made_with, read_json, read_trial, to_json
+from service.downstream.methods import METHODS, provenance
 from service.downstream.settings import TrialConfig, differences
-from service.downstream.worker import Provenance
 from service.errors import TandemError
 from service.io.files import os_errors, write_exclusive
+from service.primitives.loading import TrainedBob
 
 Result = dict[str, Any]
 
@@ -23,22 +23,22 @@ class ResultsDirectory:
         """Name the directory, which need not exist; nothing is read before it is asked for."""
         self.path = path
 
-    def find(self, trial: TrialConfig, provenance: Provenance) -> Result | None:
-        """Find the result of a trial; None where it has not been run.
+    def find(self, trial: TrialConfig, trained: TrainedBob) -> Result | None:
+        """Find the result of a trial with these primitives; None where it has not been run.
 
         Raises:
             TandemError: the file is damaged, of another format version, or of other settings or primitives.
         """
-        path = self._file(trial)
+        path = self.path / f"{trial.name}.json"
         if not path.exists():
             return None
-        result = _read(path)
-        wanted = _settings(trial) | provenance.of(trial.method)
-        if wrong := differences(_settings(read_trial(result, path)) | _made_with(result), wanted):
+        result = read_json(path)
+        wanted = _settings(trial) | provenance(trained, trial.method)
+        if wrong := differences(_settings(read_trial(result, path)) | made_with(result), wanted):
             raise TandemError(f"{path} is of {'; '.join(wrong)}: give the same settings, or name another directory")
         return result
 
-    def missing(self, trials: Iterable[TrialConfig], provenance: Provenance) -> list[TrialConfig]:
+    def missing(self, trials: Iterable[TrialConfig], trained: TrainedBob) -> list[TrialConfig]:
         """List the trials that have to be run; every file is checked before any is.
 
         What is in the directory and what is asked for comes onto one page: of the same world, of the same primitives
@@ -47,12 +47,12 @@ class ResultsDirectory:
         Raises:
             TandemError: as for ``find``; or the page would mix what cannot be compared.
         """
-        missing = [trial for trial in trials if self.find(trial, provenance) is None]
+        missing = [trial for trial in trials if self.find(trial, trained) is None]
         of_all_seeds = {(each.method, each.task): (f"{each.name}, asked for,", _settings(each)) for each in missing}
-        for path in self._files():
-            result = _read(path)
+        for path in sorted(self.path.glob("*.json")):
+            result = read_json(path)
             trial = read_trial(result, path)
-            if wrong := differences(_made_with(result), provenance.of(trial.method)):
+            if wrong := differences(made_with(result), provenance(trained, trial.method)):
                 raise TandemError(f"{path} is of {'; '.join(wrong)}: name another directory, or move it away")
             other, settings = of_all_seeds.setdefault((trial.method, trial.task), (str(path), _settings(trial)))
             if wrong := differences(_settings(trial) | {"seed": 0}, settings | {"seed": 0}):
@@ -65,7 +65,7 @@ class ResultsDirectory:
         Raises:
             TandemError: there is one already, or the disk is full.
         """
-        path = self._file(trial)
+        path = self.path / f"{trial.name}.json"
         with os_errors("write", path):
             path.parent.mkdir(parents=True, exist_ok=True)
             kept = write_exclusive(path, to_json(result))
@@ -78,17 +78,7 @@ class ResultsDirectory:
         Raises:
             TandemError: a file is damaged or of another format version.
         """
-        return [_read(path) for path in self._files()]
-
-    def _file(self, trial: TrialConfig) -> Path:
-        return self.path / f"{trial.name}.json"
-
-    def _files(self) -> list[Path]:
-        return sorted(self.path.glob("*.json"))
-
-
-def _made_with(result: Result) -> dict[str, Any]:
-    return {key: result.get(key) for key in ("primitives", "world")}
+        return [read_json(path) for path in sorted(self.path.glob("*.json"))]
 
 
 def _settings(trial: TrialConfig) -> dict[str, Any]:
@@ -96,13 +86,3 @@ def _settings(trial: TrialConfig) -> dict[str, Any]:
     method = METHODS.get(trial.method)
     learning = {"sac", "num_env_steps", "curve_every", "curve_episodes"}
     return trial.model_dump(mode="json", exclude=learning if method and method.player else None)
-
-
-def _read(path: Path) -> Result:
-    result = read_json(path)
-    found = result.get("format_version")
-    if found != FORMAT_VERSION:
-        raise TandemError(
-            f"{path}: format version {found!r}, this program reads {FORMAT_VERSION}; name another directory"
-        )
-    return result

@@ -12,9 +12,6 @@ from service.envs.tasks import find_task
 from service.errors import TandemError
 from service.frozen import FrozenModel
 
-_MAX_SEED = 2**32 - 1
-
-
 _Settings = TypeVar("_Settings", bound=FrozenModel)
 
 
@@ -41,7 +38,7 @@ class TrialConfig(FrozenModel):
 
     task: str
     method: str
-    seed: int = Field(0, ge=0, le=_MAX_SEED)
+    seed: int = Field(0, ge=0, le=2**32 - 1)
     num_env_steps: int = Field(200_000, ge=1, description="of learning; 0 in the result of a method that does not")
     sac: SACConfig = SACConfig()
     curve_every: int = Field(4, ge=1, description="iterations between evaluations on the way; one is 50 steps a world")

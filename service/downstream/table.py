@@ -10,22 +10,20 @@ import itertools
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import service
-from service.downstream.methods import find_method
-from service.downstream.page import MARK, write_page
-from service.downstream.pictures import draw_table
+from service.downstream.directory import made_with
+from service.downstream.methods import find_method, provenance
+from service.downstream.page import MARK, draw_table, write_page
 from service.downstream.results import Result, ResultsDirectory
 from service.downstream.settings import TrialConfig
-from service.downstream.worker import Callbacks, RunOptions, check_trial, find_provenance, run_trial
+from service.downstream.worker import Callbacks, RunOptions, check_trial, run_trial
 from service.errors import TandemError
 from service.io.files import os_errors, write_atomic
+from service.primitives.loading import TrainedBob
 
-if TYPE_CHECKING:
-    from service.primitives.loading import TrainedBob
-
-PAGE_FILE, PICTURE_FILE, RESULTS = "downstream.md", "downstream.png", "downstream"
+PAGE_FILE, PICTURE_FILE = "downstream.md", "downstream.png"
 _POLL_S = 1.0
 
 
@@ -39,49 +37,39 @@ class Source:
     runs: Path
     """Training directories are made here."""
 
-    def load(self) -> TrainedBob:
-        """Load the primitives.
-
-        Raises:
-            TandemError: as of ``service.load_primitives``.
-        """
-        return service.load_primitives(self.primitives, self.registry)
-
 
 Results = Iterator[tuple[TrialConfig, Result]]
-Runner = Callable[[Sequence[TrialConfig], "TrainedBob", Source, Callbacks], Results]
+Runner = Callable[[Sequence[TrialConfig], TrainedBob, Source, Callbacks], Results]
 """Runs trials with these primitives, which are the source's; ends early where it is to stop."""
 
 
 def make_table(trials: Sequence[TrialConfig], source: Source, out: Path, runner: Runner, callbacks: Callbacks) -> bool:
-    """Run what is missing and write the page.
+    """Run what is missing; write page and picture from every result in the directory.
 
     Returns:
         Whether everything is there; False where it was stopped before.
 
     Raises:
-        TandemError: results of another version or other settings, primitives that do not fit or cannot be fetched, or a
-            trial that failed. What had ended is kept.
+        TandemError: results that are damaged, of another version or other settings, primitives that do not fit or
+            cannot be fetched, or a trial that failed. What had ended is kept.
     """
     page = out / PAGE_FILE
     with os_errors("read", page):
-        ours = not page.exists() or MARK in page.read_text(encoding="utf-8")
-    if not ours:
-        raise TandemError(f"{page} was not written by this command; name another directory with --out")
-    trained = source.load()
-    results, provenance = ResultsDirectory(out / RESULTS), find_provenance(trained)
-    missing = results.missing(trials, provenance)
+        if page.exists() and MARK not in page.read_text(encoding="utf-8"):
+            raise TandemError(f"{page} was not written by this command; name another directory with --out")
+    trained = service.load_primitives(source.primitives, source.registry)
+    results = ResultsDirectory(out / "downstream")
+    missing = results.missing(trials, trained)
     callbacks.say(f"{len(trials) - len(missing)} of {len(trials)} trials are there, {len(missing)} to run")
     done = 0
     for trial, result in runner(missing, trained, source, callbacks):
-        if any(result[key] != value for key, value in provenance.of(trial.method).items()):
+        if made_with(result) != provenance(trained, trial.method):
             raise TandemError(f"{source.primitives} has changed in {source.registry} meanwhile; give NAME@VERSION")
         results.add(trial, result)
         done += 1
         rate = result["evaluation"]["success_last"]
         callbacks.say(f"{trial.name}: {rate:.1%} at the last step ({done} of {len(missing)})")
-    for path in write_results(out):
-        callbacks.say(str(path))
+    callbacks.say("\n".join(map(str, write_results(out))))
     return done == len(missing)
 
 
@@ -91,8 +79,8 @@ def write_results(out: Path) -> list[Path]:
     Raises:
         TandemError: a result is damaged or of another version, or something cannot be written.
     """
-    found = ResultsDirectory(out / RESULTS).read_all()
-    picture, page = draw_table(found, out / PICTURE_FILE), out / PAGE_FILE
+    found, page = ResultsDirectory(out / "downstream").read_all(), out / PAGE_FILE
+    picture = draw_table(found, out / PICTURE_FILE)
     with os_errors("write", page):
         write_atomic(page, write_page(found, PICTURE_FILE).encode())
     return [page, picture]
@@ -163,8 +151,9 @@ def run_on_ray(
 
 def _run_remotely(trial: TrialConfig, primitives: Source | TrainedBob, path: Path, num_threads: int) -> Result:
     """Run a trial in a Ray task, wherever it is."""
-    trained = primitives.load() if isinstance(primitives, Source) else primitives
-    result = run_trial(trial, trained, path, RunOptions(resume=True, num_threads=num_threads))
+    if isinstance(primitives, Source):
+        primitives = service.load_primitives(primitives.primitives, primitives.registry)
+    result = run_trial(trial, primitives, path, RunOptions(resume=True, num_threads=num_threads))
     assert result is not None, "nobody asks a task to stop"
     return result
 

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict
 from typing import Any
 
 import gymnasium
 import numpy as np
-from numpy.typing import NDArray
 from stable_baselines3.common.vec_env import VecEnv
 
+from service.envs.gym.vector import VectorState
 from service.types import FloatArray
 
 Observation = dict[str, FloatArray]
@@ -18,20 +17,6 @@ Info = dict[str, Any]
 
 PREVIOUS = "previous"
 """Name of what is added to an observation: the positions one step ago."""
-
-
-@dataclass(frozen=True, slots=True)
-class VecEnvState:
-    """Everything a :class:`WorldsVecEnv` continues from."""
-
-    worlds: Any
-    """State of the vector environment."""
-    previous: FloatArray
-    """(N, 11) positions as last shown."""
-    returns: NDArray[np.float64]
-    """(N,) rewards of the episodes that go on."""
-    lengths: NDArray[np.int64]
-    """(N,) their steps."""
 
 
 class WorldsVecEnv(VecEnv):
@@ -51,14 +36,11 @@ class WorldsVecEnv(VecEnv):
     """
 
     def __init__(self, env: gymnasium.vector.VectorEnv[Any, Any, Any]) -> None:
-        self.env = env
+        self.env: Any = env
         self.finished: list[tuple[float, bool]] = []
         """Return and success at the last step of the episodes that ended since this list was last cleared."""
         self._returns = np.zeros(env.num_envs)
         self._lengths = np.zeros(env.num_envs, dtype=np.int64)
-        self._actions: FloatArray | None = None
-        self._now: FloatArray | None = None
-        self._previous: FloatArray | None = None
         assert isinstance(env.single_observation_space, gymnasium.spaces.Dict)
         spaces = dict(env.single_observation_space.spaces)
         space = gymnasium.spaces.Dict({**spaces, PREVIOUS: spaces["observation"]})
@@ -83,8 +65,6 @@ class WorldsVecEnv(VecEnv):
         Returns:
             Observations, float32 rewards, dones and infos, (N, ...) each.
         """
-        assert self._actions is not None, "step_async comes first"
-        assert self._now is not None, "reset comes first"
         observation, rewards, terminated, truncated, info = self.env.step(self._actions)
         before, done = self._now, terminated | truncated
         self._returns += rewards
@@ -116,21 +96,27 @@ class WorldsVecEnv(VecEnv):
             "episode": {"r": total, "l": length},
         }
 
-    def state(self) -> VecEnvState:
-        """Copy everything that :meth:`restore` needs."""
-        assert self._previous is not None, "reset comes first"
-        worlds = getattr(self.env, "state")()  # noqa: B009 - only ``TabletopVectorEnv`` has it
-        return VecEnvState(worlds, self._previous.copy(), self._returns.copy(), self._lengths.copy())
+    def state(self) -> dict[str, Any]:
+        """Copy everything that :meth:`restore` needs.
 
-    def restore(self, state: VecEnvState) -> Observation:
+        Returns:
+            The entries of ``VectorState``, (N, 11) ``previous`` positions as last shown, and of the episodes that go on
+            (N,) ``returns`` and (N,) ``lengths``.
+        """
+        worlds = asdict(self.env.state())
+        returns, lengths = self._returns.copy(), self._lengths.copy()
+        return {**worlds, "previous": self._previous.copy(), "returns": returns, "lengths": lengths}
+
+    def restore(self, state: dict[str, Any]) -> Observation:
         """Go back to a saved state; continues bit-identically.
 
         Returns:
             The observation there.
         """
-        self._returns, self._lengths = state.returns.copy(), state.lengths.copy()
-        observation: Observation = getattr(self.env, "restore")(state.worlds)  # noqa: B009 - as above
-        return self._show(observation, state.previous)
+        worlds = dict(state)
+        previous = worlds.pop("previous")
+        self._returns, self._lengths = worlds.pop("returns").copy(), worlds.pop("lengths").copy()
+        return self._show(self.env.restore(VectorState(**worlds)), previous)
 
     def close(self) -> None:
         """Stop the worlds' threads."""
@@ -138,7 +124,7 @@ class WorldsVecEnv(VecEnv):
 
     def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
         """The environments' common attribute, once per world asked for."""
-        return [getattr(self.env, attr_name)] * self._num_asked(indices)
+        return [getattr(self.env, attr_name) for _ in self._get_indices(indices)]
 
     def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
         """Refuse: the worlds share everything.
@@ -151,11 +137,8 @@ class WorldsVecEnv(VecEnv):
     def env_method(self, method_name: str, *method_args: Any, indices: Any = None, **method_kwargs: Any) -> list[Any]:
         """The common method's answer, once per world asked for; hindsight relabelling asks for ``compute_reward``."""
         answer = getattr(self.env, method_name)(*method_args, **method_kwargs)
-        return [answer] * self._num_asked(indices)
+        return [answer for _ in self._get_indices(indices)]
 
     def env_is_wrapped(self, wrapper_class: type[gymnasium.Wrapper[Any, Any, Any, Any]], indices: Any = None) -> Any:
         """False for each: wrappers of single environments have no place here."""
-        return [False] * self._num_asked(indices)
-
-    def _num_asked(self, indices: int | Sequence[int] | Iterable[int] | None) -> int:
-        return len(list(self._get_indices(indices)))
+        return [False for _ in self._get_indices(indices)]

@@ -12,28 +12,28 @@ import functools
 import logging
 import os
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+import torch
 
 from service.actors.evaluation import DeterministicPolicy, Evaluation, evaluate, wilson_interval
-from service.downstream.compose import parameters_digest
 from service.downstream.directory import FORMAT_VERSION, TRIAL, TrainingDirectory, read_json, write_json
-from service.downstream.methods import METHODS, Method, find_method
+from service.downstream.learner import LearnedPolicy, make_learner, restore_learner, save_learner, set_progress
+from service.downstream.methods import Method, find_method, provenance
+from service.downstream.page import draw_training
 from service.downstream.settings import TrialConfig
+from service.downstream.vec_env import WorldsVecEnv
 from service.envs.gym.registration import EPISODE_STEPS
 from service.envs.gym.vector import TabletopVectorEnv
 from service.envs.tasks import SUCCESS_DISTANCE_M, find_task
 from service.errors import TandemError
 from service.io.git import git_commit
 from service.io.jsonl import plain
-
-if TYPE_CHECKING:
-    from service.downstream.vec_env import WorldsVecEnv
-    from service.primitives.loading import TrainedBob
+from service.primitives.loading import TrainedBob
 
 CHECKPOINT_EVERY_S = 120.0
 CURVE_SEED, FINAL_SEED = 1_000_000, 2_000_000
@@ -65,29 +65,6 @@ class RunOptions:
     callbacks: Callbacks = Callbacks()
 
 
-@dataclass(frozen=True, slots=True)
-class Provenance:
-    """Primitives, and the world that they bring along: what a result is of, besides its trial."""
-
-    primitives: dict[str, str]
-    """Name, and SHA-256 of the parameters as ``digest``."""
-    world: dict[str, Any]
-    """Settings of the world, before a task replaces some."""
-
-    def of(self, method: str) -> dict[str, Any]:
-        """The part that a method's result records: no primitives where it takes none."""
-        known = METHODS.get(method)
-        without = known is not None and not known.takes_primitives
-        return {"primitives": None if without else self.primitives, "world": self.world}
-
-
-def find_provenance(trained: TrainedBob) -> Provenance:
-    """Say which primitives and world these are."""
-    name = trained.label if trained.manifest is None else trained.manifest.reference  # the same wherever it came from
-    primitives = {"name": name, "digest": parameters_digest(trained.policy)}
-    return Provenance(primitives, trained.config.world.model_dump(mode="json"))
-
-
 def run_trial(trial: TrialConfig, trained: TrainedBob, path: Path, options: RunOptions) -> dict[str, Any] | None:
     """Run one trial in a directory.
 
@@ -113,11 +90,18 @@ def run_trial(trial: TrialConfig, trained: TrainedBob, path: Path, options: RunO
             new_player = functools.partial(method.player, trained)
         if learned is None:
             return None
-        evaluation = _final_evaluation(trial, trained, new_player(), options.num_threads)
+        found = play(trial, trained, new_player(), trial.num_episodes, trial.seed + FINAL_SEED, options.num_threads)
+        low, high = wilson_interval(round(found.success_ever * found.num_episodes), found.num_episodes)
+        evaluation = {**found.as_dict(), "success_ever_low": low, "success_ever_high": high}
         if _identity(trial, trained) != identity:
             raise RuntimeError("the frozen primitives have changed while they were composed")
         made = {"git_commit": git_commit(), "num_cores": os.cpu_count(), "num_threads": options.num_threads}
-        _draw(trial, trained, new_player, directory, video=options.video)
+        if method.player is None:
+            with _only_warn("curves"):
+                draw_training(path)
+        if options.video:
+            with _only_warn("video"):
+                _record_video(trial, trained, new_player(), path / "episodes.mp4")
         result: dict[str, Any] = plain(
             {"format_version": FORMAT_VERSION, **identity, "evaluation": evaluation, "made": made, **learned}
         )
@@ -136,7 +120,7 @@ def check_trial(trial: TrialConfig, trained: TrainedBob, path: Path) -> None:
 
 
 def _identity(trial: TrialConfig, trained: TrainedBob) -> dict[str, Any]:
-    return {TRIAL: trial.model_dump(mode="json"), **find_provenance(trained).of(trial.method)}
+    return {TRIAL: trial.model_dump(mode="json"), **provenance(trained, trial.method)}
 
 
 class _Training:
@@ -145,10 +129,6 @@ class _Training:
     def __init__(
         self, trial: TrialConfig, method: Method, trained: TrainedBob, directory: TrainingDirectory, options: RunOptions
     ) -> None:
-        import torch
-
-        from service.downstream.learner import make_learner
-
         torch.set_num_threads(options.num_threads or os.cpu_count() or 1)
         self.env = make_worlds(trial, method, trained, options.num_threads)
         self._learner = make_learner(trial, method, self.env)
@@ -156,11 +136,14 @@ class _Training:
         self._directory, self._num_threads, self._callbacks = directory, options.num_threads, options.callbacks
         self._iteration, self._wall_s, self._saved_s = 0, 0.0, time.monotonic()
         self._curve: list[dict[str, float]] = []
+        self.new_player: Callable[[], DeterministicPolicy] = lambda: LearnedPolicy(self._learner, method, trained)
+        """Makes the policy learned so far, ready for a batch of episodes."""
 
     def run(self, saved: dict[str, Any] | None) -> dict[str, Any] | None:
         """Learn to the end; None where stopped before."""
         if saved is not None:
-            self._restore(saved)
+            restore_learner(self._learner, self.env, saved["learner"])
+            self._iteration, self._wall_s, self._curve = saved["iteration"], saved["wall_s"], saved["curve"]
         while self._learner.num_timesteps < self._trial.num_env_steps:
             if self._callbacks.stop():
                 self._save()
@@ -174,16 +157,8 @@ class _Training:
         self._learner.save(self._directory.path / "model.zip")
         return {"env_steps": self._learner.num_timesteps, "wall_s": self._wall_s, "curve": self._curve}
 
-    def new_player(self) -> DeterministicPolicy:
-        """The policy learned so far, ready for a batch of episodes."""
-        from service.downstream.learner import LearnedPolicy
-
-        return LearnedPolicy(self._learner, self._method, self._trained)
-
     def _iterate(self) -> None:
         """Play an episode in every world, with its updates; now and then evaluate, which is not counted as time."""
-        from service.downstream.learner import set_progress
-
         begun, before = time.perf_counter(), self._learner.num_timesteps
         set_progress(self._learner, self._method, before / self._trial.num_env_steps)
         num = min(EPISODE_STEPS * self.env.num_envs, self._trial.num_env_steps - before)
@@ -211,16 +186,13 @@ class _Training:
         return {f"rollout/{name}": float(value) for name, value in means.items()}
 
     def _evaluate(self) -> dict[str, float]:
-        trial, player = self._trial, self.new_player()
-        seed = trial.seed + CURVE_SEED
-        found = play(trial, self._trained, player, trial.curve_episodes, seed, self._num_threads)
+        trial, seed = self._trial, self._trial.seed + CURVE_SEED
+        found = play(trial, self._trained, self.new_player(), trial.curve_episodes, seed, self._num_threads)
         point = {"success_last": found.success_last, "success_ever": found.success_ever}
         self._curve.append({"env_steps": self._learner.num_timesteps, "wall_s": self._wall_s, **point})
         return {f"evaluation/{name}": value for name, value in point.items()}
 
     def _save(self) -> None:
-        from service.downstream.learner import save_learner
-
         if not self._iteration:
             return
         counters = {"iteration": self._iteration, "env_steps": self._learner.num_timesteps, "wall_s": self._wall_s}
@@ -228,17 +200,9 @@ class _Training:
         self._directory.write_checkpoint({**counters, "curve": self._curve, "learner": learner})
         self._saved_s = time.monotonic()
 
-    def _restore(self, saved: dict[str, Any]) -> None:
-        from service.downstream.learner import restore_learner
-
-        restore_learner(self._learner, self.env, saved["learner"])
-        self._iteration, self._wall_s, self._curve = saved["iteration"], saved["wall_s"], saved["curve"]
-
 
 def make_worlds(trial: TrialConfig, method: Method, trained: TrainedBob, num_threads: int) -> WorldsVecEnv:
     """Make the worlds that a method's learner acts in."""
-    from service.downstream.vec_env import WorldsVecEnv
-
     worlds = TabletopVectorEnv(
         trial.sac.num_worlds,
         trained.config.world,
@@ -267,35 +231,13 @@ def play(
     )
 
 
-def _final_evaluation(
-    trial: TrialConfig, trained: TrainedBob, player: DeterministicPolicy, num_threads: int
-) -> dict[str, Any]:
-    found = play(trial, trained, player, trial.num_episodes, trial.seed + FINAL_SEED, num_threads)
-    low, high = wilson_interval(round(found.success_ever * found.num_episodes), found.num_episodes)
-    return {**found.as_dict(), "success_ever_low": low, "success_ever_high": high}
-
-
-def _draw(
-    trial: TrialConfig,
-    trained: TrainedBob,
-    new_player: Callable[[], DeterministicPolicy],
-    directory: TrainingDirectory,
-    *,
-    video: bool,
-) -> None:
-    """Curves, where anything was learned, and a video; where one cannot be made, a warning says why."""
-    from service.downstream.pictures import draw_training
-
-    makers: dict[str, Callable[[], Path]] = {}
-    if directory.metrics_file.exists():
-        makers["curves"] = lambda: draw_training(directory.path)
-    if video:
-        makers["video"] = lambda: _record_video(trial, trained, new_player(), directory.path / "episodes.mp4")
-    for name, make in makers.items():
-        try:
-            make()
-        except TandemError as error:
-            _logger.warning("no %s: %s", name, error)
+@contextlib.contextmanager
+def _only_warn(name: str) -> Iterator[None]:
+    """Log a warning where a picture or video cannot be made; the result does not need it."""
+    try:
+        yield
+    except TandemError as error:
+        _logger.warning("no %s: %s", name, error)
 
 
 def _record_video(trial: TrialConfig, trained: TrainedBob, player: DeterministicPolicy, path: Path) -> Path:

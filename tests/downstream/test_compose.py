@@ -128,7 +128,7 @@ def test_a_new_episode_acts_on_its_own_start(trained):
         observation, _, _, truncated, _ = many.step(actions)
     assert truncated.all()
     mean, _ = trained.primitives.compose(observation["observation"], action_weights(actions))
-    np.testing.assert_array_equal(many._composer.act(actions), np.clip(mean, -1.0, 1.0))
+    np.testing.assert_array_equal(many._compose(actions), np.clip(mean, -1.0, 1.0))
     many.close()
 
 

@@ -8,7 +8,7 @@ import pytest
 from service.downstream.page import steps_until, write_page
 from service.downstream.results import ResultsDirectory
 from service.downstream.table import Source, make_table, run_here, run_on_ray
-from service.downstream.worker import Callbacks, find_provenance
+from service.downstream.worker import Callbacks
 from service.errors import TandemError
 from tests.downstream.trials import small_trial
 
@@ -86,15 +86,14 @@ def test_how_to_learn_is_nothing_to_what_does_not(source, tmp_path):
     assert ran == []
 
 
-def test_new_primitives_leave_what_takes_none(source, tmp_path):
+def test_new_primitives_leave_what_takes_none(champion, source, tmp_path):
     scratch = small_trial("scratch-monolithic")
     table([scratch, *TRIALS[:2]], source, tmp_path)
-    provenance = find_provenance(source.load())
-    newer = dataclasses.replace(provenance, primitives={"name": "panda-cube@99", "digest": "0" * 64})
+    newer = dataclasses.replace(champion, manifest=champion.manifest.model_copy(update={"version": 99}))
     results = ResultsDirectory(tmp_path / "out" / "downstream")
     assert results.find(scratch, newer)["primitives"] is None
-    assert results.find(TRIALS[0], newer)["world"] == provenance.world
-    with pytest.raises(TandemError, match=rf"primitives\.name '{provenance.primitives['name']}', not 'panda-cube@99'"):
+    assert results.find(TRIALS[0], newer)["world"] == champion.config.world.model_dump(mode="json")
+    with pytest.raises(TandemError, match=rf"primitives\.name '{champion.manifest.reference}', not 'panda-cube@99'"):
         results.find(TRIALS[1], newer)
 
 
