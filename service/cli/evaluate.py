@@ -62,7 +62,7 @@ def coverage(
     as_json: JsonOption = False,
     registry: RegistryOption = REGISTRY,
 ) -> None:
-    """Where random compositions of the primitives move the object, beside a random policy."""
+    """Plot where random compositions of the primitives move the object, beside a random policy."""
     from service.actors.coverage import RandomPolicy, skill_trajectories, visited_share
     from service.media.plots import plot_coverage
     from service.primitives.loading import load_bob

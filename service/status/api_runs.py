@@ -110,7 +110,7 @@ def runs_router(runs: RunReader, histories: HistoryCache, streams: Streams, dire
 
     @router.get("/{run_id}/files", summary="A run's pictures and videos", responses=errors)
     def list_files(run_id: _Run) -> RunFiles:
-        """Those that exist at the moment."""
+        """The files that exist at the moment."""
         runs.run(run_id)
         return RunFiles(files=tuple(directories.files(run_id)))
 

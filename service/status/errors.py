@@ -10,7 +10,7 @@ class StatusError(TandemError):
 
 
 class FetchError(TandemError):
-    """No usable answer: the service is down or has an error, or something else listens at the URL."""
+    """An answer that cannot be used: the service is down or has an error, or something else listens at the URL."""
 
     exit_code = 1
 
