@@ -7,7 +7,7 @@ import sys
 import numpy as np
 import pytest
 
-from service.actors.evaluation import evaluate
+from service.actors.evaluation import EVALUATION_SEED, evaluate
 from service.config import dump_config, parse_config
 from service.errors import TandemError
 from service.io.run_directory import RunDirectory
@@ -16,7 +16,6 @@ from service.primitives import publishing
 from service.primitives.loading import load_bob, read_parameters
 from service.primitives.publishing import publish_bob
 from service.registry.registry import Registry
-from service.runtime.runner import EVALUATION_SEED
 from tests.registry.helpers import assert_identical, files_in
 from tests.runtime.runs import TREE, assert_one_line, play, tiny_config
 from tools import ship_primitives

@@ -70,7 +70,10 @@ def check_robot(trained: TrainedBob) -> None:
 
 
 def parameters_digest(primitives: object) -> str:
-    """SHA-256 of every array of a policy, in their order: the same before and after it was used."""
+    """SHA-256 of every array of a policy, in their order: the same before and after it was used.
+
+    Recorded results hold it, and the names of the policy's attributes are part of it.
+    """
     digest = hashlib.sha256()
     for name, array in _arrays(primitives, ""):
         digest.update(f"{name} {array.dtype} {array.shape} ".encode() + np.ascontiguousarray(array).tobytes())

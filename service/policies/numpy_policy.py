@@ -77,18 +77,10 @@ class NumpyMCPPolicy(NumpyPolicy):
             PolicyError: a parameter is missing, left over, of a wrong shape or not finite.
         """
         reader = ParameterReader(parameters)
-        self._input = _Input(reader, "primitives.input", POSITIONS.size)
-        self._trunk = _HiddenLayers(reader, "primitives.trunk", POSITIONS.size)
-        self._output_weight = reader.take("primitives.output_weight", (None, None, None))
-        self.num_primitives, head_size, outputs = self._output_weight.shape
-        self._output_bias = reader.take("primitives.output_bias", (self.num_primitives, outputs))[:, None]
-        self._head = _Layer(reader, "primitives.hidden", self.num_primitives * head_size, self._trunk.output_size)
-        self._squash = _GaussianSquash(reader, "primitives.squash", outputs)
-        self.action_size = self._squash.action_size
-        self._gate_input = _Input(reader, "gate.input", GATE.size)
-        self._gate_hidden = _HiddenLayers(reader, "gate.hidden", GATE.size)
-        self._gate_output = _Layer(reader, "gate.output", self.num_primitives, self._gate_hidden.output_size)
-        self._weight_floor = reader.take_scalar("gate.weight_floor", 0.0, 1.0)
+        self._primitives = _Primitives(reader)
+        self._gate = _Gate(reader, self._primitives.num_primitives)
+        self.num_primitives = self._primitives.num_primitives
+        self.action_size = self._primitives.action_size
         reader.finish()
 
     def primitives(self, positions: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -97,17 +89,9 @@ class NumpyMCPPolicy(NumpyPolicy):
         Raises:
             PolicyError: the last axis is not 11.
         """
-        rows = _rows(positions, POSITIONS.size, "positions")
-        hidden = _elu(self._head(self._trunk(self._input(rows))))
-        # All primitives share one matrix product per layer.
-        heads = hidden.reshape(-1, self.num_primitives, self._output_weight.shape[1])
-        output = np.matmul(heads.transpose(1, 0, 2), self._output_weight)  # (K, N, 2A)
-        output += self._output_bias
-        means, log_stds = self._squash(output)
-        log_stds *= 2.0
-        variances = np.exp(log_stds, out=log_stds)
+        means, variances = self._primitives(_rows(positions, POSITIONS.size, "positions"))
         shape = (*np.shape(positions)[:-1], self.num_primitives, self.action_size)
-        return means.transpose(1, 0, 2).reshape(shape), variances.transpose(1, 0, 2).reshape(shape)
+        return means.reshape(shape), variances.reshape(shape)
 
     def gate(self, observation: FloatArray) -> FloatArray:
         """Weights (..., K) at (..., 14) observations, each in [floor, 1].
@@ -115,10 +99,7 @@ class NumpyMCPPolicy(NumpyPolicy):
         Raises:
             PolicyError: the last axis is not 14.
         """
-        rows = _rows(observation, BOB.size, "observation")
-        features = np.concatenate((rows, rows[:, BOB["goal"]] - rows[:, BOB["object"]]), axis=1)
-        output = self._gate_output(self._gate_hidden(self._gate_input(features)))
-        weights = _squash(output, self._weight_floor, np.float32(1.0) - self._weight_floor)
+        weights = self._gate(_rows(observation, BOB.size, "observation"))
         return weights.reshape((*np.shape(observation)[:-1], self.num_primitives))
 
     def compose(self, positions: FloatArray, weights: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -140,7 +121,7 @@ class NumpyMCPPolicy(NumpyPolicy):
             PolicyError: the observation's last axis is not 14.
         """
         weights = self.gate(observation)
-        return self.compose(np.asarray(observation)[..., : POSITIONS.size], weights)
+        return self.compose(np.asarray(observation)[..., :POSITIONS.size], weights)
 
 
 def numpy_bob(parameters: Parameters) -> NumpyPolicy:
@@ -151,6 +132,46 @@ def numpy_bob(parameters: Parameters) -> NumpyPolicy:
     """
     composed = any(name.startswith("primitives.") for name in parameters)
     return NumpyMCPPolicy(parameters) if composed else NumpyGaussianPolicy(parameters)
+
+
+class _Primitives:
+    """Means and variances (N, K, A) at (N, 11) positions; the K heads share one matrix product per layer."""
+
+    def __init__(self, reader: ParameterReader) -> None:
+        self._input = _Input(reader, "primitives.input", POSITIONS.size)
+        self._trunk = _HiddenLayers(reader, "primitives.trunk", POSITIONS.size)
+        self._weight = reader.take("primitives.output_weight", (None, None, None))
+        self.num_primitives, self._head_size, outputs = self._weight.shape
+        self._bias = reader.take("primitives.output_bias", (self.num_primitives, outputs))[:, None]
+        head_sizes = (self.num_primitives * self._head_size, self._trunk.output_size)
+        self._head = _Layer(reader, "primitives.hidden", *head_sizes)
+        self._squash = _GaussianSquash(reader, "primitives.squash", outputs)
+        self.action_size = self._squash.action_size
+
+    def __call__(self, rows: FloatArray) -> tuple[FloatArray, FloatArray]:
+        hidden = _elu(self._head(self._trunk(self._input(rows))))
+        heads = hidden.reshape(-1, self.num_primitives, self._head_size)
+        output = np.matmul(heads.transpose(1, 0, 2), self._weight)  # (K, N, 2A)
+        output += self._bias
+        means, log_stds = self._squash(output)
+        log_stds *= 2.0
+        return means.transpose(1, 0, 2), np.exp(log_stds, out=log_stds).transpose(1, 0, 2)
+
+
+class _Gate:
+    """Weights (N, K) at (N, 14) observations."""
+
+    def __init__(self, reader: ParameterReader, num_primitives: int) -> None:
+        self._input = _Input(reader, "gate.input", GATE.size)
+        self._hidden = _HiddenLayers(reader, "gate.hidden", self._input.size)
+        self._output = _Layer(reader, "gate.output", num_primitives, self._hidden.output_size)
+        self._floor = reader.take_scalar("gate.weight_floor", 0.0, 1.0)
+
+    def __call__(self, rows: FloatArray) -> FloatArray:
+        goal_from_object = rows[:, BOB["goal"]] - rows[:, BOB["object"]]
+        features = np.concatenate((rows, goal_from_object), axis=1)
+        output = self._output(self._hidden(self._input(features)))
+        return _squash(output, self._floor, np.float32(1.0) - self._floor)
 
 
 class _Input:
