@@ -170,7 +170,7 @@ def chaos_words(result: Result) -> str:
     account, redis, calm = result["account"], result["redis"], result["curves"]["undisturbed"][0]
     shot = result["curves"]["disturbed"]
     return (
-        f"{len(result['strikes'])} of {result['num_planned']} planned strikes. The run took {duration(shot['wall_s'])} "
+        f"{len(result['strikes'])} of {result['num_planned']} planned faults. The run took {duration(shot['wall_s'])} "
         f"for {shot['env_steps']:,} env steps, undisturbed {duration(calm['wall_s'])}, and published "
         f"`{result['ended']['published']}`. The driver counted {account['num_counted']:,} rollouts, the learner's "
         f"ledger {account['num_in_ledger']:,}; {account['num_refused']} were refused. Actors that were killed had "

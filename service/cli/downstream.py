@@ -53,7 +53,7 @@ def train(
     threads: _Threads = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print the result as JSON.")] = False,
 ) -> None:
-    """Learn one task, evaluate, film."""
+    """Learn one task, evaluate, record a video."""
     _check_installed()
     import service
     from service.downstream.settings import make_trial
