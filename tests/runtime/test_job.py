@@ -71,7 +71,8 @@ def head():
     ports = [f"--port={gcs}", f"--dashboard-port={dashboard}", f"--ray-client-server-port={client}"]
     ports.append(f"--dashboard-agent-listen-port={agent}")
     command = [RAY, "start", "--head", "--block", "--num-cpus=3", f"--temp-dir={scratch}", *ports]
-    environment = os.environ | {"RAY_JOB_STOP_WAIT_TIME_S": f"{PATIENCE_S:.0f}"}  # else Ray kills a job that still saves
+    # Else Ray kills a job that still saves; it wants whole seconds.
+    environment = os.environ | {"RAY_JOB_STOP_WAIT_TIME_S": f"{PATIENCE_S:.0f}"}
     with (scratch / "head.log").open("wb") as log:
         process = subprocess.Popen(command, stdout=log, stderr=log, env=environment)
         try:
