@@ -121,7 +121,7 @@ class NumpyMCPPolicy(NumpyPolicy):
             PolicyError: the observation's last axis is not 14.
         """
         weights = self.gate(observation)
-        return self.compose(np.asarray(observation)[..., :POSITIONS.size], weights)
+        return self.compose(np.asarray(observation)[..., : POSITIONS.size], weights)
 
 
 def numpy_bob(parameters: Parameters) -> NumpyPolicy:
