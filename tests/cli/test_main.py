@@ -92,7 +92,7 @@ def test_pretrain_films_rounds_where_pictures_can_be_drawn(trained):
         SceneRenderer(tiny_config().world, 64, 48).close()
     except RenderError:
         assert "rounds.mp4" not in trained.result.stdout
-        pytest.skip("films need OpenGL: EGL or OSMesa, apt-get install libegl1")
+        pytest.skip("videos need OpenGL: EGL or OSMesa, apt-get install libegl1")
     video = trained.run / "rounds.mp4"
     assert str(video) in trained.result.stdout
     assert video.read_bytes()[4:8] == b"ftyp"
