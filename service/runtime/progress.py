@@ -12,7 +12,7 @@ from rich.live import Live
 from rich.progress_bar import ProgressBar
 from rich.table import Table
 
-from service.store.models import ACTIVE, RunState
+from service.store.models import RunState
 
 PLAIN_INTERVAL_S = 10.0
 
@@ -137,11 +137,12 @@ class StudyProgress(_Shown):
         """Show all runs, each with its state; None: it waits for others to end."""
         if self._live is not None:
             self._live.update(self._table(states))
-        elif self._due():
-            for seed, values in self._values.items():
-                if states[seed] in ACTIVE and values.env_steps != self._said.get(seed):
-                    self._said[seed] = values.env_steps
-                    self.say(f"seed {seed}: {values.line()}")
+            return
+        new = {seed: each for seed, each in self._values.items() if each.env_steps != self._said.get(seed)}
+        if new and self._due():
+            for seed, values in new.items():
+                self._said[seed] = values.env_steps
+                self.say(f"seed {seed}: {values.line()}")
 
     def _table(self, states: Mapping[int, RunState | None]) -> Table:
         table = Table("seed", "state", f"of {self._total:,} env steps", *(label for label, _ in _COLUMNS))

@@ -129,7 +129,7 @@ class Study:
         """
         runs = {
             str(run.seed): {
-                "state": run.state or "waiting",
+                "state": "running" if run.seed in self._processes else run.state or "waiting",
                 "env_steps": run.num_env_steps,
                 "wall_s": round(run.wall_s, 1),
                 "error": run.error,
@@ -149,6 +149,7 @@ class Study:
             self._processes[seed] = subprocess.Popen(
                 arguments, stdin=subprocess.DEVNULL, stdout=log, stderr=subprocess.STDOUT, start_new_session=True
             )
+        self._save_if_possible()
 
     def _end(self, seed: int, progress: StudyProgress) -> None:
         code = self._processes.pop(seed).returncode
@@ -156,14 +157,17 @@ class Study:
         if code not in (0, *(128 + number for number in STOPPING)) and not (self._stopping and -code in STOPPING):
             run = RunEnd(seed, "failed", run.num_env_steps, run.wall_s, self._reason(seed, code))
         self.runs[seed] = run
-        try:
-            self.save()
-        except StorageError as error:  # the others go on
-            _logger.warning("%s", error)
+        self._save_if_possible()
         said = run.state or "stopped before it began"
         progress.say(
             f"seed {seed}: {said} after {run.num_env_steps:,} env steps{': ' + run.error if run.error else ''}"
         )
+
+    def _save_if_possible(self) -> None:
+        try:
+            self.save()
+        except StorageError as error:  # the runs go on
+            _logger.warning("%s", error)
 
     def _reason(self, seed: int, code: int) -> str:
         log_file = self._directory.log_file(seed)
@@ -180,13 +184,14 @@ class Study:
         if status is None:
             return RunEnd(seed, None)
         records = self._reader.metrics(status.run_id, after_iteration=max(0, status.iteration - 1))
-        wall_s = (records[-1].get("time/wall_s") if records else None) or 0.0
+        newest = records[-1] if records else {}
+        num_env_steps = max(status.num_env_steps, int(newest.get("env_steps") or 0))  # a killed run said less
         state = status.state
-        if state == "finished" and status.num_env_steps < self._total:
+        if state == "finished" and num_env_steps < self._total:
             state = "interrupted"  # it has a larger budget now
         elif state not in ENDED and state != "failed":
             state = "interrupted"  # nobody runs it, whatever it said last
-        return RunEnd(seed, state, status.num_env_steps, wall_s, status.last_error)
+        return RunEnd(seed, state, num_env_steps, newest.get("time/wall_s") or 0.0, status.last_error)
 
     def _status(self, seed: int) -> RunStatus | None:
         try:
@@ -224,3 +229,7 @@ class Study:
                 if time.monotonic() > deadline_s:
                     break
                 time.sleep(POLL_S)
+        for seed in list(self._processes):
+            del self._processes[seed]
+            self.runs[seed] = self._found(seed)
+        self._save_if_possible()
