@@ -263,11 +263,11 @@ def test_a_run_is_told_when_the_process_of_the_study_is_gone(tmp_path):
     run = (
         "import os, signal, sys, time; from service.cli.study_run import stop_with\n"
         "signal.signal(signal.SIGUSR1, lambda *_: (print('told', flush=True), os._exit(0)))\n"
-        "stop_with(int(sys.argv[1])); print('ready', flush=True); time.sleep(300)"
+        "stop_with(int(sys.argv[1])); print('ready', flush=True); time.sleep(60)"
     )
     middle = (
         "import os, subprocess, sys, time\n"
-        f"subprocess.Popen([sys.executable, '-c', {run!r}, str(os.getpid())], start_new_session=True); time.sleep(300)"
+        f"subprocess.Popen([sys.executable, '-c', {run!r}, str(os.getpid())], start_new_session=True); time.sleep(60)"
     )
     with subprocess.Popen([sys.executable, "-c", middle], cwd=ROOT, stdout=subprocess.PIPE, text=True) as process:
         assert process.stdout.readline() == "ready\n"
