@@ -105,7 +105,7 @@ def pretrain_study(
             _logger.info("status: %s", url)
         if study.unfinished:
             num_parallel, place = _share(config, len(study.unfinished), parallel, cluster)
-            progress.say(f"{len(study.unfinished)} runs to go, {num_parallel} at once")
+            progress.say(f"runs to go: {len(study.unfinished)}, at once: {num_parallel}")
             with progress:
                 study.run(lambda seed: _arguments(config, directory, seed, place), num_parallel, signals, progress)
         if signals.first is not None:
@@ -153,7 +153,7 @@ def _finish(study: Study, directory: StudyDirectory, registry: Registry | None, 
     """Score the runs that have ended, and publish the best of them."""
     ended = [run for run in study.runs.values() if run.has_ended]
     if ended:
-        progress.say(f"learning is over; now evaluating {len(ended)} runs")
+        progress.say(f"learning is over; runs to evaluate: {len(ended)}")
     scores: dict[int, Scores] = {}
     for run in ended:
         try:

@@ -106,7 +106,7 @@ class Study:
                     while waiting and not self._stopping and len(self._processes) < num_parallel:
                         self._start(waiting.popleft(), command)
                     if self._stopping and not told:
-                        progress.say(f"{len(self._processes)} runs end after their current iteration")
+                        progress.say("stopping: each run ends after its current iteration")
                         self._signal(PASSED_ON)
                         told = True
                     time.sleep(POLL_S)
