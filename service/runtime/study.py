@@ -180,10 +180,13 @@ class Study:
 
     def _found(self, seed: int) -> RunEnd:
         """A run as its directory shows it."""
-        status = self._status(seed)
-        if status is None:
-            return RunEnd(seed, None)
-        records = self._reader.metrics(status.run_id, after_iteration=max(0, status.iteration - 1))
+        try:
+            status = self._status(seed)
+            if status is None:
+                return RunEnd(seed, None)
+            records = self._reader.metrics(status.run_id, after_iteration=max(0, status.iteration - 1))
+        except StoreError as error:  # its directory cannot be read; the other runs go on
+            return RunEnd(seed, "failed", error=str(error))
         newest = records[-1] if records else {}
         num_env_steps = max(status.num_env_steps, int(newest.get("env_steps") or 0))  # a killed run said less
         state = status.state
@@ -191,7 +194,8 @@ class Study:
             state = "interrupted"  # it has a larger budget now
         elif state not in ENDED and state != "failed":
             state = "interrupted"  # nobody runs it, whatever it said last
-        return RunEnd(seed, state, num_env_steps, newest.get("time/wall_s") or 0.0, status.last_error)
+        reason = status.last_error if state == "failed" else None  # others have told of what they survived
+        return RunEnd(seed, state, num_env_steps, newest.get("time/wall_s") or 0.0, reason)
 
     def _status(self, seed: int) -> RunStatus | None:
         try:
