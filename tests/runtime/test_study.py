@@ -25,8 +25,9 @@ from service.runtime import study_results
 from service.runtime.pretrain import resumed_config
 from service.runtime.pretrain_study import StudyCluster, _arguments, _share
 from service.runtime.ray_connection import ClusterOptions
+from service.runtime.study import RunEnd
 from service.runtime.study_plan import Share, check_same_seeds, parse_seeds, share_cluster, share_machine
-from service.runtime.study_results import Scores, best_seed, score
+from service.runtime.study_results import Scores, best_seed, publish_best, score
 from service.store.disk_reader import DiskReader
 from tests.runtime.runs import ROOT, assert_one_line, newest, play, read_lines, tiny_config, write_yaml
 
@@ -181,6 +182,25 @@ def test_goals_that_choose_are_not_those_that_are_reported(monkeypatch, tmp_path
         for name in ("evaluation/table", "evaluation/air", "evaluation/mixed", "selection/mixed")
         for which in ("last", "ever")
     }
+
+
+def test_a_better_run_found_by_a_resume_becomes_the_next_version(tmp_path):
+    registry, study = Registry(tmp_path / "registry"), StudyDirectory(tmp_path / "study")
+    study.begin(tiny_config(), (0, 1))
+    scores = Scores(an_evaluation(0.75), (an_evaluation(0.5),))
+    published = []
+    for seed in (0, 1):
+        directory = study.run(seed)
+        play(directory.path, tiny_config(seed=seed, total_env_steps=120))
+        # the second time it is there already
+        published += [publish_best(study, registry, RunEnd(seed, "finished", 120), scores) for _ in range(2)]
+    study.close()
+    assert [str(version) for version in published] == ["tiny@1", "tiny@1", "tiny@2", "tiny@2"]
+    manifest = registry.manifest("tiny@latest")
+    assert (manifest.version, manifest.config["seed"], manifest.parent) == (2, 1, None)
+    assert manifest.metrics["selection/mixed_success_last"] == 0.75
+    assert manifest.metrics["evaluation/mixed_success_last"] == 0.5
+    assert manifest.metrics["env_steps"] == 120
 
 
 # --- a whole one -----------------------------------------------------------------------------------------------------
