@@ -34,7 +34,7 @@ LONG = {"total_env_steps": 1500}
 
 METRICS = {
     "iteration", "env_steps", "world/num_broken", "actor/num_rollouts", "actor/num_alive", "time/wall_s",
-    "time/env_steps_per_s", "time/play_s", "time/wait_for_generator_s", "time/hand_over_s", "time/learn_s",
+    "time/env_steps_per_s", "time/play_s", "time/hand_over_s", "time/learn_s",
     "time/learner_idle_fraction",
     # valid, not moved and out-of-workspace rates, and how the rest ends
     "alice/valid_fraction", "alice/not_moved_fraction", "alice/outside_fraction", "alice/fallen_fraction",
