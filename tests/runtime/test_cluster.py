@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import ray
+from ray.exceptions import ObjectLostError
 
 from service.errors import DivergedError
 from service.io.checkpoints import CheckpointStore
@@ -16,7 +17,7 @@ from service.io.run_directory import RunDirectory
 from service.runtime.cluster import ClusterRun, num_gpus
 from service.runtime.ray_actors import NICENESS
 from service.runtime.ray_connection import ClusterOptions, connected
-from service.runtime.runner import ClusterError
+from service.runtime.runner import ClusterError, StateLostError
 from tests.runtime.runs import newest, play, read_lines, tiny_config
 
 TOGETHER = ("learner/", "alice/", "bob/", "generator/")
@@ -274,6 +275,21 @@ def test_a_policy_that_diverges_ends_the_run_with_how_to_go_on(tmp_path):
 
     with pytest.raises(DivergedError, match=r"resume with lower learning rates") as error:
         run_cluster(tmp_path, tiny_config(total_env_steps=10**9), num_actors=1, on_iteration=spoil)
+    assert "\n" not in str(error.value)
+
+
+def test_a_snapshot_lost_with_its_machine_sends_the_run_back(tmp_path):
+    """No other round could be played: its actor is not to blame."""
+
+    def lost():
+        raise ObjectLostError("ab" * 28, "", "")
+
+    def lose(run, metrics):
+        if metrics["iteration"] == 3:
+            run._snapshot = ray.remote(lost).options(num_cpus=0, max_retries=0).remote()
+
+    with pytest.raises(StateLostError, match=r"goes back to its newest checkpoint") as error:
+        run_cluster(tmp_path, tiny_config(total_env_steps=10**9), on_iteration=lose)
     assert "\n" not in str(error.value)
 
 
