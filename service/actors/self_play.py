@@ -86,7 +86,7 @@ class SelfPlay:
         self.worlds.close()
 
     def start_over(self) -> None:
-        """End every game, as after a round that was given up half-way."""
+        """End every game: the next round begins new ones."""
         self.worlds.reset(self._rng)
         self._round_index[:] = 0
 

@@ -95,7 +95,7 @@ class LocalRun(Runner):
         """Consume the pending rollout and produce the next one; waits for play and learning both."""
         with self.timing("weights"):
             weights, snapshot, opponents = self.learner.weights(), self._snapshot, self._opponents
-            # For the next round: as old as its weights, which the learner now learns on.
+            # For the next round, and as old as its weights will be.
             self._snapshot, self._opponents = self.generator.snapshot(), self._generator.opponents()
         learning = self._executor.submit(self._learner.update, [self._pending]) if self._pending is not None else None
         with self.timing("play"):

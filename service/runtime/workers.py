@@ -128,19 +128,16 @@ class RolloutWorker:
             max_starts=-(-NUM_STARTS // num_rounds),
             rng=self.rng,
         )
-        return (
-            rollout,
-            goals,
-            RoundSummary(
-                id=rollout.id,
-                num_env_steps=rollout.num_env_steps,
-                num_worlds=self._config.game.num_worlds,
-                num_diverged=self.game.worlds.num_diverged,
-                diverged=rollout.diverged,
-                play_s=time.perf_counter() - start,
-                metrics=rollout.metrics,
-            ),
+        summary = RoundSummary(
+            id=rollout.id,
+            num_env_steps=rollout.num_env_steps,
+            num_worlds=self._config.game.num_worlds,
+            num_diverged=self.game.worlds.num_diverged,
+            diverged=rollout.diverged,
+            play_s=time.perf_counter() - start,
+            metrics=rollout.metrics,
         )
+        return rollout, goals, summary
 
     def evaluate(self, weights: Weights, kinds: Sequence[GoalKind]) -> Metrics:
         """Bob's success without noise on the run's goals of some kinds, as metrics."""
