@@ -97,6 +97,12 @@ class GameConfig(FrozenModel):
     success_distance_m: float = Field(0.05, gt=0.0, description="paper: 5 cm; also the least move of a valid goal")
     alice_valid_reward: float = Field(1.0, description="paper, appendix")
     alice_difficult_reward: float = Field(5.0, description="paper, appendix: added when Bob fails")
+    alice_novelty_reward: float = Field(
+        0.0,
+        ge=0.0,
+        description="added for a valid goal in a cell without earlier ones, and less the more there lately were, by "
+        "1 / sqrt(1 + n); 0 in the paper",
+    )
     blocked_gripper_fraction: float = Field(
         0.0,
         ge=0.0,

@@ -119,7 +119,7 @@ class SelfPlay:
         achieved = worlds.object_position.copy()
         played = choice.played & ~diverged  # a turn in which the physics diverged says nothing about either player
         bob.learn[diverged] = False
-        self._reward_alice(alice, verdict, played & ~choice.replayed, solved)
+        self._reward_alice(alice, verdict, played & ~choice.replayed, solved, choice.novelty)
         records = GoalRecords(
             start_state=choice.start_state,
             start_position=choice.start_position,
@@ -220,11 +220,13 @@ class SelfPlay:
         turns.final_value_observation[:] = worlds.bob_value(choice.goal)
         return turns, solved, diverged
 
-    def _reward_alice(self, alice: Turns, verdict: VerdictArray, tried: BoolArray, solved: BoolArray) -> None:
+    def _reward_alice(
+        self, alice: Turns, verdict: VerdictArray, tried: BoolArray, solved: BoolArray, novelty: StateArray
+    ) -> None:
         game = self.config.game
         valid = verdict == Verdict.VALID
         last = int(np.flatnonzero(alice.active.any(axis=1))[-1])
-        alice.reward[last, valid] += game.alice_valid_reward
+        alice.reward[last, valid] += game.alice_valid_reward + game.alice_novelty_reward * novelty[valid]
         alice.reward[last, valid & tried & ~solved] += game.alice_difficult_reward
         # What a valid goal was worth is unknown where Bob could not try it.
         alice.learn[valid & ~tried] = False

@@ -13,6 +13,8 @@ from service.types import Array, Arrays, BoolArray, IntArray, StateArray
 
 DECAY = 0.95
 """Weight that a try keeps from one record to the next: half after 13.5 iterations, so the rates follow Bob."""
+PROPOSAL_DECAY = 0.99
+"""Weight that a proposal keeps from one record to the next: what was not proposed for long is new again."""
 PRIOR_TRIES = 2.0
 """Beta(1, 1), uniform: one success and one failure are added to every bin, so an untried one has rate 1/2."""
 
@@ -72,9 +74,12 @@ class DifficultyGrid:
     """Over the cells, x-major."""
     seen: BoolArray
     """(cells,) a valid goal was ever proposed there."""
+    proposals: StateArray
+    """(cells,) decayed number of valid proposals, see ``PROPOSAL_DECAY``."""
 
     def __init__(self, cells: GoalCells) -> None:
         self.cells = cells
+        self.proposals = np.zeros(len(cells))
         self.counts = SuccessCounts(len(cells))
         self.seen = np.zeros(len(cells), dtype=np.bool_)
 
@@ -96,6 +101,7 @@ class DifficultyGrid:
         """
         before = self.num_cells_seen
         self.seen |= proposed > 0
+        self.proposals = PROPOSAL_DECAY * self.proposals + proposed
         self.counts.record(tries, successes)
         return self.num_cells_seen - before
 
@@ -103,6 +109,11 @@ class DifficultyGrid:
         """(M,) p (1 - p) of the cell of each of (M, 3) goals; 1/4, the most, where untried."""
         learnability: StateArray = self.counts.learnability()[self.cells.index(goals)]
         return learnability
+
+    def novelty(self) -> StateArray:
+        """(cells,) how rare proposals are: ``1 / sqrt(1 + n)`` of their decayed count (as in Bellemare et al. 2016)."""
+        novelty: StateArray = 1.0 / np.sqrt(1.0 + self.proposals)
+        return novelty
 
     def mean_learnability(self) -> float:
         """Mean over the cells seen; not-a-number while there are none."""
@@ -122,13 +133,14 @@ class DifficultyGrid:
 
     def state(self) -> Arrays:
         """All counts, copied."""
-        return {"seen": self.seen.copy()} | join_parts({"cells": self.counts.state()})
+        return {"seen": self.seen.copy(), "proposals": self.proposals} | join_parts({"cells": self.counts.state()})
 
     def load_state(self, state: Mapping[str, Array]) -> None:
-        """Take over what ``state`` gave, of this or an older version, which also counted heights and distances.
+        """Take over what ``state`` gave, of this or an older version, which counted other things, and no proposals.
 
         Raises:
             ConfigError: of a grid of another size.
         """
         self.seen = take(state, "seen", self.seen)
+        self.proposals = take({"proposals": np.zeros(len(self.cells)), **state}, "proposals", self.proposals)
         self.counts.load_state(split_parts(state).get("cells", {}))

@@ -75,12 +75,14 @@ class TaskGenerator:
         return GeneratorSnapshot(
             config=self._config,
             success_distance_m=self._success_distance_m,
+            cells=self.cells,
             tasks=self.tasks,
             buffer=buffer,
             share=self.buffer.part_share(),
             learnability=self.grid.learnability(buffer["goal"]),
             starts=self.starts.rows(),
             reset_learnability=self.from_reset.learnability(),
+            novelty=self.grid.novelty(),
         )
 
     def record(self, summary: GoalSummary) -> Metrics:

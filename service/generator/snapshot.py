@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.config import GeneratorConfig
-from service.generator.bins import TaskBins, in_air
+from service.generator.bins import GoalCells, TaskBins, in_air
 from service.generator.opponents import RoundPlan
 from service.generator.ring import Rows, join_rows
 from service.generator.validity import Verdict
@@ -21,7 +21,7 @@ LEARNABILITY_FLOOR = 0.01
 """Added to p (1 - p), which is at most 1/4, so goals of a solved or hopeless cell stay drawable and measured."""
 MIN_REPLAY_GOALS = 64
 """Goals the buffer must hold before any is replayed: fewer would be played over and over."""
-_ARRAYS = ("share", "learnability", "reset_learnability")
+_ARRAYS = ("share", "learnability", "reset_learnability", "novelty")
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,6 +40,8 @@ class GoalChoice:
     """(N,) the start is that of a game."""
     played: BoolArray
     """(N,) there is a goal for Bob to play."""
+    novelty: StateArray
+    """(N,) how rare goals in the cell of Alice's proposal are, in (0, 1]; 0 where it is not valid."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,6 +53,7 @@ class GeneratorSnapshot:
 
     config: GeneratorConfig
     success_distance_m: float
+    cells: GoalCells
     tasks: TaskBins
     buffer: Rows
     """(M,) ``goal`` of the replay buffer, and ``start_state`` and ``start_position`` from which it was proposed."""
@@ -62,6 +65,8 @@ class GeneratorSnapshot:
     """``start_state`` and ``start_position`` of games."""
     reset_learnability: StateArray
     """(task bins,) p (1 - p) of what starts where a game does."""
+    novelty: StateArray
+    """(cells,) how rare proposals there are."""
 
     def choose_goals(
         self,
@@ -90,7 +95,9 @@ class GeneratorSnapshot:
         replayed = self._choose_replayed(valid, plan.bob_past, rng)
         starts = start_state.copy(), start_position.copy()
         from_reset = (round_index == 0) & ~replayed
-        choice = GoalChoice(proposal.copy(), *starts, replayed, from_reset, valid | replayed)
+        novelty = np.zeros(len(proposal))
+        novelty[valid] = self.novelty[self.cells.index(proposal[valid])]
+        choice = GoalChoice(proposal.copy(), *starts, replayed, from_reset, valid | replayed, novelty)
         if replayed.any():
             self._replay(choice, np.flatnonzero(replayed), rng)
         return choice

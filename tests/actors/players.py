@@ -100,6 +100,7 @@ def alices_own(start_state, start_position, round_index, proposal, verdict):
         replayed,
         np.asarray(round_index == 0),
         np.asarray(verdict == Verdict.VALID),
+        np.where(verdict == Verdict.VALID, 0.25, 0.0),
     )
 
 

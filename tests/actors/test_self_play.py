@@ -1,5 +1,7 @@
 """The game, played by scripts with a known outcome: verdicts, rewards and demonstrations are checked by hand."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -89,6 +91,11 @@ def test_rewards_come_from_the_configuration():
     rollout = play(make_game(config, STARTS), Pusher())
     assert rollout.alice.reward[-1].tolist() == [2.5, 0.0, 2.0, 0.0, 0.0]
     assert rollout.bob.reward.sum(axis=0).tolist() == [0.0, 0.0, 7.0, 0.0, 0.0]
+
+
+def test_a_valid_goal_is_worth_more_where_goals_are_rare():
+    rollout = play(make_game(make_config(5, game={"alice_novelty_reward": 2.0}), STARTS), Pusher())
+    assert rollout.alice.reward[-1].tolist() == [6.5, 0.0, 1.5, 0.0, 0.0]  # novelty is 0.25
 
 
 def test_bob_is_paid_once_and_his_turn_ends_there(rollout):
@@ -320,9 +327,7 @@ def replay_in(worlds, state, goal):
         replayed, played = choice.replayed.copy(), choice.played.copy()
         replayed[worlds] = played[worlds] = True
         choice.goal[worlds], choice.start_state[worlds], choice.start_position[worlds] = goal, state, state[OBJECT]
-        return GoalChoice(
-            choice.goal, choice.start_state, choice.start_position, replayed, choice.from_reset & ~replayed, played
-        )
+        return replace(choice, replayed=replayed, from_reset=choice.from_reset & ~replayed, played=played)
 
     return choose
 
@@ -374,7 +379,7 @@ def test_with_hindsight_bobs_failures_show_the_way_to_where_the_object_came():
     def choose(start_state, start_position, round_index, proposal, verdict):
         """These goals everywhere; only the first world's is Alice's own."""
         every, own = np.ones(5, dtype=bool), np.arange(5) == 0
-        return GoalChoice(goals.copy(), start_state.copy(), start_position.copy(), ~own, own, every)
+        return GoalChoice(goals.copy(), start_state.copy(), start_position.copy(), ~own, own, every, np.zeros(5))
 
     config = make_config(5, learner={"abc": {"hindsight": True}})
     rollout = play(make_game(config, starts), Pusher(), Pusher(), plan=plan, choose_goals=choose, past_bob=[Pusher()])

@@ -7,7 +7,7 @@ import pytest
 
 from service.config import ConfigError, WorkspaceConfig, WorldConfig
 from service.generator.bins import NUM_DISTANCE_BINS, NUM_TASK_BINS, GoalCells, distance_bins, height_bins, in_air
-from service.generator.difficulty import DECAY, DifficultyGrid, SuccessCounts
+from service.generator.difficulty import DECAY, PROPOSAL_DECAY, DifficultyGrid, SuccessCounts
 
 WORLD = WorldConfig(workspace=WorkspaceConfig(center_x_m=0.1, center_y_m=0.0))
 
@@ -112,6 +112,18 @@ def test_a_new_cell_is_counted_once_tried_or_not() -> None:
     assert not grid.counts.num_tries.any()
 
 
+def test_novelty_by_hand() -> None:
+    grid = make()
+    goals = np.array([[0.1, 0.1, 0.02]] * 3 + [[0.1, -0.1, 0.02]])
+    often, once, never = grid.cells.index(np.array([goals[0], goals[3], (0.2, 0.0, 0.3)]))
+    proposed, none = grid.cells.count(goals), np.zeros(len(grid.cells), dtype=np.int64)
+    grid.record(proposed, none, none)  # tried or not
+    np.testing.assert_allclose(grid.novelty()[[often, once, never]], [1 / 2, 0.5**0.5, 1.0], rtol=1e-15)
+    grid.record(none, none, none)
+    expected = 1.0 / (1.0 + PROPOSAL_DECAY * np.array([3.0, 1.0])) ** 0.5
+    np.testing.assert_allclose(grid.novelty()[[often, once]], expected, rtol=1e-15)
+
+
 def test_height_bins_split_table_from_air() -> None:
     heights = [0.025, 0.025 + 0.05, 0.0751, 0.125, 0.1251, 0.225, 0.2251, 0.35]
     positions = np.array([[0.0, 0.0, height] for height in heights])
@@ -132,7 +144,9 @@ def test_state_of_an_older_version_loads() -> None:
     record(old, [(0.1, 0.06, 0.025)], [True])
     counted = {f"heights/{name}": np.ones(4) for name in ("tries", "successes", "num_tries")}
     grid = make()
-    grid.load_state(old.state() | counted)
+    state = old.state() | counted
+    del state["proposals"]  # not counted by then
+    grid.load_state(state)
     assert grid.num_cells_seen == 1
     np.testing.assert_array_equal(grid.counts.tries, old.counts.tries)
 

@@ -80,6 +80,13 @@ def test_by_default_bob_plays_what_alice_proposed(make_records: MakeRecords) -> 
     assert choice.played.tolist() == [True, False, True, False, False]
 
 
+def test_a_choice_tells_how_rare_valid_proposals_are(make_records: MakeRecords) -> None:
+    generator = filled(make_records)
+    assert choose(generator, [VALID, OUTSIDE]).novelty.tolist() == [1.0, 0.0]
+    record(generator, make_records(np.tile([-0.1, 0.0, 0.1], (8, 1))))
+    np.testing.assert_allclose(choose(generator, [VALID, OUTSIDE]).novelty, [1 / 3, 0.0], rtol=1e-15)
+
+
 def test_replay_invalid_fills_worlds_without_a_goal(make_records: MakeRecords) -> None:
     choice = choose(filled(make_records, replay_invalid=True), [VALID, OUTSIDE, VALID, OUTSIDE])
     assert_rows(choice, [False, True, False, True])
@@ -331,7 +338,7 @@ def play(generator: TaskGenerator, make_records: MakeRecords, rng: np.random.Gen
         choice = generator.snapshot().choose_goals(plan, start_state, start, index, proposal, verdict, rng)
         records = make_records(
             proposal,
-            **{name: getattr(choice, name) for name in GoalChoice.__slots__},
+            **{name: getattr(choice, name) for name in GoalChoice.__slots__ if name != "novelty"},
             verdict=verdict,
             solved=choice.played & (rng.random(num) < 0.5),
             alice_past=plan.alice_past,
