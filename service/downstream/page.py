@@ -92,19 +92,21 @@ def _by_method_and_task(results: Sequence[Result]) -> dict[tuple[str, str], list
 
 
 def _old_versions(results: Sequence[Result]) -> Sequence[str]:
-    """A line for each task that has results of another version of it than today's."""
-    lines = []
+    """Lines about results of other versions of the tasks than today's, by the methods that have them."""
+    tasks_of: dict[str, list[str]] = {}
     for name, task in TASKS.items():
         trials = [result[TRIAL] for result in results if result[TRIAL]["task"] == name]
         old = {each["method"] for each in trials if each.get("task_version", 0) != task.version}
         if old:
             methods = ", ".join(METHODS[method].title for method in METHODS if method in old)
             who = "all methods" if old == {each["method"] for each in trials} else methods
-            lines.append(
-                f"*{task.title}*, {who}: recorded before `{task.id}`, with another rule of success "
-                "([which](../decisions/0007-the-downstream-tasks.md)).\n"
-            )
-    return lines
+            tasks_of.setdefault(who, []).append(f"`{task.id}`")
+    return [
+        f"Recorded before {', '.join(ids)} ({who}), with other contacts "
+        "([decision 10](../decisions/0010-a-cheaper-better-grip.md)), and *Box* with another rule of success "
+        "([decision 7](../decisions/0007-the-downstream-tasks.md)).\n"
+        for who, ids in tasks_of.items()
+    ]
 
 
 def _table(of: Mapping[tuple[str, str], Seeds], text: Callable[[Seeds], str], *, paper: bool = False) -> str:

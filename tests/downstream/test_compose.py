@@ -38,7 +38,7 @@ def trained():
 
 @pytest.fixture
 def env(trained):
-    env = ComposePrimitives(gymnasium.make("tandem/Wall-v0", config=CONFIG), trained)
+    env = ComposePrimitives(gymnasium.make("tandem/Wall-v1", config=CONFIG), trained)
     yield env
     env.close()
 

@@ -147,15 +147,15 @@ class TestBadInput:
         self.refused(r"push-idle-0\.json is of num_episodes 6, not 9", trials, source, tmp_path)
 
     def test_another_version_of_a_task(self, source, tmp_path):
-        """Files that say nothing are of version 0: of Box they are refused, of the other tasks they count."""
-        old = [small_trial("idle", task) for task in ("box", "wall")]
-        table(old, source, tmp_path)
-        for path in (tmp_path / "out" / "downstream").iterdir():
-            tree = json.loads(path.read_text())
-            del tree["cell"]["task_version"]
-            path.write_text(json.dumps(tree))
-        self.refused(r"box-idle-0\.json is of task_version 0, not 1", old[:1], source, tmp_path)
-        assert table(old[1:], source, tmp_path, counted(ran := []))
+        """A file that says nothing is of version 0, and refused."""
+        old, today = [small_trial("idle", task) for task in ("box", "wall")]
+        table([old, today], source, tmp_path)
+        path = tmp_path / "out" / "downstream" / "box-idle-0.json"
+        tree = json.loads(path.read_text())
+        del tree["cell"]["task_version"]
+        path.write_text(json.dumps(tree))
+        self.refused(r"box-idle-0\.json is of task_version 0, not 1", [old], source, tmp_path)
+        assert table([today], source, tmp_path, counted(ran := []))
         assert ran == []
 
     @pytest.fixture
@@ -238,12 +238,12 @@ def test_what_a_page_says_of_its_origin_by_hand():
     second["primitives"] = None
     lines = write_page([first, second], "picture.png").splitlines()
     assert lines[-1] == f"Primitives: panda-cube@4 (abababababab). Commits: {'c' * 12}, {'d' * 12}-dirty."
-    (old,) = [line for line in lines if "recorded before" in line]
-    assert old.startswith("*Box*, all methods: recorded before `tandem/Box-v1`, with another rule")
+    (old,) = [line for line in lines if "Recorded before" in line]
+    assert old.startswith("Recorded before `tandem/Box-v1` (all methods), with other contacts")
     second["cell"]["task_version"] = 1
-    assert "*Box*, ours: recorded before" in write_page([first, second], "picture.png")
+    assert "Recorded before `tandem/Box-v1` (ours)" in write_page([first, second], "picture.png")
     first["cell"]["task_version"] = 1
-    assert "recorded before" not in write_page([first, second], "picture.png")
+    assert "Recorded before" not in write_page([first, second], "picture.png")
 
 
 def test_the_recorded_page_is_what_its_files_give():

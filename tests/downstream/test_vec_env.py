@@ -22,7 +22,7 @@ def make(task="push", num=NUM):
 
 def single():
     return Monitor(
-        gymnasium.make("service.envs.gym.registration:tandem/Push-v0", config=CONFIG, max_episode_steps=LENGTH)
+        gymnasium.make("service.envs.gym.registration:tandem/Push-v1", config=CONFIG, max_episode_steps=LENGTH)
     )
 
 

@@ -1,7 +1,7 @@
 """The Gymnasium names of the environments. Importing this module registers them.
 
 Gymnasium 1.x loads no plug-ins by itself, so a program imports this module first, or lets ``make`` do it:
-``gymnasium.make("service.envs.gym.registration:tandem/Tabletop-v0")``. ``gymnasium.make_vec`` of any of them makes a
+``gymnasium.make("service.envs.gym.registration:tandem/Tabletop-v1")``. ``gymnasium.make_vec`` of any of them makes a
 ``TabletopVectorEnv``, unless it is asked for ``vectorization_mode="sync"``.
 """
 
@@ -11,7 +11,7 @@ import gymnasium
 
 from service.envs.tasks import TASKS
 
-TABLETOP_ID = "tandem/Tabletop-v0"
+TABLETOP_ID = "tandem/Tabletop-v1"
 EPISODE_STEPS = 50
 """Steps of an episode (paper: 50)."""
 
