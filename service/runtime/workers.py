@@ -277,12 +277,8 @@ class LearnerWorker:
             LearnerError: none of them could be learned from.
         """
         start = time.perf_counter()
-        version = self.learner.version
         taken = [rollout for rollout in rollouts if self.learner.ingest(rollout)]
         metrics = self.learner.update()
-        if taken:
-            lags = [version - rollout.policy_version for rollout in taken]
-            metrics |= {"learner/policy_lag": float(np.mean(lags)), "learner/max_policy_lag": float(max(lags))}
         counted = tuple(rollout.id for rollout in taken)
         refused = tuple(rollout.id for rollout in rollouts if rollout.id not in counted)
         return UpdateResult(self.learner.version, metrics, counted, refused, time.perf_counter() - start)
