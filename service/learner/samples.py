@@ -156,7 +156,7 @@ def augment_by_symmetry(samples: Samples, player: Player) -> Samples:
     )
     pairs = zip(samples.tensors(), reflections.tensors(), strict=True)
     columns: list[Any] = [torch.cat(pair) for pair in pairs]
-    return Samples(*columns, share=None if samples.share is None else samples.share.mirrored())
+    return replace(Samples(*columns), share=None if samples.share is None else samples.share.mirrored())
 
 
 def minibatches(

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 
 from service.actors.evaluation import EVALUATED_GOALS
 from service.actors.rollout import Rollout, from_arrays, to_arrays
-from service.config import Config
+from service.config import Config, ConfigError
 from service.io.run_directory import RunDirectory
 from service.policies.parameters import Parameters
 from service.runtime.runner import Health, IterationResult, OnBeat, Runner
@@ -35,11 +35,16 @@ class LocalRun(Runner):
         resume: continue from the newest checkpoint instead of starting anew.
 
     Raises:
-        TandemError: see ``RunDirectory.claim``.
+        TandemError: see ``RunDirectory.claim``; or a learner of several processes, which this runner does not have.
         CheckpointError: ``resume`` without a usable checkpoint.
     """
 
     def __init__(self, config: Config, directory: RunDirectory, *, resume: bool = False) -> None:
+        if config.learner.num_learners > 1:
+            raise ConfigError(
+                f"learner.num_learners = {config.learner.num_learners}: the local runner has one process; use "
+                "--runtime ray, or --set learner.num_learners=1 (what is learned is the same)"
+            )
         directory.claim(resume=resume)
         super().__init__(config, directory)
         self._incarnation = 0

@@ -207,7 +207,7 @@ def test_a_learner_that_dies_of_every_batch_ends_the_run_with_one_line(tmp_path)
 
             def restart_and_strike(why):
                 real(why)
-                os.kill(run._learner._location.pid, signal.SIGKILL)
+                os.kill(run._learner.locations[0].pid, signal.SIGKILL)
 
             run._learner.restart = restart_and_strike
             kill(run, "learner")
