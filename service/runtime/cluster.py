@@ -296,6 +296,9 @@ class ClusterRun(Runner):
             self._on_failed_answer(iteration, self._learner, error)
             return
         self._learner.record_heartbeat(rank)
+        if isinstance(result, GroupError):
+            self._on_failed_answer(iteration, self._learner, result)
+            return
         update.add(rank, result)
         if update.done:
             iteration.updated = update.joined()

@@ -218,9 +218,8 @@ class LearnerGroup:
             return list(ray.get(answers, timeout=timeout_s))
         except GetTimeoutError:
             ready, _ = ray.wait(answers, num_returns=len(answers), timeout=0)
-            ranks = (
-                "" if self.size == 1 else f"'s {self._describe([i for i, a in enumerate(answers) if a not in ready])}"
-            )
+            missing = [rank for rank, answer in enumerate(answers) if answer not in ready]
+            ranks = "" if self.size == 1 else f"'s {self._describe(missing)}"
             raise ClusterError(
                 f"the {self.name}{ranks} did not {what} within {timeout_s:.0f} s: has the cluster a free core (and "
                 "GPU, with learner.device=cuda) for each? see ray status"
@@ -228,11 +227,8 @@ class LearnerGroup:
 
     def _describe(self, ranks: Sequence[int]) -> str:
         """Ranks with their nodes, where those are known."""
-        places = dict(enumerate(self.locations))
-        named = [
-            f"{rank} on {places[rank].node}, process {places[rank].pid}" if rank in places else str(rank)
-            for rank in ranks
-        ]
+        nodes = [at.node for at in self.locations] or [""] * self.size
+        named = [f"{rank} on {nodes[rank]}" if nodes[rank] else str(rank) for rank in ranks]
         return f"rank{'s' * (len(ranks) > 1)} {' and '.join(named)}"
 
 

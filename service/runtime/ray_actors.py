@@ -19,6 +19,7 @@ from ray.util.metrics import Counter, Histogram
 
 from service.actors.rollout import Rollout
 from service.config import Config
+from service.errors import GroupError
 from service.generator.generator import GoalChoice
 from service.generator.records import GoalRecords
 from service.runtime.workers import (
@@ -195,10 +196,16 @@ class LearnerActor:
         """Weights and state before the first update."""
         return self._weights(), self._worker.learner.state()
 
-    def update_from(self, references: Sequence[Any]) -> tuple[Weights | None, Arrays, UpdateResult]:
-        """Learn from rollouts, given as object references; see ``LearnerWorker.update``."""
+    def update_from(self, references: Sequence[Any]) -> tuple[Weights | None, Arrays, UpdateResult | GroupError]:
+        """Learn from rollouts, given as object references; see ``LearnerWorker.update``.
+
+        Where another rank is gone, its error is the result: nobody asks for that of every rank, and Ray would print it.
+        """
         start = time.perf_counter()
-        result = self._worker.update(ray.get(list(references)))
+        try:
+            result = self._worker.update(ray.get(list(references)))
+        except GroupError as error:
+            return None, {}, error
         weights, state = self._weights(), self._worker.learner.state()
         return weights, state, replace(result, update_s=time.perf_counter() - start)  # all that an actor waits for
 

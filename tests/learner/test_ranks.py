@@ -14,9 +14,10 @@ from service.learner.player import LearnerError
 from service.learner.shares import join_states
 from tests.learner import ranks as work
 from tests.learner.ranks import Ranks, learn_alone
-from tests.learner.rollouts import make_config, make_rollout, nobody_learns
+from tests.learner.rollouts import make_config, make_demonstrations, make_rollout, nobody_learns
 
 EVERYTHING = {"mirror": True, "bob_window": 3, "bob_ema_decay": 0.5, "abc": {"num_iterations": 3, "mean_only": True}}
+NO_DEMONSTRATIONS = make_demonstrations(np.random.default_rng(0), 0)
 REPLICATED = ("alice/", "bob/", "steady_bob/")
 
 
@@ -32,7 +33,7 @@ def play(config, num_updates=2, num_actors=3):
     learner, updates = Learner(config), []
     for sequence in range(num_updates):
         played = [
-            replace(make_rollout(learner, sequence, seed=actor, num_demonstrations=5 * actor), actor=actor)
+            replace(make_rollout(learner, sequence, seed=actor, num_demonstrations=4 + 3 * actor), actor=actor)
             for actor in range(num_actors)
         ]
         updates.append(played)
@@ -105,7 +106,7 @@ def test_demonstrations_alone_and_nothing_at_all(pair):
     alone = learn_alone(config, updates)
     assert_learned_alike(joined(pair.run(work.learn, config, updates)), alone)
     nothing = [
-        [replace(each, alice=nobody_learns(each.alice), demonstrations=played[0].demonstrations) for each in played]
+        [replace(each, alice=nobody_learns(each.alice), demonstrations=NO_DEMONSTRATIONS) for each in played]
         for played in updates
     ]
     several = joined(pair.run(work.learn, config, nothing))
