@@ -38,7 +38,8 @@ class ClusterOptions:
     actor_threads: int = 1
     """Cores of each."""
     learner_cpus: float = 0.0
-    """Reserved for the learner. With 0 it shares the actors' cores, which is right where physics is the bottleneck."""
+    """Reserved for each rank of the learner. With 0 the only one shares the actors' cores, which is right where physics
+    is the bottleneck, and several take as many as they have threads."""
     status: StatusOptions | None = None
     """None: no status service of its own."""
 

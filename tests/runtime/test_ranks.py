@@ -14,7 +14,7 @@ from service.runtime.local import LocalRun
 from service.runtime.pretrain import resumed_config
 from service.runtime.ray_connection import ClusterOptions, connected
 from service.runtime.runner import ClusterError
-from tests.runtime.runs import TREE, assert_one_line, newest, play, read_lines, tiny_config
+from tests.runtime.runs import TREE, assert_one_line, newest, play, read_lines, tiny_config, write_yaml
 
 
 @pytest.fixture(scope="module")
@@ -118,6 +118,15 @@ def test_the_local_runner_has_one_learner(tmp_path):
         LocalRun(two_ranks(), RunDirectory(tmp_path / "run"))
     assert_one_line(error.value, "learner.num_learners = 2", "--runtime ray", "--set learner.num_learners=1")
     assert not (tmp_path / "run").exists()
+
+
+def test_a_file_may_say_another_number_of_ranks_at_a_resume(tmp_path):
+    play(tmp_path / "run", tiny_config(total_env_steps=100))
+    tree = TREE | {"learner": TREE["learner"] | {"num_learners": 2}}
+    resumed = resumed_config(RunDirectory(tmp_path / "run"), [], write_yaml(tmp_path / "two.yaml", tree))
+    assert resumed.learner.num_learners == 2
+    again = resumed_config(RunDirectory(tmp_path / "run"), ["learner.num_learners=1"], tmp_path / "two.yaml")
+    assert again.learner.num_learners == 1
 
 
 def test_a_batch_too_small_for_the_ranks_is_one_line():
