@@ -139,7 +139,7 @@ def main() -> int:
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the result")
     given = parser.parse_args()
     os.environ |= {"RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN": secrets.token_hex(32), "RAY_USAGE_STATS_ENABLED": "0"}
-    os.environ["RAY_raylet_start_wait_time_s"] = "300"  # many nodes start on few cores
+    os.environ |= {"RAY_raylet_start_wait_time_s": "300"}  # many nodes start on few cores
     try:
         with TemporaryDirectory(prefix="tandem-") as home:
             os.environ["RAY_TMPDIR"] = home

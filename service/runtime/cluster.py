@@ -322,8 +322,9 @@ class ClusterRun(Runner):
 
     def _on_failed_answer(self, iteration: Iteration, worker: RemoteWorker | LearnerGroup, error: Exception) -> None:
         """Start another learner or generator from the state before the iteration, and ask it what is left of that."""
-        reason = worker.explain(error)
-        if isinstance(error, RayTaskError) and isinstance(error.cause, ObjectLostError):
+        lost = isinstance(error, RayTaskError) and isinstance(error.cause, ObjectLostError)
+        reason = one_line(error) if lost else worker.explain(error)
+        if lost:
             self._drop_lost(iteration)
             if worker is self._learner and self._learner.size > 1:
                 worker.restart(reason)  # the other ranks wait for the one that has nothing to learn from
