@@ -11,6 +11,7 @@ counts once. It shows that a run of this shape works, not how fast.
 from __future__ import annotations
 
 import argparse
+import logging
 import os
 import secrets
 import signal
@@ -36,6 +37,7 @@ if TYPE_CHECKING:
 CALM = 5
 """Iterations between two strikes."""
 STRIKES = ("kill", "learner-1"), ("kill", "learner-0"), ("kill", "rollout-0"), ("stop", "learner-1")
+STORE = {"object_store_memory": 150_000_000}
 SIGNALS = {"kill": signal.SIGKILL, "stop": signal.SIGSTOP}
 TINY = (
     "game.alice_steps=4",
@@ -101,13 +103,13 @@ def play(home: Path, num_nodes: int, num_actors: int, num_ranks: int) -> dict[st
     from service.runtime.ray_connection import ClusterOptions, connected
 
     directory, strikes = RunDirectory(home / "run"), Strikes()
-    cluster = Cluster(
-        initialize_head=True, head_node_args={"num_cpus": 0, "include_dashboard": False, "temp_dir": str(home / "ray")}
-    )
+    (home / "ray").mkdir()
+    head = {"num_cpus": 0, "include_dashboard": False, "temp_dir": str(home / "ray")}
+    cluster = Cluster(initialize_head=True, head_node_args=head | STORE)
     with ExitStack() as stack:
         stack.callback(cluster.shutdown)
         for _ in range(num_nodes):
-            cluster.add_node(num_cpus=-(-(num_actors + num_ranks) // num_nodes))
+            cluster.add_node(num_cpus=-(-(num_actors + num_ranks) // num_nodes), **STORE)
         directory.claim(resume=False)
         stack.callback(directory.close)
         stack.enter_context(connected(cluster.address))
@@ -138,6 +140,7 @@ def main() -> int:
     parser.add_argument("--ranks", type=int, default=4, help="default: %(default)s")
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the result")
     given = parser.parse_args()
+    logging.basicConfig(format="%(asctime)s %(message)s")
     os.environ |= {"RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN": secrets.token_hex(32), "RAY_USAGE_STATS_ENABLED": "0"}
     os.environ |= {"RAY_raylet_start_wait_time_s": "300"}  # many nodes start on few cores
     try:

@@ -176,7 +176,8 @@ class LearnerGroup:
         Raises:
             StateLostError: they do not start, or a state was lost with the node that kept it.
         """
-        _logger.warning("the %s is gone (%s); another goes on from its last state", self.name, reason)
+        others = "another goes" if self.size == 1 else "other ranks go"
+        _logger.warning("the %s is gone (%s); %s on from its last state", self.name, reason, others)
         self.close()
         self.incarnation += 1
         self._last_error = reason
