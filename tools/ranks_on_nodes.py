@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 CALM = 5
 """Iterations between two strikes."""
 STRIKES = ("kill", "learner-1"), ("kill", "learner-0"), ("kill", "rollout-0"), ("stop", "learner-1")
-STORE = {"object_store_memory": 150_000_000}
+STORE: dict[str, Any] = {"object_store_memory": 150_000_000}
 SIGNALS = {"kill": signal.SIGKILL, "stop": signal.SIGSTOP}
 TINY = (
     "game.alice_steps=4",
