@@ -26,6 +26,19 @@ if TYPE_CHECKING:
     pass
 
 
+def check_one_learner(config: Config) -> None:
+    """Check that a run can be one of this runner.
+
+    Raises:
+        ConfigError: its learner has several processes.
+    """
+    if config.learner.num_learners > 1:
+        raise ConfigError(
+            f"learner.num_learners = {config.learner.num_learners}: the local runner has one process; use "
+            "--runtime ray, or --set learner.num_learners=1 (what is learned is the same)"
+        )
+
+
 class LocalRun(Runner):
     """A pre-training run in this process.
 
@@ -35,16 +48,12 @@ class LocalRun(Runner):
         resume: continue from the newest checkpoint instead of starting anew.
 
     Raises:
-        TandemError: see ``RunDirectory.claim``; or a learner of several processes, which this runner does not have.
+        TandemError: see ``RunDirectory.claim`` and ``check_one_learner``.
         CheckpointError: ``resume`` without a usable checkpoint.
     """
 
     def __init__(self, config: Config, directory: RunDirectory, *, resume: bool = False) -> None:
-        if config.learner.num_learners > 1:
-            raise ConfigError(
-                f"learner.num_learners = {config.learner.num_learners}: the local runner has one process; use "
-                "--runtime ray, or --set learner.num_learners=1 (what is learned is the same)"
-            )
+        check_one_learner(config)
         directory.claim(resume=resume)
         super().__init__(config, directory)
         self._incarnation = 0

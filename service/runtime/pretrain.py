@@ -18,7 +18,7 @@ from service.media.artifacts import make_artifacts
 from service.primitives.publishing import measure_bob, publish_run
 from service.registry.names import Version
 from service.registry.registry import Registry
-from service.runtime.local import LocalRun
+from service.runtime.local import LocalRun, check_one_learner
 from service.runtime.reporting import Report
 from service.runtime.runner import OnIteration, Runner, RunResult, StateLostError
 from service.runtime.signals import InterruptError, StopSignals
@@ -90,6 +90,7 @@ def pretrain(
     Registry(registry).check_writable()  # now, not after hours of learning
     if cluster is None:  # on a cluster, another machine has it
         torch_device(config.learner.device)
+        check_one_learner(config)
     runtime: Literal["local", "ray"] = "local" if cluster is None else "ray"
     with StopSignals() as signals, ExitStack() as stack:
         stack.callback(directory.close)
