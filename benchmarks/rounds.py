@@ -41,7 +41,13 @@ class Rounds:
     def __init__(self, run: LocalRun) -> None:
         self._run = run
         self._rng = np.random.default_rng(0)
-        self._worlds = WorldBatch(run.config.world, run.config.game.num_worlds, num_threads=run.config.run.num_threads)
+        game = run.config.game
+        self._worlds = WorldBatch(
+            run.config.world,
+            game.num_worlds,
+            num_threads=run.config.run.num_threads,
+            blocked_fraction=game.blocked_gripper_fraction,
+        )
         self.played: list[Round] = []
         """The rounds of the last ``play_and_repeat``."""
 
@@ -100,11 +106,11 @@ def repeat_physics(worlds: WorldBatch, played: Round) -> int:
     """
     alice, bob = played.rollout.alice, played.rollout.bob
     worlds.restore(played.start_state)
-    for action in alice.action:
+    for action in alice.action[alice.active.any(axis=1)]:
         worlds.step(action)
     worlds.restore(played.rollout.records.start_state)
     for action, active in zip(bob.action, bob.active, strict=True):
         playing = np.flatnonzero(active)
         if playing.size:
             worlds.step(action[playing], playing)
-    return len(alice.action) * worlds.num_worlds + int(bob.active.sum())
+    return int(alice.active.sum() + bob.active.sum())

@@ -21,6 +21,10 @@ EVALUATED_GOALS: tuple[GoalKind, ...] = ("table", "air", "mixed")
 """Kinds of goals on which a run evaluates its Bob."""
 EVALUATION_SEED = 1_000_003
 """Evaluations during a run always use the same goals, so that they compare."""
+REPORTED_SEED = EVALUATION_SEED + 1
+"""Final evaluations use goals that chose nothing."""
+SELECTION_SEED = EVALUATION_SEED + 2
+"""The best of several runs is chosen on goals of its own: chosen on those that are reported, it would look too good."""
 
 
 class DeterministicPolicy(Protocol):

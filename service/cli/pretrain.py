@@ -11,6 +11,7 @@ from rich.console import Console
 
 from service.cli.common import CHAMPION, EXIT_SIGNAL, REGISTRY, RegistryOption
 from service.cli.evaluate import evaluate
+from service.cli.study import is_study, pretrain_study
 from service.errors import TandemError
 
 if TYPE_CHECKING:
@@ -34,11 +35,18 @@ def pretrain(
         Path, typer.Option(envvar="TANDEM_RUNS", metavar="DIR", help="Directory of run directories.")
     ] = Path("runs"),
     resume: Annotated[bool, typer.Option("--resume", help="Continue the run in --run-dir exactly.")] = False,
+    seeds: Annotated[
+        str | None, typer.Option(metavar="0,1,2|0-4", help="A study: a run for each, in DIR/seed-N; names the best.")
+    ] = None,
+    parallel: Annotated[
+        int | None, typer.Option(help="Runs of a study at once; default: as many as there are cores for.", min=1)
+    ] = None,
     overrides: Annotated[
         list[str] | None,
         typer.Option("--set", metavar="A.B=C", help="Override a key of the configuration; repeatable."),
     ] = None,
     registry: RegistryOption = REGISTRY,
+    publish: Annotated[bool, typer.Option("--publish/--no-publish", help="Publish at the end.")] = True,
     runtime: Annotated[str, typer.Option(help="local: in this process; ray: on a cluster.")] = "local",
     address: Annotated[
         str | None,
@@ -62,6 +70,13 @@ def pretrain(
     from service.io.run_directory import RunDirectory
     from service.runtime.pretrain import resumed_config
 
+    def cluster_options() -> ClusterOptions:
+        from service.runtime.ray_connection import ClusterOptions, parse_status
+        from service.status.token import read_token
+
+        where = parse_status(status, read_token(token_file))
+        return ClusterOptions(num_actors=num_actors, learner_cpus=learner_cpus, status=where)
+
     if runtime not in ("local", "ray"):
         raise TandemError(f"--runtime {runtime!r}: choose one of local, ray")
     if run_id is not None:
@@ -69,6 +84,15 @@ def pretrain(
             raise TandemError("--run-id names the run directory, and continues what is there: leave out the other two")
         run_dir = runs / run_id
         resume = RunDirectory(run_dir).exists
+    if is_study(run_dir, seeds):
+        pretrain_study(
+            run_dir, seeds, config=config, overrides=overrides or [], runs=runs, registry=registry,
+            resume=None if run_id is not None else resume, publish=publish, parallel=parallel,
+            cluster=cluster_options if runtime == "ray" else None, address=address,
+        )  # fmt: skip
+        return
+    if parallel is not None:
+        raise TandemError("--parallel is for the runs of a study: give --seeds, too, or leave it out")
     if resume:
         if run_dir is None:
             raise TandemError("--resume needs --run-dir, the directory of the run to continue")
@@ -77,16 +101,13 @@ def pretrain(
         resolved = load_config(config, overrides or [])
         run_dir = run_dir or runs / resolved.name
     if runtime == "local":
-        _pretrain(resolved, run_dir, registry, resume=resume)
+        _pretrain(resolved, run_dir, registry, resume=resume, publish=publish)
         return
-    from service.runtime.ray_connection import ClusterOptions, connected, parse_status
-    from service.status.token import read_token
+    from service.runtime.ray_connection import connected
 
-    options = ClusterOptions(
-        num_actors=num_actors, learner_cpus=learner_cpus, status=parse_status(status, read_token(token_file))
-    )
+    options = cluster_options()
     with connected(address):
-        _pretrain(resolved, run_dir, registry, resume=resume, cluster=options)
+        _pretrain(resolved, run_dir, registry, resume=resume, publish=publish, cluster=options)
 
 
 def demo(
@@ -114,7 +135,13 @@ def demo(
 
 
 def _pretrain(
-    config: Config, path: Path, registry: Path, *, resume: bool, cluster: ClusterOptions | None = None
+    config: Config,
+    path: Path,
+    registry: Path,
+    *,
+    resume: bool,
+    publish: bool = True,
+    cluster: ClusterOptions | None = None,
 ) -> None:
     from service.io.run_directory import RunDirectory
     from service.runtime.pretrain import pretrain as run
@@ -124,7 +151,10 @@ def _pretrain(
     directory = RunDirectory(path)
     try:
         with Progress(config.run.total_env_steps, Console()) as progress:
-            done = run(config, directory, registry, resume=resume, on_iteration=progress.show, cluster=cluster)
+            done = run(
+                config, directory, registry,
+                resume=resume, publish=publish, on_iteration=progress.show, cluster=cluster,
+            )  # fmt: skip
     except InterruptError as interrupt:
         _say_stopped("stopped at once", interrupt.number, directory, registry)
     result = done.result

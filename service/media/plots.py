@@ -5,8 +5,9 @@ matplotlib is loaded by the first call, not by the import.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from itertools import combinations, product
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from itertools import combinations, cycle, product
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -35,6 +36,8 @@ if TYPE_CHECKING:
 
 _MARGIN_M = 0.03
 """Drawn surroundings of the workspace."""
+_COLORS = (BLUE, ORANGE, GREEN, "#CC79A7", "#56B4E9", "#E69F00")
+"""Of runs side by side."""
 _EDGE_STYLE = (0, (4, 3))
 
 # --- curves ----------------------------------------------------------------------------------------------------------
@@ -100,6 +103,40 @@ def plot_curves(run_dir: Path) -> Path:
         axes.set_xlabel("million env steps" if place >= 3 else "", color=FAINT)
     figure.subplots_adjust(left=0.05, right=0.908, top=0.85, bottom=0.08, wspace=0.64, hspace=0.42)
     return save(figure, run_dir / "curves.png")
+
+
+def plot_study(run_dirs: Mapping[str, Path], path: Path) -> Path:
+    """Draw the success of several runs side by side: on random goals, and on Alice's.
+
+    Args:
+        run_dirs: run directories by label; one without metrics is left out.
+        path: of the picture.
+
+    Raises:
+        TandemError: no run has metrics yet, or the picture cannot be written.
+    """
+    found = {}
+    for label, run_dir in run_dirs.items():
+        with suppress(TandemError):
+            found[label] = read_records(run_dir / "metrics.jsonl")
+    if not found:
+        raise TandemError(f"no run in {path.parent} has metrics yet; wait for a first iteration")
+    figure = new_figure(14.0, 5.2, f"{path.parent.resolve().name}: {counted(len(found), 'run')}")
+    shown = (("random", "evaluation/mixed_success_last"), ("bob", "bob/success_rate"))
+    for axes, (name, key) in zip(figure.subplots(1, 2), shown, strict=True):
+        style_axes(axes)
+        axes.set_title(f"{_PANELS[name].title}: {key.split('/')[1]}", loc="left", fontsize=12, weight="bold", color=INK)
+        axes.set_xlabel("million env steps", color=FAINT)
+        axes.set_ylim(0.0, 1.0)
+        ends = []
+        for (label, records), color in zip(found.items(), cycle(_COLORS), strict=False):
+            curve = _Curve(name, key, label, color)
+            end = _draw_curve(axes, curve, column(records, "env_steps") / 1e6, column(records, key))
+            ends += [(end, curve)] if end is not None else []
+        axes.set_xlim(left=0.0)
+        _label_ends(axes, ends)
+    figure.subplots_adjust(left=0.05, right=0.908, top=0.82, bottom=0.12, wspace=0.3)
+    return save(figure, path)
 
 
 def _progress(records: Sequence[dict[str, Any]]) -> str:

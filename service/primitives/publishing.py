@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import json
 
-from service.actors.evaluation import EVALUATED_GOALS, EVALUATION_SEED, success_metrics
+from service.actors.evaluation import EVALUATED_GOALS, REPORTED_SEED, success_metrics
 from service.config import Config
 from service.envs.observations import BOB, SPACES
 from service.io import tensors
@@ -28,7 +28,7 @@ def measure_bob(config: Config, parameters: Parameters) -> dict[str, float]:
         config,
         EVALUATED_GOALS,
         FINAL_EVALUATION_EPISODES,
-        seed=EVALUATION_SEED + 1,
+        seed=REPORTED_SEED,
         num_threads=config.run.num_threads,
     )
 

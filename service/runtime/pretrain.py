@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, Literal, cast
 from service.config import Config, ConfigError, load_config
 from service.errors import TandemError
 from service.io.run_directory import RunDirectory
+from service.io.study_directory import StudyDirectory
 from service.learner.learner import torch_device
 from service.media.artifacts import make_artifacts
 from service.primitives.publishing import measure_bob, publish_run
@@ -44,7 +45,7 @@ class Pretrained:
     files: dict[str, Path]
     """Pictures and video by what they show."""
     version: Version | None
-    """Of the published primitives; None when interrupted."""
+    """Of the published primitives; None when interrupted, or when nothing was to be published."""
     metrics: dict[str, float]
     """Of the final evaluation."""
     timing: str
@@ -65,6 +66,7 @@ def pretrain(
     registry: Path,
     *,
     resume: bool = False,
+    publish: bool = True,
     on_iteration: OnIteration,
     cluster: ClusterOptions | None = None,
 ) -> Pretrained:
@@ -78,6 +80,7 @@ def pretrain(
         directory: where it keeps everything.
         registry: where it publishes.
         resume: continue the run that the directory holds.
+        publish: or else leave that to a later resume, or to ``publish_run``.
         on_iteration: called with the metrics of every iteration.
         cluster: run on the Ray cluster that this process is connected to; None: in this process.
 
@@ -87,7 +90,8 @@ def pretrain(
         UnfinishedError: everything is saved, and not published.
         InterruptError: a signal while the run was being loaded, or a second one.
     """
-    Registry(registry).check_writable()  # now, not after hours of learning
+    if publish:
+        Registry(registry).check_writable()  # now, not after hours of learning
     if cluster is None:  # on a cluster, another machine has it
         torch_device(config.learner.device)
         check_one_learner(config)
@@ -107,7 +111,8 @@ def pretrain(
         while True:
             with closing(_start(config, directory, cluster, resume=resume)) as run:
                 try:
-                    done = _run(run, config, directory, Registry(registry), signals, report, on_iteration)
+                    to = Registry(registry) if publish else None
+                    done = _run(run, config, directory, to, signals, report, on_iteration)
                 except StateLostError as error:  # with a machine of the cluster
                     _logger.warning("%s", error)
                     resume = True
@@ -127,7 +132,7 @@ def _run(
     run: Runner,
     config: Config,
     directory: RunDirectory,
-    registry: Registry,
+    registry: Registry | None,
     signals: StopSignals,
     report: Report,
     on_iteration: OnIteration,
@@ -155,24 +160,26 @@ def _run(
     return done
 
 
-def _finish(done: Pretrained, config: Config, directory: RunDirectory, registry: Registry, run: Runner) -> Pretrained:
+def _finish(
+    done: Pretrained, config: Config, directory: RunDirectory, registry: Registry | None, run: Runner
+) -> Pretrained:
     _logger.info("learning is over; now evaluating, publishing, drawing and recording a video")
     bob = run.bob()
     run.close()
     metrics, version = measure_bob(config, bob), None
     try:
-        if config.policy.monolithic_bob is None:
+        if registry is not None and config.policy.monolithic_bob is None:
             version = publish_run(directory, registry, config, bob, metrics | {"env_steps": done.result.num_env_steps})
     except TandemError as error:
         raise UnfinishedError(f"learning is over and saved, but not published: {error}; --resume does it") from error
     return replace(done, files=make_artifacts(directory), version=version, metrics=metrics, timing=run.timing.tree())
 
 
-def resumed_config(directory: RunDirectory, overrides: list[str], file: Path | None = None) -> Config:
+def resumed_config(directory: RunDirectory | StudyDirectory, overrides: list[str], file: Path | None = None) -> Config:
     """The configuration to resume a run with: the saved one, where only ``RESUMABLE`` may be changed.
 
     Args:
-        directory: of the run.
+        directory: of the run, or of a study.
         overrides: ``run.a=b`` strings, or learning rates; others may only say what the run has.
         file: YAML that says the same as the saved one outside ``run`` but for the number of learners; what it says
             there comes before ``overrides``.
@@ -196,7 +203,7 @@ def resumed_config(directory: RunDirectory, overrides: list[str], file: Path | N
     return directory.read_config(overrides)
 
 
-def _says(saved: Config, directory: RunDirectory, override: str) -> bool:
+def _says(saved: Config, directory: RunDirectory | StudyDirectory, override: str) -> bool:
     try:
         return directory.read_config([override]) == saved
     except ConfigError:

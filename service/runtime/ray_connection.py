@@ -96,6 +96,18 @@ def connected(address: str | None, num_cpus: int | None = None) -> Iterator[None
         ray.shutdown()
 
 
+def cluster_size(address: str | None) -> tuple[str, float]:
+    """The address at which other processes reach the cluster that this one is connected to, and its cores.
+
+    Args:
+        address: that was given to ``connected``.
+    """
+    import ray
+
+    named = address if address not in (None, "auto") else ray.get_runtime_context().gcs_address
+    return str(named), float(ray.cluster_resources().get("CPU", 0.0))
+
+
 def _check_reachable(address: str | None) -> None:
     """Check that something answers; Ray itself would end the whole process where nothing does."""
     host, separator, port = (address or "").removeprefix("ray://").rpartition(":")

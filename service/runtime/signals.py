@@ -8,7 +8,10 @@ from contextlib import contextmanager
 from types import FrameType, TracebackType
 from typing import Self
 
-STOPPING = (signal.SIGINT, signal.SIGTERM)
+PASSED_ON = signal.SIGUSR1
+"""A stop that the process above passes on. It counts only where no other signal came: a supervisor, such as Ray's for
+jobs, signals a process and those below it, and what comes twice that way must not count as a second signal."""
+STOPPING = (signal.SIGINT, signal.SIGTERM, PASSED_ON)
 
 
 class InterruptError(BaseException):
@@ -21,7 +24,7 @@ class InterruptError(BaseException):
 
 
 class StopSignals:
-    """Takes SIGINT and SIGTERM over while its ``with`` block runs, which has to be in the main thread.
+    """Takes the signals of ``STOPPING`` over while its ``with`` block runs, which has to be in the main thread.
 
     A signal raises ``InterruptError`` there, except where ``asking`` is told of another way to stop.
     """
@@ -55,8 +58,12 @@ class StopSignals:
             self._ask = None
 
     def _handle(self, number: int, frame: FrameType | None) -> None:
+        if number == PASSED_ON and self.first is not None:
+            return
         self.first = self.first or number
-        ask, self._ask = self._ask, None
+        ask = self._ask
+        if number != PASSED_ON:
+            self._ask = None
         if ask is None:
             raise InterruptError(number)
         ask()

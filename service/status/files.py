@@ -15,7 +15,7 @@ from starlette.staticfiles import NotModifiedResponse, StaticFiles
 from service.status.openapi import problems
 from service.status.problems import ProblemError
 from service.status.schemas import RunFile
-from service.store.disk_reader import run_id_of
+from service.store.disk_reader import run_directories, run_id_of
 
 RUN_FILES = {
     "rounds.mp4": ("Alice beside Bob", "video/mp4"),
@@ -38,7 +38,7 @@ _CONDITIONS = StaticFiles()
 
 
 class RunDirectories:
-    """Pictures and videos in the directories ``root``/*/; None if runs have no directories on this machine."""
+    """Pictures and videos in the run directories of ``root``; None if runs have no directories on this machine."""
 
     def __init__(self, root: Path | None) -> None:
         self._root = root
@@ -71,11 +71,11 @@ class RunDirectories:
 
     def _paths(self, run_id: str) -> dict[str, Path]:
         try:
-            found = sorted(self._root.iterdir()) if self._root is not None else []
+            found = run_directories(self._root) if self._root is not None else []
         except OSError:
             return {}
         # looked up instead of built from the id, so that no id leads outside the root
-        directory = next((path for path in found if path.is_dir() and run_id_of(path) == run_id), None)
+        directory = next((path for path in found if run_id_of(path) == run_id), None)
         paths = {name: directory / name for name in RUN_FILES} if directory is not None else {}
         return {name: path for name, path in paths.items() if os.path.isfile(path)}
 

@@ -1,9 +1,10 @@
-"""Runs read from their directories, those of an older tandem, which has no ``status.json``, included."""
+"""Runs read from their directories, also those of studies, and of an older tandem, which has no ``status.json``."""
 
 from __future__ import annotations
 
 import json
 import re
+from contextlib import suppress
 from datetime import UTC, datetime
 from functools import lru_cache
 from pathlib import Path
@@ -13,6 +14,7 @@ import yaml
 from pydantic import ValidationError
 
 from service.io.lock import is_locked
+from service.io.study_directory import is_study
 from service.store.disk import GOALS_FILE, STATUS_FILE, STOP_FILE
 from service.store.errors import DamagedStoreError, StoreError, StoreUnavailableError, UnknownRunError
 from service.store.models import ACTIVE, SILENT_AFTER, GoalGrid, Record, RunState, RunStatus
@@ -20,9 +22,26 @@ from service.store.tail import RecordFile
 
 
 def run_id_of(directory: Path) -> str:
-    """A run's id on one machine: the name of its directory, with a dash for what an id may not hold."""
-    name = re.sub(r"[^A-Za-z0-9._-]", "-", directory.resolve().name).lstrip("._-")[:128]
-    return name or "run"
+    """A run's id on one machine: the name of its directory, with a dash for what an id may not hold.
+
+    That of a study's run begins with the name of the study.
+    """
+    path = directory.resolve()
+    name = f"{path.parent.name[:100]}-{path.name}" if is_study(path.parent) else path.name
+    return re.sub(r"[^A-Za-z0-9._-]", "-", name).lstrip("._-")[:128] or "run"
+
+
+def run_directories(root: Path) -> list[Path]:
+    """The run directories in ``root``, and those of the studies in it.
+
+    Raises:
+        OSError: ``root`` cannot be read.
+    """
+    found = sorted(root.iterdir())
+    for study in filter(is_study, found):
+        with suppress(OSError):
+            found.extend(sorted(study.iterdir()))
+    return [path for path in found if _is_run(path)]
 
 
 class DiskReader:
@@ -91,7 +110,7 @@ class DiskReader:
     def _list(self) -> dict[str, tuple[Path, RecordFile]]:
         """Directory and records of each run, by its id."""
         try:
-            found = sorted(path for path in self.root.iterdir() if _is_run(path))
+            found = run_directories(self.root)
         except OSError as error:
             raise StoreUnavailableError(
                 f"cannot read the runs in {self.root}: {error.strerror}; name the directory that holds run directories"

@@ -20,6 +20,7 @@ from service.media.plots import (
     plot_coverage,
     plot_curves,
     plot_goals,
+    plot_study,
 )
 
 # x and y from -0.1 to 0.1, z from 0 to 0.2: 4 x 4 x 4 cells of 5 cm
@@ -62,6 +63,22 @@ def test_more_values_change_the_picture(tmp_path):
     assert plot_curves(tmp_path).read_bytes() == before
     _append(tmp_path / "metrics.jsonl", {"iteration": 10, "env_steps": 9000, "evaluation/air_success_ever": 0.5})
     assert plot_curves(tmp_path).read_bytes() != before
+
+
+def test_the_runs_of_a_study_in_one_picture(tmp_path):
+    runs = {f"seed {seed}": tmp_path / f"seed-{seed}" for seed in range(8)}
+    picture = tmp_path / "curves.png"
+    with pytest.raises(TandemError, match="no run in"):
+        plot_study(runs, picture)
+    _append(runs["seed 0"] / "metrics.jsonl", *map(_metrics, range(10)))
+    before = plot_study(runs, picture).read_bytes()
+    assert _png_size(picture)[1] == 1400
+    for path in list(runs.values())[1:7]:  # more than there are colours; one has not begun
+        _append(path / "metrics.jsonl", *map(_metrics, range(5)))
+    several = plot_study(runs, picture).read_bytes()
+    assert several != before
+    _append(runs["seed 0"] / "metrics.jsonl", _metrics(10) | {"evaluation/mixed_success_last": 0.5})
+    assert plot_study(runs, picture).read_bytes() != several
 
 
 @pytest.mark.parametrize(

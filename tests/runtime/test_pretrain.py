@@ -107,6 +107,14 @@ def test_what_is_published_is_bob_and_all_that_a_user_of_him_needs(tmp_path, qui
     assert len(manifest.normalisation["offset"]) == len(manifest.normalisation["scale"]) == 14
 
 
+def test_publishing_can_be_left_to_a_resume(tmp_path, quick):
+    done = run_pretrain(tmp_path, publish=False)
+    assert (done.result.reason, done.version) == ("finished", None)
+    assert done.metrics != {}
+    assert not (tmp_path / "registry").exists()
+    assert str(run_pretrain(tmp_path, resume=True).version) == "tiny@1"
+
+
 def test_a_finished_run_that_goes_on_publishes_another_version(tmp_path, quick):
     first = run_pretrain(tmp_path)
     config = resumed_config(RunDirectory(tmp_path / "run"), ["run.total_env_steps=600"])

@@ -6,7 +6,7 @@ import time
 import pytest
 from rich.console import Console
 
-from service.runtime.progress import PLAIN_INTERVAL_S, Progress
+from service.runtime.progress import PLAIN_INTERVAL_S, Progress, StudyProgress
 from service.runtime.timing import Timing
 
 
@@ -83,6 +83,33 @@ def test_a_table_on_a_terminal():
     assert "500 of 1,000 env steps" in text
     assert "42%" in text
     assert "Bob: random table goals" in text
+
+
+def test_lines_of_a_study_name_the_seed_and_tell_no_run_twice(clock):
+    console = Console(file=io.StringIO(), force_terminal=False, width=60)
+    with StudyProgress(1000, console) as progress:
+        progress.show({3: "starting", 8: None})
+        progress.take(3, metrics(100, bob__success_rate=0.5) | {"alice/valid_fraction": None})
+        progress.show({3: "running", 8: None})  # the first line comes at once
+        progress.take(3, metrics(200))
+        progress.show({3: "running", 8: None})  # too soon
+        clock.now_s += PLAIN_INTERVAL_S
+        progress.take(8, metrics(70))
+        progress.show({3: "running", 8: "running"})
+        clock.now_s += PLAIN_INTERVAL_S
+        progress.show({3: "running", 8: "running"})  # nothing new
+    lines = [line.split(" env steps")[0].split() for line in console.file.getvalue().splitlines()]
+    assert lines == [["seed", "3:", "100"], ["seed", "3:", "200"], ["seed", "8:", "70"]]
+
+
+def test_a_study_on_a_terminal():
+    console = Console(file=io.StringIO(), force_terminal=True, width=120)
+    with StudyProgress(1000, console) as progress:
+        progress.take(3, metrics(500, alice__valid_fraction=0.42, time__env_steps_per_s=1234.0))
+        progress.show({3: "running", 8: None})
+    text = console.file.getvalue()
+    for part in ("seed", "running", "waiting", "42%", "1,234", "1,000 env steps"):
+        assert part in text
 
 
 def test_a_table_fits_a_narrow_terminal():

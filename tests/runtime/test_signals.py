@@ -11,7 +11,7 @@ from typer.testing import CliRunner
 from service.cli.main import app
 from service.registry.registry import Registry
 from service.runtime.local import LocalRun
-from service.runtime.signals import InterruptError, StopSignals
+from service.runtime.signals import PASSED_ON, STOPPING, InterruptError, StopSignals
 from tests.runtime.runs import assert_same_run, newest, play, tiny_config, write_yaml
 
 pytestmark = pytest.mark.usefixtures("default_signals")
@@ -73,10 +73,27 @@ def test_a_signal_that_somebody_swallowed_is_not_forgotten():
 
 
 def test_the_handlers_from_before_are_put_back():
-    before = [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)]
+    before = [signal.getsignal(number) for number in STOPPING]
     with pytest.raises(InterruptError), StopSignals():
         send(signal.SIGTERM)
-    assert [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)] == before
+    assert [signal.getsignal(number) for number in STOPPING] == before
+
+
+@pytest.mark.parametrize("order", [(PASSED_ON, signal.SIGTERM), (signal.SIGTERM, PASSED_ON)])
+def test_a_stop_that_comes_directly_and_is_passed_on_is_one(order):
+    asked = []
+    with StopSignals() as signals, signals.asking(lambda: asked.append("stop")):
+        for number in order:
+            send(number)
+        assert asked
+        with pytest.raises(InterruptError, match="SIGINT"):
+            send(signal.SIGINT)
+    assert signals.first == order[0]
+
+
+def test_a_stop_that_is_passed_on_raises_where_nothing_else_was_asked_for():
+    with pytest.raises(InterruptError, match="SIGUSR1"), StopSignals():
+        send(PASSED_ON)
 
 
 # --- the command -----------------------------------------------------------------------------------------------------

@@ -5,6 +5,7 @@ import hashlib
 import pytest
 
 from service.registry.registry import Registry
+from service.status.files import RunDirectories
 from tests.status.runs import VIDEO
 
 URL = "/v1/runs/old/video"
@@ -41,6 +42,17 @@ def test_a_range_beyond_the_file(client, asked):
 def test_a_malformed_range_gives_the_whole_file(client, asked):
     answer = client.get(URL, headers={"Range": asked})
     assert (answer.status_code, answer.content) == (200, VIDEO)
+
+
+def test_pictures_of_a_studys_run(tmp_path):
+    run = tmp_path / "night" / "seed-3"
+    run.mkdir(parents=True)
+    for path in (run.parent / "study.yaml", run / "config.yaml", run / "curves.png"):
+        path.write_bytes(b"-")
+    (found,) = RunDirectories(tmp_path).files("night-seed-3")
+    assert (found.name, found.num_bytes) == ("curves.png", 1)
+    assert RunDirectories(tmp_path).path("night-seed-3", "curves.png") == run / "curves.png"
+    assert RunDirectories(tmp_path).files("seed-3") == []
 
 
 def test_not_changed(client):

@@ -167,6 +167,28 @@ def test_what_is_no_run_is_none(tmp_path):
     assert DiskReader(tmp_path).runs() == []
 
 
+def test_the_runs_of_a_study_are_listed_with_the_others_under_its_name(tmp_path):
+    study = tmp_path / "night 1"
+    for path in (tmp_path / "cube", study / "seed-0", study / "seed-12"):
+        path.mkdir(parents=True)
+        DiskWriter(path).status(a_status(run_id_of(path), state="finished", iteration=len(path.name)))
+    assert {run.run_id for run in DiskReader(tmp_path).runs()} == {"cube"}
+    (study / "study.yaml").touch()
+    (study / "seed-99").mkdir()  # not begun
+    iterations = {run.run_id: run.iteration for run in DiskReader(tmp_path).runs()}
+    assert iterations == {"cube": 4, "night-1-seed-0": 6, "night-1-seed-12": 7}
+    assert {run.run_id for run in DiskReader(study).runs()} == {"night-1-seed-0", "night-1-seed-12"}
+    assert DiskReader(tmp_path).run("night-1-seed-12").run_id == "night-1-seed-12"
+
+
+def test_seeds_of_a_study_with_a_long_name_are_told_apart(tmp_path):
+    study = tmp_path / ("x" * 200)
+    study.mkdir()
+    (study / "study.yaml").touch()
+    assert run_id_of(study / "seed-10") != run_id_of(study / "seed-11")
+    assert a_status(run_id_of(study / "seed-10"))
+
+
 @pytest.mark.parametrize(
     ("name", "run_id"), [("cube-1", "cube-1"), ("my run", "my-run"), ("..odd_", "odd_"), ("\u00e9", "run")]
 )
