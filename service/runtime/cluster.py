@@ -126,7 +126,7 @@ class ClusterRun(Runner):
         self._last_error: str | None = None
         self._last_iteration = self._last_beat = self._last_resize = time.monotonic()
         learner = config.learner
-        self._rank_cpus = options.learner_cpus or float(learner.num_threads * (learner.num_learners > 1))
+        self._rank_cpus = options.rank_cpus(learner)
         check_room(learner.num_learners, learner.device, self._rank_cpus, options.actor_threads)
         learner_state = generator_state = pending = None
         first_incarnation = 0

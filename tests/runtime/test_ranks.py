@@ -113,6 +113,13 @@ def test_more_ranks_than_cores_or_gpus_is_one_line(monkeypatch):
     assert_one_line(error.value, "learner.num_learners = 2", "each rank takes a GPU", "has 1")
 
 
+def test_cores_of_ranks():
+    learner = two_ranks().learner.model_copy(update={"num_threads": 3})
+    assert ClusterOptions().rank_cpus(learner) == 3.0
+    assert ClusterOptions(learner_cpus=0.5).rank_cpus(learner) == 0.5
+    assert ClusterOptions().rank_cpus(tiny_config().learner) == 0.0
+
+
 def test_the_local_runner_has_one_learner(tmp_path):
     with pytest.raises(ConfigError) as error:
         LocalRun(two_ranks(), RunDirectory(tmp_path / "run"))
