@@ -85,8 +85,9 @@ class Rounds:
     def _play_round(self, players: Players) -> int:
         game, generator = self._run.game, self._run.generator
         start_state = game.worlds.states.copy()
-        plan = generator.plan(game.worlds.num_worlds, self._rng)
-        rollout = game.play_round(players, plan, partial(generator.choose_goals, plan, rng=self._rng))
+        fraction = self._run.config.generator.past_opponent_fraction
+        plan = generator.opponents.freeze(0).plan(game.worlds.num_worlds, fraction, self._rng)
+        rollout = game.play_round(players, plan, partial(generator.snapshot().choose_goals, plan, rng=self._rng))
         self.played.append(Round(start_state, rollout))
         return rollout.num_env_steps
 

@@ -32,7 +32,7 @@ PREDICTED = (1, 2, 4, 16, 256, 4096)
 WAKES = (16, 256, 4096)
 NUM_TINY_ACTORS = 8
 LEARNER, GENERATOR, DRIVER, GCS = "learner", "task generator", "driver", "GCS"
-ROLLOUTS_IN, WEIGHTS_OUT = "rollouts to the learner's node", "weights to the nodes"
+ROLLOUTS_IN, WEIGHTS_OUT = "rollouts to the learner's node", "weights and snapshots to the nodes"
 ROLES = {LEARNER: "learner", GENERATOR: "generator", DRIVER: "driver", GCS: "gcs"}
 """Processes that there are one of, and their roles in ``processes.py``."""
 
@@ -68,7 +68,7 @@ class Assumed:
     """Between two nodes, one receiver: pulls of 1 MB between two Ray nodes on this box, pipelined. A cluster's
     network is faster."""
     actors_per_node: int = 16
-    """Actors that share a copy of the weights."""
+    """Actors that share a copy of the weights and of the snapshot."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -110,7 +110,8 @@ def costs(
     parts[DRIVER] = Cost(parts[DRIVER].update_s, parts[DRIVER].rollout_s, pair_s=pair_s)
     bytes_per_s = assumed.network_mb_per_s * 1e6
     parts[ROLLOUTS_IN] = Cost(world_s=sizes["rollout"] / sizes["num_worlds"] / bytes_per_s)
-    parts[WEIGHTS_OUT] = Cost(rollout_s=sizes["weights"] / assumed.actors_per_node / bytes_per_s)
+    out = sizes["weights"] + sizes["snapshot"]  # past opponents go out once in many iterations
+    parts[WEIGHTS_OUT] = Cost(rollout_s=out / assumed.actors_per_node / bytes_per_s)
     steps = sum(each.num_steps for each in real) / sum(each.num_rollouts * each.num_worlds for each in real)
     return Model(_actor(real), parts, steps)
 

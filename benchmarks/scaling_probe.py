@@ -1,6 +1,6 @@
 """Single costs of a run on Ray, each measured in a process of its own; other benchmarks start it.
 
-    python -m benchmarks.scaling_probe sizes RUN_DIR           bytes of a rollout, of weights, of states
+    python -m benchmarks.scaling_probe sizes RUN_DIR           bytes of a rollout, of weights, snapshots, states
     python -m benchmarks.scaling_probe wakes NUM ...           time of the driver for each event, with so many actors
     python -m benchmarks.scaling_probe broadcast RUN_DIR NUM   time until so many actors have new weights
 
@@ -37,6 +37,8 @@ def sizes(directory: RunDirectory) -> dict[str, Any]:
         found = {
             "rollout": num_bytes(rollout),
             "weights": num_bytes(run.learner.weights()),
+            "snapshot": num_bytes(run.generator.snapshot()),
+            "opponents": num_bytes(run.generator.opponents.freeze(0)),
             "learner_state": num_bytes(run.learner.state()),
             "generator_state": num_bytes(run.generator.state()),
         }

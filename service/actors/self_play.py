@@ -18,9 +18,10 @@ from service.actors.rollout import Demonstrations, Rollout, Turns
 from service.config import Config
 from service.envs.batch import WorldBatch
 from service.envs.observations import ACTION, BOB, BOB_VALUE, FULL, POSITIONS, bob_observation
-from service.generator.generator import GoalChoice
 from service.generator.opponents import CURRENT, RoundPlan
 from service.generator.records import GoalRecords
+from service.generator.ring import Rows
+from service.generator.snapshot import GoalChoice
 from service.generator.validity import Verdict, classify_goal
 from service.types import Arrays, BoolArray, FloatArray, IntArray, Metrics, StateArray
 
@@ -35,7 +36,7 @@ class StochasticPolicy(Protocol):
 
 
 ChooseGoals = Callable[[StateArray, StateArray, IntArray, StateArray, VerdictArray], GoalChoice]
-"""Start state, start position, round index, proposal and verdict of a round to Bob's goals (``TaskGenerator``)."""
+"""Start state, start position, round index, proposal and verdict of a round to Bob's goals (``GeneratorSnapshot``)."""
 Observer = Callable[[StateArray], None]
 """Called with the (N, S) states at the start of a turn and after each of its steps; it must copy what it keeps."""
 
@@ -85,9 +86,14 @@ class SelfPlay:
         self.worlds.close()
 
     def start_over(self) -> None:
-        """End every game, as after a round that was given up half-way."""
+        """End every game: the next round begins new ones."""
         self.worlds.reset(self._rng)
         self._round_index[:] = 0
+
+    def game_starts(self) -> Rows:
+        """``start_state`` and ``start_position`` of the games that the next round begins."""
+        begins = self._round_index == 0
+        return {"start_state": self.worlds.states[begins], "start_position": self.worlds.object_position[begins]}
 
     def play_round(
         self, players: Players, plan: RoundPlan, choose_goals: ChooseGoals, *, observe: Observer | None = None

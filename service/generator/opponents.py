@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -19,9 +19,9 @@ class RoundPlan:
     """Players of a round of N worlds; at most one of the two players of a world is a past version."""
 
     alice_opponent: IntArray
-    """(N,) index of Alice in ``OpponentPool.alice``, or ``CURRENT``."""
+    """(N,) index of Alice in ``Opponents.alice``, or ``CURRENT``."""
     bob_opponent: IntArray
-    """(N,) index of Bob in ``OpponentPool.bob``, or ``CURRENT``."""
+    """(N,) index of Bob in ``Opponents.bob``, or ``CURRENT``."""
 
     @property
     def alice_past(self) -> BoolArray:
@@ -34,6 +34,47 @@ class RoundPlan:
         """(N,) a past Bob plays."""
         past: BoolArray = self.bob_opponent != CURRENT
         return past
+
+
+@dataclass(frozen=True, slots=True)
+class Opponents:
+    """Past versions of both players, as a rollout worker gets them; nobody writes to them."""
+
+    version: int
+    """Another one wherever the players are others."""
+    alice: tuple[Arrays, ...] = ()
+    """Alice's parameters by name, one dict a snapshot, oldest first."""
+    bob: tuple[Arrays, ...] = ()
+    """Bob's parameters by name, one dict a snapshot, oldest first."""
+
+    def plan(self, num_worlds: int, fraction: float, rng: np.random.Generator) -> RoundPlan:
+        """Choose which worlds meet a past Alice or Bob this round, and one snapshot of each; none while there are none.
+
+        Args:
+            num_worlds: N.
+            fraction: share of worlds, each way; where it is not a whole number of worlds it is met on average.
+            rng: source of the choice.
+        """
+        plan = RoundPlan(np.full(num_worlds, CURRENT), np.full(num_worlds, CURRENT))
+        if not self.alice or fraction == 0.0:
+            return plan
+        num_past = min(_round_at_random(fraction * num_worlds, rng), num_worlds // 2)
+        worlds = rng.permutation(num_worlds)
+        # One past version each a round: every further one would cost another batch of inference in every step.
+        plan.alice_opponent[worlds[:num_past]] = rng.integers(len(self.alice))
+        plan.bob_opponent[worlds[num_past : 2 * num_past]] = rng.integers(len(self.alice))
+        return plan
+
+    def state(self) -> Arrays:
+        """All parameters as ``SNAPSHOT/PLAYER/NAME``, and how many there are; the version is left out."""
+        return _flatten(self.alice, self.bob) | {"num": np.array(len(self.alice))}
+
+    @classmethod
+    def from_state(cls, version: int, state: Mapping[str, Array]) -> Opponents:
+        """The players that ``state`` gave, as another version."""
+        snapshots = split_parts({name: array for name, array in state.items() if name != "num"})
+        pairs = [split_parts(snapshots[str(index)]) for index in range(int(state["num"]))]
+        return cls(version, tuple(each["alice"] for each in pairs), tuple(each["bob"] for each in pairs))
 
 
 class OpponentPool:
@@ -58,32 +99,13 @@ class OpponentPool:
             pool.append({name: np.array(array) for name, array in parameters.items()})
             del pool[: -self._capacity]
 
-    def plan(self, num_worlds: int, fraction: float, rng: np.random.Generator) -> RoundPlan:
-        """Choose which worlds meet a past Alice or Bob this round, and one snapshot of each; none of an empty pool.
-
-        Args:
-            num_worlds: N.
-            fraction: share of worlds, each way; where it is not a whole number of worlds it is met on average.
-            rng: source of the choice.
-        """
-        plan = RoundPlan(np.full(num_worlds, CURRENT), np.full(num_worlds, CURRENT))
-        if not self.alice or fraction == 0.0:
-            return plan
-        num_past = min(_round_at_random(fraction * num_worlds, rng), num_worlds // 2)
-        worlds = rng.permutation(num_worlds)
-        # One past version each a round: every further one would cost another batch of inference in every step.
-        plan.alice_opponent[worlds[:num_past]] = rng.integers(len(self))
-        plan.bob_opponent[worlds[num_past : 2 * num_past]] = rng.integers(len(self))
-        return plan
+    def freeze(self, version: int) -> Opponents:
+        """The snapshots held now, for rollout workers."""
+        return Opponents(version, tuple(self.alice), tuple(self.bob))
 
     def state(self) -> Arrays:
         """All parameters, copied, as ``SNAPSHOT/PLAYER/NAME``."""
-        return {
-            f"{index}/{player}/{name}": array.copy()
-            for player, pool in (("alice", self.alice), ("bob", self.bob))
-            for index, parameters in enumerate(pool)
-            for name, array in parameters.items()
-        }
+        return {name: array.copy() for name, array in _flatten(self.alice, self.bob).items()}
 
     def load_state(self, state: Mapping[str, Array]) -> None:
         """Take over what ``state`` gave; a smaller pool keeps the newest."""
@@ -91,6 +113,15 @@ class OpponentPool:
         snapshots = split_parts(state)
         for index in sorted(snapshots, key=int):
             self.add(**split_parts(snapshots[index]))
+
+
+def _flatten(alice: Sequence[Arrays], bob: Sequence[Arrays]) -> Arrays:
+    return {
+        f"{index}/{player}/{name}": array
+        for player, pool in (("alice", alice), ("bob", bob))
+        for index, parameters in enumerate(pool)
+        for name, array in parameters.items()
+    }
 
 
 def _round_at_random(count: float, rng: np.random.Generator) -> int:

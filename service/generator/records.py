@@ -2,18 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from collections.abc import Mapping
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from service.generator.difficulty import HEIGHT_NAMES, height_bins, in_air
+from service.generator.bins import HEIGHT_NAMES, height_bins, in_air
 from service.generator.validity import Verdict
 from service.types import Array, BoolArray, IntArray, Metrics, StateArray
 
 GOALS_PER_ITERATION = 32
 """Number of valid proposals kept for the run directory per iteration, at most."""
+HEIGHT_STEP_M = 0.001
+NUM_HEIGHT_STEPS = 801
+"""Up to 0.8 m, the highest workspace there may be."""
+Sums = dict[str, tuple[int, float]]
+"""Number of cases and the sum over them, by metric: those of several rounds add up."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,12 +64,6 @@ class GoalRecords:
         return self.own & ~self.alice_past & ~self.bob_past
 
 
-def join_records(records: Sequence[GoalRecords]) -> GoalRecords:
-    """Join the records of several rounds into one of all their worlds."""
-    names = [field.name for field in fields(GoalRecords)]
-    return GoalRecords(**{name: np.concatenate([getattr(each, name) for each in records]) for name in names})
-
-
 def sampled_goals(records: GoalRecords) -> StateArray:
     """Valid proposals that the current Bob played, at most ``GOALS_PER_ITERATION``.
 
@@ -76,29 +75,28 @@ def sampled_goals(records: GoalRecords) -> StateArray:
     return np.concatenate([records.start_position[rows], records.goal[rows], solved], axis=1)
 
 
-def alice_metrics(records: GoalRecords, rest_height_m: float) -> Metrics:
-    """The current Alice's proposals; a mean over no cases is left out.
+def alice_sums(records: GoalRecords, rest_height_m: float) -> Sums:
+    """Metrics of the current Alice's proposals, as sums.
 
     Verdict fractions are over all her proposals; lifted, heights and distance over the valid ones. The distance leaves
     out worlds whose valid goal was replaced by a replayed one: their records hold the replayed goal's start.
     """
     verdict = records.verdict[~records.alice_past]
-    valid = (records.verdict == Verdict.VALID) & ~records.alice_past
+    valid = _valid(records)
     proposal = records.proposal[valid]
     from_own_start = valid & ~records.replayed
     distance = np.linalg.norm((records.proposal - records.start_position)[from_own_start], axis=-1)
-    metrics = {f"alice/{kind.name.lower()}_fraction": mean(verdict == kind) for kind in Verdict}
-    metrics["alice/lifted_fraction"] = mean(in_air(proposal, rest_height_m))
     bins = height_bins(proposal, rest_height_m)
-    metrics |= {f"alice/goal_height_{name}_fraction": mean(bins == index) for index, name in enumerate(HEIGHT_NAMES)}
-    metrics["alice/goal_distance_m"] = mean(distance)
-    metrics["alice/goal_height_m"] = mean(proposal[:, 2])
-    metrics["alice/goal_height_p90_m"] = float(np.percentile(proposal[:, 2], 90)) if len(proposal) else float("nan")
-    return without_nan(metrics)
+    cases: dict[str, Array] = {f"alice/{kind.name.lower()}_fraction": verdict == kind for kind in Verdict}
+    cases["alice/lifted_fraction"] = in_air(proposal, rest_height_m)
+    cases |= {f"alice/goal_height_{name}_fraction": bins == index for index, name in enumerate(HEIGHT_NAMES)}
+    cases["alice/goal_distance_m"] = distance
+    cases["alice/goal_height_m"] = proposal[:, 2]
+    return sum_up(cases)
 
 
-def bob_metrics(records: GoalRecords, rest_height_m: float) -> Metrics:
-    """The current Bob's success by kind of goal; a mean over no cases is left out.
+def bob_sums(records: GoalRecords, rest_height_m: float) -> Sums:
+    """Metrics of the current Bob's success by kind of goal, as sums.
 
     No suffix, table and air: the current Alice's valid goals. ``past_alice`` and ``replayed`` stand apart.
     """
@@ -112,16 +110,35 @@ def bob_metrics(records: GoalRecords, rest_height_m: float) -> Metrics:
         "_from_reset": records.played & records.from_reset & ~records.bob_past,
         "_replayed": records.played & records.replayed & ~records.bob_past,
     }
-    metrics = {f"bob/success_rate{suffix}": mean(records.solved[goals]) for suffix, goals in kinds.items()}
-    metrics["bob/steps_to_success"] = mean(records.num_bob_steps[current & records.solved])
-    return without_nan(metrics)
+    cases: dict[str, Array] = {f"bob/success_rate{suffix}": records.solved[goals] for suffix, goals in kinds.items()}
+    cases["bob/steps_to_success"] = records.num_bob_steps[current & records.solved]
+    return sum_up(cases)
 
 
-def mean(values: Array) -> float:
-    """Mean of (M,) values; not-a-number of none, without NumPy's warning."""
-    return float(values.mean()) if len(values) else float("nan")
+def sum_up(cases: Mapping[str, Array]) -> Sums:
+    """Number and sum of the (M,) cases of each metric."""
+    return {name: (len(values), float(values.sum())) for name, values in cases.items()}
 
 
-def without_nan(metrics: Metrics) -> Metrics:
-    """Metrics that have a value."""
-    return {name: value for name, value in metrics.items() if not np.isnan(value)}
+def means(sums: Sums) -> Metrics:
+    """Means of metrics; one over no cases is left out."""
+    return {name: total / num for name, (num, total) in sums.items() if num}
+
+
+def count_heights(records: GoalRecords) -> IntArray:
+    """(H,) how many valid proposals of the current Alice there are in each ``HEIGHT_STEP_M`` above the table."""
+    steps = np.floor(records.proposal[_valid(records), 2] / HEIGHT_STEP_M).astype(np.int64)
+    return np.bincount(np.clip(steps, 0, NUM_HEIGHT_STEPS - 1), minlength=NUM_HEIGHT_STEPS)
+
+
+def height_percentile(heights: IntArray, percent: float) -> float:
+    """The height up to which so many per cent of ``count_heights`` lie, metres; not-a-number while there are none."""
+    counted = np.cumsum(heights)
+    if not counted[-1]:
+        return float("nan")
+    return float(np.searchsorted(counted, counted[-1] * percent / 100.0) + 0.5) * HEIGHT_STEP_M
+
+
+def _valid(records: GoalRecords) -> BoolArray:
+    valid: BoolArray = (records.verdict == Verdict.VALID) & ~records.alice_past
+    return valid

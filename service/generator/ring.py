@@ -2,13 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
 from service.config import ConfigError
 from service.generator.state import take
 from service.types import Array, Arrays, IntArray, StateArray
+
+Rows = dict[str, StateArray]
+"""Named columns of equally many rows."""
+
+
+def join_rows(parts: Sequence[Rows]) -> Rows:
+    """All rows of several parts with the same columns, in their order."""
+    return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
 
 
 class Ring:
@@ -29,10 +37,10 @@ class Ring:
         """Number of rows held."""
         return int(self._num_held.sum())
 
-    def __getitem__(self, column: str) -> StateArray:
-        """(len, size) rows held, in the order of ``part_share``; a copy."""
-        rows: StateArray = self._columns[column][self._held]
-        return rows
+    def rows(self) -> Rows:
+        """(len, size) rows held of each column, in the order of ``part_share``; copies."""
+        held = self._held
+        return {name: column[held] for name, column in self._columns.items()}
 
     def add(self, part: IntArray | None = None, **rows: StateArray) -> None:
         """Add M rows to every column; the oldest of their part are overwritten.
@@ -56,11 +64,6 @@ class Ring:
             self._columns[name][where[newest]] = new[order[newest]]
         self._num_added += counted
 
-    def sample(self, rng: np.random.Generator, num: int) -> dict[str, StateArray]:
-        """Draw ``num`` whole rows with replacement, all alike, as copies; something must have been added."""
-        rows = self._held[rng.choice(len(self), size=num)]
-        return {name: column[rows] for name, column in self._columns.items()}
-
     def part_share(self) -> StateArray:
         """(len,) weights that make all parts equally likely: one over the rows held of each row's part."""
         num = self._num_held
@@ -69,7 +72,7 @@ class Ring:
 
     def state(self) -> Arrays:
         """Everything held, copied; rows never written are left out."""
-        state: Arrays = {name: self[name] for name in self._columns}
+        state: Arrays = dict(self.rows())
         state["num_added"] = self._num_added.copy()
         return state
 

@@ -18,9 +18,11 @@ from service.actors.self_play import Players, SelfPlay, StochasticPolicy
 from service.config import Config, WorldConfig
 from service.envs.batch import WorldBatch
 from service.envs.sampling import GoalKind
-from service.generator.difficulty import in_air
+from service.generator.bins import in_air
 from service.generator.generator import TaskGenerator
+from service.generator.opponents import Opponents
 from service.generator.records import GoalRecords
+from service.generator.snapshot import GeneratorSnapshot
 from service.generator.validity import Verdict
 from service.types import BoolArray, FloatArray, StateArray
 
@@ -76,10 +78,10 @@ def record_rounds(
     players = Players(version=0, alice=alice, bob=_WithoutNoise(bob))
     rounds: list[tuple[_Interest, RecordedRound]] = []
     with contextlib.closing(SelfPlay(config, rng, num_threads=config.run.num_threads)) as self_play:
-        # It is never told of a goal, so it replays none: Bob plays those of this round's Alice.
-        generator = TaskGenerator(config, self_play.worlds.layout)
+        # It was never told of a goal, so it replays none: Bob plays those of this round's Alice.
+        snapshot = TaskGenerator(config, self_play.worlds.layout).snapshot()
         for _ in range(_MAX_ROLLOUTS):
-            records, recorded = _record(self_play, players, generator, rng)
+            records, recorded = _record(self_play, players, snapshot, rng)
             rounds += zip(_interest(records, config.world.object_size_m / 2), recorded, strict=True)
             if sum(played for (played, *_), _ in rounds) >= num_rounds:
                 break
@@ -130,11 +132,11 @@ class _WithoutNoise:
 
 
 def _record(
-    self_play: SelfPlay, players: Players, generator: TaskGenerator, rng: np.random.Generator
+    self_play: SelfPlay, players: Players, snapshot: GeneratorSnapshot, rng: np.random.Generator
 ) -> tuple[GoalRecords, list[RecordedRound]]:
     """Play a round in every world and take each world's states and actions out of it."""
-    plan = generator.plan(self_play.worlds.num_worlds, rng)
-    choose_goals = partial(generator.choose_goals, plan, rng=rng)
+    plan = Opponents(0).plan(self_play.worlds.num_worlds, 0.0, rng)  # there are none
+    choose_goals = partial(snapshot.choose_goals, plan, rng=rng)
     states: list[StateArray] = []
     rollout = self_play.play_round(players, plan, choose_goals, observe=lambda now: states.append(now.copy()))
     records, alice_steps = rollout.records, int(rollout.alice.active.any(axis=1).sum())

@@ -10,11 +10,9 @@ from statistics import median
 from typing import Any
 
 import ray
-from ray.exceptions import RayError
 
 from service.config import Config
 from service.runtime.ray_actors import Location, RolloutActor
-from service.runtime.remote_worker import ANSWER_S
 from service.runtime.workers import RoundSummary
 from service.store.models import ActorStatus
 
@@ -43,9 +41,6 @@ class ActorSlot:
     last_error: str | None = None
     location: Location | None = None
     """None until it has started."""
-    rng: Any = None
-    """Reference to its random numbers as they are after its last round."""
-    pool_version: int = -1
     ticket: int | None = None
     """Rollout slot of the round it plays."""
     round_started: float = 0.0
@@ -61,33 +56,21 @@ class ActorSlot:
         """Whether it has started and plays no round."""
         return self.alive and self.ticket is None
 
-    def join(self, location: Location, rng: Any) -> None:
+    def join(self, location: Location) -> None:
         """Note that it has started."""
-        self.location, self.rng = location, rng
+        self.location = location
         self.heartbeat = datetime.now(UTC)
 
     def start_round(self, ticket: int) -> None:
         """Note that it was given a round."""
         self.ticket, self.round_started = ticket, time.monotonic()
 
-    def finish_round(self, summary: RoundSummary, rng: Any) -> None:
+    def finish_round(self, summary: RoundSummary) -> None:
         """Note that it has played its round."""
-        self.ticket, self.rng, self.pool_version = None, rng, summary.pool_version
+        self.ticket = None
         self.num_rollouts += 1
         self.num_env_steps += summary.num_env_steps
         self.heartbeat = datetime.now(UTC)
-
-    def abandon_round(self) -> None:
-        """Note that its round came to nothing, through no fault of its own."""
-        self.ticket = None
-
-    def answers(self) -> bool:
-        """Whether it is alive. Only to be asked while it has no round."""
-        try:
-            ray.get(self.handle.ping.remote(), timeout=ANSWER_S)
-        except RayError:
-            return False
-        return True
 
     def status(self) -> ActorStatus:
         """The slot's state for the status service."""

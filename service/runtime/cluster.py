@@ -3,9 +3,13 @@
 | process | consumes | produces | waits for | bounded by |
 |---|---|---|---|---|
 | driver, ``ClusterRun`` | results of the others | calls, records, checkpoints | next result, ``POLL_S`` at most | - |
-| rollout actors x N | weights, an assignment | a rollout, goal records | goals, once a round | ``RolloutSlots`` |
+| rollout actors x N | weights, snapshot, opponents | a rollout, a goal summary | nothing | ``RolloutSlots`` |
 | learner, R ranks | shares of an iteration's rollouts | weights, states, metrics | each other | ``RANK_ANSWER_S`` |
-| task generator | goal records, requests for goals | assignments, goals, its state | nothing | one record at a time |
+| task generator | goal summaries of one iteration | snapshot, opponents, its state | nothing | one record at a time |
+
+The weights of an iteration and the task generator's snapshot come out together, and a round is given the newest of
+both. No worker calls another, but for the learner's ranks among themselves: one that dies or freezes holds back
+iterations, and no round.
 
 The driver holds references, not data. Learner and generator hand back their whole state with every iteration, so when
 one dies, another goes on from there with the rollouts in hand: what an actor handed over is neither lost nor counted
@@ -15,6 +19,7 @@ twice. A rank of the learner that dies or hangs ends all of them, and as many ot
 from __future__ import annotations
 
 import logging
+import math
 import time
 from collections import Counter
 from collections.abc import Callable
@@ -24,7 +29,7 @@ from typing import Any
 
 import numpy as np
 import ray
-from ray.exceptions import ObjectLostError, RayActorError, RayError, RayTaskError
+from ray.exceptions import ObjectLostError, RayError, RayTaskError
 
 from service.actors.evaluation import EVALUATED_GOALS
 from service.actors.rollout import from_arrays
@@ -33,11 +38,11 @@ from service.errors import DivergedError, GroupError
 from service.io.run_directory import RunDirectory
 from service.policies.parameters import Parameters, PolicyError
 from service.runtime.actor_pool import QUIET, THREAD_VARIABLES, ActorPool, ActorSlot
-from service.runtime.learner_group import LearnerGroup, Update, check_room
-from service.runtime.ray_actors import GeneratorActor, GeneratorGoneError, LearnerActor
+from service.runtime.learner_group import LearnerGroup, Update, check_room, num_gpus
+from service.runtime.ray_actors import GeneratorActor, LearnerActor
 from service.runtime.ray_connection import ClusterOptions
 from service.runtime.remote_worker import RemoteWorker, one_line
-from service.runtime.runner import ClusterError, Health, IterationResult, OnBeat, Runner
+from service.runtime.runner import ClusterError, Health, IterationResult, OnBeat, Runner, StateLostError
 from service.runtime.slots import RolloutSlots
 from service.runtime.workers import GeneratorResult, RoundSummary, UpdateResult
 from service.store.models import GoalGrid
@@ -51,6 +56,8 @@ BEAT_S = 1.0
 """Time between two heartbeats of the run."""
 RESIZE_S = 5.0
 """Time between two looks at the size of the cluster."""
+GENERATOR_DEADLINE_S = 60.0
+"""A task generator that takes longer for an iteration, a matter of milliseconds, hangs."""
 MAX_ATTEMPTS = 3
 """Learners or generators in a row that may die of the same iteration."""
 MAX_FAILED_ROUNDS = 20
@@ -64,8 +71,8 @@ class PendingRollout:
     ticket: int
     rollout: Any
     """Reference to it."""
-    records: Any
-    """Reference to its goal records."""
+    goals: Any
+    """Reference to the summary of its goals."""
     weights: Any
     """Reference to the weights it was played with."""
     summary: RoundSummary
@@ -78,12 +85,18 @@ class Iteration:
     """One iteration on its way through the learner and the task generator, which work on it side by side."""
 
     batch: list[PendingRollout]
+    asked_generator: float = 0.0
+    """``time.monotonic()`` of the last request; infinity once its answer is no longer waited for."""
     num_attempts: Counter[str] = field(default_factory=Counter)
     """Failed attempts, by worker."""
     update: Update | None = None
     """The learner's part, as it was asked for last."""
+    snapshot: Any = None
+    """Reference to what the generator knows after it."""
+    opponents: Any = None
+    """Reference to the past players after it; of nothing where they are those before it."""
     generator_state: Any = None
-    """Reference to the task generator's state after it."""
+    """Reference to the generator's state after it."""
     updated: UpdateResult | None = None
     recorded: GeneratorResult | None = None
     grid: GoalGrid | None = None
@@ -141,7 +154,8 @@ class ClusterRun(Runner):
         self._learner.wait_ready()
         self._generator.wait_ready()
         self._weights = self._learner.begin()
-        self._generator.state = self._generator.handle.begin.remote()
+        begun = self._generator.handle.begin.options(num_returns=3).remote()
+        self._generator.state, self._snapshot, self._opponents = begun
         self._version: int = ray.get(self._weights).version
         self._pool = self._start_actors(first_incarnation)
         self._open_directory(resume=resume)
@@ -182,6 +196,7 @@ class ClusterRun(Runner):
                 self._waiting.pop(reference)(reference)
         self._check_learner()
         self._check_actors()
+        self._check_generator()
         if time.monotonic() - self._last_beat >= BEAT_S:
             self._last_beat = time.monotonic()
             on_beat()
@@ -196,17 +211,14 @@ class ClusterRun(Runner):
 
     def _start_round(self, slot: ActorSlot) -> None:
         ticket = self._slots.begin(self._version)
-        generator = self._generator.handle
-        assignment = generator.assign.remote(self._pool.num_worlds, slot.rng, slot.pool_version)
-        play = slot.handle.play_round.options(num_returns=4)
-        rollout, records, rng, summary = play.remote(self._weights, assignment, generator)
+        play = slot.handle.play_round.options(num_returns=3)
+        num_rounds = self._pool.num_counted_on
+        rollout, goals, summary = play.remote(self._weights, self._snapshot, self._opponents, num_rounds)
         slot.start_round(ticket)
-        pending = partial(PendingRollout, ticket, rollout, records, self._weights)
-        self._waiting[summary] = partial(self._on_round, slot, ticket, pending, rng)
+        pending = partial(PendingRollout, ticket, rollout, goals, self._weights)
+        self._waiting[summary] = partial(self._on_round, slot, ticket, pending)
 
-    def _on_round(
-        self, slot: ActorSlot, ticket: int, pending: Callable[..., PendingRollout], rng: Any, reference: Any
-    ) -> None:
+    def _on_round(self, slot: ActorSlot, ticket: int, pending: Callable[..., PendingRollout], reference: Any) -> None:
         if not self._pool.holds(slot):
             return  # it was replaced meanwhile, and its ticket given back
         try:
@@ -215,16 +227,21 @@ class ClusterRun(Runner):
             self._on_failed_round(slot, ticket, error)
             return
         self._num_failed_rounds = 0
-        slot.finish_round(summary, rng)
+        slot.finish_round(summary)
         self._pool.record_duration(summary.play_s)
         self._slots.finish(ticket)
         self._pending.append(pending(summary, time.monotonic() - slot.round_started - summary.play_s))
         self.directory.dump_diverged("-".join(map(str, summary.id)), summary.diverged)
 
     def _on_failed_round(self, slot: ActorSlot, ticket: int, error: Exception) -> None:
-        """Replace the worker that failed: the actor, or the generator it waited for."""
+        """Replace the actor, unless the run as a whole cannot go on."""
         if isinstance(error, (DivergedError, PolicyError)):
             raise error
+        if _lost(error):
+            raise StateLostError(
+                f"weights or goals were lost with the machine that kept them ({one_line(error)}); the run goes back to "
+                "its newest checkpoint"
+            ) from None
         self._slots.lose(ticket)
         self._num_failed_rounds += 1
         reason = one_line(error)
@@ -232,13 +249,7 @@ class ClusterRun(Runner):
             raise ClusterError(
                 f"{self._num_failed_rounds} rounds in a row failed, the last one with: {reason}"
             ) from error
-        if self._current is None and not self._generator.alive:  # else its iteration notices
-            self._generator.restart(reason)
-        # What the generator was to give an actor fails as that actor's round, too.
-        if isinstance(error, GeneratorGoneError) or (isinstance(error, RayActorError) and slot.answers()):
-            slot.abandon_round()
-        else:
-            self._replace(slot, reason)
+        self._replace(slot, reason)
 
     def _replace(self, slot: ActorSlot, reason: str) -> None:
         _logger.warning("rollout actor %d is gone (%s); another takes its place", slot.index, reason)
@@ -247,14 +258,13 @@ class ClusterRun(Runner):
 
     def _await_start(self, slot: ActorSlot) -> None:
         self._next_incarnation = max(self._next_incarnation, slot.incarnation + 1)
-        location, rng = slot.handle.ping.options(num_returns=2).remote()
-        self._waiting[location] = partial(self._on_start, slot, rng)
+        self._waiting[slot.handle.ping.remote()] = partial(self._on_start, slot)
 
-    def _on_start(self, slot: ActorSlot, rng: Any, reference: Any) -> None:
+    def _on_start(self, slot: ActorSlot, reference: Any) -> None:
         if not self._pool.holds(slot):
             return
         try:
-            slot.join(ray.get(reference), rng)
+            slot.join(ray.get(reference))
         except RayError as error:
             self._num_failed_rounds += 1
             if self._num_failed_rounds > MAX_FAILED_ROUNDS:
@@ -281,10 +291,12 @@ class ClusterRun(Runner):
 
     def _ask_generator(self, iteration: Iteration) -> None:
         num_env_steps = self.num_env_steps + iteration.num_env_steps
-        records = [each.records for each in iteration.batch]
-        record = self._generator.handle.record_from.options(num_returns=2)
+        goals = [each.goals for each in iteration.batch]
+        record = self._generator.handle.record_from.options(num_returns=4)
         weights = iteration.batch[0].weights  # the players of this iteration may become past opponents
-        recorded, iteration.generator_state = record.remote(self.iteration, num_env_steps, weights, records)
+        recorded, *others = record.remote(self.iteration, num_env_steps, weights, goals)
+        iteration.generator_state, iteration.snapshot, iteration.opponents = others
+        iteration.asked_generator = time.monotonic()
         self._waiting[recorded] = partial(self._on_recorded, iteration)
 
     def _on_learned(self, iteration: Iteration, update: Update, rank: int, reference: Any) -> None:
@@ -322,7 +334,7 @@ class ClusterRun(Runner):
 
     def _on_failed_answer(self, iteration: Iteration, worker: RemoteWorker | LearnerGroup, error: Exception) -> None:
         """Start another learner or generator from the state before the iteration, and ask it what is left of that."""
-        lost = isinstance(error, RayTaskError) and isinstance(error.cause, ObjectLostError)
+        lost = _lost(error)
         reason = one_line(error) if lost else worker.explain(error)
         if lost:
             self._drop_lost(iteration)
@@ -349,7 +361,7 @@ class ClusterRun(Runner):
         """Forget rollouts that were lost with the node that held them."""
         for each in list(iteration.batch):
             try:
-                ray.get([each.rollout, each.records])
+                ray.get([each.rollout, each.goals])
             except RayError as error:
                 _logger.warning("rollout %s is lost (%s)", each.summary.id, one_line(error))
                 iteration.batch.remove(each)
@@ -366,6 +378,9 @@ class ClusterRun(Runner):
         now = time.monotonic()
         elapsed_s, self._last_iteration = now - self._last_iteration, now
         self._weights, self._version = update.weights, updated.version
+        self._snapshot = iteration.snapshot
+        if recorded.new_opponents:
+            self._opponents = iteration.opponents
         self._learner.keep(update)
         self._generator.state = iteration.generator_state
         self._slots.publish([each.ticket for each in iteration.batch])
@@ -413,6 +428,16 @@ class ClusterRun(Runner):
             for slot in self._pool.resize(self._num_actors()):
                 self._await_start(slot)
 
+    def _check_generator(self) -> None:
+        """End a task generator that hangs: then its answer fails, and another takes its place."""
+        iteration = self._current
+        if iteration is None or iteration.recorded is not None:
+            return
+        if time.monotonic() - iteration.asked_generator > GENERATOR_DEADLINE_S:
+            iteration.asked_generator = math.inf
+            _logger.warning("the generator has not answered for %.0f s", GENERATOR_DEADLINE_S)
+            self._generator.close()
+
     def _num_actors(self) -> int:
         if self._options.num_actors is not None:
             return self._options.num_actors
@@ -454,8 +479,6 @@ class ClusterRun(Runner):
         return RemoteWorker("generator", actor, self.config, state)
 
 
-def num_gpus(device: str, num_learners: int = 1) -> int:
-    """GPUs that each rank of the learner asks Ray for; an actor that asks for none sees none."""
-    if device == "auto":
-        return int(ray.cluster_resources().get("GPU", 0.0) >= num_learners)
-    return int(device == "cuda")
+def _lost(error: Exception) -> bool:
+    """Whether a call failed because an argument of it was lost with a node."""
+    return isinstance(error, RayTaskError) and isinstance(error.cause, ObjectLostError)

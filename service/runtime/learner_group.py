@@ -240,17 +240,24 @@ def check_room(num_learners: int, device: str, cpus: float, actor_threads: int) 
         ClusterError: it has too few cores or GPUs; only asked of several ranks.
     """
     there = ray.cluster_resources()
-    num_cores, num_gpus = there.get("CPU", 0.0), there.get("GPU", 0.0)
-    if num_learners > 1 and num_learners * cpus + actor_threads > num_cores:
+    cores, gpus = there.get("CPU", 0.0), there.get("GPU", 0.0)
+    if num_learners > 1 and num_learners * cpus + actor_threads > cores:
         raise ClusterError(
             f"learner.num_learners = {num_learners}: with {cpus:g} cores for each rank and {actor_threads} for an "
-            f"actor, the cluster has too few, {num_cores:g}: add nodes first, or use fewer ranks"
+            f"actor, the cluster has too few, {cores:g}: add nodes first, or use fewer ranks"
         )
-    if num_learners > 1 and device == "cuda" and num_learners > num_gpus:
+    if num_learners > 1 and device == "cuda" and num_learners > gpus:
         raise ClusterError(
             f"learner.num_learners = {num_learners}: with learner.device=cuda each rank takes a GPU, and the cluster "
-            f"has {num_gpus:g}: use as many ranks as GPUs, or learner.device=cpu"
+            f"has {gpus:g}: use as many ranks as GPUs, or learner.device=cpu"
         )
+
+
+def num_gpus(device: str, num_learners: int = 1) -> int:
+    """GPUs that each rank of the learner asks Ray for; an actor that asks for none sees none."""
+    if device == "auto":
+        return int(ray.cluster_resources().get("GPU", 0.0) >= num_learners)
+    return int(device == "cuda")
 
 
 def _is_dead(ping: Any) -> bool:

@@ -10,11 +10,11 @@ import os
 import time
 from concurrent.futures import ThreadPoolExecutor
 from datetime import UTC, datetime
-from typing import TYPE_CHECKING
 
 from service.actors.evaluation import EVALUATED_GOALS
 from service.actors.rollout import Rollout, from_arrays, to_arrays
 from service.config import Config, ConfigError
+from service.generator.opponents import Opponents
 from service.io.run_directory import RunDirectory
 from service.policies.parameters import Parameters
 from service.runtime.runner import Health, IterationResult, OnBeat, Runner
@@ -22,8 +22,8 @@ from service.runtime.workers import GeneratorWorker, LearnerWorker, RolloutWorke
 from service.store.models import ActorStatus, GoalGrid
 from service.types import Metrics
 
-if TYPE_CHECKING:
-    pass
+OLDER_OPPONENTS = -1
+"""Version of past players that a checkpoint has beside the task generator's, which have joined meanwhile."""
 
 
 def check_one_learner(config: Config) -> None:
@@ -62,6 +62,7 @@ class LocalRun(Runner):
         self._actor = RolloutWorker(config, num_threads=config.run.num_threads)
         self._generator = GeneratorWorker(config)
         self.learner, self.game, self.generator = self._learner.learner, self._actor.game, self._generator.generator
+        self._snapshot, self._opponents = self.generator.snapshot(), self._generator.opponents()
         self._executor = ThreadPoolExecutor(max_workers=1, thread_name_prefix="learner")
         if resume:
             self._load()
@@ -107,14 +108,14 @@ class LocalRun(Runner):
     def _iterate(self) -> tuple[IterationResult, Metrics]:
         """Consume the pending rollout and produce the next one; waits for play and learning both."""
         with self.timing("weights"):
-            weights = self.learner.weights()
+            weights, snapshot, opponents = self.learner.weights(), self._snapshot, self._opponents
+            # For the next round, and as old as its weights will be.
+            self._snapshot, self._opponents = self.generator.snapshot(), self._generator.opponents()
         learning = self._executor.submit(self._learner.update, [self._pending]) if self._pending is not None else None
         with self.timing("play"):
-            num_worlds = self.config.game.num_worlds
-            assignment = self._generator.assign(num_worlds, self._actor.rng, self._actor.pool_version)
-            rollout, summary = self._actor.play(weights, assignment, self._generator.choose_goals)
+            rollout, goals, summary = self._actor.play(weights, snapshot, opponents)
         with self.timing("generator"):
-            recorded = self._generator.record(self.iteration, weights, [rollout.records])
+            recorded = self._generator.record(self.iteration, weights, [goals])
             self.directory.dump_diverged(f"{rollout.sequence:06d}", rollout.diverged)
         with self.timing("wait for learner"):
             updated = learning.result() if learning is not None else None
@@ -134,10 +135,13 @@ class LocalRun(Runner):
             parts = {
                 "learner": self.learner.state(),
                 "generator": self.generator.state(),
+                "snapshot": self._snapshot.state(),
                 "game": self.game.state(),
                 "alice": weights.alice,  # for readers without torch: evaluate, render, coverage
                 "bob": weights.bob_ema,
             }
+            if self._opponents.version != self._generator.opponents().version:
+                parts["opponents"] = self._opponents.state()
             if self._pending is not None:
                 parts["pending"] = to_arrays(self._pending)
             meta = {"rng": self._actor.rng.bit_generator.state, "next_incarnation": self._incarnation + 1}
@@ -147,6 +151,11 @@ class LocalRun(Runner):
         parts, meta = self.bookkeeper.resume()
         self.learner.load_state(parts["learner"])
         self.generator.load_state(parts["generator"])
+        self._snapshot, self._opponents = self.generator.snapshot(), self._generator.opponents()
+        if "snapshot" in parts:  # a cluster's checkpoint has none
+            self._snapshot = self._snapshot.with_state(parts["snapshot"])
+        if "opponents" in parts:
+            self._opponents = Opponents.from_state(OLDER_OPPONENTS, parts["opponents"])
         next_incarnation = int(meta.get("next_incarnation", 1))
         # The same actor goes on. A cluster's are no part of a checkpoint: after them another begins.
         self._incarnation = next_incarnation - 1 if "game" in parts else next_incarnation

@@ -13,17 +13,16 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
 import ray
 from ray.util.metrics import Counter, Histogram
 
 from service.actors.rollout import Rollout
 from service.config import Config
 from service.errors import GroupError
-from service.generator.generator import GoalChoice
-from service.generator.records import GoalRecords
+from service.generator.opponents import Opponents
+from service.generator.snapshot import GeneratorSnapshot
+from service.generator.summary import GoalSummary
 from service.runtime.workers import (
-    Assignment,
     GeneratorResult,
     GeneratorWorker,
     LearnerWorker,
@@ -38,14 +37,8 @@ if TYPE_CHECKING:
     from service.learner.group import Group
     from service.learner.weights import Weights
 
-GENERATOR_TIMEOUT_S = 30.0
-"""The task generator answers within milliseconds, if it is there."""
 NICENESS = 10
 """Of workers that compute, above that of processes that answer: a tenth of the share of a core that both want."""
-
-
-class GeneratorGoneError(RuntimeError):
-    """The task generator did not answer in the middle of a round; the round is given up."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,51 +64,24 @@ def lower_priority() -> None:
 
 
 class RolloutActor(RolloutWorker):
-    """A rollout worker whose task generator is in another process."""
+    """A rollout worker in a process of its own."""
 
     def __init__(self, config: Config, actor: int, incarnation: int, num_threads: int) -> None:
         lower_priority()
         super().__init__(config, actor, incarnation, num_threads=num_threads)
         self._count = _round_counters(actor)
 
-    def ping(self) -> tuple[Location, np.random.Generator]:
-        """The worker's location and random numbers; the first assignment advances them."""
-        return Location.here(), self.rng
+    def ping(self) -> Location:
+        """The worker's location."""
+        return Location.here()
 
     def play_round(
-        self, weights: Weights, assignment: Assignment, generator: Any
-    ) -> tuple[Rollout, GoalRecords, np.random.Generator, RoundSummary]:
-        """Play a round in every world; see ``RolloutWorker.play``.
-
-        Args:
-            weights: the policy version to act with.
-            assignment: from the task generator, made with this worker's random numbers.
-            generator: handle of the task generator.
-
-        Returns:
-            The rollout, its records again for the generator, this worker's random numbers, and the round's numbers.
-
-        Raises:
-            GeneratorGoneError: the generator died meanwhile; the next round starts from resets.
-            DivergedError: a policy no longer acts in finite numbers.
-        """
-
-        def choose_goals(*arguments: Any) -> tuple[GoalChoice, np.random.Generator]:
-            asked = generator.choose_goals.remote(*arguments)
-            try:
-                choice, rng = ray.get(asked, timeout=GENERATOR_TIMEOUT_S)
-            except (ray.exceptions.RayActorError, ray.exceptions.GetTimeoutError) as error:
-                # A RayActorError of the generator must not be taken for the end of this worker.
-                raise GeneratorGoneError(f"the task generator did not answer: {type(error).__name__}") from None
-            return choice, rng
-
-        try:
-            rollout, summary = self.play(weights, assignment, choose_goals)
-        except GeneratorGoneError:
-            self.game.start_over()
-            raise
-        self._count(summary)
-        return rollout, rollout.records, self.rng, summary
+        self, weights: Weights, snapshot: GeneratorSnapshot, opponents: Opponents, num_rounds: int
+    ) -> tuple[Rollout, GoalSummary, RoundSummary]:
+        """Play a round in every world; see ``RolloutWorker.play``."""
+        played = self.play(weights, snapshot, opponents, num_rounds)
+        self._count(played[-1])
+        return played
 
 
 class GeneratorActor(GeneratorWorker):
@@ -125,20 +91,23 @@ class GeneratorActor(GeneratorWorker):
         """The worker's location."""
         return Location.here()
 
-    def begin(self) -> Arrays:
-        """The generator's state before the first iteration."""
-        return self.generator.state()
+    def begin(self) -> tuple[Arrays, GeneratorSnapshot, Opponents]:
+        """State, snapshot and past players before the first iteration."""
+        return self.generator.state(), self.generator.snapshot(), self.opponents()
 
     def record_from(
         self, iteration: int, num_env_steps: int, weights: Weights, references: Sequence[Any]
-    ) -> tuple[tuple[GeneratorResult, GoalGrid], Arrays]:
+    ) -> tuple[tuple[GeneratorResult, GoalGrid], Arrays, GeneratorSnapshot, Opponents | None]:
         """Learn from an iteration's goals, given as object references; see ``GeneratorWorker.record``.
 
         Returns:
-            The result with the goal grid after it, and the generator's whole state.
+            The result with the goal grid after it, the generator's whole state, a snapshot for the next rounds, and
+            the past players if there are others than before.
         """
         result = self.record(iteration, weights, ray.get(list(references)))
-        return (result, self.grid(iteration + 1, num_env_steps)), self.generator.state()
+        opponents = self.opponents() if result.new_opponents else None
+        grid = self.grid(iteration + 1, num_env_steps)
+        return (result, grid), self.generator.state(), self.generator.snapshot(), opponents
 
 
 class LearnerActor:

@@ -215,5 +215,4 @@ def _round_metrics(rounds: Sequence[RoundSummary]) -> Metrics:
     return means | {
         "world/num_broken": float(sum(each.num_diverged for each in rounds)),
         "time/play_s": float(np.mean([each.play_s for each in rounds])),
-        "time/wait_for_generator_s": float(np.mean([each.generator_s for each in rounds])),
     }

@@ -7,8 +7,9 @@ cluster. Arrays that come through Ray's object store are read-only and are never
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -20,36 +21,20 @@ from service.actors.self_play import Players, SelfPlay, StochasticPolicy
 from service.config import Config
 from service.envs.sampling import GoalKind
 from service.envs.scene import build_layout
-from service.generator.generator import GoalChoice, TaskGenerator
-from service.generator.opponents import OpponentPool, RoundPlan
-from service.generator.records import GoalRecords, join_records, sampled_goals
+from service.generator.bins import GoalCells, TaskBins
+from service.generator.generator import NUM_STARTS, TaskGenerator
+from service.generator.opponents import Opponents
+from service.generator.snapshot import GeneratorSnapshot
+from service.generator.summary import GoalSummary, join_summaries, summarize
 from service.policies.numpy_policy import NumpyGaussianPolicy, numpy_bob
 from service.store.models import GoalCell, GoalGrid
-from service.types import Arrays, IntArray, Metrics, StateArray
+from service.types import Arrays, Metrics
 
 if TYPE_CHECKING:
     from service.learner.group import Group
     from service.learner.weights import Weights
 
 RolloutId = tuple[int, int, int]
-
-
-@dataclass(frozen=True, slots=True)
-class Assignment:
-    """The opponents and the random numbers of a round."""
-
-    plan: RoundPlan
-    rng: np.random.Generator
-    """The actor's, advanced by the plan."""
-    pool_version: int
-    pool: OpponentPool | None
-    """Past opponents; None where the actor has this version of them."""
-
-
-Proposals = tuple[StateArray, StateArray, IntArray, StateArray, NDArray[np.int8]]
-"""The arguments of ``TaskGenerator.choose_goals`` between the plan and the random numbers."""
-ChooseGoals = Callable[[RoundPlan, Proposals, np.random.Generator], tuple[GoalChoice, np.random.Generator]]
-"""``GeneratorWorker.choose_goals``, or a call of it in another process."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,9 +49,6 @@ class RoundSummary:
     diverged: Diverged
     """Those of this round."""
     play_s: float
-    generator_s: float
-    """Part of ``play_s``: waiting for the task generator."""
-    pool_version: int
     metrics: Metrics
 
 
@@ -78,6 +60,8 @@ class GeneratorResult:
     should_stop: bool
     goals: NDArray[np.float64]
     """(M, 7) some of them for the run directory: start x y z, goal x y z (metres), solved 0/1."""
+    new_opponents: bool
+    """This iteration's players joined the past ones."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,7 +80,8 @@ class UpdateResult:
 class RolloutWorker:
     """Plays rounds on its own worlds.
 
-    Consumes weights and an assignment, produces a rollout; asks for Bob's goals once a round, between the turns.
+    Consumes weights, a snapshot of the task generator and past opponents, produces a rollout and a summary of its
+    goals; waits for nothing.
 
     Args:
         config: the run; ``game.num_worlds`` are this worker's.
@@ -110,58 +95,61 @@ class RolloutWorker:
         source = config.seed if (actor, incarnation) == (0, 0) else [config.seed, actor, incarnation]
         self.rng = np.random.default_rng(source)
         self.game = SelfPlay(config, self.rng, actor=actor, incarnation=incarnation, num_threads=num_threads)
-        self.pool_version = -1
+        self._cells = GoalCells(config.world, config.generator.cell_size_m)
+        self._tasks = TaskBins.from_config(config, self.game.worlds.layout)
+        self._opponents_version: int | None = None
         self._past: list[tuple[StochasticPolicy, StochasticPolicy]] = []
 
-    def play(self, weights: Weights, assignment: Assignment, choose_goals: ChooseGoals) -> tuple[Rollout, RoundSummary]:
+    def play(
+        self, weights: Weights, snapshot: GeneratorSnapshot, opponents: Opponents, num_rounds: int = 1
+    ) -> tuple[Rollout, GoalSummary, RoundSummary]:
         """Play a round in every world.
 
         Args:
             weights: the policy version to act with.
-            assignment: from the task generator, made with this worker's random numbers.
-            choose_goals: the task generator's choice of Bob's goals.
+            snapshot: what Bob's goals are chosen from.
+            opponents: past players.
+            num_rounds: rounds that make an iteration, which share the places for new goals and starts.
 
         Raises:
             DivergedError: a policy no longer acts in finite numbers.
         """
         start = time.perf_counter()
-        self._accept(assignment)
-        generator_s = 0.0
-
-        def choose(*proposals: Any) -> GoalChoice:
-            nonlocal generator_s
-            asked = time.perf_counter()
-            choice, rng = choose_goals(assignment.plan, proposals, self.rng)
-            self.rng.bit_generator.state = rng.bit_generator.state
-            generator_s = time.perf_counter() - asked
-            return choice
-
-        rollout = self.game.play_round(self._players(weights), assignment.plan, choose)
-        return rollout, RoundSummary(
+        config = self._config.generator
+        starts = self.game.game_starts()
+        plan = opponents.plan(self.game.worlds.num_worlds, config.past_opponent_fraction, self.rng)
+        choose_goals = partial(snapshot.choose_goals, plan, rng=self.rng)
+        rollout = self.game.play_round(self._players(weights, opponents), plan, choose_goals)
+        goals = summarize(
+            rollout.records,
+            starts,
+            self._cells,
+            self._tasks,
+            max_goals=-(-config.replay_buffer_size // num_rounds),
+            max_starts=-(-NUM_STARTS // num_rounds),
+            rng=self.rng,
+        )
+        summary = RoundSummary(
             id=rollout.id,
             num_env_steps=rollout.num_env_steps,
             num_worlds=self._config.game.num_worlds,
             num_diverged=self.game.worlds.num_diverged,
             diverged=rollout.diverged,
             play_s=time.perf_counter() - start,
-            generator_s=generator_s,
-            pool_version=self.pool_version,
             metrics=rollout.metrics,
         )
+        return rollout, goals, summary
 
     def evaluate(self, weights: Weights, kinds: Sequence[GoalKind]) -> Metrics:
         """Bob's success without noise on the run's goals of some kinds, as metrics."""
         bob, episodes = numpy_bob(weights.bob_ema), self._config.run.evaluation_episodes
         return success_metrics(bob, self._config, kinds, episodes, seed=EVALUATION_SEED, num_threads=self._num_threads)
 
-    def _accept(self, assignment: Assignment) -> None:
-        self.rng.bit_generator.state = assignment.rng.bit_generator.state
-        if assignment.pool is not None:
-            pairs = zip(assignment.pool.alice, assignment.pool.bob, strict=True)
+    def _players(self, weights: Weights, opponents: Opponents) -> Players:
+        if opponents.version != self._opponents_version:
+            pairs = zip(opponents.alice, opponents.bob, strict=True)
             self._past = [(NumpyGaussianPolicy(alice), numpy_bob(bob)) for alice, bob in pairs]
-        self.pool_version = assignment.pool_version
-
-    def _players(self, weights: Weights) -> Players:
+            self._opponents_version = opponents.version
         return Players(
             version=weights.version,
             alice=NumpyGaussianPolicy(weights.alice),
@@ -172,9 +160,9 @@ class RolloutWorker:
 
 
 class GeneratorWorker:
-    """The task generator, behind calls that give back what they changed.
+    """The task generator, behind one call for an iteration.
 
-    Consumes goal records, produces assignments and goals; waits for nothing.
+    Consumes summaries of goals, produces snapshots to choose goals from, and past opponents; waits for nothing.
 
     Args:
         config: the run.
@@ -184,43 +172,29 @@ class GeneratorWorker:
     def __init__(self, config: Config, state: Mapping[str, NDArray[Any]] | None = None) -> None:
         layout = build_layout(config.world, blocked_fraction=config.game.blocked_gripper_fraction)
         self.generator = TaskGenerator(config, layout)
-        self._pool_version = 0
+        self._opponents_version = 0
         if state is not None:
             self.generator.load_state(state)
-            self._pool_version = int(time.time_ns())  # no rollout worker can have it
 
-    def assign(self, num_worlds: int, rng: np.random.Generator, known_pool: int) -> Assignment:
-        """Choose the opponents in the next round of an actor with ``num_worlds``, whose random numbers these are."""
-        rng = _copy(rng)
-        plan = self.generator.plan(num_worlds, rng)
-        pool = self.generator.opponents if known_pool != self._pool_version else None
-        return Assignment(plan, rng, self._pool_version, pool)
+    def opponents(self) -> Opponents:
+        """Past players for the next rounds."""
+        return self.generator.opponents.freeze(self._opponents_version)
 
-    def choose_goals(
-        self, plan: RoundPlan, proposals: Proposals, rng: np.random.Generator
-    ) -> tuple[GoalChoice, np.random.Generator]:
-        """Choose what Bob plays in a round, as ``TaskGenerator.choose_goals`` does.
-
-        Returns:
-            The choice, and the actor's random numbers after it.
-        """
-        rng = _copy(rng)
-        return self.generator.choose_goals(plan, *proposals, rng), rng
-
-    def record(self, iteration: int, weights: Weights, records: Sequence[GoalRecords]) -> GeneratorResult:
+    def record(self, iteration: int, weights: Weights, goals: Sequence[GoalSummary]) -> GeneratorResult:
         """Learn from what became of an iteration's goals.
 
         Args:
             iteration: finished ones before it.
             weights: of the players of this iteration, who may become past opponents.
-            records: of all its rounds.
+            goals: of all its rounds.
         """
-        joined = join_records(records)
+        joined = join_summaries(goals)
         metrics = self.generator.record(joined)
-        if self.generator.snapshot_due(iteration):
+        new_opponents = self.generator.opponents_due(iteration)
+        if new_opponents:
             self.generator.add_opponents(weights.alice, weights.bob)
-            self._pool_version += 1
-        return GeneratorResult(metrics, self.generator.should_stop(), sampled_goals(joined))
+            self._opponents_version = iteration  # the same whichever process records it
+        return GeneratorResult(metrics, self.generator.should_stop(), joined.shown, new_opponents)
 
     def grid(self, iteration: int, num_env_steps: int) -> GoalGrid:
         """The cells in which a valid goal was ever proposed, as they are after ``iteration`` iterations."""
@@ -235,13 +209,13 @@ class GeneratorWorker:
             )
             for at in np.argwhere(maps["seen"])
         )
-        lower, upper = grid.bounds_m
+        lower, upper = grid.cells.bounds_m
         return GoalGrid(
             iteration=iteration,
             num_env_steps=num_env_steps,
-            cell_size_m=grid.cell_size_m,
-            shape=grid.shape,
-            num_cells=int(np.prod(grid.shape)),
+            cell_size_m=grid.cells.cell_size_m,
+            shape=grid.cells.shape,
+            num_cells=len(grid.cells),
             lower_m=lower,
             upper_m=upper,
             cells=cells,
@@ -290,10 +264,3 @@ class LearnerWorker:
         counted = tuple(rollout.id for rollout in taken)
         refused = tuple(rollout.id for rollout in rollouts if rollout.id not in counted)
         return UpdateResult(self.learner.version, metrics, counted, refused, time.perf_counter() - start)
-
-
-def _copy(rng: np.random.Generator) -> np.random.Generator:
-    """Copy random numbers: the arguments of a call that may be tried again must not change."""
-    copy = np.random.default_rng()
-    copy.bit_generator.state = rng.bit_generator.state
-    return copy

@@ -7,8 +7,8 @@ import numpy as np
 from service.actors.rollout import to_arrays
 from service.actors.self_play import Players, SelfPlay
 from service.config import parse_config
-from service.generator.generator import GoalChoice
 from service.generator.opponents import CURRENT, RoundPlan
+from service.generator.snapshot import GoalChoice
 from service.generator.validity import Verdict
 
 OBJECT, OBJECT_VELOCITY = slice(10, 13), slice(26, 29)

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from service.envs.batch import WorldBatch
-from service.generator.generator import GoalChoice
 from service.generator.opponents import RoundPlan
+from service.generator.snapshot import GoalChoice
 from service.generator.validity import Verdict
 from tests.actors.players import (
     AT_REST,

@@ -286,7 +286,8 @@ def test_a_line_does_not_fall():
 
 WAKES = {"num_actors": [10, 60, 110], "wait_s": [0.1, 9.0, 0.3]}  # the first and the last count
 SIZES = {
-    "rollout": 20e6, "num_worlds": 20, "weights": 16e6, "learner_state": 1e6, "generator_state": 1e6,
+    "rollout": 20e6, "num_worlds": 20, "weights": 12e6, "snapshot": 4e6, "opponents": 1e6, "learner_state": 1e6,
+    "generator_state": 1e6,
 }  # fmt: skip
 
 

@@ -6,23 +6,30 @@ import numpy as np
 import pytest
 
 from service.config import ConfigError, WorkspaceConfig, WorldConfig
-from service.generator.difficulty import DECAY, DifficultyGrid, SuccessCounts, distance_bins, height_bins, in_air
-from service.generator.generator import NUM_DISTANCE_BINS, NUM_TASK_BINS
+from service.generator.bins import NUM_DISTANCE_BINS, NUM_TASK_BINS, GoalCells, distance_bins, height_bins, in_air
+from service.generator.difficulty import DECAY, DifficultyGrid, SuccessCounts
 
 WORLD = WorldConfig(workspace=WorkspaceConfig(center_x_m=0.1, center_y_m=0.0))
 
 
-def record(grid: DifficultyGrid, goals: list[tuple[float, ...]], solved: list[bool]) -> None:
-    grid.record(np.array(goals), np.array(solved))
+def make(cell_size_m: float = 0.05) -> DifficultyGrid:
+    return DifficultyGrid(GoalCells(WORLD, cell_size_m))
+
+
+def record(grid: DifficultyGrid, goals: list[tuple[float, ...]], solved: list[bool]) -> int:
+    """Valid proposals that were all tried."""
+    tried = np.array(goals, dtype=np.float64).reshape(-1, 3)
+    proposed = grid.cells.count(tried)
+    return grid.record(proposed, proposed, grid.cells.count(tried[np.array(solved, dtype=np.bool_)]))
 
 
 def test_counts_by_hand() -> None:
     counts = SuccessCounts(3)
-    counts.record(np.array([0, 0, 0, 1]), np.array([True, True, False, False]))
+    counts.record(np.array([3, 1, 0]), np.array([2, 0, 0]))
     # Bin 0: (2 + 1) / (3 + 2); bin 1: (0 + 1) / (1 + 2); bin 2 untried: the prior's mean.
     np.testing.assert_allclose(counts.success_rate(), [3 / 5, 1 / 3, 1 / 2], rtol=1e-15)
     np.testing.assert_allclose(counts.learnability(), [6 / 25, 2 / 9, 1 / 4], rtol=1e-15)
-    counts.record(np.array([0]), np.array([False]))
+    counts.record(np.array([1, 0, 0]), np.array([0, 0, 0]))
     np.testing.assert_allclose(counts.tries, [3 * DECAY + 1, DECAY, 0.0], rtol=1e-15)
     np.testing.assert_allclose(counts.successes, [2 * DECAY, 0.0, 0.0], rtol=1e-15)
     assert counts.num_tries.tolist() == [4, 1, 0]
@@ -31,10 +38,10 @@ def test_counts_by_hand() -> None:
 def test_counts_follow_bob() -> None:
     counts = SuccessCounts(1)
     for _ in range(200):
-        counts.record(np.zeros(5, dtype=np.int64), np.zeros(5, dtype=np.bool_))
+        counts.record(np.array([5]), np.array([0]))
     assert counts.success_rate()[0] < 0.02
     for _ in range(60):
-        counts.record(np.zeros(5, dtype=np.int64), np.ones(5, dtype=np.bool_))
+        counts.record(np.array([5]), np.array([5]))
     # Steady 5 / (1 - 0.95) = 100 tries, of which 0.95^60 = 4.6 % are still old failures.
     expected = (100 * (1 - DECAY**60) + 1) / (100 + 2)
     np.testing.assert_allclose(counts.success_rate()[0], expected, atol=1e-4)
@@ -42,10 +49,10 @@ def test_counts_follow_bob() -> None:
 
 def test_untried_bins_forget_towards_the_prior() -> None:
     counts = SuccessCounts(1)
-    counts.record(np.zeros(50, dtype=np.int64), np.ones(50, dtype=np.bool_))
-    nothing = np.zeros(0, dtype=np.int64)
+    counts.record(np.array([50]), np.array([50]))
+    nothing = np.array([0])
     for _ in range(300):
-        counts.record(nothing, nothing.astype(np.bool_))
+        counts.record(nothing, nothing)
     np.testing.assert_allclose(counts.success_rate(), 0.5, atol=1e-4)
 
 
@@ -55,20 +62,22 @@ def test_untried_bins_forget_towards_the_prior() -> None:
 )
 def test_number_of_cells(length_m: float, cell_size_m: float, num_cells: int) -> None:
     workspace = WorkspaceConfig(length_x_m=length_m, length_y_m=length_m, height_m=length_m)
-    assert DifficultyGrid(WorldConfig(workspace=workspace), cell_size_m).shape == (num_cells,) * 3
+    assert GoalCells(WorldConfig(workspace=workspace), cell_size_m).shape == (num_cells,) * 3
 
 
 def test_cells_cover_an_off_centre_workspace() -> None:
-    grid = DifficultyGrid(WORLD, 0.05)
+    cells = GoalCells(WORLD, 0.05)
     # Box: x from -0.075 to 0.275, y from -0.175 to 0.175, z from 0 to 0.35.
     goals = np.array(
         [[-0.075, -0.175, 0.0], [0.275, 0.175, 0.35], [-0.01, -0.17, 0.01], [-0.07, -0.12, 0.01], [-0.07, -0.17, 0.06]]
     )
-    assert grid.cell_index(goals).tolist() == [0, 342, 49, 7, 1]
+    assert cells.index(goals).tolist() == [0, 342, 49, 7, 1]
+    assert np.flatnonzero(cells.count(goals)).tolist() == [0, 1, 7, 49, 342]
+    assert cells.count(goals[[1, 1, 0]])[[0, 1, 342]].tolist() == [1, 0, 2]
 
 
 def test_maps_are_indexed_by_x_y_z() -> None:
-    grid = DifficultyGrid(WORLD, 0.05)
+    grid = make()
     goal = (0.20, -0.17, 0.11)  # cell (5, 0, 2)
     record(grid, [goal, goal], [True, True])
     maps = grid.maps()
@@ -77,29 +86,30 @@ def test_maps_are_indexed_by_x_y_z() -> None:
     assert maps["success_rate"][5, 0, 2] == 0.75
     np.testing.assert_allclose(maps["center"][5, 0, 2], [0.2, -0.15, 0.125], atol=1e-12)
     np.testing.assert_allclose(maps["center"][0, 0, 0], [-0.05, -0.15, 0.025], atol=1e-12)
-    assert np.array_equal(grid.cell_index(maps["center"].reshape(-1, 3)), np.arange(343))
+    assert np.array_equal(grid.cells.index(maps["center"].reshape(-1, 3)), np.arange(343))
 
 
 def test_grid_rates_by_hand() -> None:
-    grid = DifficultyGrid(WORLD, 0.05)
+    grid = make()
     easy, hard, untried = (0.1, 0.1, 0.025), (0.1, -0.1, 0.2), (0.2, 0.0, 0.3)
     record(grid, [easy, easy, easy, hard], [True, True, True, False])
     goals = np.array([easy, hard, untried])
-    np.testing.assert_allclose(grid.cells.success_rate()[grid.cell_index(goals)], [4 / 5, 1 / 3, 1 / 2], rtol=1e-15)
+    np.testing.assert_allclose(grid.counts.success_rate()[grid.cells.index(goals)], [4 / 5, 1 / 3, 1 / 2], rtol=1e-15)
     np.testing.assert_allclose(grid.learnability(goals), [4 / 25, 2 / 9, 1 / 4], rtol=1e-15)
     np.testing.assert_allclose(grid.mean_learnability(), (4 / 25 + 2 / 9) / 2, rtol=1e-15)
     assert grid.num_cells_seen == 2
 
 
-def test_mark_seen_counts_a_new_cell_once() -> None:
-    grid = DifficultyGrid(WORLD, 0.05)
+def test_a_new_cell_is_counted_once_tried_or_not() -> None:
+    grid = make()
     assert np.isnan(grid.mean_learnability())
     goals = np.array([[0.1, 0.1, 0.02], [0.1, 0.1, 0.03], [0.1, -0.1, 0.02]])
-    assert grid.mark_seen(goals) == 2
-    assert grid.mark_seen(goals) == 0
-    assert grid.mark_seen(np.zeros((0, 3))) == 0
+    proposed, none = grid.cells.count(goals), np.zeros(len(grid.cells), dtype=np.int64)
+    assert grid.record(proposed, none, none) == 2
+    assert grid.record(proposed, none, none) == 0
+    assert grid.record(none, none, none) == 0
     assert grid.num_cells_seen == 2
-    assert not grid.cells.num_tries.any()
+    assert not grid.counts.num_tries.any()
 
 
 def test_height_bins_split_table_from_air() -> None:
@@ -118,19 +128,19 @@ def test_bins_of_distance_and_height_by_hand() -> None:
 
 
 def test_state_of_an_older_version_loads() -> None:
-    old = DifficultyGrid(WORLD, 0.05)
+    old = make()
     record(old, [(0.1, 0.06, 0.025)], [True])
     counted = {f"heights/{name}": np.ones(4) for name in ("tries", "successes", "num_tries")}
-    grid = DifficultyGrid(WORLD, 0.05)
+    grid = make()
     grid.load_state(old.state() | counted)
     assert grid.num_cells_seen == 1
-    np.testing.assert_array_equal(grid.cells.tries, old.cells.tries)
+    np.testing.assert_array_equal(grid.counts.tries, old.counts.tries)
 
 
 def test_state_of_another_grid_is_refused() -> None:
-    state = DifficultyGrid(WORLD, 0.05).state()
+    state = make().state()
     with pytest.raises(ConfigError, match=r"'seen' is bool \(343,\), this configuration needs bool \(64,\)"):
-        DifficultyGrid(WORLD, 0.1).load_state(state)
+        make(0.1).load_state(state)
     del state["cells/tries"]
     with pytest.raises(ConfigError, match="'tries' is missing"):
-        DifficultyGrid(WORLD, 0.05).load_state(state)
+        make().load_state(state)

@@ -11,15 +11,19 @@ import pytest
 
 from service.config import Config, ConfigError, parse_config
 from service.envs.state_layout import StateLayout
-from service.generator.generator import LEARNABILITY_FLOOR, MIN_REPLAY_GOALS, GoalChoice, TaskGenerator
+from service.generator.generator import TaskGenerator
 from service.generator.opponents import CURRENT, RoundPlan
 from service.generator.records import GoalRecords
+from service.generator.ring import Rows
+from service.generator.snapshot import LEARNABILITY_FLOOR, MIN_REPLAY_GOALS, GeneratorSnapshot, GoalChoice
 from service.generator.validity import Verdict
+from tests.generator.outcomes import record, starts_of
 
 FREE = StateLayout(positions={"object": 3}, velocities={}, measured={}, kept={"gripper_blocked": 0})
 SOME_BLOCKED = StateLayout(positions={}, velocities={}, measured={}, kept={"gripper_blocked": 1, "object_mass": 2})
 """Two small worlds of four numbers; the flag is not the last of them."""
 STATE_SIZE = FREE.size
+ONE_GAME = starts_of([1.0] * STATE_SIZE)
 BLOCKED = SOME_BLOCKED["gripper_blocked"].start
 OLD_GOAL = (0.0, 0.1, 0.025)
 VALID, OUTSIDE = int(Verdict.VALID), int(Verdict.OUTSIDE)
@@ -34,17 +38,23 @@ def all_current(num: int) -> RoundPlan:
     return RoundPlan(np.full(num, CURRENT), np.full(num, CURRENT))
 
 
-def filled(make_records: MakeRecords, num_goals: int = MIN_REPLAY_GOALS, **settings: Any) -> TaskGenerator:
+def filled(
+    make_records: MakeRecords, num_goals: int = MIN_REPLAY_GOALS, starts: Rows | None = None, **settings: Any
+) -> TaskGenerator:
     """A generator whose buffer holds ``num_goals`` times the same old goal, from a state of sevens."""
     generator = TaskGenerator(config(**settings), FREE)
-    generator.record(make_records(np.tile(OLD_GOAL, (num_goals, 1)), start_state=np.full((num_goals, STATE_SIZE), 7.0)))
+    states = np.full((num_goals, STATE_SIZE), 7.0)
+    record(generator, make_records(np.tile(OLD_GOAL, (num_goals, 1)), start_state=states), starts)
     return generator
 
 
-def choose(generator: TaskGenerator, verdict: list[int], plan: RoundPlan | None = None, seed: int = 0) -> GoalChoice:
+def choose(
+    source: TaskGenerator | GeneratorSnapshot, verdict: list[int], plan: RoundPlan | None = None, seed: int = 0
+) -> GoalChoice:
     """Goals of worlds whose Alices all proposed (-0.1, 0, 0.1), from a state of ones at (0, 0, 0.025)."""
     num = len(verdict)
-    return generator.choose_goals(
+    snapshot = source.snapshot() if isinstance(source, TaskGenerator) else source
+    return snapshot.choose_goals(
         plan or all_current(num),
         np.ones((num, STATE_SIZE)),
         np.tile([0.0, 0.0, 0.025], (num, 1)),
@@ -91,14 +101,14 @@ def test_replay_fraction_is_met_on_average(make_records: MakeRecords) -> None:
 def test_no_replay_before_the_buffer_holds_enough(make_records: MakeRecords) -> None:
     generator = filled(make_records, MIN_REPLAY_GOALS - 1, replay_fraction=1.0, replay_invalid=True)
     assert_rows(choose(generator, [VALID, OUTSIDE]), [False, False])
-    generator.record(make_records(OLD_GOAL, start_state=np.full((1, STATE_SIZE), 7.0)))
+    record(generator, make_records(OLD_GOAL, start_state=np.full((1, STATE_SIZE), 7.0)))
     assert_rows(choose(generator, [VALID, OUTSIDE]), [True, True])
 
 
 def test_replayed_goals_may_start_where_a_game_did(make_records: MakeRecords) -> None:
-    generator = filled(make_records, replay_fraction=1.0, replay_from_reset=True)
+    generator = filled(make_records, starts=ONE_GAME, replay_fraction=1.0, replay_from_reset=True)
     num_tries, num = MIN_REPLAY_GOALS, 2000
-    first = choose(generator, [VALID] * num)  # world 0 alone starts a game here, from a state of ones
+    first = choose(generator, [VALID] * num)
     # From their own starts the old goals were tried and failed; from a reset nothing is known, so 1/2.
     own = 1 / (num_tries + 2) * (1 - 1 / (num_tries + 2)) + LEARNABILITY_FLOOR
     share = (0.25 + LEARNABILITY_FLOOR) / (0.25 + LEARNABILITY_FLOOR + own)
@@ -109,19 +119,18 @@ def test_replayed_goals_may_start_where_a_game_did(make_records: MakeRecords) ->
 
 
 def test_tasks_from_a_reset_wait_until_bob_is_ready(make_records: MakeRecords) -> None:
-    generator = filled(make_records, replay_fraction=1.0, replay_from_reset=True)
+    generator = filled(make_records, starts=ONE_GAME, replay_fraction=1.0, replay_from_reset=True)
     goals, yes = np.tile(OLD_GOAL, (200, 1)), np.ones(200, dtype=np.bool_)
-    generator.record(make_records(goals, from_reset=yes, replayed=yes))
+    record(generator, make_records(goals, from_reset=yes, replayed=yes))
     assert choose(generator, [VALID] * 500).from_reset.mean() < 0.6  # both kinds hopeless: only the floor speaks
-    generator.record(make_records(goals, from_reset=yes, replayed=yes, solved=np.arange(200) < 150))
+    record(generator, make_records(goals, from_reset=yes, replayed=yes, solved=np.arange(200) < 150))
     assert choose(generator, [VALID] * 500).from_reset.mean() > 0.8
 
 
 def test_a_start_next_to_the_goal_is_no_task(make_records: MakeRecords) -> None:
-    generator = filled(make_records, replay_fraction=1.0, replay_from_reset=True)
-    state, near = np.ones((8, STATE_SIZE)), np.tile(OLD_GOAL, (8, 1)) + np.array([0.03, 0.03, 0.0])
-    index, verdict = np.zeros(8, dtype=np.int64), np.zeros(8, dtype=np.int8)
-    choice = generator.choose_goals(all_current(8), state, near, index, near, verdict, np.random.default_rng(0))
+    position = np.tile(OLD_GOAL, (8, 1)) + np.array([0.03, 0.03, 0.0])
+    near = {"start_state": np.ones((8, STATE_SIZE)), "start_position": position}
+    choice = choose(filled(make_records, starts=near, replay_fraction=1.0, replay_from_reset=True), [VALID] * 8)
     assert (choice.start_state == 7.0).all()
     assert not choice.from_reset.any()
 
@@ -132,12 +141,10 @@ def test_no_goal_in_the_air_from_a_blocked_reset(make_records: MakeRecords) -> N
         parse_config({**settings, "game": {"blocked_gripper_fraction": 0.2}}, where="t"), SOME_BLOCKED
     )
     goals = np.tile([[0.0, 0.1, 0.025], [0.0, 0.1, 0.2]], (40, 1))
-    generator.record(make_records(goals, start_state=np.zeros((80, STATE_SIZE))))  # none is blocked
-    num = 400
-    state, start = np.zeros((num, STATE_SIZE)), np.tile([0.0, 0.0, 0.025], (num, 1))
-    state[::2, BLOCKED] = 1.0
-    index, verdict = np.zeros(num, dtype=np.int64), np.zeros(num, dtype=np.int8)
-    choice = generator.choose_goals(all_current(num), state, start, index, start, verdict, np.random.default_rng(0))
+    blocked_start = [float(column == BLOCKED) for column in range(STATE_SIZE)]
+    starts = starts_of(*[blocked_start, [0.0] * STATE_SIZE] * 200)
+    record(generator, make_records(goals, start_state=np.zeros((80, STATE_SIZE))), starts)  # no goal's own is blocked
+    choice = choose(generator, [VALID] * 400)
     blocked, in_air = choice.start_state[:, BLOCKED] == 1.0, choice.goal[:, 2] > 0.1
     assert choice.from_reset[blocked].all()
     assert 0.1 < (blocked & ~in_air).mean() < 0.5
@@ -154,7 +161,7 @@ def test_blocked_tasks_are_counted_apart(make_records: MakeRecords) -> None:
     records = make_records(
         np.tile(OLD_GOAL, (40, 1)), start_state=state, from_reset=np.ones(40, dtype=np.bool_), solved=~blocked
     )
-    metrics = generator.record(records)
+    metrics = record(generator, records)
     assert metrics["bob/success_rate_blocked"] == 0.0
     assert metrics["bob/success_rate"] == 0.75
     assert metrics["alice/valid_fraction_blocked"] == 1.0
@@ -176,7 +183,9 @@ def test_choice_does_not_alias_its_inputs(make_records: MakeRecords) -> None:
     start_state, position = np.ones((1, STATE_SIZE)), np.zeros((1, 3))
     verdict = np.zeros(1, dtype=np.int8)
     index = np.zeros(1, dtype=np.int64)
-    generator.choose_goals(all_current(1), start_state, position, index, position, verdict, np.random.default_rng(0))
+    generator.snapshot().choose_goals(
+        all_current(1), start_state, position, index, position, verdict, np.random.default_rng(0)
+    )
     assert start_state.tolist() == [[1.0] * STATE_SIZE]
     assert position.tolist() == [[0.0] * 3]
 
@@ -185,7 +194,7 @@ def test_replay_prefers_learnable_goals(make_records: MakeRecords) -> None:
     generator = TaskGenerator(config(replay_fraction=1.0), FREE)
     solved_always, solved_half = (0.1, 0.1, 0.025), (-0.1, -0.1, 0.025)
     goals = [solved_always] * 100 + [solved_half] * 100
-    generator.record(make_records(goals, solved=[True] * 100 + [True, False] * 50))
+    record(generator, make_records(goals, solved=[True] * 100 + [True, False] * 50))
     goal = choose(generator, [VALID] * 4000).goal
     # p = 101/102 against 1/2, each with the floor of 0.01 on top of p (1 - p).
     easy, hard = 101 / 102**2 + 0.01, 0.25 + 0.01
@@ -196,17 +205,18 @@ def test_replay_over_cells_does_not_forget_what_alice_has_left(make_records: Mak
     left, crowded = (-0.2, 0.0, 0.325), [(0.1, y, 0.025) for y in (-0.15, -0.1, -0.05, 0.0, 0.05, 0.1, 0.15)]
     for over_cells, share in ((True, 1 / 8), (False, 0.0)):
         generator = TaskGenerator(config(replay_fraction=1.0, replay_over_cells=over_cells), FREE)
-        generator.record(make_records([left] * 2, solved=[True, False]))
+        record(generator, make_records([left] * 2, solved=[True, False]))
         for _ in range(5):
-            generator.record(make_records(crowded * 200, solved=[True] * 700 + [False] * 700))
-        generator.record(make_records([left] * 200, solved=[True, False] * 100, replayed=[True] * 200))
+            record(generator, make_records(crowded * 200, solved=[True] * 700 + [False] * 700))
+        record(generator, make_records([left] * 200, solved=[True, False] * 100, replayed=[True] * 200))
         goal = choose(generator, [VALID] * 4000).goal  # what Bob can learn is alike everywhere, about 1/2
         assert np.mean(goal[:, 0] == left[0]) == pytest.approx(share, abs=0.02)
 
 
 def test_record_separates_who_learns_what(make_records: MakeRecords) -> None:
     generator = TaskGenerator(config(), FREE)
-    metrics = generator.record(
+    metrics = record(
+        generator,
         make_records(
             [(-0.2, 0.0, 0.02), (-0.1, 0.0, 0.02), (0.0, 0.1, 0.02), (0.1, 0.1, 0.02), (0.5, 0.0, 0.02)],
             goal=[(-0.2, 0.0, 0.02), (-0.1, 0.0, 0.02), (0.0, 0.1, 0.02), (-0.2, 0.0, 0.02), (-0.2, 0.0, 0.02)],
@@ -215,7 +225,7 @@ def test_record_separates_who_learns_what(make_records: MakeRecords) -> None:
             solved=[True, True, True, False, False],
             alice_past=[False, True, False, False, False],
             bob_past=[False, False, True, False, False],
-        )
+        ),
     )
     # Four valid proposals open four cells; three of them were played as proposed and are kept.
     assert metrics["generator/new_cells"] == metrics["generator/num_cells_seen"] == 4.0
@@ -225,15 +235,15 @@ def test_record_separates_who_learns_what(make_records: MakeRecords) -> None:
     assert metrics["bob/success_rate_replayed"] == 0.0
     # The current Bob tried the first cell three times and the past Alice's once; the past Bob's try does not count.
     goals = np.array([(-0.2, 0.0, 0.02), (-0.1, 0.0, 0.02), (0.0, 0.1, 0.02), (0.1, 0.1, 0.02)])
-    rates = generator.grid.cells.success_rate()[generator.grid.cell_index(goals)]
+    rates = generator.grid.counts.success_rate()[generator.cells.index(goals)]
     np.testing.assert_allclose(rates, [2 / 5, 2 / 3, 1 / 2, 1 / 2])
     expected = (6 / 25 + 2 / 9 + 1 / 4 + 1 / 4) / 4
     assert metrics["generator/mean_learnability"] == pytest.approx(expected)
 
 
 def test_metric_names_are_an_api(make_records: MakeRecords) -> None:
-    metrics = TaskGenerator(config(), FREE).record(
-        make_records([(0.1, 0.0, 0.025), (0.0, 0.0, 0.2)], solved=[True, True])
+    metrics = record(
+        TaskGenerator(config(), FREE), make_records([(0.1, 0.0, 0.025), (0.0, 0.0, 0.2)], solved=[True, True])
     )
     assert set(metrics) == {
         *(f"alice/{name}_fraction" for name in ("valid", "not_moved", "outside", "fallen", "lifted")),
@@ -248,7 +258,7 @@ def test_metric_names_are_an_api(make_records: MakeRecords) -> None:
 def test_an_iteration_without_any_goal(make_records: MakeRecords) -> None:
     verdict = np.full(2, Verdict.FALLEN, dtype=np.int8)
     records = make_records(np.full((2, 3), np.nan), verdict=verdict, played=[False, False])
-    metrics = TaskGenerator(config(), FREE).record(records)
+    metrics = record(TaskGenerator(config(), FREE), records)
     assert metrics["generator/iterations_without_new_cell"] == 1.0
     assert metrics["generator/buffer_size"] == 0.0
     assert not any(name.startswith("bob/") for name in metrics)
@@ -269,24 +279,42 @@ def test_stops_on_current_players_own_goals_only(make_records: MakeRecords) -> N
         generator = TaskGenerator(config(novelty_window=2), FREE)
         for _ in range(3):
             assert not generator.should_stop()
-            generator.record(make_records(goals, **overrides))
+            record(generator, make_records(goals, **overrides))
         assert generator.should_stop() is expected, overrides
 
 
-def test_snapshots_are_due_every_interval() -> None:
+def test_opponents_are_due_every_interval() -> None:
     generator = TaskGenerator(config(opponent_interval=10), FREE)
-    assert [iteration for iteration in range(35) if generator.snapshot_due(iteration)] == [10, 20, 30]
+    assert [iteration for iteration in range(35) if generator.opponents_due(iteration)] == [10, 20, 30]
 
 
-def test_plan_uses_the_configured_share_of_the_pool() -> None:
-    generator = TaskGenerator(config(past_opponent_fraction=0.25, opponent_pool_size=2), FREE)
-    assert not generator.plan(40, np.random.default_rng(0)).alice_past.any()
-    for version in range(3):
-        generator.add_opponents({"w": np.array([version])}, {"w": np.array([version])})
-    plan = generator.plan(40, np.random.default_rng(0))
-    assert int(plan.alice_past.sum()) == int(plan.bob_past.sum()) == 10
-    assert set(plan.alice_opponent) <= {CURRENT, 0, 1}
-    assert [int(p["w"][0]) for p in generator.opponents.bob] == [1, 2]
+def test_a_snapshot_is_a_copy(make_records: MakeRecords) -> None:
+    """Rounds that go on while the generator records see nothing of it."""
+    generator = filled(make_records, starts=ONE_GAME, replay_fraction=1.0, replay_from_reset=True)
+    snapshot = generator.snapshot()
+    before = {name: array.copy() for name, array in snapshot.state().items()}
+    play(generator, make_records, np.random.default_rng(0), range(20))
+    assert all(np.array_equal(array, before[name]) for name, array in snapshot.state().items())
+    assert not all(np.array_equal(array, before[name]) for name, array in generator.snapshot().state().items())
+
+
+def test_a_choice_writes_to_nothing_and_draws_the_same_again(make_records: MakeRecords) -> None:
+    """Snapshots of other processes are read-only."""
+    generator = filled(make_records, starts=ONE_GAME, replay_fraction=0.5, replay_from_reset=True)
+    state = generator.snapshot().state()
+    for array in state.values():
+        array.flags.writeable = False
+    snapshot = TaskGenerator(config(replay_fraction=0.5, replay_from_reset=True), FREE).snapshot().with_state(state)
+    first, again, whole = (
+        choose(snapshot, [VALID] * 40),
+        choose(snapshot, [VALID] * 40),
+        choose(generator, [VALID] * 40),
+    )
+    assert 0 < first.replayed.sum() < 40
+    assert first.from_reset.any()
+    for name in GoalChoice.__slots__:
+        assert np.array_equal(getattr(first, name), getattr(again, name))
+        assert np.array_equal(getattr(first, name), getattr(whole, name))
 
 
 def play(generator: TaskGenerator, make_records: MakeRecords, rng: np.random.Generator, iterations: range) -> list[Any]:
@@ -295,12 +323,12 @@ def play(generator: TaskGenerator, make_records: MakeRecords, rng: np.random.Gen
     lower, upper = np.array([-0.2, -0.15, 0.0]), np.array([0.1, 0.15, 0.3])
     num = 20
     for iteration in iterations:
-        plan = generator.plan(num, rng)
+        plan = generator.opponents.freeze(0).plan(num, 0.2, rng)
         start_state, start = rng.normal(size=(num, STATE_SIZE)), rng.uniform(lower, upper, size=(num, 3))
         proposal = rng.uniform(lower, upper, size=(num, 3))
         verdict = rng.choice([VALID, OUTSIDE], size=num, p=[0.7, 0.3]).astype(np.int8)
         index = rng.integers(3, size=num)
-        choice = generator.choose_goals(plan, start_state, start, index, proposal, verdict, rng)
+        choice = generator.snapshot().choose_goals(plan, start_state, start, index, proposal, verdict, rng)
         records = make_records(
             proposal,
             **{name: getattr(choice, name) for name in GoalChoice.__slots__},
@@ -309,8 +337,14 @@ def play(generator: TaskGenerator, make_records: MakeRecords, rng: np.random.Gen
             alice_past=plan.alice_past,
             bob_past=plan.bob_past,
         )
-        outcomes.append((plan.alice_opponent.tolist(), choice.goal.tolist(), generator.record(records)))
-        if generator.snapshot_due(iteration):
+        outcomes.append(
+            (
+                plan.alice_opponent.tolist(),
+                choice.goal.tolist(),
+                record(generator, records, starts_of(list(start_state[0]))),
+            )
+        )
+        if generator.opponents_due(iteration):
             generator.add_opponents({"a/w": rng.normal(size=3)}, {"b.w": rng.normal(size=(2, 2))})
         outcomes.append(generator.should_stop())
     return outcomes
@@ -320,6 +354,7 @@ def test_exact_resume_through_a_file(make_records: MakeRecords, tmp_path: Path) 
     settings = config(
         replay_fraction=0.3,
         replay_invalid=True,
+        replay_from_reset=True,
         replay_buffer_size=90,
         opponent_interval=3,
         opponent_pool_size=2,

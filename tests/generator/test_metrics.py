@@ -7,10 +7,26 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from service.generator.records import GoalRecords, alice_metrics, bob_metrics
+from service.generator.records import (
+    GoalRecords,
+    alice_sums,
+    bob_sums,
+    count_heights,
+    height_percentile,
+    means,
+)
 from service.generator.validity import Verdict
+from service.types import Metrics
 
 REST = 0.025
+
+
+def alice_metrics(records: GoalRecords) -> Metrics:
+    return means(alice_sums(records, REST))
+
+
+def bob_metrics(records: GoalRecords) -> Metrics:
+    return means(bob_sums(records, REST))
 
 
 def test_six_worlds_by_hand(make_records: Callable[..., GoalRecords]) -> None:
@@ -33,7 +49,7 @@ def test_six_worlds_by_hand(make_records: Callable[..., GoalRecords]) -> None:
         bob_past=[False, False, False, True, False, False],
     )
     # The current Alice proposed in 5 worlds, 3 of them valid: at 0.1, 0.2 and 0.1 m; heights 0.025, 0.225, 0.125.
-    assert alice_metrics(records, REST) == pytest.approx(
+    assert alice_metrics(records) == pytest.approx(
         {
             "alice/valid_fraction": 3 / 5,
             "alice/not_moved_fraction": 1 / 5,
@@ -46,10 +62,9 @@ def test_six_worlds_by_hand(make_records: Callable[..., GoalRecords]) -> None:
             "alice/goal_height_high_fraction": 0.0,
             "alice/goal_distance_m": 0.4 / 3,
             "alice/goal_height_m": 0.125,
-            "alice/goal_height_p90_m": 0.205,  # 0.125 + 0.8 x 0.1, between the upper two of three
         }
     )
-    assert bob_metrics(records, REST) == pytest.approx(
+    assert bob_metrics(records) == pytest.approx(
         {
             "bob/success_rate": 1 / 2,
             "bob/success_rate_table": 1.0,
@@ -63,9 +78,9 @@ def test_six_worlds_by_hand(make_records: Callable[..., GoalRecords]) -> None:
 
 def test_a_rate_over_no_cases_is_left_out(make_records: Callable[..., GoalRecords]) -> None:
     records = make_records([(0.0, 0.0, 0.025)], verdict=np.array([Verdict.NOT_MOVED], dtype=np.int8), played=[False])
-    assert set(alice_metrics(records, REST)) == {f"alice/{kind.name.lower()}_fraction" for kind in Verdict}
-    assert bob_metrics(records, REST) == {}
-    assert alice_metrics(make_records([(0.1, 0.0, 0.025)], alice_past=[True]), REST) == {}
+    assert set(alice_metrics(records)) == {f"alice/{kind.name.lower()}_fraction" for kind in Verdict}
+    assert bob_metrics(records) == {}
+    assert alice_metrics(make_records([(0.1, 0.0, 0.025)], alice_past=[True])) == {}
 
 
 def test_distance_leaves_out_replaced_goals(make_records: Callable[..., GoalRecords]) -> None:
@@ -74,7 +89,7 @@ def test_distance_leaves_out_replaced_goals(make_records: Callable[..., GoalReco
         start_position=[(0.0, 0.0, 0.025), (0.5, 0.5, 0.025)],  # the second start is the replayed goal's
         replayed=[False, True],
     )
-    metrics = alice_metrics(records, REST)
+    metrics = alice_metrics(records)
     assert metrics["alice/goal_distance_m"] == pytest.approx(0.1)
     assert metrics["alice/valid_fraction"] == 1.0
 
@@ -82,5 +97,19 @@ def test_distance_leaves_out_replaced_goals(make_records: Callable[..., GoalReco
 def test_fallen_proposals_may_be_not_a_number(make_records: Callable[..., GoalRecords]) -> None:
     verdict = np.array([Verdict.FALLEN, Verdict.VALID], dtype=np.int8)
     records = make_records([(np.nan, 0.0, 0.0), (0.1, 0.0, 0.025)], verdict=verdict, played=[False, True])
-    assert alice_metrics(records, REST)["alice/goal_height_m"] == 0.025
-    assert alice_metrics(records, REST)["alice/fallen_fraction"] == 0.5
+    assert alice_metrics(records)["alice/goal_height_m"] == 0.025
+    assert alice_metrics(records)["alice/fallen_fraction"] == 0.5
+
+
+def test_the_height_up_to_which_nine_of_ten_lie(make_records: Callable[..., GoalRecords]) -> None:
+    heights = [0.0254, *[0.1003] * 8, 0.2996]  # nine of ten are no higher than 0.1003
+    records = make_records([(0.1, 0.0, height) for height in heights])
+    counted = count_heights(records)
+    assert {int(step): int(counted[step]) for step in np.flatnonzero(counted)} == {25: 1, 100: 8, 299: 1}
+    assert height_percentile(counted, 90.0) == pytest.approx(0.1005)  # the middle of its millimetre
+    assert height_percentile(counted, 91.0) == pytest.approx(0.2995)
+    assert np.isnan(height_percentile(count_heights(make_records([])), 90.0))
+    past = make_records([(0.1, 0.0, 0.2)] * 2, alice_past=[True, False], verdict=np.array([0, 1], dtype=np.int8))
+    assert not count_heights(past).any()
+    highest = count_heights(make_records([(0.0, 0.0, 0.8)]))  # the upper face of the highest workspace there may be
+    assert np.flatnonzero(highest).tolist() == [800]

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from service.generator.records import GOALS_PER_ITERATION, GoalRecords, join_records, sampled_goals
+from service.generator.records import GOALS_PER_ITERATION, GoalRecords, sampled_goals
 from service.generator.validity import Verdict
 
 MakeRecords = Callable[..., GoalRecords]
@@ -43,11 +43,3 @@ def test_only_goals_the_current_bob_played_himself(make_records: MakeRecords) ->
 def test_no_goals_and_very_many(make_records: MakeRecords) -> None:
     assert sampled_goals(make(make_records, 0)).shape == (0, 7)
     assert sampled_goals(make(make_records, 100)).shape == (GOALS_PER_ITERATION, 7)
-
-
-def test_joined_records_hold_the_worlds_of_all_rounds(make_records: MakeRecords) -> None:
-    first, second = make(make_records, 2, solved=[True, False]), make(make_records, 1)
-    joined = join_records([first, second])
-    assert joined.solved.tolist() == [True, False, True]
-    assert joined.goal.tolist() == [*first.goal.tolist(), *second.goal.tolist()]
-    assert join_records([second]).goal.tolist() == second.goal.tolist()

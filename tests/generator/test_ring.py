@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from service.config import ConfigError
-from service.generator.ring import Ring
+from service.generator.ring import Ring, join_rows
 
 
 def add(buffer: Ring, *numbers: int) -> None:
@@ -19,7 +19,7 @@ def make(capacity: int = 3, first: int = 2) -> Ring:
 
 
 def held(buffer: Ring) -> list[int]:
-    return [int(row[0]) for row in buffer["second"]]
+    return [int(row[0]) for row in buffer.rows()["second"]]
 
 
 def test_ring_overwrites_the_oldest() -> None:
@@ -44,24 +44,16 @@ def test_more_goals_than_capacity_keep_the_newest() -> None:
     assert sorted(held(buffer)) == [5, 6, 7]
 
 
-def test_sampled_rows_belong_together() -> None:
+def test_rows_are_copies_and_join_in_their_order() -> None:
     buffer = make(8)
     add(buffer, 1, 2, 3)
-    drawn = buffer.sample(np.random.default_rng(0), 50)
-    assert drawn["first"].shape == (50, 2)
-    np.testing.assert_array_equal(drawn["second"][:, 0], drawn["first"][:, 0] + 0.25)
-    assert set(drawn["first"][:, 0]) == {1.0, 2.0, 3.0}
-    drawn["first"][:] = 0.0
+    rows = buffer.rows()
+    np.testing.assert_array_equal(rows["second"][:, 0], rows["first"][:, 0] + 0.25)
+    rows["first"][:] = 0.0
     assert held(buffer) == [1, 2, 3]
-
-
-def test_all_rows_are_drawn_alike() -> None:
-    buffer = make(8)
-    add(buffer, 0, 1, 2, 3)
-    drawn = buffer.sample(np.random.default_rng(3), 20_000)
-    counted = np.bincount(drawn["first"][:, 0].astype(int), minlength=4)
-    chi_square = float(np.sum((counted - 5_000) ** 2 / 5_000))
-    assert chi_square < 11.34, counted  # 99 % point of 3 degrees of freedom
+    joined = join_rows([buffer.rows(), {"first": np.full((1, 2), 9.0), "second": np.full((1, 3), 9.5)}])
+    assert joined["first"][:, 0].tolist() == [1.0, 2.0, 3.0, 9.0]
+    assert joined["second"][:, 2].tolist() == [1.25, 2.25, 3.25, 9.5]
 
 
 def test_state_of_another_buffer_is_refused() -> None:
@@ -80,17 +72,17 @@ def test_every_part_keeps_its_newest_rows() -> None:
     buffer = Ring(6, 3, first=1)  # two each
     for part, number in ((0, 1), (0, 2), (2, 3), (0, 4)):
         buffer.add(np.array([part]), first=np.array([[float(number)]]))
-    assert buffer["first"].ravel().tolist() == [4, 2, 3]
+    assert buffer.rows()["first"].ravel().tolist() == [4, 2, 3]
     assert buffer.part_share().tolist() == [0.5, 0.5, 1.0]
     buffer.add(np.array([1, 2, 2, 2, 1]), first=np.arange(5.0, 10.0)[:, None])  # 3 of part 2 at once: 5 is too old
-    assert sorted(buffer["first"].ravel().tolist()) == [2, 4, 5, 7, 8, 9]
-    assert buffer["first"][2:4].ravel().tolist() == [5, 9]
+    assert sorted(buffer.rows()["first"].ravel().tolist()) == [2, 4, 5, 7, 8, 9]
+    assert buffer.rows()["first"][2:4].ravel().tolist() == [5, 9]
     copy = Ring(6, 3, first=1)
     copy.load_state(buffer.state())
     for ring in (buffer, copy):
         ring.add(np.array([2, 0]), first=np.array([[10.0], [11.0]]))
-    assert copy["first"].tolist() == buffer["first"].tolist()
-    assert sorted(buffer["first"][4:].ravel().tolist()) == [8, 10]
+    assert copy.rows()["first"].tolist() == buffer.rows()["first"].tolist()
+    assert sorted(buffer.rows()["first"][4:].ravel().tolist()) == [8, 10]
 
 
 def test_the_shares_make_all_parts_equally_likely() -> None:
@@ -98,7 +90,7 @@ def test_the_shares_make_all_parts_equally_likely() -> None:
     buffer.add(np.repeat([0, 1], [19, 1]), first=np.repeat([[0.0], [1.0]], [19, 1], axis=0))
     share = buffer.part_share()
     assert share.sum() == pytest.approx(2.0)
-    assert np.average(buffer["first"].ravel(), weights=share) == pytest.approx(0.5)
+    assert np.average(buffer.rows()["first"].ravel(), weights=share) == pytest.approx(0.5)
 
 
 def test_state_round_trip_continues_the_ring() -> None:

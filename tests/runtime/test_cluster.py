@@ -9,14 +9,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 import ray
+from ray.exceptions import ObjectLostError
 
 from service.errors import DivergedError
 from service.io.checkpoints import CheckpointStore
 from service.io.run_directory import RunDirectory
-from service.runtime.cluster import ClusterRun, num_gpus
+from service.runtime.cluster import ClusterRun
+from service.runtime.learner_group import num_gpus
 from service.runtime.ray_actors import NICENESS
 from service.runtime.ray_connection import ClusterOptions, connected
-from service.runtime.runner import ClusterError
+from service.runtime.runner import ClusterError, StateLostError
 from tests.runtime.runs import newest, play, read_lines, tiny_config
 
 TOGETHER = ("learner/", "alice/", "bob/", "generator/")
@@ -175,6 +177,42 @@ def test_an_actor_that_hangs_is_replaced(tmp_path, monkeypatch):
     assert not is_alive(stopped[0])
 
 
+def test_no_round_notices_a_generator_that_is_frozen(tmp_path, monkeypatch):
+    """Iterations wait until another takes its place; no actor is replaced, no rollout is lost or counted twice."""
+    monkeypatch.setattr("service.runtime.cluster.GENERATOR_DEADLINE_S", 15.0)
+    frozen, played = [], []
+
+    def freeze(run, metrics):
+        actors = run.health().actors
+        if not frozen and metrics["iteration"] >= 4 and not any(actor.pid is None for actor in actors):
+            frozen.append(pid_of(run, "generator"))
+            os.kill(frozen[0], signal.SIGSTOP)
+        elif frozen and run._generator.incarnation == 1 and metrics["iteration"] >= 12:
+            run.request_stop()
+
+    def look(run):
+        if frozen and run._generator.incarnation == 0:
+            played.append((run.iteration, run._slots.num_taken, len(run._slots._began)))
+
+    run, result = run_cluster(tmp_path, tiny_config(total_env_steps=10**9), on_iteration=freeze, on_beat=look)
+    assert result.reason == "interrupted"
+    # All that the policy lag allows was played: two rollouts wait for the generator, and two for the next iteration.
+    assert played[-1][1:] == (4, 0)
+    assert len({iteration for iteration, _, _ in played}) <= 2
+    assert not is_alive(frozen[0])
+    health = run.health()
+    errors = {actor.name: actor.last_error for actor in health.actors}
+    assert errors.pop("generator") is not None
+    assert set(errors.values()) == {None}
+    assert health.num_rollouts_refused == 0
+    counted = ids(tmp_path)
+    assert {incarnation for _, incarnation, _ in counted} == {0}
+    assert sum(highest + 1 for _, _, highest in counted) == health.num_rollouts_counted
+    rows = read_lines(tmp_path / "metrics.jsonl")
+    assert [row["iteration"] for row in rows] == list(range(1, len(rows) + 1))
+    assert [row["learner/version"] for row in rows] == list(range(1, len(rows) + 1))
+
+
 def test_a_stop_ends_it_at_once_and_saved(tmp_path):
     torch, nice, asked = {}, {}, []
 
@@ -238,6 +276,21 @@ def test_a_policy_that_diverges_ends_the_run_with_how_to_go_on(tmp_path):
 
     with pytest.raises(DivergedError, match=r"resume with lower learning rates") as error:
         run_cluster(tmp_path, tiny_config(total_env_steps=10**9), num_actors=1, on_iteration=spoil)
+    assert "\n" not in str(error.value)
+
+
+def test_a_snapshot_lost_with_its_machine_sends_the_run_back(tmp_path):
+    """No other round could be played: its actor is not to blame."""
+
+    def lost():
+        raise ObjectLostError("ab" * 28, "", "")
+
+    def lose(run, metrics):
+        if metrics["iteration"] == 3:
+            run._snapshot = ray.remote(lost).options(num_cpus=0, max_retries=0).remote()
+
+    with pytest.raises(StateLostError, match=r"goes back to its newest checkpoint") as error:
+        run_cluster(tmp_path, tiny_config(total_env_steps=10**9), on_iteration=lose)
     assert "\n" not in str(error.value)
 
 

@@ -37,10 +37,10 @@ def diverge_after(patch, iteration):
     """Alice's policy is no good from the iteration behind this one."""
     players, rounds = RolloutWorker._players, count()
 
-    def spoiled(self, weights):
+    def spoiled(self, *given):
         if next(rounds) >= iteration:
             patch.setattr("service.runtime.workers.NumpyGaussianPolicy", NotANumber)
-        return players(self, weights)
+        return players(self, *given)
 
     patch.setattr(RolloutWorker, "_players", spoiled)
 

@@ -1,0 +1,146 @@
+"""The choice of Bob's goals in a rollout worker, from a snapshot of what the task generator knows."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from service.config import GeneratorConfig
+from service.generator.bins import TaskBins, in_air
+from service.generator.opponents import RoundPlan
+from service.generator.ring import Rows, join_rows
+from service.generator.validity import Verdict
+from service.io.tensors import join_parts, split_parts
+from service.types import Array, Arrays, BoolArray, IntArray, StateArray
+
+LEARNABILITY_FLOOR = 0.01
+"""Added to p (1 - p), which is at most 1/4, so goals of a solved or hopeless cell stay drawable and measured."""
+MIN_REPLAY_GOALS = 64
+"""Goals the buffer must hold before any is replayed: fewer would be played over and over."""
+_ARRAYS = ("share", "learnability", "reset_learnability")
+
+
+@dataclass(frozen=True, slots=True)
+class GoalChoice:
+    """The goals Bob plays in a round of N worlds, and where both he and the object start."""
+
+    goal: StateArray
+    """(N, 3) metres; where not ``played`` it is Alice's proposal as it came."""
+    start_state: StateArray
+    """(N, S) full physics state."""
+    start_position: StateArray
+    """(N, 3) object position there, metres."""
+    replayed: BoolArray
+    """(N,) the goal and its start come from the buffer, not from this round's Alice."""
+    from_reset: BoolArray
+    """(N,) the start is that of a game."""
+    played: BoolArray
+    """(N,) there is a goal for Bob to play."""
+
+
+@dataclass(frozen=True, slots=True)
+class GeneratorSnapshot:
+    """All that the choice of goals needs, as it was after some iteration: plain arrays to which nobody writes.
+
+    It comes with the weights, so a worker that has both asks nobody in the middle of a round.
+    """
+
+    config: GeneratorConfig
+    success_distance_m: float
+    tasks: TaskBins
+    buffer: Rows
+    """(M,) ``goal`` of the replay buffer, and ``start_state`` and ``start_position`` from which it was proposed."""
+    share: StateArray
+    """(M,) weights that make all cells of the buffer equally likely."""
+    learnability: StateArray
+    """(M,) p (1 - p) of the cell of each goal of the buffer."""
+    starts: Rows
+    """``start_state`` and ``start_position`` of games."""
+    reset_learnability: StateArray
+    """(task bins,) p (1 - p) of what starts where a game does."""
+
+    def choose_goals(
+        self,
+        plan: RoundPlan,
+        start_state: StateArray,
+        start_position: StateArray,
+        round_index: IntArray,
+        proposal: StateArray,
+        verdict: NDArray[np.int8],
+        rng: np.random.Generator,
+    ) -> GoalChoice:
+        """Choose what Bob plays: Alice's valid goals, or replayed ones where the configuration says so.
+
+        Replayed goals go to the current Bob only: nobody learns from a past Bob, he shows how hard Alice's goals are.
+
+        Args:
+            plan: who plays.
+            start_state: (N, S) full physics state of this round's start.
+            start_position: (N, 3) object position there, metres.
+            round_index: (N,) 0 where it is the start of a game.
+            proposal: (N, 3) object position at the end of Alice's turn, metres.
+            verdict: (N,) ``Verdict`` of the proposal.
+            rng: source of the choice.
+        """
+        valid: BoolArray = verdict == Verdict.VALID
+        replayed = self._choose_replayed(valid, plan.bob_past, rng)
+        starts = start_state.copy(), start_position.copy()
+        from_reset = (round_index == 0) & ~replayed
+        choice = GoalChoice(proposal.copy(), *starts, replayed, from_reset, valid | replayed)
+        if replayed.any():
+            self._replay(choice, np.flatnonzero(replayed), rng)
+        return choice
+
+    def state(self) -> Arrays:
+        """All arrays by flat names."""
+        arrays: Arrays = {name: getattr(self, name) for name in _ARRAYS}
+        return arrays | join_parts({"buffer": self.buffer, "starts": self.starts})
+
+    def with_state(self, state: Mapping[str, Array]) -> GeneratorSnapshot:
+        """A snapshot with the arrays that ``state`` gave, and all else from this one."""
+        parts = split_parts(state)
+        arrays: dict[str, Any] = {name: state[name] for name in _ARRAYS}
+        return replace(self, **arrays, buffer=parts["buffer"], starts=parts["starts"])
+
+    def _choose_replayed(self, valid: BoolArray, bob_past: BoolArray, rng: np.random.Generator) -> BoolArray:
+        """(N,) worlds whose goal comes from the buffer."""
+        if len(self.buffer["goal"]) < MIN_REPLAY_GOALS:
+            return np.zeros(len(valid), dtype=np.bool_)
+        replaced: BoolArray = valid & (rng.random(len(valid)) < self.config.replay_fraction)
+        filled: BoolArray = ~valid & self.config.replay_invalid
+        return (replaced | filled) & ~bob_past
+
+    def _replay(self, choice: GoalChoice, worlds: IntArray, rng: np.random.Generator) -> None:
+        """Give ``worlds`` earlier goals, from the start each was proposed from or from that of some game.
+
+        Whatever is asked of Bob downstream begins with a reset, but Alice reaches far goals over several rounds, so few
+        of her own do. Both kinds of task compete by learnability: far goals from a reset wait until Bob is ready.
+        """
+        # Each goal of the buffer is a candidate from its own start and, behind all of these, from the start of a game.
+        goal, num_starts = self.buffer["goal"], len(self.starts["start_position"])
+        tasks = self.buffer
+        weight = (self.learnability + LEARNABILITY_FLOOR) * self.share
+        if self.config.replay_from_reset and num_starts:
+            drawn = rng.choice(num_starts, size=len(goal))
+            start = {name: rows[drawn] for name, rows in self.starts.items()}
+            weight = np.concatenate([weight, self._weight_from_reset(**start) * self.share])
+            tasks = join_rows([{name: tasks[name] for name in start}, start])
+        drawn = rng.choice(len(weight), size=len(worlds), p=weight / weight.sum())
+        choice.goal[worlds] = goal[drawn % len(goal)]
+        choice.from_reset[worlds] = drawn >= len(goal)
+        choice.start_state[worlds] = tasks["start_state"][drawn]
+        choice.start_position[worlds] = tasks["start_position"][drawn]
+
+    def _weight_from_reset(self, start_state: StateArray, start_position: StateArray) -> StateArray:
+        """(M,) weight, but for its share, of each goal of the buffer from one (M, S) start of a game each."""
+        goal = self.buffer["goal"]
+        far = np.linalg.norm(goal - start_position, axis=1) > self.success_distance_m  # nearer ones are no task
+        # A closed gripper lifts nothing.
+        possible = ~(self.tasks.blocked(start_state) & in_air(goal, self.tasks.rest_height_m))
+        learnability = self.reset_learnability[self.tasks.index(goal, start_position, start_state)]
+        weight: StateArray = np.where(far & possible, learnability + LEARNABILITY_FLOOR, 0.0)
+        return weight
