@@ -30,6 +30,10 @@ _REMOVED = {
 """Keys that only version 0.1.0 has, each with its default, at which it did nothing."""
 
 
+MIN_ROWS = 32
+"""Least rows of a minibatch for each of several learners. Ranks pay off from about a thousand on."""
+
+
 class ConfigError(TandemError):
     """A configuration the user can mend; the message says what, where, which value, and what to do."""
 
@@ -233,6 +237,12 @@ class ABCConfig(FrozenModel):
 class LearnerConfig(FrozenModel):
     """Central learner."""
 
+    num_learners: int = Field(
+        1,
+        ge=1,
+        description="processes that learn together on a cluster, its ranks: each from its share of the rollouts, with "
+        "gradients averaged. How many is no part of what is learned, and may change when a run is resumed",
+    )
     device: Literal["cpu", "cuda", "auto"] = Field(
         "cpu", description="of the learner; auto: cuda where there is one, else cpu. These networks gain little from it"
     )
@@ -256,6 +266,17 @@ class LearnerConfig(FrozenModel):
     )
     abc: ABCConfig = ABCConfig()
     mirror: bool = Field(False, description="learn from every Bob sample also reflected in y; the task is symmetric")
+
+    @model_validator(mode="after")
+    def _enough_rows(self) -> Self:
+        for name, size in (("alice", self.alice.minibatch_size), ("bob", self.bob.minibatch_size)):
+            if self.num_learners > 1 and size < MIN_ROWS * self.num_learners:
+                raise ValueError(
+                    f"{self.num_learners} learners have {size // self.num_learners} rows each of a minibatch of "
+                    f"{name}'s, {size}; less than {MIN_ROWS} are not worth a message: use at most "
+                    f"{max(1, size // MIN_ROWS)} learners, or raise learner.{name}.minibatch_size"
+                )
+        return self
 
 
 class RunConfig(FrozenModel):

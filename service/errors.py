@@ -16,3 +16,9 @@ class DivergedError(TandemError):
     """A policy no longer acts in finite numbers; what it did before is not in doubt."""
 
     exit_code = 1
+
+
+class GroupError(TandemError):
+    """The ranks of a learner do not hear each other; the message says which rank noticed it."""
+
+    exit_code = 1

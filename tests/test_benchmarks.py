@@ -13,6 +13,7 @@ from benchmarks import (
     ablations,
     compare_commits,
     env_throughput,
+    learner_ranks,
     measuring,
     record_run,
     rounds,
@@ -35,7 +36,9 @@ from service.envs.gym.registration import TABLETOP_ID
 from service.errors import TandemError
 from service.io.jsonl import JsonlWriter
 from service.io.run_directory import RunDirectory
+from service.learner.group import ALONE
 from service.learner.learner import Learner
+from service.policies.networks import make_bob, make_bob_value
 from service.policies.numpy_policy import numpy_bob
 from service.primitives.bundled import BUNDLED
 from service.primitives.loading import read_parameters, read_stages
@@ -103,6 +106,31 @@ def test_the_machine_is_described_in_one_line():
     assert where["cpu"] in measuring.describe(where)
     assert "\n" not in measuring.describe(where)
     json.dumps(where)
+
+
+# --- ranks of the learner ---------------------------------------------------------------------------------------------
+
+
+def test_one_rank_learns_from_all_that_is_made_up():
+    settings = learner_ranks.Settings(num_worlds=5, num_rollouts=2, minibatch_rows=64, num_updates=1, num_messages=2)
+    config = learner_ranks.make_config(settings)
+    rollouts = learner_ranks.make_rollouts(config, settings, 0)
+    assert [len(rollout.bob.learn) for rollout in rollouts] == [2, 3]
+    measured = learner_ranks.measure(ALONE, settings, 1)
+    assert len(measured.update_s) == len(measured.cpu_s) == 1
+    # Alice: 5 x 20 steps in 2 minibatches, 3 epochs. Bob: 2 x 5 x 40 in 6, 3 epochs. Then moments, KLs, metrics.
+    assert measured.num_sums >= 3 * 2 + 3 * 6
+    bob = make_bob(config.policy), make_bob_value(config.policy)
+    assert measured.num_parameters == sum(each.numel() for network in bob for each in network.parameters())
+
+
+def test_ranks_are_reported_beside_threads():
+    each = {"num_ranks": 1, "num_threads": 1, "update_s": 0.5, "cpu_s": 0.5, "messages_s": 0.0, "message_s": 0.0}
+    two = each | {"num_ranks": 2, "update_s": 0.3125, "cpu_s": 0.6, "messages_s": 0.0625, "message_s": 0.002}
+    ranks = [each | {"efficiency": 1.0}, two | {"efficiency": 0.8}]
+    text = learner_ranks.report({"ranks": ranks, "threads": [each | {"num_threads": 2}]})
+    assert "| 2 x 1 | 0.312 | 0.600 | 80 % | 2.00 | 20 % |" in text
+    assert "| 1 x 2 | 0.500 | 0.500 |  |  |  |" in text
 
 
 # --- env throughput ---------------------------------------------------------------------------------------------------

@@ -26,7 +26,15 @@ HEAVY = (
     "uvicorn",
     "httpx",
 )
-CLUSTER_MODULES = ("actor_pool", "cluster", "ray_actors", "ray_connection", "remote_worker", "status_actor")
+CLUSTER_MODULES = (
+    "actor_pool",
+    "cluster",
+    "learner_group",
+    "ray_actors",
+    "ray_connection",
+    "remote_worker",
+    "status_actor",
+)
 ROOMS_WITHOUT_TORCH = ("actors", "envs", "generator", "registry", "status")
 ROOMS = (
     *("errors", "frozen", "types", "config", "io", "envs", "policies", "generator", "actors", "learner", "registry"),

@@ -56,7 +56,7 @@ def pretrain(
         int | None, typer.Option(help="Rollout actors; default: as many as the cluster has cores.", min=1)
     ] = None,
     learner_cpus: Annotated[
-        float, typer.Option(help="Cores reserved for the learner; 0: it shares the actors'.", min=0)
+        float, typer.Option(help="Cores reserved for each rank of the learner; 0: one shares the actors'.", min=0)
     ] = 0.0,
     status: Annotated[
         str, typer.Option(metavar="HOST:PORT|off", help="Where the status service of a run on a cluster listens.")

@@ -8,24 +8,40 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from service.envs.observations import POSITIONS
+from service.learner.group import ALONE, Group, mean_and_std
 from service.learner.player import Player
-from service.learner.samples import Cloning
+from service.learner.samples import Cloning, Rows
 from service.policies import gaussian
 from service.policies.networks import MCPPolicy
+from service.types import Metrics
 
 NUM_PROBES = 1024
 """Number of rows that are enough for what is measured once an update."""
 
 
-def probes(rows: Tensor) -> Tensor:
-    """At most ``NUM_PROBES`` of the rows, evenly spread."""
-    return rows[:: -(-len(rows) // NUM_PROBES)]
+def probes(rows: Rows) -> Rows:
+    """The own ones of at most ``NUM_PROBES`` of the rows of all ranks, evenly spread."""
+    return rows.find(np.arange(0, rows.num_total, -(-rows.num_total // NUM_PROBES)))
 
 
-def explained_variance(returns: NDArray[np.floating], values: NDArray[np.floating]) -> float:
-    """Share of the variance of ``returns`` that ``values`` predict: 1 at best, 0 for a constant (any shape)."""
-    variance = float(np.var(returns))
-    return 1.0 - float(np.var(returns - values)) / variance if variance > 0.0 else 0.0
+def explained_variance(
+    returns: NDArray[np.floating], values: NDArray[np.floating], num: int, group: Group = ALONE
+) -> float:
+    """Share of the variance of ``returns`` (N,) that ``values`` predict: 1 at best, 0 for a constant.
+
+    ``num`` rows are those of all ranks together.
+    """
+    _, std = mean_and_std(returns.astype(np.float64), num, group)
+    _, error_std = mean_and_std((returns - values).astype(np.float64), num, group)
+    return 1.0 - (error_std / std) ** 2 if std > 0.0 else 0.0
+
+
+def mean_over_ranks(metrics: Metrics, num_rows: int, num_total: int, group: Group) -> Metrics:
+    """Average a rank's means over its ``num_rows`` with those of the other ranks, ``num_total`` rows together."""
+    weighted = [value * (num_rows / num_total) if num_rows else 0.0 for value in metrics.values()]
+    sums = torch.tensor(weighted, dtype=torch.float64)
+    group.sum(sums)
+    return dict(zip(metrics, sums.tolist(), strict=True))
 
 
 @torch.no_grad()

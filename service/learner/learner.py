@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import zlib
 from collections import deque
 from collections.abc import Mapping, Sequence
 
@@ -12,12 +13,14 @@ from numpy.typing import NDArray
 
 from service.actors.rollout import Rollout, Turns, part_to_arrays
 from service.config import Config
-from service.envs.observations import ACTION, BOB
+from service.envs.observations import ACTION, BOB, BOB_VALUE, FULL, ObservationLayout
 from service.io.tensors import join_parts, split_parts
 from service.learner import ppo
-from service.learner.diagnostics import cloning_metrics, composition_metrics, probes
+from service.learner.diagnostics import cloning_metrics, composition_metrics, mean_over_ranks, probes
+from service.learner.group import ALONE, Group
 from service.learner.player import LearnerError, Player
-from service.learner.samples import Cloning, DemonstrationHistory, augment_by_symmetry
+from service.learner.samples import Cloning, DemonstrationHistory, Samples, augment_by_symmetry
+from service.learner.shares import own_demonstrations, share_of, share_out
 from service.learner.weights import MAX_POLICY_LAG, Weights
 from service.policies import networks
 from service.types import Array, Arrays, Metrics
@@ -34,13 +37,18 @@ class Learner:
     ``state`` holds all that ``load_state`` needs to continue as if nothing had happened, bit for bit.
     """
 
-    def __init__(self, config: Config) -> None:
+    def __init__(self, config: Config, group: Group = ALONE) -> None:
         """Make both players from ``config.seed``; this is version 0.
+
+        Args:
+            config: the run.
+            group: of the ranks that learn together. Each has a learner of its own and takes its share of the rollouts,
+                ``shares.share_out`` of their ids in order; ``update`` is called on all at once.
 
         Raises:
             LearnerError: CUDA is asked for and not there.
         """
-        self.config = config
+        self.config, self._group = config, group
         self.version = 0
         self._device = torch_device(config.learner.device)
         with torch.random.fork_rng(devices=[]):
@@ -76,19 +84,23 @@ class Learner:
         """Learn from all rollouts taken since the last update, in the order of their ids; makes the next version.
 
         Returns:
-            Metrics named ``learner/...``; one that could not be measured is left out.
+            Metrics named ``learner/...``, equal on all ranks; one that could not be measured is left out.
 
         Raises:
-            LearnerError: there are none.
+            LearnerError: no rank has any, or the ranks are not at the same point of the same run.
+            GroupError: another rank does not answer; this learner cannot go on.
         """
-        if not self._pending:
-            raise LearnerError("learner update with 0 rollouts: ingest at least one first")
         rollouts = [self._pending[key] for key in sorted(self._pending)]
+        everyones = self._meet(rollouts)
+        if not len(everyones):
+            raise LearnerError("learner update with 0 rollouts: ingest at least one first")
         metrics = self._update_alice(rollouts)
         for name, value in self._update_bob(rollouts).items():
             metrics[name] = metrics.get(name, 0.0) + value  # only counts of failures are both players'
-        self._counted |= {(actor, incarnation): sequence for actor, incarnation, sequence in sorted(self._pending)}
+        self._counted |= {(actor, incarnation): sequence for actor, incarnation, sequence, _ in sorted(everyones)}
         self._pending.clear()
+        lags = [self.version - version for *_, version in everyones]
+        metrics |= {"policy_lag": float(np.mean(lags)), "max_policy_lag": float(max(lags))}
         self.version += 1
         self._average_bob()
         metrics["version"] = float(self.version)
@@ -100,11 +112,18 @@ class Learner:
         return Weights(self.version, alice, bob, {name: array.copy() for name, array in self._bob_ema.items()})
 
     def state(self) -> Arrays:
-        """Everything a resumed run needs, as arrays by name; rollouts not yet learned from are not part of it."""
-        parts = {"alice": self._alice.state(), "bob": self._bob.state(), "demonstrations": self._history.state()}
-        parts |= {_BOB_EMA: {name: array.copy() for name, array in self._bob_ema.items()}}
+        """Everything a resumed run needs, as arrays by name; rollouts not yet learned from are not part of it.
+
+        Where there are several ranks, ``shares.join_states`` makes one state of theirs; all but rank 0 hand out only
+        what they alone have.
+        """
+        parts = {"demonstrations": self._history.state()}
         for index, iteration in enumerate(self._used_again()):
             parts |= {f"window/{index:04}/{place:04}": part_to_arrays(each) for place, each in enumerate(iteration)}
+        if self._group.rank > 0:
+            return join_parts(parts)
+        parts |= {"alice": self._alice.state(), "bob": self._bob.state()}
+        parts |= {_BOB_EMA: {name: array.copy() for name, array in self._bob_ema.items()}}
         counted = [(*source, sequence) for source, sequence in sorted(self._counted.items())]
         return join_parts(parts) | {
             "version": np.array(self.version, dtype=np.int64),
@@ -114,6 +133,8 @@ class Learner:
 
     def load_state(self, state: Mapping[str, Array]) -> None:
         """Continue exactly where ``state`` was taken, by a learner of the same configuration.
+
+        Of several ranks' joined state each takes its share; there may have been another number of ranks.
 
         Raises:
             LearnerError: an array is missing, left over or does not fit; the learner is as it was then.
@@ -131,12 +152,36 @@ class Learner:
         self._bob_ema = bob_ema
         self._window.clear()
         for _, iteration in sorted(window.items()):
-            self._window.append([Turns(**arrays) for _, arrays in sorted(split_parts(iteration).items())])
+            turns = [Turns(**arrays) for _, arrays in sorted(split_parts(iteration).items())]
+            self._window.append(list(share_out(turns, self._group.rank, self._group.size)))
         self.version = int(own["version"])
         self._rng = _rng_from_array(own["rng"])
         self._counted = {(int(actor), int(incarnation)): int(last) for actor, incarnation, last in own["counted"]}
-        self._history.load_state(history)
+        self._history.load_state(own_demonstrations(history, self._group.rank, self._group.size))
         self._pending.clear()
+
+    def _meet(self, rollouts: Sequence[Rollout]) -> list[tuple[int, ...]]:
+        """Tell the other ranks what this one learns from, and go on from exactly the same parameters.
+
+        Ranks on processors of different kinds round differently; taking over what rank 0 has keeps them from drifting
+        apart, and costs no more than one gradient step.
+
+        Returns:
+            (actor, incarnation, sequence, policy version) of the rollouts of all ranks.
+        """
+        players = self._alice, self._bob
+        rates = np.array([player.optimizer.learning_rate for player in players])
+        random = zlib.crc32(_rng_to_array(self._rng).tobytes() + rates.tobytes())
+        ids = [number for each in rollouts for number in (*each.id, each.policy_version)]
+        told = self._group.gather(np.array([self.version, random, *ids], dtype=np.int64))
+        for rank, numbers in enumerate(told):
+            if (numbers[:2] != told[0][:2]).any():
+                raise LearnerError(
+                    f"learner rank {rank} is at version {numbers[0]} with random numbers and learning rates "
+                    f"{numbers[1]:08x}, rank 0 at {told[0][0]} with {told[0][1]:08x}: start all ranks from one state"
+                )
+        self._group.copy_first([tensor for player in players for tensor in player.tensors().values()])
+        return [tuple(each) for numbers in told for each in numbers[2:].reshape(-1, 4).tolist()]
 
     def _average_bob(self) -> None:
         """Move the average towards the new version; faster at first, when it is mostly the untrained Bob."""
@@ -160,40 +205,70 @@ class Learner:
             player.load_state(states[key])
 
     def _update_alice(self, rollouts: Sequence[Rollout]) -> Metrics:
-        samples = ppo.collect([rollout.alice for rollout in rollouts], self._alice)
-        metrics = ppo.update(self._alice, samples, None, self.config.learner.abc, self._rng)
-        return _prefixed("alice", metrics) | {"num_alice_samples": float(len(samples or ()))}
+        samples = ppo.collect([[rollout.alice for rollout in rollouts]], _NO_ALICE, self._alice, self._group)
+        metrics = ppo.update(self._alice, samples, None, self.config.learner.abc, self._rng, self._group)
+        return _prefixed("alice", metrics) | {"num_alice_samples": float(_num(samples))}
 
     def _update_bob(self, rollouts: Sequence[Rollout]) -> Metrics:
-        config, bob = self.config.learner, self._bob
+        config, bob, group = self.config.learner, self._bob, self._group
         self._window.append([rollout.bob for rollout in rollouts])
-        samples = ppo.collect([turns for iteration in self._window for turns in iteration], bob)
-        metrics = {"num_bob_samples": float(len(samples or ()))}
+        samples = ppo.collect(self._window, _NO_BOB, bob, group)
+        metrics = {"num_bob_samples": float(_num(samples))}
         if samples is not None and config.mirror:
             samples = augment_by_symmetry(samples, bob)
         cloning = self._cloning(rollouts)
-        metrics["num_demonstrations"] = float(len(cloning or ()) // (2 if config.mirror else 1))
-        metrics |= _prefixed("bob", ppo.update(bob, samples, cloning, config.abc, self._rng))
+        metrics["num_demonstrations"] = float(_num(cloning) // (2 if config.mirror else 1))
+        metrics |= _prefixed("bob", ppo.update(bob, samples, cloning, config.abc, self._rng, group))
         rows = samples if samples is not None else cloning
         if rows is not None and isinstance(self._bob_policy, networks.MCPPolicy):
-            metrics |= composition_metrics(self._bob_policy, probes(rows.observation))
+            probed = probes(rows)
+            composed = composition_metrics(self._bob_policy, probed.observation)
+            metrics |= mean_over_ranks(composed, len(probed), probed.num_total, group)
         if cloning is not None:
-            metrics |= cloning_metrics(bob, Cloning(*(probes(column) for column in cloning.tensors())))
+            probed = probes(cloning)
+            metrics |= mean_over_ranks(cloning_metrics(bob, probed), len(probed), probed.num_total, group)
         return metrics
 
     def _cloning(self, rollouts: Sequence[Rollout]) -> Cloning | None:
-        """The demonstrations to clone, this update's among them; None if there are none or they have no weight."""
+        """The demonstrations to clone, this update's among them; None if no rank has any or they have no weight."""
         self._history.append([rollout.demonstrations for rollout in rollouts])
         kept = self._history.joined()
         observation, action = kept.observation, kept.action
-        if len(action) == 0 or self.config.learner.abc.weight == 0.0:
+        share = share_of(self._history.sizes(), self._group)
+        num_total = len(action) if share is None else share.total
+        if num_total == 0 or self.config.learner.abc.weight == 0.0:
             return None
         if self.config.learner.mirror:
             observation = np.concatenate((observation, BOB.mirror(observation)))
             action = np.concatenate((action, ACTION.mirror(action)))
+            share = None if share is None else share.mirrored()
         rows, actions = (torch.from_numpy(array).to(self._device) for array in (observation, action))
         with torch.no_grad():
-            return Cloning(rows, actions, self._bob.log_prob(rows, actions))
+            return Cloning(rows, actions, self._bob.log_prob(rows, actions), share)
+
+
+def _no_turns(observation: ObservationLayout, value_observation: ObservationLayout) -> Turns:
+    """Turns of no world, for a rank without rollouts."""
+    numbers, flags = np.zeros((0, 0), dtype=np.float32), np.zeros((0, 0), dtype=np.bool_)
+    return Turns(
+        observation=numbers.reshape(0, 0, observation.size),
+        value_observation=numbers.reshape(0, 0, value_observation.size),
+        final_value_observation=numbers.reshape(0, value_observation.size),
+        action=numbers.reshape(0, 0, ACTION.size),
+        log_prob=numbers,
+        reward=numbers,
+        active=flags,
+        terminated=flags,
+        learn=flags.ravel(),
+    )
+
+
+_NO_ALICE, _NO_BOB = _no_turns(FULL, FULL), _no_turns(BOB, BOB_VALUE)
+
+
+def _num(rows: Samples | Cloning | None) -> int:
+    """Rows of all ranks."""
+    return 0 if rows is None else rows.num_total
 
 
 def _prefixed(player: str, metrics: Metrics) -> Metrics:

@@ -86,17 +86,17 @@ class Player:
 
     def snapshot(self) -> list[Tensor]:
         """Copy the parameters and Adam's state, for ``restore``."""
-        return [tensor.detach().clone() for tensor in self._tensors().values()]
+        return [tensor.detach().clone() for tensor in self.tensors().values()]
 
     def restore(self, snapshot: list[Tensor]) -> None:
         """Go back to a snapshot; the learning rate stays."""
         with torch.no_grad():
-            for tensor, value in zip(self._tensors().values(), snapshot, strict=True):
+            for tensor, value in zip(self.tensors().values(), snapshot, strict=True):
                 tensor.copy_(value)
 
     def state(self) -> Arrays:
         """Copy everything that changes: parameters, Adam's state, learning rate."""
-        arrays: Arrays = {name: tensor.detach().cpu().numpy().copy() for name, tensor in self._tensors().items()}
+        arrays: Arrays = {name: tensor.detach().cpu().numpy().copy() for name, tensor in self.tensors().items()}
         return arrays | {"learning_rate": np.array(self.optimizer.learning_rate)}
 
     def check_state(self, state: Mapping[str, Array], *, where: str) -> None:
@@ -106,7 +106,7 @@ class Player:
             LearnerError: they differ; names the first array that does.
         """
         actual = {name: array.shape for name, array in state.items()}
-        expected = {name: tuple(tensor.shape) for name, tensor in self._tensors().items()} | {"learning_rate": ()}
+        expected = {name: tuple(tensor.shape) for name, tensor in self.tensors().items()} | {"learning_rate": ()}
         for name in sorted(actual.keys() | expected.keys()):
             found, wanted = actual.get(name, "none"), expected.get(name, "none")
             if found != wanted:
@@ -119,10 +119,10 @@ class Player:
 
         Where a lower or higher learning rate is configured by now, the saved one is moved within its bounds.
         """
-        self.restore([torch.from_numpy(np.array(state[name])) for name in self._tensors()])
+        self.restore([torch.from_numpy(np.array(state[name])) for name in self.tensors()])
         low, high = (self.config.learning_rate * bound for bound in LEARNING_RATE_BOUNDS)
         self.optimizer.learning_rate = min(max(float(state["learning_rate"]), low), high)
 
-    def _tensors(self) -> dict[str, Tensor]:
+    def tensors(self) -> dict[str, Tensor]:
         """Parameters and Adam's state by name: the tensors themselves, always in the same order."""
         return self._parameters | {f"adam/{name}": tensor for name, tensor in self.optimizer.tensors().items()}

@@ -3,6 +3,10 @@
 Three policies meet in an update, with the names of decoupled PPO (Hilton et al. 2022). The behaviour policy acted. The
 proximal policy is the one at the start of the update, which may be a version or two ahead. The third is being learned.
 
+A ``group`` of several ranks computes what one rank would from all rows, up to the order of float sums: a mean is each
+rank's sum divided by the number of rows of all ranks, added up over the ranks, and all decisions are taken from such
+sums.
+
 Shapes: T steps of a turn (time first), N worlds, B samples, D steps of demonstrations.
 """
 
@@ -21,11 +25,13 @@ from torch.nn.utils import clip_grad_norm_
 
 from service.actors.rollout import Turns
 from service.config import ABCConfig
-from service.learner.diagnostics import explained_variance, probes
+from service.learner.diagnostics import explained_variance, mean_over_ranks, probes
+from service.learner.group import ALONE, Group, mean_and_std
 from service.learner.player import LEARNING_RATE_BOUNDS, Player
 from service.learner.samples import Cloning, Samples, minibatches
+from service.learner.shares import share_of
 from service.policies import gaussian
-from service.types import Array, BoolArray, Metrics
+from service.types import Array, BoolArray, IntArray, Metrics
 
 FloatArray = NDArray[np.floating]
 Scalars = dict[str, Tensor]
@@ -42,18 +48,25 @@ LEARNING_RATE_STEP = 1.5
 """The KL-adaptive learning rate moves by this factor (rsl_rl)."""
 
 
-def collect(turns: Sequence[Turns], player: Player) -> Samples | None:
+def collect(
+    iterations: Sequence[Sequence[Turns]], nobody: Turns, player: Player, group: Group = ALONE
+) -> Samples | None:
     """Turn what was played into samples: the active steps of all worlds that ``learn``.
 
     Args:
-        turns: of one player, with equal T; joined along worlds.
+        iterations: turns of one player, with equal T, by iteration; joined along worlds.
+        nobody: turns of no world, for a rank without any.
         player: values the states, and is the proximal policy.
+        group: advantages are normalised over all its ranks.
 
     Returns:
-        The samples, None if there are none.
+        The samples of this rank, None if no rank has any.
     """
+    turns = [each for iteration in iterations for each in iteration] or [nobody]
     active = _join(turns, "active")
-    if not active.any():
+    share = share_of(_block_sizes(iterations, len(active)), group)
+    num_total = int(active.sum()) if share is None else share.total
+    if num_total == 0:
         return None
 
     def tensor(array: Array) -> Tensor:
@@ -72,7 +85,8 @@ def collect(turns: Sequence[Turns], player: Player) -> Samples | None:
     estimated = rewards, values, final_value.cpu().numpy(), active, terminated
     advantage = advantages(*estimated, gamma=config.gamma, gae_lambda=config.gae_lambda)[active]
     wide = advantage.astype(np.float64)
-    normalised = ((wide - wide.mean()) / (wide.std() + 1e-8)).astype(np.float32)
+    mean, std = mean_and_std(wide, num_total, group)
+    normalised = ((wide - mean) / (std + 1e-8)).astype(np.float32)
     return Samples(
         observation=observation,
         value_observation=value_observation,
@@ -83,6 +97,7 @@ def collect(turns: Sequence[Turns], player: Player) -> Samples | None:
         advantage=tensor(normalised),
         value_target=tensor(advantage + values[active]),
         value=value,
+        share=share,
     )
 
 
@@ -128,7 +143,12 @@ def advantages(
 
 
 def update(
-    player: Player, samples: Samples | None, cloning: Cloning | None, abc: ABCConfig, rng: np.random.Generator
+    player: Player,
+    samples: Samples | None,
+    cloning: Cloning | None,
+    abc: ABCConfig,
+    rng: np.random.Generator,
+    group: Group = ALONE,
 ) -> Metrics:
     """Learn from samples, demonstrations or both; go back to the parameters before if that fails.
 
@@ -142,20 +162,20 @@ def update(
     rows = samples if samples is not None else cloning
     if rows is None:
         return metrics
-    snapshot, observation = player.snapshot(), probes(rows.observation)
+    snapshot, probed = player.snapshot(), probes(rows)
     with torch.no_grad():
-        before = player.policy(observation)
-    stats = train(player, samples, cloning, abc, rng)
+        before = player.policy(probed.observation)
+    stats = train(player, samples, cloning, abc, rng, group)
     with torch.no_grad():
-        kl = float(gaussian.kl(*before, *player.policy(observation)).mean())
+        moved = gaussian.kl(*before, *player.policy(probed.observation))
+    kl = mean_over_ranks({"kl": float(moved.mean())}, len(probed), probed.num_total, group)["kl"]
     failed = stats.aborted or not kl <= KL_COLLAPSE * player.config.target_kl
     if failed:
         player.restore(snapshot)
     player.optimizer.learning_rate = _adapted_learning_rate(player, math.inf if failed or stats.stopped else kl)
     if samples is not None:
-        metrics["explained_variance"] = explained_variance(
-            samples.value_target.cpu().numpy(), samples.value.cpu().numpy()
-        )
+        estimated = samples.value_target.cpu().numpy(), samples.value.cpu().numpy()
+        metrics["explained_variance"] = explained_variance(*estimated, samples.num_total, group)
     metrics |= {"non_finite_steps": float(stats.num_non_finite), "rollbacks": float(failed)}
     metrics["policy_steps"] = float(max(len(stats.scalars.get(name, ())) for name in ("policy_loss", "cloning_loss")))
     return metrics | stats.means() | {"kl": kl}
@@ -195,39 +215,55 @@ class UpdateStats:
 
 
 def train(
-    player: Player, samples: Samples | None, cloning: Cloning | None, abc: ABCConfig, rng: np.random.Generator
+    player: Player,
+    samples: Samples | None,
+    cloning: Cloning | None,
+    abc: ABCConfig,
+    rng: np.random.Generator,
+    group: Group = ALONE,
 ) -> UpdateStats:
     """Take a player's gradient steps of one update, until its epochs are over or three minibatches were not finite."""
     stats = UpdateStats()
     for _ in range(player.config.num_epochs):
         stats.kls.clear()
         for minibatch in minibatches(samples, cloning, player.config.minibatch_size, rng):
-            _step(player, *minibatch, abc, stats)
+            _step(player, *minibatch, abc, stats, group)
             if stats.aborted:
                 return stats
     return stats
 
 
-def _step(player: Player, samples: Samples | None, cloning: Cloning | None, abc: ABCConfig, stats: UpdateStats) -> None:
-    """Take one gradient step, or none if it would not be finite."""
-    config, parts, scalars = player.config, [], Scalars()
+def _step(
+    player: Player, samples: Samples | None, cloning: Cloning | None, abc: ABCConfig, stats: UpdateStats, group: Group
+) -> None:
+    """Take one gradient step, or none if it would not be finite.
+
+    The gradients of all ranks and the numbers that decide about the step travel together. Policy and value network
+    share no parameter, so a policy that is to stop by now is left out of the step after its gradient was computed.
+    """
+    config, losses, scalars = player.config, Scalars(), Scalars()
     if not stats.stopped:
-        loss, policy_scalars = _policy_loss(player, samples, cloning, abc)
-        if samples is not None:
-            stats.stopped = stats.passes(float(policy_scalars["kl"]), KL_STOP * config.target_kl)
-        if not stats.stopped:
-            parts.append(loss)
-            scalars |= policy_scalars
+        losses["policy"], scalars = _policy_loss(player, samples, cloning, abc)
     if samples is not None:
-        scalars["value_loss"] = value_loss(player.value(samples.value_observation), samples.value_target)
-        parts.append(config.value_weight * scalars["value_loss"])
-    total = torch.stack(parts).sum()
+        value = player.value(samples.value_observation)
+        scalars["value_loss"] = value_loss(value, samples.value_target, samples.num_total)
+        losses["value"] = config.value_weight * scalars["value_loss"]
     player.policy.zero_grad()
     player.value.zero_grad()
-    total.backward()
+    torch.stack(list(losses.values())).sum().backward()
+    losses, scalars = ({name: each.detach() for name, each in part.items()} for part in (losses, scalars))
+    parameters = (*player.policy_parameters, *player.value_parameters)
+    gradients = [each.grad for each in parameters if each.grad is not None]
+    group.sum(*gradients, *losses.values(), *scalars.values())
+    if not stats.stopped and samples is not None:
+        stats.stopped = stats.passes(float(scalars["kl"]), KL_STOP * config.target_kl)
+        if stats.stopped:
+            player.policy.zero_grad()
+            del losses["policy"]
+            scalars = {"value_loss": scalars["value_loss"]}
     norm = clip_grad_norm_(player.policy_parameters, config.max_grad_norm)
     value_norm = clip_grad_norm_(player.value_parameters, config.max_grad_norm)
-    if not math.isfinite(float(total.detach() + norm + value_norm)):
+    if not math.isfinite(float(torch.stack(list(losses.values())).sum() + norm + value_norm)):
         stats.num_non_finite += 1
         return
     player.optimizer.step()
@@ -237,7 +273,7 @@ def _step(player: Player, samples: Samples | None, cloning: Cloning | None, abc:
 def _policy_loss(
     player: Player, samples: Samples | None, cloning: Cloning | None, abc: ABCConfig
 ) -> tuple[Tensor, Scalars]:
-    """PPO's surrogate, entropy bonus and cloning, of one pass through the policy."""
+    """PPO's surrogate, entropy bonus and cloning, of one pass through the policy: this rank's part of each mean."""
     rows = [part for part in (samples, cloning) if part is not None]
     action = torch.cat([part.action for part in rows])
     mean, std = player.policy(torch.cat([part.observation for part in rows]))
@@ -254,23 +290,24 @@ def _policy_loss(
             # the whole clip range for this update.
             reference = samples.proximal_log_prob
             advantage = advantage * importance_weight(reference, samples.behaviour_log_prob)
-        pair = log_prob[:num_samples], reference
-        surrogate, clip_fraction = clipped_surrogate(*pair, advantage, config.clip, config.dual_clip)
-        entropy = gaussian.entropy(std[:num_samples]).mean()
+        pair, num = (log_prob[:num_samples], reference), samples.num_total
+        surrogate, clip_fraction = clipped_surrogate(*pair, advantage, config.clip, config.dual_clip, num)
+        entropy = gaussian.entropy(std[:num_samples]).sum() / num
         loss = surrogate - config.entropy_weight * entropy
         scalars = {"policy_loss": surrogate, "entropy": entropy, "clip_fraction": clip_fraction}
         # Exact: the usual estimate from sampled actions is ruled by the few that the policy would hardly have taken,
         # of which symmetry augmentation makes many.
         kl = gaussian.kl(samples.proximal_mean, samples.proximal_std, mean[:num_samples], std[:num_samples])
-        scalars["kl"] = kl.mean().detach()
+        scalars["kl"] = kl.detach().sum() / num
     if cloning is not None:
-        scalars["cloning_loss"] = cloning_loss(log_prob[num_samples:], cloning.proximal_log_prob, abc.clip)
+        pair = log_prob[num_samples:], cloning.proximal_log_prob
+        scalars["cloning_loss"] = cloning_loss(*pair, abc.clip, cloning.num_total)
         loss = loss + abc.weight * scalars["cloning_loss"]
     return loss, scalars
 
 
 def clipped_surrogate(
-    log_prob: Tensor, reference_log_prob: Tensor, advantage: Tensor, clip: float, dual_clip: float
+    log_prob: Tensor, reference_log_prob: Tensor, advantage: Tensor, clip: float, dual_clip: float, num: int
 ) -> tuple[Tensor, Tensor]:
     """PPO's clipped surrogate (Schulman et al. 2017, eq. 7) with the dual clip of Ye et al. (2020, eq. 5).
 
@@ -283,6 +320,7 @@ def clipped_surrogate(
         advantage: (B,) normalised.
         clip: epsilon.
         dual_clip: greater than 1.
+        num: rows of the minibatch on all ranks, by which sums are divided.
 
     Returns:
         The loss, a mean, and the share of ratios outside ``1 +- clip`` (no gradient).
@@ -290,8 +328,8 @@ def clipped_surrogate(
     ratio = gaussian.log_ratio(log_prob, reference_log_prob).exp()
     objective = torch.minimum(ratio * advantage, ratio.clamp(1.0 - clip, 1.0 + clip) * advantage)
     bounded = torch.where(advantage < 0.0, torch.maximum(objective, dual_clip * advantage), objective)
-    clip_fraction = ((ratio.detach() - 1.0).abs() > clip).float().mean()
-    return -bounded.mean(), clip_fraction
+    clip_fraction = ((ratio.detach() - 1.0).abs() > clip).float().sum() / num
+    return -(bounded.sum() / num), clip_fraction
 
 
 def importance_weight(proximal_log_prob: Tensor, behaviour_log_prob: Tensor) -> Tensor:
@@ -299,17 +337,18 @@ def importance_weight(proximal_log_prob: Tensor, behaviour_log_prob: Tensor) -> 
     return gaussian.log_ratio(proximal_log_prob, behaviour_log_prob).exp().clamp(max=MAX_IMPORTANCE_WEIGHT)
 
 
-def cloning_loss(log_prob: Tensor, proximal_log_prob: Tensor, clip: float) -> Tensor:
+def cloning_loss(log_prob: Tensor, proximal_log_prob: Tensor, clip: float, num: int) -> Tensor:
     """Alice behavioural cloning (OpenAI 2021): the clipped surrogate with advantage 1, ``-mean(min(ratio, 1 + clip))``.
 
-    An action that is already ``1 + clip`` times likelier than at the start of the update has no gradient.
+    An action that is already ``1 + clip`` times likelier than at the start of the update has no gradient. ``num`` is
+    the number of demonstrations in the minibatch on all ranks.
     """
-    return -gaussian.log_ratio(log_prob, proximal_log_prob).exp().clamp(max=1.0 + clip).mean()
+    return -(gaussian.log_ratio(log_prob, proximal_log_prob).exp().clamp(max=1.0 + clip).sum() / num)
 
 
-def value_loss(value: Tensor, target: Tensor) -> Tensor:
-    """Half the mean squared error."""
-    return 0.5 * (value - target).square().mean()
+def value_loss(value: Tensor, target: Tensor, num: int) -> Tensor:
+    """Half the mean squared error over ``num`` rows, those of all ranks."""
+    return 0.5 * ((value - target).square().sum() / num)
 
 
 def _adapted_learning_rate(player: Player, kl: float) -> float:
@@ -324,6 +363,15 @@ def _adapted_learning_rate(player: Player, kl: float) -> float:
     if kl < 0.5 * player.config.target_kl:
         return min(player.optimizer.learning_rate * LEARNING_RATE_STEP, high)
     return player.optimizer.learning_rate
+
+
+def _block_sizes(iterations: Sequence[Sequence[Turns]], num_steps: int) -> IntArray:
+    """(T * iterations,) samples of each iteration at each step: the order of samples is by step, then by iteration."""
+    sizes = np.zeros((num_steps, len(iterations)), dtype=np.int64)
+    for index, iteration in enumerate(iterations):
+        for turns in iteration:
+            sizes[:, index] += turns.active[:, turns.learn].sum(1)
+    return sizes.ravel()
 
 
 def _join(turns: Sequence[Turns], name: str) -> Array:

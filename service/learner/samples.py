@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, fields, replace
-from typing import Self, TypeVar
+from typing import Any, Self, TypeVar
 
 import numpy as np
 import torch
@@ -14,17 +14,25 @@ from torch import Tensor
 from service.actors.rollout import Demonstrations
 from service.envs.observations import ACTION, BOB, BOB_VALUE, Mirror
 from service.learner.player import Player
+from service.learner.shares import Share
 from service.policies import gaussian
-from service.types import Array, Arrays
+from service.types import Array, Arrays, IntArray
 
-Rows = TypeVar("Rows", "Samples", "Cloning")
+Rows = TypeVar("Rows", bound="_Rows")
 
 
 class _Rows:
-    """A dataclass of tensors with equally many rows."""
+    """A dataclass of tensors with equally many rows, and of ``share``: their places among the rows of all ranks."""
+
+    share: Share | None
 
     def __len__(self) -> int:
         return len(self.tensors()[0])
+
+    @property
+    def num_total(self) -> int:
+        """Rows of all ranks together."""
+        return len(self) if self.share is None else self.share.total
 
     def take(self, rows: Tensor) -> Self:
         """Take the rows of these indices, in their order."""
@@ -37,7 +45,15 @@ class _Rows:
 
     def tensors(self) -> list[Tensor]:
         """The columns, in the order of the fields."""
-        return [getattr(self, field.name) for field in fields(self)]  # type: ignore[arg-type]
+        return [getattr(self, field.name) for field in fields(self) if field.name != "share"]  # type: ignore[arg-type]
+
+    def find(self, drawn: IntArray) -> Self:
+        """Take the own ones of the rows at these places of all ranks' rows, in their order."""
+        if self.share is None:
+            rows, share = drawn, None
+        else:
+            rows, share = self.share.find(drawn)
+        return replace(self.take(torch.from_numpy(rows).to(self.tensors()[0].device)), share=share)  # type: ignore[type-var]
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,6 +78,8 @@ class Samples(_Rows):
     """(B,) advantage, not normalised, plus ``value``."""
     value: Tensor
     """(B,) estimated at the start of the update."""
+    share: Share | None = None
+    """Places among the samples of all ranks; None without other ranks."""
 
     @property
     def proximal_log_prob(self) -> Tensor:
@@ -79,6 +97,8 @@ class Cloning(_Rows):
     """(D, A)."""
     proximal_log_prob: Tensor
     """(D,) of the action under the policy at the start of the update."""
+    share: Share | None = None
+    """Places among the demonstrations of all ranks; None without other ranks."""
 
 
 class DemonstrationHistory:
@@ -98,11 +118,14 @@ class DemonstrationHistory:
         """Join all that is kept, oldest first."""
         return _join(self._iterations)
 
+    def sizes(self) -> IntArray:
+        """Steps of each iteration, oldest first."""
+        return np.array([len(each.action) for each in self._iterations], dtype=np.int64)
+
     def state(self) -> Arrays:
         """Everything that a resumed run needs, by name."""
         everything = self.joined()
-        sizes = np.array([len(each.action) for each in self._iterations], dtype=np.int64)
-        return {"observation": everything.observation, "action": everything.action, "num_steps": sizes}
+        return {"observation": everything.observation, "action": everything.action, "num_steps": self.sizes()}
 
     def load_state(self, state: Mapping[str, Array]) -> None:
         """Continue where ``state`` was taken; a shorter history keeps the newest."""
@@ -132,7 +155,8 @@ def augment_by_symmetry(samples: Samples, player: Player) -> Samples:
         proximal_std=std,
     )
     pairs = zip(samples.tensors(), reflections.tensors(), strict=True)
-    return Samples(*(torch.cat(pair) for pair in pairs))
+    columns: list[Any] = [torch.cat(pair) for pair in pairs]
+    return replace(Samples(*columns), share=None if samples.share is None else samples.share.mirrored())
 
 
 def minibatches(
@@ -143,20 +167,23 @@ def minibatches(
     Samples are cut into as many equal minibatches as bring them nearest to ``size``. Demonstrations come in half that
     size, and are cycled through if they are too few. Demonstrations alone are gone through once.
 
+    The rows of all ranks are cut together: with equal random numbers the minibatches of every rank are its own rows of
+    the same minibatches, maybe none.
+
     Args:
         samples: B of them, or None.
         cloning: D demonstrations, or None; not both None.
-        size: of a minibatch of samples.
+        size: of a minibatch of samples, of all ranks together.
         rng: shuffles.
     """
     half = max(size // 2, 1)
     if samples is not None:
-        num = max(round(len(samples) / size), 1)
+        num = max(round(samples.num_total / size), 1)
     else:
         assert cloning is not None, "an epoch needs samples or demonstrations"
-        num = max(round(len(cloning) / half), 1)
-    own = [None] * num if samples is None else _draw(samples, len(samples), rng).split(num)
-    drawn = [None] * num if cloning is None else _draw(cloning, num * min(half, len(cloning)), rng).split(num)
+        num = max(round(cloning.num_total / half), 1)
+    own = [None] * num if samples is None else _draw(samples, samples.num_total, num, rng)
+    drawn = [None] * num if cloning is None else _draw(cloning, num * min(half, cloning.num_total), num, rng)
     return list(zip(own, drawn, strict=True))
 
 
@@ -166,11 +193,13 @@ def _join(parts: Iterable[Demonstrations]) -> Demonstrations:
     return Demonstrations(np.concatenate(observations), np.concatenate(actions))
 
 
-def _draw(rows: Rows, num: int, rng: np.random.Generator) -> Rows:
-    """Draw ``num`` rows in random order, none twice before each was drawn once."""
-    rounds = [rng.permutation(len(rows)) for _ in range(-(-num // len(rows)))]
-    indices = torch.from_numpy(np.concatenate(rounds)[:num])
-    return rows.take(indices.to(rows.observation.device))
+def _draw(rows: Rows, num: int, num_parts: int, rng: np.random.Generator) -> list[Rows]:
+    """Draw ``num`` rows of all ranks in random order, none twice before each was drawn once; the own ones in parts."""
+    rounds = [rng.permutation(rows.num_total) for _ in range(-(-num // rows.num_total))]
+    drawn = np.concatenate(rounds)[:num]
+    if rows.share is None:
+        return rows.find(drawn).split(num_parts)  # copied once
+    return [rows.find(part) for part in np.array_split(drawn, num_parts)]
 
 
 def _reflect(rows: Tensor, mirror: Mirror) -> Tensor:

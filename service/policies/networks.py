@@ -135,7 +135,7 @@ class Primitives(nn.Module):
     def forward(self, positions: Tensor) -> tuple[Tensor, Tensor]:
         """Means and variances, (..., K, A) each."""
         hidden = elu(self.hidden(self.trunk(self.input(positions))), inplace=True)
-        heads = hidden.reshape(*hidden.shape[:-1], self.num_primitives, -1)
+        heads = hidden.unflatten(-1, self.output_weight.shape[:2])
         output = torch.einsum("...kh,kho->...ko", heads, self.output_weight) + self.output_bias
         means, log_stds = self.squash(output)
         return means, (2.0 * log_stds).exp()

@@ -4,15 +4,16 @@
 |---|---|---|---|---|
 | driver, ``ClusterRun`` | results of the others | calls, records, checkpoints | next result, ``POLL_S`` at most | - |
 | rollout actors x N | weights, snapshot, opponents | a rollout, a goal summary | nothing | ``RolloutSlots`` |
-| learner | rollouts of one iteration | weights, its state, metrics | nothing | one update at a time |
+| learner, R ranks | shares of an iteration's rollouts | weights, states, metrics | each other | ``RANK_ANSWER_S`` |
 | task generator | goal summaries of one iteration | snapshot, opponents, its state | nothing | one record at a time |
 
 The weights of an iteration and the task generator's snapshot come out together, and a round is given the newest of
-both. No worker calls another: one that dies or freezes holds back iterations, and no round.
+both. No worker calls another, but for the learner's ranks among themselves: one that dies or freezes holds back
+iterations, and no round.
 
 The driver holds references, not data. Learner and generator hand back their whole state with every iteration, so when
 one dies, another goes on from there with the rollouts in hand: what an actor handed over is neither lost nor counted
-twice.
+twice. A rank of the learner that dies or hangs ends all of them, and as many others go on.
 """
 
 from __future__ import annotations
@@ -33,10 +34,11 @@ from ray.exceptions import ObjectLostError, RayError, RayTaskError
 from service.actors.evaluation import EVALUATED_GOALS
 from service.actors.rollout import from_arrays
 from service.config import Config
-from service.errors import DivergedError
+from service.errors import DivergedError, GroupError
 from service.io.run_directory import RunDirectory
 from service.policies.parameters import Parameters, PolicyError
 from service.runtime.actor_pool import QUIET, THREAD_VARIABLES, ActorPool, ActorSlot
+from service.runtime.learner_group import LearnerGroup, Update, check_room, num_gpus
 from service.runtime.ray_actors import GeneratorActor, LearnerActor
 from service.runtime.ray_connection import ClusterOptions
 from service.runtime.remote_worker import RemoteWorker, one_line
@@ -87,14 +89,14 @@ class Iteration:
     """``time.monotonic()`` of the last request; infinity once its answer is no longer waited for."""
     num_attempts: Counter[str] = field(default_factory=Counter)
     """Failed attempts, by worker."""
-    weights: Any = None
-    """Reference to the version that comes out of it."""
+    update: Update | None = None
+    """The learner's part, as it was asked for last."""
     snapshot: Any = None
     """Reference to what the generator knows after it."""
     opponents: Any = None
     """Reference to the past players after it; of nothing where they are those before it."""
-    states: dict[str, Any] = field(default_factory=dict)
-    """References to the workers' states after it, by worker."""
+    generator_state: Any = None
+    """Reference to the generator's state after it."""
     updated: UpdateResult | None = None
     recorded: GeneratorResult | None = None
     grid: GoalGrid | None = None
@@ -136,6 +138,9 @@ class ClusterRun(Runner):
         self._num_failed_rounds = self._num_counted = self._num_refused = 0
         self._last_error: str | None = None
         self._last_iteration = self._last_beat = self._last_resize = time.monotonic()
+        learner = config.learner
+        self._rank_cpus = options.rank_cpus(learner)
+        check_room(learner.num_learners, learner.device, self._rank_cpus, options.actor_threads)
         learner_state = generator_state = pending = None
         first_incarnation = 0
         if resume:
@@ -148,7 +153,7 @@ class ClusterRun(Runner):
         self._generator = self._start_generator(generator_state)
         self._learner.wait_ready()
         self._generator.wait_ready()
-        self._weights, self._learner.state = self._learner.handle.begin.options(num_returns=2).remote()
+        self._weights = self._learner.begin()
         begun = self._generator.handle.begin.options(num_returns=3).remote()
         self._generator.state, self._snapshot, self._opponents = begun
         self._version: int = ray.get(self._weights).version
@@ -167,7 +172,7 @@ class ClusterRun(Runner):
         """The state of all its workers."""
         waiting = self._pool.num_waiting
         lack = (f"{waiting} of {len(self._pool)} rollout actors wait for a free core",) if waiting else ()
-        actors = (*(slot.status() for slot in self._pool), self._learner.status(), self._generator.status())
+        actors = (*(slot.status() for slot in self._pool), *self._learner.statuses(), self._generator.status())
         return Health(actors, self._num_counted, self._num_refused, lack, self._last_error)
 
     def grid(self) -> GoalGrid:
@@ -189,6 +194,7 @@ class ClusterRun(Runner):
         with self.bookkeeper.explaining_divergence():
             for reference in ready:
                 self._waiting.pop(reference)(reference)
+        self._check_learner()
         self._check_actors()
         self._check_generator()
         if time.monotonic() - self._last_beat >= BEAT_S:
@@ -278,10 +284,10 @@ class ClusterRun(Runner):
         self._ask_learner(self._current)
 
     def _ask_learner(self, iteration: Iteration) -> None:
-        update = self._learner.handle.update_from.options(num_returns=3)
-        iteration.weights, state, updated = update.remote([each.rollout for each in iteration.batch])
-        iteration.states["learner"] = state
-        self._waiting[updated] = partial(self._on_answer, iteration, self._learner)
+        in_order = sorted(iteration.batch, key=lambda each: each.summary.id)
+        update = iteration.update = self._learner.update([each.rollout for each in in_order])
+        for rank, answer in enumerate(update.answers):
+            self._waiting[answer] = partial(self._on_learned, iteration, update, rank)
 
     def _ask_generator(self, iteration: Iteration) -> None:
         num_env_steps = self.num_env_steps + iteration.num_env_steps
@@ -289,38 +295,60 @@ class ClusterRun(Runner):
         record = self._generator.handle.record_from.options(num_returns=4)
         weights = iteration.batch[0].weights  # the players of this iteration may become past opponents
         recorded, *others = record.remote(self.iteration, num_env_steps, weights, goals)
-        iteration.states["generator"], iteration.snapshot, iteration.opponents = others
+        iteration.generator_state, iteration.snapshot, iteration.opponents = others
         iteration.asked_generator = time.monotonic()
-        self._waiting[recorded] = partial(self._on_answer, iteration, self._generator)
+        self._waiting[recorded] = partial(self._on_recorded, iteration)
 
-    def _on_answer(self, iteration: Iteration, worker: RemoteWorker, reference: Any) -> None:
+    def _on_learned(self, iteration: Iteration, update: Update, rank: int, reference: Any) -> None:
+        if iteration.update is not update:
+            return  # of ranks that were ended meanwhile
         try:
-            answer = ray.get(reference)
+            result = ray.get(reference)
         except RayError as error:
-            self._on_failed_answer(iteration, worker, error)
+            self._on_failed_answer(iteration, self._learner, error)
             return
-        worker.record_heartbeat()
-        if worker is self._learner:
-            iteration.updated = answer
-        else:
-            iteration.recorded, iteration.grid = answer
-        if iteration.updated is not None and iteration.recorded is not None:
-            self._finish_iteration(iteration, iteration.updated, iteration.recorded)
+        self._learner.record_heartbeat(rank)
+        if isinstance(result, GroupError):
+            self._on_failed_answer(iteration, self._learner, result)
+            return
+        update.add(rank, result)
+        if update.done:
+            iteration.updated = update.joined()
+            self._finish_if_done(iteration)
 
-    def _on_failed_answer(self, iteration: Iteration, worker: RemoteWorker, error: RayError) -> None:
+    def _on_recorded(self, iteration: Iteration, reference: Any) -> None:
+        try:
+            iteration.recorded, iteration.grid = ray.get(reference)
+        except RayError as error:
+            self._on_failed_answer(iteration, self._generator, error)
+            return
+        self._generator.record_heartbeat()
+        self._finish_if_done(iteration)
+
+    def _check_learner(self) -> None:
+        """Replace the learner if one of its ranks hangs where no other waits for it."""
+        iteration = self._current
+        update = iteration.update if iteration is not None and iteration.updated is None else None
+        if iteration is not None and update is not None and update.overdue:
+            self._on_failed_answer(iteration, self._learner, GroupError("a rank does not hand back its state"))
+
+    def _on_failed_answer(self, iteration: Iteration, worker: RemoteWorker | LearnerGroup, error: Exception) -> None:
         """Start another learner or generator from the state before the iteration, and ask it what is left of that."""
-        if _lost(error):
+        lost = _lost(error)
+        reason = one_line(error) if lost else worker.explain(error)
+        if lost:
             self._drop_lost(iteration)
-        elif isinstance(error, (DivergedError, PolicyError)) or worker.alive:
+            if worker is self._learner and self._learner.size > 1:
+                worker.restart(reason)  # the other ranks wait for the one that has nothing to learn from
+        elif isinstance(error, (DivergedError, PolicyError)) or (not isinstance(error, GroupError) and worker.alive):
             raise error
         else:
-            worker.restart(one_line(error))
-            self._last_error = f"{worker.name}: {one_line(error)}"
+            worker.restart(reason)
+            self._last_error = f"{worker.name}: {reason}"
         iteration.num_attempts[worker.name] += 1
         if iteration.num_attempts[worker.name] >= MAX_ATTEMPTS:
             raise ClusterError(
-                f"{MAX_ATTEMPTS} times in a row the {worker.name} failed at the same rollouts, at last with: "
-                f"{one_line(error)}"
+                f"{MAX_ATTEMPTS} times in a row the {worker.name} failed at the same rollouts, at last with: {reason}"
             ) from error
         if not iteration.batch:
             self._current = None
@@ -339,15 +367,22 @@ class ClusterRun(Runner):
                 iteration.batch.remove(each)
                 self._slots.lose(each.ticket)
 
-    def _finish_iteration(self, iteration: Iteration, updated: UpdateResult, recorded: GeneratorResult) -> None:
+    def _finish_if_done(self, iteration: Iteration) -> None:
+        if iteration.update is not None and iteration.updated is not None and iteration.recorded is not None:
+            self._finish_iteration(iteration, iteration.update, iteration.updated, iteration.recorded)
+
+    def _finish_iteration(
+        self, iteration: Iteration, update: Update, updated: UpdateResult, recorded: GeneratorResult
+    ) -> None:
         """Count and record an iteration whose version is out, and give its rollout slots back."""
         now = time.monotonic()
         elapsed_s, self._last_iteration = now - self._last_iteration, now
-        self._weights, self._version = iteration.weights, updated.version
+        self._weights, self._version = update.weights, updated.version
         self._snapshot = iteration.snapshot
         if recorded.new_opponents:
             self._opponents = iteration.opponents
-        self._learner.state, self._generator.state = iteration.states["learner"], iteration.states["generator"]
+        self._learner.keep(update)
+        self._generator.state = iteration.generator_state
         self._slots.publish([each.ticket for each in iteration.batch])
         self._current, self._grid = None, iteration.grid
         self._num_counted += len(updated.counted)
@@ -406,7 +441,7 @@ class ClusterRun(Runner):
     def _num_actors(self) -> int:
         if self._options.num_actors is not None:
             return self._options.num_actors
-        cores = ray.cluster_resources().get("CPU", 0.0) - self._options.learner_cpus
+        cores = ray.cluster_resources().get("CPU", 0.0) - self._rank_cpus * self._learner.size
         return max(1, int(cores // self._options.actor_threads))
 
     def _start_actors(self, first_incarnation: int) -> ActorPool:
@@ -423,20 +458,21 @@ class ClusterRun(Runner):
         """Write a checkpoint of the last iteration; rounds being played and their actors are no part of it."""
         with self.timing("checkpoint"):
             weights = ray.get(self._weights)
-            parts = {"learner": ray.get(self._learner.state), "generator": ray.get(self._generator.state)}
+            parts = {"learner": self._learner.state(), "generator": ray.get(self._generator.state)}
             parts |= {"alice": weights.alice, "bob": weights.bob_ema}  # for readers without torch
             rng = np.random.default_rng([self.config.seed, self.iteration])  # what a local runner goes on with
             meta = {"next_incarnation": self._next_incarnation, "rng": rng.bit_generator.state}
             self.bookkeeper.save(parts, meta)
 
-    def _start_learner(self, *arguments: Any) -> RemoteWorker:
+    def _start_learner(self, *arguments: Any) -> LearnerGroup:
+        learner = self.config.learner
         actor = ray.remote(LearnerActor).options(
-            num_cpus=self._options.learner_cpus,
-            num_gpus=num_gpus(self.config.learner.device),
+            num_cpus=self._rank_cpus,
+            num_gpus=num_gpus(learner.device, learner.num_learners),
             runtime_env={"env_vars": THREAD_VARIABLES},
             **QUIET,
         )
-        return RemoteWorker("learner", actor, self.config, *arguments)
+        return LearnerGroup(actor, self.config, *arguments)
 
     def _start_generator(self, state: Any) -> RemoteWorker:
         actor = ray.remote(GeneratorActor).options(num_cpus=0, runtime_env={"env_vars": THREAD_VARIABLES}, **QUIET)
@@ -446,10 +482,3 @@ class ClusterRun(Runner):
 def _lost(error: Exception) -> bool:
     """Whether a call failed because an argument of it was lost with a node."""
     return isinstance(error, RayTaskError) and isinstance(error.cause, ObjectLostError)
-
-
-def num_gpus(device: str) -> int:
-    """GPUs that the learner asks Ray for; an actor that asks for none sees none."""
-    if device == "auto":
-        return min(1, int(ray.cluster_resources().get("GPU", 0)))
-    return int(device == "cuda")

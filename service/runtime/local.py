@@ -13,7 +13,7 @@ from datetime import UTC, datetime
 
 from service.actors.evaluation import EVALUATED_GOALS
 from service.actors.rollout import Rollout, from_arrays, to_arrays
-from service.config import Config
+from service.config import Config, ConfigError
 from service.generator.opponents import Opponents
 from service.io.run_directory import RunDirectory
 from service.policies.parameters import Parameters
@@ -26,6 +26,19 @@ OLDER_OPPONENTS = -1
 """Version of past players that a checkpoint has beside the task generator's, which have joined meanwhile."""
 
 
+def check_one_learner(config: Config) -> None:
+    """Check that a run can be one of this runner.
+
+    Raises:
+        ConfigError: its learner has several processes.
+    """
+    if config.learner.num_learners > 1:
+        raise ConfigError(
+            f"learner.num_learners = {config.learner.num_learners}: the local runner has one process; use "
+            "--runtime ray, or --set learner.num_learners=1 (what is learned is the same)"
+        )
+
+
 class LocalRun(Runner):
     """A pre-training run in this process.
 
@@ -35,11 +48,12 @@ class LocalRun(Runner):
         resume: continue from the newest checkpoint instead of starting anew.
 
     Raises:
-        TandemError: see ``RunDirectory.claim``.
+        TandemError: see ``RunDirectory.claim`` and ``check_one_learner``.
         CheckpointError: ``resume`` without a usable checkpoint.
     """
 
     def __init__(self, config: Config, directory: RunDirectory, *, resume: bool = False) -> None:
+        check_one_learner(config)
         directory.claim(resume=resume)
         super().__init__(config, directory)
         self._incarnation = 0

@@ -19,7 +19,7 @@ from service.media.artifacts import make_artifacts
 from service.primitives.publishing import measure_bob, publish_run
 from service.registry.names import Version
 from service.registry.registry import Registry
-from service.runtime.local import LocalRun
+from service.runtime.local import LocalRun, check_one_learner
 from service.runtime.reporting import Report
 from service.runtime.runner import OnIteration, Runner, RunResult, StateLostError
 from service.runtime.signals import InterruptError, StopSignals
@@ -31,8 +31,9 @@ if TYPE_CHECKING:
     from service.runtime.ray_connection import ClusterOptions
     from service.store.models import RunState
 
-RESUMABLE = ("run.", "learner.alice.learning_rate=", "learner.bob.learning_rate=")
+RESUMABLE = ("run.", "learner.num_learners=", "learner.alice.learning_rate=", "learner.bob.learning_rate=")
 """What an override of a resumed run may begin with: nothing that its past would have to be made again for."""
+_NUM_LEARNERS = "learner.num_learners"
 _logger = logging.getLogger(__name__)
 
 
@@ -93,6 +94,7 @@ def pretrain(
         Registry(registry).check_writable()  # now, not after hours of learning
     if cluster is None:  # on a cluster, another machine has it
         torch_device(config.learner.device)
+        check_one_learner(config)
     runtime: Literal["local", "ray"] = "local" if cluster is None else "ray"
     with StopSignals() as signals, ExitStack() as stack:
         stack.callback(directory.close)
@@ -179,7 +181,8 @@ def resumed_config(directory: RunDirectory | StudyDirectory, overrides: list[str
     Args:
         directory: of the run, or of a study.
         overrides: ``run.a=b`` strings, or learning rates; others may only say what the run has.
-        file: YAML that says the same as the saved one outside ``run``; what it says there comes before ``overrides``.
+        file: YAML that says the same as the saved one outside ``run`` but for the number of learners; what it says
+            there comes before ``overrides``.
 
     Raises:
         ConfigError: no run there, an override of anything else, or a file that says otherwise.
@@ -188,14 +191,15 @@ def resumed_config(directory: RunDirectory | StudyDirectory, overrides: list[str
     for override in overrides:
         if not override.startswith(RESUMABLE) and not _says(saved, directory, override):
             raise ConfigError(
-                f"override {override!r}: a resumed run keeps its configuration; only run.* and the learning rates may "
-                "change, for example run.total_env_steps"
+                f"override {override!r}: a resumed run keeps its configuration; only run.*, the learning rates and "
+                "learner.num_learners may change, for example run.total_env_steps"
             )
     if file is not None:
         given = load_config(file, recorded=True)  # maybe the one the run was begun with, by an earlier version
         _check_same_outside_run(saved, given, file)
         named = given.run.model_dump(mode="json", exclude_unset=True)
-        overrides = [f"run.{key}={json.dumps(value)}" for key, value in named.items()] + overrides
+        free = {f"run.{key}": value for key, value in named.items()} | {_NUM_LEARNERS: given.learner.num_learners}
+        overrides = [f"{key}={json.dumps(value)}" for key, value in free.items()] + overrides
     return directory.read_config(overrides)
 
 
@@ -208,7 +212,7 @@ def _says(saved: Config, directory: RunDirectory | StudyDirectory, override: str
 
 def _check_same_outside_run(saved: Config, given: Config, file: Path) -> None:
     left, right = (dict(_leaves(config.model_dump(mode="json", exclude={"run"}))) for config in (saved, given))
-    for key in sorted(left.keys() | right.keys()):
+    for key in sorted((left.keys() | right.keys()) - {_NUM_LEARNERS}):
         if left.get(key) != right.get(key):
             raise ConfigError(
                 f"{file}: {key} = {right.get(key)!r}, but the run has {left.get(key)!r}; a resumed run keeps its "

@@ -17,6 +17,7 @@ from service.learner.learner import torch_device
 from service.media.plots import plot_study
 from service.registry.names import Version
 from service.registry.registry import Registry
+from service.runtime.local import check_one_learner
 from service.runtime.progress import StudyProgress
 from service.runtime.ray_connection import ClusterOptions
 from service.runtime.signals import StopSignals
@@ -78,7 +79,7 @@ def pretrain_study(
         resume: go on with the runs in the directory that have not ended, and begin those that are missing.
         publish: or else leave that to a later resume.
         parallel: how many runs at once; None: see ``share_machine`` and ``share_cluster``.
-        cluster: run on it; None: on this machine.
+        cluster: run on it; None: on this machine, by the local runner.
         progress: where the runs are shown.
 
     Raises:
@@ -89,6 +90,7 @@ def pretrain_study(
         Registry(registry).check_writable()  # now, not after hours of learning
     if cluster is None:
         torch_device(config.learner.device)
+        check_one_learner(config)
     with StopSignals() as signals, ExitStack() as stack:
         stack.callback(directory.close)
         if resume:
@@ -120,8 +122,9 @@ def _share(config: Config, num_runs: int, parallel: int | None, cluster: StudyCl
         chosen = config.run.num_threads or share.num_cores
         return share.num_parallel, ["--set", f"run.num_threads={chosen}"]
     options = cluster.options
+    learner_cpus = options.rank_cpus(config.learner) * config.learner.num_learners
     share = share_cluster(
-        cluster.num_cores, num_runs, parallel, num_actors=options.num_actors, learner_cpus=options.learner_cpus
+        cluster.num_cores, num_runs, parallel, num_actors=options.num_actors, learner_cpus=learner_cpus
     )
     place = ["--runtime", "ray", "--address", cluster.address, "--status", "off"]
     place += ["--num-actors", str(share.num_cores), "--learner-cpus", str(options.learner_cpus)]
@@ -145,6 +148,7 @@ def _resumable(config: Config) -> Iterator[str]:
     """All that may differ from what a run was begun with; see ``RESUMABLE``."""
     for key, value in config.run.model_dump(mode="json").items():
         yield f"run.{key}={json.dumps(value)}"
+    yield f"learner.num_learners={config.learner.num_learners}"
     for name, player in (("alice", config.learner.alice), ("bob", config.learner.bob)):
         yield f"learner.{name}.learning_rate={player.learning_rate!r}"
 

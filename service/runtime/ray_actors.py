@@ -18,6 +18,7 @@ from ray.util.metrics import Counter, Histogram
 
 from service.actors.rollout import Rollout
 from service.config import Config
+from service.errors import GroupError
 from service.generator.opponents import Opponents
 from service.generator.snapshot import GeneratorSnapshot
 from service.generator.summary import GoalSummary
@@ -33,6 +34,7 @@ from service.store.models import GoalGrid
 from service.types import Arrays
 
 if TYPE_CHECKING:
+    from service.learner.group import Group
     from service.learner.weights import Weights
 
 NICENESS = 10
@@ -108,27 +110,84 @@ class GeneratorActor(GeneratorWorker):
         return (result, grid), self.generator.state(), self.generator.snapshot(), opponents
 
 
-class LearnerActor(LearnerWorker):
-    """A learner that hands its whole state back with every update."""
+class LearnerActor:
+    """One rank of the learner, which hands its whole state back with every update.
 
-    def __init__(self, config: Config, state: Arrays | None, pending: Rollout | None = None) -> None:
+    Consumes its share of an iteration's rollouts, produces its state, and rank 0 weights; waits for the other ranks at
+    every gradient step, at most as long as ``start`` was told.
+
+    Args:
+        config: the run.
+        rank, size: of this process, and of the group.
+    """
+
+    def __init__(self, config: Config, rank: int, size: int) -> None:
         lower_priority()
-        super().__init__(config, state, pending)
+        import torch  # noqa: F401  now, so that nobody waits for it once the ranks meet
+
+        self._config, self._rank, self._size = config, rank, size
+        self._host = ray.util.get_node_ip_address()
+        self._store: Any = None
 
     def ping(self) -> Location:
         """The worker's location."""
         return Location.here()
 
-    def begin(self) -> tuple[Weights, Arrays]:
-        """Weights and state before the first update."""
-        return self.learner.weights(), self.learner.state()
+    def open_store(self, timeout_s: float) -> tuple[str, int]:
+        """Open the store in which the ranks of a new group find each other; its address. Of rank 0 only."""
+        from service.learner.group import open_store
 
-    def update_from(self, references: Sequence[Any]) -> tuple[Weights, Arrays, UpdateResult]:
-        """Learn from rollouts, given as object references; see ``LearnerWorker.update``."""
+        self._store = open_store(self._host, timeout_s)
+        return self._host, self._store.port
+
+    def start(
+        self, states: Sequence[Any], pending: Rollout | None, address: tuple[str, int] | None, timeout_s: float
+    ) -> None:
+        """Join the group, and continue from a state.
+
+        Args:
+            states: references to the parts of the state, by the ranks that had them; empty at the start of a run.
+            pending: rollout to be learned from with the next ones, or None.
+            address: of the store; None where there is no other rank.
+            timeout_s: most time that a rank waits for another.
+
+        Raises:
+            GroupError: the ranks cannot reach each other.
+            LearnerError: the state does not fit.
+        """
+        from service.learner.shares import join_states
+
+        state = join_states(ray.get(list(states))) if states else None
+        group = self._join_group(address, timeout_s) if address is not None else None
+        self._worker = LearnerWorker(self._config, state, pending, group)
+
+    def begin(self) -> tuple[Weights | None, Arrays]:
+        """Weights and state before the first update."""
+        return self._weights(), self._worker.learner.state()
+
+    def update_from(self, references: Sequence[Any]) -> tuple[Weights | None, Arrays, UpdateResult | GroupError]:
+        """Learn from rollouts, given as object references; see ``LearnerWorker.update``.
+
+        Where another rank is gone, its error is the result: nobody asks for that of every rank, and Ray would print it.
+        """
         start = time.perf_counter()
-        result = self.update(ray.get(list(references)))
-        weights, state = self.learner.weights(), self.learner.state()
+        try:
+            result = self._worker.update(ray.get(list(references)))
+        except GroupError as error:
+            return None, {}, error
+        weights, state = self._weights(), self._worker.learner.state()
         return weights, state, replace(result, update_s=time.perf_counter() - start)  # all that an actor waits for
+
+    def _weights(self) -> Weights | None:
+        return self._worker.learner.weights() if self._rank == 0 else None
+
+    def _join_group(self, address: tuple[str, int], timeout_s: float) -> Group:
+        from service.learner.group import TorchGroup, find_store
+        from service.learner.learner import torch_device
+
+        store = self._store if self._store is not None else find_store(*address, timeout_s)
+        device = torch_device(self._config.learner.device)
+        return TorchGroup(store, self._rank, self._size, host=self._host, device=device, timeout_s=timeout_s)
 
 
 def _round_counters(actor: int) -> Callable[[RoundSummary], None]:

@@ -12,6 +12,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Any
 
+from service.config import LearnerConfig
 from service.runtime.runner import ClusterError
 
 CONNECT_S = 5.0
@@ -38,9 +39,17 @@ class ClusterOptions:
     actor_threads: int = 1
     """Cores of each."""
     learner_cpus: float = 0.0
-    """Reserved for the learner. With 0 it shares the actors' cores, which is right where physics is the bottleneck."""
+    """Reserved for each rank of the learner; 0: see ``rank_cpus``."""
     status: StatusOptions | None = None
     """None: no status service of its own."""
+
+    def rank_cpus(self, learner: LearnerConfig) -> float:
+        """Cores reserved for each rank of a run's learner.
+
+        Without a wish the only one shares the actors' cores, which is right where physics is the bottleneck, and each
+        of several takes as many as it has threads.
+        """
+        return self.learner_cpus or float(learner.num_threads * (learner.num_learners > 1))
 
 
 def parse_status(text: str, token: str | None) -> StatusOptions | None:

@@ -1,4 +1,4 @@
-"""A worker in another process whose state the driver keeps: the learner, the task generator."""
+"""A worker in another process whose state the driver keeps: the task generator."""
 
 from __future__ import annotations
 
@@ -69,6 +69,10 @@ class RemoteWorker:
         except RayError:
             return False
         return True
+
+    def explain(self, error: BaseException) -> str:
+        """The reason in a line why it failed."""
+        return one_line(error)
 
     def restart(self, reason: str) -> None:
         """Start another from the newest state; what the last one was doing has to be asked of it again.

@@ -31,6 +31,7 @@ from service.store.models import GoalCell, GoalGrid
 from service.types import Arrays, Metrics
 
 if TYPE_CHECKING:
+    from service.learner.group import Group
     from service.learner.weights import Weights
 
 RolloutId = tuple[int, int, int]
@@ -230,15 +231,22 @@ class LearnerWorker:
         config: the run.
         state: to continue from; None to start.
         pending: rollout to be learned from with the next ones.
+        group: of the ranks that learn together; None where this is the only one.
     """
 
-    def __init__(self, config: Config, state: Arrays | None = None, pending: Rollout | None = None) -> None:
+    def __init__(
+        self,
+        config: Config,
+        state: Arrays | None = None,
+        pending: Rollout | None = None,
+        group: Group | None = None,
+    ) -> None:
         import torch  # here, not where runs are only read
 
         from service.learner.learner import Learner
 
         torch.set_num_threads(config.learner.num_threads)
-        self.learner = Learner(config)
+        self.learner = Learner(config) if group is None else Learner(config, group)
         if state is not None:
             self.learner.load_state(state)
         if pending is not None:
@@ -251,12 +259,8 @@ class LearnerWorker:
             LearnerError: none of them could be learned from.
         """
         start = time.perf_counter()
-        version = self.learner.version
         taken = [rollout for rollout in rollouts if self.learner.ingest(rollout)]
         metrics = self.learner.update()
-        if taken:
-            lags = [version - rollout.policy_version for rollout in taken]
-            metrics |= {"learner/policy_lag": float(np.mean(lags)), "learner/max_policy_lag": float(max(lags))}
         counted = tuple(rollout.id for rollout in taken)
         refused = tuple(rollout.id for rollout in rollouts if rollout.id not in counted)
         return UpdateResult(self.learner.version, metrics, counted, refused, time.perf_counter() - start)

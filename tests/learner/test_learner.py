@@ -17,6 +17,7 @@ BOTH_PLAYERS += ("explained_variance", "grad_norm", "policy_steps")
 COMMON = ("num_alice_samples", "num_bob_samples", "num_demonstrations", "cloning_loss", "demonstration_log_ratio")
 COMMON += ("demonstration_log_prob", "bob_std", "primitive_weight_0", "primitive_weight_1", "primitive_share_0")
 COMMON += ("primitive_share_1", "non_finite_steps", "rollbacks", "version")
+COMMON += ("policy_lag", "max_policy_lag")
 NAMES = {f"learner/{player}_{name}" for player in ("alice", "bob") for name in BOTH_PLAYERS}
 NAMES |= {f"learner/{name}" for name in COMMON}
 

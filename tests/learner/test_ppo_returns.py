@@ -49,6 +49,6 @@ def test_float32_stays_float32():
 
 def test_explained_variance():
     returns = np.array([1.0, 2.0, 3.0])
-    assert explained_variance(returns, returns) == 1.0
-    assert explained_variance(returns, np.full(3, 5.0)) == pytest.approx(0.0)
-    assert explained_variance(np.ones(3), returns) == 0.0
+    assert explained_variance(returns, returns, 3) == 1.0
+    assert explained_variance(returns, np.full(3, 5.0), 3) == pytest.approx(0.0)
+    assert explained_variance(np.ones(3), returns, 3) == 0.0

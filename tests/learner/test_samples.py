@@ -57,7 +57,7 @@ def make_cloning(num):
 def test_only_active_steps_of_learnable_worlds_become_samples():
     learn = np.array([True, False] * 4)
     turns = make_bob_turns(learn=learn)
-    samples = collect([turns], PLAYER)
+    samples = collect([[turns]], turns, PLAYER)
     kept = turns.active & learn
     assert len(samples) == kept.sum() > 0
     order = np.argwhere(kept)
@@ -71,7 +71,7 @@ def test_only_active_steps_of_learnable_worlds_become_samples():
 
 def test_targets_are_advantages_plus_values():
     turns = make_bob_turns()
-    samples = collect([turns], PLAYER)
+    samples = collect([[turns]], turns, PLAYER)
     values, final = (
         PLAYER.value(torch.from_numpy(each))
         for each in (turns.value_observation[turns.active], turns.final_value_observation)
@@ -87,26 +87,26 @@ def test_targets_are_advantages_plus_values():
 
 def test_several_rollouts_are_joined_along_worlds():
     first, second = make_bob_turns(0), make_bob_turns(1)
-    joined = collect([first, second], PLAYER)
+    joined = collect([[first], [second]], first, PLAYER)
     assert len(joined) == first.active.sum() + second.active.sum()
-    apart = [collect([turns], PLAYER).value_target for turns in (first, second)]
+    apart = [collect([[turns]], turns, PLAYER).value_target for turns in (first, second)]
     np.testing.assert_allclose(np.sort(joined.value_target), np.sort(np.concatenate(apart)), atol=1e-6)
 
 
 def test_no_samples_at_all():
     idle = make_bob_turns(active=np.zeros_like(make_bob_turns().active))
-    assert collect([idle, nobody_learns(make_bob_turns())], PLAYER) is None
+    assert collect([[idle, nobody_learns(make_bob_turns())]], idle, PLAYER) is None
 
 
 def test_equal_advantages_become_zero():
     turns = make_bob_turns()
     constant = replace(turns, reward=np.full_like(turns.reward, 0.1), terminated=turns.active)
-    samples = collect([constant], Player(Policy(), Zero(), CONFIG, CPU))
+    samples = collect([[constant]], constant, Player(Policy(), Zero(), CONFIG, CPU))
     np.testing.assert_array_equal(samples.advantage, np.zeros(len(samples)))
 
 
 def test_samples_are_augmented_by_their_reflections():
-    samples = collect([make_bob_turns()], PLAYER)
+    samples = collect([[make_bob_turns()]], make_bob_turns(), PLAYER)
     mirrors = BOB.mirror, BOB_VALUE.mirror, ACTION.mirror
     doubled = augment_by_symmetry(samples, PLAYER)
     num = len(samples)

@@ -14,7 +14,8 @@ from ray.exceptions import ObjectLostError
 from service.errors import DivergedError
 from service.io.checkpoints import CheckpointStore
 from service.io.run_directory import RunDirectory
-from service.runtime.cluster import ClusterRun, num_gpus
+from service.runtime.cluster import ClusterRun
+from service.runtime.learner_group import num_gpus
 from service.runtime.ray_actors import NICENESS
 from service.runtime.ray_connection import ClusterOptions, connected
 from service.runtime.runner import ClusterError, StateLostError
@@ -244,7 +245,7 @@ def test_a_learner_that_dies_of_every_batch_ends_the_run_with_one_line(tmp_path)
 
             def restart_and_strike(why):
                 real(why)
-                os.kill(run._learner._location.pid, signal.SIGKILL)
+                os.kill(run._learner.locations[0].pid, signal.SIGKILL)
 
             run._learner.restart = restart_and_strike
             kill(run, "learner")

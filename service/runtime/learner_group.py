@@ -1,0 +1,268 @@
+"""The learner of a cluster: one or several ranks, each in a process of its own, started and ended together.
+
+The driver keeps what each rank handed back. When a rank dies or hangs, there is one thing to do: end all of them, and
+start others from that under a new group id, which is the address of a new store.
+"""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from typing import Any
+
+import ray
+from ray.exceptions import GetTimeoutError, RayActorError, RayError, RayTaskError
+
+from service.config import Config
+from service.errors import TandemError
+from service.learner.shares import join_states, share_out
+from service.runtime.ray_actors import Location
+from service.runtime.remote_worker import ANSWER_S, START_S, one_line
+from service.runtime.runner import ClusterError, StateLostError
+from service.runtime.workers import UpdateResult
+from service.store.models import ActorStatus
+from service.types import Arrays
+
+RANK_ANSWER_S = 15.0
+"""A rank that does not take part in a gradient step for so long hangs; a step takes a tenth of a second."""
+PING_S = 3.0
+"""Ranks that have given up answer within it, so that the one that hangs can be named."""
+_logger = logging.getLogger(__name__)
+
+
+@dataclass(slots=True)
+class Update:
+    """An update on its way through all ranks."""
+
+    weights: Any
+    """Reference to the version that comes out of it."""
+    states: list[Any]
+    """References to the ranks' states after it."""
+    answers: list[Any]
+    """References to the ranks' results."""
+    results: dict[int, UpdateResult] = field(default_factory=dict)
+    """Results that are there, by rank."""
+    first_answer: float = 0.0
+    """``time.monotonic()`` of the first of them."""
+
+    def add(self, rank: int, result: UpdateResult) -> None:
+        """Note the result of a rank."""
+        self.first_answer = self.first_answer or time.monotonic()
+        self.results[rank] = result
+
+    @property
+    def done(self) -> bool:
+        """Whether all ranks are."""
+        return len(self.results) == len(self.answers)
+
+    @property
+    def overdue(self) -> bool:
+        """Whether a rank hangs that the others no longer wait for: theirs are done."""
+        return bool(self.results) and time.monotonic() - self.first_answer > RANK_ANSWER_S
+
+    def joined(self) -> UpdateResult:
+        """The results of all ranks as one; their metrics are equal."""
+        results = [self.results[rank] for rank in range(len(self.answers))]
+        return UpdateResult(
+            results[0].version,
+            results[0].metrics,
+            tuple(rollout_id for each in results for rollout_id in each.counted),
+            tuple(rollout_id for each in results for rollout_id in each.refused),
+            max(each.update_s for each in results),
+        )
+
+
+class LearnerGroup:
+    """The ranks of the learner, and all that is needed to start the next ones in their place.
+
+    Args:
+        actor: Ray's actor class, with its options.
+        config: the run; ``learner.num_learners`` ranks.
+        state: one learner's, to start from, or None.
+        pending: rollout to be learned from with the first ones.
+    """
+
+    name = "learner"
+
+    def __init__(self, actor: Any, config: Config, state: Arrays | None, pending: Any) -> None:
+        self.size = config.learner.num_learners
+        self.incarnation = 0
+        self.locations: list[Location] = []
+        """By rank, once all have started."""
+        self._actor, self._config = actor, config
+        self._states = [ray.put(state)] if state is not None else []
+        self._pending = pending
+        self._last_error: str | None = None
+        self._heartbeats = [datetime.now(UTC)] * self.size
+        self._ranks = self._spawn()
+
+    def wait_ready(self) -> None:
+        """Wait until all ranks have started, found each other, and loaded the state.
+
+        Raises:
+            ClusterError: they have not, or not in time.
+        """
+        try:
+            self.locations = self._ask(START_S, [rank.ping.remote() for rank in self._ranks], "start")
+            address = None
+            if self.size > 1:
+                (address,) = self._ask(ANSWER_S, [self._ranks[0].open_store.remote(RANK_ANSWER_S)], "open a port")
+            pending = [self._pending] + [None] * (self.size - 1)  # as one learner would join it: before all others
+            started = [
+                rank.start.remote(self._states, each, address, RANK_ANSWER_S)
+                for rank, each in zip(self._ranks, pending, strict=True)
+            ]
+            self._ask(START_S, started, "find each other")
+        except RayTaskError as error:
+            if isinstance(error.cause, TandemError):  # for people; where it was raised is not
+                raise ClusterError(str(error.cause)) from None
+            raise
+        self._heartbeats = [datetime.now(UTC)] * self.size
+
+    def begin(self) -> Any:
+        """A reference to the weights before the first update; notes the states."""
+        answers = [rank.begin.options(num_returns=2).remote() for rank in self._ranks]
+        self._states = [state for _, state in answers]
+        return answers[0][0]
+
+    def update(self, rollouts: Sequence[Any]) -> Update:
+        """Ask all ranks to learn from their shares of rollouts, given as references in the order of their ids."""
+        asked = [
+            rank.update_from.options(num_returns=3).remote(list(share_out(rollouts, index, self.size)))
+            for index, rank in enumerate(self._ranks)
+        ]
+        weights, states, answers = zip(*asked, strict=True)
+        return Update(weights[0], list(states), list(answers))
+
+    def keep(self, update: Update) -> None:
+        """Go on from the states after an update that is done."""
+        self._states, self._pending = update.states, None
+
+    def state(self) -> Arrays:
+        """The newest state, as one learner would have it."""
+        return join_states(ray.get(self._states))
+
+    def record_heartbeat(self, rank: int) -> None:
+        """Note that a rank just answered."""
+        self._heartbeats[rank] = datetime.now(UTC)
+
+    @property
+    def alive(self) -> bool:
+        """Whether all ranks answer. Only to be asked when they have, or will soon have, nothing to do."""
+        try:
+            ray.get([rank.ping.remote() for rank in self._ranks], timeout=RANK_ANSWER_S + ANSWER_S)
+        except RayError:
+            return False
+        return True
+
+    def explain(self, error: BaseException) -> str:
+        """The reason in a line why an update failed: the ranks that are gone or hang, else the error."""
+        if self.size == 1:
+            return one_line(error)
+        pings = [rank.ping.remote() for rank in self._ranks]
+        ready, _ = ray.wait(pings, num_returns=self.size, timeout=PING_S)
+        silent = [rank for rank, ping in enumerate(pings) if ping not in ready]
+        dead = [rank for rank, ping in enumerate(pings) if ping in ready and _is_dead(ping)]
+        if dead:
+            return f"{self._describe(dead)} died"
+        return f"{self._describe(silent)} did not answer for {RANK_ANSWER_S:g} s" if silent else one_line(error)
+
+    def restart(self, reason: str) -> None:
+        """Start other ranks from the newest state; what the last ones were doing has to be asked of them again.
+
+        Raises:
+            StateLostError: they do not start, or a state was lost with the node that kept it.
+        """
+        others = "another goes" if self.size == 1 else "other ranks go"
+        _logger.warning("the %s is gone (%s); %s on from its last state", self.name, reason, others)
+        self.close()
+        self.incarnation += 1
+        self._last_error = reason
+        self._ranks = self._spawn()
+        try:
+            self.wait_ready()
+        except (RayError, ClusterError) as error:
+            raise StateLostError(
+                f"the {self.name} cannot go on from its last state ({one_line(error)}); the run goes back to its "
+                "newest checkpoint"
+            ) from None
+
+    def close(self) -> None:
+        """Kill all ranks."""
+        for rank in self._ranks:
+            ray.kill(rank, no_restart=True)
+
+    def statuses(self) -> tuple[ActorStatus, ...]:
+        """The ranks' states for the status service."""
+        return tuple(
+            ActorStatus(
+                name=self.name if self.size == 1 else f"{self.name}-{rank}",
+                incarnation=self.incarnation,
+                state="alive",
+                node=location.node,
+                pid=location.pid,
+                heartbeat=self._heartbeats[rank],
+                last_error=self._last_error,
+            )
+            for rank, location in enumerate(self.locations)
+        )
+
+    def _spawn(self) -> list[Any]:
+        return [self._actor.remote(self._config, rank, self.size) for rank in range(self.size)]
+
+    def _ask(self, timeout_s: float, answers: list[Any], what: str) -> list[Any]:
+        """Wait for what all ranks were asked."""
+        try:
+            return list(ray.get(answers, timeout=timeout_s))
+        except GetTimeoutError:
+            ready, _ = ray.wait(answers, num_returns=len(answers), timeout=0)
+            missing = [rank for rank, answer in enumerate(answers) if answer not in ready]
+            ranks = "" if self.size == 1 else f"'s {self._describe(missing)}"
+            raise ClusterError(
+                f"the {self.name}{ranks} did not {what} within {timeout_s:.0f} s: has the cluster a free core (and "
+                "GPU, with learner.device=cuda) for each? see ray status"
+            ) from None
+
+    def _describe(self, ranks: Sequence[int]) -> str:
+        """Ranks with their nodes, where those are known."""
+        nodes = [at.node for at in self.locations] or [""] * self.size
+        named = [f"{rank} on {nodes[rank]}" if nodes[rank] else str(rank) for rank in ranks]
+        return f"rank{'s' * (len(ranks) > 1)} {' and '.join(named)}"
+
+
+def check_room(num_learners: int, device: str, cpus: float, actor_threads: int) -> None:
+    """Check that a cluster can hold so many ranks and an actor.
+
+    Raises:
+        ClusterError: it has too few cores or GPUs; only asked of several ranks.
+    """
+    there = ray.cluster_resources()
+    cores, gpus = there.get("CPU", 0.0), there.get("GPU", 0.0)
+    if num_learners > 1 and num_learners * cpus + actor_threads > cores:
+        raise ClusterError(
+            f"learner.num_learners = {num_learners}: with {cpus:g} cores for each rank and {actor_threads} for an "
+            f"actor, the cluster has too few, {cores:g}: add nodes first, or use fewer ranks"
+        )
+    if num_learners > 1 and device == "cuda" and num_learners > gpus:
+        raise ClusterError(
+            f"learner.num_learners = {num_learners}: with learner.device=cuda each rank takes a GPU, and the cluster "
+            f"has {gpus:g}: use as many ranks as GPUs, or learner.device=cpu"
+        )
+
+
+def num_gpus(device: str, num_learners: int = 1) -> int:
+    """GPUs that each rank of the learner asks Ray for; an actor that asks for none sees none."""
+    if device == "auto":
+        return int(ray.cluster_resources().get("GPU", 0.0) >= num_learners)
+    return int(device == "cuda")
+
+
+def _is_dead(ping: Any) -> bool:
+    try:
+        ray.get(ping)
+    except RayActorError:
+        return True
+    return False
