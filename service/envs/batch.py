@@ -28,7 +28,8 @@ MAX_TURN_RAD = 0.5
 """Most a joint is asked to turn in one action; behind the base and near a straight arm the solution would ask for 2."""
 MAX_SPEED = 1e3
 """A joint (rad/s) or object (m/s, rad/s) faster than this has diverged; the arm reaches 3, a falling object 30."""
-_NUM_CONTROLS = NUM_JOINTS + NUM_FINGERS
+_NUM_SERVOS = NUM_JOINTS + NUM_FINGERS
+_NUM_CONTROLS = _NUM_SERVOS + 1  # the object's weight is an actuator that ignores its control
 _PHYSICS = int(mujoco.mjtState.mjSTATE_FULLPHYSICS)
 _CONTROL_AND_BOX = int(mujoco.mjtState.mjSTATE_CTRL) | int(mujoco.mjtState.mjSTATE_MOCAP_POS)
 
@@ -61,6 +62,7 @@ class WorldBatch:
         self.layout = build_layout(config, blocked_fraction=blocked_fraction)
         """Columns of ``states``."""
         assert (self.model.nq, self.model.nv) == (self.layout.num_positions, self.layout.num_velocities)
+        assert self.model.nu == _NUM_CONTROLS
         assert mujoco.mj_stateSize(self.model, _PHYSICS) == self.layout.physics.stop
         self._blocked_fraction = blocked_fraction
         self._control_spec = _CONTROL_AND_BOX if self.model.nmocap else int(mujoco.mjtState.mjSTATE_CTRL)
@@ -190,11 +192,11 @@ class WorldBatch:
         target = kinematics.clip_to_reach(here.position + DISPLACEMENT_M * actions[:, :3], LOWEST_TARGET_M)
         width = start[:, self.layout["fingers"]].sum(axis=1) + WIDTH_CHANGE_M * actions[:, 3]
         joints, box_place = start[:, self.layout["joints"]], start[:, self.layout["box_place"]]
-        control = np.empty((start.shape[0], _NUM_CONTROLS + box_place.shape[1]))
+        control = np.zeros((start.shape[0], _NUM_CONTROLS + box_place.shape[1]))
         solution = kinematics.solve(joints, target, at=here)
         control[:, :NUM_JOINTS] = np.clip(solution, joints - MAX_TURN_RAD, joints + MAX_TURN_RAD)
         widest_m = self._widest_m * ~(start[:, self.layout["gripper_blocked"]] > 0.0).any(axis=1)
-        control[:, NUM_JOINTS:_NUM_CONTROLS] = np.clip(width, 0.0, widest_m)[:, None] / 2
+        control[:, NUM_JOINTS:_NUM_SERVOS] = np.clip(width, 0.0, widest_m)[:, None] / 2
         control[:, _NUM_CONTROLS:] = box_place
         return control
 

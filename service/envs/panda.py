@@ -66,8 +66,8 @@ GRIPPER_BIT, OBJECT_BIT, TABLE_BIT = 1, 2, 4
 def add_panda(spec: mujoco.MjSpec, *, pad_friction: float, physics_step_s: float) -> None:
     """Add the arm, its actuators and its collision shapes to a model under construction.
 
-    Actuators: seven joint positions (rad), then left and right finger positions (m). Gravity on the arm is compensated,
-    as the robot's own controller does.
+    Actuators: seven joint positions (rad), then left and right finger positions (m). The arm has no weight: its own
+    controller compensates gravity, so the scene has none (see ``scene.build_spec``).
 
     Args:
         spec: the model under construction.
@@ -86,7 +86,6 @@ def add_panda(spec: mujoco.MjSpec, *, pad_friction: float, physics_step_s: float
             ipos=centre,
             fullinertia=inertia,
             explicitinertial=True,
-            gravcomp=1.0,
         )
         body.add_joint(
             name=f"joint{index}",
@@ -107,7 +106,6 @@ def add_panda(spec: mujoco.MjSpec, *, pad_friction: float, physics_step_s: float
         ipos=(-0.01, 0, 0.03),
         inertia=(0.001, 0.0025, 0.0017),
         explicitinertial=True,
-        gravcomp=1.0,
     )
     _collision(hand, "hand", 0.038, ((0, -0.062, 0.03), (0, 0.062, 0.03)))
     for side, quaternion in (("left", (1, 0, 0, 0)), ("right", (0, 0, 0, 1))):
@@ -125,7 +123,6 @@ def _add_finger(hand: Any, side: str, quaternion: tuple[float, ...], physics_ste
         ipos=(0, 0.01, 0.03),
         inertia=(2.375e-6, 2.375e-6, 7.5e-7),
         explicitinertial=True,
-        gravcomp=1.0,
     )
     finger.add_joint(
         name=f"{side}_finger",

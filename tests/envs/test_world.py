@@ -175,13 +175,15 @@ def make_symmetric(model):
     mujoco.mj_setConst(model, mujoco.MjData(model))
 
 
-def mirrored_runs(symmetric, num_steps):
+def mirrored_runs(symmetric, num_steps, noslip=True):
     """(T, 22) largest differences between a run's reflection and the run of its reflection, after each step."""
     rng = np.random.default_rng(0)
     with WorldBatch(WorldConfig(), 40) as worlds, WorldBatch(WorldConfig(), 40) as reflected:
         if symmetric:
             make_symmetric(worlds.model)
             make_symmetric(reflected.model)
+        for model in (worlds.model, reflected.model):
+            model.opt.noslip_iterations *= noslip
         worlds.reset(rng)
         reflected.restore(mirror_state(worlds.states))
         np.testing.assert_array_equal(reflected.full(0.5), FULL.mirror(worlds.full(0.5)))
@@ -195,9 +197,15 @@ def mirrored_runs(symmetric, num_steps):
 
 
 def test_the_task_has_no_left_and_right():
-    differences = mirrored_runs(symmetric=True, num_steps=5)
+    differences = mirrored_runs(symmetric=True, num_steps=4, noslip=False)
     assert differences[0].max() < 1e-7
-    assert differences[:, :11].max() < 2e-5  # contacts magnify the last bits, so not for longer
+    assert differences[:, :11].max() < 1e-5  # contacts magnify the last bits, so not for longer
+
+
+def test_noslip_goes_through_contacts_in_an_order_which_is_worth_less_than_a_millimetre():
+    differences = mirrored_runs(symmetric=True, num_steps=5)
+    assert differences[0].max() < 1e-6
+    assert differences[:, :11].max() < 5e-4  # half of what the real links do in one step
 
 
 def test_the_real_links_spoil_the_mirror_by_a_millimetre_a_step():
