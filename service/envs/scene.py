@@ -52,8 +52,8 @@ def build_spec(config: WorldConfig) -> mujoco.MjSpec:
     option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
     option.impratio = 1.0
     option.noslip_iterations = 5
-    # The arm's controller compensates gravity, and MuJoCo's compensation would cost a Jacobian for each of ten bodies in
-    # every step. So nothing has weight but the object, by an actuator (``_add_object``).
+    # The arm's controller compensates gravity, and MuJoCo's compensation would cost a Jacobian for each of ten bodies
+    # in every step. So nothing has weight but the object, by an actuator (``_add_object``).
     option.gravity = (0, 0, 0)
     option.iterations = 50
     option.ls_iterations = 50
@@ -120,7 +120,9 @@ def _add_object(spec: mujoco.MjSpec, config: WorldConfig) -> None:
         rgba=(0.86, 0.18, 0.15, 1.0),
         **_STIFF,
     )
-    weight = spec.add_actuator(name="weight", target="object", trntype=mujoco.mjtTrn.mjTRN_JOINT, gear=(0, 0, 1, 0, 0, 0))
+    weight = spec.add_actuator(
+        name="weight", target="object", trntype=mujoco.mjtTrn.mjTRN_JOINT, gear=(0, 0, 1, 0, 0, 0)
+    )
     weight.gaintype, weight.biastype = mujoco.mjtGain.mjGAIN_FIXED, mujoco.mjtBias.mjBIAS_AFFINE
     weight.gainprm[0], weight.biasprm[0] = 0.0, -GRAVITY_MS2 * config.object_mass_kg  # whatever its control is
 
