@@ -11,10 +11,10 @@ from collections.abc import Sequence
 from contextlib import suppress
 from copy import deepcopy
 from pathlib import Path
-from typing import Any, Literal, Self
+from typing import Annotated, Any, Literal, Self
 
 import yaml
-from pydantic import BaseModel, Field, PositiveInt, ValidationError, model_validator
+from pydantic import BaseModel, BeforeValidator, Field, PositiveInt, ValidationError, model_validator
 
 from service.errors import TandemError
 from service.frozen import FrozenModel
@@ -224,6 +224,9 @@ class ABCConfig(FrozenModel):
 
     weight: float = Field(0.5, ge=0.0, description="beta")
     clip: float = Field(0.2, gt=0.0, lt=1.0, description="epsilon")
+    rows_per_sample: float = Field(
+        0.5, gt=0.0, le=4.0, description="demonstrated steps in a minibatch for each of Bob's own"
+    )
     num_iterations: int = Field(1, ge=1, description="demonstrations of that many iterations are kept; 1 is on-policy")
     hindsight: bool = Field(
         False,
@@ -232,6 +235,11 @@ class ABCConfig(FrozenModel):
     mean_only: bool = Field(
         False, description="clone Alice's actions by Bob's mean and leave his std alone, or he also copies her noise"
     )
+
+
+def _mirror(value: object) -> object:
+    """True and false, which recorded runs have, in today's words."""
+    return {True: "both", False: "none"}[value] if isinstance(value, bool) else value
 
 
 class LearnerConfig(FrozenModel):
@@ -265,7 +273,16 @@ class LearnerConfig(FrozenModel):
         "about the last 1 / (1 - decay) versions; 0: the last version. Acting and learning do not use it",
     )
     abc: ABCConfig = ABCConfig()
-    mirror: bool = Field(False, description="learn from every Bob sample also reflected in y; the task is symmetric")
+    mirror: Annotated[Literal["none", "both", "random"], BeforeValidator(_mirror)] = Field(
+        "none",
+        description="the task is symmetric in y: learn from every sample of Bob and its reflection (both, or true), or "
+        "at random from one of the two, which is half the work (random)",
+    )
+
+    @property
+    def mirrors(self) -> bool:
+        """Whether reflections are learned from."""
+        return self.mirror != "none"
 
     @model_validator(mode="after")
     def _enough_rows(self) -> Self:

@@ -13,7 +13,7 @@ from service.learner.player import Player
 from service.learner.samples import Cloning, Rows
 from service.policies import gaussian
 from service.policies.networks import MCPPolicy
-from service.types import Metrics
+from service.types import IntArray, Metrics
 
 NUM_PROBES = 1024
 """Number of rows that are enough for what is measured once an update."""
@@ -21,7 +21,12 @@ NUM_PROBES = 1024
 
 def probes(rows: Rows) -> Rows:
     """The own ones of at most ``NUM_PROBES`` of the rows of all ranks, evenly spread."""
-    return rows.find(np.arange(0, rows.num_total, -(-rows.num_total // NUM_PROBES)))
+    return rows.find(spread(np.arange(rows.num_total)))
+
+
+def spread(places: IntArray) -> IntArray:
+    """At most ``NUM_PROBES`` of the (N,) places, evenly spread."""
+    return places[:: max(1, -(-len(places) // NUM_PROBES))]
 
 
 def explained_variance(

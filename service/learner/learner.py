@@ -16,10 +16,16 @@ from service.config import Config
 from service.envs.observations import ACTION, BOB, BOB_VALUE, FULL, ObservationLayout
 from service.io.tensors import join_parts, split_parts
 from service.learner import ppo
-from service.learner.diagnostics import cloning_metrics, composition_metrics, mean_over_ranks, probes
+from service.learner.diagnostics import composition_metrics, mean_over_ranks, probes
 from service.learner.group import ALONE, Group
 from service.learner.player import LearnerError, Player
-from service.learner.samples import Cloning, DemonstrationHistory, Samples, augment_by_symmetry
+from service.learner.samples import (
+    DemonstrationHistory,
+    DemonstrationRows,
+    Samples,
+    augment_by_symmetry,
+    reflect_at_random,
+)
 from service.learner.shares import own_demonstrations, share_of, share_out
 from service.learner.weights import MAX_POLICY_LAG, Weights
 from service.policies import networks
@@ -214,37 +220,28 @@ class Learner:
         self._window.append([rollout.bob for rollout in rollouts])
         samples = ppo.collect(self._window, _NO_BOB, bob, group)
         metrics = {"num_bob_samples": float(_num(samples))}
-        if samples is not None and config.mirror:
+        if samples is not None and config.mirror == "both":
             samples = augment_by_symmetry(samples, bob)
-        cloning = self._cloning(rollouts)
-        metrics["num_demonstrations"] = float(_num(cloning) // (2 if config.mirror else 1))
-        metrics |= _prefixed("bob", ppo.update(bob, samples, cloning, config.abc, self._rng, group))
-        rows = samples if samples is not None else cloning
+        elif samples is not None and config.mirror == "random":
+            samples = reflect_at_random(samples, bob, self._rng)
+        demonstrations = self._demonstrations(rollouts)
+        metrics["num_demonstrations"] = float(_num(demonstrations) // (1 + config.mirrors))
+        metrics |= _prefixed("bob", ppo.update(bob, samples, demonstrations, config.abc, self._rng, group))
+        rows = samples if samples is not None else demonstrations
         if rows is not None and isinstance(self._bob_policy, networks.MCPPolicy):
             probed = probes(rows)
             composed = composition_metrics(self._bob_policy, probed.observation)
             metrics |= mean_over_ranks(composed, len(probed), probed.num_total, group)
-        if cloning is not None:
-            probed = probes(cloning)
-            metrics |= mean_over_ranks(cloning_metrics(bob, probed), len(probed), probed.num_total, group)
         return metrics
 
-    def _cloning(self, rollouts: Sequence[Rollout]) -> Cloning | None:
+    def _demonstrations(self, rollouts: Sequence[Rollout]) -> DemonstrationRows | None:
         """The demonstrations to clone, this update's among them; None if no rank has any or they have no weight."""
         self._history.append([rollout.demonstrations for rollout in rollouts])
         kept = self._history.joined()
-        observation, action = kept.observation, kept.action
+        observation, action = (torch.from_numpy(each).to(self._device) for each in (kept.observation, kept.action))
         share = share_of(self._history.sizes(), self._group)
-        num_total = len(action) if share is None else share.total
-        if num_total == 0 or self.config.learner.abc.weight == 0.0:
-            return None
-        if self.config.learner.mirror:
-            observation = np.concatenate((observation, BOB.mirror(observation)))
-            action = np.concatenate((action, ACTION.mirror(action)))
-            share = None if share is None else share.mirrored()
-        rows, actions = (torch.from_numpy(array).to(self._device) for array in (observation, action))
-        with torch.no_grad():
-            return Cloning(rows, actions, self._bob.log_prob(rows, actions), share)
+        rows = DemonstrationRows(observation, action, self.config.learner.mirrors, share)
+        return rows if rows.num_total and self.config.learner.abc.weight else None
 
 
 def _no_turns(observation: ObservationLayout, value_observation: ObservationLayout) -> Turns:
@@ -266,14 +263,14 @@ def _no_turns(observation: ObservationLayout, value_observation: ObservationLayo
 _NO_ALICE, _NO_BOB = _no_turns(FULL, FULL), _no_turns(BOB, BOB_VALUE)
 
 
-def _num(rows: Samples | Cloning | None) -> int:
+def _num(rows: Samples | DemonstrationRows | None) -> int:
     """Rows of all ranks."""
     return 0 if rows is None else rows.num_total
 
 
 def _prefixed(player: str, metrics: Metrics) -> Metrics:
     """Put the player's name before those that both have."""
-    shared = ("cloning_loss", "non_finite_steps", "rollbacks")
+    shared = ("cloning_loss", "non_finite_steps", "rollbacks", "demonstration_log_prob", "demonstration_log_ratio")
     return {name if name in shared else f"{player}_{name}": value for name, value in metrics.items()}
 
 

@@ -25,10 +25,10 @@ from torch.nn.utils import clip_grad_norm_
 
 from service.actors.rollout import Turns
 from service.config import ABCConfig
-from service.learner.diagnostics import explained_variance, mean_over_ranks, probes
+from service.learner.diagnostics import cloning_metrics, explained_variance, mean_over_ranks, probes, spread
 from service.learner.group import ALONE, Group, mean_and_std
 from service.learner.player import LEARNING_RATE_BOUNDS, Player
-from service.learner.samples import Cloning, Samples, minibatches
+from service.learner.samples import Cloning, DemonstrationRows, Samples, draw_epoch
 from service.learner.shares import share_of
 from service.policies import gaussian
 from service.types import Array, BoolArray, IntArray, Metrics
@@ -145,7 +145,7 @@ def advantages(
 def update(
     player: Player,
     samples: Samples | None,
-    cloning: Cloning | None,
+    demonstrations: DemonstrationRows | None,
     abc: ABCConfig,
     rng: np.random.Generator,
     group: Group = ALONE,
@@ -159,13 +159,13 @@ def update(
         Metrics without the player's prefix; one that there is nothing to measure on is left out.
     """
     metrics = {"learning_rate": player.optimizer.learning_rate, "non_finite_steps": 0.0, "rollbacks": 0.0}
-    rows = samples if samples is not None else cloning
+    rows = samples if samples is not None else demonstrations
     if rows is None:
         return metrics
     snapshot, probed = player.snapshot(), probes(rows)
     with torch.no_grad():
         before = player.policy(probed.observation)
-    stats = train(player, samples, cloning, abc, rng, group)
+    stats = train(player, samples, demonstrations, abc, rng, group)
     with torch.no_grad():
         moved = gaussian.kl(*before, *player.policy(probed.observation))
     kl = mean_over_ranks({"kl": float(moved.mean())}, len(probed), probed.num_total, group)["kl"]
@@ -178,6 +178,8 @@ def update(
         metrics["explained_variance"] = explained_variance(*estimated, samples.num_total, group)
     metrics |= {"non_finite_steps": float(stats.num_non_finite), "rollbacks": float(failed)}
     metrics["policy_steps"] = float(max(len(stats.scalars.get(name, ())) for name in ("policy_loss", "cloning_loss")))
+    if (cloned := stats.cloned) is not None:
+        metrics |= mean_over_ranks(cloning_metrics(player, cloned), len(cloned), cloned.num_total, group)
     return metrics | stats.means() | {"kl": kl}
 
 
@@ -192,6 +194,8 @@ class UpdateStats:
     num_non_finite: int = 0
     stopped: bool = False
     """The policy is done; the value network goes on."""
+    cloned: Cloning | None = None
+    """Some of the demonstrations that were drawn."""
 
     @property
     def aborted(self) -> bool:
@@ -217,16 +221,27 @@ class UpdateStats:
 def train(
     player: Player,
     samples: Samples | None,
-    cloning: Cloning | None,
+    demonstrations: DemonstrationRows | None,
     abc: ABCConfig,
     rng: np.random.Generator,
     group: Group = ALONE,
 ) -> UpdateStats:
-    """Take a player's gradient steps of one update, until its epochs are over or three minibatches were not finite."""
-    stats = UpdateStats()
-    for _ in range(player.config.num_epochs):
+    """Take a player's gradient steps of one update, until its epochs are over or three minibatches were not finite.
+
+    All epochs are drawn first: only demonstrations that are drawn need a log-probability under the policy before.
+    """
+    stats, config = UpdateStats(), player.config
+    num_samples, num_demonstrations = (0 if rows is None else rows.num_total for rows in (samples, demonstrations))
+    epochs = [draw_epoch(num_samples, num_demonstrations, config, abc, rng) for _ in range(config.num_epochs)]
+    cloning = None
+    if demonstrations is not None:
+        drawn = np.unique(np.concatenate([places for epoch in epochs for _, places in epoch]))
+        cloning = demonstrations.to_clone(drawn, player)
+        stats.cloned = cloning.find(spread(drawn))
+    for epoch in epochs:
         stats.kls.clear()
-        for minibatch in minibatches(samples, cloning, player.config.minibatch_size, rng):
+        for own, cloned in epoch:
+            minibatch = samples and samples.find(own), cloning and cloning.find(cloned)
             _step(player, *minibatch, abc, stats, group)
             if stats.aborted:
                 return stats

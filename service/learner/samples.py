@@ -5,13 +5,14 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, fields, replace
-from typing import Any, Self, TypeVar
+from typing import Self, TypeVar
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from service.actors.rollout import Demonstrations
+from service.config import ABCConfig, PPOConfig
 from service.envs.observations import ACTION, BOB, BOB_VALUE, Mirror
 from service.learner.player import Player
 from service.learner.shares import Share
@@ -45,7 +46,15 @@ class _Rows:
 
     def tensors(self) -> list[Tensor]:
         """The columns, in the order of the fields."""
-        return [getattr(self, field.name) for field in fields(self) if field.name != "share"]  # type: ignore[arg-type]
+        return [getattr(self, name) for name in self.names()]
+
+    def names(self) -> list[str]:
+        """Names of the columns, in the order of the fields."""
+        return [field.name for field in fields(self) if field.name not in ("share", "mirrored")]  # type: ignore[arg-type]
+
+    def having(self, columns: Iterable[Tensor], share: Share | None) -> Self:
+        """The same rows with other columns, in the order of the fields."""
+        return replace(self, **dict(zip(self.names(), columns, strict=True)), share=share)  # type: ignore[type-var]
 
     def find(self, drawn: IntArray) -> Self:
         """Take the own ones of the rows at these places of all ranks' rows, in their order."""
@@ -98,7 +107,48 @@ class Cloning(_Rows):
     proximal_log_prob: Tensor
     """(D,) of the action under the policy at the start of the update."""
     share: Share | None = None
+    """Places among all that could be drawn, of all ranks; None where these are all."""
+
+
+@dataclass(frozen=True, slots=True)
+class DemonstrationRows(_Rows):
+    """Demonstrations that minibatches are drawn from, far more than an update draws."""
+
+    observation: Tensor
+    """(D, O)."""
+    action: Tensor
+    """(D, A)."""
+    mirrored: bool = False
+    """Whether they are followed by as many reflections in y, which are made when they are drawn."""
+    share: Share | None = None
     """Places among the demonstrations of all ranks; None without other ranks."""
+
+    @property
+    def num_total(self) -> int:
+        """Rows of all ranks together, with their reflections."""
+        return (len(self) if self.share is None else self.share.total) * (1 + self.mirrored)
+
+    def find(self, drawn: IntArray) -> DemonstrationRows:
+        """Take the own ones of the rows at these places of all ranks' rows, in their order; reflections are made."""
+        num = self.num_total // (1 + self.mirrored)
+        rows, share = (drawn % num, None) if self.share is None else self.share.find(drawn % num)
+        part = replace(self.take(torch.from_numpy(rows).to(self.observation.device)), share=share)
+        if not self.mirrored:
+            return part
+        own = drawn if share is None else drawn[share.places]
+        reflected = torch.from_numpy(own >= num).to(self.observation.device)[:, None]
+        pairs = zip(part.tensors(), (BOB.mirror, ACTION.mirror), strict=True)
+        return part.having(
+            (torch.where(reflected, _reflect(column, mirror), column) for column, mirror in pairs), share
+        )
+
+    def to_clone(self, drawn: IntArray, player: Player) -> Cloning:
+        """Prepare the own ones of the rows at these places, ascending; ``player`` is at the start of the update."""
+        part = self.find(drawn)
+        places = drawn if part.share is None else drawn[part.share.places]
+        with torch.no_grad():
+            log_prob = player.log_prob(part.observation, part.action)
+        return Cloning(part.observation, part.action, log_prob, Share(places, self.num_total))
 
 
 class DemonstrationHistory:
@@ -137,54 +187,51 @@ class DemonstrationHistory:
 
 
 def augment_by_symmetry(samples: Samples, player: Player) -> Samples:
-    """Append the reflections in y of Bob's samples, which have the originals' advantages and values.
-
-    Nobody acted a reflection, so its behaviour log-probability is that of the policy at the start of the update, which
-    is ``player``'s.
-    """
-    observations, actions = _reflect(samples.observation, BOB.mirror), _reflect(samples.action, ACTION.mirror)
-    with torch.no_grad():
-        mean, std = player.policy(observations)
-    reflections = replace(
-        samples,
-        observation=observations,
-        value_observation=_reflect(samples.value_observation, BOB_VALUE.mirror),
-        action=actions,
-        behaviour_log_prob=gaussian.log_prob(actions, mean, std),
-        proximal_mean=mean,
-        proximal_std=std,
-    )
+    """Append the reflections in y of Bob's samples, which have the originals' advantages and values."""
+    reflections = _reflections(samples, player)
     pairs = zip(samples.tensors(), reflections.tensors(), strict=True)
-    columns: list[Any] = [torch.cat(pair) for pair in pairs]
-    return replace(Samples(*columns), share=None if samples.share is None else samples.share.mirrored())
+    return samples.having(map(torch.cat, pairs), samples.share and samples.share.mirrored())
 
 
-def minibatches(
-    samples: Samples | None, cloning: Cloning | None, size: int, rng: np.random.Generator
-) -> list[tuple[Samples | None, Cloning | None]]:
-    """Cut an epoch: each sample once, in random order, beside demonstrations drawn from a shuffled permutation.
+def reflect_at_random(samples: Samples, player: Player, rng: np.random.Generator) -> Samples:
+    """Replace half of Bob's samples, chosen at random, by their reflections in y: half the work of learning both."""
+    chosen = rng.random(samples.num_total) < 0.5  # of all ranks, so that all draw alike
+    own = chosen if samples.share is None else chosen[samples.share.places]
+    rows = torch.from_numpy(np.flatnonzero(own)).to(samples.observation.device)
+    reflections = _reflections(samples.take(rows), player)
+    pairs = zip(samples.tensors(), reflections.tensors(), strict=True)
+    return samples.having((column.index_copy(0, rows, reflected) for column, reflected in pairs), samples.share)
 
-    Samples are cut into as many equal minibatches as bring them nearest to ``size``. Demonstrations come in half that
-    size, and are cycled through if they are too few. Demonstrations alone are gone through once.
 
-    The rows of all ranks are cut together: with equal random numbers the minibatches of every rank are its own rows of
-    the same minibatches, maybe none.
+def draw_epoch(
+    num_samples: int, num_demonstrations: int, config: PPOConfig, abc: ABCConfig, rng: np.random.Generator
+) -> list[tuple[IntArray, IntArray]]:
+    """Draw the minibatches of an epoch: each sample once, in random order, beside demonstrations drawn alike.
+
+    Samples are cut into as many equal minibatches as bring them nearest to the configured size. Each has
+    ``abc.rows_per_sample`` times as many demonstrations, which are cycled through if they are too few. Demonstrations
+    alone are gone through once.
+
+    The rows of all ranks are drawn together, so with equal random numbers all draw the same.
 
     Args:
-        samples: B of them, or None.
-        cloning: D demonstrations, or None; not both None.
-        size: of a minibatch of samples, of all ranks together.
+        num_samples: of all ranks; may be 0 where there are demonstrations.
+        num_demonstrations: of all ranks; may be 0 where there are samples.
+        config: size of a minibatch of samples, of all ranks together.
+        abc: demonstrations beside them.
         rng: shuffles.
+
+    Returns:
+        Places of each minibatch's samples and of its demonstrations.
     """
-    half = max(size // 2, 1)
-    if samples is not None:
-        num = max(round(samples.num_total / size), 1)
+    num_cloned = max(int(config.minibatch_size * abc.rows_per_sample), 1)
+    if num_samples:
+        num = max(round(num_samples / config.minibatch_size), 1)
     else:
-        assert cloning is not None, "an epoch needs samples or demonstrations"
-        num = max(round(cloning.num_total / half), 1)
-    own = [None] * num if samples is None else _draw(samples, samples.num_total, num, rng)
-    drawn = [None] * num if cloning is None else _draw(cloning, num * min(half, cloning.num_total), num, rng)
-    return list(zip(own, drawn, strict=True))
+        num = max(round(num_demonstrations / num_cloned), 1)
+    samples = _draw(num_samples, num_samples, rng)
+    demonstrations = _draw(num_demonstrations, num * min(num_cloned, num_demonstrations), rng)
+    return list(zip(np.array_split(samples, num), np.array_split(demonstrations, num), strict=True))
 
 
 def _join(parts: Iterable[Demonstrations]) -> Demonstrations:
@@ -193,13 +240,30 @@ def _join(parts: Iterable[Demonstrations]) -> Demonstrations:
     return Demonstrations(np.concatenate(observations), np.concatenate(actions))
 
 
-def _draw(rows: Rows, num: int, num_parts: int, rng: np.random.Generator) -> list[Rows]:
-    """Draw ``num`` rows of all ranks in random order, none twice before each was drawn once; the own ones in parts."""
-    rounds = [rng.permutation(rows.num_total) for _ in range(-(-num // rows.num_total))]
-    drawn = np.concatenate(rounds)[:num]
-    if rows.share is None:
-        return rows.find(drawn).split(num_parts)  # copied once
-    return [rows.find(part) for part in np.array_split(drawn, num_parts)]
+def _draw(num_rows: int, num: int, rng: np.random.Generator) -> IntArray:
+    """Draw ``num`` places of rows in random order, none twice before each was drawn once."""
+    rounds = [rng.permutation(num_rows) for _ in range(-(-num // num_rows))] if num_rows else []
+    return np.concatenate([np.zeros(0, dtype=np.int64), *rounds])[:num]
+
+
+def _reflections(samples: Samples, player: Player) -> Samples:
+    """Reflect Bob's samples in y.
+
+    Nobody acted a reflection, so its behaviour log-probability is that of the policy at the start of the update, which
+    is ``player``'s.
+    """
+    observations, actions = _reflect(samples.observation, BOB.mirror), _reflect(samples.action, ACTION.mirror)
+    with torch.no_grad():
+        mean, std = player.policy(observations)
+    return replace(
+        samples,
+        observation=observations,
+        value_observation=_reflect(samples.value_observation, BOB_VALUE.mirror),
+        action=actions,
+        behaviour_log_prob=gaussian.log_prob(actions, mean, std),
+        proximal_mean=mean,
+        proximal_std=std,
+    )
 
 
 def _reflect(rows: Tensor, mirror: Mirror) -> Tensor:

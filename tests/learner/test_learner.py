@@ -312,9 +312,9 @@ def test_the_weight_of_cloning_is_that_of_the_configuration():
 def test_mirroring_doubles_what_bob_learns_from():
     learner = Learner(make_config(mirror=True))
     rollout = make_rollout(learner, 0)
-    cloning = learner._cloning([rollout])
-    np.testing.assert_array_equal(cloning.observation[12:], BOB.mirror(rollout.demonstrations.observation))
-    np.testing.assert_array_equal(cloning.action[12:], ACTION.mirror(rollout.demonstrations.action))
+    rows = learner._demonstrations([rollout]).find(np.arange(24))
+    np.testing.assert_array_equal(rows.observation[12:], BOB.mirror(rollout.demonstrations.observation))
+    np.testing.assert_array_equal(rows.action[12:], ACTION.mirror(rollout.demonstrations.action))
     metrics, plain = updated(learner, 0), updated(Learner(make_config()), 0)
     for name in ("num_bob_samples", "num_demonstrations", "num_alice_samples"):
         assert metrics[f"learner/{name}"] == plain[f"learner/{name}"]

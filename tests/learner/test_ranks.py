@@ -80,11 +80,12 @@ def test_a_group_adds_gathers_and_copies(pair):
     [
         {},
         EVERYTHING,
+        {"mirror": "random"},
         {"mirror": True, "bob": {"target_kl": 1e-7}},  # Bob stops in the middle of an epoch
         {"bob": {"target_kl": 1e-9, "learning_rate": 0.05}},  # Bob's update is undone
         {"bob": {"minibatch_size": 3}},  # some minibatches are one rank's alone
     ],
-    ids=["plain", "everything", "stopped", "undone", "tiny minibatches"],
+    ids=["plain", "everything", "reflected at random", "stopped", "undone", "tiny minibatches"],
 )
 def test_two_ranks_learn_what_one_does(pair, settings):
     config = make_config(**settings)

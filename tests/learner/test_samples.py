@@ -2,14 +2,15 @@ import math
 from dataclasses import replace
 
 import numpy as np
+import pytest
 import torch
 from torch import nn
 
-from service.config import PPOConfig
+from service.config import ABCConfig, PPOConfig
 from service.envs.observations import ACTION, BOB, BOB_VALUE
 from service.learner.player import Player
 from service.learner.ppo import advantages, collect
-from service.learner.samples import Cloning, Samples, augment_by_symmetry, minibatches
+from service.learner.samples import DemonstrationRows, augment_by_symmetry, draw_epoch, reflect_at_random
 from tests.learner.rollouts import make_turns, nobody_learns
 
 CPU = torch.device("cpu")
@@ -37,21 +38,6 @@ class Policy(nn.Module):
 
 
 PLAYER = Player(Policy(), Estimate(), CONFIG, CPU)
-
-
-def make_samples(num):
-    index = torch.arange(num, dtype=torch.float32)
-    return Samples(
-        *(index[:, None].expand(num, 3) for _ in range(3)),
-        index,
-        *(index[:, None] for _ in range(2)),
-        *(index for _ in range(3)),
-    )
-
-
-def make_cloning(num):
-    index = torch.arange(num, dtype=torch.float32)
-    return Cloning(index[:, None], index[:, None], index)
 
 
 def test_only_active_steps_of_learnable_worlds_become_samples():
@@ -123,33 +109,71 @@ def test_samples_are_augmented_by_their_reflections():
     np.testing.assert_array_equal(doubled.behaviour_log_prob[num:], doubled.proximal_log_prob[num:])
 
 
+def test_half_of_the_samples_are_reflected_at_random():
+    samples = collect([[make_bob_turns()]], make_bob_turns(), PLAYER)
+    mixed = reflect_at_random(samples, PLAYER, np.random.default_rng(0))
+    reflected = np.random.default_rng(0).random(len(samples)) < 0.5
+    assert 0.3 < reflected.mean() < 0.7
+    doubled = augment_by_symmetry(samples, PLAYER)
+    for column, both in zip(mixed.tensors(), doubled.tensors(), strict=True):
+        original, reflection = both.numpy().reshape(2, len(samples), -1)
+        expected = np.where(reflected[:, None], reflection, original)
+        np.testing.assert_array_equal(column.numpy().reshape(expected.shape), expected)
+
+
+def places(epoch, part):
+    return np.concatenate([minibatch[part] for minibatch in epoch])
+
+
+def draw(num_samples, num_demonstrations, **abc):
+    config = CONFIG.model_copy(update={"minibatch_size": 8})
+    return draw_epoch(num_samples, num_demonstrations, config, ABCConfig(**abc), np.random.default_rng(0))
+
+
 def test_an_epoch_has_every_sample_once():
-    for num, size, parts in ((20, 8, 2), (21, 8, 3), (3, 8, 1), (11, 8, 1), (13, 8, 2)):
-        batches = minibatches(make_samples(num), None, size, np.random.default_rng(0))
-        assert len(batches) == parts
-        assert all(cloning is None for _, cloning in batches)
-        seen = torch.cat([samples.value_target for samples, _ in batches])
-        assert sorted(seen.tolist()) == list(range(num))
-        assert seen.tolist() != list(range(num))
-        assert all(torch.equal(samples.value_target, samples.observation[:, 0]) for samples, _ in batches)
+    for num, parts in ((20, 2), (21, 3), (3, 1), (11, 1), (13, 2)):
+        epoch = draw(num, 0)
+        assert len(epoch) == parts
+        assert sorted(places(epoch, 0)) == list(range(num))
+        assert list(places(epoch, 0)) != list(range(num))
+        assert places(epoch, 1).size == 0
 
 
 def test_demonstrations_are_cycled_through():
-    batches = minibatches(make_samples(40), make_cloning(6), 8, np.random.default_rng(0))
-    drawn = [cloning.proximal_log_prob for _, cloning in batches]
-    assert [len(each) for each in drawn] == [4] * 5
-    counts = torch.cat(drawn).int().bincount(minlength=6)
+    epoch = draw(40, 6)
+    assert [len(cloned) for _, cloned in epoch] == [4] * 5
+    counts = np.bincount(places(epoch, 1), minlength=6)
     assert counts.min() >= 3
     assert counts.max() <= 4
 
 
+@pytest.mark.parametrize(("rows_per_sample", "num"), [(0.25, 2), (1.0, 8), (0.01, 1)])
+def test_demonstrations_of_a_minibatch_follow_the_configuration(rows_per_sample, num):
+    assert [len(cloned) for _, cloned in draw(40, 100, rows_per_sample=rows_per_sample)] == [num] * 5
+
+
 def test_few_demonstrations_are_not_repeated_within_a_minibatch():
-    batches = minibatches(make_samples(16), make_cloning(2), 8, np.random.default_rng(0))
-    assert all(sorted(cloning.proximal_log_prob.tolist()) == [0.0, 1.0] for _, cloning in batches)
+    assert all(sorted(cloned) == [0, 1] for _, cloned in draw(16, 2))
 
 
-def test_demonstrations_alone_make_an_minibatches():
-    batches = minibatches(None, make_cloning(12), 8, np.random.default_rng(0))
-    assert [samples for samples, _ in batches] == [None] * 3
-    assert sorted(torch.cat([cloning.proximal_log_prob for _, cloning in batches]).tolist()) == list(range(12))
-    assert batches[0][1].action.shape == (4, 1)
+def test_demonstrations_alone_make_an_epoch():
+    epoch = draw(0, 12)
+    assert [len(own) for own, _ in epoch] == [0, 0, 0]
+    assert sorted(places(epoch, 1)) == list(range(12))
+
+
+def test_only_demonstrations_that_are_drawn_are_reflected_and_asked_for():
+    rng = np.random.default_rng(0)
+    observation, action = (rng.standard_normal((5, size)).astype(np.float32) for size in (BOB.size, ACTION.size))
+    rows = DemonstrationRows(torch.from_numpy(observation), torch.from_numpy(action), mirrored=True)
+    assert rows.num_total == 10
+    cloning = rows.to_clone(np.array([1, 4, 6]), PLAYER)  # 6 is the reflection of row 1
+    assert len(cloning) == 3
+    np.testing.assert_array_equal(cloning.observation[:2], observation[[1, 4]])
+    np.testing.assert_array_equal(cloning.observation[2], BOB.mirror(observation[1]))
+    np.testing.assert_array_equal(cloning.action[2], ACTION.mirror(action[1]))
+    expected = PLAYER.log_prob(cloning.observation, cloning.action)
+    np.testing.assert_array_equal(cloning.proximal_log_prob, expected)
+    minibatch = cloning.find(np.array([6, 1, 6]))
+    assert torch.equal(minibatch.action, cloning.action[[2, 0, 2]])
+    assert minibatch.num_total == 3

@@ -15,6 +15,7 @@ from service.policies.gaussian import log_prob
 from service.policies.networks import (
     GaussianPolicy,
     MCPPolicy,
+    elu,
     export_parameters,
     make_alice,
     make_alice_value,
@@ -187,3 +188,17 @@ def test_same_seed_same_players() -> None:
         twins.append(export_parameters(make_bob(PolicyConfig())))
     for name, value in twins[0].items():
         np.testing.assert_array_equal(value, twins[1][name])
+
+
+def test_elu_is_torchs_with_its_gradient() -> None:
+    values = torch.cat((torch.linspace(-30.0, 30.0, 1001), torch.tensor([0.0, -0.0, -1e-6, 1e-6])))
+    ours, torchs = (values.clone().requires_grad_() for _ in range(2))
+    result, expected = elu(ours), torch.nn.functional.elu(torchs)
+    np.testing.assert_allclose(result.detach(), expected.detach(), atol=1.2e-7)
+    weights = torch.linspace(-1.0, 2.0, len(values))
+    (result * weights).sum().backward()
+    (expected * weights).sum().backward()
+    assert ours.grad is not None
+    assert torchs.grad is not None
+    np.testing.assert_allclose(ours.grad, torchs.grad, atol=3e-7)
+    assert torch.equal(elu(torch.tensor([torch.nan, torch.inf])).isnan(), torch.tensor([True, False]))
