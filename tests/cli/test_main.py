@@ -445,7 +445,7 @@ def test_a_full_disk_during_a_checkpoint(tmp_path, monkeypatch):
 def test_a_disk_that_is_full_to_the_end(tmp_path):
     """It is no mistake of what was typed, and what came before it is there."""
     config = write_yaml(tmp_path / "tiny.yaml")
-    with no_room_above(150_000):
+    with no_room_above(200_000):
         result = tandem("pretrain", "--config", config, "--run-dir", tmp_path / "run", "--registry", tmp_path / "none")
     assert result.exit_code == 1
     assert result.stderr.startswith("error: ")
