@@ -181,21 +181,22 @@ def resumed_config(directory: RunDirectory | StudyDirectory, overrides: list[str
     Args:
         directory: of the run, or of a study.
         overrides: ``run.a=b`` strings, or learning rates; others may only say what the run has.
-        file: YAML that says the same as the saved one outside ``run`` but for the number of learners; what it says
-            there comes before ``overrides``.
+        file: YAML that, with ``overrides``, says the same as the saved one outside ``run`` but for the number of
+            learners; what it says there comes before ``overrides``.
 
     Raises:
         ConfigError: no run there, an override of anything else, or a file that says otherwise.
     """
     saved = directory.read_config()
-    for override in overrides:
-        if not override.startswith(RESUMABLE) and not _says(saved, directory, override):
+    fixed = [override for override in overrides if not override.startswith(RESUMABLE)]
+    for override in fixed:
+        if not _says(saved, directory, override):
             raise ConfigError(
                 f"override {override!r}: a resumed run keeps its configuration; only run.*, the learning rates and "
                 "learner.num_learners may change, for example run.total_env_steps"
             )
     if file is not None:
-        given = load_config(file, recorded=True)  # maybe the one the run was begun with, by an earlier version
+        given = load_config(file, fixed, recorded=True)  # maybe the one the run was begun with, by an earlier version
         _check_same_outside_run(saved, given, file)
         named = given.run.model_dump(mode="json", exclude_unset=True)
         free = {f"run.{key}": value for key, value in named.items()} | {_NUM_LEARNERS: given.learner.num_learners}

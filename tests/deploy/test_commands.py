@@ -11,6 +11,7 @@ from typer.testing import CliRunner
 
 from service.cli.main import app
 from service.config import dump_config
+from service.runtime.pretrain_study import StudyResult
 from tests.deploy.files import DEPLOY, DOCUMENTS, ROOT, commands, compose, manifest, manifests, pod_templates
 
 
@@ -74,14 +75,23 @@ def test_pretrain_begins_with_it_and_goes_on_with_it(arguments, monkeypatch, tmp
         path.mkdir(parents=True, exist_ok=True)
         (path / "config.yaml").write_text(dump_config(config))
 
+    def pretrain_study(config, directory, seeds, registry, *, resume, **kwargs):
+        begun.append((directory.path, resume))
+        if not resume:
+            directory.begin(config, seeds)
+            directory.close()
+        return StudyResult(())
+
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("service.cli.pretrain._pretrain", pretrain)
+    monkeypatch.setattr("service.runtime.pretrain_study.pretrain_study", pretrain_study)
+    monkeypatch.setattr("service.runtime.ray_connection.cluster_size", lambda *_: ("here", 8.0))
     monkeypatch.setattr("service.runtime.ray_connection.connected", lambda *_: nullcontext())
     here = [re.sub(r"^(/usr/local/share/tandem/)?configs/", f"{ROOT}/configs/", word) for word in arguments]
     for resumed in (False, True):
         result = CliRunner().invoke(app, here)
         assert result.exit_code == 0, result.output
-        assert begun.pop() == (Path("runs/cube"), resumed)
+        assert begun.pop() == (Path("runs/study" if "--seeds" in here else "runs/cube"), resumed)
 
 
 def test_a_wrong_option_is_found():
