@@ -12,6 +12,7 @@ import service
 from benchmarks import (
     ablations,
     compare_commits,
+    contact_solver,
     env_throughput,
     learner_ranks,
     measuring,
@@ -21,6 +22,7 @@ from benchmarks import (
     selfplay_throughput,
     stages,
     tasks,
+    time_to_skill,
 )
 from benchmarks.measuring import Sample
 from benchmarks.report.__main__ import PAGES, Report, begin, end
@@ -186,6 +188,61 @@ def test_panda_gym_plays_where_it_is_installed():
     pytest.importorskip("panda_gym", reason="panda-gym, to compare with, comes with make bench only")
     contender = env_throughput.panda_gym(env_throughput.PANDA_GYM_IDS[0])
     assert contender.episode() == env_throughput.EPISODE_STEPS
+
+
+# --- time to skill ----------------------------------------------------------------------------------------------------
+
+
+def test_the_first_of_three_in_a_row():
+    rates = [0.5, 0.9, 0.95, 0.8, 0.9, 0.91, 0.92, 0.99]
+    assert time_to_skill.first_in_a_row(rates) == 4
+    assert time_to_skill.first_in_a_row(rates, share=0.91) == 5
+    assert time_to_skill.first_in_a_row(rates[:6]) is None
+    assert time_to_skill.first_in_a_row([]) is None
+
+
+def test_time_to_skill_stops_a_seed_that_is_there_and_skips_it_later(tmp_path, capsys):
+    (tmp_path / "tiny.yaml").write_text(dump_config(load_config(None, [*TINY, "run.evaluation_interval=1"])))
+    command = ["--config", str(tmp_path / "tiny.yaml"), "--json", str(tmp_path / "out.json"), "--share", "0"]
+    assert time_to_skill.main([*command, "--seeds", "3"]) == 0
+    (run,) = json.loads((tmp_path / "out.json").read_text())["runs"]
+    assert (run["seed"], run["reached"], run["at"]) == (3, True, run["curve"][0])
+    assert len(run["curve"]) >= 3
+    assert run["curve"][0]["wall_s"] <= run["curve"][2]["wall_s"]
+    assert "Median: " in capsys.readouterr().out
+    assert time_to_skill.main([*command, "--seeds", "3"]) == 0  # at once
+    assert time_to_skill.main([*command[:-1], "0.5", "--seeds", "3"]) == 2
+    assert "name another file" in capsys.readouterr().err
+
+
+def test_the_contact_solver_is_compared_on_recorded_states(config, tmp_path):
+    run = LocalRun(config, RunDirectory(tmp_path / "run"))
+    run.run(lambda metrics: run.request_stop())
+    run.close()
+    run.directory.close()
+    settings = contact_solver.Settings(num_pairs=1, seconds=0.0, num_states=20, hold_s=0.1)
+    result = contact_solver.compare(run.directory, tmp_path, settings)
+    assert result["num_states"] == 20
+    assert result["cpu_ratio"] > 0.0
+    assert "today / version 0.1" in contact_solver.report(result)
+    old, new = (
+        contact_solver.build_model(config.world, name) for name in (contact_solver.VERSION_0_1, contact_solver.TODAY)
+    )
+    assert (old.opt.impratio, old.opt.noslip_iterations, old.opt.gravity[2]) == (100.0, 0, -9.81)
+    assert (new.opt.impratio, new.opt.noslip_iterations, new.opt.gravity[2]) == (1.0, 5, 0.0)
+
+
+def test_a_held_object_slips_less_than_one_that_is_dropped(config):
+    world = config.world
+    with WorldBatch(world, 2) as worlds:
+        worlds.reset(np.random.default_rng(0))
+        states = worlds.states.copy()
+        away = np.array([[0.0, 0.0, 0.0], [0.0, 0.3, 1.0]])  # in the gripper; high up
+        states[:, worlds.layout["object"]] = worlds.ee_position + away
+    for solver in (contact_solver.TODAY, contact_solver.VERSION_0_1):
+        held, dropped = contact_solver.slip_m(world, 0.0, states, solver, 0.5)
+        assert held < 0.005
+        assert dropped > 0.05
 
 
 # --- self-play throughput ---------------------------------------------------------------------------------------------

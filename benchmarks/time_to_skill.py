@@ -1,0 +1,125 @@
+"""Wall-clock time until Bob solves 90 % of mixed goals, from the start of the process, for several seeds.
+
+    python -m benchmarks.time_to_skill --seeds 0,1,2,3,4 --json docs/results/time_to_skill.json
+
+What counts is the first of three evaluations in a row with 90 % of mixed goals at the last step, by the evaluations
+that any run makes. Seeds run one after the other, each until it is there or at ``--max-env-steps``; a seed that the
+file has already is not run again. The machine should do nothing else.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import statistics
+import sys
+import time
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from benchmarks.measuring import RECIPE_FILE, machine, write_json
+from benchmarks.processes import cpu_s_by_role
+from benchmarks.training_process import Training, overrides, scratch
+from service.errors import TandemError
+from service.runtime.study_plan import parse_seeds
+
+SHARE = 0.9
+NUM_IN_A_ROW = 3
+SUCCESS = "evaluation/mixed_success_last"
+PACKAGES = ("mujoco", "numpy", "torch")
+
+
+def first_in_a_row(rates: Sequence[float], share: float = SHARE, num: int = NUM_IN_A_ROW) -> int | None:
+    """Index of the first of ``num`` neighbours that all reach ``share``; None if there are none."""
+    for index in range(len(rates) - num + 1):
+        if min(rates[index : index + num]) >= share:
+            return index
+    return None
+
+
+def run_seed(config: Path, settings: Sequence[str], seed: int, max_env_steps: int, share: float) -> dict[str, Any]:
+    """Run one seed until it is there, or to ``max_env_steps``; for JSON.
+
+    Raises:
+        TandemError: the run ended by itself, by an error.
+    """
+    budget = overrides({"seed": seed, "run.total_env_steps": max_env_steps})
+    given = [word for each in settings for word in ("--set", each)]
+    points: list[dict[str, float]] = []
+    with scratch() as home:
+        start_s = time.monotonic()
+        arguments = ["--config", str(config), "--no-publish", *given, *budget]
+        with Training(home, arguments, runtime="local") as training:
+            found = None
+            while found is None and (not points or points[-1]["env_steps"] < max_env_steps):
+                rows = training.wait_for(training.records.new, 600.0)
+                seen_s, cpu_s = time.monotonic() - start_s, sum(cpu_s_by_role(training.pid).values())
+                times = {"wall_s": seen_s, "cpu_s": cpu_s}
+                points += [_point(row) | times for row in rows if SUCCESS in row]
+                found = first_in_a_row([each["success"] for each in points], share)
+                if rows[-1]["env_steps"] >= max_env_steps:
+                    break
+    there = points[found] if found is not None else None
+    return {"seed": seed, "reached": there is not None, "at": there, "curve": points}
+
+
+def _point(row: Mapping[str, float]) -> dict[str, float]:
+    return {"success": row[SUCCESS], "env_steps": row["env_steps"], "iteration": row["iteration"]}
+
+
+def report(result: Mapping[str, Any]) -> str:
+    """What was measured, as Markdown."""
+    lines = ["| seed | minutes | env steps | updates | CPU minutes |", "| --- | --- | --- | --- | --- |"]
+    for run in result["runs"]:
+        at = run["at"]
+        if at is None:
+            last = run["curve"][-1] if run["curve"] else {"env_steps": 0}
+            lines.append(f"| {run['seed']} | not within {last['env_steps'] / 1e6:.1f} M env steps | | | |")
+            continue
+        cells = (
+            f"{at['wall_s'] / 60:.1f} | {at['env_steps'] / 1e6:.2f} M | {at['iteration']:.0f} | {at['cpu_s'] / 60:.1f}"
+        )
+        lines.append(f"| {run['seed']} | {cells} |")
+    if all(run["reached"] for run in result["runs"]):
+        median_s = statistics.median(run["at"]["wall_s"] for run in result["runs"])
+        lines += ["", f"Median: {median_s / 60:.1f} minutes."]
+    return "\n".join(lines)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Parse the command line, measure, print."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n", 1)[0])
+    parser.add_argument("--config", type=Path, default=RECIPE_FILE, metavar="FILE")
+    parser.add_argument("--set", action="append", default=[], metavar="A.B=C", help="override; repeatable")
+    parser.add_argument("--seeds", default="0-4", metavar="0,1,2|0-4", help="default: %(default)s")
+    parser.add_argument("--share", type=float, default=SHARE, help="default: %(default)s")
+    parser.add_argument("--max-env-steps", type=int, default=12_000_000, help="default: %(default)s")
+    parser.add_argument("--json", type=Path, required=True, metavar="FILE", help="results; seeds it has are not run")
+    given = parser.parse_args(arguments)
+    try:
+        settings = {"config": given.config.name, "set": given.set, "share": given.share}
+        result: dict[str, Any] = {"benchmark": "time_to_skill", "settings": settings, "runs": []}
+        if given.json.exists():
+            result = json.loads(given.json.read_text(encoding="utf-8"))
+            if result["settings"] != settings:
+                raise TandemError(
+                    f"{given.json}: measured with {result['settings']}, not {settings}; name another file"
+                )
+        done = {run["seed"] for run in result["runs"]}
+        for seed in parse_seeds(given.seeds):
+            if seed not in done:
+                where = machine(*PACKAGES)
+                run = run_seed(given.config, given.set, seed, given.max_env_steps, given.share)
+                result["runs"].append(run | {"machine": where})
+                write_json(given.json, result)
+                print(report(result), flush=True)
+    except TandemError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+    print(report(result))
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
