@@ -196,13 +196,13 @@ class TestBadInput:
         self.refused(r"begun with num_episodes 6, not 7", other, champion, tmp_path, resume=True)
 
     def test_a_task_of_another_version(self, champion, tmp_path):
-        """A directory of before tasks had versions is of version 0, which Box no longer is."""
+        """A directory of before tasks had versions is of version 0, which none is any more."""
         for task in ("wall", "box"):
             run(small_trial("idle", task), champion, tmp_path / task)
             (tmp_path / task / "result.json").unlink()
-            tree = json.loads((tmp_path / task / "cell.json").read_text())
-            del tree["cell"]["task_version"]
-            (tmp_path / task / "cell.json").write_text(json.dumps(tree))
+        tree = json.loads((tmp_path / "box" / "cell.json").read_text())
+        del tree["cell"]["task_version"]
+        (tmp_path / "box" / "cell.json").write_text(json.dumps(tree))
         run(small_trial("idle", "wall"), champion, tmp_path / "wall", resume=True)
         words = r"begun with task_version 0, not 1"
         self.refused(words, small_trial("idle", "box"), champion, tmp_path / "box", resume=True)

@@ -97,8 +97,8 @@ class Sweep(Constant):
 
 
 def test_a_bob_who_passes_the_goal_has_not_solved_it():
-    # He does what Alice did, but for 20 steps, not 8: where she left the object he does not stop.
-    config = Config(game=GameConfig(alice_steps=8, bob_steps=20, bob_hold_steps=20))
+    # He does what Alice did, but for 20 steps, not 5: where she left the object he does not stop.
+    config = Config(game=GameConfig(alice_steps=5, bob_steps=20, bob_hold_steps=20))
     rounds = record_rounds(config, Sweep(), Sweep(), num_rounds=30, seed=0)
     tried = [played for played in rounds if played.verdict == Verdict.VALID]
     assert {len(played.bob_actions) for played in tried} == {20}
@@ -110,8 +110,8 @@ def test_a_bob_who_passes_the_goal_has_not_solved_it():
 
 @pytest.mark.parametrize("distance_m", [0.03, 0.06])
 def test_the_caption_says_solved_where_the_runs_own_rule_does(monkeypatch, distance_m):
-    config = Config(game=GameConfig(alice_steps=8, bob_steps=11, bob_hold_steps=11, success_distance_m=distance_m))
-    rounds = record_rounds(config, Sweep(), Sweep(), num_rounds=30, seed=0)
+    config = Config(game=GameConfig(alice_steps=5, bob_steps=11, bob_hold_steps=11, success_distance_m=distance_m))
+    rounds = record_rounds(config, Sweep(), Sweep(), num_rounds=30, seed=1)
     blank = SimpleNamespace(render=lambda state, goal=None: np.zeros((8, 8, 3), dtype=np.uint8))
     words, bar = [], video._bar
     monkeypatch.setattr(video, "_bar", lambda width, text, *more: words.append(text) or bar(width, text, *more))
