@@ -114,6 +114,13 @@ class GameConfig(FrozenModel):
         description="share of games in which the gripper stays closed for both players, whatever they ask for; 0 in "
         "the paper. What is learned there are primitives that push",
     )
+    blocked_gripper_min_success: float = Field(
+        0.0,
+        ge=0.0,
+        le=1.0,
+        description="games with a blocked gripper begin once Bob's mean success rate over all goal cells, 0 where "
+        "Alice never was, has come to this; before, they keep him from learning to lift",
+    )
     bob_success_reward: float = Field(
         1.0, gt=0.0, description="when the object comes onto the goal; taken back when it leaves (OpenAI 2021)"
     )

@@ -79,11 +79,18 @@ class SelfPlay:
         self.incarnation = incarnation
         self._actor, self._sequence = actor, 0
         self._round_index: IntArray = np.zeros(config.game.num_worlds, dtype=np.int64)
+        self.block_grippers(0.0)
         self.worlds.reset(rng)
 
     def close(self) -> None:
         """Stop the worlds' threads."""
         self.worlds.close()
+
+    def block_grippers(self, success_rate: float) -> None:
+        """Say how good Bob is over all goal cells: on that depends whether new games may have a blocked gripper."""
+        game = self.config.game
+        may_be = success_rate >= game.blocked_gripper_min_success
+        self.worlds.blocked_fraction = game.blocked_gripper_fraction if may_be else 0.0
 
     def start_over(self) -> None:
         """End every game: the next round begins new ones."""

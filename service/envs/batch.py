@@ -64,7 +64,8 @@ class WorldBatch:
         assert (self.model.nq, self.model.nv) == (self.layout.num_positions, self.layout.num_velocities)
         assert self.model.nu == _NUM_CONTROLS
         assert mujoco.mj_stateSize(self.model, _PHYSICS) == self.layout.physics.stop
-        self._blocked_fraction = blocked_fraction
+        self.blocked_fraction = blocked_fraction
+        """Share of later starts with a blocked gripper; more than 0 only where it was when the batch was made."""
         self._control_spec = _CONTROL_AND_BOX if self.model.nmocap else int(mujoco.mjtState.mjSTATE_CTRL)
         self._widest_m = 2 * FINGER_STROKE_M if config.gripper == "free" else 0.0
         self._fresh_state = self._make_fresh_state()
@@ -120,8 +121,8 @@ class WorldBatch:
         """
         states = np.tile(self._fresh_state, (num, 1))
         states[:, self.layout["object"]], states[:, self.layout["box_place"]] = draw_starts(rng, num, self.config)
-        if self._blocked_fraction:
-            blocked = rng.random(num) < self._blocked_fraction
+        if self.blocked_fraction:
+            blocked = rng.random(num) < self.blocked_fraction
             states[blocked, self.layout["fingers"]] = 0.0
             states[:, self.layout["gripper_blocked"]] = blocked[:, None]
         return states

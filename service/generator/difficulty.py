@@ -115,6 +115,10 @@ class DifficultyGrid:
         novelty: StateArray = 1.0 / np.sqrt(1.0 + self.proposals)
         return novelty
 
+    def mean_success_rate(self) -> float:
+        """Mean over all cells, 0 where no goal was ever proposed: how much of the workspace Bob masters."""
+        return float(np.where(self.seen, self.counts.success_rate(), 0.0).mean())
+
     def mean_learnability(self) -> float:
         """Mean over the cells seen; not-a-number while there are none."""
         return float(self.counts.learnability()[self.seen].mean()) if self.seen.any() else float("nan")

@@ -83,6 +83,7 @@ class TaskGenerator:
             starts=self.starts.rows(),
             reset_learnability=self.from_reset.learnability(),
             novelty=self.grid.novelty(),
+            success_rate=np.array(self.grid.mean_success_rate()),
         )
 
     def record(self, summary: GoalSummary) -> Metrics:
@@ -109,6 +110,7 @@ class TaskGenerator:
             "generator/iterations_without_new_cell": float(self._stop.num_iterations_without_new_cell),
             "generator/buffer_size": float(len(self.buffer)),
             "generator/mean_learnability": self.grid.mean_learnability(),
+            "generator/mean_success_rate": self.grid.mean_success_rate(),
         }
         return {name: value for name, value in metrics.items() if not np.isnan(value)}
 

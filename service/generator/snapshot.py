@@ -21,7 +21,7 @@ LEARNABILITY_FLOOR = 0.01
 """Added to p (1 - p), which is at most 1/4, so goals of a solved or hopeless cell stay drawable and measured."""
 MIN_REPLAY_GOALS = 64
 """Goals the buffer must hold before any is replayed: fewer would be played over and over."""
-_ARRAYS = ("share", "learnability", "reset_learnability", "novelty")
+_ARRAYS = ("share", "learnability", "reset_learnability", "novelty", "success_rate")
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,6 +67,8 @@ class GeneratorSnapshot:
     """(task bins,) p (1 - p) of what starts where a game does."""
     novelty: StateArray
     """(cells,) how rare proposals there are."""
+    success_rate: StateArray
+    """() mean over all cells, 0 where no goal was ever proposed."""
 
     def choose_goals(
         self,

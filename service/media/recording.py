@@ -78,6 +78,9 @@ def record_rounds(
     players = Players(version=0, alice=alice, bob=_WithoutNoise(bob))
     rounds: list[tuple[_Interest, RecordedRound]] = []
     with contextlib.closing(SelfPlay(config, rng, num_threads=config.run.num_threads)) as self_play:
+        if config.game.blocked_gripper_min_success > 0.0:  # by now he has come to it
+            self_play.block_grippers(1.0)
+            self_play.start_over()
         # It was never told of a goal, so it replays none: Bob plays those of this round's Alice.
         snapshot = TaskGenerator(config, self_play.worlds.layout).snapshot()
         for _ in range(_MAX_ROLLOUTS):

@@ -1,10 +1,12 @@
 """The game, played by scripts with a known outcome: verdicts, rewards and demonstrations are checked by hand."""
 
+import contextlib
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
+from service.actors.self_play import SelfPlay
 from service.envs.batch import WorldBatch
 from service.generator.opponents import RoundPlan
 from service.generator.snapshot import GoalChoice
@@ -570,3 +572,20 @@ def test_a_turn_of_alice_may_be_shorter():
         path = idle_positions(SLIDES, length)
         np.testing.assert_allclose(rollout.records.proposal[SLID], path[-1], atol=1e-5)
     assert lengths == {5, 6, 7, 8, 9}
+
+
+def test_grippers_are_blocked_once_bob_is_good_enough():
+    config = make_config(40, game={"blocked_gripper_fraction": 0.5, "blocked_gripper_min_success": 0.6})
+    with contextlib.closing(SelfPlay(config, np.random.default_rng(0), num_threads=1)) as game:
+
+        def num_blocked():
+            game.start_over()
+            return int((game.worlds.states[:, game.worlds.layout["gripper_blocked"]] > 0.0).sum())
+
+        assert num_blocked() == 0
+        game.block_grippers(0.59)
+        assert num_blocked() == 0
+        game.block_grippers(0.6)
+        assert 10 < num_blocked() < 30
+        game.block_grippers(0.5)
+        assert num_blocked() == 0

@@ -97,6 +97,7 @@ def test_grid_rates_by_hand() -> None:
     np.testing.assert_allclose(grid.counts.success_rate()[grid.cells.index(goals)], [4 / 5, 1 / 3, 1 / 2], rtol=1e-15)
     np.testing.assert_allclose(grid.learnability(goals), [4 / 25, 2 / 9, 1 / 4], rtol=1e-15)
     np.testing.assert_allclose(grid.mean_learnability(), (4 / 25 + 2 / 9) / 2, rtol=1e-15)
+    np.testing.assert_allclose(grid.mean_success_rate(), (4 / 5 + 1 / 3) / len(grid.cells), rtol=1e-15)
     assert grid.num_cells_seen == 2
 
 

@@ -258,7 +258,7 @@ def test_metric_names_are_an_api(make_records: MakeRecords) -> None:
         *("alice/goal_distance_m", "alice/goal_height_m", "alice/goal_height_p90_m"),
         *("bob/success_rate", "bob/success_rate_table", "bob/success_rate_air", "bob/steps_to_success"),
         *("generator/num_cells_seen", "generator/new_cells", "generator/iterations_without_new_cell"),
-        *("generator/buffer_size", "generator/mean_learnability"),
+        *("generator/buffer_size", "generator/mean_learnability", "generator/mean_success_rate"),
     }
 
 

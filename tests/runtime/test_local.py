@@ -62,7 +62,7 @@ METRICS = {
     "learner/alice_value_loss", "learner/bob_value_loss", "learner/alice_clip_fraction", "learner/bob_clip_fraction",
     "learner/alice_grad_norm", "learner/bob_grad_norm", "learner/alice_policy_steps", "learner/bob_policy_steps",
     "generator/num_cells_seen", "generator/new_cells", "generator/iterations_without_new_cell",
-    "generator/buffer_size", "generator/mean_learnability",
+    "generator/buffer_size", "generator/mean_learnability", "generator/mean_success_rate",
     "evaluation/table_success_last", "evaluation/table_success_ever",
     "evaluation/air_success_last", "evaluation/air_success_ever",
     "evaluation/mixed_success_last", "evaluation/mixed_success_ever",
