@@ -82,11 +82,10 @@ class Bookkeeper:
         """Whether a checkpoint is to be written after this iteration."""
         return self.iteration % self.config.run.checkpoint_interval == 0
 
-    @property
-    def evaluation_due(self) -> bool:
-        """Whether Bob is to be evaluated after this iteration."""
+    def evaluation_due(self, iteration: int) -> bool:
+        """Whether Bob is to be evaluated once so many iterations are finished."""
         interval = self.config.run.evaluation_interval
-        return interval > 0 and self.iteration % interval == 0
+        return interval > 0 and iteration % interval == 0
 
     def count(self, num_env_steps: int) -> None:
         """Count an iteration and its env steps."""

@@ -398,7 +398,7 @@ class ClusterRun(Runner):
         self.bookkeeper.wall_s += elapsed_s
         evaluated, self._evaluated = self._evaluated, {}
         self._record(result, self._metrics(result, elapsed_s) | evaluated)
-        if self.bookkeeper.evaluation_due:
+        if self.bookkeeper.evaluation_due(self.iteration):
             self._evaluate()
 
     def _evaluate(self) -> None:

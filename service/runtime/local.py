@@ -117,14 +117,15 @@ class LocalRun(Runner):
         with self.timing("generator"):
             recorded = self._generator.record(self.iteration, weights, [goals])
             self.directory.dump_diverged(f"{rollout.sequence:06d}", rollout.diverged)
+        with self.timing("evaluate"):  # the players of this round, while the learner goes on
+            due = self.bookkeeper.evaluation_due(self.iteration + 1)
+            evaluated = self._actor.evaluate(weights, EVALUATED_GOALS) if due else {}
         with self.timing("wait for learner"):
             updated = learning.result() if learning is not None else None
         self._pending = rollout
         result = IterationResult([summary], recorded, updated, num_actors_alive=1)
         self._count(result)
-        with self.timing("evaluate"):
-            due = self.bookkeeper.evaluation_due
-            return result, self._actor.evaluate(weights, EVALUATED_GOALS) if due else {}
+        return result, evaluated
 
     # --- exact resume ----------------------------------------------------------------------------------------------
 
