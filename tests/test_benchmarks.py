@@ -202,7 +202,8 @@ def test_the_first_of_three_in_a_row():
 
 
 def test_time_to_skill_stops_a_seed_that_is_there_and_skips_it_later(tmp_path, capsys):
-    (tmp_path / "tiny.yaml").write_text(dump_config(load_config(None, [*TINY, "run.evaluation_interval=1"])))
+    evaluated = [f"run.evaluation_{name}" for name in ("interval=1", "episodes=2", "steps=2")]
+    (tmp_path / "tiny.yaml").write_text(dump_config(load_config(None, [*TINY, *evaluated])))
     command = ["--config", str(tmp_path / "tiny.yaml"), "--json", str(tmp_path / "out.json"), "--share", "0"]
     assert time_to_skill.main([*command, "--seeds", "3"]) == 0
     (run,) = json.loads((tmp_path / "out.json").read_text())["runs"]
