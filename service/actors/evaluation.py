@@ -110,6 +110,28 @@ def evaluate(
     )
 
 
+def evaluate_run(
+    policy: DeterministicPolicy,
+    config: Config,
+    kind: GoalKind,
+    num_episodes: int,
+    *,
+    seed: int,
+    num_threads: int = 0,
+) -> Evaluation:
+    """Evaluate a policy as a run's configuration says; see ``evaluate``."""
+    return evaluate(
+        policy,
+        config.world,
+        kind,
+        num_episodes=num_episodes,
+        num_steps=config.run.evaluation_steps,
+        success_distance_m=config.game.success_distance_m,
+        seed=seed,
+        num_threads=num_threads,
+    )
+
+
 def success_metrics(
     policy: DeterministicPolicy,
     config: Config,
@@ -122,16 +144,7 @@ def success_metrics(
     """Success rates on several kinds of goals in a run's world, as metrics ``evaluation/KIND_success_...``."""
     metrics = {}
     for kind in kinds:
-        result = evaluate(
-            policy,
-            config.world,
-            kind,
-            num_episodes=num_episodes,
-            num_steps=config.run.evaluation_steps,
-            success_distance_m=config.game.success_distance_m,
-            seed=seed,
-            num_threads=num_threads,
-        )
+        result = evaluate_run(policy, config, kind, num_episodes, seed=seed, num_threads=num_threads)
         metrics[f"evaluation/{kind}_success_last"] = result.success_last
         metrics[f"evaluation/{kind}_success_ever"] = result.success_ever
     return metrics

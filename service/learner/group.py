@@ -21,11 +21,11 @@ from service.types import IntArray, StateArray
 _dist: Any = torch.distributed
 """Its stubs lack what is used here."""
 Store = Any
-"""Where the ranks of a group find each other: a ``torch.distributed.TCPStore``."""
+"""Meeting place of the ranks of a group: a ``torch.distributed.TCPStore``."""
 
 
 class Group(Protocol):
-    """What the ranks do together. Every rank makes the same calls in the same order, each waits for all.
+    """Operations of all ranks together. Every rank makes the same calls in the same order, each waits for all.
 
     All calls raise ``GroupError`` where another rank does not answer in time.
     """

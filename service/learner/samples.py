@@ -39,11 +39,6 @@ class _Rows:
         """Take the rows of these indices, in their order."""
         return type(self)(*(tensor.index_select(0, rows) for tensor in self.tensors()))
 
-    def split(self, num_parts: int) -> list[Self]:
-        """Cut into consecutive parts, as views; sizes differ by one at most."""
-        parts = [tensor.tensor_split(num_parts) for tensor in self.tensors()]
-        return [type(self)(*columns) for columns in zip(*parts, strict=True)]
-
     def tensors(self) -> list[Tensor]:
         """The columns, in the order of the fields."""
         return [getattr(self, name) for name in self.names()]
@@ -131,16 +126,14 @@ class DemonstrationRows(_Rows):
     def find(self, drawn: IntArray) -> DemonstrationRows:
         """Take the own ones of the rows at these places of all ranks' rows, in their order; reflections are made."""
         num = self.num_total // (1 + self.mirrored)
-        rows, share = (drawn % num, None) if self.share is None else self.share.find(drawn % num)
-        part = replace(self.take(torch.from_numpy(rows).to(self.observation.device)), share=share)
+        part = _Rows.find(self, drawn % num)
         if not self.mirrored:
             return part
-        own = drawn if share is None else drawn[share.places]
+        own = drawn if part.share is None else drawn[part.share.places]
         reflected = torch.from_numpy(own >= num).to(self.observation.device)[:, None]
         pairs = zip(part.tensors(), (BOB.mirror, ACTION.mirror), strict=True)
-        return part.having(
-            (torch.where(reflected, _reflect(column, mirror), column) for column, mirror in pairs), share
-        )
+        columns = (torch.where(reflected, _reflect(column, mirror), column) for column, mirror in pairs)
+        return part.having(columns, part.share)
 
     def to_clone(self, drawn: IntArray, player: Player) -> Cloning:
         """Prepare the own ones of the rows at these places, ascending; ``player`` is at the start of the update."""

@@ -36,7 +36,7 @@ class StudyCluster:
     address: str
     num_cores: float
     options: ClusterOptions
-    """Of each run, but for its status service, which is the study's."""
+    """Options of each run, but for its status service, which is the study's."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,10 +49,10 @@ class StudyResult:
     best: int | None = None
     """Seed of the best run; None where no run has ended, or a signal came first."""
     version: Version | None = None
-    """Of its primitives."""
+    """Version of its primitives."""
     picture: Path | None = None
     signal: int | None = None
-    """That ended it before its time."""
+    """Signal that ended it before its time."""
 
 
 def pretrain_study(
@@ -116,7 +116,7 @@ def pretrain_study(
 
 
 def _share(config: Config, num_runs: int, parallel: int | None, cluster: StudyCluster | None) -> tuple[int, list[str]]:
-    """How many runs at once, and what tells each of them where it runs."""
+    """Number of runs at once, and the arguments that tell each where it runs."""
     if cluster is None:
         share = share_machine(len(os.sched_getaffinity(0)), num_runs, parallel)
         chosen = config.run.num_threads or share.num_cores

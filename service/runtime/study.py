@@ -49,7 +49,7 @@ class RunEnd:
     wall_s: float = 0.0
     """Seconds spent on iterations, by all processes that ran this run."""
     error: str | None = None
-    """Why it failed, in one line."""
+    """Reason of a failure, in one line."""
 
     @property
     def has_ended(self) -> bool:
@@ -77,7 +77,7 @@ class Study:
         """Last iteration of each run that was shown."""
         self._stopping = False
         self.runs = {seed: self._found(seed) for seed in seeds}
-        """How each run was left, by its seed."""
+        """State in which each run was left, by its seed."""
 
     @property
     def unfinished(self) -> list[int]:

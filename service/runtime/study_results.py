@@ -11,7 +11,7 @@ from contextlib import closing, suppress
 from dataclasses import dataclass
 from typing import Any
 
-from service.actors.evaluation import EVALUATED_GOALS, REPORTED_SEED, SELECTION_SEED, Evaluation, evaluate
+from service.actors.evaluation import EVALUATED_GOALS, REPORTED_SEED, SELECTION_SEED, Evaluation, evaluate_run
 from service.config import Config
 from service.envs.sampling import GoalKind
 from service.io.run_directory import RunDirectory
@@ -66,19 +66,8 @@ def score(config: Config, parameters: Parameters) -> Scores:
     """
     policy = numpy_bob(parameters)
 
-    def rate(kind: GoalKind, seed: int) -> Evaluation:
-        return evaluate(
-            policy,
-            config.world,
-            kind,
-            num_episodes=NUM_EPISODES,
-            num_steps=config.run.evaluation_steps,
-            success_distance_m=config.game.success_distance_m,
-            seed=seed,
-        )
-
-    reported = tuple(rate(kind, REPORTED_SEED) for kind in EVALUATED_GOALS)
-    return Scores(rate(SELECTION_GOALS, SELECTION_SEED), reported)
+    reported = tuple(evaluate_run(policy, config, kind, NUM_EPISODES, seed=REPORTED_SEED) for kind in EVALUATED_GOALS)
+    return Scores(evaluate_run(policy, config, SELECTION_GOALS, NUM_EPISODES, seed=SELECTION_SEED), reported)
 
 
 def score_run(directory: RunDirectory) -> Scores:

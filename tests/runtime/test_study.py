@@ -165,12 +165,12 @@ def test_the_best_is_chosen_by_the_selections_goals_alone():
 def test_goals_that_choose_are_not_those_that_are_reported(monkeypatch, tmp_path):
     asked = []
 
-    def evaluate(policy, world, kind, *, num_episodes, num_steps, success_distance_m, seed):
+    def evaluate(policy, world, kind, *, num_episodes, num_steps, success_distance_m, seed, num_threads):
         asked.append((kind, num_episodes, num_steps, seed))
         return an_evaluation(0.5, goals=kind)
 
-    monkeypatch.setattr(study_results, "evaluate", evaluate)
     play(tmp_path, tiny_config(total_env_steps=120))
+    monkeypatch.setattr("service.actors.evaluation.evaluate", evaluate)
     scores = score(tiny_config(), read_parameters(RunDirectory(tmp_path), "bob"))
     reported = [(kind, 1000, 2, REPORTED_SEED) for kind in ("table", "air", "mixed")]
     assert sorted(asked) == sorted([*reported, ("mixed", 1000, 2, SELECTION_SEED)])
