@@ -264,6 +264,11 @@ class LearnerConfig(FrozenModel):
     num_threads: int = Field(
         1, ge=1, description="torch threads; one leaves the other core to the worlds, and two spin when a core is taken"
     )
+    bfloat16: bool = Field(
+        False,
+        description="multiply in bfloat16 inside hidden layers, where a processor has it in two thirds of the time; "
+        "what is learned then depends on the machine",
+    )
     alice: PPOConfig = PPOConfig()
     bob: PPOConfig = PPOConfig(num_epochs=5, minibatch_size=512)
     bob_window: int = Field(

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from service.envs.observations import POSITIONS
@@ -29,15 +28,13 @@ def spread(places: IntArray) -> IntArray:
     return places[:: max(1, -(-len(places) // NUM_PROBES))]
 
 
-def explained_variance(
-    returns: NDArray[np.floating], values: NDArray[np.floating], num: int, group: Group = ALONE
-) -> float:
+def explained_variance(returns: Tensor, values: Tensor, num: int, group: Group = ALONE) -> float:
     """Share of the variance of ``returns`` (N,) that ``values`` predict: 1 at best, 0 for a constant.
 
     ``num`` rows are those of all ranks together.
     """
-    _, std = mean_and_std(returns.astype(np.float64), num, group)
-    _, error_std = mean_and_std((returns - values).astype(np.float64), num, group)
+    _, std = mean_and_std(returns.double(), num, group)
+    _, error_std = mean_and_std((returns - values).double(), num, group)
     return 1.0 - (error_std / std) ** 2 if std > 0.0 else 0.0
 
 

@@ -6,6 +6,7 @@ Rank r of R. The learner knows only ``Group``. ``ALONE`` is the group of a learn
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from datetime import timedelta
 from typing import Any, Protocol
@@ -16,7 +17,7 @@ import torch.distributed
 from torch import Tensor
 
 from service.errors import GroupError
-from service.types import IntArray, StateArray
+from service.types import IntArray
 
 _dist: Any = torch.distributed
 """Its stubs lack what is used here."""
@@ -161,16 +162,16 @@ def find_store(host: str, port: int, timeout_s: float) -> Store:
         ) from None
 
 
-def mean_and_std(values: StateArray, num: int, group: Group) -> tuple[float, float]:
+def mean_and_std(values: Tensor, num: int, group: Group) -> tuple[float, float]:
     """Mean and standard deviation of the (N,) values of all ranks, ``num`` together."""
-    mean = _total(values.sum(), group) / num
-    return mean, float(np.sqrt(_total(np.square(values - mean).sum(), group) / num))
+    mean = _total(values, group) / num
+    return mean, math.sqrt(_total((values - mean).square(), group) / num)
 
 
-def _total(value: np.float64, group: Group) -> float:
-    tensor = torch.tensor(value, dtype=torch.float64)
-    group.sum(tensor)
-    return float(tensor)
+def _total(values: Tensor, group: Group) -> float:
+    total = values.sum()
+    group.sum(total)
+    return float(total)
 
 
 def _flat(tensors: Sequence[Tensor]) -> Tensor:

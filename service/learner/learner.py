@@ -61,6 +61,9 @@ class Learner:
             torch.default_generator.manual_seed(config.seed)
             alice = networks.make_alice(config.policy), networks.make_alice_value(config.policy)
             bob = networks.make_bob(config.policy), networks.make_bob_value(config.policy)
+        if config.learner.bfloat16:
+            for network in (*alice, *bob):
+                networks.use_bfloat16(network)
         self._alice = Player(*alice, config.learner.alice, self._device)
         self._bob = Player(*bob, config.learner.bob, self._device)
         self._bob_policy = bob[0]

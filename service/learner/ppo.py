@@ -19,7 +19,6 @@ from dataclasses import dataclass, field
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn.utils import clip_grad_norm_
 
@@ -31,9 +30,8 @@ from service.learner.player import LEARNING_RATE_BOUNDS, Player
 from service.learner.samples import Cloning, DemonstrationRows, Samples, draw_epoch
 from service.learner.shares import share_of
 from service.policies import gaussian
-from service.types import Array, BoolArray, IntArray, Metrics
+from service.types import Array, IntArray, Metrics
 
-FloatArray = NDArray[np.floating]
 Scalars = dict[str, Tensor]
 
 MAX_IMPORTANCE_WEIGHT = 2.0
@@ -74,19 +72,17 @@ def collect(
 
     names = "observation", "value_observation", "action", "log_prob"
     observation, value_observation, action, log_prob = (tensor(_join(turns, name)[active]) for name in names)
+    reward, terminated, acted = tensor(_join(turns, "reward")), tensor(_join(turns, "terminated")), tensor(active)
     final = tensor(np.concatenate([each.final_value_observation[each.learn] for each in turns]))
     with torch.no_grad():
         estimates = player.value(torch.cat((value_observation, final)))
         proximal_mean, proximal_std = player.policy(observation)
     value, final_value = estimates[: len(action)], estimates[len(action) :]
-    values = np.zeros(active.shape, dtype=np.float32)
-    values[active] = value.cpu().numpy()
-    rewards, terminated, config = _join(turns, "reward"), _join(turns, "terminated"), player.config
-    estimated = rewards, values, final_value.cpu().numpy(), active, terminated
-    advantage = advantages(*estimated, gamma=config.gamma, gae_lambda=config.gae_lambda)[active]
-    wide = advantage.astype(np.float64)
+    values, config = torch.zeros_like(reward).masked_scatter_(acted, value), player.config
+    estimated = reward, values, final_value, acted, terminated
+    advantage = advantages(*estimated, gamma=config.gamma, gae_lambda=config.gae_lambda)[acted]
+    wide = advantage.double()
     mean, std = mean_and_std(wide, num_total, group)
-    normalised = ((wide - mean) / (std + 1e-8)).astype(np.float32)
     return Samples(
         observation=observation,
         value_observation=value_observation,
@@ -94,23 +90,23 @@ def collect(
         behaviour_log_prob=log_prob,
         proximal_mean=proximal_mean,
         proximal_std=proximal_std,
-        advantage=tensor(normalised),
-        value_target=tensor(advantage + values[active]),
+        advantage=((wide - mean) / (std + 1e-8)).float(),
+        value_target=advantage + value,
         value=value,
         share=share,
     )
 
 
 def advantages(
-    rewards: FloatArray,
-    values: FloatArray,
-    final_values: FloatArray,
-    active: BoolArray,
-    terminated: BoolArray,
+    rewards: Tensor,
+    values: Tensor,
+    final_values: Tensor,
+    active: Tensor,
+    terminated: Tensor,
     *,
     gamma: float,
     gae_lambda: float,
-) -> FloatArray:
+) -> Tensor:
     """Estimate advantages by GAE (Schulman et al. 2016, eq. 16), for turns of unequal length.
 
     ``A_t = d_t + gamma lambda A_{t+1}`` with ``d_t = r_t + gamma V_{t+1} - V_t``. Behind the last active step, ``A`` is
@@ -129,16 +125,14 @@ def advantages(
     Returns:
         Advantages (T, N), zero where not active; ``advantages + values`` are the value targets.
     """
-    result = np.zeros_like(rewards)
-    next_value = final_values
-    next_advantage = np.zeros_like(final_values)
+    result = torch.zeros_like(rewards)
+    discounts = gamma * terminated.logical_not()
+    next_value, next_advantage = final_values, torch.zeros_like(final_values)
     for step in reversed(range(len(rewards))):
-        discount = np.where(terminated[step], 0.0, gamma).astype(rewards.dtype)
-        error = rewards[step] + discount * next_value - values[step]
-        advantage = error + discount * gae_lambda * next_advantage
-        result[step] = np.where(active[step], advantage, 0.0)
-        next_advantage = result[step]
-        next_value = np.where(active[step], values[step], next_value)
+        error = rewards[step] + discounts[step] * next_value - values[step]
+        advantage = error + discounts[step] * gae_lambda * next_advantage
+        result[step] = next_advantage = torch.where(active[step], advantage, 0.0)
+        next_value = torch.where(active[step], values[step], next_value)
     return result
 
 
@@ -174,7 +168,7 @@ def update(
         player.restore(snapshot)
     player.optimizer.learning_rate = _adapted_learning_rate(player, math.inf if failed or stats.stopped else kl)
     if samples is not None:
-        estimated = samples.value_target.cpu().numpy(), samples.value.cpu().numpy()
+        estimated = samples.value_target, samples.value
         metrics["explained_variance"] = explained_variance(*estimated, samples.num_total, group)
     metrics |= {"non_finite_steps": float(stats.num_non_finite), "rollbacks": float(failed)}
     metrics["policy_steps"] = float(max(len(stats.scalars.get(name, ())) for name in ("policy_loss", "cloning_loss")))

@@ -77,20 +77,34 @@ class InputNormalisation(nn.Module):
         return ((values - self.offset) / self.scale).clamp(-INPUT_CLIP, INPUT_CLIP)
 
 
-class HiddenLayers(nn.ModuleList):
-    """Linear layers, each followed by ELU; orthogonal with gain sqrt(2)."""
+class HiddenLayer(nn.Linear):
+    """A linear layer followed by ELU."""
+
+    in_bfloat16 = False
+    """Multiply in bfloat16, forward and backward; parameters, sums and ELU stay in float32."""
+
+    def forward(self, values: Tensor) -> Tensor:
+        """Map (..., inputs) to (..., outputs)."""
+        with torch.autocast(values.device.type, torch.bfloat16, enabled=self.in_bfloat16):
+            product = super().forward(values)
+        return elu(product.float())
+
+
+def use_bfloat16(network: nn.Module) -> None:
+    """Let the hidden layers of a network, where nearly all of its work is, multiply in bfloat16."""
+    for module in network.modules():
+        if isinstance(module, HiddenLayer):
+            module.in_bfloat16 = True
+
+
+class HiddenLayers(nn.Sequential):
+    """Hidden layers one after the other; orthogonal with gain sqrt(2)."""
 
     def __init__(self, input_size: int, hidden_sizes: Sequence[int]) -> None:
         """Build one layer per hidden size; ``output_size`` is the last."""
         sizes = [input_size, *hidden_sizes]
-        super().__init__(linear(*pair, gain=_HIDDEN_GAIN) for pair in pairwise(sizes))
+        super().__init__(*(initialised(HiddenLayer(*pair), gain=_HIDDEN_GAIN) for pair in pairwise(sizes)))
         self.output_size = sizes[-1]
-
-    def forward(self, values: Tensor) -> Tensor:
-        """Map (..., input_size) to (..., output_size)."""
-        for layer in self:
-            values = elu(layer(values))
-        return values
 
 
 class GaussianSquash(nn.Module):
@@ -112,9 +126,8 @@ class GaussianSquash(nn.Module):
         return MEAN_BOUND * torch.tanh(mean / MEAN_BOUND), bounded
 
 
-def linear(inputs: int, outputs: int, *, gain: float) -> nn.Linear:
-    """A linear layer, orthogonal, with zero bias."""
-    layer = nn.Linear(inputs, outputs)
+def initialised(layer: nn.Linear, *, gain: float) -> nn.Linear:
+    """The layer with orthogonal weights and a bias of zero."""
     nn.init.orthogonal_(layer.weight, gain)
     nn.init.zeros_(layer.bias)
     return layer
@@ -135,7 +148,7 @@ class GaussianPolicy(nn.Module):
         super().__init__()
         self.input = InputNormalisation(normalisation)
         self.hidden = HiddenLayers(len(normalisation.offset), config.hidden_sizes)
-        self.output = linear(self.hidden.output_size, 2 * ACTION.size, gain=_SMALL_GAIN)
+        self.output = initialised(nn.Linear(self.hidden.output_size, 2 * ACTION.size), gain=_SMALL_GAIN)
         self.squash = GaussianSquash(log_std_min, log_std_max)
         nn.init.constant_(self.output.bias[ACTION.size :], log_std_bias(INITIAL_LOG_STD, log_std_min, log_std_max))
 
@@ -154,7 +167,7 @@ class Primitives(nn.Module):
         self.num_primitives, self.action_size = config.num_primitives, action_size
         self.input = InputNormalisation(POSITIONS.normalisation)
         self.trunk = HiddenLayers(POSITIONS.size, config.trunk_hidden_sizes)
-        self.hidden = nn.Linear(self.trunk.output_size, config.num_primitives * config.primitive_hidden_size)
+        self.hidden = HiddenLayer(self.trunk.output_size, config.num_primitives * config.primitive_hidden_size)
         heads = config.num_primitives, config.primitive_hidden_size, 2 * action_size
         self.output_weight = nn.Parameter(torch.empty(heads))
         self.output_bias = nn.Parameter(torch.zeros(config.num_primitives, 2 * action_size))
@@ -163,7 +176,7 @@ class Primitives(nn.Module):
 
     def forward(self, positions: Tensor) -> tuple[Tensor, Tensor]:
         """Means and variances, (..., K, A) each."""
-        hidden = elu(self.hidden(self.trunk(self.input(positions))))
+        hidden = self.hidden(self.trunk(self.input(positions)))
         heads = hidden.unflatten(-1, self.output_weight.shape[:2])
         output = torch.einsum("...kh,kho->...ko", heads, self.output_weight) + self.output_bias
         means, log_stds = self.squash(output)
@@ -194,7 +207,7 @@ class Gate(nn.Module):
         super().__init__()
         self.input = InputNormalisation(GATE.normalisation)
         self.hidden = HiddenLayers(GATE.size, config.gate_hidden_sizes)
-        self.output = linear(self.hidden.output_size, config.num_primitives, gain=_GATE_GAIN)
+        self.output = initialised(nn.Linear(self.hidden.output_size, config.num_primitives), gain=_GATE_GAIN)
         self.register_buffer("weight_floor", torch.tensor(config.weight_floor))
 
     def forward(self, observation: Tensor) -> Tensor:
@@ -233,7 +246,7 @@ class ValueNetwork(nn.Module):
         super().__init__()
         self.input = InputNormalisation(normalisation)
         self.hidden = HiddenLayers(len(normalisation.offset), config.hidden_sizes)
-        self.output = linear(self.hidden.output_size, 1, gain=_SMALL_GAIN)
+        self.output = initialised(nn.Linear(self.hidden.output_size, 1), gain=_SMALL_GAIN)
 
     def forward(self, observation: Tensor) -> Tensor:
         """Values (...,)."""

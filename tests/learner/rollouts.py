@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import replace
 from typing import Any
 
@@ -15,6 +16,8 @@ from service.generator.records import GoalRecords
 from service.learner.learner import Learner
 from service.learner.player import Player
 
+DEVICE = torch.device(os.environ.get("TANDEM_TEST_DEVICE", "cpu"))
+"""The device that learners of these tests learn on."""
 NUM_STEPS, NUM_WORLDS = 6, 8
 _SMALL = {"hidden_sizes": [16]}
 _SMALL_MCP = {"num_primitives": 2, "trunk_hidden_sizes": [16], "primitive_hidden_size": 8, "gate_hidden_sizes": [16]}
@@ -27,6 +30,7 @@ def make_config(alice: dict[str, Any] | None = None, bob: dict[str, Any] | None 
         "learner": {
             "alice": {"num_epochs": 2, "minibatch_size": 16, **(alice or {})},
             "bob": {"num_epochs": 2, "minibatch_size": 8, **(bob or {})},
+            "device": DEVICE.type,
             **learner,
         },
     }
@@ -78,9 +82,10 @@ def make_demonstrations(rng: np.random.Generator, num: int) -> Demonstrations:
 
 def acted_by(player: Player, turns: Turns) -> Turns:
     """The same turns with the player's own log-probabilities."""
+    acted = (torch.from_numpy(each).to(player.device) for each in (turns.observation, turns.action))
     with torch.no_grad():
-        log_prob = player.log_prob(torch.from_numpy(turns.observation), torch.from_numpy(turns.action))
-    return replace(turns, log_prob=log_prob.numpy())
+        log_prob = player.log_prob(*acted)
+    return replace(turns, log_prob=log_prob.cpu().numpy())
 
 
 def nobody_learns(turns: Turns) -> Turns:

@@ -77,6 +77,20 @@ def test_the_average_of_bob_is_a_running_one():
     assert all(weights.bob[name].tobytes() == each.tobytes() for name, each in weights.bob_ema.items())
 
 
+def test_products_in_bfloat16_learn_nearly_the_same():
+    exact, rounded = Learner(make_config()), Learner(make_config(bfloat16=True))
+    metrics = [updated(learner, 0) for learner in (exact, rounded)]
+    for player in ("alice", "bob"):
+        pairs = [
+            (getattr(exact.weights(), player)[name], each) for name, each in getattr(rounded.weights(), player).items()
+        ]
+        assert any(not np.array_equal(*pair) for pair in pairs)
+        for pair in pairs:
+            np.testing.assert_allclose(*pair, atol=5e-3)
+    for name in ("alice_value_loss", "bob_value_loss", "bob_std"):
+        assert metrics[1][f"learner/{name}"] == pytest.approx(metrics[0][f"learner/{name}"], rel=0.05)
+
+
 def test_weights_are_copies():
     learner = Learner(make_config())
     weights = learner.weights()

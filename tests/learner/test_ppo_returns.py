@@ -1,16 +1,18 @@
 import numpy as np
 import pytest
+import torch
 
 from service.learner.diagnostics import explained_variance
 from service.learner.ppo import advantages
+from tests.learner.rollouts import DEVICE
 
 GAMMA, LAMBDA = 0.9, 0.5
 
 
 def gae(rewards, values, final_values, active, terminated):
-    arrays = [np.array(each, dtype=np.float64) for each in (rewards, values, final_values)]
-    masks = [np.array(each, dtype=bool) for each in (active, terminated)]
-    return advantages(*arrays, *masks, gamma=GAMMA, gae_lambda=LAMBDA)
+    numbers = [torch.tensor(each, dtype=torch.float64, device=DEVICE) for each in (rewards, values, final_values)]
+    masks = [torch.tensor(each, dtype=torch.bool, device=DEVICE) for each in (active, terminated)]
+    return advantages(*numbers, *masks, gamma=GAMMA, gae_lambda=LAMBDA).cpu()
 
 
 def column(*steps):
@@ -43,12 +45,12 @@ def test_short_turns_bootstrap_behind_their_own_last_step():
 
 
 def test_float32_stays_float32():
-    zeros, mask = np.zeros((2, 3), dtype=np.float32), np.ones((2, 3), dtype=bool)
-    assert advantages(zeros, zeros, zeros[0], mask, mask, gamma=0.9, gae_lambda=0.9).dtype == np.float32
+    zeros, mask = torch.zeros((2, 3)), torch.ones((2, 3), dtype=torch.bool)
+    assert advantages(zeros, zeros, zeros[0], mask, mask, gamma=0.9, gae_lambda=0.9).dtype == torch.float32
 
 
 def test_explained_variance():
-    returns = np.array([1.0, 2.0, 3.0])
+    returns = torch.tensor([1.0, 2.0, 3.0], device=DEVICE)
     assert explained_variance(returns, returns, 3) == 1.0
-    assert explained_variance(returns, np.full(3, 5.0), 3) == pytest.approx(0.0)
-    assert explained_variance(np.ones(3), returns, 3) == 0.0
+    assert explained_variance(returns, torch.full_like(returns, 5.0), 3) == pytest.approx(0.0)
+    assert explained_variance(torch.ones_like(returns), returns, 3) == 0.0

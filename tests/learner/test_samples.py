@@ -58,17 +58,15 @@ def test_only_active_steps_of_learnable_worlds_become_samples():
 def test_targets_are_advantages_plus_values():
     turns = make_bob_turns()
     samples = collect([[turns]], turns, PLAYER)
-    values, final = (
-        PLAYER.value(torch.from_numpy(each))
-        for each in (turns.value_observation[turns.active], turns.final_value_observation)
-    )
-    grid = np.zeros(turns.active.shape, dtype=np.float32)
-    grid[turns.active] = values.numpy()
-    masks = turns.active, turns.terminated
-    gae = advantages(turns.reward, grid, final.numpy(), *masks, gamma=CONFIG.gamma, gae_lambda=CONFIG.gae_lambda)
-    expected = gae[turns.active]
-    np.testing.assert_allclose(samples.value_target, expected + values.numpy(), atol=1e-6)
-    np.testing.assert_allclose(samples.advantage, (expected - expected.mean()) / expected.std(), atol=1e-5)
+    names = "reward", "active", "terminated", "value_observation", "final_value_observation"
+    reward, active, terminated, *observed = (torch.from_numpy(getattr(turns, name)) for name in names)
+    values, final = (PLAYER.value(each.flatten(0, -2)) for each in observed)
+    grid = values.view(reward.shape)
+    arrays = reward, grid, final, active, terminated
+    expected = advantages(*arrays, gamma=CONFIG.gamma, gae_lambda=CONFIG.gae_lambda)[active]
+    np.testing.assert_allclose(samples.value_target, expected + grid[active], atol=1e-6)
+    standard = (expected - expected.mean()) / expected.std(correction=0)
+    np.testing.assert_allclose(samples.advantage, standard, atol=1e-5)
 
 
 def test_several_rollouts_are_joined_along_worlds():
