@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from dataclasses import dataclass
 from functools import partial
 
@@ -10,7 +11,7 @@ from numpy.typing import NDArray
 
 from benchmarks.measuring import Sample, Stopwatch, measure, total
 from service.actors.rollout import Rollout
-from service.actors.self_play import Players
+from service.actors.self_play import Players, SelfPlay
 from service.envs.batch import WorldBatch
 from service.envs.observations import ACTION
 from service.policies.numpy_policy import NumpyGaussianPolicy, numpy_bob
@@ -61,7 +62,7 @@ class Rounds:
         Returns:
             What the rounds took, and what their physics alone took; both together take about ``seconds``.
         """
-        players, watch = self._players(), Stopwatch()
+        players, watch = players_of(self._run), Stopwatch()
         self.played, whole, bare = [], [], []
         while not self.played or watch.wall_s() < seconds:
             whole.append(measure(lambda: self._play_round(players), 0.0))
@@ -71,16 +72,6 @@ class Rounds:
     def act_at_random(self, seconds: float) -> Sample:
         """Physics of an easier kind: every world always acts, at random, from fresh resets."""
         return measure(self._random_episode, seconds)
-
-    def _players(self) -> Players:
-        weights, pool = self._run.learner.weights(), self._run.generator.opponents
-        return Players(
-            version=weights.version,
-            alice=NumpyGaussianPolicy(weights.alice),
-            bob=numpy_bob(weights.bob),
-            past_alice=[NumpyGaussianPolicy(each) for each in pool.alice],
-            past_bob=[numpy_bob(each) for each in pool.bob],
-        )
 
     def _play_round(self, players: Players) -> int:
         game, generator = self._run.game, self._run.generator
@@ -97,6 +88,35 @@ class Rounds:
         for action in self._rng.uniform(-1.0, 1.0, shape).astype(np.float32):
             self._worlds.step(action)
         return shape[0] * shape[1]
+
+
+def players_of(run: LocalRun) -> Players:
+    """The newest policies of a run, and its past opponents."""
+    weights, pool = run.learner.weights(), run.generator.opponents
+    return Players(
+        version=weights.version,
+        alice=NumpyGaussianPolicy(weights.alice),
+        bob=numpy_bob(weights.bob),
+        past_alice=[NumpyGaussianPolicy(each) for each in pool.alice],
+        past_bob=[numpy_bob(each) for each in pool.bob],
+    )
+
+
+def round_cpu_s(run: LocalRun, num_worlds: int) -> float:
+    """Mean CPU seconds of a round of ``num_worlds`` in this process, on one thread, once games are of all ages."""
+    players, rng = players_of(run), np.random.default_rng(0)
+    config = run.config.model_copy(update={"game": run.config.game.model_copy(update={"num_worlds": num_worlds})})
+    game = SelfPlay(config, rng, num_threads=1)
+    opponents, snapshot = run.generator.opponents.freeze(0), run.generator.snapshot()
+    num_rounds, start_s = max(10, 2400 // num_worlds), 0.0
+    for index in range(-config.game.num_goals, num_rounds):
+        if index == 0:
+            start_s = time.process_time()
+        plan = opponents.plan(num_worlds, config.generator.past_opponent_fraction, rng)
+        game.play_round(players, plan, partial(snapshot.choose_goals, plan, rng=rng))
+    used_s = time.process_time() - start_s
+    game.close()
+    return used_s / num_rounds
 
 
 def repeat_physics(worlds: WorldBatch, played: Round) -> int:

@@ -6,7 +6,9 @@
 - On paper: ``scaling_model.py`` with what was measured. Tiny games, whose physics and networks cost nearly nothing,
   with 1 and with 8 actors tell what an update and what a rollout costs by itself in driver, learner, generator and
   GCS; the trained run tells what a world costs on top. Costs are CPU seconds, so that cores which all share do not
-  count as work. Waiting for many actors is measured with as many that do nothing.
+  count as work. A round is measured alone, with few and with many worlds in one process, and so are updates of few
+  and of many samples with as many gradient steps, and messages between two and between four ranks. Waiting for many
+  actors is measured with as many that do nothing.
 
 What cannot be measured on one box is assumed, and is in the result: how fast a node's network is and how many actors
 a node has.
@@ -20,10 +22,24 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+from benchmarks import learner_ranks
 from benchmarks.cluster_throughput import measure_run
 from benchmarks.measuring import ask_module, parser_of, run_benchmark
 from benchmarks.report.scaling import box_block, limits_block, model_block
-from benchmarks.scaling_model import ACTORS, Cost, Model, Prediction, limit, line, predict
+from benchmarks.scaling_model import (
+    ACTORS,
+    LEARNER,
+    ROLLOUTS_IN,
+    Cost,
+    Model,
+    Prediction,
+    Ranks,
+    limit,
+    line,
+    predict,
+    ring,
+    with_ranks,
+)
 from benchmarks.training_process import ENDLESS, Measured, Training, copy_run, environment, overrides, scratch
 from service.io.run_directory import RunDirectory
 
@@ -31,8 +47,12 @@ PACKAGES = ("ray", "redis", "mujoco", "numpy", "torch")
 PREDICTED = (1, 2, 4, 16, 256, 4096)
 WAKES = (16, 256, 4096)
 NUM_TINY_ACTORS = 8
-LEARNER, GENERATOR, DRIVER, GCS = "learner", "task generator", "driver", "GCS"
-ROLLOUTS_IN, WEIGHTS_OUT = "rollouts to the learner's node", "weights and snapshots to the nodes"
+FEW_WORLDS = 15
+"""Worlds of a round that is nearly all overhead: a sixteenth of 240."""
+WORLDS_EACH = 120
+"""Worlds of each actor where every actor brings as many."""
+GENERATOR, DRIVER, GCS = "task generator", "driver", "GCS"
+WEIGHTS_OUT = "weights and snapshots to the nodes"
 ROLES = {LEARNER: "learner", GENERATOR: "generator", DRIVER: "driver", GCS: "gcs"}
 """Processes that there are one of, and their roles in ``processes.py``."""
 
@@ -68,7 +88,7 @@ class Assumed:
     """Between two nodes, one receiver: pulls of 1 MB between two Ray nodes on this box, pipelined. A cluster's
     network is faster."""
     actors_per_node: int = 16
-    """Actors that share a copy of the weights and of the snapshot."""
+    """Actors that share a copy of the weights and of the snapshot; ranks on their own nodes are as many."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,50 +101,71 @@ class Settings:
     num_tiny_iterations: int = 400
 
 
-def costs(
-    tiny: Sequence[Measured], real: Sequence[Measured], wakes: Mapping[str, Any], sizes: Mapping[str, Any],
-    assumed: Assumed = Assumed(),
-) -> Model:  # fmt: skip
+@dataclass(frozen=True, slots=True)
+class Alone:
+    """What was measured of one part by itself."""
+
+    rounds: Mapping[str, Any]
+    """Of ``scaling_probe.py``: CPU seconds by number of worlds."""
+    updates: Mapping[str, Any]
+    """CPU seconds of updates of one rank with as many gradient steps, by number of worlds."""
+    messages: Mapping[str, Any]
+    """Seconds of a message by number of ranks, and the number of messages of an update."""
+    wakes: Mapping[str, Any]
+    """Of ``scaling_probe.py``."""
+    sizes: Mapping[str, Any]
+    """Of ``scaling_probe.py``."""
+
+
+def costs(tiny: Sequence[Measured], real: Measured, alone: Alone, assumed: Assumed = Assumed()) -> Model:
     """The model's constants.
 
     Args:
         tiny: of tiny games with few and with many actors.
-        real: of a trained run with one actor and with more, the same worlds in all.
-        wakes: of ``scaling_probe.py``.
-        sizes: of ``scaling_probe.py``.
+        real: of a trained run.
+        alone: of single parts.
         assumed: the rest.
     """
     shares = [(each.num_rollouts / each.num_iterations, each) for each in tiny]
-    last = real[-1]
-    num_worlds = last.num_rollouts / last.num_iterations * last.num_worlds
+
+    def spent(role: str) -> tuple[float, float, float]:
+        """Of an update and of each rollout in tiny games, and of an update of the trained run."""
+        few, many = ((num, each.role_cpu_s.get(role, 0.0) / each.num_iterations) for num, each in shares)
+        return *line(few, many), real.role_cpu_s.get(role, 0.0) / real.num_iterations
+
+    num_rollouts = real.num_rollouts / real.num_iterations
     parts = {}
     for name, role in ROLES.items():
-        few, many = ((num, each.role_cpu_s.get(role, 0.0) / each.num_iterations) for num, each in shares)
-        update_s, rollout_s = line(few, many)
-        spent = last.role_cpu_s.get(role, 0.0) / last.num_iterations
-        rest = spent - update_s - last.num_rollouts / last.num_iterations * rollout_s
-        world_s = max(0.0, rest / num_worlds) if name in (LEARNER, GENERATOR) else 0.0
+        update_s, rollout_s, all_s = spent(role)
+        if name == LEARNER:
+            update_s += line(*_points(alone.updates))[0]
+        rest = all_s - update_s - num_rollouts * rollout_s
+        world_s = max(0.0, rest / (num_rollouts * real.num_worlds)) if name in (LEARNER, GENERATOR) else 0.0
         parts[name] = Cost(update_s, rollout_s, world_s)
-    few, *_, many = zip(wakes["num_actors"], wakes["wait_s"], strict=True)
+    few, *_, many = zip(alone.wakes["num_actors"], alone.wakes["wait_s"], strict=True)
     _, pair_s = line(few, many)
     parts[DRIVER] = Cost(parts[DRIVER].update_s, parts[DRIVER].rollout_s, pair_s=pair_s)
-    bytes_per_s = assumed.network_mb_per_s * 1e6
+    bytes_per_s, sizes = assumed.network_mb_per_s * 1e6, alone.sizes
     parts[ROLLOUTS_IN] = Cost(world_s=sizes["rollout"] / sizes["num_worlds"] / bytes_per_s)
     out = sizes["weights"] + sizes["snapshot"]  # past opponents go out once in many iterations
     parts[WEIGHTS_OUT] = Cost(rollout_s=out / assumed.actors_per_node / bytes_per_s)
-    steps = sum(each.num_steps for each in real) / sum(each.num_rollouts * each.num_worlds for each in real)
-    return Model(_actor(real), parts, steps)
+    round_s, world_s = line(*_points(alone.rounds))
+    actor = Cost(rollout_s=round_s + _tiny_rollout_s(tiny), world_s=world_s)
+    hop_s, gradient_s = ring(*alone.messages["message_s"])
+    ranks = Ranks(alone.messages["num_messages"], hop_s, gradient_s)
+    env_steps = real.num_steps / (real.num_rollouts * real.num_worlds)
+    return Model(actor, parts, env_steps, ranks, assumed.actors_per_node)
 
 
-def _actor(real: Sequence[Measured]) -> Cost:
-    """An actor's rollout by its number of worlds; where there is one number only, all of it is the worlds'."""
-    points = {each.num_worlds: each.role_cpu_s["actor"] / each.num_rollouts for each in real}
-    if len(points) == 1:
-        ((num_worlds, seconds),) = points.items()
-        return Cost(world_s=seconds / num_worlds)
-    few, many = min(points), max(points)
-    rollout_s, world_s = line((few, points[few]), (many, points[many]))
-    return Cost(rollout_s=rollout_s, world_s=world_s)
+def _points(measured: Mapping[str, Any]) -> tuple[tuple[float, float], tuple[float, float]]:
+    """The first and the last number of worlds, with the seconds of each."""
+    first, *_, last = zip(measured["num_worlds"], measured["cpu_s"], strict=True)
+    return first, last
+
+
+def _tiny_rollout_s(tiny: Sequence[Measured]) -> float:
+    """What a rollout of nearly nothing costs its actor: mostly Ray."""
+    return min(each.role_cpu_s.get("actor", 0.0) / each.num_rollouts for each in tiny)
 
 
 def on_paper(model: Model, num_worlds: int, total_worlds: int) -> dict[str, Any]:
@@ -135,14 +176,15 @@ def on_paper(model: Model, num_worlds: int, total_worlds: int) -> dict[str, Any]
         num_worlds: of each actor where every actor brings as many.
         total_worlds: of the experiment where its actors share them out.
     """
-    same = [predict(model, num, num_worlds) for num in PREDICTED]
-    shared = [predict(model, num, max(1, -(-total_worlds // num))) for num in PREDICTED]
+    shares = {num: max(1, -(-total_worlds // num)) for num in PREDICTED}
     limits = {name: limit(model, name, num_worlds) for name in model.parts}
     return {
         "constants": {ACTORS: asdict(model.actor), **{name: asdict(cost) for name, cost in model.parts.items()}},
+        "ranks": asdict(model.ranks),
         "env_steps_per_world": model.env_steps,
-        "worlds_each": [_row(each) for each in same],
-        "worlds_shared": [_row(each) for each in shared],
+        "one_rank": [_row(predict(model, num, num_worlds)) for num in PREDICTED],
+        "worlds_each": [_row(with_ranks(model, num, num_worlds)) for num in PREDICTED],
+        "worlds_shared": [_row(with_ranks(model, num, worlds)) for num, worlds in shares.items()],
         "limits": dict(sorted(limits.items(), key=lambda item: float("inf") if item[1] is None else item[1])),
     }
 
@@ -150,6 +192,7 @@ def on_paper(model: Model, num_worlds: int, total_worlds: int) -> dict[str, Any]
 def _row(each: Prediction) -> dict[str, Any]:
     return {
         "num_actors": each.num_actors,
+        "num_ranks": each.num_ranks,
         "num_worlds": each.num_worlds,
         "update_s": each.update_s,
         "env_steps_per_s": each.env_steps_per_s,
@@ -175,18 +218,39 @@ def benchmark(source: RunDirectory, settings: Settings) -> dict[str, Any]:
         real = _measure(source, home, numbers, settings.num_iterations)
         small = _measure(make_tiny(home), home, (1, NUM_TINY_ACTORS), settings.num_tiny_iterations)
         probe, ray, copy = "benchmarks.scaling_probe", environment(home), copy_run(source, home, "copy")
-        sizes = ask_module(probe, "sizes", copy.path, environment=ray)
-        wakes = ask_module(probe, "wakes", *WAKES, environment=ray)
-    model = costs(list(small.values()), list(real.values()), wakes, sizes)
-    most = real[max(real)]
+        total_worlds = source.read_config().game.num_worlds
+        alone = Alone(
+            rounds=ask_module(probe, "rounds", copy.path, FEW_WORLDS, total_worlds, environment=ray),
+            updates=_updates(total_worlds),
+            messages=_messages(total_worlds),
+            wakes=ask_module(probe, "wakes", *WAKES, environment=ray),
+            sizes=ask_module(probe, "sizes", copy.path, environment=ray),
+        )
+    model = costs(list(small.values()), real[1], alone)
     return {
         "one_box": {str(num): _box(each) for num, each in real.items()},
         "tiny": {str(num): _box(each) for num, each in small.items()},
-        "sizes": sizes,
-        "wakes": wakes,
+        "alone": asdict(alone),
         "assumed": asdict(Assumed()),
-        "model": on_paper(model, most.num_worlds, int(sizes["num_worlds"])),
+        "model": on_paper(model, WORLDS_EACH, total_worlds),
     }
+
+
+def _updates(num_worlds: int) -> dict[str, Any]:
+    """CPU seconds of updates of a quarter and of all worlds, with minibatches in proportion."""
+    sizes = {num_worlds // 4: 128, num_worlds: 512}
+    found = [
+        learner_ranks.measure_ranks(1, learner_ranks.Settings(num, num_rollouts=1, minibatch_rows=rows))["cpu_s"]
+        for num, rows in sizes.items()
+    ]
+    return {"num_worlds": list(sizes), "cpu_s": found}
+
+
+def _messages(num_worlds: int) -> dict[str, Any]:
+    """Seconds of a message between two and between four ranks, which do nothing else, on this box."""
+    settings = learner_ranks.Settings(num_worlds, num_rollouts=4, minibatch_rows=0, num_updates=1)
+    found = [learner_ranks.measure_ranks(num, settings) for num in (2, 4)]
+    return {"message_s": [each["message_s"] for each in found], "num_messages": found[0]["num_messages"]}
 
 
 def _measure(source: RunDirectory, home: Path, numbers: Sequence[int], num_iterations: int) -> dict[int, Measured]:

@@ -8,14 +8,17 @@ learns from the rollouts before. So the slowest part sets the pace, and what it 
 with W worlds for each actor. Actors work at the same time and pay for their own rollout only. As long as they are
 the slowest, N actors are N times as fast as one; the first part that takes longer than they do is the first
 bottleneck, and from there on more actors help no more.
+
+A learner of R ranks shares out what rollouts cost, not what an update costs by itself, and pays for the messages of
+its gradient steps (``Ranks``). Every actor and every rank is counted as a core.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
-ACTORS = "actors"
+ACTORS, LEARNER, ROLLOUTS_IN = "actors", "learner", "rollouts to the learner's node"
 MAX_ACTORS = 1 << 24
 
 
@@ -43,22 +46,54 @@ class Cost:
 
 
 @dataclass(frozen=True, slots=True)
+class Ranks:
+    """Messages of a learner of several ranks: each gradient step sends gradients round a ring of all ranks, twice.
+
+    A ring's all-reduce takes ``2 (R - 1)`` hops one after the other, each with ``1 / R`` of the gradients
+    (Patarasuk and Yuan 2009).
+    """
+
+    num_messages: float = 0.0
+    """Messages of an update: its gradient steps, and a few more."""
+    hop_s: float = 0.0
+    """Seconds of a hop, whatever is sent."""
+    gradient_s: float = 0.0
+    """Seconds to send all gradients once."""
+
+    def seconds(self, num_ranks: int) -> float:
+        """Seconds of an update's messages."""
+        hops = 2 * (num_ranks - 1)
+        return self.num_messages * hops * (self.hop_s + self.gradient_s / num_ranks)
+
+
+def ring(two_s: float, four_s: float) -> tuple[float, float]:
+    """``hop_s`` and ``gradient_s`` from the seconds of a message between two and between four ranks."""
+    # two_s = 2 hop_s + gradient_s and four_s = 6 hop_s + 1.5 gradient_s
+    gradient_s = min(max(0.0, (3.0 * two_s - four_s) / 1.5), two_s)
+    return (two_s - gradient_s) / 2.0, gradient_s
+
+
+@dataclass(frozen=True, slots=True)
 class Model:
     """Costs of every part."""
 
     actor: Cost
     """Cost of one actor for its own rollout."""
     parts: Mapping[str, Cost]
-    """Everything there is only one of, by name."""
+    """Everything there is only one of, by name; the learner as one rank."""
     env_steps: float
     """Env steps of one world in a round."""
+    ranks: Ranks = Ranks()
+    ranks_per_node: int = 1
+    """Ranks that get their rollouts through one node's network."""
 
 
 @dataclass(frozen=True, slots=True)
 class Prediction:
-    """A run with so many actors."""
+    """A run with so many actors and ranks."""
 
     num_actors: int
+    num_ranks: int
     num_worlds: float
     """Worlds of each actor."""
     seconds: Mapping[str, float]
@@ -80,12 +115,62 @@ class Prediction:
         return self.seconds[name] / self.update_s
 
 
-def predict(model: Model, num_actors: int, num_worlds: float) -> Prediction:
-    """Predict a run with ``num_actors`` of ``num_worlds`` each."""
+def predict(model: Model, num_actors: int, num_worlds: float, num_ranks: int = 1) -> Prediction:
+    """Predict a run with ``num_actors`` of ``num_worlds`` each, and a learner of ``num_ranks``."""
     seconds = {ACTORS: model.actor.seconds(1, num_worlds)}
     seconds |= {name: cost.seconds(num_actors, num_worlds) for name, cost in model.parts.items()}
+    if num_ranks > 1:
+        alone_s = model.parts[LEARNER].update_s
+        shared_s = (seconds[LEARNER] - alone_s) / num_ranks
+        seconds[LEARNER] = alone_s + shared_s + model.ranks.seconds(num_ranks)
+    if ROLLOUTS_IN in seconds:
+        seconds[ROLLOUTS_IN] /= -(-num_ranks // model.ranks_per_node)
     steps = num_actors * num_worlds * model.env_steps
-    return Prediction(num_actors, num_worlds, seconds, steps / max(seconds.values()))
+    return Prediction(num_actors, num_ranks, num_worlds, seconds, steps / max(seconds.values()))
+
+
+def with_ranks(model: Model, num_actors: int, num_worlds: float) -> Prediction:
+    """Predict a run with as few ranks as keep up with the actors; if none do, with those that are fastest."""
+    best = predict(model, num_actors, num_worlds)
+    for num_ranks in range(2, num_actors + 1):
+        if best.seconds[LEARNER] <= best.seconds[ACTORS]:
+            break
+        more = predict(model, num_actors, num_worlds, num_ranks)
+        if more.seconds[LEARNER] < best.seconds[LEARNER]:
+            best = more
+    return best
+
+
+@dataclass(frozen=True, slots=True)
+class Batch:
+    """A size of update, and how many of them a skill takes."""
+
+    num_worlds: int
+    """Of all actors together."""
+    num_updates: float
+
+
+@dataclass(frozen=True, slots=True)
+class Skill:
+    """The way to a skill on so many cores."""
+
+    batch: Batch
+    run: Prediction
+
+    @property
+    def seconds(self) -> float:
+        """Until the skill is there."""
+        return self.batch.num_updates * self.run.update_s
+
+
+def fastest(model: Model, batches: Iterable[Batch], num_cores: int) -> Skill:
+    """The fastest way to a skill on ``num_cores``: which batch, and how many of the cores are ranks."""
+    ways = (
+        Skill(batch, predict(model, num_actors, batch.num_worlds / num_actors, num_cores - num_actors))
+        for batch in batches
+        for num_actors in range(1, min(num_cores - 1, batch.num_worlds) + 1)
+    )
+    return min(ways, key=lambda way: way.seconds)
 
 
 def limit(model: Model, part: str, num_worlds: float) -> int | None:

@@ -1,6 +1,7 @@
 """Single costs of a run on Ray, each measured in a process of its own; other benchmarks start it.
 
     python -m benchmarks.scaling_probe sizes RUN_DIR           bytes of a rollout, of weights, snapshots, states
+    python -m benchmarks.scaling_probe rounds RUN_DIR NUM ...  CPU time of rounds of so many worlds, in one process
     python -m benchmarks.scaling_probe wakes NUM ...           time of the driver for each event, with so many actors
     python -m benchmarks.scaling_probe broadcast RUN_DIR NUM   time until so many actors have new weights
 
@@ -19,7 +20,7 @@ from contextlib import closing
 from pathlib import Path
 from typing import Any
 
-from benchmarks.rounds import Rounds
+from benchmarks.rounds import Rounds, round_cpu_s
 from service.io.run_directory import RunDirectory
 from service.primitives.loading import read_parameters
 from service.runtime.local import LocalRun
@@ -44,6 +45,14 @@ def sizes(directory: RunDirectory) -> dict[str, Any]:
         }
     directory.close()
     return {**found, "num_worlds": run.config.game.num_worlds}
+
+
+def rounds(directory: RunDirectory, numbers: Sequence[int]) -> dict[str, Any]:
+    """CPU seconds of a round of so many worlds, each number by itself."""
+    with closing(LocalRun(directory.read_config(), directory, resume=True)) as run:
+        found = [round_cpu_s(run, num) for num in numbers]
+    directory.close()
+    return {"num_worlds": list(numbers), "cpu_s": found}
 
 
 def num_bytes(value: Any) -> int:
@@ -113,12 +122,14 @@ def broadcast(directory: RunDirectory, num_actors: int) -> dict[str, float]:
 def main() -> None:
     """Measure and print."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("what", choices=("sizes", "wakes", "broadcast"))
+    parser.add_argument("what", choices=("sizes", "rounds", "wakes", "broadcast"))
     parser.add_argument("arguments", nargs="+")
     given = parser.parse_args()
     first, *rest = given.arguments
     if given.what == "sizes":
         result = sizes(RunDirectory(Path(first)))
+    elif given.what == "rounds":
+        result = rounds(RunDirectory(Path(first)), [int(each) for each in rest])
     elif given.what == "wakes":
         with connected(None, 1):
             result = wakes([int(each) for each in given.arguments])

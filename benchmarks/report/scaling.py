@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import statistics
 from collections.abc import Mapping
 from typing import Any
 
 from benchmarks.report.markdown import commit, percent, table
+from benchmarks.scaling_model import ACTORS, Batch, Cost, Model, Ranks, fastest
 from service.media.figures import counted
 
 Result = Mapping[str, Any]
+CORES = (16, 64, 256)
 NAMED = (16, 256, 4096)
 """Numbers of actors for which the time of every part is shown."""
 
@@ -31,7 +34,7 @@ def nodes_block(result: Result) -> str:
     """Runs on the test cluster, which were measured once."""
     if "nodes" not in result:
         return ""
-    nodes, sizes = result["nodes"], result["sizes"]
+    nodes, sizes = result["nodes"], _sizes(result)
     placed = ", ".join(f"{name} on node {place}" for name, place in sorted(nodes["places"].items()))
     return (
         f"A head without cores and two nodes beside it: {nodes['env_steps_per_s']:,.0f} env steps/s over "
@@ -63,22 +66,47 @@ def constants_block(result: Result) -> str:
 def model_block(result: Result) -> str:
     """Predictions: as many worlds for each actor, and the same worlds shared out."""
     model = result["model"]
-    each = _predictions(model["worlds_each"])
-    shared = _predictions(model["worlds_shared"])
-    num = model["worlds_each"][0]["num_worlds"]
-    total = result["sizes"]["num_worlds"]
+    num, total = model["worlds_each"][0]["num_worlds"], _sizes(result)["num_worlds"]
     return (
-        f"Every actor brings {num} worlds, so that more actors make larger updates:\n\n{each}\n\n"
-        f"The same experiment shared out, {total} worlds in all and at least one for each actor:\n\n{shared}"
+        f"Every actor brings {num} worlds, so that more actors make larger updates, and the learner has as many ranks "
+        f"as keep up with them:\n\n{_predictions(model['worlds_each'])}\n\n"
+        f"The same experiment shared out, {total} worlds in all and at least one for each actor:\n\n"
+        f"{_predictions(model['worlds_shared'])}"
     )
 
 
+def skill_block(result: Result, batches: Mapping[int, Result]) -> str:
+    """Time to a skill on many cores, from the model and from updates until 90 % of mixed goals by size of update."""
+    model = result["model"]
+    costs = {name: Cost(**cost) for name, cost in model["constants"].items()}
+    actor = costs.pop(ACTORS)
+    ranks, per_node = Ranks(**model["ranks"]), result["assumed"]["actors_per_node"]
+    made = Model(actor, costs, model["env_steps_per_world"], ranks, per_node)
+    found = [
+        Batch(num_worlds, statistics.median(run["at"]["iteration"] for run in study["runs"] if run["reached"]))
+        for num_worlds, study in sorted(batches.items())
+    ]
+    head = ("cores", "worlds in all", "actors", "ranks", "an update every", "minutes", "core-hours")
+    rows = []
+    for num_cores in CORES:
+        way = fastest(made, found, num_cores)
+        rows.append(
+            (str(num_cores), str(way.batch.num_worlds), str(way.run.num_actors), str(way.run.num_ranks),
+             f"{way.run.update_s:.3f} s",
+             f"{way.seconds / 60:.1f}", f"{way.seconds * num_cores / 3600:.2f}")
+        )  # fmt: skip
+    updates = ", ".join(f"{each.num_updates:,.0f} with {each.num_worlds}" for each in found)
+    return f"Updates until 90 % of mixed goals, medians: {updates} worlds.\n\n{table(head, rows)}"
+
+
 def _predictions(rows: list[Mapping[str, Any]]) -> str:
-    head = ("actors", "worlds of each", "env steps/s", "an update every", "actors busy", "learner idle", "bottleneck")
+    head = ("actors", "ranks", "worlds of each", "env steps/s", "of one actor's", "an update every", "actors busy",
+            "learner idle", "bottleneck")  # fmt: skip
     return table(
         head,
         [
-            (f"{row['num_actors']:,}", f"{row['num_worlds']:g}", f"{row['env_steps_per_s']:,.0f}",
+            (f"{row['num_actors']:,}", f"{row['num_ranks']:,}", f"{row['num_worlds']:g}",
+             f"{row['env_steps_per_s']:,.0f}", f"{row['env_steps_per_s'] / rows[0]['env_steps_per_s']:.1f}",
              f"{_seconds(row['update_s'])} s", percent(row["actors_busy"], 1), percent(row["learner_idle"]),
              row["bottleneck"])
             for row in rows
@@ -91,7 +119,7 @@ def limits_block(result: Result) -> str:
     model = result["model"]
     limits = model["limits"]
     first, most = next(iter(limits.items()))
-    rows = {row["num_actors"]: row for row in model["worlds_each"]}
+    rows = {row["num_actors"]: row for row in model["one_rank"]}
     head = ("part", "keeps up with", *(f"seconds an update, {num:,} actors" for num in NAMED))
     parts = table(
         head,
@@ -102,12 +130,17 @@ def limits_block(result: Result) -> str:
     )
     playing = rows[NAMED[0]]["seconds"]["actors"]
     words = f"**The first bottleneck is the {first}**: it keeps up with {_actors(most)}"
-    world = result["sizes"]["rollout"] / result["sizes"]["num_worlds"]
+    world = _sizes(result)["rollout"] / _sizes(result)["num_worlds"]
     held = ", ".join(f"{_mb(num * rows[num]['num_worlds'] * world)} with {num:,}" for num in NAMED)
     return (
         f"{words}, whose rounds take {playing:.2f} s. The rollouts of one update, which the learner holds in memory, "
         f"have {held}. In the order in which parts become one:\n\n{parts}"
     )
+
+
+def _sizes(result: Result) -> Mapping[str, Any]:
+    sizes: Mapping[str, Any] = result["alone"]["sizes"]
+    return sizes
 
 
 def _actors(num: int | None) -> str:

@@ -4,6 +4,7 @@ import json
 import os
 import subprocess
 import threading
+from dataclasses import asdict
 from datetime import UTC, datetime
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 
@@ -14,7 +15,20 @@ from benchmarks import cluster_throughput, measuring, processes, scaling, scalin
 from benchmarks.report import __main__ as report
 from benchmarks.report import cluster as cluster_blocks
 from benchmarks.report import scaling as scaling_blocks
-from benchmarks.scaling_model import ACTORS, Cost, Model, limit, line, predict
+from benchmarks.scaling_model import (
+    ACTORS,
+    ROLLOUTS_IN,
+    Batch,
+    Cost,
+    Model,
+    Ranks,
+    fastest,
+    limit,
+    line,
+    predict,
+    ring,
+    with_ranks,
+)
 from benchmarks.training_process import Measured, Records, Training, copy_run, measure_training, summarise_rows
 from service.errors import TandemError
 from service.io.run_directory import RunDirectory
@@ -253,6 +267,7 @@ MODEL = Model(
     actor=Cost(rollout_s=1.0, world_s=0.1),
     parts={"learner": Cost(update_s=0.5, rollout_s=0.25, world_s=0.025), "driver": Cost(rollout_s=0.01, pair_s=0.001)},
     env_steps=40.0,
+    ranks=Ranks(num_messages=5.0, hop_s=0.01, gradient_s=0.04),
 )
 
 
@@ -278,6 +293,35 @@ def test_limits_by_hand():
     assert limit(Model(MODEL.actor, {"slow": Cost(3.0)}, 1.0), "slow", 10) == 0
 
 
+def test_ranks_by_hand():
+    # between two ranks 2 hops of 0.01 + 0.04 / 2 each, between four 6 of 0.01 + 0.04 / 4
+    assert [MODEL.ranks.seconds(num) for num in (1, 2, 4)] == pytest.approx([0.0, 5 * 0.06, 5 * 0.12])
+    assert ring(0.06, 0.12) == pytest.approx((0.01, 0.04))
+    assert ring(0.06, 0.5) == pytest.approx((0.03, 0.0))  # a noisy measurement makes nothing negative
+    # 10 worlds, 6 actors: 2 s of an actor, the learner 0.5 + 3.0 / R + messages
+    two = predict(MODEL, 6, 10, 2)
+    assert two.seconds["learner"] == pytest.approx(0.5 + 1.5 + 0.3)
+    enough = with_ranks(MODEL, 6, 10)
+    assert (enough.num_ranks, enough.bottleneck) == (3, ACTORS)  # 0.5 + 1.0 + 5 x 4 (0.01 + 0.04 / 3) = 1.97
+    assert with_ranks(MODEL, 2, 10).num_ranks == 1
+    network = Model(MODEL.actor, {"learner": Cost(), ROLLOUTS_IN: Cost(rollout_s=1.0)}, 1.0, ranks_per_node=2)
+    assert [predict(network, 6, 10, num).seconds[ROLLOUTS_IN] for num in (1, 2, 3, 5)] == [6.0, 6.0, 3.0, 2.0]
+    # 40 actors: more and more ranks spend more on messages than they save, and none keeps up
+    most = with_ranks(MODEL, 40, 10)
+    assert most.bottleneck == "learner"
+    assert most.update_s == min(predict(MODEL, 40, 10, num).update_s for num in range(1, 41))
+
+
+def test_the_fastest_way_to_a_skill_by_hand():
+    model = Model(Cost(world_s=0.1), {"learner": Cost(world_s=0.05)}, 40.0, Ranks())
+    # three cores: two actors of 10 worlds and a rank take 1 s an update; one actor and two ranks take 2 s
+    way = fastest(model, [Batch(20, 100.0)], 3)
+    assert (way.run.num_actors, way.run.num_ranks, way.seconds) == (2, 1, pytest.approx(100.0))
+    # updates twice as large take twice as long: they have to save half of all updates
+    assert fastest(model, [Batch(20, 100.0), Batch(40, 60.0)], 3).batch.num_worlds == 20
+    assert fastest(model, [Batch(20, 100.0), Batch(40, 40.0)], 3).batch.num_worlds == 40
+
+
 def test_a_line_does_not_fall():
     assert line((1, 3.0), (8, 10.0)) == pytest.approx((2.0, 1.0))
     assert line((1, 3.0), (8, 2.0)) == (3.0, 0.0)
@@ -291,39 +335,53 @@ SIZES = {
 }  # fmt: skip
 
 
+ALONE = scaling.Alone(
+    rounds={"num_worlds": [10, 20], "cpu_s": [3.0, 5.0]},
+    updates={"num_worlds": [10, 20], "cpu_s": [0.7, 1.3]},
+    messages={"message_s": [0.06, 0.12], "num_messages": 5},
+    wakes=WAKES,
+    sizes=SIZES,
+)
+
+
 def model_of_scaling():
-    few = measured(num_rollouts=4, role_cpu_s={"learner": 4 * 0.3, "driver": 4 * 0.2, "gcs": 0.0})
-    many = measured(num_rollouts=32, role_cpu_s={"learner": 4 * 1.0, "driver": 4 * 0.9, "gcs": 2.8})
-    one = measured(num_rollouts=4, num_worlds=20, num_steps=3200, role_cpu_s={"actor": 4 * 5.0})
-    two = measured(num_rollouts=8, num_worlds=10, num_steps=3200, role_cpu_s={"actor": 8 * 3.0, "learner": 4 * 2.4})
+    few = measured(num_rollouts=4, role_cpu_s={"learner": 4 * 0.3, "driver": 4 * 0.2, "gcs": 0.0, "actor": 4 * 0.5})
+    many = measured(num_rollouts=32, role_cpu_s={"learner": 4 * 1.0, "driver": 4 * 0.9, "gcs": 2.8, "actor": 32 * 0.6})
+    one = measured(num_rollouts=4, num_worlds=20, num_steps=3200, role_cpu_s={"learner": 4 * 2.4})
     assumed = scaling.Assumed(network_mb_per_s=100.0, actors_per_node=16)
-    return scaling.costs([few, many], [one, two], WAKES, SIZES, assumed)
+    return scaling.costs([few, many], one, ALONE, assumed)
 
 
 def test_the_models_constants_by_hand():
     model = model_of_scaling()
-    # tiny games: 1 rollout an iteration costs 0.3 s, 8 cost 1.0: 0.2 + 0.1 N. The trained run: 2.4 - 0.2 - 2 x 0.1 over
-    # 20 worlds
-    assert model.parts[scaling.LEARNER] == Cost(pytest.approx(0.2), pytest.approx(0.1), pytest.approx(0.1))
+    # tiny games: 1 rollout an iteration costs 0.3 s, 8 cost 1.0: 0.2 + 0.1 N, and 0.1 for gradient steps of no samples.
+    # The trained run: 2.4 - 0.3 - 0.1 over 20 worlds
+    assert model.parts[scaling.LEARNER] == Cost(pytest.approx(0.3), pytest.approx(0.1), pytest.approx(0.1))
     driver = model.parts[scaling.DRIVER]
     assert (driver.update_s, driver.rollout_s, driver.pair_s) == pytest.approx((0.1, 0.1, 0.002))
     assert model.parts[scaling.GCS] == Cost(0.0, pytest.approx(0.1))
     assert model.parts[scaling.ROLLOUTS_IN].world_s == pytest.approx(0.01)
     assert model.parts[scaling.WEIGHTS_OUT].rollout_s == pytest.approx(0.01)
-    assert model.actor == Cost(rollout_s=pytest.approx(1.0), world_s=pytest.approx(0.2))
+    assert model.actor == Cost(rollout_s=pytest.approx(1.5), world_s=pytest.approx(0.2))  # 1.0 of a round, 0.5 of Ray
     assert model.env_steps == 40.0
+    assert model.ranks == Ranks(5, pytest.approx(0.01), pytest.approx(0.04))
 
 
 def test_what_is_on_paper_goes_onto_the_page():
     paper = scaling.on_paper(model_of_scaling(), num_worlds=10, total_worlds=20)
     assert [row["num_actors"] for row in paper["worlds_each"]] == [1, 2, 4, 16, 256, 4096]
     assert [row["num_worlds"] for row in paper["worlds_shared"]] == [20, 10, 5, 2, 1, 1]
-    # an actor takes 3 s, the learner 0.2 + 1.1 N
+    # an actor takes 3.5 s, the learner 0.3 + 1.1 N, with four actors 2.5 s on two ranks and with messages of 0.3 s
     assert paper["limits"][scaling.LEARNER] == 2
+    assert [row["num_ranks"] for row in paper["worlds_each"]][:3] == [1, 1, 2]
     assert next(iter(paper["limits"])) == scaling.LEARNER
-    result = {"machine": WHERE, "model": paper, "sizes": SIZES}
+    result = {"machine": WHERE, "model": paper, "alone": asdict(ALONE), "assumed": asdict(scaling.Assumed())}
     assert "**The first bottleneck is the learner**: it keeps up with 2 actors" in scaling_blocks.limits_block(result)
-    assert "| 16 | 10 |" in scaling_blocks.model_block(result)
+    assert "| 4 | 2 | 10 | 457 | 4.0 | 3.5 s |" in scaling_blocks.model_block(result)
+    study = {"runs": [{"reached": True, "at": {"iteration": num}} for num in (300, 500, 400)] + [{"reached": False}]}
+    block = scaling_blocks.skill_block(result, {20: study})
+    assert "400 with 20 worlds" in block
+    assert "| 16 | 20 |" in block
 
 
 @pytest.fixture(scope="module")
