@@ -29,7 +29,7 @@ ABLATIONS: dict[str, tuple[str, ...]] = {
     "one-goal": ("game.num_goals=1",),
     "no-past-opponents": ("generator.past_opponent_fraction=0",),
     "monolithic": ("policy.monolithic_bob={hidden_sizes: [256, 128]}",),
-    "no-mirror": ("learner.mirror=false",),
+    "no-mirror": ("learner.bob.mirror=none", "learner.alice.mirror=none"),
     "no-replay-invalid": ("generator.replay_invalid=false",),
     "no-replay-over-cells": ("generator.replay_over_cells=false",),
     "no-average": ("learner.bob_ema_decay=0",),

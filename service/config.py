@@ -19,7 +19,7 @@ from pydantic import BaseModel, BeforeValidator, Field, PositiveInt, ValidationE
 from service.errors import TandemError
 from service.frozen import FrozenModel
 
-_RENAMED = {"learner.bob_average_decay": "learner.bob_ema_decay"}
+_RENAMED = {"learner.bob_average_decay": "learner.bob_ema_decay", "learner.mirror": "learner.bob.mirror"}
 """Keys that had another name in version 0.1.0."""
 _REMOVED = {
     "game.alice_outside_reward": 0.0,
@@ -207,6 +207,11 @@ class PolicyConfig(FrozenModel):
         return self
 
 
+def _mirror(value: object) -> object:
+    """True and false, which recorded runs have, in today's words."""
+    return {True: "both", False: "none"}[value] if isinstance(value, bool) else value
+
+
 class PPOConfig(FrozenModel):
     """One player's PPO (Schulman et al. 2017)."""
 
@@ -224,6 +229,16 @@ class PPOConfig(FrozenModel):
     minibatch_size: int = Field(3200, ge=2)
     max_grad_norm: float = Field(0.5, gt=0.0)
     target_kl: float = Field(0.02, gt=0.0, description="an update stops early once its mean KL passes 1.5 x this")
+    mirror: Annotated[Literal["none", "both", "random"], BeforeValidator(_mirror)] = Field(
+        "none",
+        description="symmetry augmentation, since the task is the same from left and right: learn from every sample "
+        "and its reflection in y (both, or true), or at random from one of the two, which is half the work (random)",
+    )
+
+    @property
+    def mirrors(self) -> bool:
+        """Whether reflections are learned from."""
+        return self.mirror != "none"
 
 
 class ABCConfig(FrozenModel):
@@ -242,11 +257,6 @@ class ABCConfig(FrozenModel):
     mean_only: bool = Field(
         False, description="clone Alice's actions by Bob's mean and leave his std alone, or he also copies her noise"
     )
-
-
-def _mirror(value: object) -> object:
-    """True and false, which recorded runs have, in today's words."""
-    return {True: "both", False: "none"}[value] if isinstance(value, bool) else value
 
 
 class LearnerConfig(FrozenModel):
@@ -270,7 +280,7 @@ class LearnerConfig(FrozenModel):
         "what is learned then depends on the machine",
     )
     alice: PPOConfig = PPOConfig()
-    bob: PPOConfig = PPOConfig(num_epochs=5, minibatch_size=512)
+    bob: PPOConfig = PPOConfig()
     bob_window: int = Field(
         1,
         ge=1,
@@ -285,16 +295,6 @@ class LearnerConfig(FrozenModel):
         "about the last 1 / (1 - decay) versions; 0: the last version. Acting and learning do not use it",
     )
     abc: ABCConfig = ABCConfig()
-    mirror: Annotated[Literal["none", "both", "random"], BeforeValidator(_mirror)] = Field(
-        "none",
-        description="the task is symmetric in y: learn from every sample of Bob and its reflection (both, or true), or "
-        "at random from one of the two, which is half the work (random)",
-    )
-
-    @property
-    def mirrors(self) -> bool:
-        """Whether reflections are learned from."""
-        return self.mirror != "none"
 
     @model_validator(mode="after")
     def _enough_rows(self) -> Self:

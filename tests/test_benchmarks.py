@@ -645,7 +645,8 @@ def test_words_of_the_pages_by_hand():
 
 
 EVERYTHING_ON = [
-    "seed=3", "learner.mirror=true", "learner.abc={weight: 0.5, num_iterations: 8, hindsight: true}",
+    "seed=3", "learner.bob.mirror=both", "learner.alice.mirror=both",
+    "learner.abc={weight: 0.5, num_iterations: 8, hindsight: true}",
     "game.num_goals=5", "game.bob_hold_steps=5", "generator.past_opponent_fraction=0.2",
     "generator.replay_invalid=true", "generator.replay_from_reset=true", "game.alice_steps_min=5",
     "learner.alice.decoupled=false",
@@ -670,7 +671,12 @@ def _leaves(tree, prefix=""):
 
 
 def test_what_is_off_already_is_no_ablation():
-    assert ablations.ablated_config(measuring.RECIPE_FILE, "no-mirror", ["learner.mirror=false"]) is None
+    assert (
+        ablations.ablated_config(
+            measuring.RECIPE_FILE, "no-mirror", ["learner.bob.mirror=none", "learner.alice.mirror=none"]
+        )
+        is None
+    )
     assert ablations.ablated_config(measuring.RECIPE_FILE, ablations.RECIPE, []) == load_config(measuring.RECIPE_FILE)
     with pytest.raises(TandemError, match="no ablation 'no-such'; choose from recipe, no-abc"):
         ablations.ablated_config(measuring.RECIPE_FILE, "no-such", [])
@@ -684,7 +690,10 @@ def test_ablations_are_run_recorded_and_then_skipped(tmp_path, monkeypatch, caps
     command = ["ablations", *map(str, arguments), "--out", str(tmp_path), "no-abc", "no-mirror"]
     monkeypatch.setattr(sys, "argv", command)
     assert ablations.main() == 0
-    assert "no-mirror: learner.mirror=false\n  skipped, the recipe does not have it on" in capsys.readouterr().out
+    assert (
+        "no-mirror: learner.bob.mirror=none, learner.alice.mirror=none\n  skipped, the recipe does not have it on"
+        in capsys.readouterr().out
+    )
     (file,) = tmp_path.glob("ablation-*")
     run = run_files.read_run(file)
     assert (file.name, run["name"]) == ("ablation-no-abc-2.json", "ablation-no-abc-2")

@@ -81,8 +81,8 @@ def test_frozen():
         ("run.total_env_steps=2e5", "run.total_env_steps", 200_000),
         ("learner.bob.learning_rate=1e-3", "learner.bob.learning_rate", 0.001),
         ("learner.bob.learning_rate=0.001", "learner.bob.learning_rate", 0.001),
-        ("learner.mirror=true", "learner.mirror", "both"),
-        ("learner.mirror=random", "learner.mirror", "random"),
+        ("learner.bob.mirror=true", "learner.bob.mirror", "both"),
+        ("learner.alice.mirror=random", "learner.alice.mirror", "random"),
         ("generator.replay_invalid=false", "generator.replay_invalid", False),
         ("world.object=sphere", "world.object", "sphere"),
         ("world.workspace.center_y_m=-0.1", "world.workspace.center_y_m", -0.1),
@@ -216,9 +216,9 @@ RECORDED = {
         "alice_proximity_reward": 0.0,
         "num_goals": 7,
     },
-    "learner": {"alice_interval": 1, "bob_average_decay": 0.9},
+    "learner": {"alice_interval": 1, "bob_average_decay": 0.9, "mirror": True},
 }
-TODAY = {"game": {"num_goals": 7}, "learner": {"bob_ema_decay": 0.9}}
+TODAY = {"game": {"num_goals": 7}, "learner": {"bob_ema_decay": 0.9, "bob": {"mirror": "both"}}}
 
 
 def test_what_version_0_1_0_recorded_is_read(tmp_path):

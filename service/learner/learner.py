@@ -20,11 +20,12 @@ from service.learner.diagnostics import composition_metrics, mean_over_ranks, pr
 from service.learner.group import ALONE, Group
 from service.learner.player import LearnerError, Player
 from service.learner.samples import (
+    ALICES,
+    BOBS,
     DemonstrationHistory,
     DemonstrationRows,
     Samples,
-    augment_by_symmetry,
-    reflect_at_random,
+    mirror,
 )
 from service.learner.shares import own_demonstrations, share_of, share_out
 from service.learner.weights import MAX_POLICY_LAG, Weights
@@ -215,20 +216,21 @@ class Learner:
 
     def _update_alice(self, rollouts: Sequence[Rollout]) -> Metrics:
         samples = ppo.collect([[rollout.alice for rollout in rollouts]], _NO_ALICE, self._alice, self._group)
+        counted = {"num_alice_samples": float(_num(samples))}
+        if samples is not None:
+            samples = mirror(samples, ALICES, self._alice, self._rng)
         metrics = ppo.update(self._alice, samples, None, self.config.learner.abc, self._rng, self._group)
-        return _prefixed("alice", metrics) | {"num_alice_samples": float(_num(samples))}
+        return _prefixed("alice", metrics) | counted
 
     def _update_bob(self, rollouts: Sequence[Rollout]) -> Metrics:
         config, bob, group = self.config.learner, self._bob, self._group
         self._window.append([rollout.bob for rollout in rollouts])
         samples = ppo.collect(self._window, _NO_BOB, bob, group)
         metrics = {"num_bob_samples": float(_num(samples))}
-        if samples is not None and config.mirror == "both":
-            samples = augment_by_symmetry(samples, bob)
-        elif samples is not None and config.mirror == "random":
-            samples = reflect_at_random(samples, bob, self._rng)
+        if samples is not None:
+            samples = mirror(samples, BOBS, bob, self._rng)
         demonstrations = self._demonstrations(rollouts)
-        metrics["num_demonstrations"] = float(_num(demonstrations) // (1 + config.mirrors))
+        metrics["num_demonstrations"] = float(_num(demonstrations) // (1 + config.bob.mirrors))
         metrics |= _prefixed("bob", ppo.update(bob, samples, demonstrations, config.abc, self._rng, group))
         rows = samples if samples is not None else demonstrations
         if rows is not None and isinstance(self._bob_policy, networks.MCPPolicy):
@@ -243,7 +245,7 @@ class Learner:
         kept = self._history.joined()
         observation, action = (torch.from_numpy(each).to(self._device) for each in (kept.observation, kept.action))
         share = share_of(self._history.sizes(), self._group)
-        rows = DemonstrationRows(observation, action, self.config.learner.mirrors, share)
+        rows = DemonstrationRows(observation, action, self.config.learner.bob.mirrors, share)
         return rows if rows.num_total and self.config.learner.abc.weight else None
 
 

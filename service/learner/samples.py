@@ -13,7 +13,7 @@ from torch import Tensor
 
 from service.actors.rollout import Demonstrations
 from service.config import ABCConfig, PPOConfig
-from service.envs.observations import ACTION, BOB, BOB_VALUE, Mirror
+from service.envs.observations import ACTION, BOB, BOB_VALUE, FULL, Mirror
 from service.learner.player import Player
 from service.learner.shares import Share
 from service.policies import gaussian
@@ -179,19 +179,38 @@ class DemonstrationHistory:
             self._iterations.append(Demonstrations(state["observation"][rows].copy(), state["action"][rows].copy()))
 
 
-def augment_by_symmetry(samples: Samples, player: Player) -> Samples:
-    """Append the reflections in y of Bob's samples, which have the originals' advantages and values."""
-    reflections = _reflections(samples, player)
+@dataclass(frozen=True, slots=True)
+class Mirrors:
+    """Reflections in y of what a player sees."""
+
+    observation: Mirror
+    value_observation: Mirror
+
+
+ALICES = Mirrors(FULL.mirror, FULL.mirror)
+BOBS = Mirrors(BOB.mirror, BOB_VALUE.mirror)
+
+
+def mirror(samples: Samples, mirrors: Mirrors, player: Player, rng: np.random.Generator) -> Samples:
+    """Augment samples by symmetry, as ``PPOConfig.mirror`` of the player says."""
+    if player.config.mirror == "both":
+        return augment_by_symmetry(samples, mirrors, player)
+    return reflect_at_random(samples, mirrors, player, rng) if player.config.mirror == "random" else samples
+
+
+def augment_by_symmetry(samples: Samples, mirrors: Mirrors, player: Player) -> Samples:
+    """Append the reflections in y of samples, which have the originals' advantages and values."""
+    reflections = _reflections(samples, mirrors, player)
     pairs = zip(samples.tensors(), reflections.tensors(), strict=True)
     return samples.having(map(torch.cat, pairs), samples.share and samples.share.mirrored())
 
 
-def reflect_at_random(samples: Samples, player: Player, rng: np.random.Generator) -> Samples:
-    """Replace half of Bob's samples, chosen at random, by their reflections in y: half the work of learning both."""
+def reflect_at_random(samples: Samples, mirrors: Mirrors, player: Player, rng: np.random.Generator) -> Samples:
+    """Replace half of the samples, chosen at random, by their reflections in y: half the work of learning both."""
     chosen = rng.random(samples.num_total) < 0.5  # of all ranks, so that all draw alike
     own = chosen if samples.share is None else chosen[samples.share.places]
     rows = torch.from_numpy(np.flatnonzero(own)).to(samples.observation.device)
-    reflections = _reflections(samples.take(rows), player)
+    reflections = _reflections(samples.take(rows), mirrors, player)
     pairs = zip(samples.tensors(), reflections.tensors(), strict=True)
     return samples.having((column.index_copy(0, rows, reflected) for column, reflected in pairs), samples.share)
 
@@ -239,19 +258,20 @@ def _draw(num_rows: int, num: int, rng: np.random.Generator) -> IntArray:
     return np.concatenate([np.zeros(0, dtype=np.int64), *rounds])[:num]
 
 
-def _reflections(samples: Samples, player: Player) -> Samples:
-    """Reflect Bob's samples in y.
+def _reflections(samples: Samples, mirrors: Mirrors, player: Player) -> Samples:
+    """Reflect samples in y.
 
     Nobody acted a reflection, so its behaviour log-probability is that of the policy at the start of the update, which
     is ``player``'s.
     """
-    observations, actions = _reflect(samples.observation, BOB.mirror), _reflect(samples.action, ACTION.mirror)
+    observations = _reflect(samples.observation, mirrors.observation)
+    actions = _reflect(samples.action, ACTION.mirror)
     with torch.no_grad():
         mean, std = player.policy(observations)
     return replace(
         samples,
         observation=observations,
-        value_observation=_reflect(samples.value_observation, BOB_VALUE.mirror),
+        value_observation=_reflect(samples.value_observation, mirrors.value_observation),
         action=actions,
         behaviour_log_prob=gaussian.log_prob(actions, mean, std),
         proximal_mean=mean,

@@ -10,7 +10,7 @@ from service.learner.learner import Learner, _rng_from_array, _rng_to_array, tor
 from service.learner.player import LearnerError
 from tests.learner.rollouts import make_config, make_rollout, nobody_learns
 
-HISTORY = {"abc": {"num_iterations": 2}, "mirror": True}
+HISTORY = {"abc": {"num_iterations": 2}, "bob": {"mirror": "both"}}
 
 BOTH_PLAYERS = ("policy_loss", "value_loss", "entropy", "kl", "clip_fraction", "learning_rate")
 BOTH_PLAYERS += ("explained_variance", "grad_norm", "policy_steps")
@@ -323,8 +323,20 @@ def test_the_weight_of_cloning_is_that_of_the_configuration():
     assert log_ratios[1] > 1.5 * log_ratios[0] > 0.0
 
 
+def test_each_player_is_mirrored_by_itself():
+    plain = Learner(make_config())
+    updated(plain, 0)
+    for player, other in (("alice", "bob"), ("bob", "alice")):
+        learner = Learner(make_config(**{player: {"mirror": "both"}}))
+        updated(learner, 0)
+        weights, expected = ({"alice": each.alice, "bob": each.bob} for each in (learner.weights(), plain.weights()))
+        assert any(not np.array_equal(each, expected[player][name]) for name, each in weights[player].items())
+        if player == "bob":  # Bob comes second, with random numbers that her minibatches have moved
+            assert all(np.array_equal(each, expected[other][name]) for name, each in weights[other].items())
+
+
 def test_mirroring_doubles_what_bob_learns_from():
-    learner = Learner(make_config(mirror=True))
+    learner = Learner(make_config(bob={"mirror": "both"}))
     rollout = make_rollout(learner, 0)
     rows = learner._demonstrations([rollout]).find(np.arange(24))
     np.testing.assert_array_equal(rows.observation[12:], BOB.mirror(rollout.demonstrations.observation))

@@ -16,7 +16,12 @@ from tests.learner import ranks as work
 from tests.learner.ranks import Ranks, learn_alone
 from tests.learner.rollouts import make_config, make_demonstrations, make_rollout, nobody_learns
 
-EVERYTHING = {"mirror": True, "bob_window": 3, "bob_ema_decay": 0.5, "abc": {"num_iterations": 3, "mean_only": True}}
+EVERYTHING = {
+    "bob": {"mirror": "both"},
+    "bob_window": 3,
+    "bob_ema_decay": 0.5,
+    "abc": {"num_iterations": 3, "mean_only": True},
+}
 NO_DEMONSTRATIONS = make_demonstrations(np.random.default_rng(0), 0)
 REPLICATED = ("alice/", "bob/", "steady_bob/")
 
@@ -80,8 +85,11 @@ def test_a_group_adds_gathers_and_copies(pair):
     [
         {},
         EVERYTHING,
-        {"mirror": "random"},
-        {"mirror": True, "bob": {"target_kl": 1e-7}},  # Bob stops in the middle of an epoch
+        {"bob": {"mirror": "random"}, "alice": {"mirror": "both"}},
+        {
+            "bob": {"target_kl": 1e-7, "mirror": "both"},
+            "alice": {"mirror": "random"},
+        },  # Bob stops in the middle of an epoch
         {"bob": {"target_kl": 1e-9, "learning_rate": 0.05}},  # Bob's update is undone
         {"bob": {"minibatch_size": 3}},  # some minibatches are one rank's alone
     ],
@@ -102,7 +110,7 @@ def test_a_rank_without_rollouts_learns_along(pair, cut):
 
 
 def test_demonstrations_alone_and_nothing_at_all(pair):
-    config = make_config(mirror=True)
+    config = make_config(bob={"mirror": "both"})
     updates = [[replace(each, bob=nobody_learns(each.bob)) for each in played] for played in play(config)]
     alone = learn_alone(config, updates)
     assert_learned_alike(joined(pair.run(work.learn, config, updates)), alone)

@@ -7,10 +7,18 @@ import torch
 from torch import nn
 
 from service.config import ABCConfig, PPOConfig
-from service.envs.observations import ACTION, BOB, BOB_VALUE
+from service.envs.observations import ACTION, BOB, BOB_VALUE, FULL
 from service.learner.player import Player
 from service.learner.ppo import advantages, collect
-from service.learner.samples import DemonstrationRows, augment_by_symmetry, draw_epoch, reflect_at_random
+from service.learner.samples import (
+    ALICES,
+    BOBS,
+    DemonstrationRows,
+    augment_by_symmetry,
+    draw_epoch,
+    mirror,
+    reflect_at_random,
+)
 from tests.learner.rollouts import make_turns, nobody_learns
 
 CPU = torch.device("cpu")
@@ -92,14 +100,14 @@ def test_equal_advantages_become_zero():
 def test_samples_are_augmented_by_their_reflections():
     samples = collect([[make_bob_turns()]], make_bob_turns(), PLAYER)
     mirrors = BOB.mirror, BOB_VALUE.mirror, ACTION.mirror
-    doubled = augment_by_symmetry(samples, PLAYER)
+    doubled = augment_by_symmetry(samples, BOBS, PLAYER)
     num = len(samples)
     assert len(doubled) == 2 * num
     for before, after in zip(samples.tensors(), doubled.tensors(), strict=True):
         assert torch.equal(after[:num], before)
     names = "observation", "value_observation", "action"
-    for name, mirror in zip(names, mirrors, strict=True):
-        np.testing.assert_array_equal(getattr(doubled, name)[num:], mirror(getattr(samples, name).numpy()))
+    for name, each in zip(names, mirrors, strict=True):
+        np.testing.assert_array_equal(getattr(doubled, name)[num:], each(getattr(samples, name).numpy()))
     for name in ("advantage", "value_target", "value"):
         assert torch.equal(getattr(doubled, name)[num:], getattr(samples, name))
     # The policy is asked at the reflected observation, whose y changes its sign.
@@ -109,14 +117,33 @@ def test_samples_are_augmented_by_their_reflections():
 
 def test_half_of_the_samples_are_reflected_at_random():
     samples = collect([[make_bob_turns()]], make_bob_turns(), PLAYER)
-    mixed = reflect_at_random(samples, PLAYER, np.random.default_rng(0))
+    mixed = reflect_at_random(samples, BOBS, PLAYER, np.random.default_rng(0))
     reflected = np.random.default_rng(0).random(len(samples)) < 0.5
     assert 0.3 < reflected.mean() < 0.7
-    doubled = augment_by_symmetry(samples, PLAYER)
+    doubled = augment_by_symmetry(samples, BOBS, PLAYER)
     for column, both in zip(mixed.tensors(), doubled.tensors(), strict=True):
         original, reflection = both.numpy().reshape(2, len(samples), -1)
         expected = np.where(reflected[:, None], reflection, original)
         np.testing.assert_array_equal(column.numpy().reshape(expected.shape), expected)
+
+
+@pytest.mark.parametrize("how", ["none", "both", "random"])
+def test_a_player_is_mirrored_as_configured(how):
+    turns = make_turns(np.random.default_rng(0), FULL.size, FULL.size)
+    alice = Player(Policy(), Estimate(), PPOConfig(mirror=how), CPU)
+    samples = collect([[turns]], turns, alice)
+    found = mirror(samples, ALICES, alice, np.random.default_rng(0))
+    num = len(samples)
+    reflected = FULL.mirror(samples.observation.numpy())
+    if how == "none":
+        assert found is samples
+    elif how == "both":
+        np.testing.assert_array_equal(found.observation[num:], reflected)
+        np.testing.assert_array_equal(found.value_observation[num:], FULL.mirror(samples.value_observation.numpy()))
+    else:
+        chosen = np.random.default_rng(0).random(num) < 0.5
+        np.testing.assert_array_equal(found.observation[chosen], reflected[chosen])
+        assert torch.equal(found.observation[~chosen], samples.observation[~chosen])
 
 
 def places(epoch, part):

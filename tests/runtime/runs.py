@@ -47,9 +47,8 @@ TREE = {
         },
     },
     "learner": {
-        "mirror": True,
-        "alice": {"minibatch_size": 64},
-        "bob": {"minibatch_size": 64, "num_epochs": 2},
+        "alice": {"minibatch_size": 64, "mirror": "both"},
+        "bob": {"minibatch_size": 64, "num_epochs": 2, "mirror": "both"},
         "abc": {"num_iterations": 2},
     },
     "run": {
