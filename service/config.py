@@ -146,7 +146,13 @@ class GeneratorConfig(FrozenModel):
     )
     opponent_pool_size: int = Field(5, ge=1)
     opponent_interval: int = Field(10, ge=1, description="iterations between two snapshots of the players")
-    replay_fraction: float = Field(0.0, ge=0.0, le=1.0, description="share of valid goals replaced by replayed ones")
+    replay_fraction: float = Field(
+        0.0,
+        ge=0.0,
+        le=1.0,
+        description="share of valid goals replaced by replayed ones once Alice has proposed in every goal cell; before "
+        "that, as much less as cells are missing",
+    )
     replay_invalid: bool = Field(False, description="give Bob a replayed goal where Alice's goal was invalid")
     replay_from_reset: bool = Field(
         False, description="replayed goals also start where games do, when Bob can learn from that"
@@ -292,7 +298,8 @@ class LearnerConfig(FrozenModel):
         ge=0.0,
         lt=1.0,
         description="the Bob that is evaluated and published is an exponential moving average of his parameters, over "
-        "about the last 1 / (1 - decay) versions; 0: the last version. Acting and learning do not use it",
+        "about the last 1 / (1 - decay) versions, or a twentieth of all if that is less; 0: the last version. Acting "
+        "and learning do not use it",
     )
     abc: ABCConfig = ABCConfig()
 

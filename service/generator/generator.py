@@ -84,6 +84,7 @@ class TaskGenerator:
             reset_learnability=self.from_reset.learnability(),
             novelty=self.grid.novelty(),
             success_rate=np.array(self.grid.mean_success_rate()),
+            coverage=np.array(self.grid.seen.mean()),
         )
 
     def record(self, summary: GoalSummary) -> Metrics:

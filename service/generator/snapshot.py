@@ -21,7 +21,7 @@ LEARNABILITY_FLOOR = 0.01
 """Added to p (1 - p), which is at most 1/4, so goals of a solved or hopeless cell stay drawable and measured."""
 MIN_REPLAY_GOALS = 64
 """Goals the buffer must hold before any is replayed: fewer would be played over and over."""
-_ARRAYS = ("share", "learnability", "reset_learnability", "novelty", "success_rate")
+_ARRAYS = ("share", "learnability", "reset_learnability", "novelty", "success_rate", "coverage")
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,6 +69,8 @@ class GeneratorSnapshot:
     """(cells,) how rare proposals there are."""
     success_rate: StateArray
     """() mean over all cells, 0 where no goal was ever proposed."""
+    coverage: StateArray
+    """() share of the cells in which a goal was ever proposed."""
 
     def choose_goals(
         self,
@@ -119,7 +121,8 @@ class GeneratorSnapshot:
         """(N,) worlds whose goal comes from the buffer."""
         if len(self.buffer["goal"]) < MIN_REPLAY_GOALS:
             return np.zeros(len(valid), dtype=np.bool_)
-        replaced: BoolArray = valid & (rng.random(len(valid)) < self.config.replay_fraction)
+        # While much of the workspace is new to her, what she proposes is worth more than what she once did.
+        replaced: BoolArray = valid & (rng.random(len(valid)) < self.config.replay_fraction * self.coverage)
         filled: BoolArray = ~valid & self.config.replay_invalid
         return (replaced | filled) & ~bob_past
 

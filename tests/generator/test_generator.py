@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -49,12 +50,16 @@ def filled(
 
 
 def choose(
-    source: TaskGenerator | GeneratorSnapshot, verdict: list[int], plan: RoundPlan | None = None, seed: int = 0
+    source: TaskGenerator | GeneratorSnapshot,
+    verdict: list[int],
+    plan: RoundPlan | None = None,
+    seed: int = 0,
+    coverage: float = 1.0,
 ) -> GoalChoice:
     """Goals of worlds whose Alices all proposed (-0.1, 0, 0.1), from a state of ones at (0, 0, 0.025)."""
     num = len(verdict)
     snapshot = source.snapshot() if isinstance(source, TaskGenerator) else source
-    return snapshot.choose_goals(
+    return replace(snapshot, coverage=np.array(coverage)).choose_goals(
         plan or all_current(num),
         np.ones((num, STATE_SIZE)),
         np.tile([0.0, 0.0, 0.025], (num, 1)),
@@ -103,6 +108,16 @@ def test_replay_fraction_is_met_on_average(make_records: MakeRecords) -> None:
     generator = filled(make_records, replay_fraction=0.3)
     assert choose(generator, [VALID] * 4000).replayed.mean() == pytest.approx(0.3, abs=0.03)
     assert np.array_equal(choose(generator, [VALID] * 50).replayed, choose(generator, [VALID] * 50).replayed)
+
+
+def test_replay_fraction_waits_for_coverage(make_records: MakeRecords) -> None:
+    generator = filled(make_records, replay_fraction=0.8)
+    for coverage in (0.0, 0.25):
+        replayed = choose(generator, [VALID] * 4000, coverage=coverage).replayed
+        assert replayed.mean() == pytest.approx(0.8 * coverage, abs=0.02)
+    assert generator.snapshot().coverage == 1 / len(generator.cells)
+    invalid = filled(make_records, replay_fraction=0.8, replay_invalid=True)
+    assert_rows(choose(invalid, [VALID, OUTSIDE], coverage=0.0), [False, True])
 
 
 def test_no_replay_before_the_buffer_holds_enough(make_records: MakeRecords) -> None:
