@@ -247,21 +247,42 @@ class PPOConfig(FrozenModel):
         return self.mirror != "none"
 
 
-class ABCConfig(FrozenModel):
-    """Alice behavioural cloning (OpenAI 2021): PPO-clipped cloning of Alice's turns whose goal Bob failed."""
+class CloningConfig(FrozenModel):
+    """PPO-clipped cloning of demonstrations, beside a player's own turns."""
 
     weight: float = Field(0.5, ge=0.0, description="beta")
     clip: float = Field(0.2, gt=0.0, lt=1.0, description="epsilon")
     rows_per_sample: float = Field(
-        0.5, gt=0.0, le=4.0, description="demonstrated steps in a minibatch for each of Bob's own"
+        0.5, gt=0.0, le=4.0, description="demonstrated steps in a minibatch for each of the player's own"
     )
     num_iterations: int = Field(1, ge=1, description="demonstrations of that many iterations are kept; 1 is on-policy")
+    mean_only: bool = Field(
+        False, description="clone actions by the mean and leave the std alone, or it also copies a demonstrator's noise"
+    )
+
+
+class SelfImitationConfig(CloningConfig):
+    """Self-imitation (Oh et al. 2018): Alice clones those of her own turns that were paid well.
+
+    Chance lifts the object once in hundreds of turns. Policy gradients of one update hardly see it; cloned for some
+    iterations, it becomes a habit.
+    """
+
+    weight: float = Field(0.0, ge=0.0, description="0: off")
+    num_iterations: int = Field(8, ge=1, description="turns of that many iterations are kept")
+    min_reward: float = Field(
+        9.0,
+        description="least reward of a turn that is cloned: with the usual rewards for a valid and a difficult goal, 6 "
+        "together, and 10 for novelty, goals where Alice has proposed up to ten times of late",
+    )
+
+
+class ABCConfig(CloningConfig):
+    """Alice behavioural cloning (OpenAI 2021): PPO-clipped cloning of Alice's turns whose goal Bob failed."""
+
     hindsight: bool = Field(
         False,
         description="also clone Bob's failed turns, relabelled with where the object ended (Ghosh et al. 2021)",
-    )
-    mean_only: bool = Field(
-        False, description="clone Alice's actions by Bob's mean and leave his std alone, or he also copies her noise"
     )
 
 
@@ -302,6 +323,7 @@ class LearnerConfig(FrozenModel):
         "and learning do not use it",
     )
     abc: ABCConfig = ABCConfig()
+    self_imitation: SelfImitationConfig = SelfImitationConfig()
 
     @model_validator(mode="after")
     def _enough_rows(self) -> Self:

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from service.actors.rollout import Rollout, Turns, part_to_arrays
+from service.actors.rollout import Demonstrations, Rollout, Turns, part_to_arrays
 from service.config import Config
 from service.envs.observations import ACTION, BOB, BOB_VALUE, FULL, ObservationLayout
 from service.io.tensors import join_parts, split_parts
@@ -27,7 +27,7 @@ from service.learner.samples import (
     Samples,
     mirror,
 )
-from service.learner.shares import own_demonstrations, share_of, share_out
+from service.learner.shares import DEMONSTRATIONS, IMITATED, own_demonstrations, share_of, share_out
 from service.learner.weights import MAX_POLICY_LAG, Weights
 from service.policies import networks
 from service.types import Array, Arrays, Metrics
@@ -69,7 +69,9 @@ class Learner:
         self._bob = Player(*bob, config.learner.bob, self._device)
         self._bob_policy = bob[0]
         self._rng = np.random.Generator(np.random.PCG64(config.seed))
-        self._history = DemonstrationHistory(config.learner.abc.num_iterations)
+        self._histories = {DEMONSTRATIONS: DemonstrationHistory(config.learner.abc.num_iterations, BOB.size)}
+        if config.learner.self_imitation.weight:
+            self._histories[IMITATED] = DemonstrationHistory(config.learner.self_imitation.num_iterations, FULL.size)
         self._counted: dict[tuple[int, int], int] = {}  # (actor, incarnation) to the last sequence learned from
         self._pending: dict[tuple[int, int, int], Rollout] = {}
         self._bob_ema = networks.export_parameters(bob[0])
@@ -127,7 +129,7 @@ class Learner:
         Where there are several ranks, ``shares.join_states`` makes one state of theirs; all but rank 0 hand out only
         what they alone have.
         """
-        parts = {"demonstrations": self._history.state()}
+        parts = {name: history.state() for name, history in self._histories.items()}
         for index, iteration in enumerate(self._used_again()):
             parts |= {f"window/{index:04}/{place:04}": part_to_arrays(each) for place, each in enumerate(iteration)}
         if self._group.rank > 0:
@@ -153,7 +155,8 @@ class Learner:
         try:
             own = {name: state.pop(name) for name in ("version", "rng", "counted")}
             bob_ema = {name: np.array(state.pop(f"{_BOB_EMA}/{name}")) for name in self._bob_ema}
-            history = {name: state.pop(f"demonstrations/{name}") for name in ("observation", "action", "num_steps")}
+            arrays = "observation", "action", "num_steps"
+            histories = {key: {name: state.pop(f"{key}/{name}") for name in arrays} for key in self._histories}
         except KeyError as error:
             raise LearnerError(f"learner state: no array {error}; take an undamaged checkpoint") from None
         parts = split_parts(state)
@@ -167,7 +170,8 @@ class Learner:
         self.version = int(own["version"])
         self._rng = _rng_from_array(own["rng"])
         self._counted = {(int(actor), int(incarnation)): int(last) for actor, incarnation, last in own["counted"]}
-        self._history.load_state(own_demonstrations(history, self._group.rank, self._group.size))
+        for name, history in histories.items():
+            self._histories[name].load_state(own_demonstrations(history, self._group.rank, self._group.size))
         self._pending.clear()
 
     def _meet(self, rollouts: Sequence[Rollout]) -> list[tuple[int, ...]]:
@@ -223,7 +227,11 @@ class Learner:
         counted = {"num_alice_samples": float(_num(samples))}
         if samples is not None:
             samples = mirror(samples, ALICES, self._alice, self._rng)
-        metrics = ppo.update(self._alice, samples, None, self.config.learner.abc, self._rng, self._group)
+        how, imitated = self.config.learner.self_imitation, None
+        if IMITATED in self._histories:
+            imitated = self._to_clone(IMITATED, [paid_well(each.alice, how.min_reward) for each in rollouts])
+            counted["num_imitated"] = float(_num(imitated))
+        metrics = ppo.update(self._alice, samples, imitated, how, self._rng, self._group)
         return _prefixed("alice", metrics) | counted
 
     def _update_bob(self, rollouts: Sequence[Rollout]) -> Metrics:
@@ -233,7 +241,7 @@ class Learner:
         metrics = {"num_bob_samples": float(_num(samples))}
         if samples is not None:
             samples = mirror(samples, BOBS, bob, self._rng)
-        demonstrations = self._demonstrations(rollouts)
+        demonstrations = self._to_clone(DEMONSTRATIONS, [each.demonstrations for each in rollouts])
         metrics["num_demonstrations"] = float(_num(demonstrations) // (1 + config.bob.mirrors))
         metrics |= _prefixed("bob", ppo.update(bob, samples, demonstrations, config.abc, self._rng, group))
         rows = samples if samples is not None else demonstrations
@@ -243,14 +251,21 @@ class Learner:
             metrics |= mean_over_ranks(composed, len(probed), probed.num_total, group)
         return metrics
 
-    def _demonstrations(self, rollouts: Sequence[Rollout]) -> DemonstrationRows | None:
-        """The demonstrations to clone, this update's among them; None if no rank has any or they have no weight."""
-        self._history.append([rollout.demonstrations for rollout in rollouts])
-        kept = self._history.joined()
+    def _to_clone(self, name: str, new: Sequence[Demonstrations]) -> DemonstrationRows | None:
+        """What a history keeps, this update's among it; None if no rank has any or it has no weight."""
+        history, config = self._histories[name], self.config.learner
+        how, mirrored = (config.abc, config.bob.mirrors) if name == DEMONSTRATIONS else (config.self_imitation, False)
+        history.append(new)
+        kept = history.joined()
         observation, action = (torch.from_numpy(each).to(self._device) for each in (kept.observation, kept.action))
-        share = share_of(self._history.sizes(), self._group)
-        rows = DemonstrationRows(observation, action, self.config.learner.bob.mirrors, share)
-        return rows if rows.num_total and self.config.learner.abc.weight else None
+        rows = DemonstrationRows(observation, action, mirrored, share_of(history.sizes(), self._group))
+        return rows if rows.num_total and how.weight else None
+
+
+def paid_well(turns: Turns, min_reward: float) -> Demonstrations:
+    """The steps of the turns that ``learn`` and were paid at least ``min_reward``."""
+    chosen = turns.active & (turns.learn & (turns.reward.sum(axis=0) >= min_reward))
+    return Demonstrations(turns.observation[chosen], turns.action[chosen])
 
 
 def _no_turns(observation: ObservationLayout, value_observation: ObservationLayout) -> Turns:
@@ -279,7 +294,9 @@ def _num(rows: Samples | DemonstrationRows | None) -> int:
 
 def _prefixed(player: str, metrics: Metrics) -> Metrics:
     """Put the player's name before those that both have."""
-    shared = ("cloning_loss", "non_finite_steps", "rollbacks", "demonstration_log_prob", "demonstration_log_ratio")
+    shared = ["non_finite_steps", "rollbacks"]
+    if player == "bob":  # what Alice clones is rarely meant
+        shared += ["cloning_loss", "demonstration_log_prob", "demonstration_log_ratio"]
     return {name if name in shared else f"{player}_{name}": value for name, value in metrics.items()}
 
 

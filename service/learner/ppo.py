@@ -23,7 +23,7 @@ from torch import Tensor
 from torch.nn.utils import clip_grad_norm_
 
 from service.actors.rollout import Turns
-from service.config import ABCConfig
+from service.config import CloningConfig
 from service.learner.diagnostics import cloning_metrics, explained_variance, mean_over_ranks, probes, spread
 from service.learner.group import ALONE, Group, mean_and_std
 from service.learner.player import LEARNING_RATE_BOUNDS, Player
@@ -140,7 +140,7 @@ def update(
     player: Player,
     samples: Samples | None,
     demonstrations: DemonstrationRows | None,
-    abc: ABCConfig,
+    how: CloningConfig,
     rng: np.random.Generator,
     group: Group = ALONE,
 ) -> Metrics:
@@ -159,7 +159,7 @@ def update(
     snapshot, probed = player.snapshot(), probes(rows)
     with torch.no_grad():
         before = player.policy(probed.observation)
-    stats = train(player, samples, demonstrations, abc, rng, group)
+    stats = train(player, samples, demonstrations, how, rng, group)
     with torch.no_grad():
         moved = gaussian.kl(*before, *player.policy(probed.observation))
     kl = mean_over_ranks({"kl": float(moved.mean())}, len(probed), probed.num_total, group)["kl"]
@@ -216,7 +216,7 @@ def train(
     player: Player,
     samples: Samples | None,
     demonstrations: DemonstrationRows | None,
-    abc: ABCConfig,
+    how: CloningConfig,
     rng: np.random.Generator,
     group: Group = ALONE,
 ) -> UpdateStats:
@@ -226,7 +226,7 @@ def train(
     """
     stats, config = UpdateStats(), player.config
     num_samples, num_demonstrations = (0 if rows is None else rows.num_total for rows in (samples, demonstrations))
-    epochs = [draw_epoch(num_samples, num_demonstrations, config, abc, rng) for _ in range(config.num_epochs)]
+    epochs = [draw_epoch(num_samples, num_demonstrations, config, how, rng) for _ in range(config.num_epochs)]
     cloning = None
     if demonstrations is not None:
         drawn = np.unique(np.concatenate([places for epoch in epochs for _, places in epoch]))
@@ -236,14 +236,19 @@ def train(
         stats.kls.clear()
         for own, cloned in epoch:
             minibatch = samples and samples.find(own), cloning and cloning.find(cloned)
-            _step(player, *minibatch, abc, stats, group)
+            _step(player, *minibatch, how, stats, group)
             if stats.aborted:
                 return stats
     return stats
 
 
 def _step(
-    player: Player, samples: Samples | None, cloning: Cloning | None, abc: ABCConfig, stats: UpdateStats, group: Group
+    player: Player,
+    samples: Samples | None,
+    cloning: Cloning | None,
+    how: CloningConfig,
+    stats: UpdateStats,
+    group: Group,
 ) -> None:
     """Take one gradient step, or none if it would not be finite.
 
@@ -252,7 +257,7 @@ def _step(
     """
     config, losses, scalars = player.config, Scalars(), Scalars()
     if not stats.stopped:
-        losses["policy"], scalars = _policy_loss(player, samples, cloning, abc)
+        losses["policy"], scalars = _policy_loss(player, samples, cloning, how)
     if samples is not None:
         value = player.value(samples.value_observation)
         scalars["value_loss"] = value_loss(value, samples.value_target, samples.num_total)
@@ -280,7 +285,7 @@ def _step(
 
 
 def _policy_loss(
-    player: Player, samples: Samples | None, cloning: Cloning | None, abc: ABCConfig
+    player: Player, samples: Samples | None, cloning: Cloning | None, how: CloningConfig
 ) -> tuple[Tensor, Scalars]:
     """PPO's surrogate, entropy bonus and cloning, of one pass through the policy: this rank's part of each mean."""
     rows = [part for part in (samples, cloning) if part is not None]
@@ -288,7 +293,7 @@ def _policy_loss(
     mean, std = player.policy(torch.cat([part.observation for part in rows]))
     num_samples = 0 if samples is None else len(samples)
     # Alice's noise is not part of what she demonstrates: her actions pull Bob's mean, and leave his std to PPO.
-    learned_std = torch.cat((std[:num_samples], std[num_samples:].detach())) if abc.mean_only else std
+    learned_std = torch.cat((std[:num_samples], std[num_samples:].detach())) if how.mean_only else std
     log_prob = gaussian.log_prob(action, mean, learned_std)
     loss, scalars = log_prob.new_zeros(()), Scalars()
     if samples is not None:
@@ -310,8 +315,8 @@ def _policy_loss(
         scalars["kl"] = kl.detach().sum() / num
     if cloning is not None:
         pair = log_prob[num_samples:], cloning.proximal_log_prob
-        scalars["cloning_loss"] = cloning_loss(*pair, abc.clip, cloning.num_total)
-        loss = loss + abc.weight * scalars["cloning_loss"]
+        scalars["cloning_loss"] = cloning_loss(*pair, how.clip, cloning.num_total)
+        loss = loss + how.weight * scalars["cloning_loss"]
     return loss, scalars
 
 

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from service.actors.rollout import Demonstrations
-from service.config import ABCConfig, PPOConfig
+from service.config import CloningConfig, PPOConfig
 from service.envs.observations import ACTION, BOB, BOB_VALUE, FULL, Mirror
 from service.learner.player import Player
 from service.learner.shares import Share
@@ -147,19 +147,21 @@ class DemonstrationRows(_Rows):
 class DemonstrationHistory:
     """Demonstrations of the last ``num_iterations`` iterations; one without demonstrations counts too."""
 
-    def __init__(self, num_iterations: int) -> None:
+    def __init__(self, num_iterations: int, observation_size: int) -> None:
         """Start empty."""
         self._iterations: deque[Demonstrations] = deque(maxlen=num_iterations)
+        numbers = np.zeros((0, observation_size), dtype=np.float32), np.zeros((0, ACTION.size), dtype=np.float32)
+        self._nothing = Demonstrations(*numbers)
 
     def append(self, demonstrations: Iterable[Demonstrations]) -> None:
         """Add one iteration, without steps that are not finite; the oldest one goes if there are too many."""
-        new = _join(demonstrations)
+        new = self._join(demonstrations)
         finite = np.isfinite(new.observation).all(1) & np.isfinite(new.action).all(1)
         self._iterations.append(Demonstrations(new.observation[finite], new.action[finite]))
 
     def joined(self) -> Demonstrations:
         """Join all that is kept, oldest first."""
-        return _join(self._iterations)
+        return self._join(self._iterations)
 
     def sizes(self) -> IntArray:
         """Steps of each iteration, oldest first."""
@@ -177,6 +179,11 @@ class DemonstrationHistory:
         for start, end in zip(ends - state["num_steps"], ends, strict=True):
             rows = slice(int(start), int(end))
             self._iterations.append(Demonstrations(state["observation"][rows].copy(), state["action"][rows].copy()))
+
+    def _join(self, parts: Iterable[Demonstrations]) -> Demonstrations:
+        all_parts = [self._nothing, *parts]
+        observation = np.concatenate([part.observation for part in all_parts])
+        return Demonstrations(observation, np.concatenate([part.action for part in all_parts]))
 
 
 @dataclass(frozen=True, slots=True)
@@ -216,12 +223,12 @@ def reflect_at_random(samples: Samples, mirrors: Mirrors, player: Player, rng: n
 
 
 def draw_epoch(
-    num_samples: int, num_demonstrations: int, config: PPOConfig, abc: ABCConfig, rng: np.random.Generator
+    num_samples: int, num_demonstrations: int, config: PPOConfig, how: CloningConfig, rng: np.random.Generator
 ) -> list[tuple[IntArray, IntArray]]:
     """Draw the minibatches of an epoch: each sample once, in random order, beside demonstrations drawn alike.
 
     Samples are cut into as many equal minibatches as bring them nearest to the configured size. Each has
-    ``abc.rows_per_sample`` times as many demonstrations, which are cycled through if they are too few. Demonstrations
+    ``how.rows_per_sample`` times as many demonstrations, which are cycled through if they are too few. Demonstrations
     alone are gone through once.
 
     The rows of all ranks are drawn together, so with equal random numbers all draw the same.
@@ -230,13 +237,13 @@ def draw_epoch(
         num_samples: of all ranks; may be 0 where there are demonstrations.
         num_demonstrations: of all ranks; may be 0 where there are samples.
         config: size of a minibatch of samples, of all ranks together.
-        abc: demonstrations beside them.
+        how: demonstrations beside them.
         rng: shuffles.
 
     Returns:
         Places of each minibatch's samples and of its demonstrations.
     """
-    num_cloned = max(int(config.minibatch_size * abc.rows_per_sample), 1)
+    num_cloned = max(int(config.minibatch_size * how.rows_per_sample), 1)
     if num_samples:
         num = max(round(num_samples / config.minibatch_size), 1)
     else:
@@ -244,12 +251,6 @@ def draw_epoch(
     samples = _draw(num_samples, num_samples, rng)
     demonstrations = _draw(num_demonstrations, num * min(num_cloned, num_demonstrations), rng)
     return list(zip(np.array_split(samples, num), np.array_split(demonstrations, num), strict=True))
-
-
-def _join(parts: Iterable[Demonstrations]) -> Demonstrations:
-    observations = [np.zeros((0, BOB.size), dtype=np.float32), *(part.observation for part in parts)]
-    actions = [np.zeros((0, ACTION.size), dtype=np.float32), *(part.action for part in parts)]
-    return Demonstrations(np.concatenate(observations), np.concatenate(actions))
 
 
 def _draw(num_rows: int, num: int, rng: np.random.Generator) -> IntArray:

@@ -20,6 +20,8 @@ if TYPE_CHECKING:
     from service.learner.group import Group
 
 Item = TypeVar("Item")
+HISTORIES = DEMONSTRATIONS, IMITATED = "demonstrations", "imitated"
+"""Names of what is cloned in a learner's state, each a ``DemonstrationHistory``."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,9 +96,11 @@ def join_states(states: Sequence[Arrays]) -> Arrays:
             for _, arrays in sorted(split_parts(turns).items()):
                 place = num_places[iteration] = num_places.get(iteration, -1) + 1
                 window |= join_parts({f"{iteration}/{place:04}": arrays})
-    alike = {name: array for name, array in states[0].items() if not name.startswith(("window/", "demonstrations/"))}
-    demonstrations = _join_demonstrations([each["demonstrations"] for each in parts])
-    return alike | join_parts({"demonstrations": demonstrations, "window": window})
+    histories = [name for name in HISTORIES if name in parts[0]]
+    kept = {name: _join_demonstrations([each[name] for each in parts]) for name in histories}
+    own = tuple(f"{name}/" for name in ("window", *histories))
+    alike = {name: array for name, array in states[0].items() if not name.startswith(own)}
+    return alike | join_parts(kept | {"window": window})
 
 
 def _join_demonstrations(states: Sequence[Arrays]) -> Arrays:

@@ -6,11 +6,12 @@ import torch
 from safetensors.numpy import load, save
 
 from service.envs.observations import ACTION, BOB
-from service.learner.learner import Learner, _rng_from_array, _rng_to_array, torch_device
+from service.learner.learner import Learner, _rng_from_array, _rng_to_array, paid_well, torch_device
 from service.learner.player import LearnerError
 from tests.learner.rollouts import make_config, make_rollout, nobody_learns
 
-HISTORY = {"abc": {"num_iterations": 2}, "bob": {"mirror": "both"}}
+IMITATION = {"weight": 0.5, "num_iterations": 2, "min_reward": 0.5}
+HISTORY = {"abc": {"num_iterations": 2}, "bob": {"mirror": "both"}, "self_imitation": IMITATION}
 
 BOTH_PLAYERS = ("policy_loss", "value_loss", "entropy", "kl", "clip_fraction", "learning_rate")
 BOTH_PLAYERS += ("explained_variance", "grad_norm", "policy_steps")
@@ -309,6 +310,35 @@ def test_without_samples_or_demonstrations_a_player_stays():
     assert metrics["learner/alice_learning_rate"] == 3e-4
 
 
+def test_alice_clones_her_turns_that_were_paid_well():
+    learner, plain = Learner(make_config(self_imitation=IMITATION)), Learner(make_config())
+    rollouts = [make_rollout(learner, sequence) for sequence in range(3)]
+    paid = [int(each.alice.active[:, each.alice.reward.sum(axis=0) >= 0.5].sum()) for each in rollouts]
+    assert min(paid) > 0
+    for sequence, rollout in enumerate(rollouts):
+        learner.ingest(replace(rollout, policy_version=learner.version))
+        metrics = learner.update()
+        assert metrics["learner/num_imitated"] == sum(paid[max(0, sequence - 1) : sequence + 1])  # of two iterations
+    assert metrics["learner/alice_demonstration_log_ratio"] > 0.0
+    assert "learner/num_imitated" not in updated(plain, 0)
+    again = Learner(make_config(self_imitation=IMITATION))
+    updated(again, 0)
+    pairs = [(each, again.weights().alice[name]) for name, each in plain.weights().alice.items()]
+    assert any(not np.array_equal(*pair) for pair in pairs)
+
+
+def test_turns_of_past_players_and_badly_paid_ones_are_not_cloned():
+    turns = make_rollout(Learner(make_config()), 0).alice
+    reward = np.zeros_like(turns.reward)
+    reward[0] = [9.0, 8.9, 9.0, 0.0, 4.0, 0.0, 0.0, np.nan]
+    reward[1, 4] = 5.0  # with the first step's it is 9
+    learn = np.array([True, True, False, True, True, True, True, True])
+    found = paid_well(replace(turns, reward=reward, learn=learn), 9.0)
+    expected = turns.active & np.isin(np.arange(8), [0, 4])
+    np.testing.assert_array_equal(found.observation, turns.observation[expected])
+    np.testing.assert_array_equal(found.action, turns.action[expected])
+
+
 def test_cloning_can_be_switched_off():
     metrics = updated(Learner(make_config(abc={"weight": 0.0})), 0)
     assert "learner/cloning_loss" not in metrics
@@ -338,7 +368,7 @@ def test_each_player_is_mirrored_by_itself():
 def test_mirroring_doubles_what_bob_learns_from():
     learner = Learner(make_config(bob={"mirror": "both"}))
     rollout = make_rollout(learner, 0)
-    rows = learner._demonstrations([rollout]).find(np.arange(24))
+    rows = learner._to_clone("demonstrations", [rollout.demonstrations]).find(np.arange(24))
     np.testing.assert_array_equal(rows.observation[12:], BOB.mirror(rollout.demonstrations.observation))
     np.testing.assert_array_equal(rows.action[12:], ACTION.mirror(rollout.demonstrations.action))
     metrics, plain = updated(learner, 0), updated(Learner(make_config()), 0)

@@ -21,6 +21,7 @@ EVERYTHING = {
     "bob_window": 3,
     "bob_ema_decay": 0.5,
     "abc": {"num_iterations": 3, "mean_only": True},
+    "self_imitation": {"weight": 0.5, "num_iterations": 2, "min_reward": 0.5},
 }
 NO_DEMONSTRATIONS = make_demonstrations(np.random.default_rng(0), 0)
 REPLICATED = ("alice/", "bob/", "steady_bob/")

@@ -50,6 +50,7 @@ TREE = {
         "alice": {"minibatch_size": 64, "mirror": "both"},
         "bob": {"minibatch_size": 64, "num_epochs": 2, "mirror": "both"},
         "abc": {"num_iterations": 2},
+        "self_imitation": {"weight": 0.2, "num_iterations": 2, "min_reward": 1.0},
     },
     "run": {
         "total_env_steps": 600,
