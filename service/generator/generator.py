@@ -8,7 +8,7 @@ import numpy as np
 
 from service.config import Config
 from service.envs.state_layout import StateLayout
-from service.generator.bins import GoalCells, TaskBins
+from service.generator.bins import GoalCells, TaskBins, in_air
 from service.generator.difficulty import DifficultyGrid, SuccessCounts
 from service.generator.opponents import OpponentPool
 from service.generator.records import height_percentile, means
@@ -17,7 +17,7 @@ from service.generator.snapshot import GeneratorSnapshot
 from service.generator.stopping import StopCriterion
 from service.generator.summary import GoalSummary
 from service.io.tensors import join_parts, split_parts
-from service.types import Array, Arrays, Metrics
+from service.types import Array, Arrays, Metrics, StateArray
 
 NUM_STARTS = 1024
 """Starts of games kept for ``replay_from_reset``."""
@@ -78,7 +78,7 @@ class TaskGenerator:
             cells=self.cells,
             tasks=self.tasks,
             buffer=buffer,
-            share=self.buffer.part_share(),
+            share=self._replay_share(buffer["goal"]),
             learnability=self.grid.learnability(buffer["goal"]),
             starts=self.starts.rows(),
             reset_learnability=self.from_reset.learnability(),
@@ -86,6 +86,18 @@ class TaskGenerator:
             success_rate=np.array(self.grid.mean_success_rate()),
             coverage=np.array(self.grid.seen.mean()),
         )
+
+    def _replay_share(self, goal: StateArray) -> StateArray:
+        """(M,) weights of the buffer's goals that make all cells equally likely, and the table as likely as the air.
+
+        The table is one layer of cells of seven, yet where most of what is asked of Bob begins or ends.
+        """
+        share = self.buffer.part_share()
+        if self._config.replay_over_cells:
+            air = in_air(goal, self.tasks.rest_height_m)
+            for part in (air, ~air):
+                share[part] /= max(share[part].sum(), 1e-12)
+        return share
 
     def record(self, summary: GoalSummary) -> Metrics:
         """Take in the outcomes of one iteration's goals.
