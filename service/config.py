@@ -104,8 +104,8 @@ class GameConfig(FrozenModel):
     alice_novelty_reward: float = Field(
         0.0,
         ge=0.0,
-        description="added for a valid goal in a cell without earlier ones, and less the more there lately were, by "
-        "1 / sqrt(1 + n); 0 in the paper",
+        description="added for a valid goal in a cell without earlier ones; less the more there lately were, by "
+        "1 / sqrt(1 + n), and the more cells there are with goals, down to nothing; 0 in the paper",
     )
     blocked_gripper_fraction: float = Field(
         0.0,

@@ -71,7 +71,7 @@ class TaskGenerator:
 
     def snapshot(self) -> GeneratorSnapshot:
         """All that rollout workers need to choose goals in the next round; a copy."""
-        buffer = self.buffer.rows()
+        buffer, coverage = self.buffer.rows(), self.grid.seen.mean()
         return GeneratorSnapshot(
             config=self._config,
             success_distance_m=self._success_distance_m,
@@ -82,9 +82,9 @@ class TaskGenerator:
             learnability=self.grid.learnability(buffer["goal"]),
             starts=self.starts.rows(),
             reset_learnability=self.from_reset.learnability(),
-            novelty=self.grid.novelty(),
+            novelty=self.grid.novelty() * (1.0 - coverage),
             success_rate=np.array(self.grid.mean_success_rate()),
-            coverage=np.array(self.grid.seen.mean()),
+            coverage=np.array(coverage),
         )
 
     def _replay_share(self, goal: StateArray) -> StateArray:

@@ -41,7 +41,7 @@ class GoalChoice:
     played: BoolArray
     """(N,) there is a goal for Bob to play."""
     novelty: StateArray
-    """(N,) how rare goals in the cell of Alice's proposal are, in (0, 1]; 0 where it is not valid."""
+    """(N,) how rare goals in the cell of Alice's proposal are, in [0, 1); 0 where it is not valid."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,7 +66,7 @@ class GeneratorSnapshot:
     reset_learnability: StateArray
     """(task bins,) p (1 - p) of what starts where a game does."""
     novelty: StateArray
-    """(cells,) how rare proposals there are."""
+    """(cells,) how rare proposals there are, times the share of cells in which none was ever made."""
     success_rate: StateArray
     """() mean over all cells, 0 where no goal was ever proposed."""
     coverage: StateArray

@@ -231,6 +231,9 @@ class Learner:
         if IMITATED in self._histories:
             imitated = self._to_clone(IMITATED, [paid_well(each.alice, how.min_reward) for each in rollouts])
             counted["num_imitated"] = float(_num(imitated))
+            # A few turns that are cycled through many times would count for more than all others together.
+            share = _num(imitated) / max(how.rows_per_sample * counted["num_alice_samples"], 1.0)
+            how = how.model_copy(update={"weight": how.weight * min(1.0, share)})
         metrics = ppo.update(self._alice, samples, imitated, how, self._rng, self._group)
         return _prefixed("alice", metrics) | counted
 

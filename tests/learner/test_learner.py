@@ -6,6 +6,7 @@ import torch
 from safetensors.numpy import load, save
 
 from service.envs.observations import ACTION, BOB
+from service.learner import ppo
 from service.learner.learner import Learner, _rng_from_array, _rng_to_array, paid_well, torch_device
 from service.learner.player import LearnerError
 from tests.learner.rollouts import make_config, make_rollout, nobody_learns
@@ -325,6 +326,17 @@ def test_alice_clones_her_turns_that_were_paid_well():
     updated(again, 0)
     pairs = [(each, again.weights().alice[name]) for name, each in plain.weights().alice.items()]
     assert any(not np.array_equal(*pair) for pair in pairs)
+
+
+@pytest.mark.parametrize("rows_per_sample", [0.05, 4.0])
+def test_a_few_imitated_turns_count_in_proportion(monkeypatch, rows_per_sample):
+    weights, real = [], ppo.update
+    monkeypatch.setattr(ppo, "update", lambda *given: weights.append(given[3].weight) or real(*given))
+    learner = Learner(make_config(self_imitation=IMITATION | {"rows_per_sample": rows_per_sample}))
+    metrics = updated(learner, 0)
+    share = metrics["learner/num_imitated"] / (rows_per_sample * metrics["learner/num_alice_samples"])
+    assert (share < 1.0) == (rows_per_sample == 4.0)
+    assert weights[0] == pytest.approx(0.5 * min(share, 1.0))
 
 
 def test_turns_of_past_players_and_badly_paid_ones_are_not_cloned():
