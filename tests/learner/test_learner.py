@@ -328,7 +328,7 @@ def test_alice_clones_her_turns_that_were_paid_well():
     assert any(not np.array_equal(*pair) for pair in pairs)
 
 
-@pytest.mark.parametrize("rows_per_sample", [0.05, 4.0])
+@pytest.mark.parametrize("rows_per_sample", [0.02, 4.0])
 def test_a_few_imitated_turns_count_in_proportion(monkeypatch, rows_per_sample):
     weights, real = [], ppo.update
     monkeypatch.setattr(ppo, "update", lambda *given: weights.append(given[3].weight) or real(*given))
