@@ -34,7 +34,7 @@ def nodes_block(result: Result) -> str:
     """Runs on the test cluster, which were measured once."""
     if "nodes" not in result:
         return ""
-    nodes, sizes = result["nodes"], _sizes(result)
+    nodes, sizes = result["nodes"], result["nodes"].get("sizes") or _sizes(result)
     placed = ", ".join(f"{name} on node {place}" for name, place in sorted(nodes["places"].items()))
     return (
         f"A head without cores and two nodes beside it: {nodes['env_steps_per_s']:,.0f} env steps/s over "
@@ -54,22 +54,30 @@ def constants_block(result: Result) -> str:
         (name, *(_time(cost[key]) for key in ("update_s", "rollout_s", "world_s", "pair_s")))
         for name, cost in result["model"]["constants"].items()
     ]
-    assumed = result["assumed"]
+    assumed, ranks = result["assumed"], ""
+    if "alone" in result:
+        messages = result["alone"]["messages"]
+        two_s, four_s = messages["message_s"]
+        ranks = (
+            f"Messages of an update between ranks: {messages['num_messages']}, of {_time(two_s)} between two ranks and "
+            f"{_time(four_s)} between four.\n\n"
+        )
     redis = f"Redis takes {assumed['redis_mb_per_s']:g} MB/s, " if "redis_mb_per_s" in assumed else ""
     words = (
         f"Assumed, not measured: a node receives {assumed['network_mb_per_s']:g} MB/s (two Ray nodes on one box do, so "
         f"a cluster does better), {redis}a node has {assumed['actors_per_node']} actors."
     )
-    return f"{table(head, rows)}\n\n{words}"
+    return f"{table(head, rows)}\n\n{ranks}{words}"
 
 
 def model_block(result: Result) -> str:
     """Predictions: as many worlds for each actor, and the same worlds shared out."""
     model = result["model"]
     num, total = model["worlds_each"][0]["num_worlds"], _sizes(result)["num_worlds"]
+    ranks = ", and the learner has as many ranks as keep up with them" if "ranks" in model else ""
     return (
-        f"Every actor brings {num} worlds, so that more actors make larger updates, and the learner has as many ranks "
-        f"as keep up with them:\n\n{_predictions(model['worlds_each'])}\n\n"
+        f"Every actor brings {num} worlds, so that more actors make larger updates{ranks}:\n\n"
+        f"{_predictions(model['worlds_each'])}\n\n"
         f"The same experiment shared out, {total} worlds in all and at least one for each actor:\n\n"
         f"{_predictions(model['worlds_shared'])}"
     )
@@ -105,7 +113,7 @@ def _predictions(rows: list[Mapping[str, Any]]) -> str:
     return table(
         head,
         [
-            (f"{row['num_actors']:,}", f"{row['num_ranks']:,}", f"{row['num_worlds']:g}",
+            (f"{row['num_actors']:,}", f"{row.get('num_ranks', 1):,}", f"{row['num_worlds']:g}",
              f"{row['env_steps_per_s']:,.0f}", f"{row['env_steps_per_s'] / rows[0]['env_steps_per_s']:.1f}",
              f"{_seconds(row['update_s'])} s", percent(row["actors_busy"], 1), percent(row["learner_idle"]),
              row["bottleneck"])
@@ -119,7 +127,7 @@ def limits_block(result: Result) -> str:
     model = result["model"]
     limits = model["limits"]
     first, most = next(iter(limits.items()))
-    rows = {row["num_actors"]: row for row in model["one_rank"]}
+    rows = {row["num_actors"]: row for row in model.get("one_rank", model["worlds_each"])}
     head = ("part", "keeps up with", *(f"seconds an update, {num:,} actors" for num in NAMED))
     parts = table(
         head,
@@ -139,7 +147,8 @@ def limits_block(result: Result) -> str:
 
 
 def _sizes(result: Result) -> Mapping[str, Any]:
-    sizes: Mapping[str, Any] = result["alone"]["sizes"]
+    """Bytes of what travels; results from before ranks have no part ``alone``, and one rank."""
+    sizes: Mapping[str, Any] = result.get("alone", result)["sizes"]
     return sizes
 
 
