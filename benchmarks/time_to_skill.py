@@ -1,6 +1,6 @@
 """Wall-clock time until Bob solves 90 % of mixed goals, from the start of the process, for several seeds.
 
-    python -m benchmarks.time_to_skill --seeds 0,1,2,3,4 --json docs/results/time_to_skill.json
+    python -m benchmarks.time_to_skill --seeds 0-4 --json docs/results/time_to_skill/recipe.json
 
 What counts is the first of three evaluations in a row with 90 % of mixed goals at the last step, by the evaluations
 that any run makes. Seeds run one after the other, each until it is there or at ``--max-env-steps``; a seed that the
@@ -21,6 +21,7 @@ from typing import Any
 from benchmarks.measuring import RECIPE_FILE, machine, write_json
 from benchmarks.processes import cpu_s_by_role
 from benchmarks.training_process import Training, overrides, scratch
+from service.config import load_config
 from service.errors import TandemError
 from service.runtime.study_plan import parse_seeds
 
@@ -69,7 +70,7 @@ def _point(row: Mapping[str, float]) -> dict[str, float]:
 
 
 def report(result: Mapping[str, Any]) -> str:
-    """What was measured, as Markdown."""
+    """A row for each seed, as Markdown, and the median of their times where all were there."""
     lines = ["| seed | minutes | env steps | updates | CPU minutes |", "| --- | --- | --- | --- | --- |"]
     for run in result["runs"]:
         at = run["at"]
@@ -98,7 +99,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--json", type=Path, required=True, metavar="FILE", help="results; seeds it has are not run")
     given = parser.parse_args(arguments)
     try:
-        settings = {"config": given.config.name, "set": given.set, "share": given.share}
+        num_worlds = load_config(given.config, given.set).game.num_worlds
+        settings = {"config": given.config.name, "set": given.set, "num_worlds": num_worlds, "share": given.share}
         result: dict[str, Any] = {"benchmark": "time_to_skill", "settings": settings, "runs": []}
         if given.json.exists():
             result = json.loads(given.json.read_text(encoding="utf-8"))

@@ -272,8 +272,8 @@ class SelfImitationConfig(CloningConfig):
     num_iterations: int = Field(8, ge=1, description="turns of that many iterations are kept")
     min_reward: float = Field(
         9.0,
-        description="least reward of a turn that is cloned: with the usual rewards for a valid and a difficult goal, 6 "
-        "together, and 10 for novelty, goals where Alice has proposed up to ten times of late",
+        description="least reward of a turn that is cloned. A valid goal that Bob fails pays 6 with the usual rewards, "
+        "so 9 asks for a novelty reward of 3 on top: few goals of late where this one lies",
     )
 
 

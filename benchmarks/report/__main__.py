@@ -18,6 +18,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from benchmarks import time_to_skill
 from benchmarks.report import cluster, pretraining, scaling
 from benchmarks.report.figures import (
     draw_ablations,
@@ -43,11 +44,13 @@ PROGRAMS = {
 }
 """Modules by the name of the recorded file that they make."""
 PAGES = {
-    "results/pretraining.md": ("tasks", "curves", "curriculum", "coverage", "ablations", "throughput"),
+    "results/pretraining.md": ("skill", "tasks", "curves", "curriculum", "coverage", "ablations", "throughput"),
     "results/cluster.md": ("targets", "throughput", "chaos", "rest", "soak"),
-    "scaling.md": ("bottleneck", "box", "nodes", "model", "constants"),
+    "scaling.md": ("bottleneck", "box", "nodes", "model", "batches", "skill", "constants"),
 }
 """Blocks of every page."""
+RECIPE = "recipe"
+"""Name of the recorded time to a skill with the shipped recipe."""
 Results = Mapping[str, Mapping[str, Any]]
 """Recorded files by the name of their benchmark."""
 Blocks = Mapping[str, Sequence[str]]
@@ -95,6 +98,15 @@ def read_results(results: Path) -> dict[str, dict[str, Any]]:
     return found
 
 
+def read_studies(directory: Path) -> dict[str, dict[str, Any]]:
+    """Recorded times to a skill by the name of their file."""
+    studies = {}
+    for path in sorted(directory.glob("*.json")):
+        with os_errors("read", path):
+            studies[path.stem] = json.loads(path.read_text(encoding="utf-8"))
+    return studies
+
+
 def read_runs(directory: Path) -> tuple[list[Run], list[Run]]:
     """Recorded runs in the order of their names, and recorded ablations in that of their list."""
     from benchmarks.ablations import ABLATIONS
@@ -121,9 +133,14 @@ class Report:
     def write(self) -> None:
         """Write all pages and pictures."""
         found, (runs, ablations) = read_results(self._results), read_runs(self._results / "runs")
+        studies = read_studies(self._results / "time_to_skill")
         for page, names in PAGES.items():  # a page that lacks a marker is found before anything is drawn
             replace_blocks(self._docs / page, dict.fromkeys(names, ""))
-        made = (self.pretraining_blocks(runs, ablations, found), self.cluster_blocks(found), scaling_blocks(found))
+        made = (
+            self.pretraining_blocks(runs, ablations, found, studies),
+            self.cluster_blocks(found),
+            scaling_blocks(found, studies),
+        )
         for (page, names), blocks in zip(PAGES.items(), made, strict=True):
             path = self._docs / page
             text = replace_blocks(path, {name: "\n\n".join(blocks.get(name, ())) for name in names})
@@ -132,9 +149,13 @@ class Report:
             self.files.append(path)
         self.files += write_results(self._results)
 
-    def pretraining_blocks(self, runs: Sequence[Run], ablations: Sequence[Run], found: Results) -> Blocks:
+    def pretraining_blocks(
+        self, runs: Sequence[Run], ablations: Sequence[Run], found: Results, studies: Results
+    ) -> Blocks:
         """Parts of the blocks about pre-training."""
         show, blocks = self._show, defaultdict[str, list[str]](list)
+        if RECIPE in studies:
+            blocks["skill"] = [time_to_skill.report(studies[RECIPE])]
         if runs:
             blocks["tasks"] = [pretraining.tasks_table(runs)]
             blocks["curves"] = [
@@ -179,7 +200,7 @@ class Report:
         return f"![{words}]({name}.png)"
 
 
-def scaling_blocks(found: Results) -> Blocks:
+def scaling_blocks(found: Results, studies: Results) -> Blocks:
     """Parts of the blocks about scaling."""
     makers = {
         "bottleneck": scaling.limits_block,
@@ -188,7 +209,12 @@ def scaling_blocks(found: Results) -> Blocks:
         "model": scaling.model_block,
         "constants": scaling.constants_block,
     }
-    return {name: [maker(found["scaling"])] for name, maker in makers.items() if "scaling" in found}
+    blocks = {name: [maker(found["scaling"])] for name, maker in makers.items() if "scaling" in found}
+    if studies:
+        blocks["batches"] = [scaling.batches_block(studies)]
+    if studies and "scaling" in found:
+        blocks["skill"] = [scaling.skill_block(found["scaling"], studies)]
+    return blocks
 
 
 def main() -> int:

@@ -6,7 +6,7 @@ import statistics
 from collections.abc import Mapping
 from typing import Any
 
-from benchmarks.report.markdown import commit, percent, table
+from benchmarks.report.markdown import commit, millions, percent, table
 from benchmarks.scaling_model import ACTORS, Batch, Cost, Model, Ranks, fastest
 from service.media.figures import counted
 
@@ -83,17 +83,27 @@ def model_block(result: Result) -> str:
     )
 
 
-def skill_block(result: Result, batches: Mapping[int, Result]) -> str:
-    """Time to a skill on many cores, from the model and from updates until 90 % of mixed goals by size of update."""
+def batches_block(studies: Mapping[str, Result]) -> str:
+    """Env steps and updates until the skill, by worlds of an update; medians over the seeds that were there."""
+    head = ("worlds", "recorded in", "seeds that were there", "env steps", "updates")
+    rows = []
+    for name, study in sorted(studies.items(), key=lambda item: item[1]["settings"]["num_worlds"]):
+        there, num_seeds = _there(study), len(study["runs"])
+        row = [str(study["settings"]["num_worlds"]), f"`{name}.json`", f"{len(there)} of {num_seeds}", "", ""]
+        if there:
+            row[-2:] = millions(statistics.median(at["env_steps"] for at in there)), f"{_updates(study):,.0f}"
+        rows.append(row)
+    return table(head, rows)
+
+
+def skill_block(result: Result, studies: Mapping[str, Result]) -> str:
+    """Time to a skill on many cores: the model's seconds of an update, and how many updates a study took."""
     model = result["model"]
     costs = {name: Cost(**cost) for name, cost in model["constants"].items()}
     actor = costs.pop(ACTORS)
     ranks, per_node = Ranks(**model["ranks"]), result["assumed"]["actors_per_node"]
     made = Model(actor, costs, model["env_steps_per_world"], ranks, per_node)
-    found = [
-        Batch(num_worlds, statistics.median(run["at"]["iteration"] for run in study["runs"] if run["reached"]))
-        for num_worlds, study in sorted(batches.items())
-    ]
+    found = [Batch(study["settings"]["num_worlds"], _updates(study)) for study in studies.values() if _there(study)]
     head = ("cores", "worlds in all", "actors", "ranks", "an update every", "minutes", "core-hours")
     rows = []
     for num_cores in CORES:
@@ -103,8 +113,17 @@ def skill_block(result: Result, batches: Mapping[int, Result]) -> str:
              f"{way.run.update_s:.3f} s",
              f"{way.seconds / 60:.1f}", f"{way.seconds * num_cores / 3600:.2f}")
         )  # fmt: skip
-    updates = ", ".join(f"{each.num_updates:,.0f} with {each.num_worlds}" for each in found)
-    return f"Updates until 90 % of mixed goals, medians: {updates} worlds.\n\n{table(head, rows)}"
+    return table(head, rows)
+
+
+def _there(study: Result) -> list[Mapping[str, Any]]:
+    """Where the seeds of a study had the skill."""
+    return [run["at"] for run in study["runs"] if run["reached"]]
+
+
+def _updates(study: Result) -> float:
+    """Median of the updates until the skill."""
+    return float(statistics.median(at["iteration"] for at in _there(study)))
 
 
 def _predictions(rows: list[Mapping[str, Any]]) -> str:

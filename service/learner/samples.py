@@ -262,8 +262,9 @@ def _draw(num_rows: int, num: int, rng: np.random.Generator) -> IntArray:
 def _reflections(samples: Samples, mirrors: Mirrors, player: Player) -> Samples:
     """Reflect samples in y.
 
-    Nobody acted a reflection, so its behaviour log-probability is that of the policy at the start of the update, which
-    is ``player``'s.
+    A reflection was acted by the reflected behaviour policy, so it has the behaviour log-probability of its original.
+    The importance weight then says how much it counts: little, where ``player`` would hardly act like that. With a
+    full weight one reflection in ten, tens of standard deviations from the mean, ruled the gradient.
     """
     observations = _reflect(samples.observation, mirrors.observation)
     actions = _reflect(samples.action, ACTION.mirror)
@@ -274,7 +275,6 @@ def _reflections(samples: Samples, mirrors: Mirrors, player: Player) -> Samples:
         observation=observations,
         value_observation=_reflect(samples.value_observation, mirrors.value_observation),
         action=actions,
-        behaviour_log_prob=gaussian.log_prob(actions, mean, std),
         proximal_mean=mean,
         proximal_std=std,
     )

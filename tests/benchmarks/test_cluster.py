@@ -378,10 +378,14 @@ def test_what_is_on_paper_goes_onto_the_page():
     result = {"machine": WHERE, "model": paper, "alone": asdict(ALONE), "assumed": asdict(scaling.Assumed())}
     assert "**The first bottleneck is the learner**: it keeps up with 2 actors" in scaling_blocks.limits_block(result)
     assert "| 4 | 2 | 10 | 457 | 4.0 | 3.5 s |" in scaling_blocks.model_block(result)
-    study = {"runs": [{"reached": True, "at": {"iteration": num}} for num in (300, 500, 400)] + [{"reached": False}]}
-    block = scaling_blocks.skill_block(result, {20: study})
-    assert "400 with 20 worlds" in block
-    assert "| 16 | 20 |" in block
+    there = [{"reached": True, "at": {"iteration": num, "env_steps": 1e4 * num}} for num in (300, 500, 400)]
+    studies = {
+        "large": {"settings": {"num_worlds": 40}, "runs": [{"reached": False}]},
+        "recipe": {"settings": {"num_worlds": 20}, "runs": [*there, {"reached": False}]},
+    }
+    batches = scaling_blocks.batches_block(studies).splitlines()
+    assert batches[2:] == ["| 20 | `recipe.json` | 3 of 4 | 4 M | 400 |", "| 40 | `large.json` | 0 of 1 |  |  |"]
+    assert "| 16 | 20 |" in scaling_blocks.skill_block(result, studies)
 
 
 @pytest.fixture(scope="module")
@@ -473,4 +477,4 @@ def test_what_is_not_recorded_is_said(tmp_path):
     assert report.replace_blocks(page, {"box": ""}) == (
         f"a {report.begin('box')}\n\nNot recorded yet.\n\n{report.end('box')} b"
     )
-    assert report.scaling_blocks({}) == {}
+    assert report.scaling_blocks({}, {}) == {}

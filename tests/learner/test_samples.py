@@ -108,11 +108,10 @@ def test_samples_are_augmented_by_their_reflections():
     names = "observation", "value_observation", "action"
     for name, each in zip(names, mirrors, strict=True):
         np.testing.assert_array_equal(getattr(doubled, name)[num:], each(getattr(samples, name).numpy()))
-    for name in ("advantage", "value_target", "value"):
+    for name in ("advantage", "value_target", "value", "behaviour_log_prob"):
         assert torch.equal(getattr(doubled, name)[num:], getattr(samples, name))
     # The policy is asked at the reflected observation, whose y changes its sign.
     np.testing.assert_array_equal(doubled.proximal_mean[num:, 0], -samples.observation[:, 1])
-    np.testing.assert_array_equal(doubled.behaviour_log_prob[num:], doubled.proximal_log_prob[num:])
 
 
 def test_half_of_the_samples_are_reflected_at_random():
