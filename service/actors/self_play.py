@@ -239,7 +239,7 @@ class SelfPlay:
         alice.learn[valid & ~tried] = False
 
     def _demonstrations(self, alice: Turns, bob: Turns, records: GoalRecords, achieved: StateArray) -> Demonstrations:
-        """Alice's turns for the goals the current Bob failed; with hindsight, also his own failures."""
+        """Alice's turns for the goals the current Bob failed; with hindsight, also steps of his own failures."""
         failed = records.played & ~records.solved & ~records.bob_past
         by_alice = _relabelled(alice, failed & ~records.replayed, records.goal)
         if not self.config.learner.abc.hindsight:
@@ -247,8 +247,11 @@ class SelfPlay:
         config = self.config
         moved = classify_goal(records.start_position, achieved, config.world.workspace, config.game.success_distance_m)
         by_bob = _relabelled(bob, failed & (moved == Verdict.VALID), achieved)
+        # As many of his steps as of hers: he fails in several times as many, and would drown what she shows him.
+        every = -(-len(by_bob.observation) // max(1, len(by_alice.observation))) or 1
         return Demonstrations(
-            np.concatenate([by_alice.observation, by_bob.observation]), np.concatenate([by_alice.action, by_bob.action])
+            np.concatenate([by_alice.observation, by_bob.observation[::every]]),
+            np.concatenate([by_alice.action, by_bob.action[::every]]),
         )
 
     def _continue_games(self, end_state: StateArray, verdict: VerdictArray) -> None:

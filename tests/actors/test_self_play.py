@@ -400,6 +400,24 @@ def test_with_hindsight_bobs_failures_show_the_way_to_where_the_object_came():
     assert len(without.demonstrations.action) == 9
 
 
+def test_of_bobs_failures_no_more_steps_are_shown_than_of_alices_turns():
+    goals = np.tile((-0.1, -0.1, 0.025), (4, 1))
+
+    def choose(start_state, start_position, round_index, proposal, verdict):
+        """Only the first world's goal is Alice's own."""
+        every, own = np.ones(4, dtype=bool), np.arange(4) == 0
+        return GoalChoice(goals.copy(), start_state.copy(), start_position.copy(), ~own, own, every, np.zeros(4))
+
+    config = make_config(4, learner={"abc": {"hindsight": True}})
+    rollout = play(make_game(config, [IN_FRONT] * 4), Pusher(), Pusher(), choose_goals=choose)
+    assert not rollout.records.solved.any()
+    # 9 steps of Alice, and of Bob's 4 x 7 every fourth.
+    actions = rollout.bob.action.swapaxes(0, 1).reshape(28, 4)
+    rows = rollout.demonstrations.action[9:]
+    assert len(rows) == 7
+    assert all((row == actions).all(axis=1).any() for row in rows)
+
+
 def test_no_failure_no_demonstrations():
     rollout = play(make_game(make_config(2), [AT_REST, SLIDES]))
     assert rollout.demonstrations.observation.shape == (0, 14)
