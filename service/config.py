@@ -282,7 +282,8 @@ class ABCConfig(CloningConfig):
 
     hindsight: bool = Field(
         False,
-        description="also clone Bob's failed turns, relabelled with where the object ended (Ghosh et al. 2021)",
+        description="also clone steps of Bob's failed turns, relabelled with where the object ended (Ghosh et al. "
+        "2021); no more than there are of Alice's",
     )
 
 

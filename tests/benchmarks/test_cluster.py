@@ -388,6 +388,21 @@ def test_what_is_on_paper_goes_onto_the_page():
     assert "| 16 | 20 |" in scaling_blocks.skill_block(result, studies)
 
 
+def test_a_run_on_nodes_goes_onto_the_page():
+    strikes = [
+        {"how": "kill", "name": "learner-1", "back_s": 19.6},
+        {"how": "stop", "name": "learner-0", "back_s": 38.2},
+    ]
+    result = {
+        "machine": WHERE, "settings": {"nodes": 8, "actors": 32, "ranks": 4}, "num_iterations": 27, "strikes": strikes,
+        "num_rollouts_handed_over": 864, "num_rollouts_counted": 863,
+    }  # fmt: skip
+    block = scaling_blocks.nodes_block(result)
+    assert "32 tiny actors and a learner of 4 ranks on 8 nodes beside a head, 27 updates" in block
+    assert "| learner-0 | stopped, so that it hangs | 38 s |" in block
+    assert "handed over: 864; that the learner counted: 863; lost or counted twice: 1." in block
+
+
 @pytest.fixture(scope="module")
 def tiny(tmp_path_factory):
     return scaling.make_tiny(tmp_path_factory.mktemp("tiny"))
