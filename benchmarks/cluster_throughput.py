@@ -49,7 +49,14 @@ class Settings:
 
 
 def measure_run(
-    source: RunDirectory, home: Path, runtime: Runtime, num_iterations: int, num_actors: int, *, plain: bool = False
+    source: RunDirectory,
+    home: Path,
+    runtime: Runtime,
+    num_iterations: int,
+    num_actors: int,
+    *,
+    actor_threads: int = 1,
+    plain: bool = False,
 ) -> Measured:
     """Measure one runner in a process of its own, on a copy of ``source`` in ``home`` that is deleted afterwards.
 
@@ -59,11 +66,14 @@ def measure_run(
         runtime: which runner.
         num_iterations: one of them has an evaluation.
         num_actors: of a run on Ray; 1 otherwise.
+        actor_threads: of each of them.
         plain: without evaluations and checkpoints.
     """
     copy = copy_run(source, home)
     settings = ENDLESS | PLAIN | ({} if plain else {"run.evaluation_interval": num_iterations})
-    arguments = overrides(settings) + (["--num-actors", str(num_actors)] if runtime == "ray" else [])
+    arguments = overrides(settings)
+    if runtime == "ray":
+        arguments += ["--num-actors", str(num_actors), "--actor-threads", str(actor_threads)]
     with Training(home, arguments, runtime=runtime) as training:
         measured = measure_training(training, num_iterations, num_actors)
     shutil.rmtree(copy.path)

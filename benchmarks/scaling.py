@@ -2,7 +2,8 @@
 
     python -m benchmarks.scaling --run-dir runs/cube --json docs/results/scaling.json
 
-- On this box: env steps a second of a trained run with 1, 2, ... rollout actors, and the CPU time of every process.
+- On this box: env steps a second of a trained run with 1, 2, ... rollout actors, and with one that has a thread for
+  every core, and the CPU time of every process.
 - On paper: ``scaling_model.py`` with what was measured. Tiny games, whose physics and networks cost nearly nothing,
   with 1 and with 8 actors tell what an update and what a rollout costs by itself in driver, learner, generator and
   GCS; the trained run tells what a world costs on top. Costs are CPU seconds, so that cores which all share do not
@@ -48,9 +49,11 @@ PREDICTED = (1, 2, 4, 16, 256, 4096)
 WAKES = (16, 256, 4096)
 NUM_TINY_ACTORS = 8
 FEW_WORLDS = 15
-"""Worlds of a round that is nearly all overhead: a sixteenth of 240."""
+"""Worlds of a round that is nearly all overhead: those of one of 16 actors that share out 240."""
 WORLDS_EACH = 120
 """Worlds of each actor where every actor brings as many."""
+SHARED_WORLDS = 240
+"""Worlds in all where actors share them out."""
 GENERATOR, DRIVER, GCS = "task generator", "driver", "GCS"
 WEIGHTS_OUT = "weights and snapshots to the nodes"
 ROLES = {LEARNER: "learner", GENERATOR: "generator", DRIVER: "driver", GCS: "gcs"}
@@ -98,7 +101,7 @@ class Settings:
     max_actors: int = os.cpu_count() or 1
     """Most actors on this box."""
     num_iterations: int = 25
-    num_tiny_iterations: int = 400
+    num_tiny_iterations: int = 100
 
 
 @dataclass(frozen=True, slots=True)
@@ -181,6 +184,7 @@ def on_paper(model: Model, num_worlds: int, total_worlds: int) -> dict[str, Any]
     return {
         "constants": {ACTORS: asdict(model.actor), **{name: asdict(cost) for name, cost in model.parts.items()}},
         "ranks": asdict(model.ranks),
+        "shared_worlds": total_worlds,
         "env_steps_per_world": model.env_steps,
         "one_rank": [_row(predict(model, num, num_worlds)) for num in PREDICTED],
         "worlds_each": [_row(with_ranks(model, num, num_worlds)) for num in PREDICTED],
@@ -216,23 +220,25 @@ def benchmark(source: RunDirectory, settings: Settings) -> dict[str, Any]:
     with scratch() as home:
         numbers = (1, *range(2, settings.max_actors + 1))
         real = _measure(source, home, numbers, settings.num_iterations)
+        threads = settings.max_actors
+        one = measure_run(source, home, "ray", settings.num_iterations, 1, actor_threads=threads, plain=True)
         small = _measure(make_tiny(home), home, (1, NUM_TINY_ACTORS), settings.num_tiny_iterations)
         probe, ray, copy = "benchmarks.scaling_probe", environment(home), copy_run(source, home, "copy")
-        total_worlds = source.read_config().game.num_worlds
+        num_worlds = source.read_config().game.num_worlds
         alone = Alone(
-            rounds=ask_module(probe, "rounds", copy.path, FEW_WORLDS, total_worlds, environment=ray),
-            updates=_updates(total_worlds),
-            messages=_messages(total_worlds),
+            rounds=ask_module(probe, "rounds", copy.path, FEW_WORLDS, num_worlds, environment=ray),
+            updates=_updates(num_worlds),
+            messages=_messages(num_worlds),
             wakes=ask_module(probe, "wakes", *WAKES, environment=ray),
             sizes=ask_module(probe, "sizes", copy.path, environment=ray),
         )
     model = costs(list(small.values()), real[1], alone)
     return {
-        "one_box": {str(num): _box(each) for num, each in real.items()},
+        "one_box": {str(num): _box(each) for num, each in real.items()} | {f"1, of {threads} threads": _box(one)},
         "tiny": {str(num): _box(each) for num, each in small.items()},
         "alone": asdict(alone),
         "assumed": asdict(Assumed()),
-        "model": on_paper(model, WORLDS_EACH, total_worlds),
+        "model": on_paper(model, WORLDS_EACH, SHARED_WORLDS),
     }
 
 

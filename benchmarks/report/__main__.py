@@ -41,6 +41,7 @@ PROGRAMS = {
     "rest_load": "benchmarks.rest_load of commit ddd0770",
     "soak": "benchmarks.soak of commit ddd0770",
     "scaling": "benchmarks.scaling",
+    "ranks_on_nodes": "tools.ranks_on_nodes",
 }
 """Modules by the name of the recorded file that they make."""
 PAGES = {
@@ -92,7 +93,7 @@ def read_results(results: Path) -> dict[str, dict[str, Any]]:
             result = json.loads(path.read_text(encoding="utf-8"))
         except (OSError, ValueError) as error:
             raise TandemError(f"cannot read {path}: {error}; make it with python -m {program}") from error
-        if not isinstance(result, dict) or result.get("benchmark") != name:
+        if not isinstance(result, dict) or name not in (result.get("benchmark"), result.get("tool")):
             raise TandemError(f"{path} is not what python -m {program} writes; make it anew")
         found[name] = result
     return found
@@ -205,14 +206,15 @@ def scaling_blocks(found: Results, studies: Results) -> Blocks:
     makers = {
         "bottleneck": scaling.limits_block,
         "box": scaling.box_block,
-        "nodes": scaling.nodes_block,
         "model": scaling.model_block,
         "constants": scaling.constants_block,
     }
     blocks = {name: [maker(found["scaling"])] for name, maker in makers.items() if "scaling" in found}
+    if "ranks_on_nodes" in found:
+        blocks["nodes"] = [scaling.nodes_block(found["ranks_on_nodes"])]
     if studies:
         blocks["batches"] = [scaling.batches_block(studies)]
-    if studies and "scaling" in found:
+    if studies and "ranks" in found.get("scaling", {}).get("model", {}):
         blocks["skill"] = [scaling.skill_block(found["scaling"], studies)]
     return blocks
 

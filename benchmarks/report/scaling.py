@@ -6,7 +6,7 @@ import statistics
 from collections.abc import Mapping
 from typing import Any
 
-from benchmarks.report.markdown import commit, millions, percent, table
+from benchmarks.report.markdown import commit, measured_on, millions, percent, table
 from benchmarks.scaling_model import ACTORS, Batch, Cost, Model, Ranks, fastest
 from service.media.figures import counted
 
@@ -18,32 +18,35 @@ NAMED = (16, 256, 4096)
 
 def box_block(result: Result) -> str:
     """One box, and several nodes on it."""
-    rows = [
-        (num, f"{each['num_worlds']}", f"{each['env_steps_per_s']:,.0f}", f"{each['iteration_s']:.2f} s",
-         percent(each["learner_idle_share"]), percent(each["actor_idle_share"]),
-         f"{sum(each['cores'].values()):.2f} of {result['machine']['num_cpus']}")
-        for num, each in result["one_box"].items()
-    ]  # fmt: skip
-    head = ("actors", "worlds of each", "env steps/s", "an iteration", "learner idle", "actors idle", "cores busy")
+    rows = []
+    for num, each in result["one_box"].items():
+        spent = {role: 1e6 * cores / each["env_steps_per_s"] for role, cores in each["cores"].items()}
+        rows.append(
+            (num, f"{each['num_worlds']}", f"{each['env_steps_per_s']:,.0f}", f"{each['iteration_s']:.2f} s",
+             percent(each["learner_idle_share"]), percent(each["actor_idle_share"]),
+             f"{sum(each['cores'].values()):.2f} of {result['machine']['num_cpus']}",
+             f"{sum(spent.values()):.0f} us", f"{spent['actor']:.0f} us", f"{spent['learner']:.0f} us")
+        )  # fmt: skip
+    head = ("actors", "worlds of each", "env steps/s", "an iteration", "learner idle", "actors idle", "cores busy",
+            "CPU time of an env step", "in actors", "in the learner")  # fmt: skip
     where = result["machine"]
     words = f"{where['cpu']}, {where['num_cpus']} cores, {commit(where['git_commit'])}, {where['time'][:10]}."
     return f"{words}\n\n{table(head, rows)}"
 
 
 def nodes_block(result: Result) -> str:
-    """Runs on the test cluster, which were measured once."""
-    if "nodes" not in result:
-        return ""
-    nodes, sizes = result["nodes"], result["nodes"].get("sizes") or _sizes(result)
-    placed = ", ".join(f"{name} on node {place}" for name, place in sorted(nodes["places"].items()))
+    """A run on many nodes that are processes, with ranks that are killed and hang."""
+    settings, strikes = result["settings"], result["strikes"]
+    words = {"kill": "killed", "stop": "stopped, so that it hangs"}
+    rows = [(each["name"], words[each["how"]], f"{each['back_s']:.0f} s") for each in strikes]
+    wrong = result["num_rollouts_handed_over"] - result["num_rollouts_counted"]
     return (
-        f"A head without cores and two nodes beside it: {nodes['env_steps_per_s']:,.0f} env steps/s over "
-        f"{nodes['num_iterations']} iterations, rollout actors on "
-        f"{counted(nodes['num_nodes_with_actors'], 'node')} ({placed}), "
-        f"greatest policy lag {nodes['max_policy_lag']:g}. {nodes['loopback_bytes_per_iteration'] / 1e6:.1f} MB an "
-        f"iteration went over the loopback interface, everything else on it included; its rollouts have "
-        f"{_mb(sizes['rollout'])}, weights {_mb(sizes['weights'])}, the learner's state {_mb(sizes['learner_state'])} "
-        f"and the generator's {_mb(sizes['generator_state'])}."
+        f"{counted(settings['actors'], 'tiny actor')} and a learner of {counted(settings['ranks'], 'rank')} on "
+        f"{counted(settings['nodes'], 'node')} beside a head, {counted(result['num_iterations'], 'update')}:\n\n"
+        f"{table(('process', 'was', 'next update after'), rows)}\n\n"
+        f"Rollouts that actors handed over: {result['num_rollouts_handed_over']:,}; that the learner counted: "
+        f"{result['num_rollouts_counted']:,}; lost or counted twice: {abs(wrong):,}."
+        f"{measured_on(result['machine'])}"
     )
 
 
@@ -62,10 +65,9 @@ def constants_block(result: Result) -> str:
             f"Messages of an update between ranks: {messages['num_messages']}, of {_time(two_s)} between two ranks and "
             f"{_time(four_s)} between four.\n\n"
         )
-    redis = f"Redis takes {assumed['redis_mb_per_s']:g} MB/s, " if "redis_mb_per_s" in assumed else ""
     words = (
         f"Assumed, not measured: a node receives {assumed['network_mb_per_s']:g} MB/s (two Ray nodes on one box do, so "
-        f"a cluster does better), {redis}a node has {assumed['actors_per_node']} actors."
+        f"a cluster does better), a node has {assumed['actors_per_node']} actors."
     )
     return f"{table(head, rows)}\n\n{ranks}{words}"
 
@@ -73,7 +75,7 @@ def constants_block(result: Result) -> str:
 def model_block(result: Result) -> str:
     """Predictions: as many worlds for each actor, and the same worlds shared out."""
     model = result["model"]
-    num, total = model["worlds_each"][0]["num_worlds"], _sizes(result)["num_worlds"]
+    num, total = model["worlds_each"][0]["num_worlds"], model.get("shared_worlds", 240)
     ranks = ", and the learner has as many ranks as keep up with them" if "ranks" in model else ""
     return (
         f"Every actor brings {num} worlds, so that more actors make larger updates{ranks}:\n\n"
@@ -157,18 +159,13 @@ def limits_block(result: Result) -> str:
     )
     playing = rows[NAMED[0]]["seconds"]["actors"]
     words = f"**The first bottleneck is the {first}**: it keeps up with {_actors(most)}"
-    world = _sizes(result)["rollout"] / _sizes(result)["num_worlds"]
+    sizes = result.get("alone", result)["sizes"]  # results from before ranks have no part of that name
+    world = sizes["rollout"] / sizes["num_worlds"]
     held = ", ".join(f"{_mb(num * rows[num]['num_worlds'] * world)} with {num:,}" for num in NAMED)
     return (
         f"{words}, whose rounds take {playing:.2f} s. The rollouts of one update, which the learner holds in memory, "
         f"have {held}. In the order in which parts become one:\n\n{parts}"
     )
-
-
-def _sizes(result: Result) -> Mapping[str, Any]:
-    """Bytes of what travels; results from before ranks have no part ``alone``, and one rank."""
-    sizes: Mapping[str, Any] = result.get("alone", result)["sizes"]
-    return sizes
 
 
 def _actors(num: int | None) -> str:

@@ -53,8 +53,9 @@ def pretrain(
         typer.Option(metavar="auto|HOST:PORT", help="Ray cluster; default: the job's, or a new one on this machine."),
     ] = None,
     num_actors: Annotated[
-        int | None, typer.Option(help="Rollout actors; default: as many as the cluster has cores.", min=1)
+        int | None, typer.Option(help="Rollout actors; default: as many as the cluster has cores for.", min=1)
     ] = None,
+    actor_threads: Annotated[int, typer.Option(help="Cores of each rollout actor.", min=1)] = 1,
     learner_cpus: Annotated[
         float, typer.Option(help="Cores reserved for each rank of the learner; 0: one shares the actors'.", min=0)
     ] = 0.0,
@@ -75,7 +76,7 @@ def pretrain(
         from service.status.token import read_token
 
         where = parse_status(status, read_token(token_file))
-        return ClusterOptions(num_actors=num_actors, learner_cpus=learner_cpus, status=where)
+        return ClusterOptions(num_actors, actor_threads, learner_cpus, where)
 
     if runtime not in ("local", "ray"):
         raise TandemError(f"--runtime {runtime!r}: choose one of local, ray")

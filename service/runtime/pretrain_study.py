@@ -119,15 +119,17 @@ def _share(config: Config, num_runs: int, parallel: int | None, cluster: StudyCl
     """Number of runs at once, and the arguments that tell each where it runs."""
     if cluster is None:
         share = share_machine(len(os.sched_getaffinity(0)), num_runs, parallel)
-        chosen = config.run.num_threads or share.num_cores
+        chosen = config.run.num_threads or share.num_workers
         return share.num_parallel, ["--set", f"run.num_threads={chosen}"]
     options = cluster.options
     learner_cpus = options.rank_cpus(config.learner) * config.learner.num_learners
     share = share_cluster(
-        cluster.num_cores, num_runs, parallel, num_actors=options.num_actors, learner_cpus=learner_cpus
-    )
+        cluster.num_cores, num_runs, parallel,
+        num_actors=options.num_actors, actor_threads=options.actor_threads, learner_cpus=learner_cpus,
+    )  # fmt: skip
     place = ["--runtime", "ray", "--address", cluster.address, "--status", "off"]
-    place += ["--num-actors", str(share.num_cores), "--learner-cpus", str(options.learner_cpus)]
+    place += ["--num-actors", str(share.num_workers), "--actor-threads", str(options.actor_threads)]
+    place += ["--learner-cpus", str(options.learner_cpus)]
     return share.num_parallel, place
 
 

@@ -18,8 +18,8 @@ class Share:
 
     num_parallel: int
     """Runs at once; the others wait for one of them to end."""
-    num_cores: int
-    """Cores of each for playing: threads on one machine, rollout actors on a cluster."""
+    num_workers: int
+    """Workers of each that play: threads on one machine, rollout actors on a cluster."""
 
 
 def parse_seeds(text: str) -> tuple[int, ...]:
@@ -79,6 +79,7 @@ def share_cluster(
     parallel: int | None = None,
     *,
     num_actors: int | None = None,
+    actor_threads: int = 1,
     learner_cpus: float = 0.0,
 ) -> Share:
     """Share a cluster's cores out among runs.
@@ -88,11 +89,12 @@ def share_cluster(
         num_runs: that are to be run, at least 1.
         parallel: how many of them at once; None: as many as have a core for each of their actors.
         num_actors: of each run; None: as many as its cores allow, at least 1.
+        actor_threads: cores of each actor.
         learner_cpus: cores of a run that its learner has for itself.
     """
-    least = (num_actors or 1) + learner_cpus
+    least = (num_actors or 1) * actor_threads + learner_cpus
     num_parallel = min(num_runs, parallel or max(1, int(num_cores // least)))
-    return Share(num_parallel, num_actors or max(1, int(num_cores / num_parallel - learner_cpus)))
+    return Share(num_parallel, num_actors or max(1, int((num_cores / num_parallel - learner_cpus) // actor_threads)))
 
 
 def _listed(seeds: tuple[int, ...] | list[int]) -> str:

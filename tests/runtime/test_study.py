@@ -118,6 +118,8 @@ def test_a_machine_is_shared_out(num_cores, num_runs, parallel, share):
         (3.0, 5, {"learner_cpus": 1.0}, Share(1, 2)),
         (64.0, 4, {"num_actors": 30}, Share(2, 30)),
         (64.0, 4, {"parallel": 2}, Share(2, 32)),
+        (64.0, 4, {"actor_threads": 8, "learner_cpus": 1.0}, Share(4, 1)),
+        (64.0, 4, {"actor_threads": 8, "num_actors": 3}, Share(2, 3)),
     ],
 )
 def test_a_cluster_is_shared_out(num_cores, num_runs, options, share):
@@ -131,7 +133,7 @@ def test_what_a_run_on_a_cluster_is_told(tmp_path):
     arguments = _arguments(tiny_config(), StudyDirectory(tmp_path), 7, place)
     assert " ".join(arguments) == (
         f"pretrain --run-dir {tmp_path}/seed-7 --no-publish --config {tmp_path}/study.yaml --set seed=7 "
-        "--runtime ray --address 10.0.0.1:6379 --status off --num-actors 4 --learner-cpus 0.5"
+        "--runtime ray --address 10.0.0.1:6379 --status off --num-actors 4 --actor-threads 1 --learner-cpus 0.5"
     )
 
 
