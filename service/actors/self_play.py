@@ -34,6 +34,9 @@ class StochasticPolicy(Protocol):
     def act(self, observation: FloatArray, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
         """(N, O) observations to sampled actions (N, A) and log-probabilities (N,)."""
 
+    def act_deterministic(self, observation: FloatArray) -> FloatArray:
+        """(N, O) observations to mean actions (N, A)."""
+
 
 ChooseGoals = Callable[[StateArray, StateArray, IntArray, StateArray, VerdictArray], GoalChoice]
 """Start state, start position, round index, proposal and verdict of a round to Bob's goals (``GeneratorSnapshot``)."""
@@ -79,18 +82,19 @@ class SelfPlay:
         self.incarnation = incarnation
         self._actor, self._sequence = actor, 0
         self._round_index: IntArray = np.zeros(config.game.num_worlds, dtype=np.int64)
-        self.block_grippers(0.0)
+        self.tell_success(0.0)
         self.worlds.reset(rng)
 
     def close(self) -> None:
         """Stop the worlds' threads."""
         self.worlds.close()
 
-    def block_grippers(self, success_rate: float) -> None:
-        """Say how good Bob is over all goal cells: on that depends whether new games may have a blocked gripper."""
+    def tell_success(self, success_rate: float) -> None:
+        """Say how good Bob is over all goal cells: some things begin once he is able."""
         game = self.config.game
         may_be = success_rate >= game.blocked_gripper_min_success
         self.worlds.blocked_fraction = game.blocked_gripper_fraction if may_be else 0.0
+        self._noise_free_fraction = game.bob_noise_free_fraction * success_rate
 
     def start_over(self) -> None:
         """End every game: the next round begins new ones."""
@@ -111,7 +115,7 @@ class SelfPlay:
             players: the policies.
             plan: which worlds use a past Alice or Bob.
             choose_goals: called once, between the two turns.
-            observe: records the round, Alice's turn and then Bob's; it changes nothing in the rollout.
+            observe: records Alice's turn and then Bob's, not what he does before; it changes nothing in the rollout.
         """
         game, worlds = self.config.game, self.worlds
         start_state, start_position = worlds.states.copy(), worlds.object_position.copy()
@@ -122,7 +126,8 @@ class SelfPlay:
         choice = choose_goals(start_state, start_position, self._round_index, proposal, verdict)
 
         worlds.restore(choice.start_state)
-        bob, solved, diverged = self._play_bob(players, plan, choice, observe)
+        diverged, num_noise_free = self._act_without_noise(players.bob, plan, choice)
+        bob, solved, diverged = self._play_bob(players, plan, choice, diverged, observe)
         achieved = worlds.object_position.copy()
         played = choice.played & ~diverged  # a turn in which the physics diverged says nothing about either player
         bob.learn[diverged] = False
@@ -152,7 +157,7 @@ class SelfPlay:
             bob=bob,
             demonstrations=self._demonstrations(alice, bob, records, achieved),
             records=records,
-            num_env_steps=int(alice.active.sum() + bob.active.sum()),
+            num_env_steps=int(alice.active.sum() + bob.active.sum()) + num_noise_free,
             metrics=_contact_metrics(contacts),
             diverged=tuple(worlds.diverged),
         )
@@ -189,10 +194,32 @@ class SelfPlay:
         turns.learn[diverged] = False
         return turns, contacts, diverged
 
+    def _act_without_noise(self, bob: StochasticPolicy, plan: RoundPlan, choice: GoalChoice) -> tuple[BoolArray, int]:
+        """Let Bob act before some of his turns; (N,) worlds whose physics diverged, and the number of steps.
+
+        In his turn noise frees him where his mean action would leave him stuck, and the turn ends once the object has
+        stayed on the goal: what comes then he would never see. Without noise he comes to both.
+        """
+        game, worlds = self.config.game, self.worlds
+        diverged, num_steps = np.zeros(worlds.num_worlds, dtype=bool), 0
+        if not self._noise_free_fraction:
+            return diverged, num_steps
+        chosen = self._rng.random(worlds.num_worlds) < self._noise_free_fraction
+        lengths = self._rng.integers(1, game.bob_noise_free_steps + 1, worlds.num_worlds)
+        lengths[~chosen | plan.bob_past | ~choice.played] = 0
+        for step in range(game.bob_noise_free_steps):
+            acting = np.flatnonzero((step < lengths) & ~diverged)
+            if not acting.size:
+                break
+            observation = bob_observation(worlds.positions()[acting], choice.goal[acting])
+            diverged |= worlds.step(bob.act_deterministic(observation), acting)
+            num_steps += acting.size
+        return diverged, num_steps
+
     def _play_bob(
-        self, players: Players, plan: RoundPlan, choice: GoalChoice, observe: Observer | None
+        self, players: Players, plan: RoundPlan, choice: GoalChoice, diverged: BoolArray, observe: Observer | None
     ) -> tuple[Turns, BoolArray, BoolArray]:
-        """Bob's turns; (N,) solved; (N,) worlds whose physics diverged.
+        """Bob's turns; (N,) solved; (N,) worlds whose physics diverged, ``diverged`` among them.
 
         A world's turn ends when its object has been at the goal for ``bob_hold_steps`` steps in a row, or its physics
         diverged. The others go on; ``playing`` holds their indices.
@@ -200,9 +227,9 @@ class SelfPlay:
         game, worlds = self.config.game, self.worlds
         num = worlds.num_worlds
         turns = _empty_turns(game.bob_steps, num, BOB.size, BOB_VALUE.size, learn=choice.played & ~plan.bob_past)
-        solved, diverged = np.zeros(num, dtype=bool), np.zeros(num, dtype=bool)
+        solved, diverged = np.zeros(num, dtype=bool), diverged.copy()
         num_held: IntArray = np.zeros(num, dtype=np.int64)
-        playing = np.flatnonzero(choice.played)
+        playing = np.flatnonzero(choice.played & ~diverged)
         if observe:
             observe(worlds.states)
         for step in range(game.bob_steps):

@@ -86,6 +86,8 @@ def connected(address: str | None, num_cpus: int | None = None) -> Iterator[None
         os.environ |= {"RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN": secrets.token_hex(32)}
     if address is None:
         os.environ.setdefault("RAY_worker_niceness", "0")  # not 15 for all: see ``ray_actors.lower_priority``
+        # No spare worker for every core: ours have environment variables of their own, so none would fit.
+        os.environ.setdefault("RAY_prestart_worker_first_driver", "0")
     import ray
 
     _check_reachable(address)

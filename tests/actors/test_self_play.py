@@ -8,7 +8,7 @@ import pytest
 
 from service.actors.self_play import SelfPlay
 from service.envs.batch import WorldBatch
-from service.generator.opponents import RoundPlan
+from service.generator.opponents import CURRENT, RoundPlan
 from service.generator.snapshot import GoalChoice
 from service.generator.validity import Verdict
 from tests.actors.players import (
@@ -25,6 +25,7 @@ from tests.actors.players import (
     alices_own,
     assert_same_rollout,
     assert_shapes,
+    everyone_current,
     learned_from,
     make_config,
     make_game,
@@ -601,9 +602,67 @@ def test_grippers_are_blocked_once_bob_is_good_enough():
             return int((game.worlds.states[:, game.worlds.layout["gripper_blocked"]] > 0.0).sum())
 
         assert num_blocked() == 0
-        game.block_grippers(0.59)
+        game.tell_success(0.59)
         assert num_blocked() == 0
-        game.block_grippers(0.6)
+        game.tell_success(0.6)
         assert 10 < num_blocked() < 30
-        game.block_grippers(0.5)
+        game.tell_success(0.5)
         assert num_blocked() == 0
+
+
+# --- steps without noise before Bob's turn ---------------------------------------------------------------------------
+
+
+def noise_free_game(*, starts=STARTS, **game):
+    """A game of a Bob who is told that he solves half of all cells' goals."""
+    made = make_game(make_config(len(starts), game={"bob_noise_free_steps": 3} | game), starts)
+    made.tell_success(0.5)
+    return made
+
+
+def test_bob_acts_without_noise_before_some_of_his_turns():
+    """Here his mean action is to go forward, and that with noise to stay: where his turn begins says how often."""
+    rollout = play(noise_free_game(bob_noise_free_fraction=1.0, starts=[IN_FRONT] * 40), Pusher())
+    assert rollout.records.played.all()
+    with WorldBatch(make_config(1).world, 1, num_threads=1) as worlds:
+        worlds.restore(rollout.records.start_state[:1])
+        forward = [worlds.positions()[0]]
+        for _ in range(3):
+            worlds.step(np.float32([[1.0, 0.0, 0.0, 0.0]]))
+            forward.append(worlds.positions()[0])
+    seen = rollout.bob.observation[0, :, :11]
+    num_before = np.array([np.argmax([np.array_equal(row, each) for each in forward]) for row in seen])
+    assert all(np.array_equal(row, forward[num]) for row, num in zip(seen, num_before, strict=True))
+    assert set(num_before.tolist()) == {0, 1, 2, 3}
+    assert 10 < (num_before > 0).sum() < 30  # half of them
+    num_learned = int(rollout.alice.active.sum() + rollout.bob.active.sum())
+    assert rollout.num_env_steps == num_learned + int(num_before.sum())
+    assert (rollout.records.num_bob_steps == rollout.bob.active.sum(axis=0)).all()
+
+
+def test_no_step_without_noise_where_none_is_wanted():
+    plain = play(make_game(make_config(5), STARTS), Pusher())
+    assert_same_rollout(play(noise_free_game(), Pusher()), plain)
+    unable = make_game(make_config(5, game={"bob_noise_free_fraction": 1.0}), STARTS)  # he was never told of success
+    assert_same_rollout(play(unable, Pusher()), plain)
+
+
+def test_no_step_without_noise_of_a_past_bob_or_one_who_does_not_play():
+    game = noise_free_game(bob_noise_free_fraction=1.0)
+    game.tell_success(1.0)
+    plan = replace(everyone_current(5), bob_opponent=np.array([0, CURRENT, CURRENT, CURRENT, CURRENT]))
+    rollout = play(game, Pusher(), plan=plan, past_bob=[Constant()])
+    assert rollout.records.played.tolist() == [True, False, True, False, False]
+    num_learned = int(rollout.alice.active.sum() + rollout.bob.active.sum())
+    assert 1 <= rollout.num_env_steps - num_learned <= 3  # of the one that slid
+
+
+def test_a_world_that_breaks_before_bobs_turn_says_nothing_about_either_player():
+    game = noise_free_game(bob_noise_free_fraction=1.0, starts=[IN_FRONT, IN_FRONT, SLIDES])
+    game.tell_success(1.0)
+    game.worlds._pool = Diverging(game.worlds._pool, call=9, row=1)
+    rollout = play(game, Pusher())
+    assert not learned_from(rollout.alice, [1])
+    assert not learned_from(rollout.bob, [1])
+    assert rollout.records.played.tolist() == [True, False, True]
+    assert not rollout.bob.active[:, 1].any()

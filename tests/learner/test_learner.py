@@ -19,7 +19,7 @@ BOTH_PLAYERS += ("explained_variance", "grad_norm", "policy_steps")
 COMMON = ("num_alice_samples", "num_bob_samples", "num_demonstrations", "cloning_loss", "demonstration_log_ratio")
 COMMON += ("demonstration_log_prob", "bob_std", "primitive_weight_0", "primitive_weight_1", "primitive_share_0")
 COMMON += ("primitive_share_1", "non_finite_steps", "rollbacks", "version")
-COMMON += ("policy_lag", "max_policy_lag")
+COMMON += ("policy_lag", "max_policy_lag", "cloning_weight")
 NAMES = {f"learner/{player}_{name}" for player in ("alice", "bob") for name in BOTH_PLAYERS}
 NAMES |= {f"learner/{name}" for name in COMMON}
 
@@ -363,6 +363,40 @@ def test_the_weight_of_cloning_is_that_of_the_configuration():
         metrics = updated(Learner(make_config(abc={"weight": weight}, bob={"target_kl": 1.0})), 0)
         log_ratios.append(metrics["learner/demonstration_log_ratio"])
     assert log_ratios[1] > 1.5 * log_ratios[0] > 0.0
+
+
+def test_cloning_fades_by_the_share_of_his_turns_that_bob_solves(monkeypatch):
+    fading = {"weight": 0.8, "full_up_to_success": 0.25, "faded_from_success": 0.75}
+    learner = Learner(make_config(abc=fading))
+    bob = make_rollout(learner, 0).bob
+    num = len(bob.learn)
+    real, weights = ppo.update, []
+    monkeypatch.setattr(ppo, "update", lambda *given: weights.append((given[2], given[3].weight)) or real(*given))
+
+    def weight_with(num_solved, *, left=0, past=0):
+        """That many solve it, of them ``left`` leave the goal again; ``past`` more are solved by an earlier Bob."""
+        reward = np.zeros_like(bob.reward)
+        reward[0, : num_solved + past] = 1.0
+        reward[1, :left] = -1.0
+        learn = np.ones(num, dtype=np.bool_)
+        learn[num_solved : num_solved + past] = False
+        weights.clear()
+        active = np.ones_like(bob.active)
+        metrics = updated(learner, learner.version, bob=replace(bob, reward=reward, learn=learn, active=active))
+        demonstrations, weight = weights[1]  # Alice comes first
+        assert weight == metrics["learner/cloning_weight"]
+        assert (demonstrations is None) == (weight == 0.0)
+        return weight
+
+    assert num == 8
+    assert weight_with(2) == 0.8  # a quarter
+    assert weight_with(3) == pytest.approx(0.8 * 3 / 4)  # three eighths: a quarter of the way from 1/4 to 3/4
+    assert weight_with(4) == pytest.approx(0.4)
+    assert weight_with(6) == weight_with(8) == 0.0
+    assert weight_with(5, left=1) == pytest.approx(0.4)
+    assert weight_with(3, past=2) == pytest.approx(0.4)  # 3 of 6
+    nobody = replace(bob, learn=np.zeros(num, dtype=np.bool_))
+    assert updated(learner, learner.version, bob=nobody)["learner/cloning_weight"] == 0.8
 
 
 def test_each_player_is_mirrored_by_itself():

@@ -126,11 +126,11 @@ def test_a_checkpoint_belongs_to_no_topology_and_no_runner(tmp_path):
 
 
 def test_whoever_is_killed_is_replaced(tmp_path):
-    strikes = [["rollout-1"], ["learner"], ["generator"], ["rollout-1", "learner", "generator"]]
+    strikes = [["learner"], ["rollout-1", "generator"], ["rollout-1", "learner", "generator"]]
     killed, since = [], []
 
     def strike(run, metrics):
-        """One after the other, then all at once; six iterations with everybody there end the run."""
+        """Some, others, then all at once; six iterations with everybody there end the run."""
         pids = [pid_of(run, name) for name in ("rollout-0", "rollout-1", "learner", "generator")]
         if None in pids or set(pids) & set(killed):
             return

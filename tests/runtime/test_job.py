@@ -72,9 +72,9 @@ def head():
     ports.append(f"--dashboard-agent-listen-port={agent}")
     command = [RAY, "start", "--head", "--block", "--num-cpus=3", f"--temp-dir={scratch}", *ports]
     # Else Ray kills a job that still saves; it wants whole seconds.
-    environment = os.environ | {"RAY_JOB_STOP_WAIT_TIME_S": f"{PATIENCE_S:.0f}"}
+    settings = {"RAY_JOB_STOP_WAIT_TIME_S": f"{PATIENCE_S:.0f}", "RAY_prestart_worker_first_driver": "0"}
     with (scratch / "head.log").open("wb") as log:
-        process = subprocess.Popen(command, stdout=log, stderr=log, env=environment)
+        process = subprocess.Popen(command, stdout=log, stderr=log, env=os.environ | settings)
         try:
             address = f"http://127.0.0.1:{dashboard}"
             wait_for(lambda: answers(f"{address}/api/gcs_healthz"))

@@ -56,7 +56,7 @@ def assert_nothing_lost(path, run):
 
 def test_a_run_survives_ranks_that_die_and_hang(cluster, tmp_path, monkeypatch):
     monkeypatch.setattr(learner_group, "RANK_ANSWER_S", 8.0)
-    strikes = [(0, signal.SIGKILL), (1, signal.SIGKILL), (1, signal.SIGSTOP)]
+    strikes = [(0, signal.SIGKILL), (1, signal.SIGSTOP)]
     struck, since = [], []
 
     def strike(run, metrics):
@@ -74,13 +74,12 @@ def test_a_run_survives_ranks_that_die_and_hang(cluster, tmp_path, monkeypatch):
 
     run, result = run_cluster(tmp_path, two_ranks(total_env_steps=10**9), on_iteration=strike)
     assert result.reason == "interrupted"
-    assert run._learner.incarnation == 3
+    assert run._learner.incarnation == 2
     everybody = [pid for group, _ in struck for pid in group]
-    assert len(set(everybody)) == 6  # all of a group are ended, whoever it was
-    first, *others = [error for _, error in struck]
+    assert len(set(everybody)) == 4  # all of a group are ended, whoever it was
+    first, second = [error for _, error in struck]
     assert first is None
-    for rank, error in enumerate(others):
-        assert_one_line(error, f"learner: rank {rank} on ", "died")
+    assert_one_line(second, "learner: rank 0 on ", "died")
     assert_one_line(run.health().last_error, "learner: rank 1 on ", "did not answer for 8 s")
     assert [status.name for status in run.health().actors] == ["learner-0", "learner-1", "generator"]
     assert_nothing_lost(tmp_path, run)
