@@ -134,9 +134,10 @@ class GameConfig(FrozenModel):
         0.0,
         ge=0.0,
         le=1.0,
-        description="times his mean success rate over all goal cells: share of Bob's turns before which he acts "
-        "without noise for a while, which is not learned from; 0 in the paper. So he also practises where he would get "
-        "stuck without noise, and to stay with an object that he has brought",
+        description="times his mean success rate over all goal cells: share of Bob's turns on replayed goals before "
+        "which he acts without noise for a while, which is not learned from; 0 in the paper. So he also practises "
+        "where he would get stuck without noise, and to stay with an object he has brought. Such a turn is no part "
+        "of any success rate",
     )
     bob_noise_free_steps: int = Field(30, ge=1, description="most such steps before a turn; each number is as likely")
 

@@ -126,10 +126,11 @@ class SelfPlay:
         choice = choose_goals(start_state, start_position, self._round_index, proposal, verdict)
 
         worlds.restore(choice.start_state)
-        diverged, num_noise_free = self._act_without_noise(players.bob, plan, choice)
+        num_noise_free, diverged = self._act_without_noise(players.bob, plan, choice)
         bob, solved, diverged = self._play_bob(players, plan, choice, diverged, observe)
         achieved = worlds.object_position.copy()
         played = choice.played & ~diverged  # a turn in which the physics diverged says nothing about either player
+        from_start = played & (num_noise_free == 0)
         bob.learn[diverged] = False
         self._reward_alice(alice, verdict, played & ~choice.replayed, solved, choice.novelty)
         records = GoalRecords(
@@ -140,7 +141,7 @@ class SelfPlay:
             verdict=verdict,
             replayed=choice.replayed,
             from_reset=choice.from_reset,
-            played=played,
+            played=from_start,
             solved=solved,
             num_bob_steps=bob.active.sum(axis=0),
             alice_past=plan.alice_past,
@@ -157,7 +158,7 @@ class SelfPlay:
             bob=bob,
             demonstrations=self._demonstrations(alice, bob, records, achieved),
             records=records,
-            num_env_steps=int(alice.active.sum() + bob.active.sum()) + num_noise_free,
+            num_env_steps=int(alice.active.sum() + bob.active.sum()) + int(num_noise_free.sum()),
             metrics=_contact_metrics(contacts),
             diverged=tuple(worlds.diverged),
         )
@@ -194,27 +195,30 @@ class SelfPlay:
         turns.learn[diverged] = False
         return turns, contacts, diverged
 
-    def _act_without_noise(self, bob: StochasticPolicy, plan: RoundPlan, choice: GoalChoice) -> tuple[BoolArray, int]:
-        """Let Bob act before some of his turns; (N,) worlds whose physics diverged, and the number of steps.
+    def _act_without_noise(
+        self, bob: StochasticPolicy, plan: RoundPlan, choice: GoalChoice
+    ) -> tuple[IntArray, BoolArray]:
+        """Let Bob act before some turns on replayed goals; (N,) number of steps, (N,) worlds whose physics diverged.
 
         In his turn noise frees him where his mean action would leave him stuck, and the turn ends once the object has
         stayed on the goal: what comes then he would never see. Without noise he comes to both.
         """
         game, worlds = self.config.game, self.worlds
-        diverged, num_steps = np.zeros(worlds.num_worlds, dtype=bool), 0
+        num_steps: IntArray = np.zeros(worlds.num_worlds, dtype=np.int64)
+        diverged = np.zeros(worlds.num_worlds, dtype=bool)
         if not self._noise_free_fraction:
-            return diverged, num_steps
+            return num_steps, diverged
         chosen = self._rng.random(worlds.num_worlds) < self._noise_free_fraction
         lengths = self._rng.integers(1, game.bob_noise_free_steps + 1, worlds.num_worlds)
-        lengths[~chosen | plan.bob_past | ~choice.played] = 0
+        lengths[~chosen | plan.bob_past | ~choice.played | ~choice.replayed] = 0
         for step in range(game.bob_noise_free_steps):
             acting = np.flatnonzero((step < lengths) & ~diverged)
             if not acting.size:
                 break
             observation = bob_observation(worlds.positions()[acting], choice.goal[acting])
             diverged |= worlds.step(bob.act_deterministic(observation), acting)
-            num_steps += acting.size
-        return diverged, num_steps
+            num_steps[acting] += 1
+        return num_steps, diverged
 
     def _play_bob(
         self, players: Players, plan: RoundPlan, choice: GoalChoice, diverged: BoolArray, observe: Observer | None

@@ -30,7 +30,7 @@ from service.learner.samples import (
 from service.learner.shares import DEMONSTRATIONS, IMITATED, own_demonstrations, share_of, share_out
 from service.learner.weights import MAX_POLICY_LAG, Weights
 from service.policies import networks
-from service.types import Array, Arrays, BoolArray, Metrics
+from service.types import Array, Arrays, Metrics
 
 _LOW_WORD = (1 << 64) - 1
 _BOB_EMA = "steady_bob"
@@ -188,8 +188,9 @@ class Learner:
         rates = np.array([player.optimizer.learning_rate for player in players])
         random = zlib.crc32(_rng_to_array(self._rng).tobytes() + rates.tobytes())
         ids = [number for each in rollouts for number in (*each.id, each.policy_version)]
-        turns = [solved for each in rollouts for solved in _solved(each.bob)]
-        told = self._group.gather(np.array([self.version, random, sum(turns), len(turns), *ids], dtype=np.int64))
+        solved = [each.records.solved[each.records.played & ~each.records.bob_past] for each in rollouts]
+        success = [sum(int(each.sum()) for each in solved), sum(len(each) for each in solved)]
+        told = self._group.gather(np.array([self.version, random, *success, *ids], dtype=np.int64))
         for rank, numbers in enumerate(told):
             if (numbers[:2] != told[0][:2]).any():
                 raise LearnerError(
@@ -271,13 +272,6 @@ class Learner:
         observation, action = (torch.from_numpy(each).to(self._device) for each in (kept.observation, kept.action))
         rows = DemonstrationRows(observation, action, mirrored, share_of(history.sizes(), self._group))
         return rows if rows.num_total and how.weight else None
-
-
-def _solved(turns: Turns) -> BoolArray:
-    """Whether the player was at the goal at the end of his turn, (K,) of the K turns that ``learn``."""
-    played = turns.learn & turns.active.any(axis=0)
-    solved: BoolArray = turns.reward.sum(axis=0)[played] > 0.0
-    return solved
 
 
 def paid_well(turns: Turns, min_reward: float) -> Demonstrations:

@@ -612,18 +612,21 @@ def test_grippers_are_blocked_once_bob_is_good_enough():
 
 # --- steps without noise before Bob's turn ---------------------------------------------------------------------------
 
+FAR = (0.0, -0.1, 0.025)
 
-def noise_free_game(*, starts=STARTS, **game):
-    """A game of a Bob who is told that he solves half of all cells' goals."""
-    made = make_game(make_config(len(starts), game={"bob_noise_free_steps": 3} | game), starts)
-    made.tell_success(0.5)
-    return made
+
+def noise_free_game(num_worlds, success_rate=0.5, **game):
+    """A game of a Bob who is told how good he is, and Bob's goals, all of them replayed."""
+    game = {"bob_noise_free_fraction": 1.0, "bob_noise_free_steps": 3} | game
+    made = make_game(make_config(num_worlds, game=game), [IN_FRONT] * num_worlds)
+    made.tell_success(success_rate)
+    return made, replay_in(range(num_worlds), made.worlds.states[0].copy(), FAR)
 
 
 def test_bob_acts_without_noise_before_some_of_his_turns():
     """Here his mean action is to go forward, and that with noise to stay: where his turn begins says how often."""
-    rollout = play(noise_free_game(bob_noise_free_fraction=1.0, starts=[IN_FRONT] * 40), Pusher())
-    assert rollout.records.played.all()
+    game, replays = noise_free_game(40)
+    rollout = play(game, choose_goals=replays)
     with WorldBatch(make_config(1).world, 1, num_threads=1) as worlds:
         worlds.restore(rollout.records.start_state[:1])
         forward = [worlds.positions()[0]]
@@ -635,34 +638,36 @@ def test_bob_acts_without_noise_before_some_of_his_turns():
     assert all(np.array_equal(row, forward[num]) for row, num in zip(seen, num_before, strict=True))
     assert set(num_before.tolist()) == {0, 1, 2, 3}
     assert 10 < (num_before > 0).sum() < 30  # half of them
+    assert rollout.bob.learn.all()
+    assert (rollout.records.played == (num_before == 0)).all()  # the others say nothing of how good he is
     num_learned = int(rollout.alice.active.sum() + rollout.bob.active.sum())
     assert rollout.num_env_steps == num_learned + int(num_before.sum())
-    assert (rollout.records.num_bob_steps == rollout.bob.active.sum(axis=0)).all()
 
 
-def test_no_step_without_noise_where_none_is_wanted():
-    plain = play(make_game(make_config(5), STARTS), Pusher())
-    assert_same_rollout(play(noise_free_game(), Pusher()), plain)
-    unable = make_game(make_config(5, game={"bob_noise_free_fraction": 1.0}), STARTS)  # he was never told of success
-    assert_same_rollout(play(unable, Pusher()), plain)
+@pytest.mark.parametrize(
+    ("success_rate", "fraction"), [(0.0, 1.0), (1.0, 0.0)], ids=["he is not able", "none is wanted"]
+)
+def test_no_step_without_noise_where(success_rate, fraction):
+    game, replays = noise_free_game(2, success_rate, bob_noise_free_fraction=fraction)
+    plain, _ = noise_free_game(2, 0.0, bob_noise_free_fraction=0.0)
+    assert_same_rollout(play(game, choose_goals=replays), play(plain, choose_goals=replays))
 
 
-def test_no_step_without_noise_of_a_past_bob_or_one_who_does_not_play():
-    game = noise_free_game(bob_noise_free_fraction=1.0)
-    game.tell_success(1.0)
-    plan = replace(everyone_current(5), bob_opponent=np.array([0, CURRENT, CURRENT, CURRENT, CURRENT]))
-    rollout = play(game, Pusher(), plan=plan, past_bob=[Constant()])
-    assert rollout.records.played.tolist() == [True, False, True, False, False]
+def test_no_step_without_noise_of_a_past_bob_or_to_alices_own_goals():
+    game, _ = noise_free_game(4, 1.0)
+    replays = replay_in([0, 1], game.worlds.states[0].copy(), FAR)
+    plan = replace(everyone_current(4), bob_opponent=np.array([0, CURRENT, CURRENT, CURRENT]))
+    rollout = play(game, Pusher(), plan=plan, past_bob=[Constant()], choose_goals=replays)
+    assert rollout.records.played.tolist() == [True, False, True, True]
     num_learned = int(rollout.alice.active.sum() + rollout.bob.active.sum())
-    assert 1 <= rollout.num_env_steps - num_learned <= 3  # of the one that slid
+    assert 1 <= rollout.num_env_steps - num_learned <= 3
+    assert rollout.alice.learn.tolist() == [False, False, True, True]
 
 
-def test_a_world_that_breaks_before_bobs_turn_says_nothing_about_either_player():
-    game = noise_free_game(bob_noise_free_fraction=1.0, starts=[IN_FRONT, IN_FRONT, SLIDES])
-    game.tell_success(1.0)
+def test_a_world_that_breaks_before_bobs_turn_says_nothing():
+    game, replays = noise_free_game(3, 1.0)
     game.worlds._pool = Diverging(game.worlds._pool, call=9, row=1)
-    rollout = play(game, Pusher())
-    assert not learned_from(rollout.alice, [1])
-    assert not learned_from(rollout.bob, [1])
-    assert rollout.records.played.tolist() == [True, False, True]
+    rollout = play(game, choose_goals=replays)
+    assert rollout.bob.learn.tolist() == [True, False, True]
     assert not rollout.bob.active[:, 1].any()
+    assert game.worlds.num_diverged == 1

@@ -366,37 +366,38 @@ def test_the_weight_of_cloning_is_that_of_the_configuration():
 
 
 def test_cloning_fades_by_the_share_of_his_turns_that_bob_solves(monkeypatch):
-    fading = {"weight": 0.8, "full_up_to_success": 0.25, "faded_from_success": 0.75}
+    fading = {"weight": 0.8, "full_up_to_success": 0.25, "faded_from_success": 0.75, "faded_weight": 0.2}
     learner = Learner(make_config(abc=fading))
-    bob = make_rollout(learner, 0).bob
-    num = len(bob.learn)
+    records = make_rollout(learner, 0).records
     real, weights = ppo.update, []
-    monkeypatch.setattr(ppo, "update", lambda *given: weights.append((given[2], given[3].weight)) or real(*given))
+    monkeypatch.setattr(ppo, "update", lambda *given: weights.append(given[3].weight) or real(*given))
 
-    def weight_with(num_solved, *, left=0, past=0):
-        """That many solve it, of them ``left`` leave the goal again; ``past`` more are solved by an earlier Bob."""
-        reward = np.zeros_like(bob.reward)
-        reward[0, : num_solved + past] = 1.0
-        reward[1, :left] = -1.0
-        learn = np.ones(num, dtype=np.bool_)
-        learn[num_solved : num_solved + past] = False
+    def weight_with(*outcomes):
+        """Bob of today or a past one, solved or not; a turn that was not played counts for nothing."""
+        past, solved = (np.array(each, dtype=np.bool_) for each in zip(*outcomes, (0, 1), strict=True))
+        played = np.arange(len(solved)) < len(outcomes)
         weights.clear()
-        active = np.ones_like(bob.active)
-        metrics = updated(learner, learner.version, bob=replace(bob, reward=reward, learn=learn, active=active))
-        demonstrations, weight = weights[1]  # Alice comes first
-        assert weight == metrics["learner/cloning_weight"]
-        assert (demonstrations is None) == (weight == 0.0)
-        return weight
+        metrics = updated(
+            learner, learner.version, records=replace(records, bob_past=past, solved=solved, played=played)
+        )
+        assert weights[1] == metrics["learner/cloning_weight"]  # Alice comes first
+        return weights[1]
 
-    assert num == 8
-    assert weight_with(2) == 0.8  # a quarter
-    assert weight_with(3) == pytest.approx(0.8 * 3 / 4)  # three eighths: a quarter of the way from 1/4 to 3/4
-    assert weight_with(4) == pytest.approx(0.4)
-    assert weight_with(6) == weight_with(8) == 0.0
-    assert weight_with(5, left=1) == pytest.approx(0.4)
-    assert weight_with(3, past=2) == pytest.approx(0.4)  # 3 of 6
-    nobody = replace(bob, learn=np.zeros(num, dtype=np.bool_))
-    assert updated(learner, learner.version, bob=nobody)["learner/cloning_weight"] == 0.8
+    yes, no, past = (0, 1), (0, 0), (1, 1)
+    assert weight_with(yes, no, no, no) == 0.8
+    assert weight_with(yes, yes, yes, *[no] * 5) == pytest.approx(0.65)  # 3/8: a quarter of the way from 1/4 to 3/4
+    assert weight_with(yes, no) == pytest.approx(0.5)
+    assert weight_with(yes, no, past, past) == pytest.approx(0.5)
+    assert weight_with(yes, yes, yes, no) == weight_with(yes) == 0.2
+    assert weight_with(past) == 0.8  # nothing is known of him
+
+
+def test_clones_that_faded_away_take_no_part():
+    fading = {"full_up_to_success": 0.0, "faded_from_success": 0.0}
+    metrics = updated(Learner(make_config(abc=fading)), 0)
+    assert metrics["learner/cloning_weight"] == 0.0
+    assert metrics["learner/num_demonstrations"] == 12.0
+    assert "learner/cloning_loss" not in metrics
 
 
 def test_each_player_is_mirrored_by_itself():
