@@ -232,8 +232,8 @@ def _make_rollout(config: Config, actor: int, sequence: int, num_worlds: int) ->
     )
 
 
-_NO_RECORDS: dict[str, Any] = {name: np.zeros(0, dtype=np.bool_) for name in GoalRecords.__dataclass_fields__}
-"""Of no world: the learner reads only how many turns Bob solved."""
+_NO_RECORDS: dict[str, Any] = {name: np.zeros(0) for name in GoalRecords.__dataclass_fields__}
+"""The learner never reads them."""
 
 
 def _make_turns(rng: np.random.Generator, num_steps: int, num_worlds: int, observation: int, value: int) -> Turns:

@@ -288,43 +288,13 @@ class SelfImitationConfig(CloningConfig):
 
 
 class ABCConfig(CloningConfig):
-    """Alice behavioural cloning (OpenAI 2021): PPO-clipped cloning of Alice's turns whose goal Bob failed.
+    """Alice behavioural cloning (OpenAI 2021): PPO-clipped cloning of Alice's turns whose goal Bob failed."""
 
-    It may fade as Bob becomes able, as in DAPG (Rajeswaran et al. 2018), but by his success instead of time: at first
-    he learns from nothing else, later her way of doing it and her noise hold him back.
-    """
-
-    full_up_to_success: float = Field(
-        1.0, ge=0.0, le=1.0, description="share of his turns that Bob solves up to which cloning has its full weight"
-    )
-    faded_from_success: float = Field(
-        1.0, ge=0.0, le=1.0, description="share from which it has ``faded_weight``; in between it changes linearly"
-    )
-    faded_weight: float = Field(0.0, ge=0.0, description="weight once Bob is able, if less than ``weight``")
     hindsight: bool = Field(
         False,
         description="also clone steps of Bob's failed turns, relabelled with where the object ended (Ghosh et al. "
         "2021); no more than there are of Alice's",
     )
-
-    @model_validator(mode="after")
-    def _ordered(self) -> Self:
-        if self.full_up_to_success > self.faded_from_success:
-            raise ValueError(
-                f"full_up_to_success {self.full_up_to_success} must not be above faded_from_success "
-                f"{self.faded_from_success}: cloning fades from the first to the second"
-            )
-        return self
-
-    def weight_at(self, success: float) -> float:
-        """The weight when Bob solves this share of his turns."""
-        if success <= self.full_up_to_success:
-            return self.weight
-        faded_weight = min(self.faded_weight, self.weight)
-        if success >= self.faded_from_success:
-            return faded_weight
-        faded = (success - self.full_up_to_success) / (self.faded_from_success - self.full_up_to_success)
-        return self.weight + faded * (faded_weight - self.weight)
 
 
 class LearnerConfig(FrozenModel):

@@ -153,7 +153,6 @@ def test_unknown_key_lists_the_known_ones(override, key, known):
         ("policy.alice.hidden_sizes=[64,0]", "policy.alice.hidden_sizes.1", "0"),
         ("policy.bob.log_std_min=0.5", "policy.bob", "0.5"),
         ("policy.alice_log_std_min=0.5", "policy", "0.5"),
-        ("learner.abc.faded_from_success=0.5", "learner.abc", "full_up_to_success 1.0"),
         ("game=3", "game", "3"),
     ],
 )

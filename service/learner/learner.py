@@ -103,11 +103,11 @@ class Learner:
             GroupError: another rank does not answer; this learner cannot go on.
         """
         rollouts = [self._pending[key] for key in sorted(self._pending)]
-        everyones, bob_success = self._meet(rollouts)
+        everyones = self._meet(rollouts)
         if not len(everyones):
             raise LearnerError("learner update with 0 rollouts: ingest at least one first")
         metrics = self._update_alice(rollouts)
-        for name, value in self._update_bob(rollouts, bob_success).items():
+        for name, value in self._update_bob(rollouts).items():
             metrics[name] = metrics.get(name, 0.0) + value  # only counts of failures are both players'
         self._counted |= {(actor, incarnation): sequence for actor, incarnation, sequence, _ in sorted(everyones)}
         self._pending.clear()
@@ -174,23 +174,20 @@ class Learner:
             self._histories[name].load_state(own_demonstrations(history, self._group.rank, self._group.size))
         self._pending.clear()
 
-    def _meet(self, rollouts: Sequence[Rollout]) -> tuple[list[tuple[int, ...]], float]:
+    def _meet(self, rollouts: Sequence[Rollout]) -> list[tuple[int, ...]]:
         """Tell the other ranks what this one learns from, and go on from exactly the same parameters.
 
         Ranks on processors of different kinds round differently; taking over what rank 0 has keeps them from drifting
         apart, and costs no more than one gradient step.
 
         Returns:
-            (actor, incarnation, sequence, policy version) of the rollouts of all ranks, and the share of today's Bob's
-            turns in them that he solved; 0 if there are none.
+            (actor, incarnation, sequence, policy version) of the rollouts of all ranks.
         """
         players = self._alice, self._bob
         rates = np.array([player.optimizer.learning_rate for player in players])
         random = zlib.crc32(_rng_to_array(self._rng).tobytes() + rates.tobytes())
         ids = [number for each in rollouts for number in (*each.id, each.policy_version)]
-        solved = [each.records.solved[each.records.played & ~each.records.bob_past] for each in rollouts]
-        success = [sum(int(each.sum()) for each in solved), sum(len(each) for each in solved)]
-        told = self._group.gather(np.array([self.version, random, *success, *ids], dtype=np.int64))
+        told = self._group.gather(np.array([self.version, random, *ids], dtype=np.int64))
         for rank, numbers in enumerate(told):
             if (numbers[:2] != told[0][:2]).any():
                 raise LearnerError(
@@ -198,9 +195,7 @@ class Learner:
                     f"{numbers[1]:08x}, rank 0 at {told[0][0]} with {told[0][1]:08x}: start all ranks from one state"
                 )
         self._group.copy_first([tensor for player in players for tensor in player.tensors().values()])
-        num_solved, num_turns = np.sum([numbers[2:4] for numbers in told], axis=0).tolist()
-        everyones = [tuple(each) for numbers in told for each in numbers[4:].reshape(-1, 4).tolist()]
-        return everyones, num_solved / max(num_turns, 1)
+        return [tuple(each) for numbers in told for each in numbers[2:].reshape(-1, 4).tolist()]
 
     def _average_bob(self) -> None:
         """Move the average towards the new version.
@@ -242,7 +237,7 @@ class Learner:
         metrics = ppo.update(self._alice, samples, imitated, how, self._rng, self._group)
         return _prefixed("alice", metrics) | counted
 
-    def _update_bob(self, rollouts: Sequence[Rollout], success: float) -> Metrics:
+    def _update_bob(self, rollouts: Sequence[Rollout]) -> Metrics:
         config, bob, group = self.config.learner, self._bob, self._group
         self._window.append([rollout.bob for rollout in rollouts])
         samples = ppo.collect(self._window, _NO_BOB, bob, group)
@@ -251,11 +246,7 @@ class Learner:
             samples = mirror(samples, BOBS, bob, self._rng)
         demonstrations = self._to_clone(DEMONSTRATIONS, [each.demonstrations for each in rollouts])
         metrics["num_demonstrations"] = float(_num(demonstrations) // (1 + config.bob.mirrors))
-        how = config.abc.model_copy(update={"weight": config.abc.weight_at(success)})
-        metrics["cloning_weight"] = how.weight
-        if not how.weight:
-            demonstrations = None
-        metrics |= _prefixed("bob", ppo.update(bob, samples, demonstrations, how, self._rng, group))
+        metrics |= _prefixed("bob", ppo.update(bob, samples, demonstrations, config.abc, self._rng, group))
         rows = samples if samples is not None else demonstrations
         if rows is not None and isinstance(self._bob_policy, networks.MCPPolicy):
             probed = probes(rows)

@@ -15,7 +15,6 @@ from service.envs.observations import ACTION, BOB, BOB_VALUE, FULL
 from service.generator.records import GoalRecords
 from service.learner.learner import Learner
 from service.learner.player import Player
-from service.types import BoolArray
 
 DEVICE = torch.device(os.environ.get("TANDEM_TEST_DEVICE", "cpu"))
 """The device that learners of these tests learn on."""
@@ -71,7 +70,7 @@ def make_rollout(learner: Learner, sequence: int, *, seed: int = 0, num_demonstr
         alice=acted_by(learner._alice, alice),
         bob=acted_by(learner._bob, bob),
         demonstrations=make_demonstrations(rng, num_demonstrations),
-        records=_records(solved=bob.terminated.any(axis=0)),
+        records=_NO_RECORDS,
         num_env_steps=0,
         metrics={},
     )
@@ -98,7 +97,6 @@ def _normal(rng: np.random.Generator, scale: float, *shape: int) -> np.ndarray:
     return (scale * rng.standard_normal(shape)).astype(np.float32)
 
 
-def _records(solved: BoolArray) -> GoalRecords:
-    """The learner reads nothing else of them."""
-    read = {"solved": solved, "played": np.ones_like(solved), "bob_past": np.zeros_like(solved)}
-    return GoalRecords(**{name: np.zeros(0) for name in GoalRecords.__dataclass_fields__} | read)
+_NO_RECORDS = GoalRecords(
+    **{name: np.zeros(0) for name in GoalRecords.__dataclass_fields__}  # the learner never reads them
+)

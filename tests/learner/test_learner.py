@@ -19,7 +19,7 @@ BOTH_PLAYERS += ("explained_variance", "grad_norm", "policy_steps")
 COMMON = ("num_alice_samples", "num_bob_samples", "num_demonstrations", "cloning_loss", "demonstration_log_ratio")
 COMMON += ("demonstration_log_prob", "bob_std", "primitive_weight_0", "primitive_weight_1", "primitive_share_0")
 COMMON += ("primitive_share_1", "non_finite_steps", "rollbacks", "version")
-COMMON += ("policy_lag", "max_policy_lag", "cloning_weight")
+COMMON += ("policy_lag", "max_policy_lag")
 NAMES = {f"learner/{player}_{name}" for player in ("alice", "bob") for name in BOTH_PLAYERS}
 NAMES |= {f"learner/{name}" for name in COMMON}
 
@@ -363,41 +363,6 @@ def test_the_weight_of_cloning_is_that_of_the_configuration():
         metrics = updated(Learner(make_config(abc={"weight": weight}, bob={"target_kl": 1.0})), 0)
         log_ratios.append(metrics["learner/demonstration_log_ratio"])
     assert log_ratios[1] > 1.5 * log_ratios[0] > 0.0
-
-
-def test_cloning_fades_by_the_share_of_his_turns_that_bob_solves(monkeypatch):
-    fading = {"weight": 0.8, "full_up_to_success": 0.25, "faded_from_success": 0.75, "faded_weight": 0.2}
-    learner = Learner(make_config(abc=fading))
-    records = make_rollout(learner, 0).records
-    real, weights = ppo.update, []
-    monkeypatch.setattr(ppo, "update", lambda *given: weights.append(given[3].weight) or real(*given))
-
-    def weight_with(*outcomes):
-        """Bob of today or a past one, solved or not; a turn that was not played counts for nothing."""
-        past, solved = (np.array(each, dtype=np.bool_) for each in zip(*outcomes, (0, 1), strict=True))
-        played = np.arange(len(solved)) < len(outcomes)
-        weights.clear()
-        metrics = updated(
-            learner, learner.version, records=replace(records, bob_past=past, solved=solved, played=played)
-        )
-        assert weights[1] == metrics["learner/cloning_weight"]  # Alice comes first
-        return weights[1]
-
-    yes, no, past = (0, 1), (0, 0), (1, 1)
-    assert weight_with(yes, no, no, no) == 0.8
-    assert weight_with(yes, yes, yes, *[no] * 5) == pytest.approx(0.65)  # 3/8: a quarter of the way from 1/4 to 3/4
-    assert weight_with(yes, no) == pytest.approx(0.5)
-    assert weight_with(yes, no, past, past) == pytest.approx(0.5)
-    assert weight_with(yes, yes, yes, no) == weight_with(yes) == 0.2
-    assert weight_with(past) == 0.8  # nothing is known of him
-
-
-def test_clones_that_faded_away_take_no_part():
-    fading = {"full_up_to_success": 0.0, "faded_from_success": 0.0}
-    metrics = updated(Learner(make_config(abc=fading)), 0)
-    assert metrics["learner/cloning_weight"] == 0.0
-    assert metrics["learner/num_demonstrations"] == 12.0
-    assert "learner/cloning_loss" not in metrics
 
 
 def test_each_player_is_mirrored_by_itself():

@@ -20,7 +20,7 @@ EVERYTHING = {
     "bob": {"mirror": "both"},
     "bob_window": 3,
     "bob_ema_decay": 0.5,
-    "abc": {"num_iterations": 3, "mean_only": True, "full_up_to_success": 0.0, "faded_from_success": 0.9},
+    "abc": {"num_iterations": 3, "mean_only": True},
     "self_imitation": {"weight": 0.5, "num_iterations": 2, "min_reward": 0.5},
 }
 NO_DEMONSTRATIONS = make_demonstrations(np.random.default_rng(0), 0)

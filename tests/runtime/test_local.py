@@ -49,7 +49,7 @@ METRICS = {
     "bob/success_rate_from_reset", "bob/success_rate_replayed", "bob/steps_to_success",
     # ABC samples and their mean log-ratio
     "learner/num_demonstrations", "learner/demonstration_log_ratio", "learner/demonstration_log_prob",
-    "learner/cloning_loss", "learner/cloning_weight", "learner/num_imitated", "learner/alice_cloning_loss",
+    "learner/cloning_loss", "learner/num_imitated", "learner/alice_cloning_loss",
     "learner/alice_demonstration_log_ratio", "learner/alice_demonstration_log_prob",
     # entropy and KL of each update
     "learner/alice_entropy", "learner/bob_entropy", "learner/alice_kl", "learner/bob_kl",
