@@ -101,15 +101,21 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--json", type=Path, required=True, metavar="FILE", help="results; seeds it has are not run")
     given = parser.parse_args(arguments)
     try:
-        num_worlds = load_config(given.config, given.set).game.num_worlds
-        settings = {"config": given.config.name, "set": given.set, "num_worlds": num_worlds, "share": given.share}
+        config = load_config(given.config, given.set)
+        settings = {
+            "config": given.config.name,
+            "set": given.set,
+            "num_worlds": config.game.num_worlds,
+            "share": given.share,
+            "recipe": config.model_dump(mode="json"),
+        }
         result: dict[str, Any] = {"benchmark": "time_to_skill", "settings": settings, "runs": []}
         if given.json.exists():
             result = json.loads(given.json.read_text(encoding="utf-8"))
             if result["settings"] != settings:
-                raise TandemError(
-                    f"{given.json}: measured with {result['settings']}, not {settings}; name another file"
-                )
+                before = result["settings"]
+                named = ", ".join(key for key, value in settings.items() if before.get(key) != value)
+                raise TandemError(f"{given.json}: its seeds had something else as {named}; name another file")
         done = {run["seed"] for run in result["runs"]}
         for seed in parse_seeds(given.seeds):
             if seed not in done:

@@ -213,7 +213,10 @@ def test_time_to_skill_stops_a_seed_that_is_there_and_skips_it_later(tmp_path, c
     assert "Median: " in capsys.readouterr().out
     assert time_to_skill.main([*command, "--seeds", "3"]) == 0  # at once
     assert time_to_skill.main([*command[:-1], "0.5", "--seeds", "3"]) == 2
-    assert "name another file" in capsys.readouterr().err
+    assert "something else as share; name another file" in capsys.readouterr().err
+    (tmp_path / "tiny.yaml").write_text(dump_config(load_config(None, [*TINY, *evaluated, "game.bob_steps=3"])))
+    assert time_to_skill.main([*command, "--seeds", "4"]) == 2  # the file has the same name, and says something else
+    assert "something else as recipe; name another file" in capsys.readouterr().err
 
 
 def test_the_contact_solver_is_compared_on_recorded_states(config, tmp_path):
