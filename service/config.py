@@ -130,16 +130,6 @@ class GameConfig(FrozenModel):
         description="Bob's turn ends once the object was on the goal for so many steps in a row; 1: the moment it is "
         "solved (paper). More teach him to stay: the goals of evaluation and downstream count at the last step",
     )
-    bob_noise_free_fraction: float = Field(
-        0.0,
-        ge=0.0,
-        le=1.0,
-        description="times his mean success rate over all goal cells: share of Bob's turns on replayed goals before "
-        "which he acts without noise for a while, which is not learned from; 0 in the paper. So he also practises "
-        "where he would get stuck without noise, and to stay with an object he has brought. Such a turn is no part "
-        "of any success rate",
-    )
-    bob_noise_free_steps: int = Field(30, ge=1, description="most such steps before a turn; each number is as likely")
 
     @model_validator(mode="after")
     def _ordered(self) -> Self:

@@ -34,9 +34,6 @@ class StochasticPolicy(Protocol):
     def act(self, observation: FloatArray, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
         """(N, O) observations to sampled actions (N, A) and log-probabilities (N,)."""
 
-    def act_deterministic(self, observation: FloatArray) -> FloatArray:
-        """(N, O) observations to mean actions (N, A)."""
-
 
 ChooseGoals = Callable[[StateArray, StateArray, IntArray, StateArray, VerdictArray], GoalChoice]
 """Start state, start position, round index, proposal and verdict of a round to Bob's goals (``GeneratorSnapshot``)."""
@@ -82,19 +79,18 @@ class SelfPlay:
         self.incarnation = incarnation
         self._actor, self._sequence = actor, 0
         self._round_index: IntArray = np.zeros(config.game.num_worlds, dtype=np.int64)
-        self.tell_success(0.0)
+        self.block_grippers(0.0)
         self.worlds.reset(rng)
 
     def close(self) -> None:
         """Stop the worlds' threads."""
         self.worlds.close()
 
-    def tell_success(self, success_rate: float) -> None:
-        """Say how good Bob is over all goal cells: some things begin once he is able."""
+    def block_grippers(self, success_rate: float) -> None:
+        """Say how good Bob is over all goal cells: on that depends whether new games may have a blocked gripper."""
         game = self.config.game
         may_be = success_rate >= game.blocked_gripper_min_success
         self.worlds.blocked_fraction = game.blocked_gripper_fraction if may_be else 0.0
-        self._noise_free_fraction = game.bob_noise_free_fraction * success_rate
 
     def start_over(self) -> None:
         """End every game: the next round begins new ones."""
@@ -115,7 +111,7 @@ class SelfPlay:
             players: the policies.
             plan: which worlds use a past Alice or Bob.
             choose_goals: called once, between the two turns.
-            observe: records Alice's turn and then Bob's, not what he does before; it changes nothing in the rollout.
+            observe: records the round, Alice's turn and then Bob's; it changes nothing in the rollout.
         """
         game, worlds = self.config.game, self.worlds
         start_state, start_position = worlds.states.copy(), worlds.object_position.copy()
@@ -126,11 +122,9 @@ class SelfPlay:
         choice = choose_goals(start_state, start_position, self._round_index, proposal, verdict)
 
         worlds.restore(choice.start_state)
-        num_noise_free, diverged = self._act_without_noise(players.bob, plan, choice)
-        bob, solved, diverged = self._play_bob(players, plan, choice, diverged, observe)
+        bob, solved, diverged = self._play_bob(players, plan, choice, observe)
         achieved = worlds.object_position.copy()
         played = choice.played & ~diverged  # a turn in which the physics diverged says nothing about either player
-        from_start = played & (num_noise_free == 0)
         bob.learn[diverged] = False
         self._reward_alice(alice, verdict, played & ~choice.replayed, solved, choice.novelty)
         records = GoalRecords(
@@ -141,7 +135,7 @@ class SelfPlay:
             verdict=verdict,
             replayed=choice.replayed,
             from_reset=choice.from_reset,
-            played=from_start,
+            played=played,
             solved=solved,
             num_bob_steps=bob.active.sum(axis=0),
             alice_past=plan.alice_past,
@@ -158,7 +152,7 @@ class SelfPlay:
             bob=bob,
             demonstrations=self._demonstrations(alice, bob, records, achieved),
             records=records,
-            num_env_steps=int(alice.active.sum() + bob.active.sum()) + int(num_noise_free.sum()),
+            num_env_steps=int(alice.active.sum() + bob.active.sum()),
             metrics=_contact_metrics(contacts),
             diverged=tuple(worlds.diverged),
         )
@@ -195,35 +189,10 @@ class SelfPlay:
         turns.learn[diverged] = False
         return turns, contacts, diverged
 
-    def _act_without_noise(
-        self, bob: StochasticPolicy, plan: RoundPlan, choice: GoalChoice
-    ) -> tuple[IntArray, BoolArray]:
-        """Let Bob act before some turns on replayed goals; (N,) number of steps, (N,) worlds whose physics diverged.
-
-        In his turn noise frees him where his mean action would leave him stuck, and the turn ends once the object has
-        stayed on the goal: what comes then he would never see. Without noise he comes to both.
-        """
-        game, worlds = self.config.game, self.worlds
-        num_steps: IntArray = np.zeros(worlds.num_worlds, dtype=np.int64)
-        diverged = np.zeros(worlds.num_worlds, dtype=bool)
-        if not self._noise_free_fraction:
-            return num_steps, diverged
-        chosen = self._rng.random(worlds.num_worlds) < self._noise_free_fraction
-        lengths = self._rng.integers(1, game.bob_noise_free_steps + 1, worlds.num_worlds)
-        lengths[~chosen | plan.bob_past | ~choice.played | ~choice.replayed] = 0
-        for step in range(game.bob_noise_free_steps):
-            acting = np.flatnonzero((step < lengths) & ~diverged)
-            if not acting.size:
-                break
-            observation = bob_observation(worlds.positions()[acting], choice.goal[acting])
-            diverged |= worlds.step(bob.act_deterministic(observation), acting)
-            num_steps[acting] += 1
-        return num_steps, diverged
-
     def _play_bob(
-        self, players: Players, plan: RoundPlan, choice: GoalChoice, diverged: BoolArray, observe: Observer | None
+        self, players: Players, plan: RoundPlan, choice: GoalChoice, observe: Observer | None
     ) -> tuple[Turns, BoolArray, BoolArray]:
-        """Bob's turns; (N,) solved; (N,) worlds whose physics diverged, ``diverged`` among them.
+        """Bob's turns; (N,) solved; (N,) worlds whose physics diverged.
 
         A world's turn ends when its object has been at the goal for ``bob_hold_steps`` steps in a row, or its physics
         diverged. The others go on; ``playing`` holds their indices.
@@ -231,9 +200,9 @@ class SelfPlay:
         game, worlds = self.config.game, self.worlds
         num = worlds.num_worlds
         turns = _empty_turns(game.bob_steps, num, BOB.size, BOB_VALUE.size, learn=choice.played & ~plan.bob_past)
-        solved, diverged = np.zeros(num, dtype=bool), diverged.copy()
+        solved, diverged = np.zeros(num, dtype=bool), np.zeros(num, dtype=bool)
         num_held: IntArray = np.zeros(num, dtype=np.int64)
-        playing = np.flatnonzero(choice.played & ~diverged)
+        playing = np.flatnonzero(choice.played)
         if observe:
             observe(worlds.states)
         for step in range(game.bob_steps):

@@ -40,7 +40,7 @@ class GoalRecords:
     from_reset: BoolArray
     """(N,) Bob started where a game does, as he does whenever he is evaluated."""
     played: BoolArray
-    """(N,) Bob had a whole turn: there was a goal, the physics held, and he had not acted before without noise."""
+    """(N,) Bob had a whole turn: there was a goal, and the physics held."""
     solved: BoolArray
     """(N,) Bob came within the success distance."""
     num_bob_steps: IntArray

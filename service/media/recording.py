@@ -73,14 +73,13 @@ def record_rounds(
         ``num_rounds`` rounds, the most interesting first.
     """
     rng = np.random.default_rng(seed)
-    changed = {"num_worlds": max(_NUM_WORLDS, num_rounds), "bob_noise_free_fraction": 0.0}
-    game = config.game.model_copy(update=changed)
+    game = config.game.model_copy(update={"num_worlds": max(_NUM_WORLDS, num_rounds)})
     config = config.model_copy(update={"game": game})
     players = Players(version=0, alice=alice, bob=_WithoutNoise(bob))
     rounds: list[tuple[_Interest, RecordedRound]] = []
     with contextlib.closing(SelfPlay(config, rng, num_threads=config.run.num_threads)) as self_play:
         if config.game.blocked_gripper_min_success > 0.0:  # by now he has come to it
-            self_play.tell_success(1.0)
+            self_play.block_grippers(1.0)
             self_play.start_over()
         # It was never told of a goal, so it replays none: Bob plays those of this round's Alice.
         snapshot = TaskGenerator(config, self_play.worlds.layout).snapshot()
@@ -132,10 +131,7 @@ class _WithoutNoise:
         self._policy = policy
 
     def act(self, observation: FloatArray, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
-        return self.act_deterministic(observation), np.zeros(len(observation), dtype=np.float32)
-
-    def act_deterministic(self, observation: FloatArray) -> FloatArray:
-        return self._policy.act_deterministic(observation)
+        return self._policy.act_deterministic(observation), np.zeros(len(observation), dtype=np.float32)
 
 
 def _record(

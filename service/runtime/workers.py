@@ -116,7 +116,7 @@ class RolloutWorker:
         """
         start = time.perf_counter()
         config = self._config.generator
-        self.game.tell_success(float(snapshot.success_rate))
+        self.game.block_grippers(float(snapshot.success_rate))
         starts = self.game.game_starts()
         plan = opponents.plan(self.game.worlds.num_worlds, config.past_opponent_fraction, self.rng)
         choose_goals = partial(snapshot.choose_goals, plan, rng=self.rng)

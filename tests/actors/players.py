@@ -27,9 +27,6 @@ class Constant:
         num = len(observation)
         return np.tile(self.action, (num, 1)), np.full(num, self.mark, dtype=np.float32)
 
-    def act_deterministic(self, observation):
-        return np.tile(np.float32([1.0, 0.0, 0.0, 0.0]), (len(observation), 1))
-
 
 class Pusher(Constant):
     """Closes the fingers, goes down to the table behind the object and pushes it 7 cm forward."""

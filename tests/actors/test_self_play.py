@@ -8,7 +8,7 @@ import pytest
 
 from service.actors.self_play import SelfPlay
 from service.envs.batch import WorldBatch
-from service.generator.opponents import CURRENT, RoundPlan
+from service.generator.opponents import RoundPlan
 from service.generator.snapshot import GoalChoice
 from service.generator.validity import Verdict
 from tests.actors.players import (
@@ -25,7 +25,6 @@ from tests.actors.players import (
     alices_own,
     assert_same_rollout,
     assert_shapes,
-    everyone_current,
     learned_from,
     make_config,
     make_game,
@@ -602,72 +601,9 @@ def test_grippers_are_blocked_once_bob_is_good_enough():
             return int((game.worlds.states[:, game.worlds.layout["gripper_blocked"]] > 0.0).sum())
 
         assert num_blocked() == 0
-        game.tell_success(0.59)
+        game.block_grippers(0.59)
         assert num_blocked() == 0
-        game.tell_success(0.6)
+        game.block_grippers(0.6)
         assert 10 < num_blocked() < 30
-        game.tell_success(0.5)
+        game.block_grippers(0.5)
         assert num_blocked() == 0
-
-
-# --- steps without noise before Bob's turn ---------------------------------------------------------------------------
-
-FAR = (0.0, -0.1, 0.025)
-
-
-def noise_free_game(num_worlds, success_rate=0.5, **game):
-    """A game of a Bob who is told how good he is, and Bob's goals, all of them replayed."""
-    game = {"bob_noise_free_fraction": 1.0, "bob_noise_free_steps": 3} | game
-    made = make_game(make_config(num_worlds, game=game), [IN_FRONT] * num_worlds)
-    made.tell_success(success_rate)
-    return made, replay_in(range(num_worlds), made.worlds.states[0].copy(), FAR)
-
-
-def test_bob_acts_without_noise_before_some_of_his_turns():
-    """Here his mean action is to go forward, and that with noise to stay: where his turn begins says how often."""
-    game, replays = noise_free_game(40)
-    rollout = play(game, choose_goals=replays)
-    with WorldBatch(make_config(1).world, 1, num_threads=1) as worlds:
-        worlds.restore(rollout.records.start_state[:1])
-        forward = [worlds.positions()[0]]
-        for _ in range(3):
-            worlds.step(np.float32([[1.0, 0.0, 0.0, 0.0]]))
-            forward.append(worlds.positions()[0])
-    seen = rollout.bob.observation[0, :, :11]
-    num_before = np.array([np.argmax([np.array_equal(row, each) for each in forward]) for row in seen])
-    assert all(np.array_equal(row, forward[num]) for row, num in zip(seen, num_before, strict=True))
-    assert set(num_before.tolist()) == {0, 1, 2, 3}
-    assert 10 < (num_before > 0).sum() < 30  # half of them
-    assert rollout.bob.learn.all()
-    assert (rollout.records.played == (num_before == 0)).all()  # the others say nothing of how good he is
-    num_learned = int(rollout.alice.active.sum() + rollout.bob.active.sum())
-    assert rollout.num_env_steps == num_learned + int(num_before.sum())
-
-
-@pytest.mark.parametrize(
-    ("success_rate", "fraction"), [(0.0, 1.0), (1.0, 0.0)], ids=["he is not able", "none is wanted"]
-)
-def test_no_step_without_noise_where(success_rate, fraction):
-    game, replays = noise_free_game(2, success_rate, bob_noise_free_fraction=fraction)
-    plain, _ = noise_free_game(2, 0.0, bob_noise_free_fraction=0.0)
-    assert_same_rollout(play(game, choose_goals=replays), play(plain, choose_goals=replays))
-
-
-def test_no_step_without_noise_of_a_past_bob_or_to_alices_own_goals():
-    game, _ = noise_free_game(4, 1.0)
-    replays = replay_in([0, 1], game.worlds.states[0].copy(), FAR)
-    plan = replace(everyone_current(4), bob_opponent=np.array([0, CURRENT, CURRENT, CURRENT]))
-    rollout = play(game, Pusher(), plan=plan, past_bob=[Constant()], choose_goals=replays)
-    assert rollout.records.played.tolist() == [True, False, True, True]
-    num_learned = int(rollout.alice.active.sum() + rollout.bob.active.sum())
-    assert 1 <= rollout.num_env_steps - num_learned <= 3
-    assert rollout.alice.learn.tolist() == [False, False, True, True]
-
-
-def test_a_world_that_breaks_before_bobs_turn_says_nothing():
-    game, replays = noise_free_game(3, 1.0)
-    game.worlds._pool = Diverging(game.worlds._pool, call=9, row=1)
-    rollout = play(game, choose_goals=replays)
-    assert rollout.bob.learn.tolist() == [True, False, True]
-    assert not rollout.bob.active[:, 1].any()
-    assert game.worlds.num_diverged == 1
