@@ -46,7 +46,7 @@ class Settings:
     """Env steps of training before the first measurement."""
     num_pairs: int = 5
     num_iterations: int = 20
-    """Iterations of each measurement; 20 hold one evaluation and one checkpoint, as the rest of a run does."""
+    """Iterations of each measurement, with the evaluations and checkpoints that fall into them."""
 
 
 @contextmanager

@@ -2,9 +2,9 @@
 
     python -m benchmarks.learner_ranks --json docs/results/learner_ranks.json
 
-The rollouts of one update are made up: turns of full length, of as many worlds as the recipe has, shared out among the
-ranks. All ranks are processes of this machine, and numbers of ranks or threads above its cores are left out. The KL
-stops nobody here, so every update has the same gradient steps.
+The rollouts of one update are made up: turns of full length, of ``num_worlds`` worlds, shared out among the ranks. All
+ranks are processes of this machine, and numbers of ranks or threads above its cores are left out. The KL stops nobody
+here, so every update has the same gradient steps.
 
 *Efficiency* is the wall-clock time of one rank over R times that of R ranks. *Message* is the time of one gradient
 step's all-reduce when nobody has anything else to do, *in messages* the share of an update that rank 0 spends in them,
@@ -51,7 +51,7 @@ class Settings:
     """Of all rollouts together."""
     num_rollouts: int = 16
     minibatch_rows: int = 2048
-    """Of both players' minibatches; 0 for the recipe's."""
+    """Of both players' minibatches; 0 for the recipe's, in proportion to the worlds."""
     num_updates: int = 5
     """Measured ones; one more comes before them."""
     num_messages: int = 200
@@ -100,9 +100,12 @@ class TimedGroup:
 
 def make_config(settings: Settings) -> Config:
     """The recipe with these minibatches, and with no KL that would stop a player."""
-    overrides = [f"learner.{player}.target_kl=1e9" for player in ("alice", "bob")]
-    if settings.minibatch_rows:
-        overrides += [f"learner.{player}.minibatch_size={settings.minibatch_rows}" for player in ("alice", "bob")]
+    recipe = load_config(RECIPE_FILE)
+    overrides = []
+    for name, player in (("alice", recipe.learner.alice), ("bob", recipe.learner.bob)):
+        in_proportion = player.minibatch_size * settings.num_worlds // recipe.game.num_worlds
+        overrides.append(f"learner.{name}.minibatch_size={settings.minibatch_rows or in_proportion}")
+        overrides.append(f"learner.{name}.target_kl=1e9")
     return load_config(RECIPE_FILE, overrides)
 
 

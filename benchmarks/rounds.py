@@ -78,7 +78,9 @@ class Rounds:
         start_state = game.worlds.states.copy()
         fraction = self._run.config.generator.past_opponent_fraction
         plan = generator.opponents.freeze(0).plan(game.worlds.num_worlds, fraction, self._rng)
-        rollout = game.play_round(players, plan, partial(generator.snapshot().choose_goals, plan, rng=self._rng))
+        snapshot = generator.snapshot()
+        game.block_grippers(float(snapshot.success_rate))
+        rollout = game.play_round(players, plan, partial(snapshot.choose_goals, plan, rng=self._rng))
         self.played.append(Round(start_state, rollout))
         return rollout.num_env_steps
 
@@ -103,11 +105,12 @@ def players_of(run: LocalRun) -> Players:
 
 
 def round_cpu_s(run: LocalRun, num_worlds: int) -> float:
-    """Mean CPU seconds of a round of ``num_worlds`` in this process, on one thread, once games are of all ages."""
+    """Mean CPU seconds of a round of ``num_worlds`` in this process, on one thread, after one game in every world."""
     players, rng = players_of(run), np.random.default_rng(0)
     config = run.config.model_copy(update={"game": run.config.game.model_copy(update={"num_worlds": num_worlds})})
     game = SelfPlay(config, rng, num_threads=1)
     opponents, snapshot = run.generator.opponents.freeze(0), run.generator.snapshot()
+    game.block_grippers(float(snapshot.success_rate))
     num_rounds, start_s = max(10, 2400 // num_worlds), 0.0
     for index in range(-config.game.num_goals, num_rounds):
         if index == 0:

@@ -9,7 +9,7 @@
   GCS; the trained run tells what a world costs on top. Costs are CPU seconds, so that cores which all share do not
   count as work. A round is measured alone, with few and with many worlds in one process, and so are updates of few
   and of many samples with as many gradient steps, and messages between two and between four ranks. Waiting for many
-  actors is measured with as many that do nothing.
+  actors is measured with as many calls that nobody answers.
 
 What cannot be measured on one box is assumed, and is in the result: how fast a node's network is and how many actors
 a node has.
@@ -42,6 +42,7 @@ from benchmarks.scaling_model import (
     with_ranks,
 )
 from benchmarks.training_process import ENDLESS, Measured, Training, copy_run, environment, overrides, scratch
+from service.config import MIN_ROWS
 from service.io.run_directory import RunDirectory
 
 PACKAGES = ("ray", "redis", "mujoco", "numpy", "torch")
@@ -91,7 +92,7 @@ class Assumed:
     """Between two nodes, one receiver: pulls of 1 MB between two Ray nodes on this box, pipelined. A cluster's
     network is faster."""
     actors_per_node: int = 16
-    """Actors that share a copy of the weights and of the snapshot; ranks on their own nodes are as many."""
+    """Actors of a node, which share a copy of the weights and of the snapshot; and ranks of a node."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -171,15 +172,20 @@ def _tiny_rollout_s(tiny: Sequence[Measured]) -> float:
     return min(each.role_cpu_s.get("actor", 0.0) / each.num_rollouts for each in tiny)
 
 
-def on_paper(model: Model, num_worlds: int, total_worlds: int) -> dict[str, Any]:
+def on_paper(model: Model, num_worlds: int, total_worlds: int, rows_per_world: float) -> dict[str, Any]:
     """Predictions and limits, for JSON.
 
     Args:
         model: see ``costs``.
         num_worlds: of each actor where every actor brings as many.
         total_worlds: of the experiment where its actors share them out.
+        rows_per_world: of a minibatch, which grows with the worlds and so allows more ranks.
     """
     shares = {num: max(1, -(-total_worlds // num)) for num in PREDICTED}
+
+    def row(num: int, worlds: int) -> dict[str, Any]:
+        return _row(with_ranks(model, num, worlds, int(num * worlds * rows_per_world / MIN_ROWS)))
+
     limits = {name: limit(model, name, num_worlds) for name in model.parts}
     return {
         "constants": {ACTORS: asdict(model.actor), **{name: asdict(cost) for name, cost in model.parts.items()}},
@@ -187,8 +193,8 @@ def on_paper(model: Model, num_worlds: int, total_worlds: int) -> dict[str, Any]
         "shared_worlds": total_worlds,
         "env_steps_per_world": model.env_steps,
         "one_rank": [_row(predict(model, num, num_worlds)) for num in PREDICTED],
-        "worlds_each": [_row(with_ranks(model, num, num_worlds)) for num in PREDICTED],
-        "worlds_shared": [_row(with_ranks(model, num, worlds)) for num, worlds in shares.items()],
+        "worlds_each": [row(num, num_worlds) for num in PREDICTED],
+        "worlds_shared": [row(num, worlds) for num, worlds in shares.items()],
         "limits": dict(sorted(limits.items(), key=lambda item: float("inf") if item[1] is None else item[1])),
     }
 
@@ -224,7 +230,8 @@ def benchmark(source: RunDirectory, settings: Settings) -> dict[str, Any]:
         one = measure_run(source, home, "ray", settings.num_iterations, 1, actor_threads=threads, plain=True)
         small = _measure(make_tiny(home), home, (1, NUM_TINY_ACTORS), settings.num_tiny_iterations)
         probe, ray, copy = "benchmarks.scaling_probe", environment(home), copy_run(source, home, "copy")
-        num_worlds = source.read_config().game.num_worlds
+        config = source.read_config()
+        num_worlds = config.game.num_worlds
         alone = Alone(
             rounds=ask_module(probe, "rounds", copy.path, FEW_WORLDS, num_worlds, environment=ray),
             updates=_updates(num_worlds),
@@ -233,21 +240,22 @@ def benchmark(source: RunDirectory, settings: Settings) -> dict[str, Any]:
             sizes=ask_module(probe, "sizes", copy.path, environment=ray),
         )
     model = costs(list(small.values()), real[1], alone)
+    rows_per_world = min(config.learner.alice.minibatch_size, config.learner.bob.minibatch_size) / num_worlds
     return {
         "one_box": {str(num): _box(each) for num, each in real.items()} | {f"1, of {threads} threads": _box(one)},
         "tiny": {str(num): _box(each) for num, each in small.items()},
         "alone": asdict(alone),
         "assumed": asdict(Assumed()),
-        "model": on_paper(model, WORLDS_EACH, SHARED_WORLDS),
+        "model": on_paper(model, WORLDS_EACH, SHARED_WORLDS, rows_per_world),
     }
 
 
 def _updates(num_worlds: int) -> dict[str, Any]:
     """CPU seconds of updates of a quarter and of all worlds, with minibatches in proportion."""
-    sizes = {num_worlds // 4: 128, num_worlds: 512}
+    sizes = (num_worlds // 4, num_worlds)
     found = [
-        learner_ranks.measure_ranks(1, learner_ranks.Settings(num, num_rollouts=1, minibatch_rows=rows))["cpu_s"]
-        for num, rows in sizes.items()
+        learner_ranks.measure_ranks(1, learner_ranks.Settings(num, num_rollouts=1, minibatch_rows=0))["cpu_s"]
+        for num in sizes
     ]
     return {"num_worlds": list(sizes), "cpu_s": found}
 

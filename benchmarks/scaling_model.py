@@ -129,10 +129,17 @@ def predict(model: Model, num_actors: int, num_worlds: float, num_ranks: int = 1
     return Prediction(num_actors, num_ranks, num_worlds, seconds, steps / max(seconds.values()))
 
 
-def with_ranks(model: Model, num_actors: int, num_worlds: float) -> Prediction:
-    """Predict a run with as few ranks as keep up with the actors; if none do, with those that are fastest."""
+def with_ranks(model: Model, num_actors: int, num_worlds: float, max_ranks: int) -> Prediction:
+    """Predict a run with as few ranks as keep up with the actors; if none do, with those that are fastest.
+
+    Args:
+        model: costs.
+        num_actors: and no more ranks than these.
+        num_worlds: of each actor.
+        max_ranks: ranks that a minibatch has enough rows for.
+    """
     best = predict(model, num_actors, num_worlds)
-    for num_ranks in range(2, num_actors + 1):
+    for num_ranks in range(2, min(num_actors, max_ranks) + 1):
         if best.seconds[LEARNER] <= best.seconds[ACTORS]:
             break
         more = predict(model, num_actors, num_worlds, num_ranks)
@@ -148,6 +155,8 @@ class Batch:
     num_worlds: int
     """Of all actors together."""
     num_updates: float
+    max_ranks: int
+    """Ranks that a minibatch has enough rows for."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -164,13 +173,14 @@ class Skill:
 
 
 def fastest(model: Model, batches: Iterable[Batch], num_cores: int) -> Skill:
-    """The fastest way to a skill on ``num_cores``: which batch, and how many of the cores are ranks."""
+    """The fastest way to a skill on ``num_cores``: which batch, how many actors and ranks. Cores may be left over."""
     ways = (
-        Skill(batch, predict(model, num_actors, batch.num_worlds / num_actors, num_cores - num_actors))
+        Skill(batch, predict(model, num_actors, batch.num_worlds / num_actors, num_ranks))
         for batch in batches
         for num_actors in range(1, min(num_cores - 1, batch.num_worlds) + 1)
+        for num_ranks in range(1, min(num_cores - num_actors, batch.max_ranks) + 1)
     )
-    return min(ways, key=lambda way: way.seconds)
+    return min(ways, key=lambda way: (way.seconds, way.run.num_actors + way.run.num_ranks))
 
 
 def limit(model: Model, part: str, num_worlds: float) -> int | None:

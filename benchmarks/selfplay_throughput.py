@@ -49,7 +49,7 @@ class Settings:
     seconds: float = 12.0
     """Length of each measurement of rounds and, after each round, its physics; half as long for random actions."""
     num_iterations: int = 20
-    """Length of each measurement of the whole loop; 20 hold one evaluation and one checkpoint, as in any run."""
+    """Length of each measurement of the whole loop, with the evaluations and checkpoints that fall into it."""
     num_warmup_iterations: int = 12
     """Iterations of a run that is begun; past opponents play from the 12th on."""
 

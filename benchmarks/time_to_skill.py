@@ -3,8 +3,8 @@
     python -m benchmarks.time_to_skill --seeds 0-4 --json docs/results/time_to_skill/recipe.json
 
 What counts is the first of three evaluations in a row with 90 % of mixed goals at the last step, by the evaluations
-that any run makes. Seeds run one after the other, each until it is there or at ``--max-env-steps``; a seed that the
-file has already is not run again. The machine should do nothing else.
+that any run makes. Seeds run one after the other, each until it is there or at ``--max-env-steps``. A seed that the
+file has is not run again, unless it was not there within fewer env steps. The machine should do nothing else.
 """
 
 from __future__ import annotations

@@ -3,6 +3,7 @@
 import json
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -116,6 +117,8 @@ def test_the_machine_is_described_in_one_line():
 def test_one_rank_learns_from_all_that_is_made_up():
     settings = learner_ranks.Settings(num_worlds=5, num_rollouts=2, minibatch_rows=64, num_updates=1, num_messages=2)
     config = learner_ranks.make_config(settings)
+    in_proportion = learner_ranks.make_config(replace(settings, num_worlds=30, minibatch_rows=0)).learner
+    assert (in_proportion.alice.minibatch_size, in_proportion.bob.minibatch_size) == (400, 128)  # of 120: 1600 and 512
     rollouts = learner_ranks.make_rollouts(config, settings, 0)
     assert [len(rollout.bob.learn) for rollout in rollouts] == [2, 3]
     measured = learner_ranks.measure(ALONE, settings, 1)
@@ -212,6 +215,11 @@ def test_time_to_skill_stops_a_seed_that_is_there_and_skips_it_later(tmp_path, c
     assert run["curve"][0]["wall_s"] <= run["curve"][2]["wall_s"]
     assert "Median: " in capsys.readouterr().out
     assert time_to_skill.main([*command, "--seeds", "3"]) == 0  # at once
+    before = json.loads((tmp_path / "out.json").read_text())
+    before["runs"][0] |= {"reached": False, "max_env_steps": 100}  # as if it had not been there within fewer
+    (tmp_path / "out.json").write_text(json.dumps(before))
+    assert time_to_skill.main([*command, "--seeds", "3"]) == 0
+    assert [each["reached"] for each in json.loads((tmp_path / "out.json").read_text())["runs"]] == [True]
     assert time_to_skill.main([*command[:-1], "0.5", "--seeds", "3"]) == 2
     assert "something else as share; name another file" in capsys.readouterr().err
     (tmp_path / "tiny.yaml").write_text(dump_config(load_config(None, [*TINY, *evaluated, "game.bob_steps=3"])))

@@ -23,7 +23,12 @@ _DEMO_CONFIG = Path(__file__).parents[2] / "configs" / "pretrain" / "panda_cube.
 """The shipped recipe, in a clone; an installed wheel has none, and the defaults do."""
 
 
+_CLUSTER_ONLY = ("address", "num_actors", "actor_threads", "learner_cpus", "status", "token_file")
+"""Options that mean nothing in one process."""
+
+
 def pretrain(
+    context: typer.Context,
     config: Annotated[
         Path | None, typer.Option(metavar="FILE", help="YAML; defaults where left out. Not needed to resume.")
     ] = None,
@@ -57,7 +62,11 @@ def pretrain(
     ] = None,
     actor_threads: Annotated[int, typer.Option(help="Cores of each rollout actor.", min=1)] = 1,
     learner_cpus: Annotated[
-        float, typer.Option(help="Cores reserved for each rank of the learner; 0: one shares the actors'.", min=0)
+        float,
+        typer.Option(
+            help="Cores for each rank of the learner; 0: none for one rank, its threads for several.",
+            min=0,
+        ),
     ] = 0.0,
     status: Annotated[
         str, typer.Option(metavar="HOST:PORT|off", help="Where the status service of a run on a cluster listens.")
@@ -80,6 +89,13 @@ def pretrain(
 
     if runtime not in ("local", "ray"):
         raise TandemError(f"--runtime {runtime!r}: choose one of local, ray")
+    if runtime == "local":
+        for name in _CLUSTER_ONLY:
+            source = context.get_parameter_source(name)
+            if source is not None and source.name == "COMMANDLINE":  # typer has a ParameterSource of its own
+                raise TandemError(
+                    f"--{name.replace('_', '-')} is for a run on Ray: give --runtime ray, or leave it out"
+                )
     if run_id is not None:
         if resume or run_dir is not None:
             raise TandemError("--run-id names the run directory, and continues what is there: leave out the other two")

@@ -300,8 +300,8 @@ class ClusterRun(Runner):
         self._waiting[recorded] = partial(self._on_recorded, iteration)
 
     def _on_learned(self, iteration: Iteration, update: Update, rank: int, reference: Any) -> None:
-        if iteration.update is not update:
-            return  # of ranks that were ended meanwhile
+        if iteration is not self._current or iteration.update is not update:
+            return  # of ranks that were ended meanwhile, or of rollouts that were all lost
         try:
             result = ray.get(reference)
         except RayError as error:
@@ -317,6 +317,8 @@ class ClusterRun(Runner):
             self._finish_if_done(iteration)
 
     def _on_recorded(self, iteration: Iteration, reference: Any) -> None:
+        if iteration is not self._current:
+            return  # its rollouts were all lost
         try:
             iteration.recorded, iteration.grid = ray.get(reference)
         except RayError as error:

@@ -60,7 +60,7 @@ class Update:
 
     @property
     def overdue(self) -> bool:
-        """Whether a rank hangs that the others no longer wait for: theirs are done."""
+        """Whether a rank hangs after the last gradient step, where the others do not wait for it."""
         return bool(self.results) and time.monotonic() - self.first_answer > RANK_ANSWER_S
 
     def joined(self) -> UpdateResult:
@@ -253,7 +253,7 @@ def check_room(num_learners: int, device: str, cpus: float, actor_threads: int) 
         )
 
 
-def num_gpus(device: str, num_learners: int = 1) -> int:
+def num_gpus(device: str, num_learners: int) -> int:
     """GPUs that each rank of the learner asks Ray for; an actor that asks for none sees none."""
     if device == "auto":
         return int(ray.cluster_resources().get("GPU", 0.0) >= num_learners)

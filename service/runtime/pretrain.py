@@ -199,7 +199,9 @@ def resumed_config(directory: RunDirectory | StudyDirectory, overrides: list[str
         given = load_config(file, fixed, recorded=True)  # maybe the one the run was begun with, by an earlier version
         _check_same_outside_run(saved, given, file)
         named = given.run.model_dump(mode="json", exclude_unset=True)
-        free = {f"run.{key}": value for key, value in named.items()} | {_NUM_LEARNERS: given.learner.num_learners}
+        free = {f"run.{key}": value for key, value in named.items()}
+        if _NUM_LEARNERS.rpartition(".")[2] in given.learner.model_fields_set:
+            free[_NUM_LEARNERS] = given.learner.num_learners
         overrides = [f"{key}={json.dumps(value)}" for key, value in free.items()] + overrides
     return directory.read_config(overrides)
 

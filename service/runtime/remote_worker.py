@@ -28,15 +28,14 @@ class RemoteWorker:
         actor: Ray's actor class, with its options.
         config: first argument of the worker.
         state: second one: the state to start from, or None.
-        others: further arguments of the first worker only.
     """
 
-    def __init__(self, name: str, actor: Any, config: Any, state: Any, *others: Any) -> None:
+    def __init__(self, name: str, actor: Any, config: Any, state: Any) -> None:
         self.name = name
         self.state = ray.put(state)
         """Reference to its newest state."""
         self.incarnation = 0
-        self.handle = actor.remote(config, self.state, *others)
+        self.handle = actor.remote(config, self.state)
         self._actor, self._config = actor, config
         self._location = Location("", 0)
         self._heartbeat = datetime.now(UTC)
@@ -52,8 +51,8 @@ class RemoteWorker:
             self._location = ray.get(self.handle.ping.remote(), timeout=START_S)
         except GetTimeoutError:
             raise ClusterError(
-                f"the {self.name} did not start within {START_S:.0f} s: has the cluster a free core (and GPU, with "
-                "learner.device=cuda) for it? see ray status"
+                f"the {self.name} did not start within {START_S:.0f} s: does a node of the cluster answer? see ray "
+                "status"
             ) from None
         self.record_heartbeat()
 

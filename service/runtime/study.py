@@ -174,7 +174,11 @@ class Study:
         if code < 0:
             said = f"ended by {Signals(-code).name}"
         else:
-            lines = [line.strip() for line in log_file.read_text(errors="replace").splitlines()[-20:]]
+            try:
+                text = log_file.read_text(errors="replace")
+            except OSError:
+                text = ""  # the other runs go on
+            lines = [line.strip() for line in text.splitlines()[-20:]]
             said = next((line for line in reversed(lines) if line), f"exit code {code}").removeprefix("error: ")
         return f"{said[:500]}; all it said is in {log_file}"
 

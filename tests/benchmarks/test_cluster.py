@@ -30,6 +30,7 @@ from benchmarks.scaling_model import (
     with_ranks,
 )
 from benchmarks.training_process import Measured, Records, Training, copy_run, measure_training, summarise_rows
+from service.config import load_config
 from service.errors import TandemError
 from service.io.run_directory import RunDirectory
 from service.store.models import ActorStatus, RunStatus
@@ -301,13 +302,14 @@ def test_ranks_by_hand():
     # 10 worlds, 6 actors: 2 s of an actor, the learner 0.5 + 3.0 / R + messages
     two = predict(MODEL, 6, 10, 2)
     assert two.seconds["learner"] == pytest.approx(0.5 + 1.5 + 0.3)
-    enough = with_ranks(MODEL, 6, 10)
+    enough = with_ranks(MODEL, 6, 10, 99)
     assert (enough.num_ranks, enough.bottleneck) == (3, ACTORS)  # 0.5 + 1.0 + 5 x 4 (0.01 + 0.04 / 3) = 1.97
-    assert with_ranks(MODEL, 2, 10).num_ranks == 1
+    assert with_ranks(MODEL, 2, 10, 99).num_ranks == 1
+    assert with_ranks(MODEL, 6, 10, 2).num_ranks == 2  # a minibatch has rows for no more
     network = Model(MODEL.actor, {"learner": Cost(), ROLLOUTS_IN: Cost(rollout_s=1.0)}, 1.0, ranks_per_node=2)
     assert [predict(network, 6, 10, num).seconds[ROLLOUTS_IN] for num in (1, 2, 3, 5)] == [6.0, 6.0, 3.0, 2.0]
     # 40 actors: more and more ranks spend more on messages than they save, and none keeps up
-    most = with_ranks(MODEL, 40, 10)
+    most = with_ranks(MODEL, 40, 10, 99)
     assert most.bottleneck == "learner"
     assert most.update_s == min(predict(MODEL, 40, 10, num).update_s for num in range(1, 41))
 
@@ -315,11 +317,19 @@ def test_ranks_by_hand():
 def test_the_fastest_way_to_a_skill_by_hand():
     model = Model(Cost(world_s=0.1), {"learner": Cost(world_s=0.05)}, 40.0, Ranks())
     # three cores: two actors of 10 worlds and a rank take 1 s an update; one actor and two ranks take 2 s
-    way = fastest(model, [Batch(20, 100.0)], 3)
+    way = fastest(model, [Batch(20, 100.0, 9)], 3)
     assert (way.run.num_actors, way.run.num_ranks, way.seconds) == (2, 1, pytest.approx(100.0))
     # updates twice as large take twice as long: they have to save half of all updates
-    assert fastest(model, [Batch(20, 100.0), Batch(40, 60.0)], 3).batch.num_worlds == 20
-    assert fastest(model, [Batch(20, 100.0), Batch(40, 40.0)], 3).batch.num_worlds == 40
+    assert fastest(model, [Batch(20, 100.0, 9), Batch(40, 60.0, 9)], 3).batch.num_worlds == 20
+    assert fastest(model, [Batch(20, 100.0, 9), Batch(40, 40.0, 9)], 3).batch.num_worlds == 40
+
+
+def test_the_fastest_way_may_leave_cores_over():
+    """A world for each actor takes 0.1 s, 20 on ten ranks too; more ranks would only send more messages."""
+    model = Model(Cost(world_s=0.1), {"learner": Cost(world_s=0.05)}, 40.0, Ranks(1.0, hop_s=0.0001))
+    way = fastest(model, [Batch(20, 100.0, 99)], 256)
+    assert (way.run.num_actors, way.run.num_ranks) == (20, 11)  # 1 / 11 s and 20 hops of 0.1 ms
+    assert fastest(model, [Batch(20, 100.0, 4)], 256).run.num_ranks == 4  # a minibatch has rows for no more
 
 
 def test_a_line_does_not_fall():
@@ -368,7 +378,7 @@ def test_the_models_constants_by_hand():
 
 
 def test_what_is_on_paper_goes_onto_the_page():
-    paper = scaling.on_paper(model_of_scaling(), num_worlds=10, total_worlds=20)
+    paper = scaling.on_paper(model_of_scaling(), num_worlds=10, total_worlds=20, rows_per_world=320)
     assert [row["num_actors"] for row in paper["worlds_each"]] == [1, 2, 4, 16, 256, 4096]
     assert [row["num_worlds"] for row in paper["worlds_shared"]] == [20, 10, 5, 2, 1, 1]
     # an actor takes 3.5 s, the learner 0.3 + 1.1 N, with four actors 2.5 s on two ranks and with messages of 0.3 s
@@ -378,13 +388,15 @@ def test_what_is_on_paper_goes_onto_the_page():
     result = {"machine": WHERE, "model": paper, "alone": asdict(ALONE), "assumed": asdict(scaling.Assumed())}
     assert "**The first bottleneck is the learner**: it keeps up with 2 actors" in scaling_blocks.limits_block(result)
     assert "| 4 | 2 | 10 | 457 | 4.0 | 3.5 s |" in scaling_blocks.model_block(result)
+    assert scaling.on_paper(model_of_scaling(), 10, 20, rows_per_world=1)["worlds_each"][2]["num_ranks"] == 1
     there = [{"reached": True, "at": {"iteration": num, "env_steps": 1e4 * num}} for num in (300, 500, 400)]
+    settings = {"recipe": load_config(None).model_dump(mode="json")}
     studies = {
-        "large": {"settings": {"num_worlds": 40}, "runs": [{"reached": False}]},
-        "recipe": {"settings": {"num_worlds": 20}, "runs": [*there, {"reached": False}]},
+        "large": {"settings": settings | {"num_worlds": 40}, "runs": [{"reached": False}]},
+        "recipe": {"settings": settings | {"num_worlds": 20}, "runs": [*there, {"reached": False}]},
     }
     batches = scaling_blocks.batches_block(studies).splitlines()
-    assert batches[2:] == ["| 20 | `recipe.json` | 3 of 4 | 4 M | 400 |", "| 40 | `large.json` | 0 of 1 |  |  |"]
+    assert batches[2:] == ["| 20 | `recipe.json` | 3 of 4 | 4.5 M | 450 |", "| 40 | `large.json` | 0 of 1 |  |  |"]
     assert "| 16 | 20 |" in scaling_blocks.skill_block(result, studies)
 
 

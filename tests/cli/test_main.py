@@ -207,6 +207,16 @@ def test_demo_ends_with_what_comes_with_tandem_and_what_to_type(monkeypatch, tmp
     assert evaluated.stdout in shown  # it says the same again
 
 
+@pytest.mark.parametrize(
+    "option",
+    ["--address=auto", "--num-actors=2", "--actor-threads=1", "--learner-cpus=1", "--status=off", "--token-file=x"],
+)
+def test_options_of_a_cluster_are_refused_without_one(tmp_path, option):
+    result = tandem("pretrain", "--run-dir", tmp_path / "run", option)
+    assert_user_error(result, option.partition("=")[0], "--runtime ray")
+    assert not (tmp_path / "run").exists()
+
+
 # --- what can be done with it ----------------------------------------------------------------------------------------
 
 

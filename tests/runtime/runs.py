@@ -8,6 +8,7 @@ import re
 import resource
 import subprocess
 import sys
+import time
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -158,3 +159,16 @@ def assert_one_line(text, *parts):
     text = str(text)
     assert "\n" not in text.rstrip("\n")
     assert [part for part in parts if not re.search(re.escape(str(part)), text)] == [], text
+
+
+def is_alive(pid):
+    """Whether a process still runs after some minutes to end in."""
+    for _ in range(3000):
+        try:
+            state = Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[0]
+        except FileNotFoundError:
+            return False
+        if state == "Z":
+            return False
+        time.sleep(0.1)
+    return True

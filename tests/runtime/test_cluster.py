@@ -2,7 +2,6 @@
 
 import os
 import signal
-import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -19,7 +18,7 @@ from service.runtime.learner_group import num_gpus
 from service.runtime.ray_actors import NICENESS
 from service.runtime.ray_connection import ClusterOptions, connected
 from service.runtime.runner import ClusterError, StateLostError
-from tests.runtime.runs import newest, play, read_lines, tiny_config
+from tests.runtime.runs import is_alive, newest, play, read_lines, tiny_config
 
 TOGETHER = ("learner/", "alice/", "bob/", "generator/")
 
@@ -53,19 +52,6 @@ def pid_of(run, name):
 
 def kill(run, name):
     os.kill(pid_of(run, name), signal.SIGKILL)
-
-
-def is_alive(pid):
-    """Whether a process still runs after some minutes to end in."""
-    for _ in range(3000):
-        try:
-            state = Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[0]
-        except FileNotFoundError:
-            return False
-        if state == "Z":
-            return False
-        time.sleep(0.1)
-    return True
 
 
 def ids(path):
@@ -299,4 +285,4 @@ def test_a_snapshot_lost_with_its_machine_sends_the_run_back(tmp_path):
 )
 def test_the_learner_asks_for_a_gpu(monkeypatch, device, there, asked):
     monkeypatch.setattr("ray.cluster_resources", lambda: {"CPU": 8.0} | ({"GPU": there} if there else {}))
-    assert num_gpus(device) == asked
+    assert num_gpus(device, 1) == asked

@@ -2,8 +2,11 @@
 
 import os
 import signal
+from dataclasses import replace
 
 import pytest
+import ray
+from ray.exceptions import ObjectLostError
 
 from service.config import ConfigError, parse_config
 from service.io.run_directory import RunDirectory
@@ -14,7 +17,7 @@ from service.runtime.local import LocalRun
 from service.runtime.pretrain import resumed_config
 from service.runtime.ray_connection import ClusterOptions, connected
 from service.runtime.runner import ClusterError
-from tests.runtime.runs import TREE, assert_one_line, newest, play, read_lines, tiny_config, write_yaml
+from tests.runtime.runs import TREE, assert_one_line, is_alive, newest, play, read_lines, tiny_config, write_yaml
 
 
 @pytest.fixture(scope="module")
@@ -76,13 +79,41 @@ def test_a_run_survives_ranks_that_die_and_hang(cluster, tmp_path, monkeypatch):
     assert result.reason == "interrupted"
     assert run._learner.incarnation == 2
     everybody = [pid for group, _ in struck for pid in group]
-    assert len(set(everybody)) == 4  # all of a group are ended, whoever it was
+    assert [pid for pid in everybody if is_alive(pid)] == []  # all of a group are ended, whoever it was
     first, second = [error for _, error in struck]
     assert first is None
     assert_one_line(second, "learner: rank 0 on ", "died")
     assert_one_line(run.health().last_error, "learner: rank 1 on ", "did not answer for 8 s")
     assert [status.name for status in run.health().actors] == ["learner-0", "learner-1", "generator"]
     assert_nothing_lost(tmp_path, run)
+
+
+def test_the_run_goes_on_without_rollouts_that_are_all_lost(cluster, tmp_path, monkeypatch):
+    """As when the machine of all actors loses power before the ranks have got what it held."""
+    ask_learner, asked = ClusterRun._ask_learner, []
+
+    def lose():
+        raise ObjectLostError("ab" * 28, "", "")
+
+    def lose_all_once(run, iteration):
+        asked.append([each.summary.id for each in iteration.batch])
+        if len(asked) == 2:
+            gone = ray.remote(lose).options(num_cpus=0, max_retries=0)
+            iteration.batch[:] = [replace(each, rollout=gone.remote()) for each in iteration.batch]
+        ask_learner(run, iteration)
+
+    monkeypatch.setattr(ClusterRun, "_ask_learner", lose_all_once)
+
+    def stop_at_4(run, metrics):
+        if metrics["iteration"] == 4:
+            run.request_stop()
+
+    run, result = run_cluster(tmp_path, two_ranks(total_env_steps=10**9), on_iteration=stop_at_4)
+    assert result.reason == "interrupted"
+    assert [row["learner/version"] for row in read_lines(tmp_path / "metrics.jsonl")] == [1, 2, 3, 4]
+    assert run._learner.incarnation == 1  # once, though both ranks said so
+    num_played = sum(highest + 1 for _, _, highest in newest(tmp_path).arrays["learner/counted"].tolist())
+    assert run.health().num_rollouts_counted == num_played - len(asked[1])
 
 
 def test_the_number_of_ranks_may_change_at_every_resume(cluster, tmp_path):
@@ -133,6 +164,12 @@ def test_a_file_may_say_another_number_of_ranks_at_a_resume(tmp_path):
     assert resumed.learner.num_learners == 2
     again = resumed_config(RunDirectory(tmp_path / "run"), ["learner.num_learners=1"], tmp_path / "two.yaml")
     assert again.learner.num_learners == 1
+
+
+def test_a_file_that_says_nothing_of_ranks_leaves_them_as_they_are(tmp_path):
+    write_yaml(tmp_path / "config.yaml", TREE | {"learner": TREE["learner"] | {"num_learners": 2}})
+    resumed = resumed_config(RunDirectory(tmp_path), [], write_yaml(tmp_path / "one.yaml", TREE))
+    assert resumed.learner.num_learners == 2
 
 
 def test_a_batch_too_small_for_the_ranks_is_one_line():
