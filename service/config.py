@@ -118,8 +118,8 @@ class GameConfig(FrozenModel):
         0.0,
         ge=0.0,
         le=1.0,
-        description="games with a blocked gripper begin once Bob's mean success rate over all goal cells, 0 where "
-        "Alice never was, has come to this; before, they keep him from learning to lift",
+        description="new games may have a blocked gripper while Bob's mean success rate over all goal cells, 0 where "
+        "Alice never was, is at least this; below, they keep him from learning to lift",
     )
     bob_success_reward: float = Field(
         1.0, gt=0.0, description="when the object comes onto the goal; taken back when it leaves (OpenAI 2021)"
@@ -238,7 +238,8 @@ class PPOConfig(FrozenModel):
     mirror: Annotated[Literal["none", "both", "random"], BeforeValidator(_mirror)] = Field(
         "none",
         description="symmetry augmentation, since the task is the same from left and right: learn from every sample "
-        "and its reflection in y (both, or true), or at random from one of the two, which is half the work (random)",
+        "and its reflection in y (both, or true), or at random from one of the two, which is half the work (random). "
+        "Turns of her own that Alice clones stay as they are",
     )
 
     @property
@@ -257,7 +258,9 @@ class CloningConfig(FrozenModel):
     )
     num_iterations: int = Field(1, ge=1, description="demonstrations of that many iterations are kept; 1 is on-policy")
     mean_only: bool = Field(
-        False, description="clone actions by the mean and leave the std alone, or it also copies a demonstrator's noise"
+        False,
+        description="clone by the mean and leave the std alone, or it also copies a demonstrator's noise. What Bob's "
+        "primitives weigh depends on their stds, so his may still change",
     )
 
 
@@ -364,6 +367,18 @@ class Config(FrozenModel):
     learner: LearnerConfig = LearnerConfig()
     run: RunConfig = RunConfig()
 
+    @model_validator(mode="after")
+    def _some_turn_is_imitated(self) -> Self:
+        game, how = self.game, self.learner.self_imitation
+        most = game.alice_valid_reward + game.alice_difficult_reward + game.alice_novelty_reward
+        if how.weight and how.min_reward > most:
+            raise ValueError(
+                f"learner.self_imitation.min_reward = {how.min_reward:g}, but no turn of Alice's pays more than "
+                f"{most:g}, the sum of game.alice_valid_reward, alice_difficult_reward and alice_novelty_reward: raise "
+                "one of them, lower it, or set learner.self_imitation.weight=0"
+            )
+        return self
+
 
 def load_config(path: Path | str | None = None, overrides: Sequence[str] = (), *, recorded: bool = False) -> Config:
     """Read a run's configuration.
@@ -401,13 +416,14 @@ def parse_config(tree: dict[str, Any], *, where: str, recorded: bool = False) ->
     except ValidationError as error:
         first = error.errors()[0]
         key = ".".join(str(part) for part in first["loc"]) or "the top level"
+        found = "" if isinstance(first["input"], dict) else f" = {first['input']!r}"  # a whole group says nothing
         more = f" (and {error.error_count() - 1} more)" if error.error_count() > 1 else ""
         if key in _RENAMED:
             raise ConfigError(f"{where}: {key!r} is now called {_RENAMED[key]!r}{more}") from None
         if first["type"] == "extra_forbidden":
             known = ", ".join(_known_keys(first["loc"]))
             raise ConfigError(f"{where}: unknown key {key!r}; known there: {known}{more}") from None
-        raise ConfigError(f"{where}: {key} = {first['input']!r}: {first['msg']}{more}") from None
+        raise ConfigError(f"{where}: {key}{found}: {first['msg']}{more}") from None
 
 
 def dump_config(config: Config) -> str:

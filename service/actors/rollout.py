@@ -48,12 +48,12 @@ class Turns:
 
 @dataclass(frozen=True, slots=True)
 class Demonstrations:
-    """Steps of Alice's turns whose valid goal Bob failed, relabelled for Bob."""
+    """Steps that a player clones: Alice's and Bob's own, relabelled for Bob, or Alice's own for herself."""
 
     observation: FloatArray
-    """(D, O) Bob's own input: positions and Alice's goal."""
+    """(D, O) input of whoever clones; Bob's has the goal that was reached."""
     action: FloatArray
-    """(D, A) Alice's action."""
+    """(D, A)."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -247,7 +247,7 @@ class SelfPlay:
         config = self.config
         moved = classify_goal(records.start_position, achieved, config.world.workspace, config.game.success_distance_m)
         by_bob = _relabelled(bob, failed & (moved == Verdict.VALID), achieved)
-        # As many of his steps as of hers: he fails in several times as many, and would drown what she shows him.
+        # No more of his steps than of hers: he fails in several times as many, and would drown what she shows him.
         every = -(-len(by_bob.observation) // max(1, len(by_alice.observation))) or 1
         return Demonstrations(
             np.concatenate([by_alice.observation, by_bob.observation[::every]]),

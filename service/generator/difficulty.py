@@ -137,7 +137,9 @@ class DifficultyGrid:
 
     def state(self) -> Arrays:
         """All counts, copied."""
-        return {"seen": self.seen.copy(), "proposals": self.proposals} | join_parts({"cells": self.counts.state()})
+        return {"seen": self.seen.copy(), "proposals": self.proposals.copy()} | join_parts(
+            {"cells": self.counts.state()}
+        )
 
     def load_state(self, state: Mapping[str, Array]) -> None:
         """Take over what ``state`` gave, of this or an older version, which counted other things, and no proposals.

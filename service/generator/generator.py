@@ -88,7 +88,7 @@ class TaskGenerator:
         )
 
     def _replay_share(self, goal: StateArray) -> StateArray:
-        """(M,) weights of the buffer's goals that make all cells equally likely, and the table as likely as the air.
+        """(M,) weights of the buffer's goals: its parts are equally likely, and over cells the table and the air.
 
         The table is one layer of cells of seven, yet where most of what is asked of Bob begins or ends.
         """

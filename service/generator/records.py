@@ -98,7 +98,8 @@ def alice_sums(records: GoalRecords, rest_height_m: float) -> Sums:
 def bob_sums(records: GoalRecords, rest_height_m: float) -> Sums:
     """Metrics of the current Bob's success by kind of goal, as sums.
 
-    No suffix, table and air: the current Alice's valid goals. ``past_alice`` and ``replayed`` stand apart.
+    No suffix, table and air: the current Alice's valid goals. ``past_alice`` and ``replayed`` stand apart;
+    ``from_reset`` is whatever began where a game does, Alice's own goals of a first round among it.
     """
     current = records.current
     air = in_air(records.goal, rest_height_m)

@@ -41,7 +41,7 @@ class GoalChoice:
     played: BoolArray
     """(N,) there is a goal for Bob to play."""
     novelty: StateArray
-    """(N,) how rare goals in the cell of Alice's proposal are, in [0, 1); 0 where it is not valid."""
+    """(N,) ``GeneratorSnapshot.novelty`` of the cell of Alice's proposal, in [0, 1]; 0 where it is not valid."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,7 +58,7 @@ class GeneratorSnapshot:
     buffer: Rows
     """(M,) ``goal`` of the replay buffer, and ``start_state`` and ``start_position`` from which it was proposed."""
     share: StateArray
-    """(M,) weights that make all cells of the buffer equally likely."""
+    """(M,) weights of the goals, by the parts of the buffer that they are in."""
     learnability: StateArray
     """(M,) p (1 - p) of the cell of each goal of the buffer."""
     starts: Rows

@@ -66,8 +66,8 @@ def composition_metrics(bob: MCPPolicy, observation: Tensor) -> dict[str, float]
 
 
 @torch.no_grad()
-def cloning_metrics(bob: Player, demonstrations: Cloning) -> dict[str, float]:
+def cloning_metrics(player: Player, demonstrations: Cloning) -> dict[str, float]:
     """Mean log-probability of the demonstrations, in nats, and its change by this update."""
-    log_prob = bob.log_prob(demonstrations.observation, demonstrations.action)
+    log_prob = player.log_prob(demonstrations.observation, demonstrations.action)
     log_ratio = gaussian.log_ratio(log_prob, demonstrations.proximal_log_prob)
     return {"demonstration_log_prob": float(log_prob.mean()), "demonstration_log_ratio": float(log_ratio.mean())}

@@ -7,7 +7,7 @@ Rank r of R. The learner knows only ``Group``. ``ALONE`` is the group of a learn
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from datetime import timedelta
 from typing import Any, Protocol
 
@@ -108,7 +108,7 @@ class TorchGroup:
     def sum(self, *tensors: Tensor) -> None:
         """Replace each tensor by its sum over all ranks."""
         flat = _flat(tensors).to(self._device)
-        self._wait(self._ranks.allreduce([flat]))
+        self._wait(lambda: self._ranks.allreduce([flat]))
         _copy_back(flat, tensors)
 
     def gather(self, numbers: IntArray) -> list[IntArray]:
@@ -121,7 +121,7 @@ class TorchGroup:
     def copy_first(self, tensors: Sequence[Tensor]) -> None:
         """Overwrite tensors with those of rank 0."""
         flat = _flat(tensors).to(self._device)
-        self._wait(self._ranks.broadcast([flat]))
+        self._wait(lambda: self._ranks.broadcast([flat]))
         _copy_back(flat, tensors)
 
     def _gather(self, numbers: IntArray) -> list[IntArray]:
@@ -129,12 +129,12 @@ class TorchGroup:
         own = torch.from_numpy(numbers).to(self._device)
         everyones = [torch.empty_like(own) for _ in range(self.size)]
         if len(numbers):
-            self._wait(self._ranks.allgather([everyones], [own]))
+            self._wait(lambda: self._ranks.allgather([everyones], [own]))
         return [each.cpu().numpy() for each in everyones]
 
-    def _wait(self, work: Any) -> None:
+    def _wait(self, begin: Callable[[], Any]) -> None:
         try:
-            work.wait()
+            begin().wait()  # NCCL connects at the first one, so beginning may fail, too
         except RuntimeError as error:
             raise GroupError(
                 f"learner rank {self.rank} of {self.size}: another rank is gone, or did not answer within "

@@ -160,13 +160,11 @@ class Learner:
         except KeyError as error:
             raise LearnerError(f"learner state: no array {error}; take an undamaged checkpoint") from None
         parts = split_parts(state)
-        window = split_parts(parts.pop("window", {}))
+        window = [_turns_of(iteration) for _, iteration in sorted(split_parts(parts.pop("window", {})).items())]
         self._load_players(parts)
         self._bob_ema = bob_ema
         self._window.clear()
-        for _, iteration in sorted(window.items()):
-            turns = [Turns(**arrays) for _, arrays in sorted(split_parts(iteration).items())]
-            self._window.append(list(share_out(turns, self._group.rank, self._group.size)))
+        self._window.extend(list(share_out(turns, self._group.rank, self._group.size)) for turns in window)
         self.version = int(own["version"])
         self._rng = _rng_from_array(own["rng"])
         self._counted = {(int(actor), int(incarnation)): int(last) for actor, incarnation, last in own["counted"]}
@@ -263,6 +261,14 @@ class Learner:
         observation, action = (torch.from_numpy(each).to(self._device) for each in (kept.observation, kept.action))
         rows = DemonstrationRows(observation, action, mirrored, share_of(history.sizes(), self._group))
         return rows if rows.num_total and how.weight else None
+
+
+def _turns_of(iteration: Mapping[str, Array]) -> list[Turns]:
+    """Bob's turns of one iteration of the window, by rollout."""
+    try:
+        return [Turns(**arrays) for _, arrays in sorted(split_parts(iteration).items())]
+    except TypeError as error:
+        raise LearnerError(f"learner state, window: {error}; take an undamaged checkpoint") from None
 
 
 def paid_well(turns: Turns, min_reward: float) -> Demonstrations:

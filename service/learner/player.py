@@ -20,7 +20,7 @@ LEARNING_RATE_BOUNDS = 0.03, 2.0
 
 
 class LearnerError(TandemError):
-    """A device that is not there, or a state that does not fit; the message says what to do."""
+    """A device that is not there, nothing to learn from, or states that do not fit; the message says what to do."""
 
 
 class Adam:

@@ -235,8 +235,9 @@ def train(
     for epoch in epochs:
         stats.kls.clear()
         for own, cloned in epoch:
-            minibatch = samples and samples.find(own), cloning and cloning.find(cloned)
-            _step(player, *minibatch, how, stats, group)
+            drawn_samples = None if samples is None else samples.find(own)
+            drawn_cloning = None if cloning is None else cloning.find(cloned)
+            _step(player, drawn_samples, drawn_cloning, how, stats, group)
             if stats.aborted:
                 return stats
     return stats
@@ -292,7 +293,7 @@ def _policy_loss(
     action = torch.cat([part.action for part in rows])
     mean, std = player.policy(torch.cat([part.observation for part in rows]))
     num_samples = 0 if samples is None else len(samples)
-    # Alice's noise is not part of what she demonstrates: her actions pull Bob's mean, and leave his std to PPO.
+    # A demonstrator's noise is not part of what is shown: the actions pull the mean, and leave the std to PPO.
     learned_std = torch.cat((std[:num_samples], std[num_samples:].detach())) if how.mean_only else std
     log_prob = gaussian.log_prob(action, mean, learned_std)
     loss, scalars = log_prob.new_zeros(()), Scalars()

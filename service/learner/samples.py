@@ -263,8 +263,9 @@ def _reflections(samples: Samples, mirrors: Mirrors, player: Player) -> Samples:
     """Reflect samples in y.
 
     A reflection was acted by the reflected behaviour policy, so it has the behaviour log-probability of its original.
-    The importance weight then says how much it counts: little, where ``player`` would hardly act like that. With a
-    full weight one reflection in ten, tens of standard deviations from the mean, ruled the gradient.
+    The importance weight, or without ``decoupled`` PPO's ratio, then says how much it counts: little, where ``player``
+    would hardly act like that. With a full weight one reflection in ten, tens of standard deviations from the mean,
+    ruled the gradient.
     """
     observations = _reflect(samples.observation, mirrors.observation)
     actions = _reflect(samples.action, ACTION.mirror)

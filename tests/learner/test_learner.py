@@ -253,6 +253,16 @@ def test_a_state_with_a_missing_array_is_refused(name):
     assert save(learner.state()) == before
 
 
+def test_a_window_with_a_missing_array_is_refused():
+    learner = Learner(make_config(bob_window=2))
+    updated(learner, 0)
+    state = learner.state()
+    before = save(state)
+    with pytest.raises(LearnerError, match=r"window: .*'action'; take an undamaged checkpoint"):
+        learner.load_state({key: array for key, array in state.items() if not key.endswith("0000/action")})
+    assert save(learner.state()) == before
+
+
 def test_a_state_of_other_networks_is_refused_as_a_whole():
     learner, other = Learner(make_config()), Learner(make_config())
     updated(other, 0)
@@ -384,6 +394,7 @@ def test_mirroring_doubles_what_bob_learns_from():
     np.testing.assert_array_equal(rows.observation[12:], BOB.mirror(rollout.demonstrations.observation))
     np.testing.assert_array_equal(rows.action[12:], ACTION.mirror(rollout.demonstrations.action))
     metrics, plain = updated(learner, 0), updated(Learner(make_config()), 0)
+    assert metrics["learner/bob_policy_steps"] == 2 * plain["learner/bob_policy_steps"]
     for name in ("num_bob_samples", "num_demonstrations", "num_alice_samples"):
         assert metrics[f"learner/{name}"] == plain[f"learner/{name}"]
 
