@@ -72,9 +72,10 @@ def measure_run(
     copy = copy_run(source, home)
     settings = ENDLESS | PLAIN | ({} if plain else {"run.evaluation_interval": num_iterations})
     arguments = overrides(settings)
+    num_cores = max(os.cpu_count() or 1, num_actors * actor_threads)
     if runtime == "ray":
         arguments += ["--num-actors", str(num_actors), "--actor-threads", str(actor_threads)]
-    with Training(home, arguments, runtime=runtime) as training:
+    with Training(home, arguments, runtime=runtime, num_cores=num_cores) as training:
         measured = measure_training(training, num_iterations, num_actors)
     shutil.rmtree(copy.path)
     return measured

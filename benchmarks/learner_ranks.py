@@ -41,6 +41,8 @@ from service.types import IntArray
 HOST = "127.0.0.1"
 TIMEOUT_S = 120.0
 NUMBERS = 1, 2, 4
+NUM_SMALL = 1024
+"""Numbers of a message whose size does not matter."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,6 +72,8 @@ class Measured:
     """Calls of it in an update."""
     message_s: float
     """Median of one alone."""
+    small_message_s: float
+    """The same of ``NUM_SMALL`` numbers."""
     num_parameters: int
     """Bob's, whose gradients travel."""
 
@@ -133,11 +137,8 @@ def measure(group: Group, settings: Settings, num_threads: int) -> Measured:
         update_s.append(time.perf_counter() - start)
         cpu_s.append(time.process_time() - cpu)
         messages_s.append(timed.seconds)
-    gradient = torch.zeros(num_parameters)
-    alone = [_seconds(group, gradient) for _ in range(settings.num_messages)]
-    return Measured(
-        update_s[1:], cpu_s[1:], messages_s[1:], timed.num, statistics.median(alone) if alone else 0.0, num_parameters
-    )
+    message_s, small_message_s = (_message_s(group, num, settings.num_messages) for num in (num_parameters, NUM_SMALL))
+    return Measured(update_s[1:], cpu_s[1:], messages_s[1:], timed.num, message_s, small_message_s, num_parameters)
 
 
 def measure_ranks(num_ranks: int, settings: Settings, num_threads: int = 1) -> dict[str, Any]:
@@ -170,6 +171,7 @@ def measure_ranks(num_ranks: int, settings: Settings, num_threads: int = 1) -> d
         "messages_s": statistics.median(first.messages_s),
         "num_messages": first.num_sums,
         "message_s": first.message_s,
+        "small_message_s": first.small_message_s,
         "num_parameters": first.num_parameters,
         "update_s_each": first.update_s,
     }
@@ -210,10 +212,14 @@ def _serve(end: Connection, rank: int, size: int, port: int, settings: Settings,
     end.recv()  # until all have measured: a rank that ends takes its connections with it
 
 
-def _seconds(group: Group, gradient: Tensor) -> float:
-    start = time.perf_counter()
-    group.sum(gradient)
-    return time.perf_counter() - start
+def _message_s(group: Group, size: int, num_messages: int) -> float:
+    """Median seconds of an all-reduce of ``size`` numbers."""
+    numbers, took = torch.zeros(size), []
+    for _ in range(num_messages):
+        start = time.perf_counter()
+        group.sum(numbers)
+        took.append(time.perf_counter() - start)
+    return statistics.median(took) if took else 0.0
 
 
 def _make_rollout(config: Config, actor: int, sequence: int, num_worlds: int) -> Rollout:

@@ -7,9 +7,9 @@
 - On paper: ``scaling_model.py`` with what was measured. Tiny games, whose physics and networks cost nearly nothing,
   with 1 and with 8 actors tell what an update and what a rollout costs by itself in driver, learner, generator and
   GCS; the trained run tells what a world costs on top. Costs are CPU seconds, so that cores which all share do not
-  count as work. A round is measured alone, with few and with many worlds in one process, and so are updates of few
-  and of many samples with as many gradient steps, and messages between two and between four ranks. Waiting for many
-  actors is measured with as many calls that nobody answers.
+  count as work. A round is measured alone, with few and with many worlds in one process, and so are its goals in the
+  task generator, updates of few and of many samples with as many gradient steps, and small and large messages between
+  two ranks. Waiting for many actors is measured with as many calls that nobody answers.
 
 What cannot be measured on one box is assumed, and is in the result: how fast a node's network is and how many actors
 a node has.
@@ -111,10 +111,13 @@ class Alone:
 
     rounds: Mapping[str, Any]
     """Of ``scaling_probe.py``: CPU seconds by number of worlds."""
+    goals: Mapping[str, Any]
+    """Of ``scaling_probe.py``: CPU seconds by number of worlds."""
     updates: Mapping[str, Any]
     """CPU seconds of updates of one rank with as many gradient steps, by number of worlds."""
     messages: Mapping[str, Any]
-    """Seconds of a message by number of ranks, and the number of messages of an update."""
+    """Seconds of a small and of a gradient's message between two ranks, and the number of messages of an update; of a
+    gradient's between four ranks, too, which share this box's cores."""
     wakes: Mapping[str, Any]
     """Of ``scaling_probe.py``."""
     sizes: Mapping[str, Any]
@@ -141,10 +144,13 @@ def costs(tiny: Sequence[Measured], real: Measured, alone: Alone, assumed: Assum
     parts = {}
     for name, role in ROLES.items():
         update_s, rollout_s, all_s = spent(role)
+        world_s, num_worlds = 0.0, num_rollouts * real.num_worlds
         if name == LEARNER:
             update_s += line(*_points(alone.updates))[0]
-        rest = all_s - update_s - num_rollouts * rollout_s
-        world_s = max(0.0, rest / (num_rollouts * real.num_worlds)) if name in (LEARNER, GENERATOR) else 0.0
+            world_s = max(0.0, (all_s - update_s - num_rollouts * rollout_s) / num_worlds)
+        elif name == GENERATOR:  # mostly its state and its snapshot, which only a real run has in full
+            world_s = line(*_points(alone.goals))[1]
+            update_s = max(update_s, all_s - num_rollouts * rollout_s - num_worlds * world_s)
         parts[name] = Cost(update_s, rollout_s, world_s)
     few, *_, many = zip(alone.wakes["num_actors"], alone.wakes["wait_s"], strict=True)
     _, pair_s = line(few, many)
@@ -155,7 +161,7 @@ def costs(tiny: Sequence[Measured], real: Measured, alone: Alone, assumed: Assum
     parts[WEIGHTS_OUT] = Cost(rollout_s=out / assumed.actors_per_node / bytes_per_s)
     round_s, world_s = line(*_points(alone.rounds))
     actor = Cost(rollout_s=round_s + _tiny_rollout_s(tiny), world_s=world_s)
-    hop_s, gradient_s = ring(*alone.messages["message_s"])
+    hop_s, gradient_s = ring(alone.messages["small_message_s"], alone.messages["message_s"])
     ranks = Ranks(alone.messages["num_messages"], hop_s, gradient_s)
     env_steps = real.num_steps / (real.num_rollouts * real.num_worlds)
     return Model(actor, parts, env_steps, ranks, assumed.actors_per_node)
@@ -234,6 +240,7 @@ def benchmark(source: RunDirectory, settings: Settings) -> dict[str, Any]:
         num_worlds = config.game.num_worlds
         alone = Alone(
             rounds=ask_module(probe, "rounds", copy.path, FEW_WORLDS, num_worlds, environment=ray),
+            goals=ask_module(probe, "goals", copy.path, FEW_WORLDS, num_worlds, environment=ray),
             updates=_updates(num_worlds),
             messages=_messages(num_worlds),
             wakes=ask_module(probe, "wakes", *WAKES, environment=ray),
@@ -261,10 +268,11 @@ def _updates(num_worlds: int) -> dict[str, Any]:
 
 
 def _messages(num_worlds: int) -> dict[str, Any]:
-    """Seconds of a message between two and between four ranks, which do nothing else, on this box."""
+    """Seconds of a message between ranks that do nothing else, on this box."""
     settings = learner_ranks.Settings(num_worlds, num_rollouts=4, minibatch_rows=0, num_updates=1)
-    found = [learner_ranks.measure_ranks(num, settings) for num in (2, 4)]
-    return {"message_s": [each["message_s"] for each in found], "num_messages": found[0]["num_messages"]}
+    two, four = (learner_ranks.measure_ranks(num, settings) for num in (2, 4))
+    names = "num_messages", "small_message_s", "message_s"
+    return {name: two[name] for name in names} | {"message_s_of_four": four["message_s"]}
 
 
 def _measure(source: RunDirectory, home: Path, numbers: Sequence[int], num_iterations: int) -> dict[int, Measured]:

@@ -66,11 +66,10 @@ class Ranks:
         return self.num_messages * hops * (self.hop_s + self.gradient_s / num_ranks)
 
 
-def ring(two_s: float, four_s: float) -> tuple[float, float]:
-    """``hop_s`` and ``gradient_s`` from the seconds of a message between two and between four ranks."""
-    # two_s = 2 hop_s + gradient_s and four_s = 6 hop_s + 1.5 gradient_s
-    gradient_s = min(max(0.0, (3.0 * two_s - four_s) / 1.5), two_s)
-    return (two_s - gradient_s) / 2.0, gradient_s
+def ring(small_s: float, whole_s: float) -> tuple[float, float]:
+    """``hop_s`` and ``gradient_s`` from the seconds of a small message and of a gradient's, between two ranks."""
+    small_s = min(small_s, whole_s)
+    return small_s / 2.0, whole_s - small_s
 
 
 @dataclass(frozen=True, slots=True)

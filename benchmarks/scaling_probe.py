@@ -2,6 +2,7 @@
 
     python -m benchmarks.scaling_probe sizes RUN_DIR           bytes of a rollout, of weights, snapshots, states
     python -m benchmarks.scaling_probe rounds RUN_DIR NUM ...  CPU time of rounds of so many worlds, in one process
+    python -m benchmarks.scaling_probe goals RUN_DIR NUM ...   CPU time of the task generator for such a round
     python -m benchmarks.scaling_probe wakes NUM ...           time of the driver for each event, with so many actors
     python -m benchmarks.scaling_probe broadcast RUN_DIR NUM   time until so many actors have new weights
 
@@ -13,6 +14,7 @@ from __future__ import annotations
 import argparse
 import json
 import os
+import pickle
 import statistics
 import time
 from collections.abc import Sequence
@@ -25,7 +27,9 @@ from service.io.run_directory import RunDirectory
 from service.primitives.loading import read_parameters
 from service.runtime.local import LocalRun
 from service.runtime.ray_connection import connected
+from service.runtime.workers import GeneratorWorker, RolloutWorker
 
+NUM_RECORDS = 200
 NUM_WAKES = 200
 NUM_BROADCASTS = 20
 
@@ -53,6 +57,27 @@ def rounds(directory: RunDirectory, numbers: Sequence[int]) -> dict[str, Any]:
         found = [round_cpu_s(run, num) for num in numbers]
     directory.close()
     return {"num_worlds": list(numbers), "cpu_s": found}
+
+
+def goals(directory: RunDirectory, numbers: Sequence[int]) -> dict[str, Any]:
+    """CPU seconds that the task generator takes for the goals of a round of so many worlds, and its own work."""
+    with closing(LocalRun(directory.read_config(), directory, resume=True)) as run:
+        found = [_goals_cpu_s(run, num) for num in numbers]
+    directory.close()
+    return {"num_worlds": list(numbers), "cpu_s": found}
+
+
+def _goals_cpu_s(run: LocalRun, num_worlds: int) -> float:
+    config, weights = run.config, run.learner.weights()
+    actor = RolloutWorker(config.model_copy(update={"game": config.game.model_copy(update={"num_worlds": num_worlds})}))
+    snapshot, opponents = run.generator.snapshot(), run.generator.opponents.freeze(0)
+    text = pickle.dumps(actor.play(weights, snapshot, opponents)[1])
+    actor.game.close()
+    generator = GeneratorWorker(config, run.generator.state())
+    start_s = time.process_time()
+    for _ in range(NUM_RECORDS):
+        generator.record(1, weights, [pickle.loads(text)])
+    return (time.process_time() - start_s) / NUM_RECORDS
 
 
 def num_bytes(value: Any) -> int:
@@ -122,7 +147,7 @@ def broadcast(directory: RunDirectory, num_actors: int) -> dict[str, float]:
 def main() -> None:
     """Measure and print."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("what", choices=("sizes", "rounds", "wakes", "broadcast"))
+    parser.add_argument("what", choices=("sizes", "rounds", "goals", "wakes", "broadcast"))
     parser.add_argument("arguments", nargs="+")
     given = parser.parse_args()
     first, *rest = given.arguments
@@ -130,6 +155,8 @@ def main() -> None:
         result = sizes(RunDirectory(Path(first)))
     elif given.what == "rounds":
         result = rounds(RunDirectory(Path(first)), [int(each) for each in rest])
+    elif given.what == "goals":
+        result = goals(RunDirectory(Path(first)), [int(each) for each in rest])
     elif given.what == "wakes":
         with connected(None, 1):
             result = wakes([int(each) for each in given.arguments])

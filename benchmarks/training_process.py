@@ -57,6 +57,7 @@ class Training:
         name: of the run directory.
         runtime: which runner; ``ray`` has a status service.
         tree: checkout whose code runs.
+        num_cores: that its Ray believes to have; None: those there are.
     """
 
     def __init__(
@@ -67,6 +68,7 @@ class Training:
         name: str = "run",
         runtime: Literal["local", "ray"] = "ray",
         tree: Path = ROOT,
+        num_cores: int | None = None,
     ) -> None:
         self.name, self.directory, self.log_file = name, RunDirectory(home / "runs" / name), home / f"{name}.log"
         self.address = ("127.0.0.1", _free_port())
@@ -81,7 +83,7 @@ class Training:
             self._process = subprocess.Popen(
                 [*command, *arguments],
                 cwd=tree,
-                env=environment(home, tree),
+                env=environment(home, tree) | ({} if num_cores is None else _cores(num_cores)),
                 stdin=subprocess.DEVNULL,
                 stdout=log,
                 stderr=log,
@@ -310,6 +312,11 @@ def environment(home: Path, tree: Path = ROOT) -> dict[str, str]:
     ray = {"RAY_TMPDIR": str(home), "RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN": secrets.token_hex(32)}
     kept = {name: value for name, value in os.environ.items() if name not in unset}
     return {**kept, **ray, "RAY_USAGE_STATS_ENABLED": "0", "PYTHONPATH": str(tree)}
+
+
+def _cores(num: int) -> dict[str, str]:
+    """Let a new Ray believe that it has so many cores; with less, further actors wait for one for ever."""
+    return {"RAY_OVERRIDE_RESOURCES": json.dumps({"CPU": num})}
 
 
 @contextmanager

@@ -214,7 +214,7 @@ def scaling_blocks(found: Results, studies: Results) -> Blocks:
         blocks["nodes"] = [scaling.nodes_block(found["ranks_on_nodes"])]
     if studies:
         blocks["batches"] = [scaling.batches_block(studies)]
-    if studies and "ranks" in found.get("scaling", {}).get("model", {}):
+    if studies and "scaling" in found:
         blocks["skill"] = [scaling.skill_block(found["scaling"], studies)]
     return blocks
 

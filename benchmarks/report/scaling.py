@@ -2,22 +2,28 @@
 
 from __future__ import annotations
 
+import math
 import statistics
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 from benchmarks.report.markdown import commit, measured_on, millions, percent, table
 from benchmarks.scaling_model import ACTORS, Batch, Cost, Model, Ranks, fastest
+from service.config import MIN_ROWS
 from service.media.figures import counted
 
 Result = Mapping[str, Any]
-CORES = (16, 64, 256)
+CORES = (2, 4, 16, 64, 256)
 NAMED = (16, 256, 4096)
+RECIPE = "recipe"
+"""Name of the file of the shipped recipe, which other sizes of update are compared with."""
+MIN_SEEDS = 3
+"""Seeds that a size of update needs to be called faster than another: they differ by millions of env steps."""
 """Numbers of actors for which the time of every part is shown."""
 
 
 def box_block(result: Result) -> str:
-    """One box, and several nodes on it."""
+    """One box."""
     rows = []
     for num, each in result["one_box"].items():
         spent = {role: 1e6 * cores / each["env_steps_per_s"] for role, cores in each["cores"].items()}
@@ -57,28 +63,25 @@ def constants_block(result: Result) -> str:
         (name, *(_time(cost[key]) for key in ("update_s", "rollout_s", "world_s", "pair_s")))
         for name, cost in result["model"]["constants"].items()
     ]
-    assumed, ranks = result["assumed"], ""
-    if "alone" in result:
-        messages = result["alone"]["messages"]
-        two_s, four_s = messages["message_s"]
-        ranks = (
-            f"Messages of an update between ranks: {messages['num_messages']}, of {_time(two_s)} between two ranks and "
-            f"{_time(four_s)} between four.\n\n"
-        )
+    assumed, messages = result["assumed"], result["alone"]["messages"]
+    model_s = Ranks(**(result["model"]["ranks"] | {"num_messages": 1})).seconds(4)
     words = (
+        f"Messages of an update between ranks: {messages['num_messages']}. Between two ranks one takes "
+        f"{_time(messages['message_s'])}, a small one {_time(messages['small_message_s'])}. Between four one takes "
+        f"{_time(messages['message_s_of_four'])} where they share two cores, and {_time(model_s)} in the model.\n\n"
         f"Assumed, not measured: a node receives {assumed['network_mb_per_s']:g} MB/s (two Ray nodes on one box do, so "
         f"a cluster does better), a node has {assumed['actors_per_node']} actors."
     )
-    return f"{table(head, rows)}\n\n{ranks}{words}"
+    return f"{table(head, rows)}\n\n{words}"
 
 
 def model_block(result: Result) -> str:
     """Predictions: as many worlds for each actor, and the same worlds shared out."""
     model = result["model"]
-    num, total = model["worlds_each"][0]["num_worlds"], model.get("shared_worlds", 240)
-    ranks = ", and the learner has as many ranks as keep up with them" if "ranks" in model else ""
+    num, total = model["worlds_each"][0]["num_worlds"], model["shared_worlds"]
     return (
-        f"Every actor brings {num} worlds, so that more actors make larger updates{ranks}:\n\n"
+        f"Every actor brings {num} worlds, so that more actors make larger updates, and the learner has as many ranks "
+        "as keep up with them:\n\n"
         f"{_predictions(model['worlds_each'])}\n\n"
         f"The same experiment shared out, {total} worlds in all and at least one for each actor:\n\n"
         f"{_predictions(model['worlds_shared'])}"
@@ -86,15 +89,23 @@ def model_block(result: Result) -> str:
 
 
 def batches_block(studies: Mapping[str, Result]) -> str:
-    """Env steps and updates until the skill, by worlds of an update; medians over the seeds that were there."""
-    head = ("worlds", "recorded in", "seeds that were there", "env steps", "updates")
+    """Env steps and updates until the skill, by worlds of an update; medians, a seed that was not there is infinite."""
+    head = (
+        "worlds",
+        "recorded in",
+        "seeds that were there",
+        "env steps",
+        "updates",
+        "the recipe's, same seeds",
+    )
     rows = []
     for name, study in sorted(studies.items(), key=lambda item: item[1]["settings"]["num_worlds"]):
-        there, num_seeds = _there(study), len(study["runs"])
-        row = [str(study["settings"]["num_worlds"]), f"`{name}.json`", f"{len(there)} of {num_seeds}", "", ""]
-        if there:
-            row[-2:] = millions(statistics.median(at["env_steps"] for at in there)), f"{_updates(study):,.0f}"
-        rows.append(row)
+        seeds = {run["seed"] for run in study["runs"]}
+        same = [run for run in studies[RECIPE]["runs"] if run["seed"] in seeds]
+        there = f"{sum(run['reached'] for run in study['runs'])} of {len(seeds)}"
+        steps, updates = _median(study["runs"], "env_steps"), _median(study["runs"], "iteration")
+        numbers = _number(steps, millions), _number(updates), _number(_median(same, "iteration"))
+        rows.append([str(study["settings"]["num_worlds"]), f"`{name}.json`", there, *numbers])
     return table(head, rows)
 
 
@@ -105,27 +116,32 @@ def skill_block(result: Result, studies: Mapping[str, Result]) -> str:
     actor = costs.pop(ACTORS)
     ranks, per_node = Ranks(**model["ranks"]), result["assumed"]["actors_per_node"]
     made = Model(actor, costs, model["env_steps_per_world"], ranks, per_node)
-    found = [Batch(study["settings"]["num_worlds"], _updates(study)) for study in studies.values() if _there(study)]
-    head = ("cores", "worlds in all", "actors", "ranks", "an update every", "minutes", "core-hours")
+    found = [_batch(study) for study in studies.values() if len(study["runs"]) >= MIN_SEEDS]
+    head = ("cores", "worlds in all", "actors", "ranks", "an update every", "minutes", "core-hours of those used")
     rows = []
     for num_cores in CORES:
         way = fastest(made, found, num_cores)
         rows.append(
             (str(num_cores), str(way.batch.num_worlds), str(way.run.num_actors), str(way.run.num_ranks),
              f"{way.run.update_s:.3f} s",
-             f"{way.seconds / 60:.1f}", f"{way.seconds * num_cores / 3600:.2f}")
+             f"{way.seconds / 60:.1f}", f"{way.seconds * (way.run.num_actors + way.run.num_ranks) / 3600:.2f}")
         )  # fmt: skip
     return table(head, rows)
 
 
-def _there(study: Result) -> list[Mapping[str, Any]]:
-    """Where the seeds of a study had the skill."""
-    return [run["at"] for run in study["runs"] if run["reached"]]
+def _median(runs: Sequence[Mapping[str, Any]], key: str) -> float:
+    """Median of what the skill took; a seed that was not there never is."""
+    return float(statistics.median(run["at"][key] if run["reached"] else math.inf for run in runs))
 
 
-def _updates(study: Result) -> float:
-    """Median of the updates until the skill."""
-    return float(statistics.median(at["iteration"] for at in _there(study)))
+def _number(value: float, write: Callable[[float], str] = "{:,.0f}".format) -> str:
+    return write(value) if math.isfinite(value) else ""
+
+
+def _batch(study: Result) -> Batch:
+    settings = study["settings"]
+    rows = min(settings["recipe"]["learner"][player]["minibatch_size"] for player in ("alice", "bob"))
+    return Batch(settings["num_worlds"], _median(study["runs"], "iteration"), rows // MIN_ROWS)
 
 
 def _predictions(rows: list[Mapping[str, Any]]) -> str:
@@ -134,7 +150,7 @@ def _predictions(rows: list[Mapping[str, Any]]) -> str:
     return table(
         head,
         [
-            (f"{row['num_actors']:,}", f"{row.get('num_ranks', 1):,}", f"{row['num_worlds']:g}",
+            (f"{row['num_actors']:,}", f"{row['num_ranks']:,}", f"{row['num_worlds']:g}",
              f"{row['env_steps_per_s']:,.0f}", f"{row['env_steps_per_s'] / rows[0]['env_steps_per_s']:.1f}",
              f"{_seconds(row['update_s'])} s", percent(row["actors_busy"], 1), percent(row["learner_idle"]),
              row["bottleneck"])
@@ -148,7 +164,7 @@ def limits_block(result: Result) -> str:
     model = result["model"]
     limits = model["limits"]
     first, most = next(iter(limits.items()))
-    rows = {row["num_actors"]: row for row in model.get("one_rank", model["worlds_each"])}
+    rows = {row["num_actors"]: row for row in model["one_rank"]}
     head = ("part", "keeps up with", *(f"seconds an update, {num:,} actors" for num in NAMED))
     parts = table(
         head,
@@ -159,7 +175,7 @@ def limits_block(result: Result) -> str:
     )
     playing = rows[NAMED[0]]["seconds"]["actors"]
     words = f"**The first bottleneck is the {first}**: it keeps up with {_actors(most)}"
-    sizes = result.get("alone", result)["sizes"]  # results from before ranks have no part of that name
+    sizes = result["alone"]["sizes"]
     world = sizes["rollout"] / sizes["num_worlds"]
     held = ", ".join(f"{_mb(num * rows[num]['num_worlds'] * world)} with {num:,}" for num in NAMED)
     return (

@@ -297,8 +297,8 @@ def test_limits_by_hand():
 def test_ranks_by_hand():
     # between two ranks 2 hops of 0.01 + 0.04 / 2 each, between four 6 of 0.01 + 0.04 / 4
     assert [MODEL.ranks.seconds(num) for num in (1, 2, 4)] == pytest.approx([0.0, 5 * 0.06, 5 * 0.12])
-    assert ring(0.06, 0.12) == pytest.approx((0.01, 0.04))
-    assert ring(0.06, 0.5) == pytest.approx((0.03, 0.0))  # a noisy measurement makes nothing negative
+    assert ring(0.02, 0.06) == pytest.approx((0.01, 0.04))
+    assert ring(0.5, 0.06) == pytest.approx((0.03, 0.0))  # a noisy measurement makes nothing negative
     # 10 worlds, 6 actors: 2 s of an actor, the learner 0.5 + 3.0 / R + messages
     two = predict(MODEL, 6, 10, 2)
     assert two.seconds["learner"] == pytest.approx(0.5 + 1.5 + 0.3)
@@ -347,8 +347,9 @@ SIZES = {
 
 ALONE = scaling.Alone(
     rounds={"num_worlds": [10, 20], "cpu_s": [3.0, 5.0]},
+    goals={"num_worlds": [10, 20], "cpu_s": [0.01, 0.03]},
     updates={"num_worlds": [10, 20], "cpu_s": [0.7, 1.3]},
-    messages={"message_s": [0.06, 0.12], "num_messages": 5},
+    messages={"small_message_s": 0.02, "message_s": 0.06, "message_s_of_four": 0.5, "num_messages": 5},
     wakes=WAKES,
     sizes=SIZES,
 )
@@ -357,7 +358,8 @@ ALONE = scaling.Alone(
 def model_of_scaling():
     few = measured(num_rollouts=4, role_cpu_s={"learner": 4 * 0.3, "driver": 4 * 0.2, "gcs": 0.0, "actor": 4 * 0.5})
     many = measured(num_rollouts=32, role_cpu_s={"learner": 4 * 1.0, "driver": 4 * 0.9, "gcs": 2.8, "actor": 32 * 0.6})
-    one = measured(num_rollouts=4, num_worlds=20, num_steps=3200, role_cpu_s={"learner": 4 * 2.4})
+    spent = {"learner": 4 * 2.4, "generator": 4 * 0.25}
+    one = measured(num_rollouts=4, num_worlds=20, num_steps=3200, role_cpu_s=spent)
     assumed = scaling.Assumed(network_mb_per_s=100.0, actors_per_node=16)
     return scaling.costs([few, many], one, ALONE, assumed)
 
@@ -367,6 +369,8 @@ def test_the_models_constants_by_hand():
     # tiny games: 1 rollout an iteration costs 0.3 s, 8 cost 1.0: 0.2 + 0.1 N, and 0.1 for gradient steps of no samples.
     # The trained run: 2.4 - 0.3 - 0.1 over 20 worlds
     assert model.parts[scaling.LEARNER] == Cost(pytest.approx(0.3), pytest.approx(0.1), pytest.approx(0.1))
+    # tiny games have no goals to speak of: 0.25 of the trained run, but for 20 worlds of 0.002
+    assert model.parts[scaling.GENERATOR] == Cost(pytest.approx(0.21), 0.0, pytest.approx(0.002))
     driver = model.parts[scaling.DRIVER]
     assert (driver.update_s, driver.rollout_s, driver.pair_s) == pytest.approx((0.1, 0.1, 0.002))
     assert model.parts[scaling.GCS] == Cost(0.0, pytest.approx(0.1))
@@ -389,15 +393,26 @@ def test_what_is_on_paper_goes_onto_the_page():
     assert "**The first bottleneck is the learner**: it keeps up with 2 actors" in scaling_blocks.limits_block(result)
     assert "| 4 | 2 | 10 | 457 | 4.0 | 3.5 s |" in scaling_blocks.model_block(result)
     assert scaling.on_paper(model_of_scaling(), 10, 20, rows_per_world=1)["worlds_each"][2]["num_ranks"] == 1
-    there = [{"reached": True, "at": {"iteration": num, "env_steps": 1e4 * num}} for num in (300, 500, 400)]
+    there = [
+        {"seed": seed, "reached": True, "at": {"iteration": num, "env_steps": 1e4 * num}}
+        for seed, num in enumerate((300, 500, 400))
+    ]
     settings = {"recipe": load_config(None).model_dump(mode="json")}
     studies = {
-        "large": {"settings": settings | {"num_worlds": 40}, "runs": [{"reached": False}]},
-        "recipe": {"settings": settings | {"num_worlds": 20}, "runs": [*there, {"reached": False}]},
+        "few": {
+            "settings": settings | {"num_worlds": 10},
+            "runs": [there[0] | {"at": {"iteration": 1, "env_steps": 1e6}}],
+        },
+        "large": {"settings": settings | {"num_worlds": 40}, "runs": [{"seed": 1, "reached": False}]},
+        "recipe": {"settings": settings | {"num_worlds": 20}, "runs": [*there, {"seed": 3, "reached": False}]},
     }
     batches = scaling_blocks.batches_block(studies).splitlines()
-    assert batches[2:] == ["| 20 | `recipe.json` | 3 of 4 | 4.5 M | 450 |", "| 40 | `large.json` | 0 of 1 |  |  |"]
-    assert "| 16 | 20 |" in scaling_blocks.skill_block(result, studies)
+    assert batches[2:] == [
+        "| 10 | `few.json` | 1 of 1 | 1 M | 1 | 300 |",
+        "| 20 | `recipe.json` | 3 of 4 | 4.5 M | 450 | 450 |",
+        "| 40 | `large.json` | 0 of 1 |  |  | 500 |",
+    ]
+    assert "| 16 | 20 |" in scaling_blocks.skill_block(result, studies)  # one seed of a few worlds shows nothing
 
 
 def test_a_run_on_nodes_goes_onto_the_page():
@@ -421,7 +436,11 @@ def tiny(tmp_path_factory):
 
 
 def test_sizes_are_those_of_what_travels(tiny, tmp_path):
-    found = scaling_probe.sizes(copy_run(tiny, tmp_path))
+    copy = copy_run(tiny, tmp_path)
+    few, many = scaling_probe.goals(copy, [1, 4])["cpu_s"]
+    assert 0 < few < 0.1
+    assert 0 < many < 0.1
+    found = scaling_probe.sizes(copy)
     assert found["num_worlds"] == scaling.NUM_TINY_ACTORS
     assert found["rollout"] > 8 * 4 * 14  # at least an observation of each world
     assert found["weights"] > 1000
