@@ -63,7 +63,7 @@ def run_seed(config: Path, settings: Sequence[str], seed: int, max_env_steps: in
                 if rows[-1]["env_steps"] >= max_env_steps:
                     break
     there = points[found] if found is not None else None
-    return {"seed": seed, "reached": there is not None, "at": there, "curve": points}
+    return {"seed": seed, "reached": there is not None, "max_env_steps": max_env_steps, "at": there, "curve": points}
 
 
 def _point(row: Mapping[str, float]) -> dict[str, float]:
@@ -116,12 +116,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
                 before = result["settings"]
                 named = ", ".join(key for key, value in settings.items() if before.get(key) != value)
                 raise TandemError(f"{given.json}: its seeds had something else as {named}; name another file")
-        done = {run["seed"] for run in result["runs"]}
+        kept = [run for run in result["runs"] if run["reached"] or run["max_env_steps"] >= given.max_env_steps]
+        done = {run["seed"] for run in kept}
         for seed in parse_seeds(given.seeds):
             if seed not in done:
                 where = machine(*PACKAGES)
                 run = run_seed(given.config, given.set, seed, given.max_env_steps, given.share)
-                result["runs"].append(run | {"machine": where})
+                others = [each for each in result["runs"] if each["seed"] != seed]
+                result["runs"] = sorted([*others, run | {"machine": where}], key=lambda each: each["seed"])
                 write_json(given.json, result)
                 print(report(result), flush=True)
     except TandemError as error:
