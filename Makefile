@@ -4,7 +4,8 @@
 PYTHON        ?= python3
 VENV          ?= .venv
 TORCH_BACKEND ?=
-JOBS          ?= logical
+# One process of tests more than there are cores: many tests wait for other processes.
+JOBS          ?= $(shell $(PYTHON) -c 'import os; print(1 + (os.cpu_count() or 1))')
 
 PY    := $(VENV)/bin/python
 PIP   := $(PY) -m pip install -qq --disable-pip-version-check

@@ -126,7 +126,7 @@ def test_a_job_is_stopped_and_continued_and_publishes(head, tmp_path):
     assert {actor["name"] for actor in status["actors"]} == {"rollout-0", "learner", "generator"}
     assert status["policy_lag"] <= 2
 
-    run_ray("job", "stop", "--address", jobs, "first")
+    wait_for(lambda: client.stop_job("first"))
     assert wait_for(lambda: end_of("first")) == "STOPPED"
     saved = newest(home / "runs" / "night").step
     told = json.loads((home / "runs" / "night" / "status.json").read_text())
