@@ -105,6 +105,11 @@ class Prediction:
         return max(self.seconds.values())
 
     @property
+    def num_cores(self) -> int:
+        """One for every actor and every rank."""
+        return self.num_actors + self.num_ranks
+
+    @property
     def bottleneck(self) -> str:
         """The slowest part."""
         return max(self.seconds, key=lambda name: self.seconds[name])
@@ -179,7 +184,7 @@ def fastest(model: Model, batches: Iterable[Batch], num_cores: int) -> Skill:
         for num_actors in range(1, min(num_cores - 1, batch.num_worlds) + 1)
         for num_ranks in range(1, min(num_cores - num_actors, batch.max_ranks) + 1)
     )
-    return min(ways, key=lambda way: (way.seconds, way.run.num_actors + way.run.num_ranks))
+    return min(ways, key=lambda way: (way.seconds, way.run.num_cores))
 
 
 def limit(model: Model, part: str, num_worlds: float) -> int | None:

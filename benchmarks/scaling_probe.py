@@ -2,7 +2,7 @@
 
     python -m benchmarks.scaling_probe sizes RUN_DIR           bytes of a rollout, of weights, snapshots, states
     python -m benchmarks.scaling_probe rounds RUN_DIR NUM ...  CPU time of rounds of so many worlds, in one process
-    python -m benchmarks.scaling_probe goals RUN_DIR NUM ...   CPU time of the task generator for such a round
+    python -m benchmarks.scaling_probe goals RUN_DIR NUM ...   CPU time in which their goals are recorded
     python -m benchmarks.scaling_probe wakes NUM ...           time of the driver for each event, with so many actors
     python -m benchmarks.scaling_probe broadcast RUN_DIR NUM   time until so many actors have new weights
 
@@ -60,7 +60,7 @@ def rounds(directory: RunDirectory, numbers: Sequence[int]) -> dict[str, Any]:
 
 
 def goals(directory: RunDirectory, numbers: Sequence[int]) -> dict[str, Any]:
-    """CPU seconds that the task generator takes for the goals of a round of so many worlds, and its own work."""
+    """CPU seconds in which the task generator records the goals of a round of so many worlds."""
     with closing(LocalRun(directory.read_config(), directory, resume=True)) as run:
         found = [_goals_cpu_s(run, num) for num in numbers]
     directory.close()

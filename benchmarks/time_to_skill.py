@@ -116,12 +116,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
                 before = result["settings"]
                 named = ", ".join(key for key, value in settings.items() if before.get(key) != value)
                 raise TandemError(f"{given.json}: its seeds had something else as {named}; name another file")
-        kept = [run for run in result["runs"] if run["reached"] or run["max_env_steps"] >= given.max_env_steps]
-        done = {run["seed"] for run in kept}
+        budget = given.max_env_steps
+        done = {run["seed"] for run in result["runs"] if run["reached"] or run["max_env_steps"] >= budget}
         for seed in parse_seeds(given.seeds):
             if seed not in done:
                 where = machine(*PACKAGES)
-                run = run_seed(given.config, given.set, seed, given.max_env_steps, given.share)
+                run = run_seed(given.config, given.set, seed, budget, given.share)
                 others = [each for each in result["runs"] if each["seed"] != seed]
                 result["runs"] = sorted([*others, run | {"machine": where}], key=lambda each: each["seed"])
                 write_json(given.json, result)

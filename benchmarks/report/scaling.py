@@ -15,11 +15,11 @@ from service.media.figures import counted
 Result = Mapping[str, Any]
 CORES = (2, 4, 16, 64, 256)
 NAMED = (16, 256, 4096)
+"""Numbers of actors for which the time of every part is shown."""
 RECIPE = "recipe"
 """Name of the file of the shipped recipe, which other sizes of update are compared with."""
 MIN_SEEDS = 3
 """Seeds that a size of update needs to be called faster than another: they differ by millions of env steps."""
-"""Numbers of actors for which the time of every part is shown."""
 
 
 def box_block(result: Result) -> str:
@@ -90,14 +90,7 @@ def model_block(result: Result) -> str:
 
 def batches_block(studies: Mapping[str, Result]) -> str:
     """Env steps and updates until the skill, by worlds of an update; medians, a seed that was not there is infinite."""
-    head = (
-        "worlds",
-        "recorded in",
-        "seeds that were there",
-        "env steps",
-        "updates",
-        "the recipe's, same seeds",
-    )
+    head = ("worlds", "recorded in", "seeds that were there", "env steps", "updates", "the recipe's, same seeds")
     rows = []
     for name, study in sorted(studies.items(), key=lambda item: item[1]["settings"]["num_worlds"]):
         seeds = {run["seed"] for run in study["runs"]}
@@ -124,9 +117,9 @@ def skill_block(result: Result, studies: Mapping[str, Result]) -> str:
         rows.append(
             (str(num_cores), str(way.batch.num_worlds), str(way.run.num_actors), str(way.run.num_ranks),
              f"{way.run.update_s:.3f} s",
-             f"{way.seconds / 60:.1f}", f"{way.seconds * (way.run.num_actors + way.run.num_ranks) / 3600:.2f}")
+             f"{way.seconds / 60:.1f}", f"{way.seconds * way.run.num_cores / 3600:.2f}")
         )  # fmt: skip
-    return table(head, rows)
+    return f"{table(head, rows)}\n\n**A run gets shorter up to {way.run.num_cores} cores.**"
 
 
 def _median(runs: Sequence[Mapping[str, Any]], key: str) -> float:

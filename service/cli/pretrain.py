@@ -63,10 +63,7 @@ def pretrain(
     actor_threads: Annotated[int, typer.Option(help="Cores of each rollout actor.", min=1)] = 1,
     learner_cpus: Annotated[
         float,
-        typer.Option(
-            help="Cores for each rank of the learner; 0: none for one rank, its threads for several.",
-            min=0,
-        ),
+        typer.Option(help="Cores for each rank of the learner; 0: none for one rank, its threads for several.", min=0),
     ] = 0.0,
     status: Annotated[
         str, typer.Option(metavar="HOST:PORT|off", help="Where the status service of a run on a cluster listens.")
