@@ -14,15 +14,17 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 import torch
+from stable_baselines3 import SAC
 
 import service
 from benchmarks.downstream_throughput import PACKAGES, default_learner
 from benchmarks.measuring import parser_of, run_benchmark
-from service.downstream.learner import LearnedPolicy
-from service.downstream.methods import METHODS, provenance
+from service.downstream.methods import METHODS, Method, provenance
 from service.downstream.settings import TrialConfig, make_trial
 from service.downstream.worker import CURVE_SEED, FINAL_SEED, play
+from service.envs.observations import BOB, POSITIONS
 from service.primitives.loading import TrainedBob
+from service.types import FloatArray
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,13 +43,31 @@ class Settings:
     """Threads of physics and torch."""
 
 
+class DefaultPolicy:
+    """What SB3's SAC has learned: Bob's input to actions, without noise."""
+
+    def __init__(self, learner: SAC, method: Method, trained: TrainedBob) -> None:
+        self._learner, self._method, self._trained = learner, method, trained
+
+    def act_deterministic(self, observation: FloatArray) -> FloatArray:
+        """(N, 14) Bob's input to actions (N, 4)."""
+        positions = observation[:, : POSITIONS.size]
+        seen = {
+            "observation": positions,
+            "achieved_goal": observation[:, BOB["object"]],
+            "desired_goal": observation[:, BOB["goal"]],
+        }
+        actions, _ = self._learner.predict(seen, deterministic=True)
+        return self._method.decode(self._trained, positions, actions)
+
+
 def learn(trial: TrialConfig, trained: TrainedBob, settings: Settings) -> dict[str, Any]:
     """Learn ``trial.num_env_steps``; evaluate after every ``settings.every`` env steps and at the end."""
     torch.set_num_threads(settings.threads)
     learner = default_learner(trial, trained)
 
-    def player() -> LearnedPolicy:
-        return LearnedPolicy(learner, METHODS[trial.method], trained)
+    def player() -> DefaultPolicy:
+        return DefaultPolicy(learner, METHODS[trial.method], trained)
 
     curve: list[dict[str, float]] = []
     wall_s = 0.0

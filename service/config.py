@@ -323,7 +323,7 @@ class LearnerConfig(FrozenModel):
         ge=0.0,
         lt=1.0,
         description="the Bob that is evaluated and published is an exponential moving average of his parameters, over "
-        "about the last 1 / (1 - decay) versions, or a twentieth of all if that is less; 0: the last version. Acting "
+        "about the last 1 / (1 - decay) versions, or an eighth of all if that is less; 0: the last version. Acting "
         "and learning do not use it",
     )
     abc: ABCConfig = ABCConfig()

@@ -54,7 +54,6 @@ def train(
     as_json: Annotated[bool, typer.Option("--json", help="Print the result as JSON.")] = False,
 ) -> None:
     """Learn one task, evaluate, record a video."""
-    _check_installed()
     import service
     from service.downstream.settings import make_trial
     from service.downstream.worker import RunOptions, run_trial
@@ -100,7 +99,6 @@ def table(
     threads: _Threads = None,
 ) -> None:
     """Run the trials that are missing, and write downstream.md."""
-    _check_installed()
     from service.downstream.methods import METHODS
     from service.downstream.settings import make_trial
     from service.downstream.table import Source, make_table
@@ -134,7 +132,8 @@ def _learning(steps: int | None, overrides: list[str] | None) -> dict[str, Any]:
     """Settings of a trial about learning, defaults where left out."""
     import yaml
 
-    from service.downstream.settings import SACConfig, validate
+    from service.downstream.settings import validate
+    from service.sac.settings import SACConfig
 
     values = {}
     for override in overrides or []:
@@ -213,10 +212,3 @@ class _Progress:
                 f"{metrics['time/env_steps_per_s']:,.0f} env steps/s",
                 err=True,
             )
-
-
-def _check_installed() -> None:
-    from importlib.util import find_spec
-
-    if find_spec("stable_baselines3") is None:
-        raise TandemError("learning needs the package stable-baselines3: pip install 'tandem-skills[downstream]'")

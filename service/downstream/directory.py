@@ -7,7 +7,7 @@
 | ``tensorboard/`` | the same metrics as TensorBoard events over env steps |
 | ``checkpoint.pt`` | everything the training continues from exactly, replay buffer included |
 | ``result.json`` | how well it does in the end |
-| ``model.zip`` | the learner as Stable-Baselines3 saves it: ``SAC.load(file, env)``, env as of ``worker.make_worlds`` |
+| ``policy.safetensors`` | what was learned, averaged; ``policy.load_policy`` plays it without torch |
 | ``curves.png``, ``episodes.mp4`` | for people |
 | ``.lock`` | held by the process that trains |
 """
@@ -28,7 +28,8 @@ from service.io.lock import LOCK_FILE, DirectoryLock
 from service.io.tensorboard import EventFile
 
 FORMAT_VERSION = 1
-"""Version of ``cell.json``, ``checkpoint.pt`` and ``result.json``, and of the table's files."""
+"""Version of ``cell.json`` and ``result.json``, and of the table's files."""
+_CHECKPOINT_VERSION = 2
 TRIAL = "cell"
 """Key of a trial's settings in these files, which call a trial a cell."""
 _ELSEWHERE = "name another directory (--run-dir, of a table --runs)"
@@ -44,6 +45,7 @@ class TrainingDirectory:
         self.metrics_file = path / "metrics.jsonl"
         self.checkpoint_file = path / "checkpoint.pt"
         self.result_file = path / "result.json"
+        self.policy_file = path / "policy.safetensors"
         self._metrics = JsonlWriter(self.metrics_file)
         self._lock: DirectoryLock | None = None
 
@@ -117,7 +119,7 @@ class TrainingDirectory:
 
         self._metrics.sync()
         data = io.BytesIO()
-        torch.save({"format_version": FORMAT_VERSION, **saved}, data)
+        torch.save({"format_version": _CHECKPOINT_VERSION, **saved}, data)
         with os_errors("write", self.checkpoint_file):
             write_atomic(self.checkpoint_file, data.getvalue())
 
@@ -131,7 +133,7 @@ class TrainingDirectory:
             raise TandemError(
                 f"{self.checkpoint_file} is damaged ({str(error).splitlines()[0][:80]}); remove it to begin anew"
             ) from None
-        _check_version(saved, self.checkpoint_file)
+        _check_version(saved, self.checkpoint_file, _CHECKPOINT_VERSION)
         return saved
 
 
@@ -168,12 +170,10 @@ def read_json(path: Path) -> dict[str, Any]:
     return tree
 
 
-def _check_version(tree: dict[str, Any], path: Path) -> None:
+def _check_version(tree: dict[str, Any], path: Path, wanted: int = FORMAT_VERSION) -> None:
     found = tree.get("format_version")
-    if found != FORMAT_VERSION:
-        raise TandemError(
-            f"{path}: format version {found!r}, this program reads {FORMAT_VERSION}; name another directory"
-        )
+    if found != wanted:
+        raise TandemError(f"{path}: format version {found!r}, this program reads {wanted}; name another directory")
 
 
 def write_json(path: Path, tree: dict[str, Any]) -> None:

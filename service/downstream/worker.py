@@ -22,11 +22,12 @@ import torch
 
 from service.actors.evaluation import DeterministicPolicy, Evaluation, evaluate, wilson_interval
 from service.downstream.directory import FORMAT_VERSION, TRIAL, TrainingDirectory, read_json, write_json
-from service.downstream.learner import LearnedPolicy, make_learner, restore_learner, save_learner, set_progress
+from service.downstream.learner import make_loop, set_progress, spread_seed
 from service.downstream.methods import Method, find_method, provenance
 from service.downstream.page import draw_training
+from service.downstream.policy import LearnedPolicy, save_policy
 from service.downstream.settings import TrialConfig
-from service.downstream.vec_env import WorldsVecEnv
+from service.downstream.worlds import TaskWorlds
 from service.envs.gym.registration import EPISODE_STEPS
 from service.envs.gym.vector import TabletopVectorEnv
 from service.envs.tasks import SUCCESS_DISTANCE_M, find_task
@@ -84,7 +85,7 @@ def run_trial(trial: TrialConfig, trained: TrainedBob, path: Path, options: RunO
         learned: dict[str, Any] | None = {"env_steps": 0, "wall_s": 0.0, "curve": []}
         if method.player is None:
             training = _Training(trial, method, trained, directory, options)
-            stack.callback(training.env.close)
+            stack.callback(training.worlds.close)
             learned, new_player = training.run(saved), training.new_player
         else:
             new_player = functools.partial(method.player, trained)
@@ -130,21 +131,23 @@ class _Training:
         self, trial: TrialConfig, method: Method, trained: TrainedBob, directory: TrainingDirectory, options: RunOptions
     ) -> None:
         torch.set_num_threads(options.num_threads or os.cpu_count() or 1)
-        self.env = make_worlds(trial, method, trained, options.num_threads)
-        self._learner = make_learner(trial, method, self.env)
+        self.worlds = make_worlds(trial, method, trained, options.num_threads)
+        self._loop = make_loop(trial, method, trained, self.worlds)
         self._trial, self._method, self._trained = trial, method, trained
         self._directory, self._num_threads, self._callbacks = directory, options.num_threads, options.callbacks
         self._iteration, self._wall_s, self._saved_s = 0, 0.0, time.monotonic()
         self._curve: list[dict[str, float]] = []
-        self.new_player: Callable[[], DeterministicPolicy] = lambda: LearnedPolicy(self._learner, method, trained)
-        """Makes the policy learned so far, ready for a batch of episodes."""
+
+    def new_player(self) -> DeterministicPolicy:
+        """Make the policy learned so far, ready for a batch of episodes."""
+        return LearnedPolicy(self._loop.learner.averaged_parameters(), self._method, self._trained)
 
     def run(self, saved: dict[str, Any] | None) -> dict[str, Any] | None:
         """Learn to the end; None where stopped before."""
         if saved is not None:
-            restore_learner(self._learner, self.env, saved["learner"])
+            self._loop.load_state(saved["loop"])
             self._iteration, self._wall_s, self._curve = saved["iteration"], saved["wall_s"], saved["curve"]
-        while self._learner.num_timesteps < self._trial.num_env_steps:
+        while self._loop.num_env_steps < self._trial.num_env_steps:
             if self._callbacks.stop():
                 self._save()
                 return None
@@ -154,21 +157,23 @@ class _Training:
         self._save()
         if self._callbacks.stop():
             return None
-        self._learner.save(self._directory.path / "model.zip")
-        return {"env_steps": self._learner.num_timesteps, "wall_s": self._wall_s, "curve": self._curve}
+        parameters = self._loop.learner.averaged_parameters()
+        save_policy(self._directory.policy_file, parameters, self._trial.method, self._trained)
+        return {"env_steps": self._loop.num_env_steps, "wall_s": self._wall_s, "curve": self._curve}
 
     def _iterate(self) -> None:
         """Play an episode in every world, with its updates; now and then evaluate, which is not counted as time."""
-        begun, before = time.perf_counter(), self._learner.num_timesteps
-        set_progress(self._learner, self._method, before / self._trial.num_env_steps)
-        num = min(EPISODE_STEPS * self.env.num_envs, self._trial.num_env_steps - before)
-        self._learner.learn(num, reset_num_timesteps=self._iteration == 0, log_interval=None)  # type: ignore[arg-type]
+        begun, before = time.perf_counter(), self._loop.num_env_steps
+        set_progress(self._loop, self._method, before / self._trial.num_env_steps)
+        num = min(EPISODE_STEPS * self.worlds.num_worlds, self._trial.num_env_steps - before)
+        learned = self._loop.play(num)
         self._iteration += 1
         took = time.perf_counter() - begun
         self._wall_s += took
-        steps = self._learner.num_timesteps
+        steps = self._loop.num_env_steps
         metrics: dict[str, float] = {"iteration": self._iteration, "env_steps": steps, **self._episodes()}
-        metrics |= {name: float(value) for name, value in self._learner.logger.name_to_value.items()}
+        metrics |= {f"learner/{name}": value for name, value in learned.items()}
+        metrics["learner/num_updates"] = self._loop.num_updates
         if self._iteration % self._trial.curve_every == 0 or steps >= self._trial.num_env_steps:
             metrics |= self._evaluate()
         metrics |= {"time/wall_s": self._wall_s, "time/env_steps_per_s": (steps - before) / took}
@@ -177,8 +182,8 @@ class _Training:
 
     def _episodes(self) -> dict[str, float]:
         """Means over the episodes that ended in this iteration, which were played with noise."""
-        finished = np.array(self.env.finished, dtype=float).reshape(-1, 2)
-        self.env.finished.clear()
+        finished = np.array(self.worlds.finished, dtype=float).reshape(-1, 2)
+        self.worlds.finished.clear()
         if not len(finished):
             return {}
         total, last = finished.T
@@ -189,19 +194,18 @@ class _Training:
         trial, seed = self._trial, self._trial.seed + CURVE_SEED
         found = play(trial, self._trained, self.new_player(), trial.curve_episodes, seed, self._num_threads)
         point = {"success_last": found.success_last, "success_ever": found.success_ever}
-        self._curve.append({"env_steps": self._learner.num_timesteps, "wall_s": self._wall_s, **point})
+        self._curve.append({"env_steps": self._loop.num_env_steps, "wall_s": self._wall_s, **point})
         return {f"evaluation/{name}": value for name, value in point.items()}
 
     def _save(self) -> None:
         if not self._iteration:
             return
-        counters = {"iteration": self._iteration, "env_steps": self._learner.num_timesteps, "wall_s": self._wall_s}
-        learner = save_learner(self._learner, self.env)
-        self._directory.write_checkpoint({**counters, "curve": self._curve, "learner": learner})
+        counters = {"iteration": self._iteration, "env_steps": self._loop.num_env_steps, "wall_s": self._wall_s}
+        self._directory.write_checkpoint({**counters, "curve": self._curve, "loop": self._loop.state()})
         self._saved_s = time.monotonic()
 
 
-def make_worlds(trial: TrialConfig, method: Method, trained: TrainedBob, num_threads: int) -> WorldsVecEnv:
+def make_worlds(trial: TrialConfig, method: Method, trained: TrainedBob, num_threads: int) -> TaskWorlds:
     """Make the worlds that a method's learner acts in."""
     worlds = TabletopVectorEnv(
         trial.sac.num_worlds,
@@ -211,7 +215,7 @@ def make_worlds(trial: TrialConfig, method: Method, trained: TrainedBob, num_thr
         max_episode_steps=EPISODE_STEPS,
         num_threads=num_threads,
     )
-    return WorldsVecEnv(method.wrap(worlds, trained))
+    return TaskWorlds(method.wrap(worlds, trained), spread_seed(trial.seed, 3))
 
 
 def play(

@@ -198,11 +198,11 @@ class Learner:
     def _average_bob(self) -> None:
         """Move the average towards the new version.
 
-        It spans about a twentieth of all versions until that reaches the decay's own span (polynomial-decay averaging,
+        It spans about an eighth of all versions until that reaches the decay's own span (polynomial-decay averaging,
         Shamir and Zhang 2013): while Bob still learns fast, a long average lags behind him.
         """
         new, decay = networks.export_parameters(self._bob.policy), self.config.learner.bob_ema_decay
-        keep = min(decay, (1 + self.version) / (20 + self.version))
+        keep = min(decay, (1 + self.version) / (8 + self.version))
         old = self._bob_ema if keep > 0.0 else new
         self._bob_ema = {name: np.asarray(each + np.float32(keep) * (old[name] - each)) for name, each in new.items()}
 

@@ -4,7 +4,6 @@ import pytest
 import service
 from benchmarks import downstream_success
 from service.actors.evaluation import evaluate
-from service.downstream.learner import LearnedPolicy
 from service.downstream.methods import METHODS
 from service.downstream.worker import FINAL_SEED
 from service.envs.tasks import SUCCESS_DISTANCE_M, find_task
@@ -29,7 +28,7 @@ def test_learns_and_is_evaluated_as_the_cells_are(trained, monkeypatch):
     assert learner._n_updates == 201 - 100  # one after every step but the first hundred
     task = find_task("larger")
     again = evaluate(
-        LearnedPolicy(learner, METHODS["ours"], trained),
+        downstream_success.DefaultPolicy(learner, METHODS["ours"], trained),
         task.world_from(trained.config.world),
         task.goals,
         num_episodes=6,
@@ -53,5 +52,5 @@ def test_acts_as_the_environment_that_it_learned_in(trained):
     step = inner.step
     inner.step = lambda action: acted.append(np.array(action)) or step(action)
     env.step(weights)
-    player = LearnedPolicy(learner, METHODS["ours"], trained)
+    player = downstream_success.DefaultPolicy(learner, METHODS["ours"], trained)
     np.testing.assert_allclose(player.act_deterministic(before)[0], acted[0], atol=1e-6)

@@ -2,13 +2,33 @@ import pytest
 
 import service
 from benchmarks import downstream_throughput
+from benchmarks.measuring import ROOT
+from service.errors import TandemError
 from tests.downstream.trials import small_trial
 
 
-def test_both_learn_while_they_are_measured(monkeypatch):
+@pytest.fixture(scope="module")
+def trained():
+    return service.load_primitives("panda-cube@champion", registry="no registry here")
+
+
+def test_the_worker_learns_while_it_is_measured(trained, monkeypatch):
+    steps = []
+    step = downstream_throughput.make_loop.__globals__["SACLearner"]._step
+    monkeypatch.setattr(
+        downstream_throughput.make_loop.__globals__["SACLearner"],
+        "_step",
+        lambda learner, *rows: steps.append(len(rows[0])) or step(learner, *rows),
+    )
+    play = downstream_throughput.make_worker(small_trial(), trained, 1)
+    steps.clear()
+    assert play() == 200  # an episode of each of four worlds
+    assert steps == [16] * (2 * 50)
+
+
+def test_the_default_learns_while_it_is_measured(trained, monkeypatch):
     monkeypatch.setattr(downstream_throughput, "_DEFAULT_STEPS", 4)
     monkeypatch.setattr(downstream_throughput, "_DEFAULT_WARM_UP", 102)
-    trained = service.load_primitives("panda-cube@champion", registry="no registry here")
     updates = []
     train = downstream_throughput.SAC.train
 
@@ -17,12 +37,13 @@ def test_both_learn_while_they_are_measured(monkeypatch):
         train(learner, gradient_steps, batch_size)
 
     monkeypatch.setattr(downstream_throughput.SAC, "train", counted)
-    result = downstream_throughput.compare(
-        small_trial(), trained, downstream_throughput.Settings(num_pairs=1, seconds=0.01, threads=1)
-    )
-    worker, default = (result["rows"][name] for name in (downstream_throughput.WORKER, downstream_throughput.DEFAULT))
-    assert worker["num_steps"] == 200  # an episode of each of four worlds
-    assert default["num_steps"] == 4
-    assert updates.count((1, 1, 256)) == 2 + 4  # of the warm-up, and of the measurement: one update a step
-    assert updates.count((4, 2, 16)) == 2 * 50
-    assert result["ratio"]["median"] == pytest.approx(worker["env_steps_per_s"] / default["env_steps_per_s"])
+    play = downstream_throughput.make_default(small_trial(), trained)
+    assert updates == [(1, 1, 256)] * 2  # one update a step, after 100 of them
+    assert play() == 4
+    assert updates == [(1, 1, 256)] * 6
+
+
+def test_a_process_that_fails_says_why(tmp_path):
+    settings = downstream_throughput.Settings(primitives="nobody@champion", seconds=0.01)
+    with pytest.raises(TandemError, match=r"worker in .*nobody"):
+        downstream_throughput.measure_tree(ROOT, "worker", settings, tmp_path)

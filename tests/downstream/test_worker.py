@@ -8,7 +8,6 @@ import torch
 from service.actors.evaluation import IdlePolicy, evaluate
 from service.downstream import worker
 from service.downstream.compose import parameters_digest
-from service.downstream.learner import make_learner
 from service.downstream.methods import find_method
 from service.downstream.worker import Callbacks, RunOptions, make_worlds, play, run_trial
 from service.envs.tasks import TASKS
@@ -50,10 +49,10 @@ def test_a_resumed_training_is_the_uninterrupted_one(champion, tmp_path, method)
     records = [without_times(read_jsonl(tmp_path / name / "metrics.jsonl")) for name in ("whole", "cut")]
     assert records[0] == records[1]
     assert resumed["evaluation"] == whole["evaluation"]
-    saved = [torch.load(tmp_path / name / "checkpoint.pt", weights_only=True)["learner"] for name in ("whole", "cut")]
-    first, second = (each["parameters"]["policy"] for each in saved)
-    assert all(torch.equal(first[name], second[name]) for name in first)
-    rows = [each["replay"]["rows"] for each in saved]
+    saved = [torch.load(tmp_path / name / "checkpoint.pt", weights_only=True)["loop"] for name in ("whole", "cut")]
+    first, second = (each["learner"]["parameters"]["actor"] for each in saved)
+    assert all(torch.equal(*pair) for pair in zip(first, second, strict=True))
+    rows = [each["replay"] for each in saved]
     assert all(torch.equal(rows[0][name], rows[1][name]) for name in rows[0])
 
 
@@ -74,14 +73,14 @@ def test_what_a_training_leaves(champion, tmp_path):
     result = run(small_trial(), champion, tmp_path, on_iteration=seen.append)
     files = {path.name for path in tmp_path.iterdir()} - {".lock"}
     assert files == {
-        "cell.json", "metrics.jsonl", "tensorboard", "checkpoint.pt", "result.json", "model.zip", "curves.png"
+        "cell.json", "metrics.jsonl", "tensorboard", "checkpoint.pt", "result.json", "policy.safetensors", "curves.png"
     }  # fmt: skip
     assert parameters_digest(champion.primitives) == before == result["primitives"]["digest"]
     assert result["primitives"]["name"] == champion.manifest.reference
     assert result == json.loads((tmp_path / "result.json").read_text())
     assert result["env_steps"] == 600
     assert [point["env_steps"] for point in result["curve"]] == [400, 600]
-    assert seen[-1]["train/n_updates"] == 2 * 50 * 2  # two iterations that learn, 50 steps each, two updates a step
+    assert seen[-1]["learner/num_updates"] == 2 * 50 * 2  # two iterations that learn, 50 steps each, two updates a step
     found = result["evaluation"]
     assert found["num_episodes"] == 6
     for key in ("success_last", "success_ever"):
@@ -121,11 +120,11 @@ def test_the_same_5_cm_are_paid_and_counted(champion):
         options = {"num_episodes": 300, "num_steps": 50, "success_distance_m": distance, "seed": 7}
         counts.append(evaluate(IdlePolicy(), world, task.goals, **options).success_last)
     assert play(trial, champion, IdlePolicy(), 300, 7, 1).success_last == counts[0] < counts[1]
-    env = make_worlds(trial, find_method("ours"), champion, 1)
-    achieved = np.float32([[0.0499, 0.0, 0.0], [0.0501, 0.0, 0.0], [0.0, 0.0, -0.0599]])
-    (paid,) = env.env_method("compute_reward", achieved, np.zeros((3, 3), np.float32), {}, indices=0)
-    np.testing.assert_array_equal(paid, [1.0, 0.0, 0.0])
-    env.close()
+    worlds = make_worlds(trial, find_method("ours"), champion, 1)
+    following = np.zeros((3, 11), np.float32)
+    following[:, 5:8] = [[0.0499, 0.0, 0.0], [0.0501, 0.0, 0.0], [0.0, 0.0, -0.0599]]
+    np.testing.assert_array_equal(worlds.rewards(following, np.zeros((3, 3), np.float32)), [1.0, 0.0, 0.0])
+    worlds.close()
 
 
 def test_goals_of_the_curve_of_the_end_and_of_learning_are_others(champion, tmp_path, monkeypatch):
@@ -153,10 +152,9 @@ def test_seeds_share_no_episodes(champion):
     streams = []
     for seed in (0, 1):
         trial = small_trial(seed=seed)
-        env = make_worlds(trial, find_method("ours"), champion, 1)
-        make_learner(trial, find_method("ours"), env)
-        streams.append(env.reset()["desired_goal"])
-        env.close()
+        worlds = make_worlds(trial, find_method("ours"), champion, 1)
+        streams.append(worlds.inputs()[:, 17:20])
+        worlds.close()
     distance = np.linalg.norm(streams[0][:, None] - streams[1][None], axis=2)
     assert distance.min() > 1e-6
 
@@ -230,4 +228,4 @@ class TestBadInput:
         run(small_trial(), champion, tmp_path, stop=Stop(1))
         saved = torch.load(tmp_path / "checkpoint.pt", weights_only=True)
         torch.save({**saved, "format_version": 9}, tmp_path / "checkpoint.pt")
-        self.refused("format version 9, this program reads 1", small_trial(), champion, tmp_path, resume=True)
+        self.refused("format version 9, this program reads 2", small_trial(), champion, tmp_path, resume=True)

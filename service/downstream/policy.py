@@ -1,0 +1,83 @@
+"""What a trial has learned, as a policy in NumPy: evaluated, recorded, saved to a file and loaded without torch."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+from service.downstream.inputs import learner_inputs
+from service.downstream.methods import Method, find_method, provenance
+from service.envs.observations import BOB, POSITIONS
+from service.errors import TandemError
+from service.io.files import os_errors, write_atomic
+from service.io.tensors import decode, encode, read_metadata
+from service.policies.parameters import Parameters
+from service.primitives.loading import TrainedBob
+from service.sac.numpy_actor import numpy_actor
+from service.types import FloatArray
+
+_KEY = "downstream_policy"
+
+
+class LearnedPolicy:
+    """An actor that a trial has learned: Bob's input to actions, without noise.
+
+    It keeps the positions of the step before, so it plays N episodes from their start; others need ``begin`` first.
+
+    Args:
+        parameters: of the actor, as exported.
+        method: says how its actions become the robot's.
+        trained: the primitives, where the method composes.
+    """
+
+    def __init__(self, parameters: Parameters, method: Method, trained: TrainedBob) -> None:
+        self._actor, self._method, self._trained = numpy_actor(parameters), method, trained
+        self._previous: FloatArray | None = None
+
+    def begin(self) -> None:
+        """Forget the last step: new episodes begin."""
+        self._previous = None
+
+    def act_deterministic(self, observation: FloatArray) -> FloatArray:
+        """(N, 14) Bob's input, positions and goal, to actions (N, 4)."""
+        positions = observation[:, : POSITIONS.size]
+        previous, self._previous = self._previous, positions.copy()
+        inputs = learner_inputs(positions if previous is None else previous, positions, observation[:, BOB["goal"]])
+        return self._method.decode(self._trained, positions, self._actor(inputs))
+
+
+def save_policy(path: Path, parameters: Parameters, method: str, trained: TrainedBob) -> None:
+    """Write an actor's parameters, its method and which primitives it composes.
+
+    Raises:
+        TandemError: the file cannot be written.
+    """
+    about = {"method": method, "primitives": provenance(trained, method)["primitives"]}
+    with os_errors("write", path):
+        write_atomic(path, encode(parameters, {_KEY: json.dumps(about)}))
+
+
+def load_policy(path: Path | str, trained: TrainedBob) -> LearnedPolicy:
+    """Load what ``save_policy`` wrote.
+
+    Args:
+        path: ``policy.safetensors`` of a training.
+        trained: the primitives that it was trained with; a method without primitives takes any.
+
+    Raises:
+        TandemError: no such file, damaged, or of other primitives.
+    """
+    path = Path(path)
+    with os_errors("read", path):
+        data = path.read_bytes()
+    try:
+        about: dict[str, Any] = json.loads(read_metadata(data)[_KEY])
+        parameters = decode(data)
+    except (KeyError, ValueError) as error:
+        raise TandemError(f"{path} is no policy of a downstream training ({error}); take policy.safetensors") from None
+    method = find_method(about["method"])
+    wanted, found = about["primitives"], provenance(trained, about["method"])["primitives"]
+    if wanted is not None and wanted["digest"] != found["digest"]:
+        raise TandemError(f"{path} composes {wanted['name']}, not {found['name']}; load those primitives")
+    return LearnedPolicy(parameters, method, trained)
