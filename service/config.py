@@ -8,35 +8,18 @@ description. ``load_config`` reads YAML and applies ``--set a.b=c`` overrides.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from contextlib import suppress
-from copy import deepcopy
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
 import yaml
 from pydantic import BaseModel, BeforeValidator, Field, PositiveInt, ValidationError, model_validator
 
-from service.errors import TandemError
+from service.config_tree import RENAMED, apply_override, read_yaml, updated
+from service.errors import ConfigError
 from service.frozen import FrozenModel
-
-_RENAMED = {"learner.bob_average_decay": "learner.bob_ema_decay", "learner.mirror": "learner.bob.mirror"}
-"""Keys that had another name in version 0.1.0."""
-_REMOVED = {
-    "game.alice_outside_reward": 0.0,
-    "game.alice_outside_from_valid_fraction": 0.0,
-    "game.alice_proximity_reward": 0.0,
-    "learner.alice_interval": 1,
-}
-"""Keys that only version 0.1.0 has, each with its default, at which it did nothing."""
-
 
 MIN_ROWS = 32
 """Least rows of a minibatch for each of several learners. Ranks pay off from about a thousand on."""
-
-
-class ConfigError(TandemError):
-    """A configuration the user can mend; the message says what, where, which value, and what to do."""
-
 
 Point = tuple[float, float, float]
 """x, y, z in the world frame."""
@@ -90,6 +73,11 @@ class GameConfig(FrozenModel):
 
     num_worlds: int = Field(160, ge=1, description="worlds stepped together by one actor")
     num_goals: int = Field(5, ge=1, description="most rounds from one reset (OpenAI 2021: 5)")
+    alice_plays: bool = Field(
+        True,
+        description="without her, a control, Bob plays goals of the task generator only, and each round starts where "
+        "his last one ended. Needs another generator.goal_source than alice",
+    )
     alice_steps: int = Field(40, ge=1, description="most steps of her turn")
     alice_steps_min: int | None = Field(
         None,
@@ -146,6 +134,12 @@ class GeneratorConfig(FrozenModel):
     )
     opponent_pool_size: int = Field(5, ge=1)
     opponent_interval: int = Field(10, ge=1, description="iterations between two snapshots of the players")
+    goal_source: Literal["alice", "uniform", "table", "learnable"] = Field(
+        "alice",
+        description="of the goals that Bob plays besides those that Alice has just proposed. alice: her earlier ones. "
+        "Controls: uniform, drawn as those of an evaluation; table, anywhere on it; learnable, uniform goals weighted "
+        "by p (1 - p) of their cells (SFL, Rutherford et al. 2024)",
+    )
     replay_fraction: float = Field(
         0.0,
         ge=0.0,
@@ -368,6 +362,15 @@ class Config(FrozenModel):
     run: RunConfig = RunConfig()
 
     @model_validator(mode="after")
+    def _there_are_goals(self) -> Self:
+        if not self.game.alice_plays and (self.generator.goal_source == "alice" or not self.generator.replay_invalid):
+            raise ValueError(
+                "without Alice there are no goals: set generator.goal_source to uniform, table or learnable, and "
+                "generator.replay_invalid=true, or game.alice_plays=true"
+            )
+        return self
+
+    @model_validator(mode="after")
     def _some_turn_is_imitated(self) -> Self:
         game, how = self.game, self.learner.self_imitation
         most = game.alice_valid_reward + game.alice_difficult_reward + game.alice_novelty_reward
@@ -391,11 +394,11 @@ def load_config(path: Path | str | None = None, overrides: Sequence[str] = (), *
     Raises:
         ConfigError: file missing or not YAML, unknown key, value out of range; one line a user can act on.
     """
-    tree = _read_yaml(Path(path)) if path is not None else {}
+    tree = read_yaml(Path(path)) if path is not None else {}
     if recorded:
-        tree = _updated(tree, where=str(path))
+        tree = updated(tree, where=str(path))
     for override in overrides:
-        _apply_override(tree, override)
+        apply_override(tree, override)
     return parse_config(tree, where=str(path) if path is not None else "the overrides")
 
 
@@ -412,14 +415,14 @@ def parse_config(tree: dict[str, Any], *, where: str, recorded: bool = False) ->
         ConfigError: unknown key, value out of range, or a recorded key whose effect is no longer there.
     """
     try:
-        return Config.model_validate(_updated(tree, where=where) if recorded else tree)
+        return Config.model_validate(updated(tree, where=where) if recorded else tree)
     except ValidationError as error:
         first = error.errors()[0]
         key = ".".join(str(part) for part in first["loc"]) or "the top level"
         found = "" if isinstance(first["input"], dict) else f" = {first['input']!r}"  # a whole group says nothing
         more = f" (and {error.error_count() - 1} more)" if error.error_count() > 1 else ""
-        if key in _RENAMED:
-            raise ConfigError(f"{where}: {key!r} is now called {_RENAMED[key]!r}{more}") from None
+        if key in RENAMED:
+            raise ConfigError(f"{where}: {key!r} is now called {RENAMED[key]!r}{more}") from None
         if first["type"] == "extra_forbidden":
             known = ", ".join(_known_keys(first["loc"]))
             raise ConfigError(f"{where}: unknown key {key!r}; known there: {known}{more}") from None
@@ -430,61 +433,6 @@ def dump_config(config: Config) -> str:
     """The resolved configuration as YAML that ``load_config`` reads back to an equal object."""
     text: str = yaml.safe_dump(config.model_dump(mode="json"), sort_keys=False)
     return text
-
-
-def _read_yaml(path: Path) -> dict[str, Any]:
-    try:
-        tree = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        raise ConfigError(f"no configuration file {path}; see configs/pretrain/ for those that ship") from None
-    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
-        raise ConfigError(f"{path}: cannot be read as YAML: {' '.join(str(error).split())}") from None
-    if tree is None:
-        return {}
-    if not isinstance(tree, dict):
-        raise ConfigError(f"{path}: expected keys and values at the top level, got {type(tree).__name__}")
-    return tree
-
-
-def _apply_override(tree: dict[str, Any], override: str) -> None:
-    key, separator, text = override.partition("=")
-    if not separator or not key.strip():
-        raise ConfigError(f"override {override!r}: expected KEY=VALUE, for example learner.bob.num_epochs=3")
-    try:
-        value = yaml.safe_load(text)
-    except yaml.YAMLError:
-        raise ConfigError(f"override {override!r}: the value is not YAML") from None
-    if isinstance(value, str):
-        with suppress(ValueError):
-            value = float(value)  # YAML 1.1 reads 1e-3 as text
-    group, name = _group(tree, key.strip(), where=f"override {override!r}")
-    group[name] = value
-
-
-def _updated(recorded: dict[str, Any], *, where: str) -> dict[str, Any]:
-    """A copy of a recorded tree, with the keys of this version."""
-    tree = deepcopy(recorded)
-    for key, default in _REMOVED.items():
-        group, name = _group(tree, key, where=where)
-        value = group.pop(name, default)
-        if value != default:
-            raise ConfigError(f"{where}: {key} = {value!r}: this key was removed; tandem 0.1.0 still reads it")
-    for old, new in _RENAMED.items():
-        group, name = _group(tree, old, where=where)
-        if name in group:
-            new_group, new_name = _group(tree, new, where=where)
-            new_group[new_name] = group.pop(name)
-    return tree
-
-
-def _group(tree: dict[str, Any], key: str, *, where: str) -> tuple[dict[str, Any], str]:
-    """The group of a dotted key, made if it is not there, and the key's name in it."""
-    *parents, name = key.split(".")
-    for parent in parents:
-        tree = tree.setdefault(parent, {})
-        if not isinstance(tree, dict):
-            raise ConfigError(f"{where}: {parent!r} is a value, not a group of keys")
-    return tree, name
 
 
 def _known_keys(location: tuple[int | str, ...]) -> list[str]:

@@ -12,6 +12,10 @@ class TandemError(ValueError):
     """Of a command that ends with it: 2 for what was asked for, 1 for what happened on the way."""
 
 
+class ConfigError(TandemError):
+    """A configuration the user can mend; the message says what, where, which value, and what to do."""
+
+
 class DivergedError(TandemError):
     """A policy no longer acts in finite numbers; what it did before is not in doubt."""
 

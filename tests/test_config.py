@@ -7,7 +7,8 @@ import pytest
 import yaml
 from pydantic import ValidationError
 
-from service.config import Config, ConfigError, WorkspaceConfig, dump_config, load_config, parse_config
+from service.config import Config, WorkspaceConfig, dump_config, load_config, parse_config
+from service.errors import ConfigError
 
 CONFIGS = Path(__file__).parents[1] / "configs"
 

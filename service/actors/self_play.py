@@ -3,6 +3,7 @@
 Alice acts from s0 for a number of steps, fixed or drawn; where the object then is becomes the goal. The worlds go back
 to s0, and Bob acts until he has held the object there or his time is over. The next round of the game starts where
 Alice ended, so games reach grasped objects by themselves; an invalid goal ends the game (OpenAI 2021, section 3).
+Without Alice, a control, Bob plays goals of the task generator, and the next round starts where he ended.
 """
 
 from __future__ import annotations
@@ -22,10 +23,13 @@ from service.generator.opponents import CURRENT, RoundPlan
 from service.generator.records import GoalRecords
 from service.generator.ring import Rows
 from service.generator.snapshot import GoalChoice
-from service.generator.validity import Verdict, classify_goal
+from service.generator.validity import Verdict, classify_goal, in_workspace
 from service.types import Arrays, BoolArray, FloatArray, IntArray, Metrics, StateArray
 
 VerdictArray = NDArray[np.int8]
+_HINDSIGHT_STRIDE = 4
+"""One in so many steps of Bob's failures is a demonstration where Alice gives none to measure them by: about as many as
+in self-play."""
 
 
 class StochasticPolicy(Protocol):
@@ -115,7 +119,8 @@ class SelfPlay:
         """
         game, worlds = self.config.game, self.worlds
         start_state, start_position = worlds.states.copy(), worlds.object_position.copy()
-        alice, contacts, diverged = self._play_alice(players, plan, observe)
+        play_alice = self._play_alice if game.alice_plays else self._leave_alice_out
+        alice, contacts, diverged = play_alice(players, plan, observe)
         end_state, proposal = worlds.states.copy(), worlds.object_position.copy()
         verdict = classify_goal(start_position, proposal, self.config.world.workspace, game.success_distance_m)
         verdict[diverged] = Verdict.FALLEN
@@ -126,7 +131,8 @@ class SelfPlay:
         achieved = worlds.object_position.copy()
         played = choice.played & ~diverged  # a turn in which the physics diverged says nothing about either player
         bob.learn[diverged] = False
-        self._reward_alice(alice, verdict, played & ~choice.replayed, solved, choice.novelty)
+        if game.alice_plays:
+            self._reward_alice(alice, verdict, played & ~choice.replayed, solved, choice.novelty)
         records = GoalRecords(
             start_state=choice.start_state,
             start_position=choice.start_position,
@@ -142,7 +148,12 @@ class SelfPlay:
             bob_past=plan.bob_past,
             round_index=self._round_index.copy(),
         )
-        self._continue_games(end_state, verdict)
+        if game.alice_plays:
+            self._continue_games(end_state, verdict == Verdict.VALID)
+        else:
+            inside = in_workspace(achieved, self.config.world.workspace)
+            self._continue_games(worlds.states.copy(), inside & ~diverged)
+        num_bob_steps = int(bob.active.sum())
         rollout = Rollout(
             actor=self._actor,
             incarnation=self.incarnation,
@@ -152,8 +163,8 @@ class SelfPlay:
             bob=bob,
             demonstrations=self._demonstrations(alice, bob, records, achieved),
             records=records,
-            num_env_steps=int(alice.active.sum() + bob.active.sum()),
-            metrics=_contact_metrics(contacts),
+            num_env_steps=(num_env_steps := int(alice.active.sum()) + num_bob_steps),
+            metrics=_contact_metrics(contacts) | {"bob/env_steps_fraction": num_bob_steps / max(num_env_steps, 1)},
             diverged=tuple(worlds.diverged),
         )
         worlds.diverged = []
@@ -188,6 +199,15 @@ class SelfPlay:
         turns.terminated[num_steps - 1] = True
         turns.learn[diverged] = False
         return turns, contacts, diverged
+
+    def _leave_alice_out(
+        self, players: Players, plan: RoundPlan, observe: Observer | None
+    ) -> tuple[Turns, BoolArray, BoolArray]:
+        """Turns without a step, as ``_play_alice`` gives them."""
+        num = self.worlds.num_worlds
+        nobody = np.zeros(num, dtype=bool)
+        turns = _empty_turns(self.config.game.alice_steps, num, FULL.size, FULL.size, learn=nobody)
+        return turns, np.zeros((num, 2), dtype=bool), nobody
 
     def _play_bob(
         self, players: Players, plan: RoundPlan, choice: GoalChoice, observe: Observer | None
@@ -249,15 +269,18 @@ class SelfPlay:
         by_bob = _relabelled(bob, failed & (moved == Verdict.VALID), achieved)
         # No more of his steps than of hers: he fails in several times as many, and would drown what she shows him.
         every = -(-len(by_bob.observation) // max(1, len(by_alice.observation))) or 1
+        if not config.game.alice_plays:
+            every = _HINDSIGHT_STRIDE
         return Demonstrations(
             np.concatenate([by_alice.observation, by_bob.observation[::every]]),
             np.concatenate([by_alice.action, by_bob.action[::every]]),
         )
 
-    def _continue_games(self, end_state: StateArray, verdict: VerdictArray) -> None:
+    def _continue_games(self, end_state: StateArray, going_on: BoolArray) -> None:
+        """Begin the next round at ``end_state`` (N, S) in the worlds ``going_on`` (N,), a new game in the others."""
         self.worlds.restore(end_state)
         self._round_index += 1
-        over = (verdict != Verdict.VALID) | (self._round_index >= self.config.game.num_goals)
+        over = ~going_on | (self._round_index >= self.config.game.num_goals)
         self.worlds.reset(self._rng, over)
         self._round_index[over] = 0
 

@@ -105,19 +105,15 @@ class DifficultyGrid:
         self.counts.record(tries, successes)
         return self.num_cells_seen - before
 
-    def learnability(self, goals: StateArray) -> StateArray:
-        """(M,) p (1 - p) of the cell of each of (M, 3) goals; 1/4, the most, where untried."""
-        learnability: StateArray = self.counts.learnability()[self.cells.index(goals)]
-        return learnability
-
     def novelty(self) -> StateArray:
         """(cells,) how rare proposals are: ``1 / sqrt(1 + n)`` of their decayed count (as in Bellemare et al. 2016)."""
         novelty: StateArray = 1.0 / np.sqrt(1.0 + self.proposals)
         return novelty
 
     def mean_success_rate(self) -> float:
-        """Mean over all cells, 0 where no goal was ever proposed: how much of the workspace Bob masters."""
-        return float(np.where(self.seen, self.counts.success_rate(), 0.0).mean())
+        """Mean over all cells, 0 where there never was a goal: how much of the workspace Bob masters."""
+        known = self.seen | (self.counts.num_tries > 0)
+        return float(np.where(known, self.counts.success_rate(), 0.0).mean())
 
     def mean_learnability(self) -> float:
         """Mean over the cells seen; not-a-number while there are none."""

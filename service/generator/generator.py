@@ -49,7 +49,7 @@ class TaskGenerator:
 
     def __init__(self, config: Config, layout: StateLayout) -> None:
         self._config = config.generator
-        self._success_distance_m = config.game.success_distance_m
+        self._success_distance_m, self._world = config.game.success_distance_m, config.world
         self.cells = GoalCells(config.world, config.generator.cell_size_m)
         self.tasks = TaskBins.from_config(config, layout)
         self.grid = DifficultyGrid(self.cells)
@@ -75,11 +75,12 @@ class TaskGenerator:
         return GeneratorSnapshot(
             config=self._config,
             success_distance_m=self._success_distance_m,
+            world=self._world,
             cells=self.cells,
             tasks=self.tasks,
             buffer=buffer,
             share=self._replay_share(buffer["goal"]),
-            learnability=self.grid.learnability(buffer["goal"]),
+            cell_learnability=self.grid.counts.learnability(),
             starts=self.starts.rows(),
             reset_learnability=self.from_reset.learnability(),
             novelty=self.grid.novelty() * (1.0 - coverage),

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from service.config import ConfigError
+from service.errors import ConfigError
 from service.generator.state import take
 from service.types import Array, Arrays, IntArray, StateArray
 

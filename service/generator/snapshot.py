@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from service.config import GeneratorConfig
+from service.config import GeneratorConfig, WorldConfig
+from service.envs.sampling import GoalKind, sample_goals
 from service.generator.bins import GoalCells, TaskBins, in_air
 from service.generator.opponents import RoundPlan
 from service.generator.ring import Rows, join_rows
@@ -19,9 +20,11 @@ from service.types import Array, Arrays, BoolArray, IntArray, StateArray
 
 LEARNABILITY_FLOOR = 0.01
 """Added to p (1 - p), which is at most 1/4, so goals of a solved or hopeless cell stay drawable and measured."""
+NUM_DRAWN = 1024
+"""Goals drawn in a round for another ``goal_source`` than Alice, of which those that are played are chosen."""
 MIN_REPLAY_GOALS = 64
 """Goals the buffer must hold before any is replayed: fewer would be played over and over."""
-_ARRAYS = ("share", "learnability", "reset_learnability", "novelty", "success_rate", "coverage")
+_ARRAYS = ("share", "cell_learnability", "reset_learnability", "novelty", "success_rate", "coverage")
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,14 +56,15 @@ class GeneratorSnapshot:
 
     config: GeneratorConfig
     success_distance_m: float
+    world: WorldConfig
     cells: GoalCells
     tasks: TaskBins
     buffer: Rows
     """(M,) ``goal`` of the replay buffer, and ``start_state`` and ``start_position`` from which it was proposed."""
     share: StateArray
     """(M,) weights of the goals, by the parts of the buffer that they are in."""
-    learnability: StateArray
-    """(M,) p (1 - p) of the cell of each goal of the buffer."""
+    cell_learnability: StateArray
+    """(cells,) p (1 - p) of goals there."""
     starts: Rows
     """``start_state`` and ``start_position`` of games."""
     reset_learnability: StateArray
@@ -82,7 +86,9 @@ class GeneratorSnapshot:
         verdict: NDArray[np.int8],
         rng: np.random.Generator,
     ) -> GoalChoice:
-        """Choose what Bob plays: Alice's valid goals, or replayed ones where the configuration says so.
+        """Choose what Bob plays: Alice's valid goals, or others where the configuration says so.
+
+        Others are her earlier ones, replayed, or those of another ``goal_source``, which count as replayed, too.
 
         Replayed goals go to the current Bob only: nobody learns from a past Bob, he shows how hard Alice's goals are.
 
@@ -103,7 +109,9 @@ class GeneratorSnapshot:
         novelty[valid] = self.novelty[self.cells.index(proposal[valid])]
         choice = GoalChoice(proposal.copy(), *starts, replayed, from_reset, valid | replayed, novelty)
         if replayed.any():
-            self._replay(choice, np.flatnonzero(replayed), rng)
+            own = self.config.goal_source == "alice"
+            candidates = self._earlier_goals() if own else self._drawn_goals(start_state, start_position, rng)
+            self._replay(choice, np.flatnonzero(replayed), candidates, rng)
         return choice
 
     def state(self) -> Arrays:
@@ -114,32 +122,52 @@ class GeneratorSnapshot:
     def with_state(self, state: Mapping[str, Array]) -> GeneratorSnapshot:
         """A snapshot with the arrays that ``state`` gave, and all else from this one."""
         parts = split_parts(state)
-        arrays: dict[str, Any] = {name: state[name] for name in _ARRAYS}
+        arrays: dict[str, Any] = {name: state[name] for name in _ARRAYS if name in state}  # older states lack some
         return replace(self, **arrays, buffer=parts["buffer"], starts=parts["starts"])
 
     def _choose_replayed(self, valid: BoolArray, bob_past: BoolArray, rng: np.random.Generator) -> BoolArray:
         """(N,) worlds whose goal comes from the buffer."""
-        if len(self.buffer["goal"]) < MIN_REPLAY_GOALS:
+        if self.config.goal_source == "alice" and len(self.buffer["goal"]) < MIN_REPLAY_GOALS:
             return np.zeros(len(valid), dtype=np.bool_)
         # While much of the workspace is new to her, what she proposes is worth more than what she once did.
         replaced: BoolArray = valid & (rng.random(len(valid)) < self.config.replay_fraction * self.coverage)
         filled: BoolArray = ~valid & self.config.replay_invalid
         return (replaced | filled) & ~bob_past
 
-    def _replay(self, choice: GoalChoice, worlds: IntArray, rng: np.random.Generator) -> None:
-        """Give ``worlds`` earlier goals, from the start each was proposed from or from that of some game.
+    def _earlier_goals(self) -> _Candidates:
+        """Alice's earlier goals, each from the start it was proposed from, by learnability and the buffer's parts."""
+        weight = (self.cell_learnability[self.cells.index(self.buffer["goal"])] + LEARNABILITY_FLOOR) * self.share
+        return _Candidates(self.buffer, weight, self.share)
+
+    def _drawn_goals(
+        self, start_state: StateArray, start_position: StateArray, rng: np.random.Generator
+    ) -> _Candidates:
+        """Goals that nobody proposed, each from where some world is now."""
+        kind: GoalKind = "table" if self.config.goal_source == "table" else "mixed"
+        rows = rng.integers(len(start_state), size=NUM_DRAWN)
+        tasks = {
+            "goal": sample_goals(kind, rng, NUM_DRAWN, self.world, self.success_distance_m),
+            "start_state": start_state[rows],
+            "start_position": start_position[rows],
+        }
+        weight = np.full(NUM_DRAWN, 1.0)
+        if self._by_learnability:
+            weight = self.cell_learnability[self.cells.index(tasks["goal"])] + LEARNABILITY_FLOOR
+        return _Candidates(tasks, weight * self._is_task(**tasks), np.ones(NUM_DRAWN))
+
+    def _replay(self, choice: GoalChoice, worlds: IntArray, candidates: _Candidates, rng: np.random.Generator) -> None:
+        """Give ``worlds`` some of the candidates, from their own start or from that of some game.
 
         Whatever is asked of Bob downstream begins with a reset, but Alice reaches far goals over several rounds, so few
         of her own do. Both kinds of task compete by learnability: far goals from a reset wait until Bob is ready.
         """
-        # Each goal of the buffer is a candidate from its own start and, behind all of these, from the start of a game.
-        goal, num_starts = self.buffer["goal"], len(self.starts["start_position"])
-        tasks = self.buffer
-        weight = (self.learnability + LEARNABILITY_FLOOR) * self.share
+        # Each candidate is one from its own start and, behind all of these, one from the start of a game.
+        goal, num_starts = candidates.tasks["goal"], len(self.starts["start_position"])
+        tasks, weight = candidates.tasks, candidates.weight
         if self.config.replay_from_reset and num_starts:
             drawn = rng.choice(num_starts, size=len(goal))
             start = {name: rows[drawn] for name, rows in self.starts.items()}
-            weight = np.concatenate([weight, self._weight_from_reset(**start) * self.share])
+            weight = np.concatenate([weight, self._weight_from_reset(goal, **start) * candidates.share])
             tasks = join_rows([{name: tasks[name] for name in start}, start])
         drawn = rng.choice(len(weight), size=len(worlds), p=weight / weight.sum())
         choice.goal[worlds] = goal[drawn % len(goal)]
@@ -147,12 +175,30 @@ class GeneratorSnapshot:
         choice.start_state[worlds] = tasks["start_state"][drawn]
         choice.start_position[worlds] = tasks["start_position"][drawn]
 
-    def _weight_from_reset(self, start_state: StateArray, start_position: StateArray) -> StateArray:
-        """(M,) weight, but for its share, of each goal of the buffer from one (M, S) start of a game each."""
-        goal = self.buffer["goal"]
-        far = np.linalg.norm(goal - start_position, axis=1) > self.success_distance_m  # nearer ones are no task
-        # A closed gripper lifts nothing.
-        possible = ~(self.tasks.blocked(start_state) & in_air(goal, self.tasks.rest_height_m))
-        learnability = self.reset_learnability[self.tasks.index(goal, start_position, start_state)]
-        weight: StateArray = np.where(far & possible, learnability + LEARNABILITY_FLOOR, 0.0)
-        return weight
+    @property
+    def _by_learnability(self) -> bool:
+        return self.config.goal_source in ("alice", "learnable")
+
+    def _weight_from_reset(self, goal: StateArray, start_state: StateArray, start_position: StateArray) -> StateArray:
+        """(M,) weight, but for its share, of (M, 3) goals from one (M, S) start of a game each."""
+        weight = np.full(len(goal), 1.0)
+        if self._by_learnability:
+            weight = self.reset_learnability[self.tasks.index(goal, start_position, start_state)] + LEARNABILITY_FLOOR
+        return weight * self._is_task(goal, start_state, start_position)
+
+    def _is_task(self, goal: StateArray, start_state: StateArray, start_position: StateArray) -> BoolArray:
+        """(M,) whether the object has to be moved, and can be: a closed gripper lifts nothing."""
+        far: BoolArray = np.linalg.norm(goal - start_position, axis=1) > self.success_distance_m
+        return far & ~(self.tasks.blocked(start_state) & in_air(goal, self.tasks.rest_height_m))
+
+
+@dataclass(frozen=True, slots=True)
+class _Candidates:
+    """Tasks that Bob may be given besides those of this round's Alice."""
+
+    tasks: Rows
+    """(M,) ``goal``, ``start_state`` and ``start_position``."""
+    weight: StateArray
+    """(M,) from those starts."""
+    share: StateArray
+    """(M,) factor of the weight of the same goals from the start of a game."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from service.config import ConfigError
+from service.errors import ConfigError
 from service.types import Array
 
 

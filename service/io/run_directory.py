@@ -30,8 +30,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from service.config import Config, ConfigError, dump_config, load_config
-from service.errors import TandemError
+from service.config import Config, dump_config, load_config
+from service.errors import ConfigError, TandemError
 from service.io.checkpoints import CheckpointStore
 from service.io.errors import StorageError
 from service.io.files import Appender, os_errors, remove_temporaries, write_atomic

@@ -16,8 +16,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from service.config import Config, ConfigError, dump_config, load_config
-from service.errors import TandemError
+from service.config import Config, dump_config, load_config
+from service.errors import ConfigError, TandemError
 from service.io.errors import StorageError
 from service.io.files import os_errors, write_atomic
 from service.io.lock import DirectoryLock

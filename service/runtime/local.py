@@ -13,7 +13,8 @@ from datetime import UTC, datetime
 
 from service.actors.evaluation import EVALUATED_GOALS
 from service.actors.rollout import Rollout, from_arrays, to_arrays
-from service.config import Config, ConfigError
+from service.config import Config
+from service.errors import ConfigError
 from service.generator.opponents import Opponents
 from service.io.run_directory import RunDirectory
 from service.policies.parameters import Parameters

@@ -10,8 +10,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, cast
 
-from service.config import Config, ConfigError, load_config
-from service.errors import TandemError
+from service.config import Config, load_config
+from service.errors import ConfigError, TandemError
 from service.io.run_directory import RunDirectory
 from service.io.study_directory import StudyDirectory
 from service.learner.learner import torch_device

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from dataclasses import dataclass
 
-from service.config import ConfigError
+from service.errors import ConfigError
 
 CORES_PER_RUN = 2
 """A run on one machine plays on one core and learns on another."""

@@ -443,13 +443,65 @@ def test_ids_increase_and_say_who_played():
 
 def test_env_steps_are_those_simulated(rollout):
     assert rollout.policy_version == 3
-    assert rollout.num_env_steps == 5 * 9 + int(rollout.records.num_bob_steps.sum())
+    bobs = int(rollout.records.num_bob_steps.sum())
+    assert rollout.num_env_steps == 5 * 9 + bobs
+    assert rollout.metrics["bob/env_steps_fraction"] == bobs / (5 * 9 + bobs)
 
 
 def test_contact_fractions():
     metrics = play(make_game(make_config(4), [IN_FRONT, AT_REST, SLIDES, AT_REST]), Pusher()).metrics
     assert metrics["alice/contact_fraction"] == 0.25
     assert metrics["alice/both_contact_fraction"] <= 0.25
+
+
+# --- without Alice ---------------------------------------------------------------------------------------------------
+
+
+def without_alice(num_worlds, **game):
+    goals = {"goal_source": "uniform", "replay_invalid": True}
+    config = make_config(num_worlds, game={"alice_plays": False, **game}, generator=goals)
+    return config
+
+
+def everywhere(goal):
+    """Every world's Bob plays the same goal from where his world is."""
+
+    def choose(start_state, start_position, round_index, proposal, verdict):
+        every = np.ones(len(proposal), dtype=bool)
+        goals = np.tile(goal, (len(proposal), 1))
+        first = np.asarray(round_index == 0)
+        return GoalChoice(goals, start_state.copy(), start_position.copy(), every, first, every, np.zeros(len(every)))
+
+    return choose
+
+
+def test_without_alice_bob_goes_on_from_where_he_ended():
+    game = make_game(without_alice(5, num_goals=3), STARTS)
+    alice = Constant()
+    first = play(game, alice, Pusher(), choose_goals=everywhere((0.1, 0.1, 0.025)))
+    assert alice.seen == []
+    assert not first.alice.active.any()
+    assert not first.alice.learn.any()
+    assert not first.alice.reward.any()
+    assert first.num_env_steps == 5 * 7
+    assert first.metrics["bob/env_steps_fraction"] == 1.0
+    assert (first.records.verdict == Verdict.NOT_MOVED).all()
+    going_on = game._round_index > 0
+    assert going_on.tolist() == [True, True, True, False, False]  # those that leave the workspace or fall begin anew
+    end = game.worlds.object_position.copy()
+    assert end[PUSHED, 0] > 0.05
+    second = play(game, choose_goals=everywhere((0.1, 0.1, 0.025)))
+    np.testing.assert_array_equal(second.records.start_position[:3], end[:3])
+    play(game, choose_goals=everywhere((0.1, 0.1, 0.025)))
+    assert (game._round_index[:3] == 0).all()
+
+
+def test_without_alice_one_in_four_of_bobs_failing_steps_is_a_demonstration():
+    config = without_alice(4)
+    config = config.model_copy(update={"learner": make_config(1, learner={"abc": {"hindsight": True}}).learner})
+    rollout = play(make_game(config, [IN_FRONT] * 4), bob=Pusher(), choose_goals=everywhere((-0.1, -0.1, 0.025)))
+    assert not rollout.records.solved.any()
+    assert len(rollout.demonstrations.action) == 7  # of 4 x 7
 
 
 # --- reproducible ----------------------------------------------------------------------------------------------------

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from service.config import ConfigError, WorkspaceConfig, WorldConfig
+from service.config import WorkspaceConfig, WorldConfig
+from service.errors import ConfigError
 from service.generator.bins import NUM_DISTANCE_BINS, NUM_TASK_BINS, GoalCells, distance_bins, height_bins, in_air
 from service.generator.difficulty import DECAY, PROPOSAL_DECAY, DifficultyGrid, SuccessCounts
 
@@ -95,10 +96,16 @@ def test_grid_rates_by_hand() -> None:
     record(grid, [easy, easy, easy, hard], [True, True, True, False])
     goals = np.array([easy, hard, untried])
     np.testing.assert_allclose(grid.counts.success_rate()[grid.cells.index(goals)], [4 / 5, 1 / 3, 1 / 2], rtol=1e-15)
-    np.testing.assert_allclose(grid.learnability(goals), [4 / 25, 2 / 9, 1 / 4], rtol=1e-15)
+    learnability = grid.counts.learnability()[grid.cells.index(goals)]
+    np.testing.assert_allclose(learnability, [4 / 25, 2 / 9, 1 / 4], rtol=1e-15)
     np.testing.assert_allclose(grid.mean_learnability(), (4 / 25 + 2 / 9) / 2, rtol=1e-15)
     np.testing.assert_allclose(grid.mean_success_rate(), (4 / 5 + 1 / 3) / len(grid.cells), rtol=1e-15)
     assert grid.num_cells_seen == 2
+    tries = grid.cells.count(np.array([untried]))  # a goal that nobody proposed
+    grid.record(np.zeros_like(tries), tries, tries)
+    assert grid.num_cells_seen == 2
+    rates = [(3 * 0.95 + 1) / (3 * 0.95 + 2), 1 / (0.95 + 2), 2 / 3]
+    np.testing.assert_allclose(grid.mean_success_rate(), sum(rates) / len(grid.cells), rtol=1e-12)
 
 
 def test_a_new_cell_is_counted_once_tried_or_not() -> None:

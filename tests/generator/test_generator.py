@@ -10,8 +10,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from service.config import Config, ConfigError, parse_config
+from service.config import Config, parse_config
 from service.envs.state_layout import StateLayout
+from service.errors import ConfigError
 from service.generator.generator import TaskGenerator
 from service.generator.opponents import CURRENT, RoundPlan
 from service.generator.records import GoalRecords
@@ -199,6 +200,63 @@ def test_a_past_bob_plays_no_replayed_goals(make_records: MakeRecords) -> None:
     choice = choose(generator, [VALID, VALID, OUTSIDE], plan)
     assert_rows(choice, [True, False, False])
     assert choice.played.tolist() == [True, True, False]
+
+
+@pytest.mark.parametrize("source", ["uniform", "table", "learnable"])
+def test_goals_that_nobody_proposed(make_records: MakeRecords, source: str) -> None:
+    """From a game's start or from where some world is now, and never where nothing has to be done."""
+    settings = {"goal_source": source, "replay_invalid": True, "replay_from_reset": True}
+    generator = TaskGenerator(config(**settings), FREE)
+    record(generator, make_records(np.tile(OLD_GOAL, (4, 1))), ONE_GAME)
+    choice = choose(generator, [OUTSIDE] * 4000)
+    assert choice.replayed.all()
+    assert choice.played.all()
+    assert (choice.start_state == 1.0).all()  # of a game, and of every world
+    assert 0.4 < choice.from_reset.mean() < 0.6
+    x, y, z = choice.goal.T
+    share = {"table": 1.0}.get(source, 0.3)
+    assert (z == 0.025).mean() == pytest.approx(share, abs=0.04)
+    assert len(np.unique(choice.goal, axis=0)) > 500
+    for values, low, high in ((x, -0.225, 0.125), (y, -0.175, 0.175)):
+        assert values.min() >= low
+        assert values.max() <= high
+        assert np.histogram(values, 5, (low, high))[0].min() > 500
+    assert (np.linalg.norm(choice.goal - choice.start_position, axis=1) > 0.05).all()
+
+
+def test_learnable_goals_are_drawn_by_learnability(make_records: MakeRecords) -> None:
+    """Bob always solves goals in the cells with x below -2.5 cm, 20 of 35 cm; of the others nothing is known."""
+    cells = TaskGenerator(config(), FREE).cells.centers().reshape(-1, 3)
+    solved = np.repeat(cells[cells[:, 0] < -0.025], 100, axis=0)
+    known = 101 / 102 * 1 / 102
+    for source, (left, right) in {"uniform": (1.0, 1.0), "learnable": (known + 0.01, 0.25 + 0.01)}.items():
+        generator = TaskGenerator(config(goal_source=source, replay_invalid=True), FREE)
+        record(generator, make_records(solved, solved=np.ones(len(solved), dtype=np.bool_)))
+        goal = choose(generator, [OUTSIDE] * 4000).goal
+        share = 20 * left / (20 * left + 15 * right)
+        assert np.mean(goal[:, 0] < -0.025) == pytest.approx(share, abs=0.04), source
+
+
+def test_no_drawn_goal_in_the_air_where_the_gripper_is_blocked() -> None:
+    settings = {"goal_source": "uniform", "replay_invalid": True}
+    tree = {"generator": settings, "game": {"blocked_gripper_fraction": 0.2}}
+    snapshot = TaskGenerator(parse_config(tree, where="t"), SOME_BLOCKED).snapshot()
+    state = np.zeros((400, STATE_SIZE))
+    state[::2, BLOCKED] = 1.0
+    index, verdict = np.zeros(400, dtype=np.int64), np.full(400, OUTSIDE, dtype=np.int8)
+    place = np.tile([0.0, 0.0, 0.025], (400, 1))
+    choice = snapshot.choose_goals(all_current(400), state, place, index, place, verdict, np.random.default_rng(0))
+    blocked = choice.start_state[:, BLOCKED] == 1.0
+    assert 0.1 < blocked.mean() < 0.5
+    assert (choice.goal[~blocked, 2] > 0.1).any()
+    assert (choice.goal[blocked, 2] <= 0.025 + 0.05).all()
+
+
+def test_a_state_of_before_goals_had_sources(make_records: MakeRecords) -> None:
+    state = filled(make_records).snapshot().state()
+    del state["cell_learnability"]
+    fresh = TaskGenerator(config(), FREE).snapshot()
+    np.testing.assert_array_equal(fresh.with_state(state).cell_learnability, 0.25)
 
 
 def test_choice_does_not_alias_its_inputs(make_records: MakeRecords) -> None:

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from service.config import ConfigError, load_config
-from service.errors import TandemError
+from service.config import load_config
+from service.errors import ConfigError, TandemError
 from service.io.run_directory import MAX_DIVERGED_FILES, RunDirectory
 from tests.runtime.runs import assert_one_line, no_room_above, read_lines, tiny_config
 

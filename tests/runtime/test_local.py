@@ -46,7 +46,7 @@ METRICS = {
     "alice/contact_fraction", "alice/both_contact_fraction",
     # Bob by goal type, against a past Alice, on replayed goals
     "bob/success_rate", "bob/success_rate_table", "bob/success_rate_air", "bob/success_rate_past_alice",
-    "bob/success_rate_from_reset", "bob/success_rate_replayed", "bob/steps_to_success",
+    "bob/success_rate_from_reset", "bob/success_rate_replayed", "bob/steps_to_success", "bob/env_steps_fraction",
     # ABC samples and their mean log-ratio
     "learner/num_demonstrations", "learner/demonstration_log_ratio", "learner/demonstration_log_prob",
     "learner/cloning_loss", "learner/num_imitated", "learner/alice_cloning_loss",

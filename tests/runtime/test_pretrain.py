@@ -10,9 +10,9 @@ import pytest
 import yaml
 
 from service.actors import evaluation
-from service.config import ConfigError, parse_config
+from service.config import parse_config
 from service.envs.sampling import draw_goals
-from service.errors import TandemError
+from service.errors import ConfigError, TandemError
 from service.io.run_directory import RunDirectory
 from service.primitives import publishing
 from service.primitives.bundled import BUNDLED

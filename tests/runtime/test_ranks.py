@@ -8,7 +8,8 @@ import pytest
 import ray
 from ray.exceptions import ObjectLostError
 
-from service.config import ConfigError, parse_config
+from service.config import parse_config
+from service.errors import ConfigError
 from service.io.run_directory import RunDirectory
 from service.runtime import learner_group
 from service.runtime.cluster import ClusterRun

@@ -15,8 +15,7 @@ from typer.testing import CliRunner
 
 from service.actors.evaluation import EVALUATION_SEED, REPORTED_SEED, SELECTION_SEED, Evaluation
 from service.cli.main import app
-from service.config import ConfigError
-from service.errors import TandemError
+from service.errors import ConfigError, TandemError
 from service.io.run_directory import RunDirectory
 from service.io.study_directory import StudyDirectory
 from service.primitives.loading import read_parameters

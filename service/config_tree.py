@@ -1,0 +1,79 @@
+"""Configurations as plain trees: read from YAML, changed by overrides, and brought up to date where old ones differ."""
+
+from __future__ import annotations
+
+from contextlib import suppress
+from copy import deepcopy
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from service.errors import ConfigError
+
+RENAMED = {"learner.bob_average_decay": "learner.bob_ema_decay", "learner.mirror": "learner.bob.mirror"}
+"""Keys that had another name in version 0.1.0."""
+REMOVED = {
+    "game.alice_outside_reward": 0.0,
+    "game.alice_outside_from_valid_fraction": 0.0,
+    "game.alice_proximity_reward": 0.0,
+    "learner.alice_interval": 1,
+}
+"""Keys that only version 0.1.0 has, each with its default, at which it did nothing."""
+
+
+def read_yaml(path: Path) -> dict[str, Any]:
+    """Read the tree of a YAML file; see ``config.load_config`` for its errors."""
+    try:
+        tree = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise ConfigError(f"no configuration file {path}; see configs/pretrain/ for those that ship") from None
+    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
+        raise ConfigError(f"{path}: cannot be read as YAML: {' '.join(str(error).split())}") from None
+    if tree is None:
+        return {}
+    if not isinstance(tree, dict):
+        raise ConfigError(f"{path}: expected keys and values at the top level, got {type(tree).__name__}")
+    return tree
+
+
+def apply_override(tree: dict[str, Any], override: str) -> None:
+    """Apply one ``a.b=c`` string; see ``config.load_config`` for its errors."""
+    key, separator, text = override.partition("=")
+    if not separator or not key.strip():
+        raise ConfigError(f"override {override!r}: expected KEY=VALUE, for example learner.bob.num_epochs=3")
+    try:
+        value = yaml.safe_load(text)
+    except yaml.YAMLError:
+        raise ConfigError(f"override {override!r}: the value is not YAML") from None
+    if isinstance(value, str):
+        with suppress(ValueError):
+            value = float(value)  # YAML 1.1 reads 1e-3 as text
+    group, name = group_of(tree, key.strip(), where=f"override {override!r}")
+    group[name] = value
+
+
+def updated(recorded: dict[str, Any], *, where: str) -> dict[str, Any]:
+    """A copy of a recorded tree, with the keys of this version."""
+    tree = deepcopy(recorded)
+    for key, default in REMOVED.items():
+        group, name = group_of(tree, key, where=where)
+        value = group.pop(name, default)
+        if value != default:
+            raise ConfigError(f"{where}: {key} = {value!r}: this key was removed; tandem 0.1.0 still reads it")
+    for old, new in RENAMED.items():
+        group, name = group_of(tree, old, where=where)
+        if name in group:
+            new_group, new_name = group_of(tree, new, where=where)
+            new_group[new_name] = group.pop(name)
+    return tree
+
+
+def group_of(tree: dict[str, Any], key: str, *, where: str) -> tuple[dict[str, Any], str]:
+    """The group of a dotted key, made if it is not there, and the key's name in it."""
+    *parents, name = key.split(".")
+    for parent in parents:
+        tree = tree.setdefault(parent, {})
+        if not isinstance(tree, dict):
+            raise ConfigError(f"{where}: {parent!r} is a value, not a group of keys")
+    return tree, name
