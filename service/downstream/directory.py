@@ -5,7 +5,7 @@
 | ``cell.json`` | settings of the trial, and which primitives (version and SHA-256 of their parameters) |
 | ``metrics.jsonl`` | an object per iteration, keyed by metric; only ``time/...`` differs between equal runs |
 | ``tensorboard/`` | the same metrics as TensorBoard events over env steps |
-| ``checkpoint.pt`` | everything the training continues from exactly, replay buffer included |
+| ``checkpoints/`` | the newest one: everything the training continues from exactly, replay buffer included |
 | ``result.json`` | how well it does in the end |
 | ``policy.safetensors`` | what was learned, averaged; ``policy.load_policy`` plays it without torch |
 | ``curves.png``, ``episodes.mp4`` | for people |
@@ -14,22 +14,21 @@
 
 from __future__ import annotations
 
-import io
 import json
-import pickle
 from pathlib import Path
 from typing import Any, Self
 
 from service.downstream.settings import TrialConfig, differences, validate
 from service.errors import TandemError
+from service.io.checkpoints import Checkpoint, CheckpointStore
 from service.io.files import TEMPORARY_PREFIX, os_errors, remove_temporaries, write_atomic
 from service.io.jsonl import JsonlWriter
 from service.io.lock import LOCK_FILE, DirectoryLock
 from service.io.tensorboard import EventFile
+from service.types import Arrays
 
 FORMAT_VERSION = 1
 """Version of ``cell.json`` and ``result.json``, and of the table's files."""
-_CHECKPOINT_VERSION = 2
 TRIAL = "cell"
 """Key of a trial's settings in these files, which call a trial a cell."""
 _ELSEWHERE = "name another directory (--run-dir, of a table --runs)"
@@ -43,7 +42,7 @@ class TrainingDirectory:
         self.path = path
         self.trial_file = path / "cell.json"
         self.metrics_file = path / "metrics.jsonl"
-        self.checkpoint_file = path / "checkpoint.pt"
+        self._checkpoints = CheckpointStore(path / "checkpoints", keep=1)
         self.result_file = path / "result.json"
         self.policy_file = path / "policy.safetensors"
         self._metrics = JsonlWriter(self.metrics_file)
@@ -58,7 +57,7 @@ class TrainingDirectory:
             self._lock.release()
             self._lock = None
 
-    def start(self, identity: dict[str, Any], *, resume: bool) -> dict[str, Any] | None:
+    def start(self, identity: dict[str, Any], *, resume: bool) -> Checkpoint | None:
         """Begin a training here, or continue one, and keep other processes out until the ``with`` block ends.
 
         Args:
@@ -75,13 +74,13 @@ class TrainingDirectory:
         self.check(identity, resume=resume)
         self._lock = DirectoryLock(self.path, f"stop that one first, or {_ELSEWHERE}")
         self.check(identity, resume=resume)  # of two that begin at once, the second sees here what the first has made
-        saved = self._read_checkpoint() if self.checkpoint_file.exists() else None
+        saved = self._checkpoints.load_latest() if self._checkpoints.steps() else None
         with os_errors("write", self.path):
             remove_temporaries(self.path)
         write_json(self.trial_file, {"format_version": FORMAT_VERSION, **identity})  # first: it says whose the rest is
-        self._metrics.truncate_after(saved["iteration"] if saved else 0)
+        self._metrics.truncate_after(saved.step if saved else 0)
         with os_errors("write", self.path):
-            self._events = EventFile(self.path / "tensorboard", after_step=saved["env_steps"] if saved else None)
+            self._events = EventFile(self.path / "tensorboard", after_step=saved.meta["env_steps"] if saved else None)
         return saved
 
     def check(self, identity: dict[str, Any], *, resume: bool) -> None:
@@ -109,32 +108,14 @@ class TrainingDirectory:
         self._metrics.append(metrics)
         self._events.add(metrics)
 
-    def write_checkpoint(self, saved: dict[str, Any]) -> None:
-        """Replace the checkpoint in one step; the records it knows of are on the disk before.
+    def save(self, iteration: int, arrays: Arrays, meta: dict[str, Any]) -> None:
+        """Write a checkpoint, then delete the one before; the records it knows of are on the disk first.
 
         Raises:
-            TandemError: the disk is full; the last checkpoint is as it was.
+            CheckpointError: the disk is full; the last checkpoint is as it was.
         """
-        import torch
-
         self._metrics.sync()
-        data = io.BytesIO()
-        torch.save({"format_version": _CHECKPOINT_VERSION, **saved}, data)
-        with os_errors("write", self.checkpoint_file):
-            write_atomic(self.checkpoint_file, data.getvalue())
-
-    def _read_checkpoint(self) -> dict[str, Any]:
-        import torch
-
-        try:
-            with os_errors("read", self.checkpoint_file):
-                saved: dict[str, Any] = torch.load(self.checkpoint_file, weights_only=True)
-        except (RuntimeError, EOFError, pickle.UnpicklingError) as error:
-            raise TandemError(
-                f"{self.checkpoint_file} is damaged ({str(error).splitlines()[0][:80]}); remove it to begin anew"
-            ) from None
-        _check_version(saved, self.checkpoint_file, _CHECKPOINT_VERSION)
-        return saved
+        self._checkpoints.save(iteration, arrays, meta)
 
 
 def made_with(tree: dict[str, Any]) -> dict[str, Any]:
@@ -170,10 +151,12 @@ def read_json(path: Path) -> dict[str, Any]:
     return tree
 
 
-def _check_version(tree: dict[str, Any], path: Path, wanted: int = FORMAT_VERSION) -> None:
+def _check_version(tree: dict[str, Any], path: Path) -> None:
     found = tree.get("format_version")
-    if found != wanted:
-        raise TandemError(f"{path}: format version {found!r}, this program reads {wanted}; name another directory")
+    if found != FORMAT_VERSION:
+        raise TandemError(
+            f"{path}: format version {found!r}, this program reads {FORMAT_VERSION}; name another directory"
+        )
 
 
 def write_json(path: Path, tree: dict[str, Any]) -> None:

@@ -32,6 +32,7 @@ from service.envs.gym.registration import EPISODE_STEPS
 from service.envs.gym.vector import TabletopVectorEnv
 from service.envs.tasks import SUCCESS_DISTANCE_M, find_task
 from service.errors import TandemError
+from service.io.checkpoints import Checkpoint
 from service.io.git import git_commit
 from service.io.jsonl import plain
 from service.primitives.loading import TrainedBob
@@ -142,11 +143,11 @@ class _Training:
         """Make the policy learned so far, ready for a batch of episodes."""
         return LearnedPolicy(self._loop.learner.averaged_parameters(), self._method, self._trained)
 
-    def run(self, saved: dict[str, Any] | None) -> dict[str, Any] | None:
+    def run(self, saved: Checkpoint | None) -> dict[str, Any] | None:
         """Learn to the end; None where stopped before."""
         if saved is not None:
-            self._loop.load_state(saved["loop"])
-            self._iteration, self._wall_s, self._curve = saved["iteration"], saved["wall_s"], saved["curve"]
+            self._loop.load_state(saved.arrays, saved.meta["loop"])
+            self._iteration, self._wall_s, self._curve = saved.step, saved.meta["wall_s"], saved.meta["curve"]
         while self._loop.num_env_steps < self._trial.num_env_steps:
             if self._callbacks.stop():
                 self._save()
@@ -200,8 +201,9 @@ class _Training:
     def _save(self) -> None:
         if not self._iteration:
             return
-        counters = {"iteration": self._iteration, "env_steps": self._loop.num_env_steps, "wall_s": self._wall_s}
-        self._directory.write_checkpoint({**counters, "curve": self._curve, "loop": self._loop.state()})
+        arrays, values = self._loop.state()
+        meta = {"env_steps": self._loop.num_env_steps, "wall_s": self._wall_s, "curve": self._curve, "loop": values}
+        self._directory.save(self._iteration, arrays, meta)
         self._saved_s = time.monotonic()
 
 

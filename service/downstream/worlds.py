@@ -13,7 +13,7 @@ from service.downstream.inputs import learner_inputs
 from service.envs.gym.vector import VectorState
 from service.envs.observations import POSITIONS
 from service.sac.replay import Columns
-from service.types import BoolArray, FloatArray
+from service.types import Array, Arrays, BoolArray, FloatArray
 
 COLUMNS = {"previous": POSITIONS.size, "positions": POSITIONS.size, "following": POSITIONS.size, "goal": 3, "reward": 1}
 """Columns of a transition, beside ``action``: positions one step ago, now and after it, goal and reward."""
@@ -82,15 +82,17 @@ class TaskWorlds:
         paid: FloatArray = self.env.compute_reward(following[:, POSITIONS["object"]], goal, {})
         return paid
 
-    def state(self) -> dict[str, Any]:
-        """Copy everything that ``restore`` needs: the entries of ``VectorState``, previous positions, returns."""
-        return {**asdict(self.env.state()), "previous": self._previous.copy(), "returns": self._returns.copy()}
+    def state(self) -> tuple[Arrays, Any]:
+        """Copy everything that ``load_state`` needs: ``VectorState``, previous positions and returns."""
+        worlds = asdict(self.env.state())
+        random = worlds.pop("random")
+        return {**worlds, "previous": self._previous.copy(), "returns": self._returns.copy()}, random
 
-    def restore(self, state: Mapping[str, Any]) -> None:
+    def load_state(self, arrays: Mapping[str, Array], random: Any) -> None:
         """Go back to a saved state; continues bit-identically."""
-        worlds = {**state, "random": tuple(state["random"])}
-        self._previous, self._returns = worlds.pop("previous").copy(), worlds.pop("returns").copy()
-        observation = self.env.restore(VectorState(**worlds))
+        worlds: dict[str, Any] = {name: np.array(array) for name, array in arrays.items()}
+        self._previous, self._returns = worlds.pop("previous"), worlds.pop("returns")
+        observation = self.env.restore(VectorState(**worlds, random=tuple(random)))
         self._positions, self._goal = observation["observation"].copy(), observation["desired_goal"].copy()
 
     def close(self) -> None:

@@ -7,11 +7,11 @@ from collections.abc import Mapping
 import numpy as np
 import torch
 from torch import Tensor, nn
-from torch.optim.adam import adam
 
 from service.config import PPOConfig
 from service.errors import TandemError
 from service.policies import gaussian
+from service.policies.adam import Adam
 from service.types import Array, Arrays
 
 ADAM_EPSILON = 1e-5
@@ -21,50 +21,6 @@ LEARNING_RATE_BOUNDS = 0.03, 2.0
 
 class LearnerError(TandemError):
     """A device that is not there, nothing to learn from, or states that do not fit; the message says what to do."""
-
-
-class Adam:
-    """Adam (Kingma and Ba 2015) on torch's fused kernel, through torch's functional form of it.
-
-    ``torch.optim.Adam`` computes the same, but making one imports torch's compiler: seconds at every start, for
-    nothing. The state exists from the start, so it has the same names at any time.
-    """
-
-    def __init__(self, parameters: Mapping[str, nn.Parameter], learning_rate: float) -> None:
-        """Start with moments of zero; ``learning_rate`` may be changed between steps."""
-        self.learning_rate = learning_rate
-        self._parameters = parameters
-        self._state = {
-            "first_moment": {name: torch.zeros_like(each, requires_grad=False) for name, each in parameters.items()},
-            "second_moment": {name: torch.zeros_like(each, requires_grad=False) for name, each in parameters.items()},
-            "step": {name: torch.zeros((), device=each.device) for name, each in parameters.items()},
-        }
-
-    @torch.no_grad()
-    def step(self) -> None:
-        """Move the parameters that have a gradient; the others and their moments stay."""
-        gradients = {name: each.grad for name, each in self._parameters.items() if each.grad is not None}
-        first, second, steps = ([tensors[name] for name in gradients] for tensors in self._state.values())
-        adam(
-            [self._parameters[name] for name in gradients],
-            list(gradients.values()),
-            first,
-            second,
-            [],
-            steps,
-            fused=True,
-            amsgrad=False,
-            beta1=0.9,
-            beta2=0.999,
-            lr=self.learning_rate,
-            weight_decay=0.0,
-            eps=ADAM_EPSILON,
-            maximize=False,
-        )
-
-    def tensors(self) -> dict[str, Tensor]:
-        """Moments and step counts by name: the tensors themselves."""
-        return {f"{part}/{name}": tensor for part, tensors in self._state.items() for name, tensor in tensors.items()}
 
 
 class Player:
@@ -78,7 +34,7 @@ class Player:
             f"{key}/{name}": each for key, network in networks.items() for name, each in network.named_parameters()
         }
         self.policy_parameters, self.value_parameters = list(policy.parameters()), list(value.parameters())
-        self.optimizer = Adam(self._parameters, config.learning_rate)
+        self.optimizer = Adam(self._parameters, config.learning_rate, epsilon=ADAM_EPSILON)
 
     def log_prob(self, observation: Tensor, action: Tensor) -> Tensor:
         """Log-probabilities (B,) of (B, A) actions at (B, O) observations."""

@@ -8,18 +8,19 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor, nn
-from torch.optim import Adam
-from torch.optim.swa_utils import get_ema_multi_avg_fn
 
+from service.policies.adam import Adam
 from service.policies.networks import export_parameters
 from service.sac.networks import Critics, sample_actions
 from service.sac.settings import SACConfig
-from service.types import FloatArray, Metrics
+from service.types import Array, Arrays, FloatArray, Metrics
+
+ADAM_EPSILON = 1e-8
 
 
 class Batch(NamedTuple):
@@ -54,18 +55,18 @@ class SACLearner:
         self._targets.load_state_dict(self.critics.state_dict())
         self._targets.requires_grad_(requires_grad=False)
         self._log_alpha = torch.tensor(math.log(config.initial_entropy_coefficient), requires_grad=True)
-        self._parameters: dict[str, list[Tensor]] = {
-            "actor": list(actor.parameters()),
-            "critics": list(self.critics.parameters()),
-            "alpha": [self._log_alpha],
+        self._parameters: dict[str, dict[str, Tensor]] = {
+            "actor": dict(actor.named_parameters()),
+            "critics": dict(self.critics.named_parameters()),
+            "alpha": {"log": self._log_alpha},
         }
         self._optimizers = {
-            name: Adam(parameters, lr=config.learning_rate, fused=True) for name, parameters in self._parameters.items()
+            name: Adam(parameters, config.learning_rate, epsilon=ADAM_EPSILON)
+            for name, parameters in self._parameters.items()
         }
         self._random = torch.Generator().manual_seed(seed)
-        self._average = [parameter.detach().clone() for parameter in actor.parameters()]
-        self._num_averaged = 0
-        self._follow = get_ema_multi_avg_fn(1.0 - config.tau)
+        self._average = {name: parameter.detach().clone() for name, parameter in actor.named_parameters()}
+        self._num_averaged = torch.zeros((), dtype=torch.int64)
 
     def act(self, inputs: FloatArray) -> FloatArray:
         """Sample (N, A) actions in [-1, 1] at (N, I) inputs."""
@@ -95,39 +96,32 @@ class SACLearner:
         keep = self._num_averaged / (8 + self._num_averaged)
         self._num_averaged += 1
         with torch.no_grad():
-            for average, parameter in zip(self._average, self.actor.parameters(), strict=True):
-                average.lerp_(parameter, 1.0 - keep)
+            for name, parameter in self._parameters["actor"].items():
+                self._average[name].lerp_(parameter, 1.0 - keep)
 
     def averaged_parameters(self) -> dict[str, FloatArray]:
         """Parameters and buffers of the averaged actor, as float32 copies by name."""
-        exported = export_parameters(self.actor)
-        for (name, _), average in zip(self.actor.named_parameters(), self._average, strict=True):
-            exported[name] = average.numpy().copy()
-        return exported
+        return export_parameters(self.actor) | {name: each.numpy().copy() for name, each in self._average.items()}
 
-    def state(self) -> dict[str, Any]:
-        """Everything that ``load_state`` continues from, as tensors and plain values."""
-        return {
-            "parameters": {name: [each.detach().clone() for each in part] for name, part in self._parameters.items()},
-            "targets": [each.clone() for each in self._targets.parameters()],
-            "optimizers": {name: optimizer.state_dict() for name, optimizer in self._optimizers.items()},
-            "average": [each.clone() for each in self._average],
-            "num_averaged": self._num_averaged,
-            "random": self._random.get_state(),
-        }
+    def state(self) -> Arrays:
+        """Everything that ``load_state`` continues from, copied."""
+        arrays: Arrays = {name: tensor.detach().numpy().copy() for name, tensor in self._tensors().items()}
+        return arrays | {"random": self._random.get_state().numpy().copy()}
 
-    def load_state(self, state: Mapping[str, Any]) -> None:
+    def load_state(self, state: Mapping[str, Array]) -> None:
         """Continue, bit for bit, where ``state`` was taken by a learner of the same settings."""
-        pairs = [(self._parameters[name], saved) for name, saved in state["parameters"].items()]
-        pairs += [(list(self._targets.parameters()), state["targets"]), (self._average, state["average"])]
         with torch.no_grad():
-            for tensors, saved in pairs:
-                for tensor, value in zip(tensors, saved, strict=True):
-                    tensor.copy_(value)
-        for name, optimizer in self._optimizers.items():
-            optimizer.load_state_dict(state["optimizers"][name])
-        self._num_averaged = state["num_averaged"]
-        self._random.set_state(state["random"])
+            for name, tensor in self._tensors().items():
+                tensor.copy_(torch.from_numpy(np.array(state[name])))
+        self._random.set_state(torch.from_numpy(np.array(state["random"])))
+
+    def _tensors(self) -> dict[str, Tensor]:
+        """All that changes but the random numbers, by name: the tensors themselves."""
+        parts: dict[str, Mapping[str, Tensor]] = {**self._parameters}
+        parts |= {f"adam/{name}": optimizer.tensors() for name, optimizer in self._optimizers.items()}
+        parts |= {"targets": dict(self._targets.named_parameters()), "average": self._average}
+        parts["count"] = {"averaged": self._num_averaged}
+        return {f"{part}/{name}": tensor for part, tensors in parts.items() for name, tensor in tensors.items()}
 
     def _step(self, inputs: Tensor, actions: Tensor, rewards: Tensor, next_inputs: Tensor) -> Tensor:
         alpha = self._log_alpha.detach().exp()
@@ -144,12 +138,14 @@ class SACLearner:
         self._descend("actor", actor_loss)
         entropy = -log_prob.detach().mean()
         self._descend("alpha", self._log_alpha * (entropy + self.num_actions))
-        self._follow(list(self._targets.parameters()), self._parameters["critics"], 0)
+        with torch.no_grad():
+            for own, critic in zip(self._targets.parameters(), self.critics.parameters(), strict=True):
+                own.lerp_(critic, self.config.tau)
         return torch.stack((critic_loss.detach(), actor_loss.detach(), alpha, entropy))
 
     def _descend(self, name: str, loss: Tensor) -> None:
         """Take a gradient step with these parameters alone: others, through which the loss goes, get no gradient."""
-        parameters = self._parameters[name]
+        parameters = list(self._parameters[name].values())
         for parameter, gradient in zip(parameters, torch.autograd.grad(loss, parameters), strict=True):
             parameter.grad = gradient
         self._optimizers[name].step()

@@ -6,16 +6,15 @@ done when it returns.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Mapping
 from typing import Any, Protocol
 
 import numpy as np
-import torch
 
+from service.io.tensors import join_parts, split_parts
 from service.sac.learner import Batch, SACLearner, actions_at_random
 from service.sac.replay import Columns, ReplayBuffer
-from service.types import BoolArray, FloatArray, Metrics
+from service.types import Array, Arrays, BoolArray, FloatArray, Metrics
 
 
 class Worlds(Protocol):
@@ -27,10 +26,10 @@ class Worlds(Protocol):
     def step(self, actions: FloatArray) -> tuple[Columns, BoolArray]:
         """Act by (N, A) actions; the transitions, as a replay buffer keeps them, and (N,) whose episodes ended."""
 
-    def state(self) -> dict[str, Any]:
-        """Arrays by name, and what is not an array as plain values under ``random``."""
+    def state(self) -> tuple[Arrays, Any]:
+        """Everything that ``load_state`` continues from: arrays by name, and random numbers as plain values."""
 
-    def restore(self, state: Mapping[str, Any]) -> None:
+    def load_state(self, arrays: Mapping[str, Array], random: Any) -> None:
         """Go back to a saved state; continues bit for bit."""
 
 
@@ -84,25 +83,17 @@ class OffPolicyLoop:
             self.learner.average_actor()
         return {name: float(np.mean([each[name] for each in found])) for name in (found[0] if found else ())}
 
-    def state(self) -> dict[str, Any]:
-        """Everything a new loop of the same settings continues from, as tensors and plain values."""
-        worlds = self.worlds.state()
-        random = {"worlds": worlds.pop("random"), "loop": self._rng.bit_generator.state}
-        return {
-            "learner": self.learner.state(),
-            "replay": {name: torch.from_numpy(rows) for name, rows in self.replay.state().items()},
-            "worlds": {name: torch.from_numpy(rows) for name, rows in worlds.items()},
-            "random": json.dumps(random),
-            "num_updates": self.num_updates,
-        }
+    def state(self) -> tuple[Arrays, dict[str, Any]]:
+        """Everything a new loop of the same settings continues from: arrays by name, and plain values."""
+        worlds, random = self.worlds.state()
+        arrays = join_parts({"learner": self.learner.state(), "replay": self.replay.state(), "worlds": worlds})
+        return arrays, {"worlds": random, "loop": self._rng.bit_generator.state, "num_updates": self.num_updates}
 
-    def load_state(self, state: Mapping[str, Any]) -> None:
-        """Continue, bit for bit, where ``state`` was taken."""
-        random = json.loads(state["random"])
-        self.learner.load_state(state["learner"])
-        self.replay.load_state({name: rows.numpy() for name, rows in state["replay"].items()})
-        self.worlds.restore(
-            {name: rows.numpy() for name, rows in state["worlds"].items()} | {"random": random["worlds"]}
-        )
-        self._rng.bit_generator.state = random["loop"]
-        self.num_updates = state["num_updates"]
+    def load_state(self, arrays: Mapping[str, Array], values: Mapping[str, Any]) -> None:
+        """Continue, bit for bit, where ``state`` gave these."""
+        parts = split_parts(arrays)
+        self.learner.load_state(parts["learner"])
+        self.replay.load_state(parts["replay"])
+        self.worlds.load_state(parts["worlds"], values["worlds"])
+        self._rng.bit_generator.state = values["loop"]
+        self.num_updates = values["num_updates"]

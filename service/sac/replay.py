@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from service.types import BoolArray, FloatArray
+from service.types import Array, Arrays, BoolArray, FloatArray
 
 Columns = dict[str, FloatArray]
 _LAST_STEP = "last_step"
@@ -90,14 +90,14 @@ class ReplayBuffer:
         values: FloatArray = self._columns[name][places.step % self.num_steps, places.world]
         return values
 
-    def state(self) -> dict[str, NDArray[np.generic]]:
+    def state(self) -> Arrays:
         """Everything a new buffer continues from, as arrays by name; rows that are not in use are left out."""
         used = min(self.num_added, self.num_steps)
         rows = {name: values[:used].copy() for name, values in self._columns.items()}
         counted = {"num_added": np.array(self.num_added), "began": self._began.copy()}
         return {**rows, _LAST_STEP: self._last_step[:used].copy(), **counted}
 
-    def load_state(self, state: Mapping[str, NDArray[np.generic]]) -> None:
+    def load_state(self, state: Mapping[str, Array]) -> None:
         """Continue from a buffer of the same sizes."""
         for name, values in {**self._columns, _LAST_STEP: self._last_step}.items():
             values[: len(state[name])] = state[name]

@@ -37,7 +37,7 @@ def test_a_signal_saves_and_the_same_command_continues(tmp_path, monkeypatch):
     assert "saved; continue with the same command and --resume" in cut.stderr
     assert "env steps" in cut.stderr
     path = tmp_path / "runs" / "downstream" / "wall-ours-0"
-    assert (path / "checkpoint.pt").exists()
+    assert (path / "checkpoints").exists()
     assert not (path / "result.json").exists()
     monkeypatch.setattr(commands._Progress, "show", lambda line, metrics: None)
     monkeypatch.setattr("service.downstream.worker._record_video", lambda *arguments: path)

@@ -72,7 +72,7 @@ def test_a_stopped_table_says_so_and_continues_its_training(source, tmp_path):
 
     trials = [small_trial(), small_trial("idle")]
     assert not table(trials, source, tmp_path, stop=stop)
-    assert (source.runs / "push-ours-0" / "checkpoint.pt").exists()
+    assert (source.runs / "push-ours-0" / "checkpoints").exists()
     assert not (tmp_path / "out" / "downstream").exists()
     assert table(trials, source, tmp_path)
     lines = (source.runs / "push-ours-0" / "metrics.jsonl").read_text().splitlines()

@@ -80,7 +80,7 @@ def test_restored_worlds_go_on_bit_for_bit(champion):
     rng = np.random.default_rng(0)
     for _ in range(LENGTH + 2):  # into the second episode
         first.step(rng.uniform(-1.0, 1.0, (NUM, 4)).astype(np.float32))
-    second.restore(first.state())
+    second.load_state(*first.state())
     first.finished.clear()
     for _ in range(2 * LENGTH):
         np.testing.assert_array_equal(first.inputs(), second.inputs())
@@ -98,7 +98,7 @@ def test_restored_worlds_go_on_bit_for_bit(champion):
 def test_a_state_of_other_worlds_is_refused(ours):
     other = make(num=2)
     with pytest.raises(ValueError, match=r"expected shape \(3, "):
-        ours.restore(other.state())
+        ours.load_state(*other.state())
     other.close()
 
 

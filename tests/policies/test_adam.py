@@ -4,14 +4,16 @@ import pytest
 import torch
 from torch import nn
 
-from service.learner.player import ADAM_EPSILON, Adam
+from service.policies.adam import Adam
+
+EPSILON = 1e-5
 
 
 def test_three_steps_by_hand():
     # Kingma and Ba 2015, algorithm 1, for one number; the second parameter has no gradient in the second step.
     gradients, rates = [0.5, -2.0, 1.0], [0.1, 0.05, 0.01]
     first, second = nn.Parameter(torch.ones(1)), nn.Parameter(torch.ones(1))
-    adam = Adam({"first": first, "second": second}, 0.0)
+    adam = Adam({"first": first, "second": second}, 0.0, epsilon=EPSILON)
     expected, m, v = 1.0, 0.0, 0.0
     for step, (gradient, rate) in enumerate(zip(gradients, rates, strict=True), start=1):
         first.grad = torch.tensor([gradient])
@@ -20,7 +22,7 @@ def test_three_steps_by_hand():
         adam.learning_rate = rate
         adam.step()
         m, v = 0.9 * m + 0.1 * gradient, 0.999 * v + 0.001 * gradient**2
-        expected -= rate * (m / (1 - 0.9**step)) / (math.sqrt(v / (1 - 0.999**step)) + ADAM_EPSILON)
+        expected -= rate * (m / (1 - 0.9**step)) / (math.sqrt(v / (1 - 0.999**step)) + EPSILON)
         assert first.item() == pytest.approx(expected, rel=1e-5)
         assert (second.item() == before) == (step == 2)
     tensors = adam.tensors()
