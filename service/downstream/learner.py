@@ -7,12 +7,13 @@ import functools
 import numpy as np
 import torch
 
-from service.downstream.inputs import NUM_INPUTS, NUM_WITHOUT_GOAL, learner_inputs
+from service.downstream.inputs import NUM_INPUTS, learner_inputs
 from service.downstream.methods import Method
 from service.downstream.settings import TrialConfig
 from service.downstream.worlds import COLUMNS, TaskWorlds
 from service.envs.observations import POSITIONS
 from service.primitives.loading import TrainedBob
+from service.sac.inputs import NUM_MOTION_INPUTS
 from service.sac.learner import Batch, SACLearner
 from service.sac.loop import OffPolicyLoop
 from service.sac.networks import GaussianActor, MCPActor
@@ -50,7 +51,7 @@ def make_loop(trial: TrialConfig, method: Method, trained: TrainedBob, worlds: T
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(spread_seed(trial.seed, 0))
         actor = (
-            MCPActor(NUM_WITHOUT_GOAL, NUM_INPUTS, size, trained.config.policy.bob)
+            MCPActor(NUM_MOTION_INPUTS, NUM_INPUTS, size, trained.config.policy.bob)
             if method.mcp_actor
             else GaussianActor(NUM_INPUTS, size, sac.hidden_sizes)
         )

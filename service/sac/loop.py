@@ -29,7 +29,7 @@ class Worlds(Protocol):
     def state(self) -> tuple[Arrays, Any]:
         """Everything that ``load_state`` continues from: arrays by name, and random numbers as plain values."""
 
-    def load_state(self, arrays: Mapping[str, Array], random: Any) -> None:
+    def load_state(self, arrays: dict[str, Array], random: Any) -> None:
         """Go back to a saved state; continues bit for bit."""
 
 
