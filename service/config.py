@@ -17,6 +17,7 @@ from pydantic import BaseModel, BeforeValidator, Field, PositiveInt, ValidationE
 from service.config_tree import RENAMED, apply_override, read_yaml, updated
 from service.errors import ConfigError
 from service.frozen import FrozenModel
+from service.off_policy_config import SkillsConfig
 
 MIN_ROWS = 32
 """Least rows of a minibatch for each of several learners. Ranks pay off from about a thousand on."""
@@ -359,6 +360,11 @@ class Config(FrozenModel):
     generator: GeneratorConfig = GeneratorConfig()
     policy: PolicyConfig = PolicyConfig()
     learner: LearnerConfig = LearnerConfig()
+    skills: SkillsConfig | None = Field(
+        None,
+        description="skill discovery instead of self-play, a baseline; then game, generator, policy and learner "
+        "mean nothing",
+    )
     run: RunConfig = RunConfig()
 
     @model_validator(mode="after")

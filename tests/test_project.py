@@ -37,9 +37,9 @@ CLUSTER_MODULES = (
 )
 ROOMS_WITHOUT_TORCH = ("actors", "envs", "generator", "registry", "status")
 ROOMS = (
-    *("errors", "frozen", "types", "config_tree", "config", "io", "envs", "policies", "generator", "actors"),
-    *("learner", "sac", "registry", "primitives", "media", "downstream", "store", "status", "runtime", "cli"),
-    "__main__",
+    *("errors", "frozen", "types", "config_tree", "off_policy_config", "config", "io", "envs", "policies"),
+    *("generator", "actors", "learner", "sac", "baselines", "registry", "primitives", "media", "downstream"),
+    *("store", "status", "runtime", "cli", "__main__"),
 )
 """Each room may import itself and those before it."""
 VERBS = ("demo", "pretrain", "evaluate", "render", "coverage", "registry", "serve", "downstream")

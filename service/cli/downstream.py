@@ -133,7 +133,7 @@ def _learning(steps: int | None, overrides: list[str] | None) -> dict[str, Any]:
     import yaml
 
     from service.downstream.settings import validate
-    from service.sac.settings import SACConfig
+    from service.off_policy_config import SACConfig
 
     values = {}
     for override in overrides or []:

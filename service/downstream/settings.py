@@ -11,7 +11,7 @@ from service.envs.gym.registration import EPISODE_STEPS
 from service.envs.tasks import find_task
 from service.errors import TandemError
 from service.frozen import FrozenModel
-from service.sac.settings import SACConfig
+from service.off_policy_config import SACConfig
 
 _Settings = TypeVar("_Settings", bound=FrozenModel)
 

@@ -14,10 +14,10 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from service.off_policy_config import SACConfig
 from service.policies.adam import Adam
 from service.policies.networks import export_parameters
 from service.sac.networks import Critics, sample_actions
-from service.sac.settings import SACConfig
 from service.types import Array, Arrays, FloatArray, Metrics
 
 ADAM_EPSILON = 1e-8

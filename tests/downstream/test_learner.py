@@ -5,7 +5,7 @@ from service.downstream.learner import Hindsight, make_loop, set_progress
 from service.downstream.methods import METHODS
 from service.downstream.settings import make_trial
 from service.downstream.worker import make_worlds
-from service.sac.settings import SACConfig
+from service.off_policy_config import SACConfig
 from tests.downstream.trials import SMALL, small_trial
 
 

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 import torch
 
+from service.off_policy_config import SACConfig
 from service.sac.learner import Batch, SACLearner
 from service.sac.networks import GaussianActor, sample_actions
-from service.sac.settings import SACConfig
 
 CONFIG = SACConfig(batch_size=6, gradient_steps=2, hidden_sizes=(8,), learning_rate=0.01, gamma=0.9, tau=0.2)
 SMALL = CONFIG.model_copy(update={"gradient_steps": 1})

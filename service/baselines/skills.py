@@ -1,0 +1,161 @@
+"""Skills in worlds: a vector z for every episode, and batches that are paid by an intrinsic reward."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import gymnasium
+import numpy as np
+import torch
+
+from service.baselines.rewards import IntrinsicReward, make_reward
+from service.config import Config
+from service.envs.gym.vector import TabletopVectorEnv
+from service.envs.observations import POSITIONS
+from service.off_policy_config import SkillsConfig
+from service.sac.inputs import NUM_MOTION_INPUTS, motion_inputs
+from service.sac.learner import Batch, SACLearner
+from service.sac.loop import OffPolicyLoop
+from service.sac.networks import GaussianActor
+from service.sac.replay import Columns, ReplayBuffer
+from service.sac.worlds import TabletopWorlds
+from service.types import Array, Arrays, BoolArray, FloatArray
+
+_COLUMNS = {"previous": POSITIONS.size, "positions": POSITIONS.size, "following": POSITIONS.size}
+_OBJECT = POSITIONS["object"]
+STATE_SIZE = 3
+"""Of what rewards see: the object's position."""
+DrawSkills = Callable[[int, int, np.random.Generator], FloatArray]
+
+
+def object_state(positions: FloatArray) -> FloatArray:
+    """(N, 3) the object's position in (N, 11) positions, normalised."""
+    normalisation = POSITIONS.normalisation
+    state: FloatArray = (positions[:, _OBJECT] - normalisation.offset[_OBJECT]) / normalisation.scale[_OBJECT]
+    return state
+
+
+def skill_inputs(previous: FloatArray, positions: FloatArray, skill: FloatArray) -> FloatArray:
+    """(N, 17 + Z) inputs of a policy that (N, Z) skills steer; see ``sac.inputs.motion_inputs``."""
+    inputs: FloatArray = np.concatenate((motion_inputs(previous, positions), skill), axis=1)
+    return inputs
+
+
+class SkillWorlds(TabletopWorlds):
+    """Worlds in which every episode has a skill; their goals mean nothing.
+
+    Args:
+        env: see ``TabletopWorlds``.
+        seed: of episodes and skills.
+        size: Z.
+        draw_skills: the prior.
+    """
+
+    def __init__(
+        self, env: gymnasium.vector.VectorEnv[Any, Any, Any], seed: int, size: int, draw_skills: DrawSkills
+    ) -> None:
+        super().__init__(env, seed)
+        self._rng, self._size, self._draw = np.random.default_rng(seed), size, draw_skills
+        self.skill = draw_skills(self.num_worlds, size, self._rng)
+        """(N, Z) of the episodes that go on."""
+
+    def inputs(self) -> FloatArray:
+        """(N, 17 + Z) what the actor sees now."""
+        return skill_inputs(self.previous, self.positions, self.skill)
+
+    def step(self, actions: FloatArray) -> tuple[Columns, BoolArray]:
+        """Act by (N, 4) actions; the transitions and (N,) whose episodes ended."""
+        step, skill = self.advance(actions), self.skill
+        if step.ended.any():
+            drawn = self._draw(self.num_worlds, self._size, self._rng)
+            self.skill = np.where(step.ended[:, None], drawn, skill)
+        return {**{name: getattr(step, name) for name in _COLUMNS}, "skill": skill, "action": actions}, step.ended
+
+    def state(self) -> tuple[Arrays, Any]:
+        """Copy everything that ``load_state`` needs."""
+        arrays, random = super().state()
+        return {**arrays, "skill": self.skill.copy()}, [random, self._rng.bit_generator.state]
+
+    def load_state(self, arrays: dict[str, Array], random: Any) -> None:
+        """Go back to a saved state; continues bit-identically."""
+        worlds = dict(arrays)
+        self.skill = np.array(worlds.pop("skill"), dtype=np.float32)
+        self._rng.bit_generator.state = random[1]
+        super().load_state(worlds, random[0])
+
+
+class Seen(NamedTuple):
+    """What a reward and an actor see of B transitions."""
+
+    before: FloatArray
+    """(B, S) state that the reward sees."""
+    after: FloatArray
+    """(B, S)"""
+    inputs: FloatArray
+    """(B, I) of the actor."""
+    next_inputs: FloatArray
+    """(B, I)"""
+
+
+class IntrinsicBatches:
+    """Makes batches that an intrinsic reward pays, after it has learned from others.
+
+    Args:
+        reward: of the method.
+        config: of the method.
+        see: says what is seen of the transitions in a replay buffer, which has columns ``skill`` and ``action``, too.
+    """
+
+    def __init__(self, reward: IntrinsicReward, config: SkillsConfig, see: Callable[[Columns], Seen]) -> None:
+        self.reward, self._config, self._see = reward, config, see
+        self.losses: list[float] = []
+        """Of the reward's network, since this list was last cleared."""
+
+    def __call__(self, replay: ReplayBuffer, size: int, rng: np.random.Generator) -> Batch:
+        """Draw ``size`` transitions."""
+        for _ in range(self._config.gradient_steps):
+            rows = replay.read(replay.draw(self._config.batch_size, rng))
+            self.losses.append(self.reward.learn(*_tensors(self._see(rows), rows["skill"]))["representation_loss"])
+        rows = replay.read(replay.draw(size, rng))
+        seen = self._see(rows)
+        paid: FloatArray = self.reward.rewards(*_tensors(seen, rows["skill"])).numpy()
+        return Batch(seen.inputs, rows["action"], np.float32(self._config.reward_scale) * paid, seen.next_inputs)
+
+
+def make_skill_loop(config: Config) -> OffPolicyLoop:
+    """Make the worlds, the networks and the loop of a skill-discovery run; ``loop.worlds`` has to be closed.
+
+    ``loop.make_batch`` is its ``IntrinsicBatches``.
+    """
+    skills = config.skills
+    assert skills is not None, "a run of self-play"
+    seeds = [int(seed) for seed in np.random.SeedSequence(config.seed).generate_state(5) >> 1]
+    reward = make_reward(skills, STATE_SIZE, seeds[0])
+    env = TabletopVectorEnv(
+        skills.sac.num_worlds,
+        config.world,
+        max_episode_steps=skills.episode_steps,
+        num_threads=config.run.num_threads,
+    )
+    worlds = SkillWorlds(env, seeds[1], skills.size, reward.draw_skills)
+    num_inputs, num_actions = NUM_MOTION_INPUTS + skills.size, worlds.num_actions
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(seeds[2])
+        actor = GaussianActor(num_inputs, num_actions, skills.sac.hidden_sizes)
+    learner = SACLearner(actor, num_inputs, num_actions, skills.sac, seeds[3])
+    columns = {**_COLUMNS, "skill": skills.size, "action": num_actions}
+    num_steps = -(-min(skills.replay_steps, config.run.total_env_steps) // skills.sac.num_worlds)
+    replay = ReplayBuffer(num_steps, skills.sac.num_worlds, columns)
+    return OffPolicyLoop(worlds, replay, learner, IntrinsicBatches(reward, skills, see_object), seeds[4])
+
+
+def see_object(rows: Columns) -> Seen:
+    """The object's position for the reward; for the actor positions, movements and the skill."""
+    previous, positions, following, skill = (rows[name] for name in (*_COLUMNS, "skill"))
+    states = object_state(positions), object_state(following)
+    return Seen(*states, skill_inputs(previous, positions, skill), skill_inputs(positions, following, skill))
+
+
+def _tensors(seen: Seen, skill: FloatArray) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    return torch.from_numpy(seen.before), torch.from_numpy(seen.after), torch.from_numpy(skill)

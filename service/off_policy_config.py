@@ -1,0 +1,51 @@
+"""Settings of off-policy learning: soft actor-critic, and the skill-discovery baselines on top of it."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from pydantic import Field, PositiveInt
+
+from service.frozen import FrozenModel
+
+SkillMethod = Literal["lsd", "diayn", "dads", "metra"]
+
+
+class SACConfig(FrozenModel):
+    """Soft actor-critic on many worlds: every world makes a step, then there are several large updates."""
+
+    num_worlds: int = Field(64, ge=1)
+    gradient_steps: int = Field(
+        8, ge=1, description="updates after a step of every world; 16 learn no more (docs/results)"
+    )
+    batch_size: int = Field(256, ge=1)
+    learning_rate: float = Field(1e-3, gt=0.0, description="rl-zoo for Panda and Fetch")
+    gamma: float = Field(0.95, gt=0.0, lt=1.0, description="rl-zoo; a horizon of 20 of the 50 steps")
+    tau: float = Field(0.05, gt=0.0, le=1.0, description="rl-zoo")
+    initial_entropy_coefficient: float = Field(
+        0.1, gt=0.0, description="adapted from there; SB3 starts at 1, which drowns the first rewards"
+    )
+    hidden_sizes: tuple[PositiveInt, ...] = Field(
+        (256, 256), min_length=1, description="actor and critics; an MCP actor has its own"
+    )
+    learning_starts: int = Field(6_400, ge=0, description="env steps of uniform actions first; more than an episode")
+
+
+class SkillsConfig(FrozenModel):
+    """Skill discovery: a policy that a skill vector z steers, learned from an intrinsic reward alone."""
+
+    method: SkillMethod = Field("lsd", description="LSD, DIAYN, DADS or METRA, on the object's position alone")
+    size: int = Field(4, ge=1, description="of z; paper: 4, continuous")
+    episode_steps: int = Field(50, ge=2, description="as downstream; CSD's Fetch tasks have as many")
+    hidden_sizes: tuple[PositiveInt, ...] = Field(
+        (256, 256), min_length=1, description="of the network that rewards come from; METRA's code has 1024 twice"
+    )
+    learning_rate: float = Field(3e-4, gt=0.0, description="of that network; LSD's code 3e-5, METRA's 1e-4, DADS' 3e-4")
+    gradient_steps: int = Field(2, ge=1, description="of that network after a step of every world")
+    batch_size: int = Field(256, ge=2)
+    reward_scale: float = Field(1.0, gt=0.0)
+    num_alternatives: int = Field(100, ge=1, description="DADS: skills that each one is compared with")
+    dual_initial: float = Field(30.0, gt=0.0, description="METRA: first value of the dual variable")
+    dual_slack: float = Field(1e-3, gt=0.0, description="METRA: of its constraint")
+    replay_steps: int = Field(1_000_000, ge=1, description="env steps that are kept to learn from")
+    sac: SACConfig = SACConfig(gradient_steps=4, gamma=0.98, learning_rate=3e-4, tau=0.005)

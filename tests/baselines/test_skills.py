@@ -1,0 +1,139 @@
+"""Skill discovery as a whole: on a point mass, where it has to find skills that differ, and in worlds."""
+
+import numpy as np
+import pytest
+
+from service.baselines.rewards import METHODS, make_reward
+from service.baselines.skills import IntrinsicBatches, Seen, make_skill_loop
+from service.config import parse_config
+from service.off_policy_config import SACConfig, SkillsConfig
+from service.sac.learner import SACLearner
+from service.sac.loop import OffPolicyLoop
+from service.sac.networks import GaussianActor
+from service.sac.replay import ReplayBuffer
+
+NUM, LENGTH, STEP_M = 32, 10, 0.2
+
+
+class PointMasses:
+    """Points in a plane that an action moves; the reward sees where they are."""
+
+    def __init__(self, draw_skills):
+        self._rng, self._draw = np.random.default_rng(0), draw_skills
+        self.at, self.elapsed = np.zeros((NUM, 2), np.float32), 0
+        self.skill = draw_skills(NUM, 2, self._rng)
+
+    def inputs(self):
+        return np.concatenate((self.at, self.skill), axis=1)
+
+    def step(self, actions):
+        after = self.at + np.float32(STEP_M) * actions
+        columns = {"before": self.at, "after": after, "skill": self.skill, "action": actions}
+        self.elapsed += 1
+        ended = np.full(NUM, self.elapsed % LENGTH == 0)
+        self.at = np.where(ended[:, None], np.float32(0.0), after)
+        if ended.all():
+            self.skill = self._draw(NUM, 2, self._rng)
+        return columns, ended
+
+
+def see(rows):
+    ends = rows["before"], rows["after"]
+    return Seen(*ends, *(np.concatenate((at, rows["skill"]), axis=1) for at in ends))
+
+
+def where_skills_lead(loop, skills):
+    """(M, 2) ends of episodes with (M, 2) skills, by the mean action."""
+    import torch
+
+    at = np.zeros_like(skills)
+    for _ in range(LENGTH):
+        with torch.no_grad():
+            mean, _ = loop.learner.actor(torch.from_numpy(np.concatenate((at, skills), axis=1)))
+        at = at + np.float32(STEP_M) * torch.tanh(mean).numpy()
+    return at
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_skills_of_a_point_mass_differ(method):
+    """A skill leads somewhere else than others do: its end tells which of the skills it was."""
+    sac = SACConfig(
+        num_worlds=NUM, gradient_steps=4, batch_size=128, hidden_sizes=(64, 64), learning_rate=1e-3, gamma=0.9,
+        tau=0.02, learning_starts=640,
+    )  # fmt: skip
+    config = SkillsConfig(
+        method=method, size=2, hidden_sizes=(64, 64), learning_rate=1e-3, num_alternatives=20, dual_initial=3.0, sac=sac
+    )
+    reward = make_reward(config, 2, seed=0)
+    learner = SACLearner(GaussianActor(4, 2, (64, 64)), 4, 2, sac, seed=0)
+    replay = ReplayBuffer(1000, NUM, {"before": 2, "after": 2, "skill": 2, "action": 2})
+    loop = OffPolicyLoop(PointMasses(reward.draw_skills), replay, learner, IntrinsicBatches(reward, config, see), 0)
+    loop.play(NUM * 300)
+    skills = np.repeat(reward.draw_skills(12, 2, np.random.default_rng(1)), 3, axis=0)
+    skills = skills + np.float32(0.02) * np.random.default_rng(2).standard_normal(skills.shape, dtype=np.float32)
+    ends = where_skills_lead(loop, skills)
+    assert np.linalg.norm(ends, axis=1).mean() > 0.5  # of 2 m at most, along an axis
+    # Linear in z are their ends at least: directions of skills are directions in the plane, all around.
+    fit, *_ = np.linalg.lstsq(np.column_stack((skills, np.ones(len(skills)))), ends, rcond=None)
+    left = ends - np.column_stack((skills, np.ones(len(skills)))) @ fit
+    explained = 1.0 - left.var(axis=0) / ends.var(axis=0)
+    assert explained.min() > 0.5
+    assert abs(np.linalg.det(fit[:2])) > 0.05
+
+
+def small_config(**skills):
+    sac = {"num_worlds": 4, "gradient_steps": 2, "batch_size": 16, "learning_starts": 100, "hidden_sizes": [8]}
+    tree = {"method": "lsd", "episode_steps": 10, "hidden_sizes": [8], "batch_size": 8, "sac": sac, **skills}
+    world = {"physics_step_s": 0.005, "num_substeps": 8}
+    return parse_config({"skills": tree, "world": world, "run": {"total_env_steps": 400}}, where="a test")
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_a_loop_in_worlds_goes_on_bit_for_bit(method):
+    loops = [make_skill_loop(small_config(method=method)) for _ in range(2)]
+    first, second = loops
+    first.play(150)
+    second.load_state(*first.state())
+    second.make_batch.reward.load_state(first.make_batch.reward.state())
+    for loop in loops:
+        loop.play(60)
+    for one, other in ((loop.state()[0] for loop in loops), (loop.make_batch.reward.state() for loop in loops)):
+        assert one.keys() == other.keys()
+        assert all(np.array_equal(array, other[name]) for name, array in one.items())
+    assert first.num_updates > 0
+    for loop in loops:
+        loop.worlds.close()
+
+
+def test_a_skill_lasts_an_episode():
+    loop = make_skill_loop(small_config())
+    loop.play(80)
+    skill = loop.replay.state()["skill"]
+    assert skill.shape == (20, 4, 4)
+    assert (skill[:10] == skill[0]).all()
+    assert (skill[10:] == skill[10]).all()
+    assert (skill[0] != skill[10]).all()
+    assert (skill[0, 0] != skill[0, 1]).all()
+    loop.worlds.close()
+
+
+def test_rewards_are_scaled_and_see_the_object_alone():
+    loop = make_skill_loop(small_config(reward_scale=3.0))
+    loop.play(80)
+    batch = loop.make_batch(loop.replay, 64, np.random.default_rng(0))
+    assert len(loop.make_batch.losses) == 2
+    assert batch.inputs.shape == batch.next_inputs.shape == (64, 21)
+    plain = make_skill_loop(small_config())
+    plain.load_state(*loop.state())
+    plain.make_batch.reward.load_state(loop.make_batch.reward.state())
+    rng = np.random.default_rng(1)
+    one, other = (each.make_batch(loop.replay, 64, np.random.default_rng(1)) for each in (loop, plain))
+    np.testing.assert_allclose(one.rewards, 3.0 * other.rewards, rtol=1e-5)
+    rows = loop.replay.read(loop.replay.draw(64, rng))
+    moved = np.abs(rows["following"] - rows["positions"])[:, 5:8].max(1) > 0.0
+    seen = loop.make_batch._see(rows)
+    assert seen.before.shape == (64, 3)
+    np.testing.assert_allclose(seen.before, (rows["positions"][:, 5:8] - [0, 0, 0.15]) / 0.12, atol=1e-5)
+    np.testing.assert_array_equal((seen.before != seen.after).any(1), moved)
+    for each in (loop, plain):
+        each.worlds.close()
