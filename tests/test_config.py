@@ -126,7 +126,7 @@ def test_override_through_a_value():
 @pytest.mark.parametrize(
     ("override", "key", "known"),
     [
-        ("sed=1", "'sed'", "game, generator, learner, name, policy, run, seed, world"),
+        ("sed=1", "'sed'", "game, generator, learner, name, policy, run, seed, skills, world"),
         ("game.bob_step=1", "'game.bob_step'", "bob_steps"),
         ("learner.bob.lr=1", "'learner.bob.lr'", "learning_rate"),
         ("world.workspace.width_m=1", "'world.workspace.width_m'", "length_x_m, length_y_m"),
