@@ -9,9 +9,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from service.primitives.loading import TrainedBob
+    from service.primitives.loading import TrainedBob, TrainedSkills
 
-__all__ = ["load_primitives"]
+__all__ = ["load_primitives", "load_skills"]
 __version__ = "0.2.0"
 
 
@@ -43,3 +43,26 @@ def load_primitives(reference: str = "panda-cube@champion", registry: Path | str
         fetched, version = fetch_primitives(str(registry), reference)
         return load_bob(str(version), fetched.root)
     return load_bob(reference, Path(registry))
+
+
+def load_skills(reference: str, registry: Path | str = "registry") -> TrainedSkills:
+    """Frozen skills of a skill-discovery baseline, to act by a vector z, without torch.
+
+    Args:
+        reference: see ``load_primitives``.
+        registry: see ``load_primitives``.
+
+    Returns:
+        ``.skills``, which act; ``.config`` and ``.manifest``, what they were trained with.
+
+    Raises:
+        TandemError: nothing there by that reference, damaged, or primitives; or the service cannot be reached.
+    """
+    from service.primitives.loading import load_skills
+
+    if is_service(registry):
+        from service.status.client import fetch_primitives
+
+        fetched, version = fetch_primitives(str(registry), reference)
+        return load_skills(str(version), fetched.root)
+    return load_skills(reference, Path(registry))

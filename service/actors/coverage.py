@@ -5,6 +5,7 @@ A skill is one gate weight drawn at random and held for a whole episode (Peng et
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Protocol
 
 import numpy as np
@@ -47,15 +48,36 @@ def skill_trajectories(
     """
     rng = np.random.default_rng(seed)
     weights = (1.0 - rng.random((num_skills, primitives.num_primitives))).astype(np.float32)
-    trajectories = np.empty((num_skills, num_steps + 1, 3))
-    with WorldBatch(config, num_skills, num_threads=num_threads) as worlds:
+
+    def act(positions: FloatArray) -> FloatArray:
+        mean, std = primitives.compose(positions, weights)
+        return mean + std * rng.standard_normal(mean.shape, dtype=np.float32)
+
+    return object_paths(act, config, num_paths=num_skills, num_steps=num_steps, rng=rng, num_threads=num_threads)
+
+
+def object_paths(
+    act: Callable[[FloatArray], FloatArray],
+    config: WorldConfig,
+    *,
+    num_paths: int,
+    num_steps: int,
+    rng: np.random.Generator,
+    num_threads: int = 0,
+) -> StateArray:
+    """Object positions while ``act``, (N, 11) positions to (N, 4) actions, plays N worlds from fresh resets.
+
+    Returns:
+        (num_paths, num_steps + 1, 3) metres.
+    """
+    paths = np.empty((num_paths, num_steps + 1, 3))
+    with WorldBatch(config, num_paths, num_threads=num_threads) as worlds:
         worlds.reset(rng)
-        trajectories[:, 0] = worlds.object_position
+        paths[:, 0] = worlds.object_position
         for step in range(num_steps):
-            mean, std = primitives.compose(worlds.positions(), weights)
-            worlds.step(mean + std * rng.standard_normal(mean.shape, dtype=np.float32))
-            trajectories[:, step + 1] = worlds.object_position
-    return trajectories
+            worlds.step(act(worlds.positions()))
+            paths[:, step + 1] = worlds.object_position
+    return paths
 
 
 def visited_share(trajectories: StateArray, workspace: WorkspaceConfig, *, cell_size_m: float = 0.05) -> float:

@@ -44,11 +44,6 @@ class IntrinsicReward(ABC):
         self._random = torch.Generator().manual_seed(seed)
         self._optimizer = Adam(self._learned(), config.learning_rate, epsilon=ADAM_EPSILON)
 
-    @staticmethod
-    def draw_skills(num: int, size: int, rng: np.random.Generator) -> FloatArray:
-        """(num, Z) skills of the prior: N(0, I)."""
-        return rng.standard_normal((num, size), dtype=np.float32)
-
     def learn(self, before: Tensor, after: Tensor, skill: Tensor) -> Metrics:
         """Make one gradient step."""
         loss = self._loss(before, after, skill)
@@ -62,6 +57,14 @@ class IntrinsicReward(ABC):
     def rewards(self, before: Tensor, after: Tensor, skill: Tensor) -> Tensor:
         """(B,) rewards, not scaled."""
         return self._rewards(before, after, skill)
+
+    def exported(self) -> dict[str, FloatArray]:
+        """The network's parameters as float32 copies by name, as plain layers have them."""
+        linear = [layer for layer in self.network.children() if isinstance(layer, nn.Linear)]
+        names = {f"{2 * place}": layer for place, layer in enumerate(linear)}
+        parts = {f"{name}.weight": layer.weight for name, layer in names.items()}
+        parts |= {f"{name}.bias": layer.bias for name, layer in names.items()}
+        return {name: tensor.detach().numpy().astype(np.float32) for name, tensor in parts.items()}
 
     def state(self) -> Arrays:
         """Everything that ``load_state`` continues from, copied."""
@@ -122,13 +125,6 @@ class METRA(IntrinsicReward):
         self._log_dual = torch.tensor(math.log(config.dual_initial), requires_grad=True)
         super().__init__(config, state_size, seed)
 
-    @staticmethod
-    def draw_skills(num: int, size: int, rng: np.random.Generator) -> FloatArray:
-        """(num, Z) skills, uniform on the unit sphere."""
-        drawn = rng.standard_normal((num, size), dtype=np.float32)
-        skills: FloatArray = drawn / np.linalg.norm(drawn, axis=1, keepdims=True)
-        return skills
-
     def _make_network(self) -> nn.Module:
         return make_layers(self.state_size, *self.config.hidden_sizes, self.config.size)
 
@@ -175,11 +171,6 @@ class DADS(IntrinsicReward):
         self._moments = {name: torch.zeros(state_size) for name in ("before_mean", "change_mean")}
         self._moments |= {name: torch.ones(state_size) for name in ("before_square", "change_square")}
 
-    @staticmethod
-    def draw_skills(num: int, size: int, rng: np.random.Generator) -> FloatArray:
-        """(num, Z) skills, uniform in [-1, 1]."""
-        return rng.uniform(-1.0, 1.0, (num, size)).astype(np.float32)
-
     def learn(self, before: Tensor, after: Tensor, skill: Tensor) -> Metrics:
         """Move the normalisation towards this batch's moments, then make one gradient step."""
         for name, values in {"before": before, "change": after - before}.items():
@@ -206,7 +197,7 @@ class DADS(IntrinsicReward):
     def _rewards(self, before: Tensor, after: Tensor, skill: Tensor) -> Tensor:
         num = self.config.num_alternatives
         state, change = self._normalised("before", before), self._normalised("change", after - before)
-        others = torch.rand((num, self.config.size), generator=self._random) * 2.0 - 1.0
+        others = torch.rand((num, self.config.size), generator=self._random) * 2.0 - 1.0  # as of ``frozen.draw_skills``
         own = self._log_prob(state, change, skill)
         states, changes = (each[:, None].expand(-1, num, -1) for each in (state, change))
         other = self._log_prob(states, changes, others.expand(len(state), -1, -1))

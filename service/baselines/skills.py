@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -9,12 +10,13 @@ import gymnasium
 import numpy as np
 import torch
 
+from service.baselines.frozen import draw_skills, normalised_place, skill_inputs
 from service.baselines.rewards import IntrinsicReward, make_reward
-from service.config import Config
+from service.config import Config, WorkspaceConfig
 from service.envs.gym.vector import TabletopVectorEnv
 from service.envs.observations import POSITIONS
 from service.off_policy_config import SkillsConfig
-from service.sac.inputs import NUM_MOTION_INPUTS, motion_inputs
+from service.sac.inputs import NUM_MOTION_INPUTS
 from service.sac.learner import Batch, SACLearner
 from service.sac.loop import OffPolicyLoop
 from service.sac.networks import GaussianActor
@@ -26,20 +28,6 @@ _COLUMNS = {"previous": POSITIONS.size, "positions": POSITIONS.size, "following"
 _OBJECT = POSITIONS["object"]
 STATE_SIZE = 3
 """Of what rewards see: the object's position."""
-DrawSkills = Callable[[int, int, np.random.Generator], FloatArray]
-
-
-def object_state(positions: FloatArray) -> FloatArray:
-    """(N, 3) the object's position in (N, 11) positions, normalised."""
-    normalisation = POSITIONS.normalisation
-    state: FloatArray = (positions[:, _OBJECT] - normalisation.offset[_OBJECT]) / normalisation.scale[_OBJECT]
-    return state
-
-
-def skill_inputs(previous: FloatArray, positions: FloatArray, skill: FloatArray) -> FloatArray:
-    """(N, 17 + Z) inputs of a policy that (N, Z) skills steer; see ``sac.inputs.motion_inputs``."""
-    inputs: FloatArray = np.concatenate((motion_inputs(previous, positions), skill), axis=1)
-    return inputs
 
 
 class SkillWorlds(TabletopWorlds):
@@ -48,17 +36,17 @@ class SkillWorlds(TabletopWorlds):
     Args:
         env: see ``TabletopWorlds``.
         seed: of episodes and skills.
-        size: Z.
-        draw_skills: the prior.
+        config: of the method.
     """
 
-    def __init__(
-        self, env: gymnasium.vector.VectorEnv[Any, Any, Any], seed: int, size: int, draw_skills: DrawSkills
-    ) -> None:
+    def __init__(self, env: gymnasium.vector.VectorEnv[Any, Any, Any], seed: int, config: SkillsConfig) -> None:
         super().__init__(env, seed)
-        self._rng, self._size, self._draw = np.random.default_rng(seed), size, draw_skills
-        self.skill = draw_skills(self.num_worlds, size, self._rng)
+        self._rng, self._config = np.random.default_rng(seed), config
+        self.skill = self._draw()
         """(N, Z) of the episodes that go on."""
+        self.finished: list[FloatArray] = []
+        """(2, 3) where the object was when an episode began and ended, metres, since this list was last cleared."""
+        self._start = self.positions[:, _OBJECT]
 
     def inputs(self) -> FloatArray:
         """(N, 17 + Z) what the actor sees now."""
@@ -68,21 +56,27 @@ class SkillWorlds(TabletopWorlds):
         """Act by (N, 4) actions; the transitions and (N,) whose episodes ended."""
         step, skill = self.advance(actions), self.skill
         if step.ended.any():
-            drawn = self._draw(self.num_worlds, self._size, self._rng)
-            self.skill = np.where(step.ended[:, None], drawn, skill)
+            self.skill = np.where(step.ended[:, None], self._draw(), skill)
+            ends = np.stack((self._start, step.following[:, _OBJECT]), axis=1)
+            self.finished += list(ends[step.ended])
+            self._start = np.where(step.ended[:, None], self.positions[:, _OBJECT], self._start)
         return {**{name: getattr(step, name) for name in _COLUMNS}, "skill": skill, "action": actions}, step.ended
 
     def state(self) -> tuple[Arrays, Any]:
         """Copy everything that ``load_state`` needs."""
         arrays, random = super().state()
-        return {**arrays, "skill": self.skill.copy()}, [random, self._rng.bit_generator.state]
+        arrays |= {"skill": self.skill.copy(), "start": self._start.copy()}
+        return arrays, [random, self._rng.bit_generator.state]
 
     def load_state(self, arrays: dict[str, Array], random: Any) -> None:
         """Go back to a saved state; continues bit-identically."""
         worlds = dict(arrays)
-        self.skill = np.array(worlds.pop("skill"), dtype=np.float32)
+        self.skill, self._start = (np.array(worlds.pop(name), dtype=np.float32) for name in ("skill", "start"))
         self._rng.bit_generator.state = random[1]
         super().load_state(worlds, random[0])
+
+    def _draw(self) -> FloatArray:
+        return draw_skills(self._config.method, self.num_worlds, self._config.size, self._rng)
 
 
 class Seen(NamedTuple):
@@ -138,7 +132,7 @@ def make_skill_loop(config: Config) -> OffPolicyLoop:
         max_episode_steps=skills.episode_steps,
         num_threads=config.run.num_threads,
     )
-    worlds = SkillWorlds(env, seeds[1], skills.size, reward.draw_skills)
+    worlds = SkillWorlds(env, seeds[1], skills)
     num_inputs, num_actions = NUM_MOTION_INPUTS + skills.size, worlds.num_actions
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seeds[2])
@@ -147,14 +141,20 @@ def make_skill_loop(config: Config) -> OffPolicyLoop:
     columns = {**_COLUMNS, "skill": skills.size, "action": num_actions}
     num_steps = -(-min(skills.replay_steps, config.run.total_env_steps) // skills.sac.num_worlds)
     replay = ReplayBuffer(num_steps, skills.sac.num_worlds, columns)
-    return OffPolicyLoop(worlds, replay, learner, IntrinsicBatches(reward, skills, see_object), seeds[4])
+    see = functools.partial(see_object, workspace=config.world.workspace)
+    return OffPolicyLoop(worlds, replay, learner, IntrinsicBatches(reward, skills, see), seeds[4])
 
 
-def see_object(rows: Columns) -> Seen:
-    """The object's position for the reward; for the actor positions, movements and the skill."""
+def see_object(rows: Columns, workspace: WorkspaceConfig) -> Seen:
+    """The object's position for the reward; for the actor positions, movements and the skill.
+
+    Outside the workspace the reward sees the nearest place inside: a cube that was pushed off the table falls for ever,
+    which would be the longest way of all.
+    """
     previous, positions, following, skill = (rows[name] for name in (*_COLUMNS, "skill"))
-    states = object_state(positions), object_state(following)
-    return Seen(*states, skill_inputs(previous, positions, skill), skill_inputs(positions, following, skill))
+    places = (np.clip(each[:, _OBJECT], workspace.lower_m, workspace.upper_m) for each in (positions, following))
+    before, after = map(normalised_place, places)
+    return Seen(before, after, skill_inputs(previous, positions, skill), skill_inputs(positions, following, skill))
 
 
 def _tensors(seen: Seen, skill: FloatArray) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:

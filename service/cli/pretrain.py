@@ -32,6 +32,10 @@ def pretrain(
     config: Annotated[
         Path | None, typer.Option(metavar="FILE", help="YAML; defaults where left out. Not needed to resume.")
     ] = None,
+    method: Annotated[
+        str | None,
+        typer.Option(metavar="lsd|diayn|dads|metra", help="A skill-discovery baseline instead of self-play."),
+    ] = None,
     run_dir: Annotated[Path | None, typer.Option(metavar="DIR", help="Default: RUNS/NAME.")] = None,
     run_id: Annotated[
         str | None, typer.Option(metavar="ID", help="Run in RUNS/ID, and continue it if it has begun: for jobs.")
@@ -84,6 +88,7 @@ def pretrain(
         where = parse_status(status, read_token(token_file))
         return ClusterOptions(num_actors, actor_threads, learner_cpus, where)
 
+    overrides = [*_method_overrides(method), *(overrides or [])]
     if runtime not in ("local", "ray"):
         raise TandemError(f"--runtime {runtime!r}: choose one of local, ray")
     if runtime == "local":
@@ -99,8 +104,12 @@ def pretrain(
         run_dir = runs / run_id
         resume = RunDirectory(run_dir).exists
     if is_study(run_dir, seeds):
+        if method is not None:
+            raise TandemError(
+                "--method with --seeds: a study compares Bobs; start a run for each seed with --set seed=N"
+            )
         pretrain_study(
-            run_dir, seeds, config=config, overrides=overrides or [], runs=runs, registry=registry,
+            run_dir, seeds, config=config, overrides=overrides, runs=runs, registry=registry,
             resume=None if run_id is not None else resume, publish=publish, parallel=parallel,
             cluster=cluster_options if runtime == "ray" else None, address=address,
         )  # fmt: skip
@@ -110,9 +119,9 @@ def pretrain(
     if resume:
         if run_dir is None:
             raise TandemError("--resume needs --run-dir, the directory of the run to continue")
-        resolved = resumed_config(RunDirectory(run_dir), overrides or [], config)
+        resolved = resumed_config(RunDirectory(run_dir), overrides, config)
     else:
-        resolved = load_config(config, overrides or [])
+        resolved = load_config(config, overrides)
         run_dir = run_dir or runs / resolved.name
     if runtime == "local":
         _pretrain(resolved, run_dir, registry, resume=resume, publish=publish)
@@ -122,6 +131,19 @@ def pretrain(
     options = cluster_options()
     with connected(address):
         _pretrain(resolved, run_dir, registry, resume=resume, publish=publish, cluster=options)
+
+
+def _method_overrides(method: str | None) -> list[str]:
+    """Overrides that make a run one of a skill-discovery baseline, under a name of its own."""
+    if method is None:
+        return []
+    from typing import get_args
+
+    from service.off_policy_config import SkillMethod
+
+    if method not in get_args(SkillMethod):
+        raise TandemError(f"--method {method!r}: choose one of {', '.join(get_args(SkillMethod))}; without, self-play")
+    return [f"skills.method={method}", f"name=panda-cube-{method}"]
 
 
 def demo(

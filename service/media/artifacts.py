@@ -8,13 +8,14 @@ from functools import partial
 from pathlib import Path
 
 from service.actors.coverage import skill_trajectories
+from service.baselines.coverage import skill_paths
 from service.config import Config
 from service.errors import TandemError
 from service.io.run_directory import RunDirectory
 from service.media import recording, video
 from service.media.plots import plot_coverage, plot_curves, plot_goals
 from service.policies.numpy_policy import NumpyMCPPolicy
-from service.primitives.loading import load_players
+from service.primitives.loading import load_players, load_skills
 
 NUM_SKILLS = 32
 """Random compositions in the coverage picture (paper)."""
@@ -32,6 +33,13 @@ def make_artifacts(directory: RunDirectory) -> dict[str, Path]:
         out, and a warning says why.
     """
     config = directory.read_config()
+    if config.skills is not None:
+        return _make(
+            {
+                "curves": partial(plot_curves, directory.path, of_skills=True),
+                "coverage": partial(_draw_skills, directory, config),
+            }
+        )
     alice, bob = load_players(directory)
 
     def draw_video() -> Path:
@@ -44,13 +52,25 @@ def make_artifacts(directory: RunDirectory) -> dict[str, Path]:
     }
     if isinstance(bob, NumpyMCPPolicy):
         makers["coverage"] = partial(_draw_coverage, directory, config, bob)
+    return _make(makers | {"video": draw_video})
+
+
+def _make(makers: dict[str, Callable[[], Path]]) -> dict[str, Path]:
     files = {}
-    for name, make in (makers | {"video": draw_video}).items():
+    for name, make in makers.items():
         try:
             files[name] = make()
         except TandemError as error:
             _logger.warning("no %s: %s", name, error)
     return files
+
+
+def _draw_skills(directory: RunDirectory, config: Config) -> Path:
+    assert config.skills is not None
+    skills = load_skills(str(directory.path), directory.path).skills
+    steps = config.skills.episode_steps
+    paths = skill_paths(skills, config.world, num_skills=NUM_SKILLS, num_steps=steps, seed=_SEED)
+    return plot_coverage(paths, config.world.workspace, directory.path / "coverage.png", config.name, of="skill")
 
 
 def _draw_coverage(directory: RunDirectory, config: Config, bob: NumpyMCPPolicy) -> Path:

@@ -87,10 +87,34 @@ _CURVES = (
 )
 
 
-def plot_curves(run_dir: Path) -> Path:
+_SKILL_PANELS = {
+    "moved": _Panel("What episodes do to the object", "moved grows", "fraction"),
+    "coverage": _Panel("Coverage of random skills", "grows", "fraction"),
+    "cells": _Panel("Cells in which episodes ended", "grow", "cells"),
+    "distance": _Panel("How far the object came", "grows", "metres"),
+    "loss": _Panel("Loss of the reward's network", "settles", ""),
+    "entropy": _Panel("Entropy of the policy", "falls slowly, without a collapse", "nats"),
+}
+_SKILL_CURVES = (
+    _Curve("moved", "skills/moved_fraction", "moved", BLUE),
+    _Curve("moved", "skills/lifted_fraction", "lifted", ORANGE),
+    _Curve("moved", "skills/outside_fraction", "outside", GREEN),
+    _Curve("coverage", "evaluation/coverage", "32 skills", BLUE),
+    _Curve("cells", "skills/num_cells_seen", "ever", BLUE),
+    _Curve("distance", "skills/distance_m", "distance", BLUE),
+    _Curve("loss", "learner/representation_loss", "loss", BLUE),
+    _Curve("entropy", "learner/entropy", "policy", BLUE),
+)
+
+
+def plot_curves(run_dir: Path, *, of_skills: bool = False) -> Path:
     """Draw ``curves.png`` from the run's ``metrics.jsonl``: six small panels over env steps, raw thin, smoothed thick.
 
     A value that is missing, null or not finite leaves a gap; a panel without values says so.
+
+    Args:
+        run_dir: of the run.
+        of_skills: whether it is one of skill discovery.
 
     Raises:
         TandemError: the run has no metrics yet, they are damaged, or the picture cannot be written.
@@ -98,8 +122,9 @@ def plot_curves(run_dir: Path) -> Path:
     records = read_records(run_dir / "metrics.jsonl")
     steps = column(records, "env_steps") / 1e6
     figure = new_figure(14.0, 7.8, f"{run_dir.resolve().name}: {_progress(records)}")
-    for place, (axes, (name, panel)) in enumerate(zip(figure.subplots(2, 3).flat, _PANELS.items(), strict=True)):
-        _draw_panel(axes, panel, [curve for curve in _CURVES if curve.panel == name], steps, records)
+    panels, curves = (_SKILL_PANELS, _SKILL_CURVES) if of_skills else (_PANELS, _CURVES)
+    for place, (axes, (name, panel)) in enumerate(zip(figure.subplots(2, 3).flat, panels.items(), strict=True)):
+        _draw_panel(axes, panel, [curve for curve in curves if curve.panel == name], steps, records)
         axes.set_xlabel("million env steps" if place >= 3 else "", color=FAINT)
     figure.subplots_adjust(left=0.05, right=0.908, top=0.85, bottom=0.08, wspace=0.64, hspace=0.42)
     return save(figure, run_dir / "curves.png")
@@ -174,8 +199,10 @@ def _draw_panel(
     drawn = [(end, curve) for end, curve in ends if end is not None]
     if not drawn:
         axes.text(0.5, 0.5, "no values yet", transform=axes.transAxes, ha="center", color=FAINT)
-    if panel.unit != "nats":
-        axes.set_ylim(0.0, 1.0 if panel.unit != "metres" else None)
+    if panel.unit in ("fraction", "solved"):
+        axes.set_ylim(0.0, 1.0)
+    elif panel.unit in ("metres", "cells"):
+        axes.set_ylim(0.0)
     _label_ends(axes, drawn)
 
 
@@ -298,19 +325,22 @@ def _draw_outline(axes: Axes, workspace: WorkspaceConfig) -> None:
 _MOVED_M = 0.05
 
 
-def plot_coverage(trajectories: StateArray, workspace: WorkspaceConfig, path: Path, title: str) -> Path:
-    """Draw the paper's figure of a skill set: where random compositions of the primitives take the object.
+def plot_coverage(
+    trajectories: StateArray, workspace: WorkspaceConfig, path: Path, title: str, *, of: str = "composition"
+) -> Path:
+    """Draw the paper's figure of a skill set: where random compositions, or random skills, take the object.
 
     Args:
-        trajectories: (M, T, 3) object positions in metres in the world's frame, one row per composition.
+        trajectories: (M, T, 3) object positions in metres in the world's frame, one row each.
         workspace: the box to draw; points more than a few centimetres outside it are left out.
         path: the PNG to write.
-        title: whose compositions these are, for example the primitives' name and version.
+        title: whose they are, for example the primitives' name and version.
+        of: one of them, as the title calls it.
 
     Raises:
         TandemError: the picture cannot be written.
     """
-    figure = new_figure(14.0, 7.2, f"{title}, {_summary(trajectories, workspace)}")
+    figure = new_figure(14.0, 7.2, f"{title}, {_summary(trajectories, workspace, of)}")
     box = figure.add_axes((0.0, 0.0, 0.57, 0.95), projection="3d", computed_zorder=False)
     above = figure.add_axes((0.62, 0.1, 0.36, 0.74))
     draw_paths(box, above, trajectories, workspace)
@@ -349,11 +379,12 @@ def _inside(points: StateArray, workspace: WorkspaceConfig) -> StateArray:
     return np.where(near.all(axis=1, keepdims=True), points, np.nan)
 
 
-def _summary(trajectories: StateArray, workspace: WorkspaceConfig) -> str:
+def _summary(trajectories: StateArray, workspace: WorkspaceConfig, of: str) -> str:
     share = visited_share(trajectories, workspace)
     moved = (np.linalg.norm(trajectories - trajectories[:, :1], axis=2) > _MOVED_M).any(axis=1).sum()
-    compositions = counted(len(trajectories), "composition")
-    return f"{share:.0%} of the table's cells visited: {compositions}, {moved} move the object over 5 cm"
+    return (
+        f"{share:.0%} of the table's cells visited: {counted(len(trajectories), of)}, {moved} move the object over 5 cm"
+    )
 
 
 def _draw_box(axes: Any, workspace: WorkspaceConfig) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
+from service.baselines.frozen import FrozenSkills
 from service.config import Config, parse_config
 from service.errors import TandemError
 from service.io.checkpoints import Checkpoint, CheckpointStore, read_checkpoint
@@ -13,6 +14,21 @@ from service.policies.numpy_policy import NumpyGaussianPolicy, NumpyMCPPolicy, N
 from service.policies.parameters import Parameters, PolicyError
 from service.primitives.bundled import find_version, is_bundled
 from service.registry.manifest import Manifest
+
+SKILLS = "skills"
+"""Part of a run's checkpoint that holds frozen skills, and kind in the spaces of their manifest."""
+
+
+@dataclass(frozen=True, slots=True)
+class TrainedSkills:
+    """Frozen skills ready to act, and the configuration they were trained with."""
+
+    label: str
+    """Where they come from, such as ``panda-cube-lsd@1``."""
+    skills: FrozenSkills
+    config: Config
+    manifest: Manifest | None = None
+    """Their manifest in the registry; None for those of a run directory."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,21 +65,50 @@ def load_bob(reference: str, registry: Path) -> TrainedBob:
     Raises:
         TandemError: neither a run directory nor a published version, or damaged.
     """
+    label, config, tensors, manifest = _load(reference, registry, "bob")
+    if config.skills is not None:
+        raise TandemError(
+            f"{label} holds skills of {config.skills.method}, not primitives: load them by service.load_skills, or "
+            "name primitives"
+        )
+    if manifest is None:
+        return TrainedBob(label, numpy_bob(tensors), config)
+    try:
+        return TrainedBob(label, NumpyMCPPolicy(tensors), config, manifest)
+    except PolicyError as error:
+        raise TandemError(f"{label} holds no primitives: {error}") from None
+
+
+def load_skills(reference: str, registry: Path) -> TrainedSkills:
+    """Load frozen skills; see ``load_bob``.
+
+    Raises:
+        TandemError: neither a run directory nor a published version, damaged, or no skills.
+    """
+    label, config, tensors, manifest = _load(reference, registry, SKILLS)
+    if config.skills is None:
+        raise TandemError(f"{label} holds primitives, not skills: load them by service.load_primitives, or name skills")
+    try:
+        return TrainedSkills(label, FrozenSkills(tensors, config.skills.method), config, manifest)
+    except PolicyError as error:
+        raise TandemError(f"{label} holds no skills: {error}") from None
+
+
+def _load(reference: str, registry: Path, part: str) -> tuple[str, Config, Parameters, Manifest | None]:
+    """Label, configuration, parameters and manifest of a version; those of a run's ``part`` have no manifest."""
     if Path(reference).is_dir():
         directory = RunDirectory(Path(reference))
-        config, parameters = directory.read_config(), read_parameters(directory, "bob")
-        return TrainedBob(reference, numpy_bob(parameters), config)
+        config = directory.read_config()
+        fits = (part == SKILLS) == (config.skills is not None)  # or else the caller says what it is
+        return reference, config, read_parameters(directory, part) if fits else {}, None
     if "/" in reference:
-        raise TandemError(f"{reference}: no such run directory; for published primitives write NAME@ALIAS")
+        raise TandemError(f"{reference}: no such run directory; for published versions write NAME@ALIAS")
     found, version = find_version(reference, registry)
     manifest, tensors = found.load(str(version))
     config = parse_config(manifest.config, where=f"the manifest of {reference}", recorded=True)
     # two registries may both have a version 1: which one was meant must be seen
     label = f"{version} (bundled)" if is_bundled(found) else str(version)
-    try:
-        return TrainedBob(label, NumpyMCPPolicy(tensors), config, manifest)
-    except PolicyError as error:
-        raise TandemError(f"{label} holds no primitives: {error}") from None
+    return label, config, tensors, manifest
 
 
 def load_players(directory: RunDirectory) -> tuple[NumpyGaussianPolicy, NumpyPolicy]:
@@ -77,7 +122,7 @@ def load_players(directory: RunDirectory) -> tuple[NumpyGaussianPolicy, NumpyPol
 
 
 def read_parameters(directory: RunDirectory, player: str) -> Parameters:
-    """Parameters of ``alice`` or ``bob`` in a run's newest checkpoint."""
+    """Parameters of ``alice``, ``bob`` or ``skills`` in a run's newest checkpoint."""
     return _parameters(CheckpointStore(directory.checkpoints, keep=1).load_latest(), player)
 
 

@@ -5,20 +5,27 @@ from __future__ import annotations
 import contextlib
 import json
 
+from service.actors.coverage import visited_share
 from service.actors.evaluation import EVALUATED_GOALS, REPORTED_SEED, success_metrics
+from service.baselines.coverage import skill_paths
+from service.baselines.frozen import FrozenSkills
 from service.config import Config
-from service.envs.observations import BOB, SPACES
+from service.envs.observations import BOB, POSITIONS, SPACES
 from service.io import tensors
 from service.io.errors import StorageError
 from service.io.files import os_errors, write_atomic
 from service.io.run_directory import RunDirectory
+from service.off_policy_config import SkillsConfig
 from service.policies.numpy_policy import numpy_bob
 from service.policies.parameters import Parameters
+from service.primitives.loading import SKILLS
 from service.registry.blobs import sha256_of
 from service.registry.names import Version
 from service.registry.registry import Registry
 
 FINAL_EVALUATION_EPISODES = 300
+NUM_MEASURED_SKILLS = 32
+"""Paper: 32."""
 
 
 def measure_bob(config: Config, parameters: Parameters) -> dict[str, float]:
@@ -33,10 +40,24 @@ def measure_bob(config: Config, parameters: Parameters) -> dict[str, float]:
     )
 
 
+def measure_skills(config: Config, parameters: Parameters) -> dict[str, float]:
+    """Share of the workspace's table that random skills move the object over, without noise."""
+    assert config.skills is not None
+    paths = skill_paths(
+        FrozenSkills(parameters, config.skills.method),
+        config.world,
+        num_skills=NUM_MEASURED_SKILLS,
+        num_steps=config.skills.episode_steps,
+        seed=REPORTED_SEED,
+        num_threads=config.run.num_threads,
+    )
+    return {"coverage": visited_share(paths, config.world.workspace)}
+
+
 def publish_run(
     directory: RunDirectory, registry: Registry, config: Config, parameters: Parameters, metrics: dict[str, float]
 ) -> Version:
-    """Publish a run's Bob, and note it in the run directory: of what the run publishes next, this is the parent.
+    """Publish what a run has learned, and note it in the run directory: of what it publishes next, this is the parent.
 
     Returns:
         The new version, or the newest one of that name where it has the same parameters already.
@@ -47,7 +68,8 @@ def publish_run(
     version = _newest_if_same(registry, config.name, parameters)
     if version is None:
         parent = _published_before(directory, registry)
-        version = publish_bob(registry, config, parameters, metrics, parent=parent)
+        publish = publish_bob if config.skills is None else publish_skills
+        version = publish(registry, config, parameters, metrics, parent=parent)
     note = {"version": str(version), "blob_sha256": registry.manifest(str(version)).blob_sha256}
     with os_errors("write", directory.published_file):
         write_atomic(directory.published_file, json.dumps(note).encode())
@@ -76,6 +98,38 @@ def publish_bob(
         metrics=metrics,
         parent=parent,
     )
+
+
+def publish_skills(
+    registry: Registry,
+    config: Config,
+    parameters: Parameters,
+    metrics: dict[str, float],
+    *,
+    parent: str | None = None,
+) -> Version:
+    """Publish frozen skills with everything a user of them needs; their manifest's spaces say what they are.
+
+    Raises:
+        StorageError: see ``Registry.publish``.
+    """
+    assert config.skills is not None
+    normalisation = POSITIONS.normalisation
+    return registry.publish(
+        config.name,
+        parameters,
+        spaces=skill_spaces(config.skills),
+        normalisation={"offset": normalisation.offset.tolist(), "scale": normalisation.scale.tolist()},
+        config=config.model_dump(mode="json"),
+        metrics=metrics,
+        parent=parent,
+    )
+
+
+def skill_spaces(skills: SkillsConfig) -> dict[str, object]:
+    """Sizes and layout in the manifest of frozen skills."""
+    shared = {name: size for name, size in SPACES.items() if name != "observation"}
+    return {**shared, "kind": SKILLS, "skill": skills.size}
 
 
 def _newest_if_same(registry: Registry, name: str, parameters: Parameters) -> Version | None:

@@ -162,14 +162,15 @@ class Bookkeeper:
         tenths = [steps * NUM_SNAPSHOTS // self.config.run.total_env_steps for steps in (after, self.num_env_steps)]
         return tenths[0] != tenths[1]
 
-    def take_snapshot(self, bob: Parameters) -> None:
-        """Keep Bob for good.
+    def take_snapshot(self, parameters: Parameters) -> None:
+        """Keep what was learned for good.
 
-        Checkpoints go, but what he could do at the beginning and in the middle is asked when the run is over. A resumed
-        run takes those it takes again with the same bits.
+        Checkpoints go, but what could be done at the beginning and in the middle is asked when the run is over. A
+        resumed run takes those it takes again with the same bits.
 
         Raises:
             CheckpointError: a full disk.
         """
-        arrays = {f"bob/{name}": array for name, array in bob.items()}
+        part = "bob" if self.config.skills is None else "skills"
+        arrays = {f"{part}/{name}": array for name, array in parameters.items()}
         self._snapshots.save(self.iteration, arrays, {"env_steps": self.num_env_steps})

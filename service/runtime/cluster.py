@@ -163,7 +163,7 @@ class ClusterRun(Runner):
             self._save_first()
         self._last_iteration = time.monotonic()
 
-    def bob(self) -> Parameters:
+    def parameters(self) -> Parameters:
         """The newest Bob, as he is evaluated and published."""
         parameters: Parameters = ray.get(self._weights).bob_ema
         return parameters

@@ -71,7 +71,7 @@ class LocalRun(Runner):
             self._save_first()
         self._open_directory(resume=resume)
 
-    def bob(self) -> Parameters:
+    def parameters(self) -> Parameters:
         """The newest Bob, as he is evaluated and published."""
         return self.learner.weights().bob_ema
 

@@ -16,7 +16,7 @@ from service.io.run_directory import RunDirectory
 from service.io.study_directory import StudyDirectory
 from service.learner.learner import torch_device
 from service.media.artifacts import make_artifacts
-from service.primitives.publishing import measure_bob, publish_run
+from service.primitives.publishing import measure_bob, measure_skills, publish_run
 from service.registry.names import Version
 from service.registry.registry import Registry
 from service.runtime.local import LocalRun, check_one_learner
@@ -86,12 +86,16 @@ def pretrain(
 
     Raises:
         TandemError: see ``LocalRun``, ``ClusterRun`` and ``RunDirectory.start``; or a registry that is only read; or a
-            Redis that is configured and cannot be used.
+            Redis that is configured and cannot be used; or skill discovery on a cluster.
         UnfinishedError: everything is saved, and not published.
         InterruptError: a signal while the run was being loaded, or a second one.
     """
     if publish:
         Registry(registry).check_writable()  # now, not after hours of learning
+    if cluster is not None and config.skills is not None:
+        raise ConfigError(
+            f"skills.method = {config.skills.method}: skill discovery runs in one process; use --runtime local"
+        )
     if cluster is None:  # on a cluster, another machine has it
         torch_device(config.learner.device)
         check_one_learner(config)
@@ -121,6 +125,10 @@ def pretrain(
 
 
 def _start(config: Config, directory: RunDirectory, cluster: ClusterOptions | None, *, resume: bool) -> Runner:
+    if config.skills is not None:
+        from service.runtime.skill_run import SkillRun
+
+        return SkillRun(config, directory, resume=resume)
     if cluster is None:
         return LocalRun(config, directory, resume=resume)
     from service.runtime.cluster import ClusterRun  # where there is no cluster, Ray is not needed
@@ -164,12 +172,13 @@ def _finish(
     done: Pretrained, config: Config, directory: RunDirectory, registry: Registry | None, run: Runner
 ) -> Pretrained:
     _logger.info("learning is over; now evaluating, publishing, drawing and recording a video")
-    bob = run.bob()
+    parameters = run.parameters()
     run.close()
-    metrics, version = measure_bob(config, bob), None
+    metrics, version = (measure_bob if config.skills is None else measure_skills)(config, parameters), None
     try:
-        if registry is not None and config.policy.monolithic_bob is None:
-            version = publish_run(directory, registry, config, bob, metrics | {"env_steps": done.result.num_env_steps})
+        if registry is not None and (config.policy.monolithic_bob is None or config.skills is not None):
+            known = metrics | {"env_steps": done.result.num_env_steps}
+            version = publish_run(directory, registry, config, parameters, known)
     except TandemError as error:
         raise UnfinishedError(f"learning is over and saved, but not published: {error}; --resume does it") from error
     return replace(done, files=make_artifacts(directory), version=version, metrics=metrics, timing=run.timing.tree())

@@ -25,6 +25,13 @@ _ROWS = (
     ("Bob: random goals in the air, at the end", "evaluation/air_success_last", "{:.0%}"),
     ("speed", "time/env_steps_per_s", "{:,.0f} env steps/s"),
 )
+_SKILL_ROWS = (
+    ("Episodes that move the object", "skills/moved_fraction", "{:.0%}"),
+    ("Episodes that lift it", "skills/lifted_fraction", "{:.0%}"),
+    ("How far it came", "skills/distance_m", "{:.3f} m"),
+    ("32 random skills: share of the table's cells", "evaluation/coverage", "{:.0%}"),
+    _ROWS[-1],
+)
 _COLUMNS = (
     ("valid", "alice/valid_fraction"),
     ("lifted", "alice/lifted_fraction"),
@@ -33,7 +40,7 @@ _COLUMNS = (
     ("air", "evaluation/air_success_last"),
     ("env steps/s", "time/env_steps_per_s"),
 )
-_PATTERNS = {key: pattern for _, key, pattern in _ROWS}
+_PATTERNS = {key: pattern for _, key, pattern in (*_ROWS, *_SKILL_ROWS)}
 _SMOOTHING = 0.8
 
 
@@ -53,11 +60,16 @@ class _Values:
                 old = self._values[key] if smooth else new
                 self._values[key] = _SMOOTHING * old + (1 - _SMOOTHING) * new
 
+    @property
+    def rows(self) -> tuple[tuple[str, str, str], ...]:
+        """What is shown of such a run."""
+        return _SKILL_ROWS if _SKILL_ROWS[0][1] in self._values else _ROWS
+
     def text(self, key: str) -> str:
         return _PATTERNS[key].format(self._values[key]) if key in self._values else "-"
 
     def line(self) -> str:
-        parts = [f"{key.split('/')[1]} {self.text(key)}" for _, key, _ in _ROWS if key in self._values]
+        parts = [f"{key.split('/')[1]} {self.text(key)}" for _, key, _ in self.rows if key in self._values]
         return f"{self.env_steps:>10,} env steps | " + " | ".join(parts)
 
 
@@ -113,7 +125,7 @@ class Progress(_Shown):
         steps = self._values.env_steps
         table = Table(show_header=False, title=f"{steps:,} of {self._total:,} env steps", title_justify="left")
         table.add_row("", ProgressBar(total=self._total, completed=min(steps, self._total), width=40))
-        for label, key, _ in _ROWS:
+        for label, key, _ in self._values.rows:
             table.add_row(label, self._values.text(key))
         return table
 

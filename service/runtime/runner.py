@@ -120,8 +120,8 @@ class Runner(ABC):
         return RunResult(reason, self.iteration, self.num_env_steps)
 
     @abstractmethod
-    def bob(self) -> Parameters:
-        """The newest Bob, as he is evaluated and published."""
+    def parameters(self) -> Parameters:
+        """What is evaluated and published: the newest Bob, or the newest skills."""
 
     @abstractmethod
     def health(self) -> Health:
@@ -195,8 +195,12 @@ class Runner(ABC):
             self.directory.record(metrics)
             self.directory.record_goals(self.iteration, self.num_env_steps, result.recorded.goals)
             self._on_iteration(metrics)
+        self._keep(after=self.num_env_steps - result.num_env_steps)
+
+    def _keep(self, *, after: int) -> None:
+        """Write the snapshot and the checkpoint that are due; before this iteration there were ``after`` env steps."""
         with self.bookkeeper.tolerating("without this snapshot"):
-            self._take_snapshot(after=self.num_env_steps - result.num_env_steps)
+            self._take_snapshot(after=after)
         if self.bookkeeper.save_due:
             with self.bookkeeper.tolerating(f"and saves again after {self.config.run.checkpoint_interval} iterations"):
                 self._save()
@@ -204,7 +208,7 @@ class Runner(ABC):
     def _take_snapshot(self, *, after: int) -> None:
         if self.bookkeeper.snapshot_due(after=after):
             with self.timing("checkpoint"):
-                self.bookkeeper.take_snapshot(self.bob())
+                self.bookkeeper.take_snapshot(self.parameters())
 
 
 def _round_metrics(rounds: Sequence[RoundSummary]) -> Metrics:

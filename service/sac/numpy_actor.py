@@ -22,7 +22,7 @@ class NumpyActor:
 
     def __init__(self, parameters: Parameters) -> None:
         reader = ParameterReader(parameters)
-        self._layers = _Layers(reader, "layers", None)
+        self._layers = NumpyLayers(reader, "layers", None)
         self.num_inputs, self.num_actions = self._layers.num_inputs, self._layers.num_outputs // 2
         reader.finish()
 
@@ -47,8 +47,8 @@ class NumpyMCPActor:
         self._weight = reader.take("output_weight", (None, None, None))
         num_primitives, hidden_size, outputs = self._weight.shape
         self._bias = reader.take("output_bias", (num_primitives, outputs))
-        self._primitives = _Layers(reader, "primitives", num_primitives * hidden_size)
-        self._gate = _Layers(reader, "gate", num_primitives)
+        self._primitives = NumpyLayers(reader, "primitives", num_primitives * hidden_size)
+        self._gate = NumpyLayers(reader, "gate", num_primitives)
         self._weight_floor = reader.take_scalar("weight_floor", 0.0, 1.0)
         self.num_inputs, self.num_actions = self._gate.num_inputs, outputs // 2
         reader.finish()
@@ -74,8 +74,17 @@ def numpy_actor(parameters: Parameters) -> NumpyActor | NumpyMCPActor:
     return NumpyMCPActor(parameters) if "output_weight" in parameters else NumpyActor(parameters)
 
 
-class _Layers:
-    """Affine maps with ReLU between them; weights are kept transposed and contiguous."""
+class NumpyLayers:
+    """Affine maps with ReLU between them, as of ``networks.make_layers``; weights are kept transposed and contiguous.
+
+    Args:
+        reader: of the exported parameters.
+        prefix: of their names.
+        num_outputs: that are expected; None: any.
+
+    Raises:
+        PolicyError: a parameter is missing, of a wrong shape or not finite.
+    """
 
     def __init__(self, reader: ParameterReader, prefix: str, num_outputs: int | None) -> None:
         self._layers: list[tuple[FloatArray, FloatArray]] = []
@@ -90,6 +99,7 @@ class _Layers:
         self.num_inputs, self.num_outputs = self._layers[0][0].shape[0], self._layers[-1][0].shape[1]
 
     def __call__(self, rows: FloatArray) -> FloatArray:
+        """(N, inputs) to (N, outputs)."""
         for weight, bias in self._layers[:-1]:
             rows = np.maximum(rows @ weight + bias, 0.0)
         weight, bias = self._layers[-1]

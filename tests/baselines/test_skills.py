@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from service.baselines.frozen import draw_skills
 from service.baselines.rewards import METHODS, make_reward
 from service.baselines.skills import IntrinsicBatches, Seen, make_skill_loop
 from service.config import parse_config
@@ -18,10 +19,10 @@ NUM, LENGTH, STEP_M = 32, 10, 0.2
 class PointMasses:
     """Points in a plane that an action moves; the reward sees where they are."""
 
-    def __init__(self, draw_skills):
-        self._rng, self._draw = np.random.default_rng(0), draw_skills
+    def __init__(self, method):
+        self._rng, self._method = np.random.default_rng(0), method
         self.at, self.elapsed = np.zeros((NUM, 2), np.float32), 0
-        self.skill = draw_skills(NUM, 2, self._rng)
+        self.skill = draw_skills(method, NUM, 2, self._rng)
 
     def inputs(self):
         return np.concatenate((self.at, self.skill), axis=1)
@@ -33,7 +34,7 @@ class PointMasses:
         ended = np.full(NUM, self.elapsed % LENGTH == 0)
         self.at = np.where(ended[:, None], np.float32(0.0), after)
         if ended.all():
-            self.skill = self._draw(NUM, 2, self._rng)
+            self.skill = draw_skills(self._method, NUM, 2, self._rng)
         return columns, ended
 
 
@@ -67,9 +68,9 @@ def test_skills_of_a_point_mass_differ(method):
     reward = make_reward(config, 2, seed=0)
     learner = SACLearner(GaussianActor(4, 2, (64, 64)), 4, 2, sac, seed=0)
     replay = ReplayBuffer(1000, NUM, {"before": 2, "after": 2, "skill": 2, "action": 2})
-    loop = OffPolicyLoop(PointMasses(reward.draw_skills), replay, learner, IntrinsicBatches(reward, config, see), 0)
+    loop = OffPolicyLoop(PointMasses(method), replay, learner, IntrinsicBatches(reward, config, see), 0)
     loop.play(NUM * 300)
-    skills = np.repeat(reward.draw_skills(12, 2, np.random.default_rng(1)), 3, axis=0)
+    skills = np.repeat(draw_skills(method, 12, 2, np.random.default_rng(1)), 3, axis=0)
     skills = skills + np.float32(0.02) * np.random.default_rng(2).standard_normal(skills.shape, dtype=np.float32)
     ends = where_skills_lead(loop, skills)
     assert np.linalg.norm(ends, axis=1).mean() > 0.5  # of 2 m at most, along an axis
@@ -132,9 +133,11 @@ def test_rewards_are_scaled_and_see_the_object_alone():
     rows = loop.replay.read(loop.replay.draw(64, rng))
     moved = np.abs(rows["following"] - rows["positions"])[:, 5:8].max(1) > 1e-5
     assert 0.0 < moved.mean() < 1.0
+    rows["positions"][0, 5:8], rows["following"][0, 5:8] = (0.1, 0.1, 0.02), (0.9, 0.1, -3.0)  # off the table
     seen = loop.make_batch._see(rows)
     assert seen.before.shape == (64, 3)
     np.testing.assert_allclose(seen.before, (rows["positions"][:, 5:8] - [0, 0, 0.15]) / 0.12, atol=1e-5)
-    np.testing.assert_array_equal(np.abs(seen.before - seen.after).max(1) > 1e-5 / 0.12, moved)
+    np.testing.assert_array_equal(np.abs(seen.before - seen.after).max(1)[1:] > 1e-5 / 0.12, moved[1:])
+    np.testing.assert_allclose(seen.after[0], (np.array([0.125, 0.1, 0.0]) - [0, 0, 0.15]) / 0.12, atol=1e-5)
     for each in (loop, plain):
         each.worlds.close()

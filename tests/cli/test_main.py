@@ -14,6 +14,7 @@ from typer.testing import CliRunner
 
 from service.cli.main import app
 from service.config import load_config
+from service.errors import TandemError
 from service.io import checkpoints
 from service.io.run_directory import RunDirectory
 from service.primitives.bundled import BUNDLED
@@ -472,3 +473,18 @@ def test_a_mistake_in_a_real_process_is_one_line():
     assert (result.returncode, result.stdout) == (2, "")
     assert result.stderr.count("\n") == 1
     assert "game.num_world" in result.stderr
+
+
+def test_a_method_makes_a_run_of_skills_under_its_own_name(monkeypatch, tmp_path):
+    seen = []
+
+    def pretrain(config, directory, registry, **kwargs):
+        seen.append((config.skills.method, config.name, config.seed, directory.path.name))
+        raise TandemError("not today")
+
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("service.runtime.pretrain.pretrain", pretrain)
+    tandem("pretrain", "--method", "dads", "--set", "seed=3")
+    assert seen == [("dads", "panda-cube-dads", 3, "panda-cube-dads")]
+    assert_user_error(tandem("pretrain", "--method", "ppo"), "--method 'ppo'", "lsd, diayn, dads, metra")
+    assert_user_error(tandem("pretrain", "--method", "lsd", "--seeds", "0,1"), "--method with --seeds")

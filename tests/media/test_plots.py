@@ -169,7 +169,7 @@ def test_coverage_counts_by_hand():
     moving = np.array([[0.01, 0.01, 0.01], [0.09, 0.01, 0.01], [5.0, 0.01, 0.01]])
     # One of 16 cells is entered, that of (0.09, 0.01); the one in which both start does not count.
     words = "6% of the table's cells visited: 2 compositions, 1 move the object over 5 cm"
-    assert _summary(np.stack([still, moving]), WORKSPACE) == words
+    assert _summary(np.stack([still, moving]), WORKSPACE, "composition") == words
 
 
 def test_points_far_outside_break_the_line():

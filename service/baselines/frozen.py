@@ -1,0 +1,135 @@
+"""Frozen skills in NumPy: to act by a skill vector, without torch."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from service.envs.observations import POSITIONS
+from service.errors import TandemError
+from service.off_policy_config import SkillMethod
+from service.policies.parameters import ParameterReader, Parameters, PolicyError
+from service.sac.inputs import NUM_MOTION_INPUTS, motion_inputs
+from service.sac.numpy_actor import NumpyActor, NumpyLayers
+from service.types import FloatArray
+
+_OBJECT = POSITIONS["object"]
+
+
+def object_state(positions: FloatArray) -> FloatArray:
+    """(N, 3) the object's position in (N, 11) positions, normalised: what rewards see, the paper's prior."""
+    return normalised_place(positions[:, _OBJECT])
+
+
+def normalised_place(place: FloatArray) -> FloatArray:
+    """(N, 3) places of the object, metres, normalised as ``object_state``."""
+    normalisation = POSITIONS.normalisation
+    state: FloatArray = (place - normalisation.offset[_OBJECT]) / normalisation.scale[_OBJECT]
+    return state.astype(np.float32, copy=False)
+
+
+def skill_inputs(previous: FloatArray, positions: FloatArray, skill: FloatArray) -> FloatArray:
+    """(N, 17 + Z) inputs of a policy that (N, Z) skills steer; see ``sac.inputs.motion_inputs``."""
+    inputs: FloatArray = np.concatenate((motion_inputs(previous, positions), skill), axis=1)
+    return inputs
+
+
+def draw_skills(method: SkillMethod, num: int, size: int, rng: np.random.Generator) -> FloatArray:
+    """(num, Z) skills of a method's prior.
+
+    LSD and DIAYN: N(0, I). METRA: uniform on the unit sphere. DADS: uniform in [-1, 1].
+    """
+    if method == "dads":
+        return rng.uniform(-1.0, 1.0, (num, size)).astype(np.float32)
+    drawn: FloatArray = rng.standard_normal((num, size), dtype=np.float32)
+    if method == "metra":
+        drawn /= np.linalg.norm(drawn, axis=1, keepdims=True)
+    return drawn
+
+
+def export_skills(actor: Parameters, network: Parameters) -> dict[str, FloatArray]:
+    """One dict of an actor's parameters and those of the network that its reward came from."""
+    parts = {"actor": actor, "network": network}
+    return {f"{part}.{name}": array for part, arrays in parts.items() for name, array in arrays.items()}
+
+
+class FrozenSkills:
+    """A policy that a skill vector steers, and the network that its reward came from.
+
+    Args:
+        parameters: of ``export_skills``.
+        method: that learned them.
+
+    Raises:
+        PolicyError: a parameter is missing, left over, of a wrong shape or not finite.
+    """
+
+    def __init__(self, parameters: Parameters, method: SkillMethod) -> None:
+        parts: dict[str, dict[str, FloatArray]] = {"actor": {}, "network": {}}
+        for name, array in parameters.items():
+            part, _, rest = name.partition(".")
+            if part not in parts:
+                raise PolicyError(
+                    f"policy parameter {name!r}: not of skills; load what a skill-discovery run published"
+                )
+            parts[part][rest] = array
+        self._actor, self.method = NumpyActor(parts["actor"]), method
+        self.size = self._actor.num_inputs - NUM_MOTION_INPUTS
+        """Z."""
+        reader = ParameterReader({f"network.{name}": array for name, array in parts["network"].items()})
+        self._network = NumpyLayers(reader, "network", None)
+        reader.finish()
+
+    def draw(self, num: int, rng: np.random.Generator) -> FloatArray:
+        """(num, Z) skills of the prior."""
+        return draw_skills(self.method, num, self.size, rng)
+
+    def actions(self, previous: FloatArray, positions: FloatArray, skill: FloatArray) -> FloatArray:
+        """(N, 4) mean actions of (N, Z) skills.
+
+        Args:
+            previous: (N, 11) positions one step ago; at an episode's start those of now.
+            positions: (N, 11), metres.
+            skill: (N, Z).
+
+        Raises:
+            TandemError: skills of another size.
+        """
+        if skill.shape[-1] != self.size:
+            raise TandemError(
+                f"skill: expected shape (N, {self.size}), got {skill.shape}; its size is that of training"
+            )
+        return self._actor(skill_inputs(previous, positions, skill))
+
+    def towards(self, positions: FloatArray, goal: FloatArray) -> FloatArray:
+        """(N, Z) skills that lead to (N, 3) goals, metres, without learning: zero-shot.
+
+        LSD, METRA: the direction from phi(s) to phi(g), as long as skills are on average. DIAYN: what tells g.
+
+        Raises:
+            TandemError: DADS says nothing of the kind.
+        """
+        there = normalised_place(goal)
+        if self.method == "diayn":
+            return self._network(there)
+        if self.method == "dads":
+            raise TandemError("skills of DADS lead to no given goal; learn an orchestrator")
+        step = self._network(there) - self._network(object_state(positions))
+        mean_length = math.sqrt(2.0) * math.gamma((self.size + 1) / 2) / math.gamma(self.size / 2)  # of N(0, I)
+        length = np.float32(1.0 if self.method == "metra" else mean_length)
+        skills: FloatArray = length * step / np.maximum(np.linalg.norm(step, axis=1, keepdims=True), np.float32(1e-6))
+        return skills
+
+
+class SkillPlayer:
+    """Plays N episodes from their start, each by its own skill: (N, 11) positions to actions (N, 4)."""
+
+    def __init__(self, skills: FrozenSkills, skill: FloatArray) -> None:
+        self._skills, self._skill = skills, skill
+        self._previous: FloatArray | None = None
+
+    def __call__(self, positions: FloatArray) -> FloatArray:
+        """Act."""
+        previous, self._previous = self._previous, positions.copy()
+        return self._skills.actions(positions if previous is None else previous, positions, self._skill)
