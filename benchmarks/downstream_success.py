@@ -58,7 +58,7 @@ class DefaultPolicy:
             "desired_goal": observation[:, BOB["goal"]],
         }
         actions, _ = self._learner.predict(seen, deterministic=True)
-        return self._method.decode(self._trained, positions, actions)
+        return self._method.decode(self._trained, positions, positions, actions)
 
 
 def learn(trial: TrialConfig, trained: TrainedBob, settings: Settings) -> dict[str, Any]:

@@ -15,6 +15,8 @@ from service.sac.numpy_actor import NumpyActor, NumpyLayers
 from service.types import FloatArray
 
 _OBJECT = POSITIONS["object"]
+_GREATEST_SKILL = 1.5
+"""Greatest component of a skill that an orchestrator sets, in standard deviations of the prior."""
 
 
 def object_state(positions: FloatArray) -> FloatArray:
@@ -84,6 +86,21 @@ class FrozenSkills:
     def draw(self, num: int, rng: np.random.Generator) -> FloatArray:
         """(num, Z) skills of the prior."""
         return draw_skills(self.method, num, self.size, rng)
+
+    def from_action(self, actions: FloatArray) -> FloatArray:
+        """(N, Z) skills that (N, Z) actions in [-1, 1] of an orchestrator mean.
+
+        LSD and DIAYN: up to 1.5 standard deviations of the prior, as in CSF's code. METRA: their direction. DADS: they
+        themselves.
+        """
+        if self.method == "dads":
+            return actions
+        if self.method == "metra":
+            normalised: FloatArray = actions / np.maximum(
+                np.linalg.norm(actions, axis=1, keepdims=True), np.float32(1e-6)
+            )
+            return normalised
+        return np.float32(_GREATEST_SKILL) * actions
 
     def actions(self, previous: FloatArray, positions: FloatArray, skill: FloatArray) -> FloatArray:
         """(N, 4) mean actions of (N, Z) skills.

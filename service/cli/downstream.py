@@ -24,7 +24,9 @@ downstream_app = typer.Typer(
 )
 
 _LINE_EVERY_S = 10.0
-_Primitives = Annotated[str, typer.Option(metavar="NAME@ALIAS|RUN_DIR", help="What is composed.")]
+_Primitives = Annotated[
+    str, typer.Option(metavar="NAME@ALIAS|RUN_DIR", help="What a method takes: primitives or skills.")
+]
 _Registry = Annotated[
     str, typer.Option(envvar="TANDEM_REGISTRY", metavar="DIR|URL", help="Where primitives come from.")
 ]
@@ -32,6 +34,7 @@ _Set = Annotated[
     list[str] | None, typer.Option("--set", metavar="A=B", help="How SAC learns, such as gamma=0.9; repeatable.")
 ]
 _Steps = Annotated[int | None, typer.Option(help="Env steps of learning.", min=1)]
+_SkillSteps = Annotated[int | None, typer.Option(help="Env steps that a skill is held.", min=1)]
 _Episodes = Annotated[int, typer.Option(help="Of the final evaluation.", min=1)]
 _Threads = Annotated[int | None, typer.Option(help="Cores of one training; default: all, on a cluster one.", min=1)]
 
@@ -43,6 +46,7 @@ def train(
     primitives: _Primitives = CHAMPION,
     seed: Annotated[int, typer.Option(min=0)] = 0,
     steps: _Steps = None,
+    skill_steps: _SkillSteps = None,
     episodes: _Episodes = 300,
     run_dir: Annotated[
         Path | None, typer.Option(metavar="DIR", help="Default: runs/downstream/TASK-METHOD-SEED.")
@@ -54,15 +58,17 @@ def train(
     as_json: Annotated[bool, typer.Option("--json", help="Print the result as JSON.")] = False,
 ) -> None:
     """Learn one task, evaluate, record a video."""
-    import service
+    from service.downstream.methods import load_for
     from service.downstream.settings import make_trial
     from service.downstream.worker import RunOptions, run_trial
 
-    trial = make_trial(task=task, method=method, seed=seed, num_episodes=episodes, **_learning(steps, overrides))
+    trial = make_trial(
+        task=task, method=method, seed=seed, num_episodes=episodes, **_learning(steps, skill_steps, overrides)
+    )
     path = run_dir or Path("runs") / "downstream" / trial.name
     with _stop_on_signals() as (callbacks, signals):
         options = RunOptions(resume, threads or 0, video=True, callbacks=callbacks)
-        result = run_trial(trial, service.load_primitives(primitives, registry), path, options)
+        result = run_trial(trial, load_for([method], primitives, registry), path, options)
     if result is None:
         typer.echo(f"saved; continue with the same command and --resume --run-dir {path}", err=True)
         raise typer.Exit(EXIT_SIGNAL + (signals.first or 0))
@@ -79,11 +85,12 @@ def train(
 
 @downstream_app.command()
 def table(
-    methods: Annotated[str, typer.Option(help="Names with commas between, or all.")] = "all",
+    methods: Annotated[str, typer.Option(help="Names with commas between; all: those that take no skills.")] = "all",
     tasks: Annotated[str, typer.Option(help="Names with commas between, or all.")] = "all",
     seeds: Annotated[str, typer.Option(help="Numbers with commas between.")] = "0",
     primitives: _Primitives = CHAMPION,
     steps: _Steps = None,
+    skill_steps: _SkillSteps = None,
     episodes: _Episodes = 300,
     out: Annotated[
         Path, typer.Option(metavar="DIR", help="Page and picture; in its downstream/ one file for each trial.")
@@ -104,12 +111,12 @@ def table(
     from service.downstream.table import Source, make_table
     from service.envs.tasks import TASKS
 
-    learning = _learning(steps, overrides)
+    learning = _learning(steps, skill_steps, overrides)
     trials = [
         make_trial(task=task, method=method, seed=seed, num_episodes=episodes, **learning)
         for seed in _numbers(seeds)
         for task in _names(tasks, TASKS)
-        for method in _names(methods, METHODS)
+        for method in _names(methods, [name for name, each in METHODS.items() if each.takes != "skills"])
     ]
     source = Source(primitives, registry, runs.absolute())
     with _make_runner(runtime, address, num_workers, threads) as runner, _stop_on_signals() as (callbacks, signals):
@@ -128,7 +135,7 @@ def list_methods() -> None:
         typer.echo(f"{name:<24} {method.description}")
 
 
-def _learning(steps: int | None, overrides: list[str] | None) -> dict[str, Any]:
+def _learning(steps: int | None, skill_steps: int | None, overrides: list[str] | None) -> dict[str, Any]:
     """Settings of a trial about learning, defaults where left out."""
     import yaml
 
@@ -144,7 +151,8 @@ def _learning(steps: int | None, overrides: list[str] | None) -> dict[str, Any]:
             values[key] = yaml.safe_load(text)
         except yaml.YAMLError:
             raise TandemError(f"--set {override}: the value is no YAML") from None
-    return {"sac": validate(SACConfig, values)} | ({} if steps is None else {"num_env_steps": steps})
+    chosen = {"num_env_steps": steps, "skill_steps": skill_steps}
+    return {"sac": validate(SACConfig, values), **{key: value for key, value in chosen.items() if value is not None}}
 
 
 def _names(text: str, known: Any) -> list[str]:

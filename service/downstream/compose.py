@@ -21,12 +21,13 @@ from numpy.typing import NDArray
 from service.envs.observations import POSITIONS, SPACES
 from service.errors import TandemError
 from service.policies.numpy_policy import NumpyMCPPolicy
-from service.primitives.loading import TrainedBob
+from service.primitives.loading import TrainedBob, TrainedSkills
 from service.types import FloatArray
 
 Info = dict[str, Any]
 Positions = Callable[[Any], FloatArray]
 
+_SEEN_BY_SKILLS = ("action", "positions", "layout")
 WEIGHT_RATIO = 100.0
 """Greatest weight over least. Bob's own gate has the same range, [0.01, 1]."""
 
@@ -54,8 +55,8 @@ def check_primitives(primitives: NumpyMCPPolicy | TrainedBob) -> NumpyMCPPolicy:
     return primitives.primitives
 
 
-def check_robot(trained: TrainedBob) -> None:
-    """Assert that a policy, composable or not, is for this robot and layout, as far as its manifest says.
+def check_robot(trained: TrainedBob | TrainedSkills) -> None:
+    """Assert that a policy, composable or not, or skills are for this robot and layout, as far as its manifest says.
 
     Raises:
         TandemError: it is for another.
@@ -63,7 +64,8 @@ def check_robot(trained: TrainedBob) -> None:
     if trained.manifest is None:
         return
     spaces = trained.manifest.spaces
-    wrong = {key: spaces.get(key) for key, value in SPACES.items() if spaces.get(key) != value}
+    wanted_spaces = SPACES if isinstance(trained, TrainedBob) else {key: SPACES[key] for key in _SEEN_BY_SKILLS}
+    wrong = {key: spaces.get(key) for key, value in wanted_spaces.items() if spaces.get(key) != value}
     if wrong:
         found, wanted = (", ".join(f"{key} {tree[key]}" for key in wrong) for tree in (wrong, SPACES))
         raise TandemError(f"{trained.label} is for another robot or layout: {found}; this one has {wanted}")
@@ -214,7 +216,7 @@ def _arrays(owner: Any, prefix: str) -> Iterator[tuple[str, NDArray[Any]]]:
     """Arrays below an object, by the paths to them."""
     if isinstance(owner, np.ndarray | np.generic):
         yield prefix, np.asarray(owner)
-    elif isinstance(owner, list):
+    elif isinstance(owner, list | tuple):
         for index, value in enumerate(owner):
             yield from _arrays(value, f"{prefix}.{index}")
     elif hasattr(owner, "__dict__"):

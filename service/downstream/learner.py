@@ -8,11 +8,10 @@ import numpy as np
 import torch
 
 from service.downstream.inputs import NUM_INPUTS, learner_inputs
-from service.downstream.methods import Method
+from service.downstream.methods import Method, Trained
 from service.downstream.settings import TrialConfig
 from service.downstream.worlds import COLUMNS, TaskWorlds
 from service.envs.observations import POSITIONS
-from service.primitives.loading import TrainedBob
 from service.sac.inputs import NUM_MOTION_INPUTS
 from service.sac.learner import Batch, SACLearner
 from service.sac.loop import OffPolicyLoop
@@ -41,13 +40,19 @@ class Hindsight:
             learner_inputs(rows["previous"], rows["positions"], rows["goal"]),
             rows["action"],
             rows["reward"][:, 0],
-            learner_inputs(rows["positions"], rows["following"], rows["goal"]),
+            learner_inputs(rows["before"], rows["following"], rows["goal"]),
         )
 
 
-def make_loop(trial: TrialConfig, method: Method, trained: TrainedBob, worlds: TaskWorlds) -> OffPolicyLoop:
-    """Make a new learner in worlds that have begun; ``loop.make_batch`` is its ``Hindsight``."""
-    sac, size = trial.sac, worlds.num_actions
+def make_loop(trial: TrialConfig, method: Method, trained: Trained, worlds: TaskWorlds) -> OffPolicyLoop:
+    """Make a new learner in worlds that have begun; ``loop.make_batch`` is its ``Hindsight``.
+
+    Where an action lasts for H env steps, updates an env step and the horizon in env steps stay: H times the updates
+    after each action, and a discount of ``gamma ** H``.
+    """
+    size, hold = worlds.num_actions, worlds.steps_per_action
+    longer = {"gradient_steps": hold * trial.sac.gradient_steps, "gamma": trial.sac.gamma**hold}
+    sac = trial.sac.model_copy(update=longer)
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(spread_seed(trial.seed, 0))
         actor = (
@@ -56,7 +61,7 @@ def make_loop(trial: TrialConfig, method: Method, trained: TrainedBob, worlds: T
             else GaussianActor(NUM_INPUTS, size, sac.hidden_sizes)
         )
     learner = SACLearner(actor, NUM_INPUTS, size, sac, spread_seed(trial.seed, 1))
-    num_steps = -(-trial.num_env_steps // sac.num_worlds)  # everything is kept
+    num_steps = -(-trial.num_env_steps // (sac.num_worlds * hold))  # everything is kept
     replay = ReplayBuffer(num_steps, sac.num_worlds, {**COLUMNS, "action": size})
     share = method.her_ratio[0] if method.her_ratio else 0.0
     return OffPolicyLoop(worlds, replay, learner, Hindsight(worlds, share), spread_seed(trial.seed, 2))

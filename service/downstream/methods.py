@@ -1,20 +1,23 @@
 """The methods of the paper's table, by name. The harness knows nothing of a method but what is here.
 
-A method that learns says what its learner acts by (``wrap`` and ``decode``), which actor and replay buffer it has; one
-with nothing to learn says which policy plays. A skill-discovery baseline would be one more entry: its ``wrap`` hands
-the environment the actions of its frozen skill policy, with skill vectors as actions.
+A method that learns says in which worlds its learner acts (``enter``), how its actions become the robot's (``decode``),
+which actor it has and whether goals are relabelled; one with nothing to learn says which policy plays. What a method
+takes, ``primitives``, ``skills`` or nothing, comes from a registry and never changes.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
-from typing import Any
+from pathlib import Path
+from typing import Any, Literal
 
 import gymnasium
 import numpy as np
 
+import service
 from service.actors.evaluation import DeterministicPolicy, IdlePolicy
+from service.baselines.frozen import FrozenSkills
 from service.downstream.compose import (
     ComposePrimitivesVector,
     action_weights,
@@ -22,20 +25,86 @@ from service.downstream.compose import (
     check_robot,
     parameters_digest,
 )
+from service.downstream.skills import SkillTaskWorlds, ZeroShotPolicy
+from service.downstream.worlds import TaskWorlds
 from service.errors import TandemError
-from service.primitives.loading import TrainedBob
+from service.off_policy_config import SkillMethod
+from service.primitives.loading import TrainedBob, TrainedSkills
 from service.types import FloatArray
 
-Worlds = gymnasium.vector.VectorEnv[Any, Any, Any]
+Trained = TrainedBob | TrainedSkills
+Kind = Literal["primitives", "skills"]
 
 
-def _compose(trained: TrainedBob, positions: FloatArray, actions: FloatArray) -> FloatArray:
-    mean, _ = trained.primitives.compose(positions, action_weights(actions))
+def frozen_bob(trained: Trained) -> TrainedBob:
+    """The same, a Bob.
+
+    Raises:
+        TandemError: skills.
+    """
+    if isinstance(trained, TrainedBob):
+        return trained
+    raise TandemError(
+        f"{trained.label} holds skills of {trained.skills.method}; this method takes primitives: name some"
+    )
+
+
+def frozen_skills(trained: Trained) -> FrozenSkills:
+    """The skills of ``trained``.
+
+    Raises:
+        TandemError: primitives.
+    """
+    if isinstance(trained, TrainedSkills):
+        return trained.skills
+    raise TandemError(
+        f"{trained.label} holds primitives; this method takes skills: name those of a skill-discovery run"
+    )
+
+
+def _enter(env: gymnasium.vector.VectorEnv[Any, Any, Any], seed: int, trained: Trained, hold_steps: int) -> TaskWorlds:
+    return TaskWorlds(env, seed)
+
+
+def _enter_composing(
+    env: gymnasium.vector.VectorEnv[Any, Any, Any], seed: int, trained: Trained, hold_steps: int
+) -> TaskWorlds:
+    return TaskWorlds(ComposePrimitivesVector(env, frozen_bob(trained)), seed)
+
+
+def _enter_with_skills(
+    env: gymnasium.vector.VectorEnv[Any, Any, Any], seed: int, trained: Trained, hold_steps: int
+) -> TaskWorlds:
+    return SkillTaskWorlds(env, seed, frozen_skills(trained), hold_steps)
+
+
+Decode = Callable[[Trained, FloatArray, FloatArray, FloatArray], FloatArray]
+
+
+def _itself(trained: Trained, previous: FloatArray, positions: FloatArray, actions: FloatArray) -> FloatArray:
+    return actions
+
+
+def _compose(trained: Trained, previous: FloatArray, positions: FloatArray, actions: FloatArray) -> FloatArray:
+    mean, _ = frozen_bob(trained).primitives.compose(positions, action_weights(actions))
     return np.clip(mean, -1.0, 1.0)
 
 
-def _bob(trained: TrainedBob) -> DeterministicPolicy:
-    return trained.policy
+def _act_by_skills(trained: Trained, previous: FloatArray, positions: FloatArray, actions: FloatArray) -> FloatArray:
+    skills = frozen_skills(trained)
+    return skills.actions(previous, positions, skills.from_action(actions))
+
+
+def _idle(trained: Trained) -> DeterministicPolicy:
+    return IdlePolicy()
+
+
+def _bob(trained: Trained) -> DeterministicPolicy:
+    return frozen_bob(trained).policy
+
+
+def _zero_shot(trained: Trained) -> DeterministicPolicy:
+    return ZeroShotPolicy(frozen_skills(trained))
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,52 +115,72 @@ class Method:
     """Name in the table."""
     description: str
     """A few words for ``tandem downstream methods``."""
-    wrap: Callable[[Worlds, TrainedBob], Worlds] = lambda env, trained: env
-    """The worlds its learner acts in."""
-    decode: Callable[[TrainedBob, FloatArray, FloatArray], FloatArray] = lambda trained, positions, actions: actions
-    """Turns (N, 11) positions and the learner's (N, A) actions into (N, 4) actions, as the wrapped worlds do."""
+    takes: Kind | None = None
+    """What its result depends on; None: nothing, what is loaded only says in which world it plays."""
+    enter: Callable[[gymnasium.vector.VectorEnv[Any, Any, Any], int, Trained, int], TaskWorlds] = _enter
+    """Makes the worlds its learner acts in, of the task's, a seed, what it takes, and the env steps a skill is held."""
+    decode: Decode = _itself
+    """Turns (N, 11) positions one step ago, those of now and the learner's (N, A) actions into (N, 4) actions."""
     mcp_actor: bool = False
     """Whether the actor is a Multiplicative Compositional Policy, learned end to end; else SAC's own network."""
     her_ratio: tuple[float, float] | None = None
     """Share of a batch whose goals are relabelled (HER, ``future``), when learning begins and when it ends, linear in
     between; None: no HER."""
-    composes: bool = False
-    """Whether it needs primitives that can be composed."""
-    player: Callable[[TrainedBob], DeterministicPolicy] | None = None
+    player: Callable[[Trained], DeterministicPolicy] | None = None
     """Makes the policy that plays, where nothing is learned."""
+    skills: SkillMethod | None = None
+    """The skill-discovery method whose skills it takes."""
 
     @property
-    def takes_primitives(self) -> bool:
-        """Whether its result depends on them; else they only say in which world it plays."""
-        return self.composes or self.player is _bob
+    def composes(self) -> bool:
+        """Whether its learner sets the weights of primitives."""
+        return self.decode is _compose
 
-    def check(self, trained: TrainedBob) -> None:
-        """Assert that these primitives are for this method.
+    @property
+    def holds(self) -> bool:
+        """Whether its learner's action lasts for several env steps."""
+        return self.decode is _act_by_skills
+
+    def check(self, trained: Trained) -> None:
+        """Assert that these primitives or skills are for this method.
 
         Raises:
-            TandemError: primitives of another robot or layout, or none that can be composed.
+            TandemError: of another kind, robot or layout, skills of another method, or primitives that cannot be
+                composed.
         """
         check_robot(trained)
         if self.composes:
-            check_primitives(trained)
+            check_primitives(frozen_bob(trained))
+        elif self.takes == "primitives":
+            frozen_bob(trained)
+        elif self.takes == "skills" and (found := frozen_skills(trained).method) != self.skills:
+            raise TandemError(f"{trained.label} holds skills of {found}, this method takes those of {self.skills}")
 
 
 _HER_SHARE = 0.8
 """1 - 1 / (k + 1) for the usual k = 4 (Andrychowicz et al. 2017)."""
 
+
+def _skill_method(name: SkillMethod) -> Method:
+    title = f"{name.upper()} skills"
+    return Method(title, "SAC sets the skill vector", "skills", _enter_with_skills, _act_by_skills, skills=name)
+
+
+def _zero_shot_method(name: SkillMethod) -> Method:
+    return Method(f"{name.upper()}, zero-shot", "its skill towards the goal", "skills", player=_zero_shot, skills=name)
+
+
 METHODS: Mapping[str, Method] = {
-    "ours": Method(
-        "ours", "SAC sets the weights of the frozen primitives", ComposePrimitivesVector, _compose, composes=True
-    ),
+    "ours": Method("ours", "SAC sets the weights of the frozen primitives", "primitives", _enter_composing, _compose),
     "ours-her": Method(
         "ours + HER",
         "the same, with relabelled goals, fewer and fewer",
-        ComposePrimitivesVector,
+        "primitives",
+        _enter_composing,
         _compose,
-        composes=True,
         her_ratio=(_HER_SHARE, 0.0),
     ),
-    "asp-only": Method("ASP only", "Bob as he is", player=_bob),
+    "asp-only": Method("ASP only", "Bob as he is", "primitives", player=_bob),
     "scratch-monolithic-her": Method(
         "scratch monolithic + HER", "SAC alone, with relabelled goals", her_ratio=(_HER_SHARE, _HER_SHARE)
     ),
@@ -103,7 +192,13 @@ METHODS: Mapping[str, Method] = {
     ),
     "scratch-monolithic": Method("scratch monolithic", "SAC alone"),
     "scratch-mcp": Method("scratch MCP", "primitives and gate learned together by SAC", mcp_actor=True),
-    "idle": Method("idle", "does nothing", player=lambda trained: IdlePolicy()),
+    "lsd": _skill_method("lsd"),
+    "dads": _skill_method("dads"),
+    "diayn": _skill_method("diayn"),
+    "metra": _skill_method("metra"),
+    "lsd-zero-shot": _zero_shot_method("lsd"),
+    "metra-zero-shot": _zero_shot_method("metra"),
+    "idle": Method("idle", "does nothing", player=_idle),
 }
 """The methods by the names that commands take, in the order of the table's rows."""
 
@@ -119,14 +214,33 @@ def find_method(name: str) -> Method:
     return METHODS[name]
 
 
-def provenance(trained: TrainedBob, method: str = "ours") -> dict[str, Any]:
-    """Primitives and world that a method's result is of, besides its trial.
+def load_for(methods: Iterable[str], reference: str, registry: Path | str) -> Trained:
+    """Load what methods take: skills, or else primitives, which also say in which world a method plays that takes none.
+
+    Raises:
+        TandemError: no such method, methods that take different kinds, or nothing of that kind there by that reference.
+    """
+    kinds = {takes: name for name in methods if (takes := find_method(name).takes)}
+    if len(kinds) > 1:
+        raise TandemError(
+            f"{kinds['primitives']} takes primitives and {kinds['skills']} skills: run them by two commands, each with "
+            "its own --primitives"
+        )
+    load = service.load_skills if "skills" in kinds else service.load_primitives
+    return load(reference, registry)
+
+
+def provenance(trained: Trained, method: str = "ours") -> dict[str, Any]:
+    """Primitives or skills and the world that a method's result is of, besides its trial.
 
     Returns:
-        ``primitives``: their name, and SHA-256 of their parameters as ``digest``; None where the method takes none.
+        ``primitives``: their name, SHA-256 of their parameters as ``digest``, and the env steps that they took (None of
+        a run directory); None where the method takes neither primitives nor skills.
         ``world``: settings of the world that they bring along, before a task replaces some.
     """
     name = trained.label if trained.manifest is None else trained.manifest.reference  # the same wherever it came from
-    primitives = {"name": name, "digest": parameters_digest(trained.policy)}
-    without = method in METHODS and not METHODS[method].takes_primitives
+    frozen = trained.policy if isinstance(trained, TrainedBob) else trained.skills
+    env_steps = None if trained.manifest is None else trained.manifest.metrics.get("env_steps")
+    primitives = {"name": name, "digest": parameters_digest(frozen), "env_steps": env_steps}
+    without = method in METHODS and METHODS[method].takes is None
     return {"primitives": None if without else primitives, "world": trained.config.world.model_dump(mode="json")}

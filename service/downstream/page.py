@@ -31,6 +31,9 @@ PAPER: Mapping[str, Mapping[str, float]] = {
     method: dict(zip(("larger", "inair", "push", "sphere", "wall", "box"), rates, strict=True))
     for method, rates in {
         "ours": (0.83, 1.00, 0.52, 1.00, 0.98, 0.98),
+        "lsd": (0.17, 0.17, 0.17, 0.10, 0.04, 0.73),
+        "dads": (0.06, 0.04, 0.06, 0.15, 0.56, 0.06),
+        "diayn": (0.00, 0.00, 0.06, 0.02, 0.00, 0.02),
         "asp-only": (0.94, 0.94, 0.02, 0.85, 0.00, 0.27),
         "scratch-monolithic-her": (0.58, 0.94, 0.85, 1.00, 0.00, 0.36),
         "scratch-mcp-her": (0.85, 0.52, 0.92, 0.98, 0.00, 0.00),
@@ -160,7 +163,7 @@ def _efficiency(of: Mapping[tuple[str, str], Seeds]) -> Sequence[str]:
     """The section on how soon methods that compose are good, and the first that learns from nothing is as good."""
     known = {name: method for name, method in METHODS.items() if any(found == name for found, _ in of)}
     composing = [name for name, method in known.items() if method.composes]
-    scratch = [name for name, method in known.items() if method.player is None and not method.takes_primitives]
+    scratch = [name for name, method in known.items() if method.player is None and method.takes is None]
     if not composing or not scratch:
         return ()
     rows = []
@@ -232,7 +235,7 @@ def draw_training(path: Path) -> Path:
     panels = (
         ("success", ("evaluation/success_last", "evaluation/success_ever", "rollout/success_last")),
         ("return of an episode, with noise", ("rollout/return",)),
-        ("entropy coefficient", ("train/ent_coef",)),
+        ("entropy coefficient", ("learner/entropy_coefficient",)),
     )
     for axes, (title, keys) in zip(figure.subplots(1, 3), panels, strict=True):
         for key, colour in zip(keys, (BLUE, GREEN, FAINT), strict=False):

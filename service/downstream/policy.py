@@ -7,13 +7,12 @@ from pathlib import Path
 from typing import Any
 
 from service.downstream.inputs import learner_inputs
-from service.downstream.methods import Method, find_method, provenance
+from service.downstream.methods import Method, Trained, find_method, provenance
 from service.envs.observations import BOB, POSITIONS
 from service.errors import TandemError
 from service.io.files import os_errors, write_atomic
 from service.io.tensors import decode, encode, read_metadata
 from service.policies.parameters import Parameters
-from service.primitives.loading import TrainedBob
 from service.sac.numpy_actor import numpy_actor
 from service.types import FloatArray
 
@@ -28,42 +27,48 @@ class LearnedPolicy:
     Args:
         parameters: of the actor, as exported.
         method: says how its actions become the robot's.
-        trained: the primitives, where the method composes.
+        trained: the primitives or skills, where the method takes any.
+        hold_steps: env steps that an action of the actor lasts.
     """
 
-    def __init__(self, parameters: Parameters, method: Method, trained: TrainedBob) -> None:
+    def __init__(self, parameters: Parameters, method: Method, trained: Trained, hold_steps: int = 1) -> None:
         self._actor, self._method, self._trained = numpy_actor(parameters), method, trained
-        self._previous: FloatArray | None = None
+        self._hold_steps = hold_steps
+        self.begin()
 
     def begin(self) -> None:
         """Forget the last step: new episodes begin."""
-        self._previous = None
+        self._previous: FloatArray | None = None
+        self._held: FloatArray | None = None
+        self._num_steps = 0
 
     def act_deterministic(self, observation: FloatArray) -> FloatArray:
         """(N, 14) Bob's input, positions and goal, to actions (N, 4)."""
         positions = observation[:, : POSITIONS.size]
-        previous, self._previous = self._previous, positions.copy()
-        inputs = learner_inputs(positions if previous is None else previous, positions, observation[:, BOB["goal"]])
-        return self._method.decode(self._trained, positions, self._actor(inputs))
+        previous = positions if self._previous is None else self._previous
+        if self._held is None or self._num_steps % self._hold_steps == 0:
+            self._held = self._actor(learner_inputs(previous, positions, observation[:, BOB["goal"]]))
+        self._num_steps, self._previous = self._num_steps + 1, positions.copy()
+        return self._method.decode(self._trained, previous, positions, self._held)
 
 
-def save_policy(path: Path, parameters: Parameters, method: str, trained: TrainedBob) -> None:
-    """Write an actor's parameters, its method and which primitives it composes.
+def save_policy(path: Path, parameters: Parameters, method: str, trained: Trained, hold_steps: int = 1) -> None:
+    """Write an actor's parameters, its method, and which primitives or skills it acts with.
 
     Raises:
         TandemError: the file cannot be written.
     """
-    about = {"method": method, "primitives": provenance(trained, method)["primitives"]}
+    about = {"method": method, "primitives": provenance(trained, method)["primitives"], "hold_steps": hold_steps}
     with os_errors("write", path):
         write_atomic(path, encode(parameters, {_KEY: json.dumps(about)}))
 
 
-def load_policy(path: Path | str, trained: TrainedBob) -> LearnedPolicy:
+def load_policy(path: Path | str, trained: Trained) -> LearnedPolicy:
     """Load what ``save_policy`` wrote.
 
     Args:
         path: ``policy.safetensors`` of a training.
-        trained: the primitives that it was trained with; a method without primitives takes any.
+        trained: the primitives or skills that it was trained with; a method that takes none takes any.
 
     Raises:
         TandemError: no such file, damaged, or of other primitives.
@@ -79,5 +84,5 @@ def load_policy(path: Path | str, trained: TrainedBob) -> LearnedPolicy:
     method = find_method(about["method"])
     wanted, found = about["primitives"], provenance(trained, about["method"])["primitives"]
     if wanted is not None and wanted["digest"] != found["digest"]:
-        raise TandemError(f"{path} composes {wanted['name']}, not {found['name']}; load those primitives")
-    return LearnedPolicy(parameters, method, trained)
+        raise TandemError(f"{path} acts with {wanted['name']}, not {found['name']}; load that")
+    return LearnedPolicy(parameters, method, trained, about.get("hold_steps", 1))

@@ -7,11 +7,10 @@ from pathlib import Path
 from typing import Any
 
 from service.downstream.directory import made_with, read_json, read_trial, to_json
-from service.downstream.methods import METHODS, provenance
+from service.downstream.methods import METHODS, Trained, provenance
 from service.downstream.settings import TrialConfig, differences
 from service.errors import TandemError
 from service.io.files import os_errors, write_exclusive
-from service.primitives.loading import TrainedBob
 
 Result = dict[str, Any]
 
@@ -23,7 +22,7 @@ class ResultsDirectory:
         """Name the directory, which need not exist; nothing is read before it is asked for."""
         self.path = path
 
-    def find(self, trial: TrialConfig, trained: TrainedBob) -> Result | None:
+    def find(self, trial: TrialConfig, trained: Trained) -> Result | None:
         """Find the result of a trial with these primitives; None where it has not been run.
 
         Raises:
@@ -38,21 +37,26 @@ class ResultsDirectory:
             raise TandemError(f"{path} is of {'; '.join(wrong)}: give the same settings, or name another directory")
         return result
 
-    def missing(self, trials: Iterable[TrialConfig], trained: TrainedBob) -> list[TrialConfig]:
+    def missing(self, trials: Iterable[TrialConfig], trained: Trained) -> list[TrialConfig]:
         """List the trials that have to be run; every file is checked before any is.
 
-        What is in the directory and what is asked for comes onto one page: of the same world, of the same primitives
-        where a method takes any, and the seeds of a method on a task with the same settings.
+        What is in the directory and what is asked for comes onto one page: of the same world, the tasks of a method and
+        seed with the same primitives or skills, and the seeds of a method on a task with the same settings.
 
         Raises:
             TandemError: as for ``find``; or the page would mix what cannot be compared.
         """
         missing = [trial for trial in trials if self.find(trial, trained) is None]
+        asked = {(trial.method, trial.seed) for trial in missing}
         of_all_seeds = {(each.method, each.task): (f"{each.name}, asked for,", _settings(each)) for each in missing}
         for path in sorted(self.path.glob("*.json")):
             result = read_json(path)
             trial = read_trial(result, path)
-            if wrong := differences(made_with(result), provenance(trained, trial.method)):
+            same = ("primitives", "world") if (trial.method, trial.seed) in asked else ("world",)
+            found, wanted = (
+                {key: tree[key] for key in same} for tree in (made_with(result), provenance(trained, trial.method))
+            )
+            if wrong := differences(found, wanted):
                 raise TandemError(f"{path} is of {'; '.join(wrong)}: name another directory, or move it away")
             other, settings = of_all_seeds.setdefault((trial.method, trial.task), (str(path), _settings(trial)))
             if wrong := differences(_settings(trial) | {"seed": 0}, settings | {"seed": 0}):
@@ -84,5 +88,7 @@ class ResultsDirectory:
 def _settings(trial: TrialConfig) -> dict[str, Any]:
     """Settings that a trial's result depends on; where nothing is learned, those of learning do not count."""
     method = METHODS.get(trial.method)
-    learning = {"sac", "num_env_steps", "curve_every", "curve_episodes"}
-    return trial.model_dump(mode="json", exclude=learning if method and method.player else None)
+    without = set() if method and method.holds else {"skill_steps"}
+    if method and method.player:
+        without |= {"sac", "num_env_steps", "curve_every", "curve_episodes"}
+    return trial.model_dump(mode="json", exclude=without)

@@ -26,6 +26,12 @@ class TrialConfig(FrozenModel):
     sac: SACConfig = SACConfig()
     curve_every: int = Field(4, ge=1, description="iterations between evaluations on the way; one is 50 steps a world")
     curve_episodes: int = Field(100, ge=1)
+    skill_steps: int = Field(
+        5,
+        ge=1,
+        le=EPISODE_STEPS,
+        description="env steps that a skill is held; methods with primitives act anew in each",
+    )
     num_episodes: int = Field(300, ge=1, description="of the final evaluation; paper: 16, likely")
     task_version: int = Field(0, ge=0, description="of the task's Gymnasium name; what does not say it is of v0")
 

@@ -12,16 +12,15 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import service
+from service import is_service
 from service.downstream.directory import made_with
-from service.downstream.methods import find_method, provenance
+from service.downstream.methods import Trained, find_method, load_for, provenance
 from service.downstream.page import MARK, draw_table, write_page
 from service.downstream.results import Result, ResultsDirectory
 from service.downstream.settings import TrialConfig
 from service.downstream.worker import Callbacks, RunOptions, check_trial, run_trial
 from service.errors import TandemError
 from service.io.files import os_errors, write_atomic
-from service.primitives.loading import TrainedBob
 
 PAGE_FILE, PICTURE_FILE = "downstream.md", "downstream.png"
 _POLL_S = 1.0
@@ -39,7 +38,7 @@ class Source:
 
 
 Results = Iterator[tuple[TrialConfig, Result]]
-Runner = Callable[[Sequence[TrialConfig], TrainedBob, Source, Callbacks], Results]
+Runner = Callable[[Sequence[TrialConfig], Trained, Source, Callbacks], Results]
 """Runs trials with these primitives, which are the source's; ends early where it is to stop."""
 
 
@@ -57,7 +56,7 @@ def make_table(trials: Sequence[TrialConfig], source: Source, out: Path, runner:
     with os_errors("read", page):
         if page.exists() and MARK not in page.read_text(encoding="utf-8"):
             raise TandemError(f"{page} was not written by this command; name another directory with --out")
-    trained = service.load_primitives(source.primitives, source.registry)
+    trained = load_for({trial.method for trial in trials}, source.primitives, source.registry)
     results = ResultsDirectory(out / "downstream")
     missing = results.missing(trials, trained)
     callbacks.say(f"{len(trials) - len(missing)} of {len(trials)} trials are there, {len(missing)} to run")
@@ -87,7 +86,7 @@ def write_results(out: Path) -> list[Path]:
 
 
 def run_here(
-    trials: Sequence[TrialConfig], trained: TrainedBob, source: Source, callbacks: Callbacks, *, num_threads: int = 0
+    trials: Sequence[TrialConfig], trained: Trained, source: Source, callbacks: Callbacks, *, num_threads: int = 0
 ) -> Results:
     """Run one trial after another in this process."""
     for trial in trials:  # before hours of work
@@ -105,7 +104,7 @@ def run_here(
 
 def run_on_ray(
     trials: Sequence[TrialConfig],
-    trained: TrainedBob,
+    trained: Trained,
     source: Source,
     callbacks: Callbacks,
     *,
@@ -133,7 +132,7 @@ def run_on_ray(
     task = ray.remote(num_cpus=num_threads, max_retries=3)(_run_remotely)
     for trial in trials:
         find_method(trial.method).check(trained)
-    primitives: Any = source if service.is_service(source.registry) else ray.put(trained)
+    primitives: Any = source if is_service(source.registry) else ray.put(trained)
     waiting, running = iter(trials), dict[Any, TrialConfig]()
     while True:
         for trial in itertools.islice(waiting, limit - len(running)):
@@ -149,10 +148,10 @@ def run_on_ray(
             yield trial, _fetch(trial, reference)
 
 
-def _run_remotely(trial: TrialConfig, primitives: Source | TrainedBob, path: Path, num_threads: int) -> Result:
+def _run_remotely(trial: TrialConfig, primitives: Source | Trained, path: Path, num_threads: int) -> Result:
     """Run a trial in a Ray task, wherever it is."""
     if isinstance(primitives, Source):
-        primitives = service.load_primitives(primitives.primitives, primitives.registry)
+        primitives = load_for([trial.method], primitives.primitives, primitives.registry)
     result = run_trial(trial, primitives, path, RunOptions(resume=True, num_threads=num_threads))
     assert result is not None, "nobody asks a task to stop"
     return result

@@ -23,7 +23,7 @@ import torch
 from service.actors.evaluation import DeterministicPolicy, Evaluation, evaluate, wilson_interval
 from service.downstream.directory import FORMAT_VERSION, TRIAL, TrainingDirectory, read_json, write_json
 from service.downstream.learner import make_loop, set_progress, spread_seed
-from service.downstream.methods import Method, find_method, provenance
+from service.downstream.methods import Method, Trained, find_method, provenance
 from service.downstream.page import draw_training
 from service.downstream.policy import LearnedPolicy, save_policy
 from service.downstream.settings import TrialConfig
@@ -35,7 +35,6 @@ from service.errors import TandemError
 from service.io.checkpoints import Checkpoint
 from service.io.git import git_commit
 from service.io.jsonl import plain
-from service.primitives.loading import TrainedBob
 
 CHECKPOINT_EVERY_S = 120.0
 CURVE_SEED, FINAL_SEED = 1_000_000, 2_000_000
@@ -67,7 +66,7 @@ class RunOptions:
     callbacks: Callbacks = Callbacks()
 
 
-def run_trial(trial: TrialConfig, trained: TrainedBob, path: Path, options: RunOptions) -> dict[str, Any] | None:
+def run_trial(trial: TrialConfig, trained: Trained, path: Path, options: RunOptions) -> dict[str, Any] | None:
     """Run one trial in a directory.
 
     Returns:
@@ -96,7 +95,7 @@ def run_trial(trial: TrialConfig, trained: TrainedBob, path: Path, options: RunO
         low, high = wilson_interval(round(found.success_ever * found.num_episodes), found.num_episodes)
         evaluation = {**found.as_dict(), "success_ever_low": low, "success_ever_high": high}
         if _identity(trial, trained) != identity:
-            raise RuntimeError("the frozen primitives have changed while they were composed")
+            raise RuntimeError("what is frozen has changed while it was acted with")
         made = {"git_commit": git_commit(), "num_cores": os.cpu_count(), "num_threads": options.num_threads}
         if method.player is None:
             with _only_warn("curves"):
@@ -111,7 +110,7 @@ def run_trial(trial: TrialConfig, trained: TrainedBob, path: Path, options: RunO
         return result
 
 
-def check_trial(trial: TrialConfig, trained: TrainedBob, path: Path) -> None:
+def check_trial(trial: TrialConfig, trained: Trained, path: Path) -> None:
     """Assert that ``run_trial`` could begin or continue in that directory; nothing is written.
 
     Raises:
@@ -121,7 +120,7 @@ def check_trial(trial: TrialConfig, trained: TrainedBob, path: Path) -> None:
     TrainingDirectory(path).check(_identity(trial, trained), resume=True)
 
 
-def _identity(trial: TrialConfig, trained: TrainedBob) -> dict[str, Any]:
+def _identity(trial: TrialConfig, trained: Trained) -> dict[str, Any]:
     return {TRIAL: trial.model_dump(mode="json"), **provenance(trained, trial.method)}
 
 
@@ -129,7 +128,7 @@ class _Training:
     """A learner in its worlds."""
 
     def __init__(
-        self, trial: TrialConfig, method: Method, trained: TrainedBob, directory: TrainingDirectory, options: RunOptions
+        self, trial: TrialConfig, method: Method, trained: Trained, directory: TrainingDirectory, options: RunOptions
     ) -> None:
         torch.set_num_threads(options.num_threads or os.cpu_count() or 1)
         self.worlds = make_worlds(trial, method, trained, options.num_threads)
@@ -141,7 +140,9 @@ class _Training:
 
     def new_player(self) -> DeterministicPolicy:
         """Make the policy learned so far, ready for a batch of episodes."""
-        return LearnedPolicy(self._loop.learner.averaged_parameters(), self._method, self._trained)
+        return LearnedPolicy(
+            self._loop.learner.averaged_parameters(), self._method, self._trained, self.worlds.steps_per_action
+        )
 
     def run(self, saved: Checkpoint | None) -> dict[str, Any] | None:
         """Learn to the end; None where stopped before."""
@@ -159,7 +160,8 @@ class _Training:
         if self._callbacks.stop():
             return None
         parameters = self._loop.learner.averaged_parameters()
-        save_policy(self._directory.policy_file, parameters, self._trial.method, self._trained)
+        held = self.worlds.steps_per_action
+        save_policy(self._directory.policy_file, parameters, self._trial.method, self._trained, held)
         return {"env_steps": self._loop.num_env_steps, "wall_s": self._wall_s, "curve": self._curve}
 
     def _iterate(self) -> None:
@@ -207,7 +209,7 @@ class _Training:
         self._saved_s = time.monotonic()
 
 
-def make_worlds(trial: TrialConfig, method: Method, trained: TrainedBob, num_threads: int) -> TaskWorlds:
+def make_worlds(trial: TrialConfig, method: Method, trained: Trained, num_threads: int) -> TaskWorlds:
     """Make the worlds that a method's learner acts in."""
     worlds = TabletopVectorEnv(
         trial.sac.num_worlds,
@@ -217,11 +219,11 @@ def make_worlds(trial: TrialConfig, method: Method, trained: TrainedBob, num_thr
         max_episode_steps=EPISODE_STEPS,
         num_threads=num_threads,
     )
-    return TaskWorlds(method.wrap(worlds, trained), spread_seed(trial.seed, 3))
+    return method.enter(worlds, spread_seed(trial.seed, 3), trained, trial.skill_steps)
 
 
 def play(
-    trial: TrialConfig, trained: TrainedBob, player: DeterministicPolicy, num_episodes: int, seed: int, num_threads: int
+    trial: TrialConfig, trained: Trained, player: DeterministicPolicy, num_episodes: int, seed: int, num_threads: int
 ) -> Evaluation:
     """Evaluate a player, who has not played yet, on the trial's task."""
     task = find_task(trial.task)
@@ -246,7 +248,7 @@ def _only_warn(name: str) -> Iterator[None]:
         _logger.warning("no %s: %s", name, error)
 
 
-def _record_video(trial: TrialConfig, trained: TrainedBob, player: DeterministicPolicy, path: Path) -> Path:
+def _record_video(trial: TrialConfig, trained: Trained, player: DeterministicPolicy, path: Path) -> Path:
     from service.media.recording import record_episodes
     from service.media.video import write_episode_video
 

@@ -13,8 +13,10 @@ from service.sac.replay import Columns
 from service.sac.worlds import TabletopWorlds
 from service.types import Array, Arrays, BoolArray, FloatArray
 
-COLUMNS = {"previous": POSITIONS.size, "positions": POSITIONS.size, "following": POSITIONS.size, "goal": 3, "reward": 1}
-"""Columns of a transition, beside ``action``: positions one step ago, now and after it, goal and reward."""
+_POSITIONS = ("previous", "positions", "before", "following")
+COLUMNS = {**dict.fromkeys(_POSITIONS, POSITIONS.size), "goal": 3, "reward": 1}
+"""Columns of a transition, beside ``action``: positions one env step ago, now, one env step before it ended and when it
+ended, goal and reward."""
 
 
 class TaskWorlds(TabletopWorlds):
@@ -40,7 +42,7 @@ class TaskWorlds(TabletopWorlds):
         self._returns += step.reward
         self.finished += zip(self._returns[step.ended].tolist(), step.success[step.ended].tolist(), strict=True)
         self._returns[step.ended] = 0.0
-        columns = {name: getattr(step, name) for name in ("previous", "positions", "following", "goal")}
+        columns = {name: getattr(step, name) for name in (*_POSITIONS, "goal")}
         return {**columns, "reward": step.reward[:, None], "action": actions}, step.ended
 
     def rewards(self, following: FloatArray, goal: FloatArray) -> FloatArray:

@@ -20,6 +20,9 @@ from service.types import Array, Arrays, BoolArray, FloatArray, Metrics
 class Worlds(Protocol):
     """N worlds that step together; one whose episode ends begins the next within the same step."""
 
+    steps_per_action: int
+    """Env steps that an action lasts."""
+
     def inputs(self) -> FloatArray:
         """(N, I) what the actor sees now."""
 
@@ -58,7 +61,7 @@ class OffPolicyLoop:
     @property
     def num_env_steps(self) -> int:
         """Env steps made so far, those of uniform actions among them."""
-        return self.replay.num_added * self.replay.num_worlds
+        return self.replay.num_added * self.replay.num_worlds * self.worlds.steps_per_action
 
     def play(self, num_env_steps: int) -> Metrics:
         """Make at least so many env steps, with their updates, and average the actor.

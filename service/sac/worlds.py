@@ -19,6 +19,8 @@ class Step(NamedTuple):
     """(N, 11) positions one step before ``positions``."""
     positions: FloatArray
     """(N, 11) that were acted on."""
+    before: FloatArray
+    """(N, 11) one env step before ``following``: those that were acted on, where an action lasts for one."""
     following: FloatArray
     """(N, 11) that the actions led to."""
     goal: FloatArray
@@ -38,6 +40,9 @@ class TabletopWorlds:
         env: restarts episodes in the same step (``gymnasium.vector.AutoresetMode.SAME_STEP``).
         seed: episodes begin here; world i draws its own from ``seed + i``.
     """
+
+    steps_per_action = 1
+    """Env steps that an action lasts."""
 
     def __init__(self, env: gymnasium.vector.VectorEnv[Any, Any, Any], seed: int) -> None:
         self.env: Any = env
@@ -63,7 +68,16 @@ class TabletopWorlds:
         for world in np.flatnonzero(ended):
             following[world] = info["final_obs"][world]["observation"]
             success[world] = info["final_info"]["is_success"][world]
-        step = Step(self.previous, self.positions, following, self.goal, reward.astype(np.float32), ended, success)
+        step = Step(
+            self.previous,
+            self.positions,
+            self.positions,
+            following,
+            self.goal,
+            reward.astype(np.float32),
+            ended,
+            success,
+        )
         self._see(observation)
         self.previous = np.where(ended[:, None], self.positions, step.positions)
         return step

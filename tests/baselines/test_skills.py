@@ -19,6 +19,8 @@ NUM, LENGTH, STEP_M = 32, 10, 0.2
 class PointMasses:
     """Points in a plane that an action moves; the reward sees where they are."""
 
+    steps_per_action = 1
+
     def __init__(self, method):
         self._rng, self._method = np.random.default_rng(0), method
         self.at, self.elapsed = np.zeros((NUM, 2), np.float32), 0

@@ -65,7 +65,7 @@ def test_methods_are_listed():
     ("arguments", "words"),
     [
         (["--task", "lift"], "unknown task 'lift'; choose one of larger, inair"),
-        (["--task", "wall", "--method", "diayn"], "unknown method 'diayn'; choose one of ours"),
+        (["--task", "wall", "--method", "vic"], "unknown method 'vic'; choose one of ours"),
         (["--task", "wall", "--primitives", "nothing@latest"], "nothing"),
         (["--task", "wall", "--registry", "http://127.0.0.1:9"], "127.0.0.1:9"),
         (["--task", "wall", "--set", "gama=0.9"], "--set gama=0.9: write KEY=VALUE with KEY one of num_worlds"),

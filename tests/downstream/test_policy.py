@@ -61,5 +61,5 @@ def test_what_cannot_be_loaded(champion, tmp_path):
     changed = {name: array + 1e-3 for name, array in vars(champion.policy._gate._output).items() if name == "_bias"}
     other = dataclasses.replace(champion, policy=type(champion.policy).__new__(type(champion.policy)))
     vars(other.policy).update(vars(champion.policy), _extra=changed["_bias"])
-    with pytest.raises(TandemError, match=r"composes panda-cube@\d+, not panda-cube@\d+; load those primitives"):
+    with pytest.raises(TandemError, match=r"acts with panda-cube@\d+, not panda-cube@\d+; load that"):
         load_policy(path, other)

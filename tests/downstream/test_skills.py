@@ -1,0 +1,214 @@
+"""Frozen skills downstream: a skill held for some steps, the same in learning and in evaluation, and bad input."""
+
+import numpy as np
+import pytest
+import torch
+
+import service
+from service.baselines.frozen import FrozenSkills, export_skills
+from service.config import Config, SkillsConfig, WorldConfig
+from service.downstream.learner import make_loop
+from service.downstream.methods import METHODS, load_for
+from service.downstream.policy import LearnedPolicy, load_policy, save_policy
+from service.downstream.skills import SkillTaskWorlds, ZeroShotPolicy
+from service.downstream.worker import RunOptions, make_worlds, run_trial
+from service.downstream.worlds import TaskWorlds
+from service.envs.gym.vector import TabletopVectorEnv
+from service.envs.observations import POSITIONS
+from service.errors import TandemError
+from service.io.checkpoints import CheckpointStore
+from service.policies.networks import export_parameters
+from service.primitives.loading import TrainedSkills
+from service.primitives.publishing import publish_skills
+from service.registry.registry import Registry
+from service.sac.inputs import NUM_MOTION_INPUTS
+from service.sac.networks import GaussianActor, make_layers
+from tests.downstream.trials import small_trial
+
+WORLD = WorldConfig(physics_step_s=0.005, num_substeps=8)
+NUM, LENGTH, SIZE = 3, 8, 4
+CONFIG = Config(name="made", world=WORLD, skills=SkillsConfig(method="lsd", size=SIZE))
+
+
+def parameters(seed=5):
+    with torch.random.fork_rng():
+        torch.manual_seed(seed)
+        actor, network = GaussianActor(NUM_MOTION_INPUTS + SIZE, 4, (16,)), make_layers(3, 8, SIZE)
+    return export_skills(export_parameters(actor), export_parameters(network))
+
+
+def made(method="lsd", seed=5):
+    config = CONFIG.model_copy(update={"skills": SkillsConfig(method=method, size=SIZE)})
+    return TrainedSkills("made@1", FrozenSkills(parameters(seed), method), config)
+
+
+@pytest.fixture
+def skills():
+    return made()
+
+
+def env(length=LENGTH):
+    return TabletopVectorEnv(NUM, WORLD, task="push", max_episode_steps=length, num_threads=1)
+
+
+@pytest.mark.parametrize("hold", [1, 4, 3])
+def test_a_held_skill_is_so_many_steps_of_the_frozen_policy(skills, hold):
+    """Where 3 does not divide an episode of 8, its last skill is cut short; the next episode is seen later."""
+    held, plain = SkillTaskWorlds(env(), 3, skills.skills, hold), TaskWorlds(env(), 3)
+    rng = np.random.default_rng(0)
+    for _ in range(12 // hold):
+        actions = rng.uniform(-1.0, 1.0, (NUM, SIZE)).astype(np.float32)
+        start = plain.previous, plain.positions, plain.goal
+        columns, ended = held.step(actions)
+        reward, over, last = np.zeros(NUM), np.zeros(NUM, dtype=bool), None
+        for _ in range(hold):
+            step, _ = plain.step(skills.skills.actions(plain.previous, plain.positions, np.float32(1.5) * actions))
+            if not over.any():
+                last = step
+                reward += step["reward"][:, 0]
+            over |= plain.env._elapsed == 0
+        for name, expected in zip(("previous", "positions", "goal"), start, strict=True):
+            np.testing.assert_array_equal(columns[name], expected)
+        np.testing.assert_array_equal(columns["before"], last["positions"])
+        np.testing.assert_array_equal(columns["following"], last["following"])
+        np.testing.assert_array_equal(columns["reward"][:, 0], reward)
+        np.testing.assert_array_equal(columns["action"], actions)
+        np.testing.assert_array_equal(ended, over)
+        np.testing.assert_array_equal(held.inputs(), plain.inputs())
+    assert held.finished == plain.finished
+    held.close()
+    plain.close()
+
+
+def test_updates_and_horizon_are_counted_in_env_steps(skills):
+    trial = small_trial("lsd", skill_steps=5)
+    worlds = make_worlds(trial, METHODS["lsd"], skills, 1)
+    loop = make_loop(trial, METHODS["lsd"], skills, worlds)
+    assert loop.learner.config.gradient_steps == 5 * trial.sac.gradient_steps
+    assert loop.learner.config.gamma == trial.sac.gamma**5
+    loop.play(trial.num_env_steps)
+    assert loop.num_env_steps == trial.num_env_steps == 5 * loop.replay.num_added * trial.sac.num_worlds
+    learned = trial.num_env_steps - trial.sac.learning_starts
+    assert loop.num_updates == learned // trial.sac.num_worlds * trial.sac.gradient_steps
+    worlds.close()
+
+
+def test_a_learned_policy_holds_its_skills(skills, tmp_path):
+    trial = small_trial("lsd", skill_steps=5)
+    worlds = make_worlds(trial, METHODS["lsd"], skills, 1)
+    loop = make_loop(trial, METHODS["lsd"], skills, worlds)
+    loop.play(200)  # learned nothing yet: the average is the actor
+    path, exported = tmp_path / "policy.safetensors", loop.learner.averaged_parameters()
+    save_policy(path, exported, "lsd", skills, 5)
+    players = LearnedPolicy(exported, METHODS["lsd"], skills, 5), load_policy(path, skills)
+    worlds = SkillTaskWorlds(worlds.env, 3, skills.skills, 5)
+    handed, step = [], worlds.env.step
+
+    def handing(actions):
+        handed.append((worlds.positions, worlds.goal, actions))
+        return step(actions)
+
+    worlds.env.step = handing
+    for _ in range(3):
+        with torch.no_grad():
+            actions = torch.tanh(loop.learner.actor(torch.from_numpy(worlds.inputs()))[0]).numpy()
+        worlds.step(actions)
+    assert len(handed) == 15
+    for positions, goal, expected in handed:
+        for player in players:
+            acted = player.act_deterministic(np.concatenate((positions, goal), axis=1))
+            np.testing.assert_allclose(acted, expected, rtol=0, atol=1e-5)
+    worlds.close()
+
+
+def test_skills_of_actions_by_hand():
+    action = np.array([[0.6, 0.0, -0.8, 0.0], [0.3, 0.0, 0.4, 0.0]], dtype=np.float32)
+    expected = {"lsd": 1.5 * action, "diayn": 1.5 * action, "dads": action, "metra": action / [[1.0], [0.5]]}
+    for method, skill in expected.items():
+        np.testing.assert_allclose(made(method).skills.from_action(action), skill, rtol=1e-6)
+
+
+def test_zero_shot_acts_by_the_skill_towards_the_goal(skills):
+    player, rng = ZeroShotPolicy(skills.skills), np.random.default_rng(0)
+    rows = rng.uniform(-0.1, 0.1, (2, NUM, 14)).astype(np.float32)
+    before = rows[0][:, : POSITIONS.size]
+    for seen in rows:
+        positions, goal = seen[:, : POSITIONS.size], seen[:, POSITIONS.size :]
+        expected = skills.skills.actions(before, positions, skills.skills.towards(positions, goal))
+        np.testing.assert_array_equal(player.act_deterministic(seen), expected)
+        before = positions
+
+
+@pytest.mark.parametrize("method", ["lsd", "lsd-zero-shot"])
+def test_a_trial_continues_where_it_was_cut_off(skills, tmp_path, method):
+    trial = small_trial(method)
+
+    def run(name, left, *, resume=False):
+        from service.downstream.worker import Callbacks
+
+        asked = iter(range(99))
+        options = RunOptions(resume, num_threads=1, callbacks=Callbacks(stop=lambda: next(asked) >= left))
+        return run_trial(trial, skills, tmp_path / name, options)
+
+    whole = run("whole", 99)
+    assert whole["primitives"]["name"] == "made@1"
+    assert whole["env_steps"] == (trial.num_env_steps if method == "lsd" else 0)
+    if method == "lsd":
+        assert run("cut", 2) is None
+        assert run("cut", 99, resume=True)["evaluation"] == whole["evaluation"]
+        first, second = (CheckpointStore(tmp_path / name / "checkpoints", 1).load_latest() for name in ("whole", "cut"))
+        assert all(np.array_equal(array, second.arrays[name]) for name, array in first.arrays.items())
+
+
+class TestBadInput:
+    @pytest.fixture
+    def registry(self, tmp_path):
+        registry = Registry(tmp_path / "registry")
+        publish_skills(registry, CONFIG, parameters(), {"env_steps": 100.0})
+        return registry.root
+
+    def test_skills_from_a_registry(self, registry):
+        trained = load_for(["lsd", "lsd-zero-shot", "idle"], "made", registry)
+        METHODS["lsd"].check(trained)
+        assert trained.skills.size == SIZE
+
+    def test_skills_where_primitives_are_expected(self, registry, champion):
+        with pytest.raises(TandemError, match=r"made@1 holds skills of lsd, not primitives"):
+            load_for(["ours"], "made", registry)
+        for method in ("ours", "asp-only"):
+            with pytest.raises(TandemError, match=r"made@1 holds skills of lsd; this method takes primitives"):
+                METHODS[method].check(made())
+        with pytest.raises(TandemError, match="ours takes primitives and lsd skills: run them by two commands"):
+            load_for(["ours", "lsd"], "made", registry)
+
+    def test_primitives_where_skills_are_expected(self, champion):
+        with pytest.raises(TandemError, match=r"panda-cube@\d+ \(bundled\) holds primitives, not skills"):
+            load_for(["lsd"], "panda-cube@champion", "no registry here")
+        with pytest.raises(TandemError, match=r"panda-cube@\d+ .*holds primitives; this method takes skills"):
+            METHODS["lsd"].check(champion)
+
+    def test_skills_of_another_method(self):
+        with pytest.raises(TandemError, match=r"made@1 holds skills of dads, this method takes those of lsd"):
+            METHODS["lsd-zero-shot"].check(made("dads"))
+
+    def test_skills_of_another_robot(self, registry):
+        trained = service.load_skills("made", registry)
+        spaces = {**trained.manifest.spaces, "action": 7}
+        other = TrainedSkills(
+            "made@1", trained.skills, trained.config, trained.manifest.model_copy(update={"spaces": spaces})
+        )
+        with pytest.raises(
+            TandemError, match=r"made@1 is for another robot or layout: action 7; this one has action 4"
+        ):
+            METHODS["lsd"].check(other)
+
+    def test_a_policy_of_other_skills(self, skills, tmp_path):
+        exported = GaussianActor(23, SIZE, (8,))
+        save_policy(tmp_path / "policy.safetensors", export_parameters(exported), "lsd", skills)
+        with pytest.raises(TandemError, match=r"acts with made@1, not made@1; load that"):
+            load_policy(tmp_path / "policy.safetensors", made(seed=6))
+
+    def test_another_size_of_z(self, skills):
+        rows = np.zeros((NUM, POSITIONS.size), dtype=np.float32)
+        with pytest.raises(TandemError, match=r"skill: expected shape \(N, 4\), got \(3, 2\)"):
+            skills.skills.actions(rows, rows, np.zeros((NUM, 2), dtype=np.float32))
