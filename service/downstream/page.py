@@ -78,8 +78,8 @@ def write_page(results: Sequence[Result], picture: str) -> str:
         "Without noise, 100 goals a point; dotted: what learns nothing. Where a curve still rises, the tables say what "
         "the method has after so many env steps, not what it would come to.\n",
         "## Env steps and time\n",
-        "Learning alone, without evaluations: env steps in thousands, minutes of wall-clock time. What primitives took "
-        "to learn is not counted.\n",
+        "Learning alone, without evaluations: env steps in thousands, minutes of wall-clock time. Before the plus sign "
+        "what the primitives or skills took, in millions of env steps: all tasks have the same.\n",
         _table(of, _cost),
         *_efficiency(of),
         "\n" + _origin(results),
@@ -153,10 +153,13 @@ def _each_seed(seeds: Seeds) -> str:
 
 
 def _cost(seeds: Seeds) -> str:
+    before = [(result["primitives"] or {}).get("env_steps") for result in seeds]
+    known = [each for each in before if each is not None]
+    text = f"{np.mean(known) / 1e6:.1f} M + " if known else ""
     if not seeds[0]["curve"]:
-        return "0"
+        return f"{text}0"
     steps, minutes = (float(np.mean([result[key] for result in seeds])) for key in ("env_steps", "wall_s"))
-    return f"{steps / 1e3:.0f}, {minutes / 60:.0f} min"
+    return f"{text}{steps / 1e3:.0f}, {minutes / 60:.0f} min"
 
 
 def _efficiency(of: Mapping[tuple[str, str], Seeds]) -> Sequence[str]:

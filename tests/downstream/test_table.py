@@ -186,6 +186,13 @@ class TestBadInput:
         words = r"push-asp-only-0\.json is of primitives\.name 'panda-cube@3', not"
         self.refused(words, TRIALS[3:], source, tmp_path)
 
+    def test_another_seed_may_have_other_primitives(self, played, source, tmp_path):
+        tree = json.loads(played.read_text())
+        tree["primitives"] = {"name": "panda-cube@3", "digest": "0" * 64, "env_steps": 1e7}
+        played.write_text(json.dumps(tree))
+        assert table([small_trial("asp-only", seed=1)], source, tmp_path)
+        self.refused("push-asp-only-0", [small_trial("asp-only", "box", seed=0)], source, tmp_path)
+
     def test_another_world(self, file, source, tmp_path):
         tree = json.loads(file.read_text())
         tree["world"]["friction"] = 0.5
@@ -209,7 +216,7 @@ def result(method, task, seed, last, ever, curve=(), num=100):
     return {
         "cell": {"method": method, "task": task, "seed": seed},
         "evaluation": evaluation,
-        "primitives": {"name": "panda-cube@4", "digest": "ab" * 32},
+        "primitives": {"name": "panda-cube@4", "digest": "ab" * 32, "env_steps": 1e7 + seed * 1e6},
         "made": {"git_commit": "c" * 40},
         "env_steps": 2000,
         "wall_s": 60.0,
@@ -228,7 +235,7 @@ def test_the_page_by_hand():
     assert "| *the paper's* | *83 %* | *100 %* | *52 %* | *100 %* | *98 %* | *98 %* |" in lines
     assert "| ours |  |  |  |  | 98.5 % [96, 99] (2) |  |" in lines
     assert "| ours |  |  |  |  | 95.0, 97.0 |  |" in lines
-    assert "| ours |  |  |  |  | 2, 1 min |  |" in lines
+    assert "| ours |  |  |  |  | 10.5 M + 2, 1 min |  |" in lines
     assert "scratch" not in page
 
 
