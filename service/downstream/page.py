@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from itertools import cycle, pairwise
+from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -260,10 +260,11 @@ def draw_table(results: Sequence[Result], path: Path) -> Path:
     figure = new_figure(14.0, 8.0, "Success at the last step, over thousands of env steps")
     of, lines = _by_method_and_task(results), dict[str, "Line2D"]()
     longest = max((each["env_steps"] for each in results), default=0) / 1e3
+    styles = _line_styles()
     for axes, (name, task) in zip(figure.subplots(2, 3).flat, TASKS.items(), strict=True):
-        for (method, described), colour in zip(METHODS.items(), cycle(_COLOURS), strict=False):
+        for method, described in METHODS.items():
             if (method, name) in of:
-                lines[described.title] = _draw_method(axes, of[method, name], colour)
+                lines[described.title] = _draw_method(axes, of[method, name], *styles[method])
         _finish(axes, task.title)
         axes.set_ylim(-0.02, 1.02)
         axes.set_xlim(0.0, 1.02 * longest or 1.0)
@@ -273,7 +274,18 @@ def draw_table(results: Sequence[Result], path: Path) -> Path:
     return save(figure, path)
 
 
-def _draw_method(axes: Axes, results: Seeds, colour: str) -> Line2D:
+def _line_styles() -> dict[str, tuple[str, str]]:
+    """Colour and dashes of each method: those with skills have dashes, and the colours again."""
+    drawn = [name for name, method in METHODS.items() if method.takes != "skills"]
+    dashed = [name for name in METHODS if name not in drawn]
+    return {
+        name: (colour, style)
+        for names, style in ((drawn, "-"), (dashed, "--"))
+        for name, colour in zip(names, _COLOURS, strict=False)
+    }
+
+
+def _draw_method(axes: Axes, results: Seeds, colour: str, style: str) -> Line2D:
     """Mean line of several seeds and their range; a level for a method that learns nothing. Returns the line."""
     curves = [result["curve"] for result in results]
     if not all(curves):
@@ -282,7 +294,7 @@ def _draw_method(axes: Axes, results: Seeds, colour: str) -> Line2D:
     num = min(len(curve) for curve in curves)
     steps = np.array([point["env_steps"] for point in curves[0][:num]]) / 1e3
     values = np.array([[point["success_last"] for point in curve[:num]] for curve in curves])
-    (line,) = axes.plot(steps, values.mean(0), color=colour, linewidth=1.6)
+    (line,) = axes.plot(steps, values.mean(0), color=colour, linestyle=style, linewidth=1.6)
     if len(curves) > 1:
         axes.fill_between(steps, values.min(0), values.max(0), color=colour, alpha=0.18, linewidth=0)
     return line
