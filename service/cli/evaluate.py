@@ -25,21 +25,26 @@ def evaluate(
     as_json: JsonOption = False,
     registry: RegistryOption = REGISTRY,
 ) -> None:
-    """Bob on random goals from fresh resets, without noise, beside a policy that does nothing."""
+    """Bob on random goals from fresh resets, without noise, beside a policy that does nothing.
+
+    Of skills (LSD, METRA, DIAYN) the one that leads to the goal acts, zero-shot.
+    """
     from service.actors.evaluation import IdlePolicy
     from service.actors.evaluation import evaluate as run
+    from service.downstream.skills import ZeroShotPolicy
     from service.envs.sampling import GOAL_KINDS
-    from service.primitives.loading import load_bob
+    from service.primitives.loading import TrainedBob, load_either
 
     if goals not in GOAL_KINDS:
         raise TandemError(f"--goals {goals!r}: choose one of {', '.join(GOAL_KINDS)}")
-    bob = load_bob(primitives, registry)
-    world, distance_m = bob.config.world, bob.config.game.success_distance_m
+    trained = load_either(primitives, registry)
+    player = trained.policy if isinstance(trained, TrainedBob) else ZeroShotPolicy(trained.skills)
+    world, distance_m = trained.config.world, trained.config.game.success_distance_m
     rows = {
         name: run(
             policy, world, goals, num_episodes=episodes, num_steps=steps, seed=seed, success_distance_m=distance_m
         )
-        for name, policy in ((bob.label, bob.policy), ("idle", IdlePolicy()))
+        for name, policy in ((trained.label, player), ("idle", IdlePolicy()))
     }
     if as_json:
         print_json({name: row.as_dict() for name, row in rows.items()})
@@ -55,26 +60,32 @@ def evaluate(
 
 def coverage(
     primitives: _Primitives,
-    skills: Annotated[int, typer.Option(help="Number of random compositions.", min=1)] = 32,
+    skills: Annotated[int, typer.Option(help="Number of random compositions, or skills.", min=1)] = 32,
     steps: Annotated[int, typer.Option(help="Steps each.", min=1)] = 100,
     seed: _Seed = 0,
     out: Annotated[Path, typer.Option(metavar="FILE", help="Picture to write.")] = Path("coverage.png"),
     as_json: JsonOption = False,
     registry: RegistryOption = REGISTRY,
 ) -> None:
-    """Plot where random compositions of the primitives move the object, beside a random policy."""
+    """Plot where random compositions of the primitives, or random skills, move the object, beside a random policy."""
     from service.actors.coverage import RandomPolicy, skill_trajectories, visited_share
+    from service.baselines.coverage import skill_paths
     from service.media.plots import plot_coverage
-    from service.primitives.loading import load_bob
+    from service.primitives.loading import TrainedBob, load_either
 
-    bob = load_bob(primitives, registry)
-    world = bob.config.world
-    paths = {
-        name: skill_trajectories(policy, world, num_skills=skills, num_steps=steps, seed=seed)
-        for name, policy in ((bob.label, bob.primitives), ("random policy", RandomPolicy()))
-    }
+    trained = load_either(primitives, registry)
+    world = trained.config.world
+    if isinstance(trained, TrainedBob):
+        of, path = (
+            "composition",
+            skill_trajectories(trained.primitives, world, num_skills=skills, num_steps=steps, seed=seed),
+        )
+    else:
+        of, path = "skill", skill_paths(trained.skills, world, num_skills=skills, num_steps=steps, seed=seed)
+    random = skill_trajectories(RandomPolicy(), world, num_skills=skills, num_steps=steps, seed=seed)
+    paths = {trained.label: path, "random policy": random}
     shares = {name: visited_share(path, world.workspace) for name, path in paths.items()}
-    picture = plot_coverage(paths[bob.label], world.workspace, out, bob.label)
+    picture = plot_coverage(path, world.workspace, out, trained.label, of=of)
     if as_json:
         print_json({"share_of_table_cells_visited": shares, "picture": str(picture)})
         return

@@ -94,6 +94,22 @@ def load_skills(reference: str, registry: Path) -> TrainedSkills:
         raise TandemError(f"{label} holds no skills: {error}") from None
 
 
+def load_either(reference: str, registry: Path) -> TrainedBob | TrainedSkills:
+    """Load a Bob or frozen skills, whichever is there; see ``load_bob``.
+
+    Raises:
+        TandemError: neither a run directory nor a published version, or damaged.
+    """
+    if Path(reference).is_dir():
+        skills = RunDirectory(Path(reference)).read_config().skills is not None
+    elif "/" in reference:
+        skills = False  # what is wrong is said below
+    else:
+        found, version = find_version(reference, registry)
+        skills = found.manifest(str(version)).spaces.get("kind") == SKILLS
+    return load_skills(reference, registry) if skills else load_bob(reference, registry)
+
+
 def _load(reference: str, registry: Path, part: str) -> tuple[str, Config, Parameters, Manifest | None]:
     """Label, configuration, parameters and manifest of a version; those of a run's ``part`` have no manifest."""
     if Path(reference).is_dir():

@@ -5,8 +5,6 @@ import pytest
 import torch
 
 import service
-from service.baselines.frozen import FrozenSkills, export_skills
-from service.config import Config, SkillsConfig, WorldConfig
 from service.downstream.learner import make_loop
 from service.downstream.methods import METHODS, load_for
 from service.downstream.policy import LearnedPolicy, load_policy, save_policy
@@ -21,25 +19,11 @@ from service.policies.networks import export_parameters
 from service.primitives.loading import TrainedSkills
 from service.primitives.publishing import publish_skills
 from service.registry.registry import Registry
-from service.sac.inputs import NUM_MOTION_INPUTS
-from service.sac.networks import GaussianActor, make_layers
+from service.sac.networks import GaussianActor
+from tests.downstream.skill_sets import CONFIG, SIZE, WORLD, made, parameters
 from tests.downstream.trials import small_trial
 
-WORLD = WorldConfig(physics_step_s=0.005, num_substeps=8)
-NUM, LENGTH, SIZE = 3, 8, 4
-CONFIG = Config(name="made", world=WORLD, skills=SkillsConfig(method="lsd", size=SIZE))
-
-
-def parameters(seed=5):
-    with torch.random.fork_rng():
-        torch.manual_seed(seed)
-        actor, network = GaussianActor(NUM_MOTION_INPUTS + SIZE, 4, (16,)), make_layers(3, 8, SIZE)
-    return export_skills(export_parameters(actor), export_parameters(network))
-
-
-def made(method="lsd", seed=5):
-    config = CONFIG.model_copy(update={"skills": SkillsConfig(method=method, size=SIZE)})
-    return TrainedSkills("made@1", FrozenSkills(parameters(seed), method), config)
+NUM, LENGTH = 3, 8
 
 
 @pytest.fixture
