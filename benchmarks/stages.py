@@ -11,9 +11,9 @@ from typing import Any
 
 import numpy as np
 
-from service.actors.coverage import Composable, RandomPolicy, skill_trajectories, visited_share
+from service.actors.coverage import NUM_SKILLS, Composable, RandomPolicy, skill_trajectories, visited_share
 from service.config import Config
-from service.media.artifacts import COVERAGE_STEPS, NUM_SKILLS
+from service.media.artifacts import COVERAGE_STEPS
 from service.policies.numpy_policy import NumpyMCPPolicy, numpy_bob
 from service.policies.parameters import Parameters
 from service.types import StateArray

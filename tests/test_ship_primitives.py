@@ -14,7 +14,7 @@ from service.io.run_directory import RunDirectory
 from service.policies.numpy_policy import numpy_bob
 from service.primitives import publishing
 from service.primitives.loading import load_bob, read_parameters
-from service.primitives.publishing import publish_bob
+from service.primitives.publishing import publish
 from service.registry.registry import Registry
 from tests.registry.helpers import assert_identical, files_in
 from tests.runtime.runs import TREE, assert_one_line, play, tiny_config
@@ -35,11 +35,11 @@ def registry(run, tmp_path):
     """A registry with the run's Bob as version 1 and 2, and as the only version of another name."""
     registry = Registry(tmp_path / "registry")
     bob = read_parameters(run, "bob")
-    publish_bob(registry, tiny_config(), bob, {"score": 0.25})
+    publish(registry, tiny_config(), bob, {"score": 0.25})
     changed = bob | {"gate.output.bias": bob["gate.output.bias"] + 1.0}
-    publish_bob(registry, tiny_config(), changed, {"score": 0.5}, parent="tiny@1")
+    publish(registry, tiny_config(), changed, {"score": 0.5}, parent="tiny@1")
     other = {"gate.output.bias": bob["gate.output.bias"] + 2.0}
-    publish_bob(registry, tiny_config().model_copy(update={"name": "other"}), bob | other, {})
+    publish(registry, tiny_config().model_copy(update={"name": "other"}), bob | other, {})
     return registry
 
 

@@ -26,7 +26,7 @@ from service.io.run_directory import RunDirectory
 from service.policies.numpy_policy import NumpyMCPPolicy
 from service.primitives.bundled import BUNDLED
 from service.primitives.loading import read_stages
-from service.primitives.publishing import measure_bob, publish_bob
+from service.primitives.publishing import measure_bob, publish
 from service.registry.blobs import BlobStore
 from service.registry.names import LATEST, Version
 from service.registry.registry import Registry
@@ -43,7 +43,7 @@ def publish_newest(directory: RunDirectory, registry: Registry) -> Version:
     config, stages = directory.read_config(), read_stages(directory)
     env_steps = max(stages)
     metrics = measure_bob(config, stages[env_steps]) | {"env_steps": env_steps}
-    return publish_bob(registry, config, stages[env_steps], metrics)
+    return publish(registry, config, stages[env_steps], metrics)
 
 
 def ship(reference: str, source: Registry, target: Path) -> Version:

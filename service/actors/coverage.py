@@ -15,6 +15,9 @@ from service.envs.batch import WorldBatch
 from service.envs.observations import ACTION
 from service.types import FloatArray, StateArray
 
+NUM_SKILLS = 32
+"""Random skills of which coverage is measured, unless told otherwise (paper: 32)."""
+
 
 class Composable(Protocol):
     """Primitives that compose under given weights."""
@@ -64,8 +67,11 @@ def object_paths(
     num_steps: int,
     rng: np.random.Generator,
     num_threads: int = 0,
+    observe: Callable[[WorldBatch], None] = lambda worlds: None,
 ) -> StateArray:
     """Object positions while ``act``, (N, 11) positions to (N, 4) actions, plays N worlds from fresh resets.
+
+    ``observe`` is called at the start and after each step.
 
     Returns:
         (num_paths, num_steps + 1, 3) metres.
@@ -74,9 +80,11 @@ def object_paths(
     with WorldBatch(config, num_paths, num_threads=num_threads) as worlds:
         worlds.reset(rng)
         paths[:, 0] = worlds.object_position
+        observe(worlds)
         for step in range(num_steps):
             worlds.step(act(worlds.positions()))
             paths[:, step + 1] = worlds.object_position
+            observe(worlds)
     return paths
 
 

@@ -96,31 +96,37 @@ def coverage(
 
 def render(
     primitives: _Primitives,
-    episodes: Annotated[int, typer.Option(help="Rounds, or episodes, to record.", min=1)] = 4,
+    episodes: Annotated[int, typer.Option(help="Rounds, episodes or skills to record.", min=1)] = 4,
     seed: _Seed = 0,
     out: Annotated[Path, typer.Option(metavar="FILE", help="Video to write.")] = Path("video.mp4"),
     registry: RegistryOption = REGISTRY,
 ) -> None:
-    """Make a video of a run's Alice beside its Bob, or of published primitives on random goals."""
+    """Make a video of a run's Alice beside its Bob, of published primitives on random goals, or of random skills."""
     from service.io.run_directory import RunDirectory
     from service.media import recording, video
-    from service.primitives.loading import load_bob, load_players
+    from service.primitives.loading import TrainedSkills, load_either, load_players
 
-    if Path(primitives).is_dir():
-        directory = RunDirectory(Path(primitives))
-        config = directory.read_config()
-        rounds = recording.record_rounds(config, *load_players(directory), num_rounds=episodes, seed=seed)
+    trained = load_either(primitives, registry)
+    config = trained.config
+    if isinstance(trained, TrainedSkills):
+        assert config.skills is not None
+        recorded = recording.record_skills(
+            trained.skills, config.world, num_skills=episodes, num_steps=config.skills.episode_steps, seed=seed
+        )
+        video.write_episode_video(recorded, config.world, out)
+    elif Path(primitives).is_dir():
+        players = load_players(RunDirectory(Path(primitives)))
+        rounds = recording.record_rounds(config, *players, num_rounds=episodes, seed=seed)
         video.write_video(rounds, config.world, out)
     else:
-        bob = load_bob(primitives, registry)
         recorded = recording.record_episodes(
-            bob.policy,
-            bob.config.world,
+            trained.policy,
+            config.world,
             "mixed",
             num_episodes=episodes,
-            num_steps=bob.config.run.evaluation_steps,
-            success_distance_m=bob.config.game.success_distance_m,
+            num_steps=config.run.evaluation_steps,
+            success_distance_m=config.game.success_distance_m,
             seed=seed,
         )
-        video.write_episode_video(recorded, bob.config.world, out)
+        video.write_episode_video(recorded, config.world, out)
     typer.echo(f"video: {out}")

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
-from service.actors.coverage import skill_trajectories
+from service.actors.coverage import NUM_SKILLS, skill_trajectories
 from service.baselines.coverage import skill_paths
 from service.config import Config
 from service.errors import TandemError
@@ -17,10 +17,9 @@ from service.media.plots import plot_coverage, plot_curves, plot_goals
 from service.policies.numpy_policy import NumpyMCPPolicy
 from service.primitives.loading import load_players, load_skills
 
-NUM_SKILLS = 32
-"""Random compositions in the coverage picture (paper)."""
 COVERAGE_STEPS = 100
 NUM_RECORDED_ROUNDS = 4
+NUM_RECORDED_SKILLS = 6
 _SEED = 7
 _logger = logging.getLogger(__name__)
 
@@ -38,6 +37,7 @@ def make_artifacts(directory: RunDirectory) -> dict[str, Path]:
             {
                 "curves": partial(plot_curves, directory.path, of_skills=True),
                 "coverage": partial(_draw_skills, directory, config),
+                "video": partial(_draw_skill_video, directory, config),
             }
         )
     alice, bob = load_players(directory)
@@ -71,6 +71,16 @@ def _draw_skills(directory: RunDirectory, config: Config) -> Path:
     steps = config.skills.episode_steps
     paths = skill_paths(skills, config.world, num_skills=NUM_SKILLS, num_steps=steps, seed=_SEED)
     return plot_coverage(paths, config.world.workspace, directory.path / "coverage.png", config.name, of="skill")
+
+
+def _draw_skill_video(directory: RunDirectory, config: Config) -> Path:
+    assert config.skills is not None
+    skills = load_skills(str(directory.path), directory.path).skills
+    steps = config.skills.episode_steps
+    episodes = recording.record_skills(
+        skills, config.world, num_skills=NUM_RECORDED_SKILLS, num_steps=steps, seed=_SEED
+    )
+    return video.write_episode_video(episodes, config.world, directory.path / "skills.mp4")
 
 
 def _draw_coverage(directory: RunDirectory, config: Config, bob: NumpyMCPPolicy) -> Path:

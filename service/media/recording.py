@@ -15,6 +15,8 @@ import numpy as np
 
 from service.actors.evaluation import DeterministicPolicy, evaluate
 from service.actors.self_play import Players, SelfPlay, StochasticPolicy
+from service.baselines.coverage import skill_paths
+from service.baselines.frozen import FrozenSkills
 from service.config import Config, WorldConfig
 from service.envs.batch import WorldBatch
 from service.envs.sampling import GoalKind
@@ -51,12 +53,12 @@ class RecordedRound:
 
 @dataclass(frozen=True, slots=True)
 class RecordedEpisodes:
-    """Bob on N random goals, each for T steps from a fresh reset."""
+    """Bob on N random goals, or N random skills, each for T steps from a fresh reset."""
 
     states: StateArray
     """(T + 1, N, S)."""
-    goal: StateArray
-    """(N, 3) metres."""
+    goal: StateArray | None
+    """(N, 3) metres; None for skills, which have no goal."""
     reached: BoolArray
     """(T + 1, N) the object is within the success distance."""
 
@@ -122,6 +124,22 @@ def record_episodes(
     )
     states, goals, reached = map(np.stack, zip(*kept, strict=True))
     return RecordedEpisodes(states, goals[0], reached)
+
+
+def record_skills(
+    skills: FrozenSkills, config: WorldConfig, *, num_skills: int, num_steps: int, seed: int
+) -> RecordedEpisodes:
+    """Play the random skills that ``skill_paths`` plays with these arguments, and keep every state."""
+    kept: list[StateArray] = []
+    skill_paths(
+        skills,
+        config,
+        num_skills=num_skills,
+        num_steps=num_steps,
+        seed=seed,
+        observe=lambda worlds: kept.append(worlds.states.copy()),
+    )
+    return RecordedEpisodes(np.stack(kept), None, np.zeros((num_steps + 1, num_skills), dtype=bool))
 
 
 class _WithoutNoise:

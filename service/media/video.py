@@ -117,12 +117,15 @@ def _result(played: RecordedRound, step_s: float) -> tuple[str, Colour]:
 def _episode_frames(
     renderer: SceneRenderer, episodes: RecordedEpisodes, stride: int, frame_s: float
 ) -> Iterator[Image]:
-    num = len(episodes.goal)
+    num = episodes.states.shape[1]
     for step in _thinned(len(episodes.states), stride):
         panes = []
         for episode in range(num):
-            picture = renderer.render(episodes.states[step, episode], episodes.goal[episode])
+            goal = None if episodes.goal is None else episodes.goal[episode]
+            picture = renderer.render(episodes.states[step, episode], goal)
             text, colour = ("at the goal", _GREEN) if episodes.reached[step, episode] else ("on the way", _FAINT)
+            if goal is None:
+                text = "random skill"
             panes.append(_caption(picture, text, colour, f"{episode + 1}/{num}"))
         frame = _grid(panes)
         yield frame

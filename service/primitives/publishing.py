@@ -1,11 +1,11 @@
-"""Publishing a trained Bob: measured, published once, with the version he was trained on from as parent."""
+"""Publishing a trained Bob, or skills: measured, published once, with the version training began from as parent."""
 
 from __future__ import annotations
 
 import contextlib
 import json
 
-from service.actors.coverage import visited_share
+from service.actors.coverage import NUM_SKILLS, visited_share
 from service.actors.evaluation import EVALUATED_GOALS, REPORTED_SEED, success_metrics
 from service.baselines.coverage import skill_paths
 from service.baselines.frozen import FrozenSkills
@@ -24,8 +24,6 @@ from service.registry.names import Version
 from service.registry.registry import Registry
 
 FINAL_EVALUATION_EPISODES = 300
-NUM_MEASURED_SKILLS = 32
-"""Paper: 32."""
 
 
 def measure_bob(config: Config, parameters: Parameters) -> dict[str, float]:
@@ -46,7 +44,7 @@ def measure_skills(config: Config, parameters: Parameters) -> dict[str, float]:
     paths = skill_paths(
         FrozenSkills(parameters, config.skills.method),
         config.world,
-        num_skills=NUM_MEASURED_SKILLS,
+        num_skills=NUM_SKILLS,
         num_steps=config.skills.episode_steps,
         seed=REPORTED_SEED,
         num_threads=config.run.num_threads,
@@ -68,7 +66,6 @@ def publish_run(
     version = _newest_if_same(registry, config.name, parameters)
     if version is None:
         parent = _published_before(directory, registry)
-        publish = publish_bob if config.skills is None else publish_skills
         version = publish(registry, config, parameters, metrics, parent=parent)
     note = {"version": str(version), "blob_sha256": registry.manifest(str(version)).blob_sha256}
     with os_errors("write", directory.published_file):
@@ -76,7 +73,7 @@ def publish_run(
     return version
 
 
-def publish_bob(
+def publish(
     registry: Registry,
     config: Config,
     parameters: Parameters,
@@ -84,41 +81,18 @@ def publish_bob(
     *,
     parent: str | None = None,
 ) -> Version:
-    """Publish Bob with everything a user of him needs.
+    """Publish Bob, or the skills of a run that has ``config.skills``, with everything a user needs.
+
+    The spaces in the manifest say which of the two they are.
 
     Raises:
         StorageError: see ``Registry.publish``.
     """
+    normalisation = BOB.normalisation if config.skills is None else POSITIONS.normalisation
     return registry.publish(
         config.name,
         parameters,
-        spaces=SPACES,
-        normalisation={"offset": BOB.normalisation.offset.tolist(), "scale": BOB.normalisation.scale.tolist()},
-        config=config.model_dump(mode="json"),
-        metrics=metrics,
-        parent=parent,
-    )
-
-
-def publish_skills(
-    registry: Registry,
-    config: Config,
-    parameters: Parameters,
-    metrics: dict[str, float],
-    *,
-    parent: str | None = None,
-) -> Version:
-    """Publish frozen skills with everything a user of them needs; their manifest's spaces say what they are.
-
-    Raises:
-        StorageError: see ``Registry.publish``.
-    """
-    assert config.skills is not None
-    normalisation = POSITIONS.normalisation
-    return registry.publish(
-        config.name,
-        parameters,
-        spaces=skill_spaces(config.skills),
+        spaces=SPACES if config.skills is None else skill_spaces(config.skills),
         normalisation={"offset": normalisation.offset.tolist(), "scale": normalisation.scale.tolist()},
         config=config.model_dump(mode="json"),
         metrics=metrics,

@@ -6,10 +6,8 @@ cores of a laptop are busy, and the order of everything is fixed, so a run is re
 
 from __future__ import annotations
 
-import os
 import time
 from concurrent.futures import ThreadPoolExecutor
-from datetime import UTC, datetime
 
 from service.actors.evaluation import EVALUATED_GOALS
 from service.actors.rollout import Rollout, from_arrays, to_arrays
@@ -20,7 +18,7 @@ from service.io.run_directory import RunDirectory
 from service.policies.parameters import Parameters
 from service.runtime.runner import Health, IterationResult, OnBeat, Runner
 from service.runtime.workers import GeneratorWorker, LearnerWorker, RolloutWorker
-from service.store.models import ActorStatus, GoalGrid
+from service.store.models import GoalGrid
 from service.types import Metrics
 
 OLDER_OPPONENTS = -1
@@ -77,16 +75,7 @@ class LocalRun(Runner):
 
     def health(self) -> Health:
         """The state of the one actor there is, this process."""
-        actor = ActorStatus(
-            name="rollout-0",
-            incarnation=0,
-            state="alive",
-            pid=os.getpid(),
-            heartbeat=datetime.now(UTC),
-            num_rollouts=self.iteration,
-            num_env_steps=self.num_env_steps,
-        )
-        return Health((actor,), num_rollouts_counted=max(0, self.iteration - 1))  # the newest is learned from next
+        return self._health_of_one(num_rollouts_counted=max(0, self.iteration - 1))  # the newest is learned from next
 
     def grid(self) -> GoalGrid:
         """The task generator's goal grid."""

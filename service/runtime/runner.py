@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import os
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from datetime import UTC, datetime
 
 import numpy as np
 
@@ -142,6 +144,19 @@ class Runner(ABC):
     @abstractmethod
     def _save(self) -> None:
         """Write a checkpoint of the last iteration."""
+
+    def _health_of_one(self, *, num_rollouts_counted: int) -> Health:
+        """The health of a runner whose one actor is this process."""
+        actor = ActorStatus(
+            name="rollout-0",
+            incarnation=0,
+            state="alive",
+            pid=os.getpid(),
+            heartbeat=datetime.now(UTC),
+            num_rollouts=self.iteration,
+            num_env_steps=self.num_env_steps,
+        )
+        return Health((actor,), num_rollouts_counted=num_rollouts_counted)
 
     def _stop_reason(self) -> str | None:
         if self._stop_requested:

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import os
 import time
-from datetime import UTC, datetime
 
 import numpy as np
 
-from service.actors.coverage import visited_share
+from service.actors.coverage import NUM_SKILLS, visited_share
+from service.actors.evaluation import EVALUATION_SEED
 from service.baselines.coverage import skill_paths
 from service.baselines.frozen import FrozenSkills, export_skills
 from service.baselines.skills import IntrinsicBatches, SkillWorlds, make_skill_loop
@@ -18,12 +17,8 @@ from service.io.run_directory import RunDirectory
 from service.io.tensors import join_parts, split_parts
 from service.policies.parameters import Parameters
 from service.runtime.runner import Health, OnBeat, Runner
-from service.store.models import ActorStatus, GoalCell, GoalGrid
+from service.store.models import GoalCell, GoalGrid
 from service.types import Metrics
-
-EVALUATION_SEED = 1_000_003
-NUM_EVALUATED = 32
-"""Random skills whose coverage is measured on the way (paper: 32)."""
 
 
 class SkillRun(Runner):
@@ -62,16 +57,7 @@ class SkillRun(Runner):
 
     def health(self) -> Health:
         """The state of the one actor there is, this process."""
-        actor = ActorStatus(
-            name="rollout-0",
-            incarnation=0,
-            state="alive",
-            pid=os.getpid(),
-            heartbeat=datetime.now(UTC),
-            num_rollouts=self.iteration,
-            num_env_steps=self.num_env_steps,
-        )
-        return Health((actor,), num_rollouts_counted=self.iteration)
+        return self._health_of_one(num_rollouts_counted=self.iteration)
 
     def grid(self) -> GoalGrid:
         """The cells into which episodes brought the object; nobody tries goals, so success says nothing."""
@@ -150,7 +136,7 @@ class SkillRun(Runner):
         paths = skill_paths(
             skills,
             self.config.world,
-            num_skills=NUM_EVALUATED,
+            num_skills=NUM_SKILLS,
             num_steps=self._skills.episode_steps,
             seed=EVALUATION_SEED,
             num_threads=self.config.run.num_threads,

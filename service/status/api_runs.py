@@ -141,7 +141,8 @@ def runs_router(runs: RunReader, histories: HistoryCache, streams: Streams, dire
         },
     )
     def get_video(request: Request, run_id: _Run) -> Response:
-        """Alice beside Bob; the same as `files/rounds.mp4`."""
-        return get_file(request, run_id, "rounds.mp4")
+        """Alice beside Bob, or random skills; the same as `files/rounds.mp4` or `files/skills.mp4`."""
+        names = [file.name for file in directories.files(run_id) if file.media_type == "video/mp4"]
+        return get_file(request, run_id, names[0] if names else "rounds.mp4")
 
     return router

@@ -19,9 +19,10 @@ from service.store.disk_reader import run_directories, run_id_of
 
 RUN_FILES = {
     "rounds.mp4": ("Alice beside Bob", "video/mp4"),
+    "skills.mp4": ("Random skills", "video/mp4"),
     "curves.png": ("Curves", "image/png"),
     "goals.png": ("Goals", "image/png"),
-    "coverage.png": ("Where random compositions move the object", "image/png"),
+    "coverage.png": ("Where random skills move the object", "image/png"),
 }
 """Title and media type of the files of a run directory that are served; all others are not."""
 BYTES = {"schema": {"type": "string", "format": "binary"}}

@@ -7,7 +7,7 @@ from typer.testing import CliRunner
 
 from service.cli.main import app
 from service.config import SkillsConfig
-from service.primitives.publishing import publish_skills
+from service.primitives.publishing import publish
 from service.registry.registry import Registry
 from tests.downstream.skill_sets import CONFIG, SIZE, parameters
 
@@ -17,7 +17,7 @@ def registry(tmp_path):
     registry = Registry(tmp_path / "registry")
     for method in ("lsd", "dads"):
         config = CONFIG.model_copy(update={"name": method, "skills": SkillsConfig(method=method, size=SIZE)})
-        publish_skills(registry, config, parameters(), {"env_steps": 100.0})
+        publish(registry, config, parameters(), {"env_steps": 100.0})
     return registry.root
 
 
@@ -43,3 +43,15 @@ def test_skills_are_evaluated_by_the_one_towards_the_goal(registry):
     refused = tandem(*common, "dads@1")
     assert refused.exit_code == 2
     assert refused.stderr.startswith("error: skills of DADS lead to no given goal")
+
+
+def test_render_shows_random_skills(registry, tmp_path, monkeypatch):
+    shown = []
+    monkeypatch.setattr(
+        "service.media.video.write_episode_video", lambda episodes, world, path: shown.append((episodes, path))
+    )
+    common = ("render", "--primitives", "dads@1", "--registry", registry, "--episodes", 2)
+    found = tandem(*common, "--out", tmp_path / "skills.mp4")
+    assert found.exit_code == 0, found.output
+    ((episodes, path),) = shown
+    assert (episodes.states.shape[:2], episodes.goal, path) == ((51, 2), None, tmp_path / "skills.mp4")

@@ -17,7 +17,7 @@ from service.errors import TandemError
 from service.io.checkpoints import CheckpointStore
 from service.policies.networks import export_parameters
 from service.primitives.loading import TrainedSkills
-from service.primitives.publishing import publish_skills
+from service.primitives.publishing import publish
 from service.registry.registry import Registry
 from service.sac.networks import GaussianActor
 from tests.downstream.skill_sets import CONFIG, SIZE, WORLD, made, parameters
@@ -148,7 +148,7 @@ class TestBadInput:
     @pytest.fixture
     def registry(self, tmp_path):
         registry = Registry(tmp_path / "registry")
-        publish_skills(registry, CONFIG, parameters(), {"env_steps": 100.0})
+        publish(registry, CONFIG, parameters(), {"env_steps": 100.0})
         return registry.root
 
     def test_skills_from_a_registry(self, registry):

@@ -6,11 +6,14 @@ import numpy as np
 import pytest
 
 from service.actors.evaluation import evaluate
+from service.baselines.coverage import skill_paths
+from service.baselines.frozen import FrozenSkills
 from service.config import Config, GameConfig, WorldConfig
 from service.envs.batch import WorldBatch
 from service.generator.validity import Verdict
 from service.media import recording, video
-from service.media.recording import record_episodes, record_rounds
+from service.media.recording import record_episodes, record_rounds, record_skills
+from tests.downstream.skill_sets import parameters
 
 PUSH = (-1.0, 0.0, -1.0, -1.0)
 OPEN_AND_PUSH = (-1.0, 0.0, -1.0, 1.0)
@@ -200,3 +203,13 @@ def test_recorded_episodes_are_those_of_the_evaluation():
     assert result.success_ever == episodes.reached[1:].any(axis=0).mean()
     distance = np.linalg.norm(episodes.states[-1][:, OBJECT] - episodes.goal, axis=1)
     assert result.mean_distance_m == pytest.approx(distance.mean(), abs=1e-12)
+
+
+def test_recorded_skills_are_those_of_the_coverage():
+    skills = FrozenSkills(parameters(), "lsd")
+    common = {"num_skills": 3, "num_steps": 4, "seed": 5}
+    episodes = record_skills(skills, WorldConfig(), **common)
+    assert episodes.goal is None
+    assert not episodes.reached.any()
+    paths = skill_paths(skills, WorldConfig(), **common)
+    np.testing.assert_array_equal(episodes.states[..., OBJECT].swapaxes(0, 1), paths)

@@ -1,5 +1,7 @@
 """Videos of recorded rounds and episodes: their frames, captions and files."""
 
+import dataclasses
+
 import imageio_ffmpeg
 import numpy as np
 import pytest
@@ -95,6 +97,18 @@ def test_episodes_stand_in_rows_of_three(tmp_path):
     frames, _ = read_video(write_episode_video(episodes, WorldConfig(), tmp_path / "bob.mp4"))
     assert frames.shape == (2 + 20, 2 * (PANE + BAR_HEIGHT), 3 * PANE, 3)
     assert frames[0, -PANE:, PANE + 8 :].min() > 230  # two of six places are empty
+
+
+def test_skills_have_no_goal_and_never_arrive(tmp_path):
+    states = np.tile(still(1)[:, None], (1, 3, 1))
+    skills = RecordedEpisodes(states, None, np.zeros((2, 3), dtype=bool))
+    drawn, _ = read_video(write_episode_video(skills, WorldConfig(), tmp_path / "skills.mp4"))
+    with_goals = dataclasses.replace(skills, goal=np.tile([0.0, 0.1, 0.2], (3, 1)))
+    other, _ = read_video(write_episode_video(with_goals, WorldConfig(), tmp_path / "goals.mp4"))
+    assert drawn.shape == other.shape
+    difference = np.abs(drawn[0].astype(int) - other[0])
+    assert difference[:BAR_HEIGHT].max() > 50  # another caption
+    assert difference[BAR_HEIGHT:].max() > 50  # and no object at a goal
 
 
 def test_a_video_that_fails_leaves_the_old_one(tmp_path):

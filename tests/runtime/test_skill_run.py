@@ -99,9 +99,18 @@ def test_what_the_object_did_is_counted(tmp_path):
 def published(tmp_path_factory):
     """A run that ended and published, and its registry."""
     path = tmp_path_factory.mktemp("skills")
-    done = pretrain(small_config(), RunDirectory(path / "run"), path / "registry", on_iteration=lambda metrics: None)
+    run = RunDirectory(path / "run")
+    drawn = []
+    with pytest.MonkeyPatch.context() as patch:  # a video takes seconds, and OpenGL
+        patch.setattr(
+            "service.media.video.write_episode_video", lambda episodes, world, path: drawn.append(episodes) or path
+        )
+        done = pretrain(small_config(), run, path / "registry", on_iteration=lambda metrics: None)
     assert str(done.version) == "cube-lsd@1"
-    assert set(done.files) == {"curves", "coverage"}
+    assert done.files == {
+        "curves": run.path / "curves.png", "coverage": run.path / "coverage.png", "video": run.path / "skills.mp4"
+    }  # fmt: skip
+    assert drawn[0].states.shape[:2] == (11, 6)
     assert 0.0 <= done.metrics["coverage"] <= 1.0
     return path
 

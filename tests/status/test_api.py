@@ -83,6 +83,13 @@ def test_a_run_without_pictures(client):
     assert client.get("/v1/runs/cube/video").json()["type"] == "urn:tandem:no-such-file"
 
 
+def test_the_video_of_skills(client, home):
+    path = home / "runs" / "cube" / "skills.mp4"
+    path.write_bytes(b"skills")
+    assert client.get("/v1/runs/cube/video").content == b"skills"
+    path.unlink()  # other tests share these runs
+
+
 @pytest.mark.parametrize("name", ["status.json", "metrics.jsonl", "..%2Fcube%2Fgoals.json", "%2Fetc%2Fpasswd"])
 def test_nothing_else_leaves_a_run_directory(client, name):
     answer = client.get(f"/v1/runs/old/files/{name}")
