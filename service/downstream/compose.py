@@ -3,7 +3,9 @@
 ``ComposePrimitives`` wraps an environment, ``ComposePrimitivesVector`` many at once. What a learner sees stays as it
 was; what it sets, K numbers in [-1, 1], are weights on a logarithmic scale, and the environment is handed the mean of
 the composition, which is deterministic and inside the range of the primitives' means (``policies.composition``). Only
-ratios of weights bear on that mean. NumPy alone: acting needs no torch.
+ratios of weights bear on that mean. With a residual the learner sets four more numbers, a small action of its own that
+is added: what primitives never learned, such as pushing where they only carry, is then in reach. NumPy alone: acting
+needs no torch.
 """
 
 from __future__ import annotations
@@ -41,6 +43,23 @@ def action_weights(actions: FloatArray) -> FloatArray:
     exponent = 0.5 * (np.clip(np.asarray(actions, dtype=np.float32), -1.0, 1.0) - 1.0)
     weights: FloatArray = np.exp(np.float32(math.log(WEIGHT_RATIO)) * exponent)
     return weights
+
+
+def compose_actions(
+    primitives: NumpyMCPPolicy, positions: FloatArray, actions: FloatArray, residual: float
+) -> FloatArray:
+    """(..., 4) actions of the robot, not clipped.
+
+    Args:
+        primitives: K of them.
+        positions: (..., 11), metres.
+        actions: (..., K) of a learner; with a residual (..., K + 4).
+        residual: size of the greatest action that is added (Silver et al. 2018; Johannink et al. 2019).
+    """
+    mean, _ = primitives.compose(positions, action_weights(actions[..., : primitives.num_primitives]))
+    if residual:
+        mean += np.float32(residual) * actions[..., primitives.num_primitives :]
+    return mean
 
 
 def check_primitives(primitives: NumpyMCPPolicy | TrainedBob) -> NumpyMCPPolicy:
@@ -94,9 +113,12 @@ class _ComposingWrapper:
         observation_space: gymnasium.Space[Any],
         action_space: gymnasium.Space[Any],
         positions: Positions | None,
+        residual: float,
     ) -> gymnasium.Space[FloatArray]:
         """Check that these primitives fit an environment with these spaces; the space of its new actions."""
-        self.primitives = check_primitives(primitives)
+        if not 0.0 <= residual <= 1.0:
+            raise TandemError(f"residual = {residual}: a share of the robot's greatest action, from 0 to 1")
+        self.primitives, self._residual = check_primitives(primitives), residual
         if not isinstance(action_space, gymnasium.spaces.Box) or action_space.shape != (self.primitives.action_size,):
             raise TandemError(
                 f"the environment's actions are {action_space}; the primitives act by {self.primitives.action_size} "
@@ -112,7 +134,8 @@ class _ComposingWrapper:
             )
         self._take = positions or (operator.itemgetter("observation") if named else lambda observation: observation)
         self._low, self._high = action_space.low, action_space.high
-        return gymnasium.spaces.Box(-1.0, 1.0, (self.primitives.num_primitives,), np.float32)
+        self._num_actions = self.primitives.num_primitives + (self.primitives.action_size if residual else 0)
+        return gymnasium.spaces.Box(-1.0, 1.0, (self._num_actions,), np.float32)
 
     def reset(self, *, seed: Any = None, options: Info | None = None) -> tuple[Any, Info]:
         """Reset what is wrapped."""
@@ -123,10 +146,10 @@ class _ComposingWrapper:
         """Act by the composition with these weights.
 
         Args:
-            action: (K,), or (N, K) for N environments.
+            action: (K,), or (N, K) for N environments; with a residual K + 4 instead of K.
 
         Raises:
-            TandemError: not one number per environment and primitive.
+            TandemError: another shape.
         """
         observation, *rest = self.env.step(self._compose(action))
         return (self._observe(observation), *rest)
@@ -136,18 +159,19 @@ class _ComposingWrapper:
         self._last_positions = np.array(self._take(observation), dtype=np.float32)
         return observation
 
-    def _compose(self, weights: FloatArray) -> FloatArray:
-        """Mean of the composition with weights (..., K), (..., 4), inside the environment's range."""
+    def _compose(self, actions: FloatArray) -> FloatArray:
+        """(..., 4) actions inside the environment's range."""
         if self._last_positions is None:
             raise gymnasium.error.ResetNeeded("call reset before step")
-        expected = (*self._last_positions.shape[:-1], self.primitives.num_primitives)
-        if np.shape(weights) != expected:
+        expected = (*self._last_positions.shape[:-1], self._num_actions)
+        if np.shape(actions) != expected:
             raise TandemError(
-                f"action: expected shape {expected}, a number for each of {expected[-1]} primitives, "
-                f"got {np.shape(weights)}; an orchestrator acts with the primitives it was trained with"
+                f"action: expected shape {expected}, a number for each of {self.primitives.num_primitives} primitives"
+                f"{' and 4 of the residual' if self._residual else ''}, got {np.shape(actions)}; an orchestrator acts "
+                "with the primitives it was trained with"
             )
-        mean, _ = self.primitives.compose(self._last_positions, action_weights(weights))
-        return np.clip(mean, self._low, self._high)
+        made = compose_actions(self.primitives, self._last_positions, np.asarray(actions), self._residual)
+        return np.clip(made, self._low, self._high)
 
 
 class ComposePrimitives(
@@ -160,9 +184,11 @@ class ComposePrimitives(
         primitives: what ``service.load_primitives`` returns, or its ``.primitives``. Never changed.
         positions: takes the (11,) positions (``service.envs.observations``) out of an observation. By default they are
             the observation itself, or its entry ``observation``.
+        residual: above 0, the action has four more numbers, which are added to the composition, times this.
 
     Raises:
-        TandemError: primitives of another robot or layout, or an environment that does not fit them.
+        TandemError: primitives of another robot or layout, an environment that does not fit them, or a residual that is
+            not from 0 to 1.
     """
 
     def __init__(
@@ -171,12 +197,13 @@ class ComposePrimitives(
         primitives: NumpyMCPPolicy | TrainedBob,
         *,
         positions: Positions | None = None,
+        residual: float = 0.0,
     ) -> None:
         gymnasium.utils.RecordConstructorArgs.__init__(
-            self, _disable_deepcopy=True, primitives=primitives, positions=positions
+            self, _disable_deepcopy=True, primitives=primitives, positions=positions, residual=residual
         )
         super().__init__(env)
-        self.action_space = self._compose_with(primitives, env.observation_space, env.action_space, positions)
+        self.action_space = self._compose_with(primitives, env.observation_space, env.action_space, positions, residual)
 
     def compute_reward(self, achieved_goal: Any, desired_goal: Any, info: Any) -> Any:
         """The environment's own, where it has goals: hindsight relabelling asks for it here."""
@@ -192,10 +219,11 @@ class ComposePrimitivesVector(_ComposingWrapper, gymnasium.vector.VectorWrapper[
         primitives: NumpyMCPPolicy | TrainedBob,
         *,
         positions: Positions | None = None,
+        residual: float = 0.0,
     ) -> None:
         super().__init__(env)
         self.single_action_space = self._compose_with(
-            primitives, env.single_observation_space, env.single_action_space, positions
+            primitives, env.single_observation_space, env.single_action_space, positions, residual
         )
         self.action_space = gymnasium.vector.utils.batch_space(self.single_action_space, env.num_envs)
 

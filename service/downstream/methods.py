@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
@@ -20,9 +21,9 @@ from service.actors.evaluation import DeterministicPolicy, IdlePolicy
 from service.baselines.frozen import FrozenSkills
 from service.downstream.compose import (
     ComposePrimitivesVector,
-    action_weights,
     check_primitives,
     check_robot,
+    compose_actions,
     parameters_digest,
 )
 from service.downstream.skills import SkillTaskWorlds, ZeroShotPolicy
@@ -67,9 +68,14 @@ def _enter(env: gymnasium.vector.VectorEnv[Any, Any, Any], seed: int, trained: T
 
 
 def _enter_composing(
-    env: gymnasium.vector.VectorEnv[Any, Any, Any], seed: int, trained: Trained, hold_steps: int
+    env: gymnasium.vector.VectorEnv[Any, Any, Any],
+    seed: int,
+    trained: Trained,
+    hold_steps: int,
+    *,
+    residual: float = 0.0,
 ) -> TaskWorlds:
-    return TaskWorlds(ComposePrimitivesVector(env, frozen_bob(trained)), seed)
+    return TaskWorlds(ComposePrimitivesVector(env, frozen_bob(trained), residual=residual), seed)
 
 
 def _enter_with_skills(
@@ -85,9 +91,10 @@ def _itself(trained: Trained, previous: FloatArray, positions: FloatArray, actio
     return actions
 
 
-def _compose(trained: Trained, previous: FloatArray, positions: FloatArray, actions: FloatArray) -> FloatArray:
-    mean, _ = frozen_bob(trained).primitives.compose(positions, action_weights(actions))
-    return np.clip(mean, -1.0, 1.0)
+def _compose(
+    trained: Trained, previous: FloatArray, positions: FloatArray, actions: FloatArray, *, residual: float = 0.0
+) -> FloatArray:
+    return np.clip(compose_actions(frozen_bob(trained).primitives, positions, actions, residual), -1.0, 1.0)
 
 
 def _act_by_skills(trained: Trained, previous: FloatArray, positions: FloatArray, actions: FloatArray) -> FloatArray:
@@ -134,12 +141,12 @@ class Method:
     @property
     def composes(self) -> bool:
         """Whether its learner sets the weights of primitives."""
-        return self.decode is _compose
+        return self.takes == "primitives" and self.player is None
 
     @property
     def holds(self) -> bool:
         """Whether its learner's action lasts for several env steps."""
-        return self.decode is _act_by_skills
+        return self.takes == "skills" and self.player is None
 
     def check(self, trained: Trained) -> None:
         """Assert that these primitives or skills are for this method.
@@ -159,6 +166,7 @@ class Method:
 
 _HER_SHARE = 0.8
 """1 - 1 / (k + 1) for the usual k = 4 (Andrychowicz et al. 2017)."""
+_RESIDUAL = 0.5
 
 
 def _skill_method(name: SkillMethod) -> Method:
@@ -178,6 +186,14 @@ METHODS: Mapping[str, Method] = {
         "primitives",
         _enter_composing,
         _compose,
+        her_ratio=(_HER_SHARE, 0.0),
+    ),
+    "ours-residual-her": Method(
+        "ours + residual + HER",
+        "and adds a small action of its own",
+        "primitives",
+        partial(_enter_composing, residual=_RESIDUAL),
+        partial(_compose, residual=_RESIDUAL),
         her_ratio=(_HER_SHARE, 0.0),
     ),
     "asp-only": Method("ASP only", "Bob as he is", "primitives", player=_bob),

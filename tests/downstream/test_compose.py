@@ -81,6 +81,21 @@ def test_the_environment_is_handed_the_mean_of_the_composition(trained):
     env.close()
 
 
+def test_a_residual_is_added_to_the_mean(trained):
+    recorder = Recorder(TabletopEnv(CONFIG))
+    env = ComposePrimitives(recorder, trained, residual=0.25)
+    assert env.action_space == gymnasium.spaces.Box(-1.0, 1.0, (NUM_PRIMITIVES + 4,), np.float32)
+    observation, _ = env.reset(seed=0)
+    weights, added = np.float32([0.3, -0.2, 1.0, -1.0]), np.float32([1.0, -1.0, 0.5, 0.0])
+    mean, _ = trained.primitives.compose(observation["observation"], action_weights(weights))
+    env.step(np.concatenate((weights, added)))
+    expected = np.clip(mean + [0.25, -0.25, 0.125, 0.0], -1.0, 1.0)
+    np.testing.assert_allclose(recorder.actions[-1], expected, rtol=0, atol=1e-6)
+    with pytest.raises(TandemError, match=r"expected shape \(8,\), .* 4 primitives and 4 of the residual, got \(4,\)"):
+        env.step(weights)
+    env.close()
+
+
 def test_equal_weights_are_one_composition(env):
     ends = []
     for value in (-0.7, 0.9):
@@ -182,6 +197,10 @@ class TestBadInput:
         ours.reset(seed=0)
         ours.step(np.zeros(NUM_PRIMITIVES, dtype=np.float32))
         env.close()
+
+    @pytest.mark.parametrize("residual", [-0.1, 1.5, float("nan")])
+    def test_a_residual_out_of_its_range(self, env, trained, residual):
+        self.refused(rf"residual = {residual}: .* from 0 to 1", env.unwrapped, trained, residual=residual)
 
     @pytest.mark.parametrize("shape", [(8,), (1, 4), ()])
     def test_weights_for_other_primitives(self, env, shape):

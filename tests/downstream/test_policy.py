@@ -19,7 +19,7 @@ def learned(method, champion):
     return loop, loop.learner.averaged_parameters()
 
 
-@pytest.mark.parametrize("method", ["ours", "scratch-monolithic", "scratch-mcp-her"])
+@pytest.mark.parametrize("method", ["ours", "ours-residual-her", "scratch-monolithic", "scratch-mcp-her"])
 def test_a_learned_policy_acts_as_in_its_worlds(champion, method, tmp_path):
     """Evaluation goes another way than learning, from Bob's input to actions; a loaded policy does the same."""
     loop, parameters = learned(method, champion)
