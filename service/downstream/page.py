@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from itertools import pairwise
 from pathlib import Path
@@ -20,7 +21,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.lines import Line2D
 
-_COLOURS = (BLUE, "#56B4E9", "#000000", GREEN, ORANGE, "#CC79A7", "#E69F00", "#999999")
+_COLOURS = (BLUE, "#56B4E9", "#7B3FBF", "#000000", GREEN, ORANGE, "#CC79A7", "#E69F00", "#999999")
 Seeds = Sequence[Result]
 """Results of one method on one task."""
 
@@ -46,6 +47,9 @@ PAPER: Mapping[str, Mapping[str, float]] = {
 BEST: Mapping[str, float] = {"larger": 0.94, "inair": 1.00, "push": 0.92, "sphere": 1.00, "wall": 0.98, "box": 0.98}
 """The best of all the paper's methods, skill discovery included."""
 
+_STUDENT = (12.706, 4.303, 3.182, 2.776, 2.571, 2.447, 2.365, 2.306, 2.262)
+"""97.5th percentiles of Student's t for 1 to 9 degrees of freedom; 1.96 is near enough for more."""
+
 MARK = "Written by `tandem downstream table`"
 """Words in every page, to tell it from one that a person wrote."""
 
@@ -62,9 +66,10 @@ def write_page(results: Sequence[Result], picture: str) -> str:
         f"# Downstream\n\n{MARK} from the files in `downstream/`, one for each trial, a method on a task with a "
         "seed;\n[what the tasks and methods are](../downstream.md).\n",
         "## Success at the last step\n",
-        "Share of episodes, all seeds together; in brackets the number of seeds. The interval is Wilson's of 95 % over "
-        "episodes: it says how far the share may be off because episodes were few, not how far another seed would "
-        "differ. Below each method, the paper's figures: they are of another world, likely a harder one "
+        "Mean of the seeds; in brackets their number. The interval is one of 95 % for the mean over seeds (Student's "
+        "t). A single seed has Wilson's over its episodes instead, marked by a star: it says how far the share may be "
+        "off because episodes were few, not how far another seed would differ. Below each method, the paper's figures: "
+        "they are of another world, likely a harder one "
         "([what differs](../downstream.md#beside-the-papers-table)). Tasks and methods may have had different numbers "
         "of env steps: they are below, and [there](../downstream.md#the-table) is why.\n",
         *_old_versions(results),
@@ -136,16 +141,28 @@ def _markdown(rows: Sequence[Sequence[str]]) -> str:
 
 
 def _rate(key: str) -> Callable[[Seeds], str]:
-    """Pooled rates, such as ``97.0 % [96, 98] (3)``."""
+    """Mean rates with their intervals, such as ``97.0 % [96, 98] (3)``."""
 
     def text(seeds: Seeds) -> str:
         found = [result["evaluation"] for result in seeds]
-        num = sum(each["num_episodes"] for each in found)
-        successes = sum(round(each[key] * each["num_episodes"]) for each in found)
-        low, high = wilson_interval(successes, num)
-        return f"{100 * successes / num:.1f} % [{100 * low:.0f}, {100 * high:.0f}] ({len(seeds)})"
+        rates = [float(each[key]) for each in found]
+        if len(found) == 1:
+            num = found[0]["num_episodes"]
+            low, high = wilson_interval(round(rates[0] * num), num)
+        else:
+            low, high = seed_interval(rates)
+        star = "\\*" if len(found) == 1 else ""
+        return f"{100 * np.mean(rates):.1f} % [{100 * low:.0f}, {100 * high:.0f}]{star} ({len(seeds)})"
 
     return text
+
+
+def seed_interval(rates: Sequence[float]) -> tuple[float, float]:
+    """Both ends of the 95 % interval for the mean of two or more seeds' rates, by Student's t, inside [0, 1]."""
+    degrees = len(rates) - 1
+    quantile = _STUDENT[degrees - 1] if degrees <= len(_STUDENT) else 1.96
+    half = quantile * float(np.std(rates, ddof=1)) / math.sqrt(len(rates))
+    return max(0.0, float(np.mean(rates)) - half), min(1.0, float(np.mean(rates)) + half)
 
 
 def _each_seed(seeds: Seeds) -> str:

@@ -89,7 +89,7 @@ def test_a_residual_is_added_to_the_mean(trained):
     weights, added = np.float32([0.3, -0.2, 1.0, -1.0]), np.float32([1.0, -1.0, 0.5, 0.0])
     mean, _ = trained.primitives.compose(observation["observation"], action_weights(weights))
     env.step(np.concatenate((weights, added)))
-    expected = np.clip(mean + [0.25, -0.25, 0.125, 0.0], -1.0, 1.0)
+    expected = np.clip(mean + np.float32([0.25, -0.25, 0.125, 0.0]), -1.0, 1.0)
     np.testing.assert_allclose(recorder.actions[-1], expected, rtol=0, atol=1e-6)
     with pytest.raises(TandemError, match=r"expected shape \(8,\), .* 4 primitives and 4 of the residual, got \(4,\)"):
         env.step(weights)

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from service.downstream.page import steps_until, write_page
+from service.downstream.page import seed_interval, steps_until, write_page
 from service.downstream.results import ResultsDirectory
 from service.downstream.table import Source, make_table, run_here, run_on_ray
 from service.downstream.worker import Callbacks
@@ -230,13 +230,25 @@ def test_the_page_by_hand():
         [result("ours", "wall", 1, 0.97, 1.0, curve), result("ours", "wall", 0, 0.95, 0.97, curve)], "picture.png"
     )
     lines = page.splitlines()
-    # 192 of 200: Wilson (z = 1.96) is 0.923 to 0.980
-    assert "| ours |  |  |  |  | 96.0 % [92, 98] (2) |  |" in lines
+    # std 0.01414 of two seeds: 0.96 - 12.706 * 0.01414 / sqrt(2) is 0.833
+    assert "| ours |  |  |  |  | 96.0 % [83, 100] (2) |  |" in lines
     assert "| *the paper's* | *83 %* | *100 %* | *52 %* | *100 %* | *98 %* | *98 %* |" in lines
-    assert "| ours |  |  |  |  | 98.5 % [96, 99] (2) |  |" in lines
+    assert "| ours |  |  |  |  | 98.5 % [79, 100] (2) |  |" in lines
     assert "| ours |  |  |  |  | 95.0, 97.0 |  |" in lines
     assert "| ours |  |  |  |  | 10.5 M + 2, 1 min |  |" in lines
     assert "scratch" not in page
+
+
+def test_intervals_by_hand():
+    assert seed_interval([0.80, 0.82, 0.84]) == pytest.approx(
+        (0.82 - 4.303 * 0.02 / 3**0.5, 0.82 + 4.303 * 0.02 / 3**0.5)
+    )
+    assert seed_interval([0.0, 0.5, 1.0]) == (0.0, 1.0)
+    assert seed_interval([0.5, 0.5]) == (0.5, 0.5)
+    assert seed_interval([0.0, 1.0] * 8) == pytest.approx((0.5 - 1.96 * 0.516398 / 4, 0.5 + 1.96 * 0.516398 / 4))
+    # a single seed: 96 of 100, Wilson (z = 1.96) is 0.902 to 0.984
+    page = write_page([result("ours", "wall", 0, 0.96, 0.96)], "picture.png")
+    assert r"| ours |  |  |  |  | 96.0 % [90, 98]\* (1) |  |" in page.splitlines()
 
 
 def test_what_a_page_says_of_its_origin_by_hand():
