@@ -1,17 +1,21 @@
-"""Coverage of random compositions of the primitives at three stages of training, beside a random policy.
+"""Coverage of random skills, compositions of primitives or skill vectors, at three stages of training.
 
-The paper's figure shows 32 compositions at the beginning, in the middle and at the end. One such set visits few cells
-of the table, so the share of visited cells is taken as the mean over several sets; the first is kept to be drawn.
+Beside them a random policy. The paper's figure shows 32 skills at the beginning, in the middle and at the end. One such
+set visits few cells of the table, so the share of visited cells is taken as the mean over several sets; the first is
+kept to be drawn.
 """
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Callable, Collection, Mapping
+from functools import partial
 from typing import Any
 
 import numpy as np
 
-from service.actors.coverage import NUM_SKILLS, Composable, RandomPolicy, skill_trajectories, visited_share
+from service.actors.coverage import NUM_SKILLS, RandomPolicy, skill_trajectories, visited_share
+from service.baselines.coverage import skill_paths
+from service.baselines.frozen import FrozenSkills
 from service.config import Config
 from service.media.artifacts import COVERAGE_STEPS
 from service.policies.numpy_policy import NumpyMCPPolicy, numpy_bob
@@ -25,10 +29,12 @@ KEPT_EVERY = 4
 STAGES = {"beginning": 0.0, "middle": 0.5, "end": 1.0}
 """Shares of the run."""
 RANDOM = "random policy"
+_Player = Callable[..., StateArray]
+"""Plays the random skills of a ``seed``; their paths."""
 
 
 def pick_stages(env_steps: Collection[int]) -> dict[str, int]:
-    """Snapshots of Bob that show the stages of a run: those nearest to the stages' shares of its env steps.
+    """Snapshots that show the stages of a run: those nearest to the stages' shares of its env steps.
 
     Args:
         env_steps: of training at each snapshot; where one is nearest to several stages, it shows the last of them.
@@ -39,26 +45,35 @@ def pick_stages(env_steps: Collection[int]) -> dict[str, int]:
 
 
 def measure_coverage(
-    bobs: Mapping[int, Parameters], config: Config, *, num_sets: int = NUM_SETS, num_steps: int = COVERAGE_STEPS
+    stages: Mapping[int, Parameters], config: Config, *, num_sets: int = NUM_SETS, num_steps: int = COVERAGE_STEPS
 ) -> dict[str, Any] | None:
-    """The share of the workspace's table cells of 5 cm that each stage's compositions move the object into.
+    """The share of the workspace's table cells of 5 cm that each stage's random skills move the object into.
 
     Args:
-        bobs: Bob's parameters by env steps of training.
+        stages: parameters of Bob, or of skills where the run has ``config.skills``, by env steps of training.
         config: of the run.
-        num_sets: sets of 32 compositions, each from a seed of its own, the same for all stages.
-        num_steps: of each composition.
+        num_sets: sets of 32 skills, each from a seed of its own, the same for all stages.
+        num_steps: of each skill.
 
     Returns:
         For JSON; None for a monolithic Bob, who has nothing to compose.
     """
-    evaluators = {name: (steps, numpy_bob(bobs[steps])) for name, steps in pick_stages(bobs).items()}
-    stages: dict[str, dict[str, Any]] = {RANDOM: _measure(RandomPolicy(), config, num_sets, num_steps)}
-    for name, (env_steps, bob) in evaluators.items():
-        if not isinstance(bob, NumpyMCPPolicy):
+    common: dict[str, Any] = {"num_skills": NUM_SKILLS, "num_steps": num_steps, "num_threads": config.run.num_threads}
+
+    def player(parameters: Parameters) -> _Player | None:
+        if config.skills is not None:
+            return partial(skill_paths, FrozenSkills(parameters, config.skills.method), config.world, **common)
+        bob = numpy_bob(parameters)
+        return partial(skill_trajectories, bob, config.world, **common) if isinstance(bob, NumpyMCPPolicy) else None
+
+    found: dict[str, dict[str, Any]] = {
+        RANDOM: _measure(partial(skill_trajectories, RandomPolicy(), config.world, **common), config, num_sets)
+    }
+    for name, env_steps in pick_stages(stages).items():
+        if (play := player(stages[env_steps])) is None:
             return None
-        stages[name] = {"env_steps": env_steps, **_measure(bob, config, num_sets, num_steps)}
-    return {"num_skills": NUM_SKILLS, "num_steps": num_steps, "cell_size_m": CELL_SIZE_M, "stages": stages}
+        found[name] = {"env_steps": env_steps, **_measure(play, config, num_sets)}
+    return {"num_skills": NUM_SKILLS, "num_steps": num_steps, "cell_size_m": CELL_SIZE_M, "stages": found}
 
 
 def mean_share(stage: Mapping[str, Any]) -> float:
@@ -72,18 +87,8 @@ def paths_m(stage: Mapping[str, Any]) -> StateArray:
     return flat.reshape(len(flat), -1, 3)
 
 
-def _measure(primitives: Composable, config: Config, num_sets: int, num_steps: int) -> dict[str, Any]:
-    sets = [
-        skill_trajectories(
-            primitives,
-            config.world,
-            num_skills=NUM_SKILLS,
-            num_steps=num_steps,
-            seed=seed,
-            num_threads=config.run.num_threads,
-        )
-        for seed in range(num_sets)
-    ]
+def _measure(play: _Player, config: Config, num_sets: int) -> dict[str, Any]:
+    sets = [play(seed=seed) for seed in range(num_sets)]
     kept = np.round(1000 * sets[0][:, ::KEPT_EVERY]).astype(int)
     return {
         "shares": [round(visited_share(paths, config.world.workspace, cell_size_m=CELL_SIZE_M), 4) for paths in sets],

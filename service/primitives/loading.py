@@ -143,15 +143,16 @@ def read_parameters(directory: RunDirectory, player: str) -> Parameters:
 
 
 def read_stages(directory: RunDirectory) -> dict[int, Parameters]:
-    """Bob's parameters in a run's snapshots and in its newest checkpoint, by env steps of training, in their order.
+    """Parameters of Bob, or of skills, in a run's snapshots and its newest checkpoint, by env steps, in their order.
 
     Raises:
         TandemError: a snapshot is damaged, or there is no usable checkpoint.
     """
+    part = "bob" if directory.read_config().skills is None else SKILLS
     store = CheckpointStore(directory.snapshots, keep=1)
     saved = [read_checkpoint(store.path(step)) for step in store.steps()]
     saved.append(CheckpointStore(directory.checkpoints, keep=1).load_latest())
-    stages = {int(each.meta["env_steps"]): _parameters(each, "bob") for each in saved}
+    stages = {int(each.meta["env_steps"]): _parameters(each, part) for each in saved}
     return dict(sorted(stages.items()))  # a killed run may have a snapshot that is newer than its checkpoint
 
 

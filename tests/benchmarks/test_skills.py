@@ -1,0 +1,58 @@
+"""Recorded skill-discovery runs, and self-play recorded as skills."""
+
+import json
+
+import numpy as np
+import pytest
+
+from benchmarks import measuring, record_skills, stages
+from service.actors.coverage import visited_share
+from service.baselines.coverage import skill_paths
+from service.baselines.frozen import FrozenSkills
+from service.config import parse_config
+from service.errors import TandemError
+from service.io.run_directory import RunDirectory
+from service.primitives.loading import read_stages
+from tests.runtime.runs import TREE
+from tests.runtime.runs import play as play_rounds
+from tests.runtime.test_skill_run import play, small_config
+
+
+@pytest.fixture(autouse=True)
+def short(monkeypatch):
+    monkeypatch.setattr(record_skills, "EPISODE_STEPS", 8)
+
+
+def test_a_skill_run_is_recorded(tmp_path):
+    config = small_config("dads", total_env_steps=400)
+    play(tmp_path, config)
+    run = record_skills.record_skills(RunDirectory(tmp_path), "dads-0", "a test")
+    assert (run["name"], run["note"], run["method"], run["config"]["seed"]) == ("dads-0", "a test", "dads", 0)
+    assert run["series"]["env_steps"][-1] == 400
+    assert {name.partition("/")[0] for name in run["series"]} == {
+        "iteration", "env_steps", "time", "evaluation", "skills"
+    }  # fmt: skip
+    found = run["coverage"]["stages"]
+    assert {name: stage.get("env_steps") for name, stage in found.items()} == {
+        "random policy": None, "beginning": 0, "middle": 200, "end": 400
+    }  # fmt: skip
+    newest = FrozenSkills(read_stages(RunDirectory(tmp_path))[400], "dads")
+    paths = skill_paths(newest, config.world, num_skills=32, num_steps=8, seed=0)
+    assert found["end"]["shares"][0] == round(visited_share(paths, config.world.workspace), 4)
+    np.testing.assert_allclose(stages.paths_m(found["end"]), paths[:, ::4], atol=0.0005)
+    json.loads(measuring.to_text(run))
+
+
+def test_self_play_is_recorded_as_skills(tmp_path):
+    play_rounds(tmp_path)
+    run = record_skills.record_skills(RunDirectory(tmp_path), "ours-0")
+    assert run["method"] == "ours"
+    assert "bob/env_steps_fraction" in run["series"]
+    assert not any(name.startswith("alice/") for name in run["series"])
+
+
+def test_a_monolithic_bob_is_refused(tmp_path):
+    policy = {"monolithic_bob": {"hidden_sizes": [8]}}
+    play_rounds(tmp_path, parse_config(TREE | {"policy": TREE.get("policy", {}) | policy}, where="a test"))
+    with pytest.raises(TandemError, match="monolithic Bob, who has no skills"):
+        record_skills.record_skills(RunDirectory(tmp_path), "none")
