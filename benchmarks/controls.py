@@ -1,0 +1,172 @@
+"""Controls of self-play: the same Bob and learner, and goals that somebody else than Alice proposes.
+
+    python -m benchmarks.controls uniform --seed 0
+    python -m benchmarks.controls uniform-alice --seed 0
+
+One control and seed is a pre-training run, three downstream trainings with its primitives, and a small file of both in
+``docs/results/controls``. All controls give Bob the same number of env steps; where Alice plays as well, there are more
+in all. What was stopped goes on from its directories; what has its file is not run again.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+from typing import Any
+
+from benchmarks.measuring import RECIPE_FILE, ROOT, machine, write_json
+from benchmarks.record_run import PACKAGES
+from benchmarks.run_files import COUNTERS, FORMAT_VERSION, Run, thin
+from benchmarks.tasks import measure_tasks
+from service.config import Config, load_config
+from service.downstream.settings import make_trial
+from service.downstream.worker import RunOptions, run_trial
+from service.errors import TandemError
+from service.io.run_directory import RunDirectory
+from service.media.figures import read_records
+from service.primitives.loading import load_bob
+from service.runtime.pretrain import pretrain, resumed_config
+
+OURS = "ours"
+_WITHOUT_ALICE = ("game.alice_plays=false", "generator.past_opponent_fraction=0")
+CONTROLS: dict[str, tuple[str, ...]] = {
+    OURS: (),
+    "uniform": ("generator.goal_source=uniform", *_WITHOUT_ALICE),
+    "uniform-alice": ("generator.goal_source=uniform",),
+    "table": ("generator.goal_source=table", *_WITHOUT_ALICE),
+    "learnable": ("generator.goal_source=learnable", *_WITHOUT_ALICE),
+    "learnable-alice": ("generator.goal_source=learnable",),
+}
+"""Overrides of the recipe by name; with ``-alice`` there are her demonstrations and the goals she has just proposed."""
+BOB_STEPS = 6_000_000
+"""Bob's own env steps of every control: those of 10 million of self-play."""
+BOB_SHARE = 0.6
+"""Share of all env steps that are Bob's where Alice plays, by the recorded runs of the recipe; it hardly changes."""
+TASKS, METHOD = ("wall", "box", "push"), "ours-her"
+NUM_EPISODES = 1_000
+MAX_POINTS = 100
+_KEPT = (*COUNTERS, "evaluation/", "bob/", "alice/valid_fraction", "alice/lifted_fraction")
+
+
+def control_config(recipe: Path, name: str, seed: int, bob_steps: int, settings: list[str]) -> Config:
+    """The recipe as a control has it.
+
+    Raises:
+        TandemError: no such control, or a setting that is wrong.
+    """
+    if name not in CONTROLS:
+        raise TandemError(f"no control {name!r}; choose one of {', '.join(CONTROLS)}")
+    alone = "game.alice_plays=false" in CONTROLS[name]
+    steps = bob_steps if alone else round(bob_steps / BOB_SHARE)
+    named = [f"name=control-{name}", f"seed={seed}", f"run.total_env_steps={steps}"]
+    return load_config(recipe, [*named, *CONTROLS[name], *settings])
+
+
+def record_control(directory: RunDirectory, name: str, downstream: dict[str, Any]) -> Run:
+    """Everything that is kept of a control.
+
+    Args:
+        directory: of its run, which has ended.
+        name: in ``CONTROLS``.
+        downstream: results of its trials by task.
+    """
+    config, records = directory.read_config(), read_records(directory.metrics_file)
+    kept = [{key: value for key, value in record.items() if key.startswith(_KEPT)} for record in records]
+    bob = load_bob(str(directory.path), directory.path).policy
+    return {
+        "format_version": FORMAT_VERSION,
+        "name": f"{name}-{config.seed}",
+        "control": name,
+        "overrides": list(CONTROLS[name]),
+        "recorded": machine(*PACKAGES),
+        "config": config.model_dump(mode="json"),
+        "env_steps": int(records[-1]["env_steps"]),
+        "bob_env_steps": bob_env_steps(records),
+        "evaluations": measure_tasks(bob, config, num_episodes=NUM_EPISODES),
+        "downstream": {
+            task: {key: result[key] for key in ("cell", "evaluation", "env_steps")}
+            for task, result in downstream.items()
+        },
+        "series": thin(kept, MAX_POINTS),
+    }
+
+
+def bob_env_steps(records: list[dict[str, Any]]) -> int:
+    """Env steps that were Bob's, from a run's metrics."""
+    total = before = 0.0
+    for record in records:
+        total += record["bob/env_steps_fraction"] * (record["env_steps"] - before)
+        before = record["env_steps"]
+    return round(total)
+
+
+def run_control(config: Config, name: str, given: argparse.Namespace) -> Run:
+    """Run, or go on with, what a control consists of."""
+    directory = RunDirectory(given.run_dir / f"{name}-{config.seed}")
+    resume = directory.exists
+    if resume and resumed_config(directory, []) != config:
+        raise TandemError(
+            f"{directory.path} holds a run of another configuration; remove it, or name another --run-dir"
+        )
+    pretrain(config, directory, directory.path, resume=resume, publish=False, on_iteration=_show)
+    bob = load_bob(str(directory.path), directory.path)
+    found = {}
+    for task in TASKS:
+        trial = make_trial(
+            task=task, method=METHOD, seed=config.seed, num_env_steps=given.steps, num_episodes=NUM_EPISODES
+        )
+        path = given.run_dir / f"{name}-{config.seed}-{task}"
+        result = run_trial(trial, bob, path, RunOptions(resume=path.exists(), num_threads=config.run.num_threads))
+        assert result is not None
+        found[task] = result
+        print(f"  {task}: {result['evaluation']['success_last']:.1%}", flush=True)
+    return record_control(directory, name, found)
+
+
+def _show(metrics: dict[str, float]) -> None:
+    if "evaluation/mixed_success_last" in metrics:
+        rates = ", ".join(f"{kind} {metrics[f'evaluation/{kind}_success_last']:.0%}" for kind in ("mixed", "table"))
+        print(f"  {metrics['env_steps']:>12,.0f} env steps, {metrics['time/wall_s']:.0f} s: {rates}", flush=True)
+
+
+def main() -> int:
+    """Parse the command line, run and record what is not there yet."""
+    given = _parser().parse_args()
+    try:
+        configs = {
+            name: control_config(given.config, name, given.seed, given.bob_steps, given.overrides)
+            for name in given.names
+        }
+        for name, config in configs.items():
+            file = given.out / f"{name}-{given.seed}.json"
+            print(f"{name}: {', '.join(CONTROLS[name]) or 'nothing changed'}", flush=True)
+            if file.exists():
+                print(f"  skipped, {file} is there")
+                continue
+            write_json(file, run_control(config, name, given))
+            print(f"  {file}: {file.stat().st_size / 1000:.0f} kB", flush=True)
+    except TandemError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+    return 0
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    add = parser.add_argument
+    add("names", metavar="NAME", nargs="+", help=", ".join(CONTROLS))
+    add("--seed", type=int, default=0, help="of the run and of its trials (default: %(default)s)")
+    add("--bob-steps", type=int, default=BOB_STEPS, help="Bob's env steps of each run (default: %(default)s)")
+    add("--steps", type=int, default=200_000, help="env steps of each downstream training (default: %(default)s)")
+    add("--config", type=Path, metavar="FILE", default=RECIPE_FILE)
+    add("--set", dest="overrides", metavar="A.B=C", action="append", default=[], help="repeatable")
+    add("--run-dir", type=Path, metavar="DIR", default=Path("runs") / "controls", help="default: %(default)s")
+    add(
+        "--out", type=Path, metavar="DIR", default=ROOT / "docs" / "results" / "controls", help="for the recorded files"
+    )
+    return parser
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
