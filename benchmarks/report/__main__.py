@@ -2,9 +2,10 @@
 
     python -m benchmarks.report --docs docs
 
-Every block between two markers of ``results/pretraining.md``, ``results/cluster.md`` and ``scaling.md`` is written
-anew, and all pictures; the words around the blocks stay. Whether a target was reached is computed. A block about
-something that was not recorded says so. ``results/downstream.md`` is written whole, as by ``tandem downstream table``.
+Every block between two markers of ``results/pretraining.md``, ``results/cluster.md``, ``results/skills.md`` and
+``scaling.md`` is written anew, and all pictures; the words around the blocks stay. Whether a target was reached is
+computed. A block about something that was not recorded says so. ``results/downstream.md`` is written whole, as by
+``tandem downstream table``.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks import time_to_skill
-from benchmarks.report import cluster, pretraining, scaling
+from benchmarks.report import cluster, pretraining, scaling, skills
 from benchmarks.report.figures import (
     draw_ablations,
     draw_chaos,
@@ -27,6 +28,8 @@ from benchmarks.report.figures import (
     draw_curriculum,
     draw_curves,
     draw_goals,
+    draw_skill_curves,
+    draw_skills,
     draw_soak,
 )
 from benchmarks.run_files import Run, read_run
@@ -47,6 +50,7 @@ PROGRAMS = {
 PAGES = {
     "results/pretraining.md": ("skill", "tasks", "curves", "curriculum", "coverage", "ablations", "throughput"),
     "results/cluster.md": ("targets", "throughput", "chaos", "rest", "soak"),
+    "results/skills.md": ("coverage", "curves", "controls"),
     "scaling.md": ("bottleneck", "box", "nodes", "model", "batches", "skill", "constants"),
 }
 """Blocks of every page."""
@@ -108,11 +112,16 @@ def read_studies(directory: Path) -> dict[str, dict[str, Any]]:
     return studies
 
 
+def read_all(directory: Path) -> list[Run]:
+    """Recorded runs in the order of their names."""
+    return [read_run(path) for path in sorted(directory.glob("*.json"))]
+
+
 def read_runs(directory: Path) -> tuple[list[Run], list[Run]]:
     """Recorded runs in the order of their names, and recorded ablations in that of their list."""
     from benchmarks.ablations import ABLATIONS
 
-    runs = [read_run(path) for path in sorted(directory.glob("*.json"))]
+    runs = read_all(directory)
     order = {name: place for place, name in enumerate(ABLATIONS)}
     ablations = [run for run in runs if "ablation" in run]
     ablations.sort(key=lambda run: (order.get(run["ablation"]["name"], len(order)), run["config"]["seed"]))
@@ -140,6 +149,7 @@ class Report:
         made = (
             self.pretraining_blocks(runs, ablations, found, studies),
             self.cluster_blocks(found),
+            self.skills_blocks(*(read_all(self._results / name) for name in ("skills", "controls"))),
             scaling_blocks(found, studies),
         )
         for (page, names), blocks in zip(PAGES.items(), made, strict=True):
@@ -194,6 +204,17 @@ class Report:
         if (soak := found.get("soak")) is not None:
             picture = self._show("Memory of every process", "cluster-soak", draw_soak, soak)
             blocks["soak"] = [cluster.soak_words(soak), picture, cluster.soak_table(soak)]
+        return blocks
+
+    def skills_blocks(self, runs: Sequence[Run], controls: Sequence[Run]) -> Blocks:
+        """Parts of the blocks about skills, and about controls of self-play."""
+        blocks = {}
+        if runs:
+            picture = self._show("Random skills at three stages of training", "skills", draw_skills, runs)
+            blocks["coverage"] = [skills.coverage_table(runs), picture]
+            blocks["curves"] = [self._show("Skill discovery over env steps", "skills-curves", draw_skill_curves, runs)]
+        if controls:
+            blocks["controls"] = [skills.controls_table(controls)]
         return blocks
 
     def _show(self, words: str, name: str, draw: Callable[[Any, Path], Path], recorded: Any) -> str:

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 import numpy as np
 
 from benchmarks.record_run import BIN_M, NUM_BINS, NUM_SLICES
+from benchmarks.report.skills import METHODS, by_method
 from benchmarks.run_files import Records, Run, binned, unthin
 from benchmarks.stages import CELL_SIZE_M, RANDOM, STAGES, mean_share, paths_m
 from benchmarks.tasks import ASKED
@@ -32,7 +33,7 @@ from service.media.figures import (
     save,
     style_axes,
 )
-from service.media.plots import draw_paths, plot_goals
+from service.media.plots import draw_paths, draw_paths_above, plot_goals
 from service.types import StateArray
 
 if TYPE_CHECKING:
@@ -319,6 +320,54 @@ def _stage_words(name: str, stage: dict[str, Any], random: dict[str, Any]) -> st
         return f"{name}\n{share}"
     when = f"{stage['env_steps'] / 1e6:.3g} M env steps" if stage["env_steps"] else "untrained"
     return f"{name}: {when}\n{share}, {mean_share(stage) / mean_share(random):.1f} x random"
+
+
+# --- skills -----------------------------------------------------------------------------------------------------------
+
+
+def draw_skills(runs: Sequence[Run], path: Path) -> Path:
+    """Draw random skills from above: a row for each method's first seed, a column for each stage."""
+    rows = [seeds[0] for seeds in by_method(runs).values()]
+    columns = (RANDOM, *STAGES)
+    figure = _tall_figure(0.8 + 3.3 * len(rows), "Where random skills take the object, seen from above")
+    words = f"{rows[0]['coverage']['num_skills']} skills of {rows[0]['coverage']['num_steps']} steps"
+    figure.text(0.98, 1.0 - 0.35 / (0.8 + 3.3 * len(rows)), words, ha="right", va="center", color=FAINT)
+    grid = figure.subplots(len(rows), len(columns), squeeze=False)
+    for run, line in zip(rows, grid, strict=True):
+        workspace = WorkspaceConfig.model_validate(run["config"]["world"]["workspace"])
+        stages = run["coverage"]["stages"]
+        for name, axes in zip(columns, line, strict=True):
+            if name not in stages:
+                axes.set_visible(False)
+                continue
+            draw_paths_above(axes, paths_m(stages[name]), workspace)
+            _draw_table_cells(axes, workspace)
+            axes.set(xlabel="", ylabel="")
+            axes.set_title(f"{METHODS[run['method']]}, {_stage_words(name, stages[name], stages[RANDOM])}", fontsize=9)
+    figure.subplots_adjust(left=0.04, right=0.99, bottom=0.03, top=1.0 - 1.0 / (0.8 + 3.3 * len(rows)), hspace=0.35)
+    return save(figure, path)
+
+
+def draw_skill_curves(runs: Sequence[Run], path: Path) -> Path:
+    """Draw over env steps what random skills of every run cover, and what episodes with noise did to the object."""
+    learned = {method: seeds for method, seeds in by_method(runs).items() if method != "ours"}
+    colours = dict(zip(learned, COLORS, strict=False))
+    figure = new_figure(WIDTH, 4.6, "Skill discovery over env steps, a line for each seed")
+    panels = (
+        ("evaluation/coverage", "Random skills: table cells visited"),
+        ("skills/moved_fraction", "Episodes that move the object"),
+        ("skills/outside_fraction", "Episodes that end outside the workspace"),
+    )
+    for axes, (key, title) in zip(figure.subplots(1, 3), panels, strict=True):
+        _panel(axes, title, MILLIONS.unit, "share")
+        for method, seeds in learned.items():
+            for run in seeds:
+                draw_curve(axes, unthin(run["series"]), key, MILLIONS, colours[method])
+        axes.set_ylim(0.0, 1.0)
+        axes.set_xlim(left=0.0)
+    _legend(figure, [(METHODS[method], {"color": colours[method]}) for method in learned], 0.93, len(learned) or 1)
+    figure.subplots_adjust(left=0.05, right=0.98, top=0.78, bottom=0.13)
+    return save(figure, path)
 
 
 # --- a cluster --------------------------------------------------------------------------------------------------------

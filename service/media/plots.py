@@ -358,18 +358,31 @@ def draw_paths(box: Any, above: Axes, paths: StateArray, workspace: WorkspaceCon
         paths: of the object.
         workspace: the box.
     """
-    from matplotlib import colormaps
-
     _draw_box(box, workspace)
-    _draw_outline(above, workspace)
-    # the map's ends are nearly black, where neighbours no longer differ
-    for path, color in zip(paths, colormaps["turbo"](np.linspace(0.05, 0.95, len(paths))), strict=True):
+    for path, color in zip(paths, _path_colors(len(paths)), strict=True):
         points = _inside(path, workspace)
         box.plot(*points.T, color=color, linewidth=1.5)
-        above.plot(points[:, 0], points[:, 1], color=color, linewidth=1.5)
         if np.isfinite(points[-1]).all():
             box.plot(*points[-1:].T, color=color, marker="o", markersize=4.5)
-            above.plot(*points[-1:, :2].T, color=color, marker="o", markersize=5, markeredgecolor="white")
+    draw_paths_above(above, paths, workspace)
+
+
+def draw_paths_above(axes: Axes, paths: StateArray, workspace: WorkspaceConfig) -> None:
+    """Draw (M, T, 3) paths of the object in metres as seen from above, one colour each."""
+    _draw_outline(axes, workspace)
+    for path, color in zip(paths, _path_colors(len(paths)), strict=True):
+        points = _inside(path, workspace)
+        axes.plot(points[:, 0], points[:, 1], color=color, linewidth=1.5)
+        if np.isfinite(points[-1]).all():
+            axes.plot(*points[-1:, :2].T, color=color, marker="o", markersize=5, markeredgecolor="white")
+
+
+def _path_colors(num: int) -> StateArray:
+    """(num, 4) colours; the map's ends are nearly black, where neighbours no longer differ."""
+    from matplotlib import colormaps
+
+    colors: StateArray = colormaps["turbo"](np.linspace(0.05, 0.95, num))
+    return colors
 
 
 def _inside(points: StateArray, workspace: WorkspaceConfig) -> StateArray:

@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 
 from benchmarks import measuring, record_skills, stages
+from benchmarks.report import figures, skills
 from service.actors.coverage import visited_share
 from service.baselines.coverage import skill_paths
 from service.baselines.frozen import FrozenSkills
-from service.config import parse_config
+from service.config import WorldConfig, parse_config
 from service.errors import TandemError
 from service.io.run_directory import RunDirectory
 from service.primitives.loading import read_stages
@@ -56,3 +57,67 @@ def test_a_monolithic_bob_is_refused(tmp_path):
     play_rounds(tmp_path, parse_config(TREE | {"policy": TREE.get("policy", {}) | policy}, where="a test"))
     with pytest.raises(TandemError, match="monolithic Bob, who has no skills"):
         record_skills.record_skills(RunDirectory(tmp_path), "none")
+
+
+# --- the page ---------------------------------------------------------------------------------------------------------
+
+
+def recorded(method, seed, *shares):
+    """A recorded run whose stages have these shares; its random policy has a tenth."""
+    path = [0, 0, 25, 40, 40, 25]
+    stages = {"random policy": {"shares": [0.1, 0.1], "paths_mm": [path]}}
+    for place, (name, share) in enumerate(zip(("beginning", "middle", "end"), shares, strict=True)):
+        stages[name] = {"env_steps": 500_000 * place, "shares": [share, share + 0.1], "paths_mm": [path]}
+    return {
+        "name": f"{method}-{seed}",
+        "method": method,
+        "config": {"seed": seed, "world": WorldConfig().model_dump(mode="json")},
+        "series": {
+            "env_steps": [500_000, 1_000_000], "evaluation/coverage": [0.2, 0.4],
+            "skills/moved_fraction": [0.1, 0.9], "skills/outside_fraction": [0.0, 0.5],
+        },
+        "coverage": {"num_skills": 1, "num_steps": 50, "stages": stages},
+    }  # fmt: skip
+
+
+RUNS = [recorded("lsd", 1, 0.1, 0.3, 0.5), recorded("lsd", 0, 0.0, 0.1, 0.3), recorded("ours", 0, 0.2, 0.4, 0.8)]
+
+
+def test_the_table_of_skills_by_hand():
+    assert skills.coverage_table(RUNS).splitlines()[2:] == [
+        "| random policy |  |  |  |  | 10 % |",
+        "| ours | 1 | 1 M | 25.0 % | 45.0 % | 85.0 % |",
+        "| LSD | 2 | 1 M | 10.0 % (5.0, 15.0) | 25.0 % (15.0, 35.0) | 45.0 % (35.0, 55.0) |",
+    ]
+
+
+def test_pictures_of_skills(tmp_path):
+    for draw in (figures.draw_skills, figures.draw_skill_curves):
+        assert draw(RUNS, tmp_path / "picture.png").stat().st_size > 10_000
+
+
+def control(name, seed, mixed, wall):
+    row = {"policy": "bob", "success_last": mixed}
+    trials = {task: {"evaluation": {"success_last": wall}} for task in ("wall", "box", "push")}
+    return {
+        "control": name,
+        "config": {"seed": seed},
+        "bob_env_steps": 6_000_000 + 40_000 * seed,
+        "env_steps": 10_000_000,
+        "evaluations": [row | {"goals": goals} for goals in ("mixed", "air", "table", "larger")]
+        + [{"policy": "idle", "goals": "mixed", "success_last": 0.0}],
+        "downstream": trials,
+    }
+
+
+def test_the_table_of_controls_by_hand():
+    runs = [control("uniform", 1, 0.5, 0.1), control("uniform", 0, 0.7, 0.2), control("ours", 0, 1.0, 0.9)]
+    head, _, ours, uniform = skills.controls_table(runs).splitlines()
+    assert head == (
+        "| goals proposed by | seeds | Bob's env steps | all env steps | mixed | air | table | Wall | Box | Push |"
+    )
+    assert ours == (
+        "| Alice, and her earlier goals | 1 | 6 M | 10 M | 100.0 % | 100.0 % | 100.0 % | 90.0 % | 90.0 % | 90.0 % |"
+    )
+    three = " | ".join(["60.0 % (70.0, 50.0)"] * 3), " | ".join(["15.0 % (20.0, 10.0)"] * 3)
+    assert uniform == f"| uniform in the workspace | 2 | 6.02 M | 10 M | {three[0]} | {three[1]} |"
