@@ -2,10 +2,9 @@
 
     python -m benchmarks.report --docs docs
 
-Every block between two markers of ``results/pretraining.md``, ``results/cluster.md``, ``results/skills.md`` and
-``scaling.md`` is written anew, and all pictures; the words around the blocks stay. Whether a target was reached is
-computed. A block about something that was not recorded says so. ``results/downstream.md`` is written whole, as by
-``tandem downstream table``.
+Every block between two markers of the ``PAGES`` is written anew, and all pictures; the words around the blocks stay.
+Whether a target was reached is computed. A block about something that was not recorded says so.
+``results/downstream.md`` is written whole, as by ``tandem downstream table``.
 """
 
 from __future__ import annotations
@@ -20,7 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks import time_to_skill
-from benchmarks.report import cluster, pretraining, scaling, skills
+from benchmarks.report import cluster, comparison, pretraining, scaling, skills
 from benchmarks.report.figures import (
     draw_ablations,
     draw_chaos,
@@ -33,6 +32,7 @@ from benchmarks.report.figures import (
     draw_soak,
 )
 from benchmarks.run_files import Run, read_run
+from service.downstream.results import ResultsDirectory
 from service.downstream.table import write_results
 from service.errors import TandemError
 from service.io.files import os_errors, write_atomic
@@ -51,6 +51,7 @@ PAGES = {
     "results/pretraining.md": ("skill", "tasks", "curves", "curriculum", "coverage", "ablations", "throughput"),
     "results/cluster.md": ("targets", "throughput", "chaos", "rest", "soak"),
     "results/skills.md": ("coverage", "curves", "controls"),
+    "results/comparison.md": ("rows",),
     "scaling.md": ("bottleneck", "box", "nodes", "model", "batches", "skill", "constants"),
 }
 """Blocks of every page."""
@@ -144,12 +145,14 @@ class Report:
         """Write all pages and pictures."""
         found, (runs, ablations) = read_results(self._results), read_runs(self._results / "runs")
         studies = read_studies(self._results / "time_to_skill")
+        trials = ResultsDirectory(self._results / "downstream").read_all()
         for page, names in PAGES.items():  # a page that lacks a marker is found before anything is drawn
             replace_blocks(self._docs / page, dict.fromkeys(names, ""))
         made = (
             self.pretraining_blocks(runs, ablations, found, studies),
             self.cluster_blocks(found),
             self.skills_blocks(*(read_all(self._results / name) for name in ("skills", "controls"))),
+            {"rows": [comparison.comparison_table(trials)]} if trials else {},
             scaling_blocks(found, studies),
         )
         for (page, names), blocks in zip(PAGES.items(), made, strict=True):

@@ -1,0 +1,49 @@
+"""The table of ``docs/results/comparison.md``: our success rates beside the paper's, cell by cell."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from benchmarks.report.markdown import Row, table
+from service.actors.evaluation import wilson_interval
+from service.downstream.directory import TRIAL
+from service.downstream.methods import METHODS
+from service.downstream.page import PAPER, seed_interval
+from service.downstream.results import Result
+from service.envs.tasks import TASKS
+
+PAPER_EPISODES = 48
+"""Of each of the paper's rates, most likely: nearly all are multiples of 1/48, so 16 episodes of three seeds."""
+
+
+def comparison_table(results: Sequence[Result]) -> str:
+    """Every method of the paper, every task: our mean of the seeds, and in brackets the paper's and the difference.
+
+    Bold where it is no accident: the paper's interval, Wilson's of 48 episodes, and ours have nothing in common.
+    """
+    rows: list[Row] = []
+    for method, rates in PAPER.items():
+        cells = [_cell(_rates(results, method, task), rates[task]) for task in TASKS]
+        rows.append((METHODS[method].title, *cells))
+    return table(("", *(task.title for task in TASKS.values())), rows)
+
+
+def _rates(results: Sequence[Result], method: str, task: str) -> list[tuple[float, int]]:
+    """Success at the last step and number of episodes of each seed."""
+    trials = [each for each in results if (each[TRIAL]["method"], each[TRIAL]["task"]) == (method, task)]
+    return [(float(each["evaluation"]["success_last"]), int(each["evaluation"]["num_episodes"])) for each in trials]
+
+
+def _cell(seeds: Sequence[tuple[float, int]], paper: float) -> str:
+    if not seeds:
+        return f"not run ({100 * paper:.0f})"
+    ours = float(np.mean([rate for rate, _ in seeds]))
+    if len(seeds) == 1:
+        low, high = wilson_interval(round(ours * seeds[0][1]), seeds[0][1])
+    else:
+        low, high = seed_interval([rate for rate, _ in seeds])
+    paper_low, paper_high = wilson_interval(round(paper * PAPER_EPISODES), PAPER_EPISODES)
+    text = f"{100 * ours:.1f} ({100 * paper:.0f}, {100 * (ours - paper):+.0f})"
+    return f"**{text}**" if low > paper_high or high < paper_low else text
