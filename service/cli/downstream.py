@@ -214,9 +214,10 @@ class _Progress:
             self._evaluated = f" | without noise {rate:.0%}"
         if time.monotonic() - self._shown_s >= _LINE_EVERY_S:
             self._shown_s = time.monotonic()
+            with_noise = metrics.get("rollout/success_last")  # the last iteration may be too short for an episode
             typer.echo(
-                f"{int(metrics['env_steps']):>10,} env steps | success with noise "
-                f"{metrics.get('rollout/success_last', 0.0):.0%}{self._evaluated} | "
-                f"{metrics['time/env_steps_per_s']:,.0f} env steps/s",
+                f"{int(metrics['env_steps']):>10,} env steps"
+                + ("" if with_noise is None else f" | success with noise {with_noise:.0%}")
+                + f"{self._evaluated} | {metrics['time/env_steps_per_s']:,.0f} env steps/s",
                 err=True,
             )
