@@ -113,6 +113,12 @@ class GameConfig(FrozenModel):
     bob_success_reward: float = Field(
         1.0, gt=0.0, description="when the object comes onto the goal; taken back when it leaves (OpenAI 2021)"
     )
+    bob_margin_m: float = Field(
+        0.0,
+        ge=0.0,
+        description="Bob's goals count as reached this much inside ``success_distance_m``; 0 in the paper. What he "
+        "leaves just inside drifts out again after his turn, or in another world",
+    )
     bob_hold_steps: int = Field(
         1,
         ge=1,
@@ -124,6 +130,10 @@ class GameConfig(FrozenModel):
     def _ordered(self) -> Self:
         if self.alice_steps_min is not None and self.alice_steps_min > self.alice_steps:
             raise ValueError(f"alice_steps_min {self.alice_steps_min} must not exceed alice_steps {self.alice_steps}")
+        if self.bob_margin_m >= self.success_distance_m:
+            raise ValueError(
+                f"bob_margin_m {self.bob_margin_m} must be less than success_distance_m {self.success_distance_m}"
+            )
         return self
 
 

@@ -222,6 +222,7 @@ class SelfPlay:
         turns = _empty_turns(game.bob_steps, num, BOB.size, BOB_VALUE.size, learn=choice.played & ~plan.bob_past)
         solved, diverged = np.zeros(num, dtype=bool), np.zeros(num, dtype=bool)
         num_held: IntArray = np.zeros(num, dtype=np.int64)
+        reach_m = game.success_distance_m - game.bob_margin_m
         playing = np.flatnonzero(choice.played)
         if observe:
             observe(worlds.states)
@@ -236,7 +237,7 @@ class SelfPlay:
             diverged |= worlds.step(action, playing)
             if observe:
                 observe(worlds.states)
-            reached = np.linalg.norm(worlds.object_position - choice.goal, axis=1) <= game.success_distance_m
+            reached = np.linalg.norm(worlds.object_position - choice.goal, axis=1) <= reach_m
             # Reaching the goal earns the reward and leaving it takes the reward back; ``solved`` is the step before.
             turns.reward[step, playing] = game.bob_success_reward * (reached.astype(np.float32) - solved)[playing]
             solved[playing] = reached[playing]

@@ -127,9 +127,9 @@ class Mover(Constant):
 ON_GOAL, OFF_GOAL = (-0.15, 0.0, 0.025), (-0.15, 0.13, 0.025)
 
 
-def play_moved(hold_steps, positions):
+def play_moved(hold_steps, positions, **settings):
     """Bob's turn of a round in one world, whose goal is ``ON_GOAL`` and whose object is moved while Bob plays."""
-    game = make_game(make_config(1, game={"bob_hold_steps": hold_steps}), [Start(OFF_GOAL)])
+    game = make_game(make_config(1, game={"bob_hold_steps": hold_steps, **settings}), [Start(OFF_GOAL)])
     choose = replay_in([0], game.worlds.states[0].copy(), ON_GOAL)
     return play(game, bob=Mover(game, positions), choose_goals=choose)
 
@@ -150,6 +150,15 @@ def test_bobs_turn_ends_once_the_object_was_on_the_goal_for_so_many_steps_in_a_r
     assert rollout.bob.reward[: last + 1, 0].tolist() == [0.0, 1.0, -1.0, 1.0, 0.0, 0.0][: last + 1]
     assert rollout.records.solved[0]
     assert rollout.records.num_bob_steps[0] == last + 1
+
+
+def test_with_a_margin_bob_has_to_come_nearer():
+    near = (-0.15, 0.045, 0.025)  # 4.5 cm from the goal
+    positions = [OFF_GOAL, near, near, ON_GOAL, near, ON_GOAL, ON_GOAL]
+    assert play_moved(3, positions).bob.reward[:, 0].tolist() == [0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0]
+    rollout = play_moved(3, positions, bob_margin_m=0.01)
+    assert rollout.bob.reward[:, 0].tolist() == [0.0, 0.0, 0.0, 1.0, -1.0, 1.0, 0.0]
+    assert rollout.records.solved[0]
 
 
 def test_a_goal_that_is_held_to_the_end_of_the_turn_is_solved_without_an_end():
