@@ -269,6 +269,12 @@ def test_old_keys_in_a_configuration_of_today(tmp_path):
         load_config(path, ["learner.bob_average_decay=0.8"], recorded=True)
 
 
+def test_a_margin_as_wide_as_success_is_refused():
+    text = message(overrides=["game.bob_margin_m=0.05"])
+    assert "bob_margin_m 0.05 must be less than success_distance_m 0.05" in text
+    assert load_config(overrides=["game.bob_margin_m=0.04"]).game.bob_margin_m == 0.04
+
+
 def test_self_imitation_of_turns_that_no_reward_reaches_is_refused():
     how = ["learner.self_imitation.weight=0.2", "learner.self_imitation.min_reward=11"]
     with pytest.raises(ConfigError, match=r"min_reward = 11, but no turn of Alice's pays more than 6, ") as error:

@@ -86,7 +86,7 @@ def train(
 @downstream_app.command()
 def table(
     methods: Annotated[str, typer.Option(help="Names with commas between; all: those that take no skills.")] = "all",
-    tasks: Annotated[str, typer.Option(help="Names with commas between, or all.")] = "all",
+    tasks: Annotated[str, typer.Option(help="Names with commas between; all: the paper's six.")] = "all",
     seeds: Annotated[str, typer.Option(help="Numbers with commas between.")] = "0",
     primitives: _Primitives = CHAMPION,
     steps: _Steps = None,

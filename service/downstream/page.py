@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -14,7 +14,7 @@ from service.actors.evaluation import wilson_interval
 from service.downstream.directory import TRIAL
 from service.downstream.methods import METHODS
 from service.downstream.results import Result
-from service.envs.tasks import TASKS
+from service.envs.tasks import HARD_TASKS, TASKS, find_task
 from service.media.figures import BLUE, FAINT, GREEN, ORANGE, column, new_figure, read_records, save, style_axes
 
 if TYPE_CHECKING:
@@ -87,9 +87,33 @@ def write_page(results: Sequence[Result], picture: str) -> str:
         "what the primitives or skills took, in millions of env steps: all tasks have the same.\n",
         _table(of, _cost),
         *_efficiency(of),
+        *_harder(of),
         "\n" + _origin(results),
     ]
     return "\n".join(parts)
+
+
+def _harder(of: Mapping[tuple[str, str], Seeds]) -> Sequence[str]:
+    """The section on harder tasks, if any was run."""
+    tasks = _harder_ones(task for _, task in of)
+    if not tasks:
+        return ()
+    return (
+        "\n## A harder start and cube\n",
+        "The end effector starts 20 cm above the table instead of 8, and the cube has 1 kg instead of 0.1 and half the "
+        "grip ([decision 7](../decisions/0007-the-downstream-tasks.md)). At the last step, each seed, and at any "
+        "step:\n",
+        _table(of, _rate("success_last"), tasks=tasks),
+        _table(of, _each_seed, tasks=tasks),
+        _table(of, _rate("success_ever"), tasks=tasks),
+        "Env steps and time:\n",
+        _table(of, _cost, tasks=tasks),
+    )
+
+
+def _harder_ones(names: Iterable[str]) -> list[str]:
+    found = set(names)
+    return [name for name in HARD_TASKS if name in found]
 
 
 def _by_method_and_task(results: Sequence[Result]) -> dict[tuple[str, str], list[Result]]:
@@ -102,7 +126,7 @@ def _by_method_and_task(results: Sequence[Result]) -> dict[tuple[str, str], list
 def _old_versions(results: Sequence[Result]) -> Sequence[str]:
     """Lines about results of other versions of the tasks than today's, by the methods that have them."""
     tasks_of: dict[str, list[str]] = {}
-    for name, task in TASKS.items():
+    for name, task in {**TASKS, **HARD_TASKS}.items():
         trials = [result[TRIAL] for result in results if result[TRIAL]["task"] == name]
         old = {each["method"] for each in trials if each.get("task_version", 0) != task.version}
         if old:
@@ -117,26 +141,32 @@ def _old_versions(results: Sequence[Result]) -> Sequence[str]:
     ]
 
 
-def _table(of: Mapping[tuple[str, str], Seeds], text: Callable[[Seeds], str], *, paper: bool = False) -> str:
+def _table(
+    of: Mapping[tuple[str, str], Seeds],
+    text: Callable[[Seeds], str],
+    *,
+    tasks: Sequence[str] = tuple(TASKS),
+    paper: bool = False,
+) -> str:
     """A row per method that has a result, and a text per task; below it, if asked for, the paper's."""
     rows: list[Sequence[str]] = []
     for method, described in METHODS.items():
-        found = [of.get((method, task), []) for task in TASKS]
+        found = [of.get((method, task), []) for task in tasks]
         if any(found):
             rows.append((described.title, *(text(seeds) if seeds else "" for seeds in found)))
             if paper and method in PAPER:
                 rows.append(_paper_row("*the paper's*", PAPER[method]))
     if paper:
         rows.append(_paper_row("*best of the paper*", BEST))
-    return _markdown(rows)
+    return _markdown(rows, tasks)
 
 
 def _paper_row(title: str, rates: Mapping[str, float]) -> Sequence[str]:
     return title, *(f"*{100 * rates[task]:.0f} %*" for task in TASKS)
 
 
-def _markdown(rows: Sequence[Sequence[str]]) -> str:
-    head = ("", *(task.title for task in TASKS.values()))
+def _markdown(rows: Sequence[Sequence[str]], tasks: Iterable[str] = TASKS) -> str:
+    head = ("", *(find_task(name).title for name in tasks))
     return "\n".join("| " + " | ".join(line) + " |" for line in (head, ("---",) * len(head), *rows)) + "\n"
 
 
@@ -271,23 +301,31 @@ def draw_training(path: Path) -> Path:
 def draw_table(results: Sequence[Result], path: Path) -> Path:
     """Draw success at the last step over env steps: a panel per task, a line per method, a band from least to greatest.
 
+    Harder tasks have a panel where they were run.
+
     Raises:
         TandemError: the picture cannot be written.
     """
-    figure = new_figure(14.0, 8.0, "Success at the last step, over thousands of env steps")
+    tasks = [*TASKS, *_harder_ones(result[TRIAL]["task"] for result in results)]
+    rows = math.ceil(len(tasks) / 3)
+    height_inch = 1.4 + 3.3 * rows
+    figure = new_figure(14.0, height_inch, "Success at the last step, over thousands of env steps")
     of, lines = _by_method_and_task(results), dict[str, "Line2D"]()
     longest = max((each["env_steps"] for each in results), default=0) / 1e3
     styles = _line_styles()
-    for axes, (name, task) in zip(figure.subplots(2, 3).flat, TASKS.items(), strict=True):
+    panels = list(figure.subplots(rows, 3).flat)
+    for axes in panels[len(tasks) :]:
+        axes.set_axis_off()
+    for axes, name in zip(panels, tasks, strict=False):
         for method, described in METHODS.items():
             if (method, name) in of:
                 lines[described.title] = _draw_method(axes, of[method, name], *styles[method])
-        _finish(axes, task.title)
+        _finish(axes, find_task(name).title)
         axes.set_ylim(-0.02, 1.02)
         axes.set_xlim(0.0, 1.02 * longest or 1.0)
     titles = [described.title for described in METHODS.values() if described.title in lines]
     figure.legend([lines[title] for title in titles], titles, loc="upper right", ncols=4, fontsize=9, frameon=False)
-    figure.subplots_adjust(left=0.05, right=0.98, top=0.86, bottom=0.07, hspace=0.3)
+    figure.subplots_adjust(left=0.05, right=0.98, top=1 - 1.12 / height_inch, bottom=0.56 / height_inch, hspace=0.3)
     return save(figure, path)
 
 

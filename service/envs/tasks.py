@@ -1,9 +1,9 @@
-"""The paper's six downstream tasks, as data on one world: what of the world is replaced, and where goals are."""
+"""The paper's six downstream tasks, and harder ones, as data on one world: what is replaced, and where goals are."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 from service.config import WorldConfig
@@ -61,13 +61,30 @@ TASKS: Mapping[str, Task] = {
 }
 """The tasks by the names that commands take, in the paper's order. Reasons for the numbers: docs/decisions/0007."""
 
+_HARDER: Mapping[str, Any] = {"start_height_m": 0.20, "object_mass_kg": 1.0, "friction": 0.25, "pad_friction": 0.5}
+"""Start and cube of panda-gym 3.0.7, but for the cube's edge, 4 cm there. Its simulator multiplies two frictions: 0.5
+of the cube by 0.5 of the table, and by 1 of the fingers. MuJoCo takes the greater one."""
+
+HARD_TASKS: Mapping[str, Task] = {
+    f"hard-{name}": replace(
+        task,
+        title=f"Hard{task.title}",
+        description=f"{task.description}; a higher start, a heavy and slippery cube",
+        world={**task.world, **_HARDER},
+    )
+    for name, task in TASKS.items()
+    if name not in ("sphere", "wall")  # a hand-written policy fails in most episodes, so nobody knows how hard they are
+}
+"""Tasks in a harder world, where chance seldom finds the object: docs/decisions/0007."""
+
 
 def find_task(name: str) -> Task:
-    """Find a task by its name.
+    """Find a task, one of the paper's or a harder one, by its name.
 
     Raises:
         TandemError: no such task.
     """
-    if name not in TASKS:
-        raise TandemError(f"unknown task {name!r}; choose one of {', '.join(TASKS)}")
-    return TASKS[name]
+    known = {**TASKS, **HARD_TASKS}
+    if name not in known:
+        raise TandemError(f"unknown task {name!r}; choose one of {', '.join(known)}")
+    return known[name]

@@ -4,8 +4,9 @@ import json
 from pathlib import Path
 
 import pytest
+from PIL import Image
 
-from service.downstream.page import seed_interval, steps_until, write_page
+from service.downstream.page import draw_table, seed_interval, steps_until, write_page
 from service.downstream.results import ResultsDirectory
 from service.downstream.table import Source, make_table, run_here, run_on_ray
 from service.downstream.worker import Callbacks
@@ -237,6 +238,35 @@ def test_the_page_by_hand():
     assert "| ours |  |  |  |  | 95.0, 97.0 |  |" in lines
     assert "| ours |  |  |  |  | 10.5 M + 2, 1 min |  |" in lines
     assert "scratch" not in page
+
+
+def test_harder_tasks_have_a_section_of_their_own():
+    page = write_page([result("ours", "wall", 0, 0.96, 0.96)], "picture.png")
+    assert "A harder start" not in page
+    results = [
+        result("ours", "wall", 0, 0.96, 0.96),
+        result("ours", "hard-push", 0, 0.50, 0.75),
+        result("asp-only", "hard-push", 0, 0.10, 0.10),
+    ]
+    for each in results:
+        each["cell"]["task_version"] = 1
+    page = write_page(results, "picture.png")
+    plain, _, harder = page.partition("## A harder start and cube")
+    assert "HardPush" not in plain
+    assert r"| ours |  |  |  |  | 96.0 % [90, 98]\* (1) |  |" in plain.splitlines()
+    # 50 of 100, Wilson (z = 1.96) is 0.404 to 0.596
+    assert {"|  | HardPush |", r"| ours | 50.0 % [40, 60]\* (1) |", "| ours | 50.0 |"} <= set(harder.splitlines())
+    assert "paper" not in harder
+
+
+def test_pictures_of_learning_have_a_panel_for_each_task(tmp_path):
+    sizes = []
+    for name in ("push", "hard-push"):
+        picture = draw_table([result("ours", name, 0, 0.5, 0.5)], tmp_path / f"{name}.png")
+        with Image.open(picture) as image:
+            sizes.append(image.size)
+    assert sizes[0][0] == sizes[1][0]
+    assert sizes[1][1] > 1.3 * sizes[0][1]  # three rows of panels, not two
 
 
 def test_intervals_by_hand():

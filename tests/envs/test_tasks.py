@@ -20,7 +20,7 @@ from service.envs.gym.tabletop import TabletopEnv
 from service.envs.gym.vector import TabletopVectorEnv
 from service.envs.rendering.renderer import RenderError, SceneRenderer
 from service.envs.sampling import draw_goals
-from service.envs.tasks import TASKS, find_task
+from service.envs.tasks import HARD_TASKS, TASKS, find_task
 from service.errors import TandemError
 from tests.envs.scripted_tasks import play_task
 
@@ -72,6 +72,17 @@ class TestTable:
             0.4,
             -0.05,
         )
+
+    def test_harder_ones_have_another_start_and_cube_and_the_same_goals(self):
+        assert [task.id for task in HARD_TASKS.values()] == [
+            f"tandem/Hard{title}-v1" for title in ("Larger", "InAir", "Push", "Box")
+        ]
+        harder = {"start_height_m": 0.2, "object_mass_kg": 1.0, "friction": 0.25, "pad_friction": 0.5}
+        for name, task in HARD_TASKS.items():
+            plain = TASKS[name.removeprefix("hard-")]
+            assert task.goals == plain.goals
+            assert task.world_from(CONFIG) == plain.world_from(CONFIG).model_copy(update=harder)
+            assert find_task(name) is task
 
     def test_an_unknown_one_is_named_with_those_there_are(self):
         with pytest.raises(TandemError, match=r"unknown task 'moon'; choose one of larger, inair, push, .* box"):
@@ -338,6 +349,20 @@ def test_every_task_can_be_solved_in_its_time(task):
     idle = play_task(task, CONFIG, num_episodes=30, seed=0, idle=True, num_threads=2)
     assert played.success_last.mean() >= 0.9
     assert idle.success_last.mean() <= 0.2
+
+
+@pytest.mark.parametrize("task", HARD_TASKS)
+def test_a_hand_written_policy_solves_most_episodes_of_the_harder_ones(task):
+    """It was written for a light cube that does not slip: two thirds have to do, in 80 steps."""
+    played = play_task(task, CONFIG, num_episodes=40, seed=0, num_steps=80, num_threads=2)
+    assert played.success_last.mean() >= 0.66
+
+
+def test_harder_ones_start_higher():
+    for name, height_m in (("push", 0.08), ("hard-push", 0.2)):
+        with WorldBatch(find_task(name).world_from(CONFIG), 1, num_threads=1) as worlds:
+            worlds.reset(np.random.default_rng(0))
+            np.testing.assert_allclose(worlds.ee_position[0, 2], height_m, rtol=0, atol=0.002)
 
 
 def test_a_script_is_told_from_a_lucky_start():

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import gymnasium
 
-from service.envs.tasks import TASKS
+from service.envs.tasks import HARD_TASKS, TASKS
 
 TABLETOP_ID = "tandem/Tabletop-v1"
 EPISODE_STEPS = 50
@@ -18,7 +18,8 @@ EPISODE_STEPS = 50
 
 def register_all() -> None:
     """Register every environment; a second call changes nothing."""
-    options: dict[str, dict[str, str]] = {TABLETOP_ID: {}, **{task.id: {"task": name} for name, task in TASKS.items()}}
+    tasks = {**TASKS, **HARD_TASKS}
+    options: dict[str, dict[str, str]] = {TABLETOP_ID: {}, **{task.id: {"task": name} for name, task in tasks.items()}}
     for name in [name for name in options if name not in gymnasium.registry]:
         gymnasium.register(
             id=name,
