@@ -59,8 +59,9 @@ def control_config(recipe: Path, name: str, seed: int, bob_steps: int, settings:
         raise TandemError(f"no control {name!r}; choose one of {', '.join(CONTROLS)}")
     alone = "game.alice_plays=false" in CONTROLS[name]
     steps = bob_steps if alone else round(bob_steps / BOB_SHARE)
-    named = [f"name=control-{name}", f"seed={seed}", f"run.total_env_steps={steps}"]
-    return load_config(recipe, [*named, *CONTROLS[name], *settings])
+    named = [] if name == OURS else [f"name=control-{name}"]  # ours may be the run that made the primitives of a seed
+    numbers = [f"seed={seed}", f"run.total_env_steps={steps}"]
+    return load_config(recipe, [*named, *numbers, *CONTROLS[name], *settings])
 
 
 def record_control(directory: RunDirectory, name: str, downstream: dict[str, Any]) -> Run:
