@@ -119,6 +119,11 @@ class GameConfig(FrozenModel):
         description="Bob's goals count as reached this much inside ``success_distance_m``; 0 in the paper. What he "
         "leaves just inside drifts out again after his turn, or in another world",
     )
+    bob_margin_after_updates: int = Field(
+        0,
+        ge=0,
+        description="updates of the learner before that margin counts; asked too early, it slows him (log T15)",
+    )
     bob_hold_steps: int = Field(
         1,
         ge=1,

@@ -222,7 +222,8 @@ class SelfPlay:
         turns = _empty_turns(game.bob_steps, num, BOB.size, BOB_VALUE.size, learn=choice.played & ~plan.bob_past)
         solved, diverged = np.zeros(num, dtype=bool), np.zeros(num, dtype=bool)
         num_held: IntArray = np.zeros(num, dtype=np.int64)
-        reach_m = game.success_distance_m - game.bob_margin_m
+        margin_m = game.bob_margin_m if players.version >= game.bob_margin_after_updates else 0.0
+        reach_m = game.success_distance_m - margin_m
         playing = np.flatnonzero(choice.played)
         if observe:
             observe(worlds.states)

@@ -159,6 +159,11 @@ def test_with_a_margin_bob_has_to_come_nearer():
     rollout = play_moved(3, positions, bob_margin_m=0.01)
     assert rollout.bob.reward[:, 0].tolist() == [0.0, 0.0, 0.0, 1.0, -1.0, 1.0, 0.0]
     assert rollout.records.solved[0]
+    # players of these tests are of version 3
+    now = play_moved(3, positions, bob_margin_m=0.01, bob_margin_after_updates=3)
+    later = play_moved(3, positions, bob_margin_m=0.01, bob_margin_after_updates=4)
+    assert now.bob.reward[:, 0].tolist() == [0.0, 0.0, 0.0, 1.0, -1.0, 1.0, 0.0]
+    assert later.bob.reward[:, 0].tolist() == [0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0]
 
 
 def test_a_goal_that_is_held_to_the_end_of_the_turn_is_solved_without_an_end():
