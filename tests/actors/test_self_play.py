@@ -127,11 +127,11 @@ class Mover(Constant):
 ON_GOAL, OFF_GOAL = (-0.15, 0.0, 0.025), (-0.15, 0.13, 0.025)
 
 
-def play_moved(hold_steps, positions, **settings):
+def play_moved(hold_steps, positions, *, version=0, **settings):
     """Bob's turn of a round in one world, whose goal is ``ON_GOAL`` and whose object is moved while Bob plays."""
     game = make_game(make_config(1, game={"bob_hold_steps": hold_steps, **settings}), [Start(OFF_GOAL)])
     choose = replay_in([0], game.worlds.states[0].copy(), ON_GOAL)
-    return play(game, bob=Mover(game, positions), choose_goals=choose)
+    return play(game, bob=Mover(game, positions), choose_goals=choose, version=version)
 
 
 def test_bobs_reward_is_taken_back_when_the_object_leaves_the_goal():
@@ -159,11 +159,15 @@ def test_with_a_margin_bob_has_to_come_nearer():
     rollout = play_moved(3, positions, bob_margin_m=0.01)
     assert rollout.bob.reward[:, 0].tolist() == [0.0, 0.0, 0.0, 1.0, -1.0, 1.0, 0.0]
     assert rollout.records.solved[0]
-    # players of these tests are of version 3
-    now = play_moved(3, positions, bob_margin_m=0.01, bob_margin_after_updates=3)
-    later = play_moved(3, positions, bob_margin_m=0.01, bob_margin_after_updates=4)
-    assert now.bob.reward[:, 0].tolist() == [0.0, 0.0, 0.0, 1.0, -1.0, 1.0, 0.0]
-    assert later.bob.reward[:, 0].tolist() == [0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0]
+
+
+def test_the_margin_counts_after_so_many_updates():
+    positions = [OFF_GOAL, (-0.15, 0.045, 0.025), *[ON_GOAL] * 5]  # 4.5 cm from the goal at the second step
+    paid = [
+        play_moved(3, positions, version=version, bob_margin_m=0.01, bob_margin_after_updates=4).bob.reward[:, 0]
+        for version in (3, 4)
+    ]
+    assert [int(reward.argmax()) for reward in paid] == [1, 2]
 
 
 def test_a_goal_that_is_held_to_the_end_of_the_turn_is_solved_without_an_end():
