@@ -78,7 +78,7 @@ def test_load_primitives(tmp_path, monkeypatch):
     manifest, parameters = Registry(BUNDLED).load("panda-cube@champion")
     assert bob.manifest == manifest
     assert bob.config == parse_config(manifest.config, where="the manifest", recorded=True)
-    assert bob.config.learner.bob_ema_decay == 0.97
+    assert bob.config.policy.bob.num_primitives == bob.primitives.num_primitives == 8
     rows = 0.1 * np.random.default_rng(0).standard_normal((5, 14)).astype(np.float32)
     expected = NumpyMCPPolicy(parameters)
     assert np.array_equal(bob.primitives.act_deterministic(rows), expected.act_deterministic(rows))

@@ -28,7 +28,7 @@ from service.errors import TandemError
 
 DOCUMENT = Path(__file__).parents[2] / "docs" / "downstream.md"
 CONFIG = WorldConfig(physics_step_s=0.005, num_substeps=8)
-NUM_PRIMITIVES = 4
+NUM_PRIMITIVES = 8
 
 
 @pytest.fixture(scope="module")
@@ -86,12 +86,12 @@ def test_a_residual_is_added_to_the_mean(trained):
     env = ComposePrimitives(recorder, trained, residual=0.25)
     assert env.action_space == gymnasium.spaces.Box(-1.0, 1.0, (NUM_PRIMITIVES + 4,), np.float32)
     observation, _ = env.reset(seed=0)
-    weights, added = np.float32([0.3, -0.2, 1.0, -1.0]), np.float32([1.0, -1.0, 0.5, 0.0])
+    weights, added = np.float32([0.3, -0.2, 1.0, -1.0, 0.0, 0.4, -0.6, 0.9]), np.float32([1.0, -1.0, 0.5, 0.0])
     mean, _ = trained.primitives.compose(observation["observation"], action_weights(weights))
     env.step(np.concatenate((weights, added)))
     expected = np.clip(mean + np.float32([0.25, -0.25, 0.125, 0.0]), -1.0, 1.0)
     np.testing.assert_allclose(recorder.actions[-1], expected, rtol=0, atol=1e-6)
-    with pytest.raises(TandemError, match=r"expected shape \(8,\), .* 4 primitives and 4 of the residual, got \(4,\)"):
+    with pytest.raises(TandemError, match=r"expected shape \(12,\), .* 8 primitives and 4 of the residual, got \(8,\)"):
         env.step(weights)
     env.close()
 
@@ -202,10 +202,10 @@ class TestBadInput:
     def test_a_residual_out_of_its_range(self, env, trained, residual):
         self.refused(rf"residual = {residual}: .* from 0 to 1", env.unwrapped, trained, residual=residual)
 
-    @pytest.mark.parametrize("shape", [(8,), (1, 4), ()])
+    @pytest.mark.parametrize("shape", [(4,), (1, 8), ()])
     def test_weights_for_other_primitives(self, env, shape):
         env.reset(seed=0)
-        with pytest.raises(TandemError, match=rf"expected shape \(4,\), .* got {re.escape(str(shape))}"):
+        with pytest.raises(TandemError, match=rf"expected shape \(8,\), .* got {re.escape(str(shape))}"):
             env.step(np.zeros(shape, dtype=np.float32))
 
     def test_a_step_before_the_first_reset(self, trained):
