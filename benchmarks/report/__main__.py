@@ -215,7 +215,9 @@ class Report:
         if runs:
             picture = self._show("Random skills at three stages of training", "skills", draw_skills, runs)
             blocks["coverage"] = [skills.coverage_table(runs), picture]
-            blocks["curves"] = [self._show("Skill discovery over env steps", "skills-curves", draw_skill_curves, runs)]
+        if learned := [run for run in runs if run["method"] != "ours"]:
+            picture = self._show("Skill discovery over env steps", "skills-curves", draw_skill_curves, learned)
+            blocks["curves"] = [picture]
         if controls:
             blocks["controls"] = [skills.controls_table(controls)]
         return blocks

@@ -329,9 +329,10 @@ def draw_skills(runs: Sequence[Run], path: Path) -> Path:
     """Draw random skills from above: a row for each method's first seed, a column for each stage."""
     rows = [seeds[0] for seeds in by_method(runs).values()]
     columns = (RANDOM, *STAGES)
-    figure = _tall_figure(0.8 + 3.3 * len(rows), "Where random skills take the object, seen from above")
+    height = 1.1 + 3.3 * len(rows)
+    figure = _tall_figure(height, "Where random skills take the object, seen from above")
     words = f"{rows[0]['coverage']['num_skills']} skills of {rows[0]['coverage']['num_steps']} steps"
-    figure.text(0.98, 1.0 - 0.35 / (0.8 + 3.3 * len(rows)), words, ha="right", va="center", color=FAINT)
+    figure.text(0.98, 1.0 - 0.35 / height, words, ha="right", va="center", color=FAINT)
     grid = figure.subplots(len(rows), len(columns), squeeze=False)
     for run, line in zip(rows, grid, strict=True):
         workspace = WorkspaceConfig.model_validate(run["config"]["world"]["workspace"])
@@ -344,13 +345,13 @@ def draw_skills(runs: Sequence[Run], path: Path) -> Path:
             _draw_table_cells(axes, workspace)
             axes.set(xlabel="", ylabel="")
             axes.set_title(f"{METHODS[run['method']]}, {_stage_words(name, stages[name], stages[RANDOM])}", fontsize=9)
-    figure.subplots_adjust(left=0.04, right=0.99, bottom=0.03, top=1.0 - 1.0 / (0.8 + 3.3 * len(rows)), hspace=0.35)
+    figure.subplots_adjust(left=0.04, right=0.99, bottom=0.4 / height, top=1.0 - 1.0 / height, hspace=0.35)
     return save(figure, path)
 
 
 def draw_skill_curves(runs: Sequence[Run], path: Path) -> Path:
     """Draw over env steps what random skills of every run cover, and what episodes with noise did to the object."""
-    learned = {method: seeds for method, seeds in by_method(runs).items() if method != "ours"}
+    learned = by_method(runs)
     colours = dict(zip(learned, COLORS, strict=False))
     figure = new_figure(WIDTH, 4.6, "Skill discovery over env steps, a line for each seed")
     panels = (
@@ -365,7 +366,7 @@ def draw_skill_curves(runs: Sequence[Run], path: Path) -> Path:
                 draw_curve(axes, unthin(run["series"]), key, MILLIONS, colours[method])
         axes.set_ylim(0.0, 1.0)
         axes.set_xlim(left=0.0)
-    _legend(figure, [(METHODS[method], {"color": colours[method]}) for method in learned], 0.93, len(learned) or 1)
+    _legend(figure, [(METHODS[method], {"color": colours[method]}) for method in learned], 0.93, len(learned))
     figure.subplots_adjust(left=0.05, right=0.98, top=0.78, bottom=0.13)
     return save(figure, path)
 

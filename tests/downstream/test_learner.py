@@ -31,7 +31,8 @@ def test_every_setting_reaches_the_learner(champion):
     loop = loop_of("ours", champion, make_trial(task="push", method="ours", num_env_steps=500, sac=settings))
     assert loop.worlds.num_worlds == loop.replay.num_worlds == 3
     assert loop.replay.num_steps == 167  # all 500, in whole steps of 3 worlds
-    assert [layer.out_features for layer in loop.learner.actor.layers[::2]] == [12, 7, 8]
+    num_outputs = 2 * champion.primitives.num_primitives
+    assert [layer.out_features for layer in loop.learner.actor.layers[::2]] == [12, 7, num_outputs]
     assert [layer.out_features for layer in loop.learner.critics.first[::2]] == [12, 7, 1]
     sizes = []
     make_batch = loop.make_batch
@@ -92,7 +93,8 @@ def test_without_hindsight_transitions_are_as_they_were(champion):
     state = loop.replay.state()
     batch = Hindsight(loop.worlds, 0.0)(loop.replay, 100, np.random.default_rng(0))
     goals = (state["goal"].reshape(-1, 3) - [0, 0, 0.15]) / 0.12
-    kept = np.column_stack([goals, state["reward"].reshape(-1, 1), state["action"].reshape(-1, 4)])
+    acted = state["action"].reshape(len(goals), -1)
+    kept = np.column_stack([goals, state["reward"].reshape(-1, 1), acted])
     drawn = np.column_stack([batch.inputs[:, 17:20], batch.rewards, batch.actions])
     assert (np.abs(drawn[:, None] - kept[None]).max(2).min(1) < 1e-5).all()
     loop.worlds.close()

@@ -76,15 +76,15 @@ def test_restored_worlds_go_on_bit_for_bit(champion):
         return TaskWorlds(ComposePrimitivesVector(worlds, champion), seed)
 
     first, second = composed(1), composed(2)
-    assert first.num_actions == 4
+    assert first.num_actions == champion.primitives.num_primitives
     rng = np.random.default_rng(0)
     for _ in range(LENGTH + 2):  # into the second episode
-        first.step(rng.uniform(-1.0, 1.0, (NUM, 4)).astype(np.float32))
+        first.step(rng.uniform(-1.0, 1.0, (NUM, first.num_actions)).astype(np.float32))
     second.load_state(*first.state())
     first.finished.clear()
     for _ in range(2 * LENGTH):
         np.testing.assert_array_equal(first.inputs(), second.inputs())
-        actions = rng.uniform(-1.0, 1.0, (NUM, 4)).astype(np.float32)
+        actions = rng.uniform(-1.0, 1.0, (NUM, first.num_actions)).astype(np.float32)
         one, other = first.step(actions), second.step(actions)
         for name, values in one[0].items():
             np.testing.assert_array_equal(values, other[0][name])
