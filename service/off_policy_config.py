@@ -28,6 +28,10 @@ class SACConfig(FrozenModel):
     hidden_sizes: tuple[PositiveInt, ...] = Field(
         (256, 256), min_length=1, description="actor and critics; an MCP actor has its own"
     )
+    critic_layer_norm: bool = Field(
+        True,
+        description="normalise the critics' hidden layers (Ball et al. 2023): sooner learned (docs/results, T17)",
+    )
     learning_starts: int = Field(6_400, ge=0, description="env steps of uniform actions first; more than an episode")
 
 
@@ -48,4 +52,4 @@ class SkillsConfig(FrozenModel):
     dual_initial: float = Field(30.0, gt=0.0, description="METRA: first value of the dual variable")
     dual_slack: float = Field(1e-3, gt=0.0, description="METRA: of its constraint")
     replay_steps: int = Field(1_000_000, ge=1, description="env steps that are kept to learn from")
-    sac: SACConfig = SACConfig(gradient_steps=4, gamma=0.98, learning_rate=3e-4, tau=0.005)
+    sac: SACConfig = SACConfig(gradient_steps=4, gamma=0.98, learning_rate=3e-4, tau=0.005, critic_layer_norm=False)

@@ -35,6 +35,9 @@ _Set = Annotated[
 ]
 _Steps = Annotated[int | None, typer.Option(help="Env steps of learning.", min=1)]
 _SkillSteps = Annotated[int | None, typer.Option(help="Env steps that a skill is held.", min=1)]
+_RewardMargin = Annotated[
+    float | None, typer.Option("--reward-margin-m", help="While learning, goals count as reached this much nearer.")
+]
 _Episodes = Annotated[int, typer.Option(help="Of the final evaluation.", min=1)]
 _Threads = Annotated[int | None, typer.Option(help="Cores of one training; default: all, on a cluster one.", min=1)]
 
@@ -47,6 +50,7 @@ def train(
     seed: Annotated[int, typer.Option(min=0)] = 0,
     steps: _Steps = None,
     skill_steps: _SkillSteps = None,
+    reward_margin_m: _RewardMargin = None,
     episodes: _Episodes = 300,
     run_dir: Annotated[
         Path | None, typer.Option(metavar="DIR", help="Default: runs/downstream/TASK-METHOD-SEED.")
@@ -63,7 +67,11 @@ def train(
     from service.downstream.worker import RunOptions, run_trial
 
     trial = make_trial(
-        task=task, method=method, seed=seed, num_episodes=episodes, **_learning(steps, skill_steps, overrides)
+        task=task,
+        method=method,
+        seed=seed,
+        num_episodes=episodes,
+        **_learning(steps, skill_steps, reward_margin_m, overrides),
     )
     path = run_dir or Path("runs") / "downstream" / trial.name
     with _stop_on_signals() as (callbacks, signals):
@@ -91,6 +99,7 @@ def table(
     primitives: _Primitives = CHAMPION,
     steps: _Steps = None,
     skill_steps: _SkillSteps = None,
+    reward_margin_m: _RewardMargin = None,
     episodes: _Episodes = 300,
     out: Annotated[
         Path, typer.Option(metavar="DIR", help="Page and picture; in its downstream/ one file for each trial.")
@@ -111,7 +120,7 @@ def table(
     from service.downstream.table import Source, make_table
     from service.envs.tasks import TASKS
 
-    learning = _learning(steps, skill_steps, overrides)
+    learning = _learning(steps, skill_steps, reward_margin_m, overrides)
     trials = [
         make_trial(task=task, method=method, seed=seed, num_episodes=episodes, **learning)
         for seed in _numbers(seeds)
@@ -135,7 +144,9 @@ def list_methods() -> None:
         typer.echo(f"{name:<24} {method.description}")
 
 
-def _learning(steps: int | None, skill_steps: int | None, overrides: list[str] | None) -> dict[str, Any]:
+def _learning(
+    steps: int | None, skill_steps: int | None, reward_margin_m: float | None, overrides: list[str] | None
+) -> dict[str, Any]:
     """Settings of a trial about learning, defaults where left out."""
     import yaml
 
@@ -151,7 +162,7 @@ def _learning(steps: int | None, skill_steps: int | None, overrides: list[str] |
             values[key] = yaml.safe_load(text)
         except yaml.YAMLError:
             raise TandemError(f"--set {override}: the value is no YAML") from None
-    chosen = {"num_env_steps": steps, "skill_steps": skill_steps}
+    chosen = {"num_env_steps": steps, "skill_steps": skill_steps, "reward_margin_m": reward_margin_m}
     return {"sac": validate(SACConfig, values), **{key: value for key, value in chosen.items() if value is not None}}
 
 

@@ -18,6 +18,9 @@ from service.sac.loop import OffPolicyLoop
 from service.sac.networks import GaussianActor, MCPActor
 from service.sac.replay import ReplayBuffer
 
+_RELABELLED_UNTIL = 0.5
+"""Progress from which on the share of relabelled goals is its last one (docs/results/log.md, T17)."""
+
 
 class Hindsight:
     """Makes batches in which a share of the goals are places where the object came to later in the same episode."""
@@ -72,7 +75,7 @@ def set_progress(loop: OffPolicyLoop, method: Method, progress: float) -> None:
     if method.her_ratio is not None:
         first, last = method.her_ratio
         assert isinstance(loop.make_batch, Hindsight)
-        loop.make_batch.share = first + (last - first) * progress
+        loop.make_batch.share = first + (last - first) * min(1.0, progress / _RELABELLED_UNTIL)
 
 
 @functools.cache

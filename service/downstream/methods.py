@@ -131,8 +131,8 @@ class Method:
     mcp_actor: bool = False
     """Whether the actor is a Multiplicative Compositional Policy, learned end to end; else SAC's own network."""
     her_ratio: tuple[float, float] | None = None
-    """Share of a batch whose goals are relabelled (HER, ``future``), when learning begins and when it ends, linear in
-    between; None: no HER."""
+    """Share of a batch whose goals are relabelled (HER, ``future``), when learning begins and in its second half,
+    linear in between; None: no HER."""
     player: Callable[[Trained], DeterministicPolicy] | None = None
     """Makes the policy that plays, where nothing is learned."""
     skills: SkillMethod | None = None

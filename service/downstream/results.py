@@ -90,5 +90,5 @@ def _settings(trial: TrialConfig) -> dict[str, Any]:
     method = METHODS.get(trial.method)
     without = set() if method and method.holds else {"skill_steps"}
     if method and method.player:
-        without |= {"sac", "num_env_steps", "curve_every", "curve_episodes"}
+        without |= {"sac", "num_env_steps", "curve_every", "curve_episodes", "reward_margin_m"}
     return trial.model_dump(mode="json", exclude=without)

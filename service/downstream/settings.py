@@ -8,7 +8,7 @@ from pydantic import Field, ValidationError
 
 from service.downstream.methods import find_method
 from service.envs.gym.registration import EPISODE_STEPS
-from service.envs.tasks import find_task
+from service.envs.tasks import SUCCESS_DISTANCE_M, find_task
 from service.errors import TandemError
 from service.frozen import FrozenModel
 from service.off_policy_config import SACConfig
@@ -22,7 +22,7 @@ class TrialConfig(FrozenModel):
     task: str
     method: str
     seed: int = Field(0, ge=0, le=2**32 - 1)
-    num_env_steps: int = Field(200_000, ge=1, description="of learning; 0 in the result of a method that does not")
+    num_env_steps: int = Field(300_000, ge=1, description="of learning; 0 in the result of a method that does not")
     sac: SACConfig = SACConfig()
     curve_every: int = Field(4, ge=1, description="iterations between evaluations on the way; one is 50 steps a world")
     curve_episodes: int = Field(100, ge=1)
@@ -31,6 +31,12 @@ class TrialConfig(FrozenModel):
         ge=1,
         le=EPISODE_STEPS,
         description="env steps that a skill is held; methods with primitives act anew in each",
+    )
+    reward_margin_m: float = Field(
+        0.01,
+        ge=0.0,
+        lt=SUCCESS_DISTANCE_M,
+        description="while learning the object has to be this much nearer than what counts: it seldom leaves again",
     )
     num_episodes: int = Field(300, ge=1, description="of the final evaluation; paper: 16, likely")
     task_version: int = Field(0, ge=0, description="of the task's Gymnasium name; what does not say it is of v0")

@@ -215,7 +215,7 @@ def make_worlds(trial: TrialConfig, method: Method, trained: Trained, num_thread
         trial.sac.num_worlds,
         trained.config.world,
         task=trial.task,
-        success_distance_m=SUCCESS_DISTANCE_M,
+        success_distance_m=SUCCESS_DISTANCE_M - trial.reward_margin_m,
         max_episode_steps=EPISODE_STEPS,
         num_threads=num_threads,
     )

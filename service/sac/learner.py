@@ -51,7 +51,10 @@ class SACLearner:
         self.config, self.actor, self.num_actions = config, actor, num_actions
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(seed)
-            self.critics, self._targets = (Critics(num_inputs, num_actions, config.hidden_sizes) for _ in range(2))
+            self.critics, self._targets = (
+                Critics(num_inputs, num_actions, config.hidden_sizes, layer_norm=config.critic_layer_norm)
+                for _ in range(2)
+            )
         self._targets.load_state_dict(self.critics.state_dict())
         self._targets.requires_grad_(requires_grad=False)
         self._log_alpha = torch.tensor(math.log(config.initial_entropy_coefficient), requires_grad=True)

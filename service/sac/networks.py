@@ -25,10 +25,17 @@ class Actor(Protocol):
         """Mean and log-std, (N, A) each, at (N, I) inputs."""
 
 
-def make_layers(*sizes: int) -> nn.Sequential:
-    """Linear layers between every two neighbours of ``sizes``, with ReLU between them, initialised as torch does."""
-    *hidden, output = [nn.Linear(*pair) for pair in pairwise(sizes)]
-    return nn.Sequential(*[each for layer in hidden for each in (layer, nn.ReLU(inplace=True))], output)
+def make_layers(*sizes: int, layer_norm: bool = False) -> nn.Sequential:
+    """Linear layers between every two neighbours of ``sizes``, with ReLU between them, initialised as torch does.
+
+    With ``layer_norm`` hidden layers are normalised before the ReLU.
+    """
+    layers: list[nn.Module] = []
+    *hidden, last = pairwise(sizes)
+    for num_inputs, num_outputs in hidden:
+        norm = [nn.LayerNorm(num_outputs)] if layer_norm else []
+        layers += [nn.Linear(num_inputs, num_outputs), *norm, nn.ReLU(inplace=True)]
+    return nn.Sequential(*layers, nn.Linear(*last))
 
 
 class GaussianActor(nn.Module):
@@ -47,10 +54,12 @@ class GaussianActor(nn.Module):
 class Critics(nn.Module):
     """Two networks that each say what an action is worth."""
 
-    def __init__(self, num_inputs: int, num_actions: int, hidden_sizes: Sequence[int]) -> None:
+    def __init__(
+        self, num_inputs: int, num_actions: int, hidden_sizes: Sequence[int], *, layer_norm: bool = False
+    ) -> None:
         super().__init__()
         sizes = (num_inputs + num_actions, *hidden_sizes, 1)
-        self.first, self.second = make_layers(*sizes), make_layers(*sizes)
+        self.first, self.second = (make_layers(*sizes, layer_norm=layer_norm) for _ in range(2))
 
     def forward(self, inputs: Tensor, actions: Tensor) -> Tensor:
         """(2, N) values of (N, A) actions at (N, I) inputs."""

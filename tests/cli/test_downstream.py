@@ -70,6 +70,7 @@ def test_methods_are_listed():
         (["--task", "wall", "--registry", "http://127.0.0.1:9"], "127.0.0.1:9"),
         (["--task", "wall", "--set", "gama=0.9"], "--set gama=0.9: write KEY=VALUE with KEY one of num_worlds"),
         (["--task", "wall", "--set", "gamma=2"], "gamma = 2: input should be less than 1"),
+        (["--task", "wall", "--reward-margin-m", "0.05"], "reward_margin_m = 0.05: input should be less than 0.05"),
         (["--task", "wall", "--seed", 5_000_000_000], "seed = 5000000000: input should be less than"),
         (["--task", "wall", "--steps", 200], "200 env steps are all uniform actions"),
         (["--task", "wall", "--method", "ours-her", "--set", "num_worlds=256"], "learning_starts = 6400: goals"),

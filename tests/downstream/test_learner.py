@@ -25,6 +25,7 @@ def test_every_setting_reaches_the_learner(champion):
         "tau": 0.17,
         "initial_entropy_coefficient": 0.37,
         "hidden_sizes": (12, 7),
+        "critic_layer_norm": False,
         "learning_starts": 160,
     }
     assert all(settings[name] != field.default for name, field in SACConfig.model_fields.items())
@@ -78,7 +79,7 @@ def test_relabelled_goals_are_where_the_object_came_to_later_in_the_episode(cham
     assert early.sum() > 40
     # any later step with equal chance: of 40 to 50 steps about half are before the 30th, not all are the last
     assert 0.25 < (goal_step[early] < 30).mean() < 0.75
-    paid = (np.linalg.norm(following[:, 5:8] - goal, axis=1) <= 0.05).astype(float)
+    paid = (np.linalg.norm(following[:, 5:8] - goal, axis=1) <= 0.04).astype(float)
     np.testing.assert_array_equal(batch.rewards, paid)
     assert 0.0 < paid.mean() < 1.0
     np.testing.assert_allclose(batch.inputs[:, 17:20] * 0.12 + [0, 0, 0.15], goal, atol=1e-6)
@@ -102,7 +103,7 @@ def test_without_hindsight_transitions_are_as_they_were(champion):
 
 @pytest.mark.parametrize(
     ("method", "shares"),
-    [("ours-her", (0.8, 0.4, 0.0)), ("scratch-monolithic-her", (0.8, 0.8, 0.8)), ("ours", (0,) * 3)],
+    [("ours-her", (0.8, 0.4, 0.0, 0.0)), ("scratch-monolithic-her", (0.8,) * 4), ("ours", (0,) * 4)],
 )
 def test_the_share_of_relabelled_goals(champion, method, shares):
     loop, relabelled = loop_of(method, champion), []
@@ -110,7 +111,7 @@ def test_the_share_of_relabelled_goals(champion, method, shares):
     rewards = loop.worlds.rewards
     loop.worlds.rewards = lambda following, goal: relabelled.append(len(goal)) or rewards(following, goal)
     assert loop.make_batch.share == shares[0]
-    for progress, share in zip((0.0, 0.5, 1.0), shares, strict=True):
+    for progress, share in zip((0.0, 0.25, 0.5, 1.0), shares, strict=True):
         set_progress(loop, METHODS[method], progress)
         loop.make_batch(loop.replay, 10_000, np.random.default_rng(0))
         assert (relabelled.pop() if share else 0) == pytest.approx(10_000 * share, abs=200)

@@ -48,6 +48,18 @@ def test_the_two_critics_are_two():
     assert not torch.equal(values[0], values[1])
 
 
+def test_critics_with_normalised_hidden_layers_by_hand():
+    critics = Critics(5, 3, (8, 6), layer_norm=True)
+    inputs, actions = torch.randn(4, 5), torch.randn(4, 3)
+    hidden = torch.cat((inputs, actions), 1)
+    first, norm, _, second, other_norm, _, last = critics.first
+    for layer, scale in ((first, norm), (second, other_norm)):
+        hidden = hidden @ layer.weight.T + layer.bias
+        mean, variance = hidden.mean(1, keepdim=True), hidden.var(1, keepdim=True, unbiased=False)
+        hidden = torch.relu((hidden - mean) / (variance + 1e-5).sqrt() * scale.weight + scale.bias)
+    torch.testing.assert_close(critics(inputs, actions)[0], (hidden @ last.weight.T + last.bias)[:, 0])
+
+
 def test_the_mcp_actor_is_the_product_of_its_primitives_by_hand():
     actor, inputs = actors()["mcp"], torch.randn(4, 5)
     mean, log_std = (each.detach().numpy() for each in actor(inputs))
