@@ -159,7 +159,7 @@ def _parser() -> argparse.ArgumentParser:
     add("names", metavar="NAME", nargs="+", help=", ".join(CONTROLS))
     add("--seed", type=int, default=0, help="of the run and of its trials (default: %(default)s)")
     add("--bob-steps", type=int, default=BOB_STEPS, help="Bob's env steps of each run (default: %(default)s)")
-    add("--steps", type=int, default=200_000, help="env steps of each downstream training (default: %(default)s)")
+    add("--steps", type=int, default=300_000, help="env steps of each downstream training (default: %(default)s)")
     add("--config", type=Path, metavar="FILE", default=RECIPE_FILE)
     add("--set", dest="overrides", metavar="A.B=C", action="append", default=[], help="repeatable")
     add("--run-dir", type=Path, metavar="DIR", default=Path("runs") / "controls", help="default: %(default)s")
