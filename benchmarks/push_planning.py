@@ -1,10 +1,11 @@
-"""Ceiling of *Push*: the share of goals that some sequence of compositions of frozen primitives reaches.
+"""Lower bound of what primitives can do on *Push*: the share of goals that a planned sequence of compositions reaches.
 
     python -m benchmarks.push_planning panda-cube@champion --json docs/results/push_planning.json
 
 The weights of a whole episode are searched for by the cross-entropy method (Rubinstein 1999) in the simulator itself,
-for each start and goal. A learned orchestrator, which sees positions and no simulator, can do no better; where it does
-worse, the primitives are not what limits it.
+for each start and goal, and held for several steps. Where an orchestrator, which sees positions and no simulator, does
+worse than plans, the primitives are not what limits it. The other way round says little: a search may miss what is
+there, and an orchestrator sets other weights at every step.
 """
 
 from __future__ import annotations
