@@ -32,7 +32,8 @@ from benchmarks.report.figures import (
     draw_soak,
 )
 from benchmarks.run_files import Run, read_run
-from service.downstream.results import ResultsDirectory
+from service.downstream.page import draw_table
+from service.downstream.results import Result, ResultsDirectory
 from service.downstream.table import write_results
 from service.errors import TandemError
 from service.io.files import os_errors, write_atomic
@@ -51,7 +52,7 @@ PAGES = {
     "results/pretraining.md": ("skill", "tasks", "curves", "curriculum", "coverage", "ablations", "throughput"),
     "results/cluster.md": ("targets", "throughput", "chaos", "rest", "soak"),
     "results/skills.md": ("coverage", "curves", "controls"),
-    "results/comparison.md": ("rows",),
+    "results/comparison.md": ("rows", "longer"),
     "scaling.md": ("bottleneck", "box", "nodes", "model", "batches", "skill", "constants"),
 }
 """Blocks of every page."""
@@ -145,14 +146,16 @@ class Report:
         """Write all pages and pictures."""
         found, (runs, ablations) = read_results(self._results), read_runs(self._results / "runs")
         studies = read_studies(self._results / "time_to_skill")
-        trials = ResultsDirectory(self._results / "downstream").read_all()
+        trials, longer = (
+            ResultsDirectory(self._results / name).read_all() for name in ("downstream", "downstream_longer")
+        )
         for page, names in PAGES.items():  # a page that lacks a marker is found before anything is drawn
             replace_blocks(self._docs / page, dict.fromkeys(names, ""))
         made = (
             self.pretraining_blocks(runs, ablations, found, studies),
             self.cluster_blocks(found),
             self.skills_blocks(*(read_all(self._results / name) for name in ("skills", "controls"))),
-            {"rows": [comparison.comparison_table(trials)]} if trials else {},
+            self.comparison_blocks(trials, longer),
             scaling_blocks(found, studies),
         )
         for (page, names), blocks in zip(PAGES.items(), made, strict=True):
@@ -220,6 +223,16 @@ class Report:
             blocks["curves"] = [picture]
         if controls:
             blocks["controls"] = [skills.controls_table(controls)]
+        return blocks
+
+    def comparison_blocks(self, trials: Sequence[Result], longer: Sequence[Result]) -> Blocks:
+        """Parts of the blocks that compare with the paper."""
+        blocks = {}
+        if trials:
+            blocks["rows"] = [comparison.comparison_table(trials)]
+        if longer:
+            picture = self._show("Success over more env steps", "downstream-longer", draw_table, longer)
+            blocks["longer"] = [comparison.longer_table(trials, longer), picture]
         return blocks
 
     def _show(self, words: str, name: str, draw: Callable[[Any, Path], Path], recorded: Any) -> str:

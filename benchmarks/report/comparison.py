@@ -30,6 +30,22 @@ def comparison_table(results: Sequence[Result]) -> str:
     return table(("", *(task.title for task in TASKS.values())), rows)
 
 
+def longer_table(results: Sequence[Result], longer: Sequence[Result]) -> str:
+    """Success after the env steps of the table and after those of longer trials, where there are such."""
+    tasks = [task for task in TASKS if any(each[TRIAL]["task"] == task for each in longer)]
+    rows: list[Row] = []
+    for method in METHODS:
+        pairs = [(_rates(results, method, task), _rates(longer, method, task)) for task in tasks]
+        if any(after for _, after in pairs):
+            cells = [f"{_mean(before)} → {_mean(after)} ({len(after)})" if after else "" for before, after in pairs]
+            rows.append((METHODS[method].title, *cells))
+    return table(("", *(TASKS[task].title for task in tasks)), rows)
+
+
+def _mean(seeds: Sequence[tuple[float, int]]) -> str:
+    return f"{100 * np.mean([rate for rate, _ in seeds]):.1f}" if seeds else "not run"
+
+
 def _rates(results: Sequence[Result], method: str, task: str) -> list[tuple[float, int]]:
     """Success at the last step and number of episodes of each seed."""
     trials = [each for each in results if (each[TRIAL]["method"], each[TRIAL]["task"]) == (method, task)]

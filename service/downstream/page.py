@@ -299,18 +299,19 @@ def draw_training(path: Path) -> Path:
 
 
 def draw_table(results: Sequence[Result], path: Path) -> Path:
-    """Draw success at the last step over env steps: a panel per task, a line per method, a band from least to greatest.
+    """Draw success at the last step over env steps: a panel per task that was run, a line per method.
 
-    Harder tasks have a panel where they were run.
+    Several seeds have a band from the least to the greatest.
 
     Raises:
         TandemError: the picture cannot be written.
     """
-    tasks = [*TASKS, *_harder_ones(result[TRIAL]["task"] for result in results)]
-    rows = math.ceil(len(tasks) / 3)
+    of, lines = _by_method_and_task(results), dict[str, "Line2D"]()
+    run = {task for _, task in of}
+    tasks = [name for name in (*TASKS, *HARD_TASKS) if name in run]
+    rows = max(1, math.ceil(len(tasks) / 3))
     height_inch = 1.4 + 3.3 * rows
     figure = new_figure(14.0, height_inch, "Success at the last step, over thousands of env steps")
-    of, lines = _by_method_and_task(results), dict[str, "Line2D"]()
     longest = max((each["env_steps"] for each in results), default=0) / 1e3
     styles = _line_styles()
     panels = list(figure.subplots(rows, 3).flat)

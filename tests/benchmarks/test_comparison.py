@@ -1,6 +1,6 @@
 """The page that compares with the paper, by hand."""
 
-from benchmarks.report.comparison import comparison_table
+from benchmarks.report.comparison import comparison_table, longer_table
 
 
 def trial(method, task, seed, rate):
@@ -21,3 +21,15 @@ def test_cells_by_hand():
     # none of 1,000 is up to 0.00383, 1 of 48 from 0.00369 on: in common
     assert lines[6].startswith("| ASP only | not run (94) | not run (94) | 0.0 (2, -2) |")
     assert len(lines) == 2 + 9
+
+
+def test_longer_trials_by_hand():
+    results = [trial("ours", "push", seed, rate) for seed, rate in enumerate((0.90, 0.92))]
+    results += [trial("idle", "push", 0, 0.5), trial("ours", "box", 0, 0.5)]
+    longer = [trial("ours", "push", 1, 0.97), trial("ours", "inair", 0, 1.0), trial("asp-only", "inair", 0, 0.25)]
+    lines = longer_table(results, longer).splitlines()
+    assert [lines[0], *lines[2:]] == [
+        "|  | InAir | Push |",
+        "| ours | not run → 100.0 (1) | 91.0 → 97.0 (1) |",
+        "| ASP only | not run → 25.0 (1) |  |",
+    ]

@@ -260,13 +260,14 @@ def test_harder_tasks_have_a_section_of_their_own():
 
 
 def test_pictures_of_learning_have_a_panel_for_each_task(tmp_path):
-    sizes = []
-    for name in ("push", "hard-push"):
-        picture = draw_table([result("ours", name, 0, 0.5, 0.5)], tmp_path / f"{name}.png")
+    tasks, sizes = ("larger", "inair", "push", "hard-push", "hard-box"), []
+    for num in (0, 3, 4):
+        picture = draw_table([result("ours", name, 0, 0.5, 0.5) for name in tasks[:num]], tmp_path / f"{num}.png")
         with Image.open(picture) as image:
             sizes.append(image.size)
-    assert sizes[0][0] == sizes[1][0]
-    assert sizes[1][1] > 1.3 * sizes[0][1]  # three rows of panels, not two
+    assert sizes[0] == sizes[1]
+    assert sizes[1][0] == sizes[2][0]
+    assert sizes[2][1] > 1.5 * sizes[1][1]  # two rows of panels, not one
 
 
 def test_intervals_by_hand():
