@@ -37,7 +37,7 @@ def longer_table(results: Sequence[Result], longer: Sequence[Result]) -> str:
     for method in METHODS:
         pairs = [(_rates(results, method, task), _rates(longer, method, task)) for task in tasks]
         if any(after for _, after in pairs):
-            cells = [f"{_mean(before)} → {_mean(after)} ({len(after)})" if after else "" for before, after in pairs]
+            cells = [f"{_mean(before)} to {_mean(after)} ({len(after)})" if after else "" for before, after in pairs]
             rows.append((METHODS[method].title, *cells))
     return table(("", *(TASKS[task].title for task in tasks)), rows)
 

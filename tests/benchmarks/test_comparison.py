@@ -30,6 +30,6 @@ def test_longer_trials_by_hand():
     lines = longer_table(results, longer).splitlines()
     assert [lines[0], *lines[2:]] == [
         "|  | InAir | Push |",
-        "| ours | not run → 100.0 (1) | 91.0 → 97.0 (1) |",
-        "| ASP only | not run → 25.0 (1) |  |",
+        "| ours | not run to 100.0 (1) | 91.0 to 97.0 (1) |",
+        "| ASP only | not run to 25.0 (1) |  |",
     ]
