@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks import time_to_skill
-from benchmarks.report import cluster, comparison, pretraining, scaling, skills
+from benchmarks.report import cluster, comparison, pretraining, scaling, skills, summary
 from benchmarks.report.figures import (
     draw_ablations,
     draw_chaos,
@@ -53,6 +53,8 @@ PAGES = {
     "results/cluster.md": ("targets", "throughput", "chaos", "rest", "soak"),
     "results/skills.md": ("coverage", "curves", "controls"),
     "results/comparison.md": ("rows", "longer"),
+    "downstream.md": ("headline",),
+    "../README.md": ("headline", "controls"),
     "scaling.md": ("bottleneck", "box", "nodes", "model", "batches", "skill", "constants"),
 }
 """Blocks of every page."""
@@ -149,13 +151,16 @@ class Report:
         trials, longer = (
             ResultsDirectory(self._results / name).read_all() for name in ("downstream", "downstream_longer")
         )
+        recorded_skills, controls = (read_all(self._results / name) for name in ("skills", "controls"))
         for page, names in PAGES.items():  # a page that lacks a marker is found before anything is drawn
             replace_blocks(self._docs / page, dict.fromkeys(names, ""))
         made = (
             self.pretraining_blocks(runs, ablations, found, studies),
             self.cluster_blocks(found),
-            self.skills_blocks(*(read_all(self._results / name) for name in ("skills", "controls"))),
+            self.skills_blocks(recorded_skills, controls),
             self.comparison_blocks(trials, longer),
+            summary_blocks(trials, ()),
+            summary_blocks(trials, controls),
             scaling_blocks(found, studies),
         )
         for (page, names), blocks in zip(PAGES.items(), made, strict=True):
@@ -238,6 +243,16 @@ class Report:
     def _show(self, words: str, name: str, draw: Callable[[Any, Path], Path], recorded: Any) -> str:
         self.files.append(draw(recorded, self._results / f"{name}.png"))
         return f"![{words}]({name}.png)"
+
+
+def summary_blocks(trials: Sequence[Result], controls: Sequence[Run]) -> Blocks:
+    """Parts of the blocks that say the whole in a few words."""
+    blocks = {}
+    if trials:
+        blocks["headline"] = [summary.headline_table(trials)]
+    if controls:
+        blocks["controls"] = [summary.controls_words(controls)]
+    return blocks
 
 
 def scaling_blocks(found: Results, studies: Results) -> Blocks:

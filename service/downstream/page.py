@@ -70,8 +70,8 @@ def write_page(results: Sequence[Result], picture: str) -> str:
         "t). A single seed has Wilson's over its episodes instead, marked by a star: it says how far the share may be "
         "off because episodes were few, not how far another seed would differ. Below each method, the paper's figures: "
         "they are of another world, likely a harder one "
-        "([what differs](../downstream.md#beside-the-papers-table)). Tasks and methods may have had different numbers "
-        "of env steps: they are below, and [there](../downstream.md#the-table) is why.\n",
+        "([cell by cell](comparison.md), and what differs). Tasks and methods may have had different numbers of env "
+        "steps: they are below.\n",
         *_old_versions(results),
         _table(of, _rate("success_last"), paper=True),
         "\n## Success at any step\n",

@@ -17,6 +17,7 @@ def made(tmp_path_factory):
     """A copy of the documents with all that the report writes made anew."""
     docs = tmp_path_factory.mktemp("report") / "docs"
     shutil.copytree(DOCS, docs)
+    shutil.copy(DOCS.parent / "README.md", docs.parent)
     Report(docs).write()
     return docs
 

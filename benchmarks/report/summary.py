@@ -1,0 +1,79 @@
+"""Few words about the whole: the table of systems in four rows, and what the controls of self-play say."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from benchmarks.controls import OURS
+from benchmarks.report.markdown import Row, percent, table
+from benchmarks.run_files import Run
+from service.downstream.directory import TRIAL
+from service.downstream.methods import METHODS
+from service.downstream.page import BEST
+from service.downstream.results import Result
+from service.envs.tasks import TASKS
+
+_OWN = "ours-her"
+"""The composing method of the summary."""
+_NAMES = {
+    "uniform": "goals uniform in the workspace",
+    "uniform-alice": "the same beside a playing Alice",
+    "table": "goals uniform on the table",
+    "learnable": "goals he solves half the time",
+    "learnable-alice": "the same beside a playing Alice",
+}
+
+
+def headline_table(results: Sequence[Result]) -> str:
+    """Success at the last step: composing, Bob alone, and the best method of other kinds on each task."""
+    known = {each[TRIAL]["method"] for each in results}
+    groups = {
+        "composing frozen primitives, with hindsight": [_OWN],
+        "Bob alone, no downstream step": ["asp-only"],
+        "learned from nothing": [
+            name for name, method in METHODS.items() if method.takes is None and method.player is None
+        ],
+        "other skill discovery, composed alike": [name for name, method in METHODS.items() if method.takes == "skills"],
+    }
+    rows: list[Row] = []
+    for title, names in groups.items():
+        if found := [name for name in names if name in known]:
+            words = title if len(names) == 1 else f"{title}, the best of {len(found)} on each task"
+            rows.append((words, *(_best(results, found, task) for task in TASKS)))
+    rows.append(("*the best of the paper*", *(f"*{percent(rate)}*" for rate in BEST.values())))
+    return table(("", *(task.title for task in TASKS.values())), rows)
+
+
+def controls_words(runs: Sequence[Run]) -> str:
+    """One sentence: what Bob has with Alice's goals, and with others, after as many env steps of his own."""
+    seeds = {name: [run for run in runs if run["control"] == name] for name in (OURS, *_NAMES)}
+    other = ", ".join(f"{_mixed(seeds[name])} with {words}" for name, words in _NAMES.items() if seeds[name])
+    steps = np.mean([run["bob_env_steps"] for run in seeds[OURS]]) / 1e6
+    return (
+        f"After {steps:.1f} million env steps of his own Bob solves {_mixed(seeds[OURS])} of random goals with those "
+        f"that Alice proposes, {other} (mean of {len(seeds[OURS])} seeds; [all controls](docs/results/skills.md))."
+    )
+
+
+def _best(results: Sequence[Result], methods: Sequence[str], task: str) -> str:
+    means = []
+    for method in methods:
+        rates = [
+            each["evaluation"]["success_last"]
+            for each in results
+            if (each[TRIAL]["method"], each[TRIAL]["task"]) == (method, task)
+        ]
+        means += [float(np.mean(rates))] if rates else []
+    return percent(max(means)) if means else ""
+
+
+def _mixed(runs: Sequence[Run]) -> str:
+    shares = [
+        row["success_last"]
+        for run in runs
+        for row in run["evaluations"]
+        if (row["policy"], row["goals"]) == ("bob", "mixed")
+    ]
+    return percent(float(np.mean(shares)), 1)
