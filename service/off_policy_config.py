@@ -25,6 +25,8 @@ class SACConfig(FrozenModel):
     initial_entropy_coefficient: float = Field(
         0.1, gt=0.0, description="adapted from there; SB3 starts at 1, which drowns the first rewards"
     )
+    learn_entropy_coefficient: bool = Field(True, description="towards the target entropy; or else it stays")
+    target_entropy: float = Field(-1.0, description="for each action; Haarnoja et al. 2018")
     hidden_sizes: tuple[PositiveInt, ...] = Field(
         (256, 256), min_length=1, description="actor and critics; an MCP actor has its own"
     )
@@ -48,8 +50,26 @@ class SkillsConfig(FrozenModel):
     gradient_steps: int = Field(2, ge=1, description="of that network after a step of every world")
     batch_size: int = Field(256, ge=2)
     reward_scale: float = Field(1.0, gt=0.0)
+    newest_steps: int = Field(
+        1_000_000,
+        ge=1,
+        description="env steps that the network learns from: the newest of those kept; DADS' code has 10,000",
+    )
+    variance_floor: float = Field(
+        1e-3,
+        gt=0.0,
+        description="DADS: added to the variances by which it normalises, as its code's batch normalisation does",
+    )
     num_alternatives: int = Field(100, ge=1, description="DADS: skills that each one is compared with")
     dual_initial: float = Field(30.0, gt=0.0, description="METRA: first value of the dual variable")
     dual_slack: float = Field(1e-3, gt=0.0, description="METRA: of its constraint")
     replay_steps: int = Field(1_000_000, ge=1, description="env steps that are kept to learn from")
-    sac: SACConfig = SACConfig(gradient_steps=4, gamma=0.98, learning_rate=3e-4, tau=0.005, critic_layer_norm=False)
+    sac: SACConfig = SACConfig(
+        gradient_steps=4,
+        gamma=0.98,
+        learning_rate=3e-4,
+        tau=0.005,
+        initial_entropy_coefficient=0.01,
+        target_entropy=-0.5,
+        critic_layer_norm=False,
+    )

@@ -36,17 +36,22 @@ class IntrinsicReward(ABC):
         seed: of the network's first parameters, and of what it draws.
     """
 
+    pays_jumps = True
+    """Whether it pays the way from any state to any other, not only what a step of the world can be."""
+
     def __init__(self, config: SkillsConfig, state_size: int, seed: int) -> None:
         self.config, self.state_size = config, state_size
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(seed)
-            self.network = self._make_network()
+            self.network = self._make_network().eval()
         self._random = torch.Generator().manual_seed(seed)
         self._optimizer = Adam(self._learned(), config.learning_rate, epsilon=ADAM_EPSILON)
 
     def learn(self, before: Tensor, after: Tensor, skill: Tensor) -> Metrics:
         """Make one gradient step."""
+        self.network.train()  # where spectral norms are estimated, this goes on with that
         loss = self._loss(before, after, skill)
+        self.network.eval()
         parameters = list(self._learned().values())
         for parameter, gradient in zip(parameters, torch.autograd.grad(loss, parameters), strict=True):
             parameter.grad = gradient
@@ -166,6 +171,8 @@ class DADS(IntrinsicReward):
     logarithm is clipped to +- 50.
     """
 
+    pays_jumps = False
+
     def __init__(self, config: SkillsConfig, state_size: int, seed: int) -> None:
         super().__init__(config, state_size, seed)
         self._moments = {name: torch.zeros(state_size) for name in ("before_mean", "change_mean")}
@@ -183,7 +190,7 @@ class DADS(IntrinsicReward):
 
     def _normalised(self, name: str, values: Tensor) -> Tensor:
         mean, square = self._moments[f"{name}_mean"], self._moments[f"{name}_square"]
-        return (values - mean) / (square - mean.square()).clamp(min=1e-8).sqrt()
+        return (values - mean) / (square - mean.square() + self.config.variance_floor).sqrt()
 
     def _log_prob(self, before: Tensor, change: Tensor, skill: Tensor) -> Tensor:
         """(...,) but for a constant, at normalised (..., S) states and changes and (..., Z) skills."""

@@ -24,8 +24,9 @@ from service.sac.replay import Columns, ReplayBuffer
 from service.sac.worlds import TabletopWorlds
 from service.types import Array, Arrays, BoolArray, FloatArray
 
-_COLUMNS = {"previous": POSITIONS.size, "positions": POSITIONS.size, "following": POSITIONS.size}
 _OBJECT = POSITIONS["object"]
+_STEP_COLUMNS = {"previous": POSITIONS.size, "positions": POSITIONS.size, "following": POSITIONS.size}
+_COLUMNS = {**_STEP_COLUMNS, "start": 3}
 STATE_SIZE = 3
 """Of what rewards see: the object's position."""
 
@@ -54,13 +55,14 @@ class SkillWorlds(TabletopWorlds):
 
     def step(self, actions: FloatArray) -> tuple[Columns, BoolArray]:
         """Act by (N, 4) actions; the transitions and (N,) whose episodes ended."""
-        step, skill = self.advance(actions), self.skill
+        step, skill, start = self.advance(actions), self.skill, self._start
         if step.ended.any():
             self.skill = np.where(step.ended[:, None], self._draw(), skill)
             ends = np.stack((self._start, step.following[:, _OBJECT]), axis=1)
             self.finished += list(ends[step.ended])
             self._start = np.where(step.ended[:, None], self.positions[:, _OBJECT], self._start)
-        return {**{name: getattr(step, name) for name in _COLUMNS}, "skill": skill, "action": actions}, step.ended
+        seen = {name: getattr(step, name) for name in _STEP_COLUMNS}
+        return {**seen, "start": start, "skill": skill, "action": actions}, step.ended
 
     def state(self) -> tuple[Arrays, Any]:
         """Copy everything that ``load_state`` needs."""
@@ -86,6 +88,8 @@ class Seen(NamedTuple):
     """(B, S) state that the reward sees."""
     after: FloatArray
     """(B, S)"""
+    stepped: BoolArray
+    """(B,) whether the world came from one to the other in a step."""
     inputs: FloatArray
     """(B, I) of the actor."""
     next_inputs: FloatArray
@@ -108,12 +112,14 @@ class IntrinsicBatches:
 
     def __call__(self, replay: ReplayBuffer, size: int, rng: np.random.Generator) -> Batch:
         """Draw ``size`` transitions."""
+        newest = max(1, self._config.newest_steps // replay.num_worlds)
         for _ in range(self._config.gradient_steps):
-            rows = replay.read(replay.draw(self._config.batch_size, rng))
-            self.losses.append(self.reward.learn(*_tensors(self._see(rows), rows["skill"]))["representation_loss"])
+            rows = replay.read(replay.draw(self._config.batch_size, rng, newest=newest))
+            steps = _tensors(self._see(rows), rows["skill"], jumps=False)
+            self.losses.append(self.reward.learn(*steps)["representation_loss"])
         rows = replay.read(replay.draw(size, rng))
         seen = self._see(rows)
-        paid: FloatArray = self.reward.rewards(*_tensors(seen, rows["skill"])).numpy()
+        paid: FloatArray = self.reward.rewards(*_tensors(seen, rows["skill"], jumps=self.reward.pays_jumps)).numpy()
         return Batch(seen.inputs, rows["action"], np.float32(self._config.reward_scale) * paid, seen.next_inputs)
 
 
@@ -148,14 +154,22 @@ def make_skill_loop(config: Config) -> OffPolicyLoop:
 def see_object(rows: Columns, workspace: WorkspaceConfig) -> Seen:
     """The object's position for the reward; for the actor positions, movements and the skill.
 
-    Outside the workspace the reward sees the nearest place inside: a cube that was pushed off the table falls for ever,
-    which would be the longest way of all.
+    An object outside the workspace is seen where it was when the episode began: to lose it gives back what moving it
+    has earned. Else the longest way of all would be that of a cube pushed off the table, which falls for ever.
     """
-    previous, positions, following, skill = (rows[name] for name in (*_COLUMNS, "skill"))
-    places = (np.clip(each[:, _OBJECT], workspace.lower_m, workspace.upper_m) for each in (positions, following))
-    before, after = map(normalised_place, places)
-    return Seen(before, after, skill_inputs(previous, positions, skill), skill_inputs(positions, following, skill))
+    previous, positions, following, start, skill = (rows[name] for name in (*_COLUMNS, "skill"))
+    lower, upper = np.array(workspace.lower_m), np.array(workspace.upper_m)
+    seen: list[FloatArray] = []
+    stepped: BoolArray = np.ones(len(start), dtype=np.bool_)
+    for place in (positions[:, _OBJECT], following[:, _OBJECT]):
+        inside: BoolArray = np.all((place >= lower) & (place <= upper), axis=1)
+        seen.append(normalised_place(np.where(inside[:, None], place, start)))
+        stepped &= inside
+    inputs = skill_inputs(previous, positions, skill), skill_inputs(positions, following, skill)
+    return Seen(seen[0], seen[1], stepped, *inputs)
 
 
-def _tensors(seen: Seen, skill: FloatArray) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    return torch.from_numpy(seen.before), torch.from_numpy(seen.after), torch.from_numpy(skill)
+def _tensors(seen: Seen, skill: FloatArray, *, jumps: bool) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """States before and after, and skills; without ``jumps``, what came from one to the other in no step stays."""
+    after = seen.after if jumps else np.where(seen.stepped[:, None], seen.after, seen.before)
+    return torch.from_numpy(seen.before), torch.from_numpy(after), torch.from_numpy(skill)

@@ -117,16 +117,16 @@ class SkillRun(Runner):
         start, end = np.stack(self._worlds.finished).astype(np.float64).swapaxes(0, 1)
         self._worlds.finished.clear()
         distance = np.linalg.norm(end - start, axis=1)
-        moved = distance > self.config.game.success_distance_m
         lower, upper = self._cells.bounds_m
         inside = ((end >= lower) & (end <= upper)).all(axis=1)
-        self._visits += self._cells.count(end[moved & inside])
-        lifted = in_air(end, self.config.world.object_size_m / 2)
+        moved = inside & (distance > self.config.game.success_distance_m)
+        self._visits += self._cells.count(end[moved])
+        lifted = inside & in_air(end, self.config.world.object_size_m / 2)
         return {
             "skills/moved_fraction": float(moved.mean()),
             "skills/outside_fraction": float((~inside).mean()),
             "skills/lifted_fraction": float(lifted.mean()),
-            "skills/distance_m": float(distance.mean()),
+            "skills/distance_m": float(distance[inside].mean()) if inside.any() else 0.0,
             "skills/num_cells_seen": float(np.count_nonzero(self._visits)),
         }
 

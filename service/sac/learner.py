@@ -1,6 +1,6 @@
 """Soft actor-critic: an actor, two critics and an entropy coefficient, learned from batches of transitions.
 
-Haarnoja et al. 2018 (arXiv 1812.05905), with the target entropy -A. No episode ends but by time, so every target looks
+Haarnoja et al. 2018 (arXiv 1812.05905). No episode ends but by time, so every target looks
 beyond its transition. The actor that is evaluated and exported is an average of those of the last iterations, as Bob's.
 """
 
@@ -140,7 +140,9 @@ class SACLearner:
         actor_loss = (alpha * log_prob - self.critics(inputs, new_actions).amin(0)).mean()
         self._descend("actor", actor_loss)
         entropy = -log_prob.detach().mean()
-        self._descend("alpha", self._log_alpha * (entropy + self.num_actions))
+        if self.config.learn_entropy_coefficient:
+            target_entropy = self.config.target_entropy * self.num_actions
+            self._descend("alpha", self._log_alpha * (entropy - target_entropy))
         with torch.no_grad():
             for own, critic in zip(self._targets.parameters(), self.critics.parameters(), strict=True):
                 own.lerp_(critic, self.config.tau)

@@ -67,9 +67,10 @@ class ReplayBuffer:
             self._began[world] = self.num_added + 1
         self.num_added += 1
 
-    def draw(self, size: int, rng: np.random.Generator) -> Places:
-        """Draw ``size`` transitions, all alike, with replacement."""
-        flat = rng.integers(self.oldest * self.num_worlds, self.num_added * self.num_worlds, size)
+    def draw(self, size: int, rng: np.random.Generator, *, newest: int | None = None) -> Places:
+        """Draw ``size`` transitions, all alike, with replacement; of the newest steps of every world, or of all."""
+        oldest = self.oldest if newest is None else max(self.oldest, self.num_added - newest)
+        flat = rng.integers(oldest * self.num_worlds, self.num_added * self.num_worlds, size)
         return Places(*np.divmod(flat, self.num_worlds))
 
     def draw_later(self, places: Places, rng: np.random.Generator) -> Places:

@@ -47,14 +47,14 @@ def test_diayn_by_hand():
 
 
 def test_dads_by_hand():
-    reward = make("dads", num_alternatives=7)
+    reward = make("dads", num_alternatives=7, variance_floor=0.04)
     rng = np.random.default_rng(0)
     states = torch.from_numpy(rng.standard_normal((6, 3), dtype=np.float32))
     reward.learn(states, states + 0.1, torch.zeros(6, 2))
     before_mean = 0.01 * states.numpy().mean(0)
-    before_std = np.sqrt(0.99 + 0.01 * (states.numpy() ** 2).mean(0) - before_mean**2)
+    before_std = np.sqrt(0.99 + 0.01 * (states.numpy() ** 2).mean(0) - before_mean**2 + 0.04)
     change_mean = 0.01 * 0.1
-    change_std = math.sqrt(0.99 + 0.01 * 0.1**2 - change_mean**2)
+    change_std = math.sqrt(0.99 + 0.01 * 0.1**2 - change_mean**2 + 0.04)
     state = (BEFORE.numpy() - before_mean) / before_std
     change = ((AFTER - BEFORE).numpy() - change_mean) / change_std
     others = torch.rand((7, 2), generator=torch.Generator().manual_seed(0)).numpy() * 2 - 1
@@ -133,6 +133,9 @@ def test_it_continues_bit_for_bit_where_it_was_saved(method):
     first.learn(BEFORE, AFTER, SKILL)
     first.rewards(BEFORE, AFTER, SKILL)
     second.load_state(first.state())
+    exported = first.exported()  # as a checkpoint's skills are, after its state
+    assert all(np.array_equal(array, second.exported()[name]) for name, array in exported.items())
+    first.exported()
     for reward in (first, second):
         reward.learn(AFTER, BEFORE, SKILL)
     np.testing.assert_array_equal(*(reward.rewards(BEFORE, AFTER, SKILL) for reward in (first, second)))

@@ -5,7 +5,7 @@ import pytest
 
 from service.baselines.frozen import draw_skills
 from service.baselines.rewards import METHODS, make_reward
-from service.baselines.skills import IntrinsicBatches, Seen, make_skill_loop
+from service.baselines.skills import IntrinsicBatches, Seen, make_skill_loop, see_object
 from service.config import parse_config
 from service.off_policy_config import SACConfig, SkillsConfig
 from service.sac.learner import SACLearner
@@ -42,7 +42,7 @@ class PointMasses:
 
 def see(rows):
     ends = rows["before"], rows["after"]
-    return Seen(*ends, *(np.concatenate((at, rows["skill"]), axis=1) for at in ends))
+    return Seen(*ends, np.ones(len(ends[0]), bool), *(np.concatenate((at, rows["skill"]), axis=1) for at in ends))
 
 
 def where_skills_lead(loop, skills):
@@ -82,6 +82,51 @@ def test_skills_of_a_point_mass_differ(method):
     explained = 1.0 - left.var(axis=0) / ends.var(axis=0)
     assert explained.min() > 0.5
     assert abs(np.linalg.det(fit[:2])) > 0.05
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_losing_the_object_gives_back_what_moving_it_has_earned(method):
+    """It is seen where the episode began. The network learns from steps alone, and so is DADS paid."""
+    config = small_config(method=method).skills
+    reward = make_reward(config, 3, seed=0)
+    start, edge, gone = (0.0, 0.05, 0.025), (0.12, 0.05, 0.025), (0.3, 0.05, -2.0)
+    places = np.float32([start, edge, gone, gone])  # after each of three steps
+    rows = {name: np.zeros((3, 11), np.float32) for name in ("previous", "positions", "following")}
+    rows["positions"][:, 5:8], rows["following"][:, 5:8] = places[:-1], places[1:]
+    rows |= {"start": np.tile(places[0], (3, 1)), "skill": np.ones((3, 4), np.float32), "action": np.zeros((3, 4))}
+    workspace = parse_config({}, where="a test").world.workspace
+    seen = see_object(rows, workspace)
+    at = [(np.float32(place) - [0, 0, 0.15]) / 0.12 for place in (start, edge)]
+    np.testing.assert_allclose(seen.before, [at[0], at[1], at[0]], atol=1e-5)
+    np.testing.assert_allclose(seen.after, [at[1], at[0], at[0]], atol=1e-5)
+    np.testing.assert_array_equal(seen.stepped, [True, False, False])
+    learned, paid = [], []
+    reward.learn = lambda *tensors: learned.append(tensors) or {"representation_loss": 0.0}
+    pay = reward.rewards
+    reward.rewards = lambda *tensors: paid.append(tensors) or pay(*tensors)
+    batches = IntrinsicBatches(reward, config, lambda rows: see_object(rows, workspace))
+    replay = ReplayBuffer(1, 3, {name: values.shape[1] for name, values in rows.items()})
+    replay.add({name: values.astype(np.float32) for name, values in rows.items()}, np.zeros(3, bool))
+    batch = batches(replay, 200, np.random.default_rng(0))
+    for before, after, _ in learned:  # nothing jumps
+        assert {0.0, 1.0} == set(np.round(abs(after - before).numpy().max(axis=1), 4).tolist())
+        assert (before[(after != before).any(1)][:, 0] == 0.0).all()
+    way = np.round((paid[0][1] - paid[0][0]).numpy()[:, 0], 4)
+    assert set(way.tolist()) == ({0.0, 1.0} if method == "dads" else {0.0, 1.0, -1.0})
+    if method in ("lsd", "metra"):
+        earned, lost = (batch.rewards[way == sign][0] for sign in (1.0, -1.0))
+        assert earned == pytest.approx(-lost)
+        assert earned != 0.0
+
+
+def test_the_network_may_learn_from_the_newest_steps_alone():
+    replay = ReplayBuffer(10, 2, {"number": 1})
+    for number in range(25):
+        replay.add({"number": np.full((2, 1), number, np.float32)}, np.zeros(2, bool))
+    rng = np.random.default_rng(0)
+    assert set(replay.read(replay.draw(400, rng, newest=3))["number"].ravel()) == {22.0, 23.0, 24.0}
+    assert set(replay.read(replay.draw(400, rng, newest=99))["number"].ravel()) == set(range(15, 25))
+    assert set(replay.read(replay.draw(400, rng))["number"].ravel()) == set(range(15, 25))
 
 
 def small_config(**skills):
@@ -135,11 +180,10 @@ def test_rewards_are_scaled_and_see_the_object_alone():
     rows = loop.replay.read(loop.replay.draw(64, rng))
     moved = np.abs(rows["following"] - rows["positions"])[:, 5:8].max(1) > 1e-5
     assert 0.0 < moved.mean() < 1.0
-    rows["positions"][0, 5:8], rows["following"][0, 5:8] = (0.1, 0.1, 0.02), (0.9, 0.1, -3.0)  # off the table
     seen = loop.make_batch._see(rows)
     assert seen.before.shape == (64, 3)
+    assert seen.stepped.all()
     np.testing.assert_allclose(seen.before, (rows["positions"][:, 5:8] - [0, 0, 0.15]) / 0.12, atol=1e-5)
-    np.testing.assert_array_equal(np.abs(seen.before - seen.after).max(1)[1:] > 1e-5 / 0.12, moved[1:])
-    np.testing.assert_allclose(seen.after[0], (np.array([0.125, 0.1, 0.0]) - [0, 0, 0.15]) / 0.12, atol=1e-5)
+    np.testing.assert_array_equal(np.abs(seen.before - seen.after).max(1) > 1e-5 / 0.12, moved)
     for each in (loop, plain):
         each.worlds.close()
