@@ -37,6 +37,20 @@ class SACConfig(FrozenModel):
     learning_starts: int = Field(6_400, ge=0, description="env steps of uniform actions first; more than an episode")
 
 
+class SkillsSACConfig(SACConfig):
+    """Soft actor-critic of skill discovery. A class of its own, so that what is not given is as here, not as above."""
+
+    gradient_steps: int = Field(
+        4, ge=1, description="updates after a step of every world; METRA's Ant has half as many"
+    )
+    learning_rate: float = Field(3e-4, gt=0.0)
+    gamma: float = Field(0.98, gt=0.0, lt=1.0)
+    tau: float = Field(0.005, gt=0.0, le=1.0)
+    initial_entropy_coefficient: float = Field(0.01, gt=0.0, description="LSD's and METRA's code")
+    target_entropy: float = Field(-0.5, description="for each action; METRA's code")
+    critic_layer_norm: bool = Field(False, description="none has it")
+
+
 class SkillsConfig(FrozenModel):
     """Skill discovery: a policy that a skill vector z steers, learned from an intrinsic reward alone."""
 
@@ -64,12 +78,4 @@ class SkillsConfig(FrozenModel):
     dual_initial: float = Field(30.0, gt=0.0, description="METRA: first value of the dual variable")
     dual_slack: float = Field(1e-3, gt=0.0, description="METRA: of its constraint")
     replay_steps: int = Field(1_000_000, ge=1, description="env steps that are kept to learn from")
-    sac: SACConfig = SACConfig(
-        gradient_steps=4,
-        gamma=0.98,
-        learning_rate=3e-4,
-        tau=0.005,
-        initial_entropy_coefficient=0.01,
-        target_entropy=-0.5,
-        critic_layer_norm=False,
-    )
+    sac: SkillsSACConfig = SkillsSACConfig()

@@ -187,3 +187,10 @@ def test_rewards_are_scaled_and_see_the_object_alone():
     np.testing.assert_array_equal(np.abs(seen.before - seen.after).max(1) > 1e-5 / 0.12, moved)
     for each in (loop, plain):
         each.worlds.close()
+
+
+def test_a_setting_of_the_learner_leaves_the_others_as_skill_discovery_has_them():
+    sac = parse_config({"skills": {"sac": {"num_worlds": 4}}}, where="a test").skills.sac
+    assert sac == SkillsConfig().sac.model_copy(update={"num_worlds": 4})
+    assert sac.gamma == 0.98
+    assert not sac.critic_layer_norm
