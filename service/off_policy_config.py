@@ -41,7 +41,7 @@ class SkillsSACConfig(SACConfig):
     """Soft actor-critic of skill discovery. A class of its own, so that what is not given is as here, not as above."""
 
     gradient_steps: int = Field(
-        4, ge=1, description="updates after a step of every world; METRA's Ant has half as many"
+        4, ge=1, description="updates after a step of every world: 1 for 16 env steps; METRA: 1 for 4 to 32"
     )
     learning_rate: float = Field(3e-4, gt=0.0)
     gamma: float = Field(0.98, gt=0.0, lt=1.0)

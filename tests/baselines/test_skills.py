@@ -7,7 +7,7 @@ from service.baselines.frozen import draw_skills
 from service.baselines.rewards import METHODS, make_reward
 from service.baselines.skills import IntrinsicBatches, Seen, make_skill_loop, see_object
 from service.config import parse_config
-from service.off_policy_config import SACConfig, SkillsConfig
+from service.off_policy_config import SkillsConfig, SkillsSACConfig
 from service.sac.learner import SACLearner
 from service.sac.loop import OffPolicyLoop
 from service.sac.networks import GaussianActor
@@ -60,7 +60,7 @@ def where_skills_lead(loop, skills):
 @pytest.mark.parametrize("method", METHODS)
 def test_skills_of_a_point_mass_differ(method):
     """A skill leads somewhere else than others do: its end tells which of the skills it was."""
-    sac = SACConfig(
+    sac = SkillsSACConfig(
         num_worlds=NUM, gradient_steps=4, batch_size=128, hidden_sizes=(64, 64), learning_rate=1e-3, gamma=0.9,
         tau=0.02, learning_starts=640,
     )  # fmt: skip
