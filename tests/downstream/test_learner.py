@@ -24,6 +24,8 @@ def test_every_setting_reaches_the_learner(champion):
         "gamma": 0.83,
         "tau": 0.17,
         "initial_entropy_coefficient": 0.37,
+        "learn_entropy_coefficient": False,
+        "target_entropy": -0.7,
         "hidden_sizes": (12, 7),
         "critic_layer_norm": False,
         "learning_starts": 160,
@@ -117,3 +119,18 @@ def test_the_share_of_relabelled_goals(champion, method, shares):
         assert (relabelled.pop() if share else 0) == pytest.approx(10_000 * share, abs=200)
         assert not relabelled
     loop.worlds.close()
+
+
+@pytest.mark.parametrize(("settings", "sign"), [({"target_entropy": -9.0}, -1), ({"target_entropy": 9.0}, 1)])
+def test_the_entropy_coefficient_goes_where_the_target_entropy_is(champion, settings, sign):
+    """An actor that is more random than the target gets a smaller coefficient, and the other way round."""
+    sac = {"num_worlds": 4, "gradient_steps": 8, "batch_size": 16, "learning_starts": 40, "learning_rate": 1e-2}
+    found = []
+    for changed in (settings, {**settings, "learn_entropy_coefficient": False}):
+        loop = loop_of("ours", champion, make_trial(task="push", method="ours", num_env_steps=500, sac=sac | changed))
+        loop.play(60)
+        found.append(loop.play(40)["entropy_coefficient"])
+        loop.worlds.close()
+    learned, fixed = found
+    assert fixed == pytest.approx(SACConfig().initial_entropy_coefficient)
+    assert sign * (learned - fixed) > 0.01
