@@ -133,6 +133,10 @@ def pretrain(
         _pretrain(resolved, run_dir, registry, resume=resume, publish=publish, cluster=options)
 
 
+_METHOD_SETTINGS = {"dads": ("skills.hidden_sizes=[64,64]", "skills.newest_steps=50000")}
+"""DADS compares each transition with 100 skills, so its network is small; it learns from its newest steps (T19)."""
+
+
 def _method_overrides(method: str | None) -> list[str]:
     """Overrides that make a run one of a skill-discovery baseline, under a name of its own."""
     if method is None:
@@ -143,7 +147,7 @@ def _method_overrides(method: str | None) -> list[str]:
 
     if method not in get_args(SkillMethod):
         raise TandemError(f"--method {method!r}: choose one of {', '.join(get_args(SkillMethod))}; without, self-play")
-    return [f"skills.method={method}", f"name=panda-cube-{method}"]
+    return [f"skills.method={method}", f"name=panda-cube-{method}", *_METHOD_SETTINGS.get(method, ())]
 
 
 def demo(

@@ -476,15 +476,19 @@ def test_a_mistake_in_a_real_process_is_one_line():
 
 
 def test_a_method_makes_a_run_of_skills_under_its_own_name(monkeypatch, tmp_path):
-    seen = []
+    seen, sizes = [], []
 
     def pretrain(config, directory, registry, **kwargs):
         seen.append((config.skills.method, config.name, config.seed, directory.path.name))
+        sizes.append(config.skills.hidden_sizes)
         raise TandemError("not today")
 
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("service.runtime.pretrain.pretrain", pretrain)
     tandem("pretrain", "--method", "dads", "--set", "seed=3")
     assert seen == [("dads", "panda-cube-dads", 3, "panda-cube-dads")]
+    tandem("pretrain", "--method", "lsd")
+    tandem("pretrain", "--method", "dads", "--set", "skills.hidden_sizes=[32]")
+    assert sizes == [(64, 64), (256, 256), (32,)]
     assert_user_error(tandem("pretrain", "--method", "ppo"), "--method 'ppo'", "lsd, diayn, dads, metra")
     assert_user_error(tandem("pretrain", "--method", "lsd", "--seeds", "0,1"), "--method with --seeds")
