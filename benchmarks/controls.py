@@ -110,7 +110,9 @@ def run_control(config: Config, name: str, given: argparse.Namespace) -> Run:
         raise TandemError(
             f"{directory.path} holds a run of another configuration; remove it, or name another --run-dir"
         )
-    pretrain(config, directory, directory.path, resume=resume, publish=False, on_iteration=_show)
+    done = pretrain(config, directory, directory.path, resume=resume, publish=False, on_iteration=_show)
+    if done.result.reason == "interrupted":  # what it learned so far is no result
+        raise TandemError(f"stopped at {done.result.num_env_steps:,} env steps; the same command goes on from there")
     bob = load_bob(str(directory.path), directory.path)
     found = {}
     for task in TASKS:
