@@ -1,0 +1,258 @@
+"""Run every learning experiment of ``docs/results`` that has no file there, several at once.
+
+    python -m benchmarks.reproduce --list
+    python -m benchmarks.reproduce --parallel 2
+
+That is the table of downstream tasks, the controls of self-play and skill discovery: some forty hours on two cores. Each
+is one or more of the commands that anybody can type, and this prints them. What was stopped goes on from its run
+directory. Pictures and pages are made from the files afterwards, by ``python -m benchmarks.report``.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from benchmarks.controls import CONTROLS
+from benchmarks.measuring import RECIPE_FILE, ROOT
+from service.envs.tasks import TASKS
+
+PRIMITIVES = {0: "panda-cube@seed-0", 1: "panda-cube@seed-2", 2: "panda-cube@seed-3"}
+"""Versions in ``docs/results/primitives`` by the seed of the trials that take them: each has its own pre-training."""
+SKILL_METHODS = ("lsd", "metra", "dads", "diayn")
+SKILL_ENV_STEPS = 4_000_000
+SKILL_HOLD_STEPS = 1
+"""Env steps that an orchestrator holds a skill; 1, 5 and 25 were compared (log, T20)."""
+CONTROL_SEEDS = (0, 2)
+LONGER_ENV_STEPS = 1_000_000
+NUM_EPISODES = 1_000
+Command = tuple[str, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Places:
+    """Directories that experiments read and write."""
+
+    out: Path
+    """Recorded files; the registry of primitives and skills is in its ``primitives``."""
+    runs: Path
+    """Run directories."""
+
+
+@dataclass(frozen=True, slots=True)
+class Experiment:
+    """Commands that make one recorded file."""
+
+    name: str
+    file: Path
+    """It has been run if this is there."""
+    commands: Callable[[], Sequence[Command]]
+    """What to run, in this order, which may depend on what is there already."""
+    needs: Path | None = None
+    """It can be run if this is there."""
+
+
+def experiments(places: Places) -> Iterator[Experiment]:
+    """Everything, the most important first."""
+    tasks = tuple(TASKS)
+    for seed in PRIMITIVES:
+        for method in ("ours-her", "ours", "ours-residual-her"):
+            yield from (_trial(places, task, method, seed) for task in tasks)
+        yield from (_trial(places, task, method, seed) for method in ("asp-only", "idle") for task in tasks)
+    yield from (_control(places, name, CONTROL_SEEDS[0]) for name in CONTROLS)
+    yield from _from_nothing(places, 0)
+    yield from _skills(places, 0)
+    yield from (_trial(places, task, f"scratch-{net}-her", 1) for net in ("monolithic", "mcp") for task in tasks)
+    yield from (_control(places, name, CONTROL_SEEDS[1]) for name in CONTROLS)
+    yield from _skills(places, 1)
+    yield from (_trial(places, task, f"scratch-{net}-her", 2) for net in ("monolithic", "mcp") for task in tasks)
+    yield from _skills(places, 2)
+    for seed in (0, 1):
+        for method in ("ours-her", "ours", "scratch-monolithic-her", "scratch-monolithic"):
+            yield _trial(places, "hard-push", method, seed)
+    for task in ("push", "inair", "sphere"):
+        yield from (_longer(places, task, f"scratch-{net}-her") for net in ("monolithic", "mcp"))
+    yield from (_longer(places, "push", method) for method in ("ours-her", "ours-residual-her"))
+
+
+def _from_nothing(places: Places, seed: int) -> Iterator[Experiment]:
+    for network in ("monolithic", "mcp"):
+        for method in (f"scratch-{network}-her", f"scratch-{network}"):
+            yield from (_trial(places, task, method, seed) for task in TASKS)
+
+
+def _trial(places: Places, task: str, method: str, seed: int) -> Experiment:
+    return _table(places, places.out, task, method, seed, PRIMITIVES[seed])
+
+
+def _longer(places: Places, task: str, method: str) -> Experiment:
+    extra = ("--steps", str(LONGER_ENV_STEPS))
+    return _table(places, places.out / "downstream_longer", task, method, 0, PRIMITIVES[0], extra)
+
+
+def _table(
+    places: Places, out: Path, task: str, method: str, seed: int, reference: str, extra: Command = ()
+) -> Experiment:
+    """A trial by ``tandem downstream table``, which gives it its name."""
+    name = f"{task}-{method}-{seed}"
+    command = _tandem(
+        *("downstream", "table", "--tasks", task, "--methods", method, "--seeds", str(seed)),
+        *("--primitives", reference, "--registry", str(places.out / "primitives")),
+        *("--episodes", str(NUM_EPISODES), "--threads", "1", "--out", str(out), "--runs", str(places.runs / out.name)),
+        *extra,
+    )
+    versions = places.out / "primitives" / "models" / reference.partition("@")[0]
+    return Experiment(f"{out.name}/{name}", out / "downstream" / f"{name}.json", lambda: [command], versions)
+
+
+def _control(places: Places, name: str, seed: int) -> Experiment:
+    out = places.out / "controls"
+    command = _python(
+        *("-m", "benchmarks.controls", name, "--seed", str(seed)),
+        *("--run-dir", str(places.runs / "controls"), "--out", str(out), "--set", "run.num_threads=1"),
+    )
+    return Experiment(f"controls/{name}-{seed}", out / f"{name}-{seed}.json", lambda: [command])
+
+
+def _skills(places: Places, seed: int) -> Iterator[Experiment]:
+    """Skill discovery, and what is learned downstream with the skills."""
+    for method in SKILL_METHODS:
+        yield _discover(places, method, seed)
+    for method in SKILL_METHODS:
+        rows = (method, f"{method}-zero-shot") if method in ("lsd", "metra") else (method,)
+        hold = ("--skill-steps", str(SKILL_HOLD_STEPS))
+        for row in rows:
+            for task in TASKS:
+                yield _table(places, places.out, task, row, seed, f"{_skills_name(method, seed)}@1", hold)
+
+
+def _skills_name(method: str, seed: int) -> str:
+    return f"panda-cube-{method}-{seed}"
+
+
+def _discover(places: Places, method: str, seed: int) -> Experiment:
+    run, file = places.runs / f"{method}-{seed}", places.out / "skills" / f"{method}-{seed}.json"
+    train = _tandem(
+        *("pretrain", "--method", method, "--config", str(RECIPE_FILE), "--run-dir", str(run)),
+        *("--registry", str(places.out / "primitives"), "--set", f"name={_skills_name(method, seed)}"),
+        *("--set", f"seed={seed}", "--set", f"run.total_env_steps={SKILL_ENV_STEPS}", "--set", "run.num_threads=1"),
+    )
+    record = _python("-m", "benchmarks.record_skills", str(run), "--out", str(file))
+
+    def commands() -> Sequence[Command]:
+        return [(*train, "--resume") if run.exists() else train, record]
+
+    return Experiment(f"skills/{method}-{seed}", file, commands)
+
+
+def _python(*arguments: str) -> Command:
+    return (sys.executable, *arguments)
+
+
+def _tandem(*arguments: str) -> Command:
+    return _python("-m", "service", *arguments)
+
+
+class Schedule:
+    """Experiments that several threads take from, the first that can be run."""
+
+    def __init__(self, waiting: Sequence[Experiment]) -> None:
+        self._waiting, self._running = list(waiting), 0
+        self._changed = threading.Condition()
+        self.failed = list[str]()
+
+    def take(self) -> Experiment | None:
+        """Take the next one away, waiting for what it needs; None where nothing is left that can ever be run."""
+        with self._changed:
+            while True:
+                for experiment in self._waiting:
+                    if experiment.needs is None or experiment.needs.exists():
+                        self._waiting.remove(experiment)
+                        self._running += 1
+                        return experiment
+                if not self._running:
+                    self.failed += [each.name for each in self._waiting]
+                    self._waiting.clear()
+                    return None
+                self._changed.wait()
+
+    def give_back(self, experiment: Experiment) -> None:
+        """Say that one that was taken has ended; what has not made its file has failed."""
+        with self._changed:
+            self._running -= 1
+            if not experiment.file.exists():
+                self.failed.append(experiment.name)
+            self._changed.notify_all()
+
+
+def run_all(waiting: Sequence[Experiment], parallel: int, logs: Path) -> list[str]:
+    """Run experiments, ``parallel`` at once, each with one thread and its output in a file of ``logs``.
+
+    Returns:
+        Names of those that failed, or that needed what failed.
+    """
+    schedule = Schedule(waiting)
+    logs.mkdir(parents=True, exist_ok=True)
+    threads = [threading.Thread(target=_work, args=(schedule, logs)) for _ in range(parallel)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    return schedule.failed
+
+
+def _work(schedule: Schedule, logs: Path) -> None:
+    while (experiment := schedule.take()) is not None:
+        started = time.monotonic()
+        print(f"{experiment.name} ...", flush=True)
+        try:
+            with (logs / f"{experiment.name.replace('/', '-')}.log").open("ab") as log:
+                code = _run(experiment.commands(), log.fileno())
+        finally:
+            schedule.give_back(experiment)
+        print(f"{experiment.name}: exit code {code}, {(time.monotonic() - started) / 60:.1f} min", flush=True)
+
+
+def _run(commands: Sequence[Command], log: int) -> int:
+    environment = os.environ | {"OMP_NUM_THREADS": "1"}
+    for command in commands:
+        code = subprocess.run(command, cwd=ROOT, env=environment, stdout=log, stderr=log, check=False).returncode
+        if code:
+            return code
+    return 0
+
+
+def main() -> int:
+    """Parse the command line, run what is missing."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    results = ROOT / "docs" / "results"
+    parser.add_argument("--out", type=Path, metavar="DIR", default=results, help="for the recorded files")
+    parser.add_argument("--runs", type=Path, metavar="DIR", default=Path("runs") / "reproduce", help="run directories")
+    parser.add_argument("--parallel", type=int, metavar="N", default=1, help="at once (default: %(default)s)")
+    parser.add_argument("--list", action="store_true", help="print what is missing, and stop")
+    given = parser.parse_args()
+    places = Places(given.out.absolute(), given.runs.absolute())
+    everything = list(experiments(places))
+    missing = [each for each in everything if not each.file.exists()]
+    print(f"{len(everything) - len(missing)} of {len(everything)} are there, {len(missing)} to run")
+    if given.list:
+        for experiment in missing:
+            print(experiment.name)
+            for command in experiment.commands():
+                print("   ", *command)
+        return 0
+    failed = run_all(missing, given.parallel, places.runs / "logs")
+    for name in failed:
+        print(f"failed: {name}; its output is in {places.runs / 'logs'}", file=sys.stderr)
+    return 1 if failed else 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
