@@ -3,8 +3,8 @@
     python -m benchmarks.reproduce --list
     python -m benchmarks.reproduce --parallel 2
 
-That is the table of downstream tasks, the controls of self-play and skill discovery: some forty hours on two cores. Each
-is one or more of the commands that anybody can type, and this prints them. What was stopped goes on from its run
+That is the table of downstream tasks, the controls of self-play and skill discovery: some forty hours on two cores.
+Each is one or more of the commands that anybody can type, and this prints them. What was stopped goes on from its run
 directory. Pictures and pages are made from the files afterwards, by ``python -m benchmarks.report``.
 """
 
