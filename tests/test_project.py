@@ -37,7 +37,7 @@ CLUSTER_MODULES = (
 )
 ROOMS_WITHOUT_TORCH = ("actors", "envs", "generator", "registry", "status")
 ROOMS = (
-    *("errors", "frozen", "types", "config_tree", "off_policy_config", "config", "io", "envs", "policies"),
+    *("errors", "frozen", "liveness", "types", "config_tree", "off_policy_config", "config", "io", "envs", "policies"),
     *("generator", "actors", "learner", "sac", "baselines", "registry", "primitives", "media", "downstream"),
     *("store", "status", "runtime", "cli", "__main__"),
 )

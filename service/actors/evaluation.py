@@ -12,6 +12,7 @@ from service.config import Config, WorldConfig
 from service.envs.batch import WorldBatch
 from service.envs.observations import ACTION, bob_observation
 from service.envs.sampling import GoalKind, draw_goals
+from service.liveness import count_work
 from service.types import FloatArray, Metrics, StateArray
 
 Observer = Callable[[WorldBatch, StateArray], None]
@@ -92,6 +93,7 @@ def evaluate(
             observe(worlds, goal)
         for _ in range(num_steps):
             worlds.step(policy.act_deterministic(bob_observation(worlds.positions(), goal)))
+            count_work()
             distance = np.linalg.norm(worlds.object_position - goal, axis=1)
             ever |= distance <= success_distance_m
             if observe:

@@ -24,6 +24,7 @@ from service.generator.records import GoalRecords
 from service.generator.ring import Rows
 from service.generator.snapshot import GoalChoice
 from service.generator.validity import Verdict, classify_goal, in_workspace
+from service.liveness import count_work
 from service.types import Arrays, BoolArray, FloatArray, IntArray, Metrics, StateArray
 
 VerdictArray = NDArray[np.int8]
@@ -190,6 +191,7 @@ class SelfPlay:
             )
             turns.observation[step], turns.action[step], turns.log_prob[step] = observation, action, log_prob
             diverged |= worlds.step(action[~diverged], np.flatnonzero(~diverged))
+            count_work()
             if observe:
                 observe(worlds.states)
             contacts |= worlds.contacts()
@@ -236,6 +238,7 @@ class SelfPlay:
             turns.value_observation[step, playing] = worlds.bob_value(choice.goal)[playing]
             turns.log_prob[step, playing], turns.active[step, playing] = log_prob, True
             diverged |= worlds.step(action, playing)
+            count_work()
             if observe:
                 observe(worlds.states)
             reached = np.linalg.norm(worlds.object_position - choice.goal, axis=1) <= reach_m

@@ -29,6 +29,7 @@ from service.learner.group import ALONE, Group, mean_and_std
 from service.learner.player import LEARNING_RATE_BOUNDS, Player
 from service.learner.samples import Cloning, DemonstrationRows, Samples, draw_epoch
 from service.learner.shares import share_of
+from service.liveness import count_work
 from service.policies import gaussian
 from service.types import Array, IntArray, Metrics
 
@@ -238,6 +239,7 @@ def train(
             drawn_samples = None if samples is None else samples.find(own)
             drawn_cloning = None if cloning is None else cloning.find(cloned)
             _step(player, drawn_samples, drawn_cloning, how, stats, group)
+            count_work()
             if stats.aborted:
                 return stats
     return stats

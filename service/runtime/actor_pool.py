@@ -1,30 +1,28 @@
-"""The pool of rollout actors: starting them, counting them, and replacing those that died or hang."""
+"""The pool of rollout actors: starting them, counting them, replacing those that died or hang, and who is late."""
 
 from __future__ import annotations
 
 import time
+from collections import defaultdict, deque
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from datetime import UTC, datetime
 from statistics import median
 from typing import Any
 
 import ray
 
 from service.config import Config
-from service.runtime.ray_actors import Location, RolloutActor
+from service.runtime.ray_actors import Location, RolloutActor, remote_actor
+from service.runtime.watch import Watch
 from service.runtime.workers import RoundSummary
 from service.store.models import ActorStatus
 
-THREAD_VARIABLES = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
-"""NumPy's own threads would fight with those that step the worlds and with the other actors."""
-QUIET = {"enable_task_events": False}
-"""Else Ray's head keeps the last 100,000 calls, some 350 MB: a run makes as many in half a day."""
 START_GRACE_S = 30.0
 """An actor that has not started for so long waits for a free core; updates no longer count on it."""
-MIN_DEADLINE_S = 60.0
-DEADLINE_ROUNDS = 20.0
-"""An actor hangs when its round takes this many times the usual, and at least ``MIN_DEADLINE_S``."""
+RESTART_S = 120.0
+"""An actor that has not started for so long is started anew, as it may hang there; each time it gets twice as long."""
+LATE_ROUNDS, LATE_S = 3.0, 2.0
+"""An actor is late when its round takes this many times its recent ones, and ``LATE_S`` more."""
 
 
 @dataclass(slots=True)
@@ -36,6 +34,9 @@ class ActorSlot:
     handle: Any
     spawned: float
     """``time.monotonic()``, as all times here that are no dates."""
+    watch: Watch
+    may_start_s: float = RESTART_S
+    """Time from which on it is started anew."""
     num_rollouts: int = 0
     num_env_steps: int = 0
     last_error: str | None = None
@@ -44,7 +45,12 @@ class ActorSlot:
     ticket: int | None = None
     """Rollout slot of the round it plays."""
     round_started: float = 0.0
-    heartbeat: datetime = field(default_factory=lambda: datetime.now(UTC))
+    rounds_s: deque[float] = field(default_factory=lambda: deque(maxlen=10))
+    """Durations of its last rounds."""
+    num_evaluations: int = 0
+    """Evaluations that it was asked for and has not answered."""
+    late: bool = False
+    """Whether updates go on without the round it plays."""
 
     @property
     def alive(self) -> bool:
@@ -59,18 +65,37 @@ class ActorSlot:
     def join(self, location: Location) -> None:
         """Note that it has started."""
         self.location = location
-        self.heartbeat = datetime.now(UTC)
 
     def start_round(self, ticket: int) -> None:
         """Note that it was given a round."""
         self.ticket, self.round_started = ticket, time.monotonic()
+        self.watch.begin()
 
     def finish_round(self, summary: RoundSummary) -> None:
         """Note that it has played its round."""
-        self.ticket = None
+        self.ticket, self.late = None, False
+        self.rounds_s.append(time.monotonic() - self.round_started)
         self.num_rollouts += 1
         self.num_env_steps += summary.num_env_steps
-        self.heartbeat = datetime.now(UTC)
+        self.watch.end()
+
+    def start_evaluation(self) -> None:
+        """Note that it was asked to evaluate Bob, which it does before the next round."""
+        self.num_evaluations += 1
+        self.watch.begin()
+
+    def finish_evaluation(self) -> None:
+        """Note that it has; only now its round begins."""
+        self.num_evaluations -= 1
+        self.round_started = time.monotonic()
+        self.watch.end()
+
+    @property
+    def overdue(self) -> bool:
+        """Whether its round takes far longer than its last ones did; of its first one nobody knows."""
+        if self.ticket is None or self.num_evaluations or not self.rounds_s:
+            return False
+        return time.monotonic() - self.round_started > LATE_ROUNDS * median(self.rounds_s) + LATE_S
 
     def status(self) -> ActorStatus:
         """The slot's state for the status service."""
@@ -80,7 +105,7 @@ class ActorSlot:
             state="alive" if self.location is not None else "starting",
             node=self.location.node if self.location is not None else "",
             pid=self.location.pid if self.location is not None else None,
-            heartbeat=self.heartbeat,
+            heartbeat=self.watch.heartbeat,
             num_rollouts=self.num_rollouts,
             num_env_steps=self.num_env_steps,
             last_error=self.last_error,
@@ -99,16 +124,11 @@ class ActorPool:
     def __init__(self, config: Config, num_threads: int, first_incarnation: int) -> None:
         self.num_worlds = config.game.num_worlds
         """Worlds of each actor."""
-        self._config, self._num_threads, self._incarnation = config, num_threads, first_incarnation
+        self._config, self._num_threads = config, num_threads
         self._slots: dict[int, ActorSlot] = {}
-        self._durations_s: list[float] = []
-        self._actor = ray.remote(RolloutActor).options(
-            num_cpus=num_threads,
-            max_restarts=0,
-            max_task_retries=0,
-            runtime_env={"env_vars": THREAD_VARIABLES},
-            **QUIET,
-        )
+        self._incarnations: dict[int, int] = defaultdict(lambda: first_incarnation)
+        """The next incarnation of every place; one that goes and comes again begins no rollout id anew."""
+        self._actor = remote_actor(RolloutActor, num_cpus=num_threads, max_restarts=0, max_task_retries=0)
 
     def __iter__(self) -> Iterator[ActorSlot]:
         return iter(self._slots.values())
@@ -123,9 +143,14 @@ class ActorPool:
 
     @property
     def num_counted_on(self) -> int:
-        """Actors that have started, or may any moment; at least 1. So many rollouts make an update."""
+        """Actors that have started, or may any moment, and are not late; at least 1: so many rollouts of an update."""
         now = time.monotonic()
-        return max(1, sum(slot.alive or now - slot.spawned < START_GRACE_S for slot in self))
+        return max(1, sum(not slot.late if slot.alive else now - slot.spawned < START_GRACE_S for slot in self))
+
+    @property
+    def late(self) -> list[ActorSlot]:
+        """Slots whose round updates do not wait for."""
+        return [slot for slot in self if slot.late]
 
     @property
     def num_waiting(self) -> int:
@@ -143,15 +168,17 @@ class ActorPool:
             if len(self._slots) > num and not self._slots[index].alive:
                 self._kill(self._slots.pop(index))
         free = [index for index in range(num) if index not in self._slots]
-        new = [self._spawn(index, self._incarnation) for index in free[: max(0, num - len(self._slots))]]
+        new = [self._spawn(index) for index in free[: max(0, num - len(self._slots))]]
         self._slots |= {slot.index: slot for slot in new}
         return new
 
     def replace(self, slot: ActorSlot, reason: str) -> ActorSlot:
         """Kill a slot's actor and spawn the next incarnation."""
         self._kill(slot)
-        new = self._spawn(slot.index, slot.incarnation + 1)
+        new = self._spawn(slot.index)
         new.num_rollouts, new.num_env_steps, new.last_error = slot.num_rollouts, slot.num_env_steps, reason
+        if not slot.alive:
+            new.may_start_s = 2.0 * slot.may_start_s
         self._slots[slot.index] = new
         return new
 
@@ -159,20 +186,24 @@ class ActorPool:
         """Whether this very incarnation is still in the pool."""
         return self._slots.get(slot.index) is slot
 
-    def record_duration(self, play_s: float) -> None:
-        """Learn how long rounds usually take."""
-        self._durations_s = [*self._durations_s[-50:], play_s]
+    def hung(self) -> list[tuple[ActorSlot, str]]:
+        """Slots whose actor hangs, in a call or while it starts, and why."""
+        reasons = [(slot, slot.watch.look() if slot.alive else self._late_start(slot)) for slot in self]
+        return [(slot, reason) for slot, reason in reasons if reason is not None]
 
-    @property
-    def deadline_s(self) -> float:
-        """Duration of a round from which on its actor hangs."""
-        usual_s = median(self._durations_s) if self._durations_s else 0.0
-        return max(MIN_DEADLINE_S, DEADLINE_ROUNDS * usual_s)
+    def become_late(self) -> list[ActorSlot]:
+        """Find actors whose round is overdue; from now on they are late."""
+        new = [slot for slot in self if slot.overdue and not slot.late]
+        for slot in new:
+            slot.late = True
+        return new
 
-    def hung(self) -> list[ActorSlot]:
-        """Slots whose round is past its deadline."""
-        now = time.monotonic()
-        return [slot for slot in self if slot.ticket is not None and now - slot.round_started > self.deadline_s]
+    def forgive(self, seconds: float) -> None:
+        """Leave out a time in which the driver did not look."""
+        for slot in self:
+            slot.round_started += seconds
+            slot.spawned += seconds
+            slot.watch.forgive(seconds)
 
     def close(self) -> None:
         """Kill all actors."""
@@ -183,6 +214,13 @@ class ActorPool:
     def _kill(self, slot: ActorSlot) -> None:
         ray.kill(slot.handle, no_restart=True)
 
-    def _spawn(self, index: int, incarnation: int) -> ActorSlot:
+    def _spawn(self, index: int) -> ActorSlot:
+        incarnation = self._incarnations[index]
+        self._incarnations[index] = incarnation + 1
         handle = self._actor.remote(self._config, index, incarnation, self._num_threads)
-        return ActorSlot(index, incarnation, handle, time.monotonic())
+        return ActorSlot(index, incarnation, handle, time.monotonic(), Watch(handle.progress.remote))
+
+    @staticmethod
+    def _late_start(slot: ActorSlot) -> str | None:
+        waited_s = time.monotonic() - slot.spawned
+        return f"it did not start for {waited_s:.0f} s" if waited_s > slot.may_start_s else None

@@ -14,34 +14,36 @@ iterations, and no round.
 The driver holds references, not data. Learner and generator hand back their whole state with every iteration, so when
 one dies, another goes on from there with the rollouts in hand: what an actor handed over is neither lost nor counted
 twice. A rank of the learner that dies or hangs ends all of them, and as many others go on.
+
+A worker hangs when it makes no progress (``watch``): it is ended, and then it is like one that died. Before that, an
+actor that is late no longer holds back updates. Time in which the driver itself did not run counts for nobody.
 """
 
 from __future__ import annotations
 
 import logging
-import math
 import time
-from collections import Counter
 from collections.abc import Callable
-from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
 
 import numpy as np
 import ray
-from ray.exceptions import ObjectLostError, RayError, RayTaskError
+from ray.exceptions import RayError
 
 from service.actors.evaluation import EVALUATED_GOALS
 from service.actors.rollout import from_arrays
 from service.config import Config
 from service.errors import DivergedError, GroupError
 from service.io.run_directory import RunDirectory
+from service.learner.weights import MAX_POLICY_LAG
 from service.policies.parameters import Parameters, PolicyError
-from service.runtime.actor_pool import QUIET, THREAD_VARIABLES, ActorPool, ActorSlot
+from service.runtime.actor_pool import ActorPool, ActorSlot
+from service.runtime.iteration import Iteration, PendingRollout
 from service.runtime.learner_group import LearnerGroup, Update, check_room, num_gpus
-from service.runtime.ray_actors import GeneratorActor, LearnerActor
+from service.runtime.ray_actors import GeneratorActor, LearnerActor, remote_actor
 from service.runtime.ray_connection import ClusterOptions
-from service.runtime.remote_worker import RemoteWorker, one_line
+from service.runtime.remote_worker import POLL_S, START_S, RemoteWorker, Worker, lost, one_line, pause, wait_for
 from service.runtime.runner import ClusterError, Health, IterationResult, OnBeat, Runner, StateLostError
 from service.runtime.slots import RolloutSlots
 from service.runtime.workers import GeneratorResult, RoundSummary, UpdateResult
@@ -50,61 +52,18 @@ from service.types import Metrics
 
 _logger = logging.getLogger(__name__)
 
-POLL_S = 0.2
-"""Most time between two looks at stop requests, deadlines and new actors."""
 BEAT_S = 1.0
 """Time between two heartbeats of the run."""
 RESIZE_S = 5.0
 """Time between two looks at the size of the cluster."""
-GENERATOR_DEADLINE_S = 60.0
-"""A task generator that takes longer for an iteration, a matter of milliseconds, hangs."""
+PAUSE_S = 5.0
+"""A driver that did not look for so long was paused, alone or with its machine."""
 MAX_ATTEMPTS = 3
 """Learners or generators in a row that may die of the same iteration."""
+RETRY_S = 1.0
+"""Pause before the second of them is asked; it doubles."""
 MAX_FAILED_ROUNDS = 20
 """Rounds in a row that may fail."""
-
-
-@dataclass(frozen=True, slots=True)
-class PendingRollout:
-    """A rollout that an actor handed over and that is not learned from yet."""
-
-    ticket: int
-    rollout: Any
-    """Reference to it."""
-    goals: Any
-    """Reference to the summary of its goals."""
-    weights: Any
-    """Reference to the weights it was played with."""
-    summary: RoundSummary
-    hand_over_s: float
-    """From giving the round until its end was noticed, less playing it: all that was on its way or in line."""
-
-
-@dataclass(slots=True)
-class Iteration:
-    """One iteration on its way through the learner and the task generator, which work on it side by side."""
-
-    batch: list[PendingRollout]
-    asked_generator: float = 0.0
-    """``time.monotonic()`` of the last request; infinity once its answer is no longer waited for."""
-    num_attempts: Counter[str] = field(default_factory=Counter)
-    """Failed attempts, by worker."""
-    update: Update | None = None
-    """The learner's part, as it was asked for last."""
-    snapshot: Any = None
-    """Reference to what the generator knows after it."""
-    opponents: Any = None
-    """Reference to the past players after it; of nothing where they are those before it."""
-    generator_state: Any = None
-    """Reference to the generator's state after it."""
-    updated: UpdateResult | None = None
-    recorded: GeneratorResult | None = None
-    grid: GoalGrid | None = None
-
-    @property
-    def num_env_steps(self) -> int:
-        """Env steps of its rollouts."""
-        return sum(each.summary.num_env_steps for each in self.batch)
 
 
 class ClusterRun(Runner):
@@ -137,7 +96,8 @@ class ClusterRun(Runner):
         self._grid: GoalGrid | None = None
         self._num_failed_rounds = self._num_counted = self._num_refused = 0
         self._last_error: str | None = None
-        self._last_iteration = self._last_beat = self._last_resize = time.monotonic()
+        self._last_iteration = self._last_beat = self._last_resize = self._last_look = time.monotonic()
+        self._on_beat: OnBeat = lambda: None
         learner = config.learner
         self._rank_cpus = options.rank_cpus(learner)
         check_room(learner.num_learners, learner.device, self._rank_cpus, options.actor_threads)
@@ -151,10 +111,11 @@ class ClusterRun(Runner):
         self._next_incarnation = first_incarnation + 1
         self._learner = self._start_learner(learner_state, pending)
         self._generator = self._start_generator(generator_state)
-        self._learner.wait_ready()
-        self._generator.wait_ready()
-        self._weights = self._learner.begin()
-        begun = self._generator.handle.begin.options(num_returns=3).remote()
+        self._learner.start()
+        self._generator.start()
+        self._weights, *states = self._begin(self._learner, self._learner.begin)
+        self._learner.keep_first(states)
+        begun = self._begin(self._generator, self._generator.handle.begin.options(num_returns=3).remote)
         self._generator.state, self._snapshot, self._opponents = begun
         self._version: int = ray.get(self._weights).version
         self._pool = self._start_actors(first_incarnation)
@@ -171,7 +132,11 @@ class ClusterRun(Runner):
     def health(self) -> Health:
         """The state of all its workers."""
         waiting = self._pool.num_waiting
-        lack = (f"{waiting} of {len(self._pool)} rollout actors wait for a free core",) if waiting else ()
+        lack: tuple[str, ...] = (
+            (f"{waiting} of {len(self._pool)} rollout actors wait for a free core",) if waiting else ()
+        )
+        if late := ", ".join(f"rollout-{slot.index}" for slot in self._pool.late):
+            lack += (f"{late}: late; updates go on without",)
         actors = (*(slot.status() for slot in self._pool), *self._learner.statuses(), self._generator.status())
         return Health(actors, self._num_counted, self._num_refused, lack, self._last_error)
 
@@ -187,19 +152,36 @@ class ClusterRun(Runner):
         self._generator.close()
 
     def _advance(self, on_beat: OnBeat) -> None:
+        self._on_beat = on_beat
         self._start_iteration()
         self._start_rounds()
+        self._forgive_pause()
         with self.timing("wait"):
-            ready, _ = ray.wait(list(self._waiting), timeout=POLL_S)
+            ray.wait(list(self._waiting), timeout=POLL_S)
+            # All that is there, before anybody is called late or hung: after a pause that may be everything.
+            ready, _ = ray.wait(list(self._waiting), num_returns=len(self._waiting), timeout=0)
         with self.bookkeeper.explaining_divergence():
             for reference in ready:
                 self._waiting.pop(reference)(reference)
         self._check_learner()
-        self._check_actors()
         self._check_generator()
+        self._check_actors()
+        self._beat()
+
+    def _beat(self) -> None:
+        """Say that the driver is alive, now and then; also while it waits for a worker."""
         if time.monotonic() - self._last_beat >= BEAT_S:
             self._last_beat = time.monotonic()
-            on_beat()
+            self._on_beat()
+
+    def _forgive_pause(self) -> None:
+        """Leave out a time in which the driver did not look: it was frozen, or busy with starting a worker."""
+        now = time.monotonic()
+        paused_s, self._last_look = now - self._last_look, now
+        if paused_s > PAUSE_S:
+            _logger.warning("the driver did not look after its workers for %.0f s; they get that time", paused_s)
+            for each in (self._learner, self._generator, self._pool):
+                each.forgive(paused_s)
 
     # --- rounds ----------------------------------------------------------------------------------------------------
 
@@ -215,7 +197,7 @@ class ClusterRun(Runner):
         num_rounds = self._pool.num_counted_on
         rollout, goals, summary = play.remote(self._weights, self._snapshot, self._opponents, num_rounds)
         slot.start_round(ticket)
-        pending = partial(PendingRollout, ticket, rollout, goals, self._weights)
+        pending = partial(PendingRollout, ticket, self._version, rollout, goals, self._weights)
         self._waiting[summary] = partial(self._on_round, slot, ticket, pending)
 
     def _on_round(self, slot: ActorSlot, ticket: int, pending: Callable[..., PendingRollout], reference: Any) -> None:
@@ -228,7 +210,6 @@ class ClusterRun(Runner):
             return
         self._num_failed_rounds = 0
         slot.finish_round(summary)
-        self._pool.record_duration(summary.play_s)
         self._slots.finish(ticket)
         self._pending.append(pending(summary, time.monotonic() - slot.round_started - summary.play_s))
         self.directory.dump_diverged("-".join(map(str, summary.id)), summary.diverged)
@@ -237,7 +218,7 @@ class ClusterRun(Runner):
         """Replace the actor, unless the run as a whole cannot go on."""
         if isinstance(error, (DivergedError, PolicyError)):
             raise error
-        if _lost(error):
+        if lost(error):
             raise StateLostError(
                 f"weights or goals were lost with the machine that kept them ({one_line(error)}); the run goes back to "
                 "its newest checkpoint"
@@ -278,10 +259,21 @@ class ClusterRun(Runner):
         num = self._pool.num_counted_on
         if self._current is not None or len(self._pending) < num or not self._slots.may_update(self._version):
             return
+        self._refuse_old()
+        if len(self._pending) < num:
+            return
         batch, self._pending = self._pending, []  # all: one that were left over would only get older
         self._current = Iteration(batch)
         self._ask_generator(self._current)
         self._ask_learner(self._current)
+
+    def _refuse_old(self) -> None:
+        """Leave out rollouts that came too late to be learned from."""
+        for each in [each for each in self._pending if self._version - each.version > MAX_POLICY_LAG]:
+            _logger.info("rollout %s came %d versions late", each.summary.id, self._version - each.version)
+            self._pending.remove(each)
+            self._slots.lose(each.ticket)
+            self._num_refused += 1
 
     def _ask_learner(self, iteration: Iteration) -> None:
         in_order = sorted(iteration.batch, key=lambda each: each.summary.id)
@@ -296,7 +288,7 @@ class ClusterRun(Runner):
         weights = iteration.batch[0].weights  # the players of this iteration may become past opponents
         recorded, *others = record.remote(self.iteration, num_env_steps, weights, goals)
         iteration.generator_state, iteration.snapshot, iteration.opponents = others
-        iteration.asked_generator = time.monotonic()
+        self._generator.watch.begin()
         self._waiting[recorded] = partial(self._on_recorded, iteration)
 
     def _on_learned(self, iteration: Iteration, update: Update, rank: int, reference: Any) -> None:
@@ -307,7 +299,7 @@ class ClusterRun(Runner):
         except RayError as error:
             self._on_failed_answer(iteration, self._learner, error)
             return
-        self._learner.record_heartbeat(rank)
+        self._learner.note_answer(rank)
         if isinstance(result, GroupError):
             self._on_failed_answer(iteration, self._learner, result)
             return
@@ -324,27 +316,30 @@ class ClusterRun(Runner):
         except RayError as error:
             self._on_failed_answer(iteration, self._generator, error)
             return
-        self._generator.record_heartbeat()
+        self._generator.watch.end()
         self._finish_if_done(iteration)
 
     def _check_learner(self) -> None:
-        """Replace the learner if one of its ranks hangs where no other waits for it."""
+        """End a learner that hangs: then its answer fails, and another takes its place."""
+        if (hung := self._learner.hangs()) is not None:
+            self._learner.end_hung(hung)
         iteration = self._current
         update = iteration.update if iteration is not None and iteration.updated is None else None
         if iteration is not None and update is not None and update.overdue:
             self._on_failed_answer(iteration, self._learner, GroupError("a rank does not hand back its state"))
 
-    def _on_failed_answer(self, iteration: Iteration, worker: RemoteWorker | LearnerGroup, error: Exception) -> None:
+    def _on_failed_answer(self, iteration: Iteration, worker: Worker, error: Exception) -> None:
         """Start another learner or generator from the state before the iteration, and ask it what is left of that."""
-        lost = _lost(error)
-        reason = one_line(error) if lost else worker.explain(error)
-        if lost:
+        is_lost = lost(error)
+        reason = one_line(error) if is_lost else worker.explain(error)
+        if is_lost:
             self._drop_lost(iteration)
             if worker is self._learner and self._learner.size > 1:
                 worker.restart(reason)  # the other ranks wait for the one that has nothing to learn from
         elif isinstance(error, (DivergedError, PolicyError)) or (not isinstance(error, GroupError) and worker.alive):
             raise error
         else:
+            pause(RETRY_S * 2 ** (attempt - 1) if (attempt := iteration.num_attempts[worker.name]) else 0.0, self._beat)
             worker.restart(reason)
             self._last_error = f"{worker.name}: {reason}"
         iteration.num_attempts[worker.name] += 1
@@ -408,9 +403,11 @@ class ClusterRun(Runner):
         alive = [slot for slot in self._pool if slot.alive]
         for index, kind in enumerate(EVALUATED_GOALS if alive else ()):
             slot = alive[index % len(alive)]
-            self._waiting[slot.handle.evaluate.remote(self._weights, [kind])] = self._on_evaluation
+            slot.start_evaluation()
+            self._waiting[slot.handle.evaluate.remote(self._weights, [kind])] = partial(self._on_evaluation, slot)
 
-    def _on_evaluation(self, reference: Any) -> None:
+    def _on_evaluation(self, slot: ActorSlot, reference: Any) -> None:
+        slot.finish_evaluation()
         try:
             self._evaluated |= ray.get(reference)
         except RayError as error:
@@ -419,11 +416,15 @@ class ClusterRun(Runner):
     # --- looking after actors --------------------------------------------------------------------------------------
 
     def _check_actors(self) -> None:
-        """Replace actors that hang, and follow the cluster's size."""
-        for slot in self._pool.hung():
+        """Go on without actors that are late, replace those that hang, and follow the cluster's size."""
+        for slot in self._pool.become_late():
             assert slot.ticket is not None
-            self._slots.lose(slot.ticket)
-            self._replace(slot, f"no rollout for {self._pool.deadline_s:.0f} s")
+            self._slots.release(slot.ticket)
+            _logger.info("rollout actor %d is late; updates go on without it", slot.index)
+        for slot, reason in self._pool.hung():
+            if slot.ticket is not None:
+                self._slots.lose(slot.ticket)
+            self._replace(slot, reason)
         now = time.monotonic()
         if now - self._last_resize >= RESIZE_S:
             self._last_resize = now
@@ -432,13 +433,8 @@ class ClusterRun(Runner):
 
     def _check_generator(self) -> None:
         """End a task generator that hangs: then its answer fails, and another takes its place."""
-        iteration = self._current
-        if iteration is None or iteration.recorded is not None:
-            return
-        if time.monotonic() - iteration.asked_generator > GENERATOR_DEADLINE_S:
-            iteration.asked_generator = math.inf
-            _logger.warning("the generator has not answered for %.0f s", GENERATOR_DEADLINE_S)
-            self._generator.close()
+        if (hung := self._generator.hangs()) is not None:
+            self._generator.end_hung(hung)
 
     def _num_actors(self) -> int:
         if self._options.num_actors is not None:
@@ -466,21 +462,22 @@ class ClusterRun(Runner):
             meta = {"next_incarnation": self._next_incarnation, "rng": rng.bit_generator.state}
             self.bookkeeper.save(parts, meta)
 
+    def _begin(self, worker: Worker, begin: Callable[[], list[Any]]) -> list[Any]:
+        """References to what a worker has before the first iteration; they are there when this returns."""
+        for _ in range(MAX_ATTEMPTS):
+            try:
+                begun = begin()
+                wait_for(begun, START_S, self._beat)
+                return begun
+            except RayError as error:
+                worker.restart(worker.explain(error))
+        raise ClusterError(f"the {worker.name} fails as it begins, {MAX_ATTEMPTS} times in a row")
+
     def _start_learner(self, *arguments: Any) -> LearnerGroup:
         learner = self.config.learner
-        actor = ray.remote(LearnerActor).options(
-            num_cpus=self._rank_cpus,
-            num_gpus=num_gpus(learner.device, learner.num_learners),
-            runtime_env={"env_vars": THREAD_VARIABLES},
-            **QUIET,
-        )
-        return LearnerGroup(actor, self.config, *arguments)
+        gpus = num_gpus(learner.device, learner.num_learners)
+        actor = remote_actor(LearnerActor, num_cpus=self._rank_cpus, num_gpus=gpus)
+        return LearnerGroup(actor, self.config, *arguments, on_wait=self._beat)
 
     def _start_generator(self, state: Any) -> RemoteWorker:
-        actor = ray.remote(GeneratorActor).options(num_cpus=0, runtime_env={"env_vars": THREAD_VARIABLES}, **QUIET)
-        return RemoteWorker("generator", actor, self.config, state)
-
-
-def _lost(error: Exception) -> bool:
-    """Whether a call failed because an argument of it was lost with a node."""
-    return isinstance(error, RayTaskError) and isinstance(error.cause, ObjectLostError)
+        return RemoteWorker("generator", remote_actor(GeneratorActor, num_cpus=0), self.config, state, self._beat)

@@ -6,11 +6,9 @@ start others from that under a new group id, which is the address of a new store
 
 from __future__ import annotations
 
-import logging
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from datetime import UTC, datetime
 from typing import Any
 
 import ray
@@ -20,17 +18,18 @@ from service.config import Config
 from service.errors import TandemError
 from service.learner.shares import join_states, share_out
 from service.runtime.ray_actors import Location
-from service.runtime.remote_worker import ANSWER_S, START_S, one_line
-from service.runtime.runner import ClusterError, StateLostError
+from service.runtime.remote_worker import ANSWER_S, START_S, OnWait, Worker, one_line, wait_for
+from service.runtime.runner import ClusterError
+from service.runtime.watch import Watch
 from service.runtime.workers import UpdateResult
 from service.store.models import ActorStatus
 from service.types import Arrays
 
-RANK_ANSWER_S = 15.0
-"""A rank that does not take part in a gradient step for so long hangs; a step takes a tenth of a second."""
+RANK_ANSWER_S = 25.0
+"""A rank that does not take part in a gradient step for so long hangs; a step takes a tenth of a second, and some
+seconds where other programs take nearly all of the machine."""
 PING_S = 3.0
 """Ranks that have given up answer within it, so that the one that hangs can be named."""
-_logger = logging.getLogger(__name__)
 
 
 @dataclass(slots=True)
@@ -75,7 +74,7 @@ class Update:
         )
 
 
-class LearnerGroup:
+class LearnerGroup(Worker):
     """The ranks of the learner, and all that is needed to start the next ones in their place.
 
     Args:
@@ -83,28 +82,21 @@ class LearnerGroup:
         config: the run; ``learner.num_learners`` ranks.
         state: one learner's, to start from, or None.
         pending: rollout to be learned from with the first ones.
+        on_wait: called again and again while the driver waits for them to start.
     """
 
-    name = "learner"
-
-    def __init__(self, actor: Any, config: Config, state: Arrays | None, pending: Any) -> None:
+    def __init__(self, actor: Any, config: Config, state: Arrays | None, pending: Any, *, on_wait: OnWait) -> None:
+        super().__init__("learner", on_wait)
         self.size = config.learner.num_learners
-        self.incarnation = 0
         self.locations: list[Location] = []
         """By rank, once all have started."""
         self._actor, self._config = actor, config
         self._states = [ray.put(state)] if state is not None else []
         self._pending = pending
-        self._last_error: str | None = None
-        self._heartbeats = [datetime.now(UTC)] * self.size
-        self._ranks = self._spawn()
+        self._spawn()
 
     def wait_ready(self) -> None:
-        """Wait until all ranks have started, found each other, and loaded the state.
-
-        Raises:
-            ClusterError: they have not, or not in time.
-        """
+        """Wait until all ranks have started, found each other, and loaded the state."""
         try:
             self.locations = self._ask(START_S, [rank.ping.remote() for rank in self._ranks], "start")
             address = None
@@ -120,13 +112,15 @@ class LearnerGroup:
             if isinstance(error.cause, TandemError):  # for people; where it was raised is not
                 raise ClusterError(str(error.cause)) from None
             raise
-        self._heartbeats = [datetime.now(UTC)] * self.size
 
-    def begin(self) -> Any:
-        """A reference to the weights before the first update; notes the states."""
+    def begin(self) -> list[Any]:
+        """References to the weights before the first update, and to the state of each rank."""
         answers = [rank.begin.options(num_returns=2).remote() for rank in self._ranks]
-        self._states = [state for _, state in answers]
-        return answers[0][0]
+        return [answers[0][0], *(state for _, state in answers)]
+
+    def keep_first(self, states: list[Any]) -> None:
+        """Go on from these states, of before the first update."""
+        self._states = states
 
     def update(self, rollouts: Sequence[Any]) -> Update:
         """Ask all ranks to learn from their shares of rollouts, given as references in the order of their ids."""
@@ -134,6 +128,8 @@ class LearnerGroup:
             rank.update_from.options(num_returns=3).remote(list(share_out(rollouts, index, self.size)))
             for index, rank in enumerate(self._ranks)
         ]
+        for watch in self._watches:
+            watch.begin()
         weights, states, answers = zip(*asked, strict=True)
         return Update(weights[0], list(states), list(answers))
 
@@ -145,23 +141,36 @@ class LearnerGroup:
         """The newest state, as one learner would have it."""
         return join_states(ray.get(self._states))
 
-    def record_heartbeat(self, rank: int) -> None:
-        """Note that a rank just answered."""
-        self._heartbeats[rank] = datetime.now(UTC)
+    def note_answer(self, rank: int) -> None:
+        """Note that a rank has answered an update."""
+        self._watches[rank].end()
+
+    def hangs(self) -> str | None:
+        """The reason in a few words why a rank hangs, if one does; where several stand still, one that is silent."""
+        reasons = {rank: reason for rank, watch in enumerate(self._watches) if (reason := watch.look()) is not None}
+        if not reasons or self._hung is not None:
+            return None
+        first = min(reasons, key=lambda rank: not self._watches[rank].silent)
+        return reasons[first] if self.size == 1 else f"{self._describe([first])}: {reasons[first]}"
+
+    def forgive(self, seconds: float) -> None:
+        """Leave out a time in which the driver did not look."""
+        for watch in self._watches:
+            watch.forgive(seconds)
 
     @property
     def alive(self) -> bool:
         """Whether all ranks answer. Only to be asked when they have, or will soon have, nothing to do."""
         try:
-            ray.get([rank.ping.remote() for rank in self._ranks], timeout=RANK_ANSWER_S + ANSWER_S)
+            wait_for([rank.ping.remote() for rank in self._ranks], RANK_ANSWER_S + ANSWER_S, self._on_wait)
         except RayError:
             return False
         return True
 
     def explain(self, error: BaseException) -> str:
         """The reason in a line why an update failed: the ranks that are gone or hang, else the error."""
-        if self.size == 1:
-            return one_line(error)
+        if self._hung is not None or self.size == 1:
+            return self._hung or one_line(error)
         pings = [rank.ping.remote() for rank in self._ranks]
         ready, _ = ray.wait(pings, num_returns=self.size, timeout=PING_S)
         silent = [rank for rank, ping in enumerate(pings) if ping not in ready]
@@ -169,26 +178,6 @@ class LearnerGroup:
         if dead:
             return f"{self._describe(dead)} died"
         return f"{self._describe(silent)} did not answer for {RANK_ANSWER_S:g} s" if silent else one_line(error)
-
-    def restart(self, reason: str) -> None:
-        """Start other ranks from the newest state; what the last ones were doing has to be asked of them again.
-
-        Raises:
-            StateLostError: they do not start, or a state was lost with the node that kept it.
-        """
-        others = "another goes" if self.size == 1 else "other ranks go"
-        _logger.warning("the %s is gone (%s); %s on from its last state", self.name, reason, others)
-        self.close()
-        self.incarnation += 1
-        self._last_error = reason
-        self._ranks = self._spawn()
-        try:
-            self.wait_ready()
-        except (RayError, ClusterError) as error:
-            raise StateLostError(
-                f"the {self.name} cannot go on from its last state ({one_line(error)}); the run goes back to its "
-                "newest checkpoint"
-            ) from None
 
     def close(self) -> None:
         """Kill all ranks."""
@@ -204,19 +193,20 @@ class LearnerGroup:
                 state="alive",
                 node=location.node,
                 pid=location.pid,
-                heartbeat=self._heartbeats[rank],
+                heartbeat=self._watches[rank].heartbeat,
                 last_error=self._last_error,
             )
             for rank, location in enumerate(self.locations)
         )
 
-    def _spawn(self) -> list[Any]:
-        return [self._actor.remote(self._config, rank, self.size) for rank in range(self.size)]
+    def _spawn(self) -> None:
+        self._ranks = [self._actor.remote(self._config, rank, self.size) for rank in range(self.size)]
+        self._watches = [Watch(rank.progress.remote) for rank in self._ranks]
 
     def _ask(self, timeout_s: float, answers: list[Any], what: str) -> list[Any]:
         """Wait for what all ranks were asked."""
         try:
-            return list(ray.get(answers, timeout=timeout_s))
+            return wait_for(answers, timeout_s, self._on_wait)
         except GetTimeoutError:
             ready, _ = ray.wait(answers, num_returns=len(answers), timeout=0)
             missing = [rank for rank, answer in enumerate(answers) if answer not in ready]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import logging
+import time
 from collections.abc import Iterator
 from contextlib import ExitStack, closing, suppress
 from dataclasses import dataclass, replace
@@ -31,6 +32,10 @@ if TYPE_CHECKING:
     from service.runtime.ray_connection import ClusterOptions
     from service.store.models import RunState
 
+MAX_STATES_LOST = 5
+"""Times in a row that a run goes back to a checkpoint without getting beyond it."""
+BACK_OFF_S = 2.0
+"""Pause before the second time; it doubles."""
 RESUMABLE = ("run.", "learner.num_learners=", "learner.alice.learning_rate=", "learner.bob.learning_rate=")
 """What an override of a resumed run may begin with: nothing that its past would have to be made again for."""
 _NUM_LEARNERS = "learner.num_learners"
@@ -112,16 +117,24 @@ def pretrain(
 
             url = stack.enter_context(serving(cluster.status, directory.path.absolute().parent, registry, redis))
             _logger.info("status: %s/v1/runs/%s", url, run_id)
+        num_lost, furthest = 0, -1
         while True:
             with closing(_start(config, directory, cluster, resume=resume)) as run:
                 try:
                     to = Registry(registry) if publish else None
                     done = _run(run, config, directory, to, signals, report, on_iteration)
                 except StateLostError as error:  # with a machine of the cluster
+                    num_lost, furthest = (
+                        (num_lost + 1 if run.iteration <= furthest else 1),
+                        max(furthest, run.iteration),
+                    )
+                    if num_lost >= MAX_STATES_LOST:
+                        raise
                     _logger.warning("%s", error)
                     resume = True
                 else:
                     return replace(done, signal=signals.first)
+            time.sleep(BACK_OFF_S * (2 ** (num_lost - 1) - 1))
 
 
 def _start(config: Config, directory: RunDirectory, cluster: ClusterOptions | None, *, resume: bool) -> Runner:

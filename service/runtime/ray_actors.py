@@ -22,6 +22,7 @@ from service.errors import GroupError
 from service.generator.opponents import Opponents
 from service.generator.snapshot import GeneratorSnapshot
 from service.generator.summary import GoalSummary
+from service.liveness import count_work, work_done
 from service.runtime.workers import (
     GeneratorResult,
     GeneratorWorker,
@@ -39,6 +40,14 @@ if TYPE_CHECKING:
 
 NICENESS = 10
 """Of workers that compute, above that of processes that answer: a tenth of the share of a core that both want."""
+
+
+THREAD_VARIABLES = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
+"""NumPy's own threads would fight with those that step the worlds and with the other actors."""
+QUIET = {"enable_task_events": False}
+"""Else Ray's head keeps the last 100,000 calls, some 350 MB: a run makes as many in half a day."""
+PROBE_GROUP = {"probe": 1}
+"""Concurrency groups of all workers: a thread beside the one that works, which answers ``progress``."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,7 +72,22 @@ def lower_priority() -> None:
         os.nice(NICENESS)
 
 
-class RolloutActor(RolloutWorker):
+def remote_actor(kind: type[Watched], **options: Any) -> Any:
+    """Ray's actor class of a worker, with options of its own beside those that all have."""
+    actor = ray.remote(concurrency_groups=PROBE_GROUP)(kind)  # type: ignore[call-overload]
+    return actor.options(runtime_env={"env_vars": THREAD_VARIABLES}, **QUIET, **options)
+
+
+class Watched:
+    """A worker that can be asked for its progress while it works."""
+
+    @ray.method(concurrency_group="probe")
+    def progress(self) -> int:
+        """Work that the thread beside this one has done, see ``liveness``."""
+        return work_done()
+
+
+class RolloutActor(RolloutWorker, Watched):
     """A rollout worker in a process of its own."""
 
     def __init__(self, config: Config, actor: int, incarnation: int, num_threads: int) -> None:
@@ -84,7 +108,7 @@ class RolloutActor(RolloutWorker):
         return played
 
 
-class GeneratorActor(GeneratorWorker):
+class GeneratorActor(GeneratorWorker, Watched):
     """A task generator that hands its whole state back with every record."""
 
     def ping(self) -> Location:
@@ -104,13 +128,13 @@ class GeneratorActor(GeneratorWorker):
             The result with the goal grid after it, the generator's whole state, a snapshot for the next rounds, and
             the past players if there are others than before.
         """
-        result = self.record(iteration, weights, ray.get(list(references)))
+        result = self.record(iteration, weights, _fetch(references))
         opponents = self.opponents() if result.new_opponents else None
         grid = self.grid(iteration + 1, num_env_steps)
         return (result, grid), self.generator.state(), self.generator.snapshot(), opponents
 
 
-class LearnerActor:
+class LearnerActor(Watched):
     """One rank of the learner, which hands its whole state back with every update.
 
     Consumes its share of an iteration's rollouts, produces its state, and rank 0 weights; waits for the other ranks at
@@ -172,7 +196,7 @@ class LearnerActor:
         """
         start = time.perf_counter()
         try:
-            result = self._worker.update(ray.get(list(references)))
+            result = self._worker.update(_fetch(references))
         except GroupError as error:
             return None, {}, error
         weights, state = self._weights(), self._worker.learner.state()
@@ -188,6 +212,15 @@ class LearnerActor:
         store = self._store if self._store is not None else find_store(*address, timeout_s)
         device = torch_device(self._config.learner.device)
         return TorchGroup(store, self._rank, self._size, host=self._host, device=device, timeout_s=timeout_s)
+
+
+def _fetch(references: Sequence[Any]) -> list[Any]:
+    """What references are of, one after the other: each that has come is progress."""
+    found = []
+    for reference in references:
+        found.append(ray.get(reference))
+        count_work()
+    return found
 
 
 def _round_counters(actor: int) -> Callable[[RoundSummary], None]:

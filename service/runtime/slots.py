@@ -15,7 +15,8 @@ class RolloutSlots:
     A rollout holds a slot from when its round begins until the version that learned from it is out, or until it is
     lost. There are twice as many slots as an update takes rollouts: one update's worth is learned from while the next
     is played. So a round never begins more than one update ahead of the learner, and the lag of equally fast actors is
-    1. An update that would leave the slowest round more than ``MAX_POLICY_LAG`` behind waits for it instead.
+    1. An update that would leave the slowest round more than ``MAX_POLICY_LAG`` behind waits for it instead, unless
+    that round was released: then its rollout is learned from only if it comes before it is too old.
     """
 
     _began: dict[int, int] = field(default_factory=dict)
@@ -39,9 +40,13 @@ class RolloutSlots:
         self._began[ticket] = version
         return ticket
 
-    def finish(self, ticket: int) -> None:
-        """Note that the round is over and its rollout handed over."""
+    def release(self, ticket: int) -> None:
+        """Wait no longer for a round that is being played, and give its slot to another."""
         del self._began[ticket]
+
+    def finish(self, ticket: int) -> None:
+        """Note that the round is over and its rollout handed over, be it released or not."""
+        self._began.pop(ticket, None)
         self._done.add(ticket)
 
     def lose(self, ticket: int) -> None:

@@ -1,6 +1,7 @@
 """The cluster runner on a real Ray: the same experiment as the local one, and whoever is killed is replaced."""
 
 import os
+import re
 import signal
 from dataclasses import replace
 from pathlib import Path
@@ -144,51 +145,73 @@ def test_whoever_is_killed_is_replaced(tmp_path):
     assert run.iteration == result.iteration == rows[-1]["iteration"]
 
 
-def test_an_actor_that_hangs_is_replaced(tmp_path, monkeypatch):
-    monkeypatch.setattr("service.runtime.actor_pool.MIN_DEADLINE_S", 6.0)
-    monkeypatch.setattr("service.runtime.actor_pool.DEADLINE_ROUNDS", 0.0)
-    stopped = []
+def test_updates_go_on_without_an_actor_that_is_late_and_one_that_hangs_is_replaced(tmp_path, monkeypatch):
+    monkeypatch.setattr("service.runtime.watch.STALL_S", 10.0)
+    monkeypatch.setattr("service.runtime.watch.MAX_STALL_S", 10.0)
+    late, frozen, said = [], [], []
 
-    def stop(run, metrics):
-        pid = pid_of(run, "rollout-0")
-        if metrics["iteration"] >= 4 and not stopped and pid is not None:
-            stopped.append(pid)
+    def freeze(run, metrics):
+        pid, slot = pid_of(run, "rollout-0"), run._pool._slots[0]
+        if metrics["iteration"] < 4 or pid is None or pid_of(run, "rollout-1") is None:
+            return
+        if not late:
+            late.append((pid, slot.incarnation, metrics["iteration"]))
             os.kill(pid, signal.SIGSTOP)
-        elif stopped and pid not in (None, *stopped):
+        elif slot.late and not frozen:  # iterations have gone on without it
+            said.append(run.health().warnings)
+            if metrics["iteration"] >= late[0][2] + 6:  # what it plays is too old by then
+                os.kill(pid, signal.SIGCONT)
+                frozen.append(None)
+        elif frozen == [None] and not slot.late and slot.num_rollouts:
+            frozen[:] = [pid]
+            os.kill(pid, signal.SIGSTOP)
+        elif frozen and frozen[0] and pid != frozen[0]:
             run.request_stop()
 
-    run, result = run_cluster(tmp_path, tiny_config(total_env_steps=10**9), on_iteration=stop)
+    run, result = run_cluster(tmp_path, tiny_config(total_env_steps=10**9), on_iteration=freeze)
     assert result.reason == "interrupted"
-    assert "rollout-0: no rollout for 6 s" in str(run.health().last_error)
-    assert not is_alive(stopped[0])
+    assert said
+    assert "rollout-0: late; updates go on without" in said[-1]
+    assert re.match(r"rollout-0: no progress for 1\d s", str(run.health().last_error))
+    assert not is_alive(frozen[0])
+    assert late[0][:2] == (frozen[0], 0)  # late it was not replaced, but when it was frozen for good
+    health = run.health()
+    assert health.num_rollouts_refused >= 1  # it came too late
+    counted = sum(highest + 1 for _, _, highest in ids(tmp_path))
+    assert counted - health.num_rollouts_counted in (0, 1)  # the refused one is left out, unless a later one covers it
 
 
-def test_no_round_notices_a_generator_that_is_frozen(tmp_path, monkeypatch):
+@pytest.mark.parametrize("name", ["generator", "learner"])
+def test_no_round_notices_a_worker_that_is_frozen(tmp_path, monkeypatch, name):
     """Iterations wait until another takes its place; no actor is replaced, no rollout is lost or counted twice."""
-    monkeypatch.setattr("service.runtime.cluster.GENERATOR_DEADLINE_S", 15.0)
+    monkeypatch.setattr("service.runtime.watch.STALL_S", 10.0)
+    monkeypatch.setattr("service.runtime.watch.MAX_STALL_S", 10.0)
     frozen, played = [], []
+
+    def worker(run):
+        return run._generator if name == "generator" else run._learner
 
     def freeze(run, metrics):
         actors = run.health().actors
         if not frozen and metrics["iteration"] >= 4 and not any(actor.pid is None for actor in actors):
-            frozen.append(pid_of(run, "generator"))
+            frozen.append(pid_of(run, name))
             os.kill(frozen[0], signal.SIGSTOP)
-        elif frozen and run._generator.incarnation == 1 and metrics["iteration"] >= 12:
+        elif frozen and worker(run).incarnation == 1 and metrics["iteration"] >= 12:
             run.request_stop()
 
     def look(run):
-        if frozen and run._generator.incarnation == 0:
+        if frozen and worker(run).incarnation == 0:
             played.append((run.iteration, run._slots.num_taken, len(run._slots._began)))
 
     run, result = run_cluster(tmp_path, tiny_config(total_env_steps=10**9), on_iteration=freeze, on_beat=look)
     assert result.reason == "interrupted"
-    # All that the policy lag allows was played: two rollouts wait for the generator, and two for the next iteration.
+    # All that the policy lag allows was played: two rollouts wait for the worker, and two for the next iteration.
     assert played[-1][1:] == (4, 0)
     assert len({iteration for iteration, _, _ in played}) <= 2
     assert not is_alive(frozen[0])
     health = run.health()
     errors = {actor.name: actor.last_error for actor in health.actors}
-    assert errors.pop("generator") is not None
+    assert re.match(r"no progress for 1\d s", errors.pop(name))
     assert set(errors.values()) == {None}
     assert health.num_rollouts_refused == 0
     counted = ids(tmp_path)
@@ -197,6 +220,34 @@ def test_no_round_notices_a_generator_that_is_frozen(tmp_path, monkeypatch):
     rows = read_lines(tmp_path / "metrics.jsonl")
     assert [row["iteration"] for row in rows] == list(range(1, len(rows) + 1))
     assert [row["learner/version"] for row in rows] == list(range(1, len(rows) + 1))
+
+
+def test_learners_that_die_while_they_start_lose_nothing(tmp_path):
+    struck = []
+
+    def strike(run, metrics):
+        if metrics["iteration"] == 4:
+            ask = run._learner._ask
+
+            def ask_and_strike(timeout_s, answers, what):
+                found = ask(timeout_s, answers, what)
+                if what == "start" and len(struck) < 2:  # its process is up, and has not got its state yet
+                    struck.append(found[0].pid)
+                    os.kill(struck[-1], signal.SIGKILL)
+                return found
+
+            run._learner._ask = ask_and_strike
+            kill(run, "learner")
+        elif metrics["iteration"] >= 8:
+            run.request_stop()
+
+    run, result = run_cluster(tmp_path, tiny_config(total_env_steps=10**9), num_actors=1, on_iteration=strike)
+    assert result.reason == "interrupted"
+    assert len(struck) == 2
+    assert run._learner.incarnation == 3
+    rows = read_lines(tmp_path / "metrics.jsonl")
+    assert [row["learner/version"] for row in rows] == list(range(1, len(rows) + 1))
+    assert sum(highest + 1 for _, _, highest in ids(tmp_path)) == run.health().num_rollouts_counted
 
 
 def test_a_stop_ends_it_at_once_and_saved(tmp_path):

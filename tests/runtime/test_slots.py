@@ -66,3 +66,15 @@ def test_no_order_of_events_lets_a_rollout_get_too_old(num_actors, slowness):
     assert max(lags) <= MAX_POLICY_LAG
     if slowness == 1:
         assert sum(lags) / len(lags) <= 1
+
+
+def test_a_round_that_was_released_holds_nothing_back():
+    slots = RolloutSlots()
+    late = slots.begin(3)
+    slots.release(late)
+    assert slots.num_taken == 0
+    assert slots.may_update(100)
+    slots.finish(late)  # it comes after all
+    assert slots.num_taken == 1
+    slots.publish([late])
+    assert slots.num_taken == 0
