@@ -34,6 +34,7 @@ CLUSTER_MODULES = (
     "ray_connection",
     "remote_worker",
     "status_actor",
+    "watch",
 )
 ROOMS_WITHOUT_TORCH = ("actors", "envs", "generator", "registry", "status")
 ROOMS = (

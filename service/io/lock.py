@@ -44,9 +44,10 @@ class DirectoryLock:
             _logger.warning("%s: no locks there (%s); see to it that only one process uses it", path, error.strerror)
             return
         if not taken:
-            holder = _read_holder(self._file)
             self._file.close()
-            raise RunTakenError(f"{directory} is in use by {holder}; {what_to_do}")
+            found = holder(directory)
+            who = "another process" if found is None else f"process {found[1]} on {found[0]}"
+            raise RunTakenError(f"{directory} is in use by {who}; {what_to_do}")
         note = {"pid": os.getpid(), "host": socket.gethostname()}
         with contextlib.suppress(OSError):  # a full disk: who has it is only told to people
             self._file.truncate(0)
@@ -66,6 +67,14 @@ def is_locked(directory: Path) -> bool:
         return False
 
 
+def holder(directory: Path) -> tuple[str, int] | None:
+    """Host and process that last took the directory's lock, as it noted them; None where that cannot be read."""
+    with contextlib.suppress(OSError, ValueError, KeyError, TypeError):
+        note = json.loads((directory / LOCK_FILE).read_bytes()[:1000])
+        return str(note["host"])[:100], int(note["pid"])
+    return None
+
+
 def _take(file: FileIO, kind: int, wait_s: float) -> bool:
     deadline_s = time.monotonic() + wait_s
     while True:
@@ -76,11 +85,3 @@ def _take(file: FileIO, kind: int, wait_s: float) -> bool:
             if time.monotonic() >= deadline_s:
                 return False
             time.sleep(0.02)
-
-
-def _read_holder(file: FileIO) -> str:
-    with contextlib.suppress(OSError, ValueError, KeyError, TypeError):
-        file.seek(0)
-        note = json.loads(file.read(1000))
-        return f"process {int(note['pid'])} on {str(note['host'])[:100]}"
-    return "another process"

@@ -22,6 +22,7 @@ from service.config import WorldConfig
 from service.envs.rendering.renderer import Image, RenderError, SceneRenderer
 from service.generator.validity import Verdict
 from service.io.files import TEMPORARY_PREFIX, os_errors
+from service.liveness import count_work
 from service.media.recording import RecordedEpisodes, RecordedRound
 from service.types import StateArray
 
@@ -212,6 +213,7 @@ def _run_ffmpeg(frames: Iterator[Image], path: Path, fps: float) -> None:
         try:
             with contextlib.suppress(BrokenPipeError):  # it stopped early; its exit status says why
                 for frame in itertools.chain([first], frames):
+                    count_work()
                     ffmpeg.stdin.write(frame.tobytes())
             words = ffmpeg.communicate()[1].decode(errors="replace").strip()
         except BaseException:

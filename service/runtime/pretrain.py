@@ -25,6 +25,7 @@ from service.runtime.reporting import Report
 from service.runtime.runner import OnIteration, Runner, RunResult, StateLostError
 from service.runtime.signals import InterruptError, StopSignals
 from service.store.address import address_from_environment
+from service.store.disk import read_status
 from service.store.disk_reader import run_id_of
 from service.store.run_writer import RunWriter
 
@@ -110,8 +111,10 @@ def pretrain(
         directory.claim(resume=resume)
         run_id = run_id_of(directory.path)
         redis = address_from_environment()
+        previous = read_status(directory.path) if resume else None
         writer = RunWriter(directory.path, run_id, redis)
-        report = stack.enter_context(Report(config, run_id, runtime, writer, published=directory.read_published()))
+        published = directory.read_published()
+        report = stack.enter_context(Report(config, run_id, runtime, writer, published=published, previous=previous))
         if cluster is not None and cluster.status is not None:
             from service.runtime.status_actor import serving
 
@@ -174,26 +177,28 @@ def _run(
         result = run.run(tell, beat)
     done = Pretrained(result, {}, None, {}, run.timing.tree(), signals.first)
     if result.reason != "interrupted" and signals.first is None:
-        with suppress(InterruptError):
-            done = _finish(done, config, directory, registry, run)
+        with suppress(InterruptError), report.beating():
+            done = _finish(done, config, directory, registry, run, report)
     complete = result.reason if signals.first is None else "interrupted"  # --resume does what is left
     report.end(cast("RunState", complete), published=str(done.version) if done.version is not None else None)
     return done
 
 
 def _finish(
-    done: Pretrained, config: Config, directory: RunDirectory, registry: Registry | None, run: Runner
+    done: Pretrained, config: Config, directory: RunDirectory, registry: Registry | None, run: Runner, report: Report
 ) -> Pretrained:
     _logger.info("learning is over; now evaluating, publishing, drawing and recording a video")
     parameters = run.parameters()
     run.close()
     metrics, version = (measure_bob if config.skills is None else measure_skills)(config, parameters), None
+    report.check()
     try:
         if registry is not None and (config.policy.monolithic_bob is None or config.skills is not None):
             known = metrics | {"env_steps": done.result.num_env_steps}
             version = publish_run(directory, registry, config, parameters, known)
     except TandemError as error:
         raise UnfinishedError(f"learning is over and saved, but not published: {error}; --resume does it") from error
+    report.check()
     return replace(done, files=make_artifacts(directory), version=version, metrics=metrics, timing=run.timing.tree())
 
 

@@ -3,16 +3,23 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from datetime import UTC, datetime
+from threading import Event, Thread
 from types import TracebackType
 from typing import Any, Literal, Self
 
 from service.config import Config
+from service.io.errors import RunTakenError
+from service.liveness import work_done
 from service.runtime.runner import Runner
 from service.store.disk import GOALS_INTERVAL_S
-from service.store.models import RunState, RunStatus
+from service.store.models import CONDITIONS, RunState, RunStatus, RunTotals
 from service.store.run_writer import RunWriter
+
+BEAT_S = 2.0
+"""Time between two heartbeats of what follows learning."""
 
 
 class Report:
@@ -27,6 +34,7 @@ class Report:
         runtime: which runner runs it.
         writer: to whom it is told.
         published: what the run published before.
+        previous: the last status of an earlier process, whose totals go on.
     """
 
     def __init__(
@@ -37,8 +45,11 @@ class Report:
         writer: RunWriter,
         *,
         published: str | None = None,
+        previous: RunStatus | None = None,
     ) -> None:
         self._writer = writer
+        self._totals = previous.totals.model_dump() if previous is not None else {}
+        self._counted: dict[str, int] = {}
         self._gridded_s = float("-inf")
         now = datetime.now(UTC)
         self._status = RunStatus(
@@ -50,6 +61,7 @@ class Report:
             heartbeat=now,
             total_env_steps=config.run.total_env_steps,
             published=published,
+            totals=previous.totals if previous is not None else RunTotals(),
         )
 
     def __enter__(self) -> Self:
@@ -60,20 +72,54 @@ class Report:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         try:
-            if isinstance(error, Exception):
+            if isinstance(error, RunTakenError):
+                pass  # the status is another's now
+            elif isinstance(error, Exception):
                 self.end("failed", error=" ".join(f"{type(error).__name__}: {error}".split()))
             elif error is not None:  # a signal's
                 self.end("interrupted", error=f"ended at once by {error}" if str(error) else None)
         finally:
             self._writer.close()
 
+    def check(self) -> None:
+        """Assert that this process is still the one that runs the run.
+
+        Raises:
+            RunTakenError: another one has taken it over.
+        """
+        self._writer.check()
+
+    @contextmanager
+    def beating(self) -> Iterator[None]:
+        """Tell in a block that takes long that the run is alive, for as long as its work goes on (``liveness``)."""
+        over = Event()
+
+        def beat() -> None:
+            done = work_done()
+            while not over.wait(BEAT_S):
+                if (now := work_done()) != done:
+                    done = now
+                    self._tell()
+
+        thread = Thread(target=beat, name="heartbeat", daemon=True)
+        thread.start()
+        try:
+            yield
+        finally:
+            over.set()
+            thread.join()
+
     def begin(self, runner: Runner) -> None:
         """Say that the run begins, or goes on where it was."""
         self._status = self._status.model_copy(update={"state": "running"})
+        self._counted = self._counters(runner)  # where it goes on is no work of this process
+        if not self._totals:  # of earlier ones nothing is known but how far they came
+            self._totals = {name: self._counted[name] for name in ("iterations", "env_steps")}
         self.beat(runner)
 
     def iteration(self, runner: Runner, metrics: Mapping[str, float]) -> None:
-        """Tell an iteration's metrics, where the run is, and now and then what the generator knows."""
+        """Tell an iteration's metrics, where the run is, and now and then what the generator knows; see ``beat``."""
+        self.check()
         self._writer.metrics(dict(metrics))
         if time.monotonic() - self._gridded_s >= GOALS_INTERVAL_S:
             self._gridded_s = time.monotonic()
@@ -88,9 +134,19 @@ class Report:
         self.beat(runner)
 
     def beat(self, runner: Runner) -> None:
-        """Tell that the run is alive, how far it is, and how its parts are."""
+        """Tell that the run is alive, how far it is, and how its parts are.
+
+        Raises:
+            RunTakenError: another process has taken it over.
+        """
+        self.check()
         health = runner.health()
+        counters = self._counters(runner)
+        for name, value in counters.items():
+            self._totals[name] = self._totals.get(name, 0) + max(0, value - self._counted.get(name, 0))
+        self._counted = counters
         self._tell(
+            totals=RunTotals(**self._totals),
             iteration=runner.iteration,
             num_env_steps=runner.num_env_steps,
             num_rollouts_counted=health.num_rollouts_counted,
@@ -110,8 +166,22 @@ class Report:
         published = published or self._status.published
         self._tell(state=state, stopping=False, published=published, last_error=error or self._status.last_error)
 
+    @staticmethod
+    def _counters(runner: Runner) -> dict[str, int]:
+        """What this process counts now; it falls where the run goes back to a checkpoint."""
+        health = runner.health()
+        return {
+            "iterations": runner.iteration,
+            "env_steps": runner.num_env_steps,
+            "rollouts_counted": health.num_rollouts_counted,
+            "rollouts_refused": health.num_rollouts_refused,
+            "replacements": sum(actor.incarnation for actor in health.actors),
+        }
+
     def _tell(self, **changes: Any) -> None:
-        warnings = (*self._writer.warnings(), *changes.pop("warnings", ()))
-        changes |= {"heartbeat": datetime.now(UTC), "warnings": warnings}
+        troubles = self._writer.troubles()
+        condition = max((each.condition for each in troubles), key=CONDITIONS.index, default="well")
+        warnings = (*(each.text for each in troubles), *changes.pop("warnings", ()))
+        changes |= {"heartbeat": datetime.now(UTC), "condition": condition, "warnings": warnings}
         self._status = self._status.model_copy(update=changes)
         self._writer.status(self._status)

@@ -20,7 +20,7 @@ from prometheus_client.registry import Collector
 from service.io.errors import StorageError
 from service.registry.registry import Registry
 from service.store.errors import StoreError
-from service.store.models import ACTIVE, ActorStatus, Record, RunReader, RunState, RunStatus
+from service.store.models import ACTIVE, CONDITIONS, ActorStatus, Record, RunReader, RunState, RunStatus
 
 CONTENT_TYPE = "text/plain; version=0.0.4; charset=utf-8"
 NUM_ENDED_RUNS = 5
@@ -64,7 +64,7 @@ def _of_record(name: str, key: str, text: str) -> RunMetric:
 
 
 def _age_s(when: datetime) -> float:
-    return max(0.0, (datetime.now(UTC) - when).total_seconds())
+    return (datetime.now(UTC) - when).total_seconds()
 
 
 def _actor_age_s(run: RunStatus) -> float | None:
@@ -74,20 +74,24 @@ def _actor_age_s(run: RunStatus) -> float | None:
 RUN_METRICS: tuple[RunMetric, ...] = (
     _run("started_timestamp_seconds", "Start of the process that runs it, Unix time",
          lambda run, _: run.started.timestamp()),
-    _run("heartbeat_age_seconds", "Seconds since the run's last heartbeat", lambda run, _: _age_s(run.heartbeat)),
+    _run("heartbeat_age_seconds", "Seconds since the run's last heartbeat; negative where a clock is wrong",
+         lambda run, _: _age_s(run.heartbeat)),
     _run("stopping", "1 while a stop is requested and the run has not ended", lambda run, _: run.stopping),
     _run("warnings", "Number of current warnings, such as Redis being unavailable", lambda run, _: len(run.warnings)),
-    _run("iterations_total", "Finished iterations", lambda run, _: run.iteration),
-    _run("env_steps_total", "Env steps, all worlds together", lambda run, _: run.num_env_steps),
+    _run("iteration", "Finished iterations; falls when the run goes back", lambda run, _: run.iteration),
+    _run("env_steps", "Env steps of the run so far; falls when the run goes back", lambda run, _: run.num_env_steps),
+    _run("iterations_total", "Iterations, with those made again", lambda run, _: run.totals.iterations),
+    _run("env_steps_total", "Env steps, all worlds together, with those made again",
+         lambda run, _: run.totals.env_steps),
     _run("env_steps_budget", "Env steps at which the run ends", lambda run, _: run.total_env_steps),
     _run("env_steps_per_second", "Env steps per second, newest iteration", lambda run, _: run.env_steps_per_s),
     _run("policy_version", "Updates of the policies so far", lambda run, _: run.policy_version),
     _run("policy_lag_versions", "Policy versions between acting and learning, mean of the last update",
          lambda run, _: run.policy_lag),
-    _run("rollouts_counted_total", "Rollouts learned from, each once", lambda run, _: run.num_rollouts_counted),
-    _run("rollouts_refused_total", "Rollouts seen before, or too old", lambda run, _: run.num_rollouts_refused),
+    _run("rollouts_counted_total", "Rollouts learned from, each once", lambda run, _: run.totals.rollouts_counted),
+    _run("rollouts_refused_total", "Rollouts seen before, or too old", lambda run, _: run.totals.rollouts_refused),
     _run("actor_replacements_total", "How often an actor, the learner or the generator was replaced",
-         lambda run, _: sum(actor.incarnation for actor in run.actors)),
+         lambda run, _: run.totals.replacements),
     _run("actor_heartbeat_age_seconds", "Seconds since the oldest heartbeat of an active run's actors",
          lambda run, _: _actor_age_s(run)),
     _of_record("valid_goals_ratio", "alice/valid_fraction", "Fraction of Alice's goals that are valid"),
@@ -106,6 +110,9 @@ RUN_METRICS: tuple[RunMetric, ...] = (
 
 _RUN_INFO = Metric("tandem_run_info", "gauge", ("run", "name", "runtime"), "1; a run's primitives and its runtime")
 _RUN_STATE = Metric("tandem_run_state", "gauge", ("run", "state"), "1 for the state a run is in, 0 for the others")
+_RUN_CONDITION = Metric(
+    "tandem_run_condition", "gauge", ("run", "condition"), "1 for the worst that an active run suffers from"
+)
 _RUN_ACTORS = Metric("tandem_run_actors", "gauge", ("run", "state"), "Actors, learner and generator of an active run")
 _RUNS = Metric("tandem_runs", "gauge", ("state",), "Number of runs by state")
 _STORE_UP = Metric("tandem_store_up", "gauge", (), "1 if the runs could be read for this answer")
@@ -113,7 +120,7 @@ _REGISTRY_UP = Metric("tandem_registry_up", "gauge", (), "1 if the registry coul
 _VERSIONS = Metric("tandem_registry_versions", "gauge", ("name",), "Published versions")
 _ALIAS = Metric("tandem_registry_alias_version", "gauge", ("name", "alias"), "The version an alias means")
 SERVICE_METRICS: tuple[Metric, ...] = (
-    _RUN_INFO, _RUN_STATE, _RUN_ACTORS, _RUNS, _STORE_UP, _REGISTRY_UP, _VERSIONS, _ALIAS,
+    _RUN_INFO, _RUN_STATE, _RUN_CONDITION, _RUN_ACTORS, _RUNS, _STORE_UP, _REGISTRY_UP, _VERSIONS, _ALIAS,
 )  # fmt: skip
 """The other metrics that are read at each scrape."""
 
@@ -201,14 +208,17 @@ def shown(runs: list[RunStatus]) -> list[RunStatus]:
 
 def _families(runs: list[tuple[RunStatus, Record]]) -> Iterator[_Family]:
     info, states, actors = _RUN_INFO.family(), _RUN_STATE.family(), _RUN_ACTORS.family()
+    conditions = _RUN_CONDITION.family()
     for run, _ in runs:
         info.add_metric([run.run_id, run.name, run.runtime], 1)
         for state in _STATES:
             states.add_metric([run.run_id, state], run.state == state)
+        for condition in CONDITIONS if run.state in ACTIVE else ():
+            conditions.add_metric([run.run_id, condition], run.condition == condition)
         count = Count(actor.state for actor in run.actors)
         for actor_state in _ACTOR_STATES if run.actors and run.state in ACTIVE else ():
             actors.add_metric([run.run_id, actor_state], count[actor_state])
-    yield from (info, states, actors)
+    yield from (info, states, conditions, actors)
     for metric in RUN_METRICS:
         family = metric.family()
         for run, record in runs:

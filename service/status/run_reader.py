@@ -100,7 +100,9 @@ class CombinedReader:
         if on_disk is None or in_redis is None:
             (newer,) = (run for run in (on_disk, in_redis) if run is not None)
         else:
-            newer = in_redis if in_redis.heartbeat > on_disk.heartbeat - _ABOUT_EQUAL else on_disk
+            # Where nobody hears of it, the directory's lock tells whether its process lives.
+            in_front = in_redis.heartbeat > on_disk.heartbeat - _ABOUT_EQUAL and in_redis.condition != "silent"
+            newer = in_redis if in_front else on_disk
         failure = self._failure
         if failure is None or newer.state not in ACTIVE:
             return newer

@@ -16,10 +16,10 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-from pydantic import BaseModel
+from pydantic import BaseModel, ValidationError
 
 from service.io.files import write_atomic
-from service.store.models import GoalGrid, Record, RunStatus
+from service.store.models import GoalGrid, Record, RunStatus, Trouble
 
 STATUS_FILE = "status.json"
 GOALS_FILE = "goals.json"
@@ -27,6 +27,14 @@ STOP_FILE = "stop"
 STATUS_INTERVAL_S = 1.0
 GOALS_INTERVAL_S = 5.0
 _logger = logging.getLogger(__name__)
+
+
+def read_status(directory: Path) -> RunStatus | None:
+    """The status that the last process of a run left in its directory; None where there is none that can be read."""
+    try:
+        return RunStatus.model_validate_json((directory / STATUS_FILE).read_bytes())
+    except (OSError, ValidationError):
+        return None
 
 
 class DiskWriter:
@@ -62,9 +70,13 @@ class DiskWriter:
         """Whether somebody asked the run to stop since it was started."""
         return self._stop_file.exists()
 
-    def warnings(self) -> list[str]:
-        """Files that cannot be written at the moment, a sentence each."""
-        return [problem for file in (self._status, self._goals) if (problem := file.problem) is not None]
+    def check(self) -> None:
+        """Do nothing: the directory's lock keeps others out."""
+
+    def troubles(self) -> list[Trouble]:
+        """Files that cannot be written at the moment."""
+        problems = [file.problem for file in (self._status, self._goals)]
+        return [Trouble("disk", problem) for problem in problems if problem is not None]
 
     def close(self) -> None:
         """Write what still waits."""

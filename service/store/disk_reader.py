@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import re
+import shutil
+import socket
 from contextlib import suppress
 from datetime import UTC, datetime
 from functools import lru_cache
@@ -13,12 +15,16 @@ from threading import Lock
 import yaml
 from pydantic import ValidationError
 
-from service.io.lock import is_locked
+from service.io.lock import holder, is_locked
 from service.io.study_directory import is_study
 from service.store.disk import GOALS_FILE, STATUS_FILE, STOP_FILE
 from service.store.errors import DamagedStoreError, StoreError, StoreUnavailableError, UnknownRunError
 from service.store.models import ACTIVE, SILENT_AFTER, GoalGrid, Record, RunState, RunStatus
+from service.store.pulse import Pulse, ahead_s
 from service.store.tail import RecordFile
+
+FULL_BYTES = 1_000_000
+"""A disk with less room than this is full: a status and a grid would not fit."""
 
 
 def run_id_of(directory: Path) -> str:
@@ -50,16 +56,17 @@ class DiskReader:
     def __init__(self, root: Path) -> None:
         self.root = root
         self._records: dict[Path, RecordFile] = {}
+        self._pulse = Pulse()
         self._lock = Lock()
 
     def runs(self) -> list[RunStatus]:
         """All runs, newest start first."""
-        statuses = [_status(run_id, path, records) for run_id, (path, records) in self._list().items()]
+        statuses = [self._status(run_id, path, records) for run_id, (path, records) in self._list().items()]
         return sorted(statuses, key=lambda status: status.started, reverse=True)
 
     def run(self, run_id: str) -> RunStatus:
         """One run."""
-        return _status(run_id, *self._find(run_id))
+        return self._status(run_id, *self._find(run_id))
 
     def metrics(self, run_id: str, *, after_iteration: int = 0) -> list[Record]:
         """The records of iterations above ``after_iteration``, in order."""
@@ -88,7 +95,7 @@ class DiskReader:
             StoreError: a tandem runs it that takes no requests.
         """
         path, records = self._find(run_id)
-        if _status(run_id, path, records).state not in ACTIVE:
+        if self._status(run_id, path, records).state not in ACTIVE:
             return
         if not (path / STATUS_FILE).exists():
             raise StoreError(f"run {run_id} has no {STATUS_FILE}: an older tandem runs it; stop it with Ctrl-C there")
@@ -100,6 +107,16 @@ class DiskReader:
     def ready(self) -> None:
         """Return if the directory can be read."""
         self._list()
+
+    def _status(self, run_id: str, path: Path, records: RecordFile) -> RunStatus:
+        status = _read_status(run_id, path, records)
+        age_s = self._pulse.age_s(run_id, status.heartbeat)
+        if (ahead := ahead_s(status.heartbeat)) is not None and status.state in ACTIVE:
+            text = f"its heartbeat is {ahead:.0f} s in the future: the clock of its machine, or the one here, is wrong"
+            status = status.suffering("clock", text)
+        if not status.is_silent(age_s):
+            return status
+        return _why_silent(status, path, age_s) if is_locked(path) else status.vanished()
 
     def _find(self, run_id: str) -> tuple[Path, RecordFile]:
         runs = self._list()
@@ -129,7 +146,7 @@ def _unavailable(path: Path, error: OSError) -> StoreUnavailableError:
     return StoreUnavailableError(f"cannot use {path}: {error.strerror}; check the disk and the permissions")
 
 
-def _status(run_id: str, path: Path, records: RecordFile) -> RunStatus:
+def _read_status(run_id: str, path: Path, records: RecordFile) -> RunStatus:
     try:
         status = RunStatus.model_validate_json((path / STATUS_FILE).read_bytes())
     except FileNotFoundError:
@@ -138,10 +155,30 @@ def _status(run_id: str, path: Path, records: RecordFile) -> RunStatus:
         reason = error.strerror if isinstance(error, OSError) else "it is no run's status"
         note = f"{STATUS_FILE} cannot be read: {reason}; what is shown comes from metrics.jsonl"
         return _guess_status(run_id, path, records).model_copy(update={"warnings": (note,)})
-    if status.is_silent and not is_locked(path):
-        status = status.vanished()
     stopping = status.state in ACTIVE and (status.stopping or (path / STOP_FILE).exists())
     return status.model_copy(update={"run_id": run_id, "stopping": stopping})  # a copied directory has another id
+
+
+def _why_silent(status: RunStatus, path: Path, age_s: float) -> RunStatus:
+    """The status of a silent run whose process lives, since it has the lock."""
+    with suppress(OSError):
+        if (free := shutil.disk_usage(path).free) < FULL_BYTES:
+            text = f"its process lives, and cannot say how it is: the disk of {path} is full ({free:,} bytes are left)"
+            return status.suffering("disk", text)
+    host, pid = holder(path) or ("", 0)
+    who = f"its process {pid} on {host}" if pid else "its process"
+    if host == socket.gethostname() and _is_stopped(pid):
+        return status.suffering("stuck", f"{who} is frozen by a signal; kill -CONT {pid} lets it go on")
+    text = f"{who} lives, and has not been heard of for {age_s:.0f} s: it is frozen, hangs, or cannot write here"
+    return status.suffering("stuck", f"{text}; once it is ended, --resume goes on from its last checkpoint")
+
+
+def _is_stopped(pid: int) -> bool:
+    """Whether a process of this machine was stopped by a signal, as far as can be told."""
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] in ("T", "t")
+    except (OSError, IndexError):
+        return False
 
 
 # --- without a status -------------------------------------------------------------------------------------------------

@@ -8,6 +8,7 @@
 | ``tandem:run:ID:goals`` | string | ``GoalGrid`` as JSON |
 | ``tandem:run:ID:stop`` | string | is there when somebody asked the run to stop |
 | ``tandem:run:ID:lease`` | string, expires | who runs it, as JSON; gone ``LEASE_S`` after its last sign of life |
+| ``tandem:run:ID:epoch`` | string | how many drivers have claimed it: only the last of them writes anything |
 
 Records are in a sorted set and no stream: written twice, as after an answer that got lost, a record is there once, and
 a resumed run's takes the place of the earlier one.
@@ -23,6 +24,6 @@ MAX_RECORDS = 20_000
 LEASE_S = 10.0
 
 
-def run_key(run_id: str, content: Literal["status", "metrics", "goals", "stop", "lease"]) -> str:
+def run_key(run_id: str, content: Literal["status", "metrics", "goals", "stop", "lease", "epoch"]) -> str:
     """Key of one value of a run."""
     return f"tandem:run:{run_id}:{content}"

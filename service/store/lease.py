@@ -1,4 +1,8 @@
-"""A claim on a run: a key in Redis that its holder renews, and that expires when the holder is gone."""
+"""A claim on a run: a key in Redis that its holder renews, and that expires when the holder is gone.
+
+It may expire while its holder is only frozen. So each claim has a number, the epoch, one above the last one's, and
+every message of a driver is a transaction that fails once there is a higher one: a fencing token.
+"""
 
 from __future__ import annotations
 
@@ -29,6 +33,7 @@ class Lease:
 
     def __init__(self, client: Any, run_id: str, duration_s: float = keys.LEASE_S) -> None:
         self._client, self._run_id, self._key = client, run_id, keys.run_key(run_id, "lease")
+        self._epoch_key, self._epoch = keys.run_key(run_id, "epoch"), 0
         self._duration_ms = int(1000 * duration_s)
         now = datetime.now(UTC).isoformat(timespec="seconds")
         holder = {"token": secrets.token_hex(16), "host": socket.gethostname(), "pid": os.getpid(), "since": now}
@@ -51,21 +56,25 @@ class Lease:
                 )
             previous_ms = left_ms
             time.sleep(_POLL_S)
+        self._epoch = int(self._client.incr(self._epoch_key))
 
     def renew(self, pipe: Any) -> None:
         """Begin a transaction, on a fresh pipe, that renews the claim and fails where another has taken it meanwhile.
 
-        A claim that has expired, as after an outage, is made again.
+        A claim that has expired, as after an outage, is made again, unless another driver had one meanwhile.
 
         Raises:
-            RunTakenError: another driver has it.
+            RunTakenError: another driver has it, or had it.
         """
-        pipe.watch(self._key)
-        holder = pipe.get(self._key)
+        pipe.watch(self._key, self._epoch_key)
+        holder, epoch = pipe.get(self._key), pipe.get(self._epoch_key)
         if holder not in (None, self._mine):
             raise RunTakenError(f"run {self._run_id} was taken over by {_describe(holder)}")
+        if epoch not in (None, b"%d" % self._epoch):
+            raise RunTakenError(f"run {self._run_id} was taken over by another process, which has ended since")
         pipe.multi()
         pipe.set(self._key, self._mine, px=self._duration_ms)
+        pipe.set(self._epoch_key, self._epoch)  # a Redis that lost its data has forgotten it
 
     def release(self) -> None:
         """Give the claim up, if it is ours; after an error it expires by itself."""

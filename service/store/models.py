@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from datetime import UTC, datetime, timedelta
-from typing import Literal, Protocol, Self
+from datetime import UTC, timedelta
+from typing import Literal, NamedTuple, Protocol, Self, get_args
 
 from pydantic import AwareDatetime, Field
 
@@ -13,8 +13,38 @@ RunState = Literal["starting", "running", "finished", "converged", "interrupted"
 ACTIVE: frozenset[RunState] = frozenset({"starting", "running"})
 SILENT_AFTER = timedelta(seconds=60)
 """A run without a word for so long may have lost its process, killed or cut off from power."""
+Condition = Literal["well", "clock", "redis", "disk", "stuck", "silent"]
+"""What a run that has not ended suffers from, the worst last; ``RunStatus.warnings`` has it in words.
+
+| condition | meaning |
+|---|---|
+| ``well`` | nothing |
+| ``clock`` | its heartbeat comes from the future: its machine's clock and the reader's differ |
+| ``redis`` | it is configured to report to Redis, which takes nothing |
+| ``disk`` | its files cannot be written, most likely because the disk is full |
+| ``stuck`` | its process has the run, and says nothing: it is frozen, or hangs |
+| ``silent`` | it says nothing, and nobody here knows whether its process lives |
+"""
+CONDITIONS: tuple[Condition, ...] = get_args(Condition)
 Record = dict[str, float | None]
 """One iteration's metrics; ``iteration`` and ``env_steps`` are always there. Null: JSON has no number for it."""
+
+
+class Trouble(NamedTuple):
+    """Something that is not as it should be, and what it is in words."""
+
+    condition: Condition
+    text: str
+
+
+class RunTotals(FrozenModel):
+    """Work that all processes that ever ran a run have done; what was done again after going back counts again."""
+
+    iterations: int = Field(0, ge=0)
+    env_steps: int = Field(0, ge=0)
+    rollouts_counted: int = Field(0, ge=0)
+    rollouts_refused: int = Field(0, ge=0)
+    replacements: int = Field(0, ge=0, description="of actors, learner and generator")
 
 
 class ActorStatus(FrozenModel):
@@ -48,16 +78,22 @@ class RunStatus(FrozenModel):
     policy_lag: float = Field(0.0, ge=0, description="mean over the last update's rollouts, in versions")
     num_rollouts_counted: int = Field(0, ge=0, description="learned from, each once")
     num_rollouts_refused: int = Field(0, ge=0, description="seen before, or too old")
+    totals: RunTotals = Field(RunTotals(), description="never fall, whereas a run that goes back to a checkpoint does")
+    condition: Condition = Field("well", description="the worst that it suffers from; warnings say what it is")
     stopping: bool = Field(False, description="a stop was requested and the run has not ended yet")
     published: str | None = Field(None, description="NAME@VERSION of the primitives it published last")
     last_error: str | None = None
     warnings: tuple[str, ...] = Field((), description="what is not as it should be right now, such as Redis being away")
     actors: tuple[ActorStatus, ...] = ()
 
-    @property
-    def is_silent(self) -> bool:
-        """Whether the run has not ended, and was not heard of for ``SILENT_AFTER``."""
-        return self.state in ACTIVE and datetime.now(UTC) - self.heartbeat > SILENT_AFTER
+    def is_silent(self, age_s: float) -> bool:
+        """Whether the run has not ended, and its last heartbeat, so many seconds ago, is long past."""
+        return self.state in ACTIVE and age_s > SILENT_AFTER.total_seconds()
+
+    def suffering(self, condition: Condition, text: str) -> Self:
+        """The status with another trouble, and the worst of the two as its condition."""
+        worst = max(self.condition, condition, key=CONDITIONS.index)
+        return self.model_copy(update={"condition": worst, "warnings": (*self.warnings, text)})
 
     def vanished(self) -> Self:
         """The status of a silent run that no process runs any more: it must not seem to run for ever."""
@@ -65,7 +101,8 @@ class RunStatus(FrozenModel):
         error = (
             f"its process vanished without a word, last heard of at {when}; --resume goes on from its last checkpoint"
         )
-        return self.model_copy(update={"state": "interrupted", "stopping": False, "last_error": error})
+        ended = {"state": "interrupted", "condition": "well", "warnings": (), "stopping": False, "last_error": error}
+        return self.model_copy(update=ended)
 
 
 class GoalCell(FrozenModel):

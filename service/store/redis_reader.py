@@ -13,6 +13,7 @@ from service.store import keys
 from service.store.address import RedisAddress
 from service.store.errors import DamagedStoreError, UnknownRunError
 from service.store.models import ACTIVE, GoalGrid, Record, RunStatus
+from service.store.pulse import Pulse, ahead_s
 from service.store.tail import parse_record
 
 TIMEOUT_S = 0.5
@@ -28,6 +29,7 @@ class RedisReader:
     def __init__(self, address: RedisAddress) -> None:
         self._address = address
         self._client = address.client(TIMEOUT_S)
+        self._pulse = Pulse()
 
     def runs(self) -> list[RunStatus]:
         """All runs, newest start first; one with a damaged status is left out."""
@@ -36,7 +38,7 @@ class RedisReader:
             statuses = []
             for run_id, (text, *flags) in zip(run_ids, self._look_up(run_ids), strict=True):
                 try:
-                    statuses.append(_status(run_id, text, *flags))
+                    statuses.append(self._status(run_id, text, *flags))
                 except (DamagedStoreError, UnknownRunError) as error:
                     _logger.warning("%s", error)
         return sorted(statuses, key=lambda status: status.started, reverse=True)
@@ -46,7 +48,7 @@ class RedisReader:
         with self._errors():
             ((text, *flags),) = self._look_up([run_id])
             self._check_known(run_id, text is not None)
-            return _status(run_id, text, *flags)
+            return self._status(run_id, text, *flags)
 
     def metrics(self, run_id: str, *, after_iteration: int = 0) -> list[Record]:
         """The records of iterations above ``after_iteration``, in order."""
@@ -87,6 +89,24 @@ class RedisReader:
         with self._errors():
             self._client.ping()
 
+    def _status(self, run_id: str, text: bytes | None, leased: bool, stop: bool) -> RunStatus:
+        status = _parse_status(run_id, text)
+        status = status.model_copy(update={"stopping": status.state in ACTIVE and (status.stopping or stop)})
+        age_s = self._pulse.age_s(run_id, status.heartbeat)
+        if (ahead := ahead_s(status.heartbeat)) is not None and status.state in ACTIVE:
+            said = f"its heartbeat is {ahead:.0f} s in the future: the clock of its machine, or the one here, is wrong"
+            status = status.suffering("clock", said)
+        if not status.is_silent(age_s):
+            return status
+        if leased:
+            said = f"its process renews its claim in Redis, and has said nothing else for {age_s:.0f} s: it hangs"
+            return status.suffering("stuck", said)
+        said = (
+            f"nothing was heard of it for {age_s:.0f} s, and its claim in Redis has expired: its process has ended, is "
+            "frozen, or does not reach Redis; --resume goes on from its last checkpoint, if nobody else does"
+        )
+        return status.suffering("silent", said)
+
     def _look_up(self, run_ids: list[str]) -> Iterator[tuple[bytes | None, bool, bool]]:
         """Status of each run, whether a process runs it, and whether it was asked to stop."""
         with self._client.pipeline(transaction=False) as pipe:
@@ -121,17 +141,14 @@ class RedisReader:
             raise self._address.unavailable(error) from None
 
 
-def _status(run_id: str, text: bytes | None, leased: bool, stop: bool) -> RunStatus:
+def _parse_status(run_id: str, text: bytes | None) -> RunStatus:
     key = keys.run_key(run_id, "status")
     if text is None:
         raise UnknownRunError(f"run {run_id} is in {keys.RUNS}, but {key} is missing; start it again")
     try:
-        status = RunStatus.model_validate_json(text)
+        return RunStatus.model_validate_json(text)
     except ValidationError:
         raise _damaged(key, "run's status") from None
-    if not leased and status.is_silent:
-        return status.vanished()
-    return status.model_copy(update={"stopping": status.state in ACTIVE and (status.stopping or stop)})
 
 
 def _damaged(key: str, what: str) -> DamagedStoreError:

@@ -17,7 +17,7 @@ from service.io.jsonl import plain
 from service.store import keys
 from service.store.address import RedisAddress, reason_of
 from service.store.lease import Lease
-from service.store.models import GoalGrid, Record, RunStatus
+from service.store.models import GoalGrid, Record, RunStatus, Trouble
 
 TICK_S = 0.5
 """Time between two messages to Redis; a stop request is noticed within it."""
@@ -101,9 +101,18 @@ class RedisWriter:
         """Whether somebody asked the run to stop since it was started, as of the last message to Redis."""
         return self._stop
 
-    def warnings(self) -> list[str]:
+    def check(self) -> None:
+        """Assert that this is still the run's driver, as of the last message to Redis.
+
+        Raises:
+            RunTakenError: another one has taken it over.
+        """
+        if self._taken is not None:
+            raise RunTakenError(f"{self._taken}; this process stops, and what it did since then is not kept")
+
+    def troubles(self) -> list[Trouble]:
         """Problems at the moment."""
-        found, away = [], self._away
+        found, away = list[str](), self._away
         if away is not None:
             since_s = time.monotonic() - away[0]
             found.append(
@@ -112,9 +121,7 @@ class RedisWriter:
             )
         if self._num_lost:
             found.append(f"{self._num_lost} records did not reach Redis; metrics.jsonl has them")
-        if self._taken is not None:
-            found.append(f"{self._taken}; this process no longer writes to Redis")
-        return found
+        return [Trouble("redis", text) for text in found]
 
     def close(self, timeout_s: float = 2.0) -> None:
         """Send what still waits, for at most about ``timeout_s``, and let others have the run."""
@@ -135,7 +142,6 @@ class RedisWriter:
                 more = self._send()
             except RunTakenError as error:
                 self._taken = str(error)
-                _logger.warning("%s; this process no longer writes to Redis", error)
             except WatchError:  # the lease has expired or was taken in this very moment; the next try tells which
                 pause_s = 0.0
             except (RedisError, OSError) as error:

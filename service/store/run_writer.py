@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from service.store.address import RedisAddress
 from service.store.disk import DiskWriter
-from service.store.models import GoalGrid, Record, RunStatus
+from service.store.models import GoalGrid, Record, RunStatus, Trouble
 
 if TYPE_CHECKING:
     from service.store.redis_writer import RedisWriter
@@ -35,6 +35,15 @@ class RunWriter:
             remote.append(RedisWriter(redis, run_id))
         self._writers: list[DiskWriter | RedisWriter] = [DiskWriter(directory), *remote]
 
+    def check(self) -> None:
+        """Assert that this process is still the one that runs the run.
+
+        Raises:
+            RunTakenError: another one has taken it over; then nothing more may be written.
+        """
+        for writer in self._writers:
+            writer.check()
+
     def status(self, status: RunStatus) -> None:
         """Replace what is known about the run."""
         for writer in self._writers:
@@ -54,9 +63,9 @@ class RunWriter:
         """Whether somebody asked the run to stop anywhere since it was started."""
         return any(writer.stop_requested() for writer in self._writers)
 
-    def warnings(self) -> list[str]:
-        """Problems at the moment, in one sentence each; empty when all is well."""
-        return [warning for writer in self._writers for warning in writer.warnings()]
+    def troubles(self) -> list[Trouble]:
+        """Problems at the moment; empty when all is well."""
+        return [trouble for writer in self._writers for trouble in writer.troubles()]
 
     def close(self) -> None:
         """Write what still waits, for a bounded time, to every store, also where another fails."""

@@ -174,7 +174,7 @@ def test_the_dashboard_shows_what_people_ask_for():
     # A name for the menu, a mark in time, what the state says, what is known from the rate, names of versions.
     assert not_shown == {
         "tandem_run_info", "tandem_run_started_timestamp_seconds", "tandem_run_stopping", "tandem_run_iterations_total",
-        "tandem_run_env_steps_per_second", "tandem_registry_alias_version",
+        "tandem_run_iteration", "tandem_run_env_steps_per_second", "tandem_registry_alias_version",
     }  # fmt: skip
 
 

@@ -39,6 +39,13 @@ def status(run_id: str, **changes: Any) -> RunStatus:
         "policy_lag": 1.0,
         "num_rollouts_counted": 6,
         "num_rollouts_refused": 1,
+        "totals": {
+            "iterations": 4,
+            "env_steps": 3900,
+            "rollouts_counted": 6,
+            "rollouts_refused": 1,
+            "replacements": 3,
+        },
         "actors": (
             ActorStatus(name="rollout-0", incarnation=2, state="alive", heartbeat=now, last_error="killed"),
             ActorStatus(name="rollout-1", incarnation=0, state="lost", heartbeat=now),

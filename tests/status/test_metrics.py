@@ -37,8 +37,10 @@ def value(samples, name, /, **labels):
 def test_metrics_of_a_run(service):
     samples = scrape(service[0])
     expected = {
-        "tandem_run_iterations_total": 3,
-        "tandem_run_env_steps_total": 3000,
+        "tandem_run_iteration": 3,
+        "tandem_run_env_steps": 3000,
+        "tandem_run_iterations_total": 4,
+        "tandem_run_env_steps_total": 3900,
         "tandem_run_env_steps_budget": 10_000,
         "tandem_run_env_steps_per_second": 500,
         "tandem_run_policy_version": 2,
@@ -59,6 +61,8 @@ def test_metrics_of_a_run(service):
     assert value(samples, "tandem_run_info", run="cube", name="panda-cube", runtime="ray") == 1
     assert value(samples, "tandem_run_state", run="cube", state="running") == 1
     assert value(samples, "tandem_run_state", run="cube", state="failed") == 0
+    assert value(samples, "tandem_run_condition", run="cube", condition="well") == 1
+    assert value(samples, "tandem_run_condition", run="cube", condition="disk") == 0
     assert 0 <= value(samples, "tandem_run_heartbeat_age_seconds", run="cube") < 3600
     assert value(samples, "tandem_runs", state="finished") == value(samples, "tandem_runs", state="running") == 1
 

@@ -2,20 +2,27 @@
 
 import json
 import os
+import re
 import shutil
+import signal
+import subprocess
 import time
 import tracemalloc
+from datetime import UTC, datetime, timedelta
+from types import SimpleNamespace
 
 import pytest
 
 from service.io.jsonl import JsonlWriter
+from service.io.lock import DirectoryLock
 from service.store import disk_reader
 from service.store.disk import DiskWriter
 from service.store.disk_reader import DiskReader, run_id_of
 from service.store.errors import StoreError
+from service.store.pulse import Pulse
 from service.store.tail import RecordFile
 from tests.runtime.runs import assert_one_line, no_room_above
-from tests.store.stores import a_grid, a_record, a_silent_status, a_status
+from tests.store.stores import a_grid, a_record, a_silent_status, a_status, wait_until
 
 
 class Clock:
@@ -70,13 +77,14 @@ def test_a_full_disk_is_a_warning_and_passes(tmp_path, caplog):
         for _ in range(3):
             clock.now_s += 1.0
             writer.status(a_status(iteration=2))
-        (warning,) = writer.warnings()
-        assert_one_line(warning, "status.json cannot be written", "File too large")
+        (trouble,) = writer.troubles()
+        assert trouble.condition == "disk"
+        assert_one_line(trouble.text, "status.json cannot be written", "File too large")
     assert len([message for message in caplog.messages if "status.json" in message]) == 1
     assert read_status(tmp_path)["iteration"] == 1
     writer.close()
     assert read_status(tmp_path)["iteration"] == 2
-    assert writer.warnings() == []
+    assert writer.troubles() == []
     assert list(tmp_path.glob(".tmp-*")) == []
 
 
@@ -204,6 +212,60 @@ def test_a_silent_run_that_nobody_locks_has_vanished_and_is_not_asked_to_stop(tm
     reader = DiskReader(tmp_path)
     reader.request_stop("cube")
     assert not writer.stop_requested()
+
+
+# --- a silent run whose process lives ---------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def held(tmp_path):
+    """A run directory that a process has, which has said nothing for a minute."""
+    lock = DirectoryLock(tmp_path / "cube", "")
+    DiskWriter(tmp_path / "cube").status(a_silent_status())
+    yield DiskReader(tmp_path)
+    lock.release()
+
+
+def test_a_frozen_process_is_stuck_and_named(held, monkeypatch):
+    seen = held.run("cube")
+    assert (seen.state, seen.condition) == ("running", "stuck")
+    assert_one_line(seen.warnings[-1], f"its process {os.getpid()} on ", "not been heard of for 61 s", "--resume")
+    monkeypatch.setattr(disk_reader, "_is_stopped", lambda pid: pid == os.getpid())
+    assert_one_line(held.run("cube").warnings[-1], "frozen by a signal", f"kill -CONT {os.getpid()}")
+
+
+def test_who_is_stopped():
+    with subprocess.Popen(["sleep", "60"]) as process:
+        assert not disk_reader._is_stopped(process.pid)
+        process.send_signal(signal.SIGSTOP)
+        wait_until(lambda: disk_reader._is_stopped(process.pid))
+        process.kill()
+    assert not disk_reader._is_stopped(process.pid)
+
+
+def test_a_full_disk_is_what_it_is(held, monkeypatch):
+    monkeypatch.setattr(disk_reader.shutil, "disk_usage", lambda path: SimpleNamespace(free=4096))
+    seen = held.run("cube")
+    assert (seen.state, seen.condition) == ("running", "disk")
+    assert_one_line(seen.warnings[-1], "the disk of", "is full", "4,096 bytes")
+
+
+@pytest.mark.parametrize("locked", [True, False])
+def test_a_heartbeat_from_the_future_is_no_sign_of_life(tmp_path, monkeypatch, locked):
+    clock = Clock()
+    lock = DirectoryLock(tmp_path / "cube", "")
+    DiskWriter(tmp_path / "cube").status(a_status(heartbeat=datetime.now(UTC) + timedelta(hours=1)))
+    if not locked:
+        lock.release()
+    reader = DiskReader(tmp_path)
+    monkeypatch.setattr(reader, "_pulse", Pulse(lambda: clock.now_s))
+    seen = reader.run("cube")
+    assert (seen.state, seen.condition) == ("running", "clock")
+    assert re.search(r"its heartbeat is 3[56]\d\d s in the future", seen.warnings[-1])
+    clock.now_s += 61.0
+    seen = reader.run("cube")
+    assert (seen.state, seen.condition) == (("running", "stuck") if locked else ("interrupted", "well"))
+    lock.release()
 
 
 def test_yaml_is_parsed_once(old_run, monkeypatch):

@@ -48,7 +48,7 @@ def train(writer, numbers):
     """Tell like a training thread."""
     for number in numbers:
         writer.metrics(a_record(number))
-        writer.status(a_status(iteration=number, warnings=tuple(writer.warnings())))
+        writer.status(a_status(iteration=number, warnings=tuple(each.text for each in writer.troubles())))
         writer.goals(a_grid(number))
         writer.stop_requested()
         time.sleep(0.005)
@@ -70,14 +70,14 @@ def test_killed_and_back_at_the_same_place(redis, writer, reader):
     wait_until(lambda: reader.runs() and iterations(reader)[-1:] == [30])
     redis.kill()
     train(writer, range(31, 131))
-    (warning,) = wait_until(writer.warnings)
+    ((_, warning),) = wait_until(writer.troubles)
     assert_one_line(warning, f"Redis at {redis.address} has taken nothing for", "refused", "records wait")
     redis.revive()
     wait_until(lambda: iterations(reader)[-1:] == [130])
     assert iterations(reader) == list(range(1, 131))
     assert reader.run("cube").iteration == 130
     assert reader.goals("cube").iteration == 130
-    wait_until(lambda: writer.warnings() == [])
+    wait_until(lambda: writer.troubles() == [])
 
 
 @pytest.mark.parametrize("timeout_s", [0.3, 3600.0])
@@ -93,7 +93,7 @@ def test_stopped_for_a_while(redis, reader, monkeypatch, timeout_s):
         with pytest.raises(StoreUnavailableError, match="no answer in time"):
             reader.ready()
         if timeout_s < 1.0:
-            assert "no answer in time" in wait_until(writer.warnings)[0]
+            assert "no answer in time" in wait_until(writer.troubles)[0].text
     finally:
         os.kill(redis.server.pid, signal.SIGCONT)
     wait_until(lambda: iterations(reader)[-1:] == [39])
@@ -108,7 +108,7 @@ def test_what_redis_forgot_that_it_had_is_sent_again(redis, writer, reader):
     redis.address.client(1.0).zremrangebyscore(keys.run_key("cube", "metrics"), 6, "+inf")
     redis.address.client(1.0).delete(keys.run_key("cube", "status"), keys.run_key("cube", "goals"))
     redis.kill()
-    wait_until(writer.warnings)
+    wait_until(writer.troubles)
     redis.revive()
     wait_until(lambda: reader.runs() != [])
     assert iterations(reader) == list(range(1, 11))
@@ -153,10 +153,10 @@ def test_too_many_records_for_memory_are_counted(redis, writer, reader, monkeypa
     writer.status(a_status())
     wait_until(lambda: reader.runs() != [])
     redis.kill()
-    wait_until(writer.warnings)
+    wait_until(writer.troubles)
     for number in range(1, 16):
         writer.metrics(a_record(number))
-    assert "5 records did not reach Redis" in writer.warnings()[-1]
+    assert "5 records did not reach Redis" in writer.troubles()[-1].text
     redis.revive()
     wait_until(lambda: len(iterations(reader)) == 10)
     assert iterations(reader) == list(range(6, 16))
@@ -253,7 +253,7 @@ def test_a_lease_outlives_an_outage(redis, reader):
     """It has expired by the time Redis is back, and nobody else has come."""
     writer = RedisWriter(redis.address, "cube", lease_s=1.0)
     redis.kill()
-    wait_until(writer.warnings)
+    wait_until(writer.troubles)
     time.sleep(1.1)
     redis.revive()
     writer.status(a_status())
@@ -269,12 +269,33 @@ def test_a_driver_that_was_taken_over_is_silent(redis, reader, caplog):
     wait_until(lambda: reader.runs() != [])
     theirs = b'{"token": "x", "host": "elsewhere", "pid": 7, "since": "today"}'
     redis.address.client(1.0).set(keys.run_key("cube", "lease"), theirs)
-    (warning,) = wait_until(writer.warnings)
-    assert_one_line(warning, "run cube was taken over by process 7 on elsewhere", "no longer")
+    wait_until(lambda: not writer._thread.is_alive())
+    with pytest.raises(RunTakenError) as error:
+        writer.check()
+    assert_one_line(error.value, "run cube was taken over by process 7 on elsewhere", "stops")
     writer.status(a_status(iteration=2))
     writer.close()
     assert reader.run("cube").iteration == 1
     assert redis.address.client(1.0).get(keys.run_key("cube", "lease")) == theirs
+
+
+def test_a_driver_that_was_frozen_while_another_began_and_ended_writes_nothing(redis, reader):
+    """The lease is free again; the number of the claim tells."""
+    first = RedisWriter(redis.address, "cube", lease_s=0.5)
+    client = redis.address.client(1.0)
+    with first._client.connection_pool._lock:  # nothing of it gets through, as of a process that is frozen
+        wait_until(lambda: not client.exists(keys.run_key("cube", "lease")))
+        second = RedisWriter(redis.address, "cube")
+        second.status(a_status(iteration=2))
+        wait_until(lambda: reader.runs() != [])
+        second.close()
+    first.status(a_status(iteration=1))
+    wait_until(lambda: not first._thread.is_alive())
+    with pytest.raises(RunTakenError, match="another process, which has ended since"):
+        first.check()
+    first.close()
+    assert reader.run("cube").iteration == 2
+    assert client.get(keys.run_key("cube", "epoch")) == b"2"
 
 
 def test_a_lease_that_never_expires_is_no_endless_wait(redis):
@@ -322,7 +343,7 @@ def test_keys_of_another_type(redis, reader, writer):
         reader.metrics("cube")
     assert_one_line(error.value, f"Redis at {redis.address}", "another type", "delete tandem:*")
     writer.metrics(a_record(1))
-    (warning,) = wait_until(writer.warnings)
+    ((_, warning),) = wait_until(writer.troubles)
     assert_one_line(warning, "WRONGTYPE", "1 records wait")
     client.delete(keys.run_key("cube", "metrics"))
     wait_until(lambda: iterations(reader) == [1])
@@ -341,7 +362,7 @@ def test_full_of_data(redis, writer, reader):
     client = redis.address.client(1.0)
     client.config_set("maxmemory", "1")
     writer.metrics(a_record(1))
-    (warning,) = wait_until(writer.warnings)
+    ((_, warning),) = wait_until(writer.troubles)
     assert "maxmemory" in warning
     client.config_set("maxmemory", "0")
     wait_until(lambda: iterations(reader) == [1])

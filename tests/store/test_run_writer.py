@@ -24,7 +24,7 @@ def test_a_writer_to_disk_and_redis(redis, tmp_path):
     reader.request_stop("cube")
     wait_until(writer.stop_requested)
     redis.kill()
-    (warning,) = wait_until(writer.warnings)
+    ((_, warning),) = wait_until(writer.troubles)
     assert "Redis" in warning
     writer.status(a_status(iteration=2, state="failed"))
     writer.close()

@@ -7,11 +7,10 @@ import { every, follow, isActive } from "./follow.js";
 import { bytes, count, percent, quantity } from "./format.js";
 import { GoalMap } from "./goals.js";
 import { Versions } from "./primitives.js";
-import { age, progressBar, secondsSince, share, stateChip, Table, timeLeft } from "./widgets.js";
+import { age, progressBar, share, stateChip, Table, timeLeft } from "./widgets.js";
 
 const GOALS_MS = 5000;
 const FILES_MS = 15_000;
-const SILENT_S = 30;
 const ORDER = ["lost", "starting", "alive"];
 
 /** Show a run until ``signal`` aborts. */
@@ -139,12 +138,10 @@ class Summary {
 
   show() {
     const run = this.run;
-    const silent = isActive(run) && secondsSince(run.heartbeat) > SILENT_S;
-    const warnings = [...run.warnings, ...(silent ? ["no heartbeat for a while; the run may be busy, or its process may have ended"] : [])];
     const boxes = [
       ...(this.cannot ? [["error", "This run cannot be followed", this.cannot]] : []),
       ...(run.last_error ? [["error", "Last error", run.last_error]] : []),
-      ...warnings.map((text) => ["warning", "Warning", text]),
+      ...run.warnings.map((text) => ["warning", "Warning", text]),
     ];
     const key = JSON.stringify(boxes);
     if (key === this.shown) return; // so that a screen reader says it once

@@ -50,7 +50,7 @@ function sum({ runs, num_runs: numRuns }) {
 function columns(sparks) {
   return [
     { label: "Run", changed: (run) => [run.run_id, run.name, run.runtime], node: title },
-    { label: "State", changed: (run) => [run.state, run.stopping, run.last_error, run.warnings], node: state },
+    { label: "State", changed: (run) => [run.state, run.condition, run.stopping, run.last_error, run.warnings], node: state },
     { label: "Env steps", changed: (run) => [run.num_env_steps, run.total_env_steps], node: progressBar },
     { label: "Env steps/s", text: (run) => (isActive(run) ? count(run.env_steps_per_s) : "\u2013"), number: true },
     { label: "Bob's success", changed: (run) => sparks.changed(run), node: (run) => sparks.node(run) },
@@ -64,7 +64,8 @@ function title(run) {
 }
 
 function state(run) {
-  const trouble = run.last_error ? "error" : run.warnings.length ? counted(run.warnings.length, "warning") : null;
+  const bad = run.condition !== "well" ? run.condition : null;
+  const trouble = bad ?? (run.last_error ? "error" : run.warnings.length ? counted(run.warnings.length, "warning") : null);
   return el("span", { class: "chips" }, stateChip(run), trouble && el("span", { class: "chip warn" }, trouble));
 }
 

@@ -1,0 +1,58 @@
+"""Age of a run's heartbeat, as its reader's own clock counts it: the clocks of two machines may differ, and jump."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from datetime import UTC, datetime, timedelta
+from threading import Lock
+
+MAX_AHEAD = timedelta(seconds=5)
+"""A heartbeat from further in the future says that two clocks differ."""
+_MAX_RUNS = 10_000
+
+
+@dataclass(frozen=True, slots=True)
+class _Seen:
+    heartbeat: datetime
+    beat_s: float
+    """``clock`` at the heartbeat, as far as is known."""
+    looked_s: float
+
+
+class Pulse:
+    """Remembers when heartbeats changed; for any number of threads at once.
+
+    The first time that a run is asked about, its heartbeat is as old as the clocks say. From then on it grows older by
+    this process's own clock, until there is another one.
+
+    Args:
+        clock: counts seconds, and never jumps.
+    """
+
+    def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
+        self._clock, self._lock = clock, Lock()
+        self._seen: dict[str, _Seen] = {}
+
+    def age_s(self, run_id: str, heartbeat: datetime) -> float:
+        """Seconds since a run's last heartbeat; never negative."""
+        by_date = max(0.0, (datetime.now(UTC) - heartbeat).total_seconds())
+        with self._lock:
+            now_s, seen = self._clock(), self._seen.get(run_id)
+            if seen is None:
+                beat_s = now_s - by_date
+            elif seen.heartbeat == heartbeat:
+                beat_s = seen.beat_s
+            else:  # it came at some time since the last look
+                beat_s = now_s - min(by_date, now_s - seen.looked_s)
+            if len(self._seen) > _MAX_RUNS:
+                self._seen.clear()
+            self._seen[run_id] = _Seen(heartbeat, beat_s, now_s)
+        return now_s - beat_s
+
+
+def ahead_s(heartbeat: datetime) -> float | None:
+    """Seconds by which a heartbeat comes from the future, where that is more than clocks differ by; else None."""
+    ahead = heartbeat - datetime.now(UTC)
+    return ahead.total_seconds() if ahead > MAX_AHEAD else None

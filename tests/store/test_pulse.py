@@ -1,0 +1,50 @@
+"""How old a heartbeat is, whatever the clocks of two machines say."""
+
+from datetime import UTC, datetime, timedelta
+
+import pytest
+
+from service.store.pulse import Pulse, ahead_s
+
+
+@pytest.fixture
+def clock():
+    return [100.0]
+
+
+@pytest.fixture
+def pulse(clock):
+    return Pulse(lambda: clock[0])
+
+
+def ago(seconds):
+    return datetime.now(UTC) - timedelta(seconds=seconds)
+
+
+def test_at_first_it_is_as_old_as_the_clocks_say_and_then_grows_by_our_own(pulse, clock):
+    beat = ago(10)
+    assert pulse.age_s("cube", beat) == pytest.approx(10.0, abs=1.0)
+    clock[0] += 50.0
+    assert pulse.age_s("cube", beat) == pytest.approx(60.0, abs=1.0)
+    assert pulse.age_s("other", beat) == pytest.approx(10.0, abs=1.0)
+
+
+def test_one_from_the_future_grows_old_like_any_other(pulse, clock):
+    beat = ago(-3600)
+    assert pulse.age_s("cube", beat) == 0.0
+    clock[0] += 61.0
+    assert pulse.age_s("cube", beat) == 61.0
+
+
+def test_a_new_one_is_not_older_than_our_last_look(pulse, clock):
+    pulse.age_s("cube", ago(5))
+    clock[0] += 2.0
+    assert pulse.age_s("cube", ago(3600)) == 2.0  # the clock of its machine is an hour slow, and it beats
+    clock[0] += 3600.0
+    assert pulse.age_s("cube", ago(1000)) == pytest.approx(1000.0, abs=1.0)  # it beat while nobody looked
+
+
+def test_how_far_ahead():
+    assert ahead_s(ago(60)) is None
+    assert ahead_s(ago(-3)) is None
+    assert ahead_s(ago(-60)) == pytest.approx(60.0, abs=1.0)
