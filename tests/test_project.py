@@ -37,8 +37,8 @@ CLUSTER_MODULES = (
 )
 ROOMS_WITHOUT_TORCH = ("actors", "envs", "generator", "registry", "status")
 ROOMS = (
-    *("errors", "frozen", "types", "config_tree", "off_policy_config", "config", "io", "envs", "policies"),
-    *("generator", "actors", "learner", "sac", "baselines", "registry", "primitives", "media", "downstream"),
+    *("errors", "frozen", "types", "parsing", "regular_files", "config_tree", "off_policy_config", "config", "io"),
+    *("envs", "policies", "generator", "actors", "learner", "sac", "baselines", "registry", "primitives", "media", "downstream"),
     *("store", "status", "runtime", "cli", "__main__"),
 )
 """Each room may import itself and those before it."""

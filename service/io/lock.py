@@ -11,9 +11,12 @@ import socket
 import time
 from io import FileIO
 from pathlib import Path
+from typing import BinaryIO
 
 from service.io.errors import RunTakenError
 from service.io.files import os_errors
+from service.parsing import parse_json
+from service.regular_files import open_regular
 
 LOCK_FILE = ".lock"
 WAIT_S = 0.5
@@ -60,13 +63,13 @@ class DirectoryLock:
 def is_locked(directory: Path) -> bool:
     """Whether some process holds the directory's lock now."""
     try:
-        with FileIO(directory / LOCK_FILE, "r") as file:
+        with open_regular(directory / LOCK_FILE, follow=True) as file:
             return not _take(file, fcntl.LOCK_SH, 0.0)
     except OSError:  # nobody ever locked it, or nobody can
         return False
 
 
-def _take(file: FileIO, kind: int, wait_s: float) -> bool:
+def _take(file: FileIO | BinaryIO, kind: int, wait_s: float) -> bool:
     deadline_s = time.monotonic() + wait_s
     while True:
         try:
@@ -81,6 +84,6 @@ def _take(file: FileIO, kind: int, wait_s: float) -> bool:
 def _read_holder(file: FileIO) -> str:
     with contextlib.suppress(OSError, ValueError, KeyError, TypeError):
         file.seek(0)
-        note = json.loads(file.read(1000))
+        note = parse_json(file.read(1000), "the lock")
         return f"process {int(note['pid'])} on {str(note['host'])[:100]}"
     return "another process"

@@ -207,8 +207,8 @@ def test_a_silent_run_that_nobody_locks_has_vanished_and_is_not_asked_to_stop(tm
 
 
 def test_yaml_is_parsed_once(old_run, monkeypatch):
-    calls, load = [], disk_reader.yaml.safe_load
-    monkeypatch.setattr(disk_reader.yaml, "safe_load", lambda text: calls.append(1) or load(text))
+    calls, load = [], disk_reader.parse_yaml
+    monkeypatch.setattr(disk_reader, "parse_yaml", lambda *given: calls.append(1) or load(*given))
     reader = DiskReader(old_run.parent)
     for _ in range(3):
         reader.run("old-one")

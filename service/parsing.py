@@ -13,7 +13,7 @@ from typing import Any
 
 import yaml
 
-from service.io.errors import StorageError
+from service.errors import TandemError
 
 MAX_DEPTH = 64
 """Groups within groups; a configuration has five."""
@@ -24,7 +24,7 @@ MAX_YAML_VALUES = 5000
 """Values of a YAML text, those that aliases repeat included; a configuration has 200."""
 
 
-class ParseError(StorageError):
+class ParseError(TandemError):
     """A text is neither JSON nor YAML, or nothing that could be worked with.
 
     Args:
