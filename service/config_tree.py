@@ -7,9 +7,9 @@ from copy import deepcopy
 from pathlib import Path
 from typing import Any
 
-import yaml
-
-from service.errors import ConfigError
+from service.errors import ConfigError, one_line
+from service.parsing import MAX_YAML_CHARACTERS, ParseError, parse_yaml
+from service.regular_files import read_regular
 
 RENAMED = {"learner.bob_average_decay": "learner.bob_ema_decay", "learner.mirror": "learner.bob.mirror"}
 """Keys that had another name in version 0.1.0."""
@@ -25,11 +25,13 @@ REMOVED = {
 def read_yaml(path: Path) -> dict[str, Any]:
     """Read the tree of a YAML file; see ``config.load_config`` for its errors."""
     try:
-        tree = yaml.safe_load(path.read_text(encoding="utf-8"))
+        tree = parse_yaml(read_regular(path, MAX_YAML_CHARACTERS, follow=True), path)
     except FileNotFoundError:
         raise ConfigError(f"no configuration file {path}; see configs/pretrain/ for those that ship") from None
-    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
-        raise ConfigError(f"{path}: cannot be read as YAML: {' '.join(str(error).split())}") from None
+    except OSError as error:
+        raise ConfigError(f"{path}: cannot be read: {error.strerror}; name a YAML file") from None
+    except ParseError as error:
+        raise ConfigError(f"{path}: cannot be read as YAML: {error.reason}") from None
     if tree is None:
         return {}
     if not isinstance(tree, dict):
@@ -43,9 +45,9 @@ def apply_override(tree: dict[str, Any], override: str) -> None:
     if not separator or not key.strip():
         raise ConfigError(f"override {override!r}: expected KEY=VALUE, for example learner.bob.num_epochs=3")
     try:
-        value = yaml.safe_load(text)
-    except yaml.YAMLError:
-        raise ConfigError(f"override {override!r}: the value is not YAML") from None
+        value = parse_yaml(text, "its value")
+    except ParseError as error:
+        raise ConfigError(f"override {one_line(override, 200)!r}: the value is {error.reason}") from None
     if isinstance(value, str):
         with suppress(ValueError):
             value = float(value)  # YAML 1.1 reads 1e-3 as text

@@ -12,6 +12,12 @@ class TandemError(ValueError):
     """Of a command that ends with it: 2 for what was asked for, 1 for what happened on the way."""
 
 
+class UnexpectedError(TandemError):
+    """A mistake of this program's own; the message names the file that has its traceback."""
+
+    exit_code = 1
+
+
 class ConfigError(TandemError):
     """A configuration the user can mend; the message says what, where, which value, and what to do."""
 
@@ -26,3 +32,16 @@ class GroupError(TandemError):
     """The ranks of a learner do not hear each other; the message says which rank noticed it."""
 
     exit_code = 1
+
+
+def one_line(text: str, max_characters: int = 2000) -> str:
+    """A message as one line of printable characters; of one that is too long, the middle is left out.
+
+    What a file holds may come into a message, and may be made to look like other lines, or to move a terminal's cursor.
+    """
+    joined = " ".join(line.strip() for line in text.splitlines())
+    line = "".join(each if each.isprintable() else each.encode("unicode_escape").decode() for each in joined)
+    if len(line) <= max_characters:
+        return line
+    half = max_characters // 2
+    return f"{line[:half]} ... {line[-half:]}"

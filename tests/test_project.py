@@ -38,8 +38,9 @@ CLUSTER_MODULES = (
 )
 ROOMS_WITHOUT_TORCH = ("actors", "envs", "generator", "registry", "status")
 ROOMS = (
-    *("errors", "frozen", "liveness", "types", "config_tree", "off_policy_config", "config", "io", "envs", "policies"),
-    *("generator", "actors", "learner", "sac", "baselines", "registry", "primitives", "media", "downstream"),
+    *("errors", "frozen", "liveness", "types", "parsing", "regular_files", "config_tree", "off_policy_config"),
+    *("config", "io", "envs", "policies", "generator", "actors", "learner", "sac", "baselines", "registry"),
+    *("primitives", "media", "downstream"),
     *("store", "status", "runtime", "cli", "__main__"),
 )
 """Each room may import itself and those before it."""

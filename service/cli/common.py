@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import json
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 from typer.core import TyperGroup
 
-from service.errors import TandemError
+from service.cli.unexpected import UsageError, traceback_in
+from service.errors import TandemError, one_line
 
 CHAMPION = "panda-cube@champion"
 """The primitives that come with the package."""
@@ -26,18 +28,38 @@ REGISTRY = Path("registry")
 
 
 class CommandGroup(TyperGroup):
-    """A group of commands in which a ``TandemError`` is one line on stderr and an exit code.
+    """A group of commands in which every error is one line on stderr and an exit code.
 
-    The code is 2 if the error is a mistake in what was typed.
+    The code is 2 if the error is a mistake in what was typed, or in a file that was named; else 1.
     """
+
+    def make_context(self, info_name: str | None, args: list[str], parent: Any = None, **extra: Any) -> Any:
+        """Read what was typed."""
+        with _one_line():
+            return super().make_context(info_name, args, parent, **extra)
 
     def invoke(self, ctx: Any) -> Any:
         """Run the command that was typed."""
-        try:
+        with _one_line():
             return super().invoke(ctx)
-        except TandemError as error:
-            typer.echo(f"error: {error}", err=True)
-            raise typer.Exit(error.exit_code) from None
+
+
+@contextmanager
+def _one_line() -> Iterator[None]:
+    try:
+        with traceback_in():
+            yield
+    except TandemError as error:
+        typer.echo(f"error: {one_line(str(error))}", err=True)
+        raise typer.Exit(error.exit_code) from None
+    except UsageError as error:
+        said: Any = error
+        text = said.format_message().strip()
+        if not text or "\n" in text:  # help, which was asked for by typing nothing; it may be printed already
+            raise
+        command = f"; see {said.ctx.command_path} --help" if said.ctx is not None else ""
+        typer.echo(f"error: {one_line(text).rstrip('.')}{command}", err=True)
+        raise typer.Exit(said.exit_code) from None
 
 
 def print_json(tree: Any) -> None:

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from service.cli.common import CHAMPION, EXIT_SIGNAL, CommandGroup, print_json
-from service.errors import TandemError
+from service.errors import TandemError, one_line
 
 if TYPE_CHECKING:
     from service.downstream.table import Runner
@@ -148,10 +148,9 @@ def _learning(
     steps: int | None, skill_steps: int | None, reward_margin_m: float | None, overrides: list[str] | None
 ) -> dict[str, Any]:
     """Settings of a trial about learning, defaults where left out."""
-    import yaml
-
     from service.downstream.settings import validate
     from service.off_policy_config import SACConfig
+    from service.parsing import ParseError, parse_yaml
 
     values = {}
     for override in overrides or []:
@@ -159,9 +158,9 @@ def _learning(
         if not separator or key not in SACConfig.model_fields:
             raise TandemError(f"--set {override}: write KEY=VALUE with KEY one of {', '.join(SACConfig.model_fields)}")
         try:
-            values[key] = yaml.safe_load(text)
-        except yaml.YAMLError:
-            raise TandemError(f"--set {override}: the value is no YAML") from None
+            values[key] = parse_yaml(text, "its value")
+        except ParseError as error:
+            raise TandemError(f"--set {one_line(override, 200)}: the value is {error.reason}") from None
     chosen = {"num_env_steps": steps, "skill_steps": skill_steps, "reward_margin_m": reward_margin_m}
     return {"sac": validate(SACConfig, values), **{key: value for key, value in chosen.items() if value is not None}}
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import os
+import threading
 
 import typer
 
@@ -13,6 +14,7 @@ from service.cli.evaluate import coverage, evaluate, render
 from service.cli.pretrain import demo, pretrain
 from service.cli.registry import registry_app
 from service.cli.serve import serve
+from service.cli.unexpected import report_thread_error
 
 app = typer.Typer(
     name="tandem", help="Robot skills, pre-trained.", cls=CommandGroup, no_args_is_help=True, add_completion=False
@@ -30,5 +32,6 @@ def main() -> None:
     for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
         os.environ.setdefault(name, "1")
     logging.basicConfig(level=logging.INFO, format="%(message)s")
+    threading.excepthook = report_thread_error
     logging.getLogger("OpenGL").setLevel(logging.WARNING)  # says at INFO which optional module it does without
     app()

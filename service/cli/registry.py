@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from service.cli.common import REGISTRY, CommandGroup, JsonOption, RegistryOption, print_json, print_table
+from service.errors import one_line
 
 if TYPE_CHECKING:
     from service.registry.manifest import Manifest
@@ -69,20 +70,21 @@ def verify(
     reference: Annotated[str | None, typer.Argument(help="A version; everything when left out.")] = None,
     directory: RegistryOption = REGISTRY,
 ) -> None:
-    """Check every byte against its digest; exit code 1 when something is damaged."""
+    """Check every byte against its digest, and every parameter; exit code 1 when something is damaged."""
     from service.primitives.bundled import find_version
+    from service.primitives.verification import network_problems
     from service.registry.errors import RegistryError
     from service.registry.registry import Registry
 
     if reference is not None:
         registry, version = find_version(reference, directory)
-        problems = registry.verify(str(version))
+        problems = registry.verify(str(version), network_problems)
     elif directory.is_dir():
-        problems = Registry(directory).verify()
+        problems = Registry(directory).verify(check=network_problems)
     else:
         raise RegistryError(f"no registry at {directory}; name one with --registry or TANDEM_REGISTRY")
     for problem in problems:
-        typer.echo(problem, err=True)
+        typer.echo(one_line(problem), err=True)
     if problems:
         raise typer.Exit(1)
     typer.echo(f"{reference or directory}: all is well")

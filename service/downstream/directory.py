@@ -25,12 +25,16 @@ from service.io.files import TEMPORARY_PREFIX, os_errors, remove_temporaries, wr
 from service.io.jsonl import JsonlWriter
 from service.io.lock import LOCK_FILE, DirectoryLock
 from service.io.tensorboard import EventFile
+from service.parsing import ParseError, parse_json
+from service.regular_files import read_regular
 from service.types import Arrays
 
 FORMAT_VERSION = 1
 """Version of ``cell.json`` and ``result.json``, and of the table's files."""
 TRIAL = "cell"
 """Key of a trial's settings in these files, which call a trial a cell."""
+MAX_BYTES = 64 * 1024 * 1024
+"""Of each of them, whose curves grow with the length of a training."""
 _ELSEWHERE = "name another directory (--run-dir, of a table --runs)"
 
 
@@ -142,9 +146,11 @@ def read_json(path: Path) -> dict[str, Any]:
         TandemError: there is none, or it is of another format version.
     """
     with os_errors("read", path):
-        data = path.read_bytes()
+        data = read_regular(path, MAX_BYTES, follow=True)
     try:
-        tree = dict(json.loads(data))
+        tree = dict(parse_json(data, path))
+    except ParseError as error:
+        raise TandemError(f"{path} is no JSON object: {error.reason}; remove it, or name another directory") from None
     except (ValueError, TypeError) as error:
         raise TandemError(f"{path} is no JSON object: {error}; remove it, or name another directory") from None
     _check_version(tree, path)

@@ -12,11 +12,15 @@ from service.envs.observations import BOB, POSITIONS
 from service.errors import TandemError
 from service.io.files import os_errors, write_atomic
 from service.io.tensors import decode, encode, read_metadata
+from service.parsing import parse_json
 from service.policies.parameters import Parameters
+from service.regular_files import read_regular
 from service.sac.numpy_actor import numpy_actor
 from service.types import FloatArray
 
 _KEY = "downstream_policy"
+MAX_BYTES = 1024**3
+"""Of a policy's file; usual are some hundred thousand."""
 
 
 class LearnedPolicy:
@@ -75,9 +79,9 @@ def load_policy(path: Path | str, trained: Trained) -> LearnedPolicy:
     """
     path = Path(path)
     with os_errors("read", path):
-        data = path.read_bytes()
+        data = read_regular(path, MAX_BYTES, follow=True)
     try:
-        about: dict[str, Any] = json.loads(read_metadata(data)[_KEY])
+        about: dict[str, Any] = dict(parse_json(read_metadata(data)[_KEY], path))
         parameters = decode(data)
     except (KeyError, ValueError) as error:
         raise TandemError(f"{path} is no policy of a downstream training ({error}); take policy.safetensors") from None

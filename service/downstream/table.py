@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from service import is_service
-from service.downstream.directory import made_with
+from service.downstream.directory import MAX_BYTES, made_with
 from service.downstream.methods import Trained, find_method, load_for, provenance
 from service.downstream.page import MARK, draw_table, write_page
 from service.downstream.results import Result, ResultsDirectory
@@ -21,6 +21,7 @@ from service.downstream.settings import TrialConfig
 from service.downstream.worker import Callbacks, RunOptions, check_trial, run_trial
 from service.errors import TandemError
 from service.io.files import os_errors, write_atomic
+from service.regular_files import read_regular
 
 PAGE_FILE, PICTURE_FILE = "downstream.md", "downstream.png"
 _POLL_S = 1.0
@@ -54,7 +55,7 @@ def make_table(trials: Sequence[TrialConfig], source: Source, out: Path, runner:
     """
     page = out / PAGE_FILE
     with os_errors("read", page):
-        if page.exists() and MARK not in page.read_text(encoding="utf-8"):
+        if page.exists() and MARK.encode() not in read_regular(page, MAX_BYTES, follow=True):
             raise TandemError(f"{page} was not written by this command; name another directory with --out")
     trained = load_for({trial.method for trial in trials}, source.primitives, source.registry)
     results = ResultsDirectory(out / "downstream")

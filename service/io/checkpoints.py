@@ -18,8 +18,12 @@ import numpy as np
 from service.io import tensors
 from service.io.errors import CheckpointError, FormatVersionError
 from service.io.files import os_errors, remove_temporaries, write_atomic
+from service.parsing import parse_json
+from service.regular_files import read_regular
 
 FORMAT_VERSION = 1
+MAX_BYTES = 8 * 1024**3
+"""Of a checkpoint; a replay buffer of a million steps has half a gigabyte."""
 _HEADER_KEY = "tandem_checkpoint"
 _FILE_PATTERN = re.compile(r"checkpoint-([0-9]{8,})\.safetensors")
 _logger = logging.getLogger(__name__)
@@ -67,7 +71,8 @@ class CheckpointStore:
         Args:
             step: the iteration after which the state was taken, >= 0.
             arrays: any shape and memory order; see `tensors.encode`.
-            meta: plain JSON values; integers of any size, NaN and infinities come back exactly, tuples as lists.
+            meta: plain JSON values; integers of up to 300 digits, NaN and infinities come back exactly, tuples as
+                lists.
 
         Raises:
             CheckpointError: an array or value that cannot be saved, or a full disk; earlier checkpoints are intact.
@@ -124,9 +129,9 @@ def read_checkpoint(path: Path) -> Checkpoint:
         FormatVersionError: it is of another format.
     """
     with os_errors("read", path, CheckpointError):
-        data = path.read_bytes()
+        data = read_regular(path, MAX_BYTES, follow=True)
     try:
-        header = json.loads(tensors.read_metadata(data)[_HEADER_KEY])
+        header = parse_json(tensors.read_metadata(data)[_HEADER_KEY], path, allow_nan=True)
         format_version = header["format_version"]
     except (ValueError, KeyError, TypeError):
         raise CheckpointError(f"{path} is damaged: its header cannot be read") from None
@@ -140,4 +145,7 @@ def read_checkpoint(path: Path) -> Checkpoint:
     actual = tensors.digest_of(json.dumps(header, sort_keys=True), arrays)
     if actual != expected:
         raise CheckpointError(f"{path} is damaged: expected sha256 {expected}, it has {actual}")
-    return Checkpoint(header["step"], arrays, header["meta"])
+    step, meta = header.get("step"), header.get("meta")
+    if type(step) is not int or not isinstance(meta, dict):
+        raise CheckpointError(f"{path} is damaged: it has no step, or nothing beside its arrays")
+    return Checkpoint(step, arrays, meta)

@@ -11,9 +11,13 @@ import socket
 import time
 from io import FileIO
 from pathlib import Path
+from typing import BinaryIO
 
+from service.errors import TandemError
 from service.io.errors import RunTakenError
 from service.io.files import os_errors
+from service.parsing import parse_json
+from service.regular_files import open_regular, read_regular
 
 LOCK_FILE = ".lock"
 WAIT_S = 0.5
@@ -61,7 +65,7 @@ class DirectoryLock:
 def is_locked(directory: Path) -> bool:
     """Whether some process holds the directory's lock now."""
     try:
-        with FileIO(directory / LOCK_FILE, "r") as file:
+        with open_regular(directory / LOCK_FILE, follow=True) as file:
             return not _take(file, fcntl.LOCK_SH, 0.0)
     except OSError:  # nobody ever locked it, or nobody can
         return False
@@ -69,13 +73,13 @@ def is_locked(directory: Path) -> bool:
 
 def holder(directory: Path) -> tuple[str, int] | None:
     """Host and process that last took the directory's lock, as it noted them; None where that cannot be read."""
-    with contextlib.suppress(OSError, ValueError, KeyError, TypeError):
-        note = json.loads((directory / LOCK_FILE).read_bytes()[:1000])
+    with contextlib.suppress(OSError, TandemError, ValueError, KeyError, TypeError):
+        note = parse_json(read_regular(directory / LOCK_FILE, 1000), "the lock")
         return str(note["host"])[:100], int(note["pid"])
     return None
 
 
-def _take(file: FileIO, kind: int, wait_s: float) -> bool:
+def _take(file: FileIO | BinaryIO, kind: int, wait_s: float) -> bool:
     deadline_s = time.monotonic() + wait_s
     while True:
         try:

@@ -26,7 +26,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from importlib.metadata import version
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -34,10 +34,12 @@ from service.config import Config, dump_config, load_config
 from service.errors import ConfigError, TandemError
 from service.io.checkpoints import CheckpointStore
 from service.io.errors import StorageError
-from service.io.files import Appender, os_errors, remove_temporaries, write_atomic
+from service.io.files import Appender, check_regular, os_errors, remove_temporaries, write_atomic
 from service.io.git import git_commit
 from service.io.jsonl import JsonlWriter
 from service.io.lock import DirectoryLock
+from service.parsing import ParseError, parse_json
+from service.regular_files import read_regular
 from service.types import FloatArray, StateArray
 
 if TYPE_CHECKING:
@@ -45,6 +47,16 @@ if TYPE_CHECKING:
 
 _logger = logging.getLogger(__name__)
 MAX_DIVERGED_FILES = 100
+MAX_NOTE_BYTES = 10_000
+
+
+class Published(NamedTuple):
+    """A version that a run published."""
+
+    version: str
+    """``NAME@VERSION``."""
+    blob_sha256: str
+    """Digest of its parameters: another registry may have another version of that number."""
 
 
 class RunDirectory:
@@ -96,6 +108,8 @@ class RunDirectory:
         if after_iteration is None:
             self.check_free()
         else:
+            for file in (self.metrics_file, self.goals_file):
+                check_regular(file)
             self._metrics.truncate_after(after_iteration)
             self._goals.truncate_after(after_iteration)
         with os_errors("write", self.path):
@@ -105,11 +119,37 @@ class RunDirectory:
             write_atomic(self.path / "environment.json", json.dumps(_environment(), indent=1).encode())
             write_atomic(self.config_file, dump_config(config).encode())  # last: a start that failed can be tried again
 
-    def read_published(self) -> str | None:
-        """``NAME@VERSION`` of what this run published last; None before the first."""
-        if not self.published_file.exists():
-            return None
-        return str(json.loads(self.published_file.read_bytes())["version"])
+    def read_published(self) -> Published | None:
+        """What this run published last; None before the first.
+
+        Raises:
+            StorageError: the file that says so cannot be read, or is damaged.
+        """
+        path = self.published_file
+        with os_errors("read", path):
+            try:
+                data = read_regular(path, MAX_NOTE_BYTES, follow=True)
+            except FileNotFoundError:
+                return None
+        try:
+            note = parse_json(data, path)
+            version, digest = note["version"], note["blob_sha256"]
+        except (ParseError, KeyError, TypeError):
+            version = digest = None
+        if not (isinstance(version, str) and isinstance(digest, str)):
+            raise StorageError(
+                f"{path} names no version and digest; remove it: what the run publishes next then has no parent"
+            )
+        return Published(version, digest)
+
+    def write_published(self, published: Published) -> None:
+        """Note what this run published.
+
+        Raises:
+            StorageError: it cannot be written.
+        """
+        with os_errors("write", self.published_file):
+            write_atomic(self.published_file, json.dumps(published._asdict()).encode())
 
     def claim(self, *, resume: bool) -> None:
         """Keep every other process from running this run until ``close``; a second call does nothing.

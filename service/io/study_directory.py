@@ -22,10 +22,13 @@ from service.io.errors import StorageError
 from service.io.files import os_errors, write_atomic
 from service.io.lock import DirectoryLock
 from service.io.run_directory import RunDirectory
+from service.parsing import parse_json
+from service.regular_files import read_regular
 
 STUDY_FILE = "study.yaml"
 RESULTS_FILE = "study.json"
 LOG_FILE = "log.txt"
+MAX_RESULTS_BYTES = 16 * 1024 * 1024
 
 
 def is_study(path: Path) -> bool:
@@ -73,9 +76,9 @@ class StudyDirectory:
         """
         self._check_begun()
         with os_errors("read", self.results_file):
-            data = self.results_file.read_bytes()
+            data = read_regular(self.results_file, MAX_RESULTS_BYTES, follow=True)
         try:
-            return tuple(int(seed) for seed in json.loads(data)["seeds"])
+            return tuple(int(seed) for seed in parse_json(data, self.results_file)["seeds"])
         except (ValueError, KeyError, TypeError):
             raise StorageError(
                 f'{self.results_file} names no seeds; write {{"seeds": [0, 1]}} into it, with those whose directories '

@@ -11,6 +11,8 @@ import numpy as np
 from safetensors import SafetensorError
 from safetensors.numpy import load, save
 
+from service.parsing import parse_json
+
 _SIZED = ("int8", "int16", "int32", "int64", "uint8", "uint16", "uint32", "uint64", "float16", "float32", "float64")
 DTYPES = ("bool", *_SIZED, "complex64")
 
@@ -56,9 +58,9 @@ def read_metadata(data: bytes) -> dict[str, str]:
     length = int.from_bytes(data[:8], "little")
     if length > len(data) - 8:
         raise ValueError("not a whole safetensors file: the header is cut short")
-    header = json.loads(data[8 : 8 + length])
+    header = parse_json(data[8 : 8 + length], "the header")
     metadata = header.get("__metadata__", {}) if isinstance(header, dict) else {}
-    return {str(key): str(value) for key, value in metadata.items()}
+    return {str(key): str(value) for key, value in metadata.items()} if isinstance(metadata, dict) else {}
 
 
 def digest_of(text: str, arrays: Mapping[str, np.ndarray]) -> str:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import json
 
 from service.actors.coverage import NUM_SKILLS, visited_share
 from service.actors.evaluation import EVALUATED_GOALS, REPORTED_SEED, success_metrics
@@ -13,8 +12,7 @@ from service.config import Config
 from service.envs.observations import BOB, POSITIONS, SPACES
 from service.io import tensors
 from service.io.errors import StorageError
-from service.io.files import os_errors, write_atomic
-from service.io.run_directory import RunDirectory
+from service.io.run_directory import Published, RunDirectory
 from service.off_policy_config import SkillsConfig
 from service.policies.numpy_policy import numpy_bob
 from service.policies.parameters import Parameters
@@ -67,9 +65,7 @@ def publish_run(
     if version is None:
         parent = _published_before(directory, registry)
         version = publish(registry, config, parameters, metrics, parent=parent)
-    note = {"version": str(version), "blob_sha256": registry.manifest(str(version)).blob_sha256}
-    with os_errors("write", directory.published_file):
-        write_atomic(directory.published_file, json.dumps(note).encode())
+    directory.write_published(Published(str(version), registry.manifest(str(version)).blob_sha256))
     return version
 
 
@@ -118,10 +114,8 @@ def _newest_if_same(registry: Registry, name: str, parameters: Parameters) -> Ve
 
 def _published_before(directory: RunDirectory, registry: Registry) -> str | None:
     """The version this run published last, if it did so in this registry."""
-    if not directory.published_file.exists():
-        return None
-    note = json.loads(directory.published_file.read_bytes())
+    last = directory.read_published()
     with contextlib.suppress(StorageError):
-        if registry.manifest(note["version"]).blob_sha256 == note["blob_sha256"]:
-            return str(note["version"])
+        if last is not None and registry.manifest(last.version).blob_sha256 == last.blob_sha256:
+            return last.version
     return None

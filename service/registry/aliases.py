@@ -3,11 +3,16 @@
 from __future__ import annotations
 
 import fcntl
+import os
 from pathlib import Path
 
 from service.io.files import os_errors, write_atomic
 from service.registry.errors import RegistryError
 from service.registry.names import check_alias, is_name, is_number
+from service.regular_files import read_regular
+
+MAX_BYTES = 100
+"""Of an alias' file, which holds a number."""
 
 
 def read_alias(directory: Path, alias: str) -> int | None:
@@ -20,10 +25,10 @@ def read_alias(directory: Path, alias: str) -> int | None:
     path = directory / check_alias(alias)
     with os_errors("read", path):
         try:
-            text = path.read_bytes().decode("ascii", errors="replace").strip()
+            text = read_regular(path, MAX_BYTES, follow=True).decode("ascii", errors="replace").strip()
         except FileNotFoundError:
             return None
-    if not is_number(text):
+    if not is_number(text):  # of so few bytes, it is no number that could not be worked with
         raise RegistryError(f"alias {path} is damaged: it holds {text!r}; set it again with tandem registry alias")
     return int(text)
 
@@ -51,7 +56,10 @@ def move_alias(directory: Path, alias: str, number: int, *, back: bool = True) -
     path = directory / check_alias(alias)
     with os_errors("write", path):
         directory.mkdir(parents=True, exist_ok=True)
-        with (directory / ".lock").open("a") as lock:
+        descriptor = os.open(
+            directory / ".lock", os.O_RDWR | os.O_CREAT, 0o666
+        )  # reading, too: never waits for a reader
+        with open(descriptor, "a") as lock:
             fcntl.flock(lock, fcntl.LOCK_EX)  # closing the file frees it, and so does the process's death
             if back or (read_alias(directory, alias) or 0) < number:
                 write_atomic(path, f"{number}\n".encode())

@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+import errno
 import hashlib
 from pathlib import Path
 
 from service.io.files import os_errors, write_atomic
 from service.registry.errors import DamagedBlobError
+from service.regular_files import read_regular
+
+MAX_BYTES = 1024**3
+"""Of a blob; the largest primitives there are have about a megabyte."""
 
 
 class BlobStore:
@@ -28,12 +33,16 @@ class BlobStore:
         digest = sha256_of(data)
         path = self.path(digest)
         with os_errors("write", path):
-            if not (path.exists() and sha256_of(path.read_bytes()) == digest):
+            if not (_has_size(path, len(data)) and sha256_of(read_regular(path, len(data), follow=True)) == digest):
                 write_atomic(path, data)
         return digest
 
-    def get(self, digest: str) -> bytes:
+    def get(self, digest: str, max_bytes: int = MAX_BYTES) -> bytes:
         """The bytes of that digest, verified.
+
+        Args:
+            digest: their sha256 in hex.
+            max_bytes: that there may be of them; more are not read.
 
         Raises:
             DamagedBlobError: the file is missing or holds other bytes.
@@ -42,11 +51,20 @@ class BlobStore:
         path = self.path(digest)
         with os_errors("read", path):
             try:
-                data = path.read_bytes()
+                data = read_regular(path, min(max_bytes, MAX_BYTES), follow=True)
             except FileNotFoundError:
                 raise DamagedBlobError(f"blob {path} is missing; {_MEND}") from None
+            except OSError as error:
+                if error.errno != errno.EFBIG:
+                    raise
+                raise DamagedBlobError(f"{path} is damaged: it is {error.strerror}; {_MEND}") from None
         check_digest(path, data, digest)
         return data
+
+
+def _has_size(path: Path, num_bytes: int) -> bool:
+    """Whether a file of that size is there: of one that was damaged, not even a part has to be read."""
+    return path.is_file() and path.stat().st_size == num_bytes
 
 
 def check_digest(path: Path, data: bytes, digest: str) -> None:

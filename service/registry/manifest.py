@@ -12,9 +12,12 @@ from pydantic import Field, JsonValue, ValidationError
 
 from service.frozen import FrozenModel
 from service.io.errors import FormatVersionError
+from service.parsing import ParseError, parse_json
 from service.registry.errors import DamagedBlobError, RegistryError
 
 FORMAT_VERSION = 1
+MAX_BYTES = 4 * 1024 * 1024
+"""Of a manifest; usual are ten thousand."""
 _DIGEST_KEY = "manifest_sha256"
 _MEND = "restore the file from a copy, or publish the version again"
 
@@ -84,9 +87,9 @@ def parse_manifest(data: bytes, path: Path) -> Manifest:
         DamagedBlobError: not the bytes that were published.
     """
     try:
-        tree = json.loads(data)
-    except ValueError:
-        raise DamagedBlobError(f"manifest {path} is damaged: not JSON; {_MEND}") from None
+        tree = parse_json(data, path)
+    except ParseError as error:
+        raise DamagedBlobError(f"manifest {path} is damaged: {error.reason}; {_MEND}") from None
     if not isinstance(tree, dict):
         raise DamagedBlobError(f"manifest {path} is damaged: not a JSON object; {_MEND}")
     if tree.get("format_version") != FORMAT_VERSION:

@@ -13,7 +13,7 @@ A publish writes the blob, then the manifest, then the aliases, each atomically:
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -27,11 +27,14 @@ from service.io.git import git_commit
 from service.registry import names
 from service.registry.aliases import move_alias, read_alias, read_aliases
 from service.registry.blobs import BlobStore, sha256_of
-from service.registry.errors import RegistryError, UnknownVersionError
-from service.registry.manifest import Manifest, make_manifest, parse_manifest
+from service.registry.errors import DamagedBlobError, RegistryError, UnknownVersionError
+from service.registry.manifest import MAX_BYTES, Manifest, TensorDescription, make_manifest, parse_manifest
 from service.registry.names import LATEST, Version
+from service.regular_files import read_regular
 
 READ_ONLY_FILE = "READ_ONLY"
+Check = Callable[[Manifest, Mapping[str, np.ndarray]], Iterable[str]]
+"""Tells in a line each what is wrong with a manifest and its arrays."""
 
 
 class Registry:
@@ -122,17 +125,34 @@ class Registry:
         """
         path = self._manifest_path(self.resolve(reference))
         with os_errors("read", path):
-            data = path.read_bytes()
+            data = read_regular(path, MAX_BYTES, follow=True)
         return parse_manifest(data, path)
 
     def load(self, reference: str) -> tuple[Manifest, dict[str, np.ndarray]]:
         """The verified manifest and parameters of a version.
 
         Raises:
-            StorageError: as for `manifest`; DamagedBlobError also for damaged parameters.
+            StorageError: as for `manifest`; DamagedBlobError also for damaged parameters, and for others than the
+                manifest describes.
         """
         manifest = self.manifest(reference)
-        return manifest, tensors.decode(self._blobs.get(manifest.blob_sha256))
+        data = self._blobs.get(manifest.blob_sha256, max_bytes=manifest.blob_bytes)
+        path = self._blobs.path(manifest.blob_sha256)
+        try:
+            arrays = tensors.decode(data)
+        except ValueError as error:
+            raise DamagedBlobError(
+                f"{path}, parameters of {manifest.reference}, is {error}; publish them again"
+            ) from None
+        found = {name: TensorDescription(**each) for name, each in tensors.describe(arrays).items()}
+        for name in sorted(found.keys() | manifest.tensors.keys()):
+            there, described = (_described(tree.get(name)) for tree in (found, manifest.tensors))
+            if there != described:
+                raise DamagedBlobError(
+                    f"{path}: parameter {name!r} is {there}, but the manifest of {manifest.reference} says "
+                    f"{described}; publish the version again"
+                )
+        return manifest, arrays
 
     def names(self) -> list[str]:
         """Every name that has a version, sorted."""
@@ -167,8 +187,12 @@ class Registry:
         move_alias(self._alias_directory(name), alias, version)
         return target
 
-    def verify(self, reference: str | None = None) -> list[str]:
-        """Read a version, or everything, and check each byte.
+    def verify(self, reference: str | None = None, check: Check = lambda manifest, arrays: []) -> list[str]:
+        """Read a version, or everything, and check each byte; and that every number is finite.
+
+        Args:
+            reference: of the version; None for everything.
+            check: tells what else is wrong with a manifest and its arrays, a line each.
 
         Returns:
             one line for each problem; empty when all is well.
@@ -177,9 +201,9 @@ class Registry:
             UnknownVersionError: no such version.
         """
         if reference is not None:
-            return self._problems_of(self.resolve(reference))
+            return self._problems_of(self.resolve(reference), check)
         versions = [version for name in self.names() for version in self.versions(name)]
-        problems = [problem for version in versions for problem in self._problems_of(version)]
+        problems = [problem for version in versions for problem in self._problems_of(version, check)]
         return problems + [problem for name in self.names() for problem in self._alias_problems(name)]
 
     def export(self, reference: str, directory: Path) -> Manifest:
@@ -220,14 +244,14 @@ class Registry:
                 if write_exclusive(path, make_manifest({**fields, "version": version.number}).to_bytes()):
                     return version
 
-    def _problems_of(self, version: Version) -> list[str]:
+    def _problems_of(self, version: Version, check: Check) -> list[str]:
         try:
-            manifest, _ = self.load(str(version))
+            manifest, arrays = self.load(str(version))
         except StorageError as error:
             return [f"{version}: {error}"]
         if (manifest.name, manifest.version) != version:
             return [f"{version}: its manifest is that of {manifest.reference}; restore the file from a copy"]
-        return []
+        return [f"{version}: {problem}" for problem in (*_not_finite(arrays), *check(manifest, arrays))]
 
     def _alias_problems(self, name: str) -> list[str]:
         numbers = {version.number for version in self.versions(name)}
@@ -259,3 +283,13 @@ class Registry:
 
     def _alias_directory(self, name: str) -> Path:
         return self._directory(name) / "aliases"
+
+
+def _described(tensor: TensorDescription | None) -> str:
+    return "missing" if tensor is None else f"{tensor.dtype} {list(tensor.shape)}"
+
+
+def _not_finite(arrays: Mapping[str, np.ndarray]) -> Iterator[str]:
+    for name, array in arrays.items():
+        if array.dtype.kind in "fc" and (num := int((~np.isfinite(array)).sum())):
+            yield f"parameter {name!r} has {num} of {array.size} numbers that are not finite; use an earlier version"

@@ -109,11 +109,12 @@ def pretrain(
     with StopSignals() as signals, ExitStack() as stack:
         stack.callback(directory.close)
         directory.claim(resume=resume)
+        last = directory.read_published()
         run_id = run_id_of(directory.path)
         redis = address_from_environment()
         previous = read_status(directory.path) if resume else None
         writer = RunWriter(directory.path, run_id, redis)
-        published = directory.read_published()
+        published = last.version if last is not None else None
         report = stack.enter_context(Report(config, run_id, runtime, writer, published=published, previous=previous))
         if cluster is not None and cluster.status is not None:
             from service.runtime.status_actor import serving

@@ -17,8 +17,9 @@ from dataclasses import dataclass
 from signal import SIGKILL, SIGTERM, Signals
 
 from service.io.errors import StorageError
-from service.io.files import os_errors
+from service.io.files import open_to_append, os_errors
 from service.io.study_directory import StudyDirectory
+from service.regular_files import open_regular
 from service.runtime.progress import StudyProgress
 from service.runtime.signals import PASSED_ON, STOPPING, StopSignals
 from service.store.disk_reader import DiskReader, run_id_of
@@ -30,6 +31,8 @@ SHOW_S = 1.0
 """Time between two looks into the run directories."""
 GRACE_S = 5.0
 """Time that a run has to end at once before it is killed."""
+LAST_WORDS_BYTES = 100_000
+"""End of a log in which a run said why it failed."""
 ENDED: frozenset[RunState] = frozenset({"finished", "converged"})
 """States in which a run has learned all it was to learn."""
 _logger = logging.getLogger(__name__)
@@ -143,7 +146,7 @@ class Study:
         arguments = [sys.executable, "-m", "service.cli.study_run", str(os.getpid()), *command(seed)]
         with os_errors("write", log_file):
             log_file.parent.mkdir(parents=True, exist_ok=True)
-            log = log_file.open("ab")
+            log = open_to_append(log_file)
         with log:
             # A session of its own: Ctrl-C on a terminal is for this process, which passes it on.
             self._processes[seed] = subprocess.Popen(
@@ -175,7 +178,9 @@ class Study:
             said = f"ended by {Signals(-code).name}"
         else:
             try:
-                text = log_file.read_text(errors="replace")
+                with open_regular(log_file, follow=True) as file:
+                    file.seek(max(0, file.seek(0, os.SEEK_END) - LAST_WORDS_BYTES))
+                    text = file.read(LAST_WORDS_BYTES).decode(errors="replace")
             except OSError:
                 text = ""  # the other runs go on
             lines = [line.strip() for line in text.splitlines()[-20:]]

@@ -19,8 +19,11 @@ from pathlib import Path
 from pydantic import BaseModel, ValidationError
 
 from service.io.files import write_atomic
+from service.regular_files import read_regular
 from service.store.models import GoalGrid, Record, RunStatus, Trouble
 
+MAX_BYTES = 64 * 1024 * 1024
+"""Of a run's status, its grid of goals and its note of what it published."""
 STATUS_FILE = "status.json"
 GOALS_FILE = "goals.json"
 STOP_FILE = "stop"
@@ -32,7 +35,7 @@ _logger = logging.getLogger(__name__)
 def read_status(directory: Path) -> RunStatus | None:
     """The status that the last process of a run left in its directory; None where there is none that can be read."""
     try:
-        return RunStatus.model_validate_json((directory / STATUS_FILE).read_bytes())
+        return RunStatus.model_validate_json(read_regular(directory / STATUS_FILE, MAX_BYTES))
     except (OSError, ValidationError):
         return None
 

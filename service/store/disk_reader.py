@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import re
 import shutil
 import socket
@@ -12,12 +11,13 @@ from functools import lru_cache
 from pathlib import Path
 from threading import Lock
 
-import yaml
 from pydantic import ValidationError
 
 from service.io.lock import holder, is_locked
 from service.io.study_directory import is_study
-from service.store.disk import GOALS_FILE, STATUS_FILE, STOP_FILE
+from service.parsing import MAX_YAML_CHARACTERS, parse_json, parse_yaml
+from service.regular_files import read_regular
+from service.store.disk import GOALS_FILE, MAX_BYTES, STATUS_FILE, STOP_FILE
 from service.store.errors import DamagedStoreError, StoreError, StoreUnavailableError, UnknownRunError
 from service.store.models import ACTIVE, SILENT_AFTER, GoalGrid, Record, RunState, RunStatus
 from service.store.pulse import Pulse, ahead_s
@@ -80,7 +80,7 @@ class DiskReader:
         """The newest grid; None before the first."""
         path = self._find(run_id)[0] / GOALS_FILE
         try:
-            return GoalGrid.model_validate_json(path.read_bytes())
+            return GoalGrid.model_validate_json(read_regular(path, MAX_BYTES))
         except FileNotFoundError:
             return None
         except OSError as error:
@@ -148,7 +148,7 @@ def _unavailable(path: Path, error: OSError) -> StoreUnavailableError:
 
 def _read_status(run_id: str, path: Path, records: RecordFile) -> RunStatus:
     try:
-        status = RunStatus.model_validate_json((path / STATUS_FILE).read_bytes())
+        status = RunStatus.model_validate_json(read_regular(path / STATUS_FILE, MAX_BYTES))
     except FileNotFoundError:
         return _guess_status(run_id, path, records)
     except (OSError, ValidationError) as error:
@@ -226,15 +226,15 @@ def _guess_state(path: Path, steps: int, total: int | None, heartbeat: datetime)
 def _read_config(path: Path, modified: datetime) -> tuple[str | None, int | None]:
     """Name and budget, from a configuration of any version; read once, as YAML takes its time."""
     try:
-        tree = yaml.safe_load(path.read_bytes())
+        tree = parse_yaml(read_regular(path, MAX_YAML_CHARACTERS, follow=True), path)
         return str(tree["name"]), max(1, int(tree["run"]["total_env_steps"]))
-    except (OSError, yaml.YAMLError, KeyError, TypeError, ValueError):
+    except (OSError, KeyError, TypeError, ValueError, OverflowError):
         return None, None
 
 
 def _read_published(path: Path) -> str | None:
     try:
-        return str(json.loads((path / "published.json").read_bytes())["version"])
+        return str(parse_json(read_regular(path / "published.json", MAX_BYTES), path)["version"])
     except (OSError, KeyError, TypeError, ValueError):
         return None
 

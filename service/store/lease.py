@@ -15,6 +15,7 @@ from datetime import UTC, datetime
 from typing import Any
 
 from service.io.errors import RunTakenError
+from service.parsing import parse_json
 from service.store import keys
 
 _POLL_S = 0.1
@@ -88,7 +89,7 @@ class Lease:
 
 def _describe(holder: object) -> str:
     try:
-        tree = json.loads(holder if isinstance(holder, bytes) else b"")
+        tree = parse_json(holder if isinstance(holder, bytes) else b"", "the lease")
         return f"process {int(tree['pid'])} on {str(tree['host'])[:100]} since {str(tree['since'])[:30]}"
     except (ValueError, KeyError, TypeError):
         return "another process"

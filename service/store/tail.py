@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
-import json
 import logging
+import math
 from bisect import bisect_left, bisect_right
 from pathlib import Path
 from threading import Lock
 from typing import BinaryIO
 
+from service.parsing import ParseError, parse_json
+from service.regular_files import open_regular
 from service.store.models import Record
 
 _SEAL_BYTES = 256
+_MAX_LINE_BYTES = 1024 * 1024
 _logger = logging.getLogger(__name__)
 
 
@@ -49,7 +52,7 @@ class RecordFile:
 
     def _open(self) -> BinaryIO:
         try:
-            return self._path.open("rb")
+            return open_regular(self._path, follow=True)
         except FileNotFoundError:
             return open("/dev/null", "rb")
 
@@ -64,9 +67,9 @@ class RecordFile:
         if file.read(len(self._seal)) != self._seal:  # cut by a resume, or another file
             self._forget()
             file.seek(0)
-        for line in file:
-            if not line.endswith(b"\n"):
-                break
+        while (line := file.readline(_MAX_LINE_BYTES)).endswith(
+            b"\n"
+        ):  # a longer one is no record, nor is what follows
             self._take(line)
             self._end += len(line)
             self._seal = line[-_SEAL_BYTES:]
@@ -92,9 +95,10 @@ class RecordFile:
 def parse_record(text: bytes) -> Record | None:
     """One record of JSON text; None where it is none."""
     try:
-        record = json.loads(text, parse_constant=lambda _: None)
-    except (ValueError, RecursionError):  # the first also of bytes that are no UTF-8
+        record = parse_json(text, "record", allow_nan=True)
+    except ParseError:
         return None
     if not isinstance(record, dict) or type(record.get("iteration")) is not int:
         return None
-    return {name: value for name, value in record.items() if value is None or type(value) in (int, float)}
+    values = {name: value for name, value in record.items() if value is None or type(value) in (int, float)}
+    return {name: None if value is not None and not math.isfinite(value) else value for name, value in values.items()}

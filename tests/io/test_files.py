@@ -2,6 +2,7 @@ import os
 
 import pytest
 
+from service.io import files
 from service.io.errors import StorageError
 from service.io.files import Appender
 from tests.runtime.runs import assert_one_line, no_room_above
@@ -57,8 +58,8 @@ def test_a_part_is_taken_back_when_a_signal_comes_between_two_writes(path, monke
     appender = Appender(path)
     appender.append_bytes(b"aaa")
     with monkeypatch.context() as patch:
-        unbuffered = type(path).open
-        patch.setattr(type(path), "open", lambda *args, **kwargs: Interrupted(unbuffered(*args, **kwargs)))
+        unbuffered = files.open_to_append
+        patch.setattr(files, "open_to_append", lambda path: Interrupted(unbuffered(path)))
         with pytest.raises(KeyboardInterrupt):
             appender.append_bytes(b"bbb")
     assert path.read_bytes() == b"aaa"

@@ -269,8 +269,8 @@ def test_a_heartbeat_from_the_future_is_no_sign_of_life(tmp_path, monkeypatch, l
 
 
 def test_yaml_is_parsed_once(old_run, monkeypatch):
-    calls, load = [], disk_reader.yaml.safe_load
-    monkeypatch.setattr(disk_reader.yaml, "safe_load", lambda text: calls.append(1) or load(text))
+    calls, load = [], disk_reader.parse_yaml
+    monkeypatch.setattr(disk_reader, "parse_yaml", lambda *given: calls.append(1) or load(*given))
     reader = DiskReader(old_run.parent)
     for _ in range(3):
         reader.run("old-one")

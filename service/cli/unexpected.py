@@ -1,0 +1,89 @@
+"""Errors that nobody expected: one line for the user, and the traceback in a file for whoever mends the program."""
+
+from __future__ import annotations
+
+import errno
+import logging
+import os
+import platform
+import secrets
+import sys
+import tempfile
+import threading
+import time
+import traceback
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import typer
+
+from service import __version__
+from service.errors import TandemError, UnexpectedError, one_line
+
+UsageError: type[Exception] = typer.BadParameter.__bases__[0]
+"""The error of arguments that typer cannot read; it has no public name in all versions of typer."""
+_PATH_ERRORS = (errno.EACCES, errno.EPERM, errno.ENAMETOOLONG, errno.ELOOP, errno.ENOTDIR, errno.EISDIR)
+"""Reasons for which a path that was typed cannot be used."""
+_logger = logging.getLogger(__name__)
+
+
+@contextmanager
+def traceback_in(directory: Path | None = None) -> Iterator[None]:
+    """Turn an error of the block that nobody expected into one line that names a file with its traceback.
+
+    Args:
+        directory: of the run that the block is about; None, or where nothing can be written there: that for temporary
+            files.
+
+    Raises:
+        UnexpectedError: it happened.
+        TandemError: a path that cannot be used; or whatever the block raised.
+    """
+    try:
+        yield
+    except (TandemError, UsageError, typer.Exit, typer.Abort):
+        raise
+    except OSError as error:
+        if error.errno == errno.EPIPE:  # whoever read our output is gone, which typer knows how to end
+            raise
+        if error.errno in _PATH_ERRORS and error.filename is not None:
+            raise TandemError(
+                f"cannot use {os.fsdecode(error.filename)}: {error.strerror}; check the path and its permissions"
+            ) from error
+        raise _unexpected(error, directory) from error
+    except Exception as error:
+        raise _unexpected(error, directory) from error
+
+
+def report_thread_error(arguments: threading.ExceptHookArgs) -> None:
+    """Log one line where a thread ends with an error; to be ``threading.excepthook``."""
+    if arguments.exc_value is not None and not isinstance(arguments.exc_value, SystemExit):
+        name = arguments.thread.name if arguments.thread is not None else "?"
+        _logger.error("thread %s: %s", name, _unexpected(arguments.exc_value, None))
+
+
+def _unexpected(error: BaseException, directory: Path | None) -> UnexpectedError:
+    said = one_line(str(error), 300)
+    what = f"unexpected {type(error).__name__}{': ' if said else ''}{said}"
+    for place in ([directory] if directory is not None and directory.is_dir() else []) + [Path(tempfile.gettempdir())]:
+        try:
+            path = _write_traceback(error, place)
+        except OSError:
+            continue
+        return UnexpectedError(f"{what}; its traceback is in {path}, please report it")
+    last = traceback.extract_tb(error.__traceback__)[-1:]
+    where = "".join(f" ({Path(frame.filename).name}, line {frame.lineno})" for frame in last)
+    return UnexpectedError(f"{what}{where}; its traceback cannot be written anywhere; please report it")
+
+
+def _write_traceback(error: BaseException, directory: Path) -> Path:
+    """Make a file of its own, which only this user may read: a traceback may quote what is nobody else's business."""
+    stamp = time.strftime("%Y%m%d-%H%M%S", time.gmtime())
+    path = directory / f"tandem-error-{stamp}-{secrets.token_hex(4)}.txt"
+    head = f"tandem {__version__}, Python {platform.python_version()}, {platform.platform()}\n{sys.argv}\n\n"
+    text = head + "".join(traceback.format_exception(error))
+    descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW, 0o600)
+    with open(descriptor, "w", encoding="utf-8", errors="backslashreplace") as file:
+        file.write(text)
+    return path

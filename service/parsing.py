@@ -1,0 +1,142 @@
+"""JSON and YAML that anybody may have written, read within bounds.
+
+The parsers alone follow wherever a text leads: brackets nested a hundred thousand deep, aliases of YAML that stand for
+a billion values, whole numbers that no float holds. What is refused here is refused with one line that says why. How
+long a text may be is for whoever reads the file to say; YAML is slow, so it has a limit here.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from typing import Any
+
+import yaml
+
+from service.errors import TandemError
+
+MAX_DEPTH = 64
+"""Groups within groups; a configuration has five."""
+MAX_WHOLE_NUMBER = 10**300
+"""Greater ones are no floats; states of random generators have 39 digits."""
+MAX_YAML_CHARACTERS = 256 * 1024
+MAX_YAML_VALUES = 5000
+"""Values of a YAML text, those that aliases repeat included; a configuration has 200."""
+
+
+class ParseError(TandemError):
+    """A text is neither JSON nor YAML, or nothing that could be worked with.
+
+    Args:
+        where: named in the message.
+        reason: why it is refused, in a few words.
+    """
+
+    def __init__(self, where: object, reason: str) -> None:
+        super().__init__(f"{where}: {reason}; restore it from a copy, or remove it")
+        self.reason = reason
+
+
+def parse_json(text: str | bytes, where: object, *, allow_nan: bool = False) -> Any:
+    """The value of a JSON text.
+
+    Args:
+        text: bytes are UTF-8, or what else JSON may be in.
+        where: its origin, named in errors.
+        allow_nan: let NaN and infinity pass, which JSON has no words for but Python's has.
+
+    Raises:
+        ParseError: no JSON; or nested too deep, a number that no float holds, or text that is no Unicode.
+    """
+    try:
+        tree = json.loads(text)
+    except RecursionError:
+        raise ParseError(where, _TOO_DEEP) from None
+    except ValueError as error:  # also for bytes that are no UTF-8, and for numbers of thousands of digits
+        raise ParseError(where, f"not JSON ({_described(error)})") from None
+    _check(tree, where, allow_nan=allow_nan)
+    return tree
+
+
+def parse_yaml(text: str | bytes, where: object) -> Any:
+    """The value of a YAML text, of plain types only.
+
+    Args:
+        text: bytes are UTF-8 or UTF-16.
+        where: its origin, named in errors.
+
+    Raises:
+        ParseError: no YAML; or too long, nested too deep, too many values, a number that no float holds, or text that
+            is no Unicode.
+    """
+    if len(text) > MAX_YAML_CHARACTERS:
+        raise ParseError(where, f"too long for YAML ({len(text)} characters; {MAX_YAML_CHARACTERS} are the most)")
+    try:
+        loader = _BoundedLoader(text)
+        try:
+            tree = loader.get_single_data()
+        finally:
+            loader.dispose()
+    except Exception as error:  # beside its own errors whatever its constructors meet: "!!bool x" is a KeyError
+        raise ParseError(where, f"not YAML ({_described(error)})") from None
+    _check(tree, where, allow_nan=True)  # whose fields they are refuses them where they are no good
+    return tree
+
+
+_TOO_DEEP = f"nested more than {MAX_DEPTH} deep"
+
+
+def _described(error: Exception) -> str:
+    return " ".join(str(error).split())[:300]
+
+
+class _BoundedLoader(yaml.SafeLoader):
+    """PyYAML's safe loader, which stops where a text is nested too deep or stands for too many values."""
+
+    def __init__(self, text: str | bytes) -> None:
+        super().__init__(text)
+        self._depth = self._num_values = 0
+        self._sizes: dict[int, int] = {}
+        """By node: how many values it stands for, where each alias stands for all that it repeats."""
+
+    def compose_node(self, parent: yaml.Node | None, index: int) -> yaml.Node | None:
+        """Read one value with all that is in it."""
+        self._depth += 1
+        if self._depth > MAX_DEPTH:
+            raise yaml.YAMLError(_TOO_DEEP)
+        is_alias = self.check_event(yaml.AliasEvent)
+        before = self._num_values
+        node = super().compose_node(parent, index)
+        if is_alias:
+            if id(node) not in self._sizes:  # it is still being read
+                raise yaml.YAMLError("an alias within what it stands for")
+            self._num_values += self._sizes[id(node)]
+        else:
+            self._num_values += 1
+            self._sizes[id(node)] = self._num_values - before
+        if self._num_values > MAX_YAML_VALUES:
+            raise yaml.YAMLError(f"more than {MAX_YAML_VALUES} values")
+        self._depth -= 1
+        return node
+
+
+def _check(tree: Any, where: object, *, allow_nan: bool) -> None:
+    """Refuse what parsers take but nobody can work with; without recursion, which is what deep trees are made for."""
+    level, depth = [tree], 0
+    while level:
+        if depth > MAX_DEPTH:
+            raise ParseError(where, _TOO_DEEP)
+        inner: list[Any] = []
+        for value in level:
+            if isinstance(value, dict):
+                inner += value
+                inner += value.values()
+            elif isinstance(value, (list, tuple, set)):
+                inner += value
+            elif isinstance(value, int) and abs(value) > MAX_WHOLE_NUMBER:
+                raise ParseError(where, "a whole number of more than 300 digits")
+            elif isinstance(value, float) and not allow_nan and not math.isfinite(value):
+                raise ParseError(where, f"the number {value}; only finite ones can be used")
+            elif isinstance(value, str) and not value.isascii() and any("\ud800" <= each <= "\udfff" for each in value):
+                raise ParseError(where, "text that is no Unicode (half of a surrogate pair)")
+        level, depth = inner, depth + 1
