@@ -26,7 +26,8 @@ from service.errors import TandemError
 from service.io.run_directory import RunDirectory
 from service.media.figures import read_records
 from service.primitives.loading import load_bob
-from service.runtime.pretrain import pretrain, resumed_config
+from service.runtime.pretrain import pretrain
+from service.runtime.resuming import resumed_config
 
 OURS = "ours"
 _WITHOUT_ALICE = ("game.alice_plays=false", "generator.past_opponent_fraction=0")

@@ -337,11 +337,13 @@ def copy_run(source: RunDirectory, home: Path, name: str = "run") -> RunDirector
     """
     source.read_config()
     store, target = CheckpointStore(source.checkpoints, keep=1), RunDirectory(home / "runs" / name)
-    if not store.steps():
+    if (newest := store.newest()) is None:
         raise TandemError(f"no checkpoint in {source.checkpoints}; name a run that has one")
     target.checkpoints.mkdir(parents=True)
-    shutil.copy(store.path(store.steps()[-1]), target.checkpoints)
-    shutil.copy(source.config_file, target.config_file)
+    shutil.copy(newest, target.checkpoints)
+    for file in (source.config_file, source.metrics_file, source.goals_file):
+        if file.exists():
+            shutil.copy(file, target.path)
     return target
 
 

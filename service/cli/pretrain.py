@@ -79,7 +79,7 @@ def pretrain(
     """Pre-train primitives by self-play, in this process or on a Ray cluster, and publish them."""
     from service.config import load_config
     from service.io.run_directory import RunDirectory
-    from service.runtime.pretrain import resumed_config
+    from service.runtime.resuming import resumed_config
 
     def cluster_options() -> ClusterOptions:
         from service.runtime.ray_connection import ClusterOptions, parse_status

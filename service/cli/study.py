@@ -59,10 +59,10 @@ def pretrain_study(
     """
     from service.config import load_config
     from service.io.study_directory import StudyDirectory
-    from service.runtime.pretrain import resumed_config
     from service.runtime.pretrain_study import StudyCluster
     from service.runtime.pretrain_study import pretrain_study as run
     from service.runtime.progress import StudyProgress
+    from service.runtime.resuming import resumed_config
     from service.runtime.signals import InterruptError
     from service.runtime.study_plan import check_same_seeds, parse_seeds
 

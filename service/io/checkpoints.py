@@ -25,7 +25,7 @@ FORMAT_VERSION = 1
 MAX_BYTES = 8 * 1024**3
 """Of a checkpoint; a replay buffer of a million steps has half a gigabyte."""
 _HEADER_KEY = "tandem_checkpoint"
-_FILE_PATTERN = re.compile(r"checkpoint-([0-9]{8,})\.safetensors")
+_FILE_PATTERN = re.compile(r"checkpoint-(?:e([0-9]{8})-)?([0-9]{8,})\.safetensors")
 _logger = logging.getLogger(__name__)
 
 
@@ -38,23 +38,41 @@ class Checkpoint(NamedTuple):
 
 
 class CheckpointStore:
-    """The newest ``keep`` checkpoints of one run in a directory; one writer, any number of readers."""
+    """The newest ``keep`` checkpoints of one run in a directory; one writer, any number of readers.
 
-    def __init__(self, directory: Path, keep: int) -> None:
+    The newest is that of the highest epoch (``epoch``), and of its checkpoints that of the last step: what a process
+    writes that was overtaken by another one is never read.
+
+    Args:
+        directory: made when missing.
+        keep: how many stay.
+        epoch: of the process that writes; 0 where there is never more than one.
+    """
+
+    def __init__(self, directory: Path, keep: int, *, epoch: int = 0) -> None:
         assert keep >= 1
-        self.directory = directory
-        self.keep = keep
+        self.directory, self.keep, self.epoch = directory, keep, epoch
 
     def path(self, step: int) -> Path:
-        """File of the checkpoint of ``step``, there or not."""
-        return self.directory / f"checkpoint-{step:08d}.safetensors"
+        """File to which this process writes the checkpoint of ``step``, there or not."""
+        epoch = f"e{self.epoch:08d}-" if self.epoch else ""
+        return self.directory / f"checkpoint-{epoch}{step:08d}.safetensors"
 
     def steps(self) -> list[int]:
-        """The steps of which a checkpoint is there, good or damaged, in order."""
+        """The steps of which a checkpoint is there, good or damaged, the newest last."""
+        return [step for _, step, _ in self._files()]
+
+    def newest(self) -> Path | None:
+        """File of the newest checkpoint, good or damaged; None where there is none."""
+        files = self._files()
+        return files[-1][2] if files else None
+
+    def _files(self) -> list[tuple[int, int, Path]]:
+        """Epoch, step and file of every checkpoint, the newest last."""
         if not self.directory.is_dir():
             return []
-        matches = (_FILE_PATTERN.fullmatch(entry.name) for entry in self.directory.iterdir())
-        return sorted(int(match[1]) for match in matches if match)
+        matches = ((_FILE_PATTERN.fullmatch(entry.name), entry) for entry in self.directory.iterdir())
+        return sorted((int(match[1] or 0), int(match[2]), entry) for match, entry in matches if match)
 
     def check_any(self) -> None:
         """Check that there is a checkpoint, good or damaged.
@@ -99,23 +117,24 @@ class CheckpointStore:
         """
         self.check_any()
         reasons: list[str] = []
-        for step in reversed(self.steps()):
+        for _, _, path in reversed(self._files()):
             try:
-                checkpoint = read_checkpoint(self.path(step))
+                checkpoint = read_checkpoint(path)
             except CheckpointError as error:
                 reasons.append(str(error))
                 continue
             for reason in reasons:
-                _logger.warning("%s; continuing from %s", reason, self.path(step).name)
+                _logger.warning("%s; continuing from %s", reason, path.name)
             return checkpoint
         raise CheckpointError(f"no usable checkpoint in {self.directory}: {'; '.join(reasons)}; start the run anew")
 
     def _prune(self, newest: int) -> None:
         # a file above the one just written is a damaged one that was passed over: it must not crowd out a good one
-        remaining = [step for step in self.steps() if step <= newest]
+        # and what another process writes in a higher epoch is not for this one to delete
+        remaining = [path for epoch, step, path in self._files() if (epoch, step) <= (self.epoch, newest)]
         try:
-            for step in remaining[: -self.keep]:
-                self.path(step).unlink(missing_ok=True)
+            for path in remaining[: -self.keep]:
+                path.unlink(missing_ok=True)
             remove_temporaries(self.directory)
         except OSError as error:
             _logger.warning("cannot delete old checkpoints in %s: %s", self.directory, error.strerror)

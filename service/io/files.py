@@ -106,6 +106,9 @@ def check_regular(path: Path) -> None:
 class Appender:
     """Appends pieces to one file; a piece that does not fit waits, and comes before the next one.
 
+    Once it has written to the file, it writes to no other: a process that goes on with a run puts new files in the
+    places of those it continues, so one that was overtaken without noticing writes to nothing that anybody reads.
+
     Args:
         path: the file; what is there already stays, and nothing is made before the first piece.
     """
@@ -113,6 +116,8 @@ class Appender:
     def __init__(self, path: Path) -> None:
         self.path = path
         self._waiting: deque[bytes] = deque()
+        self._identity: tuple[int, int] | None = None
+        """Device and inode of the file that it writes to."""
 
     def append_bytes(self, piece: bytes) -> None:
         """Put ``piece`` at the file's end and hand it to the operating system.
@@ -123,6 +128,10 @@ class Appender:
         """
         self._waiting.append(piece)
         self._flush()
+
+    def take_new_file(self) -> None:
+        """Write to whichever file is there next."""
+        self._identity = None
 
     def sync(self) -> None:
         """Write what waits, and wait until the disk has it.
@@ -141,9 +150,17 @@ class Appender:
         with os_errors("write", self.path):
             self.path.parent.mkdir(parents=True, exist_ok=True)
             with open_to_append(self.path) as file:
+                self._check_same(file)
                 while self._waiting:
                     _write_whole(file, self._waiting[0])
                     self._waiting.popleft()
+
+    def _check_same(self, file: FileIO) -> None:
+        there = os.fstat(file.fileno())
+        identity = there.st_dev, there.st_ino
+        if self._identity not in (None, identity) and there.st_size:  # an empty one takes the place of one removed
+            raise OSError(errno.ESTALE, "another process has put a file of its own in its place", str(self.path))
+        self._identity = identity
 
 
 @contextlib.contextmanager

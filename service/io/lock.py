@@ -29,11 +29,12 @@ class DirectoryLock:
     """An exclusive hold on a directory, from construction until `release` or until this process dies.
 
     Args:
-        directory: made when missing. On a network file system without locks a warning says that there is none.
+        directory: made when missing.
         what_to_do: the end of the error's message.
 
     Raises:
-        RunTakenError: another process, or another object in this one, has the lock.
+        RunTakenError: another process, or another object in this one, has the lock; or the file system has no locks,
+            and ``TANDEM_WITHOUT_LOCKS`` does not say that this is known.
         StorageError: the directory cannot be written.
     """
 

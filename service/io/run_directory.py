@@ -4,6 +4,8 @@
 |---|---|
 | ``config.yaml`` | the resolved configuration |
 | ``environment.json`` | git commit, package versions and cores of the last start |
+| ``run.json`` | the run's identity, and of each start what had changed and which records were damaged |
+| ``epochs/`` | a file for each process that ever ran it; the highest number is who runs it now |
 | ``metrics.jsonl`` | an object per iteration, keyed by metric; only ``time/...`` differs between equal runs |
 | ``goals.jsonl`` | per iteration a sample of valid proposals: start x y z, goal x y z (metres), solved 0/1 |
 | ``tensorboard/`` | the same metrics as TensorBoard events over env steps |
@@ -22,22 +24,26 @@ import json
 import logging
 import os
 import platform
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from datetime import UTC, datetime
 from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
+from pydantic import JsonValue
 
 from service.config import Config, dump_config, load_config
 from service.errors import ConfigError, TandemError
 from service.io.checkpoints import CheckpointStore
+from service.io.epoch import Epoch
 from service.io.errors import StorageError
 from service.io.files import Appender, check_regular, os_errors, remove_temporaries, write_atomic
 from service.io.git import git_commit
 from service.io.jsonl import JsonlWriter
 from service.io.lock import DirectoryLock
+from service.io.run_history import RunHistory, read_history
 from service.parsing import ParseError, parse_json
 from service.regular_files import read_regular
 from service.types import FloatArray, StateArray
@@ -60,10 +66,16 @@ class Published(NamedTuple):
 
 
 class RunDirectory:
-    """Reads and writes the files of one run; nothing is written before `claim` or `start`."""
+    """Reads and writes the files of one run; nothing is written before `claim` or `start`.
 
-    def __init__(self, path: Path) -> None:
+    Args:
+        path: of the directory.
+        accept_damaged_records: go on with a run whose records are not as they were written, without those.
+    """
+
+    def __init__(self, path: Path, *, accept_damaged_records: bool = False) -> None:
         self.path = path
+        self._accept_damaged_records = accept_damaged_records
         self.config_file = path / "config.yaml"
         self.metrics_file = path / "metrics.jsonl"
         self.goals_file = path / "goals.jsonl"
@@ -76,6 +88,11 @@ class RunDirectory:
         self._events: EventFile | None = None
         self._failing: set[Path] = set()
         self._lock: DirectoryLock | None = None
+        self._history: RunHistory | None = None
+        self._changed: dict[str, tuple[JsonValue, JsonValue]] = {}
+        self._damage: list[str] = []
+        self.epoch: Epoch | None = None
+        """Number of this process among those that ever ran the run; None before ``claim``."""
 
     @property
     def exists(self) -> bool:
@@ -116,6 +133,11 @@ class RunDirectory:
             self.checkpoints.mkdir(parents=True, exist_ok=True)
             remove_temporaries(self.path)
             self._events = EventFile(self.path / "tensorboard", after_step=after_env_steps)
+            if self._history is not None:
+                at = datetime.now(UTC)
+                self._history = self._history.with_event(at, after_iteration or 0, self._changed, self._damage)
+                self._history.write(self.path)
+                self._changed, self._damage = {}, []
             write_atomic(self.path / "environment.json", json.dumps(_environment(), indent=1).encode())
             write_atomic(self.config_file, dump_config(config).encode())  # last: a start that failed can be tried again
 
@@ -167,6 +189,59 @@ class RunDirectory:
         self._lock = DirectoryLock(self.path, "stop that one first, or name another --run-dir")
         if not resume:
             self.check_free()  # of two that begin at once, the second sees here what the first has made
+        self._history = (read_history(self.path) if resume else None) or RunHistory.new()
+        self.epoch = Epoch(self.path)
+
+    def check_owner(self) -> None:
+        """Assert that no other process has taken over the run since ``claim``.
+
+        Raises:
+            RunTakenError: one has; this one must write nothing more.
+        """
+        if self.epoch is not None:
+            self.epoch.check()
+
+    @property
+    def history(self) -> RunHistory:
+        """The run's identity, and what was not as before when a process went on with it.
+
+        Raises:
+            StorageError: it cannot be read, or is damaged.
+        """
+        if self._history is None:
+            self._history = read_history(self.path) or RunHistory.new()
+        return self._history
+
+    def take_over(self, run: str, changed: dict[str, tuple[JsonValue, JsonValue]]) -> None:
+        """Go on as the run of that identity, and note the settings that have changed, for ``start``."""
+        self._history = self.history.model_copy(update={"run": run})
+        self._changed = changed
+
+    def checksums(self) -> dict[str, str]:
+        """How far the records reach and what they are, for a checkpoint: see ``JsonlWriter.checksums``."""
+        return {writer.path.name: writer.checksums() for writer in (self._metrics, self._goals)}
+
+    def check_records(self, checksums: Mapping[str, str]) -> bool:
+        """Compare the records with what a checkpoint knows of them.
+
+        Returns:
+            Whether they are as they were; else the damage was accepted, and only sound records are there now.
+
+        Raises:
+            StorageError: some are missing or changed, and that is not accepted; or they cannot be read.
+        """
+        writers = [writer for writer in (self._metrics, self._goals) if writer.path.name in checksums]
+        damaged = [(writer, damage) for writer in writers if (damage := writer.damage(checksums[writer.path.name]))]
+        if damaged and not self._accept_damaged_records:
+            raise StorageError(
+                f"{'; '.join(str(damage) for _, damage in damaged)}: restore the file from a copy, or go on without "
+                "them by --accept-damaged-records"
+            )
+        for writer, damage in damaged:
+            _logger.warning("%s; going on without", damage)
+            writer.keep_only(checksums[writer.path.name])
+            self._damage.append(f"{damage.path.name}: {damage.text}")
+        return not damaged
 
     def check_free(self) -> None:
         """Assert that no run has begun here.

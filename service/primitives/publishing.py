@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import contextlib
+from collections.abc import Mapping
+from typing import Any
 
 from service.actors.coverage import NUM_SKILLS, visited_share
 from service.actors.evaluation import EVALUATED_GOALS, REPORTED_SEED, success_metrics
@@ -64,7 +66,8 @@ def publish_run(
     version = _newest_if_same(registry, config.name, parameters)
     if version is None:
         parent = _published_before(directory, registry)
-        version = publish(registry, config, parameters, metrics, parent=parent)
+        history = directory.history.model_dump(mode="json") if directory.history.events else None
+        version = publish(registry, config, parameters, metrics, parent=parent, history=history)
     directory.write_published(Published(str(version), registry.manifest(str(version)).blob_sha256))
     return version
 
@@ -76,6 +79,7 @@ def publish(
     metrics: dict[str, float],
     *,
     parent: str | None = None,
+    history: Mapping[str, Any] | None = None,
 ) -> Version:
     """Publish Bob, or the skills of a run that has ``config.skills``, with everything a user needs.
 
@@ -93,6 +97,7 @@ def publish(
         config=config.model_dump(mode="json"),
         metrics=metrics,
         parent=parent,
+        history=history,
     )
 
 

@@ -44,6 +44,9 @@ class Manifest(FrozenModel):
     config: dict[str, JsonValue] = Field(description="configuration of the run that made it")
     metrics: dict[str, float]
     parent: str | None = Field(None, description="NAME@VERSION this one was trained on from")
+    history: dict[str, JsonValue] | None = Field(
+        None, description="of its run: settings that changed on the way, and records that were lost; absent without"
+    )
     git_commit: str | None = Field(None, description="of the code that published it; '-dirty' with local changes")
 
     @property
@@ -54,6 +57,8 @@ class Manifest(FrozenModel):
     def to_bytes(self) -> bytes:
         """The manifest as the JSON text that `parse_manifest` reads back to an equal object."""
         tree = self.model_dump(mode="json")
+        if self.history is None:  # so that earlier versions read it, too
+            del tree["history"]
         return (json.dumps({**tree, _DIGEST_KEY: _digest(tree)}, indent=1, sort_keys=True) + "\n").encode()
 
 

@@ -66,6 +66,7 @@ class Registry:
         config: Mapping[str, Any],
         metrics: Mapping[str, float],
         parent: str | None = None,
+        history: Mapping[str, Any] | None = None,
     ) -> Version:
         """Make the next version of ``name`` and move ``latest`` to it.
 
@@ -79,6 +80,7 @@ class Registry:
             config: configuration of the run, plain JSON values.
             metrics: finite numbers.
             parent: reference of the version this one was trained on from; it must exist.
+            history: of the run, where not all went as it was begun; plain JSON values.
 
         Raises:
             RegistryError: a bad name, array or value, or a registry that is only read; nothing is written.
@@ -96,6 +98,7 @@ class Registry:
             "config": dict(config),
             "metrics": dict(metrics),
             "parent": str(self.resolve(parent)) if parent is not None else None,
+            "history": dict(history) if history is not None else None,
             "git_commit": git_commit(),
         }
         version = self._publish_version(name, parameters, fields)

@@ -13,10 +13,12 @@ from numpy.typing import NDArray
 
 from service.config import Config
 from service.errors import DivergedError
-from service.io.checkpoints import CheckpointStore
+from service.io.checkpoints import Checkpoint, CheckpointStore
 from service.io.errors import CheckpointError
 from service.io.run_directory import RunDirectory
+from service.io.run_history import FILE as RUN_FILE
 from service.policies.parameters import Parameters, PolicyError
+from service.runtime.resuming import changed_settings
 from service.types import Arrays
 
 _logger = logging.getLogger(__name__)
@@ -48,29 +50,49 @@ class Bookkeeper:
     def __init__(self, config: Config, directory: RunDirectory) -> None:
         self.config = config
         self.directory = directory
-        self.checkpoints = CheckpointStore(directory.checkpoints, config.run.keep_checkpoints)
+        epoch = directory.epoch.number if directory.epoch is not None else 0
+        self.checkpoints = CheckpointStore(directory.checkpoints, config.run.keep_checkpoints, epoch=epoch)
         self._snapshots = CheckpointStore(directory.snapshots, keep=sys.maxsize)
         self.iteration, self.num_env_steps, self.wall_s = 0, 0, 0.0
         self._saved: int | None = None
 
     def resume(self) -> tuple[dict[str, Arrays], dict[str, Any]]:
-        """Take over the newest checkpoint's counters.
+        """Take over the newest checkpoint's counters, once it is clear that it is of this run, and its records are.
 
         Returns:
             Its arrays by part, and what else was saved.
 
         Raises:
-            CheckpointError: there is no usable one.
+            CheckpointError: there is no usable one, or it is of another run or configuration.
+            StorageError: see ``RunDirectory.check_records``.
         """
         checkpoint = self.checkpoints.load_latest()
+        self._check_same_run(checkpoint)
         parts: dict[str, Arrays] = defaultdict(dict)
         for name, array in checkpoint.arrays.items():
             part, _, rest = name.partition("/")
             parts[part][rest] = array
+        if (records := checkpoint.meta.get("records")) is not None:
+            self._saved = checkpoint.step if self.directory.check_records(records) else None
+        else:
+            _logger.warning("%s: an earlier version saved it, and nobody knows its records", self.directory.path)
         self.iteration, self.num_env_steps = checkpoint.step, int(checkpoint.meta["env_steps"])
         self.wall_s = float(checkpoint.meta["wall_s"])
         _logger.info("resumed at iteration %d, %d env steps", self.iteration, self.num_env_steps)
         return parts, checkpoint.meta
+
+    def _check_same_run(self, checkpoint: Checkpoint) -> None:
+        ours, theirs = self.directory.history.run, checkpoint.meta.get("run", self.directory.history.run)
+        if theirs != ours:
+            raise CheckpointError(
+                f"{self.directory.path}: its newest checkpoint is of another run ({theirs[:8]}, not {ours[:8]}); put "
+                f"that of this run back, or remove {RUN_FILE} if the records are the other run's, too"
+            )
+        changed = changed_settings(checkpoint.meta.get("config", {}), self.config, self.directory.path)
+        if changed:
+            said = ", ".join(f"{key} from {was!r} to {now!r}" for key, (was, now) in changed.items())
+            _logger.info("changed since iteration %d: %s", checkpoint.step, said)
+        self.directory.take_over(theirs, changed)
 
     @property
     def budget_spent(self) -> bool:
@@ -102,9 +124,11 @@ class Bookkeeper:
         Raises:
             CheckpointError: a full disk; earlier checkpoints are intact.
         """
+        self.directory.check_owner()
         arrays = {f"{part}/{name}": array for part, state in parts.items() for name, array in state.items()}
         config = self.config.model_dump(mode="json")
         own = {"config": config, "env_steps": self.num_env_steps, "wall_s": self.wall_s}
+        own |= {"run": self.directory.history.run, "records": self.directory.checksums()}
         self.directory.sync()
         self.checkpoints.save(self.iteration, arrays, {**own, **meta})
         self._saved = self.iteration
@@ -133,8 +157,9 @@ class Bookkeeper:
         try:
             yield
         except (DivergedError, PolicyError) as error:
-            newest, learner = max(self.checkpoints.steps(), default=0), self.config.learner
-            has_it = f"delete {self.checkpoints.path(newest).name}, which has this policy; " if newest == played else ""
+            newest, learner = self.checkpoints.newest(), self.config.learner
+            is_played = newest is not None and self.checkpoints.steps()[-1] == played
+            has_it = f"delete {newest.name}, which has this policy; " if newest is not None and is_played else ""
             rates = f"alice.learning_rate={learner.alice.learning_rate / 2:g} --set learner.bob.learning_rate="
             said = str(error).strip().splitlines()[-1]  # from another process it comes with its traceback
             raise DivergedError(
@@ -152,7 +177,7 @@ class Bookkeeper:
         try:
             yield
         except CheckpointError as error:
-            saved = max(self.checkpoints.steps(), default=None)
+            saved = next(reversed(self.checkpoints.steps()), None)
             raise UnsavedError(
                 f"{error}; the run is at iteration {self.iteration}, saved is iteration {saved}: --resume goes on there"
             ) from error

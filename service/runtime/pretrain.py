@@ -2,19 +2,16 @@
 
 from __future__ import annotations
 
-import json
 import logging
 import time
-from collections.abc import Iterator
 from contextlib import ExitStack, closing, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, cast
+from typing import TYPE_CHECKING, Literal, cast
 
-from service.config import Config, load_config
+from service.config import Config
 from service.errors import ConfigError, TandemError
 from service.io.run_directory import RunDirectory
-from service.io.study_directory import StudyDirectory
 from service.learner.learner import torch_device
 from service.media.artifacts import make_artifacts
 from service.primitives.publishing import measure_bob, measure_skills, publish_run
@@ -37,9 +34,6 @@ MAX_STATES_LOST = 5
 """Times in a row that a run goes back to a checkpoint without getting beyond it."""
 BACK_OFF_S = 2.0
 """Pause before the second time; it doubles."""
-RESUMABLE = ("run.", "learner.num_learners=", "learner.alice.learning_rate=", "learner.bob.learning_rate=")
-"""What an override of a resumed run may begin with: nothing that its past would have to be made again for."""
-_NUM_LEARNERS = "learner.num_learners"
 _logger = logging.getLogger(__name__)
 
 
@@ -113,9 +107,12 @@ def pretrain(
         run_id = run_id_of(directory.path)
         redis = address_from_environment()
         previous = read_status(directory.path) if resume else None
-        writer = RunWriter(directory.path, run_id, redis)
+        writer = RunWriter(directory.path, run_id, redis, directory.epoch)
         published = last.version if last is not None else None
-        report = stack.enter_context(Report(config, run_id, runtime, writer, published=published, previous=previous))
+        assert directory.epoch is not None
+        epoch = directory.epoch.number
+        report = Report(config, run_id, runtime, writer, published=published, previous=previous, epoch=epoch)
+        stack.enter_context(report)
         if cluster is not None and cluster.status is not None:
             from service.runtime.status_actor import serving
 
@@ -201,59 +198,3 @@ def _finish(
         raise UnfinishedError(f"learning is over and saved, but not published: {error}; --resume does it") from error
     report.check()
     return replace(done, files=make_artifacts(directory), version=version, metrics=metrics, timing=run.timing.tree())
-
-
-def resumed_config(directory: RunDirectory | StudyDirectory, overrides: list[str], file: Path | None = None) -> Config:
-    """The configuration to resume a run with: the saved one, where only ``RESUMABLE`` may be changed.
-
-    Args:
-        directory: of the run, or of a study.
-        overrides: ``run.a=b`` strings, or learning rates; others may only say what the run has.
-        file: YAML that, with ``overrides``, says the same as the saved one outside ``run`` but for the number of
-            learners; what it says there comes before ``overrides``.
-
-    Raises:
-        ConfigError: no run there, an override of anything else, or a file that says otherwise.
-    """
-    saved = directory.read_config()
-    fixed = [override for override in overrides if not override.startswith(RESUMABLE)]
-    for override in fixed:
-        if not _says(saved, directory, override):
-            raise ConfigError(
-                f"override {override!r}: a resumed run keeps its configuration; only run.*, the learning rates and "
-                "learner.num_learners may change, for example run.total_env_steps"
-            )
-    if file is not None:
-        given = load_config(file, fixed, recorded=True)  # maybe the one the run was begun with, by an earlier version
-        _check_same_outside_run(saved, given, file)
-        named = given.run.model_dump(mode="json", exclude_unset=True)
-        free = {f"run.{key}": value for key, value in named.items()}
-        if _NUM_LEARNERS.rpartition(".")[2] in given.learner.model_fields_set:
-            free[_NUM_LEARNERS] = given.learner.num_learners
-        overrides = [f"{key}={json.dumps(value)}" for key, value in free.items()] + overrides
-    return directory.read_config(overrides)
-
-
-def _says(saved: Config, directory: RunDirectory | StudyDirectory, override: str) -> bool:
-    try:
-        return directory.read_config([override]) == saved
-    except ConfigError:
-        return False
-
-
-def _check_same_outside_run(saved: Config, given: Config, file: Path) -> None:
-    left, right = (dict(_leaves(config.model_dump(mode="json", exclude={"run"}))) for config in (saved, given))
-    for key in sorted((left.keys() | right.keys()) - {_NUM_LEARNERS}):
-        if left.get(key) != right.get(key):
-            raise ConfigError(
-                f"{file}: {key} = {right.get(key)!r}, but the run has {left.get(key)!r}; a resumed run keeps its "
-                "configuration: leave out --config, or start another run without --resume"
-            )
-
-
-def _leaves(tree: dict[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
-    for key, value in tree.items():
-        if isinstance(value, dict):
-            yield from _leaves(value, f"{prefix}{key}.")
-        else:
-            yield prefix + key, value

@@ -35,6 +35,7 @@ class Report:
         writer: to whom it is told.
         published: what the run published before.
         previous: the last status of an earlier process, whose totals go on.
+        epoch: number of this process among those that ever ran the run.
     """
 
     def __init__(
@@ -46,6 +47,7 @@ class Report:
         *,
         published: str | None = None,
         previous: RunStatus | None = None,
+        epoch: int = 0,
     ) -> None:
         self._writer = writer
         self._totals = previous.totals.model_dump() if previous is not None else {}
@@ -59,6 +61,7 @@ class Report:
             state="starting",
             started=now,
             heartbeat=now,
+            epoch=epoch,
             total_env_steps=config.run.total_env_steps,
             published=published,
             totals=previous.totals if previous is not None else RunTotals(),

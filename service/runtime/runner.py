@@ -169,6 +169,8 @@ class Runner(ABC):
         """Begin the run's records, or cut them back to where it goes on."""
         position = {"after_iteration": self.iteration, "after_env_steps": self.num_env_steps} if resume else {}
         self.directory.start(self.config, **position)
+        if resume and not self.bookkeeper.saved:  # records are not as the checkpoint says, and that was accepted
+            self._save()
 
     def _save_first(self) -> None:
         """Save an untrained run, so that one that is killed before its first interval can be resumed, too."""

@@ -18,6 +18,7 @@ from pathlib import Path
 
 from pydantic import BaseModel, ValidationError
 
+from service.io.epoch import Epoch
 from service.io.files import write_atomic
 from service.regular_files import read_regular
 from service.store.models import GoalGrid, Record, RunStatus, Trouble
@@ -46,8 +47,11 @@ class DiskWriter:
     A few small files a second are written without waiting for the disk, so the training thread does it by the way.
     """
 
-    def __init__(self, directory: Path, *, clock: Callable[[], float] = time.monotonic) -> None:
+    def __init__(
+        self, directory: Path, epoch: Epoch | None = None, *, clock: Callable[[], float] = time.monotonic
+    ) -> None:
         """Take back the stop request of an earlier process; ``clock`` counts seconds."""
+        self._epoch = epoch
         self._stop_file = directory / STOP_FILE
         self._status = _LatestFile(directory / STATUS_FILE, STATUS_INTERVAL_S, clock)
         self._goals = _LatestFile(directory / GOALS_FILE, GOALS_INTERVAL_S, clock)
@@ -74,7 +78,13 @@ class DiskWriter:
         return self._stop_file.exists()
 
     def check(self) -> None:
-        """Do nothing: the directory's lock keeps others out."""
+        """Assert that this is still the run's driver.
+
+        Raises:
+            RunTakenError: another one has taken it over.
+        """
+        if self._epoch is not None:
+            self._epoch.check()
 
     def troubles(self) -> list[Trouble]:
         """Files that cannot be written at the moment."""

@@ -13,6 +13,7 @@ from threading import Lock
 
 from pydantic import ValidationError
 
+from service.io.epoch import newest_epoch
 from service.io.lock import holder, is_locked
 from service.io.study_directory import is_study
 from service.parsing import MAX_YAML_CHARACTERS, parse_json, parse_yaml
@@ -155,6 +156,9 @@ def _read_status(run_id: str, path: Path, records: RecordFile) -> RunStatus:
         reason = error.strerror if isinstance(error, OSError) else "it is no run's status"
         note = f"{STATUS_FILE} cannot be read: {reason}; what is shown comes from metrics.jsonl"
         return _guess_status(run_id, path, records).model_copy(update={"warnings": (note,)})
+    if status.epoch < newest_epoch(path):
+        note = f"{STATUS_FILE} is of an earlier process; what is shown comes from metrics.jsonl"
+        return _guess_status(run_id, path, records).suffering("well", note)
     stopping = status.state in ACTIVE and (status.stopping or (path / STOP_FILE).exists())
     return status.model_copy(update={"run_id": run_id, "stopping": stopping})  # a copied directory has another id
 

@@ -12,7 +12,7 @@ from service.errors import DivergedError
 from service.io.run_directory import RunDirectory
 from service.policies.numpy_policy import NumpyGaussianPolicy
 from service.runtime.local import LocalRun
-from service.runtime.pretrain import resumed_config
+from service.runtime.resuming import resumed_config
 from service.runtime.workers import RolloutWorker
 from tests.runtime.runs import assert_one_line, assert_same_run, newest, play, read_lines, write_yaml
 
@@ -63,7 +63,7 @@ def test_a_checkpoint_that_has_the_policy_already_is_named(tmp_path, monkeypatch
     diverge_after(monkeypatch, iteration=4)
     with pytest.raises(DivergedError) as error:
         play(tmp_path)
-    assert_one_line(error.value, "iteration 5", "delete checkpoint-00000004.safetensors", "--resume")
+    assert_one_line(error.value, "iteration 5", "delete checkpoint-e00000001-00000004.safetensors", "--resume")
     assert newest(tmp_path).step == 4
 
 

@@ -14,7 +14,7 @@ from service.io import files, tensors
 from service.io.checkpoints import CheckpointStore
 from service.io.jsonl import JsonlWriter
 from service.io.run_directory import RunDirectory
-from service.runtime.pretrain import resumed_config
+from service.runtime.resuming import resumed_config
 from tests.runtime.runs import ROOT, assert_same_run, newest, play, start_endless_run, tiny_config
 
 STEP = 4

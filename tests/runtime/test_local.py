@@ -16,7 +16,7 @@ from service.primitives.loading import read_parameters, read_stages
 from service.runtime import workers
 from service.runtime.bookkeeping import UnsavedError
 from service.runtime.local import LocalRun
-from service.runtime.pretrain import resumed_config
+from service.runtime.resuming import resumed_config
 from tests.runtime.runs import (
     KilledError,
     assert_one_line,
@@ -173,7 +173,7 @@ def test_the_newest_checkpoints_are_kept(tmp_path):
     _, result = play(tmp_path, tiny_config(keep_checkpoints=2, checkpoint_interval=1))
     files = sorted(file.name for file in (tmp_path / "checkpoints").iterdir())
     last = result.iteration
-    assert files == [f"checkpoint-{step:08d}.safetensors" for step in (last - 1, last)]
+    assert files == [f"checkpoint-e00000001-{step:08d}.safetensors" for step in (last - 1, last)]
     config = resumed_config(RunDirectory(tmp_path), ["run.keep_checkpoints=1", "run.total_env_steps=900"])
     _, result = play(tmp_path, config, resume=True)
     assert CheckpointStore(tmp_path / "checkpoints", keep=1).steps() == [result.iteration]
@@ -329,7 +329,7 @@ def test_a_damaged_newest_checkpoint_is_passed_over(uninterrupted, tmp_path, cap
     last.write_bytes(data if damage == "flip" else data[: len(data) // 2])
     config, started = tiny_config(**LONG), []
     play(path, config, resume=True, on_iteration=lambda run, metrics: started.append(run.iteration))
-    assert started[0] == int(before.stem.removeprefix("checkpoint-")) + 1
+    assert started[0] == int(before.stem.rpartition("-")[2]) + 1
     assert last.name in caplog.text
     assert_same_run(path, uninterrupted)
 
@@ -359,12 +359,14 @@ def test_a_full_disk_leaves_the_earlier_checkpoint(uninterrupted, tmp_path, capl
     with no_room_above(175_000), pytest.raises(UnsavedError) as error:
         play(tmp_path, config)
     last = newest(uninterrupted).step
-    assert_one_line(error.value, f"checkpoint-{last:08d}", "File too large", "intact", f"iteration {last}", "--resume")
+    assert_one_line(
+        error.value, f"checkpoint-e00000001-{last:08d}", "File too large", "intact", f"iteration {last}", "--resume"
+    )
     failed = [message for message in caplog.messages if "the run goes on" in message]
-    assert_one_line(failed[0], "checkpoint-00000004", "File too large")
+    assert_one_line(failed[0], "checkpoint-e00000001-00000004", "File too large")
     assert len(failed) == last // 2 - 1  # it tried again at every interval
     files = sorted(file.name for file in (tmp_path / "checkpoints").iterdir())
-    assert files == ["checkpoint-00000000.safetensors", "checkpoint-00000002.safetensors"]
+    assert files == ["checkpoint-e00000001-00000000.safetensors", "checkpoint-e00000001-00000002.safetensors"]
     assert newest(tmp_path).step == 2
     play(tmp_path, config, resume=True)
     assert_same_run(tmp_path, uninterrupted)
@@ -384,9 +386,9 @@ def test_a_disk_that_was_full_for_a_while_costs_nothing(uninterrupted, tmp_path,
         _, result = play(tmp_path, tiny_config(**LONG), on_iteration=fill_and_clear)
     assert result.reason == "finished"
     assert_same_run(tmp_path, uninterrupted)
-    for name in ("checkpoint-00000004", "checkpoint-00000008", "metrics.jsonl", "goals.jsonl", "snapshots"):
+    for name in ("e00000001-00000004", "e00000001-00000008", "metrics.jsonl", "goals.jsonl", "snapshots"):
         assert name in caplog.text
-    assert "checkpoint-00000010" not in caplog.text
+    assert "e00000001-00000010" not in caplog.text
 
 
 def test_the_last_checkpoint_is_not_written_twice(tmp_path, monkeypatch):

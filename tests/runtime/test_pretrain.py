@@ -18,7 +18,8 @@ from service.primitives import publishing
 from service.primitives.bundled import BUNDLED
 from service.registry.registry import Registry
 from service.runtime import pretrain as module
-from service.runtime.pretrain import UnfinishedError, pretrain, resumed_config
+from service.runtime.pretrain import UnfinishedError, pretrain
+from service.runtime.resuming import resumed_config
 from service.runtime.signals import InterruptError
 from tests.runtime.runs import (
     TREE,

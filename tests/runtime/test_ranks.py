@@ -15,8 +15,8 @@ from service.runtime import learner_group
 from service.runtime.cluster import ClusterRun
 from service.runtime.learner_group import check_room
 from service.runtime.local import LocalRun
-from service.runtime.pretrain import resumed_config
 from service.runtime.ray_connection import ClusterOptions, connected
+from service.runtime.resuming import resumed_config
 from service.runtime.runner import ClusterError
 from tests.runtime.runs import TREE, assert_one_line, is_alive, newest, play, read_lines, tiny_config, write_yaml
 

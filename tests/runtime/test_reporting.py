@@ -16,7 +16,8 @@ from service.io.run_directory import RunDirectory
 from service.primitives import publishing
 from service.registry.registry import Registry
 from service.runtime import pretrain as module
-from service.runtime.pretrain import UnfinishedError, pretrain, resumed_config
+from service.runtime.pretrain import UnfinishedError, pretrain
+from service.runtime.resuming import resumed_config
 from service.runtime.signals import InterruptError
 from service.store import disk, redis_writer
 from service.store.disk_reader import DiskReader

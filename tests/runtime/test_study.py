@@ -21,9 +21,9 @@ from service.io.study_directory import StudyDirectory
 from service.primitives.loading import read_parameters
 from service.registry.registry import Registry
 from service.runtime import study_results
-from service.runtime.pretrain import resumed_config
 from service.runtime.pretrain_study import StudyCluster, _arguments, _share
 from service.runtime.ray_connection import ClusterOptions
+from service.runtime.resuming import resumed_config
 from service.runtime.study import RunEnd
 from service.runtime.study_plan import Share, check_same_seeds, parse_seeds, share_cluster, share_machine
 from service.runtime.study_results import Scores, best_seed, publish_best, score
