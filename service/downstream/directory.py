@@ -9,6 +9,7 @@
 | ``result.json`` | how well it does in the end |
 | ``policy.safetensors`` | what was learned, averaged; ``policy.load_policy`` plays it without torch |
 | ``curves.png``, ``episodes.mp4`` | for people |
+| ``tandem-error-*.txt`` | traceback of an error that nobody expected |
 | ``.lock`` | held by the process that trains |
 """
 
@@ -21,7 +22,7 @@ from typing import Any, Self
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from service.downstream.settings import TrialConfig, differences, validate
-from service.errors import TandemError
+from service.errors import TRACEBACK_PREFIX, TandemError
 from service.io.checkpoints import Checkpoint, CheckpointStore
 from service.io.files import TEMPORARY_PREFIX, check_regular, os_errors, remove_temporaries, write_atomic
 from service.io.jsonl import JsonlWriter
@@ -99,8 +100,8 @@ class TrainingDirectory:
         if not self.trial_file.exists():
             with os_errors("read", self.path):
                 names = [file.name for file in self.path.iterdir()] if self.path.exists() else []
-            # a process that was killed before it wrote its first file leaves a lock and temporary files
-            if any(name != LOCK_FILE and not name.startswith(TEMPORARY_PREFIX) for name in names):
+            # a process that ended before it wrote its first file leaves a lock, temporary files, or a traceback
+            if any(name != LOCK_FILE and not name.startswith((TEMPORARY_PREFIX, TRACEBACK_PREFIX)) for name in names):
                 raise TandemError(f"{self.path} holds something else than a downstream training; {_ELSEWHERE}")
             return
         if not resume:
