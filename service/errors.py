@@ -4,6 +4,9 @@ from __future__ import annotations
 
 from typing import ClassVar
 
+TRACEBACK_PREFIX = "tandem-error-"
+"""Begins the names of the files that `UnexpectedError` names."""
+
 
 class TandemError(ValueError):
     """A mistake the user can mend; the message says what, where, which value, and what to do, in one line."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shlex
 import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -60,6 +61,13 @@ def _one_line() -> Iterator[None]:
         command = f"; see {said.ctx.command_path} --help" if said.ctx is not None else ""
         typer.echo(f"error: {one_line(text).rstrip('.')}{command}", err=True)
         raise typer.Exit(said.exit_code) from None
+
+
+def how_to_go_on(run_dir: Path, registry: Path, *, runtime: str = "local", address: str | None = None) -> str:
+    """The command that continues a run or a study, where it was begun."""
+    place = ["--runtime", runtime] * (runtime != "local") + (["--address", address] if address is not None else [])
+    command = ["tandem", "pretrain", "--resume", "--run-dir", str(run_dir), "--registry", str(registry), *place]
+    return f"continue with: {shlex.join(command)}"
 
 
 def print_json(tree: Any) -> None:

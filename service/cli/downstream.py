@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from service.cli.common import CHAMPION, EXIT_SIGNAL, CommandGroup, print_json
+from service.cli.unexpected import traceback_in
 from service.errors import TandemError, one_line
 
 if TYPE_CHECKING:
@@ -76,7 +77,9 @@ def train(
     path = run_dir or Path("runs") / "downstream" / trial.name
     with _stop_on_signals() as (callbacks, signals):
         options = RunOptions(resume, threads or 0, video=True, callbacks=callbacks)
-        result = run_trial(trial, load_for([method], primitives, registry), path, options)
+        trained = load_for([method], primitives, registry)
+        with traceback_in(path):
+            result = run_trial(trial, trained, path, options)
     if result is None:
         typer.echo(f"saved; continue with the same command and --resume --run-dir {path}", err=True)
         raise typer.Exit(EXIT_SIGNAL + (signals.first or 0))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import closing
 from itertools import count
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, NoReturn
@@ -9,9 +10,10 @@ from typing import TYPE_CHECKING, Annotated, NoReturn
 import typer
 from rich.console import Console
 
-from service.cli.common import CHAMPION, EXIT_SIGNAL, REGISTRY, RegistryOption
+from service.cli.common import CHAMPION, EXIT_SIGNAL, REGISTRY, RegistryOption, how_to_go_on
 from service.cli.evaluate import evaluate
 from service.cli.study import is_study, pretrain_study
+from service.cli.unexpected import traceback_in
 from service.errors import TandemError
 
 if TYPE_CHECKING:
@@ -75,10 +77,14 @@ def pretrain(
     token_file: Annotated[
         Path | None, typer.Option(metavar="FILE", help="Its token; default: TANDEM_TOKEN. See tandem serve.")
     ] = None,
+    accept_damaged_records: Annotated[
+        bool, typer.Option("--accept-damaged-records", help="Resume without the records that are missing or changed.")
+    ] = False,
 ) -> None:
     """Pre-train primitives by self-play, in this process or on a Ray cluster, and publish them."""
     from service.config import load_config
     from service.io.run_directory import RunDirectory
+    from service.runtime.pretrain import prepare
     from service.runtime.resuming import resumed_config
 
     def cluster_options() -> ClusterOptions:
@@ -123,14 +129,17 @@ def pretrain(
     else:
         resolved = load_config(config, overrides)
         run_dir = run_dir or runs / resolved.name
+    directory = RunDirectory(run_dir, accept_damaged_records=accept_damaged_records)
     if runtime == "local":
-        _pretrain(resolved, run_dir, registry, resume=resume, publish=publish)
+        _pretrain(resolved, directory, registry, resume=resume, publish=publish)
         return
     from service.runtime.ray_connection import connected
 
     options = cluster_options()
-    with connected(address):
-        _pretrain(resolved, run_dir, registry, resume=resume, publish=publish, cluster=options)
+    with closing(directory), traceback_in(run_dir):
+        prepare(resolved, directory, registry, resume=resume, publish=publish, runtime=runtime)
+        with connected(address):
+            _pretrain(resolved, directory, registry, resume=resume, publish=publish, cluster=options, address=address)
 
 
 _METHOD_SETTINGS = {"dads": ("skills.hidden_sizes=[64,64]", "skills.newest_steps=50000")}
@@ -158,6 +167,7 @@ def demo(
 ) -> None:
     """Watch a robot arm teach itself: a small pre-training from scratch, with pictures and a video."""
     from service.config import load_config
+    from service.io.run_directory import RunDirectory
     from service.primitives.bundled import BUNDLED
 
     paths = (Path("runs") / f"demo-{number}" for number in count(1))
@@ -165,7 +175,7 @@ def demo(
     Console().print("A robot arm is about to teach itself: Alice proposes goals, Bob learns to reach them.")
     overrides = [f"run.total_env_steps={env_steps}", "name=panda-cube-demo"]
     config = load_config(_DEMO_CONFIG if _DEMO_CONFIG.exists() else None, overrides)
-    _pretrain(config, path, path / "registry", resume=False)
+    _pretrain(config, RunDirectory(path), path / "registry", resume=False)
     typer.echo(f"\nThat was a beginning. Primitives that have learned for longer come with tandem; {CHAMPION}:")
     evaluate(CHAMPION, registry=BUNDLED)  # prints what the first of the next commands prints
     typer.echo("\nnext:")
@@ -176,44 +186,43 @@ def demo(
 
 def _pretrain(
     config: Config,
-    path: Path,
+    directory: RunDirectory,
     registry: Path,
     *,
     resume: bool,
     publish: bool = True,
     cluster: ClusterOptions | None = None,
+    address: str | None = None,
 ) -> None:
-    from service.io.run_directory import RunDirectory
     from service.runtime.pretrain import pretrain as run
     from service.runtime.progress import Progress
     from service.runtime.signals import InterruptError
 
-    directory = RunDirectory(path)
+    def say_stopped(what: str, number: int) -> NoReturn:
+        """Say how to go on, and exit as a process that a signal ends."""
+        runtime = "local" if cluster is None else "ray"
+        how = how_to_go_on(directory.path, registry, runtime=runtime, address=address)
+        typer.echo(f"{what}; {how if directory.exists else 'nothing was saved yet'}")
+        raise typer.Exit(EXIT_SIGNAL + number)
+
     try:
-        with Progress(config.run.total_env_steps, Console()) as progress:
+        with traceback_in(directory.path), Progress(config.run.total_env_steps, Console()) as progress:
             done = run(
                 config, directory, registry,
                 resume=resume, publish=publish, on_iteration=progress.show, cluster=cluster,
             )  # fmt: skip
     except InterruptError as interrupt:
-        _say_stopped("stopped at once", interrupt.number, directory, registry)
+        say_stopped("stopped at once", interrupt.number)
     result = done.result
     typer.echo(f"\n{result.reason} after {result.num_env_steps:,} env steps, {result.iteration} iterations")
     typer.echo(done.timing)
     if done.signal is not None:
         rest = "" if result.reason == "interrupted" else ", but not evaluated, published and drawn to the end"
-        _say_stopped(f"saved{rest}", done.signal, directory, registry)
+        say_stopped(f"saved{rest}", done.signal)
     for name, value in done.metrics.items():
         typer.echo(f"{name:<36} {value:.1%}")
     for name, file in done.files.items():
         typer.echo(f"{name:<12} {file}")
-    typer.echo(f"{'checkpoint':<12} {path / 'checkpoints'}")
+    typer.echo(f"{'checkpoint':<12} {directory.checkpoints}")
     if done.version is not None:
         typer.echo(f"{'primitives':<12} {done.version} in {registry}")
-
-
-def _say_stopped(what: str, number: int, directory: RunDirectory, registry: Path) -> NoReturn:
-    """Say how to go on, and exit as a process that a signal ends."""
-    how = f"continue with: tandem pretrain --resume --run-dir {directory.path} --registry {registry}"
-    typer.echo(f"{what}; {how if directory.exists else 'nothing was saved yet'}")
-    raise typer.Exit(EXIT_SIGNAL + number)

@@ -3,21 +3,23 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from contextlib import nullcontext
+from contextlib import closing, nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import typer
 from rich.console import Console
 
-from service.cli.common import EXIT_SIGNAL, print_table
-from service.errors import TandemError
+from service.cli.common import EXIT_SIGNAL, how_to_go_on, print_table
+from service.cli.unexpected import traceback_in
+from service.errors import TandemError, one_line
 
 if TYPE_CHECKING:
     from service.io.study_directory import StudyDirectory
     from service.runtime.pretrain_study import StudyResult
     from service.runtime.ray_connection import ClusterOptions
 
+_NOTHING = "nothing was saved yet"
 HEADER = ("seed", "state", "env steps", "minutes", "chosen by", "95 % interval", "mixed", "table", "air")
 
 
@@ -91,9 +93,11 @@ def pretrain_study(
     if options is not None:
         from service.runtime.ray_connection import cluster_size, connected
 
+        directory.claim()  # before Ray is started, which may take a minute
         connection = connected(address)
+    hint = how_to_go_on(path, registry, runtime="ray" if options is not None else "local", address=address)
     try:
-        with connection:
+        with closing(directory), traceback_in(path), connection:
             place = StudyCluster(*cluster_size(address), options) if options is not None else None
             progress = StudyProgress(resolved.run.total_env_steps, Console())
             result = run(
@@ -101,12 +105,12 @@ def pretrain_study(
                 resume=resume, publish=publish, parallel=parallel, cluster=place, progress=progress,
             )  # fmt: skip
     except InterruptError as interrupt:
-        typer.echo(f"stopped at once; {_how_to_go_on(directory, registry)}")
+        typer.echo(f"stopped at once; {hint if directory.exists else _NOTHING}")
         raise typer.Exit(EXIT_SIGNAL + interrupt.number) from None
-    _print_result(result, directory, registry)
+    _print_result(result, directory, registry, hint)
 
 
-def _print_result(result: StudyResult, directory: StudyDirectory, registry: Path) -> None:
+def _print_result(result: StudyResult, directory: StudyDirectory, registry: Path, hint: str) -> None:
     failed = [run for run in result.runs if run.state == "failed"]
     if result.signal is None:
         _print_scores(result)
@@ -118,12 +122,12 @@ def _print_result(result: StudyResult, directory: StudyDirectory, registry: Path
         if result.version is not None:
             typer.echo(f"primitives   {result.version} in {registry}")
     for run in failed:
-        typer.echo(f"seed {run.seed} failed: {run.error}", err=True)
+        typer.echo(one_line(f"seed {run.seed} failed: {run.error}"), err=True)
     if result.signal is not None:
-        typer.echo(f"saved; {_how_to_go_on(directory, registry)}")
+        typer.echo(f"saved; {hint}")
         raise typer.Exit(EXIT_SIGNAL + result.signal)
     if not all(run.has_ended for run in result.runs):
-        typer.echo(_how_to_go_on(directory, registry))
+        typer.echo(hint)
     if failed:
         raise typer.Exit(1)
 
@@ -140,9 +144,3 @@ def _print_scores(result: StudyResult) -> None:
             cells += [reported[kind] for kind in HEADER[-3:]]
         rows.append(cells + ["-"] * (len(HEADER) - len(cells)))
     print_table(HEADER, rows)
-
-
-def _how_to_go_on(directory: StudyDirectory, registry: Path) -> str:
-    if not directory.exists:
-        return "nothing was saved yet"
-    return f"continue with: tandem pretrain --resume --run-dir {directory.path} --registry {registry}"

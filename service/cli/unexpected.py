@@ -19,7 +19,7 @@ from pathlib import Path
 import typer
 
 from service import __version__
-from service.errors import TandemError, UnexpectedError, one_line
+from service.errors import TRACEBACK_PREFIX, TandemError, UnexpectedError, one_line
 
 UsageError: type[Exception] = typer.BadParameter.__bases__[0]
 """The error of arguments that typer cannot read; it has no public name in all versions of typer."""
@@ -80,7 +80,7 @@ def _unexpected(error: BaseException, directory: Path | None) -> UnexpectedError
 def _write_traceback(error: BaseException, directory: Path) -> Path:
     """Make a file of its own, which only this user may read: a traceback may quote what is nobody else's business."""
     stamp = time.strftime("%Y%m%d-%H%M%S", time.gmtime())
-    path = directory / f"tandem-error-{stamp}-{secrets.token_hex(4)}.txt"
+    path = directory / f"{TRACEBACK_PREFIX}{stamp}-{secrets.token_hex(4)}.txt"
     head = f"tandem {__version__}, Python {platform.python_version()}, {platform.platform()}\n{sys.argv}\n\n"
     text = head + "".join(traceback.format_exception(error))
     descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW, 0o600)

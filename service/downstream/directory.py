@@ -9,6 +9,7 @@
 | ``result.json`` | how well it does in the end |
 | ``policy.safetensors`` | what was learned, averaged; ``policy.load_policy`` plays it without torch |
 | ``curves.png``, ``episodes.mp4`` | for people |
+| ``tandem-error-*.txt`` | traceback of an error that nobody expected |
 | ``.lock`` | held by the process that trains |
 """
 
@@ -18,10 +19,12 @@ import json
 from pathlib import Path
 from typing import Any, Self
 
+from pydantic import BaseModel, ConfigDict, ValidationError
+
 from service.downstream.settings import TrialConfig, differences, validate
-from service.errors import TandemError
+from service.errors import TRACEBACK_PREFIX, TandemError
 from service.io.checkpoints import Checkpoint, CheckpointStore
-from service.io.files import TEMPORARY_PREFIX, os_errors, remove_temporaries, write_atomic
+from service.io.files import TEMPORARY_PREFIX, check_regular, os_errors, remove_temporaries, write_atomic
 from service.io.jsonl import JsonlWriter
 from service.io.lock import LOCK_FILE, DirectoryLock
 from service.io.tensorboard import EventFile
@@ -82,6 +85,7 @@ class TrainingDirectory:
         with os_errors("write", self.path):
             remove_temporaries(self.path)
         write_json(self.trial_file, {"format_version": FORMAT_VERSION, **identity})  # first: it says whose the rest is
+        check_regular(self.metrics_file)
         self._metrics.truncate_after(saved.step if saved else 0)
         with os_errors("write", self.path):
             self._events = EventFile(self.path / "tensorboard", after_step=saved.meta["env_steps"] if saved else None)
@@ -96,8 +100,8 @@ class TrainingDirectory:
         if not self.trial_file.exists():
             with os_errors("read", self.path):
                 names = [file.name for file in self.path.iterdir()] if self.path.exists() else []
-            # a process that was killed before it wrote its first file leaves a lock and temporary files
-            if any(name != LOCK_FILE and not name.startswith(TEMPORARY_PREFIX) for name in names):
+            # a process that ended before it wrote its first file leaves a lock, temporary files, or a traceback
+            if any(name != LOCK_FILE and not name.startswith((TEMPORARY_PREFIX, TRACEBACK_PREFIX)) for name in names):
                 raise TandemError(f"{self.path} holds something else than a downstream training; {_ELSEWHERE}")
             return
         if not resume:
@@ -154,6 +158,56 @@ def read_json(path: Path) -> dict[str, Any]:
     except (ValueError, TypeError) as error:
         raise TandemError(f"{path} is no JSON object: {error}; remove it, or name another directory") from None
     _check_version(tree, path)
+    return tree
+
+
+class _Evaluation(BaseModel):
+    success_last: float
+    success_last_low: float
+    success_last_high: float
+    success_ever: float
+    num_episodes: int
+
+
+class _Point(BaseModel):
+    env_steps: float
+    success_last: float
+
+
+class _Primitives(BaseModel):
+    name: str
+    env_steps: float | None = None
+
+
+class _Made(BaseModel):
+    git_commit: str | None
+
+
+class _Result(BaseModel):
+    """The parts of a result that commands and pages show; there are others."""
+
+    model_config = ConfigDict(allow_inf_nan=False)
+    evaluation: _Evaluation
+    primitives: _Primitives | None
+    made: _Made
+    env_steps: float
+    wall_s: float
+    curve: list[_Point]
+
+
+def read_result(path: Path) -> dict[str, Any]:
+    """Read the result of a training.
+
+    Raises:
+        TandemError: as for ``read_json``; or it is no result.
+    """
+    tree = read_json(path)
+    try:
+        _Result.model_validate(tree)
+    except ValidationError as error:
+        first = error.errors()[0]
+        where = ".".join(str(part) for part in first["loc"])
+        raise TandemError(f"{path} is no result: {where}: {first['msg']}; remove it, and it is made again") from None
     return tree
 
 

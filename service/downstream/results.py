@@ -6,7 +6,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
-from service.downstream.directory import made_with, read_json, read_trial, to_json
+from service.downstream.directory import made_with, read_result, read_trial, to_json
 from service.downstream.methods import METHODS, Trained, provenance
 from service.downstream.settings import TrialConfig, differences
 from service.errors import TandemError
@@ -31,7 +31,7 @@ class ResultsDirectory:
         path = self.path / f"{trial.name}.json"
         if not path.exists():
             return None
-        result = read_json(path)
+        result = read_result(path)
         wanted = _settings(trial) | provenance(trained, trial.method)
         if wrong := differences(_settings(read_trial(result, path)) | made_with(result), wanted):
             raise TandemError(f"{path} is of {'; '.join(wrong)}: give the same settings, or name another directory")
@@ -50,7 +50,7 @@ class ResultsDirectory:
         asked = {(trial.method, trial.seed) for trial in missing}
         of_all_seeds = {(each.method, each.task): (f"{each.name}, asked for,", _settings(each)) for each in missing}
         for path in sorted(self.path.glob("*.json")):
-            result = read_json(path)
+            result = read_result(path)
             trial = read_trial(result, path)
             same = ("primitives", "world") if (trial.method, trial.seed) in asked else ("world",)
             found, wanted = (
@@ -82,7 +82,7 @@ class ResultsDirectory:
         Raises:
             TandemError: a file is damaged or of another format version.
         """
-        return [read_json(path) for path in sorted(self.path.glob("*.json"))]
+        return [read_result(path) for path in sorted(self.path.glob("*.json"))]
 
 
 def _settings(trial: TrialConfig) -> dict[str, Any]:

@@ -21,7 +21,7 @@ import numpy as np
 import torch
 
 from service.actors.evaluation import DeterministicPolicy, Evaluation, evaluate, wilson_interval
-from service.downstream.directory import FORMAT_VERSION, TRIAL, TrainingDirectory, read_json, write_json
+from service.downstream.directory import FORMAT_VERSION, TRIAL, TrainingDirectory, read_result, write_json
 from service.downstream.learner import make_loop, set_progress, spread_seed
 from service.downstream.methods import Method, Trained, find_method, provenance
 from service.downstream.page import draw_training
@@ -81,7 +81,7 @@ def run_trial(trial: TrialConfig, trained: Trained, path: Path, options: RunOpti
     with TrainingDirectory(path) as directory, contextlib.ExitStack() as stack:
         saved = directory.start(identity, resume=options.resume)
         if directory.result_file.exists():
-            return read_json(directory.result_file)
+            return read_result(directory.result_file)
         learned: dict[str, Any] | None = {"env_steps": 0, "wall_s": 0.0, "curve": []}
         if method.player is None:
             training = _Training(trial, method, trained, directory, options)

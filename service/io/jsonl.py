@@ -93,8 +93,9 @@ class JsonlWriter(Appender):
             return None
         there = set(found)
         lost = [iteration for iteration, crc in rows if (iteration, crc) not in there]
-        before, known = found[: len(rows) - len(lost)], set(rows)
-        return Damage(self.path, tuple(lost), sum(row not in known for row in before))
+        known = set(rows)
+        unknown = sum(row not in known for row in found[: len(rows)])
+        return Damage(self.path, tuple(lost), max(0, unknown - len(lost)))  # of a lost one, what it was changed to
 
     def keep_only(self, checksums: str) -> None:
         """Drop every line that ``checksums`` did not know, in one atomic step.

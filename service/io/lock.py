@@ -20,6 +20,8 @@ from service.parsing import parse_json
 from service.regular_files import open_regular, read_regular
 
 LOCK_FILE = ".lock"
+WITHOUT_LOCKS = "TANDEM_WITHOUT_LOCKS"
+"""Variable of the environment that says, with 1, that somebody sees to it that one process uses a directory."""
 WAIT_S = 0.5
 """Longer than ``is_locked`` of another process keeps the lock to itself."""
 _logger = logging.getLogger(__name__)
@@ -46,8 +48,14 @@ class DirectoryLock:
         try:
             taken = _take(self._file, fcntl.LOCK_EX, WAIT_S)
         except OSError as error:
-            _logger.warning("%s: no locks there (%s); see to it that only one process uses it", path, error.strerror)
-            return
+            self._file.close()
+            if os.environ.get(WITHOUT_LOCKS) == "1":
+                _logger.warning("%s: no locks there (%s), as %s says", path, error.strerror, WITHOUT_LOCKS)
+                return
+            raise RunTakenError(
+                f"{path}: its file system has no locks ({error.strerror}), so nothing keeps a second process out; use "
+                f"another directory, or see to it that there is only one and set {WITHOUT_LOCKS}=1"
+            ) from None
         if not taken:
             self._file.close()
             found = holder(directory)

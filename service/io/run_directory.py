@@ -14,6 +14,7 @@
 | ``published.json`` | the version this run published last, and the sha256 of its parameters |
 | ``broken/`` | states of worlds whose physics diverged |
 | ``status.json``, ``goals.json``, ``stop`` | the run's state while it goes on; see ``service.store.disk`` |
+| ``tandem-error-*.txt`` | traceback of an error that nobody expected |
 | ``.lock`` | held by the process that runs it |
 """
 

@@ -85,6 +85,16 @@ class StudyDirectory:
                 "are there, and try again"
             ) from None
 
+    def claim(self) -> None:
+        """Keep every other process from running this study until ``close``; a second call does nothing.
+
+        Raises:
+            RunTakenError: another process runs it.
+            StorageError: the directory cannot be written.
+        """
+        if self._lock is None:
+            self._lock = DirectoryLock(self.path, "stop that one first, or name another --run-dir")
+
     def begin(self, config: Config, seeds: Sequence[int]) -> None:
         """Begin a study here, and keep every other process from running it until ``close``.
 
@@ -92,7 +102,7 @@ class StudyDirectory:
             TandemError: a study, or a run, is here already, or the directory cannot be written.
         """
         self.check_free(seeds)
-        self._lock = DirectoryLock(self.path, "stop that one first, or name another --run-dir")
+        self.claim()
         self.check_free(seeds)  # of two that begin at once, the second sees here what the first has made
         self.write_results({"seeds": list(seeds)})
         self._write_config(config)  # last: a start that failed can be tried again
@@ -107,7 +117,7 @@ class StudyDirectory:
             TandemError: no study is here, another process runs it, or the directory cannot be written.
         """
         self._check_begun()
-        self._lock = DirectoryLock(self.path, "stop that one first")
+        self.claim()
         self._write_config(config)
 
     def write_results(self, tree: Mapping[str, Any]) -> None:

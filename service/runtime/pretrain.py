@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Literal, cast
 
 from service.config import Config
 from service.errors import ConfigError, TandemError
-from service.io.run_directory import RunDirectory
+from service.io.run_directory import Published, RunDirectory
 from service.learner.learner import torch_device
 from service.media.artifacts import make_artifacts
 from service.primitives.publishing import measure_bob, measure_skills, publish_run
@@ -90,20 +90,10 @@ def pretrain(
         UnfinishedError: everything is saved, and not published.
         InterruptError: a signal while the run was being loaded, or a second one.
     """
-    if publish:
-        Registry(registry).check_writable()  # now, not after hours of learning
-    if cluster is not None and config.skills is not None:
-        raise ConfigError(
-            f"skills.method = {config.skills.method}: skill discovery runs in one process; use --runtime local"
-        )
-    if cluster is None:  # on a cluster, another machine has it
-        torch_device(config.learner.device)
-        check_one_learner(config)
     runtime: Literal["local", "ray"] = "local" if cluster is None else "ray"
     with StopSignals() as signals, ExitStack() as stack:
         stack.callback(directory.close)
-        directory.claim(resume=resume)
-        last = directory.read_published()
+        last = prepare(config, directory, registry, resume=resume, publish=publish, runtime=runtime)
         run_id = run_id_of(directory.path)
         redis = address_from_environment()
         previous = read_status(directory.path) if resume else None
@@ -118,6 +108,10 @@ def pretrain(
 
             url = stack.enter_context(serving(cluster.status, directory.path.absolute().parent, registry, redis))
             _logger.info("status: %s/v1/runs/%s", url, run_id)
+        if cluster is not None:
+            from service.runtime.ray_connection import explaining_ray_errors
+
+            stack.enter_context(explaining_ray_errors())  # before the report has them
         num_lost, furthest = 0, -1
         while True:
             with closing(_start(config, directory, cluster, resume=resume)) as run:
@@ -138,6 +132,32 @@ def pretrain(
             time.sleep(BACK_OFF_S * (2 ** (num_lost - 1) - 1))
 
 
+def prepare(
+    config: Config, directory: RunDirectory, registry: Path, *, resume: bool, publish: bool, runtime: str
+) -> Published | None:
+    """Check what can be checked before Ray is started, which may take a minute, and keep other processes out.
+
+    The caller closes the directory. A second call does nothing new.
+
+    Returns:
+        What the run published last.
+
+    Raises:
+        TandemError: see ``pretrain``.
+    """
+    if publish:
+        Registry(registry).check_writable()  # now, not after hours of learning
+    if runtime == "ray" and config.skills is not None:
+        raise ConfigError(
+            f"skills.method = {config.skills.method}: skill discovery runs in one process; use --runtime local"
+        )
+    if runtime == "local":  # on a cluster, another machine has it
+        torch_device(config.learner.device)
+        check_one_learner(config)
+    directory.claim(resume=resume)
+    return directory.read_published()
+
+
 def _start(config: Config, directory: RunDirectory, cluster: ClusterOptions | None, *, resume: bool) -> Runner:
     if config.skills is not None:
         from service.runtime.skill_run import SkillRun
@@ -146,8 +166,9 @@ def _start(config: Config, directory: RunDirectory, cluster: ClusterOptions | No
     if cluster is None:
         return LocalRun(config, directory, resume=resume)
     from service.runtime.cluster import ClusterRun  # where there is no cluster, Ray is not needed
+    from service.runtime.ray_connection import started
 
-    return ClusterRun(config, directory, cluster, resume=resume)
+    return started(lambda: ClusterRun(config, directory, cluster, resume=resume))
 
 
 def _run(

@@ -7,17 +7,24 @@ import os
 import secrets
 import socket
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, TypeVar
 
 from service.config import LearnerConfig
+from service.errors import TandemError, one_line
 from service.runtime.runner import ClusterError
 
 CONNECT_S = 5.0
+ANSWER_S = 20.0
+"""Time that the head of a cluster has to answer; Ray itself waits as long."""
 START_ATTEMPTS = 3
 """Ray gives up on a node of its own after 30 s, which a busy machine may need."""
+
+_NOBODY = "no Ray cluster answers there: is it up (ray status), and is the address right (ray start prints it)"
+_Started = TypeVar("_Started")
+_logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,7 +83,8 @@ def connected(address: str | None, num_cpus: int | None = None) -> Iterator[None
         num_cpus: of a new one; None: all there are.
 
     Raises:
-        ClusterError: nobody there, another version of Ray or Python there, or it does not let us in.
+        ClusterError: nobody there, another version of Ray or Python there, or it does not let us in; or Ray fails
+            while the block runs.
     """
     address = address or ("auto" if os.environ.get("RAY_ADDRESS") else None)
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
@@ -91,6 +99,7 @@ def connected(address: str | None, num_cpus: int | None = None) -> Iterator[None
     import ray
 
     _check_reachable(address)
+    _check_token(address)
     options: dict[str, Any] = {"num_cpus": num_cpus, "include_dashboard": False} if address is None else {}
     for attempt in range(START_ATTEMPTS, 0, -1):
         try:
@@ -100,10 +109,58 @@ def connected(address: str | None, num_cpus: int | None = None) -> Iterator[None
             ray.shutdown()
             if attempt == 1 or address is not None or "timed out during startup" not in str(error):
                 raise ClusterError(_explained(address, error)) from None
+        except BaseException:  # a signal's
+            ray.shutdown()
+            raise
     try:
-        yield
+        with explaining_ray_errors():
+            yield
     finally:
         ray.shutdown()
+
+
+@contextmanager
+def explaining_ray_errors() -> Iterator[None]:
+    """Turn what Ray says of a worker that failed, which has the worker's traceback in it, into one line.
+
+    Raises:
+        TandemError: what the worker itself raised for people.
+        ClusterError: the worker, or what it made, is gone.
+        RuntimeError: anything else that a worker raised; its traceback is in the cause.
+    """
+    from ray.exceptions import RayError, RayTaskError
+
+    try:
+        yield
+    except RayTaskError as error:
+        if isinstance(error.cause, TandemError):
+            raise error.cause from None
+        raise RuntimeError(_last_line(error)) from error
+    except RayError as error:
+        raise ClusterError(
+            f"Ray gave up: {_last_line(error)}; see ray status, and continue with --resume from what was saved"
+        ) from error
+
+
+def started(start: Callable[[], _Started]) -> _Started:
+    """Call ``start``; where a worker dies before it has started, once more and once again.
+
+    Raises:
+        ClusterError: workers died every time.
+    """
+    from ray.exceptions import RayActorError
+
+    for attempt in range(START_ATTEMPTS, 0, -1):
+        try:
+            return start()
+        except RayActorError as error:
+            said = _last_line(error)
+        if attempt > 1:
+            _logger.warning("a worker died while the run was starting: %s; starting again", said)
+    raise ClusterError(
+        f"{START_ATTEMPTS} times in a row a worker died while the run was starting: {said}; is there enough memory for "
+        "it? see ray status, and the logs of the node"
+    )
 
 
 def cluster_size(address: str | None) -> tuple[str, float]:
@@ -131,6 +188,44 @@ def _check_reachable(address: str | None) -> None:
         raise ClusterError(_explained(address, error)) from None
 
 
+def _check_token(address: str | None) -> None:
+    """Ask the cluster for its id, which needs the right token; Ray itself tries for 20 s, and says nobody answers."""
+    if address is None or address.startswith("ray://"):
+        return
+    import grpc
+    from ray._private.grpc_utils import init_grpc_channel
+    from ray._private.services import canonicalize_bootstrap_address
+
+    try:
+        place = canonicalize_bootstrap_address(address)
+        if place is None:
+            return
+        with init_grpc_channel(place) as channel:
+            channel.unary_unary("/ray.rpc.NodeInfoGcsService/GetClusterId")(b"", timeout=ANSWER_S)
+        return
+    except grpc.RpcError as error:
+        code, said = error.code(), f" It says: {one_line(str(error.details()), 300)}"
+    except Exception:  # no token at all, no cluster of that name: Ray says so at once
+        return
+    if code == grpc.StatusCode.UNAUTHENTICATED:
+        sent = os.environ.get("RAY_AUTH_MODE") == "token"
+        what = "it refuses the token that was sent" if sent else "it wants a token, and none was sent"
+        mode = "" if sent else "RAY_AUTH_MODE=token, and "
+        raise ClusterError(
+            f"--address {address}: {what}: set {mode}RAY_AUTH_TOKEN or RAY_AUTH_TOKEN_PATH to the one that the cluster "
+            f"was started with.{said}"
+        )
+    if code in (grpc.StatusCode.UNAVAILABLE, grpc.StatusCode.DEADLINE_EXCEEDED):
+        raise ClusterError(f"--address {address}: {_NOBODY}.{said}")
+
+
+def _last_line(error: Exception) -> str:
+    """What an error of Ray's says: the end of a traceback, or the sentences before a table of ids."""
+    lines = [line.strip() for line in str(error).splitlines() if line.strip()]
+    said = "" if not lines else lines[-1] if "Traceback" in str(error) else lines[0]
+    return one_line(f"{type(error).__name__}: {said}", 300)
+
+
 def _explained(address: str | None, error: Exception) -> str:
     said = " ".join(str(error).split())
     if "ersion" in said and "mismatch" in said.lower():
@@ -140,5 +235,5 @@ def _explained(address: str | None, error: Exception) -> str:
     elif address is None:
         what = "Ray does not start here"
     else:
-        what = "no Ray cluster answers there: is it up (ray status), and is the address right (ray start prints it)?"
-    return f"--address {address or '(none)'}: {what}. It says: {said[:300]}"
+        what = _NOBODY
+    return f"--address {address or '(none)'}: {what}. It says: {one_line(said, 300)}"

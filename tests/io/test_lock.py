@@ -77,11 +77,15 @@ def test_a_damaged_lock_file_is_as_good_as_any(tmp_path):
     first.release()
 
 
-def test_a_file_system_without_locks_is_warned_of(tmp_path, monkeypatch, caplog):
+def test_a_file_system_without_locks_is_refused_unless_one_says_so(tmp_path, monkeypatch, caplog):
     def unsupported(*_):
         raise OSError(95, "Operation not supported")
 
     monkeypatch.setattr("fcntl.flock", unsupported)
+    with pytest.raises(RunTakenError) as error:
+        DirectoryLock(tmp_path, "")
+    assert_one_line(error.value, tmp_path, "no locks", "Operation not supported", "TANDEM_WITHOUT_LOCKS=1")
+    monkeypatch.setenv("TANDEM_WITHOUT_LOCKS", "1")
     with caplog.at_level(logging.WARNING):
         DirectoryLock(tmp_path, "").release()
     assert_one_line(caplog.messages[0], tmp_path, "no locks", "Operation not supported")

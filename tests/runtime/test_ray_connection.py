@@ -22,6 +22,7 @@ def starts(monkeypatch):
 
     monkeypatch.setattr(ray, "init", init)
     monkeypatch.setattr(ray, "shutdown", lambda: None)
+    monkeypatch.setattr("service.runtime.ray_connection._check_token", lambda address: None)
     monkeypatch.delenv("RAY_ADDRESS", raising=False)
     return tried, failing
 
