@@ -32,6 +32,7 @@ from benchmarks.processes import cpu_s_by_role, descendants, is_running
 from service.errors import TandemError
 from service.io.checkpoints import CheckpointStore
 from service.io.run_directory import RunDirectory
+from service.io.run_history import FILE as RUN_FILE
 from service.store.disk import STATUS_FILE
 from service.store.models import RunStatus
 
@@ -341,7 +342,7 @@ def copy_run(source: RunDirectory, home: Path, name: str = "run") -> RunDirector
         raise TandemError(f"no checkpoint in {source.checkpoints}; name a run that has one")
     target.checkpoints.mkdir(parents=True)
     shutil.copy(newest, target.checkpoints)
-    for file in (source.config_file, source.metrics_file, source.goals_file):
+    for file in (source.config_file, source.metrics_file, source.goals_file, source.path / RUN_FILE):
         if file.exists():
             shutil.copy(file, target.path)
     return target

@@ -39,14 +39,27 @@ class Epoch:
             path.mkdir(parents=True, exist_ok=True)
             while True:
                 self.number = newest_epoch(directory) + 1
-                with contextlib.suppress(FileExistsError):  # another process was quicker
-                    descriptor = os.open(path / f"{self.number:08d}", os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o666)
+                file = path / f"{self.number:08d}"
+                try:
+                    descriptor = os.open(file, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o666)
+                except FileExistsError:  # another process was quicker
+                    continue
+                if newest_epoch(directory) == self.number:
                     break
+                os.close(descriptor)  # several were, and this number may have been claimed and deleted before
+                file.unlink(missing_ok=True)
             with contextlib.suppress(OSError):  # a full disk: who it is is only told to people
                 os.write(descriptor, json.dumps(note).encode())
             os.close(descriptor)
             for number in _numbers(directory)[:-NUM_KEPT]:
                 (path / f"{number:08d}").unlink(missing_ok=True)
+
+    def give_back(self) -> None:
+        """Let the number go, of a run that did not begin."""
+        with contextlib.suppress(OSError):
+            path = self._directory / DIRECTORY
+            (path / f"{self.number:08d}").unlink()
+            path.rmdir()
 
     def check(self) -> None:
         """Assert that no other process has a higher number.

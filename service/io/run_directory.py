@@ -26,7 +26,7 @@ import logging
 import os
 import platform
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from datetime import UTC, datetime
 from importlib.metadata import version
 from pathlib import Path
@@ -43,7 +43,7 @@ from service.io.errors import StorageError
 from service.io.files import Appender, check_regular, os_errors, remove_temporaries, write_atomic
 from service.io.git import git_commit
 from service.io.jsonl import JsonlWriter
-from service.io.lock import DirectoryLock
+from service.io.lock import LOCK_FILE, DirectoryLock
 from service.io.run_history import RunHistory, read_history
 from service.parsing import ParseError, parse_json
 from service.regular_files import read_regular
@@ -190,7 +190,7 @@ class RunDirectory:
         self._lock = DirectoryLock(self.path, "stop that one first, or name another --run-dir")
         if not resume:
             self.check_free()  # of two that begin at once, the second sees here what the first has made
-        self._history = (read_history(self.path) if resume else None) or RunHistory.new()
+        self._history = read_history(self.path) if resume else RunHistory.new()
         self.epoch = Epoch(self.path)
 
     def check_owner(self) -> None:
@@ -203,19 +203,14 @@ class RunDirectory:
             self.epoch.check()
 
     @property
-    def history(self) -> RunHistory:
-        """The run's identity, and what was not as before when a process went on with it.
-
-        Raises:
-            StorageError: it cannot be read, or is damaged.
-        """
-        if self._history is None:
-            self._history = read_history(self.path) or RunHistory.new()
+    def history(self) -> RunHistory | None:
+        """The run's identity, and what was not as before when a process went on with it; None where nobody noted it."""
         return self._history
 
-    def take_over(self, run: str, changed: dict[str, tuple[JsonValue, JsonValue]]) -> None:
-        """Go on as the run of that identity, and note the settings that have changed, for ``start``."""
-        self._history = self.history.model_copy(update={"run": run})
+    def take_over(self, run: str | None, changed: dict[str, tuple[JsonValue, JsonValue]]) -> None:
+        """Go on as the run of that identity, or a new one if it has none, and note for ``start`` what has changed."""
+        if self._history is None:
+            self._history = RunHistory.new() if run is None else RunHistory(run=run)
         self._changed = changed
 
     def checksums(self) -> dict[str, str]:
@@ -295,8 +290,19 @@ class RunDirectory:
                 _logger.warning("the newest records are lost: %s", error)
         self._events = None
         if self._lock is not None:
+            if not self.exists:
+                self._leave_nothing()
             self._lock.release()
             self._lock = None
+            self.epoch = None
+
+    def _leave_nothing(self) -> None:
+        """Remove what a run that did not begin has claimed, and the directory if nothing else is in it."""
+        if self.epoch is not None:
+            self.epoch.give_back()
+        with suppress(OSError):
+            (self.path / LOCK_FILE).unlink()
+            self.path.rmdir()
 
     def _writers(self) -> list[Appender]:
         return [self._metrics, self._goals, *([self._events] if self._events is not None else [])]

@@ -66,7 +66,8 @@ def publish_run(
     version = _newest_if_same(registry, config.name, parameters)
     if version is None:
         parent = _published_before(directory, registry)
-        history = directory.history.model_dump(mode="json") if directory.history.events else None
+        known = directory.history
+        history = known.model_dump(mode="json") if known is not None and known.events else None
         version = publish(registry, config, parameters, metrics, parent=parent, history=history)
     directory.write_published(Published(str(version), registry.manifest(str(version)).blob_sha256))
     return version

@@ -82,11 +82,12 @@ class Bookkeeper:
         return parts, checkpoint.meta
 
     def _check_same_run(self, checkpoint: Checkpoint) -> None:
-        ours, theirs = self.directory.history.run, checkpoint.meta.get("run", self.directory.history.run)
-        if theirs != ours:
+        history, theirs = self.directory.history, checkpoint.meta.get("run")
+        if history is not None and theirs is not None and theirs != history.run:
             raise CheckpointError(
-                f"{self.directory.path}: its newest checkpoint is of another run ({theirs[:8]}, not {ours[:8]}); put "
-                f"that of this run back, or remove {RUN_FILE} if the records are the other run's, too"
+                f"{self.directory.path}: its newest checkpoint is of another run ({theirs[:8]}, not "
+                f"{history.run[:8]}); put that of this run back, or remove {RUN_FILE} if the "
+                "records are the other run's, too"
             )
         changed = changed_settings(checkpoint.meta.get("config", {}), self.config, self.directory.path)
         if changed:
@@ -128,6 +129,7 @@ class Bookkeeper:
         arrays = {f"{part}/{name}": array for part, state in parts.items() for name, array in state.items()}
         config = self.config.model_dump(mode="json")
         own = {"config": config, "env_steps": self.num_env_steps, "wall_s": self.wall_s}
+        assert self.directory.history is not None
         own |= {"run": self.directory.history.run, "records": self.directory.checksums()}
         self.directory.sync()
         self.checkpoints.save(self.iteration, arrays, {**own, **meta})

@@ -11,6 +11,7 @@ from typer.testing import CliRunner
 
 from service.cli.main import app
 from service.config import dump_config
+from service.io.checkpoints import CheckpointStore
 from service.runtime.pretrain_study import StudyResult
 from tests.deploy.files import DEPLOY, DOCUMENTS, ROOT, commands, compose, manifest, manifests, pod_templates
 
@@ -70,10 +71,10 @@ def test_pretrain_begins_with_it_and_goes_on_with_it(arguments, monkeypatch, tmp
     """Up to where a run would begin: options that exclude each other are found out only then."""
     begun = []
 
-    def pretrain(config, path, registry, *, resume, **kwargs):
-        begun.append((path, resume))
-        path.mkdir(parents=True, exist_ok=True)
-        (path / "config.yaml").write_text(dump_config(config))
+    def pretrain(config, directory, registry, *, resume, **kwargs):
+        begun.append((directory.path, resume))
+        CheckpointStore(directory.checkpoints, keep=1).save(0, {}, {})
+        directory.config_file.write_text(dump_config(config))
 
     def pretrain_study(config, directory, seeds, registry, *, resume, **kwargs):
         begun.append((directory.path, resume))

@@ -156,4 +156,4 @@ def test_a_cluster_of_another_version_of_ray(head, tmp_path):
     assert address in line
     assert "use the same image or environment everywhere" in line
     assert "2.0.0" in line
-    assert not (tmp_path / "runs").exists()
+    assert not (tmp_path / "runs" / "night").exists()
