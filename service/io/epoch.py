@@ -39,15 +39,13 @@ class Epoch:
             path.mkdir(parents=True, exist_ok=True)
             while True:
                 self.number = newest_epoch(directory) + 1
-                file = path / f"{self.number:08d}"
                 try:
-                    descriptor = os.open(file, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o666)
+                    descriptor = os.open(path / f"{self.number:08d}", os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o666)
                 except FileExistsError:  # another process was quicker
                     continue
                 if newest_epoch(directory) == self.number:
                     break
                 os.close(descriptor)  # several were, and this number may have been claimed and deleted before
-                file.unlink(missing_ok=True)
             with contextlib.suppress(OSError):  # a full disk: who it is is only told to people
                 os.write(descriptor, json.dumps(note).encode())
             os.close(descriptor)
