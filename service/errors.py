@@ -21,6 +21,12 @@ class UnexpectedError(TandemError):
     exit_code = 1
 
 
+class NoRoomError(TandemError):
+    """There is not enough memory, or no room on a disk; nothing is wrong with the program."""
+
+    exit_code = 1
+
+
 class ConfigError(TandemError):
     """A configuration the user can mend; the message says what, where, which value, and what to do."""
 

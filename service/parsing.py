@@ -17,8 +17,10 @@ from service.errors import TandemError
 
 MAX_DEPTH = 64
 """Groups within groups; a configuration has five."""
-MAX_WHOLE_NUMBER = 10**300
-"""Greater ones are no floats; states of random generators have 39 digits."""
+MAX_JSON_NUMBER = 10**300
+"""Greatest whole number in JSON: greater ones are no floats. States of random generators have 39 digits."""
+MAX_YAML_NUMBER = 2**63 - 1
+"""Greatest whole number in YAML, which has configurations."""
 MAX_YAML_CHARACTERS = 256 * 1024
 MAX_YAML_VALUES = 5000
 """Values of a YAML text, those that aliases repeat included; a configuration has 200."""
@@ -54,7 +56,7 @@ def parse_json(text: str | bytes, where: object, *, allow_nan: bool = False) -> 
         raise ParseError(where, _TOO_DEEP) from None
     except ValueError as error:  # also for bytes that are no UTF-8, and for numbers of thousands of digits
         raise ParseError(where, f"not JSON ({_described(error)})") from None
-    _check(tree, where, allow_nan=allow_nan)
+    _check(tree, where, MAX_JSON_NUMBER, allow_nan=allow_nan)
     return tree
 
 
@@ -79,7 +81,7 @@ def parse_yaml(text: str | bytes, where: object) -> Any:
             loader.dispose()
     except Exception as error:  # beside its own errors whatever its constructors meet: "!!bool x" is a KeyError
         raise ParseError(where, f"not YAML ({_described(error)})") from None
-    _check(tree, where, allow_nan=True)  # whose fields they are refuses them where they are no good
+    _check(tree, where, MAX_YAML_NUMBER, allow_nan=True)  # whose fields they are refuses them where they are no good
     return tree
 
 
@@ -120,7 +122,7 @@ class _BoundedLoader(yaml.SafeLoader):
         return node
 
 
-def _check(tree: Any, where: object, *, allow_nan: bool) -> None:
+def _check(tree: Any, where: object, greatest: int, *, allow_nan: bool) -> None:
     """Refuse what parsers take but nobody can work with; without recursion, which is what deep trees are made for."""
     level, depth = [tree], 0
     while level:
@@ -133,8 +135,8 @@ def _check(tree: Any, where: object, *, allow_nan: bool) -> None:
                 inner += value.values()
             elif isinstance(value, (list, tuple, set)):
                 inner += value
-            elif isinstance(value, int) and abs(value) > MAX_WHOLE_NUMBER:
-                raise ParseError(where, "a whole number of more than 300 digits")
+            elif isinstance(value, int) and abs(value) > greatest:
+                raise ParseError(where, f"a whole number beyond {greatest:.3g}")
             elif isinstance(value, float) and not allow_nan and not math.isfinite(value):
                 raise ParseError(where, f"the number {value}; only finite ones can be used")
             elif isinstance(value, str) and not value.isascii() and any("\ud800" <= each <= "\udfff" for each in value):

@@ -6,6 +6,7 @@ import errno
 import logging
 import os
 import platform
+import re
 import secrets
 import sys
 import tempfile
@@ -19,7 +20,7 @@ from pathlib import Path
 import typer
 
 from service import __version__
-from service.errors import TRACEBACK_PREFIX, TandemError, UnexpectedError, one_line
+from service.errors import TRACEBACK_PREFIX, NoRoomError, TandemError, UnexpectedError, one_line
 
 UsageError: type[Exception] = typer.BadParameter.__bases__[0]
 """The error of arguments that typer cannot read; it has no public name in all versions of typer."""
@@ -38,6 +39,7 @@ def traceback_in(directory: Path | None = None) -> Iterator[None]:
 
     Raises:
         UnexpectedError: it happened.
+        NoRoomError: no memory, or a full disk.
         TandemError: a path that cannot be used; or whatever the block raised.
     """
     try:
@@ -51,8 +53,16 @@ def traceback_in(directory: Path | None = None) -> Iterator[None]:
             raise TandemError(
                 f"cannot use {os.fsdecode(error.filename)}: {error.strerror}; check the path and its permissions"
             ) from error
+        if error.errno in (errno.ENOSPC, errno.EDQUOT):
+            where = os.fsdecode(error.filename) if error.filename is not None else "what is printed"
+            raise NoRoomError(f"cannot write {where}: {error.strerror}; free some space and try again") from error
         raise _unexpected(error, directory) from error
     except Exception as error:
+        if isinstance(error, MemoryError) or re.search(r"allocate memory|out of memory", str(error)):  # NumPy, torch
+            raise NoRoomError(
+                f"not enough memory: {one_line(str(error), 300) or 'none is left'}; ask for less, such as fewer worlds "
+                "(game.num_worlds) or smaller networks, or take a machine with more"
+            ) from error
         raise _unexpected(error, directory) from error
 
 

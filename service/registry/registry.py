@@ -218,7 +218,7 @@ class Registry:
             RegistryError: the directory holds an export already.
             StorageError: it cannot be written.
         """
-        manifest = self.manifest(reference)
+        manifest, _ = self.load(reference)
         files = {
             directory / "primitives.safetensors": self._blobs.get(manifest.blob_sha256),
             directory / "manifest.json": manifest.to_bytes(),

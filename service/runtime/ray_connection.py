@@ -96,8 +96,12 @@ def connected(address: str | None, num_cpus: int | None = None) -> Iterator[None
         os.environ.setdefault("RAY_worker_niceness", "0")  # not 15 for all: see ``ray_actors.lower_priority``
         # No spare worker for every core: ours have environment variables of their own, so none would fit.
         os.environ.setdefault("RAY_prestart_worker_first_driver", "0")
-    import ray
-
+    try:
+        import ray
+    except ImportError:
+        raise ClusterError(
+            "Ray is not installed: pip install 'tandem-skills[cluster]', or use --runtime local"
+        ) from None
     _check_reachable(address)
     _check_token(address)
     options: dict[str, Any] = {"num_cpus": num_cpus, "include_dashboard": False} if address is None else {}

@@ -1,0 +1,205 @@
+"""What anybody may have put where a command expects a file: one line, an exit code, no traceback, no waiting.
+
+To add an attack, add a line to ``NOT_FILES`` or ``NO_CONTENT``; to add a place that is attacked, one to ``PLACES``.
+"""
+
+import gzip
+import io
+import os
+import pickle
+import shutil
+import signal
+import socket
+import zipfile
+from contextlib import contextmanager
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from service.cli.main import app
+from service.io.checkpoints import CheckpointStore
+from service.primitives.publishing import publish
+from service.registry.registry import Registry
+from tests.runtime.runs import play, tiny_config, write_yaml
+
+LIMIT_S = 60
+"""Far more than any refusal takes, and far less than forever."""
+
+
+def a_socket(path):
+    here = os.getcwd()
+    os.chdir(path.parent)  # a socket's path has at most 107 bytes
+    try:
+        with socket.socket(socket.AF_UNIX) as made:
+            made.bind(path.name)
+    finally:
+        os.chdir(here)
+
+
+def an_archive():
+    data = io.BytesIO()
+    with zipfile.ZipFile(data, "w") as archive:
+        archive.writestr("primitives.safetensors", "x")
+    return data.getvalue()
+
+
+def some_arrays():
+    data = io.BytesIO()
+    np.savez(data, weight=np.ones(3))
+    return data.getvalue()
+
+
+def a_billion_laughs():
+    names = "abcdefghij"
+    lines = ["a: &a [x, x, x, x, x, x, x, x, x]"]
+    lines += [f"{each}: &{each} [{', '.join(['*' + last] * 9)}]" for last, each in zip(names, names[1:], strict=False)]
+    return "\n".join(lines).encode()
+
+
+NOT_FILES = {
+    "fifo": os.mkfifo,
+    "directory": os.mkdir,
+    "socket": a_socket,
+    "endless device": lambda path: path.symlink_to("/dev/zero"),
+    "full device": lambda path: path.symlink_to("/dev/full"),
+}
+NO_CONTENT = {
+    "noise": b"\x93\xff\x00noise" * 20,
+    "zeros": bytes(1000),
+    "pickle": pickle.dumps({"weight": [1.0]}),
+    "npz": some_arrays(),
+    "zip": an_archive(),
+    "gzip": gzip.compress(b"x"),
+    "UTF-16": "words".encode("utf-16"),
+    "brackets, a hundred thousand deep": b"[" * 100_000,
+    "objects, deep": b'{"a":' * 20_000,
+    "lists, deeper than anybody needs": b"[" * 100 + b"]" * 100,
+    "billion laughs": a_billion_laughs(),
+    "list within itself": b"&a [*a, *a]",
+    "tag of a Python object": b"!!python/object/apply:os.system [id]",
+    "tag that does not fit": b"!!bool x",
+    "5000 digits": b"9" * 5000,
+    "400 digits": b'{"version": %s, "seeds": [%s], "seed": %s}' % ((b"9" * 400,) * 3),
+    "5000 hexadecimal digits": b"seed: 0x" + b"f" * 5000,
+    "greater than any float": b'{"version": 1e999, "seeds": [1e999], "seed": 1e999}',
+    "not a number": b"NaN",
+    "half a character": b'{"name": "\\ud800", "version": "\\ud800", "seeds": ["\\ud800"]}',
+    "list": b"[1, 2]",
+    "wrong types": b'{"version": [1], "seeds": "x", "name": {"a": 1}, "format_version": 1, "run": 4, "cell": 3}',
+    "keys that are no text": b"{1: 2, null: 3, 2026-01-01: 4}",
+    "lines for a terminal": b'name: "x\\nTraceback (most recent call last):\\n\\e[2J"',
+}
+EVALUATE = ("evaluate", "--episodes", "2", "--steps", "2", "--registry", "registry", "--primitives")
+RESUME = ("pretrain", "--resume", "--registry", "registry", "--run-dir")
+IDLE = ("--method", "idle", "--task", "push", "--episodes", "4")
+CHECKPOINT, TRAINING = "run/checkpoints/*", "trainings/push-idle-0"
+VERSION, ALIAS, BLOB = "registry/models/tiny/versions/1", "registry/models/tiny/aliases/latest", "registry/blobs/*/*"
+PLACES = {
+    "--config": ("tiny.yaml", ("pretrain", "--config", "tiny.yaml", "--run-dir", "new")),
+    "--config of a resume": ("tiny.yaml", (*RESUME, "run", "--config", "tiny.yaml")),
+    "config.yaml": ("run/config.yaml", (*RESUME, "run")),
+    "config.yaml to evaluate": ("run/config.yaml", (*EVALUATE, "run")),
+    "checkpoint": (CHECKPOINT, (*RESUME, "run")),
+    "checkpoint to evaluate": (CHECKPOINT, (*EVALUATE, "run")),
+    "published.json": ("run/published.json", (*RESUME, "run")),
+    "study.yaml": ("study/study.yaml", (*RESUME, "study", "--seeds", "0,1")),
+    "study.json": ("study/study.json", (*RESUME, "study", "--seeds", "0,1")),
+    "manifest": (VERSION, (*EVALUATE, "tiny")),
+    "manifest to list": (VERSION, ("registry", "list", "--registry", "registry")),
+    "manifest to verify": (VERSION, ("registry", "verify", "--registry", "registry")),
+    "alias": (ALIAS, (*EVALUATE, "tiny")),
+    "blob": (BLOB, (*EVALUATE, "tiny")),
+    "blob to verify": (BLOB, ("registry", "verify", "--registry", "registry")),
+    "blob to export": (BLOB, ("registry", "export", "tiny", "out", "--registry", "registry")),
+    "cell.json": (f"{TRAINING}/cell.json", ("downstream", "train", *IDLE, "--resume", "--run-dir", TRAINING)),
+    "result.json": (f"{TRAINING}/result.json", ("downstream", "train", *IDLE, "--resume", "--run-dir", TRAINING)),
+}
+RECORDS = {
+    "metrics.jsonl": ("run/metrics.jsonl", (*RESUME, "run")),
+    "goals.jsonl": ("run/goals.jsonl", (*RESUME, "run")),
+    "records of a training": (f"{TRAINING}/metrics.jsonl", PLACES["cell.json"][1]),
+}
+"""Places where a file may also be missing, or end with a torn line."""
+
+
+@contextmanager
+def soon():
+    """Fail where the block waits for something that never comes."""
+
+    before = signal.signal(signal.SIGALRM, lambda *which: pytest.fail(f"not within {LIMIT_S} s"))
+    signal.alarm(LIMIT_S)
+    try:
+        yield
+    finally:
+        signal.alarm(0)
+        signal.signal(signal.SIGALRM, before)
+
+
+def refuse(arguments):
+    """Run a command that has to end with one line; returns it."""
+    with soon():
+        result = CliRunner().invoke(app, arguments, env={"COLUMNS": "80"})
+    assert result.exit_code == (1 if "verify" in arguments else 2), (result.stderr, result.exception)
+    assert result.stderr.count("\n") == 1, result.stderr
+    assert result.stderr.endswith("\n")
+    assert "Traceback (" not in result.stderr.replace("\\nTraceback", "")
+    assert "unexpected" not in result.stderr
+    assert result.stderr[:-1].isprintable()
+    return result.stderr
+
+
+@pytest.fixture(scope="module")
+def good(tmp_path_factory):
+    """A run, what it published, a study and a training that has ended, all of them small."""
+    home = tmp_path_factory.mktemp("good")
+    config = tiny_config(keep_checkpoints=1)
+    run, _ = play(home / "run", config)
+    write_yaml(home / "tiny.yaml", config.model_dump(mode="json"))
+    registry = Registry(home / "registry")
+    publish(registry, config, run.parameters(), {"env_steps": 600.0})
+    (home / "study").mkdir()
+    shutil.copy(home / "run" / "config.yaml", home / "study" / "study.yaml")
+    (home / "study" / "study.json").write_text('{"seeds": [0, 1]}')
+    trained = CliRunner().invoke(app, ["downstream", "table", "--methods", "idle", "--tasks", "push", *IDLE[4:],
+        "--out", str(home / "out"), "--runs", str(home / "trainings")])  # fmt: skip
+    assert trained.exit_code == 0, trained.output
+    return home
+
+
+@pytest.fixture
+def home(good, tmp_path, monkeypatch):
+    """A copy of all that, as the directory that commands run in."""
+    shutil.copytree(good, tmp_path / "home", symlinks=True)
+    monkeypatch.chdir(tmp_path / "home")
+    return tmp_path / "home"
+
+
+def take_away(home, file):
+    """Make room for something else in the place of a file; returns its path."""
+    (path,) = list(home.glob(file)) or [home / file]
+    path.unlink(missing_ok=True)
+    return path
+
+
+@pytest.mark.parametrize("place", [*PLACES, *RECORDS])
+def test_what_is_no_file(home, place):
+    file, arguments = (PLACES | RECORDS)[place]
+    path = take_away(home, file)
+    for make in NOT_FILES.values():
+        make(path)
+        assert path.name in refuse(arguments)
+        (path.rmdir if path.is_dir() else path.unlink)()
+
+
+@pytest.mark.parametrize("place", PLACES)
+def test_a_file_with_something_else_in_it(home, place):
+    file, arguments = PLACES[place]
+    path = take_away(home, file)
+    for name, content in NO_CONTENT.items():
+        path.write_bytes(content)
+        said = refuse(arguments)
+        assert path.name in said or "tiny" in said, (name, said)
+    with path.open("wb") as huge:
+        huge.truncate(1 << 36)  # without a block on the disk
+    assert path.name in refuse(arguments)
