@@ -21,7 +21,7 @@ def health_router(runs: RunReader, registry: Registry, telemetry: Telemetry) -> 
     router = APIRouter(tags=["health"])
 
     @router.get("/livez", summary="Whether the service answers")
-    def livez() -> Alive:
+    async def livez() -> Alive:  # in the event loop: the threads may all wait for a file
         """Needs no files and no Redis: a service that answers this need not be restarted."""
         return Alive()
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 import asyncio
 import ipaddress
 import logging
+import re
 import time
 from collections.abc import Callable
 from http import HTTPStatus
@@ -37,6 +38,7 @@ _HEADERS = {
     "cache-control": "no-store",
 }
 """Headers of every answer that does not set them itself."""
+_HOST = re.compile(r"(?:\[([0-9A-Fa-f:.]+)\]|([^:@/\[\]\s]+))(?::[0-9]{1,5})?")
 _BASIC = 'Basic realm="tandem", charset="UTF-8"'
 """Sent as a header of its own: Chromium ignores it behind another challenge in the same header."""
 _logger = logging.getLogger(__name__)
@@ -130,10 +132,9 @@ def is_loopback(host: str) -> bool:
 
 
 def _host(header: str) -> str:
-    """The host of a Host header: ``127.0.0.1`` of ``127.0.0.1:8321``, ``::1`` of ``[::1]:8321``."""
-    if header.startswith("["):
-        return header[1:].partition("]")[0]
-    return header.partition(":")[0]
+    """The host of a Host header: ``127.0.0.1`` of ``127.0.0.1:8321``, ``::1`` of ``[::1]:8321``; empty if malformed."""
+    found = _HOST.fullmatch(header)
+    return "" if found is None else found[1] or found[2]
 
 
 def _template(scope: Scope) -> str:

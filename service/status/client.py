@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import asyncio
 import hashlib
 import json
 import os
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -25,9 +28,16 @@ except ImportError:
         "fetching primitives needs the package httpx, which is not installed: pip install 'tandem-skills[cluster]'"
     ) from None
 
-MAX_MANIFEST_BYTES = 16 * 1024 * 1024
+MAX_MANIFEST_BYTES = 4 * 1024 * 1024
+MAX_BLOB_BYTES = 256 * 1024 * 1024
+"""Of parameters, whatever a service says; those of the recipe have 711 kB."""
+DEADLINE_S = 300.0
+"""Of one answer, from the question to its last byte."""
+URL_VARIABLE, REGISTRY_VARIABLE = "TANDEM_URL", "TANDEM_REGISTRY"
+"""Variables that name the service which ``TANDEM_TOKEN`` is for."""
 _MAX_PROBLEM_BYTES = 64 * 1024
 _TIMEOUT = httpx.Timeout(20.0, connect=5.0)
+_PLAIN = {"Accept-Encoding": "identity"}
 
 
 def fetch_primitives(
@@ -40,7 +50,8 @@ def fetch_primitives(
     Args:
         url: URL of the service, such as ``http://lab:8321``.
         reference: NAME, NAME@VERSION or NAME@ALIAS.
-        token: token of the service; None for that of ``TANDEM_TOKEN``.
+        token: token of the service; None for that of ``TANDEM_TOKEN``, which is sent only to the service that
+            ``TANDEM_URL`` or ``TANDEM_REGISTRY`` names.
         cache_dir: directory of fetched registries; None for ``~/.cache/tandem/registries``.
 
     Returns:
@@ -57,59 +68,89 @@ def fetch_primitives(
     name, target = split_reference(reference)
     directory = hashlib.sha256(base.encode()).hexdigest()[:16]  # one for each service: two may both have a version 1
     registry = Registry((cache_dir or _default_cache()) / directory)
-    token = read_token() if token is None else token
-    headers = {"Authorization": f"Bearer {token}"} if token else {}
-    with httpx.Client(base_url=base, headers=headers, timeout=_TIMEOUT) as client:
-        data = _get(client, f"/v1/primitives/{name}/versions/{target}", MAX_MANIFEST_BYTES)
-        manifest = parse_manifest(data, _named(f"{name}@{target}", client))
-        if manifest.name != name or (isinstance(target, int) and manifest.version != target):
-            raise DamagedBlobError(
-                f"{base} gave the manifest of {manifest.reference} for {reference}; check its registry"
-            )
-        _keep(client, manifest, registry)
+    if token is None and _is_configured(base):
+        token = read_token()
+    service = _Service(base, token)
+    data = service.get(f"/v1/primitives/{name}/versions/{target}", MAX_MANIFEST_BYTES)
+    manifest = parse_manifest(data, service.named(f"{name}@{target}"))
+    if manifest.name != name or (isinstance(target, int) and manifest.version != target):
+        raise DamagedBlobError(f"{base} gave the manifest of {manifest.reference} for {reference}; check its registry")
+    _keep(service, manifest, registry)
     path = registry.root / "models" / name / "versions" / str(manifest.version)
     with os_errors("write", path):  # after its parameters: a version that is listed can be loaded
         write_atomic(path, manifest.to_bytes())
     return registry, Version(name, manifest.version)
 
 
-def _keep(client: httpx.Client, manifest: Manifest, registry: Registry) -> None:
+class _Service:
+    """The status service at a URL."""
+
+    def __init__(self, base: str, token: str | None) -> None:
+        self._base = base
+        self._headers = _PLAIN | ({"Authorization": f"Bearer {token}"} if token else {})
+
+    def named(self, what: str) -> Path:
+        """A name for error messages, such as ``panda-cube@3 from lab:8321``."""
+        return Path(f"{what} from {httpx.URL(self._base).netloc.decode()}")
+
+    def get(self, path: str, max_bytes: int) -> bytes:
+        """The body of a successful answer of at most ``max_bytes``, which may take ``DEADLINE_S`` in all."""
+        with ThreadPoolExecutor(1) as thread:  # the caller may have an event loop of its own, as notebooks do
+            response, data = thread.submit(asyncio.run, self._ask(path, max_bytes)).result()
+        if response.status_code != httpx.codes.OK:
+            raise _refusal(self._base, path, response, data)
+        return data
+
+    async def _ask(self, path: str, max_bytes: int) -> tuple[httpx.Response, bytes]:
+        data = bytearray()
+        try:
+            async with (
+                asyncio.timeout(DEADLINE_S),
+                httpx.AsyncClient(base_url=self._base, headers=self._headers, timeout=_TIMEOUT) as client,
+                client.stream("GET", path) as response,
+            ):
+                limit = max_bytes if response.is_success else _MAX_PROBLEM_BYTES
+                async for chunk in response.aiter_raw():  # never unpacked: a small answer could become a huge one
+                    data += chunk
+                    if len(data) > limit:
+                        raise DamagedBlobError(
+                            f"{self._base}{path} gave more than {limit} bytes, which is too long; check its registry"
+                        )
+        except (TimeoutError, httpx.TimeoutException):
+            raise FetchError(f"{self._base} does not answer in time; is `tandem serve` well there? Try again") from None
+        except httpx.RequestError as error:
+            raise FetchError(f"cannot reach {self._base}: {_reason(error)}; is `tandem serve` running there?") from None
+        return response, bytes(data)
+
+
+def _keep(service: _Service, manifest: Manifest, registry: Registry) -> None:
     """Fetch the parameters unless the cache has them undamaged."""
     digest = manifest.blob_sha256
     blobs = BlobStore(registry.root / "blobs")
     try:
         blobs.get(digest)
     except DamagedBlobError:  # or not there yet
-        data = _get(client, f"/v1/blobs/sha256/{digest}", manifest.blob_bytes)
-        check_digest(_named(manifest.reference, client), data, digest)
+        data = service.get(f"/v1/blobs/sha256/{digest}", min(manifest.blob_bytes, MAX_BLOB_BYTES))
+        check_digest(service.named(manifest.reference), data, digest)
         blobs.put(data)
 
 
-def _named(what: str, client: httpx.Client) -> Path:
-    """A name for error messages, such as ``panda-cube@3 from lab:8321``."""
-    return Path(f"{what} from {client.base_url.netloc.decode()}")
+def _reason(error: BaseException) -> str:
+    """The reason in the innermost error, such as that the connection was refused."""
+    while (cause := error.__cause__ or error.__context__) is not None:
+        error = cause.exceptions[0] if isinstance(cause, BaseExceptionGroup) else cause
+    text = os.strerror(error.errno) if isinstance(error, OSError) and error.errno else str(error)
+    return " ".join(text.split()) or type(error).__name__
 
 
-def _get(client: httpx.Client, path: str, max_bytes: int) -> bytes:
-    """The body of a successful answer of at most ``max_bytes``."""
-    base = str(client.base_url).rstrip("/")
-    try:
-        with client.stream("GET", path) as response:
-            limit, data = max_bytes if response.is_success else _MAX_PROBLEM_BYTES, b""
-            for chunk in response.iter_bytes():
-                data += chunk
-                if len(data) > limit:
-                    raise DamagedBlobError(
-                        f"{base}{path} gave more than {limit} bytes, which is too long; check its registry"
-                    )
-    except httpx.TimeoutException:
-        raise FetchError(f"{base} does not answer in time; is `tandem serve` well there? Try again") from None
-    except httpx.RequestError as error:
-        reason = " ".join(str(error).split()) or type(error).__name__
-        raise FetchError(f"cannot reach {base}: {reason}; is `tandem serve` running there?") from None
-    if response.status_code != httpx.codes.OK:
-        raise _refusal(base, path, response, data)
-    return data
+def _is_configured(base: str) -> bool:
+    """Whether the environment names this very service, so that the environment's token is for it."""
+    named = (os.environ.get(variable, "") for variable in (URL_VARIABLE, REGISTRY_VARIABLE))
+    for url in filter(None, named):
+        with suppress(StatusError):
+            if _base_url(url) == base:
+                return True
+    return False
 
 
 def _refusal(base: str, path: str, response: httpx.Response, data: bytes) -> TandemError:
@@ -119,7 +160,8 @@ def _refusal(base: str, path: str, response: httpx.Response, data: bytes) -> Tan
         case 401:
             wanted = "a token" if problem.get("type") == "urn:tandem:missing-token" else "another token"
             return WrongTokenError(
-                f"{base} wants {wanted}: set {VARIABLE} to the one it was started with, or give token="
+                f"{base} wants {wanted}: set {VARIABLE} to the one it was started with and {URL_VARIABLE} to this URL, "
+                "or give token="
             )
         case 404 if problem.get("type") == "urn:tandem:unknown-version":
             return UnknownVersionError(f"{base} says: {detail}")

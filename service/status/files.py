@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import os
 import re
+import stat
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 from fastapi import Request
 from starlette.responses import FileResponse, Response
 from starlette.staticfiles import NotModifiedResponse, StaticFiles
 
+from service.regular_files import open_regular
 from service.status.openapi import problems
 from service.status.problems import ProblemError
 from service.status.schemas import RunFile
@@ -78,7 +80,7 @@ class RunDirectories:
         # looked up instead of built from the id, so that no id leads outside the root
         directory = next((path for path in found if run_id_of(path) == run_id), None)
         paths = {name: directory / name for name in RUN_FILES} if directory is not None else {}
-        return {name: path for name, path in paths.items() if os.path.isfile(path)}
+        return {name: path for name, path in paths.items() if _is_regular(path)}
 
 
 def file_response(request: Request, path: Path, media_type: str, *, etag: str | None = None, cache: str) -> Response:
@@ -94,11 +96,30 @@ def file_response(request: Request, path: Path, media_type: str, *, etag: str | 
         ProblemError: 416, the range lies beyond the file.
     """
     headers = {"cache-control": cache, **({"etag": f'"{etag}"'} if etag else {})}
-    response = FileResponse(path, headers=headers, media_type=media_type, stat_result=os.stat(path))
+    try:
+        file = open_regular(path)
+    except OSError as error:
+        raise ProblemError(404, "no-such-file", f"{path.name} cannot be read: {error.strerror}") from None
+    response = _OpenFileResponse(file, headers=headers, media_type=media_type)
     if _CONDITIONS.is_not_modified(response.headers, request.headers):
         return NotModifiedResponse(response.headers)
     _check_range(request, response)
     return response
+
+
+class _OpenFileResponse(FileResponse):
+    """Starlette's, of a file that is open: what lies at its path may be another one by now, or a link."""
+
+    def __init__(self, file: BinaryIO, **options: Any) -> None:
+        super().__init__(f"/proc/self/fd/{file.fileno()}", stat_result=os.fstat(file.fileno()), **options)
+        self._file = file  # open for as long as the response is there
+
+
+def _is_regular(path: Path) -> bool:
+    try:
+        return stat.S_ISREG(path.lstat().st_mode)
+    except OSError:
+        return False
 
 
 def _check_range(request: Request, response: FileResponse) -> None:

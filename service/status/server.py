@@ -16,6 +16,7 @@ import uvicorn
 from service.registry.registry import Registry
 from service.status.app import create_app
 from service.status.auth import is_loopback
+from service.status.connections import BoundedConnection
 from service.status.errors import StatusError
 from service.store.models import RunReader
 
@@ -59,6 +60,7 @@ class StatusServer:
         self.app = app
         config = uvicorn.Config(
             app,
+            http=BoundedConnection,
             log_config=None,  # keep the program's own logging
             log_level="warning",
             access_log=False,  # /metrics counts requests

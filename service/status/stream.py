@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import asyncio
 import time
-from collections.abc import AsyncIterator, Collection
+import weakref
+from collections.abc import AsyncIterator, Callable, Collection
 
 from anyio import to_thread
 from fastapi.sse import ServerSentEvent
@@ -42,6 +43,8 @@ class RunFollower:
         self._status: RunStatus | None = None
         self._unavailable = False
         self.ended = False
+        self.release: Callable[[], object] = lambda: None
+        """Gives its place among the open streams back, if it has not yet."""
 
     def poll(self) -> list[ServerSentEvent]:
         """Read the run and return the new events; store errors become events."""
@@ -86,6 +89,7 @@ class Streams:
         self._runs = runs
         self._closed = False
         self.num_open = 0
+        """Places that are taken, from before a run is looked up until its stream has ended."""
 
     def close(self) -> None:
         """End all streams, within ``POLL_S``."""
@@ -103,12 +107,18 @@ class Streams:
             raise ProblemError(
                 503, "too-many-streams", f"{MAX_STREAMS} streams are open; close one, or ask for /metrics"
             )
-        run = await to_thread.run_sync(self._runs.run, run_id)
-        return RunFollower(self._runs, run, names, after_iteration)
+        self.num_open += 1  # before anything is waited for, or many could pass at once
+        try:
+            run = await to_thread.run_sync(self._runs.run, run_id)
+        except BaseException:
+            self.num_open -= 1
+            raise
+        follower = RunFollower(self._runs, run, names, after_iteration)
+        follower.release = weakref.finalize(follower, self._release)  # also where its stream never begins
+        return follower
 
     async def events(self, follower: RunFollower) -> AsyncIterator[ServerSentEvent]:
         """Yield events until the run ends, the stream is too old, or the service stops."""
-        self.num_open += 1
         end_s = time.monotonic() + MAX_AGE_S
         try:
             yield ServerSentEvent(retry=_RETRY_MS)
@@ -119,4 +129,7 @@ class Streams:
                     return
                 await asyncio.sleep(POLL_S)
         finally:
-            self.num_open -= 1
+            follower.release()
+
+    def _release(self) -> None:
+        self.num_open -= 1

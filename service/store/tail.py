@@ -52,7 +52,7 @@ class RecordFile:
 
     def _open(self) -> BinaryIO:
         try:
-            return open_regular(self._path, follow=True)
+            return open_regular(self._path)
         except FileNotFoundError:
             return open("/dev/null", "rb")
 

@@ -5,6 +5,7 @@ To add an attack, add a line to ``NOT_FILES`` or ``NO_CONTENT``; to add a place 
 
 import gzip
 import io
+import itertools
 import os
 import pickle
 import shutil
@@ -18,7 +19,6 @@ import pytest
 from typer.testing import CliRunner
 
 from service.cli.main import app
-from service.io.checkpoints import CheckpointStore
 from service.primitives.publishing import publish
 from service.registry.registry import Registry
 from tests.runtime.runs import play, tiny_config, write_yaml
@@ -53,7 +53,7 @@ def some_arrays():
 def a_billion_laughs():
     names = "abcdefghij"
     lines = ["a: &a [x, x, x, x, x, x, x, x, x]"]
-    lines += [f"{each}: &{each} [{', '.join(['*' + last] * 9)}]" for last, each in zip(names, names[1:], strict=False)]
+    lines += [f"{each}: &{each} [{', '.join(['*' + last] * 9)}]" for last, each in itertools.pairwise(names)]
     return "\n".join(lines).encode()
 
 

@@ -147,7 +147,23 @@ def test_invalid_tokens(home, token):
     assert token not in str(error.value)
 
 
-@pytest.mark.parametrize("host", ["evil.example", "evil.example:80", "127.0.0.1.evil.example", "10.0.0.1", "", "[::2]"])
+@pytest.mark.parametrize(
+    "host",
+    [
+        "evil.example",
+        "evil.example:80",
+        "127.0.0.1.evil.example",
+        "10.0.0.1",
+        "",
+        "[::2]",
+        "[::1].evil",
+        "[::1]:1.evil",
+        "[::1",
+        "localhost:80:80",
+        "localhost@evil",
+        "127.0.0.1:",
+    ],
+)
 def test_on_loopback_other_host_names_are_refused(server, host):
     with httpx.Client(base_url=server.url, **CLIENT) as client:
         answer = client.get("/v1/runs", headers={"Host": host, "Authorization": RIGHT["bearer"]})

@@ -1,10 +1,15 @@
 """Primitives over HTTP, from real services, correct and faulty ones."""
 
+import asyncio
+import gzip
+import itertools
 import os
+import socket
 import subprocess
 import sys
 import threading
-from contextlib import contextmanager
+import time
+from contextlib import contextmanager, suppress
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 
@@ -17,6 +22,7 @@ from service.io.errors import StorageError
 from service.primitives.bundled import BUNDLED
 from service.registry.errors import DamagedBlobError, RegistryError, UnknownVersionError
 from service.registry.registry import Registry
+from service.status import client
 from service.status.client import fetch_primitives
 from service.status.errors import FetchError, StatusError, WrongTokenError
 from service.status.server import StatusServer
@@ -39,7 +45,7 @@ print(bob.label)
 @pytest.fixture(autouse=True)
 def no_token(monkeypatch, tmp_path):
     """Remove the variables of the environment that the client reads."""
-    for name in ("TANDEM_TOKEN", "HTTP_PROXY", "http_proxy", "ALL_PROXY", "all_proxy"):
+    for name in ("TANDEM_TOKEN", "TANDEM_URL", "TANDEM_REGISTRY", "HTTP_PROXY", "http_proxy", "ALL_PROXY", "all_proxy"):
         monkeypatch.delenv(name, raising=False)
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "xdg"))
 
@@ -208,7 +214,63 @@ def test_the_token(home, tmp_path, monkeypatch):
         assert WRONG not in str(error.value)
         assert fetch_primitives(server.url, "tiny", token=TOKEN, cache_dir=tmp_path)[1].number == 2
         monkeypatch.setenv("TANDEM_TOKEN", TOKEN)
-        assert fetch_primitives(server.url, "tiny", cache_dir=tmp_path)[1].number == 2
+        for variable in ("TANDEM_URL", "TANDEM_REGISTRY"):
+            with pytest.raises(WrongTokenError) as error:  # it may be anybody's URL
+                fetch_primitives(server.url, "tiny", cache_dir=tmp_path)
+            assert_one_line(error.value, "wants a token", "TANDEM_URL to this URL")
+            with monkeypatch.context() as configured:
+                configured.setenv(variable, f"{server.url}/")
+                assert fetch_primitives(server.url, "tiny", cache_dir=tmp_path)[1].number == 2
+
+
+@contextmanager
+def dripping(pieces, pause_s):
+    """Run a server that sends these bytes to whoever connects, with pauses; yield its URL and what it was asked."""
+    asked = []
+    with socket.create_server(("127.0.0.1", 0)) as server:
+
+        def answer():
+            with suppress(OSError):
+                connection, _ = server.accept()
+                with connection:
+                    asked.append(connection.recv(65536))
+                    for piece in pieces:
+                        connection.sendall(piece)
+                        time.sleep(pause_s)
+
+        threading.Thread(target=answer, daemon=True).start()
+        yield f"http://127.0.0.1:{server.getsockname()[1]}", asked
+
+
+@pytest.mark.parametrize(
+    "begin", [b"HTTP/1.1 200 OK\r\ncontent-length: 9999\r\n\r\n", b"HTTP/1.1 200 OK\r\nx: "], ids=["body", "head"]
+)
+def test_a_service_that_drips_is_given_up(tmp_path, monkeypatch, begin):
+    monkeypatch.setattr(client, "DEADLINE_S", 1.0)
+    pieces = itertools.chain([begin], itertools.repeat(b"a"))
+    with dripping(pieces, 0.05) as (url, _), pytest.raises(FetchError, match="does not answer in time"):
+        fetch_primitives(url, "tiny", cache_dir=tmp_path)
+
+
+def test_nothing_is_unpacked_and_no_word_of_the_service_is_believed(tmp_path, monkeypatch):
+    """A few kilobytes that would unpack to a gigabyte, and an answer without end."""
+    monkeypatch.setattr(client, "MAX_MANIFEST_BYTES", 100_000)
+    packed = gzip.compress(bytes(10_000_000))
+    head = b"HTTP/1.1 200 OK\r\ncontent-encoding: gzip\r\ncontent-length: %d\r\n\r\n" % len(packed)
+    with dripping([head + packed], 0.0) as (url, asked), pytest.raises(DamagedBlobError, match="not JSON"):
+        fetch_primitives(url, "tiny", cache_dir=tmp_path)
+    assert b"accept-encoding: identity" in asked[0].lower()
+    endless = itertools.chain([b"HTTP/1.1 200 OK\r\nconnection: close\r\n\r\n"], itertools.repeat(bytes(10_000)))
+    with dripping(endless, 0.0) as (url, _), pytest.raises(DamagedBlobError, match="more than 100000 bytes"):
+        fetch_primitives(url, "tiny", cache_dir=tmp_path)
+
+
+def test_an_event_loop_may_run_already(home, tmp_path):
+    async def fetch():
+        return fetch_primitives(server.url, "tiny", cache_dir=tmp_path)[1].number
+
+    with serve(home) as server:
+        assert asyncio.run(fetch()) == 2
 
 
 def test_no_service_at_the_url(home, tmp_path):

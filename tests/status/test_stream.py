@@ -1,5 +1,7 @@
 """Event streams over real connections."""
 
+import asyncio
+import gc
 import json
 import time
 from contextlib import contextmanager
@@ -12,7 +14,7 @@ from service.io.files import write_atomic
 from service.registry.registry import Registry
 from service.status import stream
 from service.status.server import StatusServer
-from service.status.stream import RunFollower
+from service.status.stream import RunFollower, Streams
 from service.store.disk_reader import DiskReader
 from service.store.redis_reader import RedisReader
 from service.store.redis_writer import RedisWriter
@@ -189,6 +191,22 @@ def test_the_number_of_streams_is_limited(root, service, monkeypatch):
     while server.app.streams.num_open and time.monotonic() < deadline_s:
         time.sleep(0.02)
     assert server.app.streams.num_open == 0
+
+
+def test_no_race_opens_more_streams_than_may_be(root, service, monkeypatch):
+    """Many ask at once, while the run that the first ones want is still being read."""
+    monkeypatch.setattr(stream, "MAX_STREAMS", 3)
+    streams, real = Streams(DiskReader(root)), DiskReader.run
+    monkeypatch.setattr(DiskReader, "run", lambda self, run_id: time.sleep(0.1) or real(self, run_id))
+
+    async def follow_all():
+        return await asyncio.gather(*(streams.follow("cube", None, None) for _ in range(10)), return_exceptions=True)
+
+    found = asyncio.run(follow_all())
+    assert [isinstance(each, RunFollower) for each in found].count(True) == streams.num_open == 3
+    found.clear()  # their streams never begin
+    gc.collect()
+    assert streams.num_open == 0
 
 
 def test_the_service_stops_with_open_streams(root, monkeypatch):
