@@ -19,6 +19,8 @@ from service.runtime.runner import ClusterError
 CONNECT_S = 5.0
 ANSWER_S = 20.0
 """Time that the head of a cluster has to answer; Ray itself waits as long."""
+_CLUSTERS_VARIABLE = "RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER"
+"""With 0 a Ray has one machine, and every port that it opens is on loopback; on Linux, too, despite the name."""
 START_ATTEMPTS = 3
 """Ray gives up on a node of its own after 30 s, which a busy machine may need."""
 
@@ -93,6 +95,7 @@ def connected(address: str | None, num_cpus: int | None = None) -> Iterator[None
         # Else Ray would leave a token in the home directory, and every later cluster there would take it up.
         os.environ |= {"RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN": secrets.token_hex(32)}
     if address is None:
+        os.environ.setdefault(_CLUSTERS_VARIABLE, "0")
         os.environ.setdefault("RAY_worker_niceness", "0")  # not 15 for all: see ``ray_actors.lower_priority``
         # No spare worker for every core: ours have environment variables of their own, so none would fit.
         os.environ.setdefault("RAY_prestart_worker_first_driver", "0")

