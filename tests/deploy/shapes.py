@@ -63,7 +63,7 @@ POD_TEMPLATE = {
 }
 CLAIM = {"accessModes!": [str], "resources!": {"requests!": {"storage!": str}}}
 SELECTOR = {"matchLabels!": {"*": str}}
-PEER = {"podSelector": SELECTOR, "namespaceSelector": {}}
+PEER = {"podSelector!": {"matchLabels": {"*": str}}, "namespaceSelector": {"matchLabels": {"*": str}}}
 
 HEAD_GROUP = {"rayStartParams!": {"*": str}, "template!": POD_TEMPLATE, "serviceType": str}
 WORKER_GROUP = {
@@ -109,6 +109,7 @@ SPECS = {
         "podSelector!": {"matchLabels": {"*": str}},
         "policyTypes!": [{"Ingress", "Egress"}],
         "ingress": [{"from!": [PEER], "ports": [{"port!": ONE_OF}]}],
+        "egress": [{"to!": [PEER], "ports": [{"port!": ONE_OF, "protocol": {"UDP", "TCP"}}]}],
     },
     ("monitoring.coreos.com/v1", "PodMonitor"): {
         "selector!": SELECTOR,

@@ -212,20 +212,49 @@ def test_the_status_service_reads_where_the_driver_writes():
 
 def test_nobody_may_talk_to_a_pod_unless_a_policy_says_so():
     policies = {each["metadata"]["name"]: each["spec"] for each in manifests("base") if each["kind"] == "NetworkPolicy"}
-    assert policies.pop("nobody") == {"podSelector": {}, "policyTypes": ["Ingress"]}
+    assert policies.pop("nobody") == {"podSelector": {}, "policyTypes": ["Ingress", "Egress"]}
     templates = pod_templates(manifests())
     for name, spec in policies.items():
-        assert spec["policyTypes"] == ["Ingress"], name
+        assert spec["policyTypes"] == [kind for kind in ("Ingress", "Egress") if kind.lower() in spec], name
         chosen = [each for each in templates if selects(spec["podSelector"], each)]
         assert chosen, name
-        for rule in spec["ingress"]:
-            # Whoever comes from our own namespace is one of our pods; everybody else is named, and meets one port only.
-            for peer in rule["from"]:
-                ours = any(selects(peer["podSelector"], each) for each in templates)
-                assert ours or ("namespaceSelector" in peer and rule["ports"]), name
-            opened = {name: number for each in chosen for name, number in ports(each).items()}
+        for direction, rules in (("from", spec.get("ingress", [])), ("to", spec.get("egress", []))):
+            for rule in rules:
+                check_rule(name, rule, rule[direction], templates, chosen if direction == "from" else None)
+
+
+def check_rule(name, rule, peers, templates, chosen):
+    """Peers in our own namespace are our pods; others are in a namespace with a label, and meet some ports only.
+
+    ``chosen``: the pods whose ports are opened; None for those of the peers.
+    """
+    for peer in peers:
+        assert peer["podSelector"]["matchLabels"], name
+        if "namespaceSelector" in peer:
+            assert peer["namespaceSelector"]["matchLabels"], name  # labels of pods alone are anybody's there
+            assert rule["ports"], name
+        else:
+            ours = [each for each in templates if selects(peer["podSelector"], each)]
+            assert ours, name
+            opened = {name: number for each in chosen or ours for name, number in ports(each).items()}
             for port in rule.get("ports", []):
                 assert port["port"] in opened or port["port"] in opened.values(), name
+
+
+def test_whoever_is_asked_may_be_asked():
+    """What one side may send, the other lets in, and the other way round."""
+    policies = [each["spec"] for each in manifests("base") if each["kind"] == "NetworkPolicy"]
+    components = ("ray", "redis", "status")
+    sent, received = set(), set()
+    for spec in policies:
+        own = spec["podSelector"].get("matchLabels", {}).get("app.kubernetes.io/component")
+        for kind, direction, found in (("egress", "to", sent), ("ingress", "from", received)):
+            for rule in spec.get(kind, []):
+                for peer in rule[direction]:
+                    other = peer["podSelector"]["matchLabels"].get("app.kubernetes.io/component")
+                    if other in components:
+                        found.add((own, other) if kind == "egress" else (other, own))
+    assert sent == received == {("ray", "ray"), ("ray", "redis"), ("status", "redis")}
 
 
 def test_pod_monitors_find_pods_and_ports():
