@@ -88,8 +88,8 @@ class LearnerGroup(Worker):
     def __init__(self, actor: Any, config: Config, state: Arrays | None, pending: Any, *, on_wait: OnWait) -> None:
         super().__init__("learner", on_wait)
         self.size = config.learner.num_learners
-        self.locations: list[Location] = []
-        """By rank, once all have started."""
+        self.locations: list[Location]
+        """By rank, once all have started; empty before."""
         self._actor, self._config = actor, config
         self._states = [ray.put(state)] if state is not None else []
         self._pending = pending
@@ -190,17 +190,18 @@ class LearnerGroup(Worker):
             ActorStatus(
                 name=self.name if self.size == 1 else f"{self.name}-{rank}",
                 incarnation=self.incarnation,
-                state="alive",
-                node=location.node,
-                pid=location.pid,
-                heartbeat=self._watches[rank].heartbeat,
+                state="alive" if self.locations else "starting",
+                node=self.locations[rank].node if self.locations else "",
+                pid=self.locations[rank].pid if self.locations else None,
+                heartbeat=watch.heartbeat,
                 last_error=self._last_error,
             )
-            for rank, location in enumerate(self.locations)
+            for rank, watch in enumerate(self._watches)
         )
 
     def _spawn(self) -> None:
         self._ranks = [self._actor.remote(self._config, rank, self.size) for rank in range(self.size)]
+        self.locations = []
         self._watches = [Watch(rank.progress.remote) for rank in self._ranks]
 
     def _ask(self, timeout_s: float, answers: list[Any], what: str) -> list[Any]:

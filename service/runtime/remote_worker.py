@@ -147,17 +147,19 @@ class RemoteWorker(Worker):
         self.state = ray.put(state)
         """Reference to its newest state."""
         self._actor, self._config = actor, config
+        self._location: Location | None
         self._spawn()
 
     def wait_ready(self) -> None:
         """Wait until it has started."""
         try:
-            (self._location,) = wait_for([self.handle.ping.remote()], START_S, self._on_wait)
+            (found,) = wait_for([self.handle.ping.remote()], START_S, self._on_wait)
         except GetTimeoutError:
             raise ClusterError(
                 f"the {self.name} did not start within {START_S:.0f} s: does a node of the cluster answer? see ray "
                 "status"
             ) from None
+        self._location = found
 
     def hangs(self) -> str | None:
         """The reason in a few words why it hangs, if it does."""
@@ -189,9 +191,9 @@ class RemoteWorker(Worker):
         return ActorStatus(
             name=self.name,
             incarnation=self.incarnation,
-            state="alive",
-            node=self._location.node,
-            pid=self._location.pid,
+            state="alive" if self._location is not None else "starting",
+            node=self._location.node if self._location is not None else "",
+            pid=self._location.pid if self._location is not None else None,
             heartbeat=self.watch.heartbeat,
             last_error=self._last_error,
         )
@@ -199,7 +201,7 @@ class RemoteWorker(Worker):
     def _spawn(self) -> None:
         self.handle = self._actor.remote(self._config, self.state)
         self.watch = Watch(self.handle.progress.remote)
-        self._location = Location("", 0)
+        self._location = None
 
 
 def wait_for(answers: Sequence[Any], timeout_s: float, on_wait: OnWait) -> list[Any]:

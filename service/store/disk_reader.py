@@ -24,6 +24,8 @@ from service.store.models import ACTIVE, SILENT_AFTER, GoalGrid, Record, RunStat
 from service.store.pulse import Pulse, ahead_s
 from service.store.tail import RecordFile
 
+QUIET_S = 10.0
+"""A run writes its status every second; after so long something keeps it from that."""
 FULL_BYTES = 1_000_000
 """A disk with less room than this is full: a status and a grid would not fit."""
 
@@ -115,7 +117,9 @@ class DiskReader:
         if (ahead := ahead_s(status.heartbeat)) is not None and status.state in ACTIVE:
             text = f"its heartbeat is {ahead:.0f} s in the future: the clock of its machine, or the one here, is wrong"
             status = status.suffering("clock", text)
-        if not status.is_silent(age_s):
+        if status.state in ACTIVE and age_s > QUIET_S and is_locked(path):
+            status = _with_full_disk(status, path)
+        if status.condition == "disk" or not status.is_silent(age_s):
             return status
         return _why_silent(status, path, age_s) if is_locked(path) else status.vanished()
 
@@ -165,16 +169,21 @@ def _read_status(run_id: str, path: Path, records: RecordFile) -> RunStatus:
 
 def _why_silent(status: RunStatus, path: Path, age_s: float) -> RunStatus:
     """The status of a silent run whose process lives, since it has the lock."""
-    with suppress(OSError):
-        if (free := shutil.disk_usage(path).free) < FULL_BYTES:
-            text = f"its process lives, and cannot say how it is: the disk of {path} is full ({free:,} bytes are left)"
-            return status.suffering("disk", text)
     host, pid = holder(path) or ("", 0)
     who = f"its process {pid} on {host}" if pid else "its process"
     if host == socket.gethostname() and _is_stopped(pid):
         return status.suffering("stuck", f"{who} is frozen by a signal; kill -CONT {pid} lets it go on")
     text = f"{who} lives, and has not been heard of for {age_s:.0f} s: it is frozen, hangs, or cannot write here"
     return status.suffering("stuck", f"{text}; once it is ended, --resume goes on from its last checkpoint")
+
+
+def _with_full_disk(status: RunStatus, path: Path) -> RunStatus:
+    """The status of a run whose process lives and is quiet: where its disk is full, that is why."""
+    with suppress(OSError):
+        if (free := shutil.disk_usage(path).free) < FULL_BYTES:
+            text = f"its process lives, and cannot say how it is: the disk of {path} is full ({free:,} bytes are left)"
+            return status.suffering("disk", text)
+    return status
 
 
 def _is_stopped(pid: int) -> bool:
