@@ -134,6 +134,19 @@ def wait_for_all(training: Training) -> dict[str, tuple[int | None, int]]:
     return actors_of(training.status())
 
 
+def replaced_and_working(watcher: Watcher, name: str, incarnation: int) -> float | None:
+    """Seconds since the strike until another worker has the place, and two more iterations are over."""
+    if watcher.until(lambda status: _is_next(status, name, incarnation)) is None:
+        return None
+    iteration = (watcher.look() or _no_status()).iteration
+    return watcher.until(lambda status: status.iteration > iteration + 1)
+
+
+def _is_next(status: RunStatus, name: str, incarnation: int) -> bool:
+    pid, now = actors_of(status)[name]
+    return pid is not None and now > incarnation
+
+
 # --- strikes ----------------------------------------------------------------------------------------------------------
 
 
@@ -143,10 +156,7 @@ def frozen_worker(strike: Strike, name: str) -> None:
         before = wait_for_all(training)
         watcher = Watcher(training, strike)
         os.kill(int(before[name][0] or 0), signal.SIGSTOP)
-        iteration = (training.status() or _no_status()).iteration
-        seconds = watcher.until(
-            lambda status: actors_of(status)[name][1] > before[name][1] and status.iteration > iteration + 1
-        )
+        seconds = replaced_and_working(watcher, name, before[name][1])
         status = watcher.look() or _no_status()
         after = actors_of(status)
     others = [each for each in before if each != name and after.get(each) != before[each]]
@@ -226,10 +236,8 @@ def killed_twice(strike: Strike) -> None:
         watcher.until(lambda status: (now := actors_of(status)["learner"])[1] > incarnation and now[0] is not None)
         second = actors_of(watcher.look())["learner"]
         os.kill(int(second[0] or 0), signal.SIGKILL)
-        iteration, watcher.struck = (training.status() or _no_status()).iteration, time.monotonic()
-        seconds = watcher.until(
-            lambda status: actors_of(status)["learner"][1] > second[1] and status.iteration > iteration + 1
-        )
+        watcher.struck = time.monotonic()
+        seconds = replaced_and_working(watcher, "learner", second[1])
         rows = _rows(training)
     versions = [row["learner/version"] for row in rows]
     whole = versions == list(range(1, len(versions) + 1))

@@ -340,8 +340,8 @@ class ClusterRun(Runner):
             raise error
         else:
             pause(RETRY_S * 2 ** (attempt - 1) if (attempt := iteration.num_attempts[worker.name]) else 0.0, self._beat)
-            worker.restart(reason)
             self._last_error = f"{worker.name}: {reason}"
+            worker.restart(reason)
         iteration.num_attempts[worker.name] += 1
         if iteration.num_attempts[worker.name] >= MAX_ATTEMPTS:
             raise ClusterError(
