@@ -1,0 +1,38 @@
+"""One command for every learning experiment: what it would run, in which order, and what becomes of failures."""
+
+import sys
+
+import pytest
+
+from benchmarks.reproduce import Experiment, Places, experiments, run_all
+from service.downstream.methods import METHODS
+from service.envs.tasks import TASKS
+
+
+@pytest.fixture
+def places(tmp_path):
+    return Places(tmp_path / "out", tmp_path / "runs")
+
+
+def test_every_method_is_run_on_every_task(places):
+    everything = list(experiments(places))
+    names = [each.name for each in everything]
+    assert len(set(names)) == len(names) == len({each.file for each in everything})
+    table = {name.removeprefix("out/").rpartition("-")[0] for name in names if name.startswith("out/")}
+    assert {f"{task}-{method}" for task in TASKS for method in METHODS} <= table
+
+
+def making(tmp_path, name, *, needs=None, code=0):
+    """An experiment that writes its name, unless it fails."""
+    program = f"import pathlib, sys; {code} or pathlib.Path({str(tmp_path / name)!r}).touch(); sys.exit({code})"
+    return Experiment(name, tmp_path / name, lambda: [(sys.executable, "-c", program)], needs)
+
+
+def test_one_waits_for_what_it_needs_and_failures_are_named(tmp_path):
+    second = making(tmp_path, "second", needs=tmp_path / "first")
+    bad = making(tmp_path, "bad", code=3)
+    never = making(tmp_path, "never", needs=tmp_path / "bad")
+    failed = run_all([second, never, bad, making(tmp_path, "first")], 2, tmp_path / "logs")
+    assert sorted(failed) == ["bad", "never"]
+    assert (tmp_path / "second").exists()
+    assert sorted(path.stem for path in (tmp_path / "logs").iterdir()) == ["bad", "first", "second"]
