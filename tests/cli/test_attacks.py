@@ -5,7 +5,6 @@ To add an attack, add a line to ``NOT_FILES`` or ``NO_CONTENT``; to add a place 
 
 import gzip
 import io
-import itertools
 import os
 import pickle
 import shutil
@@ -13,6 +12,7 @@ import signal
 import socket
 import zipfile
 from contextlib import contextmanager
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -53,7 +53,7 @@ def some_arrays():
 def a_billion_laughs():
     names = "abcdefghij"
     lines = ["a: &a [x, x, x, x, x, x, x, x, x]"]
-    lines += [f"{each}: &{each} [{', '.join(['*' + last] * 9)}]" for last, each in itertools.pairwise(names)]
+    lines += [f"{each}: &{each} [{', '.join(['*' + last] * 9)}]" for last, each in pairwise(names)]
     return "\n".join(lines).encode()
 
 
