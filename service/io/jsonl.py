@@ -119,8 +119,8 @@ class JsonlWriter(Appender):
         for line in lines:
             record = _parse(line) or {}
             iteration = record.get("iteration")
-            known = isinstance(iteration, int) and abs(iteration) < 2**63
-            yield (iteration if known else -1), zlib.crc32(line), line
+            number = iteration if isinstance(iteration, int) and abs(iteration) < 2**63 else -1
+            yield number, zlib.crc32(line), line
 
     def append(self, record: Mapping[str, Any]) -> None:
         """Write ``record``, made `plain`, as the file's last line and hand it to the operating system.
