@@ -84,9 +84,9 @@ def test_where_no_file_can_be_written_the_line_says_where_it_happened(tmp_path, 
     ("error", "code", "said"),
     [
         (
-            PermissionError(errno.EACCES, "Permission denied", "/a\n/b"),
+            PermissionError(errno.EACCES, "Permission denied", "/a\n/b\x1b[2J"),
             2,
-            r"error: cannot use /a /b: Permission denied",
+            r"error: cannot use /a /b\x1b[2J: Permission denied",
         ),
         (OSError(errno.ENAMETOOLONG, "File name too long", "a" * 5000), 2, "File name too long; check the path"),
         (OSError(errno.ENOSPC, "No space left on device"), 1, "error: cannot write what is printed: No space left"),
