@@ -1,4 +1,4 @@
-"""Starting a Ray of our own on a machine that is slow; the real one is in test_cluster and test_job."""
+"""Connections to Ray: a slow machine, a wrong token, errors of workers; real runs are in test_cluster and test_job."""
 
 import os
 import subprocess
