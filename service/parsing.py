@@ -126,10 +126,10 @@ def _check(tree: Any, where: object, greatest: int, *, allow_nan: bool) -> None:
     """Refuse what parsers take but nobody can work with; without recursion, which is what deep trees are made for."""
     level, depth = [tree], 0
     while level:
-        if depth > MAX_DEPTH:
-            raise ParseError(where, _TOO_DEEP)
         inner: list[Any] = []
         for value in level:
+            if depth == MAX_DEPTH and isinstance(value, (dict, list, tuple, set)):
+                raise ParseError(where, _TOO_DEEP)
             if isinstance(value, dict):
                 inner += value
                 inner += value.values()

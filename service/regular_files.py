@@ -42,7 +42,10 @@ def read_regular(path: Path, max_bytes: int, *, follow: bool = False) -> bytes:
         OSError: as for ``open_regular``, or it is longer.
     """
     with open_regular(path, follow=follow) as file:
-        data = b"" if os.fstat(file.fileno()).st_size > max_bytes else file.read(max_bytes + 1)
-        if (not data and os.fstat(file.fileno()).st_size) or len(data) > max_bytes:
+        size = os.fstat(file.fileno()).st_size
+        data = b"" if size > max_bytes else file.read(size + 1)  # not max_bytes, for which memory would be taken
+        if len(data) > size:  # it grows, or is one of the kernel's, which say 0
+            data += file.read(max_bytes + 1 - len(data))
+        if max(size, len(data)) > max_bytes:
             raise OSError(errno.EFBIG, f"longer than {max_bytes} bytes", str(path))
         return data

@@ -20,6 +20,7 @@ import numpy as np
 
 from service.io.errors import StorageError
 from service.io.files import Appender, os_errors, write_atomic
+from service.parsing import ParseError, parse_json
 from service.regular_files import read_regular
 
 MAX_BYTES = 8 * 1024**3
@@ -118,7 +119,8 @@ class JsonlWriter(Appender):
         for line in lines:
             record = _parse(line) or {}
             iteration = record.get("iteration")
-            yield (iteration if isinstance(iteration, int) else -1), zlib.crc32(line), line
+            number = iteration if isinstance(iteration, int) and abs(iteration) < 2**63 else -1
+            yield number, zlib.crc32(line), line
 
     def append(self, record: Mapping[str, Any]) -> None:
         """Write ``record``, made `plain`, as the file's last line and hand it to the operating system.
@@ -172,15 +174,15 @@ def _lines(path: Path) -> Iterator[tuple[bytes, dict[str, Any]]]:
 
 def _parse(line: bytes) -> dict[str, Any] | None:
     try:
-        record = json.loads(line)
-    except ValueError:  # also what bytes that are no UTF-8 raise
+        record = parse_json(line, "a line", allow_nan=True)
+    except ParseError:
         return None
     return record if isinstance(record, dict) else None
 
 
 def _iteration(record: Mapping[str, Any], path: Path) -> int:
     iteration = record.get("iteration")
-    if not isinstance(iteration, int):
+    if not isinstance(iteration, int) or abs(iteration) >= 2**63:
         raise StorageError(
             f"{path}: a record has iteration {iteration!r}, not a whole number; remove that line and try again"
         )

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +21,7 @@ from service.config import Config, dump_config, load_config
 from service.errors import ConfigError, TandemError
 from service.io.errors import StorageError
 from service.io.files import os_errors, write_atomic
-from service.io.lock import DirectoryLock
+from service.io.lock import LOCK_FILE, DirectoryLock
 from service.io.run_directory import RunDirectory
 from service.parsing import parse_json
 from service.regular_files import read_regular
@@ -132,6 +133,10 @@ class StudyDirectory:
     def close(self) -> None:
         """Let other processes in; a second call does nothing."""
         if self._lock is not None:
+            if not self.exists:  # a study that did not begin leaves nothing
+                with suppress(OSError):
+                    (self.path / LOCK_FILE).unlink()
+                    self.path.rmdir()
             self._lock.release()
             self._lock = None
 

@@ -166,9 +166,8 @@ def _start(config: Config, directory: RunDirectory, cluster: ClusterOptions | No
     if cluster is None:
         return LocalRun(config, directory, resume=resume)
     from service.runtime.cluster import ClusterRun  # where there is no cluster, Ray is not needed
-    from service.runtime.ray_connection import started
 
-    return started(lambda: ClusterRun(config, directory, cluster, resume=resume))
+    return ClusterRun(config, directory, cluster, resume=resume)
 
 
 def _run(

@@ -7,10 +7,10 @@ import os
 import secrets
 import socket
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from typing import Any, TypeVar
+from typing import Any
 
 from service.config import LearnerConfig
 from service.errors import TandemError, one_line
@@ -25,8 +25,6 @@ START_ATTEMPTS = 3
 """Ray gives up on a node of its own after 30 s, which a busy machine may need."""
 
 _NOBODY = "no Ray cluster answers there: is it up (ray status), and is the address right (ray start prints it)"
-_Started = TypeVar("_Started")
-_logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True)
@@ -142,32 +140,11 @@ def explaining_ray_errors() -> Iterator[None]:
     except RayTaskError as error:
         if isinstance(error.cause, TandemError):
             raise error.cause from None
-        raise RuntimeError(_last_line(error)) from error
+        raise RuntimeError(f"a worker failed: {type(error.cause).__name__}: {error.cause}") from error
     except RayError as error:
         raise ClusterError(
             f"Ray gave up: {_last_line(error)}; see ray status, and continue with --resume from what was saved"
         ) from error
-
-
-def started(start: Callable[[], _Started]) -> _Started:
-    """Call ``start``; where a worker dies before it has started, once more and once again.
-
-    Raises:
-        ClusterError: workers died every time.
-    """
-    from ray.exceptions import RayActorError
-
-    for attempt in range(START_ATTEMPTS, 0, -1):
-        try:
-            return start()
-        except RayActorError as error:
-            said = _last_line(error)
-        if attempt > 1:
-            _logger.warning("a worker died while the run was starting: %s; starting again", said)
-    raise ClusterError(
-        f"{START_ATTEMPTS} times in a row a worker died while the run was starting: {said}; is there enough memory for "
-        "it? see ray status, and the logs of the node"
-    )
 
 
 def cluster_size(address: str | None) -> tuple[str, float]:
@@ -227,10 +204,9 @@ def _check_token(address: str | None) -> None:
 
 
 def _last_line(error: Exception) -> str:
-    """What an error of Ray's says: the end of a traceback, or the sentences before a table of ids."""
-    lines = [line.strip() for line in str(error).splitlines() if line.strip()]
-    said = "" if not lines else lines[-1] if "Traceback" in str(error) else lines[0]
-    return one_line(f"{type(error).__name__}: {said}", 300)
+    """What an error of Ray's says in the end, after a traceback or a table of ids."""
+    lines = str(error).strip().splitlines()
+    return f"{type(error).__name__}: {lines[-1].strip() if lines else ''}"[:200]
 
 
 def _explained(address: str | None, error: Exception) -> str:

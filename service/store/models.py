@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from datetime import UTC, timedelta
+from datetime import UTC, datetime, timedelta
 from typing import Literal, NamedTuple, Protocol, Self, get_args
 
 from pydantic import AwareDatetime, Field
@@ -98,7 +98,8 @@ class RunStatus(FrozenModel):
 
     def vanished(self) -> Self:
         """The status of a silent run that no process runs any more: it must not seem to run for ever."""
-        when = self.heartbeat.astimezone(UTC).isoformat(timespec="seconds")
+        heard = max(self.heartbeat, datetime.fromtimestamp(0, UTC))  # one of the year 1 may have no date in UTC
+        when = heard.astimezone(UTC).isoformat(timespec="seconds")
         error = (
             f"its process vanished without a word, last heard of at {when}; --resume goes on from its last checkpoint"
         )

@@ -5,7 +5,6 @@ To add an attack, add a line to ``NOT_FILES`` or ``NO_CONTENT``; to add a place 
 
 import gzip
 import io
-import itertools
 import os
 import pickle
 import shutil
@@ -13,6 +12,7 @@ import signal
 import socket
 import zipfile
 from contextlib import contextmanager
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -53,7 +53,7 @@ def some_arrays():
 def a_billion_laughs():
     names = "abcdefghij"
     lines = ["a: &a [x, x, x, x, x, x, x, x, x]"]
-    lines += [f"{each}: &{each} [{', '.join(['*' + last] * 9)}]" for last, each in itertools.pairwise(names)]
+    lines += [f"{each}: &{each} [{', '.join(['*' + last] * 9)}]" for last, each in pairwise(names)]
     return "\n".join(lines).encode()
 
 
@@ -88,6 +88,7 @@ NO_CONTENT = {
     "list": b"[1, 2]",
     "wrong types": b'{"version": [1], "seeds": "x", "name": {"a": 1}, "format_version": 1, "run": 4, "cell": 3}',
     "keys that are no text": b"{1: 2, null: 3, 2026-01-01: 4}",
+    "iteration that no computer counts to": b'{"iteration": %s, "version": 1}' % (b"9" * 100),
     "lines for a terminal": b'name: "x\\nTraceback (most recent call last):\\n\\e[2J"',
 }
 EVALUATE = ("evaluate", "--episodes", "2", "--steps", "2", "--registry", "registry", "--primitives")
@@ -103,6 +104,7 @@ PLACES = {
     "checkpoint": (CHECKPOINT, (*RESUME, "run")),
     "checkpoint to evaluate": (CHECKPOINT, (*EVALUATE, "run")),
     "published.json": ("run/published.json", (*RESUME, "run")),
+    "run.json": ("run/run.json", (*RESUME, "run")),
     "study.yaml": ("study/study.yaml", (*RESUME, "study", "--seeds", "0,1")),
     "study.json": ("study/study.json", (*RESUME, "study", "--seeds", "0,1")),
     "manifest": (VERSION, (*EVALUATE, "tiny")),
@@ -120,7 +122,7 @@ RECORDS = {
     "goals.jsonl": ("run/goals.jsonl", (*RESUME, "run")),
     "records of a training": (f"{TRAINING}/metrics.jsonl", PLACES["cell.json"][1]),
 }
-"""Places where a file may also be missing, or end with a torn line."""
+"""Places of files with a line for each iteration."""
 
 
 @contextmanager
@@ -192,12 +194,12 @@ def test_what_is_no_file(home, place):
         (path.rmdir if path.is_dir() else path.unlink)()
 
 
-@pytest.mark.parametrize("place", PLACES)
+@pytest.mark.parametrize("place", [*PLACES, *RECORDS])
 def test_a_file_with_something_else_in_it(home, place):
-    file, arguments = PLACES[place]
+    file, arguments = (PLACES | RECORDS)[place]
     path = take_away(home, file)
     for name, content in NO_CONTENT.items():
-        path.write_bytes(content)
+        path.write_bytes(content + b"\n" * (place in RECORDS))  # else it would be a torn line
         said = refuse(arguments)
         assert path.name in said or "tiny" in said, (name, said)
     with path.open("wb") as huge:

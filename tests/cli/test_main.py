@@ -4,8 +4,10 @@ import json
 import os
 import re
 import shlex
+import signal
 import subprocess
 import sys
+from contextlib import nullcontext
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -16,11 +18,13 @@ from service.cli.main import app
 from service.config import load_config
 from service.errors import TandemError
 from service.io import checkpoints
+from service.io.lock import DirectoryLock
 from service.io.run_directory import RunDirectory
 from service.primitives.bundled import BUNDLED
 from service.registry.names import Version
 from service.registry.registry import Registry
-from tests.runtime.runs import TREE, no_room_above, tiny_config, write_yaml
+from service.runtime.signals import InterruptError
+from tests.runtime.runs import TREE, assert_one_line, no_room_above, tiny_config, write_yaml
 
 ROOT = Path(__file__).parents[2]
 README = (ROOT / "README.md").read_text()
@@ -216,6 +220,49 @@ def test_options_of_a_cluster_are_refused_without_one(tmp_path, option):
     result = tandem("pretrain", "--run-dir", tmp_path / "run", option)
     assert_user_error(result, option.partition("=")[0], "--runtime ray")
     assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize("seeds", [(), ("--seeds", "0,1")])
+def test_whoever_else_has_the_directory_is_named_before_ray_is_started(tmp_path, monkeypatch, seeds):
+    monkeypatch.setattr("service.runtime.ray_connection.connected", lambda address: pytest.fail("it takes a minute"))
+    arguments = ("pretrain", "--run-dir", tmp_path / "run", *seeds, "--runtime", "ray", "--status", "off")
+    lock = DirectoryLock(tmp_path / "run", "")
+    assert_user_error(tandem(*arguments), tmp_path / "run", f"is in use by process {os.getpid()} on ")
+    lock.release()
+
+
+@pytest.mark.parametrize("seeds", [(), ("--seeds", "0,1")])
+def test_a_ray_that_does_not_start_leaves_nothing(tmp_path, monkeypatch, seeds):
+    arguments = ("pretrain", "--run-dir", tmp_path / "run", *seeds, "--runtime", "ray", "--address", "127.0.0.1:1")
+    result = tandem(*arguments)
+    assert result.exit_code == 1
+    assert_one_line(result.stderr, "error: --address 127.0.0.1:1: no Ray cluster answers there")
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("options", "hint"),
+    [
+        ((), ""),
+        (("--runtime", "ray", "--status", "off"), " --runtime ray"),
+        (("--runtime", "ray", "--address", "head:6379", "--status", "off"), " --runtime ray --address head:6379"),
+    ],
+)
+@pytest.mark.parametrize("seeds", [(), ("--seeds", "0,1")])
+def test_how_to_go_on_is_where_the_run_was_begun(tmp_path, monkeypatch, options, hint, seeds):
+    def stop(config, directory, *arguments, **keywords):
+        directory.config_file.parent.mkdir(exist_ok=True)
+        directory.config_file.touch()  # so it has begun
+        raise InterruptError(signal.SIGTERM)
+
+    monkeypatch.setattr("service.runtime.ray_connection.connected", lambda address: nullcontext())
+    monkeypatch.setattr("service.runtime.ray_connection.cluster_size", lambda address: ("head:6379", 4.0))
+    monkeypatch.setattr("service.runtime.pretrain.pretrain", stop)
+    monkeypatch.setattr("service.runtime.pretrain_study.pretrain_study", stop)
+    result = tandem("pretrain", "--run-dir", tmp_path / "a run", "--registry", "registry", *seeds, *options)
+    assert result.exit_code == 128 + signal.SIGTERM, result.exception
+    how = f"continue with: tandem pretrain --resume --run-dir '{tmp_path}/a run' --registry registry{hint}\n"
+    assert result.stdout == f"stopped at once; {how}"
 
 
 # --- what can be done with it ----------------------------------------------------------------------------------------

@@ -72,3 +72,19 @@ def test_a_device_that_is_always_full(tmp_path):
     with pytest.raises(StorageError) as error:
         Appender(path).append_bytes(b"a")
     assert_one_line(error.value, "cannot write", path, "No space left on device")
+
+
+@pytest.mark.parametrize("somebody_reads", [False, True])
+def test_nobody_waits_for_a_fifo(path, somebody_reads):
+    path.parent.mkdir()
+    os.mkfifo(path)
+    reader = os.open(path, os.O_RDONLY | os.O_NONBLOCK) if somebody_reads else None
+    with pytest.raises(StorageError) as error:
+        Appender(path).append_bytes(b"a")
+    assert_one_line(error.value, "cannot write", path, "not a regular file" if somebody_reads else "No such device")
+    with pytest.raises(StorageError) as error:
+        files.check_regular(path)
+    assert_one_line(error.value, "cannot read", path, "not a regular file")
+    files.check_regular(path.with_name("missing"))
+    if reader is not None:
+        os.close(reader)

@@ -3,6 +3,7 @@
 import os
 import re
 import signal
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 
@@ -15,7 +16,7 @@ from service.errors import DivergedError
 from service.io.checkpoints import CheckpointStore
 from service.io.run_directory import RunDirectory
 from service.runtime.cluster import ClusterRun
-from service.runtime.learner_group import num_gpus
+from service.runtime.learner_group import LearnerGroup, num_gpus
 from service.runtime.ray_actors import NICENESS
 from service.runtime.ray_connection import ClusterOptions, connected
 from service.runtime.runner import ClusterError, StateLostError
@@ -292,6 +293,23 @@ def test_a_learner_that_dies_of_every_batch_ends_the_run_with_one_line(tmp_path,
     with pytest.raises(ClusterError, match=r"2 times in a row the learner failed") as error:
         run_cluster(tmp_path, tiny_config(total_env_steps=10**9), num_actors=1, on_iteration=strike)
     assert "\n" not in str(error.value)
+
+
+def test_a_learner_that_is_killed_before_the_run_has_begun_is_started_again(tmp_path, monkeypatch):
+    ready, killed = LearnerGroup.wait_ready, []
+
+    def kill_first(group):
+        if not killed:
+            killed.append(ray.get(group._ranks[0].ping.remote()).pid)
+            os.kill(killed[0], signal.SIGKILL)
+        ready(group)
+
+    monkeypatch.setattr(LearnerGroup, "wait_ready", kill_first)
+    directory = RunDirectory(tmp_path)
+    directory.claim(resume=False)
+    with closing(directory), closing(ClusterRun(tiny_config(), directory, ClusterOptions(num_actors=1))) as run:
+        assert pid_of(run, "learner") not in killed
+    assert newest(tmp_path).step == 0
 
 
 @pytest.mark.parametrize(

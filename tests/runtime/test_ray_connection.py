@@ -1,13 +1,17 @@
-"""Starting a Ray of our own on a machine that is slow; the real one is in test_cluster and test_job."""
+"""Connections to Ray: a slow machine, a wrong token, errors of workers; real runs are in test_cluster and test_job."""
 
 import os
 import subprocess
 import sys
+from concurrent.futures import ThreadPoolExecutor
 
+import grpc
 import pytest
 import ray
+from ray.exceptions import ActorDiedError, RayTaskError
 
-from service.runtime.ray_connection import START_ATTEMPTS, connected
+from service.errors import DivergedError
+from service.runtime.ray_connection import START_ATTEMPTS, connected, explaining_ray_errors
 from service.runtime.runner import ClusterError
 from tests.runtime.runs import ROOT, assert_one_line
 
@@ -84,3 +88,104 @@ def test_a_ray_of_our_own_listens_on_loopback_only():
     addresses = done.stdout.split()
     assert len(addresses) >= 8  # of its control store, node, agents, worker and this driver
     assert set(addresses) <= {"127.0.0.1", "::1", "::ffff:127.0.0.1"}
+
+
+# --- the token --------------------------------------------------------------------------------------------------------
+
+
+class Head(grpc.GenericRpcHandler):
+    """Answers like the head of a cluster that wants a token, or like something else that speaks gRPC."""
+
+    def __init__(self, token, error=grpc.StatusCode.UNAUTHENTICATED):
+        self._token, self._error = token, error
+
+    def service(self, details):
+        given = dict(details.invocation_metadata).get("authorization")
+
+        def answer(request, context):
+            assert details.method == "/ray.rpc.NodeInfoGcsService/GetClusterId"
+            if given != f"Bearer {self._token}":
+                context.abort(self._error, "InvalidAuthToken:\nmissing or incorrect")
+            return b""
+
+        return grpc.unary_unary_rpc_method_handler(answer)
+
+
+@pytest.fixture
+def serve(monkeypatch):
+    """Start a head; gives its address. This machine's own address is not asked for."""
+    monkeypatch.setattr("ray._private.services.canonicalize_bootstrap_address", lambda address: address)
+    servers = []
+
+    def start(head):
+        servers.append(grpc.server(ThreadPoolExecutor(max_workers=1), handlers=[head]))
+        port = servers[-1].add_insecure_port("127.0.0.1:0")
+        servers[-1].start()
+        return f"127.0.0.1:{port}"
+
+    yield start
+    for server in servers:
+        server.stop(grace=None)
+
+
+def test_a_wrong_token_is_named_before_ray_is_asked(serve, monkeypatch):
+    monkeypatch.setattr(ray, "init", lambda *arguments, **options: pytest.fail("Ray tries for 20 s"))
+    address = serve(Head("a" * 64))
+    with pytest.raises(ClusterError) as error, connected(address):
+        pass
+    assert_one_line(
+        error.value, address, "it refuses the token that was sent: set RAY_AUTH_TOKEN", "InvalidAuthToken: "
+    )
+    monkeypatch.setenv("RAY_AUTH_MODE", "disabled")
+    with pytest.raises(ClusterError) as error, connected(address):
+        pass
+    assert_one_line(error.value, "it wants a token, and none was sent: set RAY_AUTH_MODE=token, and RAY_AUTH_TOKEN")
+
+
+def test_the_right_token_goes_on_to_ray(serve, monkeypatch):
+    tried = []
+    monkeypatch.setattr(ray, "init", lambda *arguments, **options: tried.append(arguments))
+    monkeypatch.setattr(ray, "shutdown", lambda: None)
+    address = serve(Head(os.environ["RAY_AUTH_TOKEN"]))
+    with connected(address):
+        assert tried == [(address,)]
+
+
+def test_somebody_else_at_that_port(serve, monkeypatch):
+    monkeypatch.setattr(ray, "init", lambda *arguments, **options: pytest.fail("Ray tries for 20 s"))
+    with pytest.raises(ClusterError) as error, connected(serve(Head("", grpc.StatusCode.UNAVAILABLE))):
+        pass
+    assert_one_line(error.value, "no Ray cluster answers there")
+
+
+# --- workers ----------------------------------------------------------------------------------------------------------
+
+
+def dies():
+    raise ActorDiedError  # Ray gives it a sentence
+
+
+def remote_error(cause):
+    """As ``ray.get`` raises it: an error of both kinds, whose text is the worker's traceback."""
+    text = f'ray::Learner.update() (pid=1)\n  File "x.py", line 1\n{type(cause).__name__}: {cause}'
+    return RayTaskError("update", f"Traceback (most recent call last):\n{text}", cause).as_instanceof_cause()
+
+
+def test_what_a_worker_raises_for_people_is_raised_here():
+    with pytest.raises(DivergedError) as error, explaining_ray_errors():
+        raise remote_error(DivergedError("lower the rates"))
+    assert type(error.value) is DivergedError
+    assert str(error.value) == "lower the rates"
+
+
+def test_any_other_error_of_a_worker_is_its_last_line():
+    with pytest.raises(RuntimeError) as error, explaining_ray_errors():
+        raise remote_error(KeyError("x"))
+    assert str(error.value) == "a worker failed: KeyError: 'x'"
+    assert 'File "x.py", line 1' in str(error.value.__cause__)
+
+
+def test_an_error_of_rays_own_is_one_line():
+    with pytest.raises(ClusterError) as error, explaining_ray_errors():
+        dies()
+    assert_one_line(error.value, "Ray gave up: ActorDiedError: The actor died unexpectedly", "--resume")

@@ -8,6 +8,7 @@ import signal
 import subprocess
 import time
 import tracemalloc
+from contextlib import suppress
 from datetime import UTC, datetime, timedelta
 from types import SimpleNamespace
 
@@ -278,6 +279,45 @@ def test_yaml_is_parsed_once(old_run, monkeypatch):
     os.utime(old_run / "config.yaml")  # as a resume does
     reader.run("old-one")
     assert len(calls) == 2
+
+
+@pytest.mark.parametrize(
+    "name", ["status.json", "goals.json", "metrics.jsonl", "config.yaml", "published.json", ".lock"]
+)
+def test_nobody_waits_for_a_fifo(old_run, name):
+    (old_run / name).unlink(missing_ok=True)
+    if name == "config.yaml":  # so that it is a run
+        (old_run / "status.json").write_text("no status")
+    os.mkfifo(old_run / name)
+    reader = DiskReader(old_run.parent)
+    (status,) = reader.runs()
+    assert status.run_id == "old-one"
+    for read in (reader.metrics, reader.goals, reader.request_stop):
+        with suppress(StoreError):
+            read("old-one")
+
+
+@pytest.mark.parametrize("heartbeat", ["0001-01-01T00:00:00+14:00", "9999-12-31T23:59:59-14:00"])
+def test_a_heartbeat_of_no_time_there_is(tmp_path, heartbeat):
+    (tmp_path / "cube").mkdir()
+    tree = json.loads(a_silent_status().model_dump_json()) | {"heartbeat": heartbeat}
+    (tmp_path / "cube" / "status.json").write_text(json.dumps(tree))
+    assert DiskReader(tmp_path).run("cube").model_dump_json()
+
+
+@pytest.mark.parametrize("number", ["1e999", "-1e999", "NaN"])
+def test_a_number_of_a_record_that_is_not_finite_is_none(growing, number):
+    path, _, records = growing
+    path.write_text(f'{{"iteration": 1, "env_steps": {number}}}\n{{"iteration": {"9" * 400}}}\n{{"iteration": 2}}\n')
+    assert records.after(0) == [{"iteration": 1, "env_steps": None}, {"iteration": 2}]
+
+
+def test_a_line_without_end_is_not_read_whole(growing):
+    path, _, records = growing
+    path.write_bytes(b'{"iteration": 1}\n')
+    with path.open("ab") as file:
+        file.truncate(1 << 40)  # without a block on the disk
+    assert records.after(0) == [{"iteration": 1}]
 
 
 # --- records that grow -----------------------------------------------------------------------------------------------
