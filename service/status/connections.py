@@ -53,11 +53,11 @@ class BoundedConnection(HttpToolsProtocol):
         """Take what came, as long as the head is not too large."""
         if self.transport is None or self.transport.is_closing():
             return
-        if self._in_head:
+        if was_in_head := self._in_head:
             self._wait_for_head()
         num_heads = self._num_heads
         super().data_received(data)
-        if self._in_head and self._num_heads == num_heads:  # all of it belongs to a head that is not whole yet
+        if was_in_head and self._in_head and self._num_heads == num_heads:  # all of it belongs to a head still
             self._num_head_bytes += len(data)
             if self._num_head_bytes > MAX_HEAD_BYTES and not self.transport.is_closing():
                 self.transport.write(_TOO_LARGE)
