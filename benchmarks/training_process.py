@@ -22,7 +22,7 @@ from dataclasses import dataclass
 from http.client import HTTPException
 from pathlib import Path
 from tempfile import mkdtemp
-from types import TracebackType
+from types import MappingProxyType, TracebackType
 from typing import Any, Literal, Self, TypeVar
 
 from pydantic import ValidationError
@@ -33,7 +33,8 @@ from service.errors import TandemError
 from service.io.checkpoints import CheckpointStore
 from service.io.run_directory import RunDirectory
 from service.io.run_history import FILE as RUN_FILE
-from service.store.disk import STATUS_FILE
+from service.store.disk_reader import DiskReader
+from service.store.errors import StoreError
 from service.store.models import RunStatus
 
 ENDLESS = {"run.total_env_steps": 1_000_000_000_000}
@@ -59,6 +60,7 @@ class Training:
         runtime: which runner; ``ray`` has a status service.
         tree: checkout whose code runs.
         num_cores: that its Ray believes to have; None: those there are.
+        variables: further ones of its environment.
     """
 
     def __init__(
@@ -70,6 +72,7 @@ class Training:
         runtime: Literal["local", "ray"] = "ray",
         tree: Path = ROOT,
         num_cores: int | None = None,
+        variables: Mapping[str, str] = MappingProxyType({}),
     ) -> None:
         self.name, self.directory, self.log_file = name, RunDirectory(home / "runs" / name), home / f"{name}.log"
         self.address = ("127.0.0.1", _free_port())
@@ -80,11 +83,12 @@ class Training:
         if runtime == "ray":
             command += ["--runtime", "ray", "--status", "{}:{}".format(*self.address)]
         self.records = Records(self.directory.metrics_file)
+        self._reader = DiskReader(self.directory.path.parent)
         with self.log_file.open("ab") as log:
             self._process = subprocess.Popen(
                 [*command, *arguments],
                 cwd=tree,
-                env=environment(home, tree) | ({} if num_cores is None else _cores(num_cores)),
+                env=environment(home, tree) | ({} if num_cores is None else _cores(num_cores)) | dict(variables),
                 stdin=subprocess.DEVNULL,
                 stdout=log,
                 stderr=log,
@@ -117,11 +121,12 @@ class Training:
             return b""
 
     def status(self) -> RunStatus | None:
-        """The run's status by the status service, else from its directory; None before there is one."""
+        """The run's status by its status service, else as one for its directory has it; None before there is one."""
         try:
-            told = self.get(f"/v1/runs/{self.name}", 2.0) or (self.directory.path / STATUS_FILE).read_bytes()
-            return RunStatus.model_validate_json(told)
-        except (OSError, ValidationError):
+            if told := self.get(f"/v1/runs/{self.name}", 2.0):
+                return RunStatus.model_validate_json(told)
+            return self._reader.run(self.name)
+        except (StoreError, ValidationError):
             return None
 
     def wait_for(self, what: Callable[[], _Answer | None], seconds: float = START_S) -> _Answer:

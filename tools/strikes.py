@@ -22,129 +22,34 @@ import subprocess
 import sys
 import time
 import traceback
-from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
-from dataclasses import asdict, dataclass, field
+from collections.abc import Callable
+from contextlib import ExitStack, suppress
+from dataclasses import asdict
 from pathlib import Path
-from typing import Any
 
-from benchmarks import training_process
-from benchmarks.measuring import RECIPE_FILE, ROOT, machine, write_json
-from benchmarks.training_process import ENDLESS, Training, environment, overrides, scratch
-from service.errors import TandemError
-from service.io.jsonl import read_jsonl
+from benchmarks.measuring import ROOT, machine, write_json
+from benchmarks.training_process import Training, environment, scratch
 from service.store.models import RunStatus
-from tests.store.redis_server import RedisServer
+from tools.strike_runs import (
+    ARGUMENTS,
+    CALM,
+    Clock,
+    Strike,
+    Watcher,
+    changed,
+    no_status,
+    redis_to_strike,
+    replaced_and_working,
+    rows_of,
+    run_of,
+    run_on_nodes,
+    seconds_text,
+    versions_are_whole,
+    wait_for_all,
+    workers_of,
+)
 
-SETTINGS = {
-    **ENDLESS, "game.num_worlds": 48, "run.checkpoint_interval": 10, "run.evaluation_interval": 0, "run.num_threads": 1,
-}  # fmt: skip
-"""A small game, so that rounds are short beside what is measured."""
-CALM = 4
-"""Iterations before a strike."""
-TICK_S = 0.2
-PATIENCE_S = 240.0
-
-
-@dataclass
-class Strike:
-    """What was asked of a strike, and what was seen."""
-
-    name: str
-    must: str
-    measured: str = "not measured"
-    reached: bool | None = None
-    seconds: float | None = None
-    conditions: list[tuple[float, str, str]] = field(default_factory=list)
-    """(seconds since the strike, state, condition) at each change, as the status service told."""
-    warnings: list[str] = field(default_factory=list)
-    tracebacks: int = 0
-
-    def judge(self, measured: str, reached: bool, seconds: float | None = None) -> None:
-        """Note the outcome; a traceback anywhere is none."""
-        self.measured, self.reached, self.seconds = measured, reached and not self.tracebacks, seconds
-
-
-class Watcher:
-    """Looks at a run after a strike, again and again."""
-
-    def __init__(self, training: Training, strike: Strike) -> None:
-        self._training, self._strike = training, strike
-        self.struck = time.monotonic()
-
-    def since(self) -> float:
-        """Seconds since the strike."""
-        return time.monotonic() - self.struck
-
-    def look(self) -> RunStatus | None:
-        """The status now; notes what it says that is new."""
-        status, strike = self._training.status(), self._strike
-        if status is not None:
-            if not strike.conditions or strike.conditions[-1][1:] != (status.state, status.condition):
-                strike.conditions.append((round(self.since(), 1), status.state, status.condition))
-            strike.warnings += [text for text in status.warnings if _kind(text) not in map(_kind, strike.warnings)]
-        return status
-
-    def until(self, holds: Callable[[RunStatus], bool], seconds: float = PATIENCE_S) -> float | None:
-        """Seconds since the strike until the status is so; None if it was not in time."""
-        deadline = time.monotonic() + seconds
-        while time.monotonic() < deadline:
-            if (status := self.look()) is not None and holds(status):
-                return self.since()
-            time.sleep(TICK_S)
-        return None
-
-
-def _kind(text: str) -> str:
-    """A warning without its numbers."""
-    return "".join(each for each in text if not each.isdigit())
-
-
-@contextmanager
-def run_of(strike: Strike, *, runtime: Any = "ray") -> Iterator[Training]:
-    """A training that has made some iterations; counts the tracebacks in its log at the end."""
-    arguments = ["--config", str(RECIPE_FILE), *overrides(SETTINGS)]
-    arguments += ["--num-actors", "2"] if runtime == "ray" else []
-    with scratch() as home, Training(home, arguments, runtime=runtime) as training:
-        training.wait_until("iteration", CALM)
-        yield training
-        training.stop()
-        strike.tracebacks = training.log_file.read_text(errors="replace").count("Traceback (most recent call last)")
-
-
-@contextmanager
-def with_redis(url: str) -> Iterator[None]:
-    """Let the trainings of a block report to a Redis."""
-    real = training_process.environment
-    training_process.environment = lambda home, tree=ROOT: real(home, tree) | {"TANDEM_REDIS_URL": url}
-    try:
-        yield
-    finally:
-        training_process.environment = real
-
-
-def actors_of(status: RunStatus | None) -> dict[str, tuple[int | None, int]]:
-    """Pid and incarnation of every worker by name."""
-    return {} if status is None else {each.name: (each.pid, each.incarnation) for each in status.actors}
-
-
-def wait_for_all(training: Training) -> dict[str, tuple[int | None, int]]:
-    """Wait until every worker has a process."""
-    training.wait_for(lambda: (all_ := actors_of(training.status())) and all(pid for pid, _ in all_.values()))
-    return actors_of(training.status())
-
-
-def replaced_and_working(watcher: Watcher, name: str, incarnation: int) -> float | None:
-    """Seconds since the strike until another worker has the place, and two more iterations are over."""
-    if watcher.until(lambda status: _is_next(status, name, incarnation)) is None:
-        return None
-    iteration = (watcher.look() or _no_status()).iteration
-    return watcher.until(lambda status: status.iteration > iteration + 1)
-
-
-def _is_next(status: RunStatus, name: str, incarnation: int) -> bool:
-    pid, now = actors_of(status)[name]
-    return pid is not None and now > incarnation
+JUMP_S = 3600.0
 
 
 # --- strikes ----------------------------------------------------------------------------------------------------------
@@ -153,24 +58,57 @@ def _is_next(status: RunStatus, name: str, incarnation: int) -> bool:
 def frozen_worker(strike: Strike, name: str) -> None:
     """Freeze the learner or the task generator for good."""
     with run_of(strike) as training:
-        before = wait_for_all(training)
-        watcher = Watcher(training, strike)
-        os.kill(int(before[name][0] or 0), signal.SIGSTOP)
-        seconds = replaced_and_working(watcher, name, before[name][1])
-        status = watcher.look() or _no_status()
-        after = actors_of(status)
-    others = [each for each in before if each != name and after.get(each) != before[each]]
+        _freeze_worker(strike, training, name)
+
+
+def frozen_worker_on_a_node(strike: Strike, name: str) -> None:
+    """Freeze it on a cluster of two nodes."""
+    with run_on_nodes(strike) as (_, training):
+        _freeze_worker(strike, training, name)
+
+
+def _freeze_worker(strike: Strike, training: Training, name: str) -> None:
+    before = wait_for_all(training)
+    watcher = Watcher(training, strike)
+    os.kill(int(before[name][0] or 0), signal.SIGSTOP)
+    seconds = replaced_and_working(watcher, name, before[name][1])
+    status = watcher.look() or no_status()
+    others = changed(before, workers_of(status), but=name)
     named = name in str(status.last_error) and "no progress" in str(status.last_error)
     said = "others were killed, too: " + ", ".join(others) if others else "nobody else killed"
-    measured = f"{_s(seconds)}, {said}, {'named' if named else 'not named'} as the last error"
+    measured = f"{seconds_text(seconds)}, {said}, {'named' if named else 'not named'} as the last error"
     strike.judge(measured, seconds is not None and seconds <= 60.0 and not others and named, seconds)
+
+
+def lost_node(strike: Strike, kind: signal.Signals) -> None:
+    """Freeze or kill all of one of two nodes, the one with the learner on it: as if the network to it had parted."""
+    with run_on_nodes(strike) as (nodes, training):
+        before = wait_for_all(training)
+        struck = nodes.of(int(before["learner"][0] or 0))
+        there = [name for name, (pid, _) in before.items() if pid in struck]
+        watcher = Watcher(training, strike)
+        for pid in struck:
+            os.kill(pid, kind)
+        seconds = replaced_and_working(watcher, "learner", before["learner"][1])
+        others = [each for each in changed(before, workers_of(watcher.look())) if each not in there]
+        if kind == signal.SIGSTOP:  # what wakes up has to leave the run alone
+            for pid in struck:
+                _signal(pid, signal.SIGCONT)
+            watcher.until_iterations(5)
+        whole = versions_are_whole(training)
+    measured = (
+        f"{', '.join(there)} were on it; learning goes on after {seconds_text(seconds)}, "
+        f"{'nobody else killed' if not others else 'others killed: ' + ', '.join(others)}, "
+        f"{'no version missing or made twice' if whole else 'versions lost'}"
+    )
+    strike.judge(measured, seconds is not None and seconds <= 60.0 and not others and whole, seconds)
 
 
 def frozen_actor(strike: Strike) -> None:
     """Freeze one of two rollout actors for good."""
     with run_of(strike) as training:
         before = wait_for_all(training)
-        recent = statistics.median(row["time/play_s"] + row["time/hand_over_s"] for row in _rows(training)[-4:])
+        recent = statistics.median(row["time/play_s"] + row["time/hand_over_s"] for row in rows_of(training)[-4:])
         iterations: list[tuple[float, int]] = []
         watcher = Watcher(training, strike)
         os.kill(int(before["rollout-0"][0] or 0), signal.SIGSTOP)
@@ -178,14 +116,16 @@ def frozen_actor(strike: Strike) -> None:
         def replaced(status: RunStatus) -> bool:
             if not iterations or iterations[-1][1] != status.iteration:
                 iterations.append((watcher.since(), status.iteration))
-            return actors_of(status)["rollout-0"][1] > before["rollout-0"][1]
+            return workers_of(status)["rollout-0"][1] > before["rollout-0"][1]
 
         seconds = watcher.until(replaced)
-        after = actors_of(watcher.look())
+        after = workers_of(watcher.look())
     gap = max((late - early for (early, _), (late, _) in itertools.pairwise(iterations)), default=1e9)
-    others = [each for each in before if each != "rollout-0" and after.get(each) != before[each]]
+    others = changed(before, after, but="rollout-0")
     bound = 3.0 * recent + 2.0 + 1.0  # the status comes once a second
-    measured = f"updates stood still for {gap:.1f} s (a round takes {recent:.1f} s), replaced after {_s(seconds)}"
+    measured = (
+        f"updates stood still for {gap:.1f} s (a round takes {recent:.1f} s), replaced after {seconds_text(seconds)}"
+    )
     strike.judge(measured, gap <= bound and seconds is not None and not others, gap)
 
 
@@ -202,8 +142,8 @@ def spinning(strike: Strike, seconds: float) -> None:
             for spinner in spinners:
                 spinner.kill()
                 spinner.wait()
-        after = actors_of(status)
-    killed = [each for each in before if after.get(each) != before[each]]
+        after = workers_of(status)
+    killed = changed(before, after)
     bad = sorted({condition for _, _, condition in strike.conditions} - {"well"})
     said = f"{', '.join(killed) or 'nobody'} killed, conditions besides well: {', '.join(bad) or 'none'}"
     strike.judge(f"{said}, in {seconds:.0f} s", not killed and not bad)
@@ -217,12 +157,14 @@ def frozen_driver(strike: Strike, seconds: float = 67.0) -> None:
         os.kill(training.pid, signal.SIGSTOP)
         stuck = watcher.until(lambda status: status.condition == "stuck", seconds + 5.0)
         time.sleep(max(0.0, seconds - watcher.since()))
-        iteration = (training.status() or _no_status()).iteration
+        iteration = (training.status() or no_status()).iteration
         os.kill(training.pid, signal.SIGCONT)
         back = watcher.until(lambda status: status.condition == "well" and status.iteration > iteration + 2)
-        after = actors_of(watcher.look())
-    killed = [each for each in before if after.get(each) != before[each]]
-    measured = f"the status says stuck after {_s(stuck)}; nobody killed" if not killed else f"killed: {killed}"
+        after = workers_of(watcher.look())
+    killed = changed(before, after)
+    measured = (
+        f"the status says stuck after {seconds_text(stuck)}; nobody killed" if not killed else f"killed: {killed}"
+    )
     strike.judge(measured, stuck is not None and back is not None and not killed, stuck)
 
 
@@ -233,17 +175,14 @@ def killed_twice(strike: Strike) -> None:
         watcher = Watcher(training, strike)
         os.kill(int(before["learner"][0] or 0), signal.SIGKILL)
         incarnation = before["learner"][1]
-        watcher.until(lambda status: (now := actors_of(status)["learner"])[1] > incarnation and now[0] is not None)
-        second = actors_of(watcher.look())["learner"]
+        watcher.until(lambda status: (now := workers_of(status)["learner"])[1] > incarnation and now[0] is not None)
+        second = workers_of(watcher.look())["learner"]
         os.kill(int(second[0] or 0), signal.SIGKILL)
         watcher.struck = time.monotonic()
         seconds = replaced_and_working(watcher, "learner", second[1])
-        rows = _rows(training)
-    versions = [row["learner/version"] for row in rows]
-    whole = versions == list(range(1, len(versions) + 1))
-    measured = (
-        f"{_s(seconds)} after the second kill, {'no version missing or made twice' if whole else 'versions lost'}"
-    )
+        whole = versions_are_whole(training)
+    lost = "no version missing or made twice" if whole else "versions lost"
+    measured = f"{seconds_text(seconds)} after the second kill, {lost}"
     strike.judge(measured, whole and seconds is not None and seconds <= 20.0, seconds)
 
 
@@ -251,98 +190,127 @@ def killed_driver(strike: Strike) -> None:
     """Kill the driver, and type the command that resumes it."""
     with run_of(strike) as training:
         training.wait_until("iteration", 16)
-        iteration = _rows(training)[-1]["iteration"]
+        iteration = rows_of(training)[-1]["iteration"]
         os.kill(training.pid, signal.SIGKILL)
         started = time.monotonic()
-        arguments = ["--config", str(RECIPE_FILE), *overrides(SETTINGS), "--num-actors", "2"]
         home = training.directory.path.parents[1]
-        with Training(home, arguments) as again:
+        with Training(home, [*ARGUMENTS, "--num-actors", "2"]) as again:
             again.wait_for(lambda: _is_back(again, iteration))
             seconds = time.monotonic() - started
     strike.judge(f"back at iteration {iteration:.0f} after {seconds:.1f} s", seconds <= 20.0, seconds)
 
 
-def two_drivers(strike: Strike) -> None:
-    """Freeze a driver past its claim in Redis, begin another one of the same run id elsewhere, let the first go on."""
+def two_drivers(strike: Strike, how: str) -> None:
+    """Keep a driver from its claim in Redis until another one of the same run id has begun elsewhere.
+
+    Args:
+        strike: what is noted.
+        how: ``frozen``: the first driver is; ``parted``: the network between it and Redis is.
+    """
     with ExitStack() as stack:
-        place = stack.enter_context(scratch())
-        redis = stack.enter_context(RedisServer(place / "redis"))
-        stack.enter_context(with_redis(redis.address.url))
-        with run_of(strike, runtime="local") as first:
+        redis = stack.enter_context(redis_to_strike("parted"))
+        first = stack.enter_context(run_of(strike, runtime="local", variables=redis.variables))
+        if how == "frozen":
             os.kill(first.pid, signal.SIGSTOP)
-            time.sleep(12.0)
-            with scratch() as home, Training(home, ["--config", str(RECIPE_FILE), *overrides(SETTINGS)],
-                                             runtime="local") as second:  # fmt: skip
-                second.wait_until("iteration", 2)
-                there = len(_rows(first))
-                os.kill(first.pid, signal.SIGCONT)
-                watcher = Watcher(first, strike)
-                while first.ended is None and watcher.since() < 60.0:
-                    time.sleep(0.05)
-                seconds, said = watcher.since(), first.last_words()
-                grown = len(_rows(first)) - there
-                alive = second.ended is None
+        else:
+            redis.away()
+        time.sleep(12.0)
+        home = stack.enter_context(scratch())
+        second = stack.enter_context(Training(home, ARGUMENTS, runtime="local", variables=redis.direct))
+        second.wait_until("iteration", 2)
+        there = len(rows_of(first))
+        if how == "frozen":
+            os.kill(first.pid, signal.SIGCONT)
+        else:
+            redis.come_back()
+        watcher = Watcher(first, strike)
+        while first.ended is None and watcher.since() < 60.0:
+            time.sleep(0.05)
+        seconds, said = watcher.since(), first.last_words()
+        grown, alive = len(rows_of(first)) - there, second.ended is None
     measured = f"it stops after {seconds:.1f} s, having recorded {grown} more iterations: {said[:90]}"
-    strike.judge(measured, seconds <= 5.0 and alive and "taken over" in said and grown <= 1, seconds)
+    few = grown <= 1 or how == "parted"
+    strike.judge(measured, seconds <= 5.0 and alive and "taken over" in said and few, seconds)
 
 
 def full_disk(strike: Strike) -> None:
     """Fill the disk that a run writes to, and make room again."""
-    with scratch() as home:
+    with ExitStack() as stack:
+        home = stack.enter_context(scratch())
         (home / "runs").mkdir()
         command = ["mount", "-t", "tmpfs", "-o", "size=60m", "tmpfs", str(home / "runs")]
         if shutil.which("mount") is None or subprocess.run(command, capture_output=True, check=False).returncode:
             strike.measured = "not measured: no disk can be mounted here"
             return
-        try:
-            arguments = ["--config", str(RECIPE_FILE), *overrides(SETTINGS), "--num-actors", "2"]
-            with Training(home, arguments) as training:
-                training.wait_until("iteration", CALM)
-                filler = home / "runs" / "filler"
-                watcher = Watcher(training, strike)
-                with filler.open("wb") as file:
-                    try:
-                        while file.write(bytes(100_000)):
-                            file.flush()
-                    except OSError:
-                        pass
-                full = watcher.until(lambda status: status.condition == "disk", 120.0)
-                vanished = any("vanished" in str(each) for each in (training.status() or _no_status()).warnings)
-                filler.unlink()
-                back = watcher.until(lambda status: status.condition == "well", 60.0)
-                training.stop()
-                log = training.log_file.read_text(errors="replace")
-                strike.tracebacks = log.count("Traceback (most recent call last)")
-        finally:
-            subprocess.run(["umount", "-l", str(home / "runs")], capture_output=True, check=False)
-    measured = f"the status says disk after {_s(full)}, and well again {'yes' if back else 'no'}"
-    strike.judge(measured, full is not None and back is not None and not vanished, full)
+        unmount = ["umount", "-l", str(home / "runs")]
+        stack.callback(lambda: subprocess.run(unmount, capture_output=True, check=False))
+        training = stack.enter_context(run_of(strike, home=home))
+        filler = home / "runs" / "filler"
+        watcher = Watcher(training, strike)
+        with filler.open("wb") as file, suppress(OSError):
+            while file.write(bytes(100_000)):
+                file.flush()
+        full = watcher.until(lambda status: status.condition == "disk", 120.0)
+        watcher.until(lambda status: False, 30.0)
+        filler.unlink()
+        back = watcher.until_well()
+    states = {state for _, state, _ in strike.conditions}
+    measured = (
+        f"the status says disk after {seconds_text(full)}, and well again {seconds_text(back)} after the strike; its "
+        f"state: {', '.join(sorted(states))}"
+    )
+    strike.judge(measured, full is not None and back is not None and states == {"running"}, full)
 
 
 def without_redis(strike: Strike, how: str) -> None:
-    """Freeze Redis, kill it, or cut its file; let it come back."""
-    with ExitStack() as stack:
-        place = stack.enter_context(scratch())
-        redis, away, come_back = stack.enter_context(_redis(place, how))
-        stack.enter_context(with_redis(redis))
-        with run_of(strike) as training:
+    """Take Redis away, one way or another, and bring it back."""
+    with redis_to_strike(how) as redis, run_of(strike, variables=redis.variables) as training:
+        before = wait_for_all(training)
+        watcher = Watcher(training, strike)
+        redis.away()
+        noticed = watcher.until(lambda status: status.condition == "redis", 60.0)
+        learning = watcher.until_iterations(3, 120.0)
+        redis.come_back()
+        well = watcher.until_well()
+        killed = changed(before, workers_of(watcher.look()))
+    measured = (
+        f"the status says redis after {seconds_text(noticed)}, it {'goes on learning' if learning else 'stands still'},"
+        f" {'nobody killed' if not killed else 'killed: ' + ', '.join(killed)}, well again: {'yes' if well else 'no'}"
+    )
+    strike.judge(measured, None not in (noticed, learning, well) and not killed, noticed)
+
+
+def wrong_clock(strike: Strike) -> None:
+    """Let the clock of a run's machine jump an hour ahead, and an hour back, as seen from a machine that is right."""
+    if not Clock.is_there():
+        strike.measured = "not measured: libfaketime is not installed"
+        return
+    with scratch() as place:
+        clock = Clock(place)
+        with run_of(strike, runtime="local", variables=clock.variables) as training:
             watcher = Watcher(training, strike)
-            iteration = (training.status() or _no_status()).iteration
-            away()
-            noticed = watcher.until(lambda status: status.condition == "redis", 60.0)
-            learning = watcher.until(lambda status: status.iteration > iteration + 3, 120.0)
-            come_back()
-            well = watcher.until(lambda status: status.condition == "well", 60.0)
-    learned = "goes on learning" if learning else "stands still"
-    measured = f"the status says redis after {_s(noticed)}, it {learned}, well again: {'yes' if well else 'no'}"
-    strike.judge(measured, None not in (noticed, learning, well), noticed)
+            clock.jump(JUMP_S)
+            noticed = watcher.until(lambda status: status.condition == "clock", 60.0)
+            ahead = watcher.until_iterations(3)
+            clock.jump(-JUMP_S)
+            well = watcher.until_well()
+            back = watcher.until_iterations(3)
+            clock.jump(0)
+            right = watcher.until_iterations(3)
+            rates = [row["time/env_steps_per_s"] for row in rows_of(training)]
+    sane = min(rates) > 0.0 and max(rates) < 10.0 * statistics.median(rates)
+    learned = "goes on learning each time" if None not in (ahead, back, right) else "stands still"
+    measured = (
+        f"the status says clock after {seconds_text(noticed)}, well again: {'yes' if well else 'no'}, it {learned}, "
+        f"its rates are {'right' if sane else 'wrong'}"
+    )
+    strike.judge(measured, None not in (noticed, ahead, well, back, right) and sane, noticed)
 
 
 def resumed(strike: Strike, damage: Callable[[Path], None]) -> None:
     """Change what a run left behind, and resume it."""
     with scratch() as home:
-        arguments = ["--config", str(RECIPE_FILE), *overrides(SETTINGS | {"run.total_env_steps": 20_000})]
-        with Training(home, [*arguments, "--no-publish"], runtime="local") as training:
+        with Training(home, [*ARGUMENTS, "--no-publish"], runtime="local") as training:
             training.wait_until("iteration", CALM)
         path = training.directory.path
         damage(path)
@@ -357,46 +325,15 @@ def resumed(strike: Strike, damage: Callable[[Path], None]) -> None:
 # --- helpers ----------------------------------------------------------------------------------------------------------
 
 
-@contextmanager
-def _redis(place: Path, how: str) -> Iterator[tuple[str, Callable[[], object], Callable[[], object]]]:
-    """URL of a Redis, and what takes it away and brings it back."""
-    servers = [RedisServer(place / "redis")]
-    url = servers[0].address.url
-    port, password = int(url.rpartition(":")[2].partition("/")[0]), url.removeprefix("redis://:").partition("@")[0]
-
-    def come_back() -> None:
-        servers[-1].close()
-        if how == "cut":
-            for file in (place / "redis").rglob("*.aof"):
-                file.write_bytes(file.read_bytes()[: file.stat().st_size * 2 // 3])
-        servers.append(RedisServer(place / "redis", port=port, password=password))
-
-    try:
-        if how == "frozen":
-            pid = servers[0].pid
-            yield url, lambda: os.kill(pid, signal.SIGSTOP), lambda: os.kill(pid, signal.SIGCONT)
-        else:
-            yield url, lambda: servers[-1].kill(), come_back
-    finally:
-        servers[-1].close()
-
-
-def _rows(training: Training) -> list[dict[str, Any]]:
-    return read_jsonl(training.directory.metrics_file)
+def _signal(pid: int, kind: signal.Signals) -> None:
+    with suppress(ProcessLookupError):
+        os.kill(pid, kind)
 
 
 def _is_back(training: Training, iteration: float) -> bool:
     """Whether the second process of a run has come to an iteration."""
     status = training.status()
     return status is not None and status.epoch >= 2 and status.iteration >= iteration
-
-
-def _no_status() -> RunStatus:
-    raise TandemError("the run has no status")
-
-
-def _s(seconds: float | None) -> str:
-    return "never" if seconds is None else f"{seconds:.1f} s"
 
 
 def _cut_records(path: Path) -> None:
@@ -423,20 +360,29 @@ def _change_identity(path: Path) -> None:
 
 def strikes(spin_s: float) -> dict[str, tuple[str, Callable[[Strike], None]]]:
     """What must hold, and the strike, by name."""
+    replaced = "replaced in <= 60 s, nobody else killed, named"
+    away = "what was on it is replaced in <= 60 s, nothing lost"
     refused = "refused in one line, exit code 2"
     return {
-        "learner-frozen": ("replaced in <= 60 s, nobody else killed, named", lambda s: frozen_worker(s, "learner")),
-        "generator-frozen": ("replaced in <= 60 s, nobody else killed, named", lambda s: frozen_worker(s, "generator")),
+        "learner-frozen": (replaced, lambda s: frozen_worker(s, "learner")),
+        "generator-frozen": (replaced, lambda s: frozen_worker(s, "generator")),
         "actor-frozen": ("updates go on after <= 3 x its round + 2 s, replaced later", frozen_actor),
         "spinning": ("nobody is killed, no alert of a hang", lambda s: spinning(s, spin_s)),
         "driver-frozen": ("the status says stuck, nobody is killed", frozen_driver),
         "learner-killed-twice": ("nothing lost, <= 20 s", killed_twice),
         "driver-killed": ("back at the same iteration in <= 20 s", killed_driver),
-        "two-drivers": ("the first stops in <= 5 s and writes nothing more", two_drivers),
+        "two-drivers": ("the first stops in <= 5 s and writes nothing more", lambda s: two_drivers(s, "frozen")),
+        "two-drivers-parted": ("the first stops <= 5 s after the network is back", lambda s: two_drivers(s, "parted")),
         "disk-full": ("the status says disk, and well once there is room", full_disk),
         "redis-frozen": ("the status says redis, learning goes on", lambda s: without_redis(s, "frozen")),
         "redis-killed": ("the status says redis, learning goes on", lambda s: without_redis(s, "killed")),
         "redis-file-cut": ("the status says redis, learning goes on", lambda s: without_redis(s, "cut")),
+        "redis-parted": ("the status says redis, learning goes on", lambda s: without_redis(s, "parted")),
+        "clock-jumps": ("the status says clock, learning goes on", wrong_clock),
+        "node-frozen": (away, lambda s: lost_node(s, signal.SIGSTOP)),
+        "node-killed": (away, lambda s: lost_node(s, signal.SIGKILL)),
+        "learner-frozen-on-a-node": (replaced, lambda s: frozen_worker_on_a_node(s, "learner")),
+        "generator-frozen-on-a-node": (replaced, lambda s: frozen_worker_on_a_node(s, "generator")),
         "records-deleted": (refused, lambda s: resumed(s, lambda path: (path / "metrics.jsonl").unlink())),
         "records-cut": (refused, lambda s: resumed(s, _cut_records)),
         "records-changed": (refused, lambda s: resumed(s, _change_records)),

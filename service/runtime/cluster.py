@@ -11,9 +11,9 @@ The weights of an iteration and the task generator's snapshot come out together,
 both. No worker calls another, but for the learner's ranks among themselves: one that dies or freezes holds back
 iterations, and no round.
 
-The driver holds references, not data. Learner and generator hand back their whole state with every iteration, so when
-one dies, another goes on from there with the rollouts in hand: what an actor handed over is neither lost nor counted
-twice. A rank of the learner that dies or hangs ends all of them, and as many others go on.
+The driver hands on references, not data. Learner and generator hand back their whole state with every iteration, of
+which the driver's node keeps a copy; so when one dies, alone or with its node, another goes on from there with the
+rollouts in hand: what an actor handed over is neither lost, but with its own node, nor counted twice. A rank of the learner that dies or hangs ends all of them, and as many others go on.
 
 A worker hangs when it makes no progress (``watch``): it is ended, and then it is like one that died. Before that, an
 actor that is late no longer holds back updates. Time in which the driver itself did not run counts for nobody.
@@ -24,6 +24,7 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from functools import partial
 from typing import Any
 
@@ -89,6 +90,8 @@ class ClusterRun(Runner):
         super().__init__(config, directory)
         self._options = options
         self._waiting: dict[Any, Callable[[Any], None]] = {}
+        self._copies: dict[Any, Any] = {}
+        """What is needed to go on from the last iteration, by reference: held here, it outlives the node it is from."""
         self._slots = RolloutSlots()
         self._pending: list[PendingRollout] = []
         self._current: Iteration | None = None
@@ -118,6 +121,7 @@ class ClusterRun(Runner):
         begun = self._begin(self._generator, self._generator.handle.begin.options(num_returns=3).remote)
         self._generator.state, self._snapshot, self._opponents = begun
         self._version: int = ray.get(self._weights).version
+        self._keep_copies()
         self._pool = self._start_actors(first_incarnation)
         self._open_directory(resume=resume)
         if not resume:
@@ -380,6 +384,7 @@ class ClusterRun(Runner):
             self._opponents = iteration.opponents
         self._learner.keep(update)
         self._generator.state = iteration.generator_state
+        self._keep_copies()
         self._slots.publish([each.ticket for each in iteration.batch])
         self._current, self._grid = None, iteration.grid
         self._num_counted += len(updated.counted)
@@ -412,6 +417,20 @@ class ClusterRun(Runner):
             self._evaluated |= ray.get(reference)
         except RayError as error:
             _logger.warning("without this evaluation: %s", one_line(error))
+
+    def _keep_copies(self) -> None:
+        """Let the driver's node have what the next workers would begin with, and forget what is older.
+
+        On one machine, where all share a store, nothing is copied.
+        """
+        needed = [self._weights, self._snapshot, self._opponents, self._generator.state, *self._learner.states]
+        self._copies = {each: self._copies.get(each) for each in needed}
+        self._waiting |= {each: self._on_copy for each in needed if self._copies[each] is None}
+
+    def _on_copy(self, reference: Any) -> None:
+        if reference in self._copies:
+            with suppress(RayError):  # it went with its node, and who needs it will say so
+                self._copies[reference] = ray.get(reference)
 
     # --- looking after actors --------------------------------------------------------------------------------------
 

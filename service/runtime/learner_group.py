@@ -91,7 +91,8 @@ class LearnerGroup(Worker):
         self.locations: list[Location]
         """By rank, once all have started; empty before."""
         self._actor, self._config = actor, config
-        self._states = [ray.put(state)] if state is not None else []
+        self.states: list[Any] = [ray.put(state)] if state is not None else []
+        """References to the newest state of each rank; of one learner's after a start from a checkpoint."""
         self._pending = pending
         self._spawn()
 
@@ -104,7 +105,7 @@ class LearnerGroup(Worker):
                 (address,) = self._ask(ANSWER_S, [self._ranks[0].open_store.remote(RANK_ANSWER_S)], "open a port")
             pending = [self._pending] + [None] * (self.size - 1)  # as one learner would join it: before all others
             started = [
-                rank.start.remote(self._states, each, address, RANK_ANSWER_S)
+                rank.start.remote(self.states, each, address, RANK_ANSWER_S)
                 for rank, each in zip(self._ranks, pending, strict=True)
             ]
             self._ask(START_S, started, "find each other")
@@ -120,7 +121,7 @@ class LearnerGroup(Worker):
 
     def keep_first(self, states: list[Any]) -> None:
         """Go on from these states, of before the first update."""
-        self._states = states
+        self.states = states
 
     def update(self, rollouts: Sequence[Any]) -> Update:
         """Ask all ranks to learn from their shares of rollouts, given as references in the order of their ids."""
@@ -135,11 +136,11 @@ class LearnerGroup(Worker):
 
     def keep(self, update: Update) -> None:
         """Go on from the states after an update that is done."""
-        self._states, self._pending = update.states, None
+        self.states, self._pending = update.states, None
 
     def state(self) -> Arrays:
         """The newest state, as one learner would have it."""
-        return join_states(ray.get(self._states))
+        return join_states(ray.get(self.states))
 
     def note_answer(self, rank: int) -> None:
         """Note that a rank has answered an update."""
