@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks import time_to_skill
-from benchmarks.report import cluster, comparison, pretraining, scaling, skills, summary
+from benchmarks.report import attacks, cluster, comparison, pretraining, scaling, skills, summary
 from benchmarks.report.figures import (
     draw_ablations,
     draw_chaos,
@@ -44,13 +44,15 @@ PROGRAMS = {
     "chaos": "benchmarks.chaos of commit ddd0770",
     "rest_load": "benchmarks.rest_load of commit ddd0770",
     "soak": "benchmarks.soak of commit ddd0770",
+    "strikes": "tools.strikes",
+    "flood": "tools.flood",
     "scaling": "benchmarks.scaling",
     "ranks_on_nodes": "tools.ranks_on_nodes",
 }
 """Modules by the name of the recorded file that they make."""
 PAGES = {
     "results/pretraining.md": ("skill", "tasks", "curves", "curriculum", "coverage", "ablations", "throughput"),
-    "results/cluster.md": ("targets", "throughput", "chaos", "rest", "soak"),
+    "results/cluster.md": ("targets", "throughput", "chaos", "strikes", "rest", "flood", "soak"),
     "results/skills.md": ("coverage", "curves", "controls"),
     "results/comparison.md": ("rows", "longer"),
     "downstream.md": ("headline",),
@@ -210,6 +212,10 @@ class Report:
         if (chaos := found.get("chaos")) is not None:
             picture = self._show("Success, shot at and not", "cluster-chaos", draw_chaos, chaos)
             blocks["chaos"] = [cluster.chaos_words(chaos), picture, cluster.faults_table(chaos)]
+        if (strikes := found.get("strikes")) is not None:
+            blocks["strikes"] = [attacks.strikes_words(strikes), attacks.strikes_table(strikes)]
+        if (flood := found.get("flood")) is not None:
+            blocks["flood"] = [attacks.flood_table(flood), attacks.flood_words(flood)]
         if (rest := found.get("rest_load")) is not None:
             blocks["rest"] = [cluster.latency_table(rest), cluster.rest_words(rest)]
         if (soak := found.get("soak")) is not None:

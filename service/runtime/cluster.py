@@ -13,7 +13,8 @@ iterations, and no round.
 
 The driver hands on references, not data. Learner and generator hand back their whole state with every iteration, of
 which the driver's node keeps a copy; so when one dies, alone or with its node, another goes on from there with the
-rollouts in hand: what an actor handed over is neither lost, but with its own node, nor counted twice. A rank of the learner that dies or hangs ends all of them, and as many others go on.
+rollouts in hand: what an actor handed over is neither lost, but with its own node, nor counted twice. A rank of the
+learner that dies or hangs ends all of them, and as many others go on.
 
 A worker hangs when it makes no progress (``watch``): it is ended, and then it is like one that died. Before that, an
 actor that is late no longer holds back updates. Time in which the driver itself did not run counts for nobody.

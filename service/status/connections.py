@@ -6,12 +6,16 @@ What a client sends before its request is whole costs memory and a place, and no
 from __future__ import annotations
 
 import asyncio
+from collections import OrderedDict
 from typing import Any
+from weakref import WeakKeyDictionary
 
 from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol
+from uvicorn.server import ServerState
 
 MAX_CONNECTIONS = 512
-"""Open at once; further ones are closed with 503."""
+"""Open at once. A further one takes the place of the one that has waited longest for a request to become whole; where
+all have one, it is closed with 503."""
 MAX_HEAD_BYTES = 64 * 1024
 """Request line and headers; a browser's have one or two kilobytes."""
 HEAD_TIMEOUT_S = 10.0
@@ -25,26 +29,33 @@ _TOO_LARGE = (
 )
 
 
+_idle_ones: WeakKeyDictionary[ServerState, OrderedDict[BoundedConnection, None]] = WeakKeyDictionary()
+"""Connections of each server that wait for a request, the one that has waited longest first."""
+
+
 class BoundedConnection(HttpToolsProtocol):
     """One connection of uvicorn's, with these bounds."""
 
     def __init__(self, *args: Any, **options: Any) -> None:
         super().__init__(*args, **options)
         self._in_head = True
+        self._idle = _idle_ones.setdefault(self.server_state, OrderedDict())
         self._num_heads = self._num_head_bytes = 0
         self._deadline: asyncio.TimerHandle | None = None
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
-        """Begin to wait for a request, or close one connection too many."""
-        if len(self.connections) >= MAX_CONNECTIONS:
+        """Begin to wait for a request; one connection too many is closed, this one or another."""
+        if len(self.connections) >= MAX_CONNECTIONS and not self._take_place():
             transport.write(_BUSY)
             transport.close()
             return
         super().connection_made(transport)
+        self._idle[self] = None
         self._wait_for_head()
 
     def connection_lost(self, exc: Exception | None) -> None:
         """Forget it."""
+        self._idle.pop(self, None)
         self._stop_waiting()
         if self.transport is not None:
             super().connection_lost(exc)
@@ -65,6 +76,7 @@ class BoundedConnection(HttpToolsProtocol):
 
     def on_headers_complete(self) -> None:
         """Go on with a request whose head is whole."""
+        self._idle.pop(self, None)
         self._in_head, self._num_head_bytes = False, 0
         self._num_heads += 1
         self._stop_waiting()
@@ -74,6 +86,23 @@ class BoundedConnection(HttpToolsProtocol):
         """Expect the next request."""
         super().on_message_complete()
         self._in_head = True
+
+    def on_response_complete(self) -> None:
+        """Be idle until the next request."""
+        super().on_response_complete()
+        if self._in_head and self.cycle.response_complete:  # no further request has begun
+            self._idle[self] = None
+
+    def _take_place(self) -> bool:
+        """Close the connection that has been idle for longest; False where none is."""
+        longest = next((each for each in self._idle if not each.transport.get_write_buffer_size()), None)
+        if longest is None:
+            return False
+        longest._stop_waiting()
+        del self._idle[longest]
+        self.connections.discard(longest)
+        longest.transport.abort()
+        return True
 
     def _wait_for_head(self) -> None:
         if self._deadline is None:

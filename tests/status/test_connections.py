@@ -86,18 +86,48 @@ def test_requests_one_after_the_other_and_long_bodies_are_no_long_heads(server):
         assert client.get("/livez", headers={"x": "a" * 30_000}).status_code == 200
 
 
-def test_no_more_connections_than_may_be(server, monkeypatch):
-    monkeypatch.setattr(connections, "MAX_CONNECTIONS", 5)
-    open_ones = [connect(server) for _ in range(5)]
+def wait_for_connections(server, num):
     deadline_s = time.monotonic() + 60.0
-    while len(server._server.server_state.connections) < 5 and time.monotonic() < deadline_s:
+    while len(server._server.server_state.connections) != num and time.monotonic() < deadline_s:
         time.sleep(0.01)
+    assert len(server._server.server_state.connections) == num
+
+
+def test_where_all_places_are_taken_the_longest_idle_connection_gives_way(server, monkeypatch):
+    monkeypatch.setattr(connections, "MAX_CONNECTIONS", 5)
+    oldest, second = connect(server), connect(server)
+    wait_for_connections(server, 2)
+    others = [connect(server) for _ in range(3)]
+    wait_for_connections(server, 5)
+    oldest.sendall(b"GET /livez HTTP/1.1\r\nhost: localhost\r\n\r\n")  # it is no longer the one that is idle longest
+    assert oldest.recv(100).startswith(b"HTTP/1.1 200 ")
+    assert is_well(server)
+    assert received(second) == b""
+    wait_for_connections(server, 4)
+    for connection in (oldest, *others):
+        connection.close()
+    wait_for_connections(server, 0)
+
+
+def test_no_more_connections_than_may_be_where_all_have_a_request(server, monkeypatch):
+    monkeypatch.setattr(connections, "MAX_CONNECTIONS", 5)
+    waiting, over = threading.Semaphore(0), threading.Event()
+    monkeypatch.setattr(DiskReader, "run", lambda *_: waiting.release() or over.wait(60.0))
+    asking = []
+    for number in range(5):
+        asking.append(connect(server))
+        token = BEARER["Authorization"]
+        asking[-1].sendall(
+            f"GET /v1/runs/{number} HTTP/1.1\r\nhost: localhost\r\nauthorization: {token}\r\n\r\n".encode()
+        )
+        assert waiting.acquire(timeout=60.0)
     with connect(server) as one_too_many:
         assert received(one_too_many).startswith(b"HTTP/1.1 503 ")
-    for connection in open_ones:
+    over.set()
+    for connection in asking:
+        assert connection.recv(100).startswith(b"HTTP/1.1 ")  # it was left alone
         connection.close()
-    while len(server._server.server_state.connections) and time.monotonic() < deadline_s:
-        time.sleep(0.01)
+    wait_for_connections(server, 0)
     assert is_well(server)
 
 
