@@ -51,6 +51,8 @@ class Strike:
     tracebacks: int = 0
     lasted_s: float = 0.0
     """Seconds from the strike to the last look."""
+    commit: str = ""
+    """Of the code that was struck."""
 
     def judge(self, measured: str, reached: bool, seconds: float | None = None) -> None:
         """Note the outcome; with a traceback anywhere it is not reached."""

@@ -228,7 +228,7 @@ def two_drivers(strike: Strike, how: str) -> None:
             time.sleep(0.05)
         seconds, said = watcher.since(), first.last_words()
         grown, alive = len(rows_of(first)) - there, second.ended is None
-    measured = f"it stops after {seconds:.1f} s, having recorded {grown} more iterations: {said[:90]}"
+    measured = f"it stops after {seconds:.1f} s, having recorded {grown} more iterations: {said}"
     few = grown <= 1 or how == "parted"
     strike.judge(measured, seconds <= 5.0 and alive and "taken over" in said and few, seconds)
 
@@ -318,8 +318,8 @@ def resumed(strike: Strike, damage: Callable[[Path], None]) -> None:
         done = subprocess.run(command, cwd=ROOT, env=environment(home), capture_output=True, text=True, check=False)
     lines = [line for line in done.stderr.splitlines() if line.strip()]
     strike.tracebacks = done.stderr.count("Traceback")
-    said = lines[-1] if lines else "nothing"
-    strike.judge(f"exit code {done.returncode}: {said[:160]}", done.returncode == 2 and len(lines) == 1)
+    said = lines[-1].replace(str(path), "RUN") if lines else "nothing"
+    strike.judge(f"exit code {done.returncode}: {said}", done.returncode == 2 and len(lines) == 1)
 
 
 # --- helpers ----------------------------------------------------------------------------------------------------------
@@ -402,22 +402,29 @@ def main() -> int:
     names = given.only.split(",") if given.only else list(known)
     if wrong := [name for name in names if name not in known]:
         parser.error(f"--only: no strike {wrong[0]!r}; choose of {', '.join(known)}")
-    done: list[Strike] = []
+    done = _recorded(given.json)
     for name in names:
         must, play = known[name]
-        strike = Strike(name, must)
-        done.append(strike)
+        strike = done[name] = Strike(name, must)
         try:
             play(strike)
         except Exception as error:
             traceback.print_exc()
             strike.judge(f"{type(error).__name__}: {str(error)[:160]}", reached=False)
+        where = machine("ray", "torch", "mujoco")
+        strike.commit = where["git_commit"]
         print(f"{name}: {strike.measured} ({strike.reached})", flush=True)
         if given.json is not None:
-            where = machine("ray", "torch", "mujoco")
-            tree = [asdict(each) for each in done]
+            tree = [asdict(done[name]) for name in known if name in done]
             write_json(given.json, {"tool": "strikes", "machine": where, "strikes": tree})
-    return int(any(strike.reached is False for strike in done))
+    return int(any(done[name].reached is False for name in names))
+
+
+def _recorded(file: Path | None) -> dict[str, Strike]:
+    """Strikes that a file has already, by name; those struck again take their places."""
+    if file is None or not file.exists():
+        return {}
+    return {each["name"]: Strike(**each) for each in json.loads(file.read_text())["strikes"]}
 
 
 if __name__ == "__main__":

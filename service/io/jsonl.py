@@ -63,7 +63,9 @@ class Damage:
     @property
     def text(self) -> str:
         """The damage in words, without the file."""
-        parts = [f"the records of iterations {_ranges(self.lost)} are missing or changed"] if self.lost else []
+        many = "the records of iterations" if len(self.lost) > 1 else "the record of iteration"
+        be = "are" if len(self.lost) > 1 else "is"
+        parts = [f"{many} {_ranges(self.lost)} {be} missing or changed"] if self.lost else []
         parts += [f"{self.num_foreign} lines are not the run's"] if self.num_foreign else []
         return " and ".join(parts) or "its lines are in another order"
 

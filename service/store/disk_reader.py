@@ -117,11 +117,12 @@ class DiskReader:
         if (ahead := ahead_s(status.heartbeat)) is not None and status.state in ACTIVE:
             text = f"its heartbeat is {ahead:.0f} s in the future: the clock of its machine, or the one here, is wrong"
             status = status.suffering("clock", text)
-        if status.state in ACTIVE and age_s > QUIET_S and is_locked(path):
-            status = _with_full_disk(status, path)
-        if status.condition == "disk" or not status.is_silent(age_s):
+        if status.state not in ACTIVE or age_s <= QUIET_S:
             return status
-        return _why_silent(status, path, age_s) if is_locked(path) else status.vanished()
+        silent = status.is_silent(age_s)
+        if not is_locked(path):
+            return status.vanished() if silent else status
+        return _why_quiet(status, path) or (_why_silent(status, path, age_s) if silent else status)
 
     def _find(self, run_id: str) -> tuple[Path, RecordFile]:
         runs = self._list()
@@ -171,19 +172,21 @@ def _why_silent(status: RunStatus, path: Path, age_s: float) -> RunStatus:
     """The status of a silent run whose process lives, since it has the lock."""
     host, pid = holder(path) or ("", 0)
     who = f"its process {pid} on {host}" if pid else "its process"
-    if host == socket.gethostname() and _is_stopped(pid):
-        return status.suffering("stuck", f"{who} is frozen by a signal; kill -CONT {pid} lets it go on")
     text = f"{who} lives, and has not been heard of for {age_s:.0f} s: it is frozen, hangs, or cannot write here"
     return status.suffering("stuck", f"{text}; once it is ended, --resume goes on from its last checkpoint")
 
 
-def _with_full_disk(status: RunStatus, path: Path) -> RunStatus:
-    """The status of a run whose process lives and is quiet: where its disk is full, that is why."""
+def _why_quiet(status: RunStatus, path: Path) -> RunStatus | None:
+    """The status of a run whose process lives and is quiet: a signal froze it, its disk is full, or None."""
+    host, pid = holder(path) or ("", 0)
+    if host == socket.gethostname() and _is_stopped(pid):
+        text = f"its process {pid} on {host} is frozen by a signal; kill -CONT {pid} lets it go on"
+        return status.suffering("stuck", text)
     with suppress(OSError):
         if (free := shutil.disk_usage(path).free) < FULL_BYTES:
             text = f"its process lives, and cannot say how it is: the disk of {path} is full ({free:,} bytes are left)"
             return status.suffering("disk", text)
-    return status
+    return None
 
 
 def _is_stopped(pid: int) -> bool:

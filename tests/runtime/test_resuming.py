@@ -73,9 +73,9 @@ def swap_lines(path):
     ("damage", "said"),
     [
         (lambda path: path.unlink(), "the records of iterations 1-{last} are missing or changed"),
-        (cut, "the records of iterations {last} are missing or changed"),
-        (leave_out_a_line, "the records of iterations 2 are missing or changed"),
-        (change_a_byte, "the records of iterations 2 are missing or changed"),
+        (cut, "the record of iteration {last} is missing or changed"),
+        (leave_out_a_line, "the record of iteration 2 is missing or changed"),
+        (change_a_byte, "the record of iteration 2 is missing or changed"),
         (add_a_line, "1 lines are not the run's"),
         (swap_lines, "its lines are in another order"),
     ],
@@ -93,7 +93,7 @@ def test_a_hole_that_is_accepted_is_named_and_asked_about_once(run, tmp_path):
     last = newest(run).step
     change_a_byte(run / "metrics.jsonl")
     go_on(run, accept=True, steps=600)  # nothing is left to do, and it is saved all the same
-    said = ("metrics.jsonl: the records of iterations 2 are missing or changed",)
+    said = ("metrics.jsonl: the record of iteration 2 is missing or changed",)
     (event,) = read_history(run).events
     assert (event.after_iteration, event.damaged_records) == (last, said)
     assert [row["iteration"] for row in read_lines(run / "metrics.jsonl")] == [1, *range(3, last + 1)]

@@ -235,6 +235,25 @@ def test_a_frozen_process_is_stuck_and_named(held, monkeypatch):
     assert_one_line(held.run("cube").warnings[-1], "frozen by a signal", f"kill -CONT {os.getpid()}")
 
 
+def test_a_frozen_process_is_seen_long_before_it_is_silent(tmp_path, monkeypatch):
+    lock = DirectoryLock(tmp_path / "cube", "")
+    heartbeat = datetime.now(UTC) - timedelta(seconds=disk_reader.QUIET_S + 2)
+    DiskWriter(tmp_path / "cube").status(a_status(heartbeat=heartbeat))
+    reader = DiskReader(tmp_path)
+    assert reader.run("cube").condition == "well"
+    monkeypatch.setattr(disk_reader, "_is_stopped", lambda pid: pid == os.getpid())
+    assert reader.run("cube").condition == "stuck"
+    lock.release()
+
+
+def test_a_run_that_vanished_while_its_disk_was_full_has_vanished(tmp_path):
+    (tmp_path / "cube").mkdir()
+    DiskWriter(tmp_path / "cube").status(a_silent_status().suffering("disk", "no room"))
+    seen = DiskReader(tmp_path).run("cube")
+    assert (seen.state, seen.condition) == ("interrupted", "well")
+    assert "vanished" in seen.last_error
+
+
 def test_who_is_stopped():
     with subprocess.Popen(["sleep", "60"]) as process:
         assert not disk_reader._is_stopped(process.pid)
