@@ -25,7 +25,6 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Callable
-from contextlib import suppress
 from functools import partial
 from typing import Any
 
@@ -41,6 +40,7 @@ from service.io.run_directory import RunDirectory
 from service.learner.weights import MAX_POLICY_LAG
 from service.policies.parameters import Parameters, PolicyError
 from service.runtime.actor_pool import ActorPool, ActorSlot
+from service.runtime.copies import Copies
 from service.runtime.iteration import Iteration, PendingRollout
 from service.runtime.learner_group import LearnerGroup, Update, check_room, num_gpus
 from service.runtime.ray_actors import GeneratorActor, LearnerActor, remote_actor
@@ -91,8 +91,7 @@ class ClusterRun(Runner):
         super().__init__(config, directory)
         self._options = options
         self._waiting: dict[Any, Callable[[Any], None]] = {}
-        self._copies: dict[Any, Any] = {}
-        """What is needed to go on from the last iteration, by reference: held here, it outlives the node it is from."""
+        self._copies = Copies()
         self._slots = RolloutSlots()
         self._pending: list[PendingRollout] = []
         self._current: Iteration | None = None
@@ -420,18 +419,9 @@ class ClusterRun(Runner):
             _logger.warning("without this evaluation: %s", one_line(error))
 
     def _keep_copies(self) -> None:
-        """Let the driver's node have what the next workers would begin with, and forget what is older.
-
-        On one machine, where all share a store, nothing is copied.
-        """
+        """Let the driver's node have what the next workers would begin with."""
         needed = [self._weights, self._snapshot, self._opponents, self._generator.state, *self._learner.states]
-        self._copies = {each: self._copies.get(each) for each in needed}
-        self._waiting |= {each: self._on_copy for each in needed if self._copies[each] is None}
-
-    def _on_copy(self, reference: Any) -> None:
-        if reference in self._copies:
-            with suppress(RayError):  # it went with its node, and who needs it will say so
-                self._copies[reference] = ray.get(reference)
+        self._waiting |= self._copies.keep(needed)
 
     # --- looking after actors --------------------------------------------------------------------------------------
 
