@@ -56,9 +56,8 @@ def move_alias(directory: Path, alias: str, number: int, *, back: bool = True) -
     path = directory / check_alias(alias)
     with os_errors("write", path):
         directory.mkdir(parents=True, exist_ok=True)
-        descriptor = os.open(
-            directory / ".lock", os.O_RDWR | os.O_CREAT, 0o666
-        )  # reading, too: never waits for a reader
+        # to read it as well, so that opening a FIFO does not wait for a reader
+        descriptor = os.open(directory / ".lock", os.O_RDWR | os.O_CREAT, 0o666)
         with open(descriptor, "a") as lock:
             fcntl.flock(lock, fcntl.LOCK_EX)  # closing the file frees it, and so does the process's death
             if back or (read_alias(directory, alias) or 0) < number:

@@ -119,10 +119,8 @@ def pretrain(
                     to = Registry(registry) if publish else None
                     done = _run(run, config, directory, to, signals, report, on_iteration)
                 except StateLostError as error:  # with a machine of the cluster
-                    num_lost, furthest = (
-                        (num_lost + 1 if run.iteration <= furthest else 1),
-                        max(furthest, run.iteration),
-                    )
+                    num_lost = num_lost + 1 if run.iteration <= furthest else 1
+                    furthest = max(furthest, run.iteration)
                     if num_lost >= MAX_STATES_LOST:
                         raise
                     _logger.warning("%s", error)

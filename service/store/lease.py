@@ -71,7 +71,7 @@ class Lease:
         holder, epoch = pipe.get(self._key), pipe.get(self._epoch_key)
         if holder not in (None, self._mine):
             raise RunTakenError(f"run {self._run_id} was taken over by {_describe(holder)}")
-        if epoch not in (None, b"%d" % self._epoch):
+        if epoch is not None and not (epoch.isdigit() and int(epoch) <= self._epoch):
             raise RunTakenError(f"run {self._run_id} was taken over by another process, which has ended since")
         pipe.multi()
         pipe.set(self._key, self._mine, px=self._duration_ms)

@@ -67,9 +67,8 @@ class RecordFile:
         if file.read(len(self._seal)) != self._seal:  # cut by a resume, or another file
             self._forget()
             file.seek(0)
-        while (line := file.readline(_MAX_LINE_BYTES)).endswith(
-            b"\n"
-        ):  # a longer one is no record, nor is what follows
+        # a line that is longer is no record, nor is what follows it
+        while (line := file.readline(_MAX_LINE_BYTES)).endswith(b"\n"):
             self._take(line)
             self._end += len(line)
             self._seal = line[-_SEAL_BYTES:]

@@ -298,6 +298,26 @@ def test_a_driver_that_was_frozen_while_another_began_and_ended_writes_nothing(r
     assert client.get(keys.run_key("cube", "epoch")) == b"2"
 
 
+@pytest.mark.parametrize(("number", "goes_on"), [(b"3", True), (b"2", True), (b"4", False), (b"many", False)])
+def test_only_a_higher_number_is_a_takeover(redis, reader, number, goes_on):
+    """A Redis that begins again from an older copy has an older number."""
+    client, key = redis.address.client(1.0), keys.run_key("cube", "epoch")
+    client.set(key, 2)
+    writer = RedisWriter(redis.address, "cube")
+    client.set(key, number)
+    if goes_on:
+        wait_until(lambda: client.get(key) == b"3")
+        client.set(key, number)
+        writer.status(a_status(iteration=7))
+        wait_until(lambda: [run.iteration for run in reader.runs()] == [7])
+        writer.check()
+    else:
+        wait_until(lambda: not writer._thread.is_alive())
+        with pytest.raises(RunTakenError):
+            writer.check()
+    writer.close()
+
+
 def test_a_lease_that_never_expires_is_no_endless_wait(redis):
     redis.address.client(1.0).set(keys.run_key("cube", "lease"), b"\xff nobody")
     with pytest.raises(RunTakenError, match="another process"):
