@@ -29,6 +29,7 @@ HEAVY = (
 CLUSTER_MODULES = (
     "actor_pool",
     "cluster",
+    "copies",
     "learner_group",
     "ray_actors",
     "ray_connection",
