@@ -38,9 +38,9 @@ def spread_out(worlds, rng, lowest_m=LOWEST_TARGET_M):
 @pytest.mark.parametrize(
     ("shape", "physics", "num_worlds", "least_share"),
     [
-        ("cube", FINE, 200, 0.99),
+        ("cube", FINE, 100, 0.99),
         ("cube", COARSE, 150, 0.99),
-        ("sphere", FINE, 200, 0.95),
+        ("sphere", FINE, 100, 0.95),
         ("sphere", COARSE, 100, 0.95),
     ],
     ids=["cube", "cube-coarse", "sphere", "sphere-coarse"],

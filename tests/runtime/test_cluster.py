@@ -16,7 +16,7 @@ from service.errors import DivergedError
 from service.io.checkpoints import CheckpointStore
 from service.io.run_directory import RunDirectory
 from service.runtime.cluster import ClusterRun
-from service.runtime.learner_group import LearnerGroup, num_gpus
+from service.runtime.learner_group import LearnerGroup
 from service.runtime.ray_actors import NICENESS
 from service.runtime.ray_connection import ClusterOptions, connected
 from service.runtime.runner import ClusterError, StateLostError
@@ -312,16 +312,6 @@ def test_a_learner_that_is_killed_before_the_run_has_begun_is_started_again(tmp_
     assert newest(tmp_path).step == 0
 
 
-@pytest.mark.parametrize(
-    ("address", "said"), [("127.0.0.1:1", "no Ray cluster answers there"), ("head:x", "HOST:PORT")]
-)
-def test_no_cluster_at_an_address_is_one_line(address, said):
-    with pytest.raises(ClusterError, match=said) as error, connected(address):
-        pass
-    assert "\n" not in str(error.value)
-    assert address in str(error.value)
-
-
 def test_a_policy_that_diverges_ends_the_run_with_how_to_go_on(tmp_path):
     """Parameters that are not finite, as a learning rate far too high would make them."""
 
@@ -349,11 +339,3 @@ def test_a_snapshot_lost_with_its_machine_sends_the_run_back(tmp_path):
     with pytest.raises(StateLostError, match=r"goes back to its newest checkpoint") as error:
         run_cluster(tmp_path, tiny_config(total_env_steps=10**9), num_actors=1, on_iteration=lose)
     assert "\n" not in str(error.value)
-
-
-@pytest.mark.parametrize(
-    ("device", "there", "asked"), [("cpu", 2.0, 0), ("cuda", 0.0, 1), ("auto", 0.0, 0), ("auto", 2.0, 1)]
-)
-def test_the_learner_asks_for_a_gpu(monkeypatch, device, there, asked):
-    monkeypatch.setattr("ray.cluster_resources", lambda: {"CPU": 8.0} | ({"GPU": there} if there else {}))
-    assert num_gpus(device, 1) == asked

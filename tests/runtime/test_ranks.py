@@ -13,7 +13,7 @@ from service.errors import ConfigError
 from service.io.run_directory import RunDirectory
 from service.runtime import learner_group
 from service.runtime.cluster import ClusterRun
-from service.runtime.learner_group import check_room
+from service.runtime.learner_group import check_room, num_gpus
 from service.runtime.local import LocalRun
 from service.runtime.ray_connection import ClusterOptions, connected
 from service.runtime.resuming import resumed_config
@@ -128,6 +128,14 @@ def test_more_ranks_than_cores_or_gpus_is_one_line(monkeypatch):
     with pytest.raises(ClusterError) as error:
         check_room(2, "cuda", 1.0, 1)
     assert_one_line(error.value, "learner.num_learners = 2", "each rank takes a GPU", "has 1")
+
+
+@pytest.mark.parametrize(
+    ("device", "there", "asked"), [("cpu", 2.0, 0), ("cuda", 0.0, 1), ("auto", 0.0, 0), ("auto", 2.0, 1)]
+)
+def test_the_learner_asks_for_a_gpu(monkeypatch, device, there, asked):
+    monkeypatch.setattr("ray.cluster_resources", lambda: {"CPU": 8.0} | ({"GPU": there} if there else {}))
+    assert num_gpus(device, 1) == asked
 
 
 def test_cores_of_ranks():

@@ -189,3 +189,13 @@ def test_an_error_of_rays_own_is_one_line():
     with pytest.raises(ClusterError) as error, explaining_ray_errors():
         dies()
     assert_one_line(error.value, "Ray gave up: ActorDiedError: The actor died unexpectedly", "--resume")
+
+
+@pytest.mark.parametrize(
+    ("address", "said"), [("127.0.0.1:1", "no Ray cluster answers there"), ("head:x", "HOST:PORT")]
+)
+def test_no_cluster_at_an_address_is_one_line(address, said):
+    with pytest.raises(ClusterError, match=said) as error, connected(address):
+        pass
+    assert "\n" not in str(error.value)
+    assert address in str(error.value)
