@@ -12,12 +12,22 @@ from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
 import yaml
-from pydantic import BaseModel, BeforeValidator, Field, PositiveInt, ValidationError, model_validator
+from pydantic import (
+    BaseModel,
+    BeforeValidator,
+    Discriminator,
+    Field,
+    PositiveInt,
+    Tag,
+    ValidationError,
+    model_validator,
+)
 
 from service.config_tree import RENAMED, apply_override, read_yaml, updated
 from service.errors import ConfigError
 from service.frozen import FrozenModel
 from service.off_policy_config import SkillsConfig
+from service.robot_config import RobotConfig, read_robot
 
 MIN_ROWS = 32
 """Least rows of a minibatch for each of several learners. Ranks pay off from about a thousand on."""
@@ -46,9 +56,22 @@ class WorkspaceConfig(FrozenModel):
         return self.center_x_m + self.length_x_m / 2, self.center_y_m + self.length_y_m / 2, self.height_m
 
 
+def _read_robot(value: Any) -> Any:
+    return read_robot(Path(value)) if isinstance(value, str) and value != "panda" else value
+
+
+_BUILT_IN, _DESCRIBED = "built-in", "described"
+Robot = Annotated[
+    Annotated[Literal["panda"], Tag(_BUILT_IN)] | Annotated[RobotConfig, Tag(_DESCRIBED)],
+    Discriminator(lambda value: _BUILT_IN if isinstance(value, str) else _DESCRIBED),
+    BeforeValidator(_read_robot),
+]
+
+
 class WorldConfig(FrozenModel):
     """The MuJoCo world: robot, table, one rigid object."""
 
+    robot: Robot = Field("panda", description="panda, or a YAML file with a description of yours (docs/robots.md)")
     object: Literal["cube", "sphere"] = "cube"
     object_size_m: float = Field(0.05, ge=0.02, le=0.07, description="cube edge or sphere diameter; paper: 5 cm")
     object_mass_kg: float = Field(0.1, gt=0.0, le=2.0)
@@ -439,7 +462,7 @@ def parse_config(tree: dict[str, Any], *, where: str, recorded: bool = False) ->
         return Config.model_validate(updated(tree, where=where) if recorded else tree)
     except ValidationError as error:
         first = error.errors()[0]
-        key = ".".join(str(part) for part in first["loc"]) or "the top level"
+        key = ".".join(str(part) for part in first["loc"] if part not in (_BUILT_IN, _DESCRIBED)) or "the top level"
         found = "" if isinstance(first["input"], dict) else f" = {first['input']!r}"  # a whole group says nothing
         more = f" (and {error.error_count() - 1} more)" if error.error_count() > 1 else ""
         if key in RENAMED:

@@ -10,9 +10,9 @@ import numpy as np
 from mujoco import rollout
 
 from service.config import WorldConfig
-from service.envs import kinematics
 from service.envs.observations import ACTION, BOB_VALUE, FULL, POSITIONS, ObservationLayout
-from service.envs.panda import FINGER_STROKE_M, NUM_FINGERS, NUM_JOINTS
+from service.envs.reach import reach_of
+from service.envs.robot import Robot, described
 from service.envs.sampling import draw_starts
 from service.envs.scene import build_layout, build_spec
 from service.errors import DivergedError
@@ -22,14 +22,10 @@ DISPLACEMENT_M = 0.05
 """End-effector displacement of a full action (paper)."""
 WIDTH_CHANGE_M = 0.10
 """Change of the finger width of a full action (paper)."""
-LOWEST_TARGET_M = 0.012
-"""Least height of a commanded end effector; the fingertips end 0.7 cm below it."""
 MAX_TURN_RAD = 0.5
 """Most a joint is asked to turn in one action; behind the base and near a straight arm the solution would ask for 2."""
 MAX_SPEED = 1e3
 """A joint (rad/s) or object (m/s, rad/s) faster than this has diverged; the arm reaches 3, a falling object 30."""
-_NUM_SERVOS = NUM_JOINTS + NUM_FINGERS
-_NUM_CONTROLS = _NUM_SERVOS + 1  # the object's weight is an actuator that ignores its control
 _PHYSICS = int(mujoco.mjtState.mjSTATE_FULLPHYSICS)
 _CONTROL_AND_BOX = int(mujoco.mjtState.mjSTATE_CTRL) | int(mujoco.mjtState.mjSTATE_MOCAP_POS)
 
@@ -55,6 +51,10 @@ class WorldBatch:
         self.config = config
         self.num_worlds = num_worlds
         self.model = build_spec(config).compile()
+        self.robot = Robot(config, self.model)
+        robot = described(config)
+        self.reach = reach_of(robot, self.robot.arm)
+        """Where the end effector can be commanded to."""
         _quieten_mujoco()
         num_threads = min(num_threads or os.cpu_count() or 1, num_worlds)
         self._pool = rollout.Rollout(nthread=num_threads if num_threads > 1 else 0)
@@ -62,16 +62,18 @@ class WorldBatch:
         self.layout = build_layout(config, blocked_fraction=blocked_fraction)
         """Columns of ``states``."""
         assert (self.model.nq, self.model.nv) == (self.layout.num_positions, self.layout.num_velocities)
-        assert self.model.nu == _NUM_CONTROLS
+        # The object's weight is an actuator, too, the last, which ignores its control.
+        assert self.model.nu == self.robot.num_joints + self.robot.num_fingers + 1
         assert mujoco.mj_stateSize(self.model, _PHYSICS) == self.layout.physics.stop
         self.blocked_fraction = blocked_fraction
         """Share of later starts with a blocked gripper; more than 0 only where it was when the batch was made."""
         self._control_spec = _CONTROL_AND_BOX if self.model.nmocap else int(mujoco.mjtState.mjSTATE_CTRL)
-        self._widest_m = 2 * FINGER_STROKE_M if config.gripper == "free" else 0.0
+        self.reach.check(config.workspace, robot.name)
+        self._widest_m = self.robot.opening_m if config.gripper == "free" else 0.0
         self._fresh_state = self._make_fresh_state()
         self.states: StateArray = np.tile(self._fresh_state, (num_worlds, 1))
         """(N, S)."""
-        self._kinematics = kinematics.forward(self.joints)
+        self._kinematics = self.robot.arm.forward(self.joints)
         self.num_diverged = 0
         self.diverged: list[tuple[StateArray, FloatArray]] = []
         """(last finite state, action) of every world whose physics diverged; whoever reports them clears the list."""
@@ -90,7 +92,7 @@ class WorldBatch:
 
     @property
     def joints(self) -> StateArray:
-        """(N, 7) arm joint angles, rad."""
+        """(N, J) joints of the arm, rad or metres."""
         return self.states[:, self.layout["joints"]]
 
     @property
@@ -123,14 +125,14 @@ class WorldBatch:
         states[:, self.layout["object"]], states[:, self.layout["box_place"]] = draw_starts(rng, num, self.config)
         if self.blocked_fraction:
             blocked = rng.random(num) < self.blocked_fraction
-            states[blocked, self.layout["fingers"]] = 0.0
+            states[blocked, self.layout["fingers"]] = self.robot.finger_values(np.zeros(1))
             states[:, self.layout["gripper_blocked"]] = blocked[:, None]
         return states
 
     def restore(self, states: StateArray, worlds: BoolArray | None = None) -> None:
         """Overwrite the states of all worlds, or of those where ``worlds`` is true, with (N or count, S) rows."""
         self.states[slice(None) if worlds is None else worlds] = states
-        self._kinematics = kinematics.forward(self.joints)
+        self._kinematics = self.robot.arm.forward(self.joints)
 
     # --- stepping --------------------------------------------------------------------------------------------------
 
@@ -172,7 +174,7 @@ class WorldBatch:
         )
         after = np.empty_like(start)
         after[:, self.layout.physics] = states[:, -1]
-        after[:, self.layout["contacts"]] = (sensors > 0).any(axis=1)
+        after[:, self.layout["contacts"]] = self.robot.contacts((sensors > 0).any(axis=1))
         after[:, self.layout.kept] = start[:, self.layout.kept]
         finite = (np.abs(after[:, self.layout.velocities]) < MAX_SPEED).all(axis=1) & np.isfinite(after).all(axis=1)
         diverged = np.zeros(self.num_worlds, dtype=bool)
@@ -182,23 +184,22 @@ class WorldBatch:
             self.num_diverged += int((~finite).sum())
             self.diverged += [(start[row].copy(), actions[row].copy()) for row in np.flatnonzero(~finite)]
         self.states[index] = after
-        self._kinematics = kinematics.forward(self.joints)
+        self._kinematics = self.robot.arm.forward(self.joints)
         return diverged
 
     def _control(self, start: StateArray, actions: StateArray, index: slice | IntArray) -> StateArray:
         actions = np.clip(actions, -1.0, 1.0)
-        here = kinematics.Kinematics(
-            self._kinematics.position[index], self._kinematics.rotation[index], self._kinematics.jacobian[index]
-        )
-        target = kinematics.clip_to_reach(here.position + DISPLACEMENT_M * actions[:, :3], LOWEST_TARGET_M)
-        width = start[:, self.layout["fingers"]].sum(axis=1) + WIDTH_CHANGE_M * actions[:, 3]
+        here, num_joints = self._kinematics[index], self.robot.num_joints
+        target = self.reach.clip(here.position + DISPLACEMENT_M * actions[:, :3])
+        width = self.robot.openings(start[:, self.layout["fingers"]]).sum(axis=1) + WIDTH_CHANGE_M * actions[:, 3]
         joints, box_place = start[:, self.layout["joints"]], start[:, self.layout["box_place"]]
-        control = np.zeros((start.shape[0], _NUM_CONTROLS + box_place.shape[1]))
-        solution = kinematics.solve(joints, target, at=here)
-        control[:, :NUM_JOINTS] = np.clip(solution, joints - MAX_TURN_RAD, joints + MAX_TURN_RAD)
+        control = np.zeros((start.shape[0], self.model.nu + box_place.shape[1]))
+        solution = self.robot.arm.solve(joints, target, at=here)
+        control[:, :num_joints] = np.clip(solution, joints - MAX_TURN_RAD, joints + MAX_TURN_RAD)
         widest_m = self._widest_m * ~(start[:, self.layout["gripper_blocked"]] > 0.0).any(axis=1)
-        control[:, NUM_JOINTS:_NUM_SERVOS] = np.clip(width, 0.0, widest_m)[:, None] / 2
-        control[:, _NUM_CONTROLS:] = box_place
+        fingers = self.robot.finger_values(np.clip(width, 0.0, widest_m))
+        control[:, num_joints : num_joints + self.robot.num_fingers] = fingers
+        control[:, self.model.nu :] = box_place
         return control
 
     # --- observations ----------------------------------------------------------------------------------------------
@@ -224,6 +225,10 @@ class WorldBatch:
 
     def _measure(self, name: str) -> StateArray:
         """(N, size) one entry of an observation: computed here, or else a part of the state of the same name."""
+        if name == "fingers":
+            return self.robot.openings(self.states[:, self.layout["fingers"]])
+        if name == "finger_velocities":
+            return self.robot.opening_speeds(self.states[:, self.layout["finger_velocities"]])
         if name == "effector":
             return self.ee_position
         if name == "object_from_effector":
@@ -243,8 +248,9 @@ class WorldBatch:
         home = np.array([[workspace.center_x_m, workspace.center_y_m, self.config.start_height_m]])
         state = np.zeros(self.layout.size)
         mujoco.mj_getState(self.model, mujoco.MjData(self.model), state[self.layout.physics], _PHYSICS)
-        state[self.layout["joints"]] = kinematics.solve(kinematics.NEUTRAL_JOINTS[None], home, num_iterations=30)[0]
-        state[self.layout["fingers"]] = self._widest_m / 2
+        arm = self.robot.arm
+        state[self.layout["joints"]] = arm.solve(arm.home[None], home, num_iterations=30)[0]
+        state[self.layout["fingers"]] = self.robot.finger_values(np.array([self._widest_m]))[0]
         return state
 
 

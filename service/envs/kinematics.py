@@ -1,37 +1,31 @@
-"""Closed-form kinematics of many Pandas at once: forward kinematics, Jacobian, and one damped step towards a pose.
+"""Kinematics of many serial arms at once: forward kinematics, Jacobian, and damped steps towards a pose.
 
-Everything is NumPy over the worlds' axis (N, ...), with no loop over worlds. The chain is the modified DH table of the
-Franka documentation; every twist in it is a multiple of 90 degrees, so rotations are column swaps.
+A chain is read from a compiled model, as the axes of its joints in one configuration, and becomes a table of Denavit
+and Hartenberg (modified: Craig 2005, chapter 3), whatever frames the model has. Everything is NumPy over the worlds'
+axis (N, ...), with no loop over worlds. Most arms have twists of 90 degrees; these are swaps of axes.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any, Literal, NamedTuple
 
+import mujoco
 import numpy as np
 
-from service.envs.panda import BASE_POSITION, FLANGE_TO_TIP_M, JOINT_LOWER, JOINT_UPPER, NUM_JOINTS
-from service.types import StateArray
+from service.types import BoolArray, IntArray, StateArray
 
-# (a, d, quarter turns about x) of each joint, modified DH (Craig): twist, then offset a along x and d along the new z.
-_DH = (
-    (0.0, 0.333, 0),
-    (0.0, 0.0, -1),
-    (0.0, 0.316, 1),
-    (0.0825, 0.0, 1),
-    (-0.0825, 0.384, -1),
-    (0.0, 0.0, 1),
-    (0.088, 0.0, 1),
-)
-_SHOULDER_HEIGHT_M = 0.333
-_WRIST_OFFSET_M = 0.088
-_ARM_LENGTH_M = float(np.hypot(0.316, 0.0825) + np.hypot(0.384, 0.0825))  # He & Liu: L24 + L46
-_REACH_MARGIN_M = 0.015
-_LIMIT_MARGIN_RAD = 0.03
+Orientation = Literal["down", "down_any_turn", "free"]
+"""What a gripper may do with its direction: it points down and does not turn, it points down, or nothing is asked."""
+DOWN = np.diag([1.0, -1.0, -1.0])
+"""Rotation of a gripper that points down: its z axis is down, and its y axis, along which fingers open, is -y."""
+_NUM_ROWS = {"down": 6, "down_any_turn": 5, "free": 3}
+"""Rows of the Jacobian that count: the last is the turn about the vertical."""
+_LIMIT_MARGIN = 0.03
+"""Distance, rad or share of the range in metres, that joints keep from their limits."""
 _DAMPING = 0.02
 _POSTURE_GAIN = 0.1
-NEUTRAL_JOINTS = np.array([0.0, 0.41, 0.0, -1.85, 0.0, 2.26, np.pi / 4])
-"""panda-gym's neutral pose; the redundant degree of freedom is drawn towards it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,36 +35,229 @@ class Kinematics:
     position: StateArray
     """(N, 3) end effector in the world frame, metres."""
     rotation: StateArray
-    """(N, 3, 3) of the last link; columns are its axes."""
+    """(N, 3, 3) of the end effector; columns are its axes."""
     jacobian: StateArray
-    """(N, 6, 7) linear then angular velocity per joint velocity."""
+    """(N, 6, J) linear then angular velocity per joint velocity."""
+
+    def __getitem__(self, index: slice | IntArray) -> Kinematics:
+        """Some of the arms."""
+        return Kinematics(self.position[index], self.rotation[index], self.jacobian[index])
 
 
-def forward(joints: StateArray) -> Kinematics:
-    """Forward kinematics of (N, 7) joint angles, rad."""
-    num = joints.shape[0]
-    x_axis, y_axis, z_axis = (np.tile(axis, (num, 1)) for axis in np.eye(3))
-    position = np.tile(np.asarray(BASE_POSITION), (num, 1))
-    origins = np.empty((NUM_JOINTS, num, 3))
-    axes = np.empty((NUM_JOINTS, num, 3))
-    cosines, sines = np.cos(joints), np.sin(joints)
-    for index, (offset_a, offset_d, quarter) in enumerate(_DH):
-        if offset_a:
-            position = position + offset_a * x_axis
-        if quarter == 1:
-            y_axis, z_axis = z_axis, -y_axis
-        elif quarter == -1:
-            y_axis, z_axis = -z_axis, y_axis
-        if offset_d:
-            position = position + offset_d * z_axis
-        cosine, sine = cosines[:, index, None], sines[:, index, None]
-        x_axis, y_axis = cosine * x_axis + sine * y_axis, cosine * y_axis - sine * x_axis
-        origins[index], axes[index] = position, z_axis
-    position = position + FLANGE_TO_TIP_M * z_axis
-    jacobian = np.empty((num, 6, NUM_JOINTS))
-    jacobian[:, :3] = _cross(axes, position - origins).transpose(1, 2, 0)
-    jacobian[:, 3:] = axes.transpose(1, 2, 0)
-    return Kinematics(position, np.stack([x_axis, y_axis, z_axis], axis=-1), jacobian)
+class Chain:
+    """A serial chain of J hinges and slides.
+
+    Args:
+        model: compiled, with the arm in it.
+        joints: names, from the base to the end effector.
+        frame: name of the site or body that the end effector is fixed to.
+        position: (3,) of the end effector in that frame, metres.
+        quaternion: (4,) its rotation there, w x y z.
+        home: (J,) posture that joints are drawn to where the end effector leaves them free, rad or metres.
+        orientation: asked of the gripper.
+    """
+
+    def __init__(
+        self,
+        model: mujoco.MjModel,
+        joints: Sequence[str],
+        frame: str,
+        *,
+        position: Sequence[float],
+        quaternion: Sequence[float],
+        home: Sequence[float],
+        orientation: Orientation,
+    ) -> None:
+        self.num_joints = len(joints)
+        self.home: StateArray = np.array(home)
+        self._num_rows = _NUM_ROWS[orientation]
+        data = mujoco.MjData(model)  # in the model's own configuration, qpos0
+        mujoco.mj_kinematics(model, data)
+        ids = [model.joint(name).id for name in joints]
+        axes, anchors = data.xaxis[ids], data.xanchor[ids]
+        is_slide = model.jnt_type[ids] == mujoco.mjtJoint.mjJNT_SLIDE
+        self.lower, self.upper = _limits(model, ids)
+        """(J,) limits less a margin, rad or metres; infinite where a joint has none."""
+        is_upright = not is_slide[0] and abs(axes[0, 2]) > 1.0 - 1e-6
+        self.base_axis: StateArray | None = anchors[0, :2] if is_upright else None
+        """(2,) place of the first joint's axis, metres, if it is a hinge about the vertical."""
+        end_position, end_rotation = _pose(model, data, frame, position, quaternion)
+        table = _denavit_hartenberg(axes, anchors, end_rotation[:, 0])
+        zero = model.qpos0[model.jnt_qposadr[ids]]
+        self._slides: BoolArray = is_slide
+        self._angle = np.where(is_slide, table.angle, table.angle - zero)
+        self._offset_d = np.where(is_slide, table.offset_d - zero, table.offset_d)
+        self._offset_a, self._twist = table.offset_a, table.twist
+        self._base = table.base
+        self._end_position = _rounded(table.end.T @ (end_position - table.end_origin))
+        self._end_axes = _rounded(table.end.T @ end_rotation).T
+
+    def forward(self, joints: StateArray) -> Kinematics:
+        """Forward kinematics of (N, J) joint values, rad or metres."""
+        num = joints.shape[0]
+        angles = np.where(self._slides, 0.0, joints) + self._angle
+        cosines, sines = np.cos(angles), np.sin(angles)
+        x_axis, y_axis, z_axis, position = (np.tile(row, (num, 1)) for row in self._base)
+        origins, axes = np.empty((2, self.num_joints, num, 3))
+        for index, (offset_a, twist, offset_d) in enumerate(
+            zip(self._offset_a, self._twist, self._offset_d, strict=True)
+        ):
+            if offset_a:
+                position = position + offset_a * x_axis
+            y_axis, z_axis = _twisted(y_axis, z_axis, *twist)
+            if self._slides[index]:
+                position = position + (offset_d + joints[:, index, None]) * z_axis
+            elif offset_d:
+                position = position + offset_d * z_axis
+            cosine, sine = cosines[:, index, None], sines[:, index, None]
+            x_axis, y_axis = cosine * x_axis + sine * y_axis, cosine * y_axis - sine * x_axis
+            origins[index], axes[index] = position, z_axis
+        end = (x_axis, y_axis, z_axis)
+        position = position + _combined(self._end_position, end)
+        rotation = np.stack([_combined(axis, end) for axis in self._end_axes], axis=-1)
+        return Kinematics(position, rotation, self._jacobian(axes, position - origins))
+
+    def _jacobian(self, axes: StateArray, arms: StateArray) -> StateArray:
+        """(N, 6, J) of (J, N, 3) axes, and ways from each to the end effector, metres."""
+        jacobian = np.empty((axes.shape[1], 6, self.num_joints))
+        jacobian[:, :3], jacobian[:, 3:] = _cross(axes, arms).transpose(1, 2, 0), axes.transpose(1, 2, 0)
+        if self._slides.any():
+            jacobian[:, :3, self._slides] = axes[self._slides].transpose(1, 2, 0)
+            jacobian[:, 3:, self._slides] = 0.0
+        return jacobian
+
+    def errors(self, here: Kinematics, target: StateArray) -> StateArray:
+        """(N, E) way to (N, 3) targets, metres, and the turn to the orientation, rad, as far as one is asked."""
+        return np.concatenate([target - here.position, orientation_error(here.rotation)], axis=1)[:, : self._num_rows]
+
+    def solve(
+        self, joints: StateArray, target: StateArray, *, at: Kinematics | None = None, num_iterations: int = 2
+    ) -> StateArray:
+        """Joint values that bring the end effector to ``target`` with the orientation that is asked of it.
+
+        Damped least squares (Wampler 1986) with the posture drawn to home in the null space.
+
+        Args:
+            joints: (N, J) where to start, rad or metres.
+            target: (N, 3) end-effector positions, metres.
+            at: kinematics of ``joints`` if already known.
+            num_iterations: two leave an error below 1 mm for one action, 3 mm where an arm is nearly straight.
+
+        Returns:
+            (N, J) joint values inside the limits.
+        """
+        rows = self._num_rows
+        for remaining in reversed(range(num_iterations)):
+            here = self.forward(joints) if at is None else at
+            at = None
+            error = self.errors(here, target)
+            # Not in the last iteration: damping lets a little of the posture through to the end effector, and since
+            # every action starts from where the end effector is, that would add up to a drift of 2 mm in 40 idle steps.
+            posture = (_POSTURE_GAIN if remaining else 0.0) * (self.home - joints)
+            jacobian = here.jacobian[:, :rows]
+            error -= np.matmul(jacobian, posture[:, :, None])[:, :, 0]
+            transposed = jacobian.transpose(0, 2, 1)
+            square = np.matmul(jacobian, transposed)
+            square[:, range(rows), range(rows)] += _DAMPING**2
+            step = np.matmul(transposed, np.linalg.solve(square, error[:, :, None]))[:, :, 0]
+            joints = np.clip(joints + posture + step, self.lower, self.upper)
+        return joints
+
+
+def orientation_error(rotation: StateArray) -> StateArray:
+    """(N, 3) small rotation vector that takes ``rotation`` to ``DOWN``: half the sum of the axes' cross products."""
+    error = np.empty((rotation.shape[0], 3))  # written out, as DOWN has only three numbers
+    error[:, 0] = 0.5 * (rotation[:, 2, 1] - rotation[:, 1, 2])
+    error[:, 1] = 0.5 * (rotation[:, 2, 0] + rotation[:, 0, 2])
+    error[:, 2] = -0.5 * (rotation[:, 1, 0] + rotation[:, 0, 1])
+    return error
+
+
+def _limits(model: mujoco.MjModel, joints: Sequence[int]) -> tuple[StateArray, StateArray]:
+    lower, upper = model.jnt_range[joints].T
+    margin = np.minimum(_LIMIT_MARGIN, 0.05 * (upper - lower))
+    limited = model.jnt_limited[joints].astype(bool)
+    return np.where(limited, lower + margin, -np.inf), np.where(limited, upper - margin, np.inf)
+
+
+class _Table(NamedTuple):
+    """A table of Denavit and Hartenberg for one configuration, and the frames at its two ends."""
+
+    offset_a: list[float]
+    """Of each joint along the x axis of the frame before it, metres."""
+    twist: list[tuple[float, float]]
+    """Cosine and sine of the turn about that x axis."""
+    offset_d: StateArray
+    """(J,) along the joint's own axis, metres."""
+    angle: StateArray
+    """(J,) about it, rad."""
+    base: StateArray
+    """(4, 3) x, y, z axis and origin before the first joint."""
+    end: StateArray
+    """(3, 3) frame after the last joint; columns are its axes."""
+    end_origin: StateArray
+    """(3,) metres."""
+
+
+def _denavit_hartenberg(axes: StateArray, anchors: StateArray, last_x: StateArray) -> _Table:
+    """The table of a chain.
+
+    Frame i has its z axis on joint i, and its x axis on the common normal of joints i and i + 1.
+
+    Args:
+        axes: (J, 3) directions of the joints.
+        anchors: (J, 3) a point of each axis, metres.
+        last_x: (3,) direction that the last frame's x axis gets, as far as it is free.
+    """
+    num = len(axes)
+    normals, feet, ends = np.empty((3, num, 3))  # common normal, where it leaves axis i, where it meets axis i + 1
+    for index in range(num - 1):
+        normals[index], feet[index], ends[index] = _common_normal(axes[index : index + 2], anchors[index : index + 2])
+    across = last_x - axes[-1] * (axes[-1] @ last_x)
+    free = across if np.linalg.norm(across) > 1e-6 else normals[num - 2]
+    normals[-1], feet[-1] = free / np.linalg.norm(free), ends[num - 2] if num > 1 else anchors[-1]
+    offset_a, twist, offset_d, angle = [0.0], [(1.0, 0.0)], np.zeros(num), np.zeros(num)
+    for index in range(1, num):
+        before, x_axis = axes[index - 1], normals[index - 1]
+        offset_a.append(float(_rounded((ends[index - 1] - feet[index - 1]) @ x_axis)))
+        cosine, sine = _rounded(np.array([before @ axes[index], np.cross(before, axes[index]) @ x_axis]))
+        twist.append((float(cosine), float(sine)))
+        offset_d[index] = _rounded((feet[index] - ends[index - 1]) @ axes[index])
+        angle[index] = np.arctan2(np.cross(x_axis, normals[index]) @ axes[index], x_axis @ normals[index])
+    base = np.stack([normals[0], np.cross(axes[0], normals[0]), axes[0], feet[0]])
+    end = np.stack([normals[-1], np.cross(axes[-1], normals[-1]), axes[-1]], axis=1)
+    return _Table(offset_a, twist, offset_d, angle, base, end, feet[-1])
+
+
+def _common_normal(axes: StateArray, anchors: StateArray) -> tuple[StateArray, StateArray, StateArray]:
+    """Direction of the shortest way from one axis to the next, and where it leaves the one and meets the other."""
+    (first, second), (start, other) = axes, anchors
+    way, normal = other - start, np.cross(first, second)
+    if (length := float(np.linalg.norm(normal))) > 1e-6:
+        normal = normal / length
+        leave = start + first * (np.cross(way, second) @ normal / length)
+        meet = other + second * (np.cross(way, first) @ normal / length)
+        return normal, leave, meet
+    across = way - first * (first @ way)  # of parallel axes there are many normals
+    if np.linalg.norm(across) < 1e-9:
+        across = np.cross(first, np.eye(3)[np.argmin(np.abs(first))])
+        return across / np.linalg.norm(across), start, start
+    return across / np.linalg.norm(across), start, start + across
+
+
+def _twisted(y_axis: StateArray, z_axis: StateArray, cosine: float, sine: float) -> tuple[StateArray, StateArray]:
+    """The two axes turned about the third."""
+    if not sine:
+        return (y_axis, z_axis) if cosine > 0.0 else (-y_axis, -z_axis)
+    if not cosine:
+        return (z_axis, -y_axis) if sine > 0.0 else (-z_axis, y_axis)
+    return cosine * y_axis + sine * z_axis, cosine * z_axis - sine * y_axis
+
+
+def _combined(vector: StateArray, axes: Sequence[StateArray]) -> StateArray:
+    """(N, 3) a vector of three numbers along (N, 3) axes; most of them are often 0."""
+    terms = [axis if number == 1.0 else number * axis for number, axis in zip(vector, axes, strict=True) if number]
+    return sum(terms[1:], terms[0]) if terms else np.zeros_like(axes[0])
 
 
 def _cross(left: StateArray, right: StateArray) -> StateArray:
@@ -82,68 +269,20 @@ def _cross(left: StateArray, right: StateArray) -> StateArray:
     return out
 
 
-# Gripper down, fingers along y: the hand (turned -45 deg against the last link) has x forward, z down.
-_HALF = np.sqrt(0.5)
-DOWN = np.array([[_HALF, -_HALF, 0.0], [-_HALF, -_HALF, 0.0], [0.0, 0.0, -1.0]])
-"""Rotation of the last link when the gripper points down."""
+def _rounded(numbers: Any) -> StateArray:
+    """Numbers that differ from -1, 0 or 1 only by rounding, as those."""
+    near = np.round(numbers)
+    rounded: StateArray = np.where((np.abs(numbers - near) < 1e-12) & (np.abs(near) <= 1.0), near, numbers)
+    return rounded
 
 
-def _orientation_error(rotation: StateArray) -> StateArray:
-    """(N, 3) small rotation vector that takes ``rotation`` to DOWN: half the sum of the axes' cross products."""
-    error: StateArray = 0.5 * _cross(rotation.transpose(0, 2, 1), np.broadcast_to(DOWN.T, rotation.shape)).sum(axis=1)
-    return error
-
-
-def clip_to_reach(target: StateArray, lowest_z_m: float) -> StateArray:
-    """Nearest point a gripper-down arm can reach: height first, then horizontal distance from the base.
-
-    The wrist sits 0.2104 m above the end effector and 0.088 m nearer to the base; its distance from the shoulder is at
-    most the arm's length.
-
-    Args:
-        target: (N, 3) end-effector positions, metres.
-        lowest_z_m: least height, which keeps the fingertips off the table.
-    """
-    clipped = target.copy()
-    arm = _ARM_LENGTH_M - _REACH_MARGIN_M
-    np.clip(clipped[:, 2], lowest_z_m, _SHOULDER_HEIGHT_M - FLANGE_TO_TIP_M + 0.9 * arm, out=clipped[:, 2])
-    rise = clipped[:, 2] + FLANGE_TO_TIP_M - _SHOULDER_HEIGHT_M
-    furthest = _WRIST_OFFSET_M + np.sqrt(arm**2 - rise**2)
-    horizontal = clipped[:, :2] - np.asarray(BASE_POSITION[:2])
-    distance = np.maximum(np.linalg.norm(horizontal, axis=1), 1e-6)
-    scale = np.clip(distance, 0.3, furthest) / distance
-    clipped[:, :2] = np.asarray(BASE_POSITION[:2]) + horizontal * scale[:, None]
-    return clipped
-
-
-def solve(
-    joints: StateArray, target: StateArray, *, at: Kinematics | None = None, num_iterations: int = 2
-) -> StateArray:
-    """Joint angles that bring the end effector to ``target`` with the gripper pointing down.
-
-    Damped least squares (Wampler 1986) with the posture drawn to neutral in the null space.
-
-    Args:
-        joints: (N, 7) where to start, rad.
-        target: (N, 3) end-effector positions, metres.
-        at: kinematics of ``joints`` if already known.
-        num_iterations: two leave an error below 1 mm for one action, 3 mm where the arm is nearly straight.
-
-    Returns:
-        (N, 7) joint angles inside the limits, rad.
-    """
-    for remaining in reversed(range(num_iterations)):
-        here = forward(joints) if at is None else at
-        at = None
-        error = np.concatenate([target - here.position, _orientation_error(here.rotation)], axis=1)
-        # Not in the last iteration: damping lets a little of the posture through to the end effector, and since every
-        # action starts from where the end effector is, that little would add up to a drift of 2 mm in 40 idle steps.
-        posture = (_POSTURE_GAIN if remaining else 0.0) * (NEUTRAL_JOINTS - joints)
-        jacobian = here.jacobian
-        error -= np.matmul(jacobian, posture[:, :, None])[:, :, 0]
-        transposed = jacobian.transpose(0, 2, 1)
-        square = np.matmul(jacobian, transposed)
-        square[:, range(6), range(6)] += _DAMPING**2
-        step = np.matmul(transposed, np.linalg.solve(square, error[:, :, None]))[:, :, 0]
-        joints = np.clip(joints + posture + step, JOINT_LOWER + _LIMIT_MARGIN_RAD, JOINT_UPPER - _LIMIT_MARGIN_RAD)
-    return joints
+def _pose(
+    model: mujoco.MjModel, data: mujoco.MjData, frame: str, position: Sequence[float], quaternion: Sequence[float]
+) -> tuple[StateArray, StateArray]:
+    """Position and rotation of what is fixed to a site or a body."""
+    is_site = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_SITE, frame) >= 0
+    at = data.site(frame) if is_site else data.body(frame)
+    turned = np.empty(9)
+    mujoco.mju_quat2Mat(turned, np.array(quaternion, dtype=float) / np.linalg.norm(quaternion))
+    rotation = at.xmat.reshape(3, 3)
+    return at.xpos + rotation @ np.array(position), rotation @ turned.reshape(3, 3)

@@ -13,26 +13,32 @@ from typing import Any
 import mujoco
 import numpy as np
 
-NUM_JOINTS = 7
-NUM_FINGERS = 2
-"""Left and right, in this order wherever there is one number for each."""
-BASE_POSITION = (-0.6, 0.0, 0.0)
+from service.envs.contacts import BODY_FRICTION, GRIPPER_BIT, grip
+from service.robot_config import EffectorConfig, FingerConfig, RobotConfig
+
 JOINT_LOWER = np.array([-2.8973, -1.7628, -2.8973, -3.0718, -2.8973, -0.0175, -2.8973])
 JOINT_UPPER = np.array([2.8973, 1.7628, 2.8973, -0.0698, 2.8973, 3.7525, 2.8973])
-JOINT_TORQUE = (87.0, 87.0, 87.0, 87.0, 12.0, 12.0, 12.0)
-FLANGE_TO_TIP_M = 0.107 + 0.1034
-"""Flange to the point between the fingertips, the end effector."""
 FINGER_STROKE_M = 0.04
 """Travel of one finger; the opening width is twice this."""
+PANDA = RobotConfig(
+    name="panda",
+    base_position_m=(-0.6, 0.0, 0.0),
+    joints=tuple(f"joint{number}" for number in range(1, 8)),
+    effector=EffectorConfig(frame="hand", position_m=(0.0, 0.0, 0.1034)),
+    fingers=tuple(
+        FingerConfig(joint=f"{side}_finger", closed=0.0, open=FINGER_STROKE_M, side=side) for side in ("left", "right")
+    ),
+    opening_m=2 * FINGER_STROKE_M,
+    home=(0.0, 0.41, 0.0, -1.85, 0.0, 2.26, np.pi / 4),  # panda-gym's neutral pose
+    stiffness=(4500.0, 4500.0, 3500.0, 3500.0, 2000.0, 2000.0, 2000.0),
+    damping=(225.0, 225.0, 175.0, 175.0, 100.0, 100.0, 100.0),
+    max_force=(87.0, 87.0, 87.0, 87.0, 12.0, 12.0, 12.0),
+)
+"""The description of it, which is built in."""
 
-_STIFFNESS = (4500.0, 4500.0, 3500.0, 3500.0, 2000.0, 2000.0, 2000.0)
-_DAMPING = (225.0, 225.0, 175.0, 175.0, 100.0, 100.0, 100.0)
 _ARMATURE = 0.1
 _JOINT_DAMPING = 1.0
 _FINGER_ARMATURE = 0.3
-_FINGER_STIFFNESS = 1000.0
-_FINGER_DAMPING = 25.0
-_FINGER_FORCE = 40.0
 
 # Link frames in their parents: position, unnormalised quaternion wxyz.
 _FRAMES: tuple[tuple[tuple[float, float, float], tuple[float, float, float, float]], ...] = (
@@ -57,24 +63,18 @@ _INERTIALS = (
 _HAND_QUATERNION = (0.9238795, 0.0, 0.0, -0.3826834)
 
 _PAD_RADIUS = 0.006
-_BODY_FRICTION = 0.3
 _STOP_SOLIMP = (0.99, 0.9999, 0.001, 0.5, 2.0)
-
-GRIPPER_BIT, OBJECT_BIT, TABLE_BIT = 1, 2, 4
 
 
 def add_panda(spec: mujoco.MjSpec, *, pad_friction: float, physics_step_s: float) -> None:
-    """Add the arm, its actuators and its collision shapes to a model under construction.
-
-    Actuators: seven joint positions (rad), then left and right finger positions (m). The arm has no weight: its own
-    controller compensates gravity, so the scene has none (see ``scene.build_spec``).
+    """Add the arm and its collision shapes to a model under construction; ``robot.add_robot`` adds its servos.
 
     Args:
         spec: the model under construction.
         pad_friction: sliding friction of the fingertips.
         physics_step_s: time step; the fingers' end stops are as stiff as it allows.
     """
-    body = spec.worldbody.add_body(name="link0", pos=BASE_POSITION)
+    body = spec.worldbody.add_body(name="link0", pos=PANDA.base_position_m)
     for index, ((position, quaternion), (mass, centre, inertia)) in enumerate(
         zip(_FRAMES, _INERTIALS, strict=True), start=1
     ):
@@ -111,7 +111,6 @@ def add_panda(spec: mujoco.MjSpec, *, pad_friction: float, physics_step_s: float
     for side, quaternion in (("left", (1, 0, 0, 0)), ("right", (0, 0, 0, 1))):
         finger = _add_finger(hand, side, quaternion, physics_step_s)
         _add_pads(finger, side, pad_friction)
-    _add_actuators(spec)
 
 
 def _add_finger(hand: Any, side: str, quaternion: tuple[float, ...], physics_step_s: float) -> Any:
@@ -145,10 +144,7 @@ def _add_pads(finger: Any, side: str, friction: float) -> None:
     # width.) Their inner surface is the pad plane y = 0; they end 7 mm below the end effector.
     for end, x in (("front", 0.0075), ("back", -0.0075)):
         pad = _collision(finger, f"{side}_pad_{end}", _PAD_RADIUS, ((x, _PAD_RADIUS, 0.034), (x, _PAD_RADIUS, 0.046)))
-        pad.friction = (friction, 0.005, 0.0001)
-        pad.condim = 4  # torsion, or a cube turns between the fingers
-        pad.solref = (0.01, 1.0)
-        pad.priority = 1  # these parameters, not a mixture with the object's
+        grip(pad, friction)
 
 
 def _collision(body: Any, name: str, radius: float, ends: tuple[tuple[float, ...], ...]) -> Any:
@@ -159,25 +155,7 @@ def _collision(body: Any, name: str, radius: float, ends: tuple[tuple[float, ...
         fromto=[*ends[0], *ends[1]],
         contype=GRIPPER_BIT,
         conaffinity=0,
-        friction=(_BODY_FRICTION, 0.005, 0.0001),
+        friction=(BODY_FRICTION, 0.005, 0.0001),
         mass=0.0,
         group=3,
     )
-
-
-def _add_actuators(spec: mujoco.MjSpec) -> None:
-    for index, (stiffness, damping, torque) in enumerate(zip(_STIFFNESS, _DAMPING, JOINT_TORQUE, strict=True)):
-        limits = JOINT_LOWER[index], JOINT_UPPER[index]
-        _add_actuator(spec, f"joint{index + 1}", stiffness, damping, torque, limits)
-    for side in ("left", "right"):
-        limits = 0.0, FINGER_STROKE_M
-        _add_actuator(spec, f"{side}_finger", _FINGER_STIFFNESS, _FINGER_DAMPING, _FINGER_FORCE, limits)
-
-
-def _add_actuator(
-    spec: mujoco.MjSpec, joint: str, stiffness: float, damping: float, force: float, limits: tuple[float, float]
-) -> None:
-    actuator = spec.add_actuator(name=joint, target=joint, trntype=mujoco.mjtTrn.mjTRN_JOINT)
-    actuator.set_to_position(kp=stiffness, kv=damping)
-    actuator.forcelimited = actuator.ctrllimited = True
-    actuator.forcerange, actuator.ctrlrange = (-force, force), limits

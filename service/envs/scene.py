@@ -1,4 +1,4 @@
-"""The scene: a Panda at a table with one rigid object, and a fixture where a task wants one.
+"""The scene: a robot at a table with one rigid object, and a fixture where a task wants one.
 
 A fixture, a wall across the workspace or an open box, cannot be moved. The wall is part of the table; the box is
 elsewhere in every world, so its place is part of a world's state. Both are touched by the object, the hand and the
@@ -13,7 +13,8 @@ from typing import Any
 import mujoco
 
 from service.config import WorldConfig
-from service.envs import panda
+from service.envs.contacts import GRIPPER_BIT, OBJECT_BIT, STIFF, TABLE_BIT
+from service.envs.robot import add_robot, described
 from service.envs.state_layout import StateLayout
 
 TABLE_CENTER_X_M = -0.3
@@ -34,9 +35,6 @@ FINGER_GAP_M = 0.04
 GRAVITY_MS2 = 9.81
 FIXTURE_PREFIX = "fixture_"
 """Beginning of the names of a fixture's geoms."""
-# MuJoCo's default contact yields more the lighter the object: an arm leaning on the cube pressed it 11 mm down.
-# These let it give 1 mm.
-_STIFF = {"solref": (0.01, 1.0), "solimp": (0.95, 0.99, 0.001, 0.5, 2.0)}
 
 
 def build_spec(config: WorldConfig) -> mujoco.MjSpec:
@@ -62,21 +60,20 @@ def build_spec(config: WorldConfig) -> mujoco.MjSpec:
     option.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)
     spec.compiler.degree = False
     spec.compiler.autolimits = False
-    panda.add_panda(spec, pad_friction=config.pad_friction, physics_step_s=config.physics_step_s)
+    add_robot(spec, config)
     spec.worldbody.add_geom(
         name="table",
         type=mujoco.mjtGeom.mjGEOM_BOX,
         size=TABLE_HALF_SIZE_M,
         pos=(TABLE_CENTER_X_M, 0, -TABLE_HALF_SIZE_M[2]),
-        contype=panda.TABLE_BIT,
-        conaffinity=panda.GRIPPER_BIT | panda.OBJECT_BIT,
+        contype=TABLE_BIT,
+        conaffinity=GRIPPER_BIT | OBJECT_BIT,
         friction=(config.friction, 0.005, 0.0001),
         group=3,
-        **_STIFF,
+        **STIFF,
     )
     _add_object(spec, config)
     _add_fixture(spec, config)
-    _add_contact_sensors(spec)
     return spec
 
 
@@ -87,15 +84,17 @@ def build_layout(config: WorldConfig, *, blocked_fraction: float = 0.0) -> State
         config: the world.
         blocked_fraction: share of games with a blocked gripper; above 0, each world remembers whether its own is.
     """
+    robot = described(config)
+    num_joints, num_fingers = len(robot.joints), len(robot.fingers)
     return StateLayout(
-        positions={"joints": panda.NUM_JOINTS, "fingers": panda.NUM_FINGERS, "object": 3, "object_quaternion": 4},
+        positions={"joints": num_joints, "fingers": num_fingers, "object": 3, "object_quaternion": 4},
         velocities={
-            "joint_velocities": panda.NUM_JOINTS,
-            "finger_velocities": panda.NUM_FINGERS,
+            "joint_velocities": num_joints,
+            "finger_velocities": num_fingers,
             "object_velocity": 3,
             "object_spin": 3,
         },
-        measured={"contacts": panda.NUM_FINGERS},
+        measured={"contacts": 2},
         kept={
             "box_place": 3 if config.fixture == "box" else 0,  # the middle of its bottom
             "gripper_blocked": int(blocked_fraction > 0.0),
@@ -114,11 +113,11 @@ def _add_object(spec: mujoco.MjSpec, config: WorldConfig) -> None:
         mass=config.object_mass_kg,
         friction=(config.friction, 0.005, 0.0001),
         condim=3 if config.object == "cube" else 6,
-        contype=panda.OBJECT_BIT,
-        conaffinity=panda.GRIPPER_BIT,
+        contype=OBJECT_BIT,
+        conaffinity=GRIPPER_BIT,
         group=2,
         rgba=(0.86, 0.18, 0.15, 1.0),
-        **_STIFF,
+        **STIFF,
     )
     weight = spec.add_actuator(
         name="weight", target="object", trntype=mujoco.mjtTrn.mjTRN_JOINT, gear=(0, 0, 1, 0, 0, 0)
@@ -151,22 +150,8 @@ def _add_plate(body: Any, name: str, middle: tuple[float, ...], half: tuple[floa
         pos=middle,
         size=half,
         contype=0,
-        conaffinity=panda.GRIPPER_BIT | panda.OBJECT_BIT,
+        conaffinity=GRIPPER_BIT | OBJECT_BIT,
         friction=(config.friction, 0.005, 0.0001),
         group=2,
-        **_STIFF,
+        **STIFF,
     )
-
-
-def _add_contact_sensors(spec: mujoco.MjSpec) -> None:
-    # Sensor parameters of a contact sensor: data bits (1: "found"), reduction (0: none), slots (1).
-    for side in ("left", "right"):
-        sensor = spec.add_sensor(
-            name=f"{side}_contact",
-            type=mujoco.mjtSensor.mjSENS_CONTACT,
-            objtype=mujoco.mjtObj.mjOBJ_BODY,
-            objname=f"{side}_finger",
-            reftype=mujoco.mjtObj.mjOBJ_BODY,
-            refname="object",
-        )
-        sensor.intprm[:3] = (1, 0, 1)

@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.config import WorldConfig
-from service.envs import kinematics, scene
-from service.envs.batch import DISPLACEMENT_M, LOWEST_TARGET_M, WorldBatch
+from service.envs import scene
+from service.envs.batch import DISPLACEMENT_M, WorldBatch
 from service.envs.gym.registration import EPISODE_STEPS
 from service.envs.observations import ACTION
 from service.envs.sampling import draw_goals
@@ -67,7 +67,7 @@ class Scripted:
         self.waited[self.phase < 2] = 0
         carry_m = self._carry_height()
         over = np.linalg.norm((obj - self.goal)[:, :2], axis=1) < _NEAR_M
-        above_object = kinematics.clip_to_reach(_at_height(obj, self.travel_m), LOWEST_TARGET_M)
+        above_object = self.worlds.reach.clip(_at_height(obj, self.travel_m))
         at_object = _at_height(obj, _GRASP_HEIGHT_M)
         up, across = _at_height(obj, carry_m) + hold, _at_height(self.goal, carry_m) + hold
         # a box is entered no deeper than the fingers need to stay above its rim
@@ -96,7 +96,7 @@ class Scripted:
         way = (self.goal - obj) * [1.0, 1.0, 0.0]
         distance = np.linalg.norm(way, axis=1)
         way /= np.maximum(distance, 1e-9)[:, None]
-        behind = kinematics.clip_to_reach(obj - _BEHIND_M * way, LOWEST_TARGET_M)
+        behind = self.worlds.reach.clip(obj - _BEHIND_M * way)
         pressing = obj - _PRESS_M * way
         arrived = distance < np.where(self.waited > 0, _LEFT_M, _ARRIVED_M)
         self.waited[:] = arrived

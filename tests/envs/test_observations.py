@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from service.config import WorldConfig
-from service.envs import kinematics, observations
+from service.envs import observations
 from service.envs.batch import WorldBatch
 
 GOALS = np.array([[0.1, 0.05, 0.3], [-0.1, -0.2, 0.025]])
@@ -34,14 +34,14 @@ def worlds():
 
 
 def end_effector(worlds):
-    return kinematics.forward(worlds.states[:, 1:8]).position
+    return worlds.robot.arm.forward(worlds.states[:, 1:8]).position
 
 
 def privileged(worlds):
     """(2, 10) by hand; the end effector's velocity by finite differences along the joints' motion."""
     joints, velocity, step = worlds.states[:, 1:8], worlds.states[:, 17:24], 1e-6
-    after = kinematics.forward(joints + step * velocity).position
-    before = kinematics.forward(joints - step * velocity).position
+    after = worlds.robot.arm.forward(joints + step * velocity).position
+    before = worlds.robot.arm.forward(joints - step * velocity).position
     rest = [[0.21, 0.22, 0.5, 0.6, 0.7, 1.0, 0.0], [0.23, 0.24, -0.5, -0.6, -0.7, 0.0, 1.0]]
     return np.hstack([(after - before) / (2 * step), rest])
 

@@ -1,0 +1,220 @@
+"""Robots: put into a scene under construction, and what a batch of worlds asks of them."""
+
+from __future__ import annotations
+
+from itertools import chain as joined
+
+import mujoco
+import numpy as np
+
+from service.config import WorldConfig
+from service.envs import panda
+from service.envs.contacts import BODY_FRICTION, GRIPPER_BIT, add_finger_sensors, grip
+from service.envs.kinematics import Chain
+from service.errors import ConfigError
+from service.robot_config import Numbers, PadConfig, RobotConfig, model_file
+from service.types import BoolArray, StateArray
+
+_PREFIX, _HAND_PREFIX = "robot/", "hand/"
+"""Begin the names of all that comes from a file, so that none is that of something in the scene; a hand's has both."""
+_SIDES = ("left", "right")
+
+
+def described(config: WorldConfig) -> RobotConfig:
+    """The description of a world's robot."""
+    return panda.PANDA if config.robot == "panda" else config.robot
+
+
+def add_robot(spec: mujoco.MjSpec, config: WorldConfig) -> None:
+    """Add the arm, its gripper, its servos and the sensors of its fingers to a scene under construction.
+
+    Actuators: joints of the arm (rad or m), then fingers, as in the description. The arm has no weight: a robot's own
+    controller compensates gravity, so the scene has none (see ``scene.build_spec``).
+
+    Raises:
+        ConfigError: the model cannot be read, or has not what the description names.
+    """
+    robot = described(config)
+    if config.robot == "panda":
+        panda.add_panda(spec, pad_friction=config.pad_friction, physics_step_s=config.physics_step_s)
+    else:
+        _add_from_files(spec, robot)
+    joints = [_find_joint(spec, robot, name) for name in robot.joints]
+    fingers = [_find_joint(spec, robot, finger.joint) for finger in robot.fingers]
+    _check_joints(spec, robot, joints, fingers)
+    for group, prefix in ((joints, ""), (fingers, "finger_")):
+        for index, joint in enumerate(group):
+            for name in ("armature", "friction_loss"):
+                if (value := getattr(robot, f"{prefix}{name}")) is not None:
+                    setattr(joint, name.replace("_", ""), _number(value, index))
+            names = (f"{prefix}{name}" for name in ("stiffness", "damping", "max_force"))
+            _add_servo(spec, joint, *(_number(getattr(robot, name), index) for name in names))
+    if config.robot != "panda":
+        _let_touch(spec, robot, [joint.parent for joint in fingers], config.pad_friction)
+    add_finger_sensors(spec, [joint.parent.name for joint in fingers])
+
+
+class Robot:
+    """What a batch of worlds asks of its robot, a compiled one.
+
+    Args:
+        config: the world.
+        model: that was compiled of it.
+    """
+
+    def __init__(self, config: WorldConfig, model: mujoco.MjModel) -> None:
+        robot = described(config)
+        self.num_joints, self.num_fingers = len(robot.joints), len(robot.fingers)
+        self.opening_m = robot.opening_m
+        """Between the fingertips where the gripper is open."""
+        self.lowest_m = robot.lowest_m
+        """Least height of a commanded end effector."""
+        prefix = "" if config.robot == "panda" else _PREFIX
+        self.arm = Chain(
+            model,
+            [prefix + name for name in robot.joints],
+            prefix + robot.effector.frame,
+            position=robot.effector.position_m,
+            quaternion=robot.effector.quaternion,
+            home=robot.home,
+            orientation=robot.orientation,
+        )
+        self._closed = np.array([finger.closed for finger in robot.fingers])
+        self._travel = np.array([finger.open for finger in robot.fingers]) - self._closed
+        on_side = np.array([[finger.side in (side, "both") for side in _SIDES] for finger in robot.fingers])
+        self._sides: BoolArray = on_side
+        """(F, 2) whether a finger is on the left, and on the right."""
+        self._openings: StateArray = on_side / np.maximum(1, on_side.sum(axis=0)) * self.opening_m / 2
+        self._openings /= self._travel[:, None]
+
+    def openings(self, fingers: StateArray) -> StateArray:
+        """(N, 2) distance of the left and right fingertip from the middle, metres, for (N, F) values of fingers."""
+        openings: StateArray = ((fingers - self._closed)[:, :, None] * self._openings).sum(axis=1)
+        return openings
+
+    def opening_speeds(self, fingers: StateArray) -> StateArray:
+        """(N, 2) the same for (N, F) velocities, m/s."""
+        speeds: StateArray = (fingers[:, :, None] * self._openings).sum(axis=1)
+        return speeds
+
+    def finger_values(self, width: StateArray) -> StateArray:
+        """(N, F) values of fingers (rad or m) that open the gripper to (N,) widths, metres."""
+        values: StateArray = self._closed + (width / self.opening_m)[:, None] * self._travel
+        return values
+
+    def contacts(self, touches: BoolArray) -> BoolArray:
+        """(N, 2) whether a left and a right finger touches, for (N, F) fingers that do."""
+        sides: BoolArray = np.matmul(touches, self._sides)
+        return sides
+
+
+def _add_from_files(spec: mujoco.MjSpec, robot: RobotConfig) -> None:
+    assert robot.model is not None
+    arm = _read(robot.model, robot.model_sha256)
+    roots = arm.worldbody.bodies
+    if robot.root is None and len(roots) != 1:
+        found = ", ".join(body.name for body in roots)
+        raise ConfigError(
+            f"robot {robot.name}: {robot.model} has {len(roots)} bodies at its top ({found}): name one as root"
+        )
+    root = roots[0] if robot.root is None else arm.body(robot.root)
+    if root is None:
+        raise ConfigError(f"robot {robot.name}: {robot.model} has no body {robot.root!r}, named as root")
+    root.pos = (0.0, 0.0, 0.0)
+    half = robot.base_turn_rad / 2
+    frame = spec.worldbody.add_frame(pos=robot.base_position_m, quat=(np.cos(half), 0.0, 0.0, np.sin(half)))
+    frame.attach_body(root, _PREFIX, "")
+    if robot.hand is not None:
+        hand = _read(robot.hand.model, robot.hand.model_sha256)
+        site = spec.site(_PREFIX + robot.hand.at)
+        if site is None:
+            raise ConfigError(f"robot {robot.name}: no site {robot.hand.at!r} to put the hand on in {robot.model}")
+        spec.attach(hand, prefix=_PREFIX + _HAND_PREFIX, site=site)
+
+
+def _read(name: str, sha256: str | None) -> mujoco.MjSpec:
+    """A model without what a scene has of its own."""
+    path = model_file(name, sha256)
+    try:
+        spec = mujoco.MjSpec.from_file(str(path))
+    except ValueError as error:
+        raise ConfigError(f"{path}: MuJoCo cannot read it: {' '.join(str(error).split())}") from None
+    for group in (spec.actuators, spec.sensors, spec.keys, spec.cameras, spec.lights, spec.worldbody.geoms):
+        for each in list(group):
+            spec.delete(each)
+    return spec
+
+
+def _find_joint(spec: mujoco.MjSpec, robot: RobotConfig, name: str) -> mujoco.MjsJoint:
+    prefix = "" if robot.model is None else _PREFIX
+    joint = spec.joint(prefix + name)
+    if joint is None:
+        found = ", ".join(each.name.removeprefix(prefix) for each in spec.joints)
+        raise ConfigError(f"robot {robot.name}: no joint {name!r} in its model; it has {found}")
+    if joint.type not in (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE):
+        raise ConfigError(f"robot {robot.name}: joint {name!r} is neither a hinge nor a slide")
+    return joint
+
+
+def _check_joints(
+    spec: mujoco.MjSpec, robot: RobotConfig, joints: list[mujoco.MjsJoint], fingers: list[mujoco.MjsJoint]
+) -> None:
+    """Refuse joints that nobody moves, and an order that is not the model's."""
+    there, named = ([each.name for each in group] for group in (spec.joints, [*joints, *fingers]))
+    if more := [name.removeprefix(_PREFIX) for name in there if name not in named]:
+        raise ConfigError(
+            f"robot {robot.name}: joints {', '.join(more)} are neither of the arm nor of a finger: name them, or weld "
+            "them in the model"
+        )
+    if there != named:
+        found = ", ".join(name.removeprefix(_PREFIX) for name in there)
+        raise ConfigError(f"robot {robot.name}: its joints and fingers are not in the order of the model: {found}")
+
+
+def _let_touch(spec: mujoco.MjSpec, robot: RobotConfig, fingers: list[mujoco.MjsBody], pad_friction: float) -> None:
+    """Let the gripper's geoms touch object and table, and nothing else of the robot anything."""
+    root = spec.body(fingers[0].name)
+    while root.parent is not spec.worldbody and root.parent.name != "world":
+        root = root.parent
+    solid = {geom.id: geom for geom in root.find_all(mujoco.mjtObj.mjOBJ_GEOM) if geom.contype or geom.conaffinity}
+    for geom in solid.values():
+        geom.contype = geom.conaffinity = 0
+    others = [_body(spec, robot, name) for name in robot.touching] + [finger.parent for finger in fingers]
+    for geom in joined.from_iterable(body.geoms for body in others):
+        if geom.id in solid:
+            geom.contype, geom.friction = GRIPPER_BIT, (BODY_FRICTION, 0.005, 0.0001)
+    for finger, description in zip(fingers, robot.fingers, strict=True):
+        own = [geom for geom in finger.find_all(mujoco.mjtObj.mjOBJ_GEOM) if geom.id in solid]
+        for geom in [_add_pad(finger, pad) for pad in description.pads] or own:
+            geom.contype = GRIPPER_BIT
+            grip(geom, pad_friction)
+
+
+def _add_pad(finger: mujoco.MjsBody, pad: PadConfig) -> mujoco.MjsGeom:
+    return finger.add_geom(
+        type=mujoco.mjtGeom.mjGEOM_CAPSULE,
+        fromto=(*pad.start_m, *pad.end_m),
+        size=(pad.radius_m, 0, 0),
+        conaffinity=0,
+        mass=0.0,
+        group=3,
+    )
+
+
+def _body(spec: mujoco.MjSpec, robot: RobotConfig, name: str) -> mujoco.MjsBody:
+    body = spec.body(_PREFIX + name)
+    if body is None:
+        raise ConfigError(f"robot {robot.name}: no body {name!r} in its model, named under touching")
+    return body
+
+
+def _add_servo(spec: mujoco.MjSpec, joint: mujoco.MjsJoint, stiffness: float, damping: float, max_force: float) -> None:
+    servo = spec.add_actuator(name=joint.name, target=joint.name, trntype=mujoco.mjtTrn.mjTRN_JOINT)
+    servo.set_to_position(kp=stiffness, kv=damping)
+    servo.forcelimited, servo.forcerange = True, (-max_force, max_force)
+    if joint.range[0] < joint.range[1]:
+        servo.ctrllimited, servo.ctrlrange = True, joint.range
+
+
+def _number(numbers: Numbers, index: int) -> float:
+    return numbers[index] if isinstance(numbers, tuple) else numbers
