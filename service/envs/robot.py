@@ -142,7 +142,19 @@ def _read(name: str, sha256: str | None) -> mujoco.MjSpec:
     for group in (spec.actuators, spec.sensors, spec.keys, spec.cameras, spec.lights, spec.worldbody.geoms):
         for each in list(group):
             spec.delete(each)
+    _forget_settings(spec)
     return spec
+
+
+def _forget_settings(spec: mujoco.MjSpec) -> None:
+    """Give a model MuJoCo's own settings of physics and pictures, so that the scene's are those of all."""
+    plain, visual = mujoco.MjSpec(), ("global_", "headlight", "map", "quality", "rgba", "scale")
+    pairs = [(spec.option, plain.option), (spec.stat, plain.stat)]
+    pairs += [(getattr(spec.visual, name), getattr(plain.visual, name)) for name in visual]
+    for theirs, ours in pairs:
+        for name in dir(ours):
+            if not name.startswith("_"):
+                setattr(theirs, name, getattr(ours, name))
 
 
 def _find_joint(spec: mujoco.MjSpec, robot: RobotConfig, name: str) -> mujoco.MjsJoint:

@@ -1,6 +1,6 @@
 """Decoration of the scene for pictures: the Panda's covers, table, floor, sky, light, and the workspace's edges.
 
-Everything is made here from numbers, nothing is loaded. No part collides, weighs anything or moves by itself, so a
+All of it is made from numbers. No part collides, weighs anything or moves by itself, so a
 state of the physics model is a state of the decorated one.
 """
 
@@ -37,7 +37,8 @@ def decorate(spec: mujoco.MjSpec, config: WorldConfig) -> None:
     """Add everything that is only drawn to the physics of ``scene.build_spec``; the layout of its state stays."""
     for name, properties in _MATERIALS.items():
         spec.add_material(name=name, **properties)
-    add_panda_visuals(spec)
+    if config.robot == "panda":  # others come with what they look like
+        add_panda_visuals(spec)
     _add_table(spec)
     _add_floor_and_sky(spec)
     _add_lights(spec)
