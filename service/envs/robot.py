@@ -42,6 +42,7 @@ def add_robot(spec: mujoco.MjSpec, config: WorldConfig) -> None:
     joints = [_find_joint(spec, robot, name) for name in robot.joints]
     fingers = [_find_joint(spec, robot, finger.joint) for finger in robot.fingers]
     _check_joints(spec, robot, joints, fingers)
+    _check_effector(spec, robot, config)
     for group, prefix in ((joints, ""), (fingers, "finger_")):
         for index, joint in enumerate(group):
             for name in ("armature", "friction_loss"):
@@ -110,7 +111,7 @@ class Robot:
 
 def _add_from_files(spec: mujoco.MjSpec, robot: RobotConfig) -> None:
     assert robot.model is not None
-    arm = _read(robot.model, robot.model_sha256)
+    arm = _read(robot.model, robot.model_sha256, spec)
     roots = arm.worldbody.bodies
     if robot.root is None and len(roots) != 1:
         found = ", ".join(body.name for body in roots)
@@ -125,14 +126,14 @@ def _add_from_files(spec: mujoco.MjSpec, robot: RobotConfig) -> None:
     frame = spec.worldbody.add_frame(pos=robot.base_position_m, quat=(np.cos(half), 0.0, 0.0, np.sin(half)))
     frame.attach_body(root, _PREFIX, "")
     if robot.hand is not None:
-        hand = _read(robot.hand.model, robot.hand.model_sha256)
+        hand = _read(robot.hand.model, robot.hand.model_sha256, spec)
         site = spec.site(_PREFIX + robot.hand.at)
         if site is None:
             raise ConfigError(f"robot {robot.name}: no site {robot.hand.at!r} to put the hand on in {robot.model}")
         spec.attach(hand, prefix=_PREFIX + _HAND_PREFIX, site=site)
 
 
-def _read(name: str, sha256: str | None) -> mujoco.MjSpec:
+def _read(name: str, sha256: str | None, scene: mujoco.MjSpec) -> mujoco.MjSpec:
     """A model without what a scene has of its own."""
     path = model_file(name, sha256)
     try:
@@ -142,16 +143,15 @@ def _read(name: str, sha256: str | None) -> mujoco.MjSpec:
     for group in (spec.actuators, spec.sensors, spec.keys, spec.cameras, spec.lights, spec.worldbody.geoms):
         for each in list(group):
             spec.delete(each)
-    _forget_settings(spec)
+    _take_settings(spec, scene)
     return spec
 
 
-def _forget_settings(spec: mujoco.MjSpec) -> None:
-    """Give a model MuJoCo's own settings of physics and pictures, so that the scene's are those of all."""
-    plain, visual = mujoco.MjSpec(), ("global_", "headlight", "map", "quality", "rgba", "scale")
-    pairs = [(spec.option, plain.option), (spec.stat, plain.stat)]
-    pairs += [(getattr(spec.visual, name), getattr(plain.visual, name)) for name in visual]
-    for theirs, ours in pairs:
+def _take_settings(spec: mujoco.MjSpec, scene: mujoco.MjSpec) -> None:
+    """Give a model the scene's settings of physics and pictures, or MuJoCo warns of every one that differs."""
+    visual = ("global_", "headlight", "map", "quality", "rgba", "scale")
+    groups = [(spec.option, scene.option), (spec.stat, scene.stat)]
+    for theirs, ours in groups + [(getattr(spec.visual, name), getattr(scene.visual, name)) for name in visual]:
         for name in dir(ours):
             if not name.startswith("_"):
                 setattr(theirs, name, getattr(ours, name))
@@ -181,6 +181,17 @@ def _check_joints(
     if there != named:
         found = ", ".join(name.removeprefix(_PREFIX) for name in there)
         raise ConfigError(f"robot {robot.name}: its joints and fingers are not in the order of the model: {found}")
+
+
+def _check_effector(spec: mujoco.MjSpec, robot: RobotConfig, config: WorldConfig) -> None:
+    prefix, frame = "" if robot.model is None else _PREFIX, robot.effector.frame
+    if spec.site(prefix + frame) is None and spec.body(prefix + frame) is None:
+        raise ConfigError(f"robot {robot.name}: no site or body {frame!r} in its model, named as the effector's frame")
+    if config.gripper == "free" and config.object_size_m >= robot.opening_m:
+        raise ConfigError(
+            f"robot {robot.name}: its gripper opens to {robot.opening_m:g} m, and the object is "
+            f"{config.object_size_m:g} m wide: set a smaller world.object_size_m, or world.gripper=blocked"
+        )
 
 
 def _let_touch(spec: mujoco.MjSpec, robot: RobotConfig, fingers: list[mujoco.MjsBody], pad_friction: float) -> None:

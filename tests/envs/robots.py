@@ -1,0 +1,128 @@
+"""Robots that nobody built, as users would describe them: models and descriptions, written into a directory."""
+
+import yaml
+
+PINCHER = """
+<mujoco model="pincher">
+  <compiler angle="radian"/>
+  <option timestep="0.1" gravity="0 0 -1"/>
+  <visual><map znear="0.1"/></visual>
+  <worldbody>
+    <light pos="0 0 3"/>
+    <geom name="floor" type="plane" size="1 1 .1"/>
+    <body name="base" pos="7 7 7">
+      <geom type="cylinder" size=".05 .05" pos="0 0 .05"/>
+      <body name="shoulder" pos="0 0 .12">
+        <joint name="yaw" axis="0 0 1" range="-3 3"/>
+        <geom type="sphere" size=".04" mass=".5"/>
+        <body name="upper">
+          <joint name="lift" axis="0 1 0" range="-1.5 2.5"/>
+          <geom type="capsule" size=".03" fromto="0 0 0 0 0 .25" mass=".5"/>
+          <body name="fore" pos="0 0 .25">
+            <joint name="elbow" axis="0 1 0" range="-.5 2.8"/>
+            <geom type="capsule" size=".025" fromto="0 0 0 0 0 .25" mass=".4"/>
+            <body name="wrist" pos="0 0 .25">
+              <joint name="bend" axis="0 1 0" range="-1 3"/>
+              <geom type="capsule" size=".02" fromto="0 0 0 0 0 .04" mass=".2"/>
+              <body name="palm" pos="0 0 .06">
+                <joint name="roll" axis="0 0 1" range="-3 3"/>
+                <geom name="fixed" type="box" size=".01 .005 .035" pos="0 -.03 .065" mass=".05"/>
+                <geom name="drawn" type="sphere" size=".02" contype="0" conaffinity="0" mass="0"/>
+                <site name="pinch" pos="0 .01 .09"/>
+                <body name="jaw" pos="0 -.02 0">
+                  <joint name="jaw" type="slide" axis="0 1 0" range="0 .07" armature=".3"/>
+                  <geom name="moving" type="box" size=".01 .005 .035" pos="0 0 .065" mass=".05"/>
+                </body>
+              </body>
+            </body>
+          </body>
+        </body>
+      </body>
+    </body>
+  </worldbody>
+  <actuator><motor joint="yaw"/></actuator>
+  <sensor><jointpos joint="yaw"/></sensor>
+  <keyframe><key qpos="0 0 0 0 0 0"/></keyframe>
+</mujoco>
+"""
+"""Five hinges and a jaw that closes against a fixed one, with all that a scene has of its own."""
+PINCHER_DESCRIPTION = {
+    "name": "pincher",
+    "model": "pincher.xml",
+    "base_position_m": [-0.36, 0.0, 0.0],
+    "joints": ["yaw", "lift", "elbow", "bend", "roll"],
+    "effector": {"frame": "pinch"},
+    "fingers": [{"joint": "jaw", "closed": 0.0, "open": 0.07}],
+    "opening_m": 0.07,
+    "home": [0.0, 0.3, 1.5, 1.34, 0.0],
+    "orientation": "down_any_turn",
+    "armature": 0.3,
+    "max_force": 40.0,
+}
+GANTRY = """
+<mujoco model="gantry">
+  <worldbody>
+    <body name="bridge">
+      <joint name="x" type="slide" axis="1 0 0" range="-.5 .5"/>
+      <geom type="box" size=".05 .5 .02" mass="1"/>
+      <body name="car">
+        <joint name="y" type="slide" axis="0 1 0" range="-.5 .5"/>
+        <geom type="box" size=".05 .05 .02" mass="1"/>
+        <body name="mast">
+          <joint name="z" type="slide" axis="0 0 1" range="-.5 .3"/>
+          <geom type="capsule" size=".02" fromto="0 0 0 0 0 .4" mass="1"/>
+          <site name="flange" quat="0 1 0 0"/>
+        </body>
+      </body>
+    </body>
+  </worldbody>
+</mujoco>
+"""
+HAND = """
+<mujoco model="hand">
+  <worldbody>
+    <body name="bridge">
+      <geom type="box" size=".02 .06 .01" mass=".2"/>
+      <site name="grip" pos="0 0 .1"/>
+      <body name="one" pos="0 .04 0">
+        <joint name="x" axis="1 0 0" range="-30 30" armature=".01"/>
+        <geom type="capsule" size=".008" fromto="0 0 .02 0 0 .1" mass=".02"/>
+      </body>
+      <body name="two" pos="0 -.04 0">
+        <joint name="z" axis="1 0 0" range="-30 30" armature=".01"/>
+        <geom type="capsule" size=".008" fromto="0 0 .02 0 0 .1" mass=".02"/>
+      </body>
+    </body>
+  </worldbody>
+</mujoco>
+"""
+"""Two fingers that turn, in degrees; it has names that the gantry has as well."""
+GANTRY_DESCRIPTION = {
+    "name": "gantry",
+    "model": "gantry.xml",
+    "hand": {"model": "hand.xml", "at": "flange"},
+    "base_position_m": [0.0, 0.0, 0.3],
+    "joints": ["x", "y", "z"],
+    "effector": {"frame": "hand/grip"},
+    "fingers": [
+        {"joint": "hand/x", "closed": 0.4, "open": -0.4, "side": "left"},
+        {"joint": "hand/z", "closed": -0.4, "open": 0.4, "side": "right"},
+    ],
+    "opening_m": 0.16,
+    "home": [0.0, 0.0, 0.0],
+    "orientation": "free",
+    "armature": 1.0,
+    "max_force": 200.0,
+    "finger_stiffness": 20.0,
+    "finger_damping": 1.0,
+}
+
+
+def write_robot(directory, xml=PINCHER, description=PINCHER_DESCRIPTION, **changed):
+    """A description's path; its model is beside it."""
+    tree = {**description, **changed}
+    (directory / f"{description['name']}.xml").write_text(xml)
+    (directory / "hand.xml").write_text(HAND)
+    path = directory / f"{description['name']}.yaml"
+    path.write_text(yaml.safe_dump({key: value for key, value in tree.items() if value is not None}))
+    return path

@@ -1,0 +1,200 @@
+"""Robots by description: arms and grippers that nobody here drew, in the same scene."""
+
+import os
+
+import mujoco
+import numpy as np
+import pytest
+
+from service.config import dump_config, load_config
+from service.envs.batch import DISPLACEMENT_M, WorldBatch
+from service.envs.contacts import GRIPPER_BIT
+from service.errors import ConfigError
+from tests.envs.robots import GANTRY, GANTRY_DESCRIPTION, PINCHER, write_robot
+from tests.envs.scripted import CLOSE, OPEN, drive, grasp
+from tests.runtime.runs import assert_one_line, play, tiny_config
+
+SMALL = ("world.workspace.length_x_m=0.25", "world.workspace.length_y_m=0.25", "world.workspace.height_m=0.2")
+
+
+def world_of(robot, *overrides):
+    return load_config(None, [f"world.robot={robot}", *SMALL, *overrides]).world
+
+
+@pytest.fixture
+def pincher(tmp_path):
+    return write_robot(tmp_path)
+
+
+@pytest.fixture
+def gantry(tmp_path):
+    return write_robot(tmp_path, GANTRY, GANTRY_DESCRIPTION)
+
+
+def test_an_arm_of_five_joints_with_one_jaw_picks_things_up(pincher):
+    with WorldBatch(world_of(pincher, "world.object_size_m=0.04"), 30) as worlds:
+        worlds.reset(np.random.default_rng(0))
+        assert worlds.states.shape[1] == 1 + (6 + 7) + (6 + 6) + 2
+        np.testing.assert_allclose(worlds.positions()[:, 3:5], 0.035, atol=1e-6)  # each half of the opening
+        np.testing.assert_allclose(worlds.ee_position, [[-0.05, 0.0, 0.08]] * 30, atol=1e-3)
+        grasp(worlds)
+        assert worlds.contacts().all(axis=1).mean() >= 0.9
+        above = worlds.ee_position + [0.0, 0.0, 0.1]
+        for _ in drive(worlds, lambda: above, CLOSE, 12):
+            pass
+        assert (worlds.object_position[:, 2] > 0.08).mean() >= 0.9
+
+
+def test_a_gantry_with_a_hand_of_another_file_and_turning_fingers(gantry):
+    with WorldBatch(world_of(gantry), 1) as worlds:
+        worlds.reset(np.random.default_rng(0))
+        np.testing.assert_allclose(worlds.ee_position, [[-0.05, 0.0, 0.08]], atol=1e-6)
+        np.testing.assert_allclose(worlds.positions()[0, 3:5], 0.08, atol=1e-6)
+        for axis in range(3):
+            action = np.zeros((1, 4), dtype=np.float32)
+            action[0, axis] = 1.0
+            worlds.reset(np.random.default_rng(0))
+            before = worlds.ee_position.copy()
+            for _ in range(3):
+                worlds.step(action)
+            moved = (worlds.ee_position - before)[0]
+            assert moved[axis] > DISPLACEMENT_M
+            assert np.abs(np.delete(moved, axis)).max() < 0.005
+        for _ in range(10):
+            worlds.step(np.float32([[0, 0, 0, -1]]))
+        np.testing.assert_allclose(worlds.positions()[0, 3:5], 0.0, atol=2e-3)
+
+
+def test_only_the_gripper_touches_and_nothing_of_a_scene_comes_along(pincher):
+    with WorldBatch(world_of(pincher), 1) as worlds:
+        model = worlds.model
+        touching = {model.geom(index).name for index in range(model.ngeom) if model.geom_contype[index] == GRIPPER_BIT}
+        assert touching == {"robot/fixed", "robot/moving"}
+        assert model.body("robot/base").pos.tolist() == [-0.36, 0.0, 0.0]
+        assert (model.opt.timestep, model.opt.gravity[2]) == (0.002, 0.0)
+        assert (model.nu, model.nkey, model.nlight, model.nsensor) == (7, 0, 0, 1)
+        assert mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_GEOM, "robot/floor") == -1
+        np.testing.assert_array_equal(model.dof_armature[:6], [0.3] * 5 + [0.3])
+
+
+def test_pads_touch_instead_of_a_fingers_own_shapes(tmp_path):
+    pad = {"start_m": [0.0, 0.0, 0.03], "end_m": [0.0, 0.0, 0.1], "radius_m": 0.006}
+    robot = write_robot(tmp_path, fingers=[{"joint": "jaw", "closed": 0.0, "open": 0.07, "pads": [pad, pad]}])
+    with WorldBatch(world_of(robot), 1) as worlds:
+        model = worlds.model
+        solid = [model.geom(index) for index in range(model.ngeom) if model.geom_contype[index] == GRIPPER_BIT]
+        assert [geom.type[0] for geom in solid if geom.name != "robot/fixed"] == [mujoco.mjtGeom.mjGEOM_CAPSULE] * 2
+
+
+def test_a_blocked_gripper_starts_and_stays_closed(gantry):
+    with WorldBatch(world_of(gantry, "world.gripper=blocked"), 1) as worlds:
+        worlds.reset(np.random.default_rng(0))
+        np.testing.assert_allclose(worlds.positions()[0, 3:5], 0.0, atol=1e-7)
+        for _ in range(5):
+            worlds.step(np.float32([[0, 0, 0, OPEN]]))
+        np.testing.assert_allclose(worlds.positions()[0, 3:5], 0.0, atol=3e-3)
+
+
+def test_it_learns_is_saved_and_goes_on(pincher, tmp_path):
+    """A run of the whole service with a robot of five joints."""
+    tree = tiny_config(total_env_steps=400).model_dump()
+    tree["world"]["robot"] = world_of(pincher).robot.model_dump()
+    tree["world"] |= {"object_size_m": 0.05, "workspace": {"length_x_m": 0.15, "length_y_m": 0.15, "height_m": 0.2}}
+    config = type(tiny_config()).model_validate(tree)
+    _, first = play(tmp_path / "run", config)
+    longer = config.model_copy(update={"run": config.run.model_copy(update={"total_env_steps": 800})})
+    _, second = play(tmp_path / "run", longer, resume=True)
+    assert second.num_env_steps > first.num_env_steps >= 400
+
+
+def test_a_description_is_part_of_the_configuration(pincher, tmp_path, monkeypatch):
+    config = load_config(None, [f"world.robot={pincher}"])
+    (tmp_path / "saved.yaml").write_text(dump_config(config))
+    pincher.unlink()  # what was read once is not needed again
+    monkeypatch.chdir("/")
+    assert load_config(tmp_path / "saved.yaml") == config
+    assert config.world.robot.model == str(tmp_path / "pincher.xml")
+    assert load_config().world.robot == "panda"
+
+
+def test_a_model_in_a_package(pincher, tmp_path, monkeypatch):
+    package = tmp_path / "site" / "arms_of_mine"
+    package.mkdir(parents=True)
+    (package / "__init__.py").write_text("raise AssertionError('it need not be imported')")
+    (package / "pincher.xml").write_text(PINCHER)
+    monkeypatch.syspath_prepend(tmp_path / "site")
+    with WorldBatch(world_of(write_robot(tmp_path)), 1) as worlds:
+        plain = worlds.ee_position.copy()
+    robot = tmp_path / "packaged.yaml"
+    robot.write_text(pincher.read_text().replace("model: pincher.xml", "model: package:arms_of_mine/pincher.xml"))
+    with WorldBatch(world_of(robot), 1) as worlds:
+        np.testing.assert_array_equal(worlds.ee_position, plain)
+    robot.write_text(pincher.read_text().replace("model: pincher.xml", "model: package:nobody_has_it/pincher.xml"))
+    with pytest.raises(ConfigError) as error:
+        world_of(robot)
+    assert_one_line(error.value, "no Python package 'nobody_has_it'")
+
+
+def test_another_model_than_the_one_that_was_described_is_refused(pincher, tmp_path):
+    world = world_of(pincher)
+    (tmp_path / "pincher.xml").write_text(PINCHER.replace("-3 3", "-2 2"))
+    with pytest.raises(ConfigError) as error:
+        WorldBatch(world, 1)
+    assert_one_line(error.value, "pincher.xml", "is not the one", "sha256")
+
+
+@pytest.mark.parametrize(
+    ("changed", "said"),
+    [
+        ({"model": "none.xml"}, ["none.xml", "No such file"]),
+        ({"model": None}, ["model is missing"]),
+        ({"joints": ["yaw", "lift", "elbow", "bend"], "home": [0.0] * 4}, ["roll", "neither of the arm nor"]),
+        ({"joints": ["yaw", "lift", "elbow", "bend", "twist"]}, ["no joint 'twist'", "it has yaw, lift"]),
+        ({"joints": ["lift", "yaw", "elbow", "bend", "roll"]}, ["not in the order", "yaw, lift, elbow"]),
+        ({"joints": ["yaw", "yaw", "elbow", "bend", "roll"]}, ["'yaw' is named twice"]),
+        ({"home": [0.0, 0.3, 1.5]}, ["home has 3 numbers, there are 5 joints"]),
+        ({"stiffness": [1.0, 2.0]}, ["stiffness has 2 numbers, there are 5 joints"]),
+        ({"finger_damping": [1.0, 2.0]}, ["finger_damping has 2 numbers, there are 1 fingers"]),
+        ({"effector": {"frame": "nose"}}, ["no site or body 'nose'"]),
+        ({"fingers": [{"joint": "jaw", "closed": 0.0, "open": 0.0}]}, ["closed and open are both 0"]),
+        ({"opening_m": 0.04}, ["opens to 0.04 m", "0.05 m wide"]),
+        ({"touching": ["ear"]}, ["no body 'ear'", "touching"]),
+        ({"root": "plinth"}, ["no body 'plinth'", "root"]),
+        ({"base_position_m": [-1.5, 0.0, 0.0]}, ["100% of the workspace is out of its reach", "base_position_m"]),
+        ({"home": [0.0, 0.0, 0.0, 0.0, 0.0]}, ["home posture", "check home, effector and orientation"]),
+        ({"hand": {"model": "hand.xml", "at": "wrist"}}, ["no site 'wrist'"]),
+        ({"wheels": 4}, ["wheels", "Extra inputs"]),
+    ],
+    ids=lambda value: next(iter(value)) if isinstance(value, dict) else "",
+)
+def test_mistakes_in_a_description_are_one_line(tmp_path, changed, said):
+    robot = write_robot(tmp_path, **changed)
+    with pytest.raises(ConfigError) as error:
+        WorldBatch(world_of(robot), 1)
+    assert_one_line(error.value, "pincher", *said)
+
+
+@pytest.mark.parametrize(
+    ("model", "said"),
+    [
+        ("<mujoco", ["MuJoCo cannot read it"]),
+        (
+            PINCHER.replace('<joint name="roll" axis="0 0 1" range="-3 3"/>', '<joint name="roll" type="ball"/>'),
+            ["hinge"],
+        ),
+        (PINCHER.replace("</worldbody>", '<body name="cup"/></worldbody>'), ["2 bodies at its top", "base, cup"]),
+    ],
+    ids=["no XML", "a ball joint", "two roots"],
+)
+def test_models_that_do_not_fit_are_one_line(tmp_path, model, said):
+    with pytest.raises(ConfigError) as error:
+        WorldBatch(world_of(write_robot(tmp_path, model)), 1)
+    assert_one_line(error.value, "pincher", *said)
+
+
+def test_a_description_that_would_never_be_read_to_its_end(tmp_path):
+    fifo = tmp_path / "robot.yaml"
+    os.mkfifo(fifo)
+    with pytest.raises(ConfigError) as error:
+        world_of(fifo)
+    assert_one_line(error.value, "robot.yaml", "not a regular file")
