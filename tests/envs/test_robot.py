@@ -1,6 +1,8 @@
 """Robots by description: arms and grippers that nobody here drew, in the same scene."""
 
 import os
+from importlib.util import find_spec
+from pathlib import Path
 
 import mujoco
 import numpy as np
@@ -11,9 +13,11 @@ from service.envs.batch import DISPLACEMENT_M, WorldBatch
 from service.envs.contacts import GRIPPER_BIT
 from service.errors import ConfigError
 from tests.envs.robots import GANTRY, GANTRY_DESCRIPTION, PINCHER, write_robot
-from tests.envs.scripted import CLOSE, OPEN, drive, grasp
+from tests.envs.scripted import CLOSE, OPEN, drive, grasp, place_in_air
 from tests.runtime.runs import assert_one_line, play, tiny_config
 
+ROBOTS = Path(__file__).parents[2] / "configs" / "robots"
+RECIPE = ROBOTS.parent / "pretrain" / "panda_cube.yaml"
 SMALL = ("world.workspace.length_x_m=0.25", "world.workspace.length_y_m=0.25", "world.workspace.height_m=0.2")
 
 
@@ -39,7 +43,7 @@ def test_an_arm_of_five_joints_with_one_jaw_picks_things_up(pincher):
         np.testing.assert_allclose(worlds.ee_position, [[-0.05, 0.0, 0.08]] * 30, atol=1e-3)
         grasp(worlds)
         assert worlds.contacts().all(axis=1).mean() >= 0.9
-        above = worlds.ee_position + [0.0, 0.0, 0.1]
+        above = worlds.ee_position + np.array([0.0, 0.0, 0.1])
         for _ in drive(worlds, lambda: above, CLOSE, 12):
             pass
         assert (worlds.object_position[:, 2] > 0.08).mean() >= 0.9
@@ -190,6 +194,18 @@ def test_models_that_do_not_fit_are_one_line(tmp_path, model, said):
     with pytest.raises(ConfigError) as error:
         WorldBatch(world_of(write_robot(tmp_path, model)), 1)
     assert_one_line(error.value, "pincher", *said)
+
+
+@pytest.mark.parametrize(
+    ("robot", "package", "kept"), [("viperx", "gym_aloha", 0.95), ("jaco", "dm_control", 0.95)], ids=lambda value: value
+)
+def test_arms_that_nobody_here_drew_pick_and_place(robot, package, kept):
+    if find_spec(package) is None:
+        pytest.skip(f"the model comes with {package}: pip install --no-deps")
+    world = load_config(RECIPE, [f"world.robot={ROBOTS / robot}.yaml", "world.workspace.height_m=0.25"]).world
+    placement = place_in_air(world, 100, seed=0)
+    held = (placement.distance_m < 0.01) & (placement.distance_after_hold_m < 0.01) & (placement.slip_m <= 0.005)
+    assert held.mean() >= kept
 
 
 def test_a_description_that_would_never_be_read_to_its_end(tmp_path):
