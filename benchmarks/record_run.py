@@ -51,7 +51,7 @@ def record_run(directory: RunDirectory, name: str, note: str = "") -> Run:
         "environment": _environment(directory),
         "config": config.model_dump(mode="json"),
         "series": thin(read_records(directory.metrics_file)),
-        "curriculum": count_goals(goals, config.world.object_size_m / 2),
+        "curriculum": count_goals(goals, config.world.rest_height_m),
         "goals": sample_goals(goals),
     }
 

@@ -26,6 +26,7 @@ from pydantic import (
 from service.config_tree import RENAMED, apply_override, read_yaml, updated
 from service.errors import ConfigError
 from service.frozen import FrozenModel
+from service.object_config import Object, ObjectConfig, simple_object
 from service.off_policy_config import SkillsConfig
 from service.robot_config import RobotConfig, read_robot
 
@@ -61,6 +62,8 @@ def _read_robot(value: Any) -> Any:
 
 
 _BUILT_IN, _DESCRIBED = "built-in", "described"
+_TAGS = (_BUILT_IN, _DESCRIBED, "named")
+"""Parts of pydantic's locations that are no keys."""
 Robot = Annotated[
     Annotated[Literal["panda"], Tag(_BUILT_IN)] | Annotated[RobotConfig, Tag(_DESCRIBED)],
     Discriminator(lambda value: _BUILT_IN if isinstance(value, str) else _DESCRIBED),
@@ -72,8 +75,10 @@ class WorldConfig(FrozenModel):
     """The MuJoCo world: robot, table, one rigid object."""
 
     robot: Robot = Field("panda", description="panda, or a YAML file with a description of yours (docs/robots.md)")
-    object: Literal["cube", "sphere"] = "cube"
-    object_size_m: float = Field(0.05, ge=0.02, le=0.07, description="cube edge or sphere diameter; paper: 5 cm")
+    object: Object = Field("cube", description="cube, sphere, or a description: shape, size_m, color (docs/objects.md)")
+    object_size_m: float = Field(
+        0.05, ge=0.02, le=0.07, description="cube edge or sphere diameter; paper: 5 cm. A description has its own"
+    )
     object_mass_kg: float = Field(0.1, gt=0.0, le=2.0)
     friction: float = Field(1.0, gt=0.0, le=3.0, description="sliding friction of the object, also on the table")
     pad_friction: float = Field(1.0, gt=0.0, le=3.0, description="sliding friction of the fingertips on the object")
@@ -90,6 +95,16 @@ class WorldConfig(FrozenModel):
     )
     physics_step_s: float = Field(0.002, gt=0.0, le=0.01)
     num_substeps: int = Field(20, ge=1, le=200, description="physics steps per action; 20 x 2 ms = 25 Hz as panda-gym")
+
+    @property
+    def shape(self) -> ObjectConfig:
+        """The object's shape and size."""
+        return simple_object(self.object, self.object_size_m) if isinstance(self.object, str) else self.object
+
+    @property
+    def rest_height_m(self) -> float:
+        """Height of the object's centre as it lies on the table."""
+        return self.shape.extent_m[2] / 2
 
 
 class GameConfig(FrozenModel):
@@ -462,7 +477,7 @@ def parse_config(tree: dict[str, Any], *, where: str, recorded: bool = False) ->
         return Config.model_validate(updated(tree, where=where) if recorded else tree)
     except ValidationError as error:
         first = error.errors()[0]
-        key = ".".join(str(part) for part in first["loc"] if part not in (_BUILT_IN, _DESCRIBED)) or "the top level"
+        key = ".".join(str(part) for part in first["loc"] if part not in _TAGS) or "the top level"
         found = "" if isinstance(first["input"], dict) else f" = {first['input']!r}"  # a whole group says nothing
         more = f" (and {error.error_count() - 1} more)" if error.error_count() > 1 else ""
         if key in RENAMED:

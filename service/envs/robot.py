@@ -187,10 +187,11 @@ def _check_effector(spec: mujoco.MjSpec, robot: RobotConfig, config: WorldConfig
     prefix, frame = "" if robot.model is None else _PREFIX, robot.effector.frame
     if spec.site(prefix + frame) is None and spec.body(prefix + frame) is None:
         raise ConfigError(f"robot {robot.name}: no site or body {frame!r} in its model, named as the effector's frame")
-    if config.gripper == "free" and config.object_size_m >= robot.opening_m:
+    width_m = config.shape.extent_m[1]
+    if config.gripper == "free" and width_m >= robot.opening_m:
         raise ConfigError(
-            f"robot {robot.name}: its gripper opens to {robot.opening_m:g} m, and the object is "
-            f"{config.object_size_m:g} m wide: set a smaller world.object_size_m, or world.gripper=blocked"
+            f"robot {robot.name}: its gripper opens to {robot.opening_m:g} m along y, and the object is {width_m:g} m wide "
+            "there: make the object smaller, turn it, or set world.gripper=blocked"
         )
 
 

@@ -18,21 +18,23 @@ MIXED_AIR_SHARE = 0.7
 """Share of mixed goals drawn anywhere in the workspace's volume; the rest lie on the table (paper: p = 0.7)."""
 
 
-def sample_on_table(rng: np.random.Generator, num: int, workspace: WorkspaceConfig, object_size_m: float) -> StateArray:
+def sample_on_table(
+    rng: np.random.Generator, num: int, workspace: WorkspaceConfig, object_height_m: float
+) -> StateArray:
     """(num, 3) object centres, uniform over the workspace's table area, resting on the table."""
     center = np.array([workspace.center_x_m, workspace.center_y_m])
     half = np.array([workspace.length_x_m, workspace.length_y_m]) / 2
     position = np.empty((num, 3))
     position[:, :2] = center + rng.uniform(-half, half, (num, 2))
-    position[:, 2] = object_size_m / 2
+    position[:, 2] = object_height_m / 2
     return position
 
 
 def sample_in_volume(
-    rng: np.random.Generator, num: int, workspace: WorkspaceConfig, object_size_m: float, *, lowest_m: float
+    rng: np.random.Generator, num: int, workspace: WorkspaceConfig, object_height_m: float, *, lowest_m: float
 ) -> StateArray:
     """(num, 3) object centres, uniform in the workspace above ``lowest_m``."""
-    position = sample_on_table(rng, num, workspace, object_size_m)
+    position = sample_on_table(rng, num, workspace, object_height_m)
     position[:, 2] = rng.uniform(lowest_m, workspace.height_m, num)
     return position
 
@@ -49,7 +51,7 @@ def draw_starts(rng: np.random.Generator, num: int, config: WorldConfig) -> tupl
     """
     if config.fixture == "wall":
         return _beside_wall(rng, rng.choice((-1.0, 1.0), num), config), np.empty((num, 0))
-    anywhere = sample_on_table(rng, num, config.workspace, config.object_size_m)
+    anywhere = sample_on_table(rng, num, config.workspace, 2 * config.rest_height_m)
     if config.fixture == "box":
         place = anywhere * (1.0, 1.0, 0.0)
         return _outside_boxes(rng, place, config), place
@@ -65,11 +67,11 @@ def sample_goals(
     (p = 1 in the paper's words). ``mixed``: as most of the paper's downstream tasks, anywhere in the volume with
     probability 0.7, else on the table.
     """
-    table = sample_on_table(rng, num, config.workspace, config.object_size_m)
+    table = sample_on_table(rng, num, config.workspace, 2 * config.rest_height_m)
     if kind == "table":
         return table
-    lowest = config.object_size_m / 2 + (success_distance_m if kind == "air" else 0.0)
-    volume = sample_in_volume(rng, num, config.workspace, config.object_size_m, lowest_m=lowest)
+    lowest = config.rest_height_m + (success_distance_m if kind == "air" else 0.0)
+    volume = sample_in_volume(rng, num, config.workspace, 2 * config.rest_height_m, lowest_m=lowest)
     if kind != "mixed":
         return volume
     return np.where(rng.random((num, 1)) < MIXED_AIR_SHARE, volume, table)
@@ -97,7 +99,7 @@ def draw_goals(
     if config.fixture == "wall":
         return _beside_wall(rng, np.where(start[:, 0] < config.workspace.center_x_m, 1.0, -1.0), config)
     if config.fixture == "box":
-        in_box: StateArray = box + np.array([0.0, 0.0, config.object_size_m / 2])
+        in_box: StateArray = box + np.array([0.0, 0.0, config.rest_height_m])
         return in_box
     return sample_goals(kind, rng, len(start), config, success_distance_m)
 
@@ -117,8 +119,8 @@ def check_goals(kind: GoalKind, config: WorldConfig) -> None:
 
 def _beside_wall(rng: np.random.Generator, side: StateArray, config: WorldConfig) -> StateArray:
     """(num, 3) object centres in the area on each (num,) side: -1 is nearer to the robot, 1 farther."""
-    position = sample_on_table(rng, len(side), config.workspace, config.object_size_m)
-    nearest = scene.WALL_THICKNESS_M / 2 + scene.GAP_M + config.object_size_m / 2
+    position = sample_on_table(rng, len(side), config.workspace, 2 * config.rest_height_m)
+    nearest = scene.WALL_THICKNESS_M / 2 + scene.GAP_M + config.shape.extent_m[0] / 2
     distance = nearest + rng.uniform(0.0, scene.AREA_LENGTH_M, len(side))
     position[:, 0] = config.workspace.center_x_m + side * distance
     return position
@@ -126,9 +128,9 @@ def _beside_wall(rng: np.random.Generator, side: StateArray, config: WorldConfig
 
 def _outside_boxes(rng: np.random.Generator, place: StateArray, config: WorldConfig) -> StateArray:
     """(num, 3) object centres in the workspace, each drawn again until it is clear of its box."""
-    apart = scene.BOX_SIZE_M / 2 + config.object_size_m / 2
-    least = np.array([apart + scene.GAP_M, apart + scene.FINGER_GAP_M])
-    position = sample_on_table(rng, len(place), config.workspace, config.object_size_m)
+    apart = scene.BOX_SIZE_M / 2 + np.array(config.shape.extent_m[:2]) / 2
+    least = apart + np.array([scene.GAP_M, scene.FINGER_GAP_M])
+    position = sample_on_table(rng, len(place), config.workspace, 2 * config.rest_height_m)
     while (inside := (np.abs(position - place)[:, :2] < least).all(axis=1)).any():
-        position[inside] = sample_on_table(rng, int(inside.sum()), config.workspace, config.object_size_m)
+        position[inside] = sample_on_table(rng, int(inside.sum()), config.workspace, 2 * config.rest_height_m)
     return position

@@ -16,6 +16,7 @@ from service.config import WorldConfig
 from service.envs.contacts import GRIPPER_BIT, OBJECT_BIT, STIFF, TABLE_BIT
 from service.envs.robot import add_robot, described
 from service.envs.state_layout import StateLayout
+from service.object_config import ROUND, ObjectConfig
 
 TABLE_CENTER_X_M = -0.3
 TABLE_HALF_SIZE_M = (0.55, 0.45, 0.2)
@@ -102,23 +103,34 @@ def build_layout(config: WorldConfig, *, blocked_fraction: float = 0.0) -> State
     )
 
 
+def geometry(shape: ObjectConfig) -> tuple[mujoco.mjtGeom, tuple[float, float, float], tuple[float, ...]]:
+    """MuJoCo's type of an object, its half sizes in metres, and its quaternion as it starts."""
+    half_x, half_y, half_z = (extent / 2 for extent in shape.extent_m)
+    upright, lying = (1.0, 0.0, 0.0, 0.0), (0.5**0.5, 0.0, 0.5**0.5, 0.0)
+    kind = getattr(mujoco.mjtGeom, f"mjGEOM_{shape.shape.upper()}")
+    if shape.shape == "cylinder":
+        return kind, (half_x, half_z, 0.0), upright
+    if shape.shape == "capsule":  # MuJoCo's length is without the two ends
+        return kind, (half_z, half_x - half_z, 0.0), lying
+    return kind, (half_x, half_y, half_z), upright
+
+
 def _add_object(spec: mujoco.MjSpec, config: WorldConfig) -> None:
-    half = config.object_size_m / 2
-    body = spec.worldbody.add_body(name="object", pos=(0, 0, half))
+    shape = config.shape
+    body = spec.worldbody.add_body(name="object", pos=(0, 0, config.rest_height_m))
     body.add_freejoint(name="object")
-    body.add_geom(
+    geom = body.add_geom(
         name="object",
-        type=mujoco.mjtGeom.mjGEOM_BOX if config.object == "cube" else mujoco.mjtGeom.mjGEOM_SPHERE,
-        size=(half, half, half) if config.object == "cube" else (half, 0, 0),
         mass=config.object_mass_kg,
         friction=(config.friction, 0.005, 0.0001),
-        condim=3 if config.object == "cube" else 6,
+        condim=6 if shape.shape in ROUND else 3,
         contype=OBJECT_BIT,
         conaffinity=GRIPPER_BIT,
         group=2,
-        rgba=(0.86, 0.18, 0.15, 1.0),
+        rgba=(*shape.color, 1.0),
         **STIFF,
     )
+    geom.type, geom.size, geom.quat = geometry(shape)
     weight = spec.add_actuator(
         name="weight", target="object", trntype=mujoco.mjtTrn.mjTRN_JOINT, gear=(0, 0, 1, 0, 0, 0)
     )

@@ -96,7 +96,7 @@ class TaskBins:
     def from_config(cls, config: Config, layout: StateLayout) -> TaskBins:
         """The bins of a run whose worlds' states have this layout."""
         return cls(
-            rest_height_m=config.world.object_size_m / 2,
+            rest_height_m=config.world.rest_height_m,
             gripper_blocked=layout["gripper_blocked"],
             some_blocked=config.game.blocked_gripper_fraction > 0.0,
         )

@@ -87,7 +87,7 @@ def record_rounds(
         snapshot = TaskGenerator(config, self_play.worlds.layout).snapshot()
         for _ in range(_MAX_ROLLOUTS):
             records, recorded = _record(self_play, players, snapshot, rng)
-            rounds += zip(_interest(records, config.world.object_size_m / 2), recorded, strict=True)
+            rounds += zip(_interest(records, config.world.rest_height_m), recorded, strict=True)
             if sum(played for (played, *_), _ in rounds) >= num_rounds:
                 break
             self_play.start_over()

@@ -121,7 +121,7 @@ class SkillRun(Runner):
         inside = ((end >= lower) & (end <= upper)).all(axis=1)
         moved = inside & (distance > self.config.game.success_distance_m)
         self._visits += self._cells.count(end[moved])
-        lifted = inside & in_air(end, self.config.world.object_size_m / 2)
+        lifted = inside & in_air(end, self.config.world.rest_height_m)
         return {
             "skills/moved_fraction": float(moved.mean()),
             "skills/outside_fraction": float((~inside).mean()),

@@ -19,12 +19,11 @@ from service.envs.rendering.panda_visuals import add_panda_visuals, make_visual
 from service.envs.scene import FIXTURE_PREFIX, TABLE_CENTER_X_M, TABLE_HALF_SIZE_M
 from service.types import StateArray
 
-OBJECT_RGB = (0.86, 0.13, 0.11)
 _FLOOR_Z_M = -0.74
 _TABLE_THICKNESS_M = 0.035
 _TEXTURE_SIZE = 512
 _MATERIALS: dict[str, dict[str, Any]] = {
-    "object": {"rgba": (*OBJECT_RGB, 1.0), "specular": 0.35, "shininess": 0.5},
+    "object": {"specular": 0.35, "shininess": 0.5},
     "fixture": {"rgba": (0.42, 0.47, 0.54, 1.0), "specular": 0.3, "shininess": 0.4},
     "leg": {"rgba": (0.24, 0.25, 0.27, 1.0), "specular": 0.2, "shininess": 0.3},
     "outline": {"rgba": (0.10, 0.36, 0.62, 0.85), "emission": 0.3, "specular": 0.0},
@@ -43,6 +42,7 @@ def decorate(spec: mujoco.MjSpec, config: WorldConfig) -> None:
     _add_floor_and_sky(spec)
     _add_lights(spec)
     _add_workspace(spec, config.workspace)
+    spec.material("object").rgba = (*config.shape.color, 1.0)
     spec.geom("object").material = "object"
     for geom in spec.geoms:
         if geom.name.startswith(FIXTURE_PREFIX):

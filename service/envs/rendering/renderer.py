@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.config import WorldConfig
-from service.envs.rendering.decoration import OBJECT_RGB, decorate
+from service.envs.rendering.decoration import decorate
 from service.envs.rendering.gl import RenderError, open_drawing
 from service.envs.scene import build_layout, build_spec
 from service.types import StateArray
@@ -22,11 +22,11 @@ __all__ = ["RenderError", "SceneRenderer"]
 
 Image = NDArray[np.uint8]
 
-_GOAL_RGBA = (*OBJECT_RGB, 0.30)
-_DROP_RGBA = (*OBJECT_RGB, 0.55)
+_GOAL_ALPHA, _DROP_ALPHA = 0.30, 0.55
 _DROP_RADIUS_M, _FOOT_RADIUS_M, _FOOT_HALF_HEIGHT_M = 0.0015, 0.012, 0.0006
 _MAX_GEOMS = 200
 _NUM_SAMPLES = 4
+_NOT_TURNED = np.eye(3).ravel()
 
 
 class SceneRenderer:
@@ -47,8 +47,8 @@ class SceneRenderer:
         self.model = _build_model(config, width, height)
         self._data = mujoco.MjData(self.model)
         self._layout = build_layout(config)  # the flag of a blocked gripper follows everything that is read here
-        self._half_m = config.object_size_m / 2
-        self._goal_geom = mujoco.mjtGeom.mjGEOM_BOX if config.object == "cube" else mujoco.mjtGeom.mjGEOM_SPHERE
+        self._rest_height_m = config.rest_height_m
+        self._object, self._color = self.model.geom("object"), config.shape.color
         self._rectangle = mujoco.MjrRect(0, 0, width, height)
         self._option = mujoco.MjvOption()
         self._scene = mujoco.MjvScene(self.model, maxgeom=_MAX_GEOMS)
@@ -97,18 +97,20 @@ class SceneRenderer:
 
     def _add_goal(self, goal: StateArray) -> None:
         """Add a transparent copy of the object, and a line down to the table, which shows its height."""
-        self._add(self._goal_geom, (self._half_m, self._half_m, self._half_m), goal, _GOAL_RGBA)
+        turned = np.empty(9)
+        mujoco.mju_quat2Mat(turned, self._object.quat)
+        self._add(mujoco.mjtGeom(self._object.type[0]), self._object.size, goal, _GOAL_ALPHA, turned)
         cylinder, foot = mujoco.mjtGeom.mjGEOM_CYLINDER, np.array([goal[0], goal[1], 0.0])
-        self._add(cylinder, (_FOOT_RADIUS_M, _FOOT_HALF_HEIGHT_M, 0.0), foot, _DROP_RGBA)
-        half_drop = (goal[2] - self._half_m) / 2
+        self._add(cylinder, (_FOOT_RADIUS_M, _FOOT_HALF_HEIGHT_M, 0.0), foot, _DROP_ALPHA)
+        half_drop = (goal[2] - self._rest_height_m) / 2
         if half_drop > _FOOT_HALF_HEIGHT_M:
             middle = np.array([goal[0], goal[1], half_drop])
-            self._add(cylinder, (_DROP_RADIUS_M, half_drop, 0.0), middle, _DROP_RGBA)
+            self._add(cylinder, (_DROP_RADIUS_M, half_drop, 0.0), middle, _DROP_ALPHA)
 
-    def _add(self, kind: Any, size: tuple[float, ...], position: StateArray, rgba: tuple[float, ...]) -> None:
+    def _add(self, kind: Any, size: Any, position: StateArray, alpha: float, turned: StateArray = _NOT_TURNED) -> None:
         geom = self._scene.geoms[self._scene.ngeom]
         mujoco.mjv_initGeom(
-            geom, kind, np.asarray(size), position, np.eye(3).ravel(), np.asarray(rgba, dtype=np.float32)
+            geom, kind, np.asarray(size), position, turned, np.array((*self._color, alpha), dtype=np.float32)
         )
         geom.category, geom.castshadow = mujoco.mjtCatBit.mjCAT_DECOR, 0
         geom.emission, geom.specular = 0.25, 0.2

@@ -1,0 +1,72 @@
+"""Descriptions of objects: their shape and size, as they lie on the table."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal, Self
+
+from pydantic import Discriminator, Field, Tag, model_validator
+
+from service.frozen import FrozenModel
+
+Shape = Literal["box", "sphere", "cylinder", "capsule", "ellipsoid"]
+_NUM_SIZES: dict[Shape, tuple[int, str]] = {
+    "box": (3, "its extent along x, y and z"),
+    "sphere": (1, "its diameter"),
+    "cylinder": (2, "its diameter and height"),
+    "capsule": (2, "its diameter and whole length"),
+    "ellipsoid": (3, "its extent along x, y and z"),
+}
+ROUND: frozenset[Shape] = frozenset({"sphere", "cylinder", "capsule", "ellipsoid"})
+"""Shapes that may roll."""
+Color = tuple[float, float, float]
+
+
+class ObjectConfig(FrozenModel):
+    """A rigid object of one shape, as it starts: a cylinder stands, a capsule lies along x.
+
+    The fingers close along y.
+    """
+
+    shape: Shape
+    size_m: tuple[Annotated[float, Field(ge=0.005, le=0.5)], ...] = Field(
+        description="box, ellipsoid: extent along x, y, z; sphere: diameter; cylinder: diameter, height; capsule: "
+        "diameter, whole length"
+    )
+    color: Color = Field((0.86, 0.13, 0.11), description="red, green, blue in pictures, 0 to 1")
+
+    @model_validator(mode="after")
+    def _fits_shape(self) -> Self:
+        expected, what = _NUM_SIZES[self.shape]
+        if len(self.size_m) != expected:
+            raise ValueError(f"size_m of a {self.shape} has {expected} numbers, {what}; got {len(self.size_m)}")
+        if self.shape == "capsule" and self.size_m[1] <= self.size_m[0]:
+            raise ValueError(f"size_m of a capsule: its length {self.size_m[1]:g} must exceed its diameter")
+        if not all(0.0 <= each <= 1.0 for each in self.color):
+            raise ValueError(f"color {self.color}: red, green and blue are from 0 to 1")
+        return self
+
+    @property
+    def extent_m(self) -> tuple[float, float, float]:
+        """Extent along x, y and z as it starts, metres."""
+        first, *others = self.size_m
+        if self.shape == "sphere":
+            return first, first, first
+        if self.shape == "cylinder":
+            return first, first, others[0]
+        if self.shape == "capsule":
+            return others[0], first, first
+        return first, others[0], others[1]
+
+
+def simple_object(name: Literal["cube", "sphere"], size_m: float) -> ObjectConfig:
+    """The description of a cube, by its edge, or of a sphere, by its diameter."""
+    size = (size_m, size_m, size_m) if name == "cube" else (size_m,)
+    return ObjectConfig.model_construct(shape="box" if name == "cube" else "sphere", size_m=size)
+
+
+_NAMED, _DESCRIBED = "named", "described"
+Object = Annotated[
+    Annotated[Literal["cube", "sphere"], Tag(_NAMED)] | Annotated[ObjectConfig, Tag(_DESCRIBED)],
+    Discriminator(lambda value: _NAMED if isinstance(value, str) else _DESCRIBED),
+]
+"""A name, or a description."""
