@@ -2,23 +2,36 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal, Self
+from typing import Annotated, Any, Literal, Self
 
-from pydantic import Discriminator, Field, Tag, model_validator
+from pydantic import BeforeValidator, Discriminator, Field, Tag, model_validator
 
 from service.frozen import FrozenModel
 
-Shape = Literal["box", "sphere", "cylinder", "capsule", "ellipsoid"]
+Shape = Literal["box", "sphere", "cylinder", "capsule", "ellipsoid", "mesh"]
 _NUM_SIZES: dict[Shape, tuple[int, str]] = {
     "box": (3, "its extent along x, y and z"),
     "sphere": (1, "its diameter"),
     "cylinder": (2, "its diameter and height"),
     "capsule": (2, "its diameter and whole length"),
     "ellipsoid": (3, "its extent along x, y and z"),
+    "mesh": (3, "its extent along x, y and z, which is read from its files"),
 }
-ROUND: frozenset[Shape] = frozenset({"sphere", "cylinder", "capsule", "ellipsoid"})
+ROUND: frozenset[Shape] = frozenset({"sphere", "cylinder", "capsule", "ellipsoid", "mesh"})
 """Shapes that may roll."""
 Color = tuple[float, float, float]
+
+
+class MeshConfig(FrozenModel):
+    """A mesh of convex pieces, each in a file; what is read from them is kept, so that they need not be read again."""
+
+    pieces: tuple[str, ...] = Field(
+        min_length=1, description="STL or OBJ files, each of one convex piece; package:NAME/FILE for one in a package"
+    )
+    scale: float = Field(1.0, gt=0.0, description="metres in a unit of the files: 0.001 where they are in millimetres")
+    sha256: tuple[str, ...] = Field((), description="of each file, when it was read first")
+    center_m: tuple[float, float, float] = Field((0.0, 0.0, 0.0), description="middle of its extent, from its origin")
+    volume_m3: float = Field(0.0, ge=0.0)
 
 
 class ObjectConfig(FrozenModel):
@@ -32,6 +45,7 @@ class ObjectConfig(FrozenModel):
         description="box, ellipsoid: extent along x, y, z; sphere: diameter; cylinder: diameter, height; capsule: "
         "diameter, whole length"
     )
+    mesh: MeshConfig | None = Field(None, description="files of a mesh; size_m is read from them")
     color: Color = Field((0.86, 0.13, 0.11), description="red, green, blue in pictures, 0 to 1")
 
     @model_validator(mode="after")
@@ -39,6 +53,8 @@ class ObjectConfig(FrozenModel):
         expected, what = _NUM_SIZES[self.shape]
         if len(self.size_m) != expected:
             raise ValueError(f"size_m of a {self.shape} has {expected} numbers, {what}; got {len(self.size_m)}")
+        if (self.shape == "mesh") != (self.mesh is not None):
+            raise ValueError("mesh, which names files, belongs to shape: mesh and to no other")
         if self.shape == "capsule" and self.size_m[1] <= self.size_m[0]:
             raise ValueError(f"size_m of a capsule: its length {self.size_m[1]:g} must exceed its diameter")
         if not all(0.0 <= each <= 1.0 for each in self.color):
@@ -64,9 +80,22 @@ def simple_object(name: Literal["cube", "sphere"], size_m: float) -> ObjectConfi
     return ObjectConfig.model_construct(shape="box" if name == "cube" else "sphere", size_m=size)
 
 
+def _read_mesh(value: Any) -> Any:
+    """A description of a mesh with what is read from its files, where that has not been done."""
+    if not isinstance(value, dict) or value.get("shape") != "mesh" or not isinstance(value.get("mesh"), dict):
+        return value
+    if value["mesh"].get("sha256") or not isinstance(value["mesh"].get("pieces"), (list, tuple)):
+        return value
+    from service.envs.meshes import measure  # it loads MuJoCo, which nothing else here needs
+
+    found, size_m = measure(MeshConfig.model_validate(value["mesh"]))
+    return {**value, "mesh": found, "size_m": size_m}
+
+
 _NAMED, _DESCRIBED = "named", "described"
 Object = Annotated[
     Annotated[Literal["cube", "sphere"], Tag(_NAMED)] | Annotated[ObjectConfig, Tag(_DESCRIBED)],
     Discriminator(lambda value: _NAMED if isinstance(value, str) else _DESCRIBED),
+    BeforeValidator(_read_mesh),
 ]
 """A name, or a description."""

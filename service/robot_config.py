@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, Literal, Self
 
@@ -11,12 +9,9 @@ from pydantic import Field, ValidationError, model_validator
 
 from service.errors import ConfigError
 from service.frozen import FrozenModel
+from service.model_files import PACKAGE, digest_of
 from service.parsing import MAX_YAML_CHARACTERS, ParseError, parse_yaml
 from service.regular_files import read_regular
-
-MAX_MODEL_BYTES = 64 * 1024 * 1024
-"""Of a model's file, without its meshes; usual are ten thousand."""
-_PACKAGE = "package:"
 
 Vector = tuple[float, float, float]
 Quaternion = tuple[float, float, float, float]
@@ -165,40 +160,8 @@ def read_robot(path: Path) -> RobotConfig:
     return robot.model_copy(update=found)
 
 
-def model_file(name: str, sha256: str | None = None) -> Path:
-    """The file that a description names as its model.
-
-    Args:
-        name: an absolute path, or ``package:NAME/FILE``.
-        sha256: digest that it must have.
-
-    Raises:
-        ConfigError: no such file or package, or one that has changed.
-    """
-    path = Path(name)
-    if name.startswith(_PACKAGE):
-        package, _, rest = name.removeprefix(_PACKAGE).partition("/")
-        found = find_spec(package) if package.isidentifier() else None
-        if found is None or not found.submodule_search_locations:
-            raise ConfigError(f"model {name}: no Python package {package!r} is installed here")
-        path = Path(found.submodule_search_locations[0]) / rest
-    if sha256 is not None and (digest := _digest(path, name)) != sha256:
-        raise ConfigError(
-            f"model {name} is not the one that the robot was described with: sha256 {digest[:12]}, not {sha256[:12]}; "
-            "put that file back, or begin a new run"
-        )
-    return path
-
-
 def _found(name: str, directory: Path) -> dict[str, Any]:
     """The model's absolute path, or its package, and the digest of the file there."""
-    if not name.startswith(_PACKAGE):
+    if not name.startswith(PACKAGE):
         name = str((directory / name).resolve())
-    return {"model": name, "model_sha256": _digest(model_file(name), name)}
-
-
-def _digest(path: Path, name: str) -> str:
-    try:
-        return hashlib.sha256(read_regular(path, MAX_MODEL_BYTES, follow=True)).hexdigest()
-    except OSError as error:
-        raise ConfigError(f"model {name}: {error.strerror}: it names the robot's MJCF or URDF file") from None
+    return {"model": name, "model_sha256": digest_of(name)}

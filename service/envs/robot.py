@@ -12,7 +12,8 @@ from service.envs import panda
 from service.envs.contacts import BODY_FRICTION, GRIPPER_BIT, add_finger_sensors, grip
 from service.envs.kinematics import Chain
 from service.errors import ConfigError
-from service.robot_config import Numbers, PadConfig, RobotConfig, model_file
+from service.model_files import model_file
+from service.robot_config import Numbers, PadConfig, RobotConfig
 from service.types import BoolArray, StateArray
 
 _PREFIX, _HAND_PREFIX = "robot/", "hand/"
@@ -190,8 +191,8 @@ def _check_effector(spec: mujoco.MjSpec, robot: RobotConfig, config: WorldConfig
     width_m = config.shape.extent_m[1]
     if config.gripper == "free" and width_m >= robot.opening_m:
         raise ConfigError(
-            f"robot {robot.name}: its gripper opens to {robot.opening_m:g} m along y, and the object is {width_m:g} m wide "
-            "there: make the object smaller, turn it, or set world.gripper=blocked"
+            f"robot {robot.name}: its gripper opens to {robot.opening_m:g} m, and along y the object is {width_m:g} m "
+            "wide: make it smaller, turn it, or set world.gripper=blocked"
         )
 
 

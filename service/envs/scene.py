@@ -14,6 +14,7 @@ import mujoco
 
 from service.config import WorldConfig
 from service.envs.contacts import GRIPPER_BIT, OBJECT_BIT, STIFF, TABLE_BIT
+from service.envs.meshes import add_mesh
 from service.envs.robot import add_robot, described
 from service.envs.state_layout import StateLayout
 from service.object_config import ROUND, ObjectConfig
@@ -104,10 +105,10 @@ def build_layout(config: WorldConfig, *, blocked_fraction: float = 0.0) -> State
 
 
 def geometry(shape: ObjectConfig) -> tuple[mujoco.mjtGeom, tuple[float, float, float], tuple[float, ...]]:
-    """MuJoCo's type of an object, its half sizes in metres, and its quaternion as it starts."""
+    """MuJoCo's type of an object, of a mesh the box around it; its half sizes, metres; and its quaternion at first."""
     half_x, half_y, half_z = (extent / 2 for extent in shape.extent_m)
     upright, lying = (1.0, 0.0, 0.0, 0.0), (0.5**0.5, 0.0, 0.5**0.5, 0.0)
-    kind = getattr(mujoco.mjtGeom, f"mjGEOM_{shape.shape.upper()}")
+    kind = getattr(mujoco.mjtGeom, f"mjGEOM_{shape.shape.upper()}" if shape.mesh is None else "mjGEOM_BOX")
     if shape.shape == "cylinder":
         return kind, (half_x, half_z, 0.0), upright
     if shape.shape == "capsule":  # MuJoCo's length is without the two ends
@@ -119,18 +120,23 @@ def _add_object(spec: mujoco.MjSpec, config: WorldConfig) -> None:
     shape = config.shape
     body = spec.worldbody.add_body(name="object", pos=(0, 0, config.rest_height_m))
     body.add_freejoint(name="object")
-    geom = body.add_geom(
-        name="object",
-        mass=config.object_mass_kg,
-        friction=(config.friction, 0.005, 0.0001),
-        condim=6 if shape.shape in ROUND else 3,
-        contype=OBJECT_BIT,
-        conaffinity=GRIPPER_BIT,
-        group=2,
-        rgba=(*shape.color, 1.0),
-        **STIFF,
-    )
-    geom.type, geom.size, geom.quat = geometry(shape)
+    if shape.mesh is None:
+        kind, size, quaternion = geometry(shape)
+        parts = [{"type": kind, "size": size, "quat": quaternion, "mass": config.object_mass_kg}]
+    else:
+        parts = add_mesh(spec, shape.mesh, config.object_mass_kg)
+    for index, part in enumerate(parts):
+        body.add_geom(
+            name=f"object{index or ''}",
+            friction=(config.friction, 0.005, 0.0001),
+            condim=6 if shape.shape in ROUND else 3,
+            contype=OBJECT_BIT,
+            conaffinity=GRIPPER_BIT,
+            group=2,
+            rgba=(*shape.color, 1.0),
+            **part,
+            **STIFF,
+        )
     weight = spec.add_actuator(
         name="weight", target="object", trntype=mujoco.mjtTrn.mjTRN_JOINT, gear=(0, 0, 1, 0, 0, 0)
     )

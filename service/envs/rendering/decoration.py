@@ -43,7 +43,8 @@ def decorate(spec: mujoco.MjSpec, config: WorldConfig) -> None:
     _add_lights(spec)
     _add_workspace(spec, config.workspace)
     spec.material("object").rgba = (*config.shape.color, 1.0)
-    spec.geom("object").material = "object"
+    for geom in spec.body("object").geoms:
+        geom.material = "object"
     for geom in spec.geoms:
         if geom.name.startswith(FIXTURE_PREFIX):
             geom.material = "fixture"

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from service.config import WorldConfig
 from service.envs.rendering.decoration import decorate
 from service.envs.rendering.gl import RenderError, open_drawing
-from service.envs.scene import build_layout, build_spec
+from service.envs.scene import build_layout, build_spec, geometry
 from service.types import StateArray
 
 __all__ = ["RenderError", "SceneRenderer"]
@@ -48,7 +48,7 @@ class SceneRenderer:
         self._data = mujoco.MjData(self.model)
         self._layout = build_layout(config)  # the flag of a blocked gripper follows everything that is read here
         self._rest_height_m = config.rest_height_m
-        self._object, self._color = self.model.geom("object"), config.shape.color
+        self._goal, self._color = geometry(config.shape), config.shape.color
         self._rectangle = mujoco.MjrRect(0, 0, width, height)
         self._option = mujoco.MjvOption()
         self._scene = mujoco.MjvScene(self.model, maxgeom=_MAX_GEOMS)
@@ -97,9 +97,10 @@ class SceneRenderer:
 
     def _add_goal(self, goal: StateArray) -> None:
         """Add a transparent copy of the object, and a line down to the table, which shows its height."""
+        kind, size, quaternion = self._goal
         turned = np.empty(9)
-        mujoco.mju_quat2Mat(turned, self._object.quat)
-        self._add(mujoco.mjtGeom(self._object.type[0]), self._object.size, goal, _GOAL_ALPHA, turned)
+        mujoco.mju_quat2Mat(turned, np.array(quaternion))
+        self._add(kind, size, goal, _GOAL_ALPHA, turned)
         cylinder, foot = mujoco.mjtGeom.mjGEOM_CYLINDER, np.array([goal[0], goal[1], 0.0])
         self._add(cylinder, (_FOOT_RADIUS_M, _FOOT_HALF_HEIGHT_M, 0.0), foot, _DROP_ALPHA)
         half_drop = (goal[2] - self._rest_height_m) / 2
@@ -109,9 +110,8 @@ class SceneRenderer:
 
     def _add(self, kind: Any, size: Any, position: StateArray, alpha: float, turned: StateArray = _NOT_TURNED) -> None:
         geom = self._scene.geoms[self._scene.ngeom]
-        mujoco.mjv_initGeom(
-            geom, kind, np.asarray(size), position, turned, np.array((*self._color, alpha), dtype=np.float32)
-        )
+        rgba = np.array((*self._color, alpha), dtype=np.float32)
+        mujoco.mjv_initGeom(geom, kind, np.asarray(size), position, turned, rgba)
         geom.category, geom.castshadow = mujoco.mjtCatBit.mjCAT_DECOR, 0
         geom.emission, geom.specular = 0.25, 0.2
         self._scene.ngeom += 1
