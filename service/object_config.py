@@ -84,7 +84,7 @@ def _read_mesh(value: Any) -> Any:
     """A description of a mesh with what is read from its files, where that has not been done."""
     if not isinstance(value, dict) or value.get("shape") != "mesh" or not isinstance(value.get("mesh"), dict):
         return value
-    if value["mesh"].get("sha256") or not isinstance(value["mesh"].get("pieces"), (list, tuple)):
+    if value["mesh"].get("sha256") or not value["mesh"].get("pieces"):
         return value
     from service.envs.meshes import measure  # it loads MuJoCo, which nothing else here needs
 
