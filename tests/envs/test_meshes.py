@@ -119,7 +119,7 @@ def test_mistakes_are_one_line(tmp_path):
     for described, said in (
         ("{shape: mesh, size_m: [0.05, 0.05, 0.05]}", ["mesh, which names files"]),
         ("{shape: box, size_m: [0.05, 0.05, 0.05], mesh: {pieces: [a.stl]}}", ["belongs to shape: mesh"]),
-        ("{shape: mesh, mesh: {pieces: []}}", ["world.object.mesh.pieces"]),
+        ("{shape: mesh, size_m: [0.05, 0.05, 0.05], mesh: {pieces: []}}", ["world.object.mesh.pieces"]),
     ):
         with pytest.raises(ConfigError) as error:
             load_config(None, [f"world.object={described}"])
