@@ -64,7 +64,7 @@ class HandConfig(FrozenModel):
     """A hand with a model file of its own."""
 
     model: str = Field(description="MJCF or URDF file, as for the robot")
-    at: str = Field(description="site of the robot's model that the hand is put on")
+    at: str = Field(description="site or body of the robot's model that the hand is put on")
     model_sha256: str | None = Field(None, description="of that file, when it was read first")
 
 

@@ -19,6 +19,8 @@ from service.types import BoolArray, StateArray
 _PREFIX, _HAND_PREFIX = "robot/", "hand/"
 """Begin the names of all that comes from a file, so that none is that of something in the scene; a hand's has both."""
 _SIDES = ("left", "right")
+_HIDDEN = 4
+"""Group of what is not drawn."""
 
 
 def described(config: WorldConfig) -> RobotConfig:
@@ -128,10 +130,11 @@ def _add_from_files(spec: mujoco.MjSpec, robot: RobotConfig) -> None:
     frame.attach_body(root, _PREFIX, "")
     if robot.hand is not None:
         hand = _read(robot.hand.model, robot.hand.model_sha256, spec)
-        site = spec.site(_PREFIX + robot.hand.at)
-        if site is None:
-            raise ConfigError(f"robot {robot.name}: no site {robot.hand.at!r} to put the hand on in {robot.model}")
-        spec.attach(hand, prefix=_PREFIX + _HAND_PREFIX, site=site)
+        site, body = spec.site(_PREFIX + robot.hand.at), spec.body(_PREFIX + robot.hand.at)
+        if site is None and body is None:
+            raise ConfigError(f"robot {robot.name}: no site or body {robot.hand.at!r} to put the hand on in {robot.model}")
+        place = {"site": site} if site is not None else {"frame": body.add_frame()}
+        spec.attach(hand, prefix=_PREFIX + _HAND_PREFIX, **place)
 
 
 def _read(name: str, sha256: str | None, scene: mujoco.MjSpec) -> mujoco.MjSpec:
@@ -144,6 +147,8 @@ def _read(name: str, sha256: str | None, scene: mujoco.MjSpec) -> mujoco.MjSpec:
     for group in (spec.actuators, spec.sensors, spec.keys, spec.cameras, spec.lights, spec.worldbody.geoms):
         for each in list(group):
             spec.delete(each)
+    for site in spec.sites:
+        site.group = _HIDDEN
     _take_settings(spec, scene)
     return spec
 

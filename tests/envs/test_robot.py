@@ -166,7 +166,7 @@ def test_another_model_than_the_one_that_was_described_is_refused(pincher, tmp_p
         ({"root": "plinth"}, ["no body 'plinth'", "root"]),
         ({"base_position_m": [-1.5, 0.0, 0.0]}, ["100% of the workspace is out of its reach", "base_position_m"]),
         ({"home": [0.0, 0.0, 0.0, 0.0, 0.0]}, ["home posture", "check home, effector and orientation"]),
-        ({"hand": {"model": "hand.xml", "at": "wrist"}}, ["no site 'wrist'"]),
+        ({"hand": {"model": "hand.xml", "at": "elbow"}}, ["no site or body 'elbow'"]),
         ({"wheels": 4}, ["wheels", "Extra inputs"]),
     ],
     ids=lambda value: next(iter(value)) if isinstance(value, dict) else "",

@@ -1,0 +1,131 @@
+"""Robots by description: do they pick, how fast are they, and what does self-play make of them?
+
+    pip install --no-deps gym-aloha dm-control robosuite
+    python -m benchmarks.robots --run viperx=runs/viperx --run jaco=runs/jaco --json docs/results/robots.json
+
+Each of ``configs/robots`` picks a cube up, carries it to a random place in the air and holds it there for 5 s, by a
+hand-written policy. Env steps are of random actions with one thread, in turn with the Panda's. A run is one of
+``tandem pretrain`` with that robot. What the file has of robots that are not measured now stays.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from benchmarks.env_throughput import BatchContender
+from benchmarks.measuring import RECIPE_FILE, ROOT, measure_in_turn, parser_of, ratio, run_benchmark
+from service.config import Config, WorldConfig, load_config
+from service.envs.batch import WorldBatch
+from service.errors import ConfigError
+from service.io.jsonl import read_jsonl
+from service.io.run_directory import RunDirectory
+
+ROBOTS = ROOT / "configs" / "robots"
+OVERRIDES = {"viperx": ("world.workspace.height_m=0.25",), "jaco": ("world.workspace.height_m=0.25",)}
+"""What these arms need of a world: they do not reach the upper corners of the usual one."""
+NUM_WORLDS = (8, 240)
+WITHIN_M, SLIP_M = 0.01, 0.005
+LAST_STEPS = 200_000
+"""Env steps at the end of a run over which its shares are means."""
+
+
+@dataclass(frozen=True, slots=True)
+class Settings:
+    """Amount of what is measured."""
+
+    num_picks: int = 100
+    num_pairs: int = 5
+    seconds: float = 2.0
+    """Length of each measurement of speed."""
+
+
+def measure_robot(name: str, settings: Settings) -> dict[str, Any]:
+    """Picks and speed of one robot."""
+    world = world_of(name)
+    placement = place_in_air(world, settings.num_picks, seed=0)
+    held = (
+        (placement.distance_m < WITHIN_M) & (placement.distance_after_hold_m < WITHIN_M) & (placement.slip_m <= SLIP_M)
+    )
+    with WorldBatch(world, 1) as worlds:
+        num_joints = worlds.robot.num_joints + worlds.robot.num_fingers
+    panda = load_config(RECIPE_FILE, OVERRIDES.get(name, ())).world
+    speeds = {}
+    for num in NUM_WORLDS:
+        rows = {each: BatchContender(config, num) for each, config in ((name, world), ("panda", panda))}
+        for row in rows.values():
+            row.episode()
+        samples = measure_in_turn(
+            {each: row.episode for each, row in rows.items()}, settings.num_pairs, settings.seconds
+        )
+        speeds[str(num)] = ratio(samples[name], samples["panda"])
+    return {
+        "num_joints": num_joints,
+        "picks": {"num": settings.num_picks, "held": int(held.sum())},
+        "speed_to_panda": speeds,
+    }
+
+
+def summarise_run(path: Path) -> dict[str, Any]:
+    """The end of a run: means over its last env steps, and what its Bob was measured on."""
+    directory = RunDirectory(path)
+    config: Config = directory.read_config()
+    records = read_jsonl(directory.metrics_file)
+    last = [each for each in records if each["env_steps"] > records[-1]["env_steps"] - LAST_STEPS]
+    return {
+        "env_steps": records[-1]["env_steps"],
+        "seed": config.seed,
+        "valid_fraction": float(np.mean([each["alice/valid_fraction"] for each in last])),
+        "lifted_fraction": float(np.mean([each["alice/lifted_fraction"] for each in last])),
+        "success_rate": float(np.mean([each["bob/success_rate"] for each in last])),
+        "object": config.world.shape.shape,
+    }
+
+
+def world_of(name: str) -> WorldConfig:
+    """The world of the recipe with another robot."""
+    return load_config(RECIPE_FILE, [f"world.robot={ROBOTS / name}.yaml", *OVERRIDES.get(name, ())]).world
+
+
+def report(result: dict[str, Any]) -> str:
+    """A result for people."""
+    return json.dumps(result["robots"], indent=1)
+
+
+def main() -> int:
+    """Parse the command line, measure, print."""
+    parser = parser_of(__doc__, Settings())
+    parser.add_argument("--run", action="append", default=[], metavar="NAME=DIR", help="a run with that robot")
+    parser.add_argument("--robots", nargs="*", metavar="NAME", help="default: all whose models are installed")
+    given = parser.parse_args()
+    return run_benchmark(
+        "robots", ("mujoco", "numpy"), given, Settings, lambda chosen: _benchmark(chosen, given), report
+    )
+
+
+def _benchmark(settings: Settings, given: argparse.Namespace) -> dict[str, Any]:
+    before = json.loads(given.json.read_text())["robots"] if given.json is not None and given.json.exists() else {}
+    robots: dict[str, dict[str, Any]] = {name: dict(each) for name, each in before.items()}
+    names = [path.stem for path in sorted(ROBOTS.glob("*.yaml"))] if given.robots is None else given.robots
+    for name in names:
+        try:
+            world_of(name)
+        except ConfigError as error:
+            if given.robots is not None:
+                raise
+            print(f"without {name}: {error}", flush=True)
+            continue
+        robots.setdefault(name, {}).update(measure_robot(name, settings))
+    for run in given.run:
+        name, _, path = run.partition("=")
+        robots.setdefault(name, {})["run"] = summarise_run(Path(path))
+    return {"robots": robots}
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
