@@ -11,6 +11,7 @@ hand-written policy. Env steps are of random actions with one thread, in turn wi
 from __future__ import annotations
 
 import argparse
+import importlib
 import json
 from dataclasses import dataclass
 from pathlib import Path
@@ -48,10 +49,9 @@ class Settings:
 def measure_robot(name: str, settings: Settings) -> dict[str, Any]:
     """Picks and speed of one robot."""
     world = world_of(name)
-    placement = place_in_air(world, settings.num_picks, seed=0)
-    held = (
-        (placement.distance_m < WITHIN_M) & (placement.distance_after_hold_m < WITHIN_M) & (placement.slip_m <= SLIP_M)
-    )
+    placement = importlib.import_module("tests.envs.scripted").place_in_air(world, settings.num_picks, seed=0)
+    arrived, stayed = (each < WITHIN_M for each in (placement.distance_m, placement.distance_after_hold_m))
+    held = arrived & stayed & (placement.slip_m <= SLIP_M)
     with WorldBatch(world, 1) as worlds:
         num_joints = worlds.robot.num_joints + worlds.robot.num_fingers
     panda = load_config(RECIPE_FILE, OVERRIDES.get(name, ())).world
