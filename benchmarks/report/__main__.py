@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks import time_to_skill
-from benchmarks.report import attacks, cluster, comparison, pretraining, scaling, skills, summary
+from benchmarks.report import attacks, cluster, comparison, pretraining, robots, scaling, skills, summary
 from benchmarks.report.figures import (
     draw_ablations,
     draw_chaos,
@@ -48,6 +48,7 @@ PROGRAMS = {
     "flood": "tools.flood",
     "scaling": "benchmarks.scaling",
     "ranks_on_nodes": "tools.ranks_on_nodes",
+    "robots": "benchmarks.robots",
 }
 """Modules by the name of the recorded file that they make."""
 PAGES = {
@@ -56,6 +57,7 @@ PAGES = {
     "results/skills.md": ("coverage", "curves", "controls"),
     "results/comparison.md": ("rows", "longer"),
     "downstream.md": ("headline",),
+    "robots.md": ("robots",),
     "../README.md": ("headline", "controls"),
     "scaling.md": ("bottleneck", "box", "nodes", "model", "batches", "skill", "constants"),
 }
@@ -134,6 +136,12 @@ def read_runs(directory: Path) -> tuple[list[Run], list[Run]]:
     return [run for run in runs if "ablation" not in run], ablations
 
 
+def robots_blocks(found: Results) -> Blocks:
+    """Parts of the block about robots by description."""
+    recorded = found.get("robots")
+    return {"robots": [robots.robots_table(recorded), robots.robots_words(recorded)]} if recorded is not None else {}
+
+
 class Report:
     """Draws pictures into ``docs/results``, and writes the pages.
 
@@ -162,6 +170,7 @@ class Report:
             self.skills_blocks(recorded_skills, controls),
             self.comparison_blocks(trials, longer),
             summary_blocks(trials, ()),
+            robots_blocks(found),
             summary_blocks(trials, controls),
             scaling_blocks(found, studies),
         )

@@ -132,7 +132,9 @@ def _add_from_files(spec: mujoco.MjSpec, robot: RobotConfig) -> None:
         hand = _read(robot.hand.model, robot.hand.model_sha256, spec)
         site, body = spec.site(_PREFIX + robot.hand.at), spec.body(_PREFIX + robot.hand.at)
         if site is None and body is None:
-            raise ConfigError(f"robot {robot.name}: no site or body {robot.hand.at!r} to put the hand on in {robot.model}")
+            raise ConfigError(
+                f"robot {robot.name}: no site or body {robot.hand.at!r} to put the hand on in {robot.model}"
+            )
         place = {"site": site} if site is not None else {"frame": body.add_frame()}
         spec.attach(hand, prefix=_PREFIX + _HAND_PREFIX, **place)
 

@@ -197,7 +197,9 @@ def test_models_that_do_not_fit_are_one_line(tmp_path, model, said):
 
 
 @pytest.mark.parametrize(
-    ("robot", "package", "kept"), [("viperx", "gym_aloha", 0.95), ("jaco", "dm_control", 0.95)], ids=lambda value: value
+    ("robot", "package", "kept"),
+    [("viperx", "gym_aloha", 0.95), ("jaco", "dm_control", 0.95), ("ur5e", "robosuite", 0.95)],
+    ids=lambda value: value,
 )
 def test_arms_that_nobody_here_drew_pick_and_place(robot, package, kept):
     if find_spec(package) is None:

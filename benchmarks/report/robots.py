@@ -1,0 +1,44 @@
+"""The block of ``docs/robots.md`` about robots that were tried, in Markdown, from the recorded file."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from benchmarks.report.markdown import measured_on, table
+
+Result = Mapping[str, Any]
+
+
+def robots_table(result: Result) -> str:
+    """Picks, speed and self-play of every robot."""
+    rows = []
+    for name, each in result["robots"].items():
+        picks, speed, run = (each.get(key) for key in ("picks", "speed_to_panda", "run"))
+        rows.append(
+            (
+                name,
+                f"{picks['held']} of {picks['num']}" if picks else "",
+                ", ".join(f"{each['median']:.2f} with {num} worlds" for num, each in speed.items()) if speed else "",
+                _self_play(run) if run else "not run",
+            )
+        )
+    head = ("robot", "cubes picked, carried and held", "env steps, the Panda's = 1", "self-play")
+    return table(head, rows)
+
+
+def robots_words(result: Result) -> str:
+    """What was measured, and where."""
+    return (
+        "A hand-written policy picks a cube up, carries it into the air and holds it for 5 s, within 1 cm. Env steps "
+        "are of random actions with one thread. Self-play is the Panda's recipe unchanged, one seed; shares are means "
+        f"over its last 200,000 env steps.{measured_on(result['machine'])}"
+    )
+
+
+def _self_play(run: Result) -> str:
+    shares = {key: f"{100 * run[key]:.0f} %" for key in ("valid_fraction", "lifted_fraction", "success_rate")}
+    return (
+        f"after {run['env_steps'] / 1e6:.1f} M env steps {shares['valid_fraction']} of Alice's goals are valid and "
+        f"{shares['lifted_fraction']} in the air; Bob reaches {shares['success_rate']}"
+    )
