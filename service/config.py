@@ -12,99 +12,18 @@ from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
 import yaml
-from pydantic import (
-    BaseModel,
-    BeforeValidator,
-    Discriminator,
-    Field,
-    PositiveInt,
-    Tag,
-    ValidationError,
-    model_validator,
-)
+from pydantic import BaseModel, BeforeValidator, Field, PositiveInt, ValidationError, model_validator
 
 from service.config_tree import RENAMED, apply_override, read_yaml, updated
 from service.errors import ConfigError
 from service.frozen import FrozenModel
-from service.object_config import Object, ObjectConfig, simple_object
 from service.off_policy_config import SkillsConfig
-from service.robot_config import RobotConfig, read_robot
+from service.world_config import NO_KEYS
+from service.world_config import WorkspaceConfig as WorkspaceConfig
+from service.world_config import WorldConfig as WorldConfig
 
 MIN_ROWS = 32
 """Least rows of a minibatch for each of several learners. Ranks pay off from about a thousand on."""
-
-Point = tuple[float, float, float]
-"""x, y, z in the world frame."""
-
-
-class WorkspaceConfig(FrozenModel):
-    """The box in which goals are valid. Origin of the world: the table top, 0.6 m in front of the robot's base."""
-
-    center_x_m: float = Field(-0.05, ge=-0.3, le=0.2, description="-0.05 keeps the downstream Larger task reachable")
-    center_y_m: float = Field(0.0, ge=-0.3, le=0.3)
-    length_x_m: float = Field(0.35, gt=0.0, le=0.8, description="paper: 35 cm")
-    length_y_m: float = Field(0.35, gt=0.0, le=0.8, description="paper: 35 cm")
-    height_m: float = Field(0.35, gt=0.0, le=0.8, description="paper: 35 cm")
-
-    @property
-    def lower_m(self) -> Point:
-        """Corner with the least coordinates, metres; the box stands on the table top."""
-        return self.center_x_m - self.length_x_m / 2, self.center_y_m - self.length_y_m / 2, 0.0
-
-    @property
-    def upper_m(self) -> Point:
-        """Corner with the greatest coordinates, metres."""
-        return self.center_x_m + self.length_x_m / 2, self.center_y_m + self.length_y_m / 2, self.height_m
-
-
-def _read_robot(value: Any) -> Any:
-    return read_robot(Path(value)) if isinstance(value, str) and value != "panda" else value
-
-
-_BUILT_IN, _DESCRIBED = "built-in", "described"
-_TAGS = (_BUILT_IN, _DESCRIBED, "named")
-"""Parts of pydantic's locations that are no keys."""
-Robot = Annotated[
-    Annotated[Literal["panda"], Tag(_BUILT_IN)] | Annotated[RobotConfig, Tag(_DESCRIBED)],
-    Discriminator(lambda value: _BUILT_IN if isinstance(value, str) else _DESCRIBED),
-    BeforeValidator(_read_robot),
-]
-
-
-class WorldConfig(FrozenModel):
-    """The MuJoCo world: robot, table, one rigid object."""
-
-    robot: Robot = Field("panda", description="panda, or a YAML file with a description of yours (docs/robots.md)")
-    object: Object = Field("cube", description="cube, sphere, or a description: shape, size_m, color (docs/objects.md)")
-    object_size_m: float = Field(
-        0.05, ge=0.02, le=0.07, description="cube edge or sphere diameter; paper: 5 cm. A description has its own"
-    )
-    object_mass_kg: float = Field(0.1, gt=0.0, le=2.0)
-    friction: float = Field(1.0, gt=0.0, le=3.0, description="sliding friction of the object, also on the table")
-    pad_friction: float = Field(1.0, gt=0.0, le=3.0, description="sliding friction of the fingertips on the object")
-    gripper: Literal["free", "blocked"] = Field("free", description="blocked: held closed, whatever the action says")
-    fixture: Literal["none", "wall", "box"] = Field(
-        "none", description="what stands on the table besides the object; docs/decisions/0007 has its geometry"
-    )
-    workspace: WorkspaceConfig = WorkspaceConfig()
-    start_height_m: float = Field(
-        0.08,
-        ge=0.08,
-        le=0.4,
-        description="end effector at reset, above the workspace's centre; low, so that chance finds the object",
-    )
-    physics_step_s: float = Field(0.002, gt=0.0, le=0.01)
-    num_substeps: int = Field(20, ge=1, le=200, description="physics steps per action; 20 x 2 ms = 25 Hz as panda-gym")
-
-    @property
-    def shape(self) -> ObjectConfig:
-        """The object's shape and size."""
-        return simple_object(self.object, self.object_size_m) if isinstance(self.object, str) else self.object
-
-    @property
-    def rest_height_m(self) -> float:
-        """Height of the object's centre as it lies on the table."""
-        return self.shape.extent_m[2] / 2
 
 
 class GameConfig(FrozenModel):
@@ -477,7 +396,7 @@ def parse_config(tree: dict[str, Any], *, where: str, recorded: bool = False) ->
         return Config.model_validate(updated(tree, where=where) if recorded else tree)
     except ValidationError as error:
         first = error.errors()[0]
-        key = ".".join(str(part) for part in first["loc"] if part not in _TAGS) or "the top level"
+        key = ".".join(str(part) for part in first["loc"] if part not in NO_KEYS) or "the top level"
         found = "" if isinstance(first["input"], dict) else f" = {first['input']!r}"  # a whole group says nothing
         more = f" (and {error.error_count() - 1} more)" if error.error_count() > 1 else ""
         if key in RENAMED:

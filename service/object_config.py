@@ -7,6 +7,7 @@ from typing import Annotated, Any, Literal, Self
 from pydantic import BeforeValidator, Discriminator, Field, Tag, model_validator
 
 from service.frozen import FrozenModel
+from service.mesh_files import measure
 
 Shape = Literal["box", "sphere", "cylinder", "capsule", "ellipsoid", "mesh"]
 _NUM_SIZES: dict[Shape, tuple[int, str]] = {
@@ -86,10 +87,10 @@ def _read_mesh(value: Any) -> Any:
         return value
     if value["mesh"].get("sha256") or not value["mesh"].get("pieces"):
         return value
-    from service.envs.meshes import measure  # it loads MuJoCo, which nothing else here needs
-
-    found, size_m = measure(MeshConfig.model_validate(value["mesh"]))
-    return {**value, "mesh": found, "size_m": size_m}
+    mesh = MeshConfig.model_validate(value["mesh"])
+    found = measure(mesh.pieces, mesh.scale)
+    read = {"sha256": found.sha256, "center_m": found.center_m, "volume_m3": found.volume_m3}
+    return {**value, "mesh": mesh.model_copy(update=read), "size_m": found.extent_m}
 
 
 _NAMED, _DESCRIBED = "named", "described"

@@ -40,7 +40,7 @@ CLUSTER_MODULES = (
 ROOMS_WITHOUT_TORCH = ("actors", "envs", "generator", "registry", "status")
 ROOMS = (
     *("errors", "frozen", "liveness", "types", "parsing", "regular_files", "config_tree", "off_policy_config"),
-    *("model_files", "robot_config", "object_config"),
+    *("model_files", "mesh_files", "robot_config", "object_config", "world_config"),
     *("config", "io", "envs", "policies", "generator", "actors", "learner", "sac", "baselines", "registry"),
     *("primitives", "media", "downstream"),
     *("store", "status", "runtime", "cli", "__main__"),

@@ -6,9 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from service.config import Config, Point, WorldConfig
+from service.config import Config, WorldConfig
 from service.envs.state_layout import StateLayout
 from service.types import Array, BoolArray, IntArray, StateArray
+from service.world_config import Point
 
 AIR_ABOVE_REST_M = 0.05
 """A goal is in the air when the object's centre is higher than it rests on the table by more than this."""

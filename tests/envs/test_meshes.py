@@ -94,7 +94,7 @@ def test_it_is_read_once(tmp_path, monkeypatch):
     file = write_box(tmp_path / "box.obj")
     config = world_with(file)
     (tmp_path / "saved.yaml").write_text(dump_config(config))
-    monkeypatch.setattr("service.envs.meshes.measure", None)
+    monkeypatch.setattr("service.object_config.measure", None)
     assert load_config(tmp_path / "saved.yaml") == config
     write_box(file, (0.05, 0.04, 0.03))
     with pytest.raises(ConfigError) as error:
