@@ -85,7 +85,7 @@ def test_a_file_in_millimetres(tmp_path):
 def test_it_is_picked_up_carried_and_held(tmp_path):
     coarse = ("world.physics_step_s=0.005", "world.num_substeps=8")
     config = world_with(write_box(tmp_path / "box.obj", (0.05, 0.05, 0.05)), overrides=coarse)
-    placement = place_in_air(config.world, 40, seed=0)
+    placement = place_in_air(config.world, 20, seed=0)
     held = (placement.distance_m < 0.01) & (placement.distance_after_hold_m < 0.01)
     assert held.mean() >= 0.9
 
