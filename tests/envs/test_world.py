@@ -38,7 +38,7 @@ def spread_out(worlds, rng, lowest_m=PANDA.lowest_m):
 @pytest.mark.parametrize(
     ("shape", "physics", "num_worlds", "least_share"),
     [
-        ("cube", FINE, 60, 0.98),
+        ("cube", FINE, 60, 0.99),
         ("cube", COARSE, 100, 0.99),
         ("sphere", FINE, 60, 0.95),
         ("sphere", COARSE, 60, 0.95),
