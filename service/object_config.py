@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Annotated, Any, Literal, Self
 
 from pydantic import BeforeValidator, Discriminator, Field, Tag, model_validator
@@ -75,6 +76,33 @@ class ObjectConfig(FrozenModel):
         return first, others[0], others[1]
 
 
+class FixtureConfig(ObjectConfig):
+    """A thing that stands on the table and cannot be moved."""
+
+    position_m: tuple[float, float] = Field(description="middle of its bottom, x and y")
+    bottom_m: float = Field(0.0, ge=0.0, le=1.0, description="height of its bottom above the table: a shelf's")
+    turn_rad: float = Field(0.0, description="about the vertical")
+    color: Color = (0.42, 0.47, 0.54)
+
+    @property
+    def lower_m(self) -> tuple[float, float, float]:
+        """Corner with the least coordinates of the upright box around it, metres."""
+        half_x, half_y = self._half_m
+        return self.position_m[0] - half_x, self.position_m[1] - half_y, self.bottom_m
+
+    @property
+    def upper_m(self) -> tuple[float, float, float]:
+        """Corner with the greatest coordinates, metres."""
+        half_x, half_y = self._half_m
+        return self.position_m[0] + half_x, self.position_m[1] + half_y, self.bottom_m + self.extent_m[2]
+
+    @property
+    def _half_m(self) -> tuple[float, float]:
+        x, y, _ = self.extent_m
+        cosine, sine = abs(math.cos(self.turn_rad)), abs(math.sin(self.turn_rad))
+        return (cosine * x + sine * y) / 2, (sine * x + cosine * y) / 2
+
+
 def simple_object(name: Literal["cube", "sphere"], size_m: float) -> ObjectConfig:
     """The description of a cube, by its edge, or of a sphere, by its diameter."""
     size = (size_m, size_m, size_m) if name == "cube" else (size_m,)
@@ -100,3 +128,4 @@ Object = Annotated[
     BeforeValidator(_read_mesh),
 ]
 """A name, or a description."""
+Fixture = Annotated[FixtureConfig, BeforeValidator(_read_mesh)]

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, Self
 
-from pydantic import BeforeValidator, Discriminator, Field, Tag
+from pydantic import BeforeValidator, Discriminator, Field, Tag, model_validator
 
 from service.frozen import FrozenModel
-from service.object_config import Object, ObjectConfig, simple_object
+from service.object_config import Fixture, Object, ObjectConfig, simple_object
 from service.robot_config import RobotConfig, read_robot
 
 Point = tuple[float, float, float]
@@ -64,6 +64,9 @@ class WorldConfig(FrozenModel):
     fixture: Literal["none", "wall", "box"] = Field(
         "none", description="what stands on the table besides the object; docs/decisions/0007 has its geometry"
     )
+    fixtures: tuple[Fixture, ...] = Field(
+        (), max_length=20, description="further things on the table that cannot be moved (docs/objects.md)"
+    )
     workspace: WorkspaceConfig = WorkspaceConfig()
     start_height_m: float = Field(
         0.08,
@@ -73,6 +76,12 @@ class WorldConfig(FrozenModel):
     )
     physics_step_s: float = Field(0.002, gt=0.0, le=0.01)
     num_substeps: int = Field(20, ge=1, le=200, description="physics steps per action; 20 x 2 ms = 25 Hz as panda-gym")
+
+    @model_validator(mode="after")
+    def _one_kind_of_fixtures(self) -> Self:
+        if self.fixtures and self.fixture != "none":
+            raise ValueError(f"fixture = {self.fixture!r} and fixtures: a world has the one or the other")
+        return self
 
     @property
     def shape(self) -> ObjectConfig:

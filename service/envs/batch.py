@@ -14,8 +14,8 @@ from service.envs.observations import ACTION, BOB_VALUE, FULL, POSITIONS, Observ
 from service.envs.reach import reach_of
 from service.envs.robot import Robot, described
 from service.envs.sampling import draw_starts
-from service.envs.scene import build_layout, build_spec
-from service.errors import DivergedError
+from service.envs.scene import FIXTURE_PREFIX, build_layout, build_spec
+from service.errors import ConfigError, DivergedError
 from service.types import BoolArray, FloatArray, IntArray, StateArray
 
 DISPLACEMENT_M = 0.05
@@ -26,6 +26,7 @@ MAX_TURN_RAD = 0.5
 """Most a joint is asked to turn in one action; behind the base and near a straight arm the solution would ask for 2."""
 MAX_SPEED = 1e3
 """A joint (rad/s) or object (m/s, rad/s) faster than this has diverged; the arm reaches 3, a falling object 30."""
+_TOUCHING_M = 1e-4
 _PHYSICS = int(mujoco.mjtState.mjSTATE_FULLPHYSICS)
 _CONTROL_AND_BOX = int(mujoco.mjtState.mjSTATE_CTRL) | int(mujoco.mjtState.mjSTATE_MOCAP_POS)
 
@@ -251,7 +252,22 @@ class WorldBatch:
         arm = self.robot.arm
         state[self.layout["joints"]] = arm.solve(arm.home[None], home, num_iterations=30)[0]
         state[self.layout["fingers"]] = self.robot.finger_values(np.array([self._widest_m]))[0]
+        self._check_start(state)
         return state
+
+    def _check_start(self, state: StateArray) -> None:
+        """Refuse a world in which the gripper starts inside something."""
+        data = mujoco.MjData(self.model)
+        mujoco.mj_setState(self.model, data, state[self.layout.physics], _PHYSICS)
+        mujoco.mj_forward(self.model, data)
+        for contact in data.contact[: data.ncon]:
+            names = [self.model.geom(int(geom)).name for geom in contact.geom]
+            fixed = [name for name in names if name.startswith(FIXTURE_PREFIX)]
+            if contact.dist < -_TOUCHING_M and fixed and not any(name.startswith("object") for name in names):
+                raise ConfigError(
+                    f"at its start, {self.config.start_height_m:g} m above the middle of the workspace, the gripper is "
+                    f"inside {fixed[0]}: raise world.start_height_m, or put the fixture elsewhere"
+                )
 
 
 def _quieten_mujoco() -> None:

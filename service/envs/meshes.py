@@ -10,20 +10,19 @@ from service.model_files import model_file
 from service.object_config import MeshConfig
 
 
-def add_mesh(spec: mujoco.MjSpec, mesh: MeshConfig, mass_kg: float) -> list[dict[str, Any]]:
+def add_mesh(spec: mujoco.MjSpec, mesh: MeshConfig, name: str, mass_kg: float) -> list[dict[str, Any]]:
     """Add the pieces of a mesh to a scene under construction; returns the settings of a geom for each.
 
     Raises:
         ConfigError: a file is gone, or another than it was.
     """
     parts = []
-    for index, (name, sha256) in enumerate(zip(mesh.pieces, mesh.sha256, strict=True)):
-        file = str(model_file(name, sha256))
-        spec.add_mesh(name=f"object{index}", file=file, scale=[mesh.scale] * 3)
+    for index, (piece, sha256) in enumerate(zip(mesh.pieces, mesh.sha256, strict=True)):
+        spec.add_mesh(name=f"{name}{index}", file=str(model_file(piece, sha256)), scale=[mesh.scale] * 3)
         parts.append(
             {
                 "type": mujoco.mjtGeom.mjGEOM_MESH,
-                "meshname": f"object{index}",
+                "meshname": f"{name}{index}",
                 "pos": [-each for each in mesh.center_m],
                 "density": mass_kg / mesh.volume_m3,
             }

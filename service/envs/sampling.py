@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from typing import Literal
 
 import numpy as np
 
 from service.config import WorkspaceConfig, WorldConfig
 from service.envs import scene
-from service.errors import TandemError
+from service.errors import ConfigError, TandemError
 from service.types import StateArray
 
 GoalKind = Literal["table", "air", "mixed", "volume"]
 GOAL_KINDS: tuple[GoalKind, ...] = ("table", "air", "mixed", "volume")
 
+_MAX_DRAWS = 1000
 MIXED_AIR_SHARE = 0.7
 """Share of mixed goals drawn anywhere in the workspace's volume; the rest lie on the table (paper: p = 0.7)."""
 
@@ -42,16 +44,19 @@ def sample_in_volume(
 def draw_starts(rng: np.random.Generator, num: int, config: WorldConfig) -> tuple[StateArray, StateArray]:
     """Random starts of objects, and of the box where there is one.
 
-    Without a fixture, anywhere on the table inside the workspace. Beside a wall, in one of its two areas, either with
-    equal chance. With a box, the box's middle is anywhere in the workspace, and the object outside of it: so far that
-    an open finger fits between the two.
+    Without a fixture, anywhere on the table inside the workspace; so far from fixtures that are described that an open
+    finger fits between. Beside a wall, in one of its two areas, either with equal chance. With a box, the box's middle
+    is anywhere in the workspace, and the object outside of it: as far as from other fixtures.
 
     Returns:
         (num, 3) object centres and (num, 3) places of the box, metres; (num, 0) places in worlds without.
     """
     if config.fixture == "wall":
         return _beside_wall(rng, rng.choice((-1.0, 1.0), num), config), np.empty((num, 0))
-    anywhere = sample_on_table(rng, num, config.workspace, 2 * config.rest_height_m)
+    gap_m = (scene.GAP_M, scene.FINGER_GAP_M, scene.GAP_M)
+    anywhere = _clear_of_fixtures(
+        lambda num: sample_on_table(rng, num, config.workspace, 2 * config.rest_height_m), num, config, gap_m
+    )
     if config.fixture == "box":
         place = anywhere * (1.0, 1.0, 0.0)
         return _outside_boxes(rng, place, config), place
@@ -65,8 +70,14 @@ def sample_goals(
 
     ``table``: on it. ``air``: out of reach of an object that rests on the table. ``volume``: anywhere in the workspace
     (p = 1 in the paper's words). ``mixed``: as most of the paper's downstream tasks, anywhere in the volume with
-    probability 0.7, else on the table.
+    probability 0.7, else on the table. None is where the object would be inside a fixture.
     """
+    return _clear_of_fixtures(lambda num: _draw_goals(kind, rng, num, config, success_distance_m), num, config)
+
+
+def _draw_goals(
+    kind: GoalKind, rng: np.random.Generator, num: int, config: WorldConfig, success_distance_m: float
+) -> StateArray:
     table = sample_on_table(rng, num, config.workspace, 2 * config.rest_height_m)
     if kind == "table":
         return table
@@ -115,6 +126,26 @@ def check_goals(kind: GoalKind, config: WorldConfig) -> None:
     if config.fixture != "none" and kind != "table":
         where = {"wall": "behind it", "box": "in it"}[config.fixture]
         raise TandemError(f"goals = {kind!r} with a {config.fixture}: its goals lie {where}; choose table")
+
+
+def _clear_of_fixtures(
+    draw: Callable[[int], StateArray], num: int, config: WorldConfig, gap_m: Sequence[float] = (0.0, 0.0, 0.0)
+) -> StateArray:
+    """(num, 3) object centres, each drawn again until the object is clear of all described fixtures."""
+    position = draw(num)
+    half = np.array(config.shape.extent_m) / 2 + gap_m
+    boxes = [(np.array(each.lower_m) - half, np.array(each.upper_m) + half) for each in config.fixtures]
+    for _ in range(_MAX_DRAWS if boxes else 0):
+        inside = np.any([((position > low) & (position < high)).all(axis=1) for low, high in boxes], axis=0)
+        if not inside.any():
+            return position
+        position[inside] = draw(int(inside.sum()))
+    if boxes:
+        raise ConfigError(
+            f"world.fixtures: the {len(boxes)} of them leave no room for the object in the workspace: take some away, "
+            "or make world.workspace larger"
+        )
+    return position
 
 
 def _beside_wall(rng: np.random.Generator, side: StateArray, config: WorldConfig) -> StateArray:

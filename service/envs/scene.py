@@ -11,6 +11,7 @@ from __future__ import annotations
 from typing import Any
 
 import mujoco
+import numpy as np
 
 from service.config import WorldConfig
 from service.envs.contacts import GRIPPER_BIT, OBJECT_BIT, STIFF, TABLE_BIT
@@ -76,6 +77,7 @@ def build_spec(config: WorldConfig) -> mujoco.MjSpec:
     )
     _add_object(spec, config)
     _add_fixture(spec, config)
+    _add_fixtures(spec, config)
     return spec
 
 
@@ -116,15 +118,19 @@ def geometry(shape: ObjectConfig) -> tuple[mujoco.mjtGeom, tuple[float, float, f
     return kind, (half_x, half_y, half_z), upright
 
 
+def _parts(spec: mujoco.MjSpec, shape: ObjectConfig, name: str, mass_kg: float) -> list[dict[str, Any]]:
+    """Settings of the geoms that an object is made of; adds what they need to the scene."""
+    if shape.mesh is not None:
+        return add_mesh(spec, shape.mesh, name, mass_kg)
+    kind, size, quaternion = geometry(shape)
+    return [{"type": kind, "size": size, "quat": quaternion, "mass": mass_kg}]
+
+
 def _add_object(spec: mujoco.MjSpec, config: WorldConfig) -> None:
     shape = config.shape
     body = spec.worldbody.add_body(name="object", pos=(0, 0, config.rest_height_m))
     body.add_freejoint(name="object")
-    if shape.mesh is None:
-        kind, size, quaternion = geometry(shape)
-        parts = [{"type": kind, "size": size, "quat": quaternion, "mass": config.object_mass_kg}]
-    else:
-        parts = add_mesh(spec, shape.mesh, config.object_mass_kg)
+    parts = _parts(spec, shape, "object", config.object_mass_kg)
     for index, part in enumerate(parts):
         body.add_geom(
             name=f"object{index or ''}",
@@ -159,6 +165,27 @@ def _add_fixture(spec: mujoco.MjSpec, config: WorldConfig) -> None:
         _add_plate(box, "far", (side, 0.0, half_height), (half_shell, outer, half_height), config)
         _add_plate(box, "left", (0.0, -side, half_height), (inner, half_shell, half_height), config)
         _add_plate(box, "right", (0.0, side, half_height), (inner, half_shell, half_height), config)
+
+
+def _add_fixtures(spec: mujoco.MjSpec, config: WorldConfig) -> None:
+    """Add the described ones."""
+    for number, fixture in enumerate(config.fixtures):
+        x, y = fixture.position_m
+        half = fixture.turn_rad / 2
+        body = spec.worldbody.add_body(
+            pos=(x, y, fixture.bottom_m + fixture.extent_m[2] / 2), quat=(np.cos(half), 0.0, 0.0, np.sin(half))
+        )
+        for index, part in enumerate(_parts(spec, fixture, f"fixture{number}-", 1.0)):
+            body.add_geom(
+                name=f"{FIXTURE_PREFIX}{number}-{index}",
+                contype=0,
+                conaffinity=GRIPPER_BIT | OBJECT_BIT,
+                friction=(config.friction, 0.005, 0.0001),
+                group=2,
+                rgba=(*fixture.color, 1.0),
+                **part,
+                **STIFF,
+            )
 
 
 def _add_plate(body: Any, name: str, middle: tuple[float, ...], half: tuple[float, ...], config: WorldConfig) -> None:
