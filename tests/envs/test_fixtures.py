@@ -113,12 +113,10 @@ def test_mistakes_in_a_description_are_one_line(described, said):
     with pytest.raises(ConfigError) as error:
         load_config(None, [f"world.fixtures={described}"])
     assert_one_line(error.value, *said)
+
+
+def test_a_wall_and_others_are_one_line():
+    post = "{shape: cylinder, size_m: [0.04, 0.2], position_m: [0.08, -0.1]}"
     with pytest.raises(ConfigError) as error:
-        load_config(
-            None,
-            [
-                "world.fixture=wall",
-                f"world.fixtures=[{{{', '.join(f'{k}: {list(v) if isinstance(v, tuple) else v}' for k, v in POST.items())}}}]",
-            ],
-        )
+        load_config(None, ["world.fixture=wall", f"world.fixtures=[{post}]"])
     assert_one_line(error.value, "the one or the other")
