@@ -40,6 +40,11 @@ def model_file(name: str, sha256: str | None = None) -> Path:
     return path
 
 
+def absolute(name: str, directory: Path) -> str:
+    """A file's name that means the same from everywhere; a relative one is from ``directory``."""
+    return name if name.startswith(PACKAGE) else str((directory / name).resolve())
+
+
 def digest_of(name: str) -> str:
     """The sha256 of a file that a description names.
 

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import math
+from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
 from pydantic import BeforeValidator, Discriminator, Field, Tag, model_validator
 
 from service.frozen import FrozenModel
 from service.mesh_files import measure
+from service.model_files import absolute
 
 Shape = Literal["box", "sphere", "cylinder", "capsule", "ellipsoid", "mesh"]
 _NUM_SIZES: dict[Shape, tuple[int, str]] = {
@@ -116,8 +118,9 @@ def _read_mesh(value: Any) -> Any:
     if value["mesh"].get("sha256") or not value["mesh"].get("pieces"):
         return value
     mesh = MeshConfig.model_validate(value["mesh"])
-    found = measure(mesh.pieces, mesh.scale)
-    read = {"sha256": found.sha256, "center_m": found.center_m, "volume_m3": found.volume_m3}
+    pieces = tuple(absolute(piece, Path()) for piece in mesh.pieces)
+    found = measure(pieces, mesh.scale)
+    read = {"pieces": pieces, "sha256": found.sha256, "center_m": found.center_m, "volume_m3": found.volume_m3}
     return {**value, "mesh": mesh.model_copy(update=read), "size_m": found.extent_m}
 
 

@@ -9,7 +9,7 @@ from pydantic import Field, ValidationError, model_validator
 
 from service.errors import ConfigError
 from service.frozen import FrozenModel
-from service.model_files import PACKAGE, digest_of
+from service.model_files import absolute, digest_of
 from service.parsing import MAX_YAML_CHARACTERS, ParseError, parse_yaml
 from service.regular_files import read_regular
 
@@ -86,7 +86,7 @@ class RobotConfig(FrozenModel):
     hand: HandConfig | None = None
     base_position_m: Vector = Field((0.0, 0.0, 0.0), description="of the root, from the table's origin")
     base_turn_rad: float = Field(0.0, description="of the root about the vertical")
-    joints: tuple[str, ...] = Field(min_length=1, description="of the arm, from the base to the end effector")
+    joints: tuple[str, ...] = Field(min_length=3, description="of the arm, from the base to the end effector")
     effector: EffectorConfig
     fingers: tuple[FingerConfig, ...] = Field(min_length=1)
     opening_m: float = Field(gt=0.0, le=0.5, description="between the fingertips where the gripper is open")
@@ -162,6 +162,5 @@ def read_robot(path: Path) -> RobotConfig:
 
 def _found(name: str, directory: Path) -> dict[str, Any]:
     """The model's absolute path, or its package, and the digest of the file there."""
-    if not name.startswith(PACKAGE):
-        name = str((directory / name).resolve())
+    name = absolute(name, directory)
     return {"model": name, "model_sha256": digest_of(name)}

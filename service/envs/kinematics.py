@@ -215,7 +215,7 @@ def _denavit_hartenberg(axes: StateArray, anchors: StateArray, last_x: StateArra
         normals[index], feet[index], ends[index] = _common_normal(axes[index : index + 2], anchors[index : index + 2])
     across = last_x - axes[-1] * (axes[-1] @ last_x)
     free = across if np.linalg.norm(across) > 1e-6 else normals[num - 2]
-    normals[-1], feet[-1] = free / np.linalg.norm(free), ends[num - 2] if num > 1 else anchors[-1]
+    normals[-1], feet[-1] = free / np.linalg.norm(free), ends[num - 2]
     offset_a, twist, offset_d, angle = [0.0], [(1.0, 0.0)], np.zeros(num), np.zeros(num)
     for index in range(1, num):
         before, x_axis = axes[index - 1], normals[index - 1]

@@ -73,7 +73,7 @@ class Robot:
         """Between the fingertips where the gripper is open."""
         self.lowest_m = robot.lowest_m
         """Least height of a commanded end effector."""
-        prefix = "" if config.robot == "panda" else _PREFIX
+        prefix = _prefix(robot)
         self.arm = Chain(
             model,
             [prefix + name for name in robot.joints],
@@ -166,7 +166,7 @@ def _take_settings(spec: mujoco.MjSpec, scene: mujoco.MjSpec) -> None:
 
 
 def _find_joint(spec: mujoco.MjSpec, robot: RobotConfig, name: str) -> mujoco.MjsJoint:
-    prefix = "" if robot.model is None else _PREFIX
+    prefix = _prefix(robot)
     joint = spec.joint(prefix + name)
     if joint is None:
         found = ", ".join(each.name.removeprefix(prefix) for each in spec.joints)
@@ -192,7 +192,7 @@ def _check_joints(
 
 
 def _check_effector(spec: mujoco.MjSpec, robot: RobotConfig, config: WorldConfig) -> None:
-    prefix, frame = "" if robot.model is None else _PREFIX, robot.effector.frame
+    prefix, frame = _prefix(robot), robot.effector.frame
     if spec.site(prefix + frame) is None and spec.body(prefix + frame) is None:
         raise ConfigError(f"robot {robot.name}: no site or body {frame!r} in its model, named as the effector's frame")
     width_m = config.shape.extent_m[1]
@@ -250,3 +250,8 @@ def _add_servo(spec: mujoco.MjSpec, joint: mujoco.MjsJoint, stiffness: float, da
 
 def _number(numbers: Numbers, index: int) -> float:
     return numbers[index] if isinstance(numbers, tuple) else numbers
+
+
+def _prefix(robot: RobotConfig) -> str:
+    """Begins the names of a robot's parts in a scene."""
+    return _PREFIX if robot.model is not None else ""

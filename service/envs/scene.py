@@ -77,7 +77,7 @@ def build_spec(config: WorldConfig) -> mujoco.MjSpec:
     )
     _add_object(spec, config)
     _add_fixture(spec, config)
-    _add_fixtures(spec, config)
+    _add_described_fixtures(spec, config)
     return spec
 
 
@@ -167,8 +167,8 @@ def _add_fixture(spec: mujoco.MjSpec, config: WorldConfig) -> None:
         _add_plate(box, "right", (0.0, side, half_height), (inner, half_shell, half_height), config)
 
 
-def _add_fixtures(spec: mujoco.MjSpec, config: WorldConfig) -> None:
-    """Add the described ones."""
+def _add_described_fixtures(spec: mujoco.MjSpec, config: WorldConfig) -> None:
+    """Add those of ``world.fixtures``."""
     for number, fixture in enumerate(config.fixtures):
         x, y = fixture.position_m
         half = fixture.turn_rad / 2

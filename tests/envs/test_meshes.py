@@ -92,8 +92,11 @@ def test_it_is_picked_up_carried_and_held(tmp_path):
 
 def test_it_is_read_once(tmp_path, monkeypatch):
     file = write_box(tmp_path / "box.obj")
-    config = world_with(file)
+    monkeypatch.chdir(tmp_path)
+    config = world_with("box.obj")
     (tmp_path / "saved.yaml").write_text(dump_config(config))
+    monkeypatch.chdir("/")
+    WorldBatch(config.world, 1).close()
     monkeypatch.setattr("service.object_config.measure", None)
     assert load_config(tmp_path / "saved.yaml") == config
     write_box(file, (0.05, 0.04, 0.03))
