@@ -42,7 +42,7 @@ ROOMS = (
     *("errors", "frozen", "liveness", "types", "parsing", "regular_files", "config_tree", "off_policy_config"),
     *("model_files", "mesh_files", "robot_config", "object_config", "world_config"),
     *("config", "io", "envs", "policies", "generator", "actors", "learner", "sac", "baselines", "registry"),
-    *("primitives", "media", "downstream"),
+    *("primitives", "media", "downstream", "robot"),
     *("store", "status", "runtime", "cli", "__main__"),
 )
 """Each room may import itself and those before it."""
