@@ -18,7 +18,7 @@ from service.config_tree import RENAMED, apply_override, read_yaml, updated
 from service.errors import ConfigError
 from service.frozen import FrozenModel
 from service.off_policy_config import SkillsConfig
-from service.world_config import NO_KEYS
+from service.world_config import NO_KEYS, ObservedConfig
 from service.world_config import WorkspaceConfig as WorkspaceConfig
 from service.world_config import WorldConfig as WorldConfig
 
@@ -346,6 +346,12 @@ class Config(FrozenModel):
                 "without Alice there are no goals: set generator.goal_source to uniform, table or learnable, and "
                 "generator.replay_invalid=true, or game.alice_plays=true"
             )
+        return self
+
+    @model_validator(mode="after")
+    def _skills_see_the_papers_positions(self) -> Self:
+        if self.skills is not None and self.world.observed != ObservedConfig():
+            raise ValueError("skill discovery sees the positions of the paper only: leave out world.observed")
         return self
 
     @model_validator(mode="after")

@@ -35,6 +35,18 @@ class WorkspaceConfig(FrozenModel):
         return self.center_x_m + self.length_x_m / 2, self.center_y_m + self.length_y_m / 2, self.height_m
 
 
+class ObservedConfig(FrozenModel):
+    """Entries of observations beyond the paper's: inputs of every policy, so they belong to what is published."""
+
+    num_commands: int = Field(
+        0,
+        ge=0,
+        le=8,
+        description="last commands of its own that a policy sees, the newest first; 0 in the paper. With late "
+        "observations or a slow arm, positions alone do not say what is still under way",
+    )
+
+
 def _read_robot(value: Any) -> Any:
     return read_robot(Path(value)) if isinstance(value, str) and value != "panda" else value
 
@@ -68,6 +80,7 @@ class WorldConfig(FrozenModel):
         (), max_length=20, description="further things on the table that cannot be moved (docs/objects.md)"
     )
     workspace: WorkspaceConfig = WorkspaceConfig()
+    observed: ObservedConfig = ObservedConfig()
     start_height_m: float = Field(
         0.08,
         ge=0.08,

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from service.actors.rollout import Demonstrations, Rollout, Turns
 from service.config import Config
 from service.envs.batch import WorldBatch
-from service.envs.observations import ACTION, BOB, BOB_VALUE, FULL, POSITIONS, bob_observation
+from service.envs.observations import ACTION, bob_observation
 from service.generator.opponents import CURRENT, RoundPlan
 from service.generator.records import GoalRecords
 from service.generator.ring import Rows
@@ -178,7 +178,8 @@ class SelfPlay:
         """Alice's turns, without the reward of her goal; (N, 2) finger contacts; (N,) worlds whose physics diverged."""
         game, worlds = self.config.game, self.worlds
         num_steps = int(self._rng.integers(game.alice_steps_min or game.alice_steps, game.alice_steps + 1))
-        turns = _empty_turns(game.alice_steps, worlds.num_worlds, FULL.size, FULL.size, learn=~plan.alice_past)
+        size = worlds.observed.full.size
+        turns = _empty_turns(game.alice_steps, worlds.num_worlds, size, size, learn=~plan.alice_past)
         all_worlds = np.arange(worlds.num_worlds)
         contacts = np.zeros((worlds.num_worlds, 2), dtype=bool)
         diverged = np.zeros(worlds.num_worlds, dtype=bool)
@@ -208,7 +209,8 @@ class SelfPlay:
         """Turns without a step, as ``_play_alice`` gives them."""
         num = self.worlds.num_worlds
         nobody = np.zeros(num, dtype=bool)
-        turns = _empty_turns(self.config.game.alice_steps, num, FULL.size, FULL.size, learn=nobody)
+        size = self.worlds.observed.full.size
+        turns = _empty_turns(self.config.game.alice_steps, num, size, size, learn=nobody)
         return turns, np.zeros((num, 2), dtype=bool), nobody
 
     def _play_bob(
@@ -221,7 +223,8 @@ class SelfPlay:
         """
         game, worlds = self.config.game, self.worlds
         num = worlds.num_worlds
-        turns = _empty_turns(game.bob_steps, num, BOB.size, BOB_VALUE.size, learn=choice.played & ~plan.bob_past)
+        sizes = worlds.observed.bob.size, worlds.observed.bob_value.size
+        turns = _empty_turns(game.bob_steps, num, *sizes, learn=choice.played & ~plan.bob_past)
         solved, diverged = np.zeros(num, dtype=bool), np.zeros(num, dtype=bool)
         num_held: IntArray = np.zeros(num, dtype=np.int64)
         margin_m = game.bob_margin_m if players.version >= game.bob_margin_after_updates else 0.0
@@ -266,12 +269,12 @@ class SelfPlay:
     def _demonstrations(self, alice: Turns, bob: Turns, records: GoalRecords, achieved: StateArray) -> Demonstrations:
         """Alice's turns for the goals the current Bob failed; with hindsight, also steps of his own failures."""
         failed = records.played & ~records.solved & ~records.bob_past
-        by_alice = _relabelled(alice, failed & ~records.replayed, records.goal)
+        by_alice = self._relabelled(alice, failed & ~records.replayed, records.goal)
         if not self.config.learner.abc.hindsight:
             return by_alice
         config = self.config
         moved = classify_goal(records.start_position, achieved, config.world.workspace, config.game.success_distance_m)
-        by_bob = _relabelled(bob, failed & (moved == Verdict.VALID), achieved)
+        by_bob = self._relabelled(bob, failed & (moved == Verdict.VALID), achieved)
         # No more of his steps than of hers: he fails in several times as many, and would drown what she shows him.
         every = -(-len(by_bob.observation) // max(1, len(by_alice.observation))) or 1
         if not config.game.alice_plays:
@@ -280,6 +283,13 @@ class SelfPlay:
             np.concatenate([by_alice.observation, by_bob.observation[::every]]),
             np.concatenate([by_alice.action, by_bob.action[::every]]),
         )
+
+    def _relabelled(self, turns: Turns, chosen: BoolArray, goal: StateArray) -> Demonstrations:
+        """The turns of the ``chosen`` worlds (N,) with Bob's input: demonstrations of how to reach ``goal`` (N, 3)."""
+        active = turns.active & chosen
+        goals = np.broadcast_to(goal, (*active.shape, 3))[active]
+        positions = turns.observation[active][:, : self.worlds.observed.positions.size]
+        return Demonstrations(bob_observation(positions, goals), turns.action[active])
 
     def _continue_games(self, end_state: StateArray, going_on: BoolArray) -> None:
         """Begin the next round at ``end_state`` (N, S) in the worlds ``going_on`` (N,), a new game in the others."""
@@ -339,14 +349,6 @@ def _empty_turns(num_steps: int, num: int, observation_size: int, value_size: in
         terminated=np.zeros((num_steps, num), dtype=bool),
         learn=learn.copy(),
     )
-
-
-def _relabelled(turns: Turns, chosen: BoolArray, goal: StateArray) -> Demonstrations:
-    """The turns of the ``chosen`` worlds (N,) with Bob's input, as demonstrations of how to reach ``goal`` (N, 3)."""
-    active = turns.active & chosen
-    goals = np.broadcast_to(goal, (*active.shape, 3))[active]
-    observation = bob_observation(turns.observation[active][:, : POSITIONS.size], goals)
-    return Demonstrations(observation, turns.action[active])
 
 
 def _contact_metrics(contacts: BoolArray) -> Metrics:

@@ -20,7 +20,7 @@ import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
-from service.envs.observations import POSITIONS, SPACES
+from service.envs.observations import layouts
 from service.errors import TandemError
 from service.policies.numpy_policy import NumpyMCPPolicy
 from service.primitives.loading import TrainedBob, TrainedSkills
@@ -52,7 +52,7 @@ def compose_actions(
 
     Args:
         primitives: K of them.
-        positions: (..., 11), metres.
+        positions: (..., P), metres.
         actions: (..., K) of a learner; with a residual (..., K + 4).
         residual: size of the greatest action that is added (Silver et al. 2018; Johannink et al. 2019).
     """
@@ -83,10 +83,11 @@ def check_robot(trained: TrainedBob | TrainedSkills) -> None:
     if trained.manifest is None:
         return
     spaces = trained.manifest.spaces
-    wanted_spaces = SPACES if isinstance(trained, TrainedBob) else {key: SPACES[key] for key in _SEEN_BY_SKILLS}
+    known = layouts(trained.config.world.observed).spaces
+    wanted_spaces = known if isinstance(trained, TrainedBob) else {key: known[key] for key in _SEEN_BY_SKILLS}
     wrong = {key: spaces.get(key) for key, value in wanted_spaces.items() if spaces.get(key) != value}
     if wrong:
-        found, wanted = (", ".join(f"{key} {tree[key]}" for key in wrong) for tree in (wrong, SPACES))
+        found, wanted = (", ".join(f"{key} {tree[key]}" for key in wrong) for tree in (wrong, known))
         raise TandemError(f"{trained.label} is for another robot or layout: {found}; this one has {wanted}")
 
 
@@ -127,10 +128,13 @@ class _ComposingWrapper:
         shown: Any = observation_space
         if named := isinstance(observation_space, gymnasium.spaces.Dict):
             shown = observation_space.get("observation")
-        if positions is None and (not isinstance(shown, gymnasium.spaces.Box) or shown.shape != (POSITIONS.size,)):
+        if positions is None and (
+            not isinstance(shown, gymnasium.spaces.Box) or shown.shape != (self.primitives.num_positions,)
+        ):
             raise TandemError(
-                f"the environment's observations are {shown}; the primitives see the {POSITIONS.size} positions of "
-                "service.envs.observations: give positions=, which takes them out of an observation"
+                f"the environment's observations are {shown}; the primitives see the "
+                f"{self.primitives.num_positions} positions of service.envs.observations: give positions=, which takes "
+                "them out of an observation"
             )
         self._take = positions or (operator.itemgetter("observation") if named else lambda observation: observation)
         self._low, self._high = action_space.low, action_space.high
@@ -180,9 +184,9 @@ class ComposePrimitives(
     """An environment whose action is K weights in [-1, 1]; everything else stays.
 
     Args:
-        env: acts by the four numbers of ``TabletopEnv``, and shows the primitives' 11 positions.
+        env: acts by the four numbers of ``TabletopEnv``, and shows the P positions that primitives see.
         primitives: what ``service.load_primitives`` returns, or its ``.primitives``. Never changed.
-        positions: takes the (11,) positions (``service.envs.observations``) out of an observation. By default they are
+        positions: takes the (P,) positions (``service.envs.observations``) out of an observation. By default they are
             the observation itself, or its entry ``observation``.
         residual: above 0, the action has four more numbers, which are added to the composition, times this.
 
@@ -211,7 +215,7 @@ class ComposePrimitives(
 
 
 class ComposePrimitivesVector(_ComposingWrapper, gymnasium.vector.VectorWrapper[Any, FloatArray, Any, FloatArray, Any]):
-    """N environments at once, as in ``ComposePrimitives``: actions are (N, K), ``positions`` takes out (N, 11)."""
+    """N environments at once, as in ``ComposePrimitives``: actions are (N, K), ``positions`` takes out (N, P)."""
 
     def __init__(
         self,

@@ -4,26 +4,33 @@ from __future__ import annotations
 
 import numpy as np
 
-from service.envs.observations import BOB, GOAL_FROM_OBJECT, POSITIONS
+from service.envs.observations import GOAL_FROM_OBJECT, PAPER, POSITIONS, Layouts
 from service.policies.parameters import INPUT_CLIP
 from service.sac.inputs import NUM_MOTION_INPUTS, motion_inputs
 from service.types import FloatArray
 
-NUM_INPUTS = NUM_MOTION_INPUTS + BOB.size - POSITIONS.size + GOAL_FROM_OBJECT.size
-"""Those of ``motion_inputs``, then the goal 3 and the goal relative to the object 3: 23."""
-_GOAL = BOB["goal"]
+_GOAL = PAPER.bob["goal"]
+_GOAL_OFFSET, _GOAL_SCALE = PAPER.bob.normalisation.offset[_GOAL], PAPER.bob.normalisation.scale[_GOAL]
 
 
-def learner_inputs(previous: FloatArray, positions: FloatArray, goal: FloatArray) -> FloatArray:
-    """(N, 23) inputs of every downstream learner.
+def num_inputs(seen: Layouts) -> tuple[int, int]:
+    """Numbers of ``motion_inputs`` alone, and of ``learner_inputs``: 17 and 23 in the paper's worlds."""
+    motion = NUM_MOTION_INPUTS + seen.positions.size - POSITIONS.size
+    return motion, motion + seen.bob.size - seen.positions.size + GOAL_FROM_OBJECT.size
+
+
+def learner_inputs(previous: FloatArray, positions: FloatArray, goal: FloatArray, seen: Layouts = PAPER) -> FloatArray:
+    """(N, I) inputs of every downstream learner: those of ``motion_inputs``, the goal, and the way from the object.
 
     Args:
-        previous: (N, 11) positions one step ago; at an episode's start those of now.
-        positions: (N, 11), metres.
+        previous: (N, P) positions one step ago; at an episode's start those of now.
+        positions: (N, P), metres.
         goal: (N, 3), metres.
+        seen: layouts of the world.
     """
-    place = (goal - BOB.normalisation.offset[_GOAL]) / BOB.normalisation.scale[_GOAL]
+    place = (goal - _GOAL_OFFSET) / _GOAL_SCALE
     relative = (goal - positions[:, POSITIONS["object"]]) / GOAL_FROM_OBJECT.normalisation.scale
     told = np.clip(np.concatenate((place, relative), axis=1), -INPUT_CLIP, INPUT_CLIP)
-    inputs: FloatArray = np.concatenate((motion_inputs(previous, positions), told), axis=1, dtype=np.float32)
+    motion = motion_inputs(previous, positions, seen.positions)
+    inputs: FloatArray = np.concatenate((motion, told), axis=1, dtype=np.float32)
     return inputs

@@ -7,12 +7,11 @@ import functools
 import numpy as np
 import torch
 
-from service.downstream.inputs import NUM_INPUTS, learner_inputs
+from service.downstream.inputs import learner_inputs, num_inputs
 from service.downstream.methods import Method, Trained
 from service.downstream.settings import TrialConfig
-from service.downstream.worlds import COLUMNS, TaskWorlds
+from service.downstream.worlds import TaskWorlds, columns
 from service.envs.observations import POSITIONS
-from service.sac.inputs import NUM_MOTION_INPUTS
 from service.sac.learner import Batch, SACLearner
 from service.sac.loop import OffPolicyLoop
 from service.sac.networks import GaussianActor, MCPActor
@@ -40,10 +39,10 @@ class Hindsight:
             rows["goal"][other] = achieved[other]
             rows["reward"][other, 0] = self._worlds.rewards(rows["following"][other], achieved[other])
         return Batch(
-            learner_inputs(rows["previous"], rows["positions"], rows["goal"]),
+            learner_inputs(rows["previous"], rows["positions"], rows["goal"], self._worlds.seen),
             rows["action"],
             rows["reward"][:, 0],
-            learner_inputs(rows["before"], rows["following"], rows["goal"]),
+            learner_inputs(rows["before"], rows["following"], rows["goal"], self._worlds.seen),
         )
 
 
@@ -56,16 +55,17 @@ def make_loop(trial: TrialConfig, method: Method, trained: Trained, worlds: Task
     size, hold = worlds.num_actions, worlds.steps_per_action
     longer = {"gradient_steps": hold * trial.sac.gradient_steps, "gamma": trial.sac.gamma**hold}
     sac = trial.sac.model_copy(update=longer)
+    num_without_goal, num_seen = num_inputs(worlds.seen)
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(spread_seed(trial.seed, 0))
         actor = (
-            MCPActor(NUM_MOTION_INPUTS, NUM_INPUTS, size, trained.config.policy.bob)
+            MCPActor(num_without_goal, num_seen, size, trained.config.policy.bob)
             if method.mcp_actor
-            else GaussianActor(NUM_INPUTS, size, sac.hidden_sizes)
+            else GaussianActor(num_seen, size, sac.hidden_sizes)
         )
-    learner = SACLearner(actor, NUM_INPUTS, size, sac, spread_seed(trial.seed, 1))
+    learner = SACLearner(actor, num_seen, size, sac, spread_seed(trial.seed, 1))
     num_steps = -(-trial.num_env_steps // (sac.num_worlds * hold))  # everything is kept
-    replay = ReplayBuffer(num_steps, sac.num_worlds, {**COLUMNS, "action": size})
+    replay = ReplayBuffer(num_steps, sac.num_worlds, {**columns(worlds.seen), "action": size})
     share = method.her_ratio[0] if method.her_ratio else 0.0
     return OffPolicyLoop(worlds, replay, learner, Hindsight(worlds, share), spread_seed(trial.seed, 2))
 

@@ -28,6 +28,7 @@ from service.downstream.compose import (
 )
 from service.downstream.skills import SkillTaskWorlds, ZeroShotPolicy
 from service.downstream.worlds import TaskWorlds
+from service.envs.observations import layouts
 from service.errors import TandemError
 from service.off_policy_config import SkillMethod
 from service.primitives.loading import TrainedBob, TrainedSkills
@@ -64,7 +65,7 @@ def frozen_skills(trained: Trained) -> FrozenSkills:
 
 
 def _enter(env: gymnasium.vector.VectorEnv[Any, Any, Any], seed: int, trained: Trained, hold_steps: int) -> TaskWorlds:
-    return TaskWorlds(env, seed)
+    return TaskWorlds(env, seed, layouts(trained.config.world.observed))
 
 
 def _enter_composing(
@@ -75,7 +76,7 @@ def _enter_composing(
     *,
     residual: float = 0.0,
 ) -> TaskWorlds:
-    return TaskWorlds(ComposePrimitivesVector(env, frozen_bob(trained), residual=residual), seed)
+    return _enter(ComposePrimitivesVector(env, frozen_bob(trained), residual=residual), seed, trained, hold_steps)
 
 
 def _enter_with_skills(
@@ -127,7 +128,7 @@ class Method:
     enter: Callable[[gymnasium.vector.VectorEnv[Any, Any, Any], int, Trained, int], TaskWorlds] = _enter
     """Makes the worlds its learner acts in, of the task's, a seed, what it takes, and the env steps a skill is held."""
     decode: Decode = _itself
-    """Turns (N, 11) positions one step ago, those of now and the learner's (N, A) actions into (N, 4) actions."""
+    """Turns (N, P) positions one step ago, those of now and the learner's (N, A) actions into (N, 4) actions."""
     mcp_actor: bool = False
     """Whether the actor is a Multiplicative Compositional Policy, learned end to end; else SAC's own network."""
     her_ratio: tuple[float, float] | None = None

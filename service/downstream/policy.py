@@ -8,7 +8,7 @@ from typing import Any
 
 from service.downstream.inputs import learner_inputs
 from service.downstream.methods import Method, Trained, find_method, provenance
-from service.envs.observations import BOB, POSITIONS
+from service.envs.observations import layouts
 from service.errors import TandemError
 from service.io.files import os_errors, write_atomic
 from service.io.tensors import decode, encode, read_metadata
@@ -38,6 +38,7 @@ class LearnedPolicy:
     def __init__(self, parameters: Parameters, method: Method, trained: Trained, hold_steps: int = 1) -> None:
         self._actor, self._method, self._trained = numpy_actor(parameters), method, trained
         self._hold_steps = hold_steps
+        self._seen = layouts(trained.config.world.observed)
         self.begin()
 
     def begin(self) -> None:
@@ -47,11 +48,12 @@ class LearnedPolicy:
         self._num_steps = 0
 
     def act_deterministic(self, observation: FloatArray) -> FloatArray:
-        """(N, 14) Bob's input, positions and goal, to actions (N, 4)."""
-        positions = observation[:, : POSITIONS.size]
+        """(N, O) Bob's input, positions and goal, to actions (N, 4)."""
+        positions = observation[:, : self._seen.positions.size]
         previous = positions if self._previous is None else self._previous
         if self._held is None or self._num_steps % self._hold_steps == 0:
-            self._held = self._actor(learner_inputs(previous, positions, observation[:, BOB["goal"]]))
+            goal = observation[:, self._seen.bob["goal"]]
+            self._held = self._actor(learner_inputs(previous, positions, goal, self._seen))
         self._num_steps, self._previous = self._num_steps + 1, positions.copy()
         return self._method.decode(self._trained, previous, positions, self._held)
 

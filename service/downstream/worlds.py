@@ -8,35 +8,42 @@ import gymnasium
 import numpy as np
 
 from service.downstream.inputs import learner_inputs
-from service.envs.observations import POSITIONS
+from service.envs.observations import PAPER, POSITIONS, Layouts
 from service.sac.replay import Columns
 from service.sac.worlds import TabletopWorlds
 from service.types import Array, Arrays, BoolArray, FloatArray
 
 _POSITIONS = ("previous", "positions", "before", "following")
-COLUMNS = {**dict.fromkeys(_POSITIONS, POSITIONS.size), "goal": 3, "reward": 1}
-"""Columns of a transition, beside ``action``: positions one env step ago, now, one env step before it ended and when it
-ended, goal and reward."""
+
+
+def columns(seen: Layouts) -> dict[str, int]:
+    """Sizes of a transition's columns, by name, but for ``action``.
+
+    They are positions one env step ago, now, one env step before it ended and when it ended, goal and reward.
+    """
+    return {**dict.fromkeys(_POSITIONS, seen.positions.size), "goal": 3, "reward": 1}
 
 
 class TaskWorlds(TabletopWorlds):
     """See ``TabletopWorlds``; where the environment is composed, actions are weights of its primitives."""
 
-    def __init__(self, env: gymnasium.vector.VectorEnv[Any, Any, Any], seed: int) -> None:
+    def __init__(self, env: gymnasium.vector.VectorEnv[Any, Any, Any], seed: int, seen: Layouts = PAPER) -> None:
         super().__init__(env, seed)
+        self.seen = seen
+        """Layouts of the worlds."""
         self.finished: list[tuple[float, bool]] = []
         """Return and success at the last step of the episodes that ended since this list was last cleared."""
         self._returns = np.zeros(self.num_worlds)
 
     def inputs(self) -> FloatArray:
-        """(N, 23) what the actor sees now."""
-        return learner_inputs(self.previous, self.positions, self.goal)
+        """(N, I) what the actor sees now."""
+        return learner_inputs(self.previous, self.positions, self.goal, self.seen)
 
     def step(self, actions: FloatArray) -> tuple[Columns, BoolArray]:
         """Act by (N, A) actions.
 
         Returns:
-            The transitions, ``COLUMNS`` and ``action``, and (N,) whose episodes ended.
+            The transitions, ``columns`` and ``action``, and (N,) whose episodes ended.
         """
         step = self.advance(actions)
         self._returns += step.reward
@@ -46,7 +53,7 @@ class TaskWorlds(TabletopWorlds):
         return {**columns, "reward": step.reward[:, None], "action": actions}, step.ended
 
     def rewards(self, following: FloatArray, goal: FloatArray) -> FloatArray:
-        """(B,) rewards for (B, 11) positions come to, had the goals (B, 3) been others."""
+        """(B,) rewards for (B, P) positions come to, had the goals (B, 3) been others."""
         paid: FloatArray = self.env.compute_reward(following[:, POSITIONS["object"]], goal, {})
         return paid
 

@@ -10,7 +10,7 @@ import numpy as np
 from mujoco import rollout
 
 from service.config import WorldConfig
-from service.envs.observations import ACTION, BOB_VALUE, FULL, POSITIONS, ObservationLayout
+from service.envs.observations import ACTION, COMMAND_PREFIX, ObservationLayout, layouts
 from service.envs.reach import reach_of
 from service.envs.robot import Robot, described
 from service.envs.sampling import draw_starts
@@ -35,9 +35,9 @@ class WorldBatch:
     """N independent worlds with one flat state each.
 
     The state of a world, see ``layout``, is MuJoCo's full physics state, the finger contacts of the last action, the
-    place of a box, and whether the gripper is blocked where only some are. A world is a pure function of (state,
-    action), because each action starts the constraint solver cold: saving is copying rows of ``states``, restoring is
-    ``restore``, and the continuation is bit-identical.
+    last actions where policies see them, the place of a box, and whether the gripper is blocked where only some are. A
+    world is a pure function of (state, action), because each action starts the constraint solver cold: saving is
+    copying rows of ``states``, restoring is ``restore``, and the continuation is bit-identical.
 
     Args:
         config: the world.
@@ -51,6 +51,8 @@ class WorldBatch:
     ) -> None:
         self.config = config
         self.num_worlds = num_worlds
+        self.observed = layouts(config.observed)
+        """What policies see here."""
         self.model = build_spec(config).compile()
         self.robot = Robot(config, self.model)
         robot = described(config)
@@ -62,6 +64,8 @@ class WorldBatch:
         self._data = [mujoco.MjData(self.model) for _ in range(max(num_threads, 1))]
         self.layout = build_layout(config, blocked_fraction=blocked_fraction)
         """Columns of ``states``."""
+        self._commands = self.layout["commands"]
+        self._num_commands = self._commands.stop - self._commands.start
         assert (self.model.nq, self.model.nv) == (self.layout.num_positions, self.layout.num_velocities)
         # The object's weight is an actuator, too, the last, which ignores its control.
         assert self.model.nu == self.robot.num_joints + self.robot.num_fingers + 1
@@ -164,7 +168,8 @@ class WorldBatch:
                 f"actions of {num} of {len(actions)} worlds are not finite: the policy that made them has diverged; "
                 "use an earlier version"
             )
-        control = self._control(start, actions.astype(np.float64), index)
+        commands: StateArray = np.clip(actions.astype(np.float64), -1.0, 1.0)
+        control = self._control(start, commands, index)
         states, sensors = self._pool.rollout(
             self.model,
             self._data,
@@ -176,6 +181,7 @@ class WorldBatch:
         after = np.empty_like(start)
         after[:, self.layout.physics] = states[:, -1]
         after[:, self.layout["contacts"]] = self.robot.contacts((sensors > 0).any(axis=1))
+        after[:, self._commands] = np.concatenate((commands, start[:, self._commands]), axis=1)[:, : self._num_commands]
         after[:, self.layout.kept] = start[:, self.layout.kept]
         finite = (np.abs(after[:, self.layout.velocities]) < MAX_SPEED).all(axis=1) & np.isfinite(after).all(axis=1)
         diverged = np.zeros(self.num_worlds, dtype=bool)
@@ -189,7 +195,6 @@ class WorldBatch:
         return diverged
 
     def _control(self, start: StateArray, actions: StateArray, index: slice | IntArray) -> StateArray:
-        actions = np.clip(actions, -1.0, 1.0)
         here, num_joints = self._kinematics[index], self.robot.num_joints
         target = self.reach.clip(here.position + DISPLACEMENT_M * actions[:, :3])
         width = self.robot.openings(start[:, self.layout["fingers"]]).sum(axis=1) + WIDTH_CHANGE_M * actions[:, 3]
@@ -206,16 +211,16 @@ class WorldBatch:
     # --- observations ----------------------------------------------------------------------------------------------
 
     def positions(self) -> FloatArray:
-        """(N, 11) input of Bob's primitives: ``observations.POSITIONS``."""
-        return self.observe(POSITIONS)
+        """(N, P) input of Bob's primitives: ``Layouts.positions``."""
+        return self.observe(self.observed.positions)
 
     def full(self, elapsed: float) -> FloatArray:
-        """(N, 22) input of Alice: ``observations.FULL``; ``elapsed`` is the share of her turn gone by, in [0, 1]."""
-        return self.observe(FULL, elapsed=elapsed)
+        """(N, F) input of Alice: ``Layouts.full``; ``elapsed`` is the share of her turn gone by, in [0, 1]."""
+        return self.observe(self.observed.full, elapsed=elapsed)
 
     def bob_value(self, goal: StateArray) -> FloatArray:
-        """(N, 27) input of Bob's value network, ``observations.BOB_VALUE``, for (N, 3) goals, metres."""
-        return self.observe(BOB_VALUE, goal=goal, goal_from_object=goal - self.object_position)
+        """(N, V) input of Bob's value network, ``Layouts.bob_value``, for (N, 3) goals, metres."""
+        return self.observe(self.observed.bob_value, goal=goal, goal_from_object=goal - self.object_position)
 
     def observe(self, layout: ObservationLayout, **given: StateArray | float) -> FloatArray:
         """(N, O) vectors of any layout; ``given`` are the (N, size) entries a world does not know, such as a goal."""
@@ -230,6 +235,9 @@ class WorldBatch:
             return self.robot.openings(self.states[:, self.layout["fingers"]])
         if name == "finger_velocities":
             return self.robot.opening_speeds(self.states[:, self.layout["finger_velocities"]])
+        if name.startswith(COMMAND_PREFIX):
+            first = self._commands.start + ACTION.size * (int(name.removeprefix(COMMAND_PREFIX)) - 1)
+            return self.states[:, first : first + ACTION.size]
         if name == "effector":
             return self.ee_position
         if name == "object_from_effector":

@@ -13,13 +13,16 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from service.envs.state_layout import columns
 from service.types import FloatArray
+
+if TYPE_CHECKING:
+    from service.world_config import ObservedConfig  # acting needs no pydantic
 
 
 @dataclass(frozen=True)
@@ -55,6 +58,8 @@ VECTOR = Kind((0, 1, 2), (1.0, -1.0, 1.0))
 PAIR = Kind((1, 0), (1.0, 1.0))
 """One number for the left finger and one for the right."""
 SCALAR = Kind((0,), (1.0,))
+COMMAND = Kind((0, 1, 2, 3), (1.0, -1.0, 1.0, 1.0))
+"""x, y, z, and one number for both fingers."""
 
 
 @dataclass(frozen=True)
@@ -118,7 +123,7 @@ POSITIONS = ObservationLayout(
     Entry("object", VECTOR, "m", _MIDDLE_M, 0.12),
     Entry("object_from_effector", VECTOR, "m", 0.0, 0.1),
 )
-"""Input of Bob's primitives."""
+"""Input of Bob's primitives in the paper, and the first entries of theirs in every world."""
 _MOTION = ObservationLayout(
     Entry("effector_velocity", VECTOR, "m/s", 0.0, 0.5),
     Entry("finger_velocities", PAIR, "m/s", 0.0, 0.2),
@@ -128,19 +133,53 @@ _MOTION = ObservationLayout(
 _GOAL = ObservationLayout(Entry("goal", VECTOR, "m", _MIDDLE_M, 0.12))
 GOAL_FROM_OBJECT = ObservationLayout(Entry("goal_from_object", VECTOR, "m", 0.0, 0.1))
 """Way that the object has to go."""
-FULL = POSITIONS + _MOTION + ObservationLayout(Entry("elapsed", SCALAR, "share of the turn", 0.5, 0.5))
-"""Input of Alice's policy and of her value network."""
-BOB = POSITIONS + _GOAL
-"""Input of Bob's policy."""
-BOB_VALUE = POSITIONS + _MOTION + _GOAL + GOAL_FROM_OBJECT
-"""Input of Bob's value network."""
-GATE = BOB + GOAL_FROM_OBJECT
-"""Input of Bob's gate: his observation and what follows from it."""
+_ELAPSED = ObservationLayout(Entry("elapsed", SCALAR, "share of the turn", 0.5, 0.5))
+COMMAND_PREFIX = "command_"
+"""Begins the names of past commands; ``command_1`` is the last one."""
 
-SPACES = {"action": ACTION.size, "positions": POSITIONS.size, "observation": BOB.size, "layout": __name__}
-"""Sizes and layout in the manifest of primitives; they differ for another robot or another layout."""
+
+class Layouts:
+    """Layouts of everything that is observed in a world.
+
+    Entries that a world has beyond the paper's follow ``POSITIONS``, so slices of ``POSITIONS`` hold in all.
+
+    Args:
+        num_commands: last commands that policies see.
+    """
+
+    def __init__(self, num_commands: int = 0) -> None:
+        commands = (
+            Entry(f"{COMMAND_PREFIX}{age + 1}", COMMAND, "share of the greatest", 0.0, 1.0)
+            for age in range(num_commands)
+        )
+        self.positions = POSITIONS + ObservationLayout(*commands)
+        """Input of Bob's primitives."""
+        self.full = self.positions + _MOTION + _ELAPSED
+        """Input of Alice's policy and of her value network."""
+        self.bob = self.positions + _GOAL
+        """Input of Bob's policy."""
+        self.bob_value = self.positions + _MOTION + _GOAL + GOAL_FROM_OBJECT
+        """Input of Bob's value network."""
+        self.gate = self.bob + GOAL_FROM_OBJECT
+        """Input of Bob's gate: his observation and what follows from it."""
+
+    @property
+    def spaces(self) -> dict[str, object]:
+        """Sizes and layout in the manifest of primitives; they differ for another robot or another layout."""
+        sizes = {"action": ACTION.size, "positions": self.positions.size, "observation": self.bob.size}
+        return {**sizes, "layout": __name__}
+
+
+def layouts(observed: ObservedConfig) -> Layouts:
+    """Layouts of worlds with such observations."""
+    return Layouts(observed.num_commands)
+
+
+PAPER = Layouts()
+"""Layouts of the paper, which worlds have unless their configuration says otherwise."""
+FULL, BOB, BOB_VALUE, GATE, SPACES = PAPER.full, PAPER.bob, PAPER.bob_value, PAPER.gate, PAPER.spaces
 
 
 def bob_observation(positions: FloatArray, goal: NDArray[np.floating]) -> FloatArray:
-    """Bob's input (N, 14) from (N, 11) positions and (N, 3) goals, metres."""
+    """Bob's input (N, P + 3) from (N, P) positions and (N, 3) goals, metres."""
     return np.concatenate([positions, goal.astype(np.float32)], axis=1)

@@ -16,6 +16,7 @@ import numpy as np
 from service.config import WorldConfig
 from service.envs.contacts import GRIPPER_BIT, OBJECT_BIT, STIFF, TABLE_BIT
 from service.envs.meshes import add_mesh
+from service.envs.observations import ACTION
 from service.envs.robot import add_robot, described
 from service.envs.state_layout import StateLayout
 from service.object_config import ROUND, ObjectConfig
@@ -98,7 +99,7 @@ def build_layout(config: WorldConfig, *, blocked_fraction: float = 0.0) -> State
             "object_velocity": 3,
             "object_spin": 3,
         },
-        measured={"contacts": 2},
+        measured={"contacts": 2, "commands": ACTION.size * config.observed.num_commands},
         kept={
             "box_place": 3 if config.fixture == "box" else 0,  # the middle of its bottom
             "gripper_blocked": int(blocked_fraction > 0.0),

@@ -6,7 +6,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from service.envs.observations import POSITIONS
 from service.learner.group import ALONE, Group, mean_and_std
 from service.learner.player import Player
 from service.learner.samples import Cloning, Rows
@@ -55,7 +54,7 @@ def composition_metrics(bob: MCPPolicy, observation: Tensor) -> dict[str, float]
         observation: (P, O).
     """
     weights = bob.gate(observation)
-    _, variances = bob.primitives(observation[:, : POSITIONS.size])
+    _, variances = bob.primitives(observation[:, : bob.num_positions])
     precisions = weights[..., None] / variances
     total = precisions.sum(1, keepdim=True)
     metrics = {"bob_std": float(total.rsqrt().mean())}

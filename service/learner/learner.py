@@ -13,18 +13,18 @@ from numpy.typing import NDArray
 
 from service.actors.rollout import Demonstrations, Rollout, Turns, part_to_arrays
 from service.config import Config
-from service.envs.observations import ACTION, BOB, BOB_VALUE, FULL, ObservationLayout
+from service.envs.observations import ACTION, ObservationLayout, layouts
 from service.io.tensors import join_parts, split_parts
 from service.learner import ppo
 from service.learner.diagnostics import composition_metrics, mean_over_ranks, probes
 from service.learner.group import ALONE, Group
 from service.learner.player import LearnerError, Player
 from service.learner.samples import (
-    ALICES,
-    BOBS,
     DemonstrationHistory,
     DemonstrationRows,
     Samples,
+    alices,
+    bobs,
     mirror,
 )
 from service.learner.shares import DEMONSTRATIONS, IMITATED, own_demonstrations, share_of, share_out
@@ -57,11 +57,12 @@ class Learner:
         """
         self.config, self._group = config, group
         self.version = 0
+        self._layouts = seen = layouts(config.world.observed)
         self._device = torch_device(config.learner.device)
         with torch.random.fork_rng(devices=[]):
             torch.default_generator.manual_seed(config.seed)
-            alice = networks.make_alice(config.policy), networks.make_alice_value(config.policy)
-            bob = networks.make_bob(config.policy), networks.make_bob_value(config.policy)
+            alice = networks.make_alice(config.policy, seen), networks.make_alice_value(config.policy, seen)
+            bob = networks.make_bob(config.policy, seen), networks.make_bob_value(config.policy, seen)
         if config.learner.bfloat16:
             for network in (*alice, *bob):
                 networks.use_bfloat16(network)
@@ -69,9 +70,11 @@ class Learner:
         self._bob = Player(*bob, config.learner.bob, self._device)
         self._bob_policy = bob[0]
         self._rng = np.random.Generator(np.random.PCG64(config.seed))
-        self._histories = {DEMONSTRATIONS: DemonstrationHistory(config.learner.abc.num_iterations, BOB.size)}
+        self._histories = {DEMONSTRATIONS: DemonstrationHistory(config.learner.abc.num_iterations, seen.bob.size)}
         if config.learner.self_imitation.weight:
-            self._histories[IMITATED] = DemonstrationHistory(config.learner.self_imitation.num_iterations, FULL.size)
+            self._histories[IMITATED] = DemonstrationHistory(
+                config.learner.self_imitation.num_iterations, seen.full.size
+            )
         self._counted: dict[tuple[int, int], int] = {}  # (actor, incarnation) to the last sequence learned from
         self._pending: dict[tuple[int, int, int], Rollout] = {}
         self._bob_ema = networks.export_parameters(bob[0])
@@ -221,10 +224,12 @@ class Learner:
             player.load_state(states[key])
 
     def _update_alice(self, rollouts: Sequence[Rollout]) -> Metrics:
-        samples = ppo.collect([[rollout.alice for rollout in rollouts]], _NO_ALICE, self._alice, self._group)
+        seen = self._layouts
+        nothing = _no_turns(seen.full, seen.full)
+        samples = ppo.collect([[rollout.alice for rollout in rollouts]], nothing, self._alice, self._group)
         counted = {"num_alice_samples": float(_num(samples))}
         if samples is not None:
-            samples = mirror(samples, ALICES, self._alice, self._rng)
+            samples = mirror(samples, alices(seen), self._alice, self._rng)
         how, imitated = self.config.learner.self_imitation, None
         if IMITATED in self._histories:
             imitated = self._to_clone(IMITATED, [paid_well(each.alice, how.min_reward) for each in rollouts])
@@ -238,10 +243,11 @@ class Learner:
     def _update_bob(self, rollouts: Sequence[Rollout]) -> Metrics:
         config, bob, group = self.config.learner, self._bob, self._group
         self._window.append([rollout.bob for rollout in rollouts])
-        samples = ppo.collect(self._window, _NO_BOB, bob, group)
+        nothing = _no_turns(self._layouts.bob, self._layouts.bob_value)
+        samples = ppo.collect(self._window, nothing, bob, group)
         metrics = {"num_bob_samples": float(_num(samples))}
         if samples is not None:
-            samples = mirror(samples, BOBS, bob, self._rng)
+            samples = mirror(samples, bobs(self._layouts), bob, self._rng)
         demonstrations = self._to_clone(DEMONSTRATIONS, [each.demonstrations for each in rollouts])
         metrics["num_demonstrations"] = float(_num(demonstrations) // (1 + config.bob.mirrors))
         metrics |= _prefixed("bob", ppo.update(bob, samples, demonstrations, config.abc, self._rng, group))
@@ -255,11 +261,12 @@ class Learner:
     def _to_clone(self, name: str, new: Sequence[Demonstrations]) -> DemonstrationRows | None:
         """What a history keeps, this update's among it; None if no rank has any or it has no weight."""
         history, config = self._histories[name], self.config.learner
-        how, mirrored = (config.abc, config.bob.mirrors) if name == DEMONSTRATIONS else (config.self_imitation, False)
+        how = config.abc if name == DEMONSTRATIONS else config.self_imitation
+        reflection = self._layouts.bob.mirror if name == DEMONSTRATIONS and config.bob.mirrors else None
         history.append(new)
         kept = history.joined()
         observation, action = (torch.from_numpy(each).to(self._device) for each in (kept.observation, kept.action))
-        rows = DemonstrationRows(observation, action, mirrored, share_of(history.sizes(), self._group))
+        rows = DemonstrationRows(observation, action, reflection, share_of(history.sizes(), self._group))
         return rows if rows.num_total and how.weight else None
 
 
@@ -291,9 +298,6 @@ def _no_turns(observation: ObservationLayout, value_observation: ObservationLayo
         terminated=flags,
         learn=flags.ravel(),
     )
-
-
-_NO_ALICE, _NO_BOB = _no_turns(FULL, FULL), _no_turns(BOB, BOB_VALUE)
 
 
 def _num(rows: Samples | DemonstrationRows | None) -> int:

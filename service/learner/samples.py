@@ -13,7 +13,7 @@ from torch import Tensor
 
 from service.actors.rollout import Demonstrations
 from service.config import CloningConfig, PPOConfig
-from service.envs.observations import ACTION, BOB, BOB_VALUE, FULL, Mirror
+from service.envs.observations import ACTION, Layouts, Mirror
 from service.learner.player import Player
 from service.learner.shares import Share
 from service.policies import gaussian
@@ -45,7 +45,7 @@ class _Rows:
 
     def names(self) -> list[str]:
         """Names of the columns, in the order of the fields."""
-        return [field.name for field in fields(self) if field.name not in ("share", "mirrored")]  # type: ignore[arg-type]
+        return [field.name for field in fields(self) if field.name not in ("share", "mirror")]  # type: ignore[arg-type]
 
     def having(self, columns: Iterable[Tensor], share: Share | None) -> Self:
         """The same rows with other columns, in the order of the fields."""
@@ -113,25 +113,29 @@ class DemonstrationRows(_Rows):
     """(D, O)."""
     action: Tensor
     """(D, A)."""
-    mirrored: bool = False
-    """Whether they are followed by as many reflections in y, which are made when they are drawn."""
+    mirror: Mirror | None = None
+    """Of observations; where there is one, as many reflections in y follow, which are made when they are drawn."""
     share: Share | None = None
     """Places among the demonstrations of all ranks; None without other ranks."""
 
     @property
     def num_total(self) -> int:
         """Rows of all ranks together, with their reflections."""
-        return (len(self) if self.share is None else self.share.total) * (1 + self.mirrored)
+        return (len(self) if self.share is None else self.share.total) * self._num_copies
+
+    @property
+    def _num_copies(self) -> int:
+        return 1 if self.mirror is None else 2
 
     def find(self, drawn: IntArray) -> DemonstrationRows:
         """Take the own ones of the rows at these places of all ranks' rows, in their order; reflections are made."""
-        num = self.num_total // (1 + self.mirrored)
+        num = self.num_total // self._num_copies
         part = _Rows.find(self, drawn % num)
-        if not self.mirrored:
+        if self.mirror is None:
             return part
         own = drawn if part.share is None else drawn[part.share.places]
         reflected = torch.from_numpy(own >= num).to(self.observation.device)[:, None]
-        pairs = zip(part.tensors(), (BOB.mirror, ACTION.mirror), strict=True)
+        pairs = zip(part.tensors(), (self.mirror, ACTION.mirror), strict=True)
         columns = (torch.where(reflected, _reflect(column, mirror), column) for column, mirror in pairs)
         return part.having(columns, part.share)
 
@@ -194,8 +198,14 @@ class Mirrors:
     value_observation: Mirror
 
 
-ALICES = Mirrors(FULL.mirror, FULL.mirror)
-BOBS = Mirrors(BOB.mirror, BOB_VALUE.mirror)
+def alices(layouts: Layouts) -> Mirrors:
+    """Reflections of what Alice sees."""
+    return Mirrors(layouts.full.mirror, layouts.full.mirror)
+
+
+def bobs(layouts: Layouts) -> Mirrors:
+    """Reflections of what Bob sees."""
+    return Mirrors(layouts.bob.mirror, layouts.bob_value.mirror)
 
 
 def mirror(samples: Samples, mirrors: Mirrors, player: Player, rng: np.random.Generator) -> Samples:

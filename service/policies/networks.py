@@ -17,7 +17,7 @@ import torch
 from torch import Tensor, nn
 
 from service.config import MCPConfig, MLPConfig, PolicyConfig
-from service.envs.observations import ACTION, BOB, BOB_VALUE, FULL, GATE, POSITIONS, Normalisation
+from service.envs.observations import ACTION, PAPER, POSITIONS, Layouts, Normalisation, ObservationLayout
 from service.policies.composition import compose
 from service.policies.parameters import INPUT_CLIP, MEAN_BOUND
 from service.types import FloatArray
@@ -159,14 +159,14 @@ class GaussianPolicy(nn.Module):
 
 
 class Primitives(nn.Module):
-    """K Gaussians over actions at (..., 11) positions: a shared trunk, one hidden layer of each primitive's own."""
+    """K Gaussians over actions at (..., P) positions: a shared trunk, one hidden layer of each primitive's own."""
 
-    def __init__(self, config: MCPConfig, action_size: int) -> None:
+    def __init__(self, config: MCPConfig, action_size: int, positions: ObservationLayout = POSITIONS) -> None:
         """Build; the initial std gives the composition ``exp(INITIAL_LOG_STD)`` under a new gate's weights."""
         super().__init__()
         self.num_primitives, self.action_size = config.num_primitives, action_size
-        self.input = InputNormalisation(POSITIONS.normalisation)
-        self.trunk = HiddenLayers(POSITIONS.size, config.trunk_hidden_sizes)
+        self.input = InputNormalisation(positions.normalisation)
+        self.trunk = HiddenLayers(positions.size, config.trunk_hidden_sizes)
         self.hidden = HiddenLayer(self.trunk.output_size, config.num_primitives * config.primitive_hidden_size)
         heads = config.num_primitives, config.primitive_hidden_size, 2 * action_size
         self.output_weight = nn.Parameter(torch.empty(heads))
@@ -195,24 +195,25 @@ class Primitives(nn.Module):
 
 
 class Gate(nn.Module):
-    """The primitives' weights (..., K) at (..., 14) observations, each in [floor, 1].
+    """The primitives' weights (..., K) at (..., O) observations, each in [floor, 1].
 
     Its network sees, besides the observation, the goal relative to the object.
     """
 
     weight_floor: Tensor
 
-    def __init__(self, config: MCPConfig) -> None:
+    def __init__(self, config: MCPConfig, layouts: Layouts = PAPER) -> None:
         """Build; initial weights scatter around one half."""
         super().__init__()
-        self.input = InputNormalisation(GATE.normalisation)
-        self.hidden = HiddenLayers(GATE.size, config.gate_hidden_sizes)
+        self._goal = layouts.bob["goal"]
+        self.input = InputNormalisation(layouts.gate.normalisation)
+        self.hidden = HiddenLayers(layouts.gate.size, config.gate_hidden_sizes)
         self.output = initialised(nn.Linear(self.hidden.output_size, config.num_primitives), gain=_GATE_GAIN)
         self.register_buffer("weight_floor", torch.tensor(config.weight_floor))
 
     def forward(self, observation: Tensor) -> Tensor:
         """Weights; not normalised to sum to one, as in the paper."""
-        goal_from_object = observation[..., BOB["goal"]] - observation[..., BOB["object"]]
+        goal_from_object = observation[..., self._goal] - observation[..., POSITIONS["object"]]
         features = torch.cat((observation, goal_from_object), dim=-1)
         openness: Tensor = self.output(self.hidden(self.input(features))).sigmoid()
         return self.weight_floor + (1.0 - self.weight_floor) * openness
@@ -225,15 +226,16 @@ class MCPPolicy(nn.Module):
     only widen or narrow a policy blind to the goal; the monolithic Bob of the ablation is a ``GaussianPolicy``.
     """
 
-    def __init__(self, config: MCPConfig, action_size: int = ACTION.size) -> None:
+    def __init__(self, config: MCPConfig, action_size: int = ACTION.size, layouts: Layouts = PAPER) -> None:
         """Build both parts."""
         super().__init__()
-        self.primitives = Primitives(config, action_size)
-        self.gate = Gate(config)
+        self.num_positions = layouts.positions.size
+        self.primitives = Primitives(config, action_size, layouts.positions)
+        self.gate = Gate(config, layouts)
 
     def forward(self, observation: Tensor) -> tuple[Tensor, Tensor]:
-        """Mean and std, (..., A) each, of the composition at (..., 14) observations."""
-        means, variances = self.primitives(observation[..., : POSITIONS.size])
+        """Mean and std, (..., A) each, of the composition at (..., O) observations."""
+        means, variances = self.primitives(observation[..., : self.num_positions])
         mean, variance = compose(self.gate(observation), means, variances)
         return mean, variance.sqrt()
 
@@ -254,26 +256,28 @@ class ValueNetwork(nn.Module):
         return value.squeeze(-1)
 
 
-def make_alice(config: PolicyConfig) -> GaussianPolicy:
+def make_alice(config: PolicyConfig, layouts: Layouts = PAPER) -> GaussianPolicy:
     """A new Alice; draws from torch's global generator."""
-    return GaussianPolicy(FULL.normalisation, config.alice, config.alice_log_std_min, config.alice_log_std_max)
+    return GaussianPolicy(layouts.full.normalisation, config.alice, config.alice_log_std_min, config.alice_log_std_max)
 
 
-def make_bob(config: PolicyConfig) -> MCPPolicy | GaussianPolicy:
+def make_bob(config: PolicyConfig, layouts: Layouts = PAPER) -> MCPPolicy | GaussianPolicy:
     """A new Bob; draws from torch's global generator."""
     if config.monolithic_bob is None:
-        return MCPPolicy(config.bob)
-    return GaussianPolicy(BOB.normalisation, config.monolithic_bob, config.bob.log_std_min, config.bob.log_std_max)
+        return MCPPolicy(config.bob, layouts=layouts)
+    return GaussianPolicy(
+        layouts.bob.normalisation, config.monolithic_bob, config.bob.log_std_min, config.bob.log_std_max
+    )
 
 
-def make_alice_value(config: PolicyConfig) -> ValueNetwork:
+def make_alice_value(config: PolicyConfig, layouts: Layouts = PAPER) -> ValueNetwork:
     """A new value network for Alice; draws from torch's global generator."""
-    return ValueNetwork(FULL.normalisation, config.value)
+    return ValueNetwork(layouts.full.normalisation, config.value)
 
 
-def make_bob_value(config: PolicyConfig) -> ValueNetwork:
+def make_bob_value(config: PolicyConfig, layouts: Layouts = PAPER) -> ValueNetwork:
     """A new value network for Bob; draws from torch's global generator."""
-    return ValueNetwork(BOB_VALUE.normalisation, config.value)
+    return ValueNetwork(layouts.bob_value.normalisation, config.value)
 
 
 def export_parameters(module: nn.Module) -> dict[str, FloatArray]:

@@ -1,7 +1,7 @@
 """The policies of ``networks`` in NumPy, from exported parameters: acting without torch.
 
 This is what actors, downstream users and a robot run. Everything is float32. A policy has no state but its parameters,
-so threads may share one. Shapes: N rows, O observation size, K primitives, A action components.
+so threads may share one. Shapes: N rows, P positions, O observation size, K primitives, A action components.
 """
 
 from __future__ import annotations
@@ -11,11 +11,12 @@ from abc import ABC, abstractmethod
 
 import numpy as np
 
-from service.envs.observations import BOB, GATE, POSITIONS
+from service.envs.observations import PAPER, POSITIONS
 from service.policies.composition import compose
 from service.policies.parameters import INPUT_CLIP, MEAN_BOUND, ParameterReader, Parameters, PolicyError
 from service.types import FloatArray
 
+_NUM_GOAL = PAPER.bob.size - PAPER.positions.size
 _HALF_LOG_TWO_PI = np.float32(0.5 * math.log(2.0 * math.pi))
 
 
@@ -78,35 +79,37 @@ class NumpyMCPPolicy(NumpyPolicy):
         """
         reader = ParameterReader(parameters)
         self._primitives = _Primitives(reader)
-        self._gate = _Gate(reader, self._primitives.num_primitives)
+        self.num_positions = self._primitives.num_positions
+        """P; the observation O is these and the goal."""
+        self._gate = _Gate(reader, self._primitives.num_primitives, self.num_positions)
         self.num_primitives = self._primitives.num_primitives
         self.action_size = self._primitives.action_size
         reader.finish()
 
     def primitives(self, positions: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Means and variances, (..., K, A) each, of the primitives at (..., 11) positions.
+        """Means and variances, (..., K, A) each, of the primitives at (..., P) positions.
 
         Raises:
-            PolicyError: the last axis is not 11.
+            PolicyError: the last axis is not P.
         """
-        means, variances = self._primitives(_rows(positions, POSITIONS.size, "positions"))
+        means, variances = self._primitives(_rows(positions, self.num_positions, "positions"))
         shape = (*np.shape(positions)[:-1], self.num_primitives, self.action_size)
         return means.reshape(shape), variances.reshape(shape)
 
     def gate(self, observation: FloatArray) -> FloatArray:
-        """Weights (..., K) at (..., 14) observations, each in [floor, 1].
+        """Weights (..., K) at (..., O) observations, each in [floor, 1].
 
         Raises:
-            PolicyError: the last axis is not 14.
+            PolicyError: the last axis is not O.
         """
-        weights = self._gate(_rows(observation, BOB.size, "observation"))
+        weights = self._gate(_rows(observation, self.num_positions + _NUM_GOAL, "observation"))
         return weights.reshape((*np.shape(observation)[:-1], self.num_primitives))
 
     def compose(self, positions: FloatArray, weights: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Mean and std, (..., A) each, of the primitives at (..., 11) positions under given (..., K) weights.
+        """Mean and std, (..., A) each, of the primitives at (..., P) positions under given (..., K) weights.
 
         Raises:
-            PolicyError: the last axis is not 11, or not K.
+            PolicyError: the last axis is not P, or not K.
         """
         weights = np.asarray(weights, dtype=np.float32)
         if weights.shape[-1:] != (self.num_primitives,):
@@ -115,13 +118,13 @@ class NumpyMCPPolicy(NumpyPolicy):
         return mean, np.sqrt(variance)
 
     def distribution(self, observation: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Mean and std, (..., A) each, of the composition at (..., 14) observations.
+        """Mean and std, (..., A) each, of the composition at (..., O) observations.
 
         Raises:
             PolicyError: the observation's last axis is not 14.
         """
         weights = self.gate(observation)
-        return self.compose(np.asarray(observation)[..., : POSITIONS.size], weights)
+        return self.compose(np.asarray(observation)[..., : self.num_positions], weights)
 
 
 def numpy_bob(parameters: Parameters) -> NumpyPolicy:
@@ -135,11 +138,17 @@ def numpy_bob(parameters: Parameters) -> NumpyPolicy:
 
 
 class _Primitives:
-    """Means and variances (N, K, A) at (N, 11) positions; the K heads share one matrix product per layer."""
+    """Means and variances (N, K, A) at (N, P) positions; the K heads share one matrix product per layer."""
 
     def __init__(self, reader: ParameterReader) -> None:
-        self._input = _Input(reader, "primitives.input", POSITIONS.size)
-        self._trunk = _HiddenLayers(reader, "primitives.trunk", POSITIONS.size)
+        self._input = _Input(reader, "primitives.input", None)
+        self.num_positions = self._input.size
+        if self.num_positions < POSITIONS.size:
+            raise PolicyError(
+                f"policy parameters 'primitives.input': {self.num_positions} positions; every layout has at least "
+                f"{POSITIONS.size}"
+            )
+        self._trunk = _HiddenLayers(reader, "primitives.trunk", self.num_positions)
         self._weight = reader.take("primitives.output_weight", (None, None, None))
         self.num_primitives, self._head_size, outputs = self._weight.shape
         self._bias = reader.take("primitives.output_bias", (self.num_primitives, outputs))[:, None]
@@ -159,16 +168,17 @@ class _Primitives:
 
 
 class _Gate:
-    """Weights (N, K) at (N, 14) observations."""
+    """Weights (N, K) at (N, O) observations."""
 
-    def __init__(self, reader: ParameterReader, num_primitives: int) -> None:
-        self._input = _Input(reader, "gate.input", GATE.size)
+    def __init__(self, reader: ParameterReader, num_primitives: int, num_positions: int) -> None:
+        self._goal = slice(num_positions, num_positions + _NUM_GOAL)
+        self._input = _Input(reader, "gate.input", num_positions + 2 * _NUM_GOAL)
         self._hidden = _HiddenLayers(reader, "gate.hidden", self._input.size)
         self._output = _Layer(reader, "gate.output", num_primitives, self._hidden.output_size)
         self._floor = reader.take_scalar("gate.weight_floor", 0.0, 1.0)
 
     def __call__(self, rows: FloatArray) -> FloatArray:
-        goal_from_object = rows[:, BOB["goal"]] - rows[:, BOB["object"]]
+        goal_from_object = rows[:, self._goal] - rows[:, POSITIONS["object"]]
         features = np.concatenate((rows, goal_from_object), axis=1)
         output = self._output(self._hidden(self._input(features)))
         return _squash(output, self._floor, np.float32(1.0) - self._floor)

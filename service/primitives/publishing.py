@@ -11,7 +11,7 @@ from service.actors.evaluation import EVALUATED_GOALS, REPORTED_SEED, success_me
 from service.baselines.coverage import skill_paths
 from service.baselines.frozen import FrozenSkills
 from service.config import Config
-from service.envs.observations import BOB, POSITIONS, SPACES
+from service.envs.observations import POSITIONS, SPACES, layouts
 from service.io import tensors
 from service.io.errors import StorageError
 from service.io.run_directory import Published, RunDirectory
@@ -89,11 +89,12 @@ def publish(
     Raises:
         StorageError: see ``Registry.publish``.
     """
-    normalisation = BOB.normalisation if config.skills is None else POSITIONS.normalisation
+    seen = layouts(config.world.observed)
+    normalisation = seen.bob.normalisation if config.skills is None else POSITIONS.normalisation
     return registry.publish(
         config.name,
         parameters,
-        spaces=SPACES if config.skills is None else skill_spaces(config.skills),
+        spaces=seen.spaces if config.skills is None else skill_spaces(config.skills),
         normalisation={"offset": normalisation.offset.tolist(), "scale": normalisation.scale.tolist()},
         config=config.model_dump(mode="json"),
         metrics=metrics,

@@ -9,7 +9,7 @@ import numpy as np
 
 from service.baselines.frozen import FrozenSkills
 from service.config import MCPConfig, parse_config
-from service.envs.observations import ACTION, GATE, POSITIONS
+from service.envs.observations import ACTION, PAPER, Layouts, layouts
 from service.errors import TandemError
 from service.off_policy_config import SkillsConfig
 from service.policies.numpy_policy import NumpyMCPPolicy
@@ -34,7 +34,11 @@ def network_problems(manifest: Manifest, arrays: Mapping[str, np.ndarray]) -> It
     except TandemError as error:
         yield str(error)
         return
-    expected = mcp_shapes(config.policy.bob) if config.skills is None else skill_shapes(config.skills)
+    expected = (
+        mcp_shapes(config.policy.bob, layouts(config.world.observed))
+        if config.skills is None
+        else skill_shapes(config.skills)
+    )
     wrong = [name for name in sorted(expected.keys() | arrays.keys()) if _shape(arrays, name) != expected.get(name)]
     for name in wrong:
         there, wanted = (_named(each) for each in (_shape(arrays, name), expected.get(name)))
@@ -49,20 +53,20 @@ def network_problems(manifest: Manifest, arrays: Mapping[str, np.ndarray]) -> It
             yield str(error)
 
 
-def mcp_shapes(config: MCPConfig) -> Shapes:
+def mcp_shapes(config: MCPConfig, seen: Layouts = PAPER) -> Shapes:
     """Shape of every parameter of ``networks.MCPPolicy``, by name."""
     heads, outputs = config.num_primitives * config.primitive_hidden_size, 2 * ACTION.size
-    trunk = (POSITIONS.size, *config.trunk_hidden_sizes)
-    gate = (GATE.size, *config.gate_hidden_sizes)
+    trunk = (seen.positions.size, *config.trunk_hidden_sizes)
+    gate = (seen.gate.size, *config.gate_hidden_sizes)
     return {
-        **_input("primitives.input", POSITIONS.size),
+        **_input("primitives.input", seen.positions.size),
         **_layers("primitives.trunk.{}", trunk),
         **_layers("primitives.hidden", (trunk[-1], heads)),
         "primitives.output_weight": (config.num_primitives, config.primitive_hidden_size, outputs),
         "primitives.output_bias": (config.num_primitives, outputs),
         "primitives.squash.log_std_min": (),
         "primitives.squash.log_std_max": (),
-        **_input("gate.input", GATE.size),
+        **_input("gate.input", seen.gate.size),
         **_layers("gate.hidden.{}", gate),
         **_layers("gate.output", (gate[-1], config.num_primitives)),
         "gate.weight_floor": (),

@@ -7,14 +7,14 @@ import torch
 from torch import nn
 
 from service.config import ABCConfig, PPOConfig
-from service.envs.observations import ACTION, BOB, BOB_VALUE, FULL
+from service.envs.observations import ACTION, BOB, BOB_VALUE, FULL, PAPER
 from service.learner.player import Player
 from service.learner.ppo import advantages, collect
 from service.learner.samples import (
-    ALICES,
-    BOBS,
     DemonstrationRows,
+    alices,
     augment_by_symmetry,
+    bobs,
     draw_epoch,
     mirror,
     reflect_at_random,
@@ -100,7 +100,7 @@ def test_equal_advantages_become_zero():
 def test_samples_are_augmented_by_their_reflections():
     samples = collect([[make_bob_turns()]], make_bob_turns(), PLAYER)
     mirrors = BOB.mirror, BOB_VALUE.mirror, ACTION.mirror
-    doubled = augment_by_symmetry(samples, BOBS, PLAYER)
+    doubled = augment_by_symmetry(samples, bobs(PAPER), PLAYER)
     num = len(samples)
     assert len(doubled) == 2 * num
     for before, after in zip(samples.tensors(), doubled.tensors(), strict=True):
@@ -116,10 +116,10 @@ def test_samples_are_augmented_by_their_reflections():
 
 def test_half_of_the_samples_are_reflected_at_random():
     samples = collect([[make_bob_turns()]], make_bob_turns(), PLAYER)
-    mixed = reflect_at_random(samples, BOBS, PLAYER, np.random.default_rng(0))
+    mixed = reflect_at_random(samples, bobs(PAPER), PLAYER, np.random.default_rng(0))
     reflected = np.random.default_rng(0).random(len(samples)) < 0.5
     assert 0.3 < reflected.mean() < 0.7
-    doubled = augment_by_symmetry(samples, BOBS, PLAYER)
+    doubled = augment_by_symmetry(samples, bobs(PAPER), PLAYER)
     for column, both in zip(mixed.tensors(), doubled.tensors(), strict=True):
         original, reflection = both.numpy().reshape(2, len(samples), -1)
         expected = np.where(reflected[:, None], reflection, original)
@@ -131,7 +131,7 @@ def test_a_player_is_mirrored_as_configured(how):
     turns = make_turns(np.random.default_rng(0), FULL.size, FULL.size)
     alice = Player(Policy(), Estimate(), PPOConfig(mirror=how), CPU)
     samples = collect([[turns]], turns, alice)
-    found = mirror(samples, ALICES, alice, np.random.default_rng(0))
+    found = mirror(samples, alices(PAPER), alice, np.random.default_rng(0))
     num = len(samples)
     reflected = FULL.mirror(samples.observation.numpy())
     if how == "none":
@@ -189,7 +189,7 @@ def test_demonstrations_alone_make_an_epoch():
 def test_only_demonstrations_that_are_drawn_are_reflected_and_asked_for():
     rng = np.random.default_rng(0)
     observation, action = (rng.standard_normal((5, size)).astype(np.float32) for size in (BOB.size, ACTION.size))
-    rows = DemonstrationRows(torch.from_numpy(observation), torch.from_numpy(action), mirrored=True)
+    rows = DemonstrationRows(torch.from_numpy(observation), torch.from_numpy(action), mirror=PAPER.bob.mirror)
     assert rows.num_total == 10
     cloning = rows.to_clone(np.array([1, 4, 6]), PLAYER)  # 6 is the reflection of row 1
     assert len(cloning) == 3

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from service.config import WorldConfig
 from service.envs.batch import WorldBatch
-from service.envs.observations import ACTION, POSITIONS
+from service.envs.observations import ACTION, layouts
 from service.envs.sampling import GoalKind, check_goals, draw_goals
 from service.envs.tasks import find_task
 from service.errors import TandemError
@@ -76,14 +76,15 @@ class GoalWorlds:
     def _observe(self) -> tuple[Observation, BoolArray]:
         """(N, ...) observations, and (N,) true where the object is at its goal."""
         positions = np.clip(self._worlds.positions(), -_FURTHEST_M, _FURTHEST_M)
-        achieved, desired = positions[:, POSITIONS["object"]].copy(), self._goal.astype(np.float32)
+        achieved = np.clip(self._worlds.object_position, -_FURTHEST_M, _FURTHEST_M).astype(np.float32)  # without noise
+        desired = self._goal.astype(np.float32)
         observation = {"observation": positions, "achieved_goal": achieved, "desired_goal": desired}
         return observation, self.compute_reward(achieved, desired, {}) > 0.0
 
 
-def goal_space() -> gymnasium.spaces.Dict:
-    """Make the space of the observations of one world."""
-    sizes = {"observation": POSITIONS.size, "achieved_goal": 3, "desired_goal": 3}
+def goal_space(config: WorldConfig) -> gymnasium.spaces.Dict:
+    """Make the space of the observations of one such world."""
+    sizes = {"observation": layouts(config.observed).positions.size, "achieved_goal": 3, "desired_goal": 3}
     return gymnasium.spaces.Dict(
         {name: gymnasium.spaces.Box(-_FURTHEST_M, _FURTHEST_M, (size,), np.float32) for name, size in sizes.items()}
     )
@@ -109,8 +110,9 @@ class TabletopState:
 class TabletopEnv(GoalWorlds, gymnasium.Env[Any, FloatArray]):
     """A Panda at a table, one rigid object, and a goal for the object's centre.
 
-    - observation: ``observation`` (11,) positions as Bob's primitives see them (``service.envs.observations``),
-      ``achieved_goal`` (3,) and ``desired_goal`` (3,) object and goal in the world frame, metres, within +-10.
+    - observation: ``observation`` (P,) positions as Bob's primitives see them (``service.envs.observations``), 11 or as
+      many as ``config.observed`` says, ``achieved_goal`` (3,) and ``desired_goal`` (3,) object and goal in the world
+      frame, metres, within +-10.
     - action: (4,) in [-1, 1]: end-effector displacement x, y, z from where it is now (1 is 5 cm), change of the finger
       width (1 is 10 cm).
     - reward: 1 at every step the object is within ``success_distance_m`` of the goal, else 0 (paper, downstream tasks).
@@ -149,7 +151,7 @@ class TabletopEnv(GoalWorlds, gymnasium.Env[Any, FloatArray]):
             raise TandemError(f"TabletopEnv: render_mode = {render_mode!r}; choose rgb_array or None")
         super().__init__(1, 1, config, task, goals, success_distance_m)
         self.render_mode = render_mode
-        self.observation_space = goal_space()
+        self.observation_space = goal_space(self.config)
         self.action_space = action_space()
         self._image_size = (width, height)
         self._renderer: SceneRenderer | None = None

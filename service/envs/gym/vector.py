@@ -78,7 +78,7 @@ class TabletopVectorEnv(GoalWorlds, gymnasium.vector.VectorEnv[Any, FloatArray, 
         super().__init__(num_envs, num_threads, config, task, goals, success_distance_m)
         self.num_envs = num_envs
         self.max_episode_steps = max_episode_steps
-        self.single_observation_space, self.single_action_space = goal_space(), action_space()
+        self.single_observation_space, self.single_action_space = goal_space(self.config), action_space()
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
         self._elapsed = np.zeros(num_envs, dtype=np.int64)
