@@ -202,6 +202,12 @@ class PPOConfig(FrozenModel):
     minibatch_size: int = Field(3200, ge=2)
     max_grad_norm: float = Field(0.5, gt=0.0)
     target_kl: float = Field(0.02, gt=0.0, description="an update stops early once its mean KL passes 1.5 x this")
+    value_first_updates: int = Field(
+        0,
+        ge=0,
+        description="first updates of a run in which the value network learns and the policy stays: one that begins "
+        "from a trained policy (--from) would else be led by a network that knows nothing",
+    )
     mirror: Annotated[Literal["none", "both", "random"], BeforeValidator(_mirror)] = Field(
         "none",
         description="symmetry augmentation, since the task is the same from left and right: learn from every sample "

@@ -9,6 +9,7 @@ from pydantic import BeforeValidator, Discriminator, Field, Tag, model_validator
 
 from service.frozen import FrozenModel
 from service.object_config import Fixture, Object, ObjectConfig, simple_object
+from service.randomisation_config import RandomisationConfig
 from service.robot_config import RobotConfig, read_robot
 
 Point = tuple[float, float, float]
@@ -81,6 +82,7 @@ class WorldConfig(FrozenModel):
     )
     workspace: WorkspaceConfig = WorkspaceConfig()
     observed: ObservedConfig = ObservedConfig()
+    randomisation: RandomisationConfig = RandomisationConfig()
     start_height_m: float = Field(
         0.08,
         ge=0.08,
@@ -95,6 +97,16 @@ class WorldConfig(FrozenModel):
         if self.fixtures and self.fixture != "none":
             raise ValueError(f"fixture = {self.fixture!r} and fixtures: a world has the one or the other")
         return self
+
+    @property
+    def nominal(self) -> WorldConfig:
+        """The same world as it says, nothing drawn; policies see what they saw."""
+        return self.model_copy(update={"randomisation": RandomisationConfig()})
+
+    @property
+    def num_kept_commands(self) -> int:
+        """Last commands that a world remembers: those that are seen, and those that do not count yet."""
+        return max(self.observed.num_commands, (self.randomisation.delay_steps or (0, 0))[1])
 
     @property
     def shape(self) -> ObjectConfig:

@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from service.config import Config
     from service.io.run_directory import RunDirectory
     from service.runtime.ray_connection import ClusterOptions
+    from service.runtime.starting import Start
 
 _DEMO_CONFIG = Path(__file__).parents[2] / "configs" / "pretrain" / "panda_cube.yaml"
 """The shipped recipe, in a clone; an installed wheel has none, and the defaults do."""
@@ -46,6 +47,10 @@ def pretrain(
         Path, typer.Option(envvar="TANDEM_RUNS", metavar="DIR", help="Directory of run directories.")
     ] = Path("runs"),
     resume: Annotated[bool, typer.Option("--resume", help="Continue the run in --run-dir exactly.")] = False,
+    start_from: Annotated[
+        str | None,
+        typer.Option("--from", metavar="NAME@ALIAS|RUN_DIR", help="Begin with what that learned, as far as it fits."),
+    ] = None,
     seeds: Annotated[
         str | None, typer.Option(metavar="0,1,2|0-4", help="A study: a run for each, in DIR/seed-N; names the best.")
     ] = None,
@@ -109,6 +114,8 @@ def pretrain(
             raise TandemError("--run-id names the run directory, and continues what is there: leave out the other two")
         run_dir = runs / run_id
         resume = RunDirectory(run_dir).exists
+    if start_from is not None and is_study(run_dir, seeds):
+        raise TandemError("--from with --seeds: start a run for each seed with --set seed=N")
     if is_study(run_dir, seeds):
         if method is not None:
             raise TandemError(
@@ -129,9 +136,14 @@ def pretrain(
     else:
         resolved = load_config(config, overrides)
         run_dir = run_dir or runs / resolved.name
+    start = None
+    if start_from is not None and not resume:
+        from service.runtime.starting import read_start
+
+        start = read_start(start_from, registry, resolved)
     directory = RunDirectory(run_dir, accept_damaged_records=accept_damaged_records)
     if runtime == "local":
-        _pretrain(resolved, directory, registry, resume=resume, publish=publish)
+        _pretrain(resolved, directory, registry, resume=resume, publish=publish, start=start)
         return
     from service.runtime.ray_connection import connected
 
@@ -139,7 +151,10 @@ def pretrain(
     with closing(directory), traceback_in(run_dir):
         prepare(resolved, directory, registry, resume=resume, publish=publish, runtime=runtime)
         with connected(address):
-            _pretrain(resolved, directory, registry, resume=resume, publish=publish, cluster=options, address=address)
+            _pretrain(
+                resolved, directory, registry,
+                resume=resume, publish=publish, cluster=options, address=address, start=start,
+            )  # fmt: skip
 
 
 _METHOD_SETTINGS = {"dads": ("skills.hidden_sizes=[64,64]", "skills.newest_steps=50000")}
@@ -193,6 +208,7 @@ def _pretrain(
     publish: bool = True,
     cluster: ClusterOptions | None = None,
     address: str | None = None,
+    start: Start | None = None,
 ) -> None:
     from service.runtime.pretrain import pretrain as run
     from service.runtime.progress import Progress
@@ -209,7 +225,7 @@ def _pretrain(
         with traceback_in(directory.path), Progress(config.run.total_env_steps, Console()) as progress:
             done = run(
                 config, directory, registry,
-                resume=resume, publish=publish, on_iteration=progress.show, cluster=cluster,
+                resume=resume, publish=publish, on_iteration=progress.show, cluster=cluster, start=start,
             )  # fmt: skip
     except InterruptError as interrupt:
         say_stopped("stopped at once", interrupt.number)

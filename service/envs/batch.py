@@ -10,11 +10,13 @@ import numpy as np
 from mujoco import rollout
 
 from service.config import WorldConfig
+from service.envs.model_bank import ModelBank
+from service.envs.noise import KEYS, normal
 from service.envs.observations import ACTION, COMMAND_PREFIX, ObservationLayout, layouts
 from service.envs.reach import reach_of
 from service.envs.robot import Robot, described
 from service.envs.sampling import draw_starts
-from service.envs.scene import FIXTURE_PREFIX, build_layout, build_spec
+from service.envs.scene import FIXTURE_PREFIX, build_layout
 from service.errors import ConfigError, DivergedError
 from service.types import BoolArray, FloatArray, IntArray, StateArray
 
@@ -35,9 +37,10 @@ class WorldBatch:
     """N independent worlds with one flat state each.
 
     The state of a world, see ``layout``, is MuJoCo's full physics state, the finger contacts of the last action, the
-    last actions where policies see them, the place of a box, and whether the gripper is blocked where only some are. A
-    world is a pure function of (state, action), because each action starts the constraint solver cold: saving is
-    copying rows of ``states``, restoring is ``restore``, and the continuation is bit-identical.
+    last actions where policies see them, the place of a box, whether the gripper is blocked where only some are, and
+    what was drawn of ``config.randomisation``. A world is a pure function of (state, action), because each action
+    starts the constraint solver cold: saving is copying rows of ``states``, restoring is ``restore``, and the
+    continuation is bit-identical.
 
     Args:
         config: the world.
@@ -53,7 +56,8 @@ class WorldBatch:
         self.num_worlds = num_worlds
         self.observed = layouts(config.observed)
         """What policies see here."""
-        self.model = build_spec(config).compile()
+        self.bank = ModelBank(config)
+        self.model = self.bank.nominal
         self.robot = Robot(config, self.model)
         robot = described(config)
         self.reach = reach_of(robot, self.robot.arm)
@@ -78,7 +82,7 @@ class WorldBatch:
         self._fresh_state = self._make_fresh_state()
         self.states: StateArray = np.tile(self._fresh_state, (num_worlds, 1))
         """(N, S)."""
-        self._kinematics = self.robot.arm.forward(self.joints)
+        self._see()
         self.num_diverged = 0
         self.diverged: list[tuple[StateArray, FloatArray]] = []
         """(last finite state, action) of every world whose physics diverged; whoever reports them clears the list."""
@@ -106,6 +110,11 @@ class WorldBatch:
         return self.states[:, self.layout["object"]]
 
     @property
+    def seen_object_position(self) -> StateArray:
+        """(N, 3) the same as policies see it: with the errors of ``config.randomisation``."""
+        return self._seen_object
+
+    @property
     def box_place(self) -> StateArray:
         """(N, 3) middle of the bottom of each world's box, metres; (N, 0) in worlds without."""
         return self.states[:, self.layout["box_place"]]
@@ -128,16 +137,37 @@ class WorldBatch:
         """
         states = np.tile(self._fresh_state, (num, 1))
         states[:, self.layout["object"]], states[:, self.layout["box_place"]] = draw_starts(rng, num, self.config)
+        self._draw_physics(rng, states)
         if self.blocked_fraction:
             blocked = rng.random(num) < self.blocked_fraction
             states[blocked, self.layout["fingers"]] = self.robot.finger_values(np.zeros(1))
             states[:, self.layout["gripper_blocked"]] = blocked[:, None]
         return states
 
+    def _draw_physics(self, rng: np.random.Generator, states: StateArray) -> None:
+        """Draw what ``config.randomisation`` has ranges for, in new states."""
+        num, drawn, layout = len(states), self.config.randomisation, self.layout
+        if drawn.model_ranges:
+            model = rng.integers(len(self.bank), size=num)
+            states[:, layout["model"]] = model[:, None]
+            states[:, layout["object"].start + 2] += self.bank.rest_height_m[model] - self.config.rest_height_m
+            if self.config.fixture == "box":
+                states[:, layout["box_place"].start + 2] += self.bank.table_height_m[model]
+        if drawn.delay_steps is not None:
+            low, high = drawn.delay_steps
+            states[:, layout["delay"]] = rng.integers(low, high + 1, (num, 1))
+        if drawn.object_offset_m is not None:
+            direction = rng.normal(size=(num, 3))
+            direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+            states[:, layout["object_offset"]] = direction * rng.uniform(*drawn.object_offset_m, (num, 1))
+        if drawn.object_noise_m is not None:
+            std, key = rng.uniform(*drawn.object_noise_m, num), rng.integers(KEYS, size=num)
+            states[:, layout["object_noise"]] = np.column_stack((std, key))
+
     def restore(self, states: StateArray, worlds: BoolArray | None = None) -> None:
         """Overwrite the states of all worlds, or of those where ``worlds`` is true, with (N or count, S) rows."""
         self.states[slice(None) if worlds is None else worlds] = states
-        self._kinematics = self.robot.arm.forward(self.joints)
+        self._see()
 
     # --- stepping --------------------------------------------------------------------------------------------------
 
@@ -169,9 +199,9 @@ class WorldBatch:
                 "use an earlier version"
             )
         commands: StateArray = np.clip(actions.astype(np.float64), -1.0, 1.0)
-        control = self._control(start, commands, index)
+        control = self._control(start, self._acted(start, commands), index)
         states, sensors = self._pool.rollout(
-            self.model,
+            self.bank.of(start[:, self.layout["model"]].ravel()),
             self._data,
             start[:, self.layout.physics],
             control[:, None, :],
@@ -191,8 +221,17 @@ class WorldBatch:
             self.num_diverged += int((~finite).sum())
             self.diverged += [(start[row].copy(), actions[row].copy()) for row in np.flatnonzero(~finite)]
         self.states[index] = after
-        self._kinematics = self.robot.arm.forward(self.joints)
+        self._see()
         return diverged
+
+    def _acted(self, start: StateArray, commands: StateArray) -> StateArray:
+        """(M, 4) commands that count now: new ones, or earlier ones where they come late."""
+        delay = start[:, self.layout["delay"]].ravel().astype(np.intp)
+        if not delay.any():
+            return commands
+        queue = np.concatenate((commands, start[:, self._commands]), axis=1).reshape(len(start), -1, ACTION.size)
+        late: StateArray = queue[np.arange(len(start)), delay]
+        return late
 
     def _control(self, start: StateArray, actions: StateArray, index: slice | IntArray) -> StateArray:
         here, num_joints = self._kinematics[index], self.robot.num_joints
@@ -219,8 +258,10 @@ class WorldBatch:
         return self.observe(self.observed.full, elapsed=elapsed)
 
     def bob_value(self, goal: StateArray) -> FloatArray:
-        """(N, V) input of Bob's value network, ``Layouts.bob_value``, for (N, 3) goals, metres."""
-        return self.observe(self.observed.bob_value, goal=goal, goal_from_object=goal - self.object_position)
+        """(N, V) input of Bob's value network, ``Layouts.bob_value``, for (N, 3) goals, metres; without errors."""
+        place = self.object_position
+        given = {"goal": goal, "object": place, "goal_from_object": goal - place}
+        return self.observe(self.observed.bob_value, object_from_effector=place - self.ee_position, **given)
 
     def observe(self, layout: ObservationLayout, **given: StateArray | float) -> FloatArray:
         """(N, O) vectors of any layout; ``given`` are the (N, size) entries a world does not know, such as a goal."""
@@ -240,13 +281,26 @@ class WorldBatch:
             return self.states[:, first : first + ACTION.size]
         if name == "effector":
             return self.ee_position
+        if name == "object":
+            return self.seen_object_position
         if name == "object_from_effector":
-            return self.object_position - self.ee_position
+            return self.seen_object_position - self.ee_position
         if name == "effector_velocity":
             velocity = self.states[:, self.layout["joint_velocities"]]
             linear: StateArray = np.matmul(self._kinematics.jacobian[:, :3], velocity[:, :, None])[:, :, 0]
             return linear
         return self.states[:, self.layout[name]]
+
+    def _see(self) -> None:
+        """Compute what several observations of the same states need."""
+        self._kinematics = self.robot.arm.forward(self.joints)
+        self._seen_object, drawn = self.object_position, self.config.randomisation
+        if drawn.object_offset_m is not None:
+            self._seen_object = self._seen_object + self.states[:, self.layout["object_offset"]]
+        if drawn.object_noise_m is not None:
+            std, key = self.states[:, self.layout["object_noise"]].T
+            steps = np.rint(self.states[:, 0] / (self.config.physics_step_s * self.config.num_substeps))
+            self._seen_object = self._seen_object + std[:, None] * normal(key, steps, 3)
 
     def contacts(self) -> BoolArray:
         """(N, 2) left, right finger touched the object during the last action."""

@@ -90,6 +90,10 @@ class ObservationLayout:
         """These entries, then those of ``other``."""
         return ObservationLayout(*self.entries, *other.entries)
 
+    def without(self, name: str) -> ObservationLayout:
+        """The others, in their order."""
+        return ObservationLayout(*(entry for entry in self.entries if entry.name != name))
+
     def __getitem__(self, name: str) -> slice:
         """Columns of an entry."""
         return self.columns[name]

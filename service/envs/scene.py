@@ -91,6 +91,7 @@ def build_layout(config: WorldConfig, *, blocked_fraction: float = 0.0) -> State
     """
     robot = described(config)
     num_joints, num_fingers = len(robot.joints), len(robot.fingers)
+    drawn = config.randomisation
     return StateLayout(
         positions={"joints": num_joints, "fingers": num_fingers, "object": 3, "object_quaternion": 4},
         velocities={
@@ -99,10 +100,14 @@ def build_layout(config: WorldConfig, *, blocked_fraction: float = 0.0) -> State
             "object_velocity": 3,
             "object_spin": 3,
         },
-        measured={"contacts": 2, "commands": ACTION.size * config.observed.num_commands},
+        measured={"contacts": 2, "commands": ACTION.size * config.num_kept_commands},
         kept={
             "box_place": 3 if config.fixture == "box" else 0,  # the middle of its bottom
             "gripper_blocked": int(blocked_fraction > 0.0),
+            "model": int(bool(drawn.model_ranges)),  # its index in the bank
+            "delay": int(drawn.delay_steps is not None),
+            "object_offset": 3 if drawn.object_offset_m is not None else 0,
+            "object_noise": 2 if drawn.object_noise_m is not None else 0,  # its std and key
         },
     )
 

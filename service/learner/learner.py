@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 
 from service.actors.rollout import Demonstrations, Rollout, Turns, part_to_arrays
 from service.config import Config
-from service.envs.observations import ACTION, ObservationLayout, layouts
+from service.envs.observations import ACTION, Layouts, ObservationLayout, layouts
 from service.io.tensors import join_parts, split_parts
-from service.learner import ppo
+from service.learner import ppo, transfer
 from service.learner.diagnostics import composition_metrics, mean_over_ranks, probes
 from service.learner.group import ALONE, Group
 from service.learner.player import LearnerError, Player
@@ -120,6 +120,31 @@ class Learner:
         self._average_bob()
         metrics["version"] = float(self.version)
         return {f"learner/{name}": value for name, value in metrics.items() if math.isfinite(value)}
+
+    def take_over(self, networks_by_name: Mapping[str, Mapping[str, Array]], seen: Layouts) -> list[str]:
+        """Take what fits of trained networks, before anything is learned; see ``transfer.take_over``.
+
+        Args:
+            networks_by_name: parameters of ``alice/policy``, ``alice/value``, ``bob/policy`` and ``bob/value``, those
+                that there are.
+            seen: layouts of the world that they were trained in.
+
+        Returns:
+            A line for each of the four, which says what was taken.
+        """
+        assert self.version == 0
+        lines, now = [], self._layouts
+        for name, part, before, after in (
+            ("bob/policy", self._bob.policy, seen.bob, now.bob),
+            ("bob/value", self._bob.value, seen.bob_value, now.bob_value),
+            ("alice/policy", self._alice.policy, seen.full, now.full),
+            ("alice/value", self._alice.value, seen.full, now.full),
+        ):
+            given = networks_by_name.get(name)
+            what = "nothing there, begins anew" if given is None else transfer.take_over(part, given, before, after)
+            lines.append(f"{name}: {what}")
+        self._bob_ema = networks.export_parameters(self._bob_policy)
+        return lines
 
     def weights(self) -> Weights:
         """Both policies of the current version, as copies."""
@@ -237,7 +262,8 @@ class Learner:
             # A few turns that are cycled through many times would count for more than all others together.
             share = _num(imitated) / max(how.rows_per_sample * counted["num_alice_samples"], 1.0)
             how = how.model_copy(update={"weight": how.weight * min(1.0, share)})
-        metrics = ppo.update(self._alice, samples, imitated, how, self._rng, self._group)
+        learns = self.version >= self.config.learner.alice.value_first_updates
+        metrics = ppo.update(self._alice, samples, imitated, how, self._rng, self._group, policy_learns=learns)
         return _prefixed("alice", metrics) | counted
 
     def _update_bob(self, rollouts: Sequence[Rollout]) -> Metrics:
@@ -250,7 +276,9 @@ class Learner:
             samples = mirror(samples, bobs(self._layouts), bob, self._rng)
         demonstrations = self._to_clone(DEMONSTRATIONS, [each.demonstrations for each in rollouts])
         metrics["num_demonstrations"] = float(_num(demonstrations) // (1 + config.bob.mirrors))
-        metrics |= _prefixed("bob", ppo.update(bob, samples, demonstrations, config.abc, self._rng, group))
+        learns = self.version >= config.bob.value_first_updates
+        updated = ppo.update(bob, samples, demonstrations, config.abc, self._rng, group, policy_learns=learns)
+        metrics |= _prefixed("bob", updated)
         rows = samples if samples is not None else demonstrations
         if rows is not None and isinstance(self._bob_policy, networks.MCPPolicy):
             probed = probes(rows)

@@ -144,8 +144,12 @@ def update(
     how: CloningConfig,
     rng: np.random.Generator,
     group: Group = ALONE,
+    *,
+    policy_learns: bool = True,
 ) -> Metrics:
     """Learn from samples, demonstrations or both; go back to the parameters before if that fails.
+
+    Without ``policy_learns`` the value network alone does.
 
     An update fails when three minibatches were not finite, or when it moved the policy by ten times the target KL.
     The KL is exact, between the policies before and after, averaged over probes.
@@ -154,20 +158,23 @@ def update(
         Metrics without the player's prefix; one that there is nothing to measure on is left out.
     """
     metrics = {"learning_rate": player.optimizer.learning_rate, "non_finite_steps": 0.0, "rollbacks": 0.0}
+    if not policy_learns:
+        demonstrations = None
     rows = samples if samples is not None else demonstrations
     if rows is None:
         return metrics
     snapshot, probed = player.snapshot(), probes(rows)
     with torch.no_grad():
         before = player.policy(probed.observation)
-    stats = train(player, samples, demonstrations, how, rng, group)
+    stats = train(player, samples, demonstrations, how, rng, group, policy_learns=policy_learns)
     with torch.no_grad():
         moved = gaussian.kl(*before, *player.policy(probed.observation))
     kl = mean_over_ranks({"kl": float(moved.mean())}, len(probed), probed.num_total, group)["kl"]
     failed = stats.aborted or not kl <= KL_COLLAPSE * player.config.target_kl
     if failed:
         player.restore(snapshot)
-    player.optimizer.learning_rate = _adapted_learning_rate(player, math.inf if failed or stats.stopped else kl)
+    if policy_learns:
+        player.optimizer.learning_rate = _adapted_learning_rate(player, math.inf if failed or stats.stopped else kl)
     if samples is not None:
         estimated = samples.value_target, samples.value
         metrics["explained_variance"] = explained_variance(*estimated, samples.num_total, group)
@@ -220,12 +227,14 @@ def train(
     how: CloningConfig,
     rng: np.random.Generator,
     group: Group = ALONE,
+    *,
+    policy_learns: bool = True,
 ) -> UpdateStats:
     """Take a player's gradient steps of one update, until its epochs are over or three minibatches were not finite.
 
     All epochs are drawn first: only demonstrations that are drawn need a log-probability under the policy before.
     """
-    stats, config = UpdateStats(), player.config
+    stats, config = UpdateStats(stopped=not policy_learns), player.config
     num_samples, num_demonstrations = (0 if rows is None else rows.num_total for rows in (samples, demonstrations))
     epochs = [draw_epoch(num_samples, num_demonstrations, config, how, rng) for _ in range(config.num_epochs)]
     cloning = None

@@ -6,6 +6,7 @@ cores of a laptop are busy, and the order of everything is fixed, so a run is re
 
 from __future__ import annotations
 
+import logging
 import time
 from concurrent.futures import ThreadPoolExecutor
 
@@ -17,10 +18,12 @@ from service.generator.opponents import Opponents
 from service.io.run_directory import RunDirectory
 from service.policies.parameters import Parameters
 from service.runtime.runner import Health, IterationResult, OnBeat, Runner
+from service.runtime.starting import Start
 from service.runtime.workers import GeneratorWorker, LearnerWorker, RolloutWorker
 from service.store.models import GoalGrid
 from service.types import Metrics
 
+_logger = logging.getLogger(__name__)
 OLDER_OPPONENTS = -1
 """Version of past players that a checkpoint has beside the task generator's, which have joined meanwhile."""
 
@@ -45,13 +48,16 @@ class LocalRun(Runner):
         config: the run.
         directory: where it keeps everything; see ``RunDirectory``.
         resume: continue from the newest checkpoint instead of starting anew.
+        start: what a new run begins from; None: from nothing.
 
     Raises:
         TandemError: see ``RunDirectory.claim`` and ``check_one_learner``.
         CheckpointError: ``resume`` without a usable checkpoint.
     """
 
-    def __init__(self, config: Config, directory: RunDirectory, *, resume: bool = False) -> None:
+    def __init__(
+        self, config: Config, directory: RunDirectory, *, resume: bool = False, start: Start | None = None
+    ) -> None:
         check_one_learner(config)
         directory.claim(resume=resume)
         super().__init__(config, directory)
@@ -66,6 +72,8 @@ class LocalRun(Runner):
         if resume:
             self._load()
         else:
+            if start is not None:
+                self._begin_from(start)
             self._save_first()
         self._open_directory(resume=resume)
 
@@ -137,6 +145,12 @@ class LocalRun(Runner):
                 parts["pending"] = to_arrays(self._pending)
             meta = {"rng": self._actor.rng.bit_generator.state, "next_incarnation": self._incarnation + 1}
             self.bookkeeper.save(parts, meta)
+
+    def _begin_from(self, start: Start) -> None:
+        for line in self.learner.take_over(start.networks, start.seen):
+            _logger.info("from %s: %s", start.label, line)
+        if start.published is not None:
+            self.directory.write_published(start.published)
 
     def _load(self) -> None:
         parts, meta = self.bookkeeper.resume()

@@ -28,6 +28,7 @@ from service.store.run_writer import RunWriter
 
 if TYPE_CHECKING:
     from service.runtime.ray_connection import ClusterOptions
+    from service.runtime.starting import Start
     from service.store.models import RunState
 
 MAX_STATES_LOST = 5
@@ -69,6 +70,7 @@ def pretrain(
     publish: bool = True,
     on_iteration: OnIteration,
     cluster: ClusterOptions | None = None,
+    start: Start | None = None,
 ) -> Pretrained:
     """Run to the end, then evaluate, publish, draw and record a video.
 
@@ -83,6 +85,7 @@ def pretrain(
         publish: or else leave that to a later resume, or to ``publish_run``.
         on_iteration: called with the metrics of every iteration.
         cluster: run on the Ray cluster that this process is connected to; None: in this process.
+        start: what a new run begins from (``starting.read_start``); a resumed one has begun already.
 
     Raises:
         TandemError: see ``LocalRun``, ``ClusterRun`` and ``RunDirectory.start``; or a registry that is only read; or a
@@ -114,7 +117,7 @@ def pretrain(
             stack.enter_context(explaining_ray_errors())  # before the report has them
         num_lost, furthest = 0, -1
         while True:
-            with closing(_start(config, directory, cluster, resume=resume)) as run:
+            with closing(_start(config, directory, cluster, resume=resume, start=start)) as run:
                 try:
                     to = Registry(registry) if publish else None
                     done = _run(run, config, directory, to, signals, report, on_iteration)
@@ -156,15 +159,23 @@ def prepare(
     return directory.read_published()
 
 
-def _start(config: Config, directory: RunDirectory, cluster: ClusterOptions | None, *, resume: bool) -> Runner:
+def _start(
+    config: Config, directory: RunDirectory, cluster: ClusterOptions | None, *, resume: bool, start: Start | None
+) -> Runner:
     if config.skills is not None:
         from service.runtime.skill_run import SkillRun
 
         return SkillRun(config, directory, resume=resume)
     if cluster is None:
-        return LocalRun(config, directory, resume=resume)
+        return LocalRun(config, directory, resume=resume, start=start)
     from service.runtime.cluster import ClusterRun  # where there is no cluster, Ray is not needed
 
+    if (
+        start is not None and not resume
+    ):  # the first checkpoint says what there is to begin from, and both runners read it
+        one = config.learner.model_copy(update={"num_learners": 1, "device": "cpu"})
+        LocalRun(config.model_copy(update={"learner": one}), directory, start=start).close()
+        resume = True
     return ClusterRun(config, directory, cluster, resume=resume)
 
 

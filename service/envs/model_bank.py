@@ -1,0 +1,98 @@
+"""Compiled models that differ in what a world's configuration gives ranges for, made once for many worlds.
+
+Compiling a model takes milliseconds and stepping another one costs nothing, so worlds draw one of the bank at each
+start instead of changing one of their own (domain randomisation of dynamics, Peng et al. 2018).
+"""
+
+from __future__ import annotations
+
+import mujoco
+import numpy as np
+
+from service.config import WorldConfig
+from service.envs.robot import described
+from service.envs.scene import FIXTURE_PREFIX, build_spec
+from service.object_config import ObjectConfig
+from service.types import Array, StateArray
+
+_SEED = 0
+
+
+class ModelBank:
+    """The models of a world, one where it gives no ranges.
+
+    Args:
+        config: the world.
+    """
+
+    def __init__(self, config: WorldConfig) -> None:
+        ranges = config.randomisation.model_ranges
+        self.nominal: mujoco.MjModel = build_spec(config).compile()
+        """Without any of it."""
+        self.drawn = _spread(ranges, config.randomisation.num_models) if ranges else {}
+        """(M,) values by the names of ``RandomisationConfig``."""
+        num = config.randomisation.num_models if ranges else 1
+        rows = [{name: float(values[index]) for name, values in self.drawn.items()} for index in range(num)]
+        variants = [_variant(config, row) for row in rows]
+        self.models = [
+            self.nominal if not row else _compile(variant, row) for variant, row in zip(variants, rows, strict=True)
+        ]
+        """M of them."""
+        self.table_height_m: StateArray = self.drawn.get("table_height_m", np.zeros(num))
+        """(M,) above where the configuration has it."""
+        self.rest_height_m: StateArray = self.table_height_m + [variant.rest_height_m for variant in variants]
+        """(M,) height of the object's centre as it lies on the table."""
+
+    def __len__(self) -> int:
+        return len(self.models)
+
+    def of(self, index: Array) -> list[mujoco.MjModel] | mujoco.MjModel:
+        """Models of worlds by their (N,) indices, as MuJoCo's rollout takes them."""
+        return self.models[0] if len(self.models) == 1 else [self.models[each] for each in index.astype(np.intp)]
+
+
+def _spread(ranges: dict[str, tuple[float, float]], num: int) -> dict[str, StateArray]:
+    """Draw ``num`` values of each range, together evenly spread (Latin hypercube, McKay et al. 1979)."""
+    rng = np.random.default_rng(_SEED)
+    shares = {name: (rng.permutation(num) + rng.random(num)) / num for name in ranges}
+    return {name: low + (high - low) * shares[name] for name, (low, high) in ranges.items()}
+
+
+def _variant(config: WorldConfig, drawn: dict[str, float]) -> WorldConfig:
+    """The world with an object as drawn."""
+    changed: dict[str, object] = {name: drawn[name] for name in ("object_mass_kg", "friction") if name in drawn}
+    if (factor := drawn.get("object_size")) is not None:
+        if isinstance(config.object, ObjectConfig):
+            changed["object"] = _scaled(config.object, factor)
+        else:
+            changed["object_size_m"] = config.object_size_m * factor
+    return config.model_copy(update=changed)
+
+
+def _scaled(shape: ObjectConfig, factor: float) -> ObjectConfig:
+    mesh = shape.mesh
+    if mesh is not None:
+        center = tuple(factor * each for each in mesh.center_m)
+        of_size = {"scale": mesh.scale * factor, "center_m": center, "volume_m3": mesh.volume_m3 * factor**3}
+        mesh = mesh.model_copy(update=of_size)
+    return shape.model_copy(update={"size_m": tuple(factor * each for each in shape.size_m), "mesh": mesh})
+
+
+def _compile(config: WorldConfig, drawn: dict[str, float]) -> mujoco.MjModel:
+    model = build_spec(config).compile()
+    servos = slice(0, len(described(config).joints))  # those of the arm come first
+    gain, damping = drawn.get("gain", 1.0), drawn.get("damping", 1.0)
+    model.actuator_gainprm[servos, 0] *= gain
+    model.actuator_biasprm[servos, 1] *= gain
+    model.actuator_biasprm[servos, 2] *= damping
+    height_m = drawn.get("table_height_m", 0.0)
+    for geom in range(model.ngeom):
+        name = model.geom(geom).name
+        if name != "table" and not name.startswith(FIXTURE_PREFIX):
+            continue
+        body = int(model.geom_bodyid[geom])
+        if body == 0:
+            model.geom_pos[geom, 2] += height_m
+        elif model.body_mocapid[body] < 0 and geom == model.body_geomadr[body]:  # once for a body of several geoms
+            model.body_pos[body, 2] += height_m
+    return model
