@@ -15,6 +15,7 @@ import yaml
 from pydantic import BaseModel, BeforeValidator, Field, PositiveInt, ValidationError, model_validator
 
 from service.config_tree import RENAMED, apply_override, read_yaml, updated
+from service.distillation_config import DistillationConfig
 from service.errors import ConfigError
 from service.frozen import FrozenModel
 from service.off_policy_config import SkillsConfig
@@ -343,7 +344,18 @@ class Config(FrozenModel):
         description="skill discovery instead of self-play, a baseline; then game, generator, policy and learner "
         "mean nothing",
     )
+    distillation: DistillationConfig | None = Field(
+        None,
+        description="Bob learns from the one of --from, who sees what a robot does not, instead of self-play; then "
+        "generator and learner mean nothing",
+    )
     run: RunConfig = RunConfig()
+
+    @model_validator(mode="after")
+    def _distillation_is_of_primitives(self) -> Self:
+        if self.distillation is not None and (self.skills is not None or self.policy.monolithic_bob is not None):
+            raise ValueError("distillation teaches primitives: leave out skills and policy.monolithic_bob")
+        return self
 
     @model_validator(mode="after")
     def _there_are_goals(self) -> Self:

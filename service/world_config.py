@@ -46,6 +46,11 @@ class ObservedConfig(FrozenModel):
         description="last commands of its own that a policy sees, the newest first; 0 in the paper. With late "
         "observations or a slow arm, positions alone do not say what is still under way",
     )
+    delay: bool = Field(
+        False,
+        description="policies see by how many control steps their commands are late; on a robot, tandem robot "
+        "calibrate measures it",
+    )
 
 
 def _read_robot(value: Any) -> Any:

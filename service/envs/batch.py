@@ -12,7 +12,7 @@ from mujoco import rollout
 from service.config import WorldConfig
 from service.envs.model_bank import ModelBank
 from service.envs.noise import KEYS, normal
-from service.envs.observations import ACTION, COMMAND_PREFIX, ObservationLayout, layouts
+from service.envs.observations import ACTION, COMMAND_PREFIX, Layouts, ObservationLayout, layouts
 from service.envs.reach import reach_of
 from service.envs.robot import Robot, described
 from service.envs.sampling import draw_starts
@@ -253,6 +253,11 @@ class WorldBatch:
         """(N, P) input of Bob's primitives: ``Layouts.positions``."""
         return self.observe(self.observed.positions)
 
+    def true_positions(self, seen: Layouts) -> FloatArray:
+        """(N, P) positions of any layouts without the errors of ``config.randomisation``."""
+        place = self.object_position
+        return self.observe(seen.positions, object=place, object_from_effector=place - self.ee_position)
+
     def full(self, elapsed: float) -> FloatArray:
         """(N, F) input of Alice: ``Layouts.full``; ``elapsed`` is the share of her turn gone by, in [0, 1]."""
         return self.observe(self.observed.full, elapsed=elapsed)
@@ -281,6 +286,8 @@ class WorldBatch:
             return self.states[:, first : first + ACTION.size]
         if name == "effector":
             return self.ee_position
+        if name == "delay" and self.config.randomisation.delay_steps is None:
+            return np.zeros((self.num_worlds, 1))
         if name == "object":
             return self.seen_object_position
         if name == "object_from_effector":

@@ -138,6 +138,7 @@ _GOAL = ObservationLayout(Entry("goal", VECTOR, "m", _MIDDLE_M, 0.12))
 GOAL_FROM_OBJECT = ObservationLayout(Entry("goal_from_object", VECTOR, "m", 0.0, 0.1))
 """Way that the object has to go."""
 _ELAPSED = ObservationLayout(Entry("elapsed", SCALAR, "share of the turn", 0.5, 0.5))
+_DELAY = Entry("delay", SCALAR, "control steps", 1.0, 1.0)
 COMMAND_PREFIX = "command_"
 """Begins the names of past commands; ``command_1`` is the last one."""
 
@@ -149,14 +150,15 @@ class Layouts:
 
     Args:
         num_commands: last commands that policies see.
+        delay: whether they see how late commands are.
     """
 
-    def __init__(self, num_commands: int = 0) -> None:
+    def __init__(self, num_commands: int = 0, *, delay: bool = False) -> None:
         commands = (
             Entry(f"{COMMAND_PREFIX}{age + 1}", COMMAND, "share of the greatest", 0.0, 1.0)
             for age in range(num_commands)
         )
-        self.positions = POSITIONS + ObservationLayout(*commands)
+        self.positions = POSITIONS + ObservationLayout(*commands, *([_DELAY] if delay else []))
         """Input of Bob's primitives."""
         self.full = self.positions + _MOTION + _ELAPSED
         """Input of Alice's policy and of her value network."""
@@ -176,7 +178,7 @@ class Layouts:
 
 def layouts(observed: ObservedConfig) -> Layouts:
     """Layouts of worlds with such observations."""
-    return Layouts(observed.num_commands)
+    return Layouts(observed.num_commands, delay=observed.delay)
 
 
 PAPER = Layouts()

@@ -31,10 +31,13 @@ def take_over(
         What was taken, in words.
     """
     own = network.state_dict()
-    if missing := sorted(own.keys() ^ given.keys()):
+    constants = {name for name, _ in network.named_buffers()}  # of the layout; a learner's state has none
+    if missing := sorted((own.keys() ^ given.keys()) - constants):
         return f"not taken, {len(missing)} parameters are not in both, such as {missing[0]}"
     fitted = {}
     for name, tensor in own.items():
+        if name not in given:
+            continue
         array = torch.from_numpy(np.array(given[name], dtype=np.float32))
         if array.shape != tensor.shape:
             with_inputs = _with_inputs(array, tensor.clone(), name, before, after)
@@ -42,7 +45,7 @@ def take_over(
                 return f"not taken, {name} is of shape {list(given[name].shape)}, not {list(tensor.shape)}"
             array = with_inputs
         fitted[name] = array
-    network.load_state_dict(fitted)
+    network.load_state_dict(own | fitted)
     new, gone = (sorted(one.columns.keys() - other.columns.keys()) for one, other in ((after, before), (before, after)))
     notes = [f"{word} {', '.join(names)}" for word, names in (("new", new), ("left out", gone)) if names]
     return f"taken{': ' if notes else ''}{'; '.join(notes)}"

@@ -15,7 +15,7 @@ from service.io.run_directory import RunDirectory
 from service.media import recording, video
 from service.media.plots import plot_coverage, plot_curves, plot_goals
 from service.policies.numpy_policy import NumpyMCPPolicy
-from service.primitives.loading import load_players, load_skills
+from service.primitives.loading import load_players, load_skills, read_parameters
 
 COVERAGE_STEPS = 100
 NUM_RECORDED_ROUNDS = 4
@@ -35,9 +35,18 @@ def make_artifacts(directory: RunDirectory) -> dict[str, Path]:
     if config.skills is not None:
         return _make(
             {
-                "curves": partial(plot_curves, directory.path, of_skills=True),
+                "curves": partial(plot_curves, directory.path, "skills"),
                 "coverage": partial(_draw_skills, directory, config),
                 "video": partial(_draw_skill_video, directory, config),
+            }
+        )
+    if config.distillation is not None:
+        student = NumpyMCPPolicy(read_parameters(directory, "bob"))
+        return _make(
+            {
+                "curves": partial(plot_curves, directory.path, "distillation"),
+                "coverage": partial(_draw_coverage, directory, config, student),
+                "video": partial(_draw_episodes, directory, config, student),
             }
         )
     alice, bob = load_players(directory)
@@ -81,6 +90,19 @@ def _draw_skill_video(directory: RunDirectory, config: Config) -> Path:
         skills, config.world, num_skills=NUM_RECORDED_SKILLS, num_steps=steps, seed=_SEED
     )
     return video.write_episode_video(episodes, config.world, directory.path / "skills.mp4")
+
+
+def _draw_episodes(directory: RunDirectory, config: Config, bob: NumpyMCPPolicy) -> Path:
+    episodes = recording.record_episodes(
+        bob,
+        config.world,
+        "mixed",
+        num_episodes=NUM_RECORDED_SKILLS,
+        num_steps=config.run.evaluation_steps,
+        success_distance_m=config.game.success_distance_m,
+        seed=_SEED,
+    )
+    return video.write_episode_video(episodes, config.world, directory.path / "episodes.mp4")
 
 
 def _draw_coverage(directory: RunDirectory, config: Config, bob: NumpyMCPPolicy) -> Path:

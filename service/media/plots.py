@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from itertools import combinations, cycle, product
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import numpy as np
 
@@ -106,15 +106,37 @@ _SKILL_CURVES = (
     _Curve("entropy", "learner/entropy", "policy", BLUE),
 )
 
+_DISTILLATION_PANELS = {
+    "solved": _Panel("The student on random goals", "grows, with noise and random actions", "solved"),
+    "random": _PANELS["random"],
+    "action": _Panel("Error of actions", "falls; noise of what is seen leaves a rest", "squared"),
+    "primitives": _Panel("Error of primitives", "falls", "squared"),
+    "gate": _Panel("Error of the gate", "falls", "squared, of logs"),
+    "rate": _Panel("Learning rate", "falls", ""),
+}
+_DISTILLATION_CURVES = (
+    _Curve("solved", "bob/success_rate", "own gate", BLUE),
+    *(curve for curve in _CURVES if curve.panel == "random"),
+    _Curve("action", "learner/action_error", "error", BLUE),
+    _Curve("primitives", "learner/primitives_error", "error", BLUE),
+    _Curve("gate", "learner/gate_error", "error", BLUE),
+    _Curve("rate", "learner/learning_rate", "rate", BLUE),
+)
+_DRAWN = {
+    "self-play": (_PANELS, _CURVES),
+    "skills": (_SKILL_PANELS, _SKILL_CURVES),
+    "distillation": (_DISTILLATION_PANELS, _DISTILLATION_CURVES),
+}
 
-def plot_curves(run_dir: Path, *, of_skills: bool = False) -> Path:
+
+def plot_curves(run_dir: Path, kind: Literal["self-play", "skills", "distillation"] = "self-play") -> Path:
     """Draw ``curves.png`` from the run's ``metrics.jsonl``: six small panels over env steps, raw thin, smoothed thick.
 
     A value that is missing, null or not finite leaves a gap; a panel without values says so.
 
     Args:
         run_dir: of the run.
-        of_skills: whether it is one of skill discovery.
+        kind: of the run, which says what there is to draw.
 
     Raises:
         TandemError: the run has no metrics yet, they are damaged, or the picture cannot be written.
@@ -122,7 +144,7 @@ def plot_curves(run_dir: Path, *, of_skills: bool = False) -> Path:
     records = read_records(run_dir / "metrics.jsonl")
     steps = column(records, "env_steps") / 1e6
     figure = new_figure(14.0, 7.8, f"{run_dir.resolve().name}: {_progress(records)}")
-    panels, curves = (_SKILL_PANELS, _SKILL_CURVES) if of_skills else (_PANELS, _CURVES)
+    panels, curves = _DRAWN[kind]
     for place, (axes, (name, panel)) in enumerate(zip(figure.subplots(2, 3).flat, panels.items(), strict=True)):
         _draw_panel(axes, panel, [curve for curve in curves if curve.panel == name], steps, records)
         axes.set_xlabel("million env steps" if place >= 3 else "", color=FAINT)

@@ -13,6 +13,7 @@ from concurrent.futures import ThreadPoolExecutor
 from service.actors.evaluation import EVALUATED_GOALS
 from service.actors.rollout import Rollout, from_arrays, to_arrays
 from service.config import Config
+from service.envs.observations import layouts
 from service.errors import ConfigError
 from service.generator.opponents import Opponents
 from service.io.run_directory import RunDirectory
@@ -147,7 +148,7 @@ class LocalRun(Runner):
             self.bookkeeper.save(parts, meta)
 
     def _begin_from(self, start: Start) -> None:
-        for line in self.learner.take_over(start.networks, start.seen):
+        for line in self.learner.take_over(start.networks, layouts(start.observed)):
             _logger.info("from %s: %s", start.label, line)
         if start.published is not None:
             self.directory.write_published(start.published)

@@ -152,6 +152,8 @@ def prepare(
         raise ConfigError(
             f"skills.method = {config.skills.method}: skill discovery runs in one process; use --runtime local"
         )
+    if runtime == "ray" and config.distillation is not None:
+        raise ConfigError("distillation runs in one process: use --runtime local, or leave out distillation")
     if runtime == "local":  # on a cluster, another machine has it
         torch_device(config.learner.device)
         check_one_learner(config)
@@ -166,6 +168,10 @@ def _start(
         from service.runtime.skill_run import SkillRun
 
         return SkillRun(config, directory, resume=resume)
+    if config.distillation is not None:
+        from service.runtime.distillation_run import DistillationRun
+
+        return DistillationRun(config, directory, resume=resume, start=start)
     if cluster is None:
         return LocalRun(config, directory, resume=resume, start=start)
     from service.runtime.cluster import ClusterRun  # where there is no cluster, Ray is not needed

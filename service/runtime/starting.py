@@ -7,13 +7,13 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from service.config import Config, parse_config
-from service.envs.observations import Layouts, layouts
 from service.errors import TandemError
 from service.io.checkpoints import CheckpointStore
 from service.io.run_directory import Published, RunDirectory
 from service.io.tensors import split_parts
 from service.primitives.bundled import find_version
 from service.types import Array
+from service.world_config import ObservedConfig
 
 _NETWORKS = ("policy", "value")
 
@@ -25,8 +25,8 @@ class Start:
     label: str
     networks: Mapping[str, Mapping[str, Array]]
     """By ``bob/policy``, ``bob/value``, ``alice/policy`` and ``alice/value``; of a published version only the first."""
-    seen: Layouts
-    """Layouts of the world they were trained in."""
+    observed: ObservedConfig
+    """What policies saw in the world they were trained in."""
     published: Published | None
     """The version, which is the parent of what the run publishes."""
 
@@ -63,7 +63,7 @@ def read_start(reference: str, registry: Path, config: Config) -> Start:
         before = parse_config(manifest.config, where=f"the manifest of {reference}", recorded=True)
         _check_self_play(before, reference)
         networks, published = {"bob/policy": tensors}, Published(str(version), manifest.blob_sha256)
-    return Start(reference, networks, layouts(before.world.observed), published)
+    return Start(reference, networks, before.world.observed, published)
 
 
 def _check_self_play(config: Config, reference: str) -> None:

@@ -1,0 +1,181 @@
+"""The runner of privileged distillation: one process, records and checkpoints as of self-play."""
+
+from __future__ import annotations
+
+import logging
+import time
+
+import numpy as np
+import torch
+
+from service.actors.distillation import DistillationWorlds
+from service.actors.evaluation import EVALUATED_GOALS, EVALUATION_SEED, success_metrics
+from service.config import Config
+from service.envs.observations import Layouts, layouts
+from service.errors import TandemError
+from service.generator.bins import GoalCells
+from service.io.run_directory import RunDirectory
+from service.learner import transfer
+from service.learner.distillation import Distiller
+from service.policies import networks
+from service.policies.numpy_policy import NumpyMCPPolicy, numpy_bob
+from service.policies.parameters import Parameters
+from service.runtime.runner import Health, OnBeat, Runner
+from service.runtime.starting import Start
+from service.store.models import GoalCell, GoalGrid
+from service.types import Metrics, StateArray
+from service.world_config import ObservedConfig
+
+_logger = logging.getLogger(__name__)
+
+
+class DistillationRun(Runner):
+    """A run in this process in which Bob learns from a teacher; an iteration is an episode of every world.
+
+    Args:
+        config: the run, with ``distillation``.
+        directory: where it keeps everything; see ``RunDirectory``.
+        resume: continue from the newest checkpoint instead of starting anew.
+        start: the teacher, from whom the student begins as well; a run that is resumed has him in its checkpoint.
+
+    Raises:
+        TandemError: no teacher, or one without primitives; see ``RunDirectory.claim``.
+        CheckpointError: ``resume`` without a usable checkpoint.
+    """
+
+    def __init__(
+        self, config: Config, directory: RunDirectory, *, resume: bool = False, start: Start | None = None
+    ) -> None:
+        assert config.distillation is not None
+        if start is None and not resume:
+            raise TandemError("distillation learns from a trained Bob: name him, --from NAME@ALIAS")
+        directory.claim(resume=resume)
+        super().__init__(config, directory)
+        with torch.random.fork_rng(devices=[]):
+            torch.default_generator.manual_seed(config.seed)
+            self._distiller = Distiller(
+                networks.MCPPolicy(config.policy.bob, layouts=layouts(config.world.observed)), config.distillation
+            )
+        self._rng = np.random.default_rng(config.seed)
+        self._cells = GoalCells(config.world, config.generator.cell_size_m)
+        self._tries, self._solved = (np.zeros(len(self._cells), dtype=np.int64) for _ in range(2))
+        if start is not None and not resume:
+            self._teacher_parameters, self._observed = dict(start.networks["bob/policy"]), start.observed
+            self._begin_from(start)
+        else:
+            self._load()
+        teacher = numpy_bob(self._teacher_parameters)
+        if not isinstance(teacher, NumpyMCPPolicy):
+            raise TandemError("--from: a monolithic Bob has no primitives to teach; name a composed one")
+        self._worlds = DistillationWorlds(config, teacher, layouts(self._observed), num_threads=config.run.num_threads)
+        if not resume:
+            self._save_first()
+        self._open_directory(resume=resume)
+
+    def parameters(self) -> Parameters:
+        """The newest Bob, as he is evaluated and published."""
+        return self._distiller.averaged_parameters()
+
+    def health(self) -> Health:
+        """The state of the one actor there is, this process."""
+        return self._health_of_one(num_rollouts_counted=self.iteration)
+
+    def grid(self) -> GoalGrid:
+        """The cells of random goals, and how often Bob solved those there."""
+        centers = self._cells.centers().reshape(-1, 3)
+        rates = self._solved / np.maximum(1, self._tries)
+        cells = tuple(
+            GoalCell(
+                center_m=tuple(np.round(centers[cell], 4).tolist()),
+                num_tries=int(self._tries[cell]),
+                success_rate=float(rates[cell]),
+                learnability=float(rates[cell] * (1.0 - rates[cell])),
+            )
+            for cell in np.flatnonzero(self._tries)
+        )
+        lower, upper = self._cells.bounds_m
+        return GoalGrid(
+            iteration=self.iteration,
+            num_env_steps=self.num_env_steps,
+            cell_size_m=self._cells.cell_size_m,
+            shape=self._cells.shape,
+            num_cells=len(self._cells),
+            lower_m=lower,
+            upper_m=upper,
+            cells=cells,
+        )
+
+    def close(self) -> None:
+        """Stop the worlds' threads; a second call does nothing."""
+        self._worlds.close()
+
+    def _advance(self, on_beat: OnBeat) -> None:
+        """Play an episode in every world and learn from it, which is short: ``on_beat`` is never needed."""
+        start = time.perf_counter()
+        with self.timing("play"):
+            played = self._worlds.play(NumpyMCPPolicy(self._distiller.parameters()), self._rng)
+        with self.timing("learn"):
+            progress = self.num_env_steps / self.config.run.total_env_steps
+            learned = self._distiller.learn(played.lesson, progress, self._rng)
+        self.bookkeeper.count(played.num_env_steps)
+        self._count_goals(played.goal, played.solved)
+        metrics = {f"learner/{name}": value for name, value in learned.items()}
+        if len(played.solved):
+            metrics["bob/success_rate"] = float(played.solved.mean())
+        with self.timing("evaluate"):
+            if self.bookkeeper.evaluation_due(self.iteration):
+                metrics |= self._evaluate()
+        elapsed_s = time.perf_counter() - start
+        self.bookkeeper.wall_s += elapsed_s
+        counted = {"iteration": self.iteration, "env_steps": self.num_env_steps}
+        speed = {"time/wall_s": self.bookkeeper.wall_s, "time/env_steps_per_s": played.num_env_steps / elapsed_s}
+        with self.timing("record"):
+            self.directory.record(counted | metrics | speed)
+            self._on_iteration(counted | metrics | speed)
+        self._keep(after=self.num_env_steps - played.num_env_steps)
+
+    def _evaluate(self) -> Metrics:
+        bob, config = numpy_bob(self.parameters()), self.config
+        return success_metrics(
+            bob,
+            config,
+            EVALUATED_GOALS,
+            config.run.evaluation_episodes,
+            seed=EVALUATION_SEED,
+            num_threads=config.run.num_threads,
+        )
+
+    def _count_goals(self, goal: StateArray, solved: np.ndarray) -> None:
+        inside = (goal >= self._cells.bounds_m[0]).all(axis=1) & (goal <= self._cells.bounds_m[1]).all(axis=1)
+        self._tries += self._cells.count(goal[inside])
+        self._solved += self._cells.count(goal[inside & solved])
+
+    # --- exact resume ----------------------------------------------------------------------------------------------
+
+    def _begin_from(self, start: Start) -> None:
+        seen: Layouts = layouts(self.config.world.observed)
+        before = layouts(start.observed)
+        said = transfer.take_over(self._distiller.student, self._teacher_parameters, before.bob, seen.bob)
+        self._distiller.begin()
+        _logger.info("from %s: bob/policy: %s", start.label, said)
+        if start.published is not None:
+            self.directory.write_published(start.published)
+
+    def _save(self) -> None:
+        with self.timing("checkpoint"):
+            parts = {
+                "distiller": self._distiller.state(),
+                "teacher": self._teacher_parameters,
+                "cells": {"tries": self._tries, "solved": self._solved},
+                "bob": dict(self.parameters()),  # for readers without torch: evaluate, render, coverage
+            }
+            meta = {"rng": self._rng.bit_generator.state, "teacher_observed": self._observed.model_dump(mode="json")}
+            self.bookkeeper.save(parts, meta)
+
+    def _load(self) -> None:
+        parts, meta = self.bookkeeper.resume()
+        self._distiller.load_state(parts["distiller"])
+        self._teacher_parameters = parts["teacher"]
+        self._observed = ObservedConfig.model_validate(meta["teacher_observed"])
+        self._tries, self._solved = (np.array(parts["cells"][name]) for name in ("tries", "solved"))
+        self._rng.bit_generator.state = meta["rng"]

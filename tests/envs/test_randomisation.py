@@ -1,0 +1,193 @@
+"""What worlds draw anew at each start: the physics from a bank of models, late commands, errors of what is seen."""
+
+import mujoco
+import numpy as np
+import pytest
+
+from service.config import WorldConfig, parse_config
+from service.envs.batch import WorldBatch
+from service.envs.model_bank import ModelBank
+from service.envs.noise import KEYS, normal
+from service.envs.observations import POSITIONS
+from service.errors import ConfigError
+
+COARSE = {"physics_step_s": 0.005, "num_substeps": 8}
+EVERYTHING = {
+    "num_models": 4,
+    "object_size": [0.8, 1.2],
+    "object_mass_kg": [0.05, 1.0],
+    "friction": [0.3, 1.2],
+    "gain": [0.8, 1.2],
+    "damping": [0.5, 1.5],
+    "table_height_m": [-0.01, 0.01],
+    "delay_steps": [0, 2],
+    "object_noise_m": [0.002, 0.01],
+    "object_offset_m": [0.005, 0.02],
+}
+
+
+def world(num_commands=0, **randomisation):
+    tree = {**COARSE, "observed": {"num_commands": num_commands}, "randomisation": randomisation}
+    return WorldConfig.model_validate(tree)
+
+
+def actions_of(num_steps, num_worlds, seed=1):
+    return np.random.default_rng(seed).uniform(-1.0, 1.0, (num_steps, num_worlds, 4)).astype(np.float32)
+
+
+def test_noise_is_standard_normal_and_a_function_of_key_and_count():
+    key = np.random.default_rng(0).integers(KEYS, size=2000).astype(np.float64)
+    first, second = normal(key, np.zeros(2000), 3), normal(key, np.ones(2000), 3)
+    assert abs(first.mean()) < 0.03
+    assert abs(first.std() - 1.0) < 0.03
+    assert abs(np.corrcoef(first.ravel(), second.ravel())[0, 1]) < 0.05
+    assert abs(np.corrcoef(first[:, 0], first[:, 1])[0, 1]) < 0.08
+    np.testing.assert_array_equal(normal(key[5:6], np.zeros(1), 3)[0], first[5])
+
+
+def test_a_bank_covers_each_range_evenly_and_its_models_are_as_drawn():
+    bank = ModelBank(world(**EVERYTHING))
+    assert len(bank) == 4
+    for name, values in bank.drawn.items():
+        low, high = EVERYTHING[name]
+        assert sorted(((values - low) / (high - low) * 4).astype(int)) == [0, 1, 2, 3], name
+    for index, model in enumerate(bank.models):
+        drawn = {name: values[index] for name, values in bank.drawn.items()}
+        body, geom = model.body("object"), model.geom("object")
+        assert body.mass[0] == pytest.approx(drawn["object_mass_kg"])
+        np.testing.assert_allclose(geom.size, 0.025 * drawn["object_size"])
+        assert geom.friction[0] == pytest.approx(drawn["friction"])
+        nominal = bank.nominal.actuator("joint1")
+        servo = model.actuator("joint1")
+        assert servo.gainprm[0] == pytest.approx(nominal.gainprm[0] * drawn["gain"])
+        assert servo.biasprm[1] == pytest.approx(nominal.biasprm[1] * drawn["gain"])
+        assert servo.biasprm[2] == pytest.approx(nominal.biasprm[2] * drawn["damping"])
+        finger = model.actuator("left_finger")
+        np.testing.assert_array_equal(finger.gainprm, bank.nominal.actuator("left_finger").gainprm)
+        assert model.geom("table").pos[2] - bank.nominal.geom("table").pos[2] == pytest.approx(drawn["table_height_m"])
+        rest_m = 0.025 * drawn["object_size"] + drawn["table_height_m"]
+        assert bank.rest_height_m[index] == pytest.approx(rest_m)
+
+
+@pytest.mark.parametrize("fixture", ["wall", "box"])
+def test_what_stands_on_the_table_goes_up_with_it(fixture):
+    config = world(num_models=1, table_height_m=[0.02, 0.02]).model_copy(update={"fixture": fixture})
+    with WorldBatch(config, 1, num_threads=1) as worlds:
+        worlds.reset(np.random.default_rng(0))
+        model = worlds.bank.models[0]
+        data = mujoco.MjData(model)
+        mujoco.mj_setState(model, data, worlds.states[0, worlds.layout.physics], mujoco.mjtState.mjSTATE_FULLPHYSICS)
+        if fixture == "box":
+            data.mocap_pos[0] = worlds.box_place[0]
+        mujoco.mj_forward(model, data)
+        bottoms = [
+            data.geom_xpos[index][2] - model.geom_size[index][2]
+            for index in range(model.ngeom)
+            if model.geom(index).name.startswith("fixture_")
+        ]
+        assert min(bottoms) == pytest.approx(0.02, abs=1e-6)
+        assert worlds.object_position[0, 2] == pytest.approx(0.045)
+
+
+def test_objects_of_every_model_lie_still_where_they_start():
+    config = world(num_models=8, object_size=[0.6, 1.2], table_height_m=[-0.01, 0.01], object_mass_kg=[0.05, 1.0])
+    with WorldBatch(config, 24, num_threads=1) as worlds:
+        worlds.reset(np.random.default_rng(0))
+        before = worlds.object_position.copy()
+        assert len(np.unique(before[:, 2].round(6))) > 4
+        for _ in range(10):
+            worlds.step(np.zeros((24, 4), np.float32))
+        assert np.abs(worlds.object_position - before).max() < 1e-3
+
+
+def test_a_late_command_does_later_what_it_would_have_done():
+    actions = actions_of(6, 3)
+    with WorldBatch(world(), 3, num_threads=1) as now, WorldBatch(world(delay_steps=[2, 2]), 3, num_threads=1) as late:
+        now.reset(np.random.default_rng(0))
+        late.reset(np.random.default_rng(0))
+        idle = np.zeros((2, 3, 4), np.float32)
+        for one, other in zip([*idle, *actions[:4]], actions, strict=True):
+            now.step(one)
+            late.step(other)
+        np.testing.assert_array_equal(late.states[:, late.layout.physics], now.states[:, now.layout.physics])
+
+
+def test_last_commands_are_seen_the_newest_first_and_none_at_a_start():
+    with WorldBatch(world(num_commands=2), 3, num_threads=1) as worlds:
+        worlds.reset(np.random.default_rng(0))
+        seen = worlds.observed.positions
+        assert seen.size == POSITIONS.size + 8
+        assert not worlds.positions()[:, seen["command_1"].start :].any()
+        first, second, third = 1.5 * actions_of(3, 3)
+        for action in (first, second, third):
+            worlds.step(action)
+        np.testing.assert_allclose(worlds.positions()[:, seen["command_1"]], np.clip(third, -1, 1))
+        np.testing.assert_allclose(worlds.positions()[:, seen["command_2"]], np.clip(second, -1, 1))
+        np.testing.assert_array_equal(worlds.full(0.0)[:, : seen.size], worlds.positions())
+
+
+def test_positions_have_the_errors_and_value_networks_see_none():
+    with WorldBatch(world(object_offset_m=[0.01, 0.01]), 200, num_threads=1) as worlds:
+        worlds.reset(np.random.default_rng(0))
+        error = worlds.positions()[:, POSITIONS["object"]] - worlds.object_position
+        np.testing.assert_allclose(np.linalg.norm(error, axis=1), 0.01, rtol=1e-3)
+        assert np.linalg.norm(error.mean(axis=0)) < 0.002  # in any direction
+        way = worlds.positions()[:, POSITIONS["object_from_effector"]] - (worlds.object_position - worlds.ee_position)
+        np.testing.assert_allclose(way, error, atol=1e-6)
+        value = worlds.bob_value(worlds.object_position + 0.1)
+        layout = worlds.observed.bob_value
+        np.testing.assert_allclose(value[:, layout["object"]], worlds.object_position, atol=1e-6)
+        np.testing.assert_allclose(value[:, layout["goal_from_object"]], 0.1, atol=1e-6)
+
+
+def test_noise_is_new_at_each_step_and_the_same_for_the_same_state():
+    with WorldBatch(world(object_noise_m=[0.01, 0.01]), 300, num_threads=1) as worlds:
+        worlds.reset(np.random.default_rng(0))
+        errors = []
+        for _ in range(2):
+            errors.append(worlds.positions()[:, POSITIONS["object"]] - worlds.object_position)
+            before = worlds.positions()
+            np.testing.assert_array_equal(worlds.positions(), before)
+            worlds.step(np.zeros((300, 4), np.float32))
+        assert np.std(errors[0]) == pytest.approx(0.01, rel=0.1)
+        assert abs(np.corrcoef(errors[0].ravel(), errors[1].ravel())[0, 1]) < 0.1
+
+
+def test_saved_states_go_on_exactly_in_another_batch():
+    config = world(num_commands=1, **EVERYTHING)
+    actions = actions_of(8, 6)
+    with WorldBatch(config, 6, num_threads=1) as one, WorldBatch(config, 6, num_threads=2) as other:
+        one.reset(np.random.default_rng(3))
+        for action in actions[:4]:
+            one.step(action)
+        other.restore(one.states.copy())
+        for action in actions[4:]:
+            one.step(action)
+            other.step(action)
+        np.testing.assert_array_equal(one.states, other.states)
+        np.testing.assert_array_equal(one.positions(), other.positions())
+        assert len(np.unique(one.states[:, one.layout["model"]])) > 1
+
+
+def test_without_ranges_a_world_is_the_same_world():
+    with WorldBatch(world(), 2, num_threads=1) as worlds:
+        assert len(worlds.bank) == 1
+        assert worlds.states.shape[1] == worlds.layout.physics.stop + 2  # its contacts
+        config = world(**EVERYTHING).nominal
+        assert config == world()
+
+
+@pytest.mark.parametrize(
+    ("given", "expected"),
+    [
+        ({"friction": [1.0, 0.5]}, "friction = [1, 0.5] is the wrong way round"),
+        ({"delay_steps": [0, 20]}, "delay_steps = [0, 20] goes beyond [0, 8]"),
+        ({"object_mass_kg": [0.0, 1.0]}, "object_mass_kg = [0, 1] goes beyond"),
+        ({"mass": [0.1, 1.0]}, "unknown key 'world.randomisation.mass'"),
+    ],
+)
+def test_ranges_that_cannot_be(given, expected):
+    with pytest.raises(ConfigError) as raised:
+        parse_config({"world": {"randomisation": given}}, where="a test")
+    assert expected in str(raised.value)
+    assert "\n" not in str(raised.value)

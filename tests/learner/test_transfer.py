@@ -1,0 +1,77 @@
+"""Networks that begin from trained ones of the same or of another layout."""
+
+import numpy as np
+import pytest
+import torch
+
+from service.config import MCPConfig, MLPConfig, PolicyConfig
+from service.envs.observations import PAPER, Layouts
+from service.learner.transfer import take_over
+from service.policies import networks
+
+SMALL = PolicyConfig(
+    alice=MLPConfig(hidden_sizes=(8,)),
+    value=MLPConfig(hidden_sizes=(8,)),
+    bob=MCPConfig(num_primitives=3, trunk_hidden_sizes=(8,), primitive_hidden_size=4, gate_hidden_sizes=(8,)),
+)
+WIDER = Layouts(num_commands=2)
+MAKERS = {
+    "alice": (networks.make_alice, "full"),
+    "alice_value": (networks.make_alice_value, "full"),
+    "bob": (networks.make_bob, "bob"),
+    "bob_value": (networks.make_bob_value, "bob_value"),
+}
+
+
+def outputs(network, rows):
+    with torch.no_grad():
+        found = network(torch.from_numpy(rows))
+    return torch.cat(found, -1) if isinstance(found, tuple) else found
+
+
+def rows_of(layout, entries):
+    """(5, O) rows of a layout, from values by entry; others at random."""
+    rows = np.random.default_rng(1).normal(size=(5, layout.size)).astype(np.float32)
+    for name, values in entries.items():
+        if name in layout.columns:
+            rows[:, layout[name]] = values
+    return rows
+
+
+@pytest.mark.parametrize("name", MAKERS)
+@pytest.mark.parametrize(("before", "after"), [(PAPER, PAPER), (PAPER, WIDER)])
+def test_it_computes_what_the_trained_one_did(name, before, after):
+    make, layout = MAKERS[name]
+    torch.manual_seed(0)
+    trained, new = make(SMALL, before), make(SMALL, after)
+    before_layout, after_layout = getattr(before, layout), getattr(after, layout)
+    said = take_over(new, networks.export_parameters(trained), before_layout, after_layout)
+    assert said == ("taken" if before is after else "taken: new command_1, command_2")
+    rows = rows_of(before_layout, {})
+    wider = rows_of(after_layout, {entry: rows[:, part] for entry, part in before_layout.columns.items()})
+    torch.testing.assert_close(outputs(new, wider), outputs(trained, rows))
+
+
+def test_inputs_that_are_gone_are_left_out():
+    torch.manual_seed(0)
+    trained, new = networks.make_bob(SMALL, WIDER), networks.make_bob(SMALL, PAPER)
+    said = take_over(new, networks.export_parameters(trained), WIDER.bob, PAPER.bob)
+    assert said == "taken: left out command_1, command_2"
+    rows = rows_of(PAPER.bob, {})
+    zero = {"command_1": 0.0, "command_2": 0.0}
+    wider = rows_of(WIDER.bob, {**{name: rows[:, part] for name, part in PAPER.bob.columns.items()}, **zero})
+    torch.testing.assert_close(outputs(new, rows), outputs(trained, wider))
+
+
+def test_other_sizes_are_not_taken_and_said():
+    torch.manual_seed(0)
+    other = SMALL.model_copy(update={"bob": SMALL.bob.model_copy(update={"num_primitives": 4})})
+    new = networks.make_bob(SMALL)
+    before = networks.export_parameters(new)
+    said = take_over(new, networks.export_parameters(networks.make_bob(other)), PAPER.bob, PAPER.bob)
+    assert said.startswith("not taken, ")
+    assert "[4" in said or "[16" in said
+    for name, array in networks.export_parameters(new).items():
+        np.testing.assert_array_equal(array, before[name])
+    monolithic = networks.export_parameters(networks.make_alice(SMALL))
+    assert "parameters are not in both" in take_over(new, monolithic, PAPER.bob, PAPER.bob)
