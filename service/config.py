@@ -431,6 +431,18 @@ def parse_config(tree: dict[str, Any], *, where: str, recorded: bool = False) ->
         raise ConfigError(f"{where}: {key}{found}: {first['msg']}{more}") from None
 
 
+def changed_config(config: Config, overrides: Sequence[str]) -> Config:
+    """The same configuration with ``a.b=c`` overrides applied in order.
+
+    Raises:
+        ConfigError: see ``load_config``.
+    """
+    tree = config.model_dump(mode="json")
+    for override in overrides:
+        apply_override(tree, override)
+    return parse_config(tree, where="the overrides")
+
+
 def dump_config(config: Config) -> str:
     """The resolved configuration as YAML that ``load_config`` reads back to an equal object."""
     text: str = yaml.safe_dump(config.model_dump(mode="json"), sort_keys=False)

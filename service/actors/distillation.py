@@ -42,8 +42,10 @@ class Round:
     """An episode of every world."""
 
     lesson: Lesson
+    start: StateArray
+    """(M, 3) where the object was at first, in the episodes in which the student's own gate acted, metres."""
     goal: StateArray
-    """(M, 3) of the episodes in which the student's own gate acted, metres."""
+    """(M, 3) of the same episodes, metres."""
     solved: BoolArray
     """(M,) whether the object was there at the end."""
     num_env_steps: int
@@ -80,6 +82,7 @@ class DistillationWorlds:
         worlds, how = self._worlds, self._how
         num, distance_m = worlds.num_worlds, self._config.game.success_distance_m
         worlds.reset(rng)
+        start = worlds.object_position.copy()
         goal = sample_goals("mixed", rng, num, self._config.world, distance_m)
         late: IntArray = np.zeros(num, dtype=np.int64)
         if self._most_late:
@@ -92,7 +95,8 @@ class DistillationWorlds:
         observation = np.stack([step.observation for step in steps[: how.episode_steps]])
         answers = (np.stack([getattr(step, each.name) for step in steps])[answered] for each in fields(Lesson)[1:])
         lesson = Lesson(*(_rows(array[:, kept]) for array in (observation, *answers)))
-        return Round(lesson, goal[~composed], reached[~composed], num * len(steps))
+        own = ~composed
+        return Round(lesson, start[own], goal[own], reached[own], num * len(steps))
 
     def _step(
         self, student: NumpyMCPPolicy, goal: StateArray, composed: BoolArray, step: int, rng: np.random.Generator

@@ -22,6 +22,10 @@ def evaluate(
     episodes: Annotated[int, typer.Option(help="Number of random goals.", min=1)] = 300,
     steps: Annotated[int, typer.Option(help="Steps an episode, 25 a second.", min=1)] = 50,
     seed: _Seed = 0,
+    overrides: Annotated[
+        list[str] | None,
+        typer.Option("--set", metavar="world.A=B", help="In another world than that of training; repeatable."),
+    ] = None,
     as_json: JsonOption = False,
     registry: RegistryOption = REGISTRY,
 ) -> None:
@@ -31,6 +35,7 @@ def evaluate(
     """
     from service.actors.evaluation import IdlePolicy
     from service.actors.evaluation import evaluate as run
+    from service.config import changed_config
     from service.downstream.skills import ZeroShotPolicy
     from service.envs.sampling import GOAL_KINDS
     from service.primitives.loading import TrainedBob, load_either
@@ -39,7 +44,8 @@ def evaluate(
         raise TandemError(f"--goals {goals!r}: choose one of {', '.join(GOAL_KINDS)}")
     trained = load_either(primitives, registry)
     player = trained.policy if isinstance(trained, TrainedBob) else ZeroShotPolicy(trained.skills)
-    world, distance_m = trained.config.world, trained.config.game.success_distance_m
+    config = changed_config(trained.config, overrides or ())
+    world, distance_m = config.world, config.game.success_distance_m
     rows = {
         name: run(
             policy, world, goals, num_episodes=episodes, num_steps=steps, seed=seed, success_distance_m=distance_m

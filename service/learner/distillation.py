@@ -106,6 +106,6 @@ class Distiller:
                 tensor.copy_(torch.from_numpy(np.array(state[name])))
 
     def _tensors(self) -> dict[str, Tensor]:
-        parts: dict[str, dict[str, Tensor]] = {"student": self._parameters, "average": self._average}
+        parts: dict[str, Mapping[str, Tensor]] = {"student": self._parameters, "average": self._average}
         parts["adam"] = self._optimizer.tensors()
         return {f"{part}/{name}": tensor for part, tensors in parts.items() for name, tensor in tensors.items()}

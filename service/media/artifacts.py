@@ -45,6 +45,7 @@ def make_artifacts(directory: RunDirectory) -> dict[str, Path]:
         return _make(
             {
                 "curves": partial(plot_curves, directory.path, "distillation"),
+                "goals": partial(plot_goals, directory.path, config.world.workspace),
                 "coverage": partial(_draw_coverage, directory, config, student),
                 "video": partial(_draw_episodes, directory, config, student),
             }

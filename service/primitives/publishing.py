@@ -27,15 +27,25 @@ FINAL_EVALUATION_EPISODES = 300
 
 
 def measure_bob(config: Config, parameters: Parameters) -> dict[str, float]:
-    """Bob's success rates without noise on every kind of goals, by metric; the goals are not those of the run."""
-    return success_metrics(
-        numpy_bob(parameters),
-        config,
-        EVALUATED_GOALS,
-        FINAL_EVALUATION_EPISODES,
-        seed=REPORTED_SEED,
-        num_threads=config.run.num_threads,
-    )
+    """Bob's success rates without noise on every kind of goals, by metric; the goals are not those of the run.
+
+    Where his worlds are drawn from ranges, also in the nominal one.
+    """
+    nominal = config.model_copy(update={"world": config.world.nominal})
+    metrics: dict[str, float] = {}
+    for world, prefix in ((config, ""), (nominal, "nominal_")):
+        if prefix and world == config:
+            break
+        found = success_metrics(
+            numpy_bob(parameters),
+            world,
+            EVALUATED_GOALS,
+            FINAL_EVALUATION_EPISODES,
+            seed=REPORTED_SEED,
+            num_threads=config.run.num_threads,
+        )
+        metrics |= {name.replace("/", f"/{prefix}"): value for name, value in found.items()}
+    return metrics
 
 
 def measure_skills(config: Config, parameters: Parameters) -> dict[str, float]:

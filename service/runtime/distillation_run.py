@@ -26,6 +26,8 @@ from service.store.models import GoalCell, GoalGrid
 from service.types import Metrics, StateArray
 from service.world_config import ObservedConfig
 
+NUM_RECORDED_GOALS = 32
+"""Of each iteration, for the run directory."""
 _logger = logging.getLogger(__name__)
 
 
@@ -131,6 +133,8 @@ class DistillationRun(Runner):
         speed = {"time/wall_s": self.bookkeeper.wall_s, "time/env_steps_per_s": played.num_env_steps / elapsed_s}
         with self.timing("record"):
             self.directory.record(counted | metrics | speed)
+            goals: StateArray = np.column_stack((played.start, played.goal, played.solved)).astype(np.float64)
+            self.directory.record_goals(self.iteration, self.num_env_steps, goals[:NUM_RECORDED_GOALS])
             self._on_iteration(counted | metrics | speed)
         self._keep(after=self.num_env_steps - played.num_env_steps)
 

@@ -1,0 +1,145 @@
+"""Privileged distillation: what the teacher is asked, what is learned of it, and that a resumed run is the same run."""
+
+import numpy as np
+import pytest
+import torch
+
+from service.actors.distillation import DistillationWorlds
+from service.config import parse_config
+from service.distillation_config import DistillationConfig
+from service.envs.batch import WorldBatch
+from service.envs.observations import PAPER, POSITIONS, layouts
+from service.errors import ConfigError, TandemError
+from service.io.run_directory import RunDirectory
+from service.learner.distillation import Distiller
+from service.learner.transfer import take_over
+from service.policies import networks
+from service.policies.numpy_policy import NumpyMCPPolicy
+from service.primitives.loading import load_bob
+from service.primitives.publishing import publish_run
+from service.registry.registry import Registry
+from service.runtime.distillation_run import DistillationRun
+from service.runtime.starting import read_start
+from tests.runtime.runs import TREE, assert_same_run, play
+
+HOW = {"num_worlds": 8, "episode_steps": 6, "gradient_steps": 3, "batch_size": 16}
+
+
+def config_of(randomisation, how=None, **run):
+    world = TREE["world"] | {"observed": {"num_commands": 2, "delay": True}, "randomisation": randomisation}
+    tree = TREE | {"name": "robust", "world": world, "distillation": HOW | (how or {}), "run": TREE["run"] | run}
+    return parse_config(tree, where="a test")
+
+
+def make_teacher(config, seed=0):
+    torch.manual_seed(seed)
+    return networks.make_bob(config.policy)
+
+
+def make_student(config, teacher):
+    student = networks.make_bob(config.policy, layouts(config.world.observed))
+    parameters = networks.export_parameters(teacher)
+    take_over(student, parameters, PAPER.bob, layouts(config.world.observed).bob)
+    return student, NumpyMCPPolicy(parameters)
+
+
+def test_labels_are_the_teachers_answers_when_the_command_counts():
+    """Two steps late: the label of step t is the answer in the state of step t + 2, seen without errors."""
+    drawn = {"delay_steps": [2, 2], "object_offset_m": [0.02, 0.02]}
+    config = config_of(drawn, {"random_fraction": 0.0, "action_noise": 0.0})
+    student, teacher = make_student(config, make_teacher(config))
+    worlds = DistillationWorlds(config, teacher, PAPER, num_threads=1)
+    played = worlds.play(NumpyMCPPolicy(networks.export_parameters(student)), np.random.default_rng(3))
+    worlds.close()
+    assert played.num_env_steps == 8 * (6 + 2)
+    seen = layouts(config.world.observed).bob
+    rows = played.lesson.observation.reshape(6, 8, seen.size)
+    answers = played.lesson.means.reshape(6, 8, *played.lesson.means.shape[1:])
+    np.testing.assert_array_equal(rows[..., seen["delay"]], 2.0)
+    with WorldBatch(config.world, 8, num_threads=1) as again:
+        again.reset(np.random.default_rng(3))
+        errors = again.states[:, again.layout["object_offset"]]
+    for world, error in enumerate(errors):
+        later = rows[2:, world, : POSITIONS.size].copy()
+        wrong, _ = teacher.primitives(later)
+        later[:, POSITIONS["object"]] -= error
+        later[:, POSITIONS["object_from_effector"]] -= error
+        expected, _ = teacher.primitives(later)
+        np.testing.assert_allclose(answers[:4, world], expected, atol=2e-4)
+        assert np.abs(answers[:4, world] - wrong).max() > 1e-3
+
+
+def test_errors_by_hand():
+    """One primitive: the composition is its mean, whatever the weight."""
+    config = config_of({})
+    config = config.policy.model_copy(update={"bob": config.policy.bob.model_copy(update={"num_primitives": 1})})
+    student = networks.make_bob(config)
+    distiller = Distiller(student, DistillationConfig())
+    observation = torch.randn(3, 14, generator=torch.Generator().manual_seed(0))
+    means, variances = student.primitives(observation[:, :11])
+    weights = student.gate(observation)
+    means, variances, weights = (each.detach() for each in (means, variances, weights))
+    assert [float(each) for each in distiller.errors(observation, means, variances, weights)] == [0.0, 0.0, 0.0]
+    shifted = distiller.errors(observation, means + 0.5, variances * np.exp(2.0), weights * np.exp(0.3))
+    assert float(shifted[0]) == pytest.approx(4 * 0.25, rel=1e-4)
+    assert float(shifted[1]) == pytest.approx(4 * 0.25 + 4 * 1.0, rel=1e-4)
+    assert float(shifted[2]) == pytest.approx(0.09, rel=1e-4)
+
+
+def test_a_student_learns_what_a_late_teacher_would_do():
+    """A teacher of other parameters: the student, who begins at random, comes nearer."""
+    config = config_of({"delay_steps": [0, 2]}, {"num_worlds": 32, "gradient_steps": 30, "batch_size": 64})
+    teacher = NumpyMCPPolicy(networks.export_parameters(make_teacher(config, seed=1)))
+    torch.manual_seed(2)
+    distiller = Distiller(networks.make_bob(config.policy, layouts(config.world.observed)), config.distillation)
+    worlds, rng = DistillationWorlds(config, teacher, PAPER, num_threads=1), np.random.default_rng(0)
+    errors = []
+    for _ in range(4):
+        played = worlds.play(NumpyMCPPolicy(distiller.parameters()), rng)
+        errors.append(distiller.learn(played.lesson, 0.0, rng)["primitives_error"])
+    worlds.close()
+    assert errors[-1] < 0.5 * errors[0]
+
+
+@pytest.fixture(scope="module")
+def taught(tmp_path_factory):
+    root = tmp_path_factory.mktemp("taught")
+    run, _ = play(root / "run", parse_config(TREE | {"run": TREE["run"] | {"total_env_steps": 200}}, where="a test"))
+    run.close()
+    return root, publish_run(run.directory, Registry(root / "registry"), run.config, run.parameters(), {})
+
+
+def run_to_end(path, config, start=None, *, resume=False, stop_after=None):
+    run = DistillationRun(config, RunDirectory(path), resume=resume, start=start)
+
+    def each(metrics):
+        if metrics["iteration"] == stop_after:
+            run.request_stop()
+
+    run.run(each)
+    run.close()
+    run.directory.close()
+    return run
+
+
+def test_a_run_is_published_with_its_teacher_as_parent_and_is_exact_when_resumed(taught, tmp_path):
+    root, version = taught
+    drawn = {"delay_steps": [0, 1], "object_noise_m": [0.0, 0.01], "friction": [0.5, 1.0], "num_models": 2}
+    config = config_of(drawn, total_env_steps=220, evaluation_interval=2)
+    start = read_start(str(version), root / "registry", config)
+    whole = run_to_end(tmp_path / "whole", config, start)
+    run_to_end(tmp_path / "part", config, start, stop_after=2)
+    run_to_end(tmp_path / "part", config, resume=True)
+    assert_same_run(tmp_path / "part", tmp_path / "whole")
+    assert whole.grid().cells
+    registry = Registry(root / "registry")
+    published = publish_run(whole.directory, registry, config, whole.parameters(), {})
+    assert registry.manifest(str(published)).parent == str(version)
+    assert load_bob(str(published), root / "registry").primitives.num_positions == 11 + 8 + 1
+
+
+def test_without_a_teacher_and_what_goes_together(tmp_path):
+    with pytest.raises(TandemError, match="name him, --from"):
+        DistillationRun(config_of({}), RunDirectory(tmp_path / "run"))
+    with pytest.raises(ConfigError, match="distillation teaches primitives"):
+        parse_config(TREE | {"distillation": {}, "skills": {"method": "lsd"}}, where="a test")
