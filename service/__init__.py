@@ -24,7 +24,7 @@ def load_primitives(reference: str = "panda-cube@champion", registry: Path | str
     """Primitives to act with and to compose, without torch; ``panda-cube@champion`` comes with the package.
 
     Args:
-        reference: NAME, NAME@ALIAS or NAME@VERSION, or a run directory.
+        reference: NAME, NAME@ALIAS or NAME@VERSION, a run directory, or the directory of an exported version.
         registry: directory to look in first; a version or alias it does not have is looked up among what comes with
             the package. Or the ``http://HOST:PORT`` of a ``tandem serve``, which alone is asked, with the token in
             TANDEM_TOKEN.

@@ -10,7 +10,9 @@ import typer
 from service.cli.common import REGISTRY, JsonOption, RegistryOption, print_json
 from service.errors import TandemError
 
-_Primitives = Annotated[str, typer.Option(metavar="NAME@ALIAS|RUN_DIR", help="Whose Bob.")]
+_Primitives = Annotated[
+    str, typer.Option(metavar="NAME@ALIAS|RUN_DIR", help="Whose Bob; or the directory of an exported version.")
+]
 _Seed = Annotated[int, typer.Option(help="Of the episodes.", min=0)]
 
 
@@ -120,7 +122,7 @@ def render(
             trained.skills, config.world, num_skills=episodes, num_steps=config.skills.episode_steps, seed=seed
         )
         video.write_episode_video(recorded, config.world, out)
-    elif Path(primitives).is_dir():
+    elif trained.manifest is None:
         players = load_players(RunDirectory(Path(primitives)))
         rounds = recording.record_rounds(config, *players, num_rounds=episodes, seed=seed)
         video.write_video(rounds, config.world, out)

@@ -19,7 +19,12 @@ registry_app = typer.Typer(
     name="registry", help="Frozen primitives: versions, aliases, export.", cls=CommandGroup, no_args_is_help=True
 )
 
-_Reference = Annotated[str, typer.Argument(help="NAME, NAME@VERSION or NAME@ALIAS; NAME is NAME@latest.")]
+_Reference = Annotated[
+    str,
+    typer.Argument(
+        help="NAME, NAME@VERSION or NAME@ALIAS; NAME is NAME@latest. Or the directory of an exported version."
+    ),
+]
 
 
 @registry_app.command("list")
@@ -110,7 +115,7 @@ def export(
     target: Annotated[Path, typer.Argument(metavar="DIRECTORY", help="Made when missing.")],
     directory: RegistryOption = REGISTRY,
 ) -> None:
-    """Write a version as two files that need no registry."""
+    """Write a version as two files that need no registry; every command takes their directory as a version."""
     from service.primitives.bundled import find_version
 
     registry, version = find_version(reference, directory)
@@ -121,11 +126,13 @@ def export(
 def _summary(registry: Registry, manifest: Manifest) -> dict[str, Any]:
     """A version's row in the list; two registries may both have a version 1, so it says where this one is."""
     from service.primitives.bundled import is_bundled
+    from service.registry.exported import ExportedVersion
 
+    exported = isinstance(registry, ExportedVersion)
     return {
         "name": manifest.name,
         "version": manifest.version,
-        "where": "bundled" if is_bundled(registry) else "yours",
+        "where": "bundled" if is_bundled(registry) else "exported" if exported else "yours",
         "created": manifest.created,
         "bytes": manifest.blob_bytes,
         "aliases": [name for name, number in registry.aliases(manifest.name).items() if number == manifest.version],

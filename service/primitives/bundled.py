@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from service.registry.errors import UnknownVersionError
+from service.registry.exported import ExportedVersion, is_exported
 from service.registry.names import Version, split_reference
 from service.registry.registry import Registry
 
@@ -19,13 +20,16 @@ def find_version(reference: str, root: Path) -> tuple[Registry, Version]:
     again: the user means a version of their own.
 
     Args:
-        reference: NAME, NAME@VERSION or NAME@ALIAS.
+        reference: NAME, NAME@VERSION or NAME@ALIAS; or the directory of an exported version.
         root: of the user's registry; need not exist.
 
     Raises:
         UnknownVersionError: in neither; the message says what there is.
         RegistryError: not a reference, or a damaged alias.
     """
+    if is_exported(Path(reference)):
+        exported = ExportedVersion(Path(reference))
+        return exported, exported.version
     own, bundled = Registry(root), Registry(BUNDLED)
     try:
         return own, own.resolve(reference)

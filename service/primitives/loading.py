@@ -13,6 +13,7 @@ from service.io.run_directory import RunDirectory
 from service.policies.numpy_policy import NumpyGaussianPolicy, NumpyMCPPolicy, NumpyPolicy, numpy_bob
 from service.policies.parameters import Parameters, PolicyError
 from service.primitives.bundled import find_version, is_bundled
+from service.registry.exported import is_exported
 from service.registry.manifest import Manifest
 
 SKILLS = "skills"
@@ -58,13 +59,18 @@ def load_bob(reference: str, registry: Path) -> TrainedBob:
     """Load NAME, NAME@ALIAS or NAME@VERSION from a registry, or the newest checkpoint of a run directory.
 
     Args:
-        reference: of a version, or a run directory.
+        reference: of a version, or a run directory; or the directory of an exported version.
         registry: directory to look in first; a version or alias it does not have is looked up among what comes with
             the package.
 
     Raises:
         TandemError: neither a run directory nor a published version, or damaged.
     """
+    return read_bob(reference, registry)[0]
+
+
+def read_bob(reference: str, registry: Path) -> tuple[TrainedBob, Parameters]:
+    """Load a Bob and the parameters that he was made of; see ``load_bob``."""
     label, config, tensors, manifest = _load(reference, registry, "bob")
     if config.skills is not None:
         raise TandemError(
@@ -72,9 +78,9 @@ def load_bob(reference: str, registry: Path) -> TrainedBob:
             "name primitives"
         )
     if manifest is None:
-        return TrainedBob(label, numpy_bob(tensors), config)
+        return TrainedBob(label, numpy_bob(tensors), config), tensors
     try:
-        return TrainedBob(label, NumpyMCPPolicy(tensors), config, manifest)
+        return TrainedBob(label, NumpyMCPPolicy(tensors), config, manifest), tensors
     except PolicyError as error:
         raise TandemError(f"{label} holds no primitives: {error}") from None
 
@@ -100,9 +106,9 @@ def load_either(reference: str, registry: Path) -> TrainedBob | TrainedSkills:
     Raises:
         TandemError: neither a run directory nor a published version, or damaged.
     """
-    if Path(reference).is_dir():
+    if _is_run(reference):
         skills = RunDirectory(Path(reference)).read_config().skills is not None
-    elif "/" in reference:
+    elif "/" in reference and not is_exported(Path(reference)):
         skills = False  # what is wrong is said below
     else:
         found, version = find_version(reference, registry)
@@ -112,12 +118,12 @@ def load_either(reference: str, registry: Path) -> TrainedBob | TrainedSkills:
 
 def _load(reference: str, registry: Path, part: str) -> tuple[str, Config, Parameters, Manifest | None]:
     """Label, configuration, parameters and manifest of a version; those of a run's ``part`` have no manifest."""
-    if Path(reference).is_dir():
+    if _is_run(reference):
         directory = RunDirectory(Path(reference))
         config = directory.read_config()
         fits = (part == SKILLS) == (config.skills is not None)  # or else the caller says what it is
         return reference, config, read_parameters(directory, part) if fits else {}, None
-    if "/" in reference:
+    if "/" in reference and not is_exported(Path(reference)):
         raise TandemError(f"{reference}: no such run directory; for published versions write NAME@ALIAS")
     found, version = find_version(reference, registry)
     manifest, tensors = found.load(str(version))
@@ -125,6 +131,11 @@ def _load(reference: str, registry: Path, part: str) -> tuple[str, Config, Param
     # two registries may both have a version 1: which one was meant must be seen
     label = f"{version} (bundled)" if is_bundled(found) else str(version)
     return label, config, tensors, manifest
+
+
+def _is_run(reference: str) -> bool:
+    """Whether a reference is that of a directory which holds a run, if anything."""
+    return Path(reference).is_dir() and not is_exported(Path(reference))
 
 
 def load_players(directory: RunDirectory) -> tuple[NumpyGaussianPolicy, NumpyPolicy]:

@@ -33,6 +33,8 @@ from service.registry.names import LATEST, Version
 from service.regular_files import read_regular
 
 READ_ONLY_FILE = "READ_ONLY"
+EXPORTED_MANIFEST, EXPORTED_PARAMETERS = "manifest.json", "primitives.safetensors"
+"""Files of an exported version."""
 Check = Callable[[Manifest, Mapping[str, np.ndarray]], Iterable[str]]
 """Tells in a line each what is wrong with a manifest and its arrays."""
 
@@ -51,10 +53,14 @@ class Registry:
             RegistryError: it is marked as only read, as the one that comes with tandem is.
         """
         if (self.root / READ_ONLY_FILE).exists():  # a file: it is found through whatever path leads to the directory
-            raise RegistryError(
-                f"cannot write {self.root}: this registry is only read; "
-                "name another directory with --registry or TANDEM_REGISTRY"
-            )
+            raise self.only_read()
+
+    def only_read(self) -> RegistryError:
+        """Make the error of whoever writes a registry that is only read."""
+        return RegistryError(
+            f"cannot write {self.root}: this registry is only read; "
+            "name another directory with --registry or TANDEM_REGISTRY"
+        )
 
     def publish(
         self,
@@ -220,8 +226,8 @@ class Registry:
         """
         manifest, _ = self.load(reference)
         files = {
-            directory / "primitives.safetensors": self._blobs.get(manifest.blob_sha256),
-            directory / "manifest.json": manifest.to_bytes(),
+            directory / EXPORTED_PARAMETERS: self._blobs.get(manifest.blob_sha256),
+            directory / EXPORTED_MANIFEST: manifest.to_bytes(),
         }
         for path in files:
             if path.exists():
