@@ -25,6 +25,8 @@ HEAVY = (
     "fastapi",
     "uvicorn",
     "httpx",
+    "onnx",
+    "onnxruntime",
 )
 CLUSTER_MODULES = (
     "actor_pool",
@@ -42,11 +44,11 @@ ROOMS = (
     *("errors", "frozen", "liveness", "types", "parsing", "regular_files", "config_tree", "off_policy_config"),
     *("model_files", "mesh_files", "robot_config", "object_config", "world_config"),
     *("config", "io", "envs", "policies", "generator", "actors", "learner", "sac", "baselines", "registry"),
-    *("primitives", "media", "downstream", "robot"),
+    *("primitives", "media", "downstream", "export", "robot"),
     *("store", "status", "runtime", "cli", "__main__"),
 )
 """Each room may import itself and those before it."""
-VERBS = ("demo", "pretrain", "evaluate", "render", "coverage", "registry", "serve", "downstream")
+VERBS = ("demo", "pretrain", "evaluate", "render", "coverage", "export", "registry", "serve", "downstream")
 DOCUMENTS = [*sorted(ROOT.glob("*.md")), *sorted((ROOT / "docs").rglob("*.md")), ROOT / "deploy" / "README.md"]
 FOLDERS = (".ci", "benchmarks", "configs", "deploy", "docs", "service", "tests", "tools")
 TEXT = {".cfg", ".json", ".jsonl", ".md", ".py", ".toml", ".txt", ".yaml", ".yml", ""}

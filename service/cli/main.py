@@ -11,6 +11,7 @@ import typer
 from service.cli.common import CommandGroup
 from service.cli.downstream import downstream_app
 from service.cli.evaluate import coverage, evaluate, render
+from service.cli.export import export
 from service.cli.pretrain import demo, pretrain
 from service.cli.registry import registry_app
 from service.cli.serve import serve
@@ -19,7 +20,7 @@ from service.cli.unexpected import report_thread_error
 app = typer.Typer(
     name="tandem", help="Robot skills, pre-trained.", cls=CommandGroup, no_args_is_help=True, add_completion=False
 )
-for command in (pretrain, demo, evaluate, coverage, render, serve):
+for command in (pretrain, demo, evaluate, coverage, render, export, serve):
     app.command()(command)
 app.add_typer(registry_app)
 app.add_typer(downstream_app)

@@ -138,6 +138,8 @@ class Method:
     """Makes the policy that plays, where nothing is learned."""
     skills: SkillMethod | None = None
     """The skill-discovery method whose skills it takes."""
+    residual: float = 0.0
+    """Size of the greatest action that its learner adds to the composition."""
 
     @property
     def composes(self) -> bool:
@@ -167,7 +169,20 @@ class Method:
 
 _HER_SHARE = 0.8
 """1 - 1 / (k + 1) for the usual k = 4 (Andrychowicz et al. 2017)."""
-_RESIDUAL = 0.5
+
+
+def _composing_method(
+    title: str, description: str, *, her_ratio: tuple[float, float] | None = None, residual: float = 0.0
+) -> Method:
+    return Method(
+        title,
+        description,
+        "primitives",
+        partial(_enter_composing, residual=residual),
+        partial(_compose, residual=residual),
+        her_ratio=her_ratio,
+        residual=residual,
+    )
 
 
 def _skill_method(name: SkillMethod) -> Method:
@@ -180,22 +195,12 @@ def _zero_shot_method(name: SkillMethod) -> Method:
 
 
 METHODS: Mapping[str, Method] = {
-    "ours": Method("ours", "SAC sets the weights of the frozen primitives", "primitives", _enter_composing, _compose),
-    "ours-her": Method(
-        "ours + HER",
-        "the same, with relabelled goals, fewer and fewer",
-        "primitives",
-        _enter_composing,
-        _compose,
-        her_ratio=(_HER_SHARE, 0.0),
+    "ours": _composing_method("ours", "SAC sets the weights of the frozen primitives"),
+    "ours-her": _composing_method(
+        "ours + HER", "the same, with relabelled goals, fewer and fewer", her_ratio=(_HER_SHARE, 0.0)
     ),
-    "ours-residual-her": Method(
-        "ours + residual + HER",
-        "and adds a small action of its own",
-        "primitives",
-        partial(_enter_composing, residual=_RESIDUAL),
-        partial(_compose, residual=_RESIDUAL),
-        her_ratio=(_HER_SHARE, 0.0),
+    "ours-residual-her": _composing_method(
+        "ours + residual + HER", "and adds a small action of its own", her_ratio=(_HER_SHARE, 0.0), residual=0.5
     ),
     "asp-only": Method("ASP only", "Bob as he is", "primitives", player=_bob),
     "scratch-monolithic-her": Method(

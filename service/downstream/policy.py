@@ -79,7 +79,12 @@ def load_policy(path: Path | str, trained: Trained) -> LearnedPolicy:
     Raises:
         TandemError: no such file, damaged, or of other primitives.
     """
-    path = Path(path)
+    method, parameters, hold_steps = read_policy(Path(path), trained)
+    return LearnedPolicy(parameters, find_method(method), trained, hold_steps)
+
+
+def read_policy(path: Path, trained: Trained) -> tuple[str, Parameters, int]:
+    """Method, parameters and env steps that an action lasts; see ``load_policy``."""
     with os_errors("read", path):
         data = read_regular(path, MAX_BYTES, follow=True)
     try:
@@ -87,8 +92,8 @@ def load_policy(path: Path | str, trained: Trained) -> LearnedPolicy:
         parameters = decode(data)
     except (KeyError, ValueError) as error:
         raise TandemError(f"{path} is no policy of a downstream training ({error}); take policy.safetensors") from None
-    method = find_method(about["method"])
+    find_method(about["method"])
     wanted, found = about["primitives"], provenance(trained, about["method"])["primitives"]
     if wanted is not None and wanted["digest"] != found["digest"]:
         raise TandemError(f"{path} acts with {wanted['name']}, not {found['name']}; load that")
-    return LearnedPolicy(parameters, method, trained, about.get("hold_steps", 1))
+    return about["method"], parameters, about.get("hold_steps", 1)

@@ -55,6 +55,28 @@ def write_exclusive(path: Path, data: bytes) -> bool:
 
 
 @contextlib.contextmanager
+def new_directory(path: Path) -> Iterator[Path]:
+    """Give an empty directory beside ``path``, which takes that name when the block ends well, and else is removed.
+
+    Raises:
+        StorageError: something is at ``path`` already, or it cannot be written.
+    """
+    if path.exists() or path.is_symlink():
+        raise StorageError(f"cannot write {path}: it exists; name another folder, or remove it first")
+    temporary = path.absolute().parent / _temporary_name()
+    with os_errors("write", path):
+        temporary.mkdir(parents=True)
+    try:
+        yield temporary
+        with os_errors("write", path):
+            temporary.rename(path)
+            _flush_directory(temporary.parent)
+    except BaseException:
+        shutil.rmtree(temporary, ignore_errors=True)
+        raise
+
+
+@contextlib.contextmanager
 def os_errors(
     action: Literal["read", "write"], path: Path, error_type: type[StorageError] = StorageError
 ) -> Iterator[None]:
@@ -166,7 +188,7 @@ class Appender:
 @contextlib.contextmanager
 def _temporary(path: Path, data: bytes, *, flush: bool = True) -> Iterator[Path]:
     path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.parent / f"{TEMPORARY_PREFIX}{os.getpid()}-{secrets.token_hex(8)}"
+    temporary = path.parent / _temporary_name()
     try:
         if flush:
             _write_flushed(temporary, data)
@@ -175,6 +197,10 @@ def _temporary(path: Path, data: bytes, *, flush: bool = True) -> Iterator[Path]
         yield temporary
     finally:
         temporary.unlink(missing_ok=True)
+
+
+def _temporary_name() -> str:
+    return f"{TEMPORARY_PREFIX}{os.getpid()}-{secrets.token_hex(8)}"
 
 
 def _write_flushed(path: Path, data: bytes) -> None:

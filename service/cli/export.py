@@ -1,0 +1,51 @@
+"""``tandem export``: a policy as one folder that needs nothing of tandem."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, cast
+
+import typer
+
+from service.cli.common import REGISTRY, JsonOption, RegistryOption
+
+
+def export(
+    policy: Annotated[
+        str,
+        typer.Argument(
+            metavar="NAME@ALIAS|RUN_DIR", help="Whose Bob; or the directory of a downstream training: its orchestrator."
+        ),
+    ],
+    format_name: Annotated[str, typer.Option("--format", help="onnx, numpy or torchscript.")],
+    out: Annotated[Path, typer.Option(metavar="FOLDER", help="To make; must not be there yet.")],
+    part: Annotated[
+        str, typer.Option(help="policy, primitives (each by itself), or all that there is.", metavar="PART")
+    ] = "all",
+    primitives: Annotated[
+        str | None,
+        typer.Option(
+            metavar="NAME@ALIAS|RUN_DIR",
+            help="Of an orchestrator; default: those that its training names, which are looked up in the registry.",
+        ),
+    ] = None,
+    episodes: Annotated[int, typer.Option(help="Played for each delay that is measured.", min=1)] = 100,
+    as_json: JsonOption = False,
+    registry: RegistryOption = REGISTRY,
+) -> None:
+    """Write a policy for use elsewhere, such as on a robot: networks, what their numbers mean, a README.
+
+    What is written is compared with the policy itself, and the folder appears only when all is within 1e-5.
+    """
+    from service.export.exporting import Part, find_source
+    from service.export.exporting import export as run
+
+    source = find_source(policy, registry, cast(Part, part), primitives)
+    about = run(source, format_name, out, num_episodes=episodes)
+    if as_json:
+        typer.echo(about.model_dump_json(indent=1))
+        return
+    greatest = max(network.max_abs_difference for network in about.networks)
+    for network in about.networks:
+        typer.echo(f"  {network.file:<20} {network.title}")
+    typer.echo(f"{about.name} is in {out}, within {greatest:.1e} of the policy itself; begin with its README.md")

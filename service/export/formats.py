@@ -1,0 +1,184 @@
+"""The formats: each writes a network into a folder, and reads it back to run it."""
+
+from __future__ import annotations
+
+import importlib.util
+import logging
+import warnings
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from service.export import standalone
+from service.export.errors import ExportError
+from service.export.networks import Network, Outputs
+from service.types import FloatArray
+
+if TYPE_CHECKING:
+    from torch import nn
+
+Run = Callable[..., Outputs]
+PROGRAM = "policy.py"
+"""The program of a folder of the format numpy."""
+_NUM_EXAMPLES = 3
+"""Rows of the input that torch follows through a network; not 1, which it would take for a size that is fixed."""
+
+
+@dataclass(frozen=True, slots=True)
+class Format:
+    """A way to write networks down."""
+
+    ending: str
+    """Of its files' names."""
+    write: Callable[[Network, Path], None]
+    """Writes a network to a file."""
+    read: Callable[[Network, Path], Run]
+    """Reads it back: a function of the network's inputs to its outputs."""
+    needs: tuple[str, ...] = ()
+    """Packages of the extra ``export``."""
+    shared: Callable[[Path], None] = lambda folder: None
+    """Writes what all networks of a folder need."""
+
+
+def find_format(name: str) -> Format:
+    """Find a format by its name.
+
+    Raises:
+        ExportError: no such format, or packages that it needs are not installed.
+    """
+    if name not in FORMATS:
+        raise ExportError(f"unknown format {name!r}; choose one of {', '.join(FORMATS)}")
+    if missing := [package for package in FORMATS[name].needs if importlib.util.find_spec(package) is None]:
+        raise ExportError(
+            f"the format {name} needs {', '.join(missing)}, which are in an extra: pip install 'tandem-skills[export]'"
+        )
+    return FORMATS[name]
+
+
+def _write_numpy(network: Network, path: Path) -> None:
+    columns = {f"{standalone.COLUMNS}{name}": [part.start, part.stop] for name, part in network.columns.items()}
+    about = {"function": network.function, "input_sizes": list(network.inputs.values()), **columns}
+    arrays: dict[str, Any] = {**network.parameters, **about}
+    np.savez(path, allow_pickle=False, **arrays)
+
+
+def _read_numpy(network: Network, path: Path) -> Run:
+    """Run the folder's own copy of the program, not the package's module."""
+    spec = importlib.util.spec_from_file_location("exported_policy", path.parent / PROGRAM)
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    loaded: Run = module.load(path)
+    return loaded
+
+
+def _write_program(folder: Path) -> None:
+    (folder / PROGRAM).write_text(Path(standalone.__file__).read_text(encoding="utf-8"), encoding="utf-8")
+
+
+def torch_module(network: Network) -> nn.Module:
+    """The network in torch: its inputs to a tuple of its outputs, in their order."""
+    import torch
+    from torch import Tensor, nn
+
+    function = standalone.FUNCTIONS[network.function]
+
+    class _Module(nn.Module):
+        def __init__(self) -> None:
+            super().__init__()
+            for name, array in network.parameters.items():
+                self.register_buffer(name.replace(".", "__"), torch.from_numpy(np.array(array)))
+
+        def forward(self, *inputs: Tensor) -> tuple[Tensor, ...]:
+            parameters = {name: getattr(self, name.replace(".", "__")) for name in network.parameters}
+            outputs = function(torch, parameters, network.columns, *inputs)
+            return tuple(outputs[name] for name in network.outputs)
+
+    return _Module().eval()
+
+
+def _examples(network: Network) -> tuple[Any, ...]:
+    import torch
+
+    return tuple(torch.zeros(_NUM_EXAMPLES, size) for size in network.inputs.values())
+
+
+def _write_torchscript(network: Network, path: Path) -> None:
+    import torch
+
+    with torch.no_grad(), _quiet_torch():
+        traced: Any = torch.jit.trace(torch_module(network), _examples(network))
+        traced.save(str(path))
+
+
+def _read_torchscript(network: Network, path: Path) -> Run:
+    import torch
+
+    with _quiet_torch():
+        loaded: Any = torch.jit.load(str(path))
+
+    def run(*inputs: FloatArray) -> Outputs:
+        with torch.no_grad():
+            found = loaded(*(torch.from_numpy(rows) for rows in inputs))
+        return {name: tensor.numpy() for name, tensor in zip(network.outputs, found, strict=True)}
+
+    return run
+
+
+def _write_onnx(network: Network, path: Path) -> None:
+    import torch
+
+    num_rows = torch.export.Dim("N", min=1)
+    with torch.no_grad(), _quiet_torch():
+        torch.onnx.export(
+            torch_module(network),
+            _examples(network),
+            path,
+            input_names=list(network.inputs),
+            output_names=list(network.outputs),
+            dynamic_shapes=(({0: num_rows},) * len(network.inputs),),
+            dynamo=True,
+            external_data=False,
+            verbose=False,
+        )
+
+
+def _read_onnx(network: Network, path: Path) -> Run:
+    import onnxruntime
+
+    session: Any = onnxruntime.InferenceSession(path, providers=["CPUExecutionProvider"])
+
+    def run(*inputs: FloatArray) -> Outputs:
+        found = session.run(list(network.outputs), dict(zip(network.inputs, inputs, strict=True)))
+        return dict(zip(network.outputs, found, strict=True))
+
+    return run
+
+
+@contextmanager
+def _quiet_torch() -> Iterator[None]:
+    """Keep torch from telling of its own deprecations, of packages that are not needed here, and of every node."""
+    loggers = [logging.getLogger(name) for name in ("torch.onnx", "onnxscript", "onnx_ir")]
+    levels = [logger.level for logger in loggers]
+    for logger in loggers:
+        logger.setLevel(logging.ERROR)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            yield
+    finally:
+        for logger, level in zip(loggers, levels, strict=True):
+            logger.setLevel(level)
+
+
+FORMATS = {
+    "onnx": Format(".onnx", _write_onnx, _read_onnx, ("onnx", "onnxscript", "onnxruntime")),
+    "numpy": Format(".npz", _write_numpy, _read_numpy, shared=_write_program),
+    "torchscript": Format(".pt", _write_torchscript, _read_torchscript),
+}
+"""The formats by the names that commands take."""
