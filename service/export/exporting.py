@@ -49,6 +49,10 @@ class Source:
     """Makes the evaluator's policy, ready for a batch of episodes."""
     digests: Mapping[str, str]
 
+    def episodes(self, num: int) -> Episodes:
+        """Episodes of it, to measure."""
+        return Episodes(self.world, self.goals, num, self.num_steps, self.success_distance_m, self.players)
+
 
 def find_source(reference: str, registry: Path, part: Part, primitives: str | None = None) -> Source:
     """Find what to export.
@@ -103,16 +107,7 @@ def export(source: Source, format_name: str, folder: Path, *, num_episodes: int 
     """
     chosen = find_format(format_name)
     with new_directory(folder) as temporary:
-        measured, observations = measure(
-            Episodes(
-                source.world,
-                source.goals,
-                num_episodes,
-                source.num_steps,
-                source.success_distance_m,
-                source.players,
-            )
-        )
+        measured, observations = measure(source.episodes(num_episodes))
         inputs = make_inputs(observations, layouts(source.world.observed))
         with os_errors("write", temporary):
             chosen.shared(temporary)

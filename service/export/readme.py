@@ -156,8 +156,9 @@ def _arm(about: Description) -> Iterator[str]:
         f"{1e3 * each.asked_m:.0f} mm in its first step."
         for each in about.measured.width_response
     )
-    force_n = max(about.gripper.max_force_n)
-    yield f"{' '.join(covered)} A finger presses with up to {force_n:g} N: {about.gripper.coupling}."
+    force_n, coupling = max(about.gripper.max_force_n), about.gripper.coupling
+    coupling = coupling[0].upper() + coupling[1:]
+    yield f"{' '.join(covered)} A finger presses with up to {force_n:g} N. {coupling}."
     motion = about.measured.motion
     yield _table(
         (f"in {motion.num_episodes} episodes", "median", "99 %", "greatest"),
@@ -180,7 +181,10 @@ def _late(about: Description) -> Iterator[str]:
             for late in about.measured.late_observations
         ),
     )
-    yield f"{1e3 * about.tolerated_late_steps / about.rate_hz:.0f} ms cost less than 10 points."
+    if about.tolerated_late_steps:
+        yield f"Up to {1e3 * about.tolerated_late_steps / about.rate_hz:.0f} ms cost less than 10 points."
+    else:
+        yield "The first step of delay already costs more than 10 points."
 
 
 def _training(about: Description) -> Iterator[str]:

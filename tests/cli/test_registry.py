@@ -9,11 +9,14 @@ from typing import Any
 import pytest
 from typer.testing import CliRunner
 
+import service
+from service.cli.main import app
 from service.cli.registry import registry_app
+from service.downstream.compose import parameters_digest
 from service.primitives.bundled import BUNDLED
 from service.registry.manifest import parse_manifest
 from service.registry.registry import Registry
-from tests.registry.helpers import Publish
+from tests.registry.helpers import Publish, files_in
 
 Run = Callable[..., Any]
 
@@ -120,6 +123,42 @@ def test_alias(run: Run, registry: Registry) -> None:
 def test_export(run: Run, tmp_path: Path) -> None:
     assert run("export", "panda-cube@1", str(tmp_path / "out")).exit_code == 0
     assert parse_manifest((tmp_path / "out" / "manifest.json").read_bytes(), tmp_path).version == 1
+
+
+def test_what_is_exported_is_a_version_for_every_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+
+    def tandem(*arguments: object) -> Any:
+        return CliRunner().invoke(app, [*map(str, arguments), "--registry", "none"])
+
+    assert tandem("registry", "export", "panda-cube@champion", "given").exit_code == 0
+    tree = json.loads(tandem("registry", "show", "given", "--json").stdout)
+    champion = Registry(BUNDLED).manifest("panda-cube@champion")
+    assert (tree["version"], tree["where"], tree["aliases"]) == (champion.version, "exported", [])
+    assert tandem("registry", "verify", "given").exit_code == 0
+    assert tandem("registry", "export", "given", "again").exit_code == 0
+    assert files_in(tmp_path / "again") == files_in(tmp_path / "given")
+    played = [
+        json.loads(tandem("evaluate", "--primitives", each, "--episodes", 3, "--steps", 5, "--json").stdout)
+        for each in ("given", "./again", "panda-cube@champion")
+    ]
+    assert played[0] == played[1]
+    assert list(played[0]) == [champion.reference, "idle"]
+    assert list(played[0].values()) == list(played[2].values())
+    assert_user_error(tandem("registry", "alias", "given", "best"), "cannot write given", "only read")
+    downstream = service.load_primitives("given")
+    assert parameters_digest(downstream.policy) == parameters_digest(service.load_primitives().policy)
+
+    parameters = tmp_path / "given" / "primitives.safetensors"
+    parameters.write_bytes(parameters.read_bytes()[:-1] + b"x")
+    result = tandem("registry", "verify", "given")
+    assert (result.exit_code, result.stderr.count("\n")) == (1, 1)
+    result = tandem("evaluate", "--primitives", "given")
+    assert result.stderr.startswith("error: given/primitives.safetensors is damaged: expected sha256")
+    parameters.unlink()
+    assert "given/primitives.safetensors is missing" in tandem("evaluate", "--primitives", "given").stderr
+    (tmp_path / "given" / "manifest.json").write_text("{}")
+    assert tandem("evaluate", "--primitives", "given").stderr.startswith("error: given/manifest.json")
 
 
 def test_verify(run: Run, registry: Registry) -> None:

@@ -88,3 +88,29 @@ def test_nobody_waits_for_a_fifo(path, somebody_reads):
     files.check_regular(path.with_name("missing"))
     if reader is not None:
         os.close(reader)
+
+
+def test_a_new_directory_takes_its_name_when_all_is_well_and_not_before(tmp_path):
+    path = tmp_path / "out" / "folder"
+    with files.new_directory(path) as temporary:
+        (temporary / "file").write_text("whole")
+        assert not path.exists()
+    assert [each.name for each in path.parent.iterdir()] == ["folder"]
+    assert (path / "file").read_text() == "whole"
+    with pytest.raises(StorageError) as error, files.new_directory(path):
+        pass
+    assert_one_line(error.value, "cannot write", path, "it exists; name another folder")
+    assert (path / "file").read_text() == "whole"
+
+
+def test_nothing_is_left_of_a_new_directory_that_was_not_finished(tmp_path):
+    def begin():
+        with files.new_directory(tmp_path / "folder") as temporary:
+            (temporary / "file").touch()
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        begin()
+    with pytest.raises(StorageError, match="cannot write"), files.new_directory(tmp_path / "other"):
+        (tmp_path / "other" / "of another process").mkdir(parents=True)
+    assert sorted(each.name for each in tmp_path.iterdir()) == ["other"]

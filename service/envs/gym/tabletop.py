@@ -113,8 +113,8 @@ class TabletopEnv(GoalWorlds, gymnasium.Env[Any, FloatArray]):
     - observation: ``observation`` (P,) positions as Bob's primitives see them (``service.envs.observations``), 11 or as
       many as ``config.observed`` says, ``achieved_goal`` (3,) and ``desired_goal`` (3,) object and goal in the world
       frame, metres, within +-10.
-    - action: (4,) in [-1, 1]: end-effector displacement x, y, z from where it is now (1 is 5 cm), change of the finger
-      width (1 is 10 cm).
+    - action: (4,) in [-1, 1]: way x, y, z from where the end effector is now to its set-point (1 is 5 cm, of which the
+      arm covers about 3 cm in a step), change of the finger width (1 is 10 cm).
     - reward: 1 at every step the object is within ``success_distance_m`` of the goal, else 0 (paper, downstream tasks).
     - never terminates; truncated where the physics diverged, else by the time limit of the registration.
 

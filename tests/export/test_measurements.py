@@ -1,0 +1,81 @@
+"""What is measured, against players whose motion is known."""
+
+import numpy as np
+import pytest
+
+from service.actors.evaluation import IdlePolicy
+from service.envs.observations import ACTION
+from service.export.measurements import Episodes, LateObservations, Measured, measure, measure_response
+from tests.export.policies import SEEN, WORLD
+
+
+class Upwards:
+    """Goes up at full speed, and keeps what it saw."""
+
+    def __init__(self, seen):
+        self._seen = seen
+        seen.append([])
+
+    def act_deterministic(self, observation):
+        self._seen[-1].append(observation.copy())
+        action = np.zeros((len(observation), ACTION.size), dtype=np.float32)
+        action[:, 2] = 1.0
+        return action
+
+
+def episodes(new_player):
+    return Episodes(WORLD, "table", 3, 5, 0.05, new_player)
+
+
+def test_late_positions_and_the_speed_of_the_tip():
+    seen = []
+    measured, observations = measure(episodes(lambda: Upwards(seen)))
+    assert observations.shape == (6, 3, SEEN.bob.size)
+    on_time = np.array(seen[0])
+    np.testing.assert_array_equal(on_time, observations[:-1])
+    commands = slice(11, 19)  # the last two commands, which a policy knows at once
+    places = [column for column in range(SEEN.bob.size) if column not in range(11, 19)]
+    for steps in (1, 2):
+        late = np.array(seen[steps])
+        np.testing.assert_array_equal(late[:, :, commands], on_time[:, :, commands])
+        np.testing.assert_array_equal(late[steps:][:, :, places], on_time[:-steps][:, :, places])
+        np.testing.assert_array_equal(late[0], on_time[0])
+    motion = measured.motion
+    velocity = np.diff(observations[:, :, :3].astype(float), axis=0) / 0.04
+    speed = np.linalg.norm(velocity, axis=2)
+    assert motion.tip_speed_m_s.max == pytest.approx(speed.max(), rel=1e-3)
+    assert motion.tip_speed_m_s.median == pytest.approx(np.median(speed), rel=1e-3)
+    acceleration = np.linalg.norm(np.diff(velocity, axis=0), axis=2) / 0.04
+    assert motion.tip_acceleration_m_s2.max == pytest.approx(acceleration.max(), rel=1e-3)
+    assert motion.num_episodes == 3
+
+
+def test_who_stands_still():
+    measured, _ = measure(episodes(IdlePolicy))
+    assert measured.motion.tip_speed_m_s.max < 0.01
+    assert measured.motion.outside_workspace == 0.0
+    assert measured.tolerated_late_steps == 2
+
+
+@pytest.mark.parametrize(("rates", "tolerated"), [((0.9, 0.85, 0.5), 1), ((0.9, 0.5, 0.9), 0), ((0.9, 0.8, 0.8), 2)])
+def test_tolerated_delay(rates, tolerated):
+    late = tuple(
+        LateObservations(steps=steps, success_last=rate, success_last_low=0.0, success_last_high=1.0)
+        for steps, rate in enumerate(rates)
+    )
+    assert Measured.model_construct(late_observations=late).tolerated_late_steps == tolerated
+
+
+def test_the_arm_covers_a_part_of_a_full_action():
+    """56 to 61 % in motion, less from rest; the gripper nearly all of its way."""
+    response, widths = measure_response(WORLD)
+    assert [(each.axis, each.direction) for each in response] == [
+        (axis, direction) for axis in "xyz" for direction in (1, -1)
+    ]
+    for each in response:
+        assert 0.56 < each.moving_mean < 0.62
+        assert each.from_rest_mean < each.moving_mean
+        assert 0.0 < each.moving_std < 0.03
+    for each in widths:
+        assert each.asked_m == 0.08
+        assert 0.06 < each.covered_m < 0.08

@@ -1,0 +1,97 @@
+"""What is written computes what the evaluator's policy does, in every format."""
+
+import numpy as np
+import pytest
+
+from service.export import parity
+from service.export.errors import ParityError
+from service.export.formats import FORMATS, find_format
+from service.export.networks import network_of_orchestrator, networks_of_bob, networks_of_primitives
+from service.export.parity import check_parity, make_inputs
+from service.policies.numpy_policy import numpy_bob
+from service.primitives.loading import TrainedBob
+from tests.export.policies import CONFIG, MONOLITHIC, SEEN, actor_of, parameters_of
+
+
+def networks():
+    parameters = parameters_of(CONFIG)
+    bob = TrainedBob("made", numpy_bob(parameters), CONFIG)
+    other = parameters_of(MONOLITHIC)
+    alone = TrainedBob("made", numpy_bob(other), MONOLITHIC)
+    return {
+        "bob": networks_of_bob(bob, parameters)[0],
+        "primitive": networks_of_primitives(bob, parameters)[1],
+        "orchestrator": network_of_orchestrator(bob, parameters, "ours-residual-her", actor_of(residual=True)),
+        "orchestrator of weights alone": network_of_orchestrator(bob, parameters, "ours", actor_of(residual=False)),
+        "monolithic": networks_of_bob(alone, other)[0],
+    }
+
+
+@pytest.fixture(scope="module")
+def inputs():
+    return make_inputs(0.1 * np.random.default_rng(2).standard_normal((5, 40, SEEN.bob.size)), SEEN)
+
+
+def written(network, format_name, folder):
+    chosen = find_format(format_name)
+    chosen.shared(folder)
+    path = folder / f"{network.name}{chosen.ending}"
+    chosen.write(network, path)
+    return chosen.read(network, path)
+
+
+@pytest.mark.parametrize(
+    ("format_name", "name"),
+    [
+        *((each, name) for each in ("numpy", "torchscript") for name in networks()),
+        ("onnx", "orchestrator"),  # has every operation that the others have; torch takes seconds for each
+    ],
+)
+def test_parity(format_name, name, inputs, tmp_path):
+    network = networks()[name]
+    found = check_parity(network, written(network, format_name, tmp_path), inputs)
+    assert 0.0 <= found.usual <= parity.TOLERANCE
+    assert found.extreme <= parity.EXTREME_TOLERANCE
+    assert next(iter(network.outputs)) == "action"
+
+
+def test_all_formats_are_tried():
+    assert list(FORMATS) == ["onnx", "numpy", "torchscript"]
+
+
+def test_actions_are_clipped_and_inputs_reach_beyond_where_networks_clip(inputs):
+    bob = networks()["bob"]
+    unclipped = bob.reference(inputs.extreme["observation"])
+    assert np.nanmax(np.abs(unclipped["means"])) > 1.0
+    assert np.nanmax(np.abs(unclipped["action"])) == 1.0
+    normalised = (inputs.extreme["observation"] - SEEN.bob.normalisation.offset) / SEEN.bob.normalisation.scale
+    assert (np.nanmax(np.abs(normalised), axis=0) > 5.0).all()
+    assert np.isnan(inputs.extreme["observation"]).any(axis=0).all()
+
+
+def test_what_differs_is_found(inputs, tmp_path):
+    network = networks()["orchestrator"]
+    run = written(network, "numpy", tmp_path)
+
+    def changed(name, change):
+        return lambda *rows: {**run(*rows), name: change(run(*rows)[name])}
+
+    for name, change, said in (
+        ("action", lambda values: values + 2e-5, "its action differs from the policy's by 2e-05, which is more than"),
+        ("weights", lambda values: np.where(np.isnan(values), 0.0, values), "its weights is NaN where the policy's"),
+        ("means", lambda values: values[:, 0], "its means has shape"),
+    ):
+        with pytest.raises(ParityError, match=said):
+            check_parity(network, changed(name, change), inputs)
+    with pytest.raises(ParityError, match="its action differs"):  # one row alone is tried, too
+        check_parity(network, changed("action", lambda values: values + (len(values) == 1)), inputs)
+
+
+def test_arrays_of_other_sizes(tmp_path):
+    run = written(networks()["orchestrator"], "numpy", tmp_path)
+    observation = np.zeros((3, SEEN.bob.size))
+    with pytest.raises(ValueError, match=r"expected arrays of \(N, 19\), \(N, 22\), got \(3, 22\), \(3, 22\)"):
+        run(observation, observation)
+    with pytest.raises(ValueError, match=r"expected arrays of"):
+        run(observation[:2, : SEEN.positions.size], observation)
+    assert run(observation[:, : SEEN.positions.size], observation)["action"].dtype == np.float32
