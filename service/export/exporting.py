@@ -164,7 +164,10 @@ def _orchestrator(training: TrainingDirectory, registry: Path, part: Part, primi
 
 
 def _name(trained: TrainedBob) -> str:
-    return trained.label if trained.manifest is None else trained.manifest.reference
+    """What it is called elsewhere, where paths of this machine mean nothing."""
+    if trained.manifest is not None:
+        return trained.manifest.reference
+    return f"{trained.config.name} of the run {Path(trained.label).resolve().name}"
 
 
 def _same(trained: TrainedBob) -> DeterministicPolicy:

@@ -155,6 +155,7 @@ def _arm(about: Description) -> Iterator[str]:
         f"{'Opening' if each.direction > 0 else 'Closing'}, the gripper comes {1e3 * each.covered_m:.0f} of "
         f"{1e3 * each.asked_m:.0f} mm in its first step."
         for each in about.measured.width_response
+        if each.asked_m > 0.0
     )
     force_n, coupling = max(about.gripper.max_force_n), about.gripper.coupling
     coupling = coupling[0].upper() + coupling[1:]

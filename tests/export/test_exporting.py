@@ -175,7 +175,9 @@ def test_a_monolithic_bob(run, tmp_path):
     write_run(tmp_path / "alone", MONOLITHIC)
     fails(run("alone", "--format", "numpy", "--part", "primitives", "--out", "out"), "alone has no primitives")
     assert run("alone", "--format", "numpy", "--out", "out", "--episodes", 2).exit_code == 0
-    assert [each.title for each in read_description(tmp_path / "out").networks] == ["Bob, who has no primitives"]
+    about = read_description(tmp_path / "out")
+    assert about.name == "made of the run alone"
+    assert [each.title for each in about.networks] == ["Bob, who has no primitives"]
 
 
 def test_what_is_no_bob(run, registry, tmp_path):
