@@ -173,7 +173,7 @@ def _field(layout: ObservationLayout, entry: Entry) -> FieldEntry:
         components=_COMPONENTS[entry.kind],
         unit=entry.unit,
         frame="world" if entry.kind == VECTOR else None,
-        meaning=_COMMAND_MEANING.format(ago) if is_command else _MEANINGS[entry.name],
+        meaning=_COMMAND_MEANING.format(ago) if is_command else _MEANINGS.get(entry.name, entry.name.replace("_", " ")),
     )
 
 
