@@ -81,7 +81,7 @@ def find_source(reference: str, registry: Path, part: Part, primitives: str | No
     return Source(
         name=_name(trained),
         networks=tuple(networks),
-        world=config.world,
+        world=config.world.nominal,
         goals="mixed",
         task=None,
         num_steps=config.run.evaluation_steps,
@@ -153,7 +153,7 @@ def _orchestrator(training: TrainingDirectory, registry: Path, part: Part, primi
     return Source(
         name=f"{trial.name} with {_name(trained)}",
         networks=tuple(networks),
-        world=task.world_from(trained.config.world),
+        world=task.world_from(trained.config.world.nominal),
         goals=task.goals,
         task=trial.task,
         num_steps=EPISODE_STEPS,
