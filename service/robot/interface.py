@@ -43,6 +43,8 @@ class Command:
     """(3,) set-point of the point between the fingertips; the gripper points down."""
     width_m: float
     """Distance between the fingertips; 0 is closed."""
+    grip_force_n: float = 40.0
+    """Most that the fingers press with, where the robot can be told; 40 N are those of the Panda in training."""
 
 
 class RobotInterface(Protocol):

@@ -1,0 +1,126 @@
+"""Back-ends by name: what makes a robot, and what sees its object, of a few words and parameters."""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Protocol
+
+from pydantic import Field, ValidationError
+
+from service.config_tree import read_yaml
+from service.errors import TandemError
+from service.frozen import FrozenModel
+from service.robot.disturbed import DisturbanceConfig, DisturbedPoses, DisturbedRobot
+from service.robot.interface import PoseSource, RobotInterface
+from service.types import StateArray
+from service.world_config import WorldConfig
+
+BACKENDS = {
+    "mujoco": "service.robot.mujoco_robot:connect",
+    "pybullet": "service.robot.pybullet_robot:connect",
+    "franka": "service.robot.franka_robot:connect",
+}
+"""Where the factory of each is, as ``module:function``."""
+
+
+class Simulator(Protocol):
+    """What a simulated robot offers besides: new starts, and the truth."""
+
+    def reset(self, object_m: StateArray) -> None:
+        """Put the arm to its start with an open gripper, and the object to (3,) metres, at rest; time goes on."""
+
+    def object_position(self) -> StateArray:
+        """(3,) where the object is in truth, metres."""
+
+
+@dataclass(frozen=True, slots=True)
+class Backend:
+    """A robot, and what sees its object."""
+
+    robot: RobotInterface
+    poses: PoseSource
+    simulator: Simulator | None = None
+    """None for a robot that people have to put back by hand."""
+
+    def close(self) -> None:
+        """Let go of both."""
+        self.poses.close()
+        self.robot.close()
+
+
+Factory = Callable[[WorldConfig, Mapping[str, Any]], Backend]
+"""Makes a back-end for a policy's world, with parameters of its own, such as an address; raises a ``TandemError``."""
+
+
+class BackendConfig(FrozenModel):
+    """A back-end and its parameters, as a YAML file has them."""
+
+    backend: str = Field(description="mujoco, pybullet, franka, or module:function of your own")
+    name: str | None = Field(None, description="of this robot, in calibrations and logs; None: the back-end's")
+    parameters: dict[str, Any] = Field(default_factory=dict, description="of the back-end")
+    disturbance: DisturbanceConfig = DisturbanceConfig()
+
+    @property
+    def label(self) -> str:
+        """Name of the robot."""
+        return self.name or self.backend
+
+
+def read_backend(reference: str) -> BackendConfig:
+    """The back-end that ``--robot`` names.
+
+    Args:
+        reference: a name in ``BACKENDS``, ``module:function``, or a YAML file.
+
+    Raises:
+        TandemError: none of these, or a file with something else in it.
+    """
+    if reference in BACKENDS or (":" in reference and not Path(reference).exists()):
+        return BackendConfig(backend=reference)
+    if not Path(reference).is_file():
+        known = ", ".join(BACKENDS)
+        raise TandemError(f"unknown robot {reference!r}: name {known}, module:function of your own, or a YAML file")
+    try:
+        return BackendConfig.model_validate(read_yaml(Path(reference)))
+    except ValidationError as error:
+        raise TandemError(f"robot {reference}: {first_error(error)}") from None
+
+
+def connect(config: BackendConfig, world: WorldConfig, *, seed: int = 0) -> Backend:
+    """Make a back-end, disturbed as its configuration asks.
+
+    Args:
+        config: which one.
+        world: of the policy; simulators build it, others take from it what they need.
+        seed: of noise.
+
+    Raises:
+        TandemError: no such back-end, what it needs is not installed, or it does not answer.
+    """
+    made = _factory(config.backend)(world, config.parameters)
+    wanted = config.disturbance
+    if wanted == DisturbanceConfig():
+        return made
+    poses = DisturbedPoses(made.poses, made.robot.now_s, wanted, seed=seed)
+    return replace(made, robot=DisturbedRobot(made.robot, wanted), poses=poses)
+
+
+def first_error(error: ValidationError) -> str:
+    """The first thing that is wrong with plain values, in a few words."""
+    first = error.errors()[0]
+    key = ".".join(str(part) for part in first["loc"]) or "the top level"
+    if first["type"] == "extra_forbidden":
+        return f"unknown key {key!r}"
+    return f"{key} = {first['input']!r}: {first['msg']}"
+
+
+def _factory(reference: str) -> Factory:
+    module, _, name = BACKENDS.get(reference, reference).partition(":")
+    try:
+        factory: Factory = getattr(importlib.import_module(module), name)
+    except (ImportError, AttributeError, ValueError) as error:
+        raise TandemError(f"robot {reference!r} cannot be loaded: {error}") from None
+    return factory
