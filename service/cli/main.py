@@ -14,6 +14,7 @@ from service.cli.evaluate import coverage, evaluate, render
 from service.cli.export import export
 from service.cli.pretrain import demo, pretrain
 from service.cli.registry import registry_app
+from service.cli.robot import robot_app
 from service.cli.serve import serve
 from service.cli.unexpected import report_thread_error
 
@@ -24,6 +25,7 @@ for command in (pretrain, demo, evaluate, coverage, render, export, serve):
     app.command()(command)
 app.add_typer(registry_app)
 app.add_typer(downstream_app)
+app.add_typer(robot_app)
 
 
 def main() -> None:

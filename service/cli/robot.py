@@ -1,0 +1,221 @@
+"""``tandem robot``: frozen policies on a robot, calibration of its arm, and videos of what was logged."""
+
+from __future__ import annotations
+
+import contextlib
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from service.cli.common import CHAMPION, EXIT_SIGNAL, REGISTRY, CommandGroup, RegistryOption, print_json
+from service.errors import TandemError
+
+if TYPE_CHECKING:
+    from service.robot.backends import Backend, BackendConfig
+    from service.robot.limits import Box
+    from service.robot.loop import BridgeConfig
+    from service.robot.policies import RobotPolicy
+    from service.types import StateArray
+
+robot_app = typer.Typer(name="robot", help="Frozen policies on a robot.", cls=CommandGroup, no_args_is_help=True)
+
+_Policy = Annotated[
+    str, typer.Option(metavar="NAME@ALIAS|RUN_DIR", help="Whose Bob, or a directory of tandem downstream train.")
+]
+_Robot = Annotated[
+    str, typer.Option(metavar="NAME|FILE", help="mujoco, pybullet, franka, module:function, or a YAML file.")
+]
+_Set = Annotated[
+    list[str] | None, typer.Option("--set", metavar="A=B", help="Of the bridge, such as safety.max_speed_m_s=0.5.")
+]
+_DeadMan = Annotated[
+    str | None, typer.Option(metavar="key|none", help="A key to be held; default: none for simulators, else key.")
+]
+
+
+@robot_app.command()
+def run(
+    robot: _Robot,
+    policy: _Policy = CHAMPION,
+    goal: Annotated[str | None, typer.Option(metavar="X,Y,Z", help="Metres; default: random ones.")] = None,
+    episodes: Annotated[int, typer.Option(help="Number of goals.", min=1)] = 1,
+    steps: Annotated[int, typer.Option(help="Control steps of each.", min=1)] = 50,
+    seed: Annotated[int, typer.Option(help="Of random goals.", min=0)] = 0,
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="Command nothing, print what would be.")] = False,
+    calibration: Annotated[Path | None, typer.Option(metavar="FILE", help="Of this robot's response.")] = None,
+    log: Annotated[Path | None, typer.Option(metavar="FILE", help="JSON lines, for tandem robot replay.")] = None,
+    overrides: _Set = None,
+    dead_man: _DeadMan = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print the result as JSON.")] = False,
+    registry: RegistryOption = REGISTRY,
+) -> None:
+    """Bring the object to goals; Ctrl-C stops the robot first."""
+    from service.robot.calibrate import read_calibration
+    from service.robot.log import RobotLog
+    from service.robot.loop import Bridge
+    from service.robot.policies import load_robot_policy
+    from service.robot.running import parse_goal, play
+
+    config, described, player = _bridge_config(overrides), _backend_config(robot), load_robot_policy(policy, registry)
+    goal_m = None if goal is None else parse_goal(goal, player.world)
+    gain = (1.0, 1.0, 1.0)
+    if calibration is not None:
+        measured = read_calibration(calibration)
+        measured.check(described.label, player.world, config)
+        gain = measured.gain
+    written = None if log is None else RobotLog(log, _header(player, described, config, calibration), player.world)
+    with _connected(described, player, seed, dead_man) as (backend, held, wait):
+
+        def record(row: dict[str, Any]) -> None:
+            if written is not None:
+                written.record(row)
+            if dry_run:
+                _print_step(row, bridge.safe.limiter.box)
+
+        def ready(episode: int, goal_m: StateArray) -> None:
+            if written is not None:
+                written.episode = episode
+            if backend.simulator is None and not dry_run:
+                typer.echo(f"goal {episode + 1} of {episodes}: {_words(goal_m)}", err=True)
+                wait("put arm and object to their start")
+
+        bridge = Bridge(
+            player.policy, backend.robot, backend.poses, player.world, config,
+            gain=gain, held=held, dry_run=dry_run, record=record,
+        )  # fmt: skip
+        outcomes = []
+        for outcome in play(
+            bridge, backend, player, goal_m=goal_m, num_episodes=episodes, num_steps=steps, seed=seed, ready=ready
+        ):
+            outcomes.append(outcome)
+            if not as_json:
+                reached = "reached" if outcome.reached else "not reached"
+                typer.echo(f"goal {_words(outcome.goal_m)}: {reached}, {outcome.distance_m:.3f} m away in the end")
+    num_reached = sum(outcome.reached for outcome in outcomes)
+    if as_json:
+        print_json({"policy": player.label, "robot": described.label, "reached": num_reached, "goals": len(outcomes)})
+    elif len(outcomes) > 1:
+        share = num_reached / len(outcomes)
+        typer.echo(f"{num_reached} of {len(outcomes)} goals reached at the last step: {share:.1%}")
+
+
+@robot_app.command()
+def calibrate(
+    robot: _Robot,
+    out: Annotated[Path, typer.Option(metavar="FILE", help="YAML to write, for tandem robot run.")],
+    policy: _Policy = CHAMPION,
+    overrides: _Set = None,
+    dead_man: _DeadMan = None,
+    registry: RegistryOption = REGISTRY,
+) -> None:
+    """Measure the response of an arm by motions of some 6 cm about the middle of its safety box, without an object."""
+    from service.robot import calibrate as measuring
+    from service.robot.policies import load_robot_policy
+
+    config, described, player = _bridge_config(overrides), _backend_config(robot), load_robot_policy(policy, registry)
+    with _connected(described, player, 0, dead_man) as (backend, held, wait):
+        if backend.simulator is None:
+            wait("take everything out of the arm's way")
+        found = measuring.calibrate(described.label, backend.robot, player.world, config, held=held)
+    measuring.write_calibration(out, found)
+    for axis, share, wanted in zip("xyz", found.covered_share, found.training_share, strict=True):
+        typer.echo(f"  {axis}: covers {share:.0%} of a commanded step; in training {wanted:.0%}")
+    typer.echo(f"  is seen to move {found.delay_steps:.2f} control steps after a command")
+    typer.echo(f"calibration: {out}")
+
+
+@robot_app.command()
+def replay(
+    log: Annotated[Path, typer.Argument(metavar="LOG", help="That tandem robot run --log wrote.")],
+    out: Annotated[Path, typer.Option(metavar="FILE", help="Video to write.")] = Path("robot.mp4"),
+) -> None:
+    """Make a video of a log: effector and object where they were measured, in the scene of training."""
+    from service.media.video import write_episode_video
+    from service.robot.log import read_log, states_of
+
+    logged = read_log(log)
+    write_episode_video(states_of(logged, logged.header["success_distance_m"]), logged.world, out)
+    typer.echo(f"video: {out}")
+
+
+def _bridge_config(overrides: list[str] | None) -> BridgeConfig:
+    from pydantic import ValidationError
+
+    from service.config_tree import apply_override
+    from service.robot.backends import first_error
+    from service.robot.loop import BridgeConfig
+
+    tree: dict[str, Any] = {}
+    for override in overrides or ():
+        apply_override(tree, override)
+    try:
+        return BridgeConfig.model_validate(tree)
+    except ValidationError as error:
+        raise TandemError(f"--set: {first_error(error)}") from None
+
+
+def _backend_config(reference: str) -> BackendConfig:
+    from service.robot.backends import read_backend
+
+    return read_backend(reference)
+
+
+@contextlib.contextmanager
+def _connected(
+    described: BackendConfig, player: RobotPolicy, seed: int, dead_man: str | None
+) -> Iterator[tuple[Backend, Callable[[], bool], Callable[[str], None]]]:
+    """A robot with its dead-man's switch, and what asks people to get ready; signals come as exceptions."""
+    from service.robot.backends import connect
+    from service.robot.dead_man import HeldKey
+    from service.robot.safety import always_held
+    from service.runtime.signals import InterruptError, StopSignals
+
+    if dead_man not in (None, "key", "none"):
+        raise TandemError(f"--dead-man {dead_man!r}: choose key or none")
+    try:
+        with StopSignals(), contextlib.ExitStack() as stack:
+            backend = stack.enter_context(contextlib.closing(connect(described, player.world, seed=seed)))
+            needed = dead_man == "key" or (dead_man is None and backend.simulator is None)
+            key = stack.enter_context(HeldKey()) if needed else None
+
+            def wait(what: str) -> None:
+                if key is None:
+                    typer.echo(f"{what}, then press Enter", err=True)
+                    sys.stdin.readline()
+                    return
+                typer.echo(f"{what}, then hold any key; letting go stops the robot", err=True)
+                key.wait()
+
+            yield backend, key or always_held, wait
+    except InterruptError as interrupt:
+        typer.echo("stopped", err=True)
+        raise typer.Exit(EXIT_SIGNAL + interrupt.number) from None
+
+
+def _header(
+    player: RobotPolicy, described: BackendConfig, config: BridgeConfig, calibration: Path | None
+) -> dict[str, Any]:
+    return {
+        "policy": player.label,
+        "success_distance_m": player.success_distance_m,
+        "robot": described.model_dump(mode="json"),
+        "bridge": config.model_dump(mode="json"),
+        "calibration": None if calibration is None else str(calibration),
+    }
+
+
+def _print_step(row: dict[str, Any], box: Box) -> None:
+    if "width_m" not in row:
+        return
+    typer.echo(
+        f"step {row['step']:>3}  gripper {_words(row['effector_m'])}  object {_words(row['object_m'])}"
+        f"  would go to {_words(box.clip(row['target_m']))}"
+        f"  width {row['width_m']:.3f} m"
+    )
+
+
+def _words(point: StateArray) -> str:
+    return ", ".join(f"{number:.3f}" for number in point)

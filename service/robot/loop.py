@@ -1,0 +1,210 @@
+"""The control loop: what is measured becomes a policy's observation, its actions become set-points, 25 times a second.
+
+An action means what it means in training (``WorldBatch.step``): a way of the end effector from where it is measured, at
+most 5 cm an axis, and a change of the finger width. The way to the target is spread over the step's set-points.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from pydantic import Field
+
+from service.actors.evaluation import DeterministicPolicy
+from service.envs.batch import DISPLACEMENT_M, WIDTH_CHANGE_M
+from service.envs.observations import ACTION, POSITIONS, ObservationLayout, bob_observation
+from service.frozen import FrozenModel
+from service.robot.interface import PoseSource, RobotInterface, RobotState
+from service.robot.safety import SafeRobot, SafetyConfig, always_held
+from service.types import FloatArray, StateArray
+from service.world_config import WorldConfig
+
+Record = Callable[[dict[str, Any]], None]
+"""Takes what happened in a step: see ``Bridge.run``."""
+
+_NO_GAIN = (1.0, 1.0, 1.0)
+_MAX_SETTLE_S = 1.0
+
+
+class BridgeConfig(FrozenModel):
+    """How a policy is brought to a robot."""
+
+    set_points_per_step: int = Field(
+        10, ge=1, le=100, description="of a control step, evenly spread: 10 are 250 a second; 1 is a jump, as training"
+    )
+    observation_delay_steps: int = Field(
+        0, ge=0, le=10, description="act on what was seen so many steps ago, to try out what that costs"
+    )
+    safety: SafetyConfig = SafetyConfig()
+
+
+@dataclass(frozen=True, slots=True)
+class Episode:
+    """What came of a goal."""
+
+    num_steps: int
+    distance_m: float
+    """From the object, as it was last seen, to the goal; NaN where nothing sees it."""
+
+
+class Bridge:
+    """Plays a policy on a robot.
+
+    Args:
+        policy: acts on Bob's observations; one that has ``begin`` is told of every start.
+        robot: that moves.
+        poses: what sees the object; None where nothing has to.
+        world: of the policy: its step, its workspace, what it observes.
+        config: of the bridge.
+        gain: (3,) by which the ways of an action are multiplied; see ``calibrate``.
+        held: the dead-man's switch.
+        dry_run: command nothing.
+        record: takes every step.
+
+    Raises:
+        ConfigError: an empty box.
+    """
+
+    def __init__(
+        self,
+        policy: DeterministicPolicy,
+        robot: RobotInterface,
+        poses: PoseSource | None,
+        world: WorldConfig,
+        config: BridgeConfig,
+        *,
+        gain: tuple[float, float, float] = _NO_GAIN,
+        held: Callable[[], bool] = always_held,
+        dry_run: bool = False,
+        record: Record | None = None,
+    ) -> None:
+        self._policy, self._robot, self._config, self._record = policy, robot, config, record
+        self._gain = np.array(gain)
+        self._layout = POSITIONS
+        self._step_s = world.physics_step_s * world.num_substeps
+        self._tick_s = self._step_s / config.set_points_per_step
+        box = config.safety.box(world.workspace)
+        self.safe = SafeRobot(robot, poses, config.safety, box, held=held, dry_run=dry_run)
+        """The only way to the robot."""
+
+    def run(self, goal_m: StateArray, num_steps: int) -> Episode:
+        """Play one goal, and come to rest.
+
+        What is recorded of a step: ``step``; ``time_s`` and ``due_s`` of its begin; ``effector_m``, ``fingers_m``,
+        ``object_m`` as measured then, with ``state_time_s`` and ``object_time_s``; ``goal_m``, ``action``,
+        ``target_m``, ``width_m``; and of its ticks ``tick_times_s``, ``set_points_m``, ``measured_m``. A step in which
+        the robot is stopped has ``stopped``, the reason, too.
+
+        Args:
+            goal_m: (3,) where the object should go, metres.
+            num_steps: control steps.
+
+        Raises:
+            RobotError: the robot was stopped; the message says why.
+        """
+        begin = getattr(self._policy, "begin", None)
+        if begin is not None:
+            begin()
+        commands = deque([np.zeros(ACTION.size)] * _NUM_KEPT, maxlen=_NUM_KEPT)
+        seen: deque[FloatArray] = deque(maxlen=self._config.observation_delay_steps + 1)
+        with self.safe.guarded():
+            self.safe.start()
+            start_s = self._robot.now_s()
+            for step in range(num_steps):
+                due_s = start_s + step * self._step_s
+                row: dict[str, Any] = {"step": step, "due_s": due_s, "goal_m": goal_m}
+                try:
+                    self._play_step(row, due_s, goal_m, commands, seen)
+                except BaseException as error:
+                    row["stopped"] = self.safe.stopped or f"{type(error).__name__}: {error}"
+                    raise
+                finally:
+                    if self._record is not None:
+                        self._record(row)
+            end_s = start_s + num_steps * self._step_s
+            self.safe.measure(end_s)
+            object_m = self.safe.object_m
+            self._settle(end_s)
+        return Episode(num_steps, float(np.linalg.norm(object_m - goal_m)))
+
+    def _play_step(
+        self,
+        row: dict[str, Any],
+        due_s: float,
+        goal_m: StateArray,
+        commands: deque[StateArray],
+        seen: deque[FloatArray],
+    ) -> None:
+        safe = self.safe
+        row["time_s"] = self._robot.now_s()
+        safe.measure(due_s)
+        state, object_m = safe.state, safe.object_m
+        row |= {"effector_m": state.effector_m, "fingers_m": state.fingers_m, "object_m": object_m}
+        row |= {"state_time_s": state.time_s, "object_time_s": safe.object_time_s}
+        seen.append(observe(self._layout, state, object_m, commands, goal_m))
+        action = self._policy.act_deterministic(seen[0])[0].astype(np.float64)
+        row["action"] = action
+        safe.check_finite(action, "the policy's action")
+        action = np.clip(action, -1.0, 1.0)
+        commands.appendleft(action)
+        target_m = state.effector_m + DISPLACEMENT_M * self._gain * action[:3]
+        width_m = float(state.fingers_m.sum() + WIDTH_CHANGE_M * action[3])
+        row |= {"target_m": target_m, "tick_times_s": [], "set_points_m": [], "measured_m": []}
+        num = self._config.set_points_per_step
+        for tick in range(num):
+            tick_s = due_s + tick * self._tick_s
+            if tick:
+                safe.measure(tick_s)
+            safe.move(target_m, width_m, (num - tick) * self._tick_s)
+            row["width_m"] = safe.width_m
+            row["tick_times_s"].append(self._robot.now_s())
+            row["set_points_m"].append(safe.limiter.position_m)
+            row["measured_m"].append(safe.state.effector_m)
+            safe.wait_until(tick_s + self._tick_s)
+
+    def _settle(self, now_s: float) -> None:
+        """Bring the set-point to rest with the gripper as wide as it is."""
+        width_m = float(self.safe.state.fingers_m.sum())
+        for tick in range(1, int(_MAX_SETTLE_S / self._tick_s)):
+            self.safe.brake(width_m)
+            if self.safe.limiter.is_still:
+                return
+            self.safe.wait_until(now_s + tick * self._tick_s)
+            self.safe.measure(now_s + tick * self._tick_s)
+
+
+_NUM_KEPT = 8
+"""Last commands that are kept, the newest first: as many as a layout may ask for."""
+
+
+def observe(
+    layout: ObservationLayout,
+    state: RobotState,
+    object_m: StateArray,
+    commands: deque[StateArray],
+    goal_m: StateArray,
+) -> FloatArray:
+    """(1, O) Bob's input: the entries of his positions from what was measured, and the goal.
+
+    Args:
+        layout: of his positions.
+        state: of the robot.
+        object_m: (3,) where the object was seen, metres.
+        commands: (4,) each, the newest first: what the policy asked for in the last steps.
+        goal_m: (3,) metres.
+    """
+    measured = {
+        "effector": state.effector_m,
+        "fingers": state.fingers_m,
+        "object": object_m,
+        "object_from_effector": object_m - state.effector_m,
+        **{f"command_{age}": command for age, command in enumerate(commands, start=1)},
+    }
+    positions = np.empty((1, layout.size), dtype=np.float32)
+    for name, part in layout.columns.items():
+        positions[0, part] = measured[name]
+    return bob_observation(positions, goal_m[None])

@@ -1,0 +1,209 @@
+"""A robot in MuJoCo: the scene of training, with another arm, object or friction where one asks for it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import mujoco
+import numpy as np
+from pydantic import Field, ValidationError
+
+from service.envs.batch import MAX_SPEED, MAX_TURN_RAD, WorldBatch
+from service.errors import TandemError
+from service.frozen import FrozenModel
+from service.robot.backends import Backend, first_error
+from service.robot.errors import RobotError
+from service.robot.interface import Command, ObjectPose, RobotState
+from service.types import StateArray
+from service.world_config import WorldConfig
+
+_EARLY_S = 1e-9
+
+
+class MujocoParameters(FrozenModel):
+    """What differs from the world of training; nothing by default."""
+
+    stiffness_scale: float = Field(1.0, gt=0.0, le=10.0, description="times the gains of the arm's servos")
+    damping_scale: float = Field(1.0, gt=0.0, le=10.0, description="times their damping")
+    max_force_scale: float = Field(1.0, gt=0.0, le=10.0, description="times the greatest force of the arm's servos")
+    armature_scale: float = Field(1.0, gt=0.0, le=10.0, description="times the inertia of the arm's motors")
+    feed_forward: float = Field(
+        0.0,
+        ge=0.0,
+        le=1.0,
+        description="share of the servos' lag (damping / stiffness, 50 ms of the Panda in training) that is made good "
+        "by the speed of the set-points, as the controllers of real arms do; for set-points without jumps",
+    )
+    joint_friction_nm: float = Field(0.0, ge=0.0, le=20.0, description="dry friction of the arm's joints")
+    object_mass_kg: float | None = Field(None, gt=0.0, le=2.0)
+    object_size_m: float | None = Field(None, ge=0.02, le=0.07)
+    friction: float | None = Field(None, gt=0.0, le=3.0)
+    pad_friction: float | None = Field(None, gt=0.0, le=3.0)
+    physics_step_s: float | None = Field(None, gt=0.0, le=0.01, description="None: that of training")
+
+
+class MujocoRobot:
+    """One world as a ``RobotInterface``; ``poses`` sees the object exactly. Its clock goes on while the loop waits.
+
+    Args:
+        world: of the policy.
+        parameters: what is different here.
+
+    Raises:
+        TandemError: a world that cannot be built.
+    """
+
+    def __init__(self, world: WorldConfig, parameters: MujocoParameters | None = None) -> None:
+        given = parameters or MujocoParameters()
+        of_world = given.model_dump(include=set(WorldConfig.model_fields), exclude_none=True)
+        self.world = WorldConfig.model_validate(world.model_dump() | of_world)
+        with WorldBatch(self.world, 1, num_threads=1) as batch:
+            self.model, self._robot, self._layout = batch.model, batch.robot, batch.layout
+            self._reach = batch.reach
+            self._start = batch.states[0].copy()
+        self._fit(given)
+        self._data = mujoco.MjData(self.model)
+        self._stopped = False
+        self._last: tuple[float, StateArray | None] = (0.0, None)
+        """When the joints got their last set-points, and which, before they were moved on."""
+        self._grip = self.model.actuator_forcerange[self._fingers].copy()
+        self.poses = ExactPoses(self)
+        self.reset(self._start[self._layout["object"]])
+
+    @property
+    def _fingers(self) -> slice:
+        """Actuators of the fingers."""
+        return slice(self._robot.num_joints, self._robot.num_joints + self._robot.num_fingers)
+
+    def _fit(self, given: MujocoParameters) -> None:
+        """Change arm and motors of the compiled model."""
+        arm = slice(0, self._robot.num_joints)
+        self.model.actuator_gainprm[arm, 0] *= given.stiffness_scale
+        self.model.actuator_biasprm[arm, 1] *= given.stiffness_scale
+        self.model.actuator_biasprm[arm, 2] *= given.damping_scale
+        self.model.actuator_forcerange[arm] *= given.max_force_scale
+        self.model.dof_armature[arm] *= given.armature_scale
+        self.model.dof_frictionloss[arm] += given.joint_friction_nm
+        lag_s = -self.model.actuator_biasprm[arm, 2] / self.model.actuator_gainprm[arm, 0]
+        self._lead_s = given.feed_forward * lag_s
+
+    # --- the robot ---------------------------------------------------------------------------------------------------
+
+    def now_s(self) -> float:
+        """Read the physics' clock, seconds."""
+        return float(self._data.time)
+
+    def read(self) -> RobotState:
+        """The robot as it is."""
+        joints, fingers = self._joints(), self._data.qpos[self._robot.num_joints :][: self._robot.num_fingers]
+        return RobotState(
+            self.now_s(), self._robot.arm.forward(joints).position[0], self._robot.openings(fingers[None])[0]
+        )
+
+    def command(self, command: Command) -> None:
+        """Send the servos to a set-point, as in training; after ``stop``, refuse until ``reset``.
+
+        Raises:
+            RobotError: it was stopped.
+        """
+        if self._stopped:
+            raise RobotError("robot mujoco: it was stopped, and takes no commands until its next start")
+        joints = self._joints()
+        target = self._reach.clip(np.array(command.effector_m, dtype=np.float64)[None])
+        solution = self._led(self._robot.arm.solve(joints, target))
+        self._data.ctrl[: self._robot.num_joints] = np.clip(solution, joints - MAX_TURN_RAD, joints + MAX_TURN_RAD)[0]
+        width_m = np.clip([command.width_m], 0.0, self._widest_m)
+        self._data.ctrl[self._fingers] = self._robot.finger_values(width_m)[0]
+        self.model.actuator_forcerange[self._fingers] = np.clip(self._grip, -command.grip_force_n, command.grip_force_n)
+
+    def _led(self, solution: StateArray) -> StateArray:
+        """Joint set-points moved on by what the servos lag behind at the speed of the set-points."""
+        now_s, (before_s, before) = self.now_s(), self._last
+        self._last = (now_s, solution)
+        if before is None or now_s <= before_s:
+            return solution
+        led: StateArray = solution + self._lead_s * (solution - before) / (now_s - before_s)
+        return led
+
+    def wait_until(self, time_s: float) -> None:
+        """Step the physics.
+
+        Raises:
+            RobotError: it has diverged.
+        """
+        while self._data.time < time_s - _EARLY_S:
+            mujoco.mj_step(self.model, self._data)
+        if not (np.abs(self._data.qvel) < MAX_SPEED).all():  # NaN, too
+            raise RobotError("robot mujoco: the physics has diverged; ask for a shorter physics_step_s")
+
+    def stop(self) -> None:
+        """Hold the joints where they are."""
+        if not self._stopped:
+            self._data.ctrl[: self._robot.num_joints] = self._joints()[0]
+        self._stopped = True
+
+    def close(self) -> None:
+        """Nothing is left behind."""
+
+    # --- the simulator -----------------------------------------------------------------------------------------------
+
+    def reset(self, object_m: StateArray) -> None:
+        """Put the arm to its start with an open gripper, and the object to (3,) metres, at rest; time goes on."""
+        now_s, layout = self._data.time, self._layout
+        state = self._start.copy()
+        state[layout["object"]] = object_m
+        mujoco.mj_setState(self.model, self._data, state[layout.physics], mujoco.mjtState.mjSTATE_FULLPHYSICS)
+        self._data.time, self._stopped = now_s, False
+        self._last = (now_s, None)
+        self._data.qacc_warmstart[:] = 0.0
+        self._data.ctrl[:] = 0.0
+        num_joints = self._robot.num_joints
+        self._data.ctrl[:num_joints] = self._joints()[0]
+        self._data.ctrl[self._fingers] = self._data.qpos[num_joints:][: self._robot.num_fingers]
+        mujoco.mj_forward(self.model, self._data)
+
+    def object_position(self) -> StateArray:
+        """(3,) where the object is, metres."""
+        first = self._robot.num_joints + self._robot.num_fingers
+        position: StateArray = self._data.qpos[first : first + 3].copy()
+        return position
+
+    @property
+    def _widest_m(self) -> float:
+        return self._robot.opening_m if self.world.gripper == "free" else 0.0
+
+    def _joints(self) -> StateArray:
+        """(1, J)."""
+        joints: StateArray = self._data.qpos[None, : self._robot.num_joints].copy()
+        return joints
+
+
+class ExactPoses:
+    """Sees the object of a simulator as it is, at every moment."""
+
+    def __init__(self, robot: MujocoRobot) -> None:
+        self._robot = robot
+
+    def read(self) -> ObjectPose:
+        """The object's pose now."""
+        return ObjectPose(self._robot.now_s(), self._robot.object_position())
+
+    def close(self) -> None:
+        """Nothing is left behind."""
+
+
+def connect(world: WorldConfig, parameters: Mapping[str, Any]) -> Backend:
+    """Make the back-end ``mujoco``.
+
+    Raises:
+        TandemError: unknown parameters, or a world that cannot be built.
+    """
+    if world.fixture == "box":
+        raise TandemError("robot mujoco: the box is elsewhere in every episode, and nothing tells a bridge where")
+    try:
+        given = MujocoParameters.model_validate(dict(parameters))
+    except ValidationError as error:
+        raise TandemError(f"robot mujoco: parameters: {first_error(error)}") from None
+    robot = MujocoRobot(world, given)
+    return Backend(robot, robot.poses, robot)

@@ -1,0 +1,109 @@
+"""Goals of a robot, one after another: where they are, and what came of them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from service.envs.sampling import draw_goals, draw_starts
+from service.errors import TandemError
+from service.robot.backends import Backend
+from service.robot.errors import RobotError
+from service.robot.loop import Bridge
+from service.robot.policies import RobotPolicy
+from service.types import StateArray
+from service.world_config import WorldConfig
+
+_ROUNDING_M = 1e-6
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """One goal that was played."""
+
+    goal_m: StateArray
+    distance_m: float
+    """From the object to it at the last step; of a simulator in truth, else as it was seen."""
+    reached: bool
+
+
+def parse_goal(text: str, world: WorldConfig) -> StateArray:
+    """(3,) a goal written as ``x,y,z``, metres.
+
+    Raises:
+        TandemError: no three numbers, or outside the box of training.
+    """
+    try:
+        goal = np.array([float(part) for part in text.split(",")])
+    except ValueError:
+        goal = np.empty(0)
+    if goal.shape != (3,) or not np.isfinite(goal).all():
+        raise TandemError(f"--goal {text!r}: expected x,y,z in metres, such as -0.05,0.1,0.2")
+    lower, upper = np.array(world.workspace.lower_m), np.array(world.workspace.upper_m)
+    lower[2] = world.rest_height_m
+    if ((goal < lower - _ROUNDING_M) | (goal > upper + _ROUNDING_M)).any():
+        box = ", ".join(f"{axis} {low:g} to {high:g}" for axis, low, high in zip("xyz", lower, upper, strict=True))
+        raise TandemError(f"--goal {text}: outside the box that the policy was trained in: {box} m")
+    return goal
+
+
+def play(
+    bridge: Bridge,
+    backend: Backend,
+    policy: RobotPolicy,
+    *,
+    goal_m: StateArray | None,
+    num_episodes: int,
+    num_steps: int,
+    seed: int,
+    ready: Callable[[int, StateArray], None],
+    first: int = 0,
+) -> Iterator[Outcome]:
+    """Play goals; a simulator starts each with its object anywhere, as an evaluation does.
+
+    Args:
+        bridge: plays the policy on the back-end's robot.
+        backend: the robot.
+        policy: says which goals are drawn, and what counts as reached.
+        goal_m: (3,) the goal of all episodes; None: random ones.
+        num_episodes: how many.
+        num_steps: of each.
+        seed: of starts and goals.
+        ready: called with the episode's number and its goal, before anything moves: people put things back then.
+        first: number of the episode to begin with; starts and goals of the others stay what they are.
+
+    Raises:
+        RobotError: the robot was stopped.
+    """
+    rng = np.random.default_rng(seed)
+    starts, boxes = draw_starts(rng, num_episodes, policy.world)
+    goals = draw_goals(policy.goals, rng, policy.world, policy.success_distance_m, start=starts, box=boxes)
+    for episode in range(first, num_episodes):
+        if backend.simulator is not None:
+            backend.simulator.reset(starts[episode])
+        elif goal_m is None and policy.world.fixture != "none":
+            goals[episode] = _goal_for(_seen(backend), rng, policy)
+        goal = goals[episode] if goal_m is None else goal_m
+        ready(episode, goal)
+        distance_m = bridge.run(goal, num_steps).distance_m
+        if backend.simulator is not None:
+            distance_m = float(np.linalg.norm(backend.simulator.object_position() - goal))
+        yield Outcome(goal, distance_m, distance_m <= policy.success_distance_m)
+
+
+def _seen(backend: Backend) -> StateArray:
+    position = backend.poses.read().position_m
+    if not np.isfinite(position).all():
+        raise RobotError("the object is not seen: put it on the table in view of what sees it")
+    return position
+
+
+def _goal_for(object_m: StateArray, rng: np.random.Generator, policy: RobotPolicy) -> StateArray:
+    """(3,) a goal for an object that lies somewhere; behind a wall it depends on that."""
+    start = object_m[None]
+    goal: StateArray = draw_goals(
+        policy.goals, rng, policy.world, policy.success_distance_m, start=start, box=np.empty((1, 0))
+    )[0]
+    return goal

@@ -1,0 +1,266 @@
+"""Safety between policy and robot: bounds and watchdogs that no policy can pass, and a stop with its reason."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Self
+
+import numpy as np
+from pydantic import Field, model_validator
+
+from service.errors import ConfigError
+from service.frozen import FrozenModel
+from service.robot.errors import RobotError, SafetyStopError
+from service.robot.interface import Command, PoseSource, RobotInterface, RobotState
+from service.robot.limits import Box, SetPointLimiter
+from service.robot.watchdogs import PoseWatch, StateWatch, WatchConfig
+from service.types import StateArray
+from service.world_config import Point, WorkspaceConfig
+
+_POLL_S = 0.01
+
+
+class SafetyConfig(FrozenModel):
+    """What a bridge lets through. Speed and acceleration are those of a Franka's Cartesian interface."""
+
+    lower_m: Point | None = Field(
+        None, description="corner of the box of set-points; None: of the policy's workspace, less the margin"
+    )
+    upper_m: Point | None = Field(None, description="the other corner; None: of the workspace, with the margin")
+    margin_m: float = Field(0.05, ge=0.0, le=0.3, description="of the box around the workspace, to the sides and up")
+    lowest_m: float = Field(0.012, ge=0.0, le=0.5, description="least height of a set-point above the table")
+    max_speed_m_s: float = Field(1.7, gt=0.0, le=1e6, description="of the set-point")
+    max_acceleration_m_s2: float = Field(13.0, gt=0.0, le=1e6, description="of the set-point")
+    min_width_m: float = Field(0.0, ge=0.0, le=0.5, description="of the gripper")
+    max_width_m: float = Field(0.08, ge=0.0, le=0.5)
+    max_grip_force_n: float = Field(40.0, gt=0.0, le=200.0)
+    max_tracking_error_m: float = Field(
+        0.15, gt=0.0, le=1.0, description="an arm further than this from its set-point is stuck, or not ours"
+    )
+    max_late_s: float = Field(0.03, gt=0.0, le=0.05, description="a control step or set-point later than this")
+    watch: WatchConfig = WatchConfig()
+
+    @model_validator(mode="after")
+    def _ordered(self) -> Self:
+        if self.min_width_m > self.max_width_m:
+            raise ValueError(f"min_width_m {self.min_width_m:g} is above max_width_m {self.max_width_m:g}")
+        return self
+
+    def box(self, workspace: WorkspaceConfig) -> Box:
+        """The box of set-points of a policy with a workspace.
+
+        Raises:
+            ConfigError: the corners are the wrong way round, or nothing is left above ``lowest_m``.
+        """
+        margin = np.full(3, self.margin_m)
+        lower = np.array(workspace.lower_m) - margin if self.lower_m is None else np.array(self.lower_m)
+        upper = np.array(workspace.upper_m) + margin if self.upper_m is None else np.array(self.upper_m)
+        lower[2] = max(lower[2], self.lowest_m)
+        box = Box(lower, upper)
+        if (lower >= upper).any():
+            raise ConfigError(f"safety: the box {box} is empty: raise upper_m, or lower lower_m or lowest_m")
+        return box
+
+
+def always_held() -> bool:
+    """A dead-man's switch that nobody has to hold, for simulators."""
+    return True
+
+
+class SafeRobot:
+    """A robot behind its safety: every command goes through ``move`` or ``brake``, and any fault ends in ``stop``.
+
+    Args:
+        robot: what moves.
+        poses: what sees the object; None where nothing has to.
+        config: bounds.
+        box: of set-points.
+        held: the dead-man's switch: whether it is held now; asked at every tick, and returns at once.
+        dry_run: command nothing.
+    """
+
+    def __init__(
+        self,
+        robot: RobotInterface,
+        poses: PoseSource | None,
+        config: SafetyConfig,
+        box: Box,
+        *,
+        held: Callable[[], bool] = always_held,
+        dry_run: bool = False,
+    ) -> None:
+        self.config, self._robot, self._poses, self._held, self._dry_run = config, robot, poses, held, dry_run
+        self.limiter = SetPointLimiter(box, config.max_speed_m_s, config.max_acceleration_m_s2)
+        self.stopped: str | None = None
+        """Why the robot was stopped; None while it was not."""
+        self.width_m = np.nan
+        """Opening that was commanded last."""
+        self._expected_s = np.inf
+        self._moved_s = np.nan
+
+    # --- measuring ---------------------------------------------------------------------------------------------------
+
+    def start(self) -> None:
+        """Begin where the robot is; all watchdogs begin anew.
+
+        Raises:
+            RobotError: it does not answer, is outside its box, the switch is not held, or the object is not seen.
+        """
+        self._state_watch, self._pose_watch = StateWatch(self.config.watch), PoseWatch(self.config.watch)
+        self.limiter.position_m = np.full(3, np.nan)  # nothing was commanded that the robot could be away from
+        self.measure(self._robot.now_s())
+        if not self.limiter.box.contains(self.state.effector_m, margin_m=0.01):
+            self._fail(f"the gripper starts at {_words(self.state.effector_m)}, outside the box {self.limiter.box}")
+        self.limiter.start(self.state.effector_m)
+        self._moved_s = self._expected_s = self._robot.now_s()
+
+    def measure(self, due_s: float) -> None:
+        """Read robot and object into ``state`` and ``object_m``, and check them and the time.
+
+        Args:
+            due_s: when this should have happened.
+
+        Raises:
+            SafetyStopError: the robot was stopped, now or before.
+        """
+        self._check_stopped()
+        try:
+            now_s = self._robot.now_s()
+            fault = self._fault(now_s, due_s)
+        except RobotError as error:
+            self._fail(str(error))
+        if fault is not None:
+            self._fail(fault)
+
+    @property
+    def object_m(self) -> StateArray:
+        """(3,) where the object was seen last, metres; NaN where nothing sees it."""
+        return self._pose_watch.position_m
+
+    @property
+    def object_time_s(self) -> float:
+        """When that was."""
+        return self._pose_watch.time_s
+
+    def _fault(self, now_s: float, due_s: float) -> str | None:
+        """What is wrong, if anything."""
+        if now_s - due_s > self.config.max_late_s:
+            return f"late: a step came {1e3 * (now_s - due_s):.0f} ms after it was due"
+        if not self._held():
+            return "the dead-man's switch was let go"
+        self.state: RobotState = self._robot.read()
+        pose = None if self._poses is None else self._poses.read()
+        # Reading may have taken long; what was read is as old as it is now.
+        now_s = self._robot.now_s()
+        if now_s - due_s > self.config.max_late_s:
+            return f"late: reading took until {1e3 * (now_s - due_s):.0f} ms after it was due"
+        fault = self._state_watch.check(self.state, now_s)
+        if fault is None and pose is not None:
+            fault = self._pose_watch.check(pose, now_s)
+        if fault is not None:
+            return fault
+        away_m = float(np.linalg.norm(self.state.effector_m - self.limiter.position_m))
+        if not self._dry_run and away_m > self.config.max_tracking_error_m:  # NaN before the start: no error
+            return f"the gripper is {away_m:.3f} m from where it was sent"
+        return None
+
+    # --- moving ------------------------------------------------------------------------------------------------------
+
+    def move(self, target_m: StateArray, width_m: float, arrive_s: float) -> None:
+        """Send the next set-point on the way to a target.
+
+        Args:
+            target_m: (3,) wanted end effector, metres.
+            width_m: wanted opening.
+            arrive_s: time in which to arrive.
+
+        Raises:
+            SafetyStopError: the robot was stopped, or the target is not finite.
+        """
+        self.check_finite(np.array([*target_m, width_m, arrive_s]), "a target")
+        self._send(lambda gap_s: self.limiter.move(target_m, arrive_s, gap_s), width_m)
+
+    def check_finite(self, numbers: StateArray, what: str) -> None:
+        """Stop the robot if not all numbers are finite.
+
+        Raises:
+            SafetyStopError: they are not.
+        """
+        if not np.isfinite(numbers).all():
+            self._fail(f"{what} is not finite: {', '.join(f'{number:g}' for number in numbers)}")
+
+    def brake(self, width_m: float) -> None:
+        """Send the next set-point on the way to rest; errors are those of ``move``."""
+        self._send(self.limiter.brake, width_m)
+
+    def _send(self, advance: Callable[[float], StateArray], width_m: float) -> None:
+        self._check_stopped()
+        try:
+            now_s = self._robot.now_s()
+            set_point = advance(now_s - self._moved_s)
+            self._moved_s = now_s
+            self.width_m = float(np.clip(width_m, self.config.min_width_m, self.config.max_width_m))
+            if not self._dry_run:
+                self._robot.command(Command(set_point.copy(), self.width_m, self.config.max_grip_force_n))
+        except RobotError as error:
+            self._fail(str(error))
+        if self.stopped is not None and not self._dry_run:  # by the other thread, and maybe before this command
+            self._robot.stop()
+        self._check_stopped()
+
+    def wait_until(self, time_s: float) -> None:
+        """Wait for the next tick.
+
+        Raises:
+            SafetyStopError: the robot was stopped.
+        """
+        self._expected_s = time_s  # the next sign of life
+        try:
+            self._robot.wait_until(time_s)
+        except RobotError as error:
+            self._fail(str(error))
+
+    # --- stopping ----------------------------------------------------------------------------------------------------
+
+    def stop(self, reason: str) -> None:
+        """Halt the robot; the first reason counts."""
+        self.stopped = self.stopped or reason
+        if not self._dry_run:
+            self._robot.stop()
+
+    @contextmanager
+    def guarded(self) -> Iterator[None]:
+        """Stop the robot if the block ends by an error or a signal, or if it hangs: another thread looks after it."""
+        ended = threading.Event()
+        self._expected_s = np.inf
+        thread = threading.Thread(target=self._look_after, args=(ended,), daemon=True, name="robot-watch")
+        thread.start()
+        try:
+            yield
+        except BaseException as error:
+            self.stop(self.stopped or f"{type(error).__name__}: {error}")
+            raise
+        finally:
+            ended.set()
+            thread.join()
+
+    def _look_after(self, ended: threading.Event) -> None:
+        """Stop the robot once its clock says that the loop has not looked at it for too long."""
+        while not ended.wait(_POLL_S):
+            late_s = self._robot.now_s() - self._expected_s
+            if self.stopped is None and late_s > self.config.max_late_s + _POLL_S:
+                self.stop(f"late: the control loop hangs, for {1e3 * late_s:.0f} ms already")
+
+    def _check_stopped(self) -> None:
+        if self.stopped is not None:
+            raise SafetyStopError(f"stopped: {self.stopped}")
+
+    def _fail(self, reason: str) -> None:
+        self.stop(reason)
+        self._check_stopped()
+
+
+def _words(point: StateArray) -> str:
+    return "(" + ", ".join(f"{number:.3f}" for number in np.asarray(point)) + ") m"

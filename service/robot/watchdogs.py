@@ -1,0 +1,90 @@
+"""Watchdogs over what is measured: late, frozen, jumping and missing measurements of a robot and of its object."""
+
+from __future__ import annotations
+
+import numpy as np
+from pydantic import Field
+
+from service.frozen import FrozenModel
+from service.robot.interface import ObjectPose, RobotState
+from service.types import StateArray
+
+_CLOCKS_AGREE_S = 0.02
+
+
+class WatchConfig(FrozenModel):
+    """How old and how wrong measurements may be before the robot is stopped."""
+
+    max_pose_age_s: float = Field(0.15, gt=0.0, le=2.0, description="of the newest pose that can be believed")
+    max_frozen_s: float = Field(0.08, gt=0.0, le=2.0, description="for which poses may keep the same time stamp")
+    max_object_speed_m_s: float = Field(3.0, gt=0.0, le=100.0, description="a cube that falls from 35 cm has 2.6")
+    jump_allowance_m: float = Field(0.05, ge=0.0, le=1.0, description="added to what that speed allows: noise")
+    max_jump_s: float = Field(0.08, gt=0.0, le=2.0, description="for which poses that jump are passed over")
+    max_state_age_s: float = Field(0.1, gt=0.0, le=2.0, description="of what the robot says of itself")
+
+
+class StateWatch:
+    """Watches what a robot says of itself."""
+
+    def __init__(self, config: WatchConfig) -> None:
+        self._config = config
+
+    def check(self, state: RobotState, now_s: float) -> str | None:
+        """What is wrong with a measurement, if anything."""
+        if not state.connected:
+            return "the robot takes no more commands"
+        if not (np.isfinite(state.effector_m).all() and np.isfinite(state.fingers_m).all()):
+            return "the robot's state is not finite"
+        age_s = now_s - state.time_s
+        if not age_s <= self._config.max_state_age_s:
+            return f"the robot's state is {1e3 * age_s:.0f} ms old"
+        if age_s < -_CLOCKS_AGREE_S:
+            return f"the robot's state is of {-1e3 * age_s:.0f} ms in the future"
+        return None
+
+
+class PoseWatch:
+    """Watches the object's poses, and keeps the last one that can be believed.
+
+    A pose that is missing (NaN) or jumps is passed over, and the one before it stands in for a while.
+    """
+
+    def __init__(self, config: WatchConfig) -> None:
+        self._config = config
+        self.position_m: StateArray = np.full(3, np.nan)
+        """(3,) the last position that can be believed; NaN before the first."""
+        self.time_s = -np.inf
+        """When that was measured."""
+        self._stamp_s, self._new_s = -np.inf, -np.inf
+        self._jumping_since_s: float | None = None
+        self._gap_s = 0.0
+
+    def check(self, pose: ObjectPose, now_s: float) -> str | None:
+        """Take a pose; what is wrong, if anything."""
+        if not np.isfinite(pose.time_s) or pose.time_s - now_s > _CLOCKS_AGREE_S:
+            return f"an object pose of {pose.time_s:.3f} s, at {now_s:.3f} s by the robot's clock: set the clocks alike"
+        if pose.time_s > self._stamp_s:
+            self._stamp_s, self._new_s = pose.time_s, now_s
+            self._take(pose, now_s)
+        if not np.isfinite(self.time_s):
+            return "the object is not seen"
+        if now_s - self._new_s > self._config.max_frozen_s:
+            return f"the object's pose is frozen: no new one for {1e3 * (now_s - self._new_s):.0f} ms"
+        if self._jumping_since_s is not None and now_s - self._jumping_since_s > self._config.max_jump_s:
+            return f"the object's pose jumps, for {1e3 * (now_s - self._jumping_since_s):.0f} ms already"
+        if now_s - self.time_s > self._config.max_pose_age_s:
+            return f"the object's newest pose is {1e3 * (now_s - self.time_s):.0f} ms old"
+        return None
+
+    def _take(self, pose: ObjectPose, now_s: float) -> None:
+        if not np.isfinite(pose.position_m).all():
+            return
+        if np.isfinite(self.time_s):
+            far_m = float(np.linalg.norm(pose.position_m - self.position_m))
+            if self._jumping_since_s is None:
+                self._gap_s = pose.time_s - self.time_s  # kept while it jumps, or in time any jump were slow enough
+            if far_m > self._config.jump_allowance_m + self._config.max_object_speed_m_s * self._gap_s:
+                self._jumping_since_s = now_s if self._jumping_since_s is None else self._jumping_since_s
+                return
+        self._jumping_since_s = None
+        self.position_m, self.time_s = np.array(pose.position_m, dtype=np.float64), pose.time_s
