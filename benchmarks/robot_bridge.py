@@ -102,9 +102,7 @@ def measure_row(row: Row, policy: RobotPolicy, settings: Settings) -> dict[str, 
         found = calibrate(described.label, undisturbed.robot, policy.world, config)
         share, gain = found.covered_share, found.gain
     motion = _Motion()
-    bridge = Bridge(
-        policy.policy, backend.robot, backend.poses, policy.world, config, gain=gain, record=motion.record
-    )
+    bridge = Bridge(policy.policy, backend.robot, backend.poses, policy.world, config, gain=gain, record=motion.record)
     num_reached, stops = _play(bridge, backend, policy, settings, motion)
     low, high = wilson_interval(num_reached, settings.num_episodes)
     return {
@@ -138,7 +136,7 @@ def _play(
             motion.end_episode()
             stops.append(str(error))
             first += 1
-            bridge.safe.stopped = None
+            bridge.safe.release()
     return num_reached, stops
 
 

@@ -62,7 +62,9 @@ class Calibration(FrozenModel):
     @property
     def gain(self) -> tuple[float, float, float]:
         """By what the ways of actions are multiplied, so that the arm covers no more than in training; 1 at most."""
-        x, y, z = (min(wanted / found, 1.0) for wanted, found in zip(self.training_share, self.covered_share, strict=True))
+        x, y, z = (
+            min(wanted / found, 1.0) for wanted, found in zip(self.training_share, self.covered_share, strict=True)
+        )
         return x, y, z
 
     def check(self, robot: str, world: WorldConfig, config: BridgeConfig) -> None:

@@ -230,6 +230,10 @@ class SafeRobot:
         if not self._dry_run:
             self._robot.stop()
 
+    def release(self) -> None:
+        """Let a robot that was stopped be commanded again, once somebody has seen to what was wrong."""
+        self.stopped = None
+
     @contextmanager
     def guarded(self) -> Iterator[None]:
         """Stop the robot if the block ends by an error or a signal, or if it hangs: another thread looks after it."""
