@@ -112,7 +112,7 @@ class Bridge:
         commands = deque([np.zeros(ACTION.size)] * _NUM_KEPT, maxlen=_NUM_KEPT)
         seen: deque[FloatArray] = deque(maxlen=self._config.observation_delay_steps + 1)
         with self.safe.guarded():
-            self.safe.start()
+            self.safe.start(self._tick_s)
             start_s = self._robot.now_s()
             for step in range(num_steps):
                 due_s = start_s + step * self._step_s

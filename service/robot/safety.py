@@ -102,8 +102,11 @@ class SafeRobot:
 
     # --- measuring ---------------------------------------------------------------------------------------------------
 
-    def start(self) -> None:
+    def start(self, rested_s: float = 0.0) -> None:
         """Begin where the robot is; all watchdogs begin anew.
+
+        Args:
+            rested_s: time for which it has been at rest, as far as its first set-point may use that.
 
         Raises:
             RobotError: it does not answer, is outside its box, the switch is not held, or the object is not seen.
@@ -114,7 +117,8 @@ class SafeRobot:
         if not self.limiter.box.contains(self.state.effector_m, margin_m=0.01):
             self._fail(f"the gripper starts at {_words(self.state.effector_m)}, outside the box {self.limiter.box}")
         self.limiter.start(self.state.effector_m)
-        self._moved_s = self._expected_s = self._robot.now_s()
+        self._expected_s = self._robot.now_s()
+        self._moved_s = self._expected_s - rested_s
 
     def measure(self, due_s: float) -> None:
         """Read robot and object into ``state`` and ``object_m``, and check them and the time.
