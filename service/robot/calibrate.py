@@ -18,7 +18,7 @@ from pydantic import Field, ValidationError
 
 from service.config_tree import read_yaml
 from service.envs.batch import DISPLACEMENT_M
-from service.envs.observations import ACTION, BOB
+from service.envs.observations import ACTION, POSITIONS
 from service.envs.robot import described
 from service.errors import TandemError
 from service.frozen import FrozenModel
@@ -187,7 +187,7 @@ class _Motions:
         self._step += 1
         action = np.zeros((1, ACTION.size), dtype=np.float32)
         if step < _APPROACH_STEPS:
-            way = (self._middle_m - observation[0, BOB["effector"]]) / DISPLACEMENT_M
+            way = (self._middle_m - observation[0, POSITIONS["effector"]]) / DISPLACEMENT_M
             action[0, :3] = np.clip(_APPROACH_ACTION * way, -_APPROACH_ACTION, _APPROACH_ACTION)
         elif step >= _APPROACH_STEPS + _REST_STEPS and index < len(_DIRECTIONS):
             action[0, :3] = _ACTION * _DIRECTIONS[index]

@@ -16,7 +16,7 @@ from pydantic import Field
 
 from service.actors.evaluation import DeterministicPolicy
 from service.envs.batch import DISPLACEMENT_M, WIDTH_CHANGE_M
-from service.envs.observations import ACTION, POSITIONS, ObservationLayout, bob_observation
+from service.envs.observations import ACTION, COMMAND_PREFIX, ObservationLayout, bob_observation, layouts
 from service.frozen import FrozenModel
 from service.robot.interface import PoseSource, RobotInterface, RobotState
 from service.robot.safety import SafeRobot, SafetyConfig, always_held
@@ -84,7 +84,8 @@ class Bridge:
     ) -> None:
         self._policy, self._robot, self._config, self._record = policy, robot, config, record
         self._gain = np.array(gain)
-        self._layout = POSITIONS
+        self._layout = layouts(world.observed).positions
+        self._num_commands = world.observed.num_commands
         self._step_s = world.physics_step_s * world.num_substeps
         self._tick_s = self._step_s / config.set_points_per_step
         box = config.safety.box(world.workspace)
@@ -109,7 +110,8 @@ class Bridge:
         begin = getattr(self._policy, "begin", None)
         if begin is not None:
             begin()
-        commands = deque([np.zeros(ACTION.size)] * _NUM_KEPT, maxlen=_NUM_KEPT)
+        num = self._num_commands
+        commands = deque([np.zeros(ACTION.size)] * num, maxlen=num)
         seen: deque[FloatArray] = deque(maxlen=self._config.observation_delay_steps + 1)
         with self.safe.guarded():
             self.safe.start(self._tick_s)
@@ -177,10 +179,6 @@ class Bridge:
             self.safe.measure(now_s + tick * self._tick_s)
 
 
-_NUM_KEPT = 8
-"""Last commands that are kept, the newest first: as many as a layout may ask for."""
-
-
 def observe(
     layout: ObservationLayout,
     state: RobotState,
@@ -202,7 +200,7 @@ def observe(
         "fingers": state.fingers_m,
         "object": object_m,
         "object_from_effector": object_m - state.effector_m,
-        **{f"command_{age}": command for age, command in enumerate(commands, start=1)},
+        **{f"{COMMAND_PREFIX}{age}": command for age, command in enumerate(commands, start=1)},
     }
     positions = np.empty((1, layout.size), dtype=np.float32)
     for name, part in layout.columns.items():

@@ -12,7 +12,7 @@ from service.downstream.compose import check_robot
 from service.downstream.directory import made_with, read_json, read_trial
 from service.downstream.methods import find_method, load_for
 from service.downstream.policy import load_policy
-from service.envs.observations import ACTION, BOB
+from service.envs.observations import ACTION, layouts
 from service.envs.sampling import GoalKind
 from service.envs.tasks import SUCCESS_DISTANCE_M, find_task
 from service.errors import TandemError
@@ -44,7 +44,7 @@ def load_robot_policy(reference: str, registry: Path) -> RobotPolicy:
     """
     directory = Path(reference)
     found = _orchestrator(directory, registry) if (directory / "cell.json").is_file() else _bob(reference, registry)
-    size = BOB.size
+    size = layouts(found.world.observed).bob.size
     try:
         shape = found.policy.act_deterministic(np.zeros((1, size), dtype=np.float32)).shape
     except ValueError as error:

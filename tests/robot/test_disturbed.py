@@ -1,0 +1,77 @@
+import numpy as np
+import pytest
+
+from service.errors import TandemError
+from service.robot.backends import BackendConfig, connect, read_backend
+from service.robot.disturbed import DisturbanceConfig, DisturbedPoses, DisturbedRobot
+from service.robot.interface import Command
+from service.world_config import WorldConfig
+from tests.robot.fakes import OBJECT_M, FakeRobot
+
+
+def test_commands_and_states_come_as_late_as_asked():
+    inner = FakeRobot()
+    robot = DisturbedRobot(inner, DisturbanceConfig(state_delay_s=0.04, command_delay_s=0.02))
+    seen = []
+    for tick in range(30):
+        robot.command(Command(np.array([tick, 0.0, 0.0]), 0.0))
+        seen.append((robot.now_s(), robot.read().time_s))
+        robot.wait_until(0.004 * (tick + 1))
+    for time_s, command in inner.commands:
+        assert time_s == pytest.approx(0.004 * command.effector_m[0] + 0.02)
+    assert len(inner.commands) == 26  # the last ones are still on their way
+    assert all(state_s == pytest.approx(max(now_s - 0.04, 0.0)) for now_s, state_s in seen)
+    robot.stop()
+    robot.wait_until(1.0)
+    assert len(inner.commands) == 26
+    assert inner.stops == [pytest.approx(0.12)]
+
+
+def test_poses_are_late_noisy_and_off_alike_for_a_seed():
+    config = DisturbanceConfig(pose_delay_s=0.04, pose_noise_m=0.005, pose_offset_m=(0.01, 0.0, -0.02))
+
+    def read(seed, reads_per_tick=1):
+        robot = FakeRobot()
+        poses = DisturbedPoses(robot.poses, robot.now_s, config, seed=seed)
+        found = []
+        for tick in range(2000):
+            found.append([poses.read() for _ in range(reads_per_tick)][-1])
+            robot.wait_until(0.004 * (tick + 1))
+        return np.array([pose.position_m for pose in found]), np.array([pose.time_s for pose in found])
+
+    places, times = read(0)
+    np.testing.assert_allclose(times[10:], 0.004 * np.arange(1990), atol=1e-9)
+    np.testing.assert_allclose(places.mean(axis=0) - OBJECT_M, config.pose_offset_m, atol=5e-4)
+    np.testing.assert_allclose(places.std(axis=0), 0.005, rtol=0.05)
+    np.testing.assert_array_equal(read(0, reads_per_tick=3)[0], places)  # a pose that is read again stays what it was
+    assert (read(1)[0] != places).any()
+
+
+def test_back_ends_by_name_file_and_function(tmp_path):
+    assert read_backend("mujoco") == BackendConfig(backend="mujoco")
+    file = tmp_path / "late.yaml"
+    file.write_text("backend: mujoco\nname: late\ndisturbance: {pose_delay_s: 0.04}\n")
+    described = read_backend(str(file))
+    assert (described.label, described.disturbance.pose_delay_s) == ("late", 0.04)
+    assert isinstance(connect(described, WorldConfig()).poses, DisturbedPoses)
+    own = read_backend("service.robot.mujoco_robot:connect")
+    assert type(connect(own, WorldConfig()).robot).__name__ == "MujocoRobot"
+
+
+@pytest.mark.parametrize(
+    ("text", "match"),
+    [
+        (None, "unknown robot 'armm': name mujoco, pybullet, franka"),
+        ("backend: mujoco\nparamters: {}\n", "unknown key 'paramters'"),
+        ("backend: mujoco\ndisturbance: {pose_delay_s: -1}\n", r"disturbance.pose_delay_s = -1: .*greater than"),
+        ("backend: mujoco\nparameters: {friction: high}\n", "robot mujoco: parameters: friction = 'high'"),
+        ("backend: nowhere:at_all\n", "robot 'nowhere:at_all' cannot be loaded: No module named 'nowhere'"),
+    ],
+)
+def test_what_is_no_robot(text, match, tmp_path):
+    reference = "armm"
+    if text is not None:
+        (tmp_path / "robot.yaml").write_text(text)
+        reference = str(tmp_path / "robot.yaml")
+    with pytest.raises(TandemError, match=match):
+        connect(read_backend(reference), WorldConfig())

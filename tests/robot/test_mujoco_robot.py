@@ -1,0 +1,135 @@
+import numpy as np
+import pytest
+
+from service.envs.batch import WorldBatch
+from service.errors import TandemError
+from service.robot.calibrate import Calibration, measure_response, read_calibration, write_calibration
+from service.robot.errors import RobotError
+from service.robot.interface import Command
+from service.robot.loop import Bridge, BridgeConfig
+from service.robot.mujoco_robot import MujocoParameters, MujocoRobot
+
+JUMPS = BridgeConfig(
+    set_points_per_step=1,
+    safety={"max_speed_m_s": 1e6, "max_acceleration_m_s2": 1e6, "max_tracking_error_m": 1.0, "margin_m": 0.3},
+)
+SMOOTH = BridgeConfig(set_points_per_step=8)
+
+
+def test_without_bounds_the_bridge_plays_what_the_evaluator_plays(champion):
+    """The same observations and actions to the tenth of a millimetre, until contacts make more of it."""
+    world, goal = champion.config.world, np.array([[-0.1, 0.05, 0.2]])
+    with WorldBatch(world, 1) as worlds:
+        worlds.reset(np.random.default_rng(4))
+        robot = MujocoRobot(world)
+        robot.reset(worlds.object_position[0])
+        rows, paths = [], []
+        Bridge(champion.policy, robot, robot.poses, world, JUMPS, record=rows.append).run(goal[0], 50)
+        for _ in range(50):
+            paths.append(worlds.ee_position[0].copy())
+            worlds.step(champion.policy.act_deterministic(np.hstack([worlds.positions(), goal]).astype(np.float32)))
+        near = np.linalg.norm(worlds.object_position[0] - goal[0])
+    np.testing.assert_allclose([row["effector_m"] for row in rows[:8]], paths[:8], atol=1e-4)
+    assert near < 0.05
+    assert np.linalg.norm(robot.object_position() - goal[0]) < 0.05
+
+
+def test_the_champion_reaches_a_goal_within_the_bounds_of_a_franka(champion):
+    world, goal = champion.config.world, np.array([-0.1, 0.05, 0.2])
+    robot = MujocoRobot(world, MujocoParameters(feed_forward=1.0))
+    robot.reset(np.array([0.0, 0.05, 0.025]))
+    bridge = Bridge(champion.policy, robot, robot.poses, world, SMOOTH, gain=(0.62, 0.62, 0.62))
+    episode = bridge.run(goal, 50)
+    assert episode.distance_m < 0.05
+    assert robot.now_s() >= 2.0
+
+
+def test_the_real_arm_stays_in_its_box_whatever_a_policy_wants(champion):
+    world = champion.config.world
+    robot = MujocoRobot(world)
+    robot.reset(np.array([0.1, 0.15, 0.025]))
+    box = SMOOTH.safety.box(world.workspace)
+    corners = np.array([[1, 1, -1, -1], [-1, 1, -1, 1], [-1, -1, 1, -1], [1, -1, -1, 1]], dtype=np.float32)
+    rows = []
+
+    class ToTheCorners:
+        def act_deterministic(self, observation):
+            return corners[None, len(rows) // 15]
+
+    Bridge(ToTheCorners(), robot, robot.poses, world, SMOOTH, record=rows.append).run(np.zeros(3), 60)
+    tip = np.concatenate([row["measured_m"] for row in rows])
+    assert (tip > box.lower_m - 0.01).all()
+    assert (tip < box.upper_m + 0.01).all()
+    assert tip[:, 2].min() < 0.02  # it did try
+
+
+def test_a_response_is_what_the_arm_covers_and_its_delay(champion):
+    world = champion.config.world
+    steady = measure_response(MujocoRobot(world), world, JUMPS)
+    assert all(0.55 < share < 0.62 for share in steady.covered_share)  # docs: 56 to 61 %
+    close = measure_response(
+        MujocoRobot(world, MujocoParameters(feed_forward=1.0)), world, BridgeConfig(set_points_per_step=2)
+    )
+    assert all(0.9 < share < 1.05 for share in close.covered_share)
+    assert steady.delay_steps > 0.0
+
+
+CALIBRATION = Calibration(
+    robot="mine",
+    arm="panda",
+    step_s=0.04,
+    set_points_per_step=8,
+    max_speed_m_s=1.7,
+    max_acceleration_m_s2=13.0,
+    covered_share=(1.0, 0.8, 0.4),
+    training_share=(0.6, 0.6, 0.6),
+    delay_steps=0.5,
+)
+
+
+def test_a_calibration_shortens_ways_and_lengthens_none(champion, tmp_path):
+    write_calibration(tmp_path / "mine.yaml", CALIBRATION)
+    found = read_calibration(tmp_path / "mine.yaml")
+    assert found == CALIBRATION
+    assert found.gain == pytest.approx((0.6, 0.75, 1.0))
+    found.check("mine", champion.config.world, SMOOTH)
+    with pytest.raises(TandemError, match="measured with robot 'mine', not 'other': calibrate again"):
+        found.check("other", champion.config.world, SMOOTH)
+    with pytest.raises(TandemError, match="set_points_per_step 8, not 10"):
+        found.check("mine", champion.config.world, BridgeConfig())
+    (tmp_path / "bad.yaml").write_text("robot: mine\n")
+    with pytest.raises(TandemError, match=r"bad\.yaml: arm"):
+        read_calibration(tmp_path / "bad.yaml")
+
+
+def test_a_stopped_arm_holds_and_refuses():
+    robot = MujocoRobot(_world())
+    robot.command(Command(np.array([0.1, 0.1, 0.2]), 0.08))
+    robot.wait_until(0.04)
+    robot.stop()
+    robot.stop()
+    robot.wait_until(0.3)
+    before = robot.read().effector_m
+    robot.wait_until(0.6)
+    np.testing.assert_allclose(robot.read().effector_m, before, atol=1e-4)
+    with pytest.raises(RobotError, match="takes no commands until its next start"):
+        robot.command(Command(np.zeros(3), 0.0))
+    robot.reset(np.array([0.0, 0.0, 0.025]))
+    assert robot.now_s() == pytest.approx(0.6)
+    robot.command(Command(robot.read().effector_m, 0.0))
+
+
+def test_parameters_change_the_arm_and_the_grip():
+    robot = MujocoRobot(_world(), MujocoParameters(stiffness_scale=2.0, object_mass_kg=0.5, joint_friction_nm=1.0))
+    usual = MujocoRobot(_world())
+    assert robot.model.actuator_gainprm[0, 0] == 2 * usual.model.actuator_gainprm[0, 0]
+    assert robot.model.body("object").mass[0] == pytest.approx(0.5)
+    assert robot.model.dof_frictionloss[0] == usual.model.dof_frictionloss[0] + 1.0
+    robot.command(Command(robot.read().effector_m, 0.0, grip_force_n=10.0))
+    assert np.abs(robot.model.actuator_forcerange[7:9]).max() == 10.0
+
+
+def _world():
+    from service.config import WorldConfig
+
+    return WorldConfig(physics_step_s=0.005, num_substeps=8)
