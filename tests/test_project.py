@@ -48,7 +48,7 @@ ROOMS = (
     *("store", "status", "runtime", "cli", "__main__"),
 )
 """Each room may import itself and those before it."""
-VERBS = ("demo", "pretrain", "evaluate", "render", "coverage", "export", "registry", "serve", "downstream")
+VERBS = ("demo", "pretrain", "evaluate", "render", "coverage", "export", "registry", "serve", "downstream", "robot")
 DOCUMENTS = [*sorted(ROOT.glob("*.md")), *sorted((ROOT / "docs").rglob("*.md")), ROOT / "deploy" / "README.md"]
 FOLDERS = (".ci", "benchmarks", "configs", "deploy", "docs", "service", "tests", "tools")
 TEXT = {".cfg", ".json", ".jsonl", ".md", ".py", ".toml", ".txt", ".yaml", ".yml", ""}

@@ -29,8 +29,8 @@ class HeldKey:
     """
 
     def __init__(self, descriptor: int | None = None) -> None:
-        self._descriptor = sys.stdin.fileno() if descriptor is None else descriptor
-        if not os.isatty(self._descriptor):
+        self._descriptor = _standard_input() if descriptor is None else descriptor
+        if self._descriptor < 0 or not os.isatty(self._descriptor):
             raise TandemError(
                 "the dead-man's switch is a key, and standard input is no terminal: run in one, or give "
                 "--dead-man none if your robot has a switch of its own"
@@ -60,3 +60,11 @@ class HeldKey:
             time.sleep(0.02)
             if not self():
                 since_s = time.monotonic()
+
+
+def _standard_input() -> int:
+    """Its descriptor, or -1 where it has none."""
+    try:
+        return sys.stdin.fileno()
+    except (AttributeError, OSError, ValueError):
+        return -1

@@ -10,6 +10,7 @@ import numpy as np
 from pydantic import Field, ValidationError
 
 from service.envs.batch import MAX_SPEED, MAX_TURN_RAD, WorldBatch
+from service.envs.kinematics import Kinematics
 from service.errors import TandemError
 from service.frozen import FrozenModel
 from service.robot.backends import Backend, first_error
@@ -67,6 +68,7 @@ class MujocoRobot:
         self._stopped = False
         self._last: tuple[float, StateArray | None] = (0.0, None)
         """When the joints got their last set-points, and which, before they were moved on."""
+        self._known: tuple[float, Kinematics] | None = None
         self._grip = self.model.actuator_forcerange[self._fingers].copy()
         self.poses = ExactPoses(self)
         self.reset(self._start[self._layout["object"]])
@@ -96,10 +98,8 @@ class MujocoRobot:
 
     def read(self) -> RobotState:
         """The robot as it is."""
-        joints, fingers = self._joints(), self._data.qpos[self._robot.num_joints :][: self._robot.num_fingers]
-        return RobotState(
-            self.now_s(), self._robot.arm.forward(joints).position[0], self._robot.openings(fingers[None])[0]
-        )
+        fingers = self._data.qpos[self._robot.num_joints :][: self._robot.num_fingers]
+        return RobotState(self.now_s(), self._here().position[0].copy(), self._robot.openings(fingers[None])[0])
 
     def command(self, command: Command) -> None:
         """Send the servos to a set-point, as in training; after ``stop``, refuse until ``reset``.
@@ -111,7 +111,7 @@ class MujocoRobot:
             raise RobotError("robot mujoco: it was stopped, and takes no commands until its next start")
         joints = self._joints()
         target = self._reach.clip(np.array(command.effector_m, dtype=np.float64)[None])
-        solution = self._led(self._robot.arm.solve(joints, target))
+        solution = self._led(self._robot.arm.solve(joints, target, at=self._here()))
         self._data.ctrl[: self._robot.num_joints] = np.clip(solution, joints - MAX_TURN_RAD, joints + MAX_TURN_RAD)[0]
         width_m = np.clip([command.width_m], 0.0, self._widest_m)
         self._data.ctrl[self._fingers] = self._robot.finger_values(width_m)[0]
@@ -155,7 +155,7 @@ class MujocoRobot:
         state[layout["object"]] = object_m
         mujoco.mj_setState(self.model, self._data, state[layout.physics], mujoco.mjtState.mjSTATE_FULLPHYSICS)
         self._data.time, self._stopped = now_s, False
-        self._last = (now_s, None)
+        self._last, self._known = (now_s, None), None
         self._data.qacc_warmstart[:] = 0.0
         self._data.ctrl[:] = 0.0
         num_joints = self._robot.num_joints
@@ -172,6 +172,12 @@ class MujocoRobot:
     @property
     def _widest_m(self) -> float:
         return self._robot.opening_m if self.world.gripper == "free" else 0.0
+
+    def _here(self) -> Kinematics:
+        """Where the arm is now; reading it and solving for the next set-point both ask."""
+        if self._known is None or self._known[0] != self._data.time:
+            self._known = (self._data.time, self._robot.arm.forward(self._joints()))
+        return self._known[1]
 
     def _joints(self) -> StateArray:
         """(1, J)."""

@@ -3,7 +3,7 @@ import pytest
 
 from service.envs.batch import WorldBatch
 from service.errors import TandemError
-from service.robot.calibrate import Calibration, measure_response, read_calibration, write_calibration
+from service.robot.calibrate import Calibration, read_calibration, write_calibration
 from service.robot.errors import RobotError
 from service.robot.interface import Command
 from service.robot.loop import Bridge, BridgeConfig
@@ -61,17 +61,6 @@ def test_the_real_arm_stays_in_its_box_whatever_a_policy_wants(champion):
     assert (tip > box.lower_m - 0.01).all()
     assert (tip < box.upper_m + 0.01).all()
     assert tip[:, 2].min() < 0.02  # it did try
-
-
-def test_a_response_is_what_the_arm_covers_and_its_delay(champion):
-    world = champion.config.world
-    steady = measure_response(MujocoRobot(world), world, JUMPS)
-    assert all(0.55 < share < 0.62 for share in steady.covered_share)  # docs: 56 to 61 %
-    close = measure_response(
-        MujocoRobot(world, MujocoParameters(feed_forward=1.0)), world, BridgeConfig(set_points_per_step=2)
-    )
-    assert all(0.9 < share < 1.05 for share in close.covered_share)
-    assert steady.delay_steps > 0.0
 
 
 CALIBRATION = Calibration(

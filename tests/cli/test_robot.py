@@ -1,0 +1,139 @@
+import json
+import os
+import signal
+
+import numpy as np
+import pytest
+import yaml
+from typer.testing import CliRunner
+
+from service.cli.main import app
+from service.robot import backends
+from service.robot.backends import Backend
+from service.robot.log import read_log, states_of
+from tests.robot.fakes import FakeRobot
+
+FAST = ["--set", "set_points_per_step=2"]
+
+
+def invoke(*arguments):
+    return CliRunner().invoke(app, ["robot", *map(str, arguments)])
+
+
+@pytest.fixture(autouse=True)
+def nowhere(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.delenv("TANDEM_REGISTRY", raising=False)
+
+
+def test_goals_are_played_logged_and_drawn_from_the_log(tmp_path):
+    log = tmp_path / "log.jsonl"
+    ran = invoke(
+        "run", "--robot", "mujoco", "--goal=-0.1,0.05,0.2", "--episodes", 2, "--steps", 6, "--log", log, "--json", *FAST
+    )
+    assert ran.exit_code == 0, ran.output
+    assert json.loads(ran.stdout) == {"policy": "panda-cube@6 (bundled)", "robot": "mujoco", "reached": 0, "goals": 2}
+    logged = read_log(log)
+    assert logged.header["bridge"]["set_points_per_step"] == 2
+    assert [len(steps) for steps in logged.episodes] == [6, 6]
+    row = logged.episodes[1][3]
+    assert len(row["set_points_m"]) == len(row["measured_m"]) == 2
+    drawn = states_of(logged, 0.05)
+    assert drawn.states.shape[:2] == (6, 2)
+    from service.envs.batch import WorldBatch
+
+    with WorldBatch(logged.world, 2, num_threads=1) as worlds:
+        worlds.restore(drawn.states[3])
+        np.testing.assert_allclose(worlds.ee_position[1], row["effector_m"], atol=1e-3)
+        np.testing.assert_allclose(worlds.object_position[1], row["object_m"])
+    again = invoke("run", "--robot", "mujoco", "--log", log)
+    assert again.exit_code == 2
+    assert "there is a file already; name another" in again.stderr
+
+
+def test_a_dry_run_says_where_it_would_go_and_moves_nothing():
+    ran = invoke("run", "--robot", "mujoco", "--dry-run", "--steps", 2, *FAST)
+    assert ran.exit_code == 0, ran.output
+    first, second, _ = ran.stdout.splitlines()
+    assert "gripper -0.050, 0.000, 0.080" in first
+    assert "gripper -0.050, 0.000, 0.080" in second
+    assert "would go to" in first
+
+
+def test_what_calibrate_writes_run_reads(tmp_path):
+    out = tmp_path / "arm.yaml"
+    (tmp_path / "mine.yaml").write_text("backend: mujoco\nname: mine\nparameters: {feed_forward: 1.0}\n")
+    made = invoke("calibrate", "--robot", "mine.yaml", "--out", out, *FAST)
+    assert made.exit_code == 0, made.output
+    found = yaml.safe_load(out.read_text())
+    assert found["robot"] == "mine"
+    assert all(0.55 < share < 0.62 for share in found["training_share"])
+    assert all(0.9 < share < 1.05 for share in found["covered_share"])
+    assert 0.0 < found["delay_steps"] < 1.5
+    ran = invoke("run", "--robot", "mine.yaml", "--calibration", out, "--steps", 2, *FAST)
+    assert ran.exit_code == 0, ran.output
+    other = invoke("run", "--robot", "mujoco", "--calibration", out, *FAST)
+    assert other.exit_code == 2
+    assert other.stderr == "error: calibration: measured with robot 'mine', not 'mujoco': calibrate again\n"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "match"),
+    [
+        (["--robot", "armm"], "unknown robot 'armm'"),
+        (["--robot", "mujoco", "--goal", "1,2,3"], "outside the box that the policy was trained in: x -0.225 to 0.125"),
+        (["--robot", "mujoco", "--goal", "here"], "expected x,y,z in metres"),
+        (["--robot", "mujoco", "--policy", "nobody@1"], "nobody"),
+        (["--robot", "mujoco", "--set", "safety.max_speed=1"], "--set: unknown key 'safety.max_speed'"),
+        (["--robot", "mujoco", "--set", "safety.lowest_m=0.49"], "safety: the box .* is empty"),
+        (["--robot", "mujoco", "--calibration", "none.yaml"], "no configuration file none.yaml"),
+        (["--robot", "mujoco", "--dead-man", "button"], "choose key or none"),
+    ],
+)
+def test_what_cannot_be_run_is_one_line(arguments, match):
+    ran = invoke("run", *arguments)
+    assert ran.exit_code == 2, ran.output
+    assert ran.stderr.startswith("error: ")
+    assert ran.stderr.count("\n") == 1
+    import re
+
+    assert re.search(match, ran.stderr), ran.stderr
+
+
+def real(robot):
+    """A back-end with people around it."""
+    return lambda world, parameters: Backend(robot, robot.poses)
+
+
+def test_a_real_robot_wants_a_dead_mans_switch_and_a_person(monkeypatch):
+    robot = FakeRobot()
+    monkeypatch.setattr(backends, "_factory", lambda reference: real(robot))
+    without = invoke("run", "--robot", "their:robot", "--goal", "0,0,0.2")
+    assert without.exit_code == 2
+    assert "the dead-man's switch is a key" in without.stderr
+    assert robot.commands == []
+    ran = CliRunner().invoke(
+        app, ["robot", "run", "--robot", "their:robot", "--goal", "0,0,0.2", "--steps", "3", "--dead-man", "none"], "\n"
+    )
+    assert ran.exit_code == 0, ran.output
+    assert "put arm and object to their start, then press Enter" in ran.stderr
+    assert robot.commands
+
+
+def test_ctrl_c_stops_the_robot_first(monkeypatch, default_signals):
+    robot, closed = FakeRobot(), []
+    command = robot.command
+
+    def interrupted(sent):
+        command(sent)
+        if len(robot.commands) == 5:
+            os.kill(os.getpid(), signal.SIGINT)
+
+    robot.command, robot.close = interrupted, lambda: closed.append(len(robot.stops))
+    monkeypatch.setattr(backends, "_factory", lambda reference: real(robot))
+    ran = CliRunner().invoke(
+        app, ["robot", "run", "--robot", "their:robot", "--goal", "0,0,0.2", "--dead-man", "none"], "\n"
+    )
+    assert ran.exit_code == 128 + signal.SIGINT
+    assert len(robot.commands) == 5
+    assert closed == [1]  # it was stopped, then given back

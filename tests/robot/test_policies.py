@@ -1,0 +1,56 @@
+import json
+
+import numpy as np
+import pytest
+
+from service.downstream.learner import make_loop
+from service.downstream.methods import METHODS, provenance
+from service.downstream.policy import save_policy
+from service.downstream.worker import make_worlds
+from service.errors import TandemError
+from service.primitives.bundled import BUNDLED
+from service.robot.policies import load_robot_policy
+from tests.downstream.trials import small_trial
+
+
+def write_training(path, champion, method="ours"):
+    """What a bridge reads of a downstream training's directory."""
+    trial = small_trial(method, task="wall")
+    worlds = make_worlds(trial, METHODS[method], champion, 1)
+    parameters = make_loop(trial, METHODS[method], champion, worlds).learner.averaged_parameters()
+    worlds.close()
+    path.mkdir()
+    about = {"format_version": 1, "cell": trial.model_dump(mode="json"), **provenance(champion, method)}
+    (path / "cell.json").write_text(json.dumps(about))
+    save_policy(path / "policy.safetensors", parameters, method, champion)
+
+
+def test_a_bob_and_an_orchestrator_with_its_world(champion, tmp_path):
+    bob = load_robot_policy("panda-cube@champion", tmp_path)
+    assert (bob.goals, bob.world.fixture) == ("mixed", "none")
+    write_training(tmp_path / "wall", champion)
+    found = load_robot_policy(str(tmp_path / "wall"), BUNDLED)
+    assert (found.label, found.goals, found.world.fixture) == ("wall-ours-0", "table", "wall")
+    action = found.policy.act_deterministic(np.zeros((1, 14), dtype=np.float32))
+    assert action.shape == (1, 4)
+
+
+def test_what_is_no_policy_for_a_robot(champion, tmp_path, monkeypatch):
+    write_training(tmp_path / "alone", champion, "scratch-mcp-her")
+    with pytest.raises(TandemError, match="acts without primitives"):
+        load_robot_policy(str(tmp_path / "alone"), BUNDLED)
+    with pytest.raises(TandemError, match="no such run directory"):
+        load_robot_policy("runs/nothing", BUNDLED)
+
+    class Narrow:
+        def act_deterministic(self, observation):
+            return observation @ np.zeros((12, 4), dtype=np.float32)
+
+    monkeypatch.setattr(
+        "service.robot.policies.load_bob",
+        lambda *given: type(
+            "Bob", (), {"label": "narrow", "policy": Narrow(), "config": champion.config, "manifest": None}
+        )(),
+    )
+    with pytest.raises(TandemError, match="narrow does not take 14 numbers"):
+        load_robot_policy("narrow", BUNDLED)
