@@ -19,7 +19,9 @@ from service.robot.watchdogs import PoseWatch, StateWatch, WatchConfig
 from service.types import StateArray
 from service.world_config import Point, WorkspaceConfig
 
+_NUM_TRIED = 5
 _POLL_S = 0.01
+_START_MARGIN_M = 0.01
 
 
 class SafetyConfig(FrozenModel):
@@ -102,23 +104,32 @@ class SafeRobot:
 
     # --- measuring ---------------------------------------------------------------------------------------------------
 
-    def start(self, rested_s: float = 0.0) -> None:
-        """Begin where the robot is; all watchdogs begin anew.
+    def start(self, tick_s: float = 0.0) -> None:
+        """Begin where the robot is, at rest; all watchdogs begin anew.
 
         Args:
-            rested_s: time for which it has been at rest, as far as its first set-point may use that.
+            tick_s: time between two set-points; 0 for not known.
 
         Raises:
-            RobotError: it does not answer, is outside its box, the switch is not held, or the object is not seen.
+            RobotError: it does not answer or answers too late, is outside its box, the switch is not held, or the
+                object is not seen.
         """
         self._state_watch, self._pose_watch = StateWatch(self.config.watch), PoseWatch(self.config.watch)
         self.limiter.position_m = np.full(3, np.nan)  # nothing was commanded that the robot could be away from
-        self.measure(self._robot.now_s())
-        if not self.limiter.box.contains(self.state.effector_m, margin_m=0.01):
+        begin_s = self._robot.now_s()
+        for _ in range(_NUM_TRIED):
+            self.measure(self._robot.now_s())
+        took_s = (self._robot.now_s() - begin_s) / _NUM_TRIED
+        if 0.0 < tick_s < took_s:
+            self._fail(
+                f"it answers late: reading takes {1e3 * took_s:.1f} ms, and a set-point is due every "
+                f"{1e3 * tick_s:.1f} ms: lower set_points_per_step"
+            )
+        if not self.limiter.box.contains(self.state.effector_m, margin_m=_START_MARGIN_M):
             self._fail(f"the gripper starts at {_words(self.state.effector_m)}, outside the box {self.limiter.box}")
         self.limiter.start(self.state.effector_m)
         self._expected_s = self._robot.now_s()
-        self._moved_s = self._expected_s - rested_s
+        self._moved_s = self._expected_s - tick_s
 
     def measure(self, due_s: float) -> None:
         """Read robot and object into ``state`` and ``object_m``, and check them and the time.
@@ -257,7 +268,11 @@ class SafeRobot:
     def _look_after(self, ended: threading.Event) -> None:
         """Stop the robot once its clock says that the loop has not looked at it for too long."""
         while not ended.wait(_POLL_S):
-            late_s = self._robot.now_s() - self._expected_s
+            try:
+                late_s = self._robot.now_s() - self._expected_s
+            except Exception as error:  # without a clock nobody looks after it
+                self.stop(f"the robot's clock cannot be read: {error}")
+                return
             if self.stopped is None and late_s > self.config.max_late_s + _POLL_S:
                 self.stop(f"late: the control loop hangs, for {1e3 * late_s:.0f} ms already")
 

@@ -14,7 +14,8 @@ OBJECT_M = np.array([0.0, 0.05, 0.025])
 class FakeRobot:
     """Follows its set-points with a lag of first order; ``fault`` names what is wrong from ``fault_s`` on."""
 
-    def __init__(self, lag_s=0.0, jitter_s=0.0, rng=None):
+    def __init__(self, lag_s=0.0, jitter_s=0.0, rng=None, read_s=0.0):
+        self.read_s = read_s
         self.time_s, self.lag_s, self.jitter_s, self.rng = 0.0, lag_s, jitter_s, rng
         self.effector_m, self.fingers_m, self.set_point_m = HOME_M.copy(), np.array([0.04, 0.04]), HOME_M.copy()
         self.commands: list[tuple[float, Command]] = []
@@ -37,8 +38,7 @@ class FakeRobot:
     def read(self):
         if self.has("read fails"):
             raise RobotError("no answer")
-        if self.has("slow read"):
-            self.time_s += 0.06
+        self.time_s += 0.06 if self.has("slow read") else self.read_s
         time_s = self.fault_s if self.has("stale state") else self.time_s
         effector = np.full(3, np.nan) if self.has("lost joints") else self.effector_m.copy()
         return RobotState(time_s, effector, self.fingers_m.copy(), connected=not self.has("disconnected"))

@@ -155,6 +155,7 @@ def test_what_is_wrong_before_the_start_moves_nothing():
     outside = FakeRobot()
     outside.effector_m = np.array([-0.05, 0.0, 0.6])
     refused(outside, r"starts at \(-0.050, 0.000, 0.600\) m, outside the box x -0.275 to 0.175")
+    refused(FakeRobot(read_s=0.009), "it answers late: reading takes 9.0 ms, and a set-point is due every 8.0 ms")
     for fault, match in (("slow read", "late: reading took"), ("unseen", "not seen"), ("switch", "switch was let go")):
         robot = FakeRobot()
         robot.fault, robot.fault_s = fault, 0.0

@@ -1,0 +1,63 @@
+import numpy as np
+
+from service.config import WorldConfig
+from service.envs.observations import layouts
+from service.robot.loop import Bridge, BridgeConfig
+from tests.robot.fakes import HOME_M, OBJECT_M, FakeRobot
+
+GOAL_M = np.array([0.0, 0.1, 0.2])
+
+
+class Counting:
+    """Acts by the number of its step, in hundredths, and keeps what it saw."""
+
+    def __init__(self):
+        self.seen = []
+
+    def begin(self):
+        self.seen.clear()
+
+    def act_deterministic(self, observation):
+        self.seen.append(observation[0].copy())
+        return np.full((1, 4), 0.01 * len(self.seen), dtype=np.float32)
+
+
+def played(config, world=None, num_steps=5):
+    robot, policy, rows = FakeRobot(), Counting(), []
+    bridge = Bridge(policy, robot, robot.poses, world or WorldConfig(), config, record=rows.append)
+    bridge.run(GOAL_M, num_steps)
+    return robot, policy.seen, rows, bridge
+
+
+def test_an_observation_has_the_layout_of_the_policys_world():
+    world = WorldConfig(observed={"num_commands": 2})
+    bob = layouts(world.observed).bob
+    _, seen, rows, _ = played(BridgeConfig(), world)
+    first, third = seen[0], seen[2]
+    assert third.shape == (bob.size,)
+    np.testing.assert_allclose(first[bob["effector"]], HOME_M, atol=1e-6)
+    np.testing.assert_allclose(third[bob["effector"]], rows[2]["effector_m"], atol=1e-6)
+    np.testing.assert_allclose(third[bob["fingers"]], 0.04)
+    np.testing.assert_allclose(third[bob["object"]], OBJECT_M, atol=1e-6)
+    np.testing.assert_allclose(third[bob["object_from_effector"]], OBJECT_M - rows[2]["effector_m"], atol=1e-6)
+    np.testing.assert_allclose(third[bob["goal"]], GOAL_M, atol=1e-6)
+    np.testing.assert_allclose(first[bob["command_1"]], 0.0)
+    np.testing.assert_allclose(third[bob["command_1"]], 0.02, atol=1e-6)  # the newest first
+    np.testing.assert_allclose(third[bob["command_2"]], 0.01, atol=1e-6)
+
+
+def test_observations_come_as_many_steps_late_as_asked():
+    _, on_time, _, _ = played(BridgeConfig())
+    _, late, rows, bridge = played(BridgeConfig(observation_delay_steps=2))
+    np.testing.assert_allclose([row[:3] for row in late[2:]], [row["effector_m"] for row in rows[:3]], atol=1e-6)
+    assert (late[4] != on_time[4]).any()
+    bridge.run(GOAL_M, 1)  # a new episode remembers nothing of the one before
+    np.testing.assert_allclose(bridge._policy.seen[0][:3], rows[5]["effector_m"], atol=1e-6)
+
+
+def test_steps_are_40_ms_and_end_at_rest():
+    robot, _, rows, bridge = played(BridgeConfig(set_points_per_step=4), num_steps=3)
+    np.testing.assert_allclose([row["time_s"] for row in rows], [0.0, 0.04, 0.08], atol=1e-9)
+    np.testing.assert_allclose(rows[1]["tick_times_s"], [0.04, 0.05, 0.06, 0.07], atol=1e-9)
+    assert bridge.safe.limiter.is_still
+    assert len(robot.commands) > 12  # it braked
