@@ -58,6 +58,12 @@ class Calibration(FrozenModel):
     )
     training_share: tuple[float, float, float] = Field(description="the same of the arm in training")
     delay_steps: float = Field(description="control steps from a command until the arm is seen to move")
+    training_delay_steps: float = Field(0.0, description="the same of the arm in training")
+
+    @property
+    def late_steps(self) -> int:
+        """Whole control steps by which it is later than the arm in training."""
+        return max(0, round(self.delay_steps - self.training_delay_steps))
 
     @property
     def gain(self) -> tuple[float, float, float]:
@@ -122,6 +128,7 @@ def calibrate(
         covered_share=found.covered_share,
         training_share=wanted.covered_share,
         delay_steps=found.delay_steps,
+        training_delay_steps=wanted.delay_steps,
     )
 
 

@@ -61,6 +61,8 @@ class Bridge:
         world: of the policy: its step, its workspace, what it observes.
         config: of the bridge.
         gain: (3,) by which the ways of an action are multiplied; see ``calibrate``.
+        late_steps: control steps by which the robot is later than the arm of training, see ``calibrate``; a policy that
+            observes its delay is told, and of ``config.observation_delay_steps``, too.
         held: the dead-man's switch.
         dry_run: command nothing.
         record: takes every step.
@@ -78,12 +80,14 @@ class Bridge:
         config: BridgeConfig,
         *,
         gain: tuple[float, float, float] = _NO_GAIN,
+        late_steps: int = 0,
         held: Callable[[], bool] = always_held,
         dry_run: bool = False,
         record: Record | None = None,
     ) -> None:
         self._policy, self._robot, self._config, self._record = policy, robot, config, record
         self._gain = np.array(gain)
+        self._delay_steps = late_steps + config.observation_delay_steps
         self._layout = layouts(world.observed).positions
         self._num_commands = world.observed.num_commands
         self._step_s = world.physics_step_s * world.num_substeps
@@ -147,7 +151,7 @@ class Bridge:
         state, object_m = safe.state, safe.object_m
         row |= {"effector_m": state.effector_m, "fingers_m": state.fingers_m, "object_m": object_m}
         row |= {"state_time_s": state.time_s, "object_time_s": safe.object_time_s}
-        seen.append(observe(self._layout, state, object_m, commands, goal_m))
+        seen.append(observe(self._layout, state, object_m, commands, goal_m, self._delay_steps))
         action = self._policy.act_deterministic(seen[0])[0].astype(np.float64)
         row["action"] = action
         safe.check_finite(action, "the policy's action")
@@ -185,6 +189,7 @@ def observe(
     object_m: StateArray,
     commands: deque[StateArray],
     goal_m: StateArray,
+    delay_steps: int,
 ) -> FloatArray:
     """(1, O) Bob's input: the entries of his positions from what was measured, and the goal.
 
@@ -194,12 +199,14 @@ def observe(
         object_m: (3,) where the object was seen, metres.
         commands: (4,) each, the newest first: what the policy asked for in the last steps.
         goal_m: (3,) metres.
+        delay_steps: by which what is seen, or what is commanded, is late.
     """
-    measured = {
+    measured: dict[str, StateArray | int] = {
         "effector": state.effector_m,
         "fingers": state.fingers_m,
         "object": object_m,
         "object_from_effector": object_m - state.effector_m,
+        "delay": delay_steps,
         **{f"{COMMAND_PREFIX}{age}": command for age, command in enumerate(commands, start=1)},
     }
     positions = np.empty((1, layout.size), dtype=np.float32)

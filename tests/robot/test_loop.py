@@ -1,8 +1,11 @@
+from collections import deque
+
 import numpy as np
 
 from service.config import WorldConfig
-from service.envs.observations import layouts
-from service.robot.loop import Bridge, BridgeConfig
+from service.envs.observations import Layouts, layouts
+from service.robot.interface import RobotState
+from service.robot.loop import Bridge, BridgeConfig, observe
 from tests.robot.fakes import HOME_M, OBJECT_M, FakeRobot
 
 GOAL_M = np.array([0.0, 0.1, 0.2])
@@ -61,3 +64,15 @@ def test_steps_are_40_ms_and_end_at_rest():
     np.testing.assert_allclose(rows[1]["tick_times_s"], [0.04, 0.05, 0.06, 0.07], atol=1e-9)
     assert bridge.safe.limiter.is_still
     assert len(robot.commands) > 12  # it braked
+
+
+def test_a_policy_that_observes_its_delay_and_commands_is_told():
+    """Entries beyond the paper's: what the layout says, from what the bridge knows."""
+    layout = Layouts(num_commands=2, delay=True).positions
+    state = RobotState(0.0, np.array([0.1, 0.2, 0.3]), np.array([0.01, 0.02]))
+    commands = deque([np.array([0.1, 0.2, 0.3, 0.4]), np.array([-0.1, 0.0, 0.0, 1.0])])
+    row = observe(layout, state, np.array([0.0, 0.0, 0.03]), commands, np.array([0.1, 0.1, 0.1]), 2)[0]
+    np.testing.assert_allclose(row[layout["command_1"]], [0.1, 0.2, 0.3, 0.4], rtol=1e-6)
+    np.testing.assert_allclose(row[layout["command_2"]], [-0.1, 0.0, 0.0, 1.0], rtol=1e-6)
+    assert row[layout["delay"]] == 2.0
+    np.testing.assert_allclose(row[-3:], 0.1, rtol=1e-6)

@@ -81,6 +81,10 @@ def test_a_calibration_shortens_ways_and_lengthens_none(champion, tmp_path):
     found = read_calibration(tmp_path / "mine.yaml")
     assert found == CALIBRATION
     assert found.gain == pytest.approx((0.6, 0.75, 1.0))
+    late = [
+        found.model_copy(update={"delay_steps": steps, "training_delay_steps": 0.4}) for steps in (0.1, 0.8, 1.6, 2.3)
+    ]
+    assert [each.late_steps for each in late] == [0, 0, 1, 2]
     found.check("mine", champion.config.world, SMOOTH)
     with pytest.raises(TandemError, match="measured with robot 'mine', not 'other': calibrate again"):
         found.check("other", champion.config.world, SMOOTH)
