@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks import time_to_skill
-from benchmarks.report import attacks, cluster, comparison, pretraining, robots, scaling, skills, summary
+from benchmarks.report import attacks, cluster, comparison, pretraining, robots, scaling, skills, summary, transfer
 from benchmarks.report.figures import (
     draw_ablations,
     draw_chaos,
@@ -49,6 +49,8 @@ PROGRAMS = {
     "scaling": "benchmarks.scaling",
     "ranks_on_nodes": "tools.ranks_on_nodes",
     "robots": "benchmarks.robots",
+    "transfer": "benchmarks.transfer",
+    "transfer_champion": "benchmarks.transfer --name transfer_champion",
 }
 """Modules by the name of the recorded file that they make."""
 PAGES = {
@@ -58,6 +60,7 @@ PAGES = {
     "results/comparison.md": ("rows", "longer"),
     "downstream.md": ("headline",),
     "robots.md": ("robots",),
+    "results/transfer.md": ("transfer", "transfer_champion"),
     "../README.md": ("headline", "controls"),
     "scaling.md": ("bottleneck", "box", "nodes", "model", "batches", "skill", "constants"),
 }
@@ -142,6 +145,15 @@ def robots_blocks(found: Results) -> Blocks:
     return {"robots": [robots.robots_table(recorded), robots.robots_words(recorded)]} if recorded is not None else {}
 
 
+def transfer_blocks(found: Results) -> Blocks:
+    """Parts of the blocks about frozen policies in another engine."""
+    return {
+        name: [transfer.transfer_table(found[name]), transfer.transfer_words(found[name])]
+        for name in PAGES["results/transfer.md"]
+        if name in found
+    }
+
+
 class Report:
     """Draws pictures into ``docs/results``, and writes the pages.
 
@@ -171,6 +183,7 @@ class Report:
             self.comparison_blocks(trials, longer),
             summary_blocks(trials, ()),
             robots_blocks(found),
+            transfer_blocks(found),
             summary_blocks(trials, controls),
             scaling_blocks(found, studies),
         )

@@ -1,0 +1,343 @@
+"""A frozen policy in an engine nobody here wrote, through the project's own bridge: docs/results/transfer.md.
+
+    python -m benchmarks.transfer --policy panda-cube@champion --json docs/results/transfer.json
+
+Every row has the same policy and the same bridge; rows differ in the back-end, and in what ``calibrate`` measures of
+it. Goals are played in chunks, each with an engine and noise of its own, so no result depends on ``--workers``.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import multiprocessing
+import time
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from benchmarks.measuring import parser_of, run_benchmark
+from benchmarks.report.markdown import percent, table
+from service.actors.evaluation import evaluate, wilson_interval
+from service.downstream.compose import parameters_digest
+from service.envs.sampling import draw_goals, draw_starts
+from service.errors import TandemError
+from service.robot.backends import Backend, BackendConfig, connect
+from service.robot.calibrate import Calibration, calibrate
+from service.robot.disturbed import DisturbanceConfig
+from service.robot.errors import RobotError
+from service.robot.loop import Bridge, BridgeConfig
+from service.robot.policies import RobotPolicy, load_robot_policy
+from service.robot.pybullet_robot import CONTROL_STEP_S, PyBulletParameters, world_of
+from service.robot.safety import SafetyConfig
+from service.types import StateArray
+
+PACKAGES = ("pybullet", "mujoco", "numpy")
+CHUNK = 25
+"""Goals of one engine."""
+SPEED_M_S, ACCELERATION_M_S2 = 1.7, 13.0
+"""Limits of a Franka's Cartesian motion."""
+_REST_STEPS = 4
+"""More than the greatest delay of a row."""
+RESPONSES = (0.4, 0.55, 0.7, 0.85, 1.0)
+
+
+@dataclass(frozen=True, slots=True)
+class Settings:
+    """What is played, and how it is brought to a robot."""
+
+    name: str = "transfer"
+    """Of the recorded file."""
+    policy: str = "panda-cube@champion"
+    larger: str = ""
+    """Directory of an orchestrator for Larger; none by default, and then its row is not measured."""
+    wall: str = ""
+    """The same for Wall."""
+    registry: str = "registry"
+    rows: str = ""
+    """Names of rows, with commas; all by default."""
+    num_goals: int = 300
+    num_steps: int = 50
+    seed: int = 0
+    set_points_per_step: int = 10
+    max_speed_m_s: float = SPEED_M_S
+    max_acceleration_m_s2: float = ACCELERATION_M_S2
+    grip_force_n: float = 140.0
+    """A Franka hand's greatest: the cube is ten times as heavy as in training, and half as rough."""
+    workers: int = 1
+
+
+@dataclass(frozen=True, slots=True)
+class Row:
+    """One line of the table."""
+
+    title: str
+    asked: float
+    """Success at the last step."""
+    policy: Literal["policy", "larger", "wall"] = "policy"
+    parameters: Mapping[str, Any] = field(default_factory=dict)
+    """Of the engine."""
+    disturbance: DisturbanceConfig = field(default_factory=DisturbanceConfig)
+    backend: str = "pybullet"
+
+
+def _late(num_steps: int, **others: Any) -> DisturbanceConfig:
+    """Everything that is observed, ``num_steps`` control steps late."""
+    late_s = num_steps * CONTROL_STEP_S
+    return DisturbanceConfig(state_delay_s=late_s, pose_delay_s=late_s, **others)
+
+
+ROWS = {
+    "nominal": Row("panda-gym's arm and cube", 0.97),
+    "together": Row(
+        "observations one step late, object noise 5 mm, offset 1 cm, together",
+        0.90,
+        disturbance=_late(1, pose_noise_m=0.005, pose_offset_m=(0.01, 0.0, 0.0)),
+    ),
+    "late": Row("observations two steps late (80 ms)", 0.85, disturbance=_late(2)),
+    "noise": Row("object noise 10 mm", 0.90, disturbance=DisturbanceConfig(pose_noise_m=0.01)),
+    **{
+        f"response-{100 * share:.0f}": Row(
+            f"an arm that covers {100 * share:.0f} % of a displacement in a step", 0.92, parameters={"response": share}
+        )
+        for share in RESPONSES
+    },
+    "larger": Row("orchestrator of *Larger*", 0.93, policy="larger"),
+    "wall": Row("orchestrator of *Wall*", 0.93, policy="wall"),
+    "mujoco": Row("the world of training, through the bridge", 0.95, backend="mujoco"),
+}
+"""Rows by name."""
+LIMITED = "nominal"
+"""The row whose tip is asked to stay inside a Franka's limits, with success of ``LIMITED_SUCCESS``."""
+LIMITED_SUCCESS = 0.95
+
+
+@dataclass(frozen=True, slots=True)
+class Job:
+    """One chunk of a row, for a process of its own."""
+
+    row: str
+    chunk: int
+    settings: Settings
+    calibration: Calibration
+
+
+@dataclass(frozen=True, slots=True)
+class Played:
+    """One goal."""
+
+    reached: bool
+    """At the last step."""
+    ever: bool
+    stopped: str
+    """Why the robot was stopped; empty where it was not."""
+    inside: tuple[int, int]
+    """Control steps with the tip, and with the set-point, inside a Franka's limits."""
+    num_steps: int
+
+
+def bridge_config(settings: Settings) -> BridgeConfig:
+    """The bridge of all rows."""
+    safety = SafetyConfig(
+        max_speed_m_s=settings.max_speed_m_s,
+        max_acceleration_m_s2=settings.max_acceleration_m_s2,
+        max_grip_force_n=settings.grip_force_n,
+    )
+    return BridgeConfig(set_points_per_step=settings.set_points_per_step, safety=safety)
+
+
+def policy_of(row: Row, settings: Settings) -> RobotPolicy:
+    """The policy of a row, in the world of its back-end."""
+    found = load_robot_policy(getattr(settings, row.policy), Path(settings.registry))
+    if row.backend != "pybullet":
+        return found
+    return replace(found, world=world_of(found.world, PyBulletParameters(**row.parameters)))
+
+
+def calibrate_row(row: Row, settings: Settings) -> Calibration:
+    """What ``tandem robot calibrate`` measures of a row's back-end."""
+    world = policy_of(row, settings).world
+    backend = connect(_backend(row), world)
+    try:
+        assert backend.simulator is not None
+        backend.simulator.reset(_out_of_the_way(world.workspace.upper_m, world.rest_height_m))
+        return calibrate(row.backend, backend.robot, world, bridge_config(settings))
+    finally:
+        backend.close()
+
+
+def play_chunk(job: Job) -> list[Played]:
+    """Play the goals of a chunk, one after the other."""
+    row, settings = ROWS[job.row], job.settings
+    policy = policy_of(row, settings)
+    starts, goals = draw_episodes(policy, settings)
+    mine = slice(job.chunk * CHUNK, (job.chunk + 1) * CHUNK)
+    backend = connect(_backend(row), policy.world, seed=settings.seed + job.chunk)
+    try:
+        assert backend.simulator is not None
+        played = []
+        for start, goal in zip(starts[mine], goals[mine], strict=True):
+            backend.simulator.reset(start)
+            _rest(backend)
+            played.append(_play(policy, backend, goal, job))
+        return played
+    finally:
+        backend.close()
+
+
+def draw_episodes(policy: RobotPolicy, settings: Settings) -> tuple[StateArray, StateArray]:
+    """(N, 3) places of the object at first, and (N, 3) goals, metres: the same as of an evaluation in MuJoCo."""
+    rng = np.random.default_rng(settings.seed)
+    starts, boxes = draw_starts(rng, settings.num_goals, policy.world)
+    return starts, draw_goals(policy.goals, rng, policy.world, policy.success_distance_m, start=starts, box=boxes)
+
+
+def inside_limits(positions_m: StateArray, gap_s: float) -> StateArray:
+    """(T,) whether speed and acceleration of (T + 2, 3) positions, ``gap_s`` apart, are a Franka's at each moment."""
+    velocity = np.diff(positions_m, axis=0) / gap_s
+    acceleration = np.diff(velocity, axis=0) / gap_s
+    inside: StateArray = (np.linalg.norm(velocity[1:], axis=1) <= SPEED_M_S * 1.001) & (
+        np.linalg.norm(acceleration, axis=1) <= ACCELERATION_M_S2 * 1.001
+    )
+    return inside
+
+
+def _rest(backend: Backend) -> None:
+    """Let some time pass, so that what is read late is no longer of the episode before."""
+    for _ in range(_REST_STEPS):
+        backend.robot.read()
+        backend.poses.read()
+        backend.robot.wait_until(backend.robot.now_s() + CONTROL_STEP_S)
+
+
+def _play(policy: RobotPolicy, backend: Backend, goal: StateArray, job: Job) -> Played:
+    simulator = backend.simulator
+    assert simulator is not None
+    distances: list[float] = []
+    tip: list[StateArray] = []
+    set_points: list[StateArray] = []
+
+    def record(step: Mapping[str, Any]) -> None:
+        distances.append(float(np.linalg.norm(simulator.object_position() - goal)))
+        tip.extend(step.get("measured_m", ()))
+        set_points.extend(step.get("set_points_m", ()))
+
+    config = bridge_config(job.settings)
+    world = policy.world
+    gain = job.calibration.gain
+    bridge = Bridge(policy.policy, backend.robot, backend.poses, world, config, gain=gain, record=record)
+    stopped = ""
+    try:
+        bridge.run(goal, job.settings.num_steps)
+    except RobotError as error:
+        stopped = str(error)
+    last = float(np.linalg.norm(simulator.object_position() - goal))
+    num = config.set_points_per_step
+    gap_s = world.physics_step_s * world.num_substeps / num
+    insides = [_steps_inside(np.array(path), gap_s, num) for path in (tip, set_points)]
+    return Played(
+        reached=not stopped and last <= policy.success_distance_m,
+        ever=min(distances, default=last) <= policy.success_distance_m,
+        stopped=stopped,
+        inside=(insides[0], insides[1]),
+        num_steps=len(distances),
+    )
+
+
+def _steps_inside(path: StateArray, gap_s: float, num_ticks: int) -> int:
+    """Control steps all of whose moments are inside the limits; the first two moments have no acceleration."""
+    if len(path) < 3:
+        return 0
+    inside = np.concatenate([[True, True], inside_limits(path, gap_s)])
+    return sum(bool(inside[at : at + num_ticks].all()) for at in range(0, len(inside), num_ticks))
+
+
+def _backend(row: Row) -> BackendConfig:
+    return BackendConfig(backend=row.backend, parameters=dict(row.parameters), disturbance=row.disturbance)
+
+
+def _out_of_the_way(upper_m: Sequence[float], height_m: float) -> StateArray:
+    return np.array([upper_m[0], upper_m[1], height_m])
+
+
+def summarise(played: Sequence[Played]) -> dict[str, Any]:
+    """Rates of a row, for JSON."""
+    num = len(played)
+    rates: dict[str, Any] = {"num_goals": num}
+    for name, hits in {"last": [each.reached for each in played], "ever": [each.ever for each in played]}.items():
+        low, high = wilson_interval(sum(hits), num)
+        rates |= {f"success_{name}": sum(hits) / num, f"success_{name}_low": low, f"success_{name}_high": high}
+    steps = max(sum(each.num_steps for each in played), 1)
+    tip, set_point = (sum(each.inside[index] for each in played) / steps for index in (0, 1))
+    reasons = sorted({each.stopped for each in played if each.stopped})
+    rates |= {"tip_inside": tip, "set_point_inside": set_point}
+    return rates | {"num_stops": sum(bool(each.stopped) for each in played), "stops": reasons[:3]}
+
+
+def benchmark(settings: Settings) -> dict[str, Any]:
+    """Everything measured, for JSON."""
+    names = [name for name in settings.rows.split(",") if name] or list(ROWS)
+    if unknown := [name for name in names if name not in ROWS]:
+        raise TandemError(f"--rows: no row {unknown[0]!r}; choose of {', '.join(ROWS)}")
+    names = [name for name in names if getattr(settings, ROWS[name].policy)]
+    policy = load_robot_policy(settings.policy, Path(settings.registry))
+    num_chunks = -(-settings.num_goals // CHUNK)
+    rows: dict[str, Any] = {}
+    with contextlib.ExitStack() as stack:
+        play_all: Callable[[Sequence[Job]], Iterable[list[Played]]] = functools.partial(map, play_chunk)
+        if settings.workers > 1:
+            context = multiprocessing.get_context("spawn")  # an engine does not survive a fork
+            pool = stack.enter_context(ProcessPoolExecutor(settings.workers, mp_context=context))
+            play_all = functools.partial(pool.map, play_chunk)
+        for name in names:
+            begun = time.perf_counter()
+            calibration = calibrate_row(ROWS[name], settings)
+            jobs = [Job(name, chunk, settings, calibration) for chunk in range(num_chunks)]
+            rows[name] = summarise([each for chunk in play_all(jobs) for each in chunk])
+            rows[name] |= {"title": ROWS[name].title, "asked": ROWS[name].asked, "policy": _label(name, settings)}
+            rows[name] |= {"calibration": calibration.model_dump(mode="json"), "gain": list(calibration.gain)}
+            rows[name]["wall_s"] = round(time.perf_counter() - begun, 1)
+            print(f"{name}: {rows[name]['success_last']:.1%} in {rows[name]['wall_s']:.0f} s", flush=True)
+    without = evaluate(
+        policy.policy,
+        policy.world,
+        "mixed",
+        num_episodes=settings.num_goals,
+        num_steps=settings.num_steps,
+        success_distance_m=policy.success_distance_m,
+        seed=settings.seed,
+    )
+    return {
+        "policy": {"label": policy.label, "digest": parameters_digest(policy.policy)},
+        "bridge": bridge_config(settings).model_dump(mode="json"),
+        "engine": PyBulletParameters().model_dump(mode="json"),
+        "rows": rows,
+        "training_world": without.as_dict(),
+    }
+
+
+def report(result: dict[str, Any]) -> str:
+    """A result for people."""
+    cells = (
+        (name, *(percent(row[key], 1) for key in ("success_last", "success_ever", "tip_inside", "asked")))
+        for name, row in result["rows"].items()
+    )
+    return table(("row", "last", "ever", "tip inside limits", "asked"), cells)
+
+
+def _label(name: str, settings: Settings) -> str:
+    return str(getattr(settings, ROWS[name].policy))
+
+
+def main() -> int:
+    """Parse the command line, measure, print, write."""
+    given = parser_of(__doc__, Settings()).parse_args()
+    return run_benchmark(given.name, PACKAGES, given, Settings, benchmark, report)
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

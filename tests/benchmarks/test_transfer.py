@@ -1,0 +1,108 @@
+"""The benchmark of a frozen policy in another engine: what it counts, a few real steps, its page, and wrong rows."""
+
+import numpy as np
+import pytest
+
+from benchmarks.report import transfer as page
+from benchmarks.transfer import (
+    ROWS,
+    Job,
+    Played,
+    Settings,
+    benchmark,
+    draw_episodes,
+    inside_limits,
+    play_chunk,
+    report,
+    summarise,
+)
+from benchmarks.transfer import policy_of as policy_of_row
+from service.errors import TandemError
+from service.robot.calibrate import Calibration
+
+MACHINE = {"num_cpus": 2, "cpu": "a processor", "git_commit": "a" * 40, "time": "2026-11-24T10:00:00+00:00"}
+CALIBRATION = Calibration(
+    robot="pybullet",
+    arm="panda",
+    step_s=0.04,
+    set_points_per_step=10,
+    max_speed_m_s=1.7,
+    max_acceleration_m_s2=13.0,
+    covered_share=(0.6, 0.6, 0.5),
+    training_share=(0.6, 0.6, 0.6),
+    delay_steps=0.4,
+)
+
+
+def test_a_tip_is_inside_the_limits_by_speed_and_acceleration():
+    gap_s = 0.01
+    times = np.arange(6) * gap_s
+    steady = np.outer(1.69 * times, [1.0, 0.0, 0.0])
+    assert inside_limits(steady, gap_s).all()
+    assert not inside_limits(steady * 1.02, gap_s).any()
+    assert inside_limits(np.outer(12.9 * times**2 / 2, [0.0, 0.0, 1.0]), gap_s).all()
+    assert not inside_limits(np.outer(13.5 * times**2 / 2, [0.0, 0.0, 1.0]), gap_s).any()
+
+
+def test_rates_count_goals_stops_and_steps():
+    played = [
+        Played(reached=True, ever=True, stopped="", inside=(40, 50), num_steps=50),
+        Played(reached=False, ever=True, stopped="stopped: late", inside=(10, 10), num_steps=10),
+        Played(reached=False, ever=False, stopped="", inside=(25, 50), num_steps=50),
+        Played(reached=True, ever=True, stopped="", inside=(50, 50), num_steps=50),
+    ]
+    found = summarise(played)
+    assert (found["num_goals"], found["success_last"], found["success_ever"]) == (4, 0.5, 0.75)
+    assert found["success_last_low"] < 0.5 < found["success_last_high"]
+    assert found["tip_inside"] == pytest.approx(125 / 160)
+    assert found["set_point_inside"] == 1.0
+    assert (found["num_stops"], found["stops"]) == (1, ["stopped: late"])
+
+
+def test_goals_are_drawn_for_the_cube_of_the_engine():
+    settings = Settings(num_goals=40)
+    starts, goals = draw_episodes(policy_of_row(ROWS["nominal"], settings), settings)
+    assert starts.shape == goals.shape == (40, 3)
+    np.testing.assert_allclose(starts[:, 2], 0.02)
+    assert (goals[:, 2] == 0.02).sum() in range(5, 20)  # 30 % of them on the table
+
+
+def test_a_chunk_is_played_alike_again_in_the_real_engine():
+    pytest.importorskip("pybullet", reason="needs PyBullet: pip install 'tandem-skills[pybullet]'")
+    job = Job("together", 0, Settings(num_goals=2, num_steps=8), CALIBRATION)
+    first = play_chunk(job)
+    assert [each.stopped for each in first] == ["", ""]
+    assert [each.num_steps for each in first] == [8, 8]
+    assert play_chunk(job) == first
+
+
+def test_an_unknown_row_is_told_in_one_line():
+    with pytest.raises(TandemError, match="--rows: no row 'windy'; choose of nominal, together"):
+        benchmark(Settings(rows="windy"))
+
+
+def test_the_page_has_a_row_for_each_and_says_what_was_not_measured():
+    row = summarise([Played(reached=True, ever=True, stopped="", inside=(45, 50), num_steps=50)] * 50) | {
+        "calibration": CALIBRATION.model_dump(mode="json"),
+        "asked": 0.97,
+    }
+    result = {
+        "rows": {"nominal": row},
+        "policy": {"label": "some-policy@1"},
+        "settings": {
+            "num_steps": 50,
+            "set_points_per_step": 10,
+            "max_speed_m_s": 1.7,
+            "max_acceleration_m_s2": 13.0,
+            "grip_force_n": 140.0,
+        },
+        "training_world": {"success_last": 0.98},
+        "machine": MACHINE,
+    }
+    text = page.transfer_table(result)
+    assert "| panda-gym's arm and cube | 100.0 % (93 % to 100 %) | 100.0 % | 60 %, 60 %, 50 % | 97 % | yes |" in text
+    assert text.count("| not measured |") == len(ROWS) - 1
+    words = page.transfer_words(result)
+    assert "some-policy@1, 50 goals a row" in words
+    assert "the tip itself in 90.0 %" in words
+    assert "| nominal | 100.0 % |" in report(result)
