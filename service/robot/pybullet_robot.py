@@ -92,6 +92,7 @@ class PyBulletRobot:
         self._set_joints(_NEUTRAL)
         self._home = self._solve(self._start_m())
         self._num_steps = 0
+        self._stopped = self._held = False
         step_s, response = self.parameters.physics_step_s, self.parameters.response
         self._follow = 1.0 if response is None else 1.0 - math.exp(-step_s / lag_s(response))
         gain = self.parameters.position_gain if response is None else 1.0 - math.exp(-step_s / _STIFF_LAG_S)
