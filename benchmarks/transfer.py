@@ -241,7 +241,7 @@ def _play(policy: RobotPolicy, backend: Backend, goal: StateArray, job: Job) -> 
     insides = [_steps_inside(np.array(path), gap_s, num) for path in (tip, set_points)]
     return Played(
         reached=not stopped and last <= policy.success_distance_m,
-        ever=min(distances, default=last) <= policy.success_distance_m,
+        ever=min([*distances, last]) <= policy.success_distance_m,
         stopped=stopped,
         inside=(insides[0], insides[1]),
         num_steps=len(distances),
