@@ -228,8 +228,9 @@ def _play(policy: RobotPolicy, backend: Backend, goal: StateArray, job: Job) -> 
 
     config = bridge_config(job.settings)
     world = policy.world
-    gain = job.calibration.gain
-    bridge = Bridge(policy.policy, backend.robot, backend.poses, world, config, gain=gain, record=record)
+    found = job.calibration
+    matched = {"gain": found.gain, "late_steps": found.late_steps, "covered_share": found.covered_share}
+    bridge = Bridge(policy.policy, backend.robot, backend.poses, world, config, **matched, record=record)
     stopped = ""
     try:
         bridge.run(goal, job.settings.num_steps)

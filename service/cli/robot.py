@@ -61,11 +61,11 @@ def run(
 
     config, described, player = _bridge_config(overrides), _backend_config(robot), load_robot_policy(policy, registry)
     goal_m = None if goal is None else parse_goal(goal, player.world)
-    gain, late_steps = (1.0, 1.0, 1.0), 0
+    matched: dict[str, Any] = {}
     if calibration is not None:
         measured = read_calibration(calibration)
         measured.check(described.label, player.world, config)
-        gain, late_steps = measured.gain, measured.late_steps
+        matched = {"gain": measured.gain, "late_steps": measured.late_steps, "covered_share": measured.covered_share}
     written = None if log is None else RobotLog(log, _header(player, described, config, calibration), player.world)
     with _connected(described, player, seed, dead_man) as (backend, held, wait):
 
@@ -84,7 +84,7 @@ def run(
 
         bridge = Bridge(
             player.policy, backend.robot, backend.poses, player.world, config,
-            gain=gain, late_steps=late_steps, held=held, dry_run=dry_run, record=record,
+            **matched, held=held, dry_run=dry_run, record=record,
         )  # fmt: skip
         outcomes = []
         for outcome in play(

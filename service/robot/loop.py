@@ -1,7 +1,10 @@
 """The control loop: what is measured becomes a policy's observation, its actions become set-points, 25 times a second.
 
-An action means what it means in training (``WorldBatch.step``): a way of the end effector from where it is measured, at
-most 5 cm an axis, and a change of the finger width. The way to the target is spread over the step's set-points.
+An action means what it means in training (``WorldBatch.step``): a way of the end effector from where it is, at most
+5 cm an axis, and a change of the finger width. The way to the target is spread over the step's set-points.
+
+What is late is late for all: a policy sees the robot as it was when the object was seen, and is told how long ago that
+was if it observes it. Where the robot itself is late, what it was commanded meanwhile says where it is by now.
 """
 
 from __future__ import annotations
@@ -28,6 +31,8 @@ Record = Callable[[dict[str, Any]], None]
 
 _NO_GAIN = (1.0, 1.0, 1.0)
 _MAX_SETTLE_S = 1.0
+_KEPT_STATES = 16
+"""States of the robot that an object's pose may belong to, one a control step."""
 
 
 class BridgeConfig(FrozenModel):
@@ -62,7 +67,9 @@ class Bridge:
         config: of the bridge.
         gain: (3,) by which the ways of an action are multiplied; see ``calibrate``.
         late_steps: control steps by which the robot is later than the arm of training, see ``calibrate``; a policy that
-            observes its delay is told, and of ``config.observation_delay_steps``, too.
+            observes its delay is told, and of what else is late, too.
+        covered_share: (3,) of a commanded way that it covers in a control step: what it did since a late measurement
+            is reckoned by it.
         held: the dead-man's switch.
         dry_run: command nothing.
         record: takes every step.
@@ -81,13 +88,15 @@ class Bridge:
         *,
         gain: tuple[float, float, float] = _NO_GAIN,
         late_steps: int = 0,
+        covered_share: tuple[float, float, float] = _NO_GAIN,
         held: Callable[[], bool] = always_held,
         dry_run: bool = False,
         record: Record | None = None,
     ) -> None:
         self._policy, self._robot, self._config, self._record = policy, robot, config, record
         self._gain = np.array(gain)
-        self._delay_steps = late_steps + config.observation_delay_steps
+        self._late_steps = late_steps
+        self._covered_m = DISPLACEMENT_M * self._gain * np.array(covered_share)
         self._layout = layouts(world.observed).positions
         self._num_commands = world.observed.num_commands
         self._step_s = world.physics_step_s * world.num_substeps
@@ -114,8 +123,9 @@ class Bridge:
         begin = getattr(self._policy, "begin", None)
         if begin is not None:
             begin()
-        num = self._num_commands
+        num = max(self._num_commands, self._late_steps)
         commands = deque([np.zeros(ACTION.size)] * num, maxlen=num)
+        self._states = deque(maxlen=_KEPT_STATES)
         seen: deque[FloatArray] = deque(maxlen=self._config.observation_delay_steps + 1)
         with self.safe.guarded():
             self.safe.start(self._tick_s)
@@ -151,13 +161,19 @@ class Bridge:
         state, object_m = safe.state, safe.object_m
         row |= {"effector_m": state.effector_m, "fingers_m": state.fingers_m, "object_m": object_m}
         row |= {"state_time_s": state.time_s, "object_time_s": safe.object_time_s}
-        seen.append(observe(self._layout, state, object_m, commands, goal_m, self._delay_steps))
+        self._states.append(state)
+        then = min(self._states, key=lambda each: abs(each.time_s - safe.object_time_s))
+        age_steps = max(0, round((state.time_s - then.time_s) / self._step_s))
+        delay_steps = self._late_steps + age_steps + self._config.observation_delay_steps
+        seen.append(observe(self._layout, then, object_m, commands, goal_m, delay_steps))
         action = self._policy.act_deterministic(seen[0])[0].astype(np.float64)
         row["action"] = action
         safe.check_finite(action, "the policy's action")
         action = np.clip(action, -1.0, 1.0)
+        under_way = sum((each[:3] for each in list(commands)[: self._late_steps]), start=np.zeros(3))
         commands.appendleft(action)
-        target_m = state.effector_m + DISPLACEMENT_M * self._gain * action[:3]
+        here_m = state.effector_m + self._covered_m * under_way
+        target_m = here_m + DISPLACEMENT_M * self._gain * action[:3]
         width_m = float(state.fingers_m.sum() + WIDTH_CHANGE_M * action[3])
         row |= {"target_m": target_m, "tick_times_s": [], "set_points_m": [], "measured_m": []}
         num = self._config.set_points_per_step
