@@ -34,6 +34,7 @@ from service.robot.loop import Bridge, BridgeConfig
 from service.robot.policies import RobotPolicy, load_robot_policy
 from service.robot.pybullet_robot import CONTROL_STEP_S, PyBulletParameters, world_of
 from service.robot.safety import SafetyConfig
+from service.robot.watchdogs import WatchConfig
 from service.types import StateArray
 
 PACKAGES = ("pybullet", "mujoco", "numpy")
@@ -146,6 +147,7 @@ def bridge_config(settings: Settings) -> BridgeConfig:
         max_speed_m_s=settings.max_speed_m_s,
         max_acceleration_m_s2=settings.max_acceleration_m_s2,
         max_grip_force_n=settings.grip_force_n,
+        watch=WatchConfig(max_state_age_s=0.2, max_pose_age_s=0.25),  # two steps late, and some more
     )
     return BridgeConfig(set_points_per_step=settings.set_points_per_step, safety=safety)
 
@@ -229,8 +231,7 @@ def _play(policy: RobotPolicy, backend: Backend, goal: StateArray, job: Job) -> 
     config = bridge_config(job.settings)
     world = policy.world
     found = job.calibration
-    matched = {"gain": found.gain, "late_steps": found.late_steps, "covered_share": found.covered_share}
-    bridge = Bridge(policy.policy, backend.robot, backend.poses, world, config, **matched, record=record)
+    bridge = Bridge(policy.policy, backend.robot, backend.poses, world, config, matched=found.matched, record=record)
     stopped = ""
     try:
         bridge.run(goal, job.settings.num_steps)

@@ -26,7 +26,7 @@ from service.io.files import os_errors, write_atomic
 from service.robot.backends import first_error
 from service.robot.errors import RobotError
 from service.robot.interface import RobotInterface
-from service.robot.loop import Bridge, BridgeConfig
+from service.robot.loop import Bridge, BridgeConfig, Matched
 from service.robot.safety import SafetyConfig, always_held
 from service.types import FloatArray, StateArray
 from service.world_config import WorldConfig
@@ -64,6 +64,11 @@ class Calibration(FrozenModel):
     def late_steps(self) -> int:
         """Whole control steps by which it is later than the arm in training."""
         return max(0, round(self.delay_steps - self.training_delay_steps))
+
+    @property
+    def matched(self) -> Matched:
+        """What a bridge needs of it."""
+        return Matched(self.gain, self.late_steps, self.covered_share)
 
     @property
     def gain(self) -> tuple[float, float, float]:

@@ -12,7 +12,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from pydantic import Field
@@ -29,7 +29,6 @@ from service.world_config import WorldConfig
 Record = Callable[[dict[str, Any]], None]
 """Takes what happened in a step: see ``Bridge.run``."""
 
-_NO_GAIN = (1.0, 1.0, 1.0)
 _MAX_SETTLE_S = 1.0
 _KEPT_STATES = 16
 """States of the robot that an object's pose may belong to, one a control step."""
@@ -56,6 +55,17 @@ class Episode:
     """From the object, as it was last seen, to the goal; NaN where nothing sees it."""
 
 
+class Matched(NamedTuple):
+    """How a robot differs from the arm of training; see ``calibrate``."""
+
+    gain: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    """By which the ways of an action are multiplied, x, y, z."""
+    late_steps: int = 0
+    """Control steps by which it is later. A policy that observes its delay is told, and of what else is late, too."""
+    covered_share: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    """Of a commanded way that it covers in a control step: what it did since a late measurement is reckoned by it."""
+
+
 class Bridge:
     """Plays a policy on a robot.
 
@@ -65,11 +75,7 @@ class Bridge:
         poses: what sees the object; None where nothing has to.
         world: of the policy: its step, its workspace, what it observes.
         config: of the bridge.
-        gain: (3,) by which the ways of an action are multiplied; see ``calibrate``.
-        late_steps: control steps by which the robot is later than the arm of training, see ``calibrate``; a policy that
-            observes its delay is told, and of what else is late, too.
-        covered_share: (3,) of a commanded way that it covers in a control step: what it did since a late measurement
-            is reckoned by it.
+        matched: what the robot's calibration found; by default a robot as in training.
         held: the dead-man's switch.
         dry_run: command nothing.
         record: takes every step.
@@ -86,17 +92,15 @@ class Bridge:
         world: WorldConfig,
         config: BridgeConfig,
         *,
-        gain: tuple[float, float, float] = _NO_GAIN,
-        late_steps: int = 0,
-        covered_share: tuple[float, float, float] = _NO_GAIN,
+        matched: Matched | None = None,
         held: Callable[[], bool] = always_held,
         dry_run: bool = False,
         record: Record | None = None,
     ) -> None:
         self._policy, self._robot, self._config, self._record = policy, robot, config, record
-        self._gain = np.array(gain)
-        self._late_steps = late_steps
-        self._covered_m = DISPLACEMENT_M * self._gain * np.array(covered_share)
+        matched = matched or Matched()
+        self._gain, self._late_steps = np.array(matched.gain), matched.late_steps
+        self._covered_m = DISPLACEMENT_M * self._gain * np.array(matched.covered_share)
         self._layout = layouts(world.observed).positions
         self._num_commands = world.observed.num_commands
         self._step_s = world.physics_step_s * world.num_substeps

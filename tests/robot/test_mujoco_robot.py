@@ -6,7 +6,7 @@ from service.errors import TandemError
 from service.robot.calibrate import Calibration, read_calibration, write_calibration
 from service.robot.errors import RobotError
 from service.robot.interface import Command
-from service.robot.loop import Bridge, BridgeConfig
+from service.robot.loop import Bridge, BridgeConfig, Matched
 from service.robot.mujoco_robot import MujocoParameters, MujocoRobot
 
 JUMPS = BridgeConfig(
@@ -38,7 +38,7 @@ def test_the_champion_reaches_a_goal_within_the_bounds_of_a_franka(champion):
     world, goal = champion.config.world, np.array([-0.1, 0.05, 0.2])
     robot = MujocoRobot(world, MujocoParameters(feed_forward=1.0))
     robot.reset(np.array([0.0, 0.05, 0.025]))
-    bridge = Bridge(champion.policy, robot, robot.poses, world, SMOOTH, gain=(0.62, 0.62, 0.62))
+    bridge = Bridge(champion.policy, robot, robot.poses, world, SMOOTH, matched=Matched((0.62, 0.62, 0.62)))
     episode = bridge.run(goal, 50)
     assert episode.distance_m < 0.05
     assert robot.now_s() >= 2.0
