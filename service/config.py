@@ -8,6 +8,7 @@ description. ``load_config`` reads YAML and applies ``--set a.b=c`` overrides.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from copy import deepcopy
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
@@ -16,7 +17,7 @@ from pydantic import BaseModel, BeforeValidator, Field, PositiveInt, ValidationE
 
 from service.config_tree import RENAMED, apply_override, read_yaml, updated
 from service.distillation_config import DistillationConfig
-from service.errors import ConfigError
+from service.errors import ConfigError, did_you_mean
 from service.frozen import FrozenModel
 from service.off_policy_config import SkillsConfig
 from service.world_config import NO_KEYS, ObservedConfig
@@ -399,9 +400,17 @@ def load_config(path: Path | str | None = None, overrides: Sequence[str] = (), *
     tree = read_yaml(Path(path)) if path is not None else {}
     if recorded:
         tree = updated(tree, where=str(path))
+    whole = deepcopy(tree)
     for override in overrides:
-        apply_override(tree, override)
-    return parse_config(tree, where=str(path) if path is not None else "the overrides")
+        apply_override(whole, override)
+    where = str(path) if path is not None else "the overrides"
+    try:
+        return parse_config(whole, where=where)
+    except ConfigError:
+        if path is not None and overrides:
+            parse_config(tree, where=where)  # what is wrong with the file alone
+            parse_config(whole, where=f"the overrides of {path}")
+        raise
 
 
 def parse_config(tree: dict[str, Any], *, where: str, recorded: bool = False) -> Config:
@@ -426,8 +435,9 @@ def parse_config(tree: dict[str, Any], *, where: str, recorded: bool = False) ->
         if key in RENAMED:
             raise ConfigError(f"{where}: {key!r} is now called {RENAMED[key]!r}{more}") from None
         if first["type"] == "extra_forbidden":
-            known = ", ".join(_known_keys(first["loc"]))
-            raise ConfigError(f"{where}: unknown key {key!r}; known there: {known}{more}") from None
+            known = _known_keys(first["loc"])
+            hint = _elsewhere(str(first["loc"][-1])) or did_you_mean(str(first["loc"][-1]), known)
+            raise ConfigError(f"{where}: unknown key {key!r}; known there: {', '.join(known)}{more}{hint}") from None
         raise ConfigError(f"{where}: {key}{found}: {first['msg']}{more}") from None
 
 
@@ -452,8 +462,23 @@ def dump_config(config: Config) -> str:
 def _known_keys(location: tuple[int | str, ...]) -> list[str]:
     model: type[BaseModel] = Config
     for part in location[:-1]:
-        field = model.model_fields.get(str(part))
-        if field is None or not (isinstance(field.annotation, type) and issubclass(field.annotation, BaseModel)):
+        group = _groups(model).get(str(part))
+        if group is None:
             break
-        model = field.annotation
+        model = group
     return sorted(model.model_fields)
+
+
+def _elsewhere(name: str) -> str:
+    """The end of a message about a key that is not in its group, where another group has it."""
+    found, groups = list[str](), list[tuple[str, type[BaseModel]]]([("", Config)])
+    while groups:
+        prefix, model = groups.pop()
+        found += [prefix + name] * (name in model.model_fields)
+        groups += [(f"{prefix}{key}.", group) for key, group in _groups(model).items()]
+    return f"; did you mean {' or '.join(sorted(found))}?" if found else ""
+
+
+def _groups(model: type[BaseModel]) -> dict[str, type[BaseModel]]:
+    kinds = {name: field.annotation for name, field in model.model_fields.items()}
+    return {name: kind for name, kind in kinds.items() if isinstance(kind, type) and issubclass(kind, BaseModel)}

@@ -7,8 +7,9 @@ from copy import deepcopy
 from pathlib import Path
 from typing import Any
 
-from service.errors import ConfigError, one_line
+from service.errors import ConfigError, did_you_mean, one_line
 from service.parsing import MAX_YAML_CHARACTERS, ParseError, parse_yaml
+from service.recipes import recipes
 from service.regular_files import read_regular
 
 RENAMED = {"learner.bob_average_decay": "learner.bob_ema_decay", "learner.mirror": "learner.bob.mirror"}
@@ -27,7 +28,10 @@ def read_yaml(path: Path) -> dict[str, Any]:
     try:
         tree = parse_yaml(read_regular(path, MAX_YAML_CHARACTERS, follow=True), path)
     except FileNotFoundError:
-        raise ConfigError(f"no configuration file {path}; see configs/pretrain/ for those that ship") from None
+        raise ConfigError(
+            f"no configuration file {path}; tandem configs lists those that come with tandem"
+            f"{did_you_mean(str(path), recipes())}"
+        ) from None
     except OSError as error:
         raise ConfigError(f"{path}: cannot be read: {error.strerror}; name a YAML file") from None
     except ParseError as error:

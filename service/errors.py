@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import ClassVar
 
 TRACEBACK_PREFIX = "tandem-error-"
@@ -54,3 +55,17 @@ def one_line(text: str, max_characters: int = 2000) -> str:
         return line
     half = max_characters // 2
     return f"{line[:half]} ... {line[-half:]}"
+
+
+def did_you_mean(name: str, known: Iterable[str]) -> str:
+    """The end of a message about a misspelt name, ``; did you mean 'x'?``; empty where no known name is like it.
+
+    Args:
+        name: as it was typed. Capitals do not count, nor does ``_`` for ``-``.
+        known: the names that there are.
+    """
+    from difflib import get_close_matches
+
+    plain = {each.lower().replace("_", "-"): each for each in known}
+    found = get_close_matches(name[:200].lower().replace("_", "-"), plain, n=1)
+    return f"; did you mean {plain[found[0]]!r}?" if found else ""

@@ -7,10 +7,11 @@ from typing import Any, Literal, Self
 
 from pydantic import Field, ValidationError, model_validator
 
-from service.errors import ConfigError
+from service.errors import ConfigError, did_you_mean
 from service.frozen import FrozenModel
 from service.model_files import absolute, digest_of
 from service.parsing import MAX_YAML_CHARACTERS, ParseError, parse_yaml
+from service.recipes import robots
 from service.regular_files import read_regular
 
 Vector = tuple[float, float, float]
@@ -143,7 +144,11 @@ def read_robot(path: Path) -> RobotConfig:
     try:
         tree = parse_yaml(read_regular(path, MAX_YAML_CHARACTERS, follow=True), path)
     except OSError as error:
-        raise ConfigError(f"robot {path}: {error.strerror}; name panda, or a YAML file with a description") from None
+        known = ("panda", *robots())
+        raise ConfigError(
+            f"robot {path}: {error.strerror}; name {', '.join(known)}, or a YAML file with a description"
+            f"{did_you_mean(str(path), known)}"
+        ) from None
     except ParseError as error:
         raise ConfigError(f"robot {path}: {error.reason}") from None
     try:

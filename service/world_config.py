@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
 from pydantic import BeforeValidator, Discriminator, Field, Tag, model_validator
@@ -10,6 +9,7 @@ from pydantic import BeforeValidator, Discriminator, Field, Tag, model_validator
 from service.frozen import FrozenModel
 from service.object_config import Fixture, Object, ObjectConfig, simple_object
 from service.randomisation_config import RandomisationConfig
+from service.recipes import find_file, robots
 from service.robot_config import RobotConfig, read_robot
 
 Point = tuple[float, float, float]
@@ -54,7 +54,7 @@ class ObservedConfig(FrozenModel):
 
 
 def _read_robot(value: Any) -> Any:
-    return read_robot(Path(value)) if isinstance(value, str) and value != "panda" else value
+    return read_robot(find_file(value, robots())) if isinstance(value, str) and value != "panda" else value
 
 
 _BUILT_IN, _DESCRIBED = "built-in", "described"
@@ -70,7 +70,10 @@ Robot = Annotated[
 class WorldConfig(FrozenModel):
     """The MuJoCo world: robot, table, one rigid object."""
 
-    robot: Robot = Field("panda", description="panda, or a YAML file with a description of yours (docs/robots.md)")
+    robot: Robot = Field(
+        "panda",
+        description="panda, a name of tandem configs, or a YAML file with a description of yours (docs/robots.md)",
+    )
     object: Object = Field("cube", description="cube, sphere, or a description: shape, size_m, color (docs/objects.md)")
     object_size_m: float = Field(
         0.05, ge=0.02, le=0.07, description="cube edge or sphere diameter; paper: 5 cm. A description has its own"

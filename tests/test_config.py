@@ -182,7 +182,7 @@ def test_missing_file(tmp_path):
     path = tmp_path / "none.yaml"
     text = message(path)
     assert str(path) in text
-    assert "configs/pretrain" in text
+    assert "tandem configs lists" in text
 
 
 @pytest.mark.parametrize(

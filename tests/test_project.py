@@ -41,14 +41,15 @@ CLUSTER_MODULES = (
 )
 ROOMS_WITHOUT_TORCH = ("actors", "envs", "generator", "registry", "status")
 ROOMS = (
-    *("errors", "frozen", "liveness", "types", "parsing", "regular_files", "config_tree", "off_policy_config"),
+    *("errors", "extras", "frozen", "liveness", "progress", "recipes", "types"),
+    *("parsing", "regular_files", "config_tree", "off_policy_config", "randomisation_config", "distillation_config"),
     *("model_files", "mesh_files", "robot_config", "object_config", "world_config"),
     *("config", "io", "envs", "policies", "generator", "actors", "learner", "sac", "baselines", "registry"),
     *("primitives", "media", "downstream", "export", "robot"),
     *("store", "status", "runtime", "cli", "__main__"),
 )
 """Each room may import itself and those before it."""
-VERBS = ("demo", "pretrain", "evaluate", "render", "coverage", "export", "registry", "serve", "downstream", "robot")
+VERBS = ("demo", "pretrain", "evaluate", "render", "coverage", "export", "registry", "serve", "downstream", "robot", "configs")
 DOCUMENTS = [*sorted(ROOT.glob("*.md")), *sorted((ROOT / "docs").rglob("*.md")), ROOT / "deploy" / "README.md"]
 FOLDERS = (".ci", "benchmarks", "configs", "deploy", "docs", "service", "tests", "tools")
 TEXT = {".cfg", ".json", ".jsonl", ".md", ".py", ".toml", ".txt", ".yaml", ".yml", ""}

@@ -13,6 +13,7 @@ import numpy as np
 from service.config import WorkspaceConfig, WorldConfig
 from service.envs.batch import WorldBatch
 from service.envs.observations import ACTION
+from service.progress import counted
 from service.types import FloatArray, StateArray
 
 NUM_SKILLS = 32
@@ -81,7 +82,7 @@ def object_paths(
         worlds.reset(rng)
         paths[:, 0] = worlds.object_position
         observe(worlds)
-        for step in range(num_steps):
+        for step in counted(range(num_steps), "playing at random", num_steps, "steps"):
             worlds.step(act(worlds.positions()))
             paths[:, step + 1] = worlds.object_position
             observe(worlds)

@@ -13,6 +13,7 @@ from service.envs.batch import WorldBatch
 from service.envs.observations import ACTION, bob_observation
 from service.envs.sampling import GoalKind, draw_goals
 from service.liveness import count_work
+from service.progress import doing
 from service.types import FloatArray, Metrics, StateArray
 
 Observer = Callable[[WorldBatch, StateArray], None]
@@ -91,13 +92,15 @@ def evaluate(
         distance = np.zeros(num_episodes)
         if observe:
             observe(worlds, goal)
-        for _ in range(num_steps):
-            worlds.step(policy.act_deterministic(bob_observation(worlds.positions(), goal)))
-            count_work()
-            distance = np.linalg.norm(worlds.object_position - goal, axis=1)
-            ever |= distance <= success_distance_m
-            if observe:
-                observe(worlds, goal)
+        with doing(f"evaluating on {kind} goals", num_steps * num_episodes, "env steps") as task:
+            for _ in range(num_steps):
+                worlds.step(policy.act_deterministic(bob_observation(worlds.positions(), goal)))
+                count_work()
+                distance = np.linalg.norm(worlds.object_position - goal, axis=1)
+                ever |= distance <= success_distance_m
+                if observe:
+                    observe(worlds, goal)
+                task.advance(num_episodes)
     last = distance <= success_distance_m
     low, high = wilson_interval(int(last.sum()), num_episodes)
     return Evaluation(

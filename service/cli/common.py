@@ -3,18 +3,21 @@
 from __future__ import annotations
 
 import json
+import logging
 import shlex
 import sys
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
+from rich.console import Console
 from typer.core import TyperGroup
 
 from service.cli.unexpected import UsageError, traceback_in
-from service.errors import TandemError, one_line
+from service.errors import TandemError, did_you_mean, one_line
+from service.progress import Display, Task, display, doing
 
 CHAMPION = "panda-cube@champion"
 """The primitives that come with the package."""
@@ -24,8 +27,54 @@ EXIT_SIGNAL = 128
 RegistryOption = Annotated[
     Path, typer.Option("--registry", envvar="TANDEM_REGISTRY", metavar="DIR", help="Directory of the registry.")
 ]
+
+
+def _quieten(quiet: bool) -> bool:
+    shown = display()
+    if quiet and shown is not None:
+        shown.quiet = True
+        logging.getLogger().setLevel(logging.WARNING)
+    return quiet
+
+
+QuietOption = Annotated[bool, typer.Option("--quiet", "-q", callback=_quieten, help="Show no progress.")]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON.")]
 REGISTRY = Path("registry")
+
+
+def shown() -> Display:
+    """The display of this process."""
+    found = display()
+    assert found is not None, "CommandGroup opens it"
+    return found
+
+
+def choose(option: str, name: str, known: Iterable[str]) -> str:
+    """Check a name that was typed.
+
+    Args:
+        option: it was typed for, such as ``--goals``.
+        name: as it was typed.
+        known: names that there are.
+
+    Raises:
+        TandemError: it is none of them.
+    """
+    names = list(known)
+    if name not in names:
+        raise TandemError(f"{option} {name!r}: choose one of {', '.join(names)}{did_you_mean(name, names)}")
+    return name
+
+
+def was_typed(context: typer.Context, name: str) -> bool:
+    """Whether an option was typed, and has not its default or what a variable says."""
+    source = context.get_parameter_source(name)
+    return source is not None and source.name == "COMMANDLINE"  # typer has a ParameterSource of its own
+
+
+def loading() -> AbstractContextManager[Task]:
+    """Show that packages and parameters are being loaded, which takes seconds on a busy machine."""
+    return doing("loading", aloud=False)
 
 
 class CommandGroup(TyperGroup):
@@ -40,8 +89,8 @@ class CommandGroup(TyperGroup):
             return super().make_context(info_name, args, parent, **extra)
 
     def invoke(self, ctx: Any) -> Any:
-        """Run the command that was typed."""
-        with _one_line():
+        """Run the command that was typed; progress is shown on stderr."""
+        with _one_line(), nullcontext() if display() is not None else Display(Console(stderr=True)):
             return super().invoke(ctx)
 
 

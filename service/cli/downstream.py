@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -11,9 +10,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from service.cli.common import CHAMPION, EXIT_SIGNAL, CommandGroup, print_json
+from service.cli.common import CHAMPION, EXIT_SIGNAL, CommandGroup, QuietOption, choose, loading, print_json, shown
 from service.cli.unexpected import traceback_in
-from service.errors import TandemError, one_line
+from service.errors import TandemError, did_you_mean, one_line
+from service.progress import answer
 
 if TYPE_CHECKING:
     from service.downstream.table import Runner
@@ -24,7 +24,21 @@ downstream_app = typer.Typer(
     name="downstream", help="New tasks with frozen primitives.", cls=CommandGroup, no_args_is_help=True
 )
 
-_LINE_EVERY_S = 10.0
+
+def _task_names() -> list[str]:
+    """What the shell completes."""
+    from service.envs.tasks import HARD_TASKS, TASKS
+
+    return [*TASKS, *HARD_TASKS]
+
+
+def _method_names() -> list[str]:
+    """What the shell completes."""
+    from service.downstream.methods import METHODS
+
+    return list(METHODS)
+
+
 _Primitives = Annotated[
     str, typer.Option(metavar="NAME@ALIAS|RUN_DIR", help="What a method takes: primitives or skills.")
 ]
@@ -40,13 +54,16 @@ _RewardMargin = Annotated[
     float | None, typer.Option("--reward-margin-m", help="While learning, goals count as reached this much nearer.")
 ]
 _Episodes = Annotated[int, typer.Option(help="Of the final evaluation.", min=1)]
-_Threads = Annotated[int | None, typer.Option(help="Cores of one training; default: all, on a cluster one.", min=1)]
+_Threads = Annotated[
+    int | None,
+    typer.Option(help="Threads of a training. Default: one that learns, and worlds on all cores; on Ray one.", min=1),
+]
 
 
 @downstream_app.command()
 def train(
-    task: Annotated[str, typer.Option(help="larger, inair, push, sphere, wall or box.")],
-    method: Annotated[str, typer.Option(help="See tandem downstream methods.")] = "ours",
+    task: Annotated[str, typer.Option(autocompletion=_task_names, help="larger, inair, push, sphere, wall or box.")],
+    method: Annotated[str, typer.Option(autocompletion=_method_names, help="See tandem downstream methods.")] = "ours",
     primitives: _Primitives = CHAMPION,
     seed: Annotated[int, typer.Option(min=0)] = 0,
     steps: _Steps = None,
@@ -61,11 +78,13 @@ def train(
     registry: _Registry = "registry",
     threads: _Threads = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print the result as JSON.")] = False,
+    quiet: QuietOption = False,
 ) -> None:
     """Learn one task, evaluate, record a video."""
-    from service.downstream.methods import load_for
-    from service.downstream.settings import make_trial
-    from service.downstream.worker import RunOptions, run_trial
+    with loading():
+        from service.downstream.methods import load_for
+        from service.downstream.settings import make_trial
+        from service.downstream.worker import RunOptions, run_trial
 
     trial = make_trial(
         task=task,
@@ -74,6 +93,7 @@ def train(
         num_episodes=episodes,
         **_learning(steps, skill_steps, reward_margin_m, overrides),
     )
+    _check_used(trial.method, steps, skill_steps, reward_margin_m, overrides)
     path = run_dir or Path("runs") / "downstream" / trial.name
     with _stop_on_signals() as (callbacks, signals):
         options = RunOptions(resume, threads or 0, video=True, callbacks=callbacks)
@@ -116,6 +136,7 @@ def table(
     ] = None,
     num_workers: Annotated[int | None, typer.Option(help="Trainings at once; default: one a core.", min=1)] = None,
     threads: _Threads = None,
+    quiet: QuietOption = False,
 ) -> None:
     """Run the trials that are missing, and write downstream.md."""
     from service.downstream.methods import METHODS
@@ -159,13 +180,30 @@ def _learning(
     for override in overrides or []:
         key, separator, text = override.partition("=")
         if not separator or key not in SACConfig.model_fields:
-            raise TandemError(f"--set {override}: write KEY=VALUE with KEY one of {', '.join(SACConfig.model_fields)}")
+            known = SACConfig.model_fields
+            hint = did_you_mean(key, known)
+            raise TandemError(f"--set {override}: write KEY=VALUE with KEY one of {', '.join(known)}{hint}")
         try:
             values[key] = parse_yaml(text, "its value")
         except ParseError as error:
             raise TandemError(f"--set {one_line(override, 200)}: the value is {error.reason}") from None
     chosen = {"num_env_steps": steps, "skill_steps": skill_steps, "reward_margin_m": reward_margin_m}
     return {"sac": validate(SACConfig, values), **{key: value for key, value in chosen.items() if value is not None}}
+
+
+def _check_used(
+    name: str, steps: int | None, skill_steps: int | None, reward_margin_m: float | None, overrides: list[str] | None
+) -> None:
+    """Refuse options that would do nothing for a method."""
+    from service.downstream.methods import find_method
+
+    method = find_method(name)
+    if skill_steps is not None and method.takes != "skills":
+        raise TandemError(f"--skill-steps is for methods that take skills, and {name} takes none: leave it out")
+    learning = {"--steps": steps, "--reward-margin-m": reward_margin_m, "--set": overrides}
+    typed = [option for option, value in learning.items() if value]
+    if method.player is not None and typed:
+        raise TandemError(f"{typed[0]} is about learning, and {name} learns nothing: leave it out")
 
 
 def _names(text: str, known: Any) -> list[str]:
@@ -183,9 +221,7 @@ def _numbers(text: str) -> list[int]:
 def _make_runner(name: str, address: str | None, num_workers: int | None, threads: int | None) -> Iterator[Runner]:
     from service.downstream.table import run_here, run_on_ray
 
-    if name not in ("local", "ray"):
-        raise TandemError(f"--runtime {name!r}: choose one of local, ray")
-    if name == "local":
+    if choose("--runtime", name, ("local", "ray")) == "local":
         for option, value in (("--address", address), ("--num-workers", num_workers)):
             if value is not None:
                 raise TandemError(f"{option} needs --runtime ray")
@@ -199,38 +235,14 @@ def _make_runner(name: str, address: str | None, num_workers: int | None, thread
 
 @contextmanager
 def _stop_on_signals() -> Iterator[tuple[Callbacks, StopSignals]]:
-    """Let SIGINT and SIGTERM end the block where it can be continued; progress goes to stderr."""
+    """Let SIGINT and SIGTERM end the block where it can be continued."""
     from service.downstream.worker import Callbacks
     from service.runtime.signals import InterruptError, StopSignals
 
-    with StopSignals() as signals, signals.asking(lambda: None):
-        say = functools.partial(typer.echo, err=True)
+    stopping = functools.partial(answer, "stopping after this iteration; again to end now")
+    with StopSignals() as signals, signals.asking(stopping):
         try:
-            yield Callbacks(lambda: signals.first is not None, _Progress().show, say), signals
+            yield Callbacks(lambda: signals.first is not None, say=shown().say), signals
         except InterruptError as interrupt:  # a second one
             typer.echo("stopped at once; what came after the last checkpoint is lost", err=True)
             raise typer.Exit(EXIT_SIGNAL + interrupt.number) from None
-
-
-class _Progress:
-    """A line of progress now and then."""
-
-    def __init__(self) -> None:
-        self._shown_s, self._evaluated, self._steps = float("-inf"), "", 0.0
-
-    def show(self, metrics: dict[str, float]) -> None:
-        """Take in an iteration."""
-        if metrics["env_steps"] <= self._steps:  # another training
-            self._evaluated = ""
-        self._steps = metrics["env_steps"]
-        if (rate := metrics.get("evaluation/success_last")) is not None:
-            self._evaluated = f" | without noise {rate:.0%}"
-        if time.monotonic() - self._shown_s >= _LINE_EVERY_S:
-            self._shown_s = time.monotonic()
-            with_noise = metrics.get("rollout/success_last")  # the last iteration may be too short for an episode
-            typer.echo(
-                f"{int(metrics['env_steps']):>10,} env steps"
-                + ("" if with_noise is None else f" | success with noise {with_noise:.0%}")
-                + f"{self._evaluated} | {metrics['time/env_steps_per_s']:,.0f} env steps/s",
-                err=True,
-            )

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, cast
 
 import typer
 
-from service.cli.common import REGISTRY, JsonOption, RegistryOption, print_json
-from service.errors import TandemError
+from service.cli.common import REGISTRY, JsonOption, QuietOption, RegistryOption, choose, loading, print_json
+
+if TYPE_CHECKING:
+    from service.envs.sampling import GoalKind
 
 _Primitives = Annotated[
     str, typer.Option(metavar="NAME@ALIAS|RUN_DIR", help="Whose Bob; or the directory of an exported version.")
@@ -30,28 +32,27 @@ def evaluate(
     ] = None,
     as_json: JsonOption = False,
     registry: RegistryOption = REGISTRY,
+    quiet: QuietOption = False,
 ) -> None:
     """Bob on random goals from fresh resets, without noise, beside a policy that does nothing.
 
     Of skills (LSD, METRA, DIAYN) the one that leads to the goal acts, zero-shot.
     """
-    from service.actors.evaluation import IdlePolicy
-    from service.actors.evaluation import evaluate as run
-    from service.config import changed_config
-    from service.downstream.skills import ZeroShotPolicy
-    from service.envs.sampling import GOAL_KINDS
-    from service.primitives.loading import TrainedBob, load_either
+    with loading():
+        from service.actors.evaluation import IdlePolicy
+        from service.actors.evaluation import evaluate as run
+        from service.config import changed_config
+        from service.downstream.skills import ZeroShotPolicy
+        from service.envs.sampling import GOAL_KINDS
+        from service.primitives.loading import TrainedBob, load_either
 
-    if goals not in GOAL_KINDS:
-        raise TandemError(f"--goals {goals!r}: choose one of {', '.join(GOAL_KINDS)}")
-    trained = load_either(primitives, registry)
+        kind = cast("GoalKind", choose("--goals", goals, GOAL_KINDS))
+        trained = load_either(primitives, registry)
     player = trained.policy if isinstance(trained, TrainedBob) else ZeroShotPolicy(trained.skills)
     config = changed_config(trained.config, overrides or ())
     world, distance_m = config.world, config.game.success_distance_m
     rows = {
-        name: run(
-            policy, world, goals, num_episodes=episodes, num_steps=steps, seed=seed, success_distance_m=distance_m
-        )
+        name: run(policy, world, kind, num_episodes=episodes, num_steps=steps, seed=seed, success_distance_m=distance_m)
         for name, policy in ((trained.label, player), ("idle", IdlePolicy()))
     }
     if as_json:
@@ -74,14 +75,16 @@ def coverage(
     out: Annotated[Path, typer.Option(metavar="FILE", help="Picture to write.")] = Path("coverage.png"),
     as_json: JsonOption = False,
     registry: RegistryOption = REGISTRY,
+    quiet: QuietOption = False,
 ) -> None:
     """Plot where random compositions of the primitives, or random skills, move the object, beside a random policy."""
-    from service.actors.coverage import RandomPolicy, skill_trajectories, visited_share
-    from service.baselines.coverage import skill_paths
-    from service.media.plots import plot_coverage
-    from service.primitives.loading import TrainedBob, load_either
+    with loading():
+        from service.actors.coverage import RandomPolicy, skill_trajectories, visited_share
+        from service.baselines.coverage import skill_paths
+        from service.media.plots import plot_coverage
+        from service.primitives.loading import TrainedBob, load_either
 
-    trained = load_either(primitives, registry)
+        trained = load_either(primitives, registry)
     world = trained.config.world
     if isinstance(trained, TrainedBob):
         of, path = (
@@ -108,13 +111,15 @@ def render(
     seed: _Seed = 0,
     out: Annotated[Path, typer.Option(metavar="FILE", help="Video to write.")] = Path("video.mp4"),
     registry: RegistryOption = REGISTRY,
+    quiet: QuietOption = False,
 ) -> None:
     """Make a video of a run's Alice beside its Bob, of published primitives on random goals, or of random skills."""
-    from service.io.run_directory import RunDirectory
-    from service.media import recording, video
-    from service.primitives.loading import TrainedSkills, load_either, load_players
+    with loading():
+        from service.io.run_directory import RunDirectory
+        from service.media import recording, video
+        from service.primitives.loading import TrainedSkills, load_either, load_players
 
-    trained = load_either(primitives, registry)
+        trained = load_either(primitives, registry)
     config = trained.config
     if isinstance(trained, TrainedSkills):
         assert config.skills is not None

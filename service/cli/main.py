@@ -4,11 +4,15 @@ from __future__ import annotations
 
 import logging
 import os
+import sys
 import threading
+from typing import Annotated
 
 import typer
 
-from service.cli.common import CommandGroup
+from service import __version__
+from service.cli.common import CommandGroup, QuietOption
+from service.cli.configs import configs_app
 from service.cli.downstream import downstream_app
 from service.cli.evaluate import coverage, evaluate, render
 from service.cli.export import export
@@ -18,14 +22,41 @@ from service.cli.robot import robot_app
 from service.cli.serve import serve
 from service.cli.unexpected import report_thread_error
 
-app = typer.Typer(
-    name="tandem", help="Robot skills, pre-trained.", cls=CommandGroup, no_args_is_help=True, add_completion=False
-)
+app = typer.Typer(name="tandem", help="Robot skills, pre-trained.", cls=CommandGroup, no_args_is_help=True)
 for command in (pretrain, demo, evaluate, coverage, render, export, serve):
     app.command()(command)
 app.add_typer(registry_app)
 app.add_typer(downstream_app)
 app.add_typer(robot_app)
+app.add_typer(configs_app)
+
+
+def _say_version(asked: bool) -> None:
+    if asked:
+        typer.echo(f"tandem {__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def options(
+    quiet: QuietOption = False,
+    version: Annotated[
+        bool, typer.Option("--version", callback=_say_version, is_eager=True, help="Print the version.")
+    ] = False,
+) -> None:
+    """Robot skills, pre-trained."""
+
+
+class _Log(logging.Handler):
+    """Writes to what ``sys.stderr`` is at the moment: while something moves there, lines go above it."""
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Write a line."""
+        try:
+            sys.stderr.write(f"{self.format(record)}\n")
+            sys.stderr.flush()
+        except Exception:
+            self.handleError(record)
 
 
 def main() -> None:
@@ -34,7 +65,8 @@ def main() -> None:
     # these variables when they are first imported, which is after this line.
     for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
         os.environ.setdefault(name, "1")
-    logging.basicConfig(level=logging.INFO, format="%(message)s")
+    logging.basicConfig(level=logging.INFO, format="%(message)s", handlers=[_Log()])
     threading.excepthook = report_thread_error
-    logging.getLogger("OpenGL").setLevel(logging.WARNING)  # says at INFO which optional module it does without
+    for name in ("OpenGL", "torch"):  # they say at INFO what they do without, and what their caches held
+        logging.getLogger(name).setLevel(logging.WARNING)
     app()

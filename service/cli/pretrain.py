@@ -2,29 +2,40 @@
 
 from __future__ import annotations
 
+import shlex
 from contextlib import closing
+from importlib.util import find_spec
 from itertools import count
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, NoReturn
 
 import typer
-from rich.console import Console
 
-from service.cli.common import CHAMPION, EXIT_SIGNAL, REGISTRY, RegistryOption, how_to_go_on
+from service.cli.common import (
+    CHAMPION,
+    EXIT_SIGNAL,
+    REGISTRY,
+    QuietOption,
+    RegistryOption,
+    choose,
+    how_to_go_on,
+    loading,
+    shown,
+    was_typed,
+)
+from service.cli.configs import config_names
 from service.cli.evaluate import evaluate
 from service.cli.study import is_study, pretrain_study
 from service.cli.unexpected import traceback_in
 from service.errors import TandemError
+from service.recipes import DEFAULT_RECIPE, find_file, recipes
 
 if TYPE_CHECKING:
     from service.config import Config
     from service.io.run_directory import RunDirectory
+    from service.runtime.pretrain import Pretrained
     from service.runtime.ray_connection import ClusterOptions
     from service.runtime.starting import Start
-
-_DEMO_CONFIG = Path(__file__).parents[2] / "configs" / "pretrain" / "panda_cube.yaml"
-"""The shipped recipe, in a clone; an installed wheel has none, and the defaults do."""
-
 
 _CLUSTER_ONLY = ("address", "num_actors", "actor_threads", "learner_cpus", "status", "token_file")
 """Options that mean nothing in one process."""
@@ -33,7 +44,13 @@ _CLUSTER_ONLY = ("address", "num_actors", "actor_threads", "learner_cpus", "stat
 def pretrain(
     context: typer.Context,
     config: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="YAML; defaults where left out. Not needed to resume.")
+        str | None,
+        typer.Option(
+            metavar="NAME|FILE",
+            autocompletion=config_names,
+            help="A name of tandem configs, or a YAML file; what that leaves out has its default. "
+            f"Without: {DEFAULT_RECIPE}, or what a resumed run has.",
+        ),
     ] = None,
     method: Annotated[
         str | None,
@@ -77,14 +94,20 @@ def pretrain(
         typer.Option(help="Cores for each rank of the learner; 0: none for one rank, its threads for several.", min=0),
     ] = 0.0,
     status: Annotated[
-        str, typer.Option(metavar="HOST:PORT|off", help="Where the status service of a run on a cluster listens.")
-    ] = "127.0.0.1:8321",
+        str | None,
+        typer.Option(
+            metavar="HOST:PORT|off",
+            help="Where the status service of a run on a cluster listens. "
+            "Default: 127.0.0.1, at port 8321 or the next free one.",
+        ),
+    ] = None,
     token_file: Annotated[
         Path | None, typer.Option(metavar="FILE", help="Its token; default: TANDEM_TOKEN. See tandem serve.")
     ] = None,
     accept_damaged_records: Annotated[
         bool, typer.Option("--accept-damaged-records", help="Resume without the records that are missing or changed.")
     ] = False,
+    quiet: QuietOption = False,
 ) -> None:
     """Pre-train primitives by self-play, in this process or on a Ray cluster, and publish them."""
     from service.config import load_config
@@ -100,15 +123,8 @@ def pretrain(
         return ClusterOptions(num_actors, actor_threads, learner_cpus, where)
 
     overrides = [*_method_overrides(method), *(overrides or [])]
-    if runtime not in ("local", "ray"):
-        raise TandemError(f"--runtime {runtime!r}: choose one of local, ray")
-    if runtime == "local":
-        for name in _CLUSTER_ONLY:
-            source = context.get_parameter_source(name)
-            if source is not None and source.name == "COMMANDLINE":  # typer has a ParameterSource of its own
-                raise TandemError(
-                    f"--{name.replace('_', '-')} is for a run on Ray: give --runtime ray, or leave it out"
-                )
+    named = find_file(config, recipes()) if config is not None else None
+    _check_used(context, choose("--runtime", runtime, ("local", "ray")), status)
     if run_id is not None:
         if resume or run_dir is not None:
             raise TandemError("--run-id names the run directory, and continues what is there: leave out the other two")
@@ -121,8 +137,10 @@ def pretrain(
             raise TandemError(
                 "--method with --seeds: a study compares Bobs; start a run for each seed with --set seed=N"
             )
+        if accept_damaged_records:
+            raise TandemError("--accept-damaged-records is for one run of a study: resume that one by its --run-dir")
         pretrain_study(
-            run_dir, seeds, config=config, overrides=overrides, runs=runs, registry=registry,
+            run_dir, seeds, config=named, overrides=overrides, runs=runs, registry=registry,
             resume=None if run_id is not None else resume, publish=publish, parallel=parallel,
             cluster=cluster_options if runtime == "ray" else None, address=address,
         )  # fmt: skip
@@ -132,9 +150,9 @@ def pretrain(
     if resume:
         if run_dir is None:
             raise TandemError("--resume needs --run-dir, the directory of the run to continue")
-        resolved = resumed_config(RunDirectory(run_dir), overrides, config)
+        resolved = resumed_config(RunDirectory(run_dir), overrides, named)
     else:
-        resolved = load_config(config, overrides)
+        resolved = load_config(named or recipes()[DEFAULT_RECIPE], overrides)
         run_dir = run_dir or runs / resolved.name
     start = None
     if start_from is not None and not resume:
@@ -157,6 +175,20 @@ def pretrain(
             )  # fmt: skip
 
 
+def _check_used(context: typer.Context, runtime: str, status: str | None) -> None:
+    """Refuse options that were typed and would do nothing."""
+    if runtime == "local":
+        for name in _CLUSTER_ONLY:
+            if was_typed(context, name):
+                raise TandemError(
+                    f"--{name.replace('_', '-')} is for a run on Ray: give --runtime ray, or leave it out"
+                )
+    if status == "off" and was_typed(context, "token_file"):
+        raise TandemError("--token-file is for the status service, and --status off leaves that out: drop one of them")
+    if was_typed(context, "runs") and was_typed(context, "run_dir"):
+        raise TandemError("--run-dir names the run's directory, and --runs the one it would be in: drop one of them")
+
+
 _METHOD_SETTINGS = {"dads": ("skills.hidden_sizes=[64,64]", "skills.newest_steps=50000")}
 """DADS compares each transition with 100 skills, so its network is small; it learns from its newest steps (T19)."""
 
@@ -169,8 +201,7 @@ def _method_overrides(method: str | None) -> list[str]:
 
     from service.off_policy_config import SkillMethod
 
-    if method not in get_args(SkillMethod):
-        raise TandemError(f"--method {method!r}: choose one of {', '.join(get_args(SkillMethod))}; without, self-play")
+    choose("--method", method, get_args(SkillMethod))
     return [f"skills.method={method}", f"name=panda-cube-{method}", *_METHOD_SETTINGS.get(method, ())]
 
 
@@ -179,6 +210,7 @@ def demo(
     env_steps: Annotated[
         int, typer.Option(help="Budget; the default takes about three minutes on 2 cores.", min=1)
     ] = 1_000_000,
+    quiet: QuietOption = False,
 ) -> None:
     """Watch a robot arm teach itself: a small pre-training from scratch, with pictures and a video."""
     from service.config import load_config
@@ -187,16 +219,31 @@ def demo(
 
     paths = (Path("runs") / f"demo-{number}" for number in count(1))
     path = run_dir or next(path for path in paths if not path.exists())
-    Console().print("A robot arm is about to teach itself: Alice proposes goals, Bob learns to reach them.")
+    typer.echo("A robot arm is about to teach itself: Alice proposes goals, Bob learns to reach them.")
     overrides = [f"run.total_env_steps={env_steps}", "name=panda-cube-demo"]
-    config = load_config(_DEMO_CONFIG if _DEMO_CONFIG.exists() else None, overrides)
-    _pretrain(config, RunDirectory(path), path / "registry", resume=False)
+    config = load_config(recipes()[DEFAULT_RECIPE], overrides)
+    done = _pretrain(config, RunDirectory(path), path / "registry", resume=False)
+    typer.echo(f"\n{_in_words(done)}")
     typer.echo(f"\nThat was a beginning. Primitives that have learned for longer come with tandem; {CHAMPION}:")
     evaluate(CHAMPION, registry=BUNDLED)  # prints what the first of the next commands prints
-    typer.echo("\nnext:")
+    typer.echo("\nLook at them, or at the run on its page, in a browser:")
     typer.echo(f"  tandem evaluate --primitives {CHAMPION} --goals mixed --episodes 300")
     typer.echo(f"  tandem render   --primitives {CHAMPION} --out champion.mp4")
     typer.echo(f"  tandem coverage --primitives {CHAMPION} --out champion.png")
+    typer.echo(f"  {shlex.join(['tandem', 'serve', '--runs', str(path.parent)])}")
+    if find_spec("fastapi") is None:
+        typer.echo("The last one needs: pip install 'tandem-skills[serve]'")
+
+
+def _in_words(done: Pretrained) -> str:
+    """What a short run has come to."""
+    rates = {where: done.metrics.get(f"evaluation/{name}_success_last") for name, where in _WHERE.items()}
+    told = [f"{rate:.0%} of random goals {where}" for where, rate in rates.items() if rate is not None]
+    said = f"Bob has practised for {done.result.num_env_steps:,} steps"
+    return f"{said}, and now reaches {' and '.join(told)}." if told else f"{said}."
+
+
+_WHERE = {"table": "on the table", "air": "in the air"}
 
 
 def _pretrain(
@@ -209,8 +256,9 @@ def _pretrain(
     cluster: ClusterOptions | None = None,
     address: str | None = None,
     start: Start | None = None,
-) -> None:
-    from service.runtime.pretrain import pretrain as run
+) -> Pretrained:
+    with loading():
+        from service.runtime.pretrain import pretrain as run
     from service.runtime.progress import Progress
     from service.runtime.signals import InterruptError
 
@@ -222,7 +270,7 @@ def _pretrain(
         raise typer.Exit(EXIT_SIGNAL + number)
 
     try:
-        with traceback_in(directory.path), Progress(config.run.total_env_steps, Console()) as progress:
+        with traceback_in(directory.path), Progress(config.run.total_env_steps, shown()) as progress:
             done = run(
                 config, directory, registry,
                 resume=resume, publish=publish, on_iteration=progress.show, cluster=cluster, start=start,
@@ -242,3 +290,4 @@ def _pretrain(
     typer.echo(f"{'checkpoint':<12} {directory.checkpoints}")
     if done.version is not None:
         typer.echo(f"{'primitives':<12} {done.version} in {registry}")
+    return done

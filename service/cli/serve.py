@@ -2,37 +2,50 @@
 
 from __future__ import annotations
 
+import logging
+from contextlib import suppress
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
-from service.cli.common import REGISTRY, RegistryOption
+from service.cli.common import REGISTRY, QuietOption, RegistryOption
+from service.extras import needs_extra
 
 
 def serve(
     runs: Annotated[Path, typer.Option(metavar="DIR", help="Directory of run directories.")] = Path("runs"),
     registry: RegistryOption = REGISTRY,
     host: Annotated[str, typer.Option(help="Where to listen; others than this machine need a token.")] = "127.0.0.1",
-    port: Annotated[int, typer.Option(help="0 for any that is free.", min=0, max=65535)] = 8321,
+    port: Annotated[
+        int | None,
+        typer.Option(help="0 for any that is free. Default: 8321, or the next free one.", min=0, max=65535),
+    ] = None,
     token_file: Annotated[
         Path | None, typer.Option(metavar="FILE", help="Holds the token; else TANDEM_TOKEN does.")
     ] = None,
+    quiet: QuietOption = False,
 ) -> None:
     """Show finished and running runs and the registry over REST, to Prometheus, and to a browser."""
     from service.registry.registry import Registry
     from service.status.errors import StatusError
+    from service.status.ports import DEFAULT_PORT, free_port
     from service.status.run_reader import open_reader
     from service.status.token import VARIABLE, read_token
 
-    try:
+    with needs_extra("serve", "tandem serve"):
         from service.status.server import StatusServer
-    except ImportError as error:
-        raise StatusError(f"{error}: pip install 'tandem-skills[cluster]'") from None
     if not runs.is_dir():
         raise StatusError(f"no directory {runs}; name with --runs the one that holds run directories")
     token = read_token(token_file)
-    server = StatusServer(open_reader(runs), Registry(registry), token=token, host=host, port=port, runs_dir=runs)
+    chosen = port
+    if chosen is None:
+        with suppress(OSError):  # what is wrong with the host is said below
+            chosen = free_port(host, DEFAULT_PORT)
+    if port is None and chosen not in (None, DEFAULT_PORT):
+        logging.getLogger(__name__).info("port %d is taken, so this is at port %d", DEFAULT_PORT, chosen)
+    place: dict[str, Any] = {"host": host, "port": DEFAULT_PORT if chosen is None else chosen, "runs_dir": runs}
+    server = StatusServer(open_reader(runs), Registry(registry), token=token, **place)
     typer.echo(f"runs of {runs}, primitives of {registry}: {server.url}")
     if token is None:
         typer.echo(f"read-only, for this machine: with {VARIABLE} set, runs can be stopped and aliases moved")

@@ -8,11 +8,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import typer
-from rich.console import Console
 
-from service.cli.common import EXIT_SIGNAL, how_to_go_on, print_table
+from service.cli.common import EXIT_SIGNAL, how_to_go_on, print_table, shown
 from service.cli.unexpected import traceback_in
 from service.errors import TandemError, one_line
+from service.recipes import DEFAULT_RECIPE, recipes
 
 if TYPE_CHECKING:
     from service.io.study_directory import StudyDirectory
@@ -49,7 +49,7 @@ def pretrain_study(
     Args:
         path: the study's directory; None: ``runs`` / its name.
         seeds: as typed; None to resume a study.
-        config: YAML file.
+        config: YAML file; None: the shipped recipe, or what the study was begun with.
         overrides: of the configuration.
         runs: directory of run directories.
         registry: where the best run is published.
@@ -75,7 +75,7 @@ def pretrain_study(
     if path is None:
         if resume:
             raise TandemError("--resume needs --run-dir, the directory of the study to continue")
-        path = runs / load_config(config, overrides).name
+        path = runs / load_config(config or recipes()[DEFAULT_RECIPE], overrides).name
     directory = StudyDirectory(path)
     resume = directory.exists if resume is None else resume
     if resume:
@@ -86,7 +86,7 @@ def pretrain_study(
     else:
         if seeds is None:
             directory.check_free(())  # says that a study is there
-        resolved, chosen = load_config(config, overrides), given
+        resolved, chosen = load_config(config or recipes()[DEFAULT_RECIPE], overrides), given
         directory.check_free(chosen)
     options = cluster() if cluster is not None else None  # reads the status service's token
     connection: Any = nullcontext()
@@ -99,7 +99,7 @@ def pretrain_study(
     try:
         with closing(directory), traceback_in(path), connection:
             place = StudyCluster(*cluster_size(address), options) if options is not None else None
-            progress = StudyProgress(resolved.run.total_env_steps, Console())
+            progress = StudyProgress(resolved.run.total_env_steps, shown())
             result = run(
                 resolved, directory, chosen, registry,
                 resume=resume, publish=publish, parallel=parallel, cluster=place, progress=progress,

@@ -29,7 +29,7 @@ from service.downstream.compose import (
 from service.downstream.skills import SkillTaskWorlds, ZeroShotPolicy
 from service.downstream.worlds import TaskWorlds
 from service.envs.observations import layouts
-from service.errors import TandemError
+from service.errors import TandemError, did_you_mean
 from service.off_policy_config import SkillMethod
 from service.primitives.loading import TrainedBob, TrainedSkills
 from service.types import FloatArray
@@ -232,7 +232,7 @@ def find_method(name: str) -> Method:
         TandemError: no such method.
     """
     if name not in METHODS:
-        raise TandemError(f"unknown method {name!r}; choose one of {', '.join(METHODS)}")
+        raise TandemError(f"unknown method {name!r}; choose one of {', '.join(METHODS)}{did_you_mean(name, METHODS)}")
     return METHODS[name]
 
 

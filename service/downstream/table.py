@@ -21,6 +21,7 @@ from service.downstream.settings import TrialConfig
 from service.downstream.worker import Callbacks, RunOptions, check_trial, run_trial
 from service.errors import TandemError
 from service.io.files import os_errors, write_atomic
+from service.progress import doing, tick
 from service.regular_files import read_regular
 
 PAGE_FILE, PICTURE_FILE = "downstream.md", "downstream.png"
@@ -62,13 +63,15 @@ def make_table(trials: Sequence[TrialConfig], source: Source, out: Path, runner:
     missing = results.missing(trials, trained)
     callbacks.say(f"{len(trials) - len(missing)} of {len(trials)} trials are there, {len(missing)} to run")
     done = 0
-    for trial, result in runner(missing, trained, source, callbacks):
-        if made_with(result) != provenance(trained, trial.method):
-            raise TandemError(f"{source.primitives} has changed in {source.registry} meanwhile; give NAME@VERSION")
-        results.add(trial, result)
-        done += 1
-        rate = result["evaluation"]["success_last"]
-        callbacks.say(f"{trial.name}: {rate:.1%} at the last step ({done} of {len(missing)})")
+    with doing("trials", len(missing), "trials") as task:
+        for trial, result in runner(missing, trained, source, callbacks):
+            if made_with(result) != provenance(trained, trial.method):
+                raise TandemError(f"{source.primitives} has changed in {source.registry} meanwhile; give NAME@VERSION")
+            results.add(trial, result)
+            done += 1
+            task.advance()
+            rate = result["evaluation"]["success_last"]
+            callbacks.say(f"{trial.name}: {rate:.1%} at the last step ({done} of {len(missing)})")
     callbacks.say("\n".join(map(str, write_results(out))))
     return done == len(missing)
 
@@ -143,6 +146,7 @@ def run_on_ray(
             for reference in running:
                 ray.cancel(reference, force=False)
             return
+        tick()
         ended, _ = ray.wait(list(running), num_returns=1, timeout=_POLL_S)
         for reference in ended:
             trial = running.pop(reference)

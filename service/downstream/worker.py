@@ -35,6 +35,7 @@ from service.errors import TandemError
 from service.io.checkpoints import Checkpoint
 from service.io.git import git_commit
 from service.io.jsonl import plain
+from service.progress import Task, doing
 
 CHECKPOINT_EVERY_S = 120.0
 CURVE_SEED, FINAL_SEED = 1_000_000, 2_000_000
@@ -60,7 +61,8 @@ class RunOptions:
 
     resume: bool = False
     num_threads: int = 0
-    """Threads of physics and torch; 0: as many as there are cores."""
+    """Threads of physics and torch; 0: torch has one, and worlds are stepped by as many as there are cores. Several
+    threads of torch wait for each other by turning round and round: beside other work they are slower than one."""
     video: bool = False
     """Whether to make a video; half a minute without a graphics card."""
     callbacks: Callbacks = Callbacks()
@@ -130,13 +132,15 @@ class _Training:
     def __init__(
         self, trial: TrialConfig, method: Method, trained: Trained, directory: TrainingDirectory, options: RunOptions
     ) -> None:
-        torch.set_num_threads(options.num_threads or os.cpu_count() or 1)
+        torch.set_num_threads(options.num_threads or 1)
         self.worlds = make_worlds(trial, method, trained, options.num_threads)
         self._loop = make_loop(trial, method, trained, self.worlds)
         self._trial, self._method, self._trained = trial, method, trained
         self._directory, self._num_threads, self._callbacks = directory, options.num_threads, options.callbacks
         self._iteration, self._wall_s, self._saved_s = 0, 0.0, time.monotonic()
         self._curve: list[dict[str, float]] = []
+        self._told: dict[str, str] = {}
+        """How good the learner was last, shown beside the progress."""
 
     def new_player(self) -> DeterministicPolicy:
         """Make the policy learned so far, ready for a batch of episodes."""
@@ -149,13 +153,15 @@ class _Training:
         if saved is not None:
             self._loop.load_state(saved.arrays, saved.meta["loop"])
             self._iteration, self._wall_s, self._curve = saved.step, saved.meta["wall_s"], saved.meta["curve"]
-        while self._loop.num_env_steps < self._trial.num_env_steps:
-            if self._callbacks.stop():
-                self._save()
-                return None
-            self._iterate()
-            if time.monotonic() - self._saved_s >= CHECKPOINT_EVERY_S:
-                self._save()
+        done, total = self._loop.num_env_steps, self._trial.num_env_steps
+        with doing(f"learning {self._trial.name}", total, "env steps", done) as task:
+            while self._loop.num_env_steps < total:
+                if self._callbacks.stop():
+                    self._save()
+                    return None
+                self._iterate(task)
+                if time.monotonic() - self._saved_s >= CHECKPOINT_EVERY_S:
+                    self._save()
         self._save()
         if self._callbacks.stop():
             return None
@@ -164,12 +170,12 @@ class _Training:
         save_policy(self._directory.policy_file, parameters, self._trial.method, self._trained, held)
         return {"env_steps": self._loop.num_env_steps, "wall_s": self._wall_s, "curve": self._curve}
 
-    def _iterate(self) -> None:
+    def _iterate(self, task: Task) -> None:
         """Play an episode in every world, with its updates; now and then evaluate, which is not counted as time."""
         begun, before = time.perf_counter(), self._loop.num_env_steps
         set_progress(self._loop, self._method, before / self._trial.num_env_steps)
         num = min(EPISODE_STEPS * self.worlds.num_worlds, self._trial.num_env_steps - before)
-        learned = self._loop.play(num)
+        learned = self._loop.play(num, task.advance)
         self._iteration += 1
         took = time.perf_counter() - begun
         self._wall_s += took
@@ -181,6 +187,10 @@ class _Training:
             metrics |= self._evaluate()
         metrics |= {"time/wall_s": self._wall_s, "time/env_steps_per_s": (steps - before) / took}
         self._directory.record(metrics)
+        for key, name in (("rollout/success_last", "success with noise"), ("evaluation/success_last", "without")):
+            if key in metrics:  # the last iteration may be too short for an episode
+                self._told[name] = f"{name} {metrics[key]:.0%}"
+        task.note = ", ".join(self._told.values())
         self._callbacks.on_iteration(metrics)
 
     def _episodes(self) -> dict[str, float]:

@@ -8,7 +8,7 @@ from typing import Any
 
 from service.config import WorldConfig
 from service.envs.sampling import GoalKind
-from service.errors import TandemError
+from service.errors import TandemError, did_you_mean
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,5 +86,5 @@ def find_task(name: str) -> Task:
     """
     known = {**TASKS, **HARD_TASKS}
     if name not in known:
-        raise TandemError(f"unknown task {name!r}; choose one of {', '.join(known)}")
+        raise TandemError(f"unknown task {name!r}; choose one of {', '.join(known)}{did_you_mean(name, known)}")
     return known[name]

@@ -16,6 +16,7 @@ from service.media import recording, video
 from service.media.plots import plot_coverage, plot_curves, plot_goals
 from service.policies.numpy_policy import NumpyMCPPolicy
 from service.primitives.loading import load_players, load_skills, read_parameters
+from service.progress import counted
 
 COVERAGE_STEPS = 100
 NUM_RECORDED_ROUNDS = 4
@@ -67,7 +68,7 @@ def make_artifacts(directory: RunDirectory) -> dict[str, Path]:
 
 def _make(makers: dict[str, Callable[[], Path]]) -> dict[str, Path]:
     files = {}
-    for name, make in makers.items():
+    for name, make in counted(makers.items(), "drawing", len(makers), "pictures"):
         try:
             files[name] = make()
         except TandemError as error:

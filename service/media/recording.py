@@ -26,6 +26,7 @@ from service.generator.opponents import Opponents
 from service.generator.records import GoalRecords
 from service.generator.snapshot import GeneratorSnapshot
 from service.generator.validity import Verdict
+from service.progress import counted
 from service.types import BoolArray, FloatArray, StateArray
 
 _NUM_WORLDS = 64
@@ -85,7 +86,7 @@ def record_rounds(
             self_play.start_over()
         # It was never told of a goal, so it replays none: Bob plays those of this round's Alice.
         snapshot = TaskGenerator(config, self_play.worlds.layout).snapshot()
-        for _ in range(_MAX_ROLLOUTS):
+        for _ in counted(range(_MAX_ROLLOUTS), "playing rounds", _MAX_ROLLOUTS, "batches at most"):
             records, recorded = _record(self_play, players, snapshot, rng)
             rounds += zip(_interest(records, config.world.rest_height_m), recorded, strict=True)
             if sum(played for (played, *_), _ in rounds) >= num_rounds:

@@ -24,6 +24,7 @@ from service.generator.validity import Verdict
 from service.io.files import TEMPORARY_PREFIX, os_errors
 from service.liveness import count_work
 from service.media.recording import RecordedEpisodes, RecordedRound
+from service.progress import counted
 from service.types import StateArray
 
 Colour = tuple[int, int, int]
@@ -70,7 +71,8 @@ def write_video(rounds: Sequence[RecordedRound], config: WorldConfig, path: Path
             for number, each in enumerate(rounds, start=1)
             for frame in _round_frames(renderer, each, f"{number}/{len(rounds)}", stride, step_s)
         )
-        return _encode(frames, path, fps=1 / (stride * step_s))
+        num = sum(_num_frames(each, stride, stride * step_s) for each in rounds)
+        return _encode(counted(frames, "drawing the video", num, "pictures"), path, fps=1 / (stride * step_s))
 
 
 def write_episode_video(episodes: RecordedEpisodes, config: WorldConfig, path: Path) -> Path:
@@ -79,7 +81,9 @@ def write_episode_video(episodes: RecordedEpisodes, config: WorldConfig, path: P
     with SceneRenderer(config, EPISODE_PANE_SIZE, EPISODE_PANE_SIZE) as renderer:
         stride = _stride(renderer, episodes.states[0, 0], num_steps * num_episodes)
         frame_s = stride * _step_s(config)
-        return _encode(_episode_frames(renderer, episodes, stride, frame_s), path, fps=1 / frame_s)
+        frames = _episode_frames(renderer, episodes, stride, frame_s)
+        num = len(_thinned(num_steps, stride)) + _num_held(END_PAUSE_S, frame_s)
+        return _encode(counted(frames, "drawing the video", num, "pictures"), path, fps=1 / frame_s)
 
 
 # --- what is shown -------------------------------------------------------------------------------------------------
@@ -151,7 +155,19 @@ def _thinned(num: int, stride: int) -> list[int]:
 
 
 def _hold(frame: Image, pause_s: float, frame_s: float) -> list[Image]:
-    return [frame] * max(round(pause_s / frame_s), 1)
+    return [frame] * _num_held(pause_s, frame_s)
+
+
+def _num_held(pause_s: float, frame_s: float) -> int:
+    return max(round(pause_s / frame_s), 1)
+
+
+def _num_frames(played: RecordedRound, stride: int, frame_s: float) -> int:
+    """Number of frames that ``_round_frames`` gives."""
+    num = len(_thinned(len(played.alice_states), stride)) + _num_held(END_PAUSE_S, frame_s)
+    if played.verdict != Verdict.VALID:
+        return num
+    return num + len(_thinned(len(played.bob_states), stride)) + _num_held(GOAL_PAUSE_S, frame_s)
 
 
 # --- pictures ------------------------------------------------------------------------------------------------------

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from service.errors import did_you_mean
 from service.registry.errors import UnknownVersionError
 from service.registry.exported import ExportedVersion, is_exported
 from service.registry.names import Version, split_reference
@@ -40,6 +41,7 @@ def find_version(reference: str, root: Path) -> tuple[Registry, Version]:
         if not bundled.versions(name):
             raise UnknownVersionError(
                 f"{error}; with tandem comes: {', '.join(bundled.names()) or 'nothing'}"
+                f"{did_you_mean(name, [*own.names(), *bundled.names()])}"
             ) from None
         missing = str(error) if own.versions(name) else f"the registry {own.root} has no {name} at all"
     try:

@@ -20,6 +20,7 @@ from typing import Any
 
 import numpy as np
 
+from service.errors import did_you_mean
 from service.io import tensors
 from service.io.errors import StorageError
 from service.io.files import os_errors, write_atomic, write_exclusive
@@ -279,10 +280,14 @@ class Registry:
         if not versions:
             known = ", ".join(self.names()) or "nothing yet"
             return f"no {name!r} in the registry {self.root}; it holds: {known}; pick one of those or another registry"
-        aliases = ", ".join(f"{alias} -> {number}" for alias, number in self.aliases(name).items()) or "none"
+        there = self.aliases(name)
+        aliases = ", ".join(f"{alias} -> {number}" for alias, number in there.items()) or "none"
         kind = "version" if isinstance(target, int) else "alias"
+        hint = did_you_mean(target, there) if isinstance(target, str) else ""
         span = f"{versions[0].number} to {versions[-1].number}"
-        return f"{name} has no {kind} {target!r} in the registry {self.root}; versions: {span}; aliases: {aliases}"
+        return (
+            f"{name} has no {kind} {target!r} in the registry {self.root}; versions: {span}; aliases: {aliases}{hint}"
+        )
 
     def _directory(self, name: str) -> Path:
         return self.root / "models" / names.check_name(name)

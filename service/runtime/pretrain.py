@@ -15,6 +15,7 @@ from service.io.run_directory import Published, RunDirectory
 from service.learner.learner import torch_device
 from service.media.artifacts import make_artifacts
 from service.primitives.publishing import measure_bob, measure_skills, publish_run
+from service.progress import answer, doing
 from service.registry.names import Version
 from service.registry.registry import Registry
 from service.runtime.local import LocalRun, check_one_learner
@@ -117,7 +118,9 @@ def pretrain(
             stack.enter_context(explaining_ray_errors())  # before the report has them
         num_lost, furthest = 0, -1
         while True:
-            with closing(_start(config, directory, cluster, resume=resume, start=start)) as run:
+            with doing("starting", aloud=False):
+                started = _start(config, directory, cluster, resume=resume, start=start)
+            with closing(started) as run:
                 try:
                     to = Registry(registry) if publish else None
                     done = _run(run, config, directory, to, signals, report, on_iteration)
@@ -206,7 +209,12 @@ def _run(
             run.request_stop()
 
     report.begin(run)
-    with signals.asking(run.request_stop):
+
+    def stop() -> None:
+        run.request_stop()
+        answer("stopping after this iteration; again to end now")
+
+    with signals.asking(stop):
         result = run.run(tell, beat)
     done = Pretrained(result, {}, None, {}, run.timing.tree(), signals.first)
     if result.reason != "interrupted" and signals.first is None:

@@ -15,6 +15,7 @@ from service.errors import TandemError
 from service.io.study_directory import StudyDirectory
 from service.learner.learner import torch_device
 from service.media.plots import plot_study
+from service.progress import counted
 from service.registry.names import Version
 from service.registry.registry import Registry
 from service.runtime.local import check_one_learner
@@ -161,7 +162,7 @@ def _finish(study: Study, directory: StudyDirectory, registry: Registry | None, 
     if ended:
         progress.say(f"learning is over; runs to evaluate: {len(ended)}")
     scores: dict[int, Scores] = {}
-    for run in ended:
+    for run in counted(ended, "evaluating the runs", len(ended), "runs"):
         try:
             scores[run.seed] = score_run(directory.run(run.seed))
         except TandemError as error:  # a damaged checkpoint

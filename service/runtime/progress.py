@@ -7,14 +7,11 @@ from collections.abc import Mapping
 from types import TracebackType
 from typing import Self
 
-from rich.console import Console
-from rich.live import Live
 from rich.progress_bar import ProgressBar
 from rich.table import Table
 
+from service.progress import Display, minutes
 from service.store.models import RunState
-
-PLAIN_INTERVAL_S = 10.0
 
 _ROWS = (
     ("Alice: valid goals", "alice/valid_fraction", "{:.0%}"),
@@ -74,70 +71,77 @@ class _Values:
 
 
 class _Shown:
-    """The part of the console that is drawn anew again and again; a context manager."""
+    """A table on the display while a block runs; it stays there afterwards, as it was at the end."""
 
-    def __init__(self, console: Console) -> None:
-        self._console = console
-        self._live = Live(console=console, refresh_per_second=4, transient=False) if console.is_terminal else None
-        self._last_line_s = float("-inf")
+    def __init__(self, total_env_steps: int, display: Display) -> None:
+        """Nothing is shown before the first ``show``.
+
+        Args:
+            total_env_steps: of each run.
+            display: where it is shown.
+        """
+        self._total, self._display = total_env_steps, display
+        self._begun_s = time.monotonic()
 
     def __enter__(self) -> Self:
-        if self._live is not None:
-            self._live.start()
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        if self._live is not None:
-            self._live.stop()
+        self._display.keep()
 
     def say(self, line: str) -> None:
-        """Print a plain line; on a terminal it stays above the table."""
-        self._console.print(line, highlight=False, soft_wrap=True, markup=False)
-
-    def _due(self) -> bool:
-        """Whether it is time for plain lines."""
-        if time.monotonic() - self._last_line_s < PLAIN_INTERVAL_S:
-            return False
-        self._last_line_s = time.monotonic()
-        return True
+        """Print a plain line."""
+        self._display.say(line)
 
 
 class Progress(_Shown):
     """Shows every iteration's metrics of one run; a context manager."""
 
-    def __init__(self, total_env_steps: int, console: Console) -> None:
-        """Nothing is printed before the first ``show``."""
-        super().__init__(console)
-        self._total = total_env_steps
+    def __init__(self, total_env_steps: int, display: Display) -> None:
+        super().__init__(total_env_steps, display)
         self._values = _Values()
+        self._first: tuple[float, int] | None = None
+        """Time and env steps of the first iteration that was shown."""
 
     def show(self, metrics: Mapping[str, float]) -> None:
         """Take in one iteration. Rates are smoothed over about five iterations; evaluations are shown as they are."""
         self._values.take(metrics)
-        if self._live is not None:
-            self._live.update(self._table())
-        elif self._due() or self._values.env_steps >= self._total:
-            self.say(self._values.line())
+        self._first = self._first or (time.monotonic(), self._values.env_steps)
+        self._display.show(self)
+        if self._display.is_due() or self._values.env_steps >= self._total:
+            self._display.say_plain(f"{self._values.line()} | {self._times()}")
 
-    def _table(self) -> Table:
+    def __rich__(self) -> Table:
+        """The table, as it is now."""
         steps = self._values.env_steps
         table = Table(show_header=False, title=f"{steps:,} of {self._total:,} env steps", title_justify="left")
         table.add_row("", ProgressBar(total=self._total, completed=min(steps, self._total), width=40))
         for label, key, _ in self._values.rows:
             table.add_row(label, self._values.text(key))
+        table.add_row("time", self._times())
         return table
+
+    def _times(self) -> str:
+        """How long it has taken, and how long it will take at the rate since the first iteration that was shown."""
+        now_s, steps = time.monotonic(), self._values.env_steps
+        begun_s, begun_steps = self._first or (now_s, steps)
+        left = ""
+        if steps >= self._total:
+            left = ", learning is over"
+        elif steps > begun_steps and now_s > begun_s:
+            left = f", about {minutes((self._total - steps) * (now_s - begun_s) / (steps - begun_steps))} left"
+        return f"{minutes(now_s - self._begun_s)}{left}"
 
 
 class StudyProgress(_Shown):
     """Shows the runs of a study side by side; a context manager."""
 
-    def __init__(self, total_env_steps: int, console: Console) -> None:
-        """Nothing is printed before the first ``show``."""
-        super().__init__(console)
-        self._total = total_env_steps
+    def __init__(self, total_env_steps: int, display: Display) -> None:
+        super().__init__(total_env_steps, display)
         self._values: dict[int, _Values] = {}
+        self._states: Mapping[int, RunState | None] = {}
         self._said: dict[int, int] = {}
         """Env steps of each run's last line."""
 
@@ -147,18 +151,23 @@ class StudyProgress(_Shown):
 
     def show(self, states: Mapping[int, RunState | None]) -> None:
         """Show all runs, each with its state; None: it waits for others to end."""
-        if self._live is not None:
-            self._live.update(self._table(states))
-            return
+        self._states = states
+        self._display.show(self)
         new = {seed: each for seed, each in self._values.items() if each.env_steps != self._said.get(seed)}
-        if new and self._due():
+        if new and self._display.is_due():
             for seed, values in new.items():
                 self._said[seed] = values.env_steps
-                self.say(f"seed {seed}: {values.line()}")
+                self._display.say_plain(f"seed {seed}: {values.line()}")
 
-    def _table(self, states: Mapping[int, RunState | None]) -> Table:
-        table = Table("seed", "state", f"of {self._total:,} env steps", *(label for label, _ in _COLUMNS))
-        for seed, state in states.items():
+    def __rich__(self) -> Table:
+        """The table, as it is now."""
+        done = sum(values.env_steps for values in self._values.values())
+        title = (
+            f"{done:,} of {self._total * len(self._states):,} env steps, {minutes(time.monotonic() - self._begun_s)}"
+        )
+        head = ("seed", "state", f"of {self._total:,} env steps", *(label for label, _ in _COLUMNS))
+        table = Table(*head, title=title, title_justify="left")
+        for seed, state in self._states.items():
             values = self._values.get(seed, _Values())
             bar = ProgressBar(total=self._total, completed=min(values.env_steps, self._total), width=20)
             cells = [values.text(key).removesuffix(" env steps/s") for _, key in _COLUMNS]

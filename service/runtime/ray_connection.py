@@ -14,7 +14,10 @@ from typing import Any
 
 from service.config import LearnerConfig
 from service.errors import TandemError, one_line
+from service.extras import needs_extra
+from service.progress import doing
 from service.runtime.runner import ClusterError
+from service.status.ports import DEFAULT_PORT
 
 CONNECT_S = 5.0
 ANSWER_S = 20.0
@@ -32,9 +35,11 @@ class StatusOptions:
     """Address and token of the status service of a run on a cluster."""
 
     host: str = "127.0.0.1"
-    port: int = 8321
+    port: int = DEFAULT_PORT
     """0: one that is free."""
     token: str | None = field(default=None, repr=False)
+    or_next: bool = False
+    """Take the next free port where that one is taken."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,12 +64,14 @@ class ClusterOptions:
         return self.learner_cpus or float(learner.num_threads * (learner.num_learners > 1))
 
 
-def parse_status(text: str, token: str | None) -> StatusOptions | None:
-    """Parse ``HOST:PORT`` or ``off``.
+def parse_status(text: str | None, token: str | None) -> StatusOptions | None:
+    """Parse ``HOST:PORT`` or ``off``; None is this machine alone, at the usual port or the next free one.
 
     Raises:
         ClusterError: neither.
     """
+    if text is None:
+        return StatusOptions(token=token, or_next=True)
     if text == "off":
         return None
     host, separator, port = text.rpartition(":")
@@ -97,19 +104,27 @@ def connected(address: str | None, num_cpus: int | None = None) -> Iterator[None
         os.environ.setdefault("RAY_worker_niceness", "0")  # not 15 for all: see ``ray_actors.lower_priority``
         # No spare worker for every core: ours have environment variables of their own, so none would fit.
         os.environ.setdefault("RAY_prestart_worker_first_driver", "0")
-    try:
+    with needs_extra("cluster", "--runtime ray"):
         import ray
-    except ImportError:
-        raise ClusterError(
-            "Ray is not installed: pip install 'tandem-skills[cluster]', or use --runtime local"
-        ) from None
     _check_reachable(address)
     _check_token(address)
     options: dict[str, Any] = {"num_cpus": num_cpus, "include_dashboard": False} if address is None else {}
+    with doing("starting Ray" if address is None else f"connecting to Ray at {address}"):
+        _init(address, options)
+    try:
+        with explaining_ray_errors():
+            yield
+    finally:
+        ray.shutdown()
+
+
+def _init(address: str | None, options: dict[str, Any]) -> None:
+    import ray
+
     for attempt in range(START_ATTEMPTS, 0, -1):
         try:
             ray.init(address or "local", logging_level=logging.WARNING, **options)
-            break
+            return
         except Exception as error:  # other versions, a refused token, a slow node: Ray has no common class for them
             ray.shutdown()
             if attempt == 1 or address is not None or "timed out during startup" not in str(error):
@@ -117,11 +132,6 @@ def connected(address: str | None, num_cpus: int | None = None) -> Iterator[None
         except BaseException:  # a signal's
             ray.shutdown()
             raise
-    try:
-        with explaining_ray_errors():
-            yield
-    finally:
-        ray.shutdown()
 
 
 @contextmanager

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import socket
+import logging
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -18,8 +18,10 @@ from service.runtime.ray_connection import StatusOptions
 from service.runtime.remote_worker import one_line
 from service.runtime.runner import ClusterError
 from service.status.errors import StatusError
+from service.status.ports import free_port
 from service.store.address import RedisAddress
 
+_logger = logging.getLogger(__name__)
 START_S = 60.0
 REBIND_S = 10.0
 """A restarted service waits so long for its port, which the one that died had a moment ago."""
@@ -72,6 +74,16 @@ class StatusWorker:
         return self._server.url
 
 
+def place(options: StatusOptions) -> StatusOptions:
+    """The options with the port that is taken in the end: a service that is restarted must be where it was."""
+    if options.port != 0 and not options.or_next:
+        return options
+    port = free_port(options.host, options.port)
+    if options.port not in (0, port):
+        _logger.info("port %d is taken, so the status service is at port %d", options.port, port)
+    return replace(options, port=port)
+
+
 @contextmanager
 def serving(options: StatusOptions, runs_dir: Path, registry: Path, redis: RedisAddress | None) -> Iterator[str]:
     """Serve for as long as the block runs, on the driver's machine, where the run directories are.
@@ -85,9 +97,7 @@ def serving(options: StatusOptions, runs_dir: Path, registry: Path, redis: Redis
     """
     here = NodeAffinitySchedulingStrategy(ray.get_runtime_context().get_node_id(), soft=False)
     actor = ray.remote(StatusWorker).options(num_cpus=0, max_restarts=-1, scheduling_strategy=here)
-    if options.port == 0:  # a restarted one must be where the first one was
-        options = replace(options, port=_free_port(options.host))
-    handle: Any = actor.remote(options, runs_dir.absolute(), registry.absolute(), redis)
+    handle: Any = actor.remote(place(options), runs_dir.absolute(), registry.absolute(), redis)
     try:
         yield _started(handle)
     finally:
@@ -104,9 +114,3 @@ def _started(handle: Any) -> str:
     except RayError as error:
         raise ClusterError(f"the status service does not start: {one_line(error)}") from None
     return url
-
-
-def _free_port(host: str) -> int:
-    with socket.socket(socket.AF_INET6 if ":" in host else socket.AF_INET) as probe:
-        probe.bind((host, 0))
-        return int(probe.getsockname()[1])

@@ -19,6 +19,7 @@ from signal import SIGKILL, SIGTERM, Signals
 from service.io.errors import StorageError
 from service.io.files import open_to_append, os_errors
 from service.io.study_directory import StudyDirectory
+from service.progress import answer
 from service.regular_files import open_regular
 from service.runtime.progress import StudyProgress
 from service.runtime.signals import PASSED_ON, STOPPING, StopSignals
@@ -109,7 +110,7 @@ class Study:
                     while waiting and not self._stopping and len(self._processes) < num_parallel:
                         self._start(waiting.popleft(), command)
                     if self._stopping and not told:
-                        progress.say("stopping: each run ends after its current iteration")
+                        answer("stopping each run after its iteration; again to end now")
                         self._signal(PASSED_ON)
                         told = True
                     time.sleep(POLL_S)

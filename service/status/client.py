@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from service.errors import TandemError
+from service.extras import needs_extra
 from service.io.files import os_errors, write_atomic
 from service.registry.blobs import BlobStore, check_digest
 from service.registry.errors import DamagedBlobError, UnknownVersionError
@@ -21,12 +22,8 @@ from service.registry.registry import Registry
 from service.status.errors import FetchError, StatusError, WrongTokenError
 from service.status.token import VARIABLE, read_token
 
-try:
+with needs_extra("serve", "fetching primitives"):
     import httpx
-except ImportError:
-    raise TandemError(
-        "fetching primitives needs the package httpx, which is not installed: pip install 'tandem-skills[cluster]'"
-    ) from None
 
 MAX_MANIFEST_BYTES = 4 * 1024 * 1024
 MAX_BLOB_BYTES = 256 * 1024 * 1024

@@ -18,9 +18,9 @@ from service.status.app import create_app
 from service.status.auth import is_loopback
 from service.status.connections import BoundedConnection
 from service.status.errors import StatusError
+from service.status.ports import DEFAULT_PORT
 from service.store.models import RunReader
 
-DEFAULT_PORT = 8321
 START_TIMEOUT_S = 10.0
 STOP_TIMEOUT_S = 5.0
 _GRACE_S = 2

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from typing import Any
 from urllib.parse import urlsplit
 
+from service.extras import needs_extra
 from service.store.errors import StoreError, StoreUnavailableError
 
 VARIABLE = "TANDEM_REDIS_URL"
@@ -26,12 +27,8 @@ class RedisAddress:
     """With the password: for a client, never for people."""
 
     def __post_init__(self) -> None:
-        try:
+        with needs_extra("cluster", f"a run reports to Redis, since {VARIABLE} is set, and that"):
             from redis.connection import parse_url
-        except ImportError:
-            raise StoreError(
-                f"{VARIABLE} is set, but the package redis is not installed: pip install 'tandem-skills[cluster]'"
-            ) from None
         try:
             parse_url(self.url)  # type: ignore[no-untyped-call]
             usable = bool(urlsplit(self.url).hostname or urlsplit(self.url).scheme == "unix")

@@ -6,8 +6,8 @@ import signal
 import pytest
 from typer.testing import CliRunner
 
-from service.cli import downstream as commands
 from service.cli.main import app
+from service.downstream.directory import TrainingDirectory
 from service.primitives.bundled import BUNDLED
 from tests.downstream.trials import SETS
 from tests.status.conftest import serve
@@ -28,18 +28,16 @@ def nowhere(tmp_path, monkeypatch):
 
 
 def test_a_signal_saves_and_the_same_command_continues(tmp_path, monkeypatch):
-    show = commands._Progress.show
-    monkeypatch.setattr(
-        commands._Progress, "show", lambda line, metrics: show(line, metrics) or os.kill(os.getpid(), signal.SIGTERM)
-    )
-    cut = train("--task", "wall")
+    record = TrainingDirectory.record
+    with monkeypatch.context() as patch:
+        patch.setattr(TrainingDirectory, "record", lambda *all: record(*all) or os.kill(os.getpid(), signal.SIGTERM))
+        cut = train("--task", "wall")
     assert cut.exit_code == 128 + signal.SIGTERM
     assert "saved; continue with the same command and --resume" in cut.stderr
-    assert "env steps" in cut.stderr
+    assert "stopping after this iteration; again to end now\n" in cut.stderr
     path = tmp_path / "runs" / "downstream" / "wall-ours-0"
     assert (path / "checkpoints").exists()
     assert not (path / "result.json").exists()
-    monkeypatch.setattr(commands._Progress, "show", lambda line, metrics: None)
     monkeypatch.setattr("service.downstream.worker._record_video", lambda *arguments: path)
     done = train("--task", "wall", "--resume", "--json")
     assert done.exit_code == 0, done.output

@@ -21,6 +21,7 @@ from service.io import checkpoints
 from service.io.lock import DirectoryLock
 from service.io.run_directory import RunDirectory
 from service.primitives.bundled import BUNDLED
+from service.recipes import recipes
 from service.registry.names import Version
 from service.registry.registry import Registry
 from service.runtime.signals import InterruptError
@@ -117,12 +118,12 @@ def test_the_readmes_commands_of_pretraining(monkeypatch, tmp_path):
     monkeypatch.setattr("service.primitives.publishing.FINAL_EVALUATION_EPISODES", 4)
     monkeypatch.setattr("service.runtime.pretrain.make_artifacts", lambda directory: {})
     monkeypatch.chdir(tmp_path)
-    commands = [shlex.split(line) for line in re.findall(r"^tandem (pretrain .*)$", README, re.MULTILINE)]
+    commands = [
+        shlex.split(line, comments=True) for line in re.findall(r"^tandem (pretrain .*)$", README, re.MULTILINE)
+    ]
     commands = [command for command in commands if "--runtime" not in command]
-    (given,) = {command[command.index("--config") + 1] for command in commands if "--config" in command}
-    assert (ROOT / given).is_file()
-    Path(given).parent.mkdir(parents=True)
-    write_yaml(Path(given), TREE | {"name": "panda-cube"})
+    write_yaml(tmp_path / "tiny.yaml", TREE | {"name": "panda-cube"})
+    monkeypatch.setitem(recipes(), "panda-cube", tmp_path / "tiny.yaml")
     for command in commands:
         result = tandem(*command)
         assert result.exit_code == 0, (command, result.output)
@@ -191,8 +192,10 @@ def test_demo_ends_with_what_comes_with_tandem_and_what_to_type(monkeypatch, tmp
     from service.runtime.pretrain import Pretrained
     from service.runtime.runner import RunResult
 
+    metrics = {"evaluation/table_success_last": 0.12, "evaluation/air_success_last": 0.03}
+
     def pretrain(*args, **kwargs):
-        return Pretrained(RunResult("finished", 1, 7), {}, Version("panda-cube-demo", 1), {}, "total 1 s")
+        return Pretrained(RunResult("finished", 1, 7), {}, Version("panda-cube-demo", 1), metrics, "total 1 s")
 
     real = evaluation.evaluate
     few = {"num_episodes": 4, "num_steps": 2}
@@ -206,7 +209,9 @@ def test_demo_ends_with_what_comes_with_tandem_and_what_to_type(monkeypatch, tmp
     assert f"\n  {champion} (bundled) " in shown
     assert "\n  idle " in shown
     commands = [shlex.split(line)[1:] for line in re.findall(r"^ +(tandem .*)$", shown, re.MULTILINE)]
-    assert [command[0] for command in commands] == ["evaluate", "render", "coverage"]
+    assert [command[0] for command in commands] == ["evaluate", "render", "coverage", "serve"]
+    assert commands[-1] == ["serve", "--runs", "runs"]
+    assert "Bob has practised for 7 steps, and now reaches 12% of random goals on the table and 3% " in shown
     evaluated = tandem(*commands[0])
     assert evaluated.exit_code == 0, evaluated.output
     assert evaluated.stdout in shown  # it says the same again
@@ -504,7 +509,9 @@ def test_a_disk_that_is_full_to_the_end(tmp_path):
     """It is no mistake of what was typed, and what came before it is there."""
     config = write_yaml(tmp_path / "tiny.yaml")
     with no_room_above(200_000):
-        result = tandem("pretrain", "--config", config, "--run-dir", tmp_path / "run", "--registry", tmp_path / "none")
+        result = tandem(
+            "pretrain", "-q", "--config", config, "--run-dir", tmp_path / "run", "--registry", tmp_path / "none"
+        )
     assert result.exit_code == 1
     assert result.stderr.startswith("error: ")
     assert result.stderr.count("\n") == 1

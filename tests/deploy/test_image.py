@@ -70,7 +70,7 @@ def test_stages_build_on_stages():
 def test_what_is_copied_is_there_and_not_ignored():
     copied = [shlex.split(rest)[:-1] for word, rest in instructions() if word == "COPY" and "--from" not in rest]
     names = {name for group in copied for name in group}
-    assert names == {"LICENSE", "README.md", "configs", "constraints.txt", "pyproject.toml", "service"}
+    assert names == {"LICENSE", "README.md", "configs", "constraints.txt", "pyproject.toml", "service", "setup.py"}
     assert all((ROOT / name).exists() and not ignored(name) for name in names)
 
 
@@ -96,7 +96,9 @@ def test_the_requirements_are_the_projects(tmp_path):
         [sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, timeout=600, check=True
     ).stdout
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
-    assert printed.splitlines() == project["dependencies"] + project["optional-dependencies"]["cluster"]
+    itself, *of_ray = project["optional-dependencies"]["cluster"]
+    assert itself == "tandem-skills[serve]"  # pip would look for it elsewhere
+    assert printed.splitlines() == project["dependencies"] + project["optional-dependencies"]["serve"] + of_ray
 
 
 def test_it_does_not_run_as_root():

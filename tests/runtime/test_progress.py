@@ -6,7 +6,8 @@ import time
 import pytest
 from rich.console import Console
 
-from service.runtime.progress import PLAIN_INTERVAL_S, Progress, StudyProgress
+from service.progress import PLAIN_INTERVAL_S, Display
+from service.runtime.progress import Progress, StudyProgress
 from service.runtime.timing import Timing
 
 
@@ -28,7 +29,7 @@ def clock(monkeypatch):
 
 def plain(total_env_steps=1000):
     console = Console(file=io.StringIO(), force_terminal=False, width=60)
-    return Progress(total_env_steps, console), console.file
+    return Progress(total_env_steps, Display(console)), console.file
 
 
 def metrics(env_steps, **values):
@@ -77,7 +78,7 @@ def test_rates_are_smoothed_and_evaluations_are_not(clock):
 
 def test_a_table_on_a_terminal():
     console = Console(file=io.StringIO(), force_terminal=True, width=100)
-    with Progress(1000, console) as progress:
+    with Progress(1000, Display(console)) as progress:
         progress.show(metrics(500, alice__valid_fraction=0.42))
     text = console.file.getvalue()
     assert "500 of 1,000 env steps" in text
@@ -87,7 +88,7 @@ def test_a_table_on_a_terminal():
 
 def test_lines_of_a_study_name_the_seed_and_tell_no_run_twice(clock):
     console = Console(file=io.StringIO(), force_terminal=False, width=60)
-    with StudyProgress(1000, console) as progress:
+    with StudyProgress(1000, Display(console)) as progress:
         progress.show({3: "starting", 8: None})
         progress.take(3, metrics(100, bob__success_rate=0.5) | {"alice/valid_fraction": None})
         progress.show({3: "running", 8: None})  # the first line comes at once
@@ -104,7 +105,7 @@ def test_lines_of_a_study_name_the_seed_and_tell_no_run_twice(clock):
 
 def test_a_study_on_a_terminal():
     console = Console(file=io.StringIO(), force_terminal=True, width=120)
-    with StudyProgress(1000, console) as progress:
+    with StudyProgress(1000, Display(console)) as progress:
         progress.take(3, metrics(500, alice__valid_fraction=0.42, time__env_steps_per_s=1234.0))
         progress.show({3: "running", 8: None})
     text = console.file.getvalue()
@@ -114,18 +115,18 @@ def test_a_study_on_a_terminal():
 
 def test_a_table_fits_a_narrow_terminal():
     console = Console(file=io.StringIO(), force_terminal=True, width=40)
-    with Progress(1000, console) as progress:
+    with Progress(1000, Display(console)) as progress:
         progress.show(metrics(2000, bob__success_rate=0.5))
     assert "2,000 of 1,000" in console.file.getvalue()
 
 
 def test_the_terminal_is_given_back_after_an_error():
     console = Console(file=io.StringIO(), force_terminal=True, width=100)
-    progress = Progress(1000, console)
+    progress = Progress(1000, Display(console))
+    progress.show(metrics(100))
     with pytest.raises(RuntimeError), progress:
         raise RuntimeError
-    assert progress._live is not None
-    assert not progress._live.is_started
+    assert console.file.getvalue().rindex("\x1b[?25h") > console.file.getvalue().rindex("\x1b[?25l")  # the cursor
 
 
 def test_timing_is_a_tree_that_adds_up(monkeypatch):

@@ -193,6 +193,7 @@ def test_a_signal_during_an_iteration(home, uninterrupted, monkeypatch, number):
         patch.setattr(LocalRun, "_take_snapshot", signalled)
         result = home.run()
     assert result.exit_code == 128 + number
+    assert "stopping after this iteration; again to end now\n" in result.stderr
     assert "interrupted after" in result.stdout
     assert result.stdout.endswith(f"\nsaved; {home.hint}")
     assert newest(home.path).step == 3

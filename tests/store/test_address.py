@@ -6,6 +6,7 @@ import traceback
 
 import pytest
 
+from service.extras import MissingPackageError
 from service.store.address import RedisAddress, address_from_environment
 from service.store.errors import StoreError, StoreUnavailableError
 from service.store.redis_reader import RedisReader
@@ -85,6 +86,6 @@ def test_something_else_listens_there():
 
 def test_the_package_is_missing(monkeypatch):
     monkeypatch.setitem(__import__("sys").modules, "redis.connection", None)
-    with pytest.raises(StoreError) as error:
+    with pytest.raises(MissingPackageError) as error:
         RedisAddress("redis://localhost")
     assert_one_line(error.value, "TANDEM_REDIS_URL is set", "pip install 'tandem-skills[cluster]'")

@@ -1,0 +1,138 @@
+"""Names that are typed: configurations that come with tandem, and what a misspelt name was meant to be."""
+
+import json
+import os
+import shlex
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from service import __version__
+from service.cli.main import app
+from service.config import load_config
+from service.errors import TandemError, did_you_mean
+from service.recipes import CONFIGS, recipes, robots
+
+RECIPE = CONFIGS / "pretrain" / "panda_cube.yaml"
+
+
+def tandem(*arguments):
+    return CliRunner().invoke(app, [str(argument) for argument in arguments])
+
+
+@pytest.fixture
+def begun(monkeypatch, tmp_path):
+    """Configurations of runs that would have begun."""
+    seen = []
+
+    def pretrain(config, *arguments, **keywords):
+        seen.append(config)
+        raise TandemError("not today")
+
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("service.runtime.pretrain.pretrain", pretrain)
+    return seen
+
+
+def test_without_a_name_it_is_the_shipped_recipe(begun):
+    for arguments in ([], ["--config", "panda-cube"], ["--config", RECIPE]):
+        tandem("pretrain", *arguments, "--set", "seed=3")
+    assert begun == 3 * [load_config(RECIPE, ["seed=3"])]
+    assert begun[0].game.num_worlds == 120  # the default is another
+    tandem("pretrain", "--method", "lsd")
+    assert begun[3] == load_config(RECIPE, ["skills.method=lsd", "name=panda-cube-lsd"])
+
+
+def test_a_file_stands_alone_and_a_name_comes_first(begun):
+    Path("panda-cube").write_text("seed: 5\n")
+    tandem("pretrain", "--config", "panda-cube")
+    tandem("pretrain", "--config", "./panda-cube")
+    assert begun == [load_config(RECIPE), load_config(overrides=["seed=5"])]
+
+
+def test_configs_are_listed_and_shown():
+    rows = json.loads(tandem("configs", "--json").stdout)
+    assert {row["name"]: row["kind"] for row in rows} == {
+        **dict.fromkeys(recipes(), "recipe"),
+        **dict.fromkeys(robots(), "robot"),
+    }
+    assert all(10 < len(row["about"]) < 120 for row in rows)
+    assert tandem("configs").stdout.splitlines()[1].startswith("panda-cube\trecipe\tSelf-play of a Panda arm")
+    assert tandem("configs", "show", "panda-cube").stdout == RECIPE.read_text()
+    assert tandem("configs", "show", "ur5e").stdout == (CONFIGS / "robots" / "ur5e.yaml").read_text()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["configs", "show", "panda_cube"], "did you mean 'panda-cube'?"),
+        (
+            ["pretrain", "--config", "panda-cub"],
+            "tandem configs lists those that come with tandem; did you mean 'panda-cube'?",
+        ),
+        (["pretrain", "--set", "world.robot=ur5"], "did you mean 'ur5e'?"),
+        (["pretrain", "--set", "learner.bob.num_epoch=3"], "did you mean 'num_epochs'?"),
+        (["pretrain", "--set", "num_worlds=3"], "did you mean game.num_worlds?"),
+        (
+            ["pretrain", "--set", "learner.gae_lambda=0.9"],
+            "did you mean learner.alice.gae_lambda or learner.bob.gae_lambda?",
+        ),
+        (["pretrain", "--method", "LSDD"], "did you mean 'lsd'?"),
+        (["pretrain", "--runtime", "rai"], "did you mean 'ray'?"),
+        (["evaluate", "--primitives", "panda-cube", "--goals", "tabel"], "did you mean 'table'?"),
+        (["evaluate", "--primitives", "panda-cub"], "did you mean 'panda-cube'?"),
+        (["evaluate", "--primitives", "panda-cube@champoin"], "did you mean 'champion'?"),
+        (["downstream", "train", "--task", "walls"], "did you mean 'wall'?"),
+        (["downstream", "train", "--task", "wall", "--method", "ours_her"], "did you mean 'ours-her'?"),
+        (["downstream", "train", "--task", "wall", "--set", "gama=0.9"], "did you mean 'gamma'?"),
+        (["evalute"], "Did you mean 'evaluate'?"),
+    ],
+)
+def test_what_was_meant_is_said(monkeypatch, tmp_path, arguments, said):
+    monkeypatch.chdir(tmp_path)
+    result = tandem(*arguments)
+    assert result.exit_code == 2, result.exception
+    assert said in result.stderr
+    assert result.stderr.count("\n") == 1
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_what_is_like_nothing_gets_no_guess():
+    assert did_you_mean("zebra", ["panda-cube", "ur5e"]) == ""
+    assert did_you_mean("x" * 100_000, ["panda-cube"]) == ""
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["pretrain", "--runs", "a", "--run-dir", "b"], "drop one of them"),
+        (["pretrain", "--runtime", "ray", "--status", "off", "--token-file", "x"], "drop one of them"),
+        (["pretrain", "--seeds", "0,1", "--accept-damaged-records"], "resume that one by its --run-dir"),
+        (["downstream", "train", "--task", "wall", "--skill-steps", "5"], "and ours takes none: leave it out"),
+        (["downstream", "train", "--task", "wall", "--method", "idle", "--steps", "900"], "idle learns nothing"),
+        (["downstream", "train", "--task", "wall", "--method", "asp-only", "--set", "gamma=0.9"], "--set is about"),
+    ],
+)
+def test_options_that_would_do_nothing_are_refused(monkeypatch, tmp_path, arguments, said):
+    monkeypatch.chdir(tmp_path)
+    result = tandem(*arguments)
+    assert result.exit_code == 2, result.exception
+    assert said in result.stderr
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_the_version():
+    assert tandem("--version").stdout == f"tandem {__version__}\n"
+
+
+def test_the_shell_completes_names():
+    typed = ["tandem", "pretrain", "--config", "pan"]
+    asked = {"_TANDEM_COMPLETE": "complete_bash", "COMP_WORDS": shlex.join(typed), "COMP_CWORD": "3"}
+    code = "import sys; sys.argv = ['tandem']; from service.cli.main import main; main()"
+    done = subprocess.run(
+        [sys.executable, "-c", code], env={**os.environ, **asked}, capture_output=True, text=True, timeout=600
+    )
+    assert done.stdout.split() == ["panda-cube"], done.stderr

@@ -1,0 +1,65 @@
+"""Several status services on one machine: each finds a port, unless it was told which."""
+
+import socket
+from contextlib import contextmanager
+
+import pytest
+from typer.testing import CliRunner
+
+from service.cli.main import app
+from service.runtime.ray_connection import StatusOptions, parse_status
+from service.runtime.status_actor import place
+from service.status.ports import DEFAULT_PORT, free_port
+
+
+@contextmanager
+def taken(port=0):
+    """A port that somebody listens at."""
+    with socket.socket() as other:
+        other.bind(("127.0.0.1", port))
+        other.listen()
+        yield other.getsockname()[1]
+
+
+@pytest.fixture
+def busy(monkeypatch):
+    """The usual port, which is taken."""
+    with taken() as port:
+        monkeypatch.setattr("service.status.ports.DEFAULT_PORT", port)
+        yield port
+
+
+def test_the_next_free_port():
+    with taken() as port:
+        found = free_port("127.0.0.1", port)
+        assert port < found < port + 50
+        with taken(found):
+            assert free_port("127.0.0.1", port) > found
+    assert free_port("127.0.0.1", port) == port
+    assert free_port("127.0.0.1") > 1023
+    assert free_port("::1") > 1023
+
+
+def test_serve_takes_the_next_one_unless_told_which(tmp_path, monkeypatch, busy, caplog):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "runs").mkdir()
+    monkeypatch.setattr("service.status.server.StatusServer.run", lambda server: server.stop())
+    with caplog.at_level("INFO"):
+        result = CliRunner().invoke(app, ["serve"])
+    assert result.exit_code == 0, result.output
+    chosen = int(result.stdout.splitlines()[0].rpartition(":")[2])
+    assert busy < chosen < busy + 50
+    assert f"port {busy} is taken, so this is at port {chosen}" in caplog.messages
+    told = CliRunner().invoke(app, ["serve", "--port", str(busy)])
+    assert told.exit_code == 2
+    assert f"port {busy} of 127.0.0.1 is taken" in told.stderr
+
+
+def test_a_run_on_ray_does_the_same(caplog):
+    assert parse_status(None, "secret") == StatusOptions("127.0.0.1", DEFAULT_PORT, "secret", or_next=True)
+    with taken() as port, caplog.at_level("INFO"):
+        placed = place(StatusOptions(port=port, or_next=True))
+        assert port < placed.port < port + 50
+        assert caplog.messages == [f"port {port} is taken, so the status service is at port {placed.port}"]
+        named = StatusOptions(port=port)
+        assert place(named) == named  # which fails when it is started
