@@ -16,7 +16,7 @@ from service.config import load_config, parse_config
 from service.errors import TandemError
 from service.policies.numpy_policy import NumpyMCPPolicy
 from service.primitives.bundled import BUNDLED
-from service.recipes import recipes
+from service.recipes import recipes, robots
 from service.registry.registry import Registry
 from tests.registry.helpers import files_in
 
@@ -108,7 +108,7 @@ def test_the_recipes_and_robots_are_in_it(installed, tmp_path):
     assert files_in(installed / "service" / "configs") == files_in(ROOT / "configs") != {}
     assert run(installed, tmp_path, "--version", program="tandem") == f"tandem {service.__version__}\n"
     listed = json.loads(run(installed, tmp_path, "configs", "--json", program="tandem"))
-    assert [row["name"] for row in listed] == ["panda-cube", "jaco", "ur5e", "viperx"]
+    assert [row["name"] for row in listed] == [*recipes(), *robots()]
 
 
 SHORT_DEMO = """
