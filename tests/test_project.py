@@ -49,7 +49,19 @@ ROOMS = (
     *("store", "status", "runtime", "cli", "__main__"),
 )
 """Each room may import itself and those before it."""
-VERBS = ("demo", "pretrain", "evaluate", "render", "coverage", "export", "registry", "serve", "downstream", "robot", "configs")
+VERBS = (
+    "demo",
+    "pretrain",
+    "evaluate",
+    "render",
+    "coverage",
+    "export",
+    "registry",
+    "serve",
+    "downstream",
+    "robot",
+    "configs",
+)
 DOCUMENTS = [*sorted(ROOT.glob("*.md")), *sorted((ROOT / "docs").rglob("*.md")), ROOT / "deploy" / "README.md"]
 FOLDERS = (".ci", "benchmarks", "configs", "deploy", "docs", "service", "tests", "tools")
 TEXT = {".cfg", ".json", ".jsonl", ".md", ".py", ".toml", ".txt", ".yaml", ".yml", ""}

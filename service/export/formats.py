@@ -13,9 +13,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from service.errors import did_you_mean
 from service.export import standalone
 from service.export.errors import ExportError
 from service.export.networks import Network, Outputs
+from service.extras import needs_extra
 from service.types import FloatArray
 
 if TYPE_CHECKING:
@@ -48,14 +50,15 @@ def find_format(name: str) -> Format:
     """Find a format by its name.
 
     Raises:
-        ExportError: no such format, or packages that it needs are not installed.
+        ExportError: no such format.
+        MissingPackageError: packages that it needs are not installed.
     """
     if name not in FORMATS:
-        raise ExportError(f"unknown format {name!r}; choose one of {', '.join(FORMATS)}")
-    if missing := [package for package in FORMATS[name].needs if importlib.util.find_spec(package) is None]:
-        raise ExportError(
-            f"the format {name} needs {', '.join(missing)}, which are in an extra: pip install 'tandem-skills[export]'"
-        )
+        raise ExportError(f"unknown format {name!r}; choose one of {', '.join(FORMATS)}{did_you_mean(name, FORMATS)}")
+    with needs_extra("export", f"the format {name}"):
+        for package in FORMATS[name].needs:
+            if importlib.util.find_spec(package) is None:
+                raise ModuleNotFoundError(name=package)
     return FORMATS[name]
 
 

@@ -165,7 +165,7 @@ def test_a_missing_extra(run, monkeypatch, tmp_path):
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None if name.startswith("onnx") else find(name))
     fails(
         run("made", "--format", "onnx", "--out", "out"),
-        "the format onnx needs onnx, onnxscript, onnxruntime",
+        "the format onnx needs the package onnx, which is not installed",
         "pip install 'tandem-skills[export]'",
     )
     assert not (tmp_path / "out").exists()
