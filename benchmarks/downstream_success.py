@@ -20,8 +20,8 @@ import service
 from benchmarks.downstream_throughput import PACKAGES, default_learner
 from benchmarks.measuring import parser_of, run_benchmark
 from service.downstream.methods import METHODS, Method, provenance
+from service.downstream.playing import CURVE_SEED, FINAL_SEED, evaluate_on
 from service.downstream.settings import TrialConfig, make_trial
-from service.downstream.worker import CURVE_SEED, FINAL_SEED, play
 from service.envs.observations import BOB, POSITIONS
 from service.primitives.loading import TrainedBob
 from service.types import FloatArray
@@ -70,17 +70,19 @@ def learn(trial: TrialConfig, trained: TrainedBob, settings: Settings) -> dict[s
         return DefaultPolicy(learner, METHODS[trial.method], trained)
 
     curve: list[dict[str, float]] = []
-    wall_s = 0.0
+    wall_s, world = 0.0, trained.config.world
     while learner.num_timesteps < trial.num_env_steps:
         begun = time.perf_counter()
         num = min(settings.every, trial.num_env_steps - learner.num_timesteps)
         learner.learn(num, reset_num_timesteps=not curve, log_interval=None)  # type: ignore[arg-type]
         wall_s += time.perf_counter() - begun
-        found = play(trial, trained, player(), trial.curve_episodes, trial.seed + CURVE_SEED, settings.threads)
+        found = evaluate_on(
+            trial.task, world, player(), trial.curve_episodes, trial.seed + CURVE_SEED, settings.threads
+        )
         rates = {"success_last": found.success_last, "success_ever": found.success_ever}
         curve.append({"env_steps": learner.num_timesteps, "wall_s": wall_s, **rates})
         print(f"{learner.num_timesteps:10,} env steps, {wall_s:6.0f} s: {found.success_last:.0%}", flush=True)
-    final = play(trial, trained, player(), trial.num_episodes, trial.seed + FINAL_SEED, settings.threads)
+    final = evaluate_on(trial.task, world, player(), trial.num_episodes, trial.seed + FINAL_SEED, settings.threads)
     return {
         "settings": {**asdict(settings), **provenance(trained, trial.method)},
         "curve": curve,

@@ -9,9 +9,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    from service.downstream.orchestrators import Orchestrator
     from service.primitives.loading import TrainedBob, TrainedSkills
 
-__all__ = ["load_primitives", "load_skills"]
+__all__ = ["load_policy", "load_primitives", "load_skills"]
 __version__ = "0.2.0"
 
 
@@ -66,3 +67,26 @@ def load_skills(reference: str, registry: Path | str = "registry") -> TrainedSki
         fetched, version = fetch_primitives(str(registry), reference)
         return load_skills(str(version), fetched.root)
     return load_skills(reference, Path(registry))
+
+
+def load_policy(reference: str, registry: Path | str = "registry", primitives: str | None = None) -> Orchestrator:
+    """What ``tandem downstream`` has learned, with the primitives or skills that it acts with, without torch.
+
+    Args:
+        reference: directory of a training, or NAME, NAME@ALIAS or NAME@VERSION of a published orchestrator.
+        registry: see ``load_primitives``; what the orchestrator acts with is looked up there by the version that it was
+            trained with, and among what comes with the package.
+        primitives: what it acts with, where that has moved: a reference or a run directory. The parameters have to be
+            those it was trained with.
+
+    Returns:
+        ``.act_deterministic`` acts and ``.begin`` begins new episodes; ``.task``, ``.world`` and ``.trained``: on what
+        task, in what world, and with what.
+
+    Raises:
+        TandemError: nothing there by that reference, damaged, or no orchestrator; or what it was trained with is not
+            here.
+    """
+    from service.downstream.orchestrators import load_orchestrator
+
+    return load_orchestrator(reference, registry, primitives)

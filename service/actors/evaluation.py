@@ -78,16 +78,19 @@ def evaluate(
     seed: int,
     num_threads: int = 0,
     observe: Observer | None = None,
+    goal: StateArray | None = None,
 ) -> Evaluation:
-    """Play ``num_episodes`` random goals from fresh resets; nothing ends an episode early.
+    """Play ``num_episodes`` goals from fresh resets; nothing ends an episode early.
 
-    ``observe`` records the episodes; it changes nothing in the result.
+    ``observe`` records the episodes; it changes nothing in the result. Goals are random of that kind, or (N, 3)
+    ``goal``, metres.
     """
     rng = np.random.default_rng(seed)
     with WorldBatch(config, num_episodes, num_threads=num_threads) as worlds:
         worlds.reset(rng)
         start, box = worlds.object_position, worlds.box_place
-        goal = draw_goals(kind, rng, config, success_distance_m, start=start, box=box)
+        if goal is None:
+            goal = draw_goals(kind, rng, config, success_distance_m, start=start, box=box)
         ever = np.zeros(num_episodes, dtype=bool)
         distance = np.zeros(num_episodes)
         if observe:

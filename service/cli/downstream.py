@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from service.cli.common import CHAMPION, EXIT_SIGNAL, CommandGroup, QuietOption, choose, loading, print_json, shown
+from service.cli.orchestrators import evaluate, publish, render
 from service.cli.unexpected import traceback_in
 from service.errors import TandemError, did_you_mean, one_line
 from service.progress import answer
@@ -23,6 +24,8 @@ if TYPE_CHECKING:
 downstream_app = typer.Typer(
     name="downstream", help="New tasks with frozen primitives.", cls=CommandGroup, no_args_is_help=True
 )
+for command in (evaluate, render, publish):
+    downstream_app.command()(command)
 
 
 def _task_names() -> list[str]:
@@ -77,12 +80,16 @@ def train(
     overrides: _Set = None,
     registry: _Registry = "registry",
     threads: _Threads = None,
+    publish_as: Annotated[
+        str | None, typer.Option("--publish", metavar="NAME", help="Publish what was learned by this name.")
+    ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print the result as JSON.")] = False,
     quiet: QuietOption = False,
 ) -> None:
     """Learn one task, evaluate, record a video."""
     with loading():
         from service.downstream.methods import load_for
+        from service.downstream.orchestrators import check_publishable, publish_orchestrator
         from service.downstream.settings import make_trial
         from service.downstream.worker import RunOptions, run_trial
 
@@ -98,11 +105,16 @@ def train(
     with _stop_on_signals() as (callbacks, signals):
         options = RunOptions(resume, threads or 0, video=True, callbacks=callbacks)
         trained = load_for([method], primitives, registry)
+        if publish_as is not None:
+            check_publishable(trial.method, trained, publish_as, registry)  # now, not after the training
         with traceback_in(path):
             result = run_trial(trial, trained, path, options)
     if result is None:
         typer.echo(f"saved; continue with the same command and --resume --run-dir {path}", err=True)
         raise typer.Exit(EXIT_SIGNAL + (signals.first or 0))
+    if publish_as is not None:
+        _, version = publish_orchestrator(path, publish_as, registry, primitives)
+        typer.echo(f"{version} is in {registry}", err=True)
     if as_json:
         print_json(result)
         return

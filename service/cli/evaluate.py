@@ -7,7 +7,21 @@ from typing import TYPE_CHECKING, Annotated, cast
 
 import typer
 
-from service.cli.common import REGISTRY, JsonOption, QuietOption, RegistryOption, choose, loading, print_json
+from service.cli.common import CHAMPION, REGISTRY, JsonOption, QuietOption, RegistryOption, choose, loading, print_json
+from service.cli.film import (
+    CAMERA,
+    OUT,
+    SIZE,
+    SPEED,
+    CameraOption,
+    GoalsOption,
+    OutOption,
+    SizeOption,
+    SpeedOption,
+    film_options,
+    parse_goals,
+)
+from service.errors import TandemError
 
 if TYPE_CHECKING:
     from service.envs.sampling import GoalKind
@@ -106,40 +120,50 @@ def coverage(
 
 
 def render(
-    primitives: _Primitives,
-    episodes: Annotated[int, typer.Option(help="Rounds, episodes or skills to record.", min=1)] = 4,
+    primitives: _Primitives = CHAMPION,
+    episodes: Annotated[int, typer.Option(help="Rounds, episodes or skills to record.", min=1, max=64)] = 4,
+    goals: GoalsOption = None,
     seed: _Seed = 0,
-    out: Annotated[Path, typer.Option(metavar="FILE", help="Video to write.")] = Path("video.mp4"),
+    out: OutOption = OUT,
+    size: SizeOption = SIZE,
+    camera: CameraOption = CAMERA,
+    speed: SpeedOption = SPEED,
     registry: RegistryOption = REGISTRY,
     quiet: QuietOption = False,
 ) -> None:
-    """Make a video of a run's Alice beside its Bob, of published primitives on random goals, or of random skills."""
+    """Make a film of a run's Alice beside its Bob, of published primitives on goals, or of random skills."""
     with loading():
         from service.io.run_directory import RunDirectory
         from service.media import recording, video
         from service.primitives.loading import TrainedSkills, load_either, load_players
 
+        options = film_options(size, camera, speed, out)
         trained = load_either(primitives, registry)
     config = trained.config
     if isinstance(trained, TrainedSkills):
         assert config.skills is not None
+        if goals is not None:
+            raise TandemError(f"--goals: {trained.label} holds skills, of which random ones are shown; leave it out")
         recorded = recording.record_skills(
             trained.skills, config.world, num_skills=episodes, num_steps=config.skills.episode_steps, seed=seed
         )
-        video.write_episode_video(recorded, config.world, out)
-    elif trained.manifest is None:
+        video.write_episode_video(recorded, config.world, out, options)
+    elif trained.manifest is None and goals is None:
         players = load_players(RunDirectory(Path(primitives)))
         rounds = recording.record_rounds(config, *players, num_rounds=episodes, seed=seed)
-        video.write_video(rounds, config.world, out)
+        video.write_video(rounds, config.world, out, options)
     else:
+        asked = parse_goals(goals or "mixed", config.world)
+        points = None if isinstance(asked, str) else asked
         recorded = recording.record_episodes(
             trained.policy,
             config.world,
-            "mixed",
-            num_episodes=episodes,
+            asked if isinstance(asked, str) else "mixed",
+            num_episodes=episodes if points is None else len(points),
             num_steps=config.run.evaluation_steps,
             success_distance_m=config.game.success_distance_m,
             seed=seed,
+            goal=points,
         )
-        video.write_episode_video(recorded, config.world, out)
+        video.write_episode_video(recorded, config.world, out, options)
     typer.echo(f"video: {out}")

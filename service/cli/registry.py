@@ -132,6 +132,7 @@ def _summary(registry: Registry, manifest: Manifest) -> dict[str, Any]:
     return {
         "name": manifest.name,
         "version": manifest.version,
+        "kind": manifest.spaces.get("kind", "primitives"),
         "where": "bundled" if is_bundled(registry) else "exported" if exported else "yours",
         "created": manifest.created,
         "bytes": manifest.blob_bytes,

@@ -252,6 +252,11 @@ def load_for(methods: Iterable[str], reference: str, registry: Path | str) -> Tr
     return load(reference, registry)
 
 
+def digest_of(trained: Trained) -> str:
+    """SHA-256 of the parameters of primitives or skills, as ``parameters_digest`` has it."""
+    return parameters_digest(trained.policy if isinstance(trained, TrainedBob) else trained.skills)
+
+
 def provenance(trained: Trained, method: str = "ours") -> dict[str, Any]:
     """Primitives or skills and the world that a method's result is of, besides its trial.
 
@@ -261,8 +266,7 @@ def provenance(trained: Trained, method: str = "ours") -> dict[str, Any]:
         ``world``: settings of the world that they bring along, before a task replaces some.
     """
     name = trained.label if trained.manifest is None else trained.manifest.reference  # the same wherever it came from
-    frozen = trained.policy if isinstance(trained, TrainedBob) else trained.skills
     env_steps = None if trained.manifest is None else trained.manifest.metrics.get("env_steps")
-    primitives = {"name": name, "digest": parameters_digest(frozen), "env_steps": env_steps}
+    primitives = {"name": name, "digest": digest_of(trained), "env_steps": env_steps}
     without = method in METHODS and METHODS[method].takes is None
     return {"primitives": None if without else primitives, "world": trained.config.world.model_dump(mode="json")}

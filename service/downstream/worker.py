@@ -20,11 +20,12 @@ from typing import Any
 import numpy as np
 import torch
 
-from service.actors.evaluation import DeterministicPolicy, Evaluation, evaluate, wilson_interval
+from service.actors.evaluation import DeterministicPolicy, wilson_interval
 from service.downstream.directory import FORMAT_VERSION, TRIAL, TrainingDirectory, read_result, write_json
 from service.downstream.learner import make_loop, set_progress, spread_seed
 from service.downstream.methods import Method, Trained, find_method, provenance
 from service.downstream.page import draw_training
+from service.downstream.playing import CURVE_SEED, FINAL_SEED, evaluate_on, record_on
 from service.downstream.policy import LearnedPolicy, save_policy
 from service.downstream.settings import TrialConfig
 from service.downstream.worlds import TaskWorlds
@@ -38,8 +39,6 @@ from service.io.jsonl import plain
 from service.progress import Task, doing
 
 CHECKPOINT_EVERY_S = 120.0
-CURVE_SEED, FINAL_SEED = 1_000_000, 2_000_000
-"""Added to a trial's seed: goals of evaluations are none that were learned on, and the same for every method."""
 _NUM_RECORDED = 6
 """Episodes in a video."""
 _logger = logging.getLogger(__name__)
@@ -93,7 +92,8 @@ def run_trial(trial: TrialConfig, trained: Trained, path: Path, options: RunOpti
             new_player = functools.partial(method.player, trained)
         if learned is None:
             return None
-        found = play(trial, trained, new_player(), trial.num_episodes, trial.seed + FINAL_SEED, options.num_threads)
+        world, seed = trained.config.world, trial.seed + FINAL_SEED
+        found = evaluate_on(trial.task, world, new_player(), trial.num_episodes, seed, options.num_threads)
         low, high = wilson_interval(round(found.success_ever * found.num_episodes), found.num_episodes)
         evaluation = {**found.as_dict(), "success_ever_low": low, "success_ever_high": high}
         if _identity(trial, trained) != identity:
@@ -205,7 +205,8 @@ class _Training:
 
     def _evaluate(self) -> dict[str, float]:
         trial, seed = self._trial, self._trial.seed + CURVE_SEED
-        found = play(trial, self._trained, self.new_player(), trial.curve_episodes, seed, self._num_threads)
+        world = self._trained.config.world
+        found = evaluate_on(trial.task, world, self.new_player(), trial.curve_episodes, seed, self._num_threads)
         point = {"success_last": found.success_last, "success_ever": found.success_ever}
         self._curve.append({"env_steps": self._loop.num_env_steps, "wall_s": self._wall_s, **point})
         return {f"evaluation/{name}": value for name, value in point.items()}
@@ -232,23 +233,6 @@ def make_worlds(trial: TrialConfig, method: Method, trained: Trained, num_thread
     return method.enter(worlds, spread_seed(trial.seed, 3), trained, trial.skill_steps)
 
 
-def play(
-    trial: TrialConfig, trained: Trained, player: DeterministicPolicy, num_episodes: int, seed: int, num_threads: int
-) -> Evaluation:
-    """Evaluate a player, who has not played yet, on the trial's task."""
-    task = find_task(trial.task)
-    return evaluate(
-        player,
-        task.world_from(trained.config.world),
-        task.goals,
-        num_episodes=num_episodes,
-        num_steps=EPISODE_STEPS,
-        success_distance_m=SUCCESS_DISTANCE_M,
-        seed=seed,
-        num_threads=num_threads,
-    )
-
-
 @contextlib.contextmanager
 def _only_warn(name: str) -> Iterator[None]:
     """Log a warning where a picture or video cannot be made; the result does not need it."""
@@ -259,18 +243,8 @@ def _only_warn(name: str) -> Iterator[None]:
 
 
 def _record_video(trial: TrialConfig, trained: Trained, player: DeterministicPolicy, path: Path) -> Path:
-    from service.media.recording import record_episodes
     from service.media.video import write_episode_video
 
-    task = find_task(trial.task)
-    world = task.world_from(trained.config.world)
-    episodes = record_episodes(
-        player,
-        world,
-        task.goals,
-        num_episodes=_NUM_RECORDED,
-        num_steps=EPISODE_STEPS,
-        success_distance_m=SUCCESS_DISTANCE_M,
-        seed=trial.seed + FINAL_SEED,
-    )
+    world = find_task(trial.task).world_from(trained.config.world)
+    episodes = record_on(trial.task, trained.config.world, player, _NUM_RECORDED, trial.seed + FINAL_SEED)
     return write_episode_video(episodes, world, path)

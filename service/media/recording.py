@@ -105,6 +105,7 @@ def record_episodes(
     num_steps: int,
     success_distance_m: float,
     seed: int,
+    goal: StateArray | None = None,
 ) -> RecordedEpisodes:
     """Play the episodes that ``evaluate`` plays with these arguments, and keep every state."""
     kept: list[tuple[StateArray, StateArray, BoolArray]] = []
@@ -122,6 +123,7 @@ def record_episodes(
         success_distance_m=success_distance_m,
         seed=seed,
         observe=keep,
+        goal=goal,
     )
     states, goals, reached = map(np.stack, zip(*kept, strict=True))
     return RecordedEpisodes(states, goals[0], reached)

@@ -1,41 +1,39 @@
 """Videos of recorded rounds, Alice's turn beside Bob's, and of recorded episodes, several at once.
 
-A video is H.264 and plays in real time. Without a graphics card a picture takes 50 to 100 ms to draw, so a slow
-machine's video shows only every second state.
+A video plays in real time unless another speed is asked for. Without a graphics card a picture takes 50 to 200 ms to
+draw, so a slow machine's video shows only every second state.
 """
 
 from __future__ import annotations
 
-import contextlib
-import errno
 import functools
-import itertools
-import os
-import subprocess
+import math
 import time
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from service.config import WorldConfig
-from service.envs.rendering.renderer import Image, RenderError, SceneRenderer
+from service.envs.rendering.camera import DEFAULT_VIEW, View
+from service.envs.rendering.renderer import Image, SceneRenderer
 from service.generator.validity import Verdict
-from service.io.files import TEMPORARY_PREFIX, os_errors
-from service.liveness import count_work
+from service.media.encoding import check_format, encode
 from service.media.recording import RecordedEpisodes, RecordedRound
 from service.progress import counted
 from service.types import StateArray
 
 Colour = tuple[int, int, int]
 
-PANE_SIZE, EPISODE_PANE_SIZE = 400, 272
-"""Width and height of one player's, and of one episode's picture, pixels, even."""
 BAR_HEIGHT = 36
 """Height of the caption over each picture, pixels."""
-EPISODE_COLUMNS = 3
 MAX_DRAWING_S = 25.0
 """Only every second state is drawn if all of them would take longer."""
+MAX_FPS = 50.0
+"""A faster film leaves states out; browsers show a GIF no faster."""
+_PANE_SHAPE = 4 / 3
+"""Width of a picture over its height that suits a scene best."""
 GOAL_PAUSE_S, END_PAUSE_S = 0.4, 0.8
 
 _PAPER, _INK, _FAINT = (248, 248, 248), (34, 34, 34), (140, 140, 140)
@@ -47,53 +45,104 @@ _NO_GOAL = {
 }
 
 
-def write_video(rounds: Sequence[RecordedRound], config: WorldConfig, path: Path) -> Path:
+@dataclass(frozen=True, slots=True)
+class FilmOptions:
+    """How a film looks."""
+
+    width: int = 1280
+    """Of the whole film, pixels, even."""
+    height: int = 720
+    view: View = DEFAULT_VIEW
+    speed: float = 1.0
+    """Seconds of the world in a second of the film."""
+
+
+def write_video(
+    rounds: Sequence[RecordedRound], config: WorldConfig, path: Path, options: FilmOptions | None = None
+) -> Path:
     """Write rounds one after another, Alice on the left and Bob on the right.
 
     Args:
         rounds: at least one, from ``record_rounds``.
         config: the world they were played in.
-        path: where to; an mp4 that takes its name only when it is whole.
+        path: where to, an mp4 or a GIF; the file takes its name only when it is whole.
+        options: size, view and speed.
 
     Returns:
         ``path``.
 
     Raises:
         RenderError: no OpenGL or no ffmpeg here.
-        TandemError: the disk is full or the file cannot be written.
+        TandemError: no such format, the disk is full, or the file cannot be written.
     """
+    options = options or FilmOptions()
+    check_format(path)
     num_pictures = sum(len(each.alice_states) + len(each.bob_states) for each in rounds)
-    step_s = _step_s(config)
-    with SceneRenderer(config, PANE_SIZE, PANE_SIZE) as renderer:
-        stride = _stride(renderer, rounds[0].alice_states[0], num_pictures)
+    step_s, pane_height = _step_s(config), options.height - BAR_HEIGHT
+    with SceneRenderer(config, options.width // 2, pane_height, options.view) as renderer:
+        stride = _stride(renderer, rounds[0].alice_states[0], num_pictures, options.speed * _rate(config))
+        frame_s = stride * step_s / options.speed
         frames = (
             frame
             for number, each in enumerate(rounds, start=1)
-            for frame in _round_frames(renderer, each, f"{number}/{len(rounds)}", stride, step_s)
+            for frame in _round_frames(renderer, each, f"{number}/{len(rounds)}", stride, step_s, frame_s)
         )
-        num = sum(_num_frames(each, stride, stride * step_s) for each in rounds)
-        return _encode(counted(frames, "drawing the video", num, "pictures"), path, fps=1 / (stride * step_s))
+        num = sum(_num_frames(each, stride, frame_s) for each in rounds)
+        return encode(counted(frames, "drawing the video", num, "pictures"), path, fps=1 / frame_s)
 
 
-def write_episode_video(episodes: RecordedEpisodes, config: WorldConfig, path: Path) -> Path:
-    """Write episodes all at once, in rows of three; arguments and errors are those of ``write_video``."""
+def write_episode_video(
+    episodes: RecordedEpisodes, config: WorldConfig, path: Path, options: FilmOptions | None = None
+) -> Path:
+    """Write episodes all at once, in rows that fill the film; arguments and errors are those of ``write_video``."""
+    options = options or FilmOptions()
+    check_format(path)
     num_steps, num_episodes = episodes.reached.shape
-    with SceneRenderer(config, EPISODE_PANE_SIZE, EPISODE_PANE_SIZE) as renderer:
-        stride = _stride(renderer, episodes.states[0, 0], num_steps * num_episodes)
-        frame_s = stride * _step_s(config)
-        frames = _episode_frames(renderer, episodes, stride, frame_s)
+    panes = pane_rows(num_episodes, options.width, options.height)
+    with SceneRenderer(config, max(row[0][0] for row in panes), panes[0][0][1], options.view) as renderer:
+        pictures = num_steps * num_episodes
+        stride = _stride(renderer, episodes.states[0, 0], pictures, options.speed * _rate(config))
+        frame_s = stride * _step_s(config) / options.speed
         num = len(_thinned(num_steps, stride)) + _num_held(END_PAUSE_S, frame_s)
-        return _encode(counted(frames, "drawing the video", num, "pictures"), path, fps=1 / frame_s)
+        frames = _episode_frames(renderer, episodes, panes, stride, frame_s)
+        return encode(counted(frames, "drawing the video", num, "pictures"), path, fps=1 / frame_s)
+
+
+def pane_rows(num: int, width: int, height: int) -> list[list[tuple[int, int]]]:
+    """Rows of panes that fill a film without a gap: (width, height) in pixels of each picture, without its caption.
+
+    The rows have as many panes each as the number allows, or one fewer; their number is that with which pictures have
+    the best shape.
+    """
+
+    def rows_of(num_rows: int) -> list[list[tuple[int, int]]]:
+        pane_height = height // num_rows - BAR_HEIGHT
+        counts = [num // num_rows + (row < num % num_rows) for row in range(num_rows)]
+        heights = [pane_height] * num_rows
+        return [
+            [(_share(width, column, count), each) for column in range(count)]
+            for count, each in zip(counts, heights, strict=True)
+        ]
+
+    def unshapely(rows: list[list[tuple[int, int]]]) -> float:
+        shapes = [pane[0] / max(pane[1], 1) / _PANE_SHAPE for row in rows for pane in row]
+        return max(abs(math.log(max(shape, 1e-6))) for shape in shapes)
+
+    return min((rows_of(num_rows) for num_rows in range(1, num + 1)), key=unshapely)
+
+
+def _share(total: int, place: int, num: int) -> int:
+    """Size of one of ``num`` parts of ``total`` pixels, which together have all of them."""
+    return total * (place + 1) // num - total * place // num
 
 
 # --- what is shown -------------------------------------------------------------------------------------------------
 
 
 def _round_frames(
-    renderer: SceneRenderer, played: RecordedRound, number: str, stride: int, step_s: float
+    renderer: SceneRenderer, played: RecordedRound, number: str, stride: int, step_s: float, frame_s: float
 ) -> Iterator[Image]:
     """Alice moves while Bob waits, then Bob moves, then both rest; ``number`` stands in the caption."""
-    frame_s = stride * step_s
     faded = (0.45 * renderer.render(played.bob_states[0]) + 0.55 * 235).astype(np.uint8)
     right = _caption(faded, "Bob waits", _FAINT, number)
     for step in _thinned(len(played.alice_states), stride):
@@ -120,19 +169,27 @@ def _result(played: RecordedRound, step_s: float) -> tuple[str, Colour]:
 
 
 def _episode_frames(
-    renderer: SceneRenderer, episodes: RecordedEpisodes, stride: int, frame_s: float
+    renderer: SceneRenderer,
+    episodes: RecordedEpisodes,
+    panes: list[list[tuple[int, int]]],
+    stride: int,
+    frame_s: float,
 ) -> Iterator[Image]:
     num = episodes.states.shape[1]
     for step in _thinned(len(episodes.states), stride):
-        panes = []
-        for episode in range(num):
-            goal = None if episodes.goal is None else episodes.goal[episode]
-            picture = renderer.render(episodes.states[step, episode], goal)
-            text, colour = ("at the goal", _GREEN) if episodes.reached[step, episode] else ("on the way", _FAINT)
-            if goal is None:
-                text = "random skill"
-            panes.append(_caption(picture, text, colour, f"{episode + 1}/{num}"))
-        frame = _grid(panes)
+        episode, rows = 0, []
+        for row in panes:
+            pictures = []
+            for size in row:
+                goal = None if episodes.goal is None else episodes.goal[episode]
+                picture = renderer.render(episodes.states[step, episode], goal, size)
+                text, colour = ("at the goal", _GREEN) if episodes.reached[step, episode] else ("on the way", _FAINT)
+                if goal is None:
+                    text = "random skill"
+                pictures.append(_caption(picture, text, colour, f"{episode + 1}/{num}" if num > 1 else ""))
+                episode += 1
+            rows.append(np.hstack(pictures))
+        frame = _filled(np.vstack(rows))
         yield frame
     yield from _hold(frame, END_PAUSE_S, frame_s)
 
@@ -141,12 +198,27 @@ def _step_s(config: WorldConfig) -> float:
     return config.physics_step_s * config.num_substeps
 
 
-def _stride(renderer: SceneRenderer, state: StateArray, num_pictures: int) -> int:
-    """1, or 2 where this machine is too slow to draw every state."""
+def _rate(config: WorldConfig) -> float:
+    """States a second."""
+    return 1 / _step_s(config)
+
+
+def _stride(renderer: SceneRenderer, state: StateArray, num_pictures: int, fps: float) -> int:
+    """How many states a picture stands for: 1, or 2 where this machine is slow; more where the film is fast.
+
+    Args:
+        renderer: draws.
+        state: (S,) to draw.
+        num_pictures: that there would be.
+        fps: of a film with every state.
+    """
     renderer.render(state)  # the first picture takes longer
     start = time.perf_counter()
     renderer.render(state)
-    return 1 if num_pictures * (time.perf_counter() - start) <= MAX_DRAWING_S else 2
+    least = math.ceil(fps / MAX_FPS - 1e-9)
+    if num_pictures / max(least, 1) * (time.perf_counter() - start) > MAX_DRAWING_S:
+        return max(least, 2)
+    return max(least, 1)
 
 
 def _thinned(num: int, stride: int) -> list[int]:
@@ -173,11 +245,9 @@ def _num_frames(played: RecordedRound, stride: int, frame_s: float) -> int:
 # --- pictures ------------------------------------------------------------------------------------------------------
 
 
-def _grid(panes: list[Image]) -> Image:
-    """Panes in rows of three, the last row filled up with paper."""
-    columns = min(len(panes), EPISODE_COLUMNS)
-    panes = panes + [np.full_like(panes[0], _PAPER)] * (-len(panes) % columns)
-    return np.vstack([np.hstack(panes[first : first + columns]) for first in range(0, len(panes), columns)])
+def _filled(frame: Image) -> Image:
+    """A frame with a last line of paper where its height is odd, which H.264 cannot have."""
+    return np.pad(frame, ((0, len(frame) % 2), (0, 0), (0, 0)), constant_values=_PAPER[0])
 
 
 def _caption(image: Image, text: str, colour: Colour, number: str = "") -> Image:
@@ -194,55 +264,3 @@ def _bar(width: int, text: str, colour: Colour, number: str) -> Image:
     drawing.text((12, BAR_HEIGHT / 2), text, fill=colour, font=font, anchor="lm")
     drawing.text((width - 12, BAR_HEIGHT / 2), number, fill=_FAINT, font=font, anchor="rm")
     return np.asarray(bar)
-
-
-# --- file ----------------------------------------------------------------------------------------------------------
-
-
-def _encode(frames: Iterator[Image], path: Path, *, fps: float) -> Path:
-    """Write frames as H.264; the file takes its name only when it is whole."""
-    temporary = path.parent / f"{TEMPORARY_PREFIX}{os.getpid()}-{path.name}"
-    with os_errors("write", path):
-        path.parent.mkdir(parents=True, exist_ok=True)
-        try:
-            _run_ffmpeg(frames, temporary, fps)
-            temporary.replace(path)
-        finally:
-            temporary.unlink(missing_ok=True)
-    return path
-
-
-def _run_ffmpeg(frames: Iterator[Image], path: Path, fps: float) -> None:
-    """Send frames to ffmpeg.
-
-    ``imageio_ffmpeg.write_frames`` would be shorter, but ignores ffmpeg's exit status: a full disk would go unnoticed.
-    """
-    first = next(frames)
-    height, width = first.shape[:2]
-    command = [
-        _ffmpeg(), "-y", "-loglevel", "error", "-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{width}x{height}",
-        "-r", f"{fps:g}", "-i", "pipe:", "-c:v", "libx264", "-pix_fmt", "yuv420p", "-crf", "21", "-preset", "veryfast",
-        "-movflags", "+faststart", "-f", "mp4", str(path),
-    ]  # fmt: skip
-    with subprocess.Popen(command, stdin=subprocess.PIPE, stderr=subprocess.PIPE) as ffmpeg:
-        assert ffmpeg.stdin is not None
-        try:
-            with contextlib.suppress(BrokenPipeError):  # it stopped early; its exit status says why
-                for frame in itertools.chain([first], frames):
-                    count_work()
-                    ffmpeg.stdin.write(frame.tobytes())
-            words = ffmpeg.communicate()[1].decode(errors="replace").strip()
-        except BaseException:
-            ffmpeg.kill()
-            raise
-    if ffmpeg.returncode:
-        raise OSError(errno.EIO, f"ffmpeg says {words.splitlines()[-1] if words else ffmpeg.returncode!r}")
-
-
-def _ffmpeg() -> str:
-    import imageio_ffmpeg
-
-    try:
-        return str(imageio_ffmpeg.get_ffmpeg_exe())
-    except RuntimeError:
-        raise RenderError("cannot write a video: there is no ffmpeg; install it (apt-get install ffmpeg)") from None

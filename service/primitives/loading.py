@@ -19,6 +19,9 @@ from service.registry.manifest import Manifest
 SKILLS = "skills"
 """Part of a run's checkpoint that holds frozen skills, and kind in the spaces of their manifest."""
 
+ORCHESTRATOR = "orchestrator"
+"""Kind in the spaces of the manifest of a policy that was learned downstream."""
+
 
 @dataclass(frozen=True, slots=True)
 class TrainedSkills:
@@ -126,6 +129,12 @@ def _load(reference: str, registry: Path, part: str) -> tuple[str, Config, Param
     if "/" in reference and not is_exported(Path(reference)):
         raise TandemError(f"{reference}: no such run directory; for published versions write NAME@ALIAS")
     found, version = find_version(reference, registry)
+    manifest = found.manifest(str(version))
+    if manifest.spaces.get("kind") == ORCHESTRATOR:
+        raise TandemError(
+            f"{version} is an orchestrator for the task {manifest.spaces.get('task')}, not primitives: load it by "
+            "service.load_policy, or name it to tandem downstream evaluate, render or play"
+        )
     manifest, tensors = found.load(str(version))
     config = parse_config(manifest.config, where=f"the manifest of {reference}", recorded=True)
     # two registries may both have a version 1: which one was meant must be seen

@@ -73,7 +73,7 @@ def publish_run(
     Raises:
         StorageError: see ``Registry.publish``; or the run directory cannot be written.
     """
-    version = _newest_if_same(registry, config.name, parameters)
+    version = newest_if_same(registry, config.name, parameters)
     if version is None:
         parent = _published_before(directory, registry)
         known = directory.history
@@ -119,8 +119,8 @@ def skill_spaces(skills: SkillsConfig) -> dict[str, object]:
     return {**shared, "kind": SKILLS, "skill": skills.size}
 
 
-def _newest_if_same(registry: Registry, name: str, parameters: Parameters) -> Version | None:
-    """The newest version, if it has these parameters: a finished run that is resumed must not publish them again."""
+def newest_if_same(registry: Registry, name: str, parameters: Parameters) -> Version | None:
+    """The newest version, if it has these parameters: what is published again must not become another version."""
     for version in registry.versions(name)[-1:]:
         with contextlib.suppress(StorageError):  # a damaged version is mended by publishing again
             manifest, _ = registry.load(str(version))

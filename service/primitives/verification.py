@@ -13,8 +13,10 @@ from service.envs.observations import ACTION, PAPER, Layouts, layouts
 from service.errors import TandemError
 from service.off_policy_config import SkillsConfig
 from service.policies.numpy_policy import NumpyMCPPolicy
+from service.primitives.loading import ORCHESTRATOR
 from service.registry.manifest import Manifest
 from service.sac.inputs import NUM_MOTION_INPUTS
+from service.sac.numpy_actor import numpy_actor
 
 Shapes = dict[str, tuple[int, ...]]
 _OBJECT_SIZE = 3
@@ -27,6 +29,12 @@ def network_problems(manifest: Manifest, arrays: Mapping[str, np.ndarray]) -> It
     Where all are, a policy is made of them, which tells what else is wrong. A manifest without networks in its
     configuration describes none, and nothing is asked of it.
     """
+    if manifest.spaces.get("kind") == ORCHESTRATOR:
+        try:
+            numpy_actor(dict(arrays))
+        except TandemError as error:
+            yield str(error)
+        return
     if "policy" not in manifest.config:
         return
     try:

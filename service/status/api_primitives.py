@@ -12,6 +12,7 @@ from fastapi import Path as InPath
 from service.io.errors import FormatVersionError
 from service.registry.blobs import BlobStore
 from service.registry.errors import DamagedBlobError, RegistryError
+from service.registry.manifest import Manifest
 from service.registry.names import NAME_PATTERN, Version
 from service.registry.registry import Registry
 from service.status.files import BYTES, PARTS, file_response
@@ -125,4 +126,12 @@ def _version(registry: Registry, version: Version, aliases: dict[str, int]) -> V
     except (DamagedBlobError, FormatVersionError) as error:  # must not hide the other versions
         return VersionSummary(version=version.number, aliases=names, problem=str(error))
     shown = manifest.model_dump(include=set(VersionSummary.model_fields) - {"version"})
-    return VersionSummary(version=version.number, aliases=names, **shown)
+    return VersionSummary(version=version.number, aliases=names, **_what_it_is(manifest), **shown)
+
+
+def _what_it_is(manifest: Manifest) -> dict[str, str | None]:
+    """Kind of a version; of an orchestrator also its task, and what it acts with."""
+    task, primitives = manifest.spaces.get("task"), manifest.spaces.get("primitives")
+    reference = primitives.get("reference") if isinstance(primitives, dict) else None
+    known = {"kind": manifest.spaces.get("kind", "primitives"), "task": task, "acts_with": reference}
+    return {key: value if isinstance(value, str) else None for key, value in known.items()}

@@ -6,6 +6,8 @@ The model that is drawn is the physics with its decoration; both have the same s
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
 from typing import Any, Self
 
 import mujoco
@@ -13,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.config import WorldConfig
+from service.envs.rendering.camera import DEFAULT_VIEW, View
 from service.envs.rendering.decoration import decorate
 from service.envs.rendering.gl import RenderError, open_drawing
 from service.envs.scene import build_layout, build_spec, geometry
@@ -22,7 +25,8 @@ __all__ = ["RenderError", "SceneRenderer"]
 
 Image = NDArray[np.uint8]
 
-_GOAL_ALPHA, _DROP_ALPHA = 0.30, 0.55
+_GOAL_COLORS = ((0.0, 0.62, 0.45), (0.90, 0.62, 0.0))
+_GOAL_ALPHA, _DROP_ALPHA = 0.45, 0.7
 _DROP_RADIUS_M, _FOOT_RADIUS_M, _FOOT_HALF_HEIGHT_M = 0.0015, 0.012, 0.0006
 _MAX_GEOMS = 200
 _NUM_SAMPLES = 4
@@ -36,19 +40,20 @@ class SceneRenderer:
         config: the world.
         width: of the pictures, pixels.
         height: of the pictures, pixels.
+        view: where they are taken from.
 
     Raises:
         RenderError: this machine has no OpenGL that works without a window.
     """
 
-    def __init__(self, config: WorldConfig, width: int = 640, height: int = 480) -> None:
-        self.camera = _three_quarter_view()
+    def __init__(self, config: WorldConfig, width: int = 640, height: int = 480, view: View = DEFAULT_VIEW) -> None:
+        self.camera = view.camera()
         """Place the pictures are taken from; it may be moved at any time."""
         self.model = _build_model(config, width, height)
         self._data = mujoco.MjData(self.model)
         self._layout = build_layout(config)  # the flag of a blocked gripper follows everything that is read here
         self._rest_height_m = config.rest_height_m
-        self._goal, self._color = geometry(config.shape), config.shape.color
+        self._goal, self._color = geometry(config.shape), goal_color(config.shape.color)
         self._rectangle = mujoco.MjrRect(0, 0, width, height)
         self._option = mujoco.MjvOption()
         self._scene = mujoco.MjvScene(self.model, maxgeom=_MAX_GEOMS)
@@ -69,12 +74,13 @@ class SceneRenderer:
             self._context.free()
             self._context = None
 
-    def render(self, state: StateArray, goal: StateArray | None = None) -> Image:
+    def render(self, state: StateArray, goal: StateArray | None = None, size: tuple[int, int] | None = None) -> Image:
         """Draw one world.
 
         Args:
             state: (S,) row of ``WorldBatch.states``.
-            goal: (3,) metres, shown as a transparent copy of the object; None for none.
+            goal: (3,) metres, shown as a transparent copy of the object in another colour; None for none.
+            size: width and height of this picture, pixels, at most those of the renderer; None for those.
 
         Returns:
             (H, W, 3), the top row first.
@@ -90,9 +96,10 @@ class SceneRenderer:
         if goal is not None:
             self._add_goal(np.asarray(goal, dtype=np.float64))
         self._context.make_current()
-        image = np.empty((self._rectangle.height, self._rectangle.width, 3), dtype=np.uint8)
-        mujoco.mjr_render(self._rectangle, self._scene, self._drawing)
-        mujoco.mjr_readPixels(image, None, self._rectangle, self._drawing)
+        rectangle = self._rectangle if size is None else mujoco.MjrRect(0, 0, *size)
+        image = np.empty((rectangle.height, rectangle.width, 3), dtype=np.uint8)
+        mujoco.mjr_render(rectangle, self._scene, self._drawing)
+        mujoco.mjr_readPixels(image, None, rectangle, self._drawing)
         return np.ascontiguousarray(image[::-1])
 
     def _add_goal(self, goal: StateArray) -> None:
@@ -127,10 +134,9 @@ def _build_model(config: WorldConfig, width: int, height: int) -> mujoco.MjModel
     return spec.compile()
 
 
-def _three_quarter_view() -> mujoco.MjvCamera:
-    """Camera in front of the table, which sees arm, workspace and object."""
-    camera = mujoco.MjvCamera()
-    camera.type = mujoco.mjtCamera.mjCAMERA_FREE
-    camera.lookat, camera.distance = (-0.20, 0.0, 0.21), 1.95
-    camera.azimuth, camera.elevation = 146.0, -21.0
-    return camera
+def goal_color(color: Sequence[float]) -> tuple[float, float, float]:
+    """Red, green and blue of the goal of an object: green, or orange where the object is nearer to green.
+
+    Both are Okabe and Ito's, which colour-blind readers tell apart.
+    """
+    return max(_GOAL_COLORS, key=lambda goal: math.dist(goal, color))

@@ -1,0 +1,61 @@
+"""Episodes of a downstream task, played by any policy: evaluated, or recorded for a film."""
+
+from __future__ import annotations
+
+from service.actors.evaluation import DeterministicPolicy, Evaluation, evaluate
+from service.config import WorldConfig
+from service.envs.gym.registration import EPISODE_STEPS
+from service.envs.tasks import SUCCESS_DISTANCE_M, find_task
+from service.media.recording import RecordedEpisodes, record_episodes
+
+CURVE_SEED, FINAL_SEED = 1_000_000, 2_000_000
+"""Added to a trial's seed: goals of evaluations are none that were learned on, and the same for every method."""
+
+
+def evaluate_on(
+    task: str, world: WorldConfig, player: DeterministicPolicy, num_episodes: int, seed: int, num_threads: int = 0
+) -> Evaluation:
+    """Evaluate a player, who has not played yet, on a task.
+
+    Args:
+        task: its name.
+        world: in which the player was trained, of which the task replaces its part.
+        player: acts.
+        num_episodes: random goals, each from a fresh reset.
+        seed: of the episodes.
+        num_threads: of physics; 0: as many as there are cores.
+
+    Raises:
+        TandemError: no such task.
+    """
+    found = find_task(task)
+    return evaluate(
+        player,
+        found.world_from(world),
+        found.goals,
+        num_episodes=num_episodes,
+        num_steps=EPISODE_STEPS,
+        success_distance_m=SUCCESS_DISTANCE_M,
+        seed=seed,
+        num_threads=num_threads,
+    )
+
+
+def record_on(
+    task: str, world: WorldConfig, player: DeterministicPolicy, num_episodes: int, seed: int
+) -> RecordedEpisodes:
+    """Record the episodes that ``evaluate_on`` plays with these arguments.
+
+    Raises:
+        TandemError: no such task.
+    """
+    found = find_task(task)
+    return record_episodes(
+        player,
+        found.world_from(world),
+        found.goals,
+        num_episodes=num_episodes,
+        num_steps=EPISODE_STEPS,
+        success_distance_m=SUCCESS_DISTANCE_M,
+        seed=seed,
+    )
