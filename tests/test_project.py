@@ -27,6 +27,8 @@ HEAVY = (
     "httpx",
     "onnx",
     "onnxruntime",
+    "viser",
+    "mjviser",
 )
 CLUSTER_MODULES = (
     "actor_pool",
@@ -39,13 +41,13 @@ CLUSTER_MODULES = (
     "status_actor",
     "watch",
 )
-ROOMS_WITHOUT_TORCH = ("actors", "envs", "generator", "registry", "status")
+ROOMS_WITHOUT_TORCH = ("actors", "envs", "generator", "play", "registry", "status")
 ROOMS = (
     *("errors", "extras", "frozen", "liveness", "progress", "recipes", "types"),
     *("parsing", "regular_files", "config_tree", "off_policy_config", "randomisation_config", "distillation_config"),
     *("model_files", "mesh_files", "robot_config", "object_config", "world_config"),
     *("config", "io", "envs", "policies", "generator", "actors", "learner", "sac", "baselines", "registry"),
-    *("primitives", "media", "downstream", "export", "robot"),
+    *("primitives", "media", "downstream", "play", "export", "robot"),
     *("store", "status", "runtime", "cli", "__main__"),
 )
 """Each room may import itself and those before it."""
@@ -62,6 +64,7 @@ VERBS = (
     "robot",
     "configs",
 )
+VERBS = ("demo", "pretrain", "evaluate", "render", "play", "coverage", "export", "registry", "serve", "downstream", "robot")
 DOCUMENTS = [*sorted(ROOT.glob("*.md")), *sorted((ROOT / "docs").rglob("*.md")), ROOT / "deploy" / "README.md"]
 FOLDERS = (".ci", "benchmarks", "configs", "deploy", "docs", "service", "tests", "tools")
 TEXT = {".cfg", ".json", ".jsonl", ".md", ".py", ".toml", ".txt", ".yaml", ".yml", ""}
@@ -136,7 +139,7 @@ def test_python_dash_m_is_the_command():
 
 
 def test_the_numpy_policies_need_no_torch():
-    run_python(IMPORT_ALL, "torch", "service.policies.numpy_policy")
+    run_python(IMPORT_ALL, "torch", "service.policies.numpy_policy,service.downstream.orchestrators")
 
 
 @pytest.mark.parametrize("room", ROOMS_WITHOUT_TORCH)

@@ -12,6 +12,7 @@ import typer
 
 from service.cli.common import CHAMPION, EXIT_SIGNAL, CommandGroup, QuietOption, choose, loading, print_json, shown
 from service.cli.orchestrators import evaluate, publish, render
+from service.cli.play import play_downstream
 from service.cli.unexpected import traceback_in
 from service.errors import TandemError, did_you_mean, one_line
 from service.progress import answer
@@ -26,6 +27,7 @@ downstream_app = typer.Typer(
 )
 for command in (evaluate, render, publish):
     downstream_app.command()(command)
+downstream_app.command("play")(play_downstream)
 
 
 def _task_names() -> list[str]:

@@ -16,6 +16,7 @@ from service.cli.configs import configs_app
 from service.cli.downstream import downstream_app
 from service.cli.evaluate import coverage, evaluate, render
 from service.cli.export import export
+from service.cli.play import play
 from service.cli.pretrain import demo, pretrain
 from service.cli.registry import registry_app
 from service.cli.robot import robot_app
@@ -24,6 +25,10 @@ from service.cli.unexpected import report_thread_error
 
 app = typer.Typer(name="tandem", help="Robot skills, pre-trained.", cls=CommandGroup, no_args_is_help=True)
 for command in (pretrain, demo, evaluate, coverage, render, export, serve):
+app = typer.Typer(
+    name="tandem", help="Robot skills, pre-trained.", cls=CommandGroup, no_args_is_help=True, add_completion=False
+)
+for command in (pretrain, demo, evaluate, coverage, render, play, export, serve):
     app.command()(command)
 app.add_typer(registry_app)
 app.add_typer(downstream_app)

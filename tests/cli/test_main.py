@@ -357,10 +357,10 @@ def filmed(monkeypatch):
     """(number of takes or episodes, file) of each video, none of which is drawn."""
     asked = []
 
-    def write_video(takes, world, path):
+    def write_video(takes, world, path, options):
         asked.append((len(takes), path))
 
-    def write_episode_video(episodes, world, path):
+    def write_episode_video(episodes, world, path, options):
         asked.append((episodes.goal.shape, path))
 
     monkeypatch.setattr("service.media.video.write_video", write_video)
@@ -382,6 +382,40 @@ def test_render_films_episodes_of_published_primitives(trained, filmed, tmp_path
     result = tandem("render", "--primitives", "tiny@latest", "--episodes", 3, *common)
     assert result.exit_code == 0, result.output
     assert filmed == [((3, 3), out)]
+
+
+def test_render_films_goals_that_are_typed(trained, monkeypatch, tmp_path):
+    shown = []
+    monkeypatch.setattr("service.media.video.write_episode_video", lambda *arguments: shown.append(arguments))
+    common = ("render", "--primitives", trained.run, "--goals", "0.1,0,0.2; 0,-0.1,0.025", "--out", tmp_path / "a.gif")
+    result = tandem(*common, "--size", "640x360", "--camera", "side,distance=2", "--speed", 0.5)
+    assert result.exit_code == 0, result.output
+    ((episodes, _, path, options),) = shown
+    assert episodes.goal.tolist() == [[0.1, 0.0, 0.2], [0.0, -0.1, 0.025]]
+    assert (path, options.width, options.height, options.speed) == (tmp_path / "a.gif", 640, 360, 0.5)
+    assert (options.view.azimuth_deg, options.view.distance_m) == (90.0, 2.0)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "part"),
+    [
+        (["--goals", "lift"], "--goals 'lift': write one of table, air, mixed, volume, or points"),
+        (["--goals", "0.1,0"], "or points x,y,z in metres"),
+        (["--goals", "0.1,nan,0.2"], "or points x,y,z in metres"),
+        (["--goals", "0.1,0,0.2;0.9,0,0.1"], "0.9, 0, 0.1 is outside of the workspace"),
+        (["--size", "641x360"], "--size '641x360': write WIDTHxHEIGHT, even numbers"),
+        (["--size", "big"], "--size 'big'"),
+        (["--camera", "moon"], "camera 'moon': there is none"),
+        (["--camera", "close,zoom=3"], "camera 'zoom=3': write a view"),
+        (["--camera", "distance=0"], "camera 'distance=0': give a number from 0.2 to 20"),
+        (["--speed", "0"], "--speed 0: give 0.05 to 20"),
+        (["--out", "film.avi"], "film.avi: a film ends in .mp4 or .gif"),
+    ],
+)
+def test_a_film_that_cannot_be_made(arguments, part, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert_user_error(tandem("render", *arguments), part)
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_registry_show(trained):

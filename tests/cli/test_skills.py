@@ -48,7 +48,7 @@ def test_skills_are_evaluated_by_the_one_towards_the_goal(registry):
 def test_render_shows_random_skills(registry, tmp_path, monkeypatch):
     shown = []
     monkeypatch.setattr(
-        "service.media.video.write_episode_video", lambda episodes, world, path: shown.append((episodes, path))
+        "service.media.video.write_episode_video", lambda episodes, world, path, options: shown.append((episodes, path))
     )
     common = ("render", "--primitives", "dads@1", "--registry", registry, "--episodes", 2)
     found = tandem(*common, "--out", tmp_path / "skills.mp4")

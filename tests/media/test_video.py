@@ -8,14 +8,16 @@ import pytest
 
 from service.config import WorldConfig
 from service.envs.batch import WorldBatch
+from service.envs.rendering.camera import parse_view
 from service.envs.rendering.renderer import RenderError, SceneRenderer
 from service.errors import TandemError
 from service.generator.validity import Verdict
-from service.media import video
+from service.media import encoding, video
 from service.media.recording import RecordedEpisodes, RecordedRound
-from service.media.video import BAR_HEIGHT, write_episode_video, write_video
+from service.media.video import BAR_HEIGHT, FilmOptions, pane_rows, write_episode_video, write_video
 
 PANE = 48
+SMALL = FilmOptions(width=2 * PANE, height=PANE + BAR_HEIGHT)
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -24,12 +26,6 @@ def _needs_opengl():
         SceneRenderer(WorldConfig(), 16, 16).close()
     except RenderError as error:
         pytest.skip(str(error))
-
-
-@pytest.fixture(autouse=True)
-def _small_panes(monkeypatch):
-    monkeypatch.setattr(video, "PANE_SIZE", PANE)
-    monkeypatch.setattr(video, "EPISODE_PANE_SIZE", PANE)
 
 
 def still(num_steps):
@@ -56,7 +52,7 @@ def read_video(path):
 
 
 def test_a_video_has_every_state_and_its_pauses(tmp_path):
-    path = write_video([recorded(), recorded(solved=False)], WorldConfig(), tmp_path / "new" / "rounds.mp4")
+    path = write_video([recorded(), recorded(solved=False)], WorldConfig(), tmp_path / "new" / "rounds.mp4", SMALL)
     frames, fps = read_video(path)
     # 25 fps: 4 of Alice, 0.4 s, 3 of Bob, 0.8 s; twice.
     assert frames.shape == (2 * (4 + 10 + 3 + 20), PANE + BAR_HEIGHT, 2 * PANE, 3)
@@ -70,13 +66,13 @@ def test_a_video_has_every_state_and_its_pauses(tmp_path):
 
 def test_without_a_goal_bob_has_no_turn(tmp_path):
     played = recorded(num_bob_steps=0, solved=False, verdict=Verdict.OUTSIDE)
-    path = write_video([played], WorldConfig(), tmp_path / "rounds.mp4")
+    path = write_video([played], WorldConfig(), tmp_path / "rounds.mp4", SMALL)
     assert len(read_video(path)[0]) == 4 + 20
 
 
 def test_on_a_slow_machine_every_second_state_is_drawn(tmp_path, monkeypatch):
     monkeypatch.setattr(video, "MAX_DRAWING_S", 0.0)
-    path = write_video([recorded()], WorldConfig(), tmp_path / "rounds.mp4")
+    path = write_video([recorded()], WorldConfig(), tmp_path / "rounds.mp4", SMALL)
     # 12.5 fps: states 0, 2, 3 of Alice, 0.4 s, 0 and 2 of Bob, 0.8 s.
     frames, fps = read_video(path)
     assert len(frames) == 3 + 5 + 2 + 10
@@ -90,21 +86,40 @@ def test_the_caption_tells_what_happened():
     assert (video._bar(200, "Bob", (0, 0, 0), "") != video._bar(200, "Alice", (0, 0, 0), "")).any()
 
 
-def test_episodes_stand_in_rows_of_three(tmp_path):
-    states = np.tile(still(1)[:, None], (1, 4, 1))
-    goal = np.tile([0.0, 0.1, 0.2], (4, 1))
-    episodes = RecordedEpisodes(states, goal, np.zeros((2, 4), dtype=bool))
-    frames, _ = read_video(write_episode_video(episodes, WorldConfig(), tmp_path / "bob.mp4"))
-    assert frames.shape == (2 + 20, 2 * (PANE + BAR_HEIGHT), 3 * PANE, 3)
-    assert frames[0, -PANE:, PANE + 8 :].min() > 230  # two of six places are empty
+def num_red(image):
+    """Pixels as red as the object."""
+    image = image.astype(int)
+    return ((image[..., 0] > 80) & (image[..., 0] > 2 * image[..., 1]) & (image[..., 0] > 2 * image[..., 2])).sum()
+
+
+def test_episodes_fill_the_film_and_a_gif_is_read_back(tmp_path):
+    """Two and one: three times the object, and no tile without a picture. A fast film leaves states out."""
+    states = np.tile(still(8)[:, None], (1, 3, 1))
+    episodes = RecordedEpisodes(states, np.tile([0.0, 0.1, 0.2], (3, 1)), np.zeros((9, 3), dtype=bool))
+    options = FilmOptions(320, 240 + 2 * BAR_HEIGHT, parse_view("close"), speed=4.0)
+    frames, fps = read_video(write_episode_video(episodes, WorldConfig(), tmp_path / "bob.gif", options))
+    assert frames.shape[1:] == (240 + 2 * BAR_HEIGHT, 320, 3)
+    assert fps == 50.0  # 100 states a second: every second one
+    panes = [frames[0, BAR_HEIGHT:156, :160], frames[0, BAR_HEIGHT:156, 160:], frames[0, -120:]]
+    assert all(num_red(pane) > 40 for pane in panes), [num_red(pane) for pane in panes]
+    assert all(pane.std() > 20 for pane in panes)
+
+
+@pytest.mark.parametrize("num", range(1, 20))
+def test_panes_fill_the_film(num):
+    rows = pane_rows(num, 1280, 720)
+    assert sum(map(len, rows)) == num
+    assert {sum(width for width, _ in row) for row in rows} == {1280}
+    assert 720 - len(rows) < sum(row[0][1] + BAR_HEIGHT for row in rows) <= 720
+    assert all(0.5 < width / height < 3.0 for row in rows for width, height in row)
 
 
 def test_skills_have_no_goal_and_never_arrive(tmp_path):
     states = np.tile(still(1)[:, None], (1, 3, 1))
     skills = RecordedEpisodes(states, None, np.zeros((2, 3), dtype=bool))
-    drawn, _ = read_video(write_episode_video(skills, WorldConfig(), tmp_path / "skills.mp4"))
+    drawn, _ = read_video(write_episode_video(skills, WorldConfig(), tmp_path / "skills.mp4", SMALL))
     with_goals = dataclasses.replace(skills, goal=np.tile([0.0, 0.1, 0.2], (3, 1)))
-    other, _ = read_video(write_episode_video(with_goals, WorldConfig(), tmp_path / "goals.mp4"))
+    other, _ = read_video(write_episode_video(with_goals, WorldConfig(), tmp_path / "goals.mp4", SMALL))
     assert drawn.shape == other.shape
     difference = np.abs(drawn[0].astype(int) - other[0])
     assert difference[:BAR_HEIGHT].max() > 50  # another caption
@@ -120,7 +135,7 @@ def test_a_video_that_fails_leaves_the_old_one(tmp_path):
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        video._encode(frames(), path, fps=25)
+        encoding.encode(frames(), path, fps=25)
     assert path.read_bytes() == b"old"
     assert list(tmp_path.iterdir()) == [path]
 
@@ -129,7 +144,9 @@ def test_a_place_that_cannot_be_written(tmp_path):
     (tmp_path / "file").write_bytes(b"")
     frame = np.zeros((32, 32, 3), dtype=np.uint8)
     with pytest.raises(TandemError, match=r"cannot write .*rounds\.mp4"):
-        video._encode(iter([frame]), tmp_path / "file" / "rounds.mp4", fps=25)
+        encoding.encode(iter([frame]), tmp_path / "file" / "rounds.mp4", fps=25)
+    with pytest.raises(TandemError, match=r"rounds\.avi: a film ends in \.mp4 or \.gif"):
+        encoding.encode(iter([frame]), tmp_path / "rounds.avi", fps=25)
     with pytest.raises(TandemError, match="ffmpeg says"):  # odd sizes are no H.264
-        video._encode(iter([np.zeros((31, 31, 3), dtype=np.uint8)]), tmp_path / "odd.mp4", fps=25)
+        encoding.encode(iter([np.zeros((31, 31, 3), dtype=np.uint8)]), tmp_path / "odd.mp4", fps=25)
     assert [path.name for path in tmp_path.iterdir()] == ["file"]

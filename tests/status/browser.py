@@ -28,10 +28,10 @@ _TIMEOUT_MS = 300_000
 
 
 @contextmanager
-def chromium() -> Iterator[Browser]:
-    """Start the system's Chromium."""
+def chromium(*more: str) -> Iterator[Browser]:
+    """Start the system's Chromium, with more arguments."""
     with sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=list(_ARGUMENTS))
+        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=[*_ARGUMENTS, *more])
         yield browser
         browser.close()
 

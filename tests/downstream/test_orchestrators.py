@@ -1,0 +1,134 @@
+"""What was learned downstream, from its directory, a registry and a service; and what is refused, in one line."""
+
+import json
+import shutil
+
+import numpy as np
+import pytest
+
+import service
+from service.downstream.orchestrators import publish_orchestrator
+from service.downstream.worker import RunOptions, run_trial
+from service.envs.observations import layouts
+from service.errors import TandemError
+from service.primitives.bundled import BUNDLED
+from service.primitives.verification import network_problems
+from service.registry.registry import Registry
+from tests.downstream.trials import small_trial
+from tests.registry.helpers import files_in
+from tests.status.conftest import serve
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory, champion):
+    """Directories of two trainings: of an orchestrator, and from nothing."""
+    home = tmp_path_factory.mktemp("trainings")
+    for method in ("ours", "scratch-monolithic"):
+        run_trial(small_trial(method), champion, home / method, RunOptions(num_threads=1))
+    return home
+
+
+@pytest.fixture
+def observation(champion):
+    size = layouts(champion.config.world.observed).bob.size
+    return np.random.default_rng(0).uniform(-0.1, 0.2, (3, size)).astype(np.float32)
+
+
+def acted(orchestrator, observation):
+    """Actions of the first and the second step of episodes."""
+    orchestrator.begin()
+    return np.stack([orchestrator.act_deterministic(observation), orchestrator.act_deterministic(observation + 0.01)])
+
+
+def refused(*arguments, **options):
+    """The one line by which loading is refused."""
+    with pytest.raises(TandemError) as refusal:
+        service.load_policy(*map(str, arguments), **options)
+    assert "\n" not in str(refusal.value)
+    return str(refusal.value)
+
+
+def test_it_acts_alike_from_its_directory_a_registry_and_a_service(finished, champion, observation, tmp_path):
+    registry = tmp_path / "registry"
+    local = service.load_policy(str(finished / "ours"), registry)
+    expected = acted(local, observation)
+    assert expected.shape == (2, 3, 4)
+    assert (expected[0] != champion.policy.act_deterministic(observation)).any()
+    assert (local.task, local.method, local.world.gripper) == ("push", "ours", "blocked")
+
+    _, version = publish_orchestrator(finished / "ours", "push-orchestrator", registry)
+    _, again = publish_orchestrator(finished / "ours", "push-orchestrator", registry)
+    assert version == again == ("push-orchestrator", 1)
+    manifest = Registry(registry).manifest("push-orchestrator")
+    assert manifest.spaces["kind"] == "orchestrator"
+    assert manifest.spaces["primitives"]["reference"] == champion.manifest.reference
+    result = json.loads((finished / "ours" / "result.json").read_text())
+    assert manifest.metrics["evaluation/success_last"] == result["evaluation"]["success_last"]
+    assert Registry(registry).verify(check=network_problems) == []
+    published = service.load_policy("push-orchestrator@latest", registry)
+    np.testing.assert_array_equal(acted(published, observation), expected)
+
+    (tmp_path / "runs").mkdir()
+    with serve(tmp_path) as server, pytest.MonkeyPatch.context() as patch:
+        patch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+        fetched = service.load_policy("push-orchestrator@latest", server.url)
+    assert fetched.label == "push-orchestrator@1"
+    np.testing.assert_array_equal(acted(fetched, observation), expected)
+
+
+def test_another_version_of_that_name_does_not_pass_for_its_primitives(finished, champion, observation, tmp_path):
+    """A registry of one's own may have other primitives by the same reference: the digest decides."""
+    own, number = Registry(tmp_path / "registry"), champion.manifest.version
+    manifest, parameters = Registry(BUNDLED).load(str(champion.manifest.reference))
+    parameters["gate.output.bias"] = parameters["gate.output.bias"] + np.float32(1.0)
+    fields = {name: getattr(manifest, name) for name in ("spaces", "normalisation", "config", "metrics")}
+    for _ in range(number):
+        own.publish(manifest.name, parameters, **fields)
+        parameters["gate.output.bias"] = parameters["gate.output.bias"] + np.float32(1.0)
+    found = service.load_policy(str(finished / "ours"), own.root)
+    assert found.trained.label == f"{champion.manifest.reference} (bundled)"
+
+    reason = refused(finished / "ours", own.root, primitives=f"{manifest.name}@{number}")
+    assert f"acts with {champion.manifest.reference} of digest" in reason
+    assert f"{manifest.name}@{number} has other parameters" in reason
+    assert "is not here: no 'nothing'" in refused(finished / "ours", own.root, primitives="nothing@1")
+
+
+def test_orchestrators_and_primitives_are_not_taken_for_each_other(finished, champion, tmp_path, monkeypatch):
+    registry = tmp_path / "registry"
+    publish_orchestrator(finished / "ours", "push-orchestrator", registry)
+    before = files_in(registry)
+    for load in (service.load_primitives, service.load_skills):
+        with pytest.raises(TandemError, match="push-orchestrator@1 is an orchestrator for the task push, not primi"):
+            load("push-orchestrator@latest", registry)
+    assert "holds primitives, not an orchestrator: load them by service.load_primitives" in refused(
+        "panda-cube@champion", registry
+    )
+    for name in (champion.manifest.name, "Push"):
+        with pytest.raises(TandemError, match=r"panda-cube is the name of primitives already|bad name 'Push'"):
+            publish_orchestrator(finished / "ours", name, registry)
+    with pytest.raises(TandemError, match="the method scratch-monolithic learns no orchestrator"):
+        publish_orchestrator(finished / "scratch-monolithic", "scratch", registry)
+    with pytest.raises(TandemError, match="read only: publish in a directory"):
+        publish_orchestrator(finished / "ours", "push-orchestrator", "http://127.0.0.1:9")
+    assert files_in(registry) == before
+
+
+def test_a_policy_from_nothing_needs_the_world_alone(finished, champion, observation, tmp_path):
+    found = service.load_policy(str(finished / "scratch-monolithic"), tmp_path)
+    assert acted(found, observation).shape == (2, 3, 4)
+    copy = shutil.copytree(finished / "scratch-monolithic", tmp_path / "copy")
+    recorded = json.loads((copy / "cell.json").read_text())
+    recorded["world"]["object_mass_kg"] = 0.3
+    (copy / "cell.json").write_text(json.dumps(recorded))
+    assert "was trained in another world than that of panda-cube" in refused(copy, tmp_path)
+
+
+def test_what_holds_no_training(finished, tmp_path):
+    assert "holds no downstream training" in refused(tmp_path, tmp_path)
+    assert "no such directory of a training" in refused("no/where", tmp_path)
+    (tmp_path / "config.yaml").write_text("name: x\n")
+    assert "is a run of tandem pretrain, not a downstream training" in refused(tmp_path, tmp_path)
+    copy = shutil.copytree(finished / "ours", tmp_path / "copy")
+    (copy / "policy.safetensors").unlink()
+    assert f"{copy} has not ended: continue it with tandem downstream train --resume" in refused(copy, tmp_path)
