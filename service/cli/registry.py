@@ -132,12 +132,12 @@ def _summary(registry: Registry, manifest: Manifest) -> dict[str, Any]:
     return {
         "name": manifest.name,
         "version": manifest.version,
-        "kind": manifest.spaces.get("kind", "primitives"),
         "where": "bundled" if is_bundled(registry) else "exported" if exported else "yours",
         "created": manifest.created,
         "bytes": manifest.blob_bytes,
         "aliases": [name for name, number in registry.aliases(manifest.name).items() if number == manifest.version],
         "parent": manifest.parent,
+        "kind": manifest.spaces.get("kind", "primitives"),
     }
 
 

@@ -45,9 +45,9 @@ def assert_user_error(result: Any, *parts: str) -> None:
 
 def test_list(run: Run) -> None:
     lines = run("list").stdout.splitlines()
-    assert lines[0].split("\t") == ["name", "version", "where", "created", "bytes", "aliases", "parent"]
+    assert lines[0].split("\t") == ["name", "version", "where", "created", "bytes", "aliases", "parent", "kind"]
     assert [line.split("\t")[:3] for line in lines[1:3]] == [["panda-cube", str(n), "yours"] for n in (1, 2)]
-    assert lines[2].split("\t")[5:] == ["latest", "panda-cube@1"]
+    assert lines[2].split("\t")[5:] == ["latest", "panda-cube@1", "primitives"]
     champion = Registry(BUNDLED).resolve("panda-cube@champion")
     assert [line.split("\t")[:3] for line in lines[3:]] == [["panda-cube", str(champion.number), "bundled"]]
 

@@ -3,6 +3,7 @@
 import json
 import shutil
 
+import httpx
 import numpy as np
 import pytest
 
@@ -72,6 +73,9 @@ def test_it_acts_alike_from_its_directory_a_registry_and_a_service(finished, cha
     with serve(tmp_path) as server, pytest.MonkeyPatch.context() as patch:
         patch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
         fetched = service.load_policy("push-orchestrator@latest", server.url)
+        (listed,) = httpx.get(f"{server.url}/v1/primitives/push-orchestrator").json()["versions"]
+    assert (listed["kind"], listed["task"]) == ("orchestrator", "push")
+    assert listed["acts_with"] == champion.manifest.reference
     assert fetched.label == "push-orchestrator@1"
     np.testing.assert_array_equal(acted(fetched, observation), expected)
 
