@@ -89,4 +89,9 @@ def load_policy(reference: str, registry: Path | str = "registry", primitives: s
     """
     from service.downstream.orchestrators import load_orchestrator
 
-    return load_orchestrator(reference, registry, primitives)
+    if is_service(registry) and not Path(reference).is_dir():
+        from service.status.client import fetch_primitives
+
+        fetched, version = fetch_primitives(str(registry), reference)
+        return load_orchestrator(str(version), fetched.root, registry, primitives)
+    return load_orchestrator(reference, Path(registry), registry, primitives)

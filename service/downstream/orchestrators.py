@@ -68,8 +68,14 @@ class Orchestrator:
         return self.policy.act_deterministic(observation)
 
 
-def load_orchestrator(reference: str, registry: Path | str = "registry", primitives: str | None = None) -> Orchestrator:
+def load_orchestrator(reference: str, place: Path, registry: Path | str, primitives: str | None = None) -> Orchestrator:
     """Load what a training has learned; see ``service.load_policy``.
+
+    Args:
+        reference: directory of a training, or a published version.
+        place: directory of the registry that has the version.
+        registry: directory or URL of the one in which to look for what it acts with.
+        primitives: what it acts with, where that has moved.
 
     Raises:
         TandemError: nothing there by that reference, something else, damaged, not finished, or without the primitives
@@ -79,7 +85,7 @@ def load_orchestrator(reference: str, registry: Path | str = "registry", primiti
         return _load_training(Path(reference), registry, primitives)
     if "/" in reference:
         raise TandemError(f"{reference}: no such directory of a training; for published ones write NAME@ALIAS")
-    found, version = _find(reference, registry)
+    found, version = find_version(reference, place)
     manifest, parameters = found.load(str(version))
     label = f"{version} (bundled)" if is_bundled(found) else str(version)
     spaces: dict[str, Any] = dict(manifest.spaces)
@@ -89,8 +95,8 @@ def load_orchestrator(reference: str, registry: Path | str = "registry", primiti
             "downstream publish has published"
         )
     try:
-        method, task, wanted = find_method(spaces["method"]), spaces["task"], spaces["primitives"]
-        recorded = {"name": wanted["reference"], "digest": wanted["digest"]}
+        method, task = find_method(spaces["method"]), spaces["task"]
+        recorded = {"name": spaces["primitives"], "digest": spaces["primitives_digest"]}
         hold_steps = int(spaces["hold_steps"])
     except (KeyError, TypeError, ValueError) as error:
         raise TandemError(f"{label}: its manifest lacks {error}; publish it again") from None
@@ -132,7 +138,8 @@ def publish_orchestrator(
         "task_version": trial.task_version,
         "method": found.method,
         "hold_steps": about.get("hold_steps", 1),
-        "primitives": {"reference": acts_with.reference, "digest": digest_of(found.trained)},
+        "primitives": acts_with.reference,
+        "primitives_digest": digest_of(found.trained),
     }
     numbers = {f"evaluation/{key}": value for key, value in result["evaluation"].items() if _is_number(value)}
     published = newest_if_same(target, name, parameters) or target.publish(
@@ -199,14 +206,6 @@ def _load_training(run: Path, registry: Path | str, primitives: str | None) -> O
         parameters, about = read_policy(directory.policy_file)
         policy = LearnedPolicy(parameters, method, trained, about.get("hold_steps", 1))
     return Orchestrator(str(run), trial.task, trial.method, policy, trained)
-
-
-def _find(reference: str, registry: Path | str) -> tuple[Registry, Version]:
-    if service.is_service(registry):
-        from service.status.client import fetch_primitives
-
-        return fetch_primitives(str(registry), reference)
-    return find_version(reference, Path(registry))
 
 
 def _find_frozen(

@@ -81,14 +81,14 @@ def write_video(
     step_s, pane_height = _step_s(config), options.height - BAR_HEIGHT
     with SceneRenderer(config, options.width // 2, pane_height, options.view) as renderer:
         stride = _stride(renderer, rounds[0].alice_states[0], num_pictures, options.speed * _rate(config))
-        frame_s = stride * step_s / options.speed
         frames = (
             frame
             for number, each in enumerate(rounds, start=1)
-            for frame in _round_frames(renderer, each, f"{number}/{len(rounds)}", stride, step_s, frame_s)
+            for frame in _round_frames(renderer, each, f"{number}/{len(rounds)}", stride, step_s, options.speed)
         )
-        num = sum(_num_frames(each, stride, frame_s) for each in rounds)
-        return encode(counted(frames, "drawing the video", num, "pictures"), path, fps=1 / frame_s)
+        num = sum(_num_frames(each, stride, stride * step_s / options.speed) for each in rounds)
+        frames = counted(frames, "drawing the video", num, "pictures")
+        return encode(frames, path, fps=options.speed / (stride * step_s))
 
 
 def write_episode_video(
@@ -140,9 +140,10 @@ def _share(total: int, place: int, num: int) -> int:
 
 
 def _round_frames(
-    renderer: SceneRenderer, played: RecordedRound, number: str, stride: int, step_s: float, frame_s: float
+    renderer: SceneRenderer, played: RecordedRound, number: str, stride: int, step_s: float, speed: float = 1.0
 ) -> Iterator[Image]:
     """Alice moves while Bob waits, then Bob moves, then both rest; ``number`` stands in the caption."""
+    frame_s = stride * step_s / speed
     faded = (0.45 * renderer.render(played.bob_states[0]) + 0.55 * 235).astype(np.uint8)
     right = _caption(faded, "Bob waits", _FAINT, number)
     for step in _thinned(len(played.alice_states), stride):

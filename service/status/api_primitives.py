@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from functools import lru_cache
-from typing import Annotated
+from typing import Annotated, Any
 
 from fastapi import APIRouter, Query, Request, Response
 from fastapi import Path as InPath
@@ -129,9 +129,7 @@ def _version(registry: Registry, version: Version, aliases: dict[str, int]) -> V
     return VersionSummary(version=version.number, aliases=names, **_what_it_is(manifest), **shown)
 
 
-def _what_it_is(manifest: Manifest) -> dict[str, str | None]:
+def _what_it_is(manifest: Manifest) -> dict[str, Any]:
     """Kind of a version; of an orchestrator also its task, and what it acts with."""
-    task, primitives = manifest.spaces.get("task"), manifest.spaces.get("primitives")
-    reference = primitives.get("reference") if isinstance(primitives, dict) else None
-    known = {"kind": manifest.spaces.get("kind", "primitives"), "task": task, "acts_with": reference}
-    return {key: value if isinstance(value, str) else None for key, value in known.items()}
+    found = {key: manifest.spaces.get(key) for key in ("kind", "task", "primitives")}
+    return {key: value for key, value in found.items() if isinstance(value, str)}

@@ -82,9 +82,9 @@ class VersionSummary(FrozenModel):
     """One version; the manifest has more."""
 
     version: int = Field(ge=1)
-    kind: str | None = Field(None, description="`primitives`, `skills` or `orchestrator`")
+    kind: str = Field("primitives", description="what it is, such as `skills` or `orchestrator`")
     task: str | None = Field(None, description="of an orchestrator", examples=["push"])
-    acts_with: str | None = Field(None, description="NAME@VERSION of the primitives of an orchestrator")
+    primitives: str | None = Field(None, description="NAME@VERSION of the primitives an orchestrator belongs to")
     created: str | None = Field(None, description="UTC, ISO 8601")
     metrics: dict[str, float] = Field(default_factory=dict)
     parent: str | None = Field(None, description="NAME@VERSION this one was trained on from")

@@ -9,8 +9,11 @@ from typer.testing import CliRunner
 from service.cli.main import app
 from service.downstream.directory import TrainingDirectory
 from service.primitives.bundled import BUNDLED
+from service.registry.registry import Registry
 from tests.downstream.trials import SETS
 from tests.status.conftest import serve
+
+CHAMPION = str(Registry(BUNDLED).resolve("panda-cube@champion"))
 
 
 def invoke(*arguments):
@@ -42,6 +45,42 @@ def test_a_signal_saves_and_the_same_command_continues(tmp_path, monkeypatch):
     done = train("--task", "wall", "--resume", "--json")
     assert done.exit_code == 0, done.output
     assert json.loads(done.stdout)["env_steps"] == 600
+
+
+def test_what_was_learned_is_published_evaluated_and_rendered(tmp_path, monkeypatch):
+    filmed = []
+    monkeypatch.setattr("service.downstream.worker._record_video", lambda *arguments: None)
+    monkeypatch.setattr("service.media.video.write_episode_video", lambda *arguments: filmed.append(arguments))
+    done = train("--task", "wall", "--seed", 3, "--publish", "wall-orchestrator")
+    assert done.exit_code == 0, done.output
+    assert "wall-orchestrator@1 is in registry" in done.stderr
+    run = "runs/downstream/wall-ours-3"
+    again = invoke("publish", run, "--name", "wall-orchestrator", "--alias", "best")
+    assert again.stdout == f"wall-orchestrator@1 is in registry: wall, acts with {CHAMPION}\n"
+    rates = {}
+    for reference in (run, "wall-orchestrator@best"):
+        found = invoke("evaluate", reference, "--episodes", 4, "--seed", 3, "--json")
+        assert found.exit_code == 0, found.output
+        rows = json.loads(found.stdout)
+        assert list(rows)[2:] == [f"{CHAMPION} (bundled), Bob alone", "idle"]
+        rates[reference] = list(rows.values())[1]
+    result = json.loads((tmp_path / run / "result.json").read_text())["evaluation"]
+    for rate in rates.values():  # the goals of its result
+        assert rate == {key: result[key] for key in rate}
+    drawn = invoke("render", "wall-orchestrator@best", "--task", "push", "--episodes", 2, "--out", "push.gif")
+    assert drawn.exit_code == 0, drawn.output
+    ((episodes, world, path, _),) = filmed
+    assert (episodes.states.shape[:2], world.gripper, path.name) == ((51, 2), "blocked", "push.gif")
+    for words, refused in (
+        ("panda-cube is the name of primitives already", invoke("train", "--task", "wall", "--publish", "panda-cube")),
+        ("load them by service.load_primitives", invoke("evaluate", "panda-cube@champion")),
+        ("unknown task 'lift'", invoke("evaluate", run, "--task", "lift")),
+    ):
+        assert refused.exit_code == 2
+        assert refused.stderr.startswith("error: ")
+        assert refused.stderr.count("\n") == 1
+        assert words in refused.stderr
+    assert not (tmp_path / "runs" / "downstream" / "wall-ours-0").exists()
 
 
 def test_a_table_from_the_command_line(tmp_path):

@@ -62,7 +62,7 @@ def test_it_acts_alike_from_its_directory_a_registry_and_a_service(finished, cha
     assert version == again == ("push-orchestrator", 1)
     manifest = Registry(registry).manifest("push-orchestrator")
     assert manifest.spaces["kind"] == "orchestrator"
-    assert manifest.spaces["primitives"]["reference"] == champion.manifest.reference
+    assert manifest.spaces["primitives"] == champion.manifest.reference
     result = json.loads((finished / "ours" / "result.json").read_text())
     assert manifest.metrics["evaluation/success_last"] == result["evaluation"]["success_last"]
     assert Registry(registry).verify(check=network_problems) == []
@@ -75,7 +75,7 @@ def test_it_acts_alike_from_its_directory_a_registry_and_a_service(finished, cha
         fetched = service.load_policy("push-orchestrator@latest", server.url)
         (listed,) = httpx.get(f"{server.url}/v1/primitives/push-orchestrator").json()["versions"]
     assert (listed["kind"], listed["task"]) == ("orchestrator", "push")
-    assert listed["acts_with"] == champion.manifest.reference
+    assert listed["primitives"] == champion.manifest.reference
     assert fetched.label == "push-orchestrator@1"
     np.testing.assert_array_equal(acted(fetched, observation), expected)
 

@@ -9,7 +9,8 @@ from service.actors.evaluation import IdlePolicy, evaluate
 from service.downstream import worker
 from service.downstream.compose import parameters_digest
 from service.downstream.methods import find_method
-from service.downstream.worker import Callbacks, RunOptions, make_worlds, play, run_trial
+from service.downstream.playing import evaluate_on
+from service.downstream.worker import Callbacks, RunOptions, make_worlds, run_trial
 from service.envs.tasks import TASKS
 from service.errors import TandemError
 from service.io.checkpoints import CheckpointStore
@@ -119,7 +120,7 @@ def test_5_cm_are_counted_and_while_learning_a_centimetre_less_is_paid(champion)
         world = task.world_from(champion.config.world)
         options = {"num_episodes": 300, "num_steps": 50, "success_distance_m": distance, "seed": 7}
         counts.append(evaluate(IdlePolicy(), world, task.goals, **options).success_last)
-    assert play(trial, champion, IdlePolicy(), 300, 7, 1).success_last == counts[0] < counts[1]
+    assert evaluate_on(trial.task, champion.config.world, IdlePolicy(), 300, 7, 1).success_last == counts[0] < counts[1]
     worlds = make_worlds(trial, find_method("ours"), champion, 1)
     following = np.zeros((3, 11), np.float32)
     following[:, 5:8] = [[0.0399, 0.0, 0.0], [0.0401, 0.0, 0.0], [0.0, 0.0, -0.0499]]
