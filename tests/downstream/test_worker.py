@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from service.actors.evaluation import IdlePolicy, evaluate
-from service.downstream import worker
+from service.downstream import playing, worker
 from service.downstream.compose import parameters_digest
 from service.downstream.methods import find_method
 from service.downstream.playing import evaluate_on
@@ -131,7 +131,7 @@ def test_5_cm_are_counted_and_while_learning_a_centimetre_less_is_paid(champion)
 def test_goals_of_the_curve_of_the_end_and_of_learning_are_others(champion, tmp_path, monkeypatch):
     seeds = []
     monkeypatch.setattr(
-        worker, "evaluate", lambda *given, **named: seeds.append(named["seed"]) or evaluate(*given, **named)
+        playing, "evaluate", lambda *given, **named: seeds.append(named["seed"]) or evaluate(*given, **named)
     )
     run(small_trial(seed=3), champion, tmp_path)
     assert seeds == [1_000_003, 1_000_003, 2_000_003]
