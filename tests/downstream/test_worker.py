@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from service.actors.evaluation import IdlePolicy, evaluate
-from service.downstream import playing, worker
+from service.downstream import playing
 from service.downstream.compose import parameters_digest
 from service.downstream.methods import find_method
 from service.downstream.playing import evaluate_on
