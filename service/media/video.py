@@ -99,7 +99,8 @@ def write_episode_video(
     check_format(path)
     num_steps, num_episodes = episodes.reached.shape
     panes = pane_rows(num_episodes, options.width, options.height)
-    with SceneRenderer(config, max(row[0][0] for row in panes), panes[0][0][1], options.view) as renderer:
+    widest = max(width for row in panes for width, _ in row)
+    with SceneRenderer(config, widest, panes[0][0][1], options.view) as renderer:
         pictures = num_steps * num_episodes
         stride = _stride(renderer, episodes.states[0, 0], pictures, options.speed * _rate(config))
         frame_s = stride * _step_s(config) / options.speed

@@ -387,7 +387,15 @@ def test_render_films_episodes_of_published_primitives(trained, filmed, tmp_path
 def test_render_films_goals_that_are_typed(trained, monkeypatch, tmp_path):
     shown = []
     monkeypatch.setattr("service.media.video.write_episode_video", lambda *arguments: shown.append(arguments))
-    common = ("render", "--primitives", trained.run, "--goals", "0.02,0,0.2; 0,-0.05,0.025", "--out", tmp_path / "a.gif")
+    common = (
+        "render",
+        "--primitives",
+        trained.run,
+        "--goals",
+        "0.02,0,0.2; 0,-0.05,0.025",
+        "--out",
+        tmp_path / "a.gif",
+    )
     result = tandem(*common, "--size", "640x360", "--camera", "side,distance=2", "--speed", 0.5)
     assert result.exit_code == 0, result.output
     ((episodes, _, path, options),) = shown

@@ -103,6 +103,8 @@ def test_episodes_fill_the_film_and_a_gif_is_read_back(tmp_path):
     panes = [frames[0, BAR_HEIGHT:156, :160], frames[0, BAR_HEIGHT:156, 160:], frames[0, -120:]]
     assert all(num_red(pane) > 40 for pane in panes), [num_red(pane) for pane in panes]
     assert all(pane.std() > 20 for pane in panes)
+    uneven = dataclasses.replace(options, width=322, height=180)  # three in a row: 107, 107 and 108 pixels
+    assert read_video(write_episode_video(episodes, WorldConfig(), tmp_path / "b.gif", uneven))[0].shape[2] == 322
 
 
 @pytest.mark.parametrize("num", range(1, 20))
