@@ -20,10 +20,21 @@ from tests.status.browser import CHROMIUM, Visit, chromium
 ROOT = Path(__file__).parents[2]
 
 
-@pytest.fixture
-def live(tmp_path):
-    with LiveWorld(cast_primitives("panda-cube@champion", tmp_path), port=0, seed=1) as live:
+@pytest.fixture(scope="module")
+def shared(tmp_path_factory):
+    cast = cast_primitives("panda-cube@champion", tmp_path_factory.mktemp("no-registry"))
+    with LiveWorld(cast, port=0, seed=1) as live:
         yield live
+
+
+@pytest.fixture
+def live(shared):
+    """The shared live world, as at its beginning."""
+    shared.panel.paused, shared.panel.speed, shared.game.new_goals = False, 1.0, True
+    shared.game.set_mode("goals")
+    shared.game.reset()
+    shared.tick(0.0)
+    return shared
 
 
 def object_of(live):
@@ -96,7 +107,7 @@ def test_a_browser_shows_and_drives_it(live):
         group.handle.visible = False
     live._server.scene.configure_default_lights(True, cast_shadow=False)
     live.panel.toggle_pause()
-    stop = threading.Event()
+    before, stop = live.game.num_steps, threading.Event()
     thread = threading.Thread(target=live.run, args=(stop.is_set,))
     thread.start()
     try:
@@ -105,9 +116,9 @@ def test_a_browser_shows_and_drives_it(live):
             page = visit.page
             page.goto(live.url)
             page.get_by_text(live.game.cast.label).wait_for()
-            assert live.game.num_steps == 0
+            assert live.game.num_steps == before
             page.get_by_role("button", name="Go on").click(force=True)
-            while live.game.num_steps == 0:
+            while live.game.num_steps == before:
                 page.wait_for_timeout(50)
             page.get_by_role("button", name="Pause").wait_for()
             assert [url for url in visit.asked if not url.removeprefix("blob:").startswith(live.url)] == []
