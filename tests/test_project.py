@@ -56,6 +56,7 @@ VERBS = (
     "pretrain",
     "evaluate",
     "render",
+    "play",
     "coverage",
     "export",
     "registry",

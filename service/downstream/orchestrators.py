@@ -16,7 +16,7 @@ from service.config import WorldConfig
 from service.downstream.directory import TrainingDirectory, read_json, read_result, read_trial
 from service.downstream.inputs import num_inputs
 from service.downstream.methods import METHODS, Method, Trained, digest_of, find_method
-from service.downstream.policy import LearnedPolicy, read_policy
+from service.downstream.policy import LearnedPolicy, load_policy, read_policy
 from service.downstream.settings import validate
 from service.envs.observations import layouts
 from service.envs.tasks import find_task
@@ -127,7 +127,7 @@ def publish_orchestrator(
     acts_with = check_publishable(found.method, found.trained, name, registry)
     target = Registry(Path(registry))
     directory = TrainingDirectory(run)
-    parameters, about = read_policy(directory.policy_file)
+    _, parameters, hold_steps = read_policy(directory.policy_file, found.trained)
     result = read_result(directory.result_file)
     trial = read_trial(read_json(directory.trial_file), directory.trial_file)
     world = found.trained.config.world
@@ -137,7 +137,7 @@ def publish_orchestrator(
         "task": found.task,
         "task_version": trial.task_version,
         "method": found.method,
-        "hold_steps": about.get("hold_steps", 1),
+        "hold_steps": hold_steps,
         "primitives": acts_with.reference,
         "primitives_digest": digest_of(found.trained),
     }
@@ -199,12 +199,7 @@ def _load_training(run: Path, registry: Path | str, primitives: str | None) -> O
             f"{run} was trained in another world than that of {trained.label}: name primitives of that world with "
             "--primitives"
         )
-    policy: DeterministicPolicy
-    if method.player is not None:
-        policy = method.player(trained)
-    else:
-        parameters, about = read_policy(directory.policy_file)
-        policy = LearnedPolicy(parameters, method, trained, about.get("hold_steps", 1))
+    policy = method.player(trained) if method.player is not None else load_policy(directory.policy_file, trained)
     return Orchestrator(str(run), trial.task, trial.method, policy, trained)
 
 
