@@ -65,7 +65,6 @@ VERBS = (
     "robot",
     "configs",
 )
-VERBS = ("demo", "pretrain", "evaluate", "render", "play", "coverage", "export", "registry", "serve", "downstream", "robot")
 DOCUMENTS = [*sorted(ROOT.glob("*.md")), *sorted((ROOT / "docs").rglob("*.md")), ROOT / "deploy" / "README.md"]
 FOLDERS = (".ci", "benchmarks", "configs", "deploy", "docs", "service", "tests", "tools")
 TEXT = {".cfg", ".json", ".jsonl", ".md", ".py", ".toml", ".txt", ".yaml", ".yml", ""}
