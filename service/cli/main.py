@@ -24,10 +24,6 @@ from service.cli.serve import serve
 from service.cli.unexpected import report_thread_error
 
 app = typer.Typer(name="tandem", help="Robot skills, pre-trained.", cls=CommandGroup, no_args_is_help=True)
-for command in (pretrain, demo, evaluate, coverage, render, export, serve):
-app = typer.Typer(
-    name="tandem", help="Robot skills, pre-trained.", cls=CommandGroup, no_args_is_help=True, add_completion=False
-)
 for command in (pretrain, demo, evaluate, coverage, render, play, export, serve):
     app.command()(command)
 app.add_typer(registry_app)
