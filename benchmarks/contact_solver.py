@@ -27,7 +27,8 @@ from benchmarks.rounds import Rounds, repeat_physics
 from benchmarks.training_process import copy_run, scratch
 from service.config import WorldConfig
 from service.envs.batch import WorldBatch
-from service.envs.scene import GRAVITY_MS2, build_spec
+from service.envs.objects import GRAVITY_MS2
+from service.envs.scene import build_spec
 from service.io.run_directory import RunDirectory
 from service.runtime.local import LocalRun
 

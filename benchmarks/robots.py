@@ -5,7 +5,8 @@
 
 Each of ``configs/robots`` picks a cube up, carries it to a random place in the air and holds it there for 5 s, by a
 hand-written policy. Env steps are of random actions with one thread, in turn with the Panda's. A run is one of
-``tandem pretrain`` with that robot. What the file has of robots that are not measured now stays.
+``tandem pretrain`` with that robot, or with another object: ``panda with a mesh`` is of the one that ``--frustum``
+writes. What the file has of robots that are not measured now stays.
 """
 
 from __future__ import annotations
@@ -87,6 +88,24 @@ def summarise_run(path: Path) -> dict[str, Any]:
     }
 
 
+def write_frustum(path: Path) -> None:
+    """Write the mesh of the recorded run: a hexagonal frustum, 60 mm wide below, 44 above and 45 high, as OBJ."""
+    num = 6
+    angles = np.arange(num) * 2 * np.pi / num
+    ring = np.column_stack([np.cos(angles), np.sin(angles)])
+    lines = [
+        f"v {radius * x:.6f} {radius * y:.6f} {z:.6f}" for radius, z in ((0.030, 0.0), (0.022, 0.045)) for x, y in ring
+    ]
+    faces = []
+    for this in range(num):
+        after = (this + 1) % num
+        faces += [(this, after, num + after), (this, num + after, num + this)]
+    faces += [(0, each + 1, each) for each in range(1, num - 1)]
+    faces += [(num, num + each, num + each + 1) for each in range(1, num - 1)]
+    lines += ["f " + " ".join(str(corner + 1) for corner in face) for face in faces]
+    path.write_text("\n".join(lines) + "\n")
+
+
 def world_of(name: str) -> WorldConfig:
     """The world of the recipe with another robot."""
     return load_config(RECIPE_FILE, [f"world.robot={ROBOTS / name}.yaml", *OVERRIDES.get(name, ())]).world
@@ -102,15 +121,19 @@ def main() -> int:
     parser = parser_of(__doc__, Settings())
     parser.add_argument("--run", action="append", default=[], metavar="NAME=DIR", help="a run with that robot")
     parser.add_argument("--robots", nargs="*", metavar="NAME", help="default: all whose models are installed")
+    parser.add_argument("--frustum", type=Path, metavar="FILE", help="write the mesh of the recorded run, and stop")
     given = parser.parse_args()
+    if given.frustum is not None:
+        write_frustum(given.frustum)
+        return 0
     return run_benchmark(
         "robots", ("mujoco", "numpy"), given, Settings, lambda chosen: _benchmark(chosen, given), report
     )
 
 
 def _benchmark(settings: Settings, given: argparse.Namespace) -> dict[str, Any]:
-    before = json.loads(given.json.read_text())["robots"] if given.json is not None and given.json.exists() else {}
-    robots: dict[str, dict[str, Any]] = {name: dict(each) for name, each in before.items()}
+    before = json.loads(given.json.read_text()) if given.json is not None and given.json.exists() else {"robots": {}}
+    robots: dict[str, dict[str, Any]] = {name: dict(each) for name, each in before["robots"].items()}
     names = [path.stem for path in sorted(ROBOTS.glob("*.yaml"))] if given.robots is None else given.robots
     for name in names:
         try:
@@ -124,7 +147,9 @@ def _benchmark(settings: Settings, given: argparse.Namespace) -> dict[str, Any]:
     for run in given.run:
         name, _, path = run.partition("=")
         robots.setdefault(name, {})["run"] = summarise_run(Path(path))
-    return {"robots": robots}
+    # Where only runs are added, the machine is still the one on which the others were measured.
+    kept = {} if names else {key: before[key] for key in ("machine", "settings") if key in before}
+    return {**kept, "robots": robots}
 
 
 if __name__ == "__main__":

@@ -105,6 +105,14 @@ class FixtureConfig(ObjectConfig):
         return (cosine * x + sine * y) / 2, (sine * x + cosine * y) / 2
 
 
+class ObstacleConfig(ObjectConfig):
+    """A further thing that lies about on the table, elsewhere at every start, and can be pushed."""
+
+    mass_kg: float = Field(0.1, gt=0.0, le=5.0)
+    friction: float = Field(1.0, gt=0.0, le=3.0, description="sliding friction of it on the table and on other things")
+    color: Color = (0.90, 0.66, 0.20)
+
+
 def simple_object(name: Literal["cube", "sphere"], size_m: float) -> ObjectConfig:
     """The description of a cube, by its edge, or of a sphere, by its diameter."""
     size = (size_m, size_m, size_m) if name == "cube" else (size_m,)
@@ -132,3 +140,4 @@ Object = Annotated[
 ]
 """A name, or a description."""
 Fixture = Annotated[FixtureConfig, BeforeValidator(_read_mesh)]
+Obstacle = Annotated[ObstacleConfig, BeforeValidator(_read_mesh)]

@@ -7,7 +7,7 @@ from typing import Annotated, Any, Literal, Self
 from pydantic import BeforeValidator, Discriminator, Field, Tag, model_validator
 
 from service.frozen import FrozenModel
-from service.object_config import Fixture, Object, ObjectConfig, simple_object
+from service.object_config import Fixture, Object, ObjectConfig, Obstacle, simple_object
 from service.randomisation_config import RandomisationConfig
 from service.recipes import find_file, robots
 from service.robot_config import RobotConfig, read_robot
@@ -51,6 +51,7 @@ class ObservedConfig(FrozenModel):
         description="policies see by how many control steps their commands are late; on a robot, tandem robot "
         "calibrate measures it",
     )
+    obstacles: bool = Field(False, description="whether policies see where the middle of each of world.obstacles is")
 
 
 def _read_robot(value: Any) -> Any:
@@ -88,6 +89,11 @@ class WorldConfig(FrozenModel):
     fixtures: tuple[Fixture, ...] = Field(
         (), max_length=20, description="further things on the table that cannot be moved (docs/objects.md)"
     )
+    obstacles: tuple[Obstacle, ...] = Field(
+        (),
+        max_length=8,
+        description="further objects that lie about on the table and can be pushed (docs/objects.md)",
+    )
     workspace: WorkspaceConfig = WorkspaceConfig()
     observed: ObservedConfig = ObservedConfig()
     randomisation: RandomisationConfig = RandomisationConfig()
@@ -105,6 +111,17 @@ class WorldConfig(FrozenModel):
         if self.fixtures and self.fixture != "none":
             raise ValueError(f"fixture = {self.fixture!r} and fixtures: a world has the one or the other")
         return self
+
+    @model_validator(mode="after")
+    def _observes_what_is_there(self) -> Self:
+        if self.observed.obstacles and not self.obstacles:
+            raise ValueError("observed.obstacles, and no obstacles: describe some, or leave it out")
+        return self
+
+    @property
+    def num_observed_obstacles(self) -> int:
+        """Number of obstacles whose positions policies see."""
+        return len(self.obstacles) if self.observed.obstacles else 0
 
     @property
     def nominal(self) -> WorldConfig:

@@ -51,6 +51,7 @@ PROGRAMS = {
     "robots": "benchmarks.robots",
     "transfer": "benchmarks.transfer",
     "transfer_champion": "benchmarks.transfer --name transfer_champion",
+    "world_speed": "benchmarks.world_speed",
 }
 """Modules by the name of the recorded file that they make."""
 PAGES = {
@@ -141,8 +142,10 @@ def read_runs(directory: Path) -> tuple[list[Run], list[Run]]:
 
 def robots_blocks(found: Results) -> Blocks:
     """Parts of the block about robots by description."""
-    recorded = found.get("robots")
-    return {"robots": [robots.robots_table(recorded), robots.robots_words(recorded)]} if recorded is not None else {}
+    recorded, speed = found.get("robots"), found.get("world_speed")
+    parts = [robots.robots_table(recorded), robots.robots_words(recorded)] if recorded is not None else []
+    parts += [robots.speed_words(speed)] if speed is not None else []
+    return {"robots": parts} if parts else {}
 
 
 def transfer_blocks(found: Results) -> Blocks:

@@ -36,6 +36,18 @@ def robots_words(result: Result) -> str:
     )
 
 
+def speed_words(result: Result) -> str:
+    """What the Panda's worlds cost before and after robots became descriptions."""
+    ratios = " and ".join(f"{each['cpu']:.2f} with {num}" for num, each in result["ratios"].items())
+    old, new = (result["commits"][key][:7] for key in ("old", "new"))
+    where, num_pairs = result["machine"], result["settings"]["num_pairs"]
+    return (
+        f"The Panda's worlds make {ratios} worlds times as many env steps in a CPU second as before robots were "
+        f"descriptions: commit `{new}` by `{old}`, random actions in the recipe's world, one thread, median of "
+        f"{num_pairs} pairs in turn. On {where['num_cpus']} cores of {where['cpu']}, {where['time'][:10]}."
+    )
+
+
 def _self_play(run: Result) -> str:
     shares = {key: f"{100 * run[key]:.0f} %" for key in ("valid_fraction", "lifted_fraction", "success_rate")}
     return (

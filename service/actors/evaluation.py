@@ -11,7 +11,8 @@ import numpy as np
 from service.config import Config, WorldConfig
 from service.envs.batch import WorldBatch
 from service.envs.observations import ACTION, bob_observation
-from service.envs.sampling import GoalKind, draw_goals
+from service.envs.obstacles import draw_goals
+from service.envs.sampling import GoalKind
 from service.liveness import count_work
 from service.progress import doing
 from service.types import FloatArray, Metrics, StateArray
@@ -88,9 +89,8 @@ def evaluate(
     rng = np.random.default_rng(seed)
     with WorldBatch(config, num_episodes, num_threads=num_threads) as worlds:
         worlds.reset(rng)
-        start, box = worlds.object_position, worlds.box_place
         if goal is None:
-            goal = draw_goals(kind, rng, config, success_distance_m, start=start, box=box)
+            goal = draw_goals(kind, rng, config, success_distance_m, worlds.places)
         ever = np.zeros(num_episodes, dtype=bool)
         distance = np.zeros(num_episodes)
         if observe:

@@ -83,7 +83,7 @@ def check_robot(trained: TrainedBob | TrainedSkills) -> None:
     if trained.manifest is None:
         return
     spaces = trained.manifest.spaces
-    known = layouts(trained.config.world.observed).spaces
+    known = layouts(trained.config.world).spaces
     wanted_spaces = known if isinstance(trained, TrainedBob) else {key: known[key] for key in _SEEN_BY_SKILLS}
     wrong = {key: spaces.get(key) for key, value in wanted_spaces.items() if spaces.get(key) != value}
     if wrong:

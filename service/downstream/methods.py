@@ -65,7 +65,7 @@ def frozen_skills(trained: Trained) -> FrozenSkills:
 
 
 def _enter(env: gymnasium.vector.VectorEnv[Any, Any, Any], seed: int, trained: Trained, hold_steps: int) -> TaskWorlds:
-    return TaskWorlds(env, seed, layouts(trained.config.world.observed))
+    return TaskWorlds(env, seed, layouts(trained.config.world))
 
 
 def _enter_composing(

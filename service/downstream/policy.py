@@ -38,7 +38,7 @@ class LearnedPolicy:
     def __init__(self, parameters: Parameters, method: Method, trained: Trained, hold_steps: int = 1) -> None:
         self._actor, self._method, self._trained = numpy_actor(parameters), method, trained
         self._hold_steps = hold_steps
-        self._seen = layouts(trained.config.world.observed)
+        self._seen = layouts(trained.config.world)
         self.begin()
 
     def begin(self) -> None:

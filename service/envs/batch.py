@@ -12,10 +12,10 @@ from mujoco import rollout
 from service.config import WorldConfig
 from service.envs.model_bank import ModelBank
 from service.envs.noise import KEYS, normal
-from service.envs.observations import ACTION, COMMAND_PREFIX, Layouts, ObservationLayout, layouts
+from service.envs.observations import ACTION, COMMAND_PREFIX, OBSTACLE_PREFIX, Layouts, ObservationLayout, layouts
+from service.envs.obstacles import SEEN_WITHIN_M, Places, draw_starts, gripper_boxes, obstacle_columns, obstacle_places
 from service.envs.reach import reach_of
 from service.envs.robot import Robot, described
-from service.envs.sampling import draw_starts
 from service.envs.scene import FIXTURE_PREFIX, build_layout
 from service.errors import ConfigError, DivergedError
 from service.types import BoolArray, FloatArray, IntArray, StateArray
@@ -30,6 +30,9 @@ MAX_TURN_RAD = 0.5
 MAX_SPEED = 1e3
 """A joint (rad/s) or object (m/s, rad/s) faster than this has diverged; the arm reaches 3, a falling object 30."""
 _TOUCHING_M = 1e-4
+_MOVED = ("object", OBSTACLE_PREFIX)
+"""Begin the names of what is put elsewhere at every start."""
+_NUM_TRIED_STARTS = 32
 _PHYSICS = int(mujoco.mjtState.mjSTATE_FULLPHYSICS)
 _CONTROL_AND_BOX = int(mujoco.mjtState.mjSTATE_CTRL) | int(mujoco.mjtState.mjSTATE_MOCAP_POS)
 
@@ -55,7 +58,7 @@ class WorldBatch:
     ) -> None:
         self.config = config
         self.num_worlds = num_worlds
-        self.observed = layouts(config.observed)
+        self.observed = layouts(config)
         """What policies see here."""
         self.bank = ModelBank(config)
         self.model = self.bank.nominal
@@ -70,10 +73,11 @@ class WorldBatch:
         self.layout = build_layout(config, blocked_fraction=blocked_fraction)
         """Columns of ``states``."""
         self._commands = self.layout["commands"]
+        self._obstacles = obstacle_columns(self.layout, len(config.obstacles))
         self._num_commands = self._commands.stop - self._commands.start
         assert (self.model.nq, self.model.nv) == (self.layout.num_positions, self.layout.num_velocities)
-        # The object's weight is an actuator, too, the last, which ignores its control.
-        assert self.model.nu == self.robot.num_joints + self.robot.num_fingers + 1
+        # The weights of object and obstacles are actuators, too, the last ones, which ignore their control.
+        assert self.model.nu == self.robot.num_joints + self.robot.num_fingers + 1 + len(config.obstacles)
         assert mujoco.mj_stateSize(self.model, _PHYSICS) == self.layout.physics.stop
         self.blocked_fraction = blocked_fraction
         """Share of later starts with a blocked gripper; more than 0 only where it was when the batch was made."""
@@ -121,6 +125,16 @@ class WorldBatch:
         return self.states[:, self.layout["box_place"]]
 
     @property
+    def obstacle_positions(self) -> StateArray:
+        """(N, K, 3) centres of the obstacles, metres."""
+        return obstacle_places(self.states, self._obstacles)
+
+    @property
+    def places(self) -> Places:
+        """Where the things are that start elsewhere in every game."""
+        return Places(self.object_position, self.box_place, self.obstacle_positions)
+
+    @property
     def ee_position(self) -> StateArray:
         """(N, 3) point between the fingertips, metres."""
         return self._kinematics.position
@@ -134,10 +148,13 @@ class WorldBatch:
         """(num, S) states in which games and episodes start.
 
         The arm is at home, the gripper open unless it is blocked, the object anywhere on the table inside the
-        workspace. Beside a wall or a box it is where ``sampling.draw_starts`` says, and a box is anywhere.
+        workspace, and so are obstacles. Beside a wall or a box the object is where ``sampling.draw_starts`` says, and a
+        box is anywhere.
         """
         states = np.tile(self._fresh_state, (num, 1))
-        states[:, self.layout["object"]], states[:, self.layout["box_place"]] = draw_starts(rng, num, self.config)
+        places = draw_starts(rng, num, self.config, self._gripper_at_start)
+        states[:, self.layout["object"]], states[:, self.layout["box_place"]] = places.object, places.box
+        obstacle_places(states, self._obstacles)[:] = places.obstacles
         self._draw_physics(rng, states)
         if self.blocked_fraction:
             blocked = rng.random(num) < self.blocked_fraction
@@ -152,6 +169,7 @@ class WorldBatch:
             model = rng.integers(len(self.bank), size=num)
             states[:, layout["model"]] = model[:, None]
             states[:, layout["object"].start + 2] += self.bank.rest_height_m[model] - self.config.rest_height_m
+            obstacle_places(states, self._obstacles)[:, :, 2] += self.bank.table_height_m[model][:, None]
             if self.config.fixture == "box":
                 states[:, layout["box_place"].start + 2] += self.bank.table_height_m[model]
         if drawn.delay_steps is not None:
@@ -285,6 +303,8 @@ class WorldBatch:
         if name.startswith(COMMAND_PREFIX):
             first = self._commands.start + ACTION.size * (int(name.removeprefix(COMMAND_PREFIX)) - 1)
             return self.states[:, first : first + ACTION.size]
+        if name.startswith(OBSTACLE_PREFIX):
+            return np.clip(self.states[:, self.layout[name]], -SEEN_WITHIN_M, SEEN_WITHIN_M)
         if name == "effector":
             return self.ee_position
         if name == "delay" and self.config.randomisation.delay_steps is None:
@@ -323,6 +343,11 @@ class WorldBatch:
         state[self.layout["joints"]] = arm.solve(arm.home[None], home, num_iterations=30)[0]
         state[self.layout["fingers"]] = self.robot.finger_values(np.array([self._widest_m]))[0]
         self._check_start(state)
+        # Where there is no room, it is said now.
+        places = draw_starts(np.random.default_rng(0), _NUM_TRIED_STARTS, self.config, self._gripper_at_start)
+        if self.config.obstacles:  # before the first reset, too, nothing is inside another
+            state[self.layout["object"]], state[self.layout["box_place"]] = places.object[0], places.box[0]
+            obstacle_places(state[None], self._obstacles)[:] = places.obstacles[:1]
         return state
 
     def _check_start(self, state: StateArray) -> None:
@@ -330,10 +355,11 @@ class WorldBatch:
         data = mujoco.MjData(self.model)
         mujoco.mj_setState(self.model, data, state[self.layout.physics], _PHYSICS)
         mujoco.mj_forward(self.model, data)
+        self._gripper_at_start = gripper_boxes(self.model, data)
         for contact in data.contact[: data.ncon]:
             names = [self.model.geom(int(geom)).name for geom in contact.geom]
             fixed = [name for name in names if name.startswith(FIXTURE_PREFIX)]
-            if contact.dist < -_TOUCHING_M and fixed and not any(name.startswith("object") for name in names):
+            if contact.dist < -_TOUCHING_M and fixed and not any(name.startswith(_MOVED) for name in names):
                 raise ConfigError(
                     f"at its start, {self.config.start_height_m:g} m above the middle of the workspace, the gripper is "
                     f"inside {fixed[0]}: raise world.start_height_m, or put the fixture elsewhere"

@@ -6,6 +6,7 @@ from typing import Any
 
 import mujoco
 
+from service.mesh_files import Vector
 from service.model_files import model_file
 from service.object_config import MeshConfig
 
@@ -28,3 +29,17 @@ def add_mesh(spec: mujoco.MjSpec, mesh: MeshConfig, name: str, mass_kg: float) -
             }
         )
     return parts
+
+
+def center_of_mass(mesh: MeshConfig) -> Vector:
+    """Center of mass of a mesh, as dense everywhere, from the middle of its extent, metres.
+
+    Raises:
+        ConfigError: a file is gone, or another than it was.
+    """
+    spec = mujoco.MjSpec()
+    body = spec.worldbody.add_body(name="mesh")
+    for part in add_mesh(spec, mesh, "piece", 1.0):
+        body.add_geom(**part)
+    x, y, z = map(float, spec.compile().body("mesh").ipos)
+    return x, y, z

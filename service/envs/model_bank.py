@@ -11,7 +11,7 @@ import numpy as np
 
 from service.config import WorldConfig
 from service.envs.robot import described
-from service.envs.scene import FIXTURE_PREFIX, build_spec
+from service.envs.scene import FIXTURE_PREFIX, build_model
 from service.object_config import ObjectConfig
 from service.types import Array, StateArray
 
@@ -27,7 +27,7 @@ class ModelBank:
 
     def __init__(self, config: WorldConfig) -> None:
         ranges = config.randomisation.model_ranges
-        self.nominal: mujoco.MjModel = build_spec(config).compile()
+        self.nominal: mujoco.MjModel = build_model(config)
         """Without any of it."""
         self.drawn = _spread(ranges, config.randomisation.num_models) if ranges else {}
         """(M,) values by the names of ``RandomisationConfig``."""
@@ -79,7 +79,7 @@ def _scaled(shape: ObjectConfig, factor: float) -> ObjectConfig:
 
 
 def _compile(config: WorldConfig, drawn: dict[str, float]) -> mujoco.MjModel:
-    model = build_spec(config).compile()
+    model = build_model(config)
     servos = slice(0, len(described(config).joints))  # those of the arm come first
     gain, damping = drawn.get("gain", 1.0), drawn.get("damping", 1.0)
     model.actuator_gainprm[servos, 0] *= gain

@@ -22,7 +22,7 @@ from service.envs.state_layout import columns
 from service.types import FloatArray
 
 if TYPE_CHECKING:
-    from service.world_config import ObservedConfig  # acting needs no pydantic
+    from service.world_config import WorldConfig  # acting needs no pydantic
 
 
 @dataclass(frozen=True)
@@ -141,6 +141,8 @@ _ELAPSED = ObservationLayout(Entry("elapsed", SCALAR, "share of the turn", 0.5, 
 _DELAY = Entry("delay", SCALAR, "control steps", 1.0, 1.0)
 COMMAND_PREFIX = "command_"
 """Begins the names of past commands; ``command_1`` is the last one."""
+OBSTACLE_PREFIX = "obstacle_"
+"""Begins the names of the obstacles' positions; ``obstacle_1`` is the first one described."""
 
 
 class Layouts:
@@ -150,15 +152,19 @@ class Layouts:
 
     Args:
         num_commands: last commands that policies see.
+        num_obstacles: obstacles whose positions they see.
         delay: whether they see how late commands are.
     """
 
-    def __init__(self, num_commands: int = 0, *, delay: bool = False) -> None:
+    def __init__(self, num_commands: int = 0, num_obstacles: int = 0, *, delay: bool = False) -> None:
+        obstacles = (
+            Entry(f"{OBSTACLE_PREFIX}{number + 1}", VECTOR, "m", _MIDDLE_M, 0.12) for number in range(num_obstacles)
+        )
         commands = (
             Entry(f"{COMMAND_PREFIX}{age + 1}", COMMAND, "share of the greatest", 0.0, 1.0)
             for age in range(num_commands)
         )
-        self.positions = POSITIONS + ObservationLayout(*commands, *([_DELAY] if delay else []))
+        self.positions = POSITIONS + ObservationLayout(*obstacles, *commands, *([_DELAY] if delay else []))
         """Input of Bob's primitives."""
         self.full = self.positions + _MOTION + _ELAPSED
         """Input of Alice's policy and of her value network."""
@@ -176,9 +182,9 @@ class Layouts:
         return {**sizes, "layout": __name__}
 
 
-def layouts(observed: ObservedConfig) -> Layouts:
-    """Layouts of worlds with such observations."""
-    return Layouts(observed.num_commands, delay=observed.delay)
+def layouts(world: WorldConfig) -> Layouts:
+    """Layouts of worlds of a configuration."""
+    return Layouts(world.observed.num_commands, world.num_observed_obstacles, delay=world.observed.delay)
 
 
 PAPER = Layouts()

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import re
 from itertools import chain as joined
+from pathlib import Path
 
 import mujoco
 import numpy as np
@@ -19,6 +21,7 @@ from service.types import BoolArray, StateArray
 _PREFIX, _HAND_PREFIX = "robot/", "hand/"
 """Begin the names of all that comes from a file, so that none is that of something in the scene; a hand's has both."""
 _SIDES = ("left", "right")
+_ROS_ADDRESS = re.compile(r"package:/+([^/]+)/(.+)")
 _HIDDEN = 4
 """Group of what is not drawn."""
 
@@ -151,8 +154,24 @@ def _read(name: str, sha256: str | None, scene: mujoco.MjSpec) -> mujoco.MjSpec:
             spec.delete(each)
     for site in spec.sites:
         site.group = _HIDDEN
+    _find_meshes(spec, path)
     _take_settings(spec, scene)
     return spec
+
+
+def _find_meshes(spec: mujoco.MjSpec, path: Path) -> None:
+    """Replace ROS's addresses of meshes by files, in the directory above the model that has the package's name."""
+    for mesh in spec.meshes:
+        if (address := _ROS_ADDRESS.fullmatch(mesh.file)) is None:
+            continue
+        package, file = address.groups()
+        home = next((above for above in path.absolute().parents if above.name == package), None)
+        if home is None:
+            raise ConfigError(
+                f"{path}: its mesh {file} is in the ROS package {package!r}, and no directory above it has that name: "
+                "put it there, or write where its meshes are from the model's file"
+            )
+        mesh.file = str(home / file)
 
 
 def _take_settings(spec: mujoco.MjSpec, scene: mujoco.MjSpec) -> None:

@@ -1,4 +1,4 @@
-"""The scene: a robot at a table with one rigid object, and a fixture where a task wants one.
+"""The scene: a robot at a table with one rigid object, obstacles, and a fixture where a task wants one.
 
 A fixture, a wall across the workspace or an open box, cannot be moved. The wall is part of the table; the box is
 elsewhere in every world, so its place is part of a world's state. Both are touched by the object, the hand and the
@@ -15,11 +15,11 @@ import numpy as np
 
 from service.config import WorldConfig
 from service.envs.contacts import GRIPPER_BIT, OBJECT_BIT, STIFF, TABLE_BIT
-from service.envs.meshes import add_mesh
-from service.envs.observations import ACTION
+from service.envs.objects import add_floor, add_object, add_obstacle, parts_of
+from service.envs.observations import ACTION, OBSTACLE_PREFIX
 from service.envs.robot import add_robot, described
 from service.envs.state_layout import StateLayout
-from service.object_config import ROUND, ObjectConfig
+from service.errors import ConfigError
 
 TABLE_CENTER_X_M = -0.3
 TABLE_HALF_SIZE_M = (0.55, 0.45, 0.2)
@@ -36,7 +36,6 @@ GAP_M = 0.005
 """Least distance of a new object from wall or box."""
 FINGER_GAP_M = 0.04
 """The same where a finger has to go in between: fingers open along y, and reach 3.7 cm beyond a 5 cm cube."""
-GRAVITY_MS2 = 9.81
 FIXTURE_PREFIX = "fixture_"
 """Beginning of the names of a fixture's geoms."""
 
@@ -55,7 +54,7 @@ def build_spec(config: WorldConfig) -> mujoco.MjSpec:
     option.impratio = 1.0
     option.noslip_iterations = 5
     # The arm's controller compensates gravity, and MuJoCo's compensation would cost a Jacobian for each of ten bodies
-    # in every step. So nothing has weight but the object, by an actuator (``_add_object``).
+    # in every step. So nothing has weight but the object, by an actuator (``objects``).
     option.gravity = (0, 0, 0)
     option.iterations = 50
     option.ls_iterations = 50
@@ -76,10 +75,28 @@ def build_spec(config: WorldConfig) -> mujoco.MjSpec:
         group=3,
         **STIFF,
     )
-    _add_object(spec, config)
+    add_object(spec, config)
+    for number, obstacle in enumerate(config.obstacles, start=1):
+        add_obstacle(spec, obstacle, f"{OBSTACLE_PREFIX}{number}")
+    if config.obstacles:
+        add_floor(spec)
     _add_fixture(spec, config)
     _add_described_fixtures(spec, config)
     return spec
+
+
+def build_model(config: WorldConfig) -> mujoco.MjModel:
+    """Compile what ``build_spec`` builds.
+
+    Raises:
+        ConfigError: MuJoCo cannot; where a file of a robot's mesh is missing, for one.
+    """
+    spec = build_spec(config)
+    try:
+        return spec.compile()
+    except ValueError as error:
+        robot = described(config).name
+        raise ConfigError(f"world with robot {robot}: MuJoCo cannot build it: {' '.join(str(error).split())}") from None
 
 
 def build_layout(config: WorldConfig, *, blocked_fraction: float = 0.0) -> StateLayout:
@@ -92,13 +109,17 @@ def build_layout(config: WorldConfig, *, blocked_fraction: float = 0.0) -> State
     robot = described(config)
     num_joints, num_fingers = len(robot.joints), len(robot.fingers)
     drawn = config.randomisation
+    obstacles = [f"{OBSTACLE_PREFIX}{number + 1}" for number in range(len(config.obstacles))]
     return StateLayout(
-        positions={"joints": num_joints, "fingers": num_fingers, "object": 3, "object_quaternion": 4},
+        positions={
+            "joints": num_joints,
+            "fingers": num_fingers,
+            **{part: size for name in ("object", *obstacles) for part, size in ((name, 3), (f"{name}_quaternion", 4))},
+        },
         velocities={
             "joint_velocities": num_joints,
             "finger_velocities": num_fingers,
-            "object_velocity": 3,
-            "object_spin": 3,
+            **{f"{name}_{part}": 3 for name in ("object", *obstacles) for part in ("velocity", "spin")},
         },
         measured={"contacts": 2, "commands": ACTION.size * config.num_kept_commands},
         kept={
@@ -110,50 +131,6 @@ def build_layout(config: WorldConfig, *, blocked_fraction: float = 0.0) -> State
             "object_noise": 2 if drawn.object_noise_m is not None else 0,  # its std and key
         },
     )
-
-
-def geometry(shape: ObjectConfig) -> tuple[mujoco.mjtGeom, tuple[float, float, float], tuple[float, ...]]:
-    """MuJoCo's type of an object, of a mesh the box around it; its half sizes, metres; and its quaternion at first."""
-    half_x, half_y, half_z = (extent / 2 for extent in shape.extent_m)
-    upright, lying = (1.0, 0.0, 0.0, 0.0), (0.5**0.5, 0.0, 0.5**0.5, 0.0)
-    kind = getattr(mujoco.mjtGeom, f"mjGEOM_{shape.shape.upper()}" if shape.mesh is None else "mjGEOM_BOX")
-    if shape.shape == "cylinder":
-        return kind, (half_x, half_z, 0.0), upright
-    if shape.shape == "capsule":  # MuJoCo's length is without the two ends
-        return kind, (half_z, half_x - half_z, 0.0), lying
-    return kind, (half_x, half_y, half_z), upright
-
-
-def _parts(spec: mujoco.MjSpec, shape: ObjectConfig, name: str, mass_kg: float) -> list[dict[str, Any]]:
-    """Settings of the geoms that an object is made of; adds what they need to the scene."""
-    if shape.mesh is not None:
-        return add_mesh(spec, shape.mesh, name, mass_kg)
-    kind, size, quaternion = geometry(shape)
-    return [{"type": kind, "size": size, "quat": quaternion, "mass": mass_kg}]
-
-
-def _add_object(spec: mujoco.MjSpec, config: WorldConfig) -> None:
-    shape = config.shape
-    body = spec.worldbody.add_body(name="object", pos=(0, 0, config.rest_height_m))
-    body.add_freejoint(name="object")
-    parts = _parts(spec, shape, "object", config.object_mass_kg)
-    for index, part in enumerate(parts):
-        body.add_geom(
-            name=f"object{index or ''}",
-            friction=(config.friction, 0.005, 0.0001),
-            condim=6 if shape.shape in ROUND else 3,
-            contype=OBJECT_BIT,
-            conaffinity=GRIPPER_BIT,
-            group=2,
-            rgba=(*shape.color, 1.0),
-            **part,
-            **STIFF,
-        )
-    weight = spec.add_actuator(
-        name="weight", target="object", trntype=mujoco.mjtTrn.mjTRN_JOINT, gear=(0, 0, 1, 0, 0, 0)
-    )
-    weight.gaintype, weight.biastype = mujoco.mjtGain.mjGAIN_FIXED, mujoco.mjtBias.mjBIAS_AFFINE
-    weight.gainprm[0], weight.biasprm[0] = 0.0, -GRAVITY_MS2 * config.object_mass_kg  # whatever its control is
 
 
 def _add_fixture(spec: mujoco.MjSpec, config: WorldConfig) -> None:
@@ -181,7 +158,7 @@ def _add_described_fixtures(spec: mujoco.MjSpec, config: WorldConfig) -> None:
         body = spec.worldbody.add_body(
             pos=(x, y, fixture.bottom_m + fixture.extent_m[2] / 2), quat=(np.cos(half), 0.0, 0.0, np.sin(half))
         )
-        for index, part in enumerate(_parts(spec, fixture, f"fixture{number}-", 1.0)):
+        for index, part in enumerate(parts_of(spec, fixture, f"fixture{number}-", 1.0)):
             body.add_geom(
                 name=f"{FIXTURE_PREFIX}{number}-{index}",
                 contype=0,

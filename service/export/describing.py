@@ -88,7 +88,7 @@ def describe(
         success_distance_m: in that world.
         digests: sha256 of the parameters that went in.
     """
-    robot, seen, workspace = described(world), layouts(world.observed), world.workspace
+    robot, seen, workspace = described(world), layouts(world), world.workspace
     with WorldBatch(world, 1) as worlds:
         joints = dict(zip(robot.joints, map(float, worlds.joints[0]), strict=True))
         effector_m, reach = worlds.ee_position[0], worlds.reach

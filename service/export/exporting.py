@@ -108,7 +108,7 @@ def export(source: Source, format_name: str, folder: Path, *, num_episodes: int 
     chosen = find_format(format_name)
     with new_directory(folder) as temporary:
         measured, observations = measure(source.episodes(num_episodes))
-        inputs = make_inputs(observations, layouts(source.world.observed))
+        inputs = make_inputs(observations, layouts(source.world))
         with os_errors("write", temporary):
             chosen.shared(temporary)
         networks = {}

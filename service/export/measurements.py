@@ -117,7 +117,7 @@ def measure(episodes: Episodes) -> tuple[Measured, FloatArray]:
         observations.append(bob_observation(worlds.positions(), goal))
         tip.append(worlds.ee_position.copy())
 
-    layout = layouts(episodes.world.observed).bob
+    layout = layouts(episodes.world).bob
     late = []
     for steps in range(_MAX_LATE_STEPS + 1):
         found = evaluate(

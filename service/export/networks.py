@@ -45,7 +45,7 @@ class Network:
 
 def networks_of_bob(trained: TrainedBob, parameters: Parameters) -> list[Network]:
     """The network of a whole Bob, composed or monolithic."""
-    seen = layouts(trained.config.world.observed)
+    seen = layouts(trained.config.world)
     policy = trained.policy
     if not isinstance(policy, NumpyMCPPolicy):
 
@@ -70,7 +70,7 @@ def networks_of_primitives(trained: TrainedBob, parameters: Parameters) -> list[
     Raises:
         TandemError: this Bob is monolithic.
     """
-    policy, seen = trained.primitives, layouts(trained.config.world.observed)
+    policy, seen = trained.primitives, layouts(trained.config.world)
     return [_primitive(policy, parameters, number, seen) for number in range(policy.num_primitives)]
 
 
@@ -88,7 +88,7 @@ def network_of_orchestrator(
     Raises:
         TandemError: the primitives are none.
     """
-    policy, seen, method = trained.primitives, layouts(trained.config.world.observed), find_method(method_name)
+    policy, seen, method = trained.primitives, layouts(trained.config.world), find_method(method_name)
     actor = numpy_actor(actor_parameters)
     num_positions, goal = seen.positions.size, seen.bob["goal"]
 

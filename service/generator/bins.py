@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from service.config import Config, WorldConfig
+from service.envs.obstacles import obstacle_columns
 from service.envs.state_layout import StateLayout
 from service.types import Array, BoolArray, IntArray, StateArray
 from service.world_config import Point
@@ -92,6 +93,8 @@ class TaskBins:
     gripper_blocked: slice
     """Columns of a state that say so; none where worlds have no such flag."""
     some_blocked: bool
+    obstacles: slice
+    """Columns of a state that hold poses of obstacles."""
 
     @classmethod
     def from_config(cls, config: Config, layout: StateLayout) -> TaskBins:
@@ -100,6 +103,7 @@ class TaskBins:
             rest_height_m=config.world.rest_height_m,
             gripper_blocked=layout["gripper_blocked"],
             some_blocked=config.game.blocked_gripper_fraction > 0.0,
+            obstacles=obstacle_columns(layout, len(config.world.obstacles)),
         )
 
     def __len__(self) -> int:

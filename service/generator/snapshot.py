@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.config import GeneratorConfig, WorldConfig
+from service.envs.obstacles import inside_obstacles, obstacle_places
 from service.envs.sampling import GoalKind, sample_goals
 from service.generator.bins import GoalCells, TaskBins, in_air
 from service.generator.opponents import RoundPlan
@@ -187,8 +188,10 @@ class GeneratorSnapshot:
         return weight * self._is_task(goal, start_state, start_position)
 
     def _is_task(self, goal: StateArray, start_state: StateArray, start_position: StateArray) -> BoolArray:
-        """(M,) whether the object has to be moved, and can be: a closed gripper lifts nothing."""
+        """(M,) whether the object has to be moved, and can be: a closed gripper lifts nothing, obstacles take room."""
         far: BoolArray = np.linalg.norm(goal - start_position, axis=1) > self.success_distance_m
+        if self.world.obstacles:
+            far &= ~inside_obstacles(goal, obstacle_places(start_state, self.tasks.obstacles), self.world)
         return far & ~(self.tasks.blocked(start_state) & in_air(goal, self.tasks.rest_height_m))
 
 

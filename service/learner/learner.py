@@ -57,7 +57,7 @@ class Learner:
         """
         self.config, self._group = config, group
         self.version = 0
-        self._layouts = seen = layouts(config.world.observed)
+        self._layouts = seen = layouts(config.world)
         self._device = torch_device(config.learner.device)
         with torch.random.fork_rng(devices=[]):
             torch.default_generator.manual_seed(config.seed)

@@ -99,7 +99,7 @@ def publish(
     Raises:
         StorageError: see ``Registry.publish``.
     """
-    seen = layouts(config.world.observed)
+    seen = layouts(config.world)
     normalisation = seen.bob.normalisation if config.skills is None else POSITIONS.normalisation
     return registry.publish(
         config.name,

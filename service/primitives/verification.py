@@ -43,9 +43,7 @@ def network_problems(manifest: Manifest, arrays: Mapping[str, np.ndarray]) -> It
         yield str(error)
         return
     expected = (
-        mcp_shapes(config.policy.bob, layouts(config.world.observed))
-        if config.skills is None
-        else skill_shapes(config.skills)
+        mcp_shapes(config.policy.bob, layouts(config.world)) if config.skills is None else skill_shapes(config.skills)
     )
     wrong = [name for name in sorted(expected.keys() | arrays.keys()) if _shape(arrays, name) != expected.get(name)]
     for name in wrong:

@@ -101,7 +101,7 @@ class Bridge:
         matched = matched or Matched()
         self._gain, self._late_steps = np.array(matched.gain), matched.late_steps
         self._covered_m = DISPLACEMENT_M * self._gain * np.array(matched.covered_share)
-        self._layout = layouts(world.observed).positions
+        self._layout = layouts(world).positions
         self._num_commands = world.observed.num_commands
         self._step_s = world.physics_step_s * world.num_substeps
         self._tick_s = self._step_s / config.set_points_per_step

@@ -44,7 +44,9 @@ def load_robot_policy(reference: str, registry: Path) -> RobotPolicy:
     """
     directory = Path(reference)
     found = _orchestrator(directory, registry) if (directory / "cell.json").is_file() else _bob(reference, registry)
-    size = layouts(found.world.observed).bob.size
+    if found.world.num_observed_obstacles:
+        raise TandemError(f"{found.label} observes obstacles, and the bridge measures the object alone; train without")
+    size = layouts(found.world).bob.size
     try:
         shape = found.policy.act_deterministic(np.zeros((1, size), dtype=np.float32)).shape
     except ValueError as error:

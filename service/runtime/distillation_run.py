@@ -56,20 +56,21 @@ class DistillationRun(Runner):
         with torch.random.fork_rng(devices=[]):
             torch.default_generator.manual_seed(config.seed)
             self._distiller = Distiller(
-                networks.MCPPolicy(config.policy.bob, layouts=layouts(config.world.observed)), config.distillation
+                networks.MCPPolicy(config.policy.bob, layouts=layouts(config.world)), config.distillation
             )
         self._rng = np.random.default_rng(config.seed)
         self._cells = GoalCells(config.world, config.generator.cell_size_m)
         self._tries, self._solved = (np.zeros(len(self._cells), dtype=np.int64) for _ in range(2))
         if start is not None and not resume:
-            self._teacher_parameters, self._observed = dict(start.networks["bob/policy"]), start.observed
+            self._teacher_parameters, self._observed = dict(start.networks["bob/policy"]), start.world.observed
             self._begin_from(start)
         else:
             self._load()
         teacher = numpy_bob(self._teacher_parameters)
         if not isinstance(teacher, NumpyMCPPolicy):
             raise TandemError("--from: a monolithic Bob has no primitives to teach; name a composed one")
-        self._worlds = DistillationWorlds(config, teacher, layouts(self._observed), num_threads=config.run.num_threads)
+        taught = config.world.model_copy(update={"observed": self._observed})
+        self._worlds = DistillationWorlds(config, teacher, layouts(taught), num_threads=config.run.num_threads)
         if not resume:
             self._save_first()
         self._open_directory(resume=resume)
@@ -157,8 +158,13 @@ class DistillationRun(Runner):
     # --- exact resume ----------------------------------------------------------------------------------------------
 
     def _begin_from(self, start: Start) -> None:
-        seen: Layouts = layouts(self.config.world.observed)
-        before = layouts(start.observed)
+        seen: Layouts = layouts(self.config.world)
+        before = layouts(start.world)
+        if start.world.num_observed_obstacles not in (0, num := len(self.config.world.obstacles)):
+            raise TandemError(
+                f"--from {start.label}: it sees {start.world.num_observed_obstacles} obstacles, here are {num}: "
+                "describe as many"
+            )
         said = transfer.take_over(self._distiller.student, self._teacher_parameters, before.bob, seen.bob)
         self._distiller.begin()
         _logger.info("from %s: bob/policy: %s", start.label, said)

@@ -148,7 +148,7 @@ class LocalRun(Runner):
             self.bookkeeper.save(parts, meta)
 
     def _begin_from(self, start: Start) -> None:
-        for line in self.learner.take_over(start.networks, layouts(start.observed)):
+        for line in self.learner.take_over(start.networks, layouts(start.world)):
             _logger.info("from %s: %s", start.label, line)
         if start.published is not None:
             self.directory.write_published(start.published)

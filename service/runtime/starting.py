@@ -13,7 +13,7 @@ from service.io.run_directory import Published, RunDirectory
 from service.io.tensors import split_parts
 from service.primitives.bundled import find_version
 from service.types import Array
-from service.world_config import ObservedConfig
+from service.world_config import WorldConfig
 
 _NETWORKS = ("policy", "value")
 
@@ -25,8 +25,8 @@ class Start:
     label: str
     networks: Mapping[str, Mapping[str, Array]]
     """By ``bob/policy``, ``bob/value``, ``alice/policy`` and ``alice/value``; of a published version only the first."""
-    observed: ObservedConfig
-    """What policies saw in the world they were trained in."""
+    world: WorldConfig
+    """That policies were trained in, which says what they saw."""
     published: Published | None
     """The version, which is the parent of what the run publishes."""
 
@@ -63,7 +63,7 @@ def read_start(reference: str, registry: Path, config: Config) -> Start:
         before = parse_config(manifest.config, where=f"the manifest of {reference}", recorded=True)
         _check_self_play(before, reference)
         networks, published = {"bob/policy": tensors}, Published(str(version), manifest.blob_sha256)
-    return Start(reference, networks, before.world.observed, published)
+    return Start(reference, networks, before.world, published)
 
 
 def _check_self_play(config: Config, reference: str) -> None:

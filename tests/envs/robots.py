@@ -116,12 +116,115 @@ GANTRY_DESCRIPTION = {
     "finger_stiffness": 20.0,
     "finger_damping": 1.0,
 }
+URDF = """
+<robot name="sixer">
+  <link name="base">
+    <visual><geometry><cylinder radius="0.06" length="0.1"/></geometry></visual>
+    <collision><origin xyz="0 0 0.05"/><geometry><cylinder radius="0.06" length="0.1"/></geometry></collision>
+  </link>
+  <joint name="yaw" type="revolute">
+    <parent link="base"/><child link="shoulder"/><origin xyz="0 0 0.15"/><axis xyz="0 0 1"/>
+    <limit lower="-3.1" upper="3.1" effort="150" velocity="3"/>
+  </joint>
+  <link name="shoulder">
+    <inertial><mass value="3"/><inertia ixx="0.01" iyy="0.01" izz="0.01" ixy="0" ixz="0" iyz="0"/></inertial>
+    <collision><geometry><sphere radius="0.06"/></geometry></collision>
+  </link>
+  <joint name="lift" type="revolute">
+    <parent link="shoulder"/><child link="upper"/><origin xyz="0 0.1 0"/><axis xyz="0 1 0"/>
+    <limit lower="-2.5" upper="2.5" effort="150" velocity="3"/>
+  </joint>
+  <link name="upper">
+    <inertial>
+      <origin xyz="0 0 0.2"/><mass value="4"/><inertia ixx="0.05" iyy="0.05" izz="0.01" ixy="0" ixz="0" iyz="0"/>
+    </inertial>
+    <collision><origin xyz="0 0 0.2"/><geometry><box size="0.08 0.08 0.4"/></geometry></collision>
+  </link>
+  <joint name="elbow" type="revolute">
+    <parent link="upper"/><child link="fore"/><origin xyz="0 -0.1 0.4"/><axis xyz="0 1 0"/>
+    <limit lower="-2.8" upper="2.8" effort="100" velocity="3"/>
+  </joint>
+  <link name="fore">
+    <inertial>
+      <origin xyz="0 0 0.18"/><mass value="2"/><inertia ixx="0.03" iyy="0.03" izz="0.01" ixy="0" ixz="0" iyz="0"/>
+    </inertial>
+    <collision><origin xyz="0 0 0.18"/><geometry><box size="0.07 0.07 0.36"/></geometry></collision>
+  </link>
+  <joint name="bend" type="revolute">
+    <parent link="fore"/><child link="wrist"/><origin xyz="0 0 0.36"/><axis xyz="0 1 0"/>
+    <limit lower="-2.8" upper="2.8" effort="40" velocity="5"/>
+  </joint>
+  <link name="wrist">
+    <inertial><mass value="1"/><inertia ixx="0.002" iyy="0.002" izz="0.002" ixy="0" ixz="0" iyz="0"/></inertial>
+  </link>
+  <joint name="roll" type="continuous">
+    <parent link="wrist"/><child link="wrist2"/><origin xyz="0 0.08 0"/><axis xyz="0 0 1"/>
+    <limit effort="40" velocity="5"/>
+  </joint>
+  <link name="wrist2">
+    <inertial><mass value="1"/><inertia ixx="0.002" iyy="0.002" izz="0.002" ixy="0" ixz="0" iyz="0"/></inertial>
+  </link>
+  <joint name="turn" type="revolute">
+    <parent link="wrist2"/><child link="flange"/><origin xyz="0 0 0.09"/><axis xyz="0 1 0"/>
+    <limit lower="-3.1" upper="3.1" effort="40" velocity="5"/>
+  </joint>
+  <link name="flange">
+    <inertial><mass value="0.5"/><inertia ixx="0.001" iyy="0.001" izz="0.001" ixy="0" ixz="0" iyz="0"/></inertial>
+  </link>
+  <joint name="mount" type="fixed">
+    <parent link="flange"/><child link="palm"/><origin xyz="0 0.06 0" rpy="-1.5707963267948966 0 0"/>
+  </joint>
+  <link name="palm">
+    <inertial><mass value="0.3"/><inertia ixx="0.001" iyy="0.001" izz="0.001" ixy="0" ixz="0" iyz="0"/></inertial>
+    <collision><origin xyz="0 0 0.02"/><geometry><box size="0.05 0.16 0.04"/></geometry></collision>
+  </link>
+  <joint name="tip" type="fixed"><parent link="palm"/><child link="tool"/><origin xyz="0 0 0.12"/></joint>
+  <link name="tool"/>
+  <joint name="left" type="prismatic">
+    <parent link="palm"/><child link="left_finger"/><origin xyz="0 0 0.04"/><axis xyz="0 1 0"/>
+    <limit lower="0" upper="0.04" effort="40" velocity="0.3"/>
+  </joint>
+  <link name="left_finger">
+    <inertial>
+      <origin xyz="0 0.01 0.05"/><mass value="0.05"/>
+      <inertia ixx="1e-4" iyy="1e-4" izz="1e-4" ixy="0" ixz="0" iyz="0"/>
+    </inertial>
+    <collision><origin xyz="0 0.008 0.05"/><geometry><box size="0.02 0.016 0.08"/></geometry></collision>
+  </link>
+  <joint name="right" type="prismatic">
+    <parent link="palm"/><child link="right_finger"/><origin xyz="0 0 0.04"/><axis xyz="0 -1 0"/>
+    <limit lower="0" upper="0.04" effort="40" velocity="0.3"/>
+  </joint>
+  <link name="right_finger">
+    <inertial>
+      <origin xyz="0 -0.01 0.05"/><mass value="0.05"/>
+      <inertia ixx="1e-4" iyy="1e-4" izz="1e-4" ixy="0" ixz="0" iyz="0"/>
+    </inertial>
+    <collision><origin xyz="0 -0.008 0.05"/><geometry><box size="0.02 0.016 0.08"/></geometry></collision>
+  </link>
+</robot>
+"""
+"""Six joints with shifted axes, one of them without limits, as URDF has them; the hand hangs on fixed joints."""
+URDF_DESCRIPTION = {
+    "name": "sixer",
+    "model": "sixer.urdf",
+    "base_position_m": [-0.6, 0.0, 0.0],
+    "joints": ["yaw", "lift", "elbow", "bend", "roll", "turn"],
+    "effector": {"frame": "tool"},
+    "fingers": [
+        {"joint": "left", "closed": 0.0, "open": 0.04, "side": "left"},
+        {"joint": "right", "closed": 0.0, "open": 0.04, "side": "right"},
+    ],
+    "opening_m": 0.08,
+    "home": [0.0, 0.33, 1.66, -0.42, -1.57, -1.57],
+    "armature": 0.3,
+}
 
 
 def write_robot(directory, xml=PINCHER, description=PINCHER_DESCRIPTION, **changed):
     """A description's path; its model is beside it."""
     tree = {**description, **changed}
-    (directory / f"{description['name']}.xml").write_text(xml)
+    (directory / description["model"]).write_text(xml)
     (directory / "hand.xml").write_text(HAND)
     path = directory / f"{description['name']}.yaml"
     path.write_text(yaml.safe_dump({key: value for key, value in tree.items() if value is not None}))

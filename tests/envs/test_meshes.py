@@ -38,6 +38,16 @@ def write_l(path):
     return path
 
 
+def write_ramp(path):
+    """An OBJ file of a ramp, 8 cm long and 6 cm high at its back; its center of mass is a third of the way along."""
+    outline = [(0.0, 0.0), (0.08, 0.0), (0.0, 0.06)]
+    lines = [f"v {x} {y} {z}" for y in (0.0, 0.05) for x, z in outline]
+    faces = [(0, 1, 2), (3, 5, 4), (0, 3, 4), (0, 4, 1), (1, 4, 5), (1, 5, 2), (2, 5, 3), (2, 3, 0)]
+    lines += [f"f {a + 1} {b + 1} {c + 1}" for a, b, c in faces]
+    path.write_text("\n".join(lines) + "\n")
+    return path
+
+
 def world_with(*pieces, scale=None, overrides=()):
     names = ", ".join(str(piece) for piece in pieces)
     extra = f", scale: {scale}" if scale is not None else ""
@@ -59,6 +69,20 @@ def test_a_mesh_is_measured_by_its_file(tmp_path):
         for _ in range(50):
             worlds.step(np.zeros((1, 4), dtype=np.float32))
         np.testing.assert_allclose(worlds.object_position, start, atol=1e-3)
+
+
+def test_its_weight_is_at_its_center_of_mass(tmp_path):
+    """13.3 mm behind its middle: with that 8 mm inside a shelf's edge it falls off, with 20 mm it does not."""
+    shelf = "world.fixtures=[{shape: box, size_m: [0.1, 0.3, 0.04], position_m: [0.0, 0.1]}]"
+    config = world_with(write_ramp(tmp_path / "ramp.obj"), overrides=[shelf, "world.start_height_m=0.3"])
+    with WorldBatch(config.world, 2) as worlds:
+        states = worlds.states.copy()
+        states[:, worlds.layout["object"]] = [(-0.042, 0.1, 0.071), (-0.03, 0.1, 0.071)]
+        worlds.restore(states)
+        for _ in range(40):
+            worlds.step(np.zeros((2, 4), dtype=np.float32))
+        assert worlds.object_position[0, 2] < 0.05
+        np.testing.assert_allclose(worlds.object_position[1], (-0.03, 0.1, 0.07), atol=1e-3)
 
 
 def test_several_pieces_are_one_object(tmp_path):

@@ -12,8 +12,9 @@ from service.config import dump_config, load_config
 from service.envs.batch import DISPLACEMENT_M, WorldBatch
 from service.envs.contacts import GRIPPER_BIT
 from service.errors import ConfigError
-from tests.envs.robots import GANTRY, GANTRY_DESCRIPTION, PINCHER, write_robot
+from tests.envs.robots import GANTRY, GANTRY_DESCRIPTION, PINCHER, URDF, URDF_DESCRIPTION, write_robot
 from tests.envs.scripted import CLOSE, OPEN, drive, grasp, place_in_air
+from tests.envs.test_meshes import write_box
 from tests.runtime.runs import assert_one_line, play, tiny_config
 
 ROBOTS = Path(__file__).parents[2] / "configs" / "robots"
@@ -33,6 +34,11 @@ def pincher(tmp_path):
 @pytest.fixture
 def gantry(tmp_path):
     return write_robot(tmp_path, GANTRY, GANTRY_DESCRIPTION)
+
+
+@pytest.fixture
+def sixer(tmp_path):
+    return write_robot(tmp_path, URDF, URDF_DESCRIPTION)
 
 
 def test_an_arm_of_five_joints_with_one_jaw_picks_things_up(pincher):
@@ -67,6 +73,53 @@ def test_a_gantry_with_a_hand_of_another_file_and_turning_fingers(gantry):
         for _ in range(10):
             worlds.step(np.float32([[0, 0, 0, -1]]))
         np.testing.assert_allclose(worlds.positions()[0, 3:5], 0.0, atol=2e-3)
+
+
+def test_an_arm_of_a_urdf_is_where_mujoco_has_it(sixer):
+    with WorldBatch(world_of(sixer), 1) as worlds:
+        model, arm = worlds.model, worlds.robot.arm
+        np.testing.assert_allclose(model.body("robot/shoulder").pos, [0.0, 0.0, 0.15])  # the base stays a body
+        np.testing.assert_allclose(worlds.ee_position, [[-0.05, 0.0, 0.08]], atol=1e-5)
+        lower, upper = model.jnt_range[:6].T
+        limited = model.jnt_limited[:6].astype(bool)
+        assert limited.tolist() == [True, True, True, True, False, True]  # "roll" is continuous
+        rng = np.random.default_rng(0)
+        joints = np.where(limited, rng.uniform(lower, upper, (20, 6)), rng.uniform(-3.0, 3.0, (20, 6)))
+        found, data = arm.forward(joints), mujoco.MjData(model)
+        for row, values in enumerate(joints):
+            data.qpos[:6] = values
+            mujoco.mj_kinematics(model, data)
+            mujoco.mj_comPos(model, data)
+            tool, linear, angular = data.body("robot/tool"), np.empty((3, model.nv)), np.empty((3, model.nv))
+            mujoco.mj_jac(model, data, linear, angular, tool.xpos, tool.id)
+            np.testing.assert_allclose(found.position[row], tool.xpos, rtol=0, atol=1e-10)
+            np.testing.assert_allclose(found.rotation[row], tool.xmat.reshape(3, 3), rtol=0, atol=1e-10)
+            np.testing.assert_allclose(found.jacobian[row], np.vstack([linear, angular])[:, :6], rtol=0, atol=1e-10)
+
+
+def with_mesh(name):
+    """The arm with a mesh in place of a sphere."""
+    sphere, mesh = '<geometry><sphere radius="0.06"/></geometry>', f'<geometry><mesh filename="{name}"/></geometry>'
+    assert sphere in URDF
+    return URDF.replace(sphere, mesh)
+
+
+@pytest.mark.parametrize("address", ["../meshes/block.obj", "package://arms/meshes/block.obj"])
+def test_meshes_of_a_urdf_are_found_beside_it_and_by_ros_addresses(tmp_path, address):
+    for name in ("meshes", "urdf"):
+        (tmp_path / "arms" / name).mkdir(parents=True)
+    write_box(tmp_path / "arms" / "meshes" / "block.obj")
+    robot = write_robot(tmp_path / "arms" / "urdf", with_mesh(address), URDF_DESCRIPTION)
+    with WorldBatch(world_of(robot), 1) as worlds:
+        assert worlds.model.nmesh == 1
+        assert worlds.model.mesh_vertnum[0] == 8
+
+
+def test_an_arm_of_a_urdf_picks_and_places(sixer):
+    placement = place_in_air(load_config(RECIPE, [f"world.robot={sixer}"]).world, 30, seed=0)
+    held = (placement.distance_m < 0.01) & (placement.distance_after_hold_m < 0.01) & (placement.slip_m <= 0.005)
+    assert held.mean() >= 0.95
+    assert placement.grasped.mean() >= 0.95
 
 
 def test_only_the_gripper_touches_and_nothing_of_a_scene_comes_along(pincher):
@@ -194,6 +247,22 @@ def test_models_that_do_not_fit_are_one_line(tmp_path, model, said):
     with pytest.raises(ConfigError) as error:
         WorldBatch(world_of(write_robot(tmp_path, model)), 1)
     assert_one_line(error.value, "pincher", *said)
+
+
+@pytest.mark.parametrize(
+    ("model", "said"),
+    [
+        ("<robot name='sixer'><link name='base'/>", ["MuJoCo cannot read it"]),
+        (URDF.replace('<child link="tool"/>', '<child link="tools"/>'), ["sixer.urdf", "MuJoCo cannot read it"]),
+        (with_mesh("a.stl"), ["a.stl", "MuJoCo cannot build it"]),
+        (with_mesh("package://arms/a.stl"), ["a.stl", "ROS package 'arms'", "no directory above"]),
+    ],
+    ids=["cut off", "a link that is not there", "a mesh that is not there", "a package that is not there"],
+)
+def test_urdfs_that_do_not_fit_are_one_line(tmp_path, model, said):
+    with pytest.raises(ConfigError) as error:
+        WorldBatch(world_of(write_robot(tmp_path, model, URDF_DESCRIPTION)), 1)
+    assert_one_line(error.value, "sixer", *said)
 
 
 @pytest.mark.parametrize(

@@ -18,7 +18,7 @@ from service.sac.networks import GaussianActor
 
 WORLD = WorldConfig(physics_step_s=0.005, num_substeps=8, observed={"num_commands": 2})
 """A world in which policies see more than in the paper."""
-SEEN = layouts(WORLD.observed)
+SEEN = layouts(WORLD)
 BOB = MCPConfig(num_primitives=2, trunk_hidden_sizes=(24, 12), primitive_hidden_size=9, gate_hidden_sizes=(16,))
 CONFIG = Config(name="made", world=WORLD, policy=PolicyConfig(bob=BOB), run=RunConfig(evaluation_steps=4))
 MONOLITHIC = CONFIG.model_copy(

@@ -34,7 +34,7 @@ def played(config, world=None, num_steps=5):
 
 def test_an_observation_has_the_layout_of_the_policys_world():
     world = WorldConfig(observed={"num_commands": 2})
-    bob = layouts(world.observed).bob
+    bob = layouts(world).bob
     _, seen, rows, _ = played(BridgeConfig(), world)
     first, third = seen[0], seen[2]
     assert third.shape == (bob.size,)

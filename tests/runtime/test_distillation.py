@@ -37,9 +37,9 @@ def make_teacher(config, seed=0):
 
 
 def make_student(config, teacher):
-    student = networks.make_bob(config.policy, layouts(config.world.observed))
+    student = networks.make_bob(config.policy, layouts(config.world))
     parameters = networks.export_parameters(teacher)
-    take_over(student, parameters, PAPER.bob, layouts(config.world.observed).bob)
+    take_over(student, parameters, PAPER.bob, layouts(config.world).bob)
     return student, NumpyMCPPolicy(parameters)
 
 
@@ -52,7 +52,7 @@ def test_labels_are_the_teachers_answers_when_the_command_counts():
     played = worlds.play(NumpyMCPPolicy(networks.export_parameters(student)), np.random.default_rng(3))
     worlds.close()
     assert played.num_env_steps == 8 * (6 + 2)
-    seen = layouts(config.world.observed).bob
+    seen = layouts(config.world).bob
     rows = played.lesson.observation.reshape(6, 8, seen.size)
     answers = played.lesson.means.reshape(6, 8, *played.lesson.means.shape[1:])
     np.testing.assert_array_equal(rows[..., seen["delay"]], 2.0)
@@ -91,7 +91,7 @@ def test_a_student_learns_what_a_late_teacher_would_do():
     config = config_of({"delay_steps": [0, 2]}, {"num_worlds": 32, "gradient_steps": 30, "batch_size": 64})
     teacher = NumpyMCPPolicy(networks.export_parameters(make_teacher(config, seed=1)))
     torch.manual_seed(2)
-    distiller = Distiller(networks.make_bob(config.policy, layouts(config.world.observed)), config.distillation)
+    distiller = Distiller(networks.make_bob(config.policy, layouts(config.world)), config.distillation)
     worlds, rng = DistillationWorlds(config, teacher, PAPER, num_threads=1), np.random.default_rng(0)
     errors = []
     for _ in range(4):

@@ -11,7 +11,7 @@ import yaml
 
 from service.actors import evaluation
 from service.config import parse_config
-from service.envs.sampling import draw_goals
+from service.envs.obstacles import draw_goals
 from service.errors import ConfigError, TandemError
 from service.io.run_directory import RunDirectory
 from service.primitives import publishing

@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 from service.config import WorldConfig
 from service.envs.batch import WorldBatch
 from service.envs.observations import ACTION, layouts
-from service.envs.sampling import GoalKind, check_goals, draw_goals
+from service.envs.obstacles import draw_goals
+from service.envs.sampling import GoalKind, check_goals
 from service.envs.tasks import find_task
 from service.errors import TandemError
 from service.types import BoolArray, FloatArray, StateArray
@@ -70,8 +71,8 @@ class GoalWorlds:
 
     def _draw_goals(self, rng: np.random.Generator, worlds: slice) -> None:
         """Give new goals to worlds at their start."""
-        start, box = self._worlds.object_position[worlds], self._worlds.box_place[worlds]
-        self._goal[worlds] = draw_goals(self.goals, rng, self.config, self.success_distance_m, start=start, box=box)
+        places = self._worlds.places.of(worlds)
+        self._goal[worlds] = draw_goals(self.goals, rng, self.config, self.success_distance_m, places)
 
     def _observe(self) -> tuple[Observation, BoolArray]:
         """(N, ...) observations, and (N,) true where the object is at its goal."""
@@ -84,7 +85,7 @@ class GoalWorlds:
 
 def goal_space(config: WorldConfig) -> gymnasium.spaces.Dict:
     """Make the space of the observations of one such world."""
-    sizes = {"observation": layouts(config.observed).positions.size, "achieved_goal": 3, "desired_goal": 3}
+    sizes = {"observation": layouts(config).positions.size, "achieved_goal": 3, "desired_goal": 3}
     return gymnasium.spaces.Dict(
         {name: gymnasium.spaces.Box(-_FURTHEST_M, _FURTHEST_M, (size,), np.float32) for name, size in sizes.items()}
     )

@@ -15,11 +15,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.config import WorkspaceConfig, WorldConfig
+from service.envs.objects import FLOOR_Z_M
 from service.envs.rendering.panda_visuals import add_panda_visuals, make_visual
 from service.envs.scene import FIXTURE_PREFIX, TABLE_CENTER_X_M, TABLE_HALF_SIZE_M
 from service.types import StateArray
 
-_FLOOR_Z_M = -0.74
 _TABLE_THICKNESS_M = 0.035
 _TEXTURE_SIZE = 512
 _MATERIALS: dict[str, dict[str, Any]] = {
@@ -56,11 +56,11 @@ def _add_table(spec: mujoco.MjSpec) -> None:
     texture.data = _wood().tobytes()
     _textured(spec, "wood", specular=0.12, shininess=0.25)
     half_x, half_y, _ = TABLE_HALF_SIZE_M
-    half_z, leg_half_z = _TABLE_THICKNESS_M / 2, -(_FLOOR_Z_M + _TABLE_THICKNESS_M) / 2
+    half_z, leg_half_z = _TABLE_THICKNESS_M / 2, -(FLOOR_Z_M + _TABLE_THICKNESS_M) / 2
     _box(spec, "wood", (TABLE_CENTER_X_M, 0, -half_z), (half_x, half_y, half_z))
     _box(spec, "leg", (TABLE_CENTER_X_M, 0, -_TABLE_THICKNESS_M - 0.025), (half_x - 0.05, half_y - 0.05, 0.025))
     for x, y in ((-1, -1), (-1, 1), (1, -1), (1, 1)):
-        center = (TABLE_CENTER_X_M + x * (half_x - 0.06), y * (half_y - 0.06), _FLOOR_Z_M + leg_half_z)
+        center = (TABLE_CENTER_X_M + x * (half_x - 0.06), y * (half_y - 0.06), FLOOR_Z_M + leg_half_z)
         _box(spec, "leg", center, (0.025, 0.025, leg_half_z))
 
 
@@ -88,7 +88,7 @@ def _add_floor_and_sky(spec: mujoco.MjSpec) -> None:
         rgb1=(0.70, 0.72, 0.74), rgb2=(0.65, 0.67, 0.69), width=256, height=256,
     )  # fmt: skip
     _textured(spec, "floor", texrepeat=(1.5, 1.5), texuniform=True, emission=0.12, specular=0.1, shininess=0.1)
-    plane = spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_PLANE, size=(0, 0, 0.05), pos=(0, 0, _FLOOR_Z_M))
+    plane = spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_PLANE, size=(0, 0, 0.05), pos=(0, 0, FLOOR_Z_M))
     make_visual(plane, "floor", casts_shadow=False)
     visual = spec.visual
     visual.rgba.haze = (0.80, 0.84, 0.88, 1.0)

@@ -116,6 +116,18 @@ def test_the_object_is_red_and_where_it_should_be(renderer, position):
     assert middle(mask) == pytest.approx(project(position, renderer.camera, renderer.model), abs=2.0)
 
 
+def test_obstacles_are_drawn_in_their_colours():
+    config = WorldConfig(obstacles=[{"shape": "sphere", "size_m": (0.06,), "color": (1.0, 0.05, 0.05)}], object={
+        "shape": "box", "size_m": (0.05, 0.05, 0.05), "color": (0.1, 0.1, 0.8)
+    })  # fmt: skip
+    position = (0.08, -0.1, 0.03)
+    with open_renderer(config) as renderer, WorldBatch(config, 1) as worlds:
+        worlds.obstacle_positions[0, 0] = position
+        mask = red(renderer.render(worlds.states[0]))
+        assert 25 < mask.sum() < 150
+        assert middle(mask) == pytest.approx(project(position, renderer.camera, renderer.model), abs=2.0)
+
+
 def test_another_camera(renderer):
     position = (0.1, -0.1, 0.025)
     usual = renderer.camera

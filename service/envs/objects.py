@@ -1,0 +1,112 @@
+"""Rigid things that lie on the table and move when they are pushed: the object, and obstacles."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import mujoco
+
+from service.config import WorldConfig
+from service.envs.contacts import FLOOR_BIT, GRIPPER_BIT, OBJECT_BIT, OBSTACLE_PRIORITY, STIFF
+from service.envs.meshes import add_mesh, center_of_mass
+from service.object_config import ROUND, ObjectConfig, ObstacleConfig
+
+GRAVITY_MS2 = 9.81
+FLOOR_Z_M = -0.74
+_HIDDEN = 3
+"""Group of what is not drawn."""
+_UPRIGHT = "upright"
+"""Site whose z axis is up: forces on other sites have its directions."""
+
+
+def geometry(shape: ObjectConfig) -> tuple[mujoco.mjtGeom, tuple[float, float, float], tuple[float, ...]]:
+    """MuJoCo's type of an object, of a mesh the box around it; its half sizes, metres; and its quaternion at first."""
+    half_x, half_y, half_z = (extent / 2 for extent in shape.extent_m)
+    upright, lying = (1.0, 0.0, 0.0, 0.0), (0.5**0.5, 0.0, 0.5**0.5, 0.0)
+    kind = getattr(mujoco.mjtGeom, f"mjGEOM_{shape.shape.upper()}" if shape.mesh is None else "mjGEOM_BOX")
+    if shape.shape == "cylinder":
+        return kind, (half_x, half_z, 0.0), upright
+    if shape.shape == "capsule":  # MuJoCo's length is without the two ends
+        return kind, (half_z, half_x - half_z, 0.0), lying
+    return kind, (half_x, half_y, half_z), upright
+
+
+def parts_of(spec: mujoco.MjSpec, shape: ObjectConfig, name: str, mass_kg: float) -> list[dict[str, Any]]:
+    """Settings of the geoms that an object is made of; adds what they need to the scene.
+
+    Raises:
+        ConfigError: a file of a mesh is gone, or another than it was.
+    """
+    if shape.mesh is not None:
+        return add_mesh(spec, shape.mesh, name, mass_kg)
+    kind, size, quaternion = geometry(shape)
+    return [{"type": kind, "size": size, "quat": quaternion, "mass": mass_kg}]
+
+
+def add_object(spec: mujoco.MjSpec, config: WorldConfig) -> None:
+    """Add the object that players move: the gripper touches it, and it touches table, fixtures and obstacles."""
+    touching = {"contype": OBJECT_BIT, "conaffinity": GRIPPER_BIT}
+    _add_free(spec, config.shape, "object", config.object_mass_kg, config.friction, touching)
+
+
+def add_obstacle(spec: mujoco.MjSpec, obstacle: ObstacleConfig, name: str) -> None:
+    """Add a further object. It touches what the object touches, the object, its like, and the floor.
+
+    Its friction counts wherever it lies, not the greater one of it and the table's, as without a priority.
+    """
+    touching = {
+        "contype": OBJECT_BIT,
+        "conaffinity": GRIPPER_BIT | OBJECT_BIT | FLOOR_BIT,
+        "priority": OBSTACLE_PRIORITY,
+    }
+    _add_free(spec, obstacle, name, obstacle.mass_kg, obstacle.friction, touching)
+
+
+def add_floor(spec: mujoco.MjSpec) -> None:
+    """Add a floor for obstacles: a game goes on when one falls off the table, and it shall not fall for ever."""
+    spec.worldbody.add_geom(
+        name="ground",
+        type=mujoco.mjtGeom.mjGEOM_PLANE,
+        size=(0, 0, 0.05),
+        pos=(0, 0, FLOOR_Z_M),
+        contype=FLOOR_BIT,
+        conaffinity=0,
+        group=_HIDDEN,
+        **STIFF,
+    )
+
+
+def _add_free(
+    spec: mujoco.MjSpec,
+    shape: ObjectConfig,
+    name: str,
+    mass_kg: float,
+    friction: float,
+    touching: dict[str, int],
+) -> None:
+    body = spec.worldbody.add_body(name=name, pos=(0, 0, shape.extent_m[2] / 2))
+    body.add_freejoint(name=name)
+    for index, part in enumerate(parts_of(spec, shape, name, mass_kg)):
+        body.add_geom(
+            name=f"{name}{index or ''}",
+            friction=(friction, 0.005, 0.0001),
+            condim=6 if shape.shape in ROUND else 3,
+            group=2,
+            rgba=(*shape.color, 1.0),
+            **touching,
+            **part,
+            **STIFF,
+        )
+    weight = spec.add_actuator(name=f"{name}_weight", gear=(0, 0, 1, 0, 0, 0), **_held_by(spec, body, shape))
+    weight.gaintype, weight.biastype = mujoco.mjtGain.mjGAIN_FIXED, mujoco.mjtBias.mjBIAS_AFFINE
+    weight.gainprm[0], weight.biasprm[0] = 0.0, -GRAVITY_MS2 * mass_kg  # whatever its control is
+
+
+def _held_by(spec: mujoco.MjSpec, body: mujoco.MjsBody, shape: ObjectConfig) -> dict[str, Any]:
+    """What the weight acts on: the free joint, which is at the middle, or of a mesh, its center of mass."""
+    if shape.mesh is None:
+        return {"target": body.name, "trntype": mujoco.mjtTrn.mjTRN_JOINT}
+    if spec.site(_UPRIGHT) is None:
+        spec.worldbody.add_site(name=_UPRIGHT, group=_HIDDEN)
+    center = body.add_site(name=f"{body.name}_center", pos=center_of_mass(shape.mesh), group=_HIDDEN)
+    return {"target": center.name, "refsite": _UPRIGHT, "trntype": mujoco.mjtTrn.mjTRN_SITE}
