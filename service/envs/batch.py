@@ -355,7 +355,9 @@ class WorldBatch:
         data = mujoco.MjData(self.model)
         mujoco.mj_setState(self.model, data, state[self.layout.physics], _PHYSICS)
         mujoco.mj_forward(self.model, data)
-        self._gripper_at_start = gripper_boxes(self.model, data)
+        # On the highest table, things come as much nearer to the gripper.
+        gripper, higher_m = gripper_boxes(self.model, data), float(self.bank.table_height_m.max())
+        self._gripper_at_start = gripper._replace(lower=gripper.lower - np.array([0.0, 0.0, higher_m]))
         for contact in data.contact[: data.ncon]:
             names = [self.model.geom(int(geom)).name for geom in contact.geom]
             fixed = [name for name in names if name.startswith(FIXTURE_PREFIX)]

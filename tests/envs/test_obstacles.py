@@ -75,6 +75,17 @@ def test_the_same_generator_gives_the_same_places():
     assert (one != other).any(axis=1).all()
 
 
+def test_on_a_table_of_another_height_they_lie_on_it_and_clear_of_the_gripper():
+    world = WorldConfig(obstacles=[BLOCK], randomisation={"table_height_m": (0.0, 0.03)})
+    with WorldBatch(world, 50) as worlds:
+        worlds.reset(np.random.default_rng(0))
+        height = worlds.obstacle_positions[:, 0, 2].copy()
+        assert np.ptp(height) > 0.02
+        for _ in range(10):
+            worlds.step(np.zeros((50, 4), dtype=np.float32))
+        np.testing.assert_allclose(worlds.obstacle_positions[:, 0, 2], height, atol=1e-3)
+
+
 def test_a_tall_object_does_not_start_inside_the_gripper():
     tall = WorldConfig(object={"shape": "cylinder", "size_m": (0.05, 0.15)})
     with WorldBatch(tall, 300) as worlds:
