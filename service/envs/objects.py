@@ -64,7 +64,8 @@ def add_obstacle(spec: mujoco.MjSpec, obstacle: ObstacleConfig, name: str) -> No
 
 def add_floor(spec: mujoco.MjSpec) -> None:
     """Add a floor for obstacles: a game goes on when one falls off the table, and it shall not fall for ever."""
-    spec.worldbody.add_geom(
+    # A body of its own: the tree of bounds of the world's geoms is made once, and a model bank moves the table later.
+    spec.worldbody.add_body(name="ground").add_geom(
         name="ground",
         type=mujoco.mjtGeom.mjGEOM_PLANE,
         size=(0, 0, 0.05),
