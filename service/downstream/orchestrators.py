@@ -132,7 +132,7 @@ def publish_orchestrator(
     trial = read_trial(read_json(directory.trial_file), directory.trial_file)
     world = found.trained.config.world
     spaces = {
-        **layouts(world.observed).spaces,
+        **layouts(world).spaces,
         "kind": ORCHESTRATOR,
         "task": found.task,
         "task_version": trial.task_version,
@@ -146,7 +146,7 @@ def publish_orchestrator(
         name,
         parameters,
         spaces=spaces,
-        normalisation={"made_by": num_inputs.__module__, "num_inputs": num_inputs(layouts(world.observed))[1]},
+        normalisation={"made_by": num_inputs.__module__, "num_inputs": num_inputs(layouts(world))[1]},
         config={"trial": trial.model_dump(mode="json"), "world": world.model_dump(mode="json")},
         metrics={**numbers, "env_steps": float(result["env_steps"])},
     )

@@ -87,8 +87,8 @@ def write_video(
             for frame in _round_frames(renderer, each, f"{number}/{len(rounds)}", stride, step_s, options.speed)
         )
         num = sum(_num_frames(each, stride, stride * step_s / options.speed) for each in rounds)
-        frames = counted(frames, "drawing the video", num, "pictures")
-        return encode(frames, path, fps=options.speed / (stride * step_s))
+        drawn = counted(frames, "drawing the video", num, "pictures")
+        return encode(drawn, path, fps=options.speed / (stride * step_s))
 
 
 def write_episode_video(
