@@ -39,6 +39,7 @@ _MOVED_M = 5e-4
 _LEAST_SHARE, _GREATEST_SHARE = 0.1, 2.0
 _DIRECTIONS = np.concatenate([np.eye(3), -np.eye(3)])
 _AS_IN_TRAINING = BridgeConfig(
+    pace=1.0,
     set_points_per_step=1,
     safety=SafetyConfig(max_speed_m_s=1e6, max_acceleration_m_s2=1e6, max_tracking_error_m=1.0),
 )
@@ -58,7 +59,7 @@ class Calibration(FrozenModel):
     )
     training_share: tuple[float, float, float] = Field(description="the same of the arm in training")
     delay_steps: float = Field(description="control steps from a command until the arm is seen to move")
-    training_delay_steps: float = Field(0.0, description="the same of the arm in training")
+    training_delay_steps: float = Field(0.0, description="the same of the arm of training, behind the same bounds")
 
     @property
     def late_steps(self) -> int:
@@ -122,18 +123,22 @@ def calibrate(
     from service.robot.mujoco_robot import MujocoRobot
 
     wanted = measure_response(MujocoRobot(world), world, _AS_IN_TRAINING)
-    found = measure_response(robot, world, config, held=held)
+    full = config.model_copy(update={"pace": 1.0})
+    usual = measure_response(MujocoRobot(world), world, full)  # as late as bounds alone make it
+    found = measure_response(robot, world, full, held=held)
     if not all(_LEAST_SHARE <= share <= _GREATEST_SHARE for share in found.covered_share):
         raise RobotError(
             f"robot {name}: it covers {_percents(found.covered_share)} of a commanded step along x, y, z; "
             f"{_LEAST_SHARE:.0%} to {_GREATEST_SHARE:.0%} can be matched: look at its controller"
         )
+    late_steps = max(0, round(found.delay_steps - usual.delay_steps))
+    x, y, z = (_share_if_reckoned(share, late_steps) for share in found.covered_share)
     return Calibration(
         **_setting(name, world, config),
-        covered_share=found.covered_share,
+        covered_share=(x, y, z),
         training_share=wanted.covered_share,
         delay_steps=found.delay_steps,
-        training_delay_steps=wanted.delay_steps,
+        training_delay_steps=usual.delay_steps,
     )
 
 
@@ -156,6 +161,15 @@ def measure_response(
     x, y, z = shares.reshape(2, 3).mean(axis=0).round(4).tolist()
     step_s = world.physics_step_s * world.num_substeps
     return Response((x, y, z), round(float(delays.mean()) / step_s, 3))
+
+
+def _share_if_reckoned(share: float, late_steps: int) -> float:
+    """Share of the way that is still to go which an arm covers in a step, of the share that was measured.
+
+    Set-points are measured from where a late arm was d steps ago, so at a steady pace v it is asked for a - d v: from
+    v = r (a - d v), r = v / (a - d v). The bridge reckons those d steps when it runs (``loop.Bridge``).
+    """
+    return round(min(share / max(1.0 - late_steps * share, 0.1), _GREATEST_SHARE), 4)
 
 
 def write_calibration(path: Path, calibration: Calibration) -> None:

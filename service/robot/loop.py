@@ -40,6 +40,13 @@ class BridgeConfig(FrozenModel):
     set_points_per_step: int = Field(
         10, ge=1, le=100, description="of a control step, evenly spread: 10 are 250 a second; 1 is a jump, as training"
     )
+    pace: float = Field(
+        0.75,
+        gt=0.0,
+        le=1.0,
+        description="share of an action's way that is commanded. Behind a bound on acceleration an arm turns late, and "
+        "at full pace it overshoots: of 75 goals 92 % are reached at 1, 96 % at 0.8 and at 0.65 (docs/robot.md)",
+    )
     observation_delay_steps: int = Field(
         0, ge=0, le=10, description="act on what was seen so many steps ago, to try out what that costs"
     )
@@ -99,7 +106,7 @@ class Bridge:
     ) -> None:
         self._policy, self._robot, self._config, self._record = policy, robot, config, record
         matched = matched or Matched()
-        self._gain, self._late_steps = np.array(matched.gain), matched.late_steps
+        self._gain, self._late_steps = config.pace * np.array(matched.gain), matched.late_steps
         self._covered_m = DISPLACEMENT_M * self._gain * np.array(matched.covered_share)
         self._layout = layouts(world).positions
         self._num_commands = world.observed.num_commands
@@ -129,7 +136,7 @@ class Bridge:
             begin()
         num = max(self._num_commands, self._late_steps)
         commands = deque([np.zeros(ACTION.size)] * num, maxlen=num)
-        self._states = deque(maxlen=_KEPT_STATES)
+        self._states: deque[RobotState] = deque(maxlen=_KEPT_STATES)
         seen: deque[FloatArray] = deque(maxlen=self._config.observation_delay_steps + 1)
         with self.safe.guarded():
             self.safe.start(self._tick_s)

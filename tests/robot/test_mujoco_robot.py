@@ -10,10 +10,11 @@ from service.robot.loop import Bridge, BridgeConfig, Matched
 from service.robot.mujoco_robot import MujocoParameters, MujocoRobot
 
 JUMPS = BridgeConfig(
+    pace=1.0,
     set_points_per_step=1,
     safety={"max_speed_m_s": 1e6, "max_acceleration_m_s2": 1e6, "max_tracking_error_m": 1.0, "margin_m": 0.3},
 )
-SMOOTH = BridgeConfig(set_points_per_step=8)
+SMOOTH = BridgeConfig(set_points_per_step=8, pace=1.0)
 
 
 def test_without_bounds_the_bridge_plays_what_the_evaluator_plays(champion):
