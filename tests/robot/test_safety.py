@@ -193,13 +193,12 @@ def test_an_action_means_a_way_from_where_the_gripper_is_measured():
     policy = Steady([0.4, -2.0, 0.0, -0.2])
     bridge = Bridge(policy, robot, robot.poses, WORLD, config, matched=Matched((0.5, 1.0, 1.0)), record=rows.append)
     bridge.run(OBJECT_M, 1)
-    np.testing.assert_allclose(
-        rows[0]["target_m"], HOME_M + np.array([0.25 * 0.4 * 0.05, -0.025, 0.0])
-    )  # clipped to -1
+    way = np.array([0.25 * 0.4 * 0.05, -0.5 * 0.05, 0.0])  # at half the pace; y is clipped to -1
+    np.testing.assert_allclose(rows[0]["target_m"], HOME_M + way)
     assert rows[0]["width_m"] == pytest.approx(0.08 - 0.02)
     np.testing.assert_allclose(rows[0]["set_points_m"][-1], rows[0]["target_m"], atol=1e-3)
-    way = np.array(rows[0]["set_points_m"])[:, 1]
-    np.testing.assert_allclose(np.diff(way), -0.005, rtol=1e-3)  # spread evenly over the step
+    path = np.array(rows[0]["set_points_m"])[:, 1]
+    np.testing.assert_allclose(np.diff(path), -0.0025, rtol=1e-3)  # spread evenly over the step
 
 
 @pytest.mark.parametrize(
