@@ -12,6 +12,8 @@
 | ``checkpoints/`` | the newest checkpoints; ``--resume`` continues from them exactly |
 | ``snapshots/`` | Bob's parameters untrained and after each tenth of the run, kept for good |
 | ``published.json`` | the version this run published last, and the sha256 of its parameters |
+| ``recordings/`` | earlier videos, with the time at which a newer one took their place |
+| ``log.jsonl`` | what happened: who died, who came back, how it ended; see ``service.io.run_log`` |
 | ``broken/`` | states of worlds whose physics diverged |
 | ``status.json``, ``goals.json``, ``stop`` | the run's state while it goes on; see ``service.store.disk`` |
 | ``tandem-error-*.txt`` | traceback of an error that nobody expected |
@@ -55,6 +57,8 @@ if TYPE_CHECKING:
 _logger = logging.getLogger(__name__)
 MAX_DIVERGED_FILES = 100
 MAX_NOTE_BYTES = 10_000
+RECORDINGS = "recordings"
+MAX_RECORDINGS = 20
 
 
 class Published(NamedTuple):
@@ -260,6 +264,16 @@ class RunDirectory:
         """Append a sample of an iteration's valid proposals: (M, 7) start x y z, goal x y z (metres), solved 0/1."""
         with self._keep_running(self.goals_file):
             self._goals.append({"iteration": iteration, "env_steps": num_env_steps, "goals": np.round(goals, 4)})
+
+    def keep_recording(self, path: Path) -> None:
+        """Put a video aside that is about to be replaced; of more than twenty, the oldest go."""
+        with self._keep_running(path), os_errors("write", self.path / RECORDINGS), suppress(FileNotFoundError):
+            when = datetime.fromtimestamp(path.stat().st_mtime, UTC).strftime("%Y%m%dT%H%M%S")
+            (self.path / RECORDINGS).mkdir(exist_ok=True)
+            path.replace(self.path / RECORDINGS / f"{path.stem}-{when}{path.suffix}")
+            kept = sorted((self.path / RECORDINGS).glob(f"{path.stem}-*{path.suffix}"))
+            for old in kept[:-MAX_RECORDINGS]:
+                old.unlink(missing_ok=True)
 
     def dump_diverged(self, name: str, diverged: Sequence[tuple[StateArray, FloatArray]]) -> None:
         """Save the (state, action) pairs of a round whose physics diverged, under the round's name, for 100 rounds."""

@@ -55,7 +55,9 @@ def make_artifacts(directory: RunDirectory) -> dict[str, Path]:
 
     def draw_video() -> Path:
         rounds = recording.record_rounds(config, alice, bob, num_rounds=NUM_RECORDED_ROUNDS, seed=_SEED)
-        return video.write_video(rounds, config.world, directory.path / "rounds.mp4")
+        path = directory.path / "rounds.mp4"
+        directory.keep_recording(path)
+        return video.write_video(rounds, config.world, path)
 
     makers: dict[str, Callable[[], Path]] = {
         "curves": partial(plot_curves, directory.path),
@@ -91,7 +93,9 @@ def _draw_skill_video(directory: RunDirectory, config: Config) -> Path:
     episodes = recording.record_skills(
         skills, config.world, num_skills=NUM_RECORDED_SKILLS, num_steps=steps, seed=_SEED
     )
-    return video.write_episode_video(episodes, config.world, directory.path / "skills.mp4")
+    path = directory.path / "skills.mp4"
+    directory.keep_recording(path)
+    return video.write_episode_video(episodes, config.world, path)
 
 
 def _draw_episodes(directory: RunDirectory, config: Config, bob: NumpyMCPPolicy) -> Path:

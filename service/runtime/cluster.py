@@ -250,6 +250,8 @@ class ClusterRun(Runner):
             return
         try:
             slot.join(ray.get(reference))
+            if slot.incarnation > 0:
+                _logger.info("rollout actor %d is back, as its incarnation %d", slot.index, slot.incarnation)
         except RayError as error:
             self._num_failed_rounds += 1
             if self._num_failed_rounds > MAX_FAILED_ROUNDS:

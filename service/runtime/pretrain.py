@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import logging
+import os
+import socket
 import time
 from contextlib import ExitStack, closing, suppress
 from dataclasses import dataclass, replace
@@ -12,6 +14,7 @@ from typing import TYPE_CHECKING, Literal, cast
 from service.config import Config
 from service.errors import ConfigError, TandemError
 from service.io.run_directory import Published, RunDirectory
+from service.io.run_log import RunLog
 from service.learner.learner import torch_device
 from service.media.artifacts import make_artifacts
 from service.primitives.publishing import measure_bob, measure_skills, publish_run
@@ -106,6 +109,9 @@ def pretrain(
         assert directory.epoch is not None
         epoch = directory.epoch.number
         report = Report(config, run_id, runtime, writer, published=published, previous=previous, epoch=epoch)
+        log = stack.enter_context(RunLog(directory.path))
+        begins = "goes on with" if resume else "begins"
+        log.note(f"process {os.getpid()} on {socket.gethostname()} {begins} the run ({runtime} runtime)")
         stack.enter_context(report)
         if cluster is not None and cluster.status is not None:
             from service.runtime.status_actor import serving
@@ -132,6 +138,9 @@ def pretrain(
                     _logger.warning("%s", error)
                     resume = True
                 else:
+                    said = f", published {done.version}" if done.version is not None else ""
+                    at = f"iteration {done.result.iteration}, {done.result.num_env_steps} env steps"
+                    log.note(f"the run is {done.result.reason} at {at}{said}")
                     return replace(done, signal=signals.first)
             time.sleep(BACK_OFF_S * (2 ** (num_lost - 1) - 1))
 

@@ -73,6 +73,7 @@ class Worker(ABC):
             self._start_next(pause_s)
             try:
                 self.wait_ready()
+                _logger.info("the %s is back, as its incarnation %d", self.name, self.incarnation)
                 return
             except (RayError, ClusterError) as error:
                 reason = one_line(error)

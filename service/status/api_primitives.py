@@ -4,16 +4,16 @@ from __future__ import annotations
 
 import os
 from functools import lru_cache
-from typing import Annotated, Any
+from pathlib import Path
+from typing import Annotated
 
 from fastapi import APIRouter, Query, Request, Response
 from fastapi import Path as InPath
 
-from service.io.errors import FormatVersionError
+from service.primitives.bundled import find_version
 from service.registry.blobs import BlobStore
-from service.registry.errors import DamagedBlobError, RegistryError
-from service.registry.manifest import Manifest
-from service.registry.names import NAME_PATTERN, Version
+from service.registry.errors import RegistryError
+from service.registry.names import NAME_PATTERN
 from service.registry.registry import Registry
 from service.status.files import BYTES, PARTS, file_response
 from service.status.openapi import INVALID, READ_ONLY, problems
@@ -23,10 +23,9 @@ from service.status.schemas import (
     AliasState,
     ManifestDocument,
     PrimitiveList,
-    PrimitiveSummary,
     PrimitiveVersions,
-    VersionSummary,
 )
+from service.status.shelf import Shelf
 
 MAX_VERIFIED = 4096
 _FOREVER = "private, max-age=31536000, immutable"
@@ -38,29 +37,29 @@ _UNKNOWN = (404, "There is no such name, version or alias.")
 
 
 def primitives_router(registry: Registry) -> APIRouter:
-    """Make the routes about frozen primitives; all answers come from the registry's files."""
+    """Make the routes about frozen primitives: those of ``registry``, and beside them those that come with tandem.
+
+    Where both have a version of one name and number, that of ``registry`` counts, as for whoever loads primitives.
+    """
     router = APIRouter(prefix="/v1", tags=["primitives"])
-    blobs = BlobStore(registry.root / "blobs")
+    shelf = Shelf(registry)
 
     @lru_cache(MAX_VERIFIED)
-    def verify(digest: str, *_stamp: int) -> None:
+    def verify(path: Path, digest: str, *_stamp: int) -> None:
         # once for each state of the file: clients cache blobs for ever, so a damaged one must never be served
-        blobs.get(digest)
+        BlobStore(path.parent.parent).get(digest)
 
     @router.get("/primitives", summary="All names")
     def list_primitives() -> PrimitiveList:
-        """Sorted; empty before the first is published."""
-        return PrimitiveList(primitives=tuple(_summary(registry, name) for name in registry.names()))
+        """Sorted; those that come with tandem are always there."""
+        return PrimitiveList(primitives=tuple(shelf.summary(name) for name in shelf.names()))
 
     @router.get("/primitives/{name}", summary="The versions of a name", responses=problems(_UNKNOWN, INVALID))
     def get_primitive(name: _Name, limit: Annotated[int, Query(ge=1, le=1000)] = 50) -> PrimitiveVersions:
-        """Newest first, and the aliases."""
-        versions = registry.versions(name)
-        if not versions:
+        """Newest first, each with where it is, and the aliases."""
+        if name not in shelf.names():
             registry.resolve(f"{name}@1")  # raises the error that says which names there are
-        summary = _summary(registry, name)
-        newest = tuple(_version(registry, version, summary.aliases) for version in versions[::-1][:limit])
-        return PrimitiveVersions(**dict(summary), versions=newest)
+        return PrimitiveVersions(**dict(shelf.summary(name)), versions=shelf.versions(name)[:limit])
 
     @router.get(
         "/primitives/{name}/versions/{version}",
@@ -71,8 +70,8 @@ def primitives_router(registry: Registry) -> APIRouter:
     )
     def get_version(name: _Name, version: _Version) -> Response:
         """The manifest; `/v1/blobs/sha256/{blob_sha256}` has the parameters, safetensors bytes."""
-        manifest = registry.manifest(f"{name}@{version}")
-        return Response(manifest.to_bytes(), media_type="application/json")
+        place, found = find_version(f"{name}@{version}", registry.root)
+        return Response(place.manifest(str(found)).to_bytes(), media_type="application/json")
 
     @router.get(
         "/blobs/sha256/{digest}",
@@ -86,15 +85,15 @@ def primitives_router(registry: Registry) -> APIRouter:
     )
     def get_blob(request: Request, digest: _Digest) -> Response:
         """Checked against the digest, which is also the entity tag; a blob never changes."""
-        path = blobs.path(digest)
-        try:
-            status = os.stat(path)
-        except FileNotFoundError:
-            raise ProblemError(
-                404, "unknown-blob", f"no blob {digest} here; a manifest names the ones there are"
-            ) from None
-        verify(digest, status.st_mtime_ns, status.st_size, status.st_ino)
-        return file_response(request, path, "application/octet-stream", etag=digest, cache=_FOREVER)
+        for place in shelf.registries.values():
+            path = BlobStore(place.root / "blobs").path(digest)
+            try:
+                status = os.stat(path)
+            except FileNotFoundError:
+                continue
+            verify(path, digest, status.st_mtime_ns, status.st_size, status.st_ino)
+            return file_response(request, path, "application/octet-stream", etag=digest, cache=_FOREVER)
+        raise ProblemError(404, "unknown-blob", f"no blob {digest} here; a manifest names the ones there are")
 
     @router.put(
         "/primitives/{name}/aliases/{alias}",
@@ -111,25 +110,3 @@ def primitives_router(registry: Registry) -> APIRouter:
         return AliasState(name=name, alias=alias, version=version.number)
 
     return router
-
-
-def _summary(registry: Registry, name: str) -> PrimitiveSummary:
-    versions = registry.versions(name)
-    aliases = registry.aliases(name)
-    return PrimitiveSummary(name=name, num_versions=len(versions), newest=versions[-1].number, aliases=aliases)
-
-
-def _version(registry: Registry, version: Version, aliases: dict[str, int]) -> VersionSummary:
-    names = tuple(alias for alias, number in aliases.items() if number == version.number)
-    try:
-        manifest = registry.manifest(str(version))
-    except (DamagedBlobError, FormatVersionError) as error:  # must not hide the other versions
-        return VersionSummary(version=version.number, aliases=names, problem=str(error))
-    shown = manifest.model_dump(include=set(VersionSummary.model_fields) - {"version"})
-    return VersionSummary(version=version.number, aliases=names, **_what_it_is(manifest), **shown)
-
-
-def _what_it_is(manifest: Manifest) -> dict[str, Any]:
-    """Kind of a version; of an orchestrator also its task, and what it acts with."""
-    found = {key: manifest.spaces.get(key) for key in ("kind", "task", "primitives")}
-    return {key: value for key, value in found.items() if isinstance(value, str)}

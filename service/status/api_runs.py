@@ -2,21 +2,27 @@
 
 # no postponed annotations: FastAPI could not resolve a dependency that is local to a function
 from collections.abc import AsyncIterator
+from contextlib import suppress
+from functools import lru_cache
+from pathlib import Path
 from typing import Annotated
 
 from fastapi import APIRouter, Depends, Header, Query, Request, Response
 from fastapi import Path as InPath
 from fastapi.sse import EventSourceResponse, ServerSentEvent
 
-from service.status.files import BYTES, PARTS, RUN_FILES, RunDirectories, file_response
-from service.status.history import HistoryCache
+from service.status import run_details, series
+from service.status.files import BYTES, PARTS, RUN_FILES, RunDirectories, file_response, kind_of
 from service.status.openapi import INVALID, READ_ONLY, UNAVAILABLE, UNKNOWN_RUN, problems
 from service.status.problems import ProblemError
-from service.status.schemas import MetricHistory, RunFiles, RunList
+from service.status.schemas import GoalFrames, MetricHistory, RunFiles, RunList, RunLog, RunSetup
 from service.status.stream import EVENT_SCHEMA, RunFollower, Streams
+from service.store.errors import StoreError
 from service.store.models import ACTIVE, GoalGrid, RunReader, RunStatus
 
 MAX_ITERATION = 2**53 - 1
+_SPARKLINE_POINTS = 40
+_MAX_SPARKLINES = 2000
 _Run = Annotated[
     str,
     InPath(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]{0,127}$", description="id of a run", examples=["cube"]),
@@ -30,19 +36,30 @@ _After = Annotated[int, Query(ge=0, le=MAX_ITERATION, description="only later it
 _MaxPoints = Annotated[int, Query(ge=1, le=10_000, description="down-sample to at most this many points")]
 
 
-def runs_router(runs: RunReader, histories: HistoryCache, streams: Streams, directories: RunDirectories) -> APIRouter:
-    """Make the routes about runs."""
+def runs_router(runs: RunReader, streams: Streams, directories: RunDirectories, registry: Path) -> APIRouter:
+    """Make the routes about runs; ``registry`` is the root of the one that commands name."""
     router = APIRouter(prefix="/v1/runs", tags=["runs"])
     errors = problems(UNKNOWN_RUN, INVALID, UNAVAILABLE)
+
+    @lru_cache(_MAX_SPARKLINES)
+    def sparkline(run_id: str, name: str, *_stamp: object) -> tuple[float | None, ...]:
+        return tuple(runs.sample(run_id, name, _SPARKLINE_POINTS))
 
     @router.get("", summary="All runs", responses=problems(INVALID, UNAVAILABLE))
     def list_runs(
         active: Annotated[bool | None, Query(description="only runs in progress, or only those that ended")] = None,
         limit: Annotated[int, Query(ge=1, le=1000)] = 100,
+        sparkline_of: Annotated[
+            _Metric | None, Query(alias="sparkline", description="a metric to give in a few points for each run")
+        ] = None,
     ) -> RunList:
         """Newest start first."""
         found = [run for run in runs.runs() if active is None or (run.state in ACTIVE) == active]
-        return RunList(runs=tuple(found[:limit]), num_runs=len(found))
+        sparklines = {}
+        for run in found[:limit] if sparkline_of is not None else ():
+            with suppress(StoreError):  # it may be deleted just now
+                sparklines[run.run_id] = sparkline(run.run_id, sparkline_of, run.started, run.iteration)
+        return RunList(runs=tuple(found[:limit]), num_runs=len(found), sparklines=sparklines)
 
     @router.get("/{run_id}", summary="One run", responses=errors)
     def get_run(run_id: _Run) -> RunStatus:
@@ -54,7 +71,7 @@ def runs_router(runs: RunReader, histories: HistoryCache, streams: Streams, dire
         run_id: _Run, names: _Names = None, after_iteration: _After = 0, max_points: _MaxPoints = 1000
     ) -> MetricHistory:
         """In columns. For new records, ask again with `after_iteration=last_iteration`, or use `metrics/stream`."""
-        return histories.history(run_id, names, after_iteration, max_points)
+        return series.history(runs, run_id, names, after_iteration, max_points)
 
     async def follow(
         run_id: _Run,
@@ -97,6 +114,23 @@ def runs_router(runs: RunReader, histories: HistoryCache, streams: Streams, dire
             )
         return grid
 
+    @router.get("/{run_id}/goals/history", summary="How goals and their difficulty changed", responses=errors)
+    def get_goal_history(run_id: _Run, frames: Annotated[int, Query(ge=1, le=60)] = 24) -> GoalFrames:
+        """From the sample of goals that a run records: cells, and how often Bob reached their goals, part by part."""
+        runs.run(run_id)
+        return run_details.goal_frames(directories.directory(run_id), runs.goals(run_id), frames)
+
+    @router.get("/{run_id}/setup", summary="A run's configuration and commands", responses=errors)
+    def get_setup(run_id: _Run) -> RunSetup:
+        """The resolved configuration, where the run is, and the commands that stop it or go on with it."""
+        return run_details.setup(runs.run(run_id), directories.directory(run_id), registry)
+
+    @router.get("/{run_id}/log", summary="What happened to a run", responses=errors)
+    def get_log(run_id: _Run, limit: Annotated[int, Query(ge=1, le=10_000)] = 500) -> RunLog:
+        """Who died, who came back, what went wrong, and what its processes said, oldest first."""
+        runs.run(run_id)
+        return run_details.log(directories.directory(run_id), limit)
+
     @router.post(
         "/{run_id}/stop",
         summary="Ask a run to end",
@@ -128,7 +162,7 @@ def runs_router(runs: RunReader, histories: HistoryCache, streams: Streams, dire
         """With ranges and an entity tag."""
         runs.run(run_id)
         path = directories.path(run_id, file)
-        return file_response(request, path, RUN_FILES[file][1], cache="private, no-cache")
+        return file_response(request, path, kind_of(file)[1], cache="private, no-cache")
 
     @router.get(
         "/{run_id}/video",

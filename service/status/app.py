@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -15,11 +16,13 @@ from service.status import openapi, problems
 from service.status.api_health import health_router
 from service.status.api_primitives import primitives_router
 from service.status.api_runs import runs_router
+from service.status.api_series import series_router
+from service.status.api_session import session_router
 from service.status.auth import AuthMiddleware
 from service.status.errors import StatusError
 from service.status.files import RunDirectories, file_response
-from service.status.history import HistoryCache
 from service.status.metrics import Telemetry
+from service.status.problems import ProblemError
 from service.status.response_cache import ResponseCache
 from service.status.stream import Streams
 from service.status.token import VARIABLE, check_token
@@ -79,18 +82,37 @@ def create_app(
     )
     app.streams, app.public = streams, public
     app.include_router(health_router(runs, registry, telemetry))
-    app.include_router(runs_router(runs, HistoryCache(runs), streams, RunDirectories(runs_dir)))
+    app.include_router(runs_router(runs, streams, RunDirectories(runs_dir), registry.root))
+    app.include_router(series_router(runs))
+    app.include_router(session_router(token))
     app.include_router(primitives_router(registry))
 
     @app.get("/", include_in_schema=False)
     def page(request: Request) -> Response:
         return file_response(request, PAGE / "index.html", "text/html", cache="no-cache")
 
+    @app.get("/page/plotly.js", include_in_schema=False)
+    def plotly(request: Request) -> Response:
+        return file_response(request, _plotly(), "text/javascript", cache="no-cache")
+
     app.mount("/page", _PageFiles(directory=PAGE))
     problems.add_handlers(app)
     app.add_middleware(ResponseCache)
     app.add_middleware(AuthMiddleware, token=token, public=public, observe=telemetry.observe)
     return app
+
+
+def _plotly() -> Path:
+    """The library that draws curves, in the package plotly, which is not imported for it.
+
+    Raises:
+        ProblemError: the package is not installed.
+    """
+    found = find_spec("plotly")
+    path = Path(found.origin or "").parent / "package_data" / "plotly.min.js" if found is not None else None
+    if path is None or not path.is_file():
+        raise ProblemError(404, "no-plotly", "curves need the package plotly: pip install 'tandem-skills[serve]'")
+    return path
 
 
 class _PageFiles(StaticFiles):

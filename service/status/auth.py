@@ -14,14 +14,19 @@ import re
 import time
 from collections.abc import Callable
 from http import HTTPStatus
+from http.cookies import CookieError, SimpleCookie
 
 from starlette.datastructures import Headers, MutableHeaders
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from service.status.problems import ProblemError
-from service.status.token import VARIABLE, check_authorization
+from service.status.token import SESSION_COOKIE, VARIABLE, check_authorization, check_session
 
-OPEN = frozenset({"/livez"})
+OPEN = frozenset({"/livez", "/"})
+OPEN_FOLDER = "/page/"
+"""The page itself, which holds no secret: it asks for the token, and then for what is to be seen."""
+SESSION = "/v1/session"
+"""Takes the token in the body."""
 PROBES = frozenset({"/readyz", "/healthz"})
 """Paths for Kubernetes, which cannot send a secret."""
 MAX_BODY_BYTES = 64 * 1024
@@ -31,7 +36,9 @@ TRUSTED = "tandem.trusted"
 _SAFE = frozenset({"GET", "HEAD", "OPTIONS"})
 _HEADERS = {
     "x-content-type-options": "nosniff",
-    "content-security-policy": "default-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'",
+    # plotly makes style rules by code, and pictures from what it drew
+    "content-security-policy": "default-src 'self'; style-src 'self' 'unsafe-inline'; img-src 'self' data: blob:; "
+    "base-uri 'none'; form-action 'none'; frame-ancestors 'none'",
     "referrer-policy": "no-referrer",
     "cross-origin-resource-policy": "same-origin",
     "cross-origin-opener-policy": "same-origin",
@@ -68,7 +75,7 @@ class AuthMiddleware:
                 headers = MutableHeaders(scope=message)
                 for name, value in _HEADERS.items():
                     headers.setdefault(name, value)
-                if status == HTTPStatus.UNAUTHORIZED and scope["method"] in _SAFE:
+                if status == HTTPStatus.UNAUTHORIZED and scope["method"] in _SAFE and not _by_script(scope):
                     headers.append("www-authenticate", _BASIC)
                 self._observe(scope["method"], _template(inner), status, time.perf_counter() - begun_s)
             await send(message)
@@ -93,15 +100,15 @@ class AuthMiddleware:
             raise ProblemError(
                 421, "wrong-host", "ask for localhost or 127.0.0.1: this service is for its machine alone"
             )
-        scope[TRUSTED] = self._is_trusted(scope["method"], scope["path"], headers.get("authorization"))
+        scope[TRUSTED] = self._is_trusted(scope["method"], scope["path"], headers)
         if "content-length" in headers or "transfer-encoding" in headers:
             receive = _replay(await _read_body(headers, receive), receive)
         await self._app(scope, receive, send)
 
-    def _is_trusted(self, method: str, path: str, authorization: str | None) -> bool:
+    def _is_trusted(self, method: str, path: str, headers: Headers) -> bool:
         """Whether an allowed request may see everything; raises ``ProblemError`` for one that is not allowed."""
         safe = method in _SAFE
-        if safe and path in OPEN:
+        if (safe and (path in OPEN or path.startswith(OPEN_FOLDER))) or path == SESSION:
             return False
         if self._token is None:
             if safe:
@@ -109,7 +116,9 @@ class AuthMiddleware:
             raise ProblemError(
                 403, "read-only", f"this service has no token and so changes nothing; start it with {VARIABLE} set"
             )
-        verdict = check_authorization(authorization, self._token, basic=safe)
+        verdict = check_authorization(headers.get("authorization"), self._token, basic=safe)
+        if verdict == "missing" and safe and check_session(_cookie(headers), self._token):
+            return True
         if verdict == "right" or (verdict == "missing" and safe and not self._public):
             return True
         if verdict == "missing" and safe and path in PROBES:
@@ -135,6 +144,19 @@ def _host(header: str) -> str:
     """The host of a Host header: ``127.0.0.1`` of ``127.0.0.1:8321``, ``::1`` of ``[::1]:8321``; empty if malformed."""
     found = _HOST.fullmatch(header)
     return "" if found is None else found[1] or found[2]
+
+
+def _cookie(headers: Headers) -> str | None:
+    try:
+        found = SimpleCookie(headers.get("cookie", "")).get(SESSION_COOKIE)
+    except CookieError:
+        return None
+    return found.value if found is not None else None
+
+
+def _by_script(scope: Scope) -> bool:
+    """Whether a page's script asks, which has a form of its own: for a challenge, browsers open a window before it."""
+    return Headers(scope=scope).get("sec-fetch-mode", "navigate") != "navigate"
 
 
 def _template(scope: Scope) -> str:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import re
 import stat
+from contextlib import suppress
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -13,6 +14,7 @@ from fastapi import Request
 from starlette.responses import FileResponse, Response
 from starlette.staticfiles import NotModifiedResponse, StaticFiles
 
+from service.io.run_directory import RECORDINGS
 from service.regular_files import open_regular
 from service.status.openapi import problems
 from service.status.problems import ProblemError
@@ -27,6 +29,9 @@ RUN_FILES = {
     "coverage.png": ("Where random skills move the object", "image/png"),
 }
 """Title and media type of the files of a run directory that are served; all others are not."""
+OLDER = re.compile(r"(rounds|skills)-[0-9]{8}T[0-9]{6}\.mp4")
+"""Name of a recording that a newer one has replaced."""
+MAX_RECORDINGS = 50
 BYTES = {"schema": {"type": "string", "format": "binary"}}
 """The content of a file in the OpenAPI document."""
 PARTS: dict[int | str, dict[str, Any]] = {
@@ -40,6 +45,12 @@ _CONDITIONS = StaticFiles()
 """Only for its ``is_not_modified``."""
 
 
+def kind_of(name: str) -> tuple[str, str]:
+    """Title and media type of a file that is served."""
+    older = OLDER.fullmatch(name)
+    return RUN_FILES[f"{older[1]}.mp4" if older else name]
+
+
 class RunDirectories:
     """Pictures and videos in the run directories of ``root``; None if runs have no directories on this machine."""
 
@@ -47,18 +58,23 @@ class RunDirectories:
         self._root = root
 
     def files(self, run_id: str) -> list[RunFile]:
-        """List those of ``RUN_FILES`` that exist; empty if the run has no directory."""
-        return [
-            RunFile(
-                name=name,
-                title=RUN_FILES[name][0],
-                media_type=RUN_FILES[name][1],
-                num_bytes=path.stat().st_size,
-                modified=datetime.fromtimestamp(path.stat().st_mtime, UTC),
-                url=f"/v1/runs/{run_id}/files/{name}",
-            )
-            for name, path in self._paths(run_id).items()
-        ]
+        """List those of ``RUN_FILES`` and older recordings that exist; empty if the run has no directory."""
+        found = []
+        for name, path in self._paths(run_id).items():
+            title, media_type = kind_of(name)
+            with suppress(OSError):  # it may be deleted meanwhile
+                status = path.stat()
+                found.append(
+                    RunFile(
+                        name=name,
+                        title=title,
+                        media_type=media_type,
+                        num_bytes=status.st_size,
+                        modified=datetime.fromtimestamp(status.st_mtime, UTC),
+                        url=f"/v1/runs/{run_id}/files/{name}",
+                    )
+                )
+        return found
 
     def path(self, run_id: str, name: str) -> Path:
         """Find one of them.
@@ -72,14 +88,23 @@ class RunDirectories:
             raise ProblemError(404, "no-such-file", f"run {run_id} has no {name[:64]!r} to show; it has: {there}")
         return paths[name]
 
-    def _paths(self, run_id: str) -> dict[str, Path]:
+    def directory(self, run_id: str) -> Path | None:
+        """Find the directory of a run; None if it is not on this machine."""
         try:
             found = run_directories(self._root) if self._root is not None else []
         except OSError:
-            return {}
+            return None
         # looked up instead of built from the id, so that no id leads outside the root
-        directory = next((path for path in found if run_id_of(path) == run_id), None)
-        paths = {name: directory / name for name in RUN_FILES} if directory is not None else {}
+        return next((path for path in found if run_id_of(path) == run_id), None)
+
+    def _paths(self, run_id: str) -> dict[str, Path]:
+        directory = self.directory(run_id)
+        if directory is None:
+            return {}
+        paths = {name: directory / name for name in RUN_FILES}
+        with suppress(OSError):  # most runs have no older recordings
+            older = sorted((directory / RECORDINGS).iterdir(), reverse=True)
+            paths |= {path.name: path for path in older[:MAX_RECORDINGS] if OLDER.fullmatch(path.name)}
         return {name: path for name, path in paths.items() if _is_regular(path)}
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from service.status.auth import OPEN, PROBES
+from service.status.auth import OPEN, PROBES, SESSION
 from service.status.problems import MEDIA_TYPE, Problem
 
 _CONTENT = {MEDIA_TYPE: {"schema": {"$ref": "#/components/schemas/Problem"}}}
@@ -59,9 +59,9 @@ def complete(tree: dict[str, Any], *, public: bool) -> None:
 
 
 def _security(path: str, *, reading: bool, public: bool) -> list[dict[str, list[str]]]:
+    if path in OPEN or path == SESSION:
+        return []
     if not reading:
         return [{"bearer": []}]
-    if path in OPEN:
-        return []
     schemes: list[dict[str, list[str]]] = [{"bearer": []}, {"basic": []}]
     return schemes if public and path not in PROBES else [{}, *schemes]

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from datetime import timedelta
 from pathlib import Path
 from typing import TypeVar
@@ -22,7 +22,7 @@ from typing import TypeVar
 from service.store.address import RedisAddress, address_from_environment
 from service.store.disk_reader import DiskReader
 from service.store.errors import StoreUnavailableError, UnknownRunError
-from service.store.models import ACTIVE, GoalGrid, Record, RunReader, RunStatus
+from service.store.models import ACTIVE, Columns, GoalGrid, Record, RunReader, RunStatus
 
 RETRY_AFTER_S = 5.0
 """Pause after Redis did not answer, so that requests do not wait for it."""
@@ -72,13 +72,15 @@ class CombinedReader:
 
     def metrics(self, run_id: str, *, after_iteration: int = 0) -> list[Record]:
         """The records of iterations above ``after_iteration``, in order."""
-        try:
-            return self._disk.metrics(run_id, after_iteration=after_iteration)
-        except UnknownRunError:
-            in_redis = self._ask_redis(lambda: self._redis.metrics(run_id, after_iteration=after_iteration))
-            if in_redis is None:
-                raise
-            return in_redis
+        return self._disk_first(lambda reader: reader.metrics(run_id, after_iteration=after_iteration))
+
+    def columns(self, run_id: str, names: Sequence[str] | None) -> Columns:
+        """These metrics of all iterations."""
+        return self._disk_first(lambda reader: reader.columns(run_id, names))
+
+    def sample(self, run_id: str, name: str, number: int) -> list[float | None]:
+        """One metric of about ``number`` records, evenly over the run."""
+        return self._disk_first(lambda reader: reader.sample(run_id, name, number))
 
     def goals(self, run_id: str) -> GoalGrid | None:
         """The newest grid; None before the first."""
@@ -108,6 +110,15 @@ class CombinedReader:
             return newer
         warning = f"the status service reads no Redis: {failure[1]}"
         return newer.model_copy(update={"warnings": (*newer.warnings, warning)})
+
+    def _disk_first(self, question: Callable[[RunReader], _Answer]) -> _Answer:
+        try:
+            return question(self._disk)
+        except UnknownRunError:
+            in_redis = self._ask_redis(lambda: question(self._redis))
+            if in_redis is None:
+                raise
+            return in_redis
 
     def _ask_redis(self, question: Callable[[], _Answer]) -> _Answer | None:
         """Ask Redis; None if it does not know the run, or is unavailable."""

@@ -4,11 +4,16 @@ from __future__ import annotations
 
 from typing import Literal
 
-from pydantic import AwareDatetime, Field
+from pydantic import AwareDatetime, Field, JsonValue
 
 from service.frozen import FrozenModel
 from service.registry.manifest import Manifest
 from service.store.models import RunStatus
+
+Axis = Literal["env_steps", "iteration", "wall_s"]
+"""What a curve is drawn over: env steps, iterations, or seconds of learning."""
+Origin = Literal["registry", "bundled"]
+"""Whether primitives are in this service's registry, or came with its package."""
 
 
 class Alive(FrozenModel):
@@ -28,6 +33,9 @@ class RunList(FrozenModel):
 
     runs: tuple[RunStatus, ...]
     num_runs: int = Field(ge=0, description="that match the request, those over the limit included")
+    sparklines: dict[str, tuple[float | None, ...]] = Field(
+        {}, description="by run, the metric that was asked for with `sparkline`, in a few of its records"
+    )
 
 
 class MetricHistory(FrozenModel):
@@ -44,6 +52,90 @@ class MetricHistory(FrozenModel):
         description="by name, the mean over the iterations of a point; null if none of them has the metric"
     )
     names: tuple[str, ...] = Field(description="of all metrics the run has")
+
+
+class Curve(FrozenModel):
+    """One metric of a run, thinned; as long as the `x` of its run, null where there is no value."""
+
+    mean: tuple[float | None, ...]
+    low: tuple[float | None, ...] | None = Field(description="of each point; null if every iteration is a point")
+    high: tuple[float | None, ...] | None
+
+
+class RunSeries(FrozenModel):
+    """Curves of one run."""
+
+    run_id: str
+    last_iteration: int = Field(ge=0, description="of the newest record, whatever part was asked for")
+    num_iterations: int = Field(ge=0, description="that the points stand for")
+    x: tuple[float, ...] = Field(description="on the axis, where each point ends")
+    curves: dict[str, Curve] = Field(description="by the name of the metric")
+    names: tuple[str, ...] = Field(description="of all metrics the run has")
+    problem: str | None = Field(description="why there are no curves of this run")
+
+
+class SeriesSet(FrozenModel):
+    """The same metrics of several runs."""
+
+    axis: Axis
+    runs: tuple[RunSeries, ...] = Field(description="in the order of the request")
+
+
+class RunSetup(FrozenModel):
+    """What a run was started with, where it is, and the commands that stop it or go on with it."""
+
+    run_id: str
+    directory: str | None = Field(description="on the machine of this service; null if it is on another")
+    config: dict[str, JsonValue] | None = Field(description="resolved: with every default")
+    problem: str | None = Field(None, description="why there is no configuration")
+    stop_command: str | None = Field(description="for a shell on that machine")
+    resume_command: str | None = Field(description="for a shell on that machine, once the run has ended")
+
+
+class LogEntry(FrozenModel):
+    """Something that happened to a run."""
+
+    at: AwareDatetime
+    level: Literal["info", "warning", "error"]
+    text: str
+
+
+class RunLog(FrozenModel):
+    """What happened to a run, oldest first."""
+
+    entries: tuple[LogEntry, ...] = Field(description="the newest that were asked for")
+    num_entries: int = Field(ge=0, description="in all")
+    output: tuple[str, ...] = Field((), description="last lines that a study's run wrote to its terminal")
+
+
+class GoalFrame(FrozenModel):
+    """Goals that Alice proposed in one part of a run, by cells."""
+
+    first_env_steps: int = Field(ge=0)
+    last_env_steps: int = Field(ge=0)
+    num_goals: int = Field(ge=0, description="recorded, a sample of all")
+    centers_m: tuple[tuple[float, float, float], ...] = Field(description="of the cells")
+    num_tries: tuple[int, ...] = Field(description="goals in each cell")
+    success_rate: tuple[float, ...] = Field(description="fraction of them that Bob reached")
+
+
+class GoalFrames(FrozenModel):
+    """How goals and their difficulty changed over a run."""
+
+    cell_size_m: float = Field(gt=0)
+    frames: tuple[GoalFrame, ...]
+
+
+class Session(FrozenModel):
+    """A browser's session."""
+
+    status: Literal["open"]
+
+
+class TokenEntry(FrozenModel):
+    """The token, as a person types it."""
+
+    token: str = Field(min_length=1, max_length=4096)
 
 
 class RunFile(FrozenModel):
@@ -70,6 +162,7 @@ class PrimitiveSummary(FrozenModel):
     num_versions: int = Field(ge=1)
     newest: int = Field(ge=1, description="the greatest version number")
     aliases: dict[str, int] = Field(description="the version of each alias", examples=[{"champion": 2, "latest": 3}])
+    origins: tuple[Origin, ...] = Field(description="where its versions are")
 
 
 class PrimitiveList(FrozenModel):
@@ -92,6 +185,9 @@ class VersionSummary(FrozenModel):
     blob_sha256: str | None = None
     blob_bytes: int | None = None
     aliases: tuple[str, ...] = Field((), description="that point to this version now")
+    origin: Origin = Field("registry", description="the registry of this service, or what comes with tandem")
+    directory: str = Field("", description="of that registry, on the machine of this service")
+    run: str | None = Field(None, description="id of the run that made it, where the manifest tells")
     problem: str | None = Field(None, description="why there is nothing else here: the manifest is damaged")
 
 

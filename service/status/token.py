@@ -11,6 +11,7 @@ from typing import Literal
 from service.status.errors import StatusError
 
 VARIABLE = "TANDEM_TOKEN"
+SESSION_COOKIE = "tandem_session"
 MIN_CHARACTERS = 16
 _MAKE = "make one with: openssl rand -hex 32"
 
@@ -60,3 +61,13 @@ def check_authorization(authorization: str | None, token: str, *, basic: bool) -
         return "wrong"
     # as bytes: compare_digest raises for text that is not ASCII, which is only a wrong token here
     return "right" if hmac.compare_digest(given.encode(), token.encode()) else "wrong"
+
+
+def session_secret(token: str) -> str:
+    """What a browser keeps in place of the token: it cannot be turned back, and another token makes it worthless."""
+    return hmac.new(token.encode(), b"tandem session", "sha256").hexdigest()
+
+
+def check_session(cookie: str | None, token: str) -> bool:
+    """Whether a browser's cookie is of a session of this token."""
+    return cookie is not None and hmac.compare_digest(cookie.encode(), session_secret(token).encode())

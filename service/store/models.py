@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 from typing import Literal, NamedTuple, Protocol, Self, get_args
 
+import numpy as np
+from numpy.typing import NDArray
 from pydantic import AwareDatetime, Field
 
 from service.frozen import FrozenModel
@@ -28,6 +32,17 @@ Condition = Literal["well", "clock", "redis", "disk", "stuck", "silent"]
 CONDITIONS: tuple[Condition, ...] = get_args(Condition)
 Record = dict[str, float | None]
 """One iteration's metrics; ``iteration`` and ``env_steps`` are always there. Null: JSON has no number for it."""
+
+
+@dataclass(frozen=True, slots=True)
+class Columns:
+    """Metrics of a run over its iterations; NaN where an iteration has none."""
+
+    iteration: NDArray[np.int64]
+    env_steps: NDArray[np.int64]
+    metrics: dict[str, NDArray[np.float64]]
+    names: tuple[str, ...]
+    """Of all metrics that the run has, sorted."""
 
 
 class Trouble(NamedTuple):
@@ -66,6 +81,7 @@ class RunStatus(FrozenModel):
 
     run_id: str = Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]{0,127}$")
     name: str = Field(description="registry name of the primitives it makes")
+    study: str | None = Field(None, description="whose run of one seed it is, as far as its directory tells")
     runtime: Literal["local", "ray"]
     state: RunState
     started: AwareDatetime = Field(description="UTC, of the process that runs it now or ran it last")
@@ -144,6 +160,12 @@ class RunReader(Protocol):
 
     def metrics(self, run_id: str, *, after_iteration: int = 0) -> list[Record]:
         """The records of iterations above ``after_iteration``, in order, each iteration once (a resumed run's last)."""
+
+    def columns(self, run_id: str, names: Sequence[str] | None) -> Columns:
+        """These metrics of all iterations, None for all metrics; those that the run does not have are left out."""
+
+    def sample(self, run_id: str, name: str, number: int) -> list[float | None]:
+        """One metric of about ``number`` records, evenly over the run: fast, whatever else the run has recorded."""
 
     def goals(self, run_id: str) -> GoalGrid | None:
         """The newest grid; None before the first."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 
 from pydantic import ValidationError
@@ -12,9 +12,9 @@ from redis.exceptions import RedisError, ResponseError
 from service.store import keys
 from service.store.address import RedisAddress
 from service.store.errors import DamagedStoreError, UnknownRunError
-from service.store.models import ACTIVE, GoalGrid, Record, RunStatus
+from service.store.models import ACTIVE, Columns, GoalGrid, Record, RunStatus
 from service.store.pulse import Pulse, ahead_s
-from service.store.tail import parse_record
+from service.store.tail import columns_of, parse_record
 
 TIMEOUT_S = 0.5
 _logger = logging.getLogger(__name__)
@@ -65,6 +65,24 @@ class RedisReader:
             else:
                 by_iteration[int(record["iteration"] or 0)] = record
         return list(by_iteration.values())
+
+    def columns(self, run_id: str, names: Sequence[str] | None) -> Columns:
+        """These metrics of all iterations that Redis keeps."""
+        return columns_of(self.metrics(run_id), names)
+
+    def sample(self, run_id: str, name: str, number: int) -> list[float | None]:
+        """One metric of about ``number`` records, evenly over those that Redis keeps."""
+        key = keys.run_key(run_id, "metrics")
+        with self._errors():
+            size = self._client.zcard(key)
+            with self._client.pipeline(transaction=False) as pipe:
+                pipe.exists(keys.run_key(run_id, "status"))
+                for index in sorted({size * place // max(1, number - 1) for place in range(number)} if size else ()):
+                    pipe.zrange(key, min(index, size - 1), min(index, size - 1))
+                known, *lines = pipe.execute()
+            self._check_known(run_id, bool(known))
+        records = [parse_record(line[0]) for line in lines if line]
+        return [record.get(name) for record in records if record is not None]
 
     def goals(self, run_id: str) -> GoalGrid | None:
         """The newest grid; None before the first."""

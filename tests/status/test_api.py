@@ -3,14 +3,17 @@
 import json
 
 import httpx
+import numpy as np
 import pytest
 
 from service.primitives.bundled import BUNDLED
 from service.registry.manifest import parse_manifest
 from service.registry.registry import Registry
 from service.status.server import StatusServer
+from service.status.shelf import Shelf
 from service.store.disk_reader import DiskReader
 from service.store.models import GoalGrid, RunStatus
+from tests.status.conftest import serve
 from tests.status.runs import BEARER, CLIENT, TOKEN, grid, publish, record, write_status
 
 
@@ -112,8 +115,39 @@ def test_a_run_that_has_ended_stays_as_it_is(client, home):
 
 def test_primitives(client):
     answer = client.get("/v1/primitives").json()
+    bundled, tiny = answer["primitives"]
     aliases = {"champion": 1, "latest": 2}
-    assert answer == {"primitives": [{"name": "tiny", "num_versions": 2, "newest": 2, "aliases": aliases}]}
+    assert tiny == {"name": "tiny", "num_versions": 2, "newest": 2, "aliases": aliases, "origins": ["registry"]}
+    assert (bundled["name"], bundled["origins"]) == ("panda-cube", ["bundled"])
+
+
+def test_what_comes_with_tandem_is_beside_the_users_own(tmp_path):
+    newest = Registry(BUNDLED).versions("panda-cube")[-1]
+    registry = Registry(tmp_path / "registry")
+    own = publish(registry, "panda-cube")
+    (tmp_path / "runs").mkdir()
+    with serve(tmp_path) as server, httpx.Client(base_url=server.url, headers=BEARER, **CLIENT) as client:
+        answer = client.get("/v1/primitives/panda-cube").json()
+        manifest = client.get(f"/v1/primitives/panda-cube/versions/{newest.number}").json()
+        blob = client.get(f"/v1/blobs/sha256/{manifest['blob_sha256']}")
+    assert answer["origins"] == ["registry", "bundled"]
+    assert [(each["version"], each["origin"], each["directory"]) for each in answer["versions"]] == [
+        (newest.number, "bundled", str(BUNDLED)),
+        (own.number, "registry", str(registry.root)),
+    ]
+    assert answer["aliases"]["latest"] == own.number  # as for who loads panda-cube: the user's own counts
+    assert answer["versions"][0]["aliases"] == ["champion"]
+    assert manifest == json.loads(Registry(BUNDLED).manifest(str(newest)).to_bytes())
+    assert len(blob.content) == manifest["blob_bytes"]
+
+
+def test_the_lineage_of_an_orchestrator(tmp_path):
+    registry = Registry(tmp_path / "registry")
+    fields = {"normalisation": {}, "config": {}, "metrics": {}}
+    spaces = {"kind": "orchestrator", "primitives": "panda-cube@6"}
+    registry.publish("push", {"gate.weight": np.zeros(2, np.float32)}, spaces=spaces, **fields)
+    (version,) = Shelf(registry).versions("push")
+    assert (version.kind, version.primitives) == ("orchestrator", "panda-cube@6")
 
 
 def test_versions_of_a_name(client, home):
@@ -192,7 +226,8 @@ def test_openapi_lists_every_route(client, server):
         "/v1/runs/{run_id}/metrics/stream", "/v1/runs/{run_id}/goals", "/v1/runs/{run_id}/stop",
         "/v1/runs/{run_id}/files", "/v1/runs/{run_id}/files/{file}", "/v1/runs/{run_id}/video", "/v1/primitives",
         "/v1/primitives/{name}", "/v1/primitives/{name}/versions/{version}", "/v1/blobs/sha256/{digest}",
-        "/v1/primitives/{name}/aliases/{alias}",
+        "/v1/primitives/{name}/aliases/{alias}", "/v1/series", "/v1/series.csv", "/v1/session",
+        "/v1/runs/{run_id}/setup", "/v1/runs/{run_id}/log", "/v1/runs/{run_id}/goals/history",
     }  # fmt: skip
     assert json.loads(json.dumps(server.app.openapi()))["paths"] == paths
     for path, methods in paths.items():

@@ -20,6 +20,10 @@ PARAMETERS = {
 }
 BODIES = {"put": {"version": 1}}
 PROBES = {"/readyz", "/healthz"}
+OPEN = {"/livez", "/", "/page/index.html", "/page/plotly.js"}
+"""The page itself holds no secret, and has a form for the token."""
+SESSION = "/v1/session"
+"""Takes the token in its body; it has tests of its own."""
 
 
 def basic(token):
@@ -46,11 +50,13 @@ def routes(server):
         (method, path.format(**PARAMETERS))
         for path, methods in server.app.openapi()["paths"].items()
         for method in methods
+        if path != SESSION
     }
     hidden = {
         ("get", "/"),
         ("get", "/openapi.json"),
         ("get", "/page/index.html"),
+        ("get", "/page/plotly.js"),
         ("get", "/v1/nope"),
         ("post", "/v1/nope"),
     }
@@ -70,7 +76,7 @@ def public(home):
 
 
 def test_the_matrix_knows_every_route_of_the_app(server):
-    known = {path for _, path in routes(server)} | {"/page"}
+    known = {path for _, path in routes(server)} | {"/page", SESSION}
     found = [route for route in server.app.routes if isinstance(route, Route | Mount)]
     assert {"/livez", "/", "/page"} <= {route.path for route in found} | {"/livez"}
     assert {route.path.format(**PARAMETERS) for route in found} <= known
@@ -79,7 +85,7 @@ def test_the_matrix_knows_every_route_of_the_app(server):
 def test_a_public_service_answers_nobody_without_its_token(public):
     server, client = public
     for method, path in routes(server):
-        expected = 200 if path == "/livez" or path in PROBES else 401
+        expected = 200 if path in OPEN | PROBES else 401
         answer = ask(client, method, path)
         assert answer.status_code == expected, (method, path)
         if expected == 401:
@@ -91,7 +97,7 @@ def test_a_public_service_answers_nobody_without_its_token(public):
 def test_a_public_service_refuses_what_is_not_its_token(public, kind):
     server, client = public
     for method, path in routes(server):
-        expected = 200 if path == "/livez" else 401
+        expected = 200 if path in OPEN else 401
         assert ask(client, method, path, REFUSED[kind]).status_code == expected, (method, path)
 
 
@@ -106,8 +112,36 @@ def test_a_public_service_answers_with_its_token(public, kind):
 
 def test_requests_that_change_something_offer_no_browser_login(public):
     _, client = public
-    assert "Basic" in client.get("/").headers["www-authenticate"]
+    assert "Basic" in client.get("/v1/runs").headers["www-authenticate"]
+    script = client.get("/v1/runs", headers={"Sec-Fetch-Mode": "cors"})
+    assert "Basic" not in script.headers["www-authenticate"]  # the page has a form of its own
     assert "Basic" not in client.post("/v1/runs/old/stop").headers["www-authenticate"]
+
+
+def test_a_session_reads_and_changes_nothing(public):
+    server, _ = public
+    with httpx.Client(base_url=server.url, **CLIENT) as browser:
+        answer = browser.post(SESSION, json={"token": WRONG})
+        assert (answer.status_code, answer.json()["type"]) == (401, "urn:tandem:wrong-token")
+        assert browser.get("/v1/runs").status_code == 401
+        answer = browser.post(SESSION, json={"token": f" {TOKEN}\n"})
+        assert answer.json() == {"status": "open"}
+        said = answer.headers["set-cookie"].lower()
+        assert "httponly" in said
+        assert "samesite=strict" in said
+        assert TOKEN not in said
+        assert browser.get("/v1/runs").status_code == 200
+        assert browser.post("/v1/runs/old/stop").status_code == 401
+        cookie = browser.cookies["tandem_session"]
+        for forged in (cookie[:-1], TOKEN, '"', "\u00e9".encode("latin-1").decode("latin-1")):
+            header = f"tandem_session={forged}".encode("latin-1")
+            assert httpx.get(f"{server.url}/v1/runs", headers={"Cookie": header}, **CLIENT).status_code == 401
+
+
+def test_without_a_token_there_is_no_session(home):
+    with serve(home, token=None) as server:
+        answer = httpx.post(f"{server.url}{SESSION}", json={"token": TOKEN}, **CLIENT)
+    assert (answer.status_code, answer.json()["type"]) == (403, "urn:tandem:read-only")
 
 
 def test_on_loopback_reading_is_free_and_changing_is_not(server):
@@ -120,7 +154,7 @@ def test_on_loopback_reading_is_free_and_changing_is_not(server):
 def test_on_loopback_a_wrong_token_is_refused_all_the_same(server):
     with httpx.Client(base_url=server.url, **CLIENT) as client:
         for method, path in routes(server):
-            expected = 200 if path == "/livez" else 401
+            expected = 200 if path in OPEN else 401
             assert ask(client, method, path, REFUSED["bearer"]).status_code == expected, (method, path)
 
 

@@ -348,5 +348,5 @@ def test_load_primitives_imports_neither_torch_nor_the_service(champions, tmp_pa
 
 
 def test_load_primitives_asks_a_service_alone(server):
-    with pytest.raises(UnknownVersionError, match=r"no 'panda-cube'"):
-        service.load_primitives("panda-cube@champion", registry=server.url)
+    with pytest.raises(UnknownVersionError, match=r"no 'panda-nobody'"):
+        service.load_primitives("panda-nobody@champion", registry=server.url)

@@ -3,10 +3,10 @@
 from datetime import UTC, datetime
 
 import pytest
+from service.status.history import HistoryCache
 
 from service.io.files import write_atomic
 from service.status import history
-from service.status.history import HistoryCache
 from service.store.disk_reader import DiskReader
 from tests.status.runs import append, record, write_status
 

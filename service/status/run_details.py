@@ -1,0 +1,132 @@
+"""What a run's directory tells beside its status and its metrics: its configuration, what happened to it, its goals."""
+
+from __future__ import annotations
+
+import shlex
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from service.io.run_history import read_history
+from service.io.run_log import read_log
+from service.io.study_directory import LOG_FILE, is_study
+from service.parsing import MAX_YAML_CHARACTERS, ParseError, parse_json, parse_yaml
+from service.regular_files import open_regular, read_regular
+from service.status.schemas import GoalFrame, GoalFrames, LogEntry, RunLog, RunSetup
+from service.store.models import GoalGrid, RunStatus
+
+DEFAULT_CELL_M = 0.05
+FRAME_BYTES = 256 * 1024
+"""Of the records of goals that are read for one frame, some thousand goals."""
+_OUTPUT_BYTES = 16 * 1024
+
+
+def setup(run: RunStatus, directory: Path | None, registry: Path) -> RunSetup:
+    """Read a run's configuration, and write the commands for it."""
+    if directory is None:
+        return RunSetup(run_id=run.run_id, directory=None, config=None, stop_command=None, resume_command=None)
+    config, problem = None, None
+    try:
+        tree = parse_yaml(read_regular(directory / "config.yaml", MAX_YAML_CHARACTERS, follow=True), "config.yaml")
+        config = tree if isinstance(tree, dict) else None
+        problem = None if config is not None else "config.yaml is no configuration"
+    except OSError as error:
+        problem = f"config.yaml cannot be read: {error.strerror}"
+    except ParseError as error:
+        problem = str(error)
+    path = directory.absolute()
+    begun = path.parent if is_study(path.parent) else path
+    runtime = ["--runtime", "ray"] * (run.runtime == "ray")
+    place = ["--run-dir", str(begun), "--registry", str(registry.absolute())]
+    return RunSetup(
+        run_id=run.run_id,
+        directory=str(path),
+        config=config,
+        problem=problem,
+        stop_command=shlex.join(["touch", str(path / "stop")]),
+        resume_command=shlex.join(["tandem", "pretrain", "--resume", *place, *runtime]),
+    )
+
+
+def log(directory: Path | None, limit: int) -> RunLog:
+    """Read what happened to a run: what its process said, and the changes between its processes."""
+    if directory is None:
+        return RunLog(entries=(), num_entries=0)
+    entries = [LogEntry(at=each.at, level=each.level, text=each.text) for each in read_log(directory)]
+    history = read_history(directory)
+    for event in history.events if history is not None else ():
+        said = [f"{name} was {before!r} and is {now!r}" for name, (before, now) in event.changed.items()]
+        said += [f"lost and left out: {text}" for text in event.damaged_records]
+        entries.append(
+            LogEntry(at=event.at, level="info", text=f"from iteration {event.after_iteration}: {'; '.join(said)}")
+        )
+    entries.sort(key=lambda entry: entry.at)
+    return RunLog(
+        entries=tuple(entries[-limit:]), num_entries=len(entries), output=tuple(_output(directory / LOG_FILE))
+    )
+
+
+def goal_frames(directory: Path | None, grid: GoalGrid | None, num_frames: int) -> GoalFrames:
+    """Read how goals changed: of each of equal parts of the record, how often Bob reached those of a cell."""
+    cell_m = grid.cell_size_m if grid is not None else DEFAULT_CELL_M
+    lower = np.array(grid.lower_m if grid is not None else (0.0, 0.0, 0.0))
+    frames = []
+    if directory is not None:
+        try:
+            with open_regular(directory / "goals.jsonl") as file:
+                size = file.seek(0, 2)
+                for index in range(num_frames):
+                    begin, end = size * index // num_frames, size * (index + 1) // num_frames
+                    file.seek(max(0, begin - 1))
+                    if begin:
+                        file.readline(FRAME_BYTES)  # which the part before has
+                    lines = []
+                    while file.tell() < min(end, begin + FRAME_BYTES) and (line := file.readline(FRAME_BYTES)):
+                        lines.append(line)
+                    if (frame := _frame(lines, lower, cell_m)) is not None:
+                        frames.append(frame)
+        except OSError:  # an older run has none; one that is being deleted has none any more
+            frames = []
+    return GoalFrames(cell_size_m=cell_m, frames=tuple(frames))
+
+
+def _frame(lines: list[bytes], lower: np.ndarray[Any, np.dtype[np.float64]], cell_m: float) -> GoalFrame | None:
+    steps, rows = list[int](), list[Any]()
+    for line in lines:
+        try:
+            record = parse_json(line, "goals.jsonl")
+            goals = np.array(record["goals"], dtype=np.float64).reshape(-1, 7)
+            steps.append(int(record["env_steps"]))
+        except (ParseError, KeyError, TypeError, ValueError):
+            continue
+        rows.append(goals[np.isfinite(goals).all(axis=1)])
+    goals = np.concatenate(rows) if rows else np.zeros((0, 7))
+    if not len(goals):
+        return None
+    cells = np.floor((goals[:, 3:6] - lower) / cell_m + 1e-9).astype(int)
+    places, which = np.unique(cells, axis=0, return_inverse=True)
+    tries = np.bincount(which.reshape(-1), minlength=len(places))
+    solved = np.bincount(which.reshape(-1), weights=goals[:, 6] > 0.5, minlength=len(places))
+    centers = np.round(lower + (places + 0.5) * cell_m, 4)
+    return GoalFrame(
+        first_env_steps=min(steps),
+        last_env_steps=max(steps),
+        num_goals=len(goals),
+        centers_m=tuple((x, y, z) for x, y, z in centers.tolist()),
+        num_tries=tuple(tries.tolist()),
+        success_rate=tuple(np.round(solved / tries, 4).tolist()),
+    )
+
+
+def _output(path: Path) -> list[str]:
+    """The last lines of a text file; empty where there is none."""
+    try:
+        with open_regular(path) as file:
+            size = file.seek(0, 2)
+            file.seek(max(0, size - _OUTPUT_BYTES))
+            text = file.read(_OUTPUT_BYTES).decode(errors="replace")
+    except OSError:
+        return []
+    lines = text.replace("\r", "\n").split("\n")
+    return [line[:500] for line in lines[1 if size > _OUTPUT_BYTES else 0 :] if line.strip()][-100:]
