@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 import shutil
 import time
 from collections.abc import Iterator
@@ -25,6 +24,8 @@ _ARGUMENTS = (
     "--disable-dev-shm-usage",
 )
 _TIMEOUT_MS = 300_000
+_ABOUT_DRAWING = ("GPU stall", "willReadFrequently")
+"""What Chromium says of any WebGL without a graphics card."""
 
 
 @contextmanager
@@ -52,7 +53,7 @@ class Visit:
         self.page.on("dialog", self._on_dialog)
 
     def _on_console(self, said: ConsoleMessage) -> None:
-        if said.type != "log":
+        if said.type != "log" and not any(words in said.text for words in _ABOUT_DRAWING):
             self.complaints.append(said.text)
 
     def _on_dialog(self, dialog: Dialog) -> None:
@@ -75,21 +76,22 @@ class Visit:
         """The panel with a title."""
         return self.page.locator("figure.chart").filter(has=self.page.get_by_role("heading", name=title, exact=True))
 
-    def raw(self, name: str) -> list[list[tuple[float, float]]]:
-        """The points (env steps, value) of each unbroken part of a curve, read from its axes."""
-        group = self.page.locator(f'g.curve[data-name="{name}"]')
-        drawing = self.page.locator(".plot svg").filter(has=group)
-        ticks = [
-            drawing.locator(f".tick.{axis}").evaluate_all(
-                f"all => all.map(t => [+t.dataset.value, +t.getAttribute('{axis}')])"
-            )
-            for axis in "xy"
-        ]
-        path = group.locator("path.raw").get_attribute("d") or ""
-        parts = [re.findall(r"([\d.-]+) ([\d.-]+)", part) for part in path.split("M")[1:]]
-        return [[(_read(x, ticks[0]), _read(y, ticks[1])) for x, y in part] for part in parts]
+    def traces(self, name: str, run: str = "cube") -> list[dict[str, Any]]:
+        """What is drawn of a metric of a run: its values and, where there are, its smooth ones; x and y each."""
+        found: list[dict[str, Any]] = self.page.evaluate(
+            """name => [...document.querySelectorAll('.canvas')].flatMap(canvas => canvas.data ?? [])
+                .filter(trace => trace.name === name)
+                .map(({x, y, fill}) => ({x: [...x], y: [...y], fill}))""",
+            f"{run} {name}",
+        )
+        return found
 
-
-def _read(pixels: str, ticks: list[list[float]]) -> float:
-    (value, at), (other_value, other_at) = ticks[0], ticks[-1]
-    return value + (float(pixels) - at) * (other_value - value) / (other_at - at)
+    def points(self, name: str, number: int, run: str = "cube") -> list[tuple[float, float | None]]:
+        """Wait until a curve has a number of points, and give them: (env steps, value) each."""
+        deadline_s = time.monotonic() + _TIMEOUT_MS / 1000
+        while True:
+            found = self.traces(name, run)
+            if found and len(found[0]["x"]) == number:
+                return list(zip(found[0]["x"], found[0]["y"], strict=True))
+            assert time.monotonic() < deadline_s, (name, found)
+            self.page.wait_for_timeout(30)

@@ -76,10 +76,10 @@ def record(iteration: int, **values: float | None) -> dict[str, Any]:
     }
 
 
-def append(root: Path, run_id: str, *records: dict[str, Any]) -> None:
+def append(root: Path, run_id: str, *records: dict[str, Any], file: str = "metrics.jsonl") -> None:
     """Append records as a run does."""
-    with (root / run_id / "metrics.jsonl").open("a") as file:
-        file.writelines(json.dumps(each) + "\n" for each in records)
+    with (root / run_id / file).open("a") as lines:
+        lines.writelines(json.dumps(each) + "\n" for each in records)
 
 
 def grid() -> GoalGrid:
@@ -106,6 +106,8 @@ def write_runs(root: Path) -> None:
     for run_id in ("old", "cube"):
         append(root, run_id, *(record(iteration) for iteration in (1, 2, 3)))
     (root / "cube" / "goals.json").write_text(grid().model_dump_json())
+    goals = [[0, 0, 0.025, 0.01, 0.01, 0.03, 1], [0, 0, 0.025, 0.01, 0.01, 0.13, 0]]
+    append(root, "cube", {"iteration": 3, "env_steps": 3000, "goals": goals}, file="goals.jsonl")
     (root / "old" / "rounds.mp4").write_bytes(VIDEO)
     (root / "old" / "curves.png").write_bytes(b"\x89PNG picture")
 

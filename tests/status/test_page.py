@@ -1,19 +1,21 @@
 """The web page in a real browser: its content, its updates, and that text is never read as markup."""
 
+import logging
 import re
+import shutil
 
 import imageio_ffmpeg
 import numpy as np
 import pytest
-from playwright.sync_api import Error
 
+from service.io.run_log import RunLog
 from service.registry.registry import Registry
 from service.status.server import StatusServer
 from service.store.disk_reader import DiskReader
 from service.store.models import ActorStatus
 from tests.status.browser import CHROMIUM, Visit, chromium
 from tests.status.conftest import serve
-from tests.status.runs import TOKEN, append, grid, publish, record, write_runs, write_status
+from tests.status.runs import TOKEN, VIDEO, WRONG, append, grid, publish, record, write_runs, write_status
 
 pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="no chromium on PATH; on Debian: apt-get install chromium")
 
@@ -52,12 +54,6 @@ def own(browser, tmp_path):
         visit.context.close()
 
 
-def num_points(visit, name, number):
-    """Wait until a curve has a number of points."""
-    d = f"document.querySelector('g.curve[data-name=\"{name}\"] path.raw')?.getAttribute('d')"
-    visit.wait(f"({d} ?? '').split(/[ML]/).length - 1 === {number}")
-
-
 # --- what it shows --------------------------------------------------------------------------------------------------
 
 
@@ -69,9 +65,10 @@ def test_nothing_goes_wrong_and_nothing_leaves_the_service(own):
         ("#/primitives", "Versions of panda-cube"),
     ):
         visit.go(place).page.get_by_role("table", name=table).wait_for()
-        visit.page.wait_for_load_state("networkidle") if place != "#/runs/cube" else num_points(
-            visit, "alice/valid_fraction", 3
-        )
+        if place == "#/runs/cube":
+            visit.points("alice/valid_fraction", 3)
+            visit.page.get_by_text("2 goals of the sample in 2 cells").wait_for()
+            visit.wait("document.querySelector('.space').dataset.cells === '2'")
     assert visit.complaints == []
     assert len(visit.asked) > 10
     assert [url for url in visit.asked if not url.startswith((f"{server.url}/", "about:blank"))] == []
@@ -98,69 +95,6 @@ def test_a_run(visit):
     assert tiles["Progress"].startswith(f"30.0{NBSP}%")
     assert f"about 14{NBSP}s to go" in tiles["Progress"]  # 7,000 env steps at 500 a second
     assert "6\n1 refused" in re.sub("\n+", "\n", tiles["Rollouts"])
-
-
-def test_curves(visit):
-    visit.go("#/runs/cube")
-    num_points(visit, "bob/success_rate", 3)
-    for name, values in {
-        "alice/valid_fraction": [0.5, 0.5, 0.5],
-        "alice/lifted_fraction": [0.25, 0.25, 0.25],
-        "bob/success_rate": [0.125, 0.25, 0.375],
-    }.items():
-        (points,) = visit.raw(name)
-        assert points == [pytest.approx((1000 * i, value), rel=0.002, abs=0.002) for i, value in enumerate(values, 1)]
-    assert visit.chart("Bob on Alice's goals").locator(".legend li").first.inner_text() == f"all 37.5{NBSP}%"
-    assert visit.chart("Bob on random goals").get_by_text("no values yet").count() == 1
-
-
-def test_a_missing_value_is_a_gap(own):
-    visit, home, _ = own
-    append(home / "runs", "cube", record(4, **{"bob/success_rate": None}), record(5))
-    visit.go("#/runs/cube")
-    num_points(visit, "bob/success_rate", 4)
-    before, after = visit.raw("bob/success_rate")
-    assert [round(steps) for steps, _ in before] == [1000, 2000, 3000]
-    assert after == [pytest.approx((5000, 0.625), rel=0.002)]
-
-
-def test_smooth_curves(own):
-    visit, home, _ = own
-    append(home / "runs", "cube", *(record(i, **{"alice/valid_fraction": i % 2}) for i in range(4, 201)))
-    visit.go("#/runs/cube")
-    num_points(visit, "alice/valid_fraction", 200)
-    # span 10 of 200 iterations keeps 9/11 of the average: between 0 and 1 it ends (2/11) / (1 + 9/11) = 0.1 around 1/2
-    smooth = visit.page.locator('g.curve[data-name="alice/valid_fraction"] path.smooth').get_attribute("d")
-    ends = [float(point.split()[1]) for point in smooth.split("L")[-2:]]
-    top, bottom = 8.0, 166.0  # of the plot, in pixels: 1 and 0
-    values = sorted((bottom - y) / (bottom - top) for y in ends)
-    assert values == pytest.approx([0.45, 0.55], abs=0.002)
-
-
-def test_the_keyboard_reads_curves(visit):
-    visit.go("#/runs/cube")
-    num_points(visit, "alice/valid_fraction", 3)
-    plot = visit.page.get_by_role("slider", name="Bob on Alice's goals")
-    plot.press("Home")
-    assert plot.get_attribute("aria-valuetext").startswith(f"1,000 env steps: all 12.5{NBSP}%, air \u2013")
-    plot.press("ArrowRight")
-    assert plot.get_attribute("aria-valuetext").startswith("2,000 env steps")
-    assert (
-        visit.chart("Alice's proposals").locator(".where").inner_text() == "at 2,000 env steps"
-    )  # they share a cursor
-    plot.press("Escape")
-    assert plot.get_attribute("aria-valuetext").startswith("3,000 env steps")
-    assert visit.chart("Alice's proposals").locator(".where").inner_text() == ""
-
-
-def test_pointing_reads_curves(visit):
-    visit.go("#/runs/cube")
-    num_points(visit, "alice/valid_fraction", 3)
-    box = visit.chart("Alice's proposals").locator(".plot").bounding_box()
-    visit.page.mouse.move(box["x"] + 52, box["y"] + 90)  # near the left end: the first point
-    assert visit.chart("Bob on Alice's goals").locator("output").first.inner_text() == f"12.5{NBSP}%"
-    visit.page.mouse.move(5, 5)
-    assert visit.chart("Bob on Alice's goals").locator("output").first.inner_text() == f"37.5{NBSP}%"
 
 
 def test_the_goal_map(visit):
@@ -213,6 +147,22 @@ def test_actors(visit):
     assert texts[2][7] == "killed"
 
 
+def test_log_commands_and_configuration(own):
+    visit, home, _ = own
+    run = home / "runs" / "cube"
+    (run / "config.yaml").write_text("name: panda-cube\nlearner: {bob: {target_kl: 0.03}}\n")
+    with RunLog(run):
+        logging.getLogger("service.runtime").warning("rollout actor 3 is gone (killed); another takes its place")
+    page = visit.go("#/runs/cube").page
+    page.locator(".log .warning").get_by_text("rollout actor 3 is gone (killed)").wait_for()
+    page.locator(".command").get_by_text(f"touch {run}/stop", exact=True).wait_for()
+    assert page.get_by_text("/v1/runs/cube/stop").count() == 1
+    page.get_by_label("Find a setting").fill("target_kl")
+    assert page.locator(".settings dt").all_inner_texts() == ["learner.bob.target_kl"]
+    write_status(home / "runs", "cube", state="interrupted")
+    page.locator(".command").get_by_text(f"tandem pretrain --resume --run-dir {run} --registry").wait_for()
+
+
 def test_versions(visit):
     page = visit.go("#/primitives").page
     rows = page.get_by_role("table", name="Versions of tiny").locator("tbody tr")
@@ -228,8 +178,10 @@ def test_versions(visit):
     assert visit.complaints == []
 
 
-def test_the_newest_video_plays(own):
+def test_the_newest_video_plays_and_older_ones(own):
     visit, home, _ = own
+    (home / "runs" / "old" / "recordings").mkdir()
+    (home / "runs" / "old" / "recordings" / "rounds-20260101T120000.mp4").write_bytes(VIDEO)
     path = str(home / "runs" / "old" / "rounds.mp4")
     writer = imageio_ffmpeg.write_frames(path, (64, 32), fps=25, codec="libx264", macro_block_size=2)
     writer.send(None)
@@ -241,6 +193,8 @@ def test_the_newest_video_plays(own):
     found = page.locator("video").evaluate("v => [v.videoWidth, v.videoHeight, v.duration]")
     assert found == [64, 32, pytest.approx(1.0, abs=0.1)]
     assert page.get_by_role("link", name="Curves").count() == 1
+    page.get_by_role("list", name="Recordings").get_by_role("button").last.click()
+    assert "rounds-20260101T120000.mp4" in page.locator("video").get_attribute("src")
     assert page.get_by_text("has no goal grid yet").count() == 1
 
 
@@ -250,10 +204,10 @@ def test_the_newest_video_plays(own):
 def test_a_run_is_updated_live(own):
     visit, home, _ = own
     page = visit.go("#/runs/cube").page
-    num_points(visit, "alice/valid_fraction", 3)
+    visit.points("alice/valid_fraction", 3)
     append(home / "runs", "cube", record(4, **{"alice/valid_fraction": 0.875}))
-    num_points(visit, "alice/valid_fraction", 4)
-    assert visit.raw("alice/valid_fraction")[0][3] == pytest.approx((4000, 0.875), rel=0.002)
+    visit.points("alice/valid_fraction", 4)
+    assert visit.points("alice/valid_fraction", 4)[3] == (4000, 0.875)
     write_status(home / "runs", "cube", state="failed", last_error="it broke", warnings=("no Redis",), iteration=4)
     page.get_by_text("it broke").wait_for()
     assert page.locator(".warning").inner_text() == "Warning: no Redis"
@@ -264,15 +218,15 @@ def test_a_run_is_updated_live(own):
 def test_a_run_that_was_resumed_from_an_earlier_iteration(own):
     visit, home, _ = own
     visit.go("#/runs/cube")
-    num_points(visit, "bob/success_rate", 3)
+    visit.points("bob/success_rate", 3)
     metrics = home / "runs" / "cube" / "metrics.jsonl"
     replaced = metrics.with_suffix(".new")
     replaced.write_bytes(metrics.read_bytes().splitlines(keepends=True)[0])
     replaced.replace(metrics)
-    num_points(visit, "bob/success_rate", 1)
+    visit.points("bob/success_rate", 1)
     append(home / "runs", "cube", record(2, **{"bob/success_rate": 0.75}))
-    num_points(visit, "bob/success_rate", 2)
-    assert visit.raw("bob/success_rate")[0][1] == pytest.approx((2000, 0.75), rel=0.002)
+    visit.points("bob/success_rate", 2)
+    assert visit.points("bob/success_rate", 2)[1] == (2000, 0.75)
 
 
 def test_the_list_of_runs_is_updated_live(own):
@@ -290,7 +244,7 @@ def test_the_list_of_runs_is_updated_live(own):
 def test_the_service_goes_away_and_comes_back(own):
     visit, home, server = own
     page = visit.go("#/runs/cube").page
-    num_points(visit, "alice/valid_fraction", 3)
+    visit.points("alice/valid_fraction", 3)
     banner = page.locator("#banner")
     assert banner.is_hidden()
     server.stop()
@@ -299,7 +253,7 @@ def test_the_service_goes_away_and_comes_back(own):
     assert page.locator("figure.chart").count() == 6  # what was known stays to be seen
     runs = home / "runs"
     with StatusServer(DiskReader(runs), Registry(home / "registry"), port=server.port, runs_dir=runs):
-        num_points(visit, "alice/valid_fraction", 4)
+        visit.points("alice/valid_fraction", 4)
         banner.wait_for(state="hidden")
 
 
@@ -313,6 +267,17 @@ def test_the_runs_go_away_and_come_back(own, place):
     (home / "elsewhere").rename(home / "runs")
     write_status(home / "runs", "cube", iteration=4)
     page.locator("#banner").wait_for(state="hidden")
+
+
+def test_a_run_is_deleted_while_it_is_looked_at(own):
+    visit, home, _ = own
+    page = visit.go("#/runs/cube").page
+    visit.points("alice/valid_fraction", 3)
+    shutil.rmtree(home / "runs" / "cube")
+    page.get_by_text("This run cannot be followed: No run 'cube' in").wait_for()
+    assert page.locator("figure.chart").count() == 6  # what was known stays to be seen
+    visit.go("#/compare/cube,old").page.get_by_text("no run 'cube' in").wait_for()
+    assert len(visit.points("bob/success_rate", 3, "old")) == 3  # the others are shown all the same
 
 
 # --- where one is ---------------------------------------------------------------------------------------------------
@@ -369,7 +334,7 @@ def test_nothing_yet(browser, tmp_path):
         page.get_by_text("tandem pretrain --config configs/pretrain/panda_cube.yaml").wait_for()
         write_status(tmp_path / "runs", "first")
         page.get_by_role("link", name="first").wait_for()
-        visit.go("#/primitives").page.get_by_text("The registry is empty.").wait_for()
+        visit.go("#/primitives").page.get_by_text("comes with tandem").wait_for()
         assert visit.complaints == []
         visit.context.close()
 
@@ -414,7 +379,7 @@ def test_a_phone_need_not_scroll_sideways(own, browser):
         page = visit.go(place).page
         page.get_by_role("table", name=table).wait_for()
         if place == "#/runs/cube":
-            num_points(visit, "alice/valid_fraction", 3)
+            visit.points("alice/valid_fraction", 3)
             page.locator("rect.cell").first.wait_for()
         assert (
             page.evaluate("[document.documentElement.scrollWidth, document.body.scrollWidth, innerWidth]") == [360] * 3
@@ -430,7 +395,7 @@ def test_light_and_dark(browser, server, scheme):
     visit = Visit(browser, server.url, color_scheme=scheme)
     page = visit.go("#/runs/cube").page
     page.get_by_role("table", name="Actors").wait_for()
-    num_points(visit, "alice/valid_fraction", 3)
+    visit.points("alice/valid_fraction", 3)
     luminance = page.evaluate(f"({LUMINANCE})(getComputedStyle(document.body).backgroundColor)")
     assert luminance > 0.8 if scheme == "light" else luminance < 0.05
     card = page.evaluate(f"({LUMINANCE})(getComputedStyle(document.querySelector('.card')).backgroundColor)")
@@ -441,28 +406,32 @@ def test_light_and_dark(browser, server, scheme):
         ".hint": "color",
         "td": "color",
         "td a": "color",
-        ".tick": "fill",
-        "g.c0 .smooth": "stroke",
-        "g.c1 .smooth": "stroke",
+        ".xtick text": "fill",
+        "li.c0 .swatch": "backgroundColor",
+        "li.c1 .swatch": "backgroundColor",
     }.items():
         script = f"({LUMINANCE})(getComputedStyle(document.querySelector('{what}')).{style})"
         low, high = sorted((card, page.evaluate(script) if page.locator(what).count() else 1 - round(card)))
         contrasts[what] = (high + 0.05) / (low + 0.05)
     # WCAG 2: 4.5 for text, 3 for what is drawn
-    assert {what: x for what, x in contrasts.items() if x < (3.0 if "smooth" in what else 4.5)} == {}
+    assert {what: x for what, x in contrasts.items() if x < (3.0 if "swatch" in what else 4.5)} == {}
     visit.context.close()
 
 
-def test_a_public_service_with_the_token_as_password(browser, tmp_path):
+def test_a_public_service_asks_for_its_token(browser, tmp_path):
     write_runs(tmp_path / "runs")
     with serve(tmp_path, host="0.0.0.0") as server:
-        stranger = Visit(browser, server.url)
-        with pytest.raises(Error, match="AUTH"):  # a window would ask for a password here
-            stranger.page.goto(server.url)
-        stranger.context.close()
-        visit = Visit(browser, server.url, http_credentials={"username": "any", "password": TOKEN})
-        visit.go("#/runs/cube")
-        num_points(visit, "alice/valid_fraction", 3)
-        append(tmp_path / "runs", "cube", record(4))
-        num_points(visit, "alice/valid_fraction", 4)
+        visit = Visit(browser, server.url)
+        page = visit.go("#/runs/cube").page
+        page.get_by_label("Token").fill(WRONG)
+        page.get_by_role("button", name="Log in").click()
+        page.get_by_text("wrong token: enter the one").wait_for()
+        page.get_by_label("Token").fill(TOKEN)
+        page.keyboard.press("Enter")
+        visit.points("alice/valid_fraction", 3)
+        append(tmp_path / "runs", "cube", record(4))  # also the stream of events, which sends no header
+        visit.points("alice/valid_fraction", 4)
+        assert TOKEN not in page.evaluate("document.cookie + JSON.stringify({...localStorage, ...sessionStorage})")
+        visit.go("#/").page.reload()
+        page.get_by_role("link", name="cube", exact=True).wait_for()
         visit.context.close()

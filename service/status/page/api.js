@@ -4,7 +4,7 @@
 import { setText } from "./dom.js";
 
 const ROOT = new URL("../", import.meta.url);
-const TIMEOUT_MS = 10_000;
+const TIMEOUT_MS = 20_000;
 const AWAY = new Set([502, 503, 504]);
 let serverAheadMs = 0;
 const troubles = new Map();
@@ -36,7 +36,7 @@ export async function get(parts, query = [], signal = undefined) {
   }
   const problem = await response.json().catch(() => ({}));
   const detail = problem.detail ?? `the service answers ${response.status} ${response.statusText}`;
-  if (response.status === 401) troubled(about, `${sentence(detail)} Reload the page to enter it.`);
+  if (response.status === 401) connection.dispatchEvent(new Event("locked"));
   else if (AWAY.has(response.status)) troubled(about, sentence(detail));
   else answered(about);
   throw new ApiError(response.status, detail);
@@ -86,7 +86,7 @@ function noteClock(response) {
   if (Number.isFinite(there)) serverAheadMs = Math.abs(there - Date.now()) > 2000 ? there - Date.now() : 0;
 }
 
-/** Fires "recovered" when the service answers again. */
+/** Fires "recovered" when the service answers again, "locked" when it wants its token, "entered" when it has it. */
 export const connection = new EventTarget();
 
 /** Record an answer; ``about`` names the part of the API it came from. */
@@ -99,7 +99,7 @@ export function answered(about) {
 
 /** Record that there was no answer. */
 function silent() {
-  troubles.set("network", `No answer from the service since ${answeredAt.toLocaleTimeString()}, trying again \u2026`);
+  troubles.set("network", `No answer from the service since ${answeredAt.toLocaleTimeString()}, trying again \u2026 Is it still running at ${ROOT.host}? It is started with: tandem serve`);
   show();
 }
 

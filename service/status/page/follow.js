@@ -1,10 +1,8 @@
-// Follow a run: first its history, then new events. After any failure it starts again with the history.
+// Follow a run: its state, and word of every new iteration. After any failure it starts again.
 
 import { address, answered, connection, get, troubled } from "./api.js";
 
 const ACTIVE = new Set(["starting", "running"]);
-const MAX_POINTS = 600;
-const MAX_RECORDS = 600;
 const AGAIN_MS = 1000;
 const RETRY_MS = 2000;
 const ENDED_MS = 5000;
@@ -14,23 +12,21 @@ export function isActive(run) {
   return ACTIVE.has(run.state);
 }
 
-/** Follow a run until the view is left. ``listener`` has status(run), history(history), record(record), failed(error). */
-export async function follow(runId, names, listener, signal) {
+/** Follow a run until the view is left. ``listener`` has status(run), curves() and failed(error). */
+export async function follow(runId, listener, signal) {
   while (!signal.aborted) {
     await visible(signal);
-    await sleep(await once(runId, names, listener, signal), signal);
+    await sleep(await once(runId, listener, signal), signal);
   }
 }
 
 /** Make one attempt; returns the milliseconds until the next. */
-async function once(runId, names, listener, signal) {
+async function once(runId, listener, signal) {
   try {
     const run = await get(["v1", "runs", runId], [], signal);
     listener.status(run);
-    const query = [...names.map((name) => ["names", name]), ["max_points", MAX_POINTS]];
-    const history = await get(["v1", "runs", runId, "metrics"], query, signal);
-    listener.history(history);
-    await (isActive(run) ? listen(runId, names, history, listener, signal) : untilResumed(run, listener, signal));
+    listener.curves();
+    await (isActive(run) ? listen(run, listener, signal) : untilResumed(run, listener, signal));
     return AGAIN_MS;
   } catch (error) {
     if (signal.aborted) return 0;
@@ -50,11 +46,10 @@ async function untilResumed(run, listener, signal) {
   }
 }
 
-/** Resolve when the stream has ended, for any reason; the history is then loaded again. */
-function listen(runId, names, history, listener, signal) {
-  const query = new URLSearchParams([...names.map((name) => ["names", name]), ["after_iteration", history.last_iteration]]);
-  const source = new EventSource(`${address("v1", "runs", runId, "metrics", "stream")}?${query}`);
-  let numRecords = 0;
+/** Resolve when the stream has ended, for any reason; the run is then looked at again. */
+function listen(run, listener, signal) {
+  const query = new URLSearchParams([["names", "iteration"], ["after_iteration", run.iteration]]);
+  const source = new EventSource(`${address("v1", "runs", run.run_id, "metrics", "stream")}?${query}`);
   return new Promise((resolve) => {
     const stopped = new AbortController();
     const done = () => {
@@ -63,13 +58,12 @@ function listen(runId, names, history, listener, signal) {
       resolve();
     };
     const on = (kind, handler) => source.addEventListener(kind, (event) => handler(JSON.parse(event.data)));
-    on("metrics", (record) => {
-      listener.record(record);
+    on("metrics", () => {
+      listener.curves();
       answered("v1/runs");
-      if (++numRecords > MAX_RECORDS) done(); // the history has the same in fewer points
     });
-    on("status", (run) => {
-      listener.status(run);
+    on("status", (found) => {
+      listener.status(found);
       answered("v1/runs");
     });
     on("unavailable", ({ detail }) => troubled("v1/runs", `The runs cannot be read: ${detail}.`));

@@ -1,8 +1,9 @@
-// Show the view of the address: #/ has all runs, #/runs/ID one run, #/primitives the registry.
+// Show the view of the address: #/ has all runs, #/runs/ID one run, #/compare/ID,ID several, #/primitives the registry.
 
+import { connection } from "./api.js";
 import { el, note } from "./dom.js";
-import { primitivesView } from "./primitives.js";
-import { runView } from "./run.js";
+import { library } from "./library.js";
+import { loginView } from "./login.js";
 import { runsView } from "./runs.js";
 import { startAges } from "./widgets.js";
 
@@ -16,10 +17,30 @@ function show() {
   const [page, id] = parts;
   document.title = page === "runs" && id ? `${id} \u00b7 Tandem` : "Tandem";
   markCurrent(page);
-  if (page === "runs" && id && parts.length === 2) runView(main, id, left.signal);
-  else if (page === "primitives" && parts.length === 1) primitivesView(main, left.signal);
+  const { signal } = left;
+  if (page === "runs" && id && parts.length === 2) load("./run.js", ({ runView }) => runView(main, id, signal), true);
+  else if (page === "compare" && id && parts.length === 2) load("./compare.js", ({ compareView }) => compareView(main, ids(id), signal), true);
+  else if (page === "primitives" && parts.length === 1) load("./primitives.js", ({ primitivesView }) => primitivesView(main, signal));
   else if (page === "" || (page === "runs" && !id)) runsView(main, left.signal);
   else main.replaceChildren(el("h1", {}, "Nothing here"), note("There is no page at this address. ", el("a", { href: "#/" }, "All runs")));
+}
+
+/** Load a view's modules, and the library of curves beside them if it has any, and show it. */
+async function load(module, view, curves = false) {
+  const { signal } = left;
+  if (curves) library().catch(() => undefined); // the view says so
+  main.replaceChildren(note("Loading \u2026"));
+  try {
+    const loaded = await import(module);
+    if (!signal.aborted) await view(loaded);
+  } catch (error) {
+    if (!signal.aborted) main.replaceChildren(note(`This view cannot be shown: ${error.message ?? error}`));
+  }
+}
+
+/** The ids in an address: "a,b" without those that come again. */
+function ids(text) {
+  return [...new Set(text.split(",").filter(Boolean))];
 }
 
 function markCurrent(page) {
@@ -45,6 +66,12 @@ document.querySelector("a.skip").addEventListener("click", (event) => {
 addEventListener("hashchange", () => {
   scrollTo(0, 0);
   show();
+});
+connection.addEventListener("locked", () => {
+  if (document.querySelector("form.login")) return;
+  left.abort();
+  document.title = "Tandem";
+  loginView(main, show);
 });
 startAges();
 show();

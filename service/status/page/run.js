@@ -1,32 +1,41 @@
-// The page of one run: its state and numbers, curves, goal map, newest video, actors and primitives.
+// The page of one run: its state and numbers, curves, goals, recordings, actors, log, configuration and primitives.
 
-import { address, ApiError, get, sentence } from "./api.js";
-import { NAMES, Panels } from "./curves.js";
+import { ApiError, get, sentence } from "./api.js";
+import { Board } from "./board.js";
+import { Commands } from "./commands.js";
+import { ConfigList } from "./config.js";
 import { el, note, section, setText } from "./dom.js";
 import { every, follow, isActive } from "./follow.js";
-import { bytes, count, percent, quantity } from "./format.js";
+import { count, percent, quantity } from "./format.js";
 import { GoalMap } from "./goals.js";
+import { Log } from "./log.js";
+import { Media } from "./media.js";
+import { OVERVIEW } from "./metrics.js";
 import { Versions } from "./primitives.js";
+import { GoalSpace } from "./space.js";
 import { age, progressBar, share, stateChip, Table, timeLeft } from "./widgets.js";
 
 const GOALS_MS = 5000;
 const FILES_MS = 15_000;
+const CURVES_MS = 2000;
+const BOB = "bob/success_rate";
 const ORDER = ["lost", "starting", "alive"];
 
 /** Show a run until ``signal`` aborts. */
 export function runView(root, runId, signal) {
   const page = new RunPage(root, runId, signal);
-  follow(runId, NAMES, page, signal);
+  follow(runId, page, signal);
 }
 
 class RunPage {
   constructor(root, runId, signal) {
     Object.assign(this, { root, runId, signal, begun: false });
     this.summary = new Summary(runId);
-    this.panels = new Panels(signal);
-    this.goals = new GoalMap();
+    this.board = new Board([{ id: runId, label: runId, study: null }], OVERVIEW, signal);
+    [this.goals, this.space] = [new GoalMap(), new GoalSpace(signal)];
     this.actors = new ActorTable();
     this.media = new Media(runId);
+    [this.log, this.config, this.commands] = [new Log(), new ConfigList(), new Commands()];
     root.replaceChildren(this.heading(), note("Asking \u2026"));
   }
 
@@ -37,59 +46,78 @@ class RunPage {
   /** Put the parts together, once the run is known to exist. */
   begin(run) {
     this.begun = true;
-    const [curves, map] = [section("Curves", "wide"), section("Goal map", "wide")];
-    const [actors, video] = [section("Actors"), section("Newest video")];
+    const parts = {
+      curves: section("Curves", "wide"), space: section("Goals over the run", "wide"), map: section("Goal map", "wide"),
+      media: section("Recordings"), actors: section("Actors"), log: section("Log"), commands: section("Commands"), config: section("Configuration"),
+    };
     this.primitives = new Versions(run.name, `Primitives ${run.name}`);
-    curves.body.append(this.panels.root);
-    this.actorsBody = actors.body;
-    video.body.append(this.media.root);
-    const parts = [curves, map, video, actors, this.primitives].map((part) => part.root);
-    this.root.replaceChildren(this.summary.root, ...parts);
-    this.ask(map.body, video.body);
+    parts.curves.body.append(this.board.root);
+    this.actorsBody = parts.actors.body;
+    const bodies = Object.fromEntries(Object.entries(parts).map(([name, part]) => [name, part.body]));
+    this.root.replaceChildren(this.summary.root, ...[...Object.values(parts), this.primitives].map((part) => part.root));
+    this.ask(bodies);
   }
 
-  ask(mapBody, videoBody) {
+  ask(bodies) {
     const { signal, runId } = this;
-    const part = (name) => get(["v1", "runs", runId, name], [], signal);
-    every(GOALS_MS, signal, () => shown(mapBody, this.goals, () => part("goals")));
-    every(FILES_MS, signal, () => shown(videoBody, this.media, () => part("files")));
+    const part = (...names) => get(["v1", "runs", runId, ...names], [], signal);
+    const keep = (milliseconds, name, shown, ...path) => every(milliseconds, signal, () => show(bodies[name], shown, () => part(...path)));
+    keep(GOALS_MS, "map", this.goals, "goals");
+    keep(FILES_MS, "space", this.space, "goals", "history");
+    keep(FILES_MS, "media", this.media, "files");
+    keep(GOALS_MS, "log", this.log, "log");
     every(FILES_MS, signal, () => this.primitives.refresh(signal));
+    every(FILES_MS, signal, async () => {
+      this.setup = await part("setup");
+      await show(bodies.config, this.config, () => this.setup);
+      this.commands.update(this.run, this.setup);
+      if (!bodies.commands.firstChild) bodies.commands.append(this.commands.root);
+    });
   }
 
   status(run) {
+    this.run = run;
     if (!this.begun) this.begin(run);
     this.summary.update(run);
     this.actors.update(run);
+    if (this.setup) this.commands.update(run, this.setup);
     const there = run.actors.length ? this.actors.root : note("No actors of this run are known.");
     if (this.actorsBody.firstChild !== there) this.actorsBody.replaceChildren(there);
   }
 
-  history(history) {
-    this.summary.trouble(null);
-    this.panels.load(history);
-    this.success();
-  }
-
-  record(record) {
-    this.panels.append(record);
-    this.success();
-  }
-
-  success() {
-    this.summary.success(this.panels.series.latest("bob/success_rate"));
+  /** Ask for the curves, now or soon: once, however many iterations came meanwhile. */
+  async curves() {
+    if (this.asking) {
+      this.again = true;
+      return;
+    }
+    this.asking = true;
+    try {
+      do {
+        this.again = false;
+        await this.board.refresh();
+        this.summary.trouble(null);
+        this.summary.success(this.board.data.get(this.runId)?.curves[BOB]?.mean.findLast((value) => value !== null));
+        await new Promise((resolve) => setTimeout(resolve, CURVES_MS));
+      } while (this.again && !this.signal.aborted);
+    } catch (error) {
+      this.failed(error);
+    } finally {
+      this.asking = false;
+    }
   }
 
   /** Say that the run does not exist or cannot be read; the banner says that the service does not answer. */
   failed(error) {
     if (!(error instanceof ApiError)) console.warn(error);
-    if (!error.status || (this.begun && error.status === 503)) return;
+    if (!error.status || error.status === 401 || (this.begun && error.status === 503)) return;
     if (this.begun) this.summary.trouble(sentence(error.message));
     else this.root.replaceChildren(this.heading(), note(`${sentence(error.message)} `, el("a", { href: "#/" }, "All runs")));
   }
 }
 
 /** Fill a part's body, or say why it is empty. */
-async function shown(body, part, find) {
+async function show(body, part, find) {
   try {
     part.update(await find());
     if (!body.contains(part.root)) body.replaceChildren(part.root);
@@ -195,41 +223,5 @@ class ActorTable {
     const byName = (a, b) => a.name.localeCompare(b.name, "en", { numeric: true });
     const actors = run.actors.map((actor) => (isActive(run) ? actor : { ...actor, state: "ended" }));
     this.table.update(actors.sort((a, b) => ORDER.indexOf(a.state) - ORDER.indexOf(b.state) || byName(a, b)));
-  }
-}
-
-/** The newest video and the pictures, from RunFiles; a video keeps playing until there is a newer one. */
-class Media {
-  constructor(runId) {
-    this.runId = runId;
-    this.shown = null;
-    this.root = el("div", { class: "media" });
-  }
-
-  update({ files }) {
-    const key = JSON.stringify(files);
-    if (key === this.shown) return;
-    this.shown = key;
-    const isVideo = (file) => file.media_type.startsWith("video/");
-    const videos = files.filter(isVideo).sort((a, b) => Date.parse(b.modified) - Date.parse(a.modified));
-    const pictures = files.filter((file) => !isVideo(file));
-    const video = videos.length ? this.video(videos[0]) : note("No video yet: a run records a few rounds at its end.");
-    this.root.replaceChildren(video, el("ul", { class: "pictures" }, ...pictures.map((file) => this.picture(file))));
-  }
-
-  video(file) {
-    const player = el("video", { controls: true, preload: "metadata", muted: true, loop: true, playsinline: true, src: `${this.url(file)}#t=0.1`, "aria-label": file.title });
-    const words = [`${file.title}, ${bytes(file.num_bytes)}, `, age(file.modified), ". "];
-    return el("figure", { class: "recording" }, player, el("figcaption", {}, ...words, el("a", { href: this.url(file), download: file.name }, "Download")));
-  }
-
-  picture(file) {
-    const image = el("img", { src: this.url(file), alt: "", loading: "lazy", decoding: "async" });
-    return el("li", {}, el("a", { href: this.url(file) }, image, file.title), ` ${bytes(file.num_bytes)}`);
-  }
-
-  /** The URL with the file's time, so that a browser does not show an older file from its cache. */
-  url(file) {
-    return `${address("v1", "runs", this.runId, "files", file.name)}?modified=${encodeURIComponent(file.modified)}`;
   }
 }

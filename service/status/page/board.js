@@ -1,0 +1,209 @@
+// All curves of one run or of several: which panels there are, their data, and what they share: axis, smoothing, zoom, cursor.
+
+import { address, get } from "./api.js";
+import { el, note, setText } from "./dom.js";
+import { counted } from "./format.js";
+import { library, onTheme } from "./library.js";
+import { grouped, panelsOf } from "./metrics.js";
+import { Panel, placeText } from "./panel.js";
+import { SPANS, usualPlace } from "./smoothing.js";
+
+const MAX_POINTS = 1000;
+const MAX_NAMES = 60;
+const AXES = [["env_steps", "env steps"], ["iteration", "iterations"], ["wall_s", "hours of learning"]];
+const HOUR_S = 3600;
+let boards = 0;
+
+export class Board {
+  /** ``runs`` are {id, label, study}; ``panels`` those that are always there; ``banded``: whether seeds may be a band. */
+  constructor(runs, panels, signal) {
+    Object.assign(this, { runs, signal, data: new Map(), names: [], cursor: null, range: null });
+    Object.assign(this, { axis: "env_steps", place: null, log: false, banded: false, pending: false, asked: 0 });
+    this.number = ++boards;
+    this.panels = panels.map((spec) => new Panel(spec, this));
+    this.groups = el("div", { class: "groups" });
+    this.opened = new Map();
+    this.trouble = el("p", { class: "note", role: "status" });
+    this.overview = el("div", { class: "charts" }, ...this.panels.map((panel) => panel.root));
+    this.root = el("div", { class: "board" }, this.controls(), this.trouble, this.overview, this.groups);
+    library().catch((error) => this.fail(error));
+    onTheme(() => this.draw(), signal);
+    signal.addEventListener("abort", () => this.shown().forEach((panel) => panel.close()));
+  }
+
+  controls() {
+    const axis = el("select", {}, ...AXES.map(([value, text]) => el("option", { value }, text)));
+    axis.addEventListener("change", () => {
+      Object.assign(this, { axis: axis.value, range: null, cursor: null });
+      this.refresh();
+    });
+    this.slider = el("input", { type: "range", min: 0, max: SPANS.length - 1, step: 1, value: 0 });
+    this.slider.addEventListener("input", () => {
+      this.place = Number(this.slider.value);
+      this.draw();
+    });
+    this.spanText = el("output", {});
+    const log = this.box("logarithmic", (on) => (this.log = on));
+    const studies = this.runs.map((run) => run.study).filter(Boolean);
+    const band = studies.length > new Set(studies).size ? this.box("seeds as a band", (on) => (this.banded = on)) : null;
+    this.whole = el("button", { type: "button", hidden: true }, "Whole run");
+    this.whole.addEventListener("click", () => this.zoom(null));
+    this.filter = el("input", { type: "search", placeholder: "Find a metric", "aria-label": "Find a metric" });
+    this.filter.addEventListener("input", () => this.list());
+    return el(
+      "div",
+      { class: "controls", role: "group", "aria-label": "How curves are shown" },
+      el("label", {}, "over ", axis), el("label", {}, "smooth ", this.slider, " ", this.spanText), log, band, this.whole, this.filter,
+    );
+  }
+
+  box(text, changed) {
+    const input = el("input", { type: "checkbox" });
+    input.addEventListener("change", () => {
+      changed(input.checked);
+      this.draw();
+    });
+    return el("label", {}, input, ` ${text}`);
+  }
+
+  /** How many iterations a smooth curve is averaged over. */
+  get span() {
+    return SPANS[this.place ?? this.usual ?? 0];
+  }
+
+  /** Panels that are to be seen. */
+  shown() {
+    const open = [...this.opened.values()].filter(({ details }) => details.open);
+    return [...this.panels, ...open.flatMap(({ panels }) => panels)];
+  }
+
+  /** Ask for the curves of all panels that are to be seen, and draw them. */
+  async refresh() {
+    const asked = ++this.asked;
+    const names = [...new Set(this.shown().flatMap((panel) => panel.names))];
+    const parts = [];
+    for (let i = 0; i < names.length; i += MAX_NAMES) parts.push(names.slice(i, i + MAX_NAMES));
+    const answers = await Promise.all(parts.map((part) => this.ask(part)));
+    if (asked !== this.asked) return; // something else was asked for meanwhile
+    this.data = new Map();
+    for (const { runs } of answers) {
+      for (const run of runs) {
+        const known = this.data.get(run.run_id);
+        this.data.set(run.run_id, known ? { ...run, curves: { ...known.curves, ...run.curves } } : run);
+      }
+    }
+    this.learn();
+    const stamp = JSON.stringify([this.axis, this.range, names, [...this.data.values()].map((run) => [run.run_id, run.last_iteration, run.x.length, run.problem])]);
+    if (stamp === this.stamp) return; // ended runs are asked for again and again
+    this.stamp = stamp;
+    await this.draw();
+  }
+
+  ask(names) {
+    const [start, end] = this.range ?? [null, null];
+    const unit = this.axis === "wall_s" ? HOUR_S : 1;
+    const bounds = this.range ? [["start", start * unit], ["end", end * unit]] : [];
+    const query = [...this.runs.map((run) => ["runs", run.id]), ...names.map((name) => ["names", name])];
+    return get(["v1", "series"], [...query, ["axis", this.axis], ["max_points", MAX_POINTS], ...bounds], this.signal);
+  }
+
+  /** Take over what the answers say beside curves: names of metrics, and runs that cannot be read. */
+  learn() {
+    const found = [...this.data.values()];
+    const names = [...new Set(found.flatMap((run) => run.names))].sort();
+    if (names.join() !== this.names.join()) {
+      this.names = names;
+      this.list();
+    }
+    if (!this.range) this.usual = usualPlace(Math.max(0, ...found.map((run) => run.num_iterations)));
+    setText(this.trouble, found.map((run) => run.problem).filter(Boolean).join("; "));
+    this.trouble.hidden = !this.trouble.textContent;
+  }
+
+  /** A folded part for each group of metrics, with a panel for each of them once it is opened. */
+  list() {
+    const wanted = this.filter.value.trim().toLowerCase();
+    const groups = grouped(this.names.filter((name) => name.toLowerCase().includes(wanted)));
+    const parts = [...groups].map(([group, names]) => this.part(group, names, Boolean(wanted)));
+    for (const group of this.opened.keys()) if (!groups.has(group)) this.opened.delete(group);
+    this.groups.replaceChildren(...parts, ...(wanted && !parts.length ? [note("No metric has this in its name.")] : []));
+    if (wanted) this.refresh().catch((error) => this.fail(error));
+  }
+
+  part(group, names, open) {
+    const known = this.opened.get(group);
+    if (known && known.names === names.join()) {
+      if (open) known.details.open = true;
+      return known.details;
+    }
+    const body = el("div", { class: "charts" });
+    const details = el("details", { open: open || known?.details.open }, el("summary", {}, group, " ", el("small", {}, counted(names.length, "metric"))), body);
+    const panels = panelsOf(names).map((spec) => new Panel(spec, this));
+    body.append(...panels.map((panel) => panel.root));
+    details.addEventListener("toggle", () => details.open && this.refresh().catch((error) => this.fail(error)));
+    this.opened.set(group, { details, panels, names: names.join() });
+    return details;
+  }
+
+  /** Show a part of the axis, asked for anew; null for all of it. */
+  zoom(range) {
+    this.range = range;
+    this.whole.hidden = range === null;
+    this.refresh().catch((error) => this.fail(error));
+  }
+
+  /** The range of the axis that panels show: the same in all of them. */
+  shownRange() {
+    if (this.range) return this.range;
+    const ends = [...this.data.values()].filter((run) => run.x.length && !this.hides(run.run_id)).map((run) => run.x.at(-1));
+    const last = Math.max(0, ...ends) / (this.axis === "wall_s" ? HOUR_S : 1);
+    return [0, last > 0 ? 1.01 * last : 1];
+  }
+
+  hides(id) {
+    return this.runs.find((run) => run.id === id)?.hidden;
+  }
+
+  /** Places on the axis as they are shown. */
+  scaled(x) {
+    return this.axis === "wall_s" ? x.map((value) => value / HOUR_S) : x;
+  }
+
+  placeText(value) {
+    return placeText(this.axis, value);
+  }
+
+  /** Show the values at one place in every panel; the newest for null. */
+  point(place) {
+    this.cursor = place;
+    if (this.pointing) return;
+    this.pointing = requestAnimationFrame(() => {
+      this.pointing = null;
+      this.shown().forEach((panel) => panel.point(this.cursor));
+    });
+  }
+
+  async draw() {
+    this.slider.value = this.place ?? this.usual ?? 0;
+    setText(this.spanText, this.span > 1 ? `${this.span} iterations` : "off");
+    if (!this.data.size) return;
+    try {
+      for (const panel of this.shown()) await panel.draw();
+    } catch (error) {
+      this.fail(error);
+    }
+    requestAnimationFrame(() => performance.mark("curves"));
+  }
+
+  /** The URL of all values of some metrics. */
+  tableUrl(names) {
+    const query = [...this.runs.map((run) => ["runs", run.id]), ...names.map((name) => ["names", name])];
+    return `${address("v1", "series.csv")}?${new URLSearchParams(query)}`;
+  }
+
+  fail(error) {
+    if (this.signal.aborted) return;
+    setText(this.trouble, error.message);
+    this.trouble.hidden = false;
+  }
+}

@@ -1,0 +1,50 @@
+// The commands that stop a run or go on with it, ready to copy: the page itself changes nothing.
+
+import { address } from "./api.js";
+import { el, note } from "./dom.js";
+import { isActive } from "./follow.js";
+
+export class Commands {
+  constructor() {
+    this.root = el("div", { class: "commands" });
+  }
+
+  update(run, setup) {
+    const key = JSON.stringify([isActive(run), setup]);
+    if (key === this.shown) return;
+    this.shown = key;
+    const parts = isActive(run) ? this.stop(run, setup) : this.resume(setup);
+    const where = setup.directory ? [note("Its directory is ", el("code", {}, setup.directory), ".")] : [];
+    this.root.replaceChildren(...parts, ...where);
+  }
+
+  stop(run, setup) {
+    const url = address("v1", "runs", run.run_id, "stop");
+    const remote = `curl -X POST -H "Authorization: Bearer $TANDEM_TOKEN" ${url}`;
+    return [
+      ...(setup.stop_command ? [command("Stop it after this iteration, saved, on its machine", setup.stop_command)] : []),
+      command("The same from anywhere, if this service has a token", remote),
+    ];
+  }
+
+  resume(setup) {
+    if (!setup.resume_command) return [note("Its directory is on another machine; go on with it there.")];
+    return [command("Go on with it, from its last checkpoint", setup.resume_command)];
+  }
+}
+
+/** A command with a button that copies it. */
+export function command(what, text) {
+  const button = el("button", { type: "button", "aria-label": `Copy: ${what}` }, "Copy");
+  button.addEventListener("click", async () => {
+    try {
+      await navigator.clipboard.writeText(text);
+      button.textContent = "Copied";
+    } catch {
+      getSelection().selectAllChildren(button.previousSibling); // without https, a browser lets nobody copy
+      button.textContent = "Selected";
+    }
+    setTimeout(() => (button.textContent = "Copy"), 2000);
+  });
+  return el("p", { class: "command" }, el("span", { class: "hint" }, what), el("code", {}, text), button);
+}

@@ -1,0 +1,57 @@
+// Which metrics there are panels for, and how their numbers are written.
+
+import { percent, quantity } from "./format.js";
+
+/** The panels of a run that are always there: a few curves each. */
+export const OVERVIEW = [
+  { title: "Alice's proposals", hint: "valid stays high, lifted grows", curves: [["alice/valid_fraction", "valid"], ["alice/lifted_fraction", "lifted"]] },
+  {
+    title: "Bob on Alice's goals",
+    hint: "stays high while the goals get harder",
+    curves: [["bob/success_rate", "all"], ["bob/success_rate_air", "air"], ["bob/success_rate_table", "table"]],
+  },
+  {
+    title: "Bob on random goals",
+    hint: "success at the last step of an evaluation; grows",
+    curves: [["evaluation/mixed_success_last", "mixed"], ["evaluation/air_success_last", "air"], ["evaluation/table_success_last", "table"]],
+  },
+  { title: "Goals", hint: "grow while Alice proposes harder goals", curves: [["alice/goal_distance_m", "distance"], ["alice/goal_height_m", "height"]] },
+  { title: "Throughput", hint: "env steps per second", curves: [["time/env_steps_per_s", "env steps/s"]] },
+  { title: "Policy lag", hint: "versions between acting and learning", curves: [["learner/policy_lag", "versions"]] },
+];
+
+/** The metrics of several runs that are always there: one a panel. */
+export const COMPARED = [
+  ["bob/success_rate", "Bob on Alice's goals"],
+  ["bob/success_rate_air", "Bob on her goals in the air"],
+  ["evaluation/mixed_success_last", "Bob on random goals"],
+  ["alice/lifted_fraction", "Alice lifts"],
+  ["alice/goal_height_m", "Height of goals"],
+  ["time/env_steps_per_s", "Throughput"],
+].map(([name, title]) => ({ title, hint: name, curves: [[name, title]] }));
+
+/** One panel for each metric of a group. */
+export function panelsOf(names) {
+  return names.map((name) => ({ title: name.split("/").slice(1).join("/") || name, hint: "", curves: [[name, name]] }));
+}
+
+/** Metrics by their prefix: "learner/bob_kl" belongs to "learner". */
+export function grouped(names) {
+  const groups = new Map();
+  for (const name of names) {
+    const group = name.includes("/") ? name.split("/")[0] : "other";
+    groups.set(group, [...(groups.get(group) ?? []), name]);
+  }
+  return groups;
+}
+
+/** Whether a metric is a share of a whole, from 0 to 1. */
+export function isFraction(name) {
+  return /(fraction|success_rate|success_last|success_ever|success_rate_\w+|share_\d+)(_[a-z]+)?$/.test(name);
+}
+
+/** A metric's value as text. */
+export function written(name, value) {
+  if (isFraction(name)) return percent(value);
+  return quantity(value, /_m$/.test(name) ? "m" : /_s$/.test(name) && !/per_s$/.test(name) ? "s" : "");
+}

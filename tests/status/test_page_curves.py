@@ -1,0 +1,167 @@
+"""The curves of the page in a real browser: one run's, and those of several over one another."""
+
+import csv
+
+import pytest
+
+from service.registry.registry import Registry
+from tests.status.browser import CHROMIUM, Visit, chromium
+from tests.status.conftest import serve
+from tests.status.runs import append, publish, record, write_runs, write_status
+
+pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="no chromium on PATH; on Debian: apt-get install chromium")
+
+NBSP = "\u00a0"
+LONG = 3000
+
+
+@pytest.fixture(scope="module")
+def browser():
+    with chromium() as browser:
+        yield browser
+
+
+@pytest.fixture(scope="module")
+def home(tmp_path_factory):
+    """Beside "cube" and "old": "long" with one record that sticks out, and a study of two seeds."""
+    home = tmp_path_factory.mktemp("curves")
+    runs = home / "runs"
+    write_runs(runs)
+    publish(Registry(home / "registry"), "panda-cube")
+    write_status(runs, "long", state="finished")
+    values = {"bob/success_rate": 0.5}
+    append(runs, "long", *(record(i, **values, **{"learner/kl": 9.0 if i == 1234 else 0.01}) for i in range(1, LONG)))
+    (runs / "night").mkdir()
+    (runs / "night" / "study.yaml").write_text("name: night\n")
+    for seed in (0, 1):
+        write_status(runs / "night", f"seed-{seed}", state="finished")
+        append(
+            runs / "night", f"seed-{seed}", *(record(i, **{"bob/success_rate": 0.25 + seed / 2}) for i in range(1, 4))
+        )
+        (runs / "night" / f"seed-{seed}" / "config.yaml").write_text(f"seed: {seed}\nname: panda-cube\n")
+    return home
+
+
+@pytest.fixture(scope="module")
+def server(home):
+    with serve(home) as server:
+        yield server
+
+
+@pytest.fixture
+def visit(browser, server):
+    visit = Visit(browser, server.url)
+    yield visit
+    visit.context.close()
+
+
+def test_curves_and_what_is_read_from_them(visit):
+    page = visit.go("#/runs/cube").page
+    assert visit.points("bob/success_rate", 3) == [(1000, 0.125), (2000, 0.25), (3000, 0.375)]
+    assert visit.points("alice/lifted_fraction", 3) == [(1000, 0.25), (2000, 0.25), (3000, 0.25)]
+    legend = visit.chart("Bob on Alice's goals").locator(".legend li").first
+    assert legend.inner_text() == f"all 37.5{NBSP}%"
+    assert visit.chart("Bob on random goals").get_by_text("no values yet").is_visible()
+    # the keyboard, and a cursor that all panels share
+    plot = page.get_by_role("slider", name="Bob on Alice's goals")
+    plot.press("Home")
+    visit.wait("document.querySelectorAll('.chart .where')[0].textContent === 'at 1,000 env steps'")
+    assert plot.get_attribute("aria-valuetext") == f"1,000 env steps: all 12.5{NBSP}%"
+    plot.press("ArrowRight")
+    visit.wait("document.querySelectorAll('.chart .where')[0].textContent === 'at 2,000 env steps'")
+    plot.press("Escape")
+    visit.wait("document.querySelectorAll('.chart .where')[0].textContent === ''")
+    # the pointer
+    box = visit.chart("Alice's proposals").locator(".plot").bounding_box()
+    page.mouse.move(box["x"] + 60, box["y"] + 90)  # near the left end: the first point
+    visit.wait("document.querySelectorAll('.plot .rule:not([hidden])').length > 1")
+    assert legend.inner_text() == f"all 12.5{NBSP}%"
+    page.mouse.move(5, 5)
+    visit.wait("document.querySelectorAll('.plot .rule:not([hidden])').length === 0")
+    # hours of learning are another axis; this run has none recorded
+    page.locator(".board select").select_option("iterations")
+    visit.wait("document.querySelectorAll('.canvas')[1].data[0].x.join() === '1,2,3'")
+
+
+def test_a_long_run_is_thinned_smoothed_and_asked_for_anew(visit):
+    page = visit.go("#/runs/long").page
+    page.locator("summary").filter(has_text="learner").click()
+    drawn = visit.points("learner/kl", 1000, "long")
+    assert max(value for _, value in drawn) == 9.0  # the one record among three thousand that sticks out
+    smooth = visit.traces("learner/kl", "long")[1]
+    assert len(smooth["x"]) == 500
+    assert max(smooth["y"]) < 0.6  # over 30 iterations, each point the mean of six
+    panel = visit.chart("kl")
+    # zoom with the pointer: 300 records around the one that sticks out, each a point of its own
+    box = panel.locator(".canvas").bounding_box()
+    left, width = box["x"] + 48, box["width"] - 60
+    page.mouse.move(left + 0.38 * width, box["y"] + 80)
+    page.mouse.down()
+    page.mouse.move(left + 0.43 * width, box["y"] + 80, steps=4)
+    page.mouse.up()
+    page.get_by_role("button", name="Whole run").wait_for()
+    visit.wait("document.querySelectorAll('.canvas')[0].data[0].x.length < 300")
+    zoomed = visit.traces("learner/kl", "long")[0]
+    assert zoomed["y"][zoomed["x"].index(1_234_000)] == 9.0
+    assert 1_100_000 < zoomed["x"][0] < 1_234_000 < zoomed["x"][-1] < 1_350_000
+    page.get_by_role("button", name="Whole run").click()
+    visit.points("learner/kl", 1000, "long")
+    page.get_by_label("logarithmic").check()
+    visit.wait("document.querySelectorAll('.canvas')[0]._fullLayout.yaxis.type === 'log'")
+    # all of it as CSV, and a picture
+    with page.expect_download() as table:
+        panel.get_by_role("link", name="CSV").click()
+    rows = list(csv.DictReader(open(table.value.path())))  # noqa: SIM115
+    assert (len(rows), rows[1233]["learner/kl"], rows[1233]["env_steps"]) == (LONG - 1, "9.0", "1234000")
+    with page.expect_download() as picture:
+        panel.get_by_role("button", name="Picture").click()
+    with open(picture.value.path(), "rb") as file:
+        assert file.read(8) == b"\x89PNG\r\n\x1a\n"
+    page.get_by_label("Find a metric").fill("idle")
+    assert page.locator("summary").filter(has_text="time").count() == 1
+    visit.points("time/learner_idle_fraction", 1000, "long")
+    assert visit.complaints == []
+
+
+def test_runs_are_found_sorted_and_compared(visit):
+    page = visit.go("#/").page
+    names = page.locator("tbody tr a")
+    page.get_by_role("link", name="night-seed-1").wait_for()
+    page.get_by_label("Sort by").select_option("Bob's success")
+    assert names.all_inner_texts() == ["night-seed-1", "long", "cube", "old", "night-seed-0"]
+    page.get_by_label("Show").select_option("ended")
+    page.get_by_label("Find a run").fill("night")
+    assert names.all_inner_texts() == ["night-seed-1", "night-seed-0"]
+    page.get_by_role("button", name="Choose all shown").click()
+    page.get_by_label("Find a run").fill("long")
+    page.get_by_label("Choose long").check()
+    page.get_by_role("link", name="Compare 3 runs").click()
+    page.get_by_role("heading", name="3 runs compared").wait_for()
+    assert visit.points("bob/success_rate", 3, "night-seed-1")[2] == (3000, 0.75)
+    assert visit.points("bob/success_rate", 3, "night-seed-0")[2] == (3000, 0.25)
+    differing = page.get_by_role("table", name="What differs").locator("tbody tr")
+    differing.first.wait_for()
+    assert differing.all_inner_texts() == ["seed\t1\t0\t\u2013"]
+    # a band from 0.25 to 0.75 for the study, and a line for the run of its own
+    page.get_by_label("seeds as a band").check()
+    visit.wait("document.querySelectorAll('.canvas')[0].data.some(trace => trace.name === 'night')")
+    data = page.evaluate(
+        "Object.fromEntries([...document.querySelectorAll('.canvas')[0].data].map(({name, y}) => [name, y[100]]))"
+    )
+    assert [data[name] for name in ("night highest", "night", "night lowest", "long")] == [0.75, 0.5, 0.25, 0.5]
+    # a run whose box is off has no curves
+    page.get_by_label("seeds as a band").uncheck()
+    page.get_by_label("Show long").uncheck()
+    visit.wait("!document.querySelectorAll('.canvas')[0].data.some(trace => trace.name.startsWith('long'))")
+    assert visit.complaints == []
+
+
+def test_a_missing_value_is_a_gap_and_a_new_one_is_drawn(browser, tmp_path):
+    write_runs(tmp_path / "runs")
+    append(tmp_path / "runs", "cube", record(4, **{"bob/success_rate": None}), record(5))
+    with serve(tmp_path) as server:
+        visit = Visit(browser, server.url).go("#/runs/cube")
+        assert visit.points("bob/success_rate", 5)[3:] == [(4000, None), (5000, 0.625)]
+        append(tmp_path / "runs", "cube", record(6))
+        assert visit.points("bob/success_rate", 6)[5] == (6000, 0.75)
+        visit.context.close()
