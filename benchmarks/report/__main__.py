@@ -19,7 +19,18 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks import time_to_skill
-from benchmarks.report import attacks, cluster, comparison, pretraining, robots, scaling, skills, summary, transfer
+from benchmarks.report import (
+    attacks,
+    cluster,
+    comparison,
+    page_speed,
+    pretraining,
+    robots,
+    scaling,
+    skills,
+    summary,
+    transfer,
+)
 from benchmarks.report.figures import (
     draw_ablations,
     draw_chaos,
@@ -52,6 +63,7 @@ PROGRAMS = {
     "transfer": "benchmarks.transfer",
     "transfer_champion": "benchmarks.transfer --name transfer_champion",
     "world_speed": "benchmarks.world_speed",
+    "page_speed": "benchmarks.page_speed",
 }
 """Modules by the name of the recorded file that they make."""
 PAGES = {
@@ -62,6 +74,7 @@ PAGES = {
     "downstream.md": ("headline",),
     "robots.md": ("robots",),
     "results/transfer.md": ("transfer", "transfer_champion"),
+    "api.md": ("page",),
     "../README.md": ("headline", "controls"),
     "scaling.md": ("bottleneck", "box", "nodes", "model", "batches", "skill", "constants"),
 }
@@ -157,6 +170,12 @@ def transfer_blocks(found: Results) -> Blocks:
     }
 
 
+def page_blocks(found: Results) -> Blocks:
+    """Parts of the block about the speed of the page."""
+    recorded = found.get("page_speed")
+    return {"page": [page_speed.page_table(recorded), page_speed.page_words(recorded)]} if recorded is not None else {}
+
+
 class Report:
     """Draws pictures into ``docs/results``, and writes the pages.
 
@@ -187,6 +206,7 @@ class Report:
             summary_blocks(trials, ()),
             robots_blocks(found),
             transfer_blocks(found),
+            page_blocks(found),
             summary_blocks(trials, controls),
             scaling_blocks(found, studies),
         )

@@ -52,6 +52,8 @@ def test_examples(environment, tmp_path, command):
     assert result.returncode == 0, result.stdout + result.stderr
     if "-o rounds.mp4" in command:
         assert (tmp_path / "rounds.mp4").read_bytes() == VIDEO
+    elif "-o metrics.csv" in command:
+        assert (tmp_path / "metrics.csv").read_text().startswith("run,iteration,env_steps,bob/success_rate\ncube,331,")
     elif "/stream" in command:
         assert "event: metrics\n" in result.stdout
         assert "event: end\n" in result.stdout

@@ -120,18 +120,18 @@ def test_a_long_run_is_thinned_smoothed_and_asked_for_anew(visit):
     page.get_by_label("Find a metric").fill("idle")
     assert page.locator("summary").filter(has_text="time").count() == 1
     visit.points("time/learner_idle_fraction", 1000, "long")
-    assert visit.complaints == []
+    assert [said for said in visit.complaints if "404" not in said] == []  # this run has no goals
 
 
 def test_runs_are_found_sorted_and_compared(visit):
     page = visit.go("#/").page
-    names = page.locator("tbody tr a")
+    listed = page.locator("tbody tr a")
     page.get_by_role("link", name="night-seed-1").wait_for()
     page.get_by_label("Sort by").select_option("Bob's success")
-    assert names.all_inner_texts() == ["night-seed-1", "long", "cube", "old", "night-seed-0"]
+    assert listed.all_inner_texts() == ["night-seed-1", "long", "cube", "old", "night-seed-0"]
     page.get_by_label("Show").select_option("ended")
     page.get_by_label("Find a run").fill("night")
-    assert names.all_inner_texts() == ["night-seed-1", "night-seed-0"]
+    assert listed.all_inner_texts() == ["night-seed-1", "night-seed-0"]
     page.get_by_role("button", name="Choose all shown").click()
     page.get_by_label("Find a run").fill("long")
     page.get_by_label("Choose long").check()
@@ -148,7 +148,8 @@ def test_runs_are_found_sorted_and_compared(visit):
     data = page.evaluate(
         "Object.fromEntries([...document.querySelectorAll('.canvas')[0].data].map(({name, y}) => [name, y[100]]))"
     )
-    assert [data[name] for name in ("night highest", "night", "night lowest", "long")] == [0.75, 0.5, 0.25, 0.5]
+    names = ("night highest", "night", "night lowest", "long")
+    assert [data[name] for name in names] == pytest.approx([0.75, 0.5, 0.25, 0.5])
     # a run whose box is off has no curves
     page.get_by_label("seeds as a band").uncheck()
     page.get_by_label("Show long").uncheck()
