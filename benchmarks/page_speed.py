@@ -26,9 +26,9 @@ from typing import Any
 
 import httpx
 import numpy as np
-import psutil
 
 from benchmarks.measuring import ROOT, parser_of, run_benchmark
+from benchmarks.processes import cpu_s, resident_bytes
 from benchmarks.report.markdown import table
 from service.errors import TandemError
 from service.store.models import RunStatus
@@ -119,8 +119,8 @@ def _write_records(path: Path, number: int, rng: np.random.Generator) -> None:
 
 
 @contextmanager
-def serving(runs: Path) -> Iterator[tuple[psutil.Process, str]]:
-    """Start ``tandem serve`` in a process of its own: the process, and its URL.
+def serving(runs: Path) -> Iterator[tuple[int, str]]:
+    """Start ``tandem serve`` in a process of its own: its pid, and its URL.
 
     Raises:
         TandemError: it does not start.
@@ -139,7 +139,7 @@ def serving(runs: Path) -> Iterator[tuple[psutil.Process, str]]:
             if time.monotonic() > deadline_s:
                 raise TandemError(f"{url} does not answer")
             time.sleep(0.02)
-        yield psutil.Process(process.pid), url
+        yield process.pid, url
     finally:
         process.terminate()
         process.wait(30)
@@ -176,14 +176,14 @@ def paint(runs: Path, place: str, mark: str) -> dict[str, float]:
         page = browser.new_page(viewport={"width": 1280, "height": 900})
         session = page.context.new_cdp_session(page)
         session.send("Performance.enable")
-        before_s = sum(service.cpu_times()[:2])
+        before_s = cpu_s(service)
         page.goto(f"{url}/{place}", wait_until="commit")
         deadline_s = time.monotonic() + PAINTED_S
         while (at_ms := page.evaluate(f"performance.getEntriesByName('{mark}')[0]?.startTime")) is None:
             if time.monotonic() > deadline_s:
                 raise TandemError(f"{place} is not painted after {PAINTED_S:g} s")
             page.wait_for_timeout(20)
-        service_s = sum(service.cpu_times()[:2]) - before_s
+        service_s = cpu_s(service) - before_s
         metrics = {each["name"]: each["value"] for each in session.send("Performance.getMetrics")["metrics"]}
         browser.close()
     return {"painted_s": at_ms / 1000, "browser_cpu_s": metrics["ThreadTime"], "service_cpu_s": service_s}
@@ -193,7 +193,7 @@ def measure_memory(runs: Path, settings: PageSettings) -> list[int]:
     """Resident bytes of one service: at first, and after each round in which all curves of all runs were asked for."""
     names = [("names", name) for name in (*CURVES, *EVALUATED)]
     with serving(runs) as (service, url), httpx.Client(base_url=url, trust_env=False, timeout=300.0) as client:
-        found = [int(service.memory_info().rss)]
+        found = [resident_bytes(service)]
         for _ in range(settings.rounds):
             for first in range(0, settings.runs, settings.compared):
                 ids = [
@@ -201,7 +201,7 @@ def measure_memory(runs: Path, settings: PageSettings) -> list[int]:
                 ]
                 client.get("/v1/series", params=[*ids, *names]).raise_for_status()
             client.get("/v1/runs", params={"sparkline": CURVES[0], "limit": 1000}).raise_for_status()
-            found.append(int(service.memory_info().rss))
+            found.append(resident_bytes(service))
     return found
 
 
