@@ -82,9 +82,13 @@ def runs_router(runs: RunReader, streams: Streams, directories: RunDirectories, 
         last_event_id: Annotated[
             int | None, Header(ge=0, le=MAX_ITERATION, description="sent by browsers; overrides after_iteration")
         ] = None,
-    ) -> RunFollower:
+    ) -> AsyncIterator[RunFollower]:
         # a dependency, because an error in the route itself would come after the headers of the answer
-        return await streams.follow(run_id, names, after_iteration if last_event_id is None else last_event_id)
+        follower = await streams.follow(run_id, names, after_iteration if last_event_id is None else last_event_id)
+        try:
+            yield follower
+        finally:  # also where a client went in the midst of an event
+            follower.release()
 
     @router.get(
         "/{run_id}/metrics/stream",

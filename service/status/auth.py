@@ -16,6 +16,7 @@ from collections.abc import Callable
 from http import HTTPStatus
 from http.cookies import CookieError, SimpleCookie
 
+from anyio import BrokenResourceError
 from starlette.datastructures import Headers, MutableHeaders
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
@@ -84,7 +85,9 @@ class AuthMiddleware:
             await self._pass_on(inner, receive, answer)
         except ProblemError as problem:
             await problem.response()(inner, receive, answer)
-        except Exception:
+        except Exception as error:
+            if status and _is_of_a_closed_connection(error):
+                return
             # without the error's message, which may quote the request
             _logger.exception("%s %s failed", scope["method"], _template(inner))
             if status:  # the answer has begun; all that is left is to break it off
@@ -144,6 +147,13 @@ def _host(header: str) -> str:
     """The host of a Host header: ``127.0.0.1`` of ``127.0.0.1:8321``, ``::1`` of ``[::1]:8321``; empty if malformed."""
     found = _HOST.fullmatch(header)
     return "" if found is None else found[1] or found[2]
+
+
+def _is_of_a_closed_connection(error: BaseException) -> bool:
+    """Whether all that went wrong is that a stream of events was cut off by its client."""
+    if isinstance(error, BaseExceptionGroup):
+        return all(map(_is_of_a_closed_connection, error.exceptions))
+    return isinstance(error, BrokenResourceError)
 
 
 def _cookie(headers: Headers) -> str | None:

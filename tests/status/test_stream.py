@@ -3,6 +3,7 @@
 import asyncio
 import gc
 import json
+import socket
 import time
 from contextlib import contextmanager
 
@@ -191,6 +192,29 @@ def test_the_number_of_streams_is_limited(root, service, monkeypatch):
     while server.app.streams.num_open and time.monotonic() < deadline_s:
         time.sleep(0.02)
     assert server.app.streams.num_open == 0
+
+
+def test_fifty_browsers_that_never_close_their_connection(root, service, caplog):
+    server, client = service
+    request = b"GET /v1/runs/cube/metrics/stream HTTP/1.1\r\nHost: localhost\r\n\r\n"
+    browsers = [socket.create_connection(("127.0.0.1", server.port)) for _ in range(50)]
+    for browser in browsers:
+        browser.sendall(request)  # and never reads the answer
+    deadline_s = time.monotonic() + 300
+    while server.app.streams.num_open < 50 and time.monotonic() < deadline_s:
+        time.sleep(0.02)
+    assert server.app.streams.num_open == 50
+    append(root, "cube", *(record(i) for i in range(4, 20)))
+    answer = client.get("/v1/series", params={"runs": "cube", "names": "bob/success_rate"}).json()
+    assert len(answer["runs"][0]["x"]) == 19
+    with listening(client, "?after_iteration=18") as heard:
+        take(heard, "metrics")
+    for browser in browsers:
+        browser.close()
+    while server.app.streams.num_open and time.monotonic() < deadline_s:
+        time.sleep(0.02)
+    assert server.app.streams.num_open == 0
+    assert caplog.records == []  # that they went is no error of the service
 
 
 def test_no_race_opens_more_streams_than_may_be(root, service, monkeypatch):
