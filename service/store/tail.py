@@ -76,7 +76,7 @@ class RecordFile:
         with self._lock, self._open() as file:
             if not self._starts:  # nothing is known yet: one pass over the file finds everything
                 asked = [name for name in names or () if name not in INDEX]
-                self._columns = {name: array("d") for name in ("env_steps", *asked)}
+                self._columns.update({name: array("d") for name in ("env_steps", *asked)})
             self._catch_up(file)
             wanted = sorted(self._names) if names is None else [name for name in names if name in self._names]
             for name in self._columns.keys() - self._names - {"env_steps"}:
