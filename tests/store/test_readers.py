@@ -126,6 +126,18 @@ def test_records_after_an_iteration(store):
     assert store.reader.metrics("cube", after_iteration=7) == []
 
 
+def test_metrics_in_columns_and_a_sample_of_one(store):
+    tell(store, records=[a_record(number, x=None if number == 3 else number / 2) for number in range(1, 6)])
+    found = store.reader.columns("cube", ["x", "no/such"])
+    assert (found.iteration.tolist(), list(found.metrics)) == ([1, 2, 3, 4, 5], ["x"])
+    assert found.metrics["x"].tolist() == pytest.approx([0.5, 1.0, float("nan"), 2.0, 2.5], nan_ok=True)
+    assert set(store.reader.columns("cube", None).metrics) == set(found.names)
+    sample = store.reader.sample("cube", "x", 5)
+    assert (sample[0], sample[-1]) == (0.5, 2.5)
+    assert None in sample
+    assert store.reader.sample("cube", "no/such", 5) == [None] * len(sample)
+
+
 def test_a_resumed_run_makes_its_last_iterations_again(store):
     """It has lost those after its last checkpoint; what it makes again takes their place."""
     tell(store, records=[a_record(number, past=0) for number in range(1, 8)])

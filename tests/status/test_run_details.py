@@ -1,0 +1,47 @@
+"""Configuration, commands and goals of a run, from its directory."""
+
+import shlex
+
+from service.status import run_details
+from tests.status.runs import append, grid, status, write_status
+
+
+def test_goals_over_a_run(tmp_path):
+    write_status(tmp_path, "cube")
+    low, high = [0, 0, 0.025, 0.01, 0.01, 0.03], [0, 0, 0.025, 0.01, 0.01, 0.13]
+    for i in range(1, 41):
+        goals = [[*low, 1], [*low, 0], [*high, 1.0 if i > 20 else 0.0], [None, *low]]
+        append(tmp_path, "cube", {"iteration": i, "env_steps": 100 * i, "goals": goals}, file="goals.jsonl")
+        append(tmp_path, "cube", {"iteration": i, "goals": "text"}, file="goals.jsonl")  # passed over
+    found = run_details.goal_frames(tmp_path / "cube", grid(), 2)
+    first, second = found.frames
+    assert found.cell_size_m == 0.05
+    assert first.centers_m == second.centers_m == ((0.025, 0.025, 0.025), (0.025, 0.025, 0.125))
+    assert (first.first_env_steps, second.last_env_steps) == (100, 4000)
+    assert first.num_goals + second.num_goals == 120
+    assert first.num_tries[0] == 2 * first.num_tries[1]
+    assert first.success_rate[0] == 0.5
+    assert first.success_rate[1] < 0.1  # parts are of equal bytes, so one of his goals may be in the first
+    assert second.success_rate == (0.5, 1.0)
+    assert run_details.goal_frames(tmp_path / "gone", None, 2).frames == ()
+
+
+def test_commands_of_a_run_of_a_study_go_on_with_the_study(tmp_path):
+    directory = tmp_path / "a night" / "seed-3"
+    directory.mkdir(parents=True)
+    (directory.parent / "study.yaml").write_text("x: 1\n")
+    (directory / "config.yaml").write_text("seed: 3\n")
+    found = run_details.setup(status("night-seed-3"), directory, tmp_path / "registry")
+    assert found.config == {"seed": 3}
+    assert shlex.split(found.stop_command) == ["touch", str(directory / "stop")]
+    words = shlex.split(found.resume_command)
+    assert words[words.index("--run-dir") + 1] == str(directory.parent)
+    assert words[-2:] == ["--runtime", "ray"]
+
+
+def test_a_configuration_that_cannot_be_read(tmp_path):
+    found = run_details.setup(status("cube"), tmp_path, tmp_path)
+    assert (found.config, found.problem) == (None, "config.yaml cannot be read: No such file or directory")
+    (tmp_path / "config.yaml").write_text("[" * 5000)
+    assert "nested" in run_details.setup(status("cube"), tmp_path, tmp_path).problem
+    assert run_details.setup(status("cube"), None, tmp_path).directory is None
