@@ -26,6 +26,7 @@ from benchmarks.report import (
     page_speed,
     pretraining,
     robots,
+    robustness,
     scaling,
     skills,
     summary,
@@ -64,6 +65,7 @@ PROGRAMS = {
     "transfer_champion": "benchmarks.transfer --name transfer_champion",
     "world_speed": "benchmarks.world_speed",
     "page_speed": "benchmarks.page_speed",
+    "robustness": "benchmarks.robustness",
 }
 """Modules by the name of the recorded file that they make."""
 PAGES = {
@@ -75,6 +77,7 @@ PAGES = {
     "robots.md": ("robots",),
     "results/transfer.md": ("transfer", "transfer_champion"),
     "api.md": ("page",),
+    "results/robust.md": ("robustness",),
     "../README.md": ("headline", "controls"),
     "scaling.md": ("bottleneck", "box", "nodes", "model", "batches", "skill", "constants"),
 }
@@ -176,6 +179,14 @@ def page_blocks(found: Results) -> Blocks:
     return {"page": [page_speed.page_table(recorded), page_speed.page_words(recorded)]} if recorded is not None else {}
 
 
+def robustness_blocks(found: Results) -> Blocks:
+    """Parts of the block about policies in worlds that differ from those of training."""
+    recorded = found.get("robustness")
+    if recorded is None:
+        return {}
+    return {"robustness": [robustness.robustness_table(recorded), robustness.robustness_words(recorded)]}
+
+
 class Report:
     """Draws pictures into ``docs/results``, and writes the pages.
 
@@ -207,6 +218,7 @@ class Report:
             robots_blocks(found),
             transfer_blocks(found),
             page_blocks(found),
+            robustness_blocks(found),
             summary_blocks(trials, controls),
             scaling_blocks(found, studies),
         )
