@@ -82,7 +82,7 @@ def build_model(config: WorldConfig, solver: str) -> mujoco.MjModel:
         spec.option.gravity = (0, 0, -GRAVITY_MS2)
         for body in spec.bodies:
             body.gravcomp = float(body.name not in ("world", "object"))
-        spec.actuator("weight").biasprm[0] = 0.0
+        spec.actuator("object_weight").biasprm[0] = 0.0
     return spec.compile()
 
 

@@ -41,15 +41,19 @@ def installed(tmp_path_factory):
         shutil.copytree(ROOT / name, source / name, ignore=shutil.ignore_patterns("__pycache__"))
     for name in ("pyproject.toml", "setup.py", "MANIFEST.in", "README.md", "LICENSE"):
         shutil.copy(ROOT / name, source)
+    environment = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}  # or it is there already
     options = ("--quiet", "--no-deps", "--no-build-isolation", "--no-index", "--disable-pip-version-check")
     subprocess.run(
-        [sys.executable, "-m", "pip", "wheel", *options, "--wheel-dir", home, source], check=True, timeout=600
+        [sys.executable, "-m", "pip", "wheel", *options, "--wheel-dir", home, source],
+        check=True,
+        timeout=600,
+        env=environment,
     )
     (wheel,) = home.glob("*.whl")
     subprocess.run([sys.executable, "-m", "venv", "--without-pip", home / "venv"], check=True, timeout=600)
     python = home / "venv" / "bin" / "python"
     install = (sys.executable, "-m", "pip", "--python", python, "install", "--quiet", "--no-deps", "--no-index", wheel)
-    subprocess.run(install, check=True, timeout=600)
+    subprocess.run(install, check=True, timeout=600, env=environment)
     (site,) = (home / "venv" / "lib").glob("python*/site-packages")
     (site / "others.pth").write_text(sysconfig.get_path("purelib"))  # what it depends on; that takes minutes to install
     return site

@@ -17,6 +17,7 @@ from typing import Any, Self
 import numpy as np
 
 from service.errors import TandemError
+from service.extras import needs_extra
 from service.play.cast import Cast
 from service.play.game import Game
 from service.play.panel import Panel
@@ -131,11 +132,9 @@ def _has_jumped(before: Any, after: Any, game: Game) -> bool:
 
 
 def _import_viser() -> Any:
-    try:
+    with needs_extra("play", "tandem play"):
         import mjviser  # noqa: F401
         import viser
-    except ImportError as error:
-        raise TandemError(f"tandem play needs {error.name or error}: pip install 'tandem-skills[play]'") from None
     return viser
 
 

@@ -160,7 +160,12 @@ def measure_response(
         delays[index] = _delay_s(rows[motions.first(index) :], direction)
     x, y, z = shares.reshape(2, 3).mean(axis=0).round(4).tolist()
     step_s = world.physics_step_s * world.num_substeps
-    return Response((x, y, z), round(float(delays.mean()) / step_s, 3))
+    seen = delays[np.isfinite(delays)]  # an arm that still swings back from the way before may hide one
+    if not seen.size:
+        raise RobotError(
+            "calibration: the arm was not seen to move along any axis: look at what the robot says it is at"
+        )
+    return Response((x, y, z), round(float(seen.mean()) / step_s, 3))
 
 
 def _share_if_reckoned(share: float, late_steps: int) -> float:

@@ -20,6 +20,7 @@ import numpy as np
 from pydantic import Field, ValidationError
 
 from service.errors import TandemError, one_line
+from service.extras import needs_extra
 from service.frozen import FrozenModel
 from service.robot.backends import Backend, first_error
 from service.robot.errors import RobotError
@@ -255,12 +256,8 @@ def connect(world: WorldConfig, parameters: Mapping[str, Any]) -> Backend:
         given = FrankaParameters.model_validate(dict(parameters))
     except ValidationError as error:
         raise TandemError(f"robot franka: parameters: {first_error(error)}") from None
-    try:
+    with needs_extra("franka", "robot franka"):
         franky = importlib.import_module("franky")
-    except ImportError as error:
-        raise TandemError(
-            f"robot franka: cannot import franky ({error}): pip install 'tandem-skills[franka]'"
-        ) from None
     poses = _pose_source(given)
     return Backend(FrankaRobot(franky, given), poses)
 

@@ -16,6 +16,7 @@ import numpy as np
 from pydantic import Field, ValidationError
 
 from service.errors import ConfigError, TandemError
+from service.extras import needs_extra
 from service.frozen import FrozenModel
 from service.robot.backends import Backend, first_error
 from service.robot.errors import RobotError
@@ -326,13 +327,9 @@ class _Engine:
 
 
 def _start_engine() -> _Engine:
-    try:
+    with needs_extra("pybullet", "robot pybullet"):  # Python 3.11 has a wheel of it
         import pybullet
         import pybullet_data
-    except ImportError as error:
-        raise TandemError(
-            f"PyBullet cannot be imported ({error}): pip install 'tandem-skills[pybullet]' (Python 3.11 has a wheel)"
-        ) from None
     bullet = _Engine(pybullet)
     bullet.setAdditionalSearchPath(pybullet_data.getDataPath())
     return bullet

@@ -31,7 +31,7 @@ def finished(tmp_path_factory, champion):
 
 @pytest.fixture
 def observation(champion):
-    size = layouts(champion.config.world.observed).bob.size
+    size = layouts(champion.config.world).bob.size
     return np.random.default_rng(0).uniform(-0.1, 0.2, (3, size)).astype(np.float32)
 
 

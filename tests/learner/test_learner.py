@@ -341,7 +341,7 @@ def test_alice_clones_her_turns_that_were_paid_well():
 @pytest.mark.parametrize("rows_per_sample", [0.02, 4.0])
 def test_a_few_imitated_turns_count_in_proportion(monkeypatch, rows_per_sample):
     weights, real = [], ppo.update
-    monkeypatch.setattr(ppo, "update", lambda *given: weights.append(given[3].weight) or real(*given))
+    monkeypatch.setattr(ppo, "update", lambda *given, **how: weights.append(given[3].weight) or real(*given, **how))
     learner = Learner(make_config(self_imitation=IMITATION | {"rows_per_sample": rows_per_sample}))
     metrics = updated(learner, 0)
     share = metrics["learner/num_imitated"] / (rows_per_sample * metrics["learner/num_alice_samples"])

@@ -82,8 +82,9 @@ def test_what_is_nowhere(registry: Registry, publish: Publish) -> None:
     for target, missing in (("best", "alias 'best'"), ("99", "version 99")):
         with pytest.raises(UnknownVersionError) as error:
             find_version(f"panda-cube@{target}", registry.root)
-        own = f"no {missing} in the registry {registry.root}; versions: 1 to 1; aliases: latest -> 1; nor does one come"
+        own = f"no {missing} in the registry {registry.root}; versions: 1 to 1; aliases: latest -> 1"
         assert own in str(error.value)
+        assert "; nor does one come with tandem: " in str(error.value)
         assert f"no {missing} in the registry {BUNDLED}" in str(error.value)
         assert "\n" not in str(error.value)
 

@@ -239,8 +239,8 @@ def test_a_study_is_killed_stopped_resumed_and_names_its_best(tmp_path, monkeypa
 
     assert result.exit_code == 130, result.output
     assert f"saved; continue with: tandem pretrain --resume --run-dir {path} --registry {registry}\n" in result.stdout
-    assert_one_line(result.stderr, "seed 8 failed: ended by SIGKILL", path / "seed-8" / "log.txt")
-    assert re.search(r"^seed [38]: +[0-9,]+ env steps \| ", result.stdout, re.MULTILINE)
+    assert_one_line(result.stderr.splitlines()[-1], "seed 8 failed: ended by SIGKILL", path / "seed-8" / "log.txt")
+    assert re.search(r"^seed [38]: +[0-9,]+ env steps \| ", result.stderr, re.MULTILINE)
     assert {seed: run["state"] for seed, run in told().items()} == {"3": "interrupted", "8": "failed"}
     statuses = {run.run_id: run for run in DiskReader(tmp_path).runs()}  # as the status service lists them
     assert set(statuses) == {"study-seed-3", "study-seed-8"}
