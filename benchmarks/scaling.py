@@ -67,6 +67,7 @@ TINY = {
     "game.num_goals": 2,
     "game.alice_steps": 2,
     "game.alice_steps_min": "null",
+    "game.bob_margin_m": 0.0,
     "game.bob_steps": 2,
     "game.success_distance_m": 0.0005,
     "world.physics_step_s": 0.01,

@@ -173,7 +173,9 @@ class Bridge:
         row |= {"effector_m": state.effector_m, "fingers_m": state.fingers_m, "object_m": object_m}
         row |= {"state_time_s": state.time_s, "object_time_s": safe.object_time_s}
         self._states.append(state)
-        then = min(self._states, key=lambda each: abs(each.time_s - safe.object_time_s))
+        then = state
+        if np.isfinite(safe.object_time_s):  # nothing sees the object where an arm is calibrated
+            then = min(reversed(self._states), key=lambda each: abs(each.time_s - safe.object_time_s))
         age_steps = max(0, round((state.time_s - then.time_s) / self._step_s))
         delay_steps = self._late_steps + age_steps + self._config.observation_delay_steps
         seen.append(observe(self._layout, then, object_m, commands, goal_m, delay_steps))

@@ -64,7 +64,7 @@ def test_nothing_goes_wrong_and_nothing_leaves_the_service(own):
         ("#/runs/cube", "Versions of panda-cube"),
         ("#/primitives", "Versions of panda-cube"),
     ):
-        visit.go(place).page.get_by_role("table", name=table).wait_for()
+        visit.go(place).page.get_by_role("table", name=table, exact=True).wait_for()
         if place == "#/runs/cube":
             visit.points("alice/valid_fraction", 3)
             visit.page.get_by_text("2 goals of the sample in 2 cells").wait_for()
@@ -365,7 +365,7 @@ def test_no_text_is_markup(own):
     make_hostile(home)
     for place, table in (("#/", "Runs"), ("#/runs/cube", "Actors")):
         page = visit.go(place).page
-        page.get_by_role("table", name=table).get_by_text(HOSTILE).first.wait_for()
+        page.get_by_role("table", name=table, exact=True).get_by_text(HOSTILE).first.wait_for()
         assert page.locator("main img, main script").count() == 0
     assert [said for said in visit.complaints if "Failed to load resource" not in said] == []
     assert [url for url in visit.asked if url.endswith("/x")] == []
@@ -377,7 +377,7 @@ def test_a_phone_need_not_scroll_sideways(own, browser):
     visit = Visit(browser, server.url, **PHONE)
     for place, table in (("#/", "Runs"), ("#/runs/cube", "Actors"), ("#/primitives", "Versions of panda-cube")):
         page = visit.go(place).page
-        page.get_by_role("table", name=table).wait_for()
+        page.get_by_role("table", name=table, exact=True).wait_for()
         if place == "#/runs/cube":
             visit.points("alice/valid_fraction", 3)
             page.locator("rect.cell").first.wait_for()
