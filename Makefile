@@ -19,13 +19,14 @@ index_url   = $(lastword $(call pip_setting,index-url))
 uv_flags    = $(addprefix --default-index ,$(index_url)) \
               $(if $(TORCH_BACKEND),--torch-backend=$(TORCH_BACKEND),$(or $(addprefix --find-links ,$(find_links)),--torch-backend=cpu))
 
-.PHONY: help setup demo check test bench clean
+.PHONY: help setup demo check test docs bench clean
 
 help:
 	@echo "make setup   make $(VENV) and install everything into it"
 	@echo "make demo    a short pre-training from scratch, about three minutes of self-play"
 	@echo "make check   ruff and mypy"
 	@echo "make test    check, then every test"
+	@echo "make docs    the docs site, into build/docs-site/site"
 	@echo "make bench   the throughput benchmarks, against panda-gym"
 	@echo "make clean   remove $(VENV) and the caches; runs/ stays"
 
@@ -56,6 +57,10 @@ check: $(STAMP)
 
 test: check
 	$(PY) -m pytest -n $(JOBS) --maxprocesses 8 --dist worksteal
+
+docs: $(STAMP)
+	$(PY) -m tools.docs_site
+	@echo "  to read it:  $(PY) -m http.server --bind 127.0.0.1 --directory build/docs-site/site 8000"
 
 $(VENV)/.bench-installed: $(STAMP)
 	@$(PIP) -c constraints.txt -e '.[bench]'

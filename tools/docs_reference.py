@@ -197,8 +197,16 @@ def signature(name: str, function: Callable[..., object]) -> str:
     """A call as Python writes it, in a block of code."""
     call = inspect.signature(function)
     call = call.replace(parameters=[each for each in call.parameters.values() if each.name != "self"])
-    text = re.sub(r"(: |-> )'([^']*)'", r"\1\2", str(call))  # annotations are strings
-    return f"```python\n{name}{text}\n```"
+    text = f"{name}{_plain(str(call))}"
+    if len(text) > 80:
+        listed = "".join(f"    {_plain(str(each))},\n" for each in call.parameters.values())
+        text = f"{name}(\n{listed}){text.rpartition(')')[2]}"
+    return f"```python\n{text}\n```"
+
+
+def _plain(signature: str) -> str:
+    """A signature whose annotations are no strings."""
+    return re.sub(r"(: |-> )'([^']*)'", r"\1\2", signature)
 
 
 def docstring(thing: object) -> str:
@@ -209,9 +217,9 @@ def docstring(thing: object) -> str:
         head, _, rest = block.partition(":\n")
         if head in SECTIONS:
             whole = textwrap.dedent(rest)
-            items = [whole] if head == "Returns" else re.split(r"\n(?=\S)", whole)
-            listed = [re.sub(r"^(\w+): ", r"`\1`: ", prose(item)) for item in items]
-            parts.append(f"**{head}**\n\n" + "\n".join(f"- {item}" for item in listed))
+            items = [re.sub(r"^(\w+): ", r"`\1`: ", prose(item)) for item in re.split(r"\n(?=\S)", whole)]
+            listed = prose(whole) if head == "Returns" else "\n".join(f"- {item}" for item in items)
+            parts.append(f"**{head}**\n\n{listed}")
         else:
             parts.append(prose(block))
     return "\n\n".join(parts)

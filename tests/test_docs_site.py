@@ -1,0 +1,153 @@
+"""The docs site builds without a broken link, its reference is complete, and what the pages say to type works."""
+
+import re
+import shlex
+from pathlib import Path
+
+import pytest
+import typer
+from typer.testing import CliRunner
+
+import service
+from service.cli.main import app
+from service.config import Config
+from tools import docs_reference
+from tools.docs_site import SiteError, build
+
+ROOT = Path(__file__).parents[1]
+PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+START = (ROOT / "docs" / "start.md").read_text()
+SETTINGS = '[project]\nsite_name = "T"\nnav = ["index.md", {"R" = ["reference/*.md"]}]\n'
+
+
+def small_site(root, text):
+    (root / "docs").mkdir()
+    (root / "docs" / "zensical.toml").write_text(SETTINGS)
+    (root / "docs" / "index.md").write_text(text)
+    return root
+
+
+@pytest.fixture
+def no_other_pages(monkeypatch):
+    monkeypatch.setattr("tools.docs_site.OUTSIDE", {})
+    monkeypatch.setattr(docs_reference, "pages", lambda: {"reference/cli.md": "# Commands\n"})
+
+
+def test_the_site_builds(tmp_path):
+    site = build(tmp_path / "out")
+    pages = {str(path.relative_to(site)) for path in site.rglob("*.html")}
+    assert {
+        "index.html",
+        "start.html",
+        "changelog.html",
+        "reference/config.html",
+        "decisions/0001-the-world.html",
+    } <= pages
+    world = (site / "decisions" / "0009-libraries-and-rooms.html").read_text()
+    assert 'href="../changelog.html"' in world  # ../../CHANGELOG.md in the repository
+    assert (site / "images" / "concepts.svg").is_file()
+    elsewhere = re.findall(r'(?:src|<link[^>]*href)="(https?://[^"]*)', (site / "index.html").read_text())
+    assert elsewhere == []  # nothing is fetched from another site
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("[a](nothing.md)", "docs/index.md: link to nothing.md, which is not there"),
+        ("![a](images/none.png)", "docs/index.md: link to images/none.png, which is not there"),
+        ("[a](../../elsewhere.md)", "docs/index.md: link to ../../elsewhere.md, which is not there"),
+        ("[a](reference/cli.md#no-such-heading)", "anchor does not exist"),
+    ],
+)
+def test_a_link_to_nothing_is_refused(tmp_path, no_other_pages, text, said):
+    with pytest.raises(SiteError, match=re.escape(said)):
+        build(tmp_path / "out", small_site(tmp_path, f"# A\n\n{text}\n"))
+
+
+def test_a_page_has_to_be_in_the_navigation(tmp_path, no_other_pages):
+    root = small_site(tmp_path, "# A\n\n`[a](no-link.md)`\n")
+    (root / "docs" / "lost.md").write_text("# Lost\n")
+    with pytest.raises(SiteError, match=r"add to nav: lost\.md"):
+        build(tmp_path / "out", root)
+
+
+def test_every_command_and_option_is_in_the_reference():
+    text = docs_reference.commands()
+    for name, command in docs_reference.walk_commands(typer.main.get_command(app), "tandem"):
+        section = text[text.index(f"# {name}\n") :].partition("\n#")[0]
+        options = [option for each in command.params for option in each.opts if option.startswith("-")]
+        assert [option for option in options if option not in section] == [], name
+
+
+def test_every_key_is_in_the_reference():
+    text = docs_reference.configuration()
+    keys = list(docs_reference.keys(Config))
+    assert "learner.bob.learning_rate" in keys
+    assert [key for key in keys if f"| `{key}` |" not in text] == []
+    assert "| `world.num_substeps` | `20` | `8` | `>= 1`, `<= 200` | physics steps per action;" in text
+
+
+def test_the_public_functions_are_in_the_reference():
+    text = docs_reference.api()
+    assert [name for name in service.__all__ if f"### service.{name}\n" not in text] == []
+    assert "- `reference`: NAME, NAME@ALIAS or NAME@VERSION, a run directory" in text
+    assert "### TrainedBob.primitives\n" in text
+    assert "- `label: str`: Where he comes from, such as `panda-cube@3`." in text
+
+
+def blocks(text, *languages):
+    """Blocks of code in a page."""
+    found = re.findall(r"^```(\w*)\n(.*?)^```", text, re.DOTALL | re.MULTILINE)
+    return [block for language, block in found if language in languages]
+
+
+def commands(text):
+    """The ``tandem`` commands in a page's blocks of code, without ``tandem``."""
+    for block in blocks(text, "", "console"):
+        for line in block.replace("\\\n", " ").splitlines():
+            words = shlex.split(line.removeprefix("$ "), comments=True)
+            if words[:1] == ["tandem"] and "VERB" not in words:
+                yield words[1:]
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda path: path.stem)
+def test_commands_in_pages_can_be_typed(page):
+    """Every command and option in a page exists; no command is run."""
+    for words in commands(page.read_text()):
+        command, name = typer.main.get_command(app), "tandem"
+        while words and words[0] in getattr(command, "commands", {}):
+            command, name, words = command.commands[words[0]], f"{name} {words[0]}", words[1:]
+        try:
+            command.make_context(name, list(words))
+        except typer.Exit:
+            pass  # --version
+        except Exception as error:
+            pytest.fail(f"{name} {shlex.join(words)}: {error}")
+
+
+def test_there_are_commands_to_type():
+    verbs = {words[0] for words in commands(START)}
+    assert verbs == {"--version", "demo", "evaluate", "play", "render", "downstream", "pretrain", "serve"}
+
+
+def test_start_here_measures_what_comes_with_tandem(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (words,) = [words for words in commands(START) if "panda-cube@champion" in words and words[0] == "evaluate"]
+    assert words[-2:] == ["--episodes", "100"]
+    result = CliRunner().invoke(app, [*words[:-1], "4", "--json"])
+    assert result.exit_code == 0, result.output
+    assert '"num_episodes": 4' in result.stdout
+
+
+def test_start_here_runs_as_a_program(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    goal, task = blocks(START, "python")
+    exec(compile(goal, "start.md", "exec"), {})
+    found = re.fullmatch(r"the cube is (\d+\.\d) cm from the goal\n", capsys.readouterr().out)
+    assert found is not None
+    assert float(found[1]) < 5.0
+    assert "learn(10_000)" in task
+    names = {}
+    exec(compile(task.replace("10_000", "110"), "start.md", "exec"), names)
+    assert names["model"].num_timesteps == 110
+    assert names["model"].action_space.shape == (names["trained"].primitives.num_primitives,)
