@@ -1,4 +1,4 @@
-"""The docs site: ``python -m tools.docs_site`` builds it from ``docs/`` and the code, and fails at any link that leads nowhere.
+"""The docs site: ``python -m tools.docs_site`` builds it from ``docs/`` and the code. A link to nothing is an error.
 
 Pages link to each other as they lie in the repository. Here they are copied to one place, with links that fit there: to
 another page, to a picture or a recorded result. A source file is no part of the site, and is named by its path.
