@@ -105,9 +105,9 @@ def commands(text):
     """The ``tandem`` commands in a page's blocks of code, without ``tandem``."""
     for block in blocks(text, "", "console"):
         for line in block.replace("\\\n", " ").splitlines():
-            words = shlex.split(line.removeprefix("$ "), comments=True)
-            if words[:1] == ["tandem"] and "VERB" not in words:
-                yield words[1:]
+            typed = line.removeprefix("$ ")
+            if typed.startswith("tandem "):
+                yield shlex.split(typed, comments=True)[1:]
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda path: path.stem)
