@@ -84,7 +84,7 @@ def _models(model: type[BaseModel], prefix: str, recipe: BaseModel | None) -> It
     """A heading and a table of a model's own keys, then those of the models inside it."""
     yield f"{'##' if prefix.count('.') < 2 else '###'} {prefix.removesuffix('.') or 'The run'}"
     yield first_line(model)
-    rows = []
+    rows: list[tuple[str, ...]] = []
     for name, field in model.model_fields.items():
         default = _default(field)
         chosen = getattr(recipe, name, field.default)
@@ -92,7 +92,7 @@ def _models(model: type[BaseModel], prefix: str, recipe: BaseModel | None) -> It
         shown = _shown(chosen) if differs else ""
         rows.append((f"`{prefix}{name}`", default, shown, _range(field), prose(field.description or "")))
     if recipe is None:
-        rows = [(key, default, limits, text) for key, default, _, limits, text in rows]
+        rows = [(*row[:2], *row[3:]) for row in rows]
         yield table(("key", "default", "range", "meaning"), rows)
     else:
         yield table(("key", "default", "recipe", "range", "meaning"), rows)
