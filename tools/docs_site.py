@@ -104,10 +104,10 @@ def _relinked(text: str, source: Path, page: str, known: dict[Path, str], root: 
 
 
 def _with_navigation(settings: str, pages: set[str]) -> str:
-    """The settings with every ``*`` of the navigation spelled out."""
+    """The settings with every ``*`` of the navigation spelled out: the pages that are not named by themselves."""
 
     def spelled(match: re.Match[str]) -> str:
-        found = sorted(page for page in pages if Path(page).match(match[1]))
+        found = sorted(page for page in pages if Path(page).match(match[1]) and f'"{page}"' not in settings)
         return ", ".join(f'"{page}"' for page in found)
 
     text = re.sub(r'"([^"\n]*\*[^"\n]*\.md)"', spelled, settings)
