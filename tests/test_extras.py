@@ -58,7 +58,7 @@ def test_a_command_says_which_one_to_install(tmp_path, monkeypatch, without, pac
 
 
 def test_every_extra_that_a_command_needs_is_named_somewhere():
-    """The others are for benchmarks, tests, the docs site, and learners of one's own: nothing in ``service`` imports them."""
+    """The others are for benchmarks, tests, docs and learners of one's own: nothing in ``service`` imports them."""
     code = "".join(path.read_text() for path in (ROOT / "service").rglob("*.py"))
     extras = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
     assert set(re.findall(r'needs_extra\(\s*"([a-z]+)"', code)) == set(extras) - {"bench", "dev", "docs", "downstream"}
