@@ -54,7 +54,7 @@ def draw_starts(rng: np.random.Generator, num: int, config: WorldConfig) -> tupl
     if config.fixture == "wall":
         return _beside_wall(rng, rng.choice((-1.0, 1.0), num), config), np.empty((num, 0))
     gap_m = (scene.GAP_M, scene.FINGER_GAP_M, scene.GAP_M)
-    anywhere = _clear_of_fixtures(
+    anywhere = clear_of_fixtures(
         lambda num: sample_on_table(rng, num, config.workspace, 2 * config.rest_height_m), num, config, gap_m
     )
     if config.fixture == "box":
@@ -72,7 +72,7 @@ def sample_goals(
     (p = 1 in the paper's words). ``mixed``: as most of the paper's downstream tasks, anywhere in the volume with
     probability 0.7, else on the table. None is where the object would be inside a fixture.
     """
-    return _clear_of_fixtures(lambda num: _draw_goals(kind, rng, num, config, success_distance_m), num, config)
+    return clear_of_fixtures(lambda num: _draw_goals(kind, rng, num, config, success_distance_m), num, config)
 
 
 def _draw_goals(
@@ -128,7 +128,7 @@ def check_goals(kind: GoalKind, config: WorldConfig) -> None:
         raise TandemError(f"goals = {kind!r} with a {config.fixture}: its goals lie {where}; choose table")
 
 
-def _clear_of_fixtures(
+def clear_of_fixtures(
     draw: Callable[[int], StateArray], num: int, config: WorldConfig, gap_m: Sequence[float] = (0.0, 0.0, 0.0)
 ) -> StateArray:
     """(num, 3) object centres, each drawn again until the object is clear of all described fixtures."""

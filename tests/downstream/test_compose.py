@@ -227,3 +227,4 @@ def test_the_documents_ten_lines_run():
     scope = {}
     exec(code.replace("10_000", "60"), scope)
     assert scope["model"].num_timesteps == 60
+    assert scope["model"].ep_success_buffer  # what counts is in the learner's logs

@@ -12,9 +12,8 @@ from numpy.typing import NDArray
 
 from service.config import WorldConfig
 from service.envs.batch import WorldBatch
+from service.envs.gym.goals import Goals, GoalSource, Success, succeeded
 from service.envs.observations import ACTION, layouts
-from service.envs.obstacles import draw_goals
-from service.envs.sampling import GoalKind, check_goals
 from service.envs.tasks import find_task
 from service.errors import TandemError
 from service.types import BoolArray, FloatArray, StateArray
@@ -43,8 +42,9 @@ class GoalWorlds:
         num_threads: int,
         config: WorldConfig | None,
         task: str | None,
-        goals: GoalKind | None,
+        goals: Goals | None,
         success_distance_m: float,
+        success: Success | None,
     ) -> None:
         self.config = config or WorldConfig()
         if task is not None:
@@ -53,26 +53,31 @@ class GoalWorlds:
                     f"goals = {goals!r} beside task = {task!r}: the task has its own; give one of the two"
                 )
             self.config, goals = find_task(task).world_from(self.config), find_task(task).goals
-        self.goals: GoalKind = goals or ("mixed" if self.config.fixture == "none" else "table")
-        check_goals(self.goals, self.config)
+        self.goals: Goals = goals if goals is not None else "mixed" if self.config.fixture == "none" else "table"
         if not success_distance_m > 0.0:
             raise TandemError(f"success_distance_m = {success_distance_m}; give a distance above 0 m")
         self.success_distance_m = success_distance_m
+        self._success = success
         self._worlds = WorldBatch(self.config, num_worlds, num_threads=num_threads)
+        self._source = GoalSource(self.goals, self.config, self._worlds.reach, success_distance_m)
         self._goal = self._worlds.object_position.copy()
 
     def compute_reward(self, achieved_goal: NDArray[Any], desired_goal: NDArray[Any], info: Any) -> Any:
         """Reward of (..., 3) achieved for (..., 3) desired goals, metres: (...) float64, 1 where reached, else 0.
 
         ``info`` is there for the convention of goal environments and is not read.
+
+        Raises:
+            TandemError: the user's ``success`` gave no bool for each.
         """
-        distance = np.linalg.norm(np.asarray(achieved_goal) - np.asarray(desired_goal), axis=-1)
-        return (distance <= self.success_distance_m).astype(np.float64)
+        achieved, desired = np.asarray(achieved_goal), np.asarray(desired_goal)
+        if self._success is not None:
+            return succeeded(self._success, achieved, desired).astype(np.float64)
+        return (np.linalg.norm(achieved - desired, axis=-1) <= self.success_distance_m).astype(np.float64)
 
     def _draw_goals(self, rng: np.random.Generator, worlds: slice) -> None:
         """Give new goals to worlds at their start."""
-        places = self._worlds.places.of(worlds)
-        self._goal[worlds] = draw_goals(self.goals, rng, self.config, self.success_distance_m, places)
+        self._goal[worlds] = self._source.draw(rng, self._worlds.places.of(worlds))
 
     def _observe(self) -> tuple[Observation, BoolArray]:
         """(N, ...) observations, and (N,) true where the object is at its goal."""
@@ -125,14 +130,19 @@ class TabletopEnv(GoalWorlds, gymnasium.Env[Any, FloatArray]):
         config: the world; the paper's by default.
         task: name of a downstream task (``service.envs.tasks``), which replaces part of ``config`` and has its goals.
         goals: where goals are: ``table``, ``air``, ``volume``, or ``mixed`` as in most of the paper's downstream tasks,
-            which is the default; with a wall or a box in ``config`` only ``table``.
+            which is the default; with a wall or a box in ``config`` only ``table``. Or a function
+            ``(rng, num, world) -> (num, 3)`` that draws them, metres. Or a box to draw them from, as its lowest and its
+            highest corner ``((x, y, z), (x, y, z))``, metres; they are clear of fixtures and obstacles.
         success_distance_m: greatest distance that counts as reached, metres.
+        success: what counts instead of that distance: ``(achieved, desired) -> bool`` of (..., 3) goals to (...). The
+            reward is 1 where it is true, and ``info["is_success"]`` says so.
         render_mode: ``rgb_array`` or None.
         width: of rendered images, pixels.
         height: of rendered images, pixels.
 
     Raises:
-        TandemError: unknown ``task``, ``goals`` or ``render_mode``, or a success distance that is not positive.
+        TandemError: unknown ``task``, ``goals`` or ``render_mode``, a box out of reach, or a success distance that is
+            not positive.
     """
 
     metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 25}  # noqa: RUF012 - as the base class has it
@@ -142,15 +152,16 @@ class TabletopEnv(GoalWorlds, gymnasium.Env[Any, FloatArray]):
         config: WorldConfig | None = None,
         *,
         task: str | None = None,
-        goals: GoalKind | None = None,
+        goals: Goals | None = None,
         success_distance_m: float = 0.05,
+        success: Success | None = None,
         render_mode: str | None = None,
         width: int = 640,
         height: int = 480,
     ) -> None:
         if render_mode not in (None, *self.metadata["render_modes"]):
             raise TandemError(f"TabletopEnv: render_mode = {render_mode!r}; choose rgb_array or None")
-        super().__init__(1, 1, config, task, goals, success_distance_m)
+        super().__init__(1, 1, config, task, goals, success_distance_m, success)
         self.render_mode = render_mode
         self.observation_space = goal_space(self.config)
         self.action_space = action_space()
@@ -164,11 +175,18 @@ class TabletopEnv(GoalWorlds, gymnasium.Env[Any, FloatArray]):
 
         Args:
             seed: restarts the environment's random numbers; the same seed gives the same episodes, bit for bit.
-            options: none are known.
+            options: ``{"goal": (x, y, z)}``, metres, in place of the random goal; object and later episodes are the
+                same with it and without.
+
+        Raises:
+            TandemError: an unknown option, a goal of another shape, not finite or out of reach.
         """
+        goal = self._source.given(options, 1)
         super().reset(seed=seed, options=options)
         self._worlds.reset(self.np_random)
         self._draw_goals(self.np_random, slice(None))
+        if goal is not None:
+            self._goal[:] = goal
         observation, success = self._observe_first()
         return observation, {"is_success": success}
 

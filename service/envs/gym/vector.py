@@ -15,8 +15,8 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
 from service.config import WorldConfig
+from service.envs.gym.goals import Goals, Success
 from service.envs.gym.tabletop import GoalWorlds, Observation, action_space, goal_space
-from service.envs.sampling import GoalKind
 from service.errors import TandemError
 from service.types import BoolArray, FloatArray, StateArray
 
@@ -50,8 +50,9 @@ class TabletopVectorEnv(GoalWorlds, gymnasium.vector.VectorEnv[Any, FloatArray, 
         num_envs: N.
         config: the world; the paper's by default.
         task: see ``TabletopEnv``.
-        goals: see ``TabletopEnv``.
+        goals: see ``TabletopEnv``; a function is asked for the goal of one world at a time.
         success_distance_m: greatest distance that counts as reached, metres.
+        success: see ``TabletopEnv``.
         max_episode_steps: where episodes are truncated.
         num_threads: native threads; 0 for one per core.
 
@@ -67,15 +68,16 @@ class TabletopVectorEnv(GoalWorlds, gymnasium.vector.VectorEnv[Any, FloatArray, 
         config: WorldConfig | None = None,
         *,
         task: str | None = None,
-        goals: GoalKind | None = None,
+        goals: Goals | None = None,
         success_distance_m: float = 0.05,
+        success: Success | None = None,
         max_episode_steps: int = 50,
         num_threads: int = 0,
     ) -> None:
         for name, value in {"num_envs": num_envs, "max_episode_steps": max_episode_steps}.items():
             if value < 1:
                 raise TandemError(f"TabletopVectorEnv: {name} = {value}; give at least 1")
-        super().__init__(num_envs, num_threads, config, task, goals, success_distance_m)
+        super().__init__(num_envs, num_threads, config, task, goals, success_distance_m, success)
         self.num_envs = num_envs
         self.max_episode_steps = max_episode_steps
         self.single_observation_space, self.single_action_space = goal_space(self.config), action_space()
@@ -91,11 +93,14 @@ class TabletopVectorEnv(GoalWorlds, gymnasium.vector.VectorEnv[Any, FloatArray, 
 
         Args:
             seed: world i draws its episodes from ``seed + i``, or ``seed[i]``; None goes on with the random numbers.
-            options: none are known.
+            options: ``{"goal": ...}``, (3,) one for all worlds or (N, 3), metres, in place of the random goals of these
+                episodes; those that begin on their own have random ones again.
 
         Raises:
             ValueError: not one seed per world.
+            TandemError: an unknown option, a goal of another shape, not finite or out of reach.
         """
+        goal = self._source.given(options, self.num_envs)
         seeds = [seed + world for world in range(self.num_envs)] if isinstance(seed, int) else seed
         if seeds is not None:
             if len(seeds) != self.num_envs:
@@ -104,6 +109,8 @@ class TabletopVectorEnv(GoalWorlds, gymnasium.vector.VectorEnv[Any, FloatArray, 
                 if each is not None:
                     self._random[world] = seeding.np_random(each)[0]
         self._start(np.ones(self.num_envs, dtype=bool))
+        if goal is not None:
+            self._goal[:] = goal
         observation, success = self._observe()
         return observation, _with_masks({"is_success": success})
 

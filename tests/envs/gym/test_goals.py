@@ -1,0 +1,181 @@
+"""Goals that a user gives: at a reset, by a function, in a box; and what counts as success."""
+
+import re
+from pathlib import Path
+
+import gymnasium
+import numpy as np
+import pytest
+
+from service.config import WorldConfig
+from service.envs.gym.registration import TABLETOP_ID
+from service.envs.gym.tabletop import TabletopEnv
+from service.envs.gym.vector import TabletopVectorEnv
+from service.errors import TandemError
+
+CONFIG = WorldConfig(physics_step_s=0.005, num_substeps=8)
+GOAL = (0.02, -0.1, 0.2)
+DOCUMENT = Path(__file__).parents[3] / "docs" / "downstream.md"
+STAY = np.zeros((2, 4), dtype=np.float32)
+
+
+@pytest.fixture
+def env():
+    env = TabletopEnv(CONFIG)
+    yield env
+    env.close()
+
+
+@pytest.fixture
+def envs():
+    envs = TabletopVectorEnv(2, CONFIG, num_threads=1, max_episode_steps=2)
+    yield envs
+    envs.close()
+
+
+def test_a_goal_is_given_at_a_reset_and_nothing_else_changes(env):
+    drawn, _ = env.reset(seed=3)
+    following, _ = env.reset()
+    given, info = env.reset(seed=3, options={"goal": GOAL})
+    np.testing.assert_array_equal(given["desired_goal"], np.float32(GOAL))
+    np.testing.assert_array_equal(given["observation"], drawn["observation"])
+    assert info == {"is_success": False}
+    at_it = env.reset(seed=3, options={"goal": given["achieved_goal"]})[1]
+    assert at_it == {"is_success": True}
+    env.reset(seed=3, options={"goal": GOAL})
+    np.testing.assert_array_equal(env.reset()[0]["desired_goal"], following["desired_goal"])
+    np.testing.assert_array_equal(env.reset(seed=3, options={})[0]["desired_goal"], drawn["desired_goal"])
+
+
+def test_many_worlds_have_one_goal_or_one_each(envs):
+    each = [GOAL, (-0.1, 0.1, 0.025)]
+    np.testing.assert_array_equal(envs.reset(seed=0, options={"goal": each})[0]["desired_goal"], np.float32(each))
+    observation, _ = envs.reset(seed=0, options={"goal": GOAL})
+    np.testing.assert_array_equal(observation["desired_goal"], np.float32([GOAL, GOAL]))
+    observation = envs.step(STAY)[0]
+    np.testing.assert_array_equal(observation["desired_goal"], np.float32([GOAL, GOAL]))
+    observation, _, _, truncated, _ = envs.step(STAY)
+    assert truncated.all()
+    assert (observation["desired_goal"] != np.float32(GOAL)).all()  # episodes that begin on their own
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        ({"goal": (0.0, 0.1)}, r"options\['goal'\] has shape \(2,\), not \(3,\) or \(2, 3\)"),
+        ({"goal": np.zeros((3, 3))}, r"has shape \(3, 3\)"),
+        ({"goal": (0.0, np.nan, 0.1)}, r"\(0, nan, 0.1\) is not finite"),
+        ({"goal": "there"}, "is no array of numbers"),
+        ({"goal": [GOAL, (0.9, 0.0, 0.1)]}, r"\(0.9, 0, 0.1\) m is out of reach: the nearest the arm comes is \(0.\d"),
+        ({"goal": (0.0, 0.0, -0.1)}, r"out of reach: the nearest the arm comes is \(0, 0, 0.025\) m"),
+        ({"goal": (0.0, 0.0, 3.0)}, "out of reach"),
+        ({"gaol": GOAL}, "unknown option 'gaol'.*did you mean"),
+    ],
+)
+def test_a_bad_goal_is_refused_in_one_line(envs, options, said):
+    before = envs.reset(seed=0)[0]["desired_goal"].copy()
+    with pytest.raises(TandemError, match=said) as caught:
+        envs.reset(options=options)
+    assert "\n" not in str(caught.value)
+    np.testing.assert_array_equal(envs.step(STAY)[0]["desired_goal"], before)
+
+
+def test_a_function_draws_goals_alike_for_one_world_and_many():
+    asked = []
+
+    def above_the_table(rng, num, world):
+        asked.append((num, world))
+        return rng.uniform((-0.1, -0.1, 0.2), (0.1, 0.1, 0.3), (num, 3))
+
+    one = gymnasium.make(TABLETOP_ID, config=CONFIG, goals=above_the_table)
+    many = gymnasium.make_vec(TABLETOP_ID, num_envs=2, config=CONFIG, goals=above_the_table)
+    expected = [one.reset(seed=seed)[0]["desired_goal"] for seed in (4, 5)]
+    found = many.reset(seed=4)[0]["desired_goal"]
+    one.close()
+    many.close()
+    np.testing.assert_array_equal(found, expected)
+    assert (found[:, 2] >= 0.2).all()
+    assert asked == [(1, CONFIG)] * 4
+
+
+def test_a_function_that_draws_nonsense_is_named():
+    for draws, said in ((np.zeros(3), r"shape \(3,\), not \(1, 3\)"), (np.full((1, 3), 2.0), "out of reach")):
+        env = TabletopEnv(CONFIG, goals=lambda rng, num, world, draws=draws: draws)
+        with pytest.raises(TandemError, match=f"goals: the function's goal.*{said}"):
+            env.reset(seed=0)
+        env.close()
+
+
+def test_goals_in_a_box_are_in_it_and_clear_of_what_stands_there():
+    low, high = (-0.1, -0.15, 0.025), (0.1, 0.15, 0.025)
+    for config in (
+        WorldConfig(obstacles=[{"shape": "box", "size_m": (0.08, 0.08, 0.06)}]),
+        WorldConfig(fixture="wall", start_height_m=0.12),
+    ):
+        env = TabletopEnv(config, goals=(low, high))
+        goals = []
+        for seed in range(40):
+            goal = env.reset(seed=seed)[0]["desired_goal"]
+            goals.append(goal)
+            for place in env._worlds.places.obstacles[0]:  # the cube's edge is 5 cm, the obstacle's 8 cm
+                assert np.abs(goal - place)[:2].max() >= 0.065 - 1e-6
+        env.close()
+        assert (np.min(goals, axis=0) >= np.float32(low)).all()
+        assert (np.max(goals, axis=0) <= np.float32(high)).all()
+        assert np.ptp(goals, axis=0)[1] > 0.2
+
+
+@pytest.mark.parametrize(
+    ("goals", "said"),
+    [
+        (((0.0, 0.0), (0.1, 0.1)), "choose one of table, air, mixed, volume, a function"),
+        (7, "choose one of table"),
+        (((0.1, 0.0, 0.1), (0.0, 0.1, 0.2)), "the first corner of a box is the lowest"),
+        (((0.0, 0.0, 0.1), (0.9, 0.1, 0.2)), r"the box's corner \(0.9, 0, 0.1\) m is out of reach"),
+        (((0.0, 0.0, np.inf), (0.9, 0.1, np.inf)), "is not finite"),
+    ],
+)
+def test_a_bad_box_is_refused_at_once(goals, said):
+    with pytest.raises(TandemError, match=said) as caught:
+        TabletopEnv(CONFIG, goals=goals)
+    assert "\n" not in str(caught.value)
+
+
+def test_success_is_what_the_user_says():
+    def lifted(achieved, desired):
+        return achieved[..., 2] > 0.1
+
+    envs = TabletopVectorEnv(2, CONFIG, success=lifted, num_threads=1)
+    _, info = envs.reset(seed=0, options={"goal": (0.0, 0.0, 0.025)})
+    assert not info["is_success"].any()
+    state = envs.state()
+    state.worlds[1, 12] = 0.3
+    envs.restore(state)
+    _, reward, _, _, info = envs.step(STAY)
+    np.testing.assert_array_equal(reward, [0.0, 1.0])
+    np.testing.assert_array_equal(info["is_success"], [False, True])
+    heights = np.array([[[0.0, 0.0, 0.2]], [[0.0, 0.0, 0.1]]])
+    np.testing.assert_array_equal(envs.compute_reward(heights, np.zeros((2, 1, 3)), {}), [[1.0], [0.0]])
+    envs.close()
+
+
+def test_a_success_that_is_no_bool_for_each_is_named():
+    for success, said in ((lambda a, d: True, r"bool of shape \(\)"), (lambda a, d: a[..., 2], "float32")):
+        env = TabletopEnv(CONFIG, success=success)
+        with pytest.raises(TandemError, match=f"success: the function gave {said}"):
+            env.reset(seed=0)
+        env.close()
+
+
+def test_the_documents_goals_are_where_it_says():
+    _, code, *_ = re.findall(r"```python\n(.*?)```", DOCUMENT.read_text(), re.DOTALL)
+    scope = {}
+    exec(code, scope)
+    given = scope["observation"]["desired_goal"]
+    np.testing.assert_array_equal(given, np.float32([(0.02, -0.1, 0.2), (0.0, 0.1, 0.025)]))
+    drawn = scope["worlds"].reset()[0]["desired_goal"]
+    np.testing.assert_allclose(drawn[:, 1:], [[0.1, 0.2], [0.1, 0.2]], rtol=0, atol=1e-6)
+    in_box = scope["world"].reset()[0]["desired_goal"]
+    assert (np.abs(in_box - [0.0, 0.0, 0.25]) <= [0.1, 0.1, 0.05]).all()
+    scope["world"].close()
+    scope["worlds"].close()
