@@ -43,7 +43,7 @@ CLUSTER_MODULES = (
 )
 ROOMS_WITHOUT_TORCH = ("actors", "envs", "generator", "play", "registry", "status")
 ROOMS = (
-    *("errors", "extras", "frozen", "liveness", "progress", "recipes", "types"),
+    *("errors", "extras", "frozen", "liveness", "progress", "recipes", "trackers", "types"),
     *("parsing", "regular_files", "config_tree", "off_policy_config", "randomisation_config", "distillation_config"),
     *("model_files", "mesh_files", "robot_config", "object_config", "world_config"),
     *("config", "io", "envs", "policies", "generator", "actors", "learner", "sac", "baselines", "registry"),

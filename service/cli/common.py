@@ -38,6 +38,12 @@ def _quieten(quiet: bool) -> bool:
 
 
 QuietOption = Annotated[bool, typer.Option("--quiet", "-q", callback=_quieten, help="Show no progress.")]
+TrackerOption = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--tracker", metavar="MODULE:FACTORY", help="Where metrics go, too, such as Weights & Biases; repeatable."
+    ),
+]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON.")]
 REGISTRY = Path("registry")
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -10,12 +11,23 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from service.cli.common import CHAMPION, EXIT_SIGNAL, CommandGroup, QuietOption, choose, loading, print_json, shown
+from service.cli.common import (
+    CHAMPION,
+    EXIT_SIGNAL,
+    CommandGroup,
+    QuietOption,
+    TrackerOption,
+    choose,
+    loading,
+    print_json,
+    shown,
+)
 from service.cli.orchestrators import evaluate, publish, render
 from service.cli.play import play_downstream
 from service.cli.unexpected import traceback_in
 from service.errors import TandemError, did_you_mean, one_line
 from service.progress import answer
+from service.trackers import Trackers
 
 if TYPE_CHECKING:
     from service.downstream.table import Runner
@@ -85,6 +97,7 @@ def train(
     publish_as: Annotated[
         str | None, typer.Option("--publish", metavar="NAME", help="Publish what was learned by this name.")
     ] = None,
+    tracker: TrackerOption = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print the result as JSON.")] = False,
     quiet: QuietOption = False,
 ) -> None:
@@ -104,13 +117,20 @@ def train(
     )
     _check_used(trial.method, steps, skill_steps, reward_margin_m, overrides)
     path = run_dir or Path("runs") / "downstream" / trial.name
-    with _stop_on_signals() as (callbacks, signals):
+    named = {**trial.model_dump(mode="json"), "primitives": primitives}
+    with (
+        _stop_on_signals() as (callbacks, signals),
+        Trackers(tracker or [], path.name, named) as tracked,
+    ):
+        callbacks = dataclasses.replace(callbacks, on_iteration=tracked.log)
         options = RunOptions(resume, threads or 0, video=True, callbacks=callbacks)
         trained = load_for([method], primitives, registry)
         if publish_as is not None:
             check_publishable(trial.method, trained, publish_as, registry)  # now, not after the training
         with traceback_in(path):
             result = run_trial(trial, trained, path, options)
+        if result is not None:
+            tracked.log({"env_steps": result["env_steps"], **_final(result["evaluation"])})
     if result is None:
         typer.echo(f"saved; continue with the same command and --resume --run-dir {path}", err=True)
         raise typer.Exit(EXIT_SIGNAL + (signals.first or 0))
@@ -126,6 +146,11 @@ def train(
         f"{found['success_last_high']:.1%}], ever {found['success_ever']:.1%}, of {found['num_episodes']} episodes"
     )
     typer.echo(f"{result['env_steps']:,} env steps in {result['wall_s']:.0f} s; {path}")
+
+
+def _final(evaluation: dict[str, Any]) -> dict[str, float]:
+    """The numbers of a result's evaluation, as trackers get them."""
+    return {f"final/{name}": value for name, value in evaluation.items() if isinstance(value, int | float)}
 
 
 @downstream_app.command()

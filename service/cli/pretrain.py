@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shlex
+from collections.abc import Sequence
 from contextlib import closing
 from importlib.util import find_spec
 from itertools import count
@@ -17,6 +18,7 @@ from service.cli.common import (
     REGISTRY,
     QuietOption,
     RegistryOption,
+    TrackerOption,
     choose,
     how_to_go_on,
     loading,
@@ -29,6 +31,7 @@ from service.cli.study import is_study, pretrain_study
 from service.cli.unexpected import traceback_in
 from service.errors import TandemError
 from service.recipes import DEFAULT_RECIPE, find_file, recipes
+from service.trackers import Trackers, find_factory
 
 if TYPE_CHECKING:
     from service.config import Config
@@ -104,6 +107,7 @@ def pretrain(
     token_file: Annotated[
         Path | None, typer.Option(metavar="FILE", help="Its token; default: TANDEM_TOKEN. See tandem serve.")
     ] = None,
+    tracker: TrackerOption = None,
     accept_damaged_records: Annotated[
         bool, typer.Option("--accept-damaged-records", help="Resume without the records that are missing or changed.")
     ] = False,
@@ -122,7 +126,9 @@ def pretrain(
         where = parse_status(status, read_token(token_file))
         return ClusterOptions(num_actors, actor_threads, learner_cpus, where)
 
-    overrides = [*_method_overrides(method), *(overrides or [])]
+    overrides, trackers = [*_method_overrides(method), *(overrides or [])], tracker or []
+    for each in trackers:
+        find_factory(each)  # now, not after Ray has started
     named = find_file(config, recipes()) if config is not None else None
     _check_used(context, choose("--runtime", runtime, ("local", "ray")), status)
     if run_id is not None:
@@ -142,7 +148,7 @@ def pretrain(
         pretrain_study(
             run_dir, seeds, config=named, overrides=overrides, runs=runs, registry=registry,
             resume=None if run_id is not None else resume, publish=publish, parallel=parallel,
-            cluster=cluster_options if runtime == "ray" else None, address=address,
+            cluster=cluster_options if runtime == "ray" else None, address=address, trackers=trackers,
         )  # fmt: skip
         return
     if parallel is not None:
@@ -161,7 +167,7 @@ def pretrain(
         start = read_start(start_from, registry, resolved)
     directory = RunDirectory(run_dir, accept_damaged_records=accept_damaged_records)
     if runtime == "local":
-        _pretrain(resolved, directory, registry, resume=resume, publish=publish, start=start)
+        _pretrain(resolved, directory, registry, resume=resume, publish=publish, start=start, trackers=trackers)
         return
     from service.runtime.ray_connection import connected
 
@@ -171,7 +177,7 @@ def pretrain(
         with connected(address):
             _pretrain(
                 resolved, directory, registry,
-                resume=resume, publish=publish, cluster=options, address=address, start=start,
+                resume=resume, publish=publish, cluster=options, address=address, start=start, trackers=trackers,
             )  # fmt: skip
 
 
@@ -256,11 +262,13 @@ def _pretrain(
     cluster: ClusterOptions | None = None,
     address: str | None = None,
     start: Start | None = None,
+    trackers: Sequence[str] = (),
 ) -> Pretrained:
     with loading():
         from service.runtime.pretrain import pretrain as run
     from service.runtime.progress import Progress
     from service.runtime.signals import InterruptError
+    from service.store.disk_reader import run_id_of
 
     def say_stopped(what: str, number: int) -> NoReturn:
         """Say how to go on, and exit as a process that a signal ends."""
@@ -270,11 +278,23 @@ def _pretrain(
         raise typer.Exit(EXIT_SIGNAL + number)
 
     try:
-        with traceback_in(directory.path), Progress(config.run.total_env_steps, shown()) as progress:
+        with (
+            traceback_in(directory.path),
+            Trackers(trackers, run_id_of(directory.path), config.model_dump(mode="json")) as tracked,
+            Progress(config.run.total_env_steps, shown()) as progress,
+        ):
+
+            def tell(metrics: dict[str, float]) -> None:
+                progress.show(metrics)
+                tracked.log(metrics)
+
             done = run(
                 config, directory, registry,
-                resume=resume, publish=publish, on_iteration=progress.show, cluster=cluster, start=start,
+                resume=resume, publish=publish, on_iteration=tell, cluster=cluster, start=start,
             )  # fmt: skip
+            if done.metrics:
+                final = {name.replace("evaluation/", "final/", 1): value for name, value in done.metrics.items()}
+                tracked.log({"env_steps": done.result.num_env_steps, **final})
     except InterruptError as interrupt:
         say_stopped("stopped at once", interrupt.number)
     result = done.result

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import closing, nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -43,6 +43,7 @@ def pretrain_study(
     parallel: int | None,
     cluster: Callable[[], ClusterOptions] | None,
     address: str | None,
+    trackers: Sequence[str] = (),
 ) -> None:
     """Run a study and say what came out; exit code 1 where a run failed.
 
@@ -58,6 +59,7 @@ def pretrain_study(
         parallel: how many runs at once.
         cluster: makes the options of each run on a Ray cluster; None: on this machine.
         address: of the cluster.
+        trackers: of every run; see ``service.trackers``.
     """
     from service.config import load_config
     from service.io.study_directory import StudyDirectory
@@ -103,6 +105,7 @@ def pretrain_study(
             result = run(
                 resolved, directory, chosen, registry,
                 resume=resume, publish=publish, parallel=parallel, cluster=place, progress=progress,
+                trackers=trackers,
             )  # fmt: skip
     except InterruptError as interrupt:
         typer.echo(f"stopped at once; {hint if directory.exists else _NOTHING}")

@@ -67,6 +67,7 @@ def pretrain_study(
     parallel: int | None = None,
     cluster: StudyCluster | None = None,
     progress: StudyProgress,
+    trackers: Sequence[str] = (),
 ) -> StudyResult:
     """Run a run for every seed, each in a process of its own, then evaluate all, name the best and publish it.
 
@@ -82,6 +83,7 @@ def pretrain_study(
         parallel: how many runs at once; None: see ``share_machine`` and ``share_cluster``.
         cluster: run on it; None: on this machine, by the local runner.
         progress: where the runs are shown.
+        trackers: of every run; see ``service.trackers``.
 
     Raises:
         TandemError: see ``StudyDirectory``; a registry that is only read; or the best run cannot be published.
@@ -108,6 +110,7 @@ def pretrain_study(
             _logger.info("status: %s", url)
         if study.unfinished:
             num_parallel, place = _share(config, len(study.unfinished), parallel, cluster)
+            place += [argument for tracker in trackers for argument in ("--tracker", tracker)]
             progress.say(f"runs to go: {len(study.unfinished)}, at once: {num_parallel}")
             with progress:
                 study.run(lambda seed: _arguments(config, directory, seed, place), num_parallel, signals, progress)
