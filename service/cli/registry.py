@@ -1,4 +1,4 @@
-"""``tandem registry``: list, show, verify, alias, export."""
+"""``tandem registry``: list, show, verify, alias, export, card."""
 
 from __future__ import annotations
 
@@ -121,6 +121,30 @@ def export(
     registry, version = find_version(reference, directory)
     manifest = registry.export(str(version), target)
     typer.echo(f"{manifest.reference} is in {target}")
+
+
+@registry_app.command()
+def card(
+    reference: _Reference,
+    out: Annotated[Path | None, typer.Option(metavar="FILE", help="Such as README.md; default: stdout.")] = None,
+    licence: Annotated[
+        str, typer.Option("--license", metavar="ID", help="Of the parameters, as hubs write it.")
+    ] = "apache-2.0",
+    directory: RegistryOption = REGISTRY,
+) -> None:
+    """Write a model card for a hub: what a version is, how it was trained, how good it is, how to load it."""
+    from service.io.files import os_errors, write_atomic
+    from service.primitives.bundled import find_version
+    from service.primitives.card import model_card
+
+    registry, version = find_version(reference, directory)
+    text = model_card(registry.manifest(str(version)), licence=licence)
+    if out is None:
+        typer.echo(text, nl=False)
+        return
+    with os_errors("write", out):
+        write_atomic(out, text.encode())
+    typer.echo(f"the card of {version} is in {out}")
 
 
 def _summary(registry: Registry, manifest: Manifest) -> dict[str, Any]:
