@@ -34,6 +34,12 @@ def without(monkeypatch):
     [
         ("fastapi", ("server", "app"), ["serve"], "tandem serve needs the package fastapi, .*'tandem-skills[serve]'"),
         (
+            "minari",
+            (),
+            ["dataset", "panda-cube@champion", "--out", "some"],
+            "tandem dataset needs the package minari, .*'tandem-skills[data]'",
+        ),
+        (
             "ray",
             (),
             ["pretrain", "--runtime", "ray"],

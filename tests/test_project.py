@@ -58,6 +58,7 @@ VERBS = (
     "render",
     "play",
     "coverage",
+    "dataset",
     "export",
     "registry",
     "serve",

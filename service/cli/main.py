@@ -13,6 +13,7 @@ import typer
 from service import __version__
 from service.cli.common import CommandGroup, QuietOption
 from service.cli.configs import configs_app
+from service.cli.dataset import dataset
 from service.cli.downstream import downstream_app
 from service.cli.evaluate import coverage, evaluate, render
 from service.cli.export import export
@@ -24,7 +25,7 @@ from service.cli.serve import serve
 from service.cli.unexpected import report_thread_error
 
 app = typer.Typer(name="tandem", help="Robot skills, pre-trained.", cls=CommandGroup, no_args_is_help=True)
-for command in (pretrain, demo, evaluate, coverage, render, play, export, serve):
+for command in (pretrain, demo, evaluate, coverage, render, play, dataset, export, serve):
     app.command()(command)
 app.add_typer(registry_app)
 app.add_typer(downstream_app)

@@ -62,6 +62,29 @@ class RecordedEpisodes:
     """(N, 3) metres; None for skills, which have no goal."""
     reached: BoolArray
     """(T + 1, N) the object is within the success distance."""
+    actions: FloatArray | None = None
+    """(T, N, 4); None where they were not kept."""
+
+    def first(self, num: int) -> RecordedEpisodes:
+        """The first ones."""
+        goal = None if self.goal is None else self.goal[:num]
+        actions = None if self.actions is None else self.actions[:, :num]
+        return RecordedEpisodes(self.states[:, :num], goal, self.reached[:, :num], actions)
+
+
+def play_rounds(
+    config: Config, alice: StochasticPolicy, bob: DeterministicPolicy, *, num_rounds: int, seed: int
+) -> list[RecordedRound]:
+    """Play rounds from fresh resets and keep them as they come, whatever became of their goals.
+
+    Alice samples her actions as in training; Bob acts without noise.
+    """
+    rounds: list[RecordedRound] = []
+    for _, recorded in _play(config, alice, bob, num_worlds=min(_NUM_WORLDS, num_rounds), seed=seed):
+        rounds += recorded
+        if len(rounds) >= num_rounds:
+            break
+    return rounds[:num_rounds]
 
 
 def record_rounds(
@@ -75,23 +98,13 @@ def record_rounds(
     Returns:
         ``num_rounds`` rounds, the most interesting first.
     """
-    rng = np.random.default_rng(seed)
-    game = config.game.model_copy(update={"num_worlds": max(_NUM_WORLDS, num_rounds)})
-    config = config.model_copy(update={"game": game})
-    players = Players(version=0, alice=alice, bob=_WithoutNoise(bob))
     rounds: list[tuple[_Interest, RecordedRound]] = []
-    with contextlib.closing(SelfPlay(config, rng, num_threads=config.run.num_threads)) as self_play:
-        if config.game.blocked_gripper_min_success > 0.0:  # by now he has come to it
-            self_play.block_grippers(1.0)
-            self_play.start_over()
-        # It was never told of a goal, so it replays none: Bob plays those of this round's Alice.
-        snapshot = TaskGenerator(config, self_play.worlds.layout).snapshot()
-        for _ in counted(range(_MAX_ROLLOUTS), "playing rounds", _MAX_ROLLOUTS, "batches at most"):
-            records, recorded = _record(self_play, players, snapshot, rng)
-            rounds += zip(_interest(records, config.world.rest_height_m), recorded, strict=True)
-            if sum(played for (played, *_), _ in rounds) >= num_rounds:
-                break
-            self_play.start_over()
+    played = _play(config, alice, bob, num_worlds=max(_NUM_WORLDS, num_rounds), seed=seed)
+    batches = zip(range(_MAX_ROLLOUTS), played, strict=False)
+    for _, (records, recorded) in counted(batches, "playing rounds", _MAX_ROLLOUTS, "batches at most"):
+        rounds += zip(_interest(records, config.world.rest_height_m), recorded, strict=True)
+        if sum(played for (played, *_), _ in rounds) >= num_rounds:
+            break
     rounds.sort(key=lambda pair: pair[0], reverse=True)
     return [each for _, each in rounds[:num_rounds]]
 
@@ -109,13 +122,14 @@ def record_episodes(
 ) -> RecordedEpisodes:
     """Play the episodes that ``evaluate`` plays with these arguments, and keep every state."""
     kept: list[tuple[StateArray, StateArray, BoolArray]] = []
+    acting = _Keeping(bob)
 
     def keep(worlds: WorldBatch, goal: StateArray) -> None:
         reached = np.linalg.norm(worlds.object_position - goal, axis=1) <= success_distance_m
         kept.append((worlds.states.copy(), goal, reached))
 
     evaluate(
-        bob,
+        acting,
         config,
         kind,
         num_episodes=num_episodes,
@@ -126,7 +140,7 @@ def record_episodes(
         goal=goal,
     )
     states, goals, reached = map(np.stack, zip(*kept, strict=True))
-    return RecordedEpisodes(states, goals[0], reached)
+    return RecordedEpisodes(states, goals[0], reached, np.stack(acting.actions))
 
 
 def record_skills(
@@ -143,6 +157,36 @@ def record_skills(
         observe=lambda worlds: kept.append(worlds.states.copy()),
     )
     return RecordedEpisodes(np.stack(kept), None, np.zeros((num_steps + 1, num_skills), dtype=bool))
+
+
+def _play(
+    config: Config, alice: StochasticPolicy, bob: DeterministicPolicy, *, num_worlds: int, seed: int
+) -> Iterator[tuple[GoalRecords, list[RecordedRound]]]:
+    """Rounds of that many worlds at once, each from a fresh reset, without end."""
+    rng = np.random.default_rng(seed)
+    config = config.model_copy(update={"game": config.game.model_copy(update={"num_worlds": num_worlds})})
+    players = Players(version=0, alice=alice, bob=_WithoutNoise(bob))
+    with contextlib.closing(SelfPlay(config, rng, num_threads=config.run.num_threads)) as self_play:
+        if config.game.blocked_gripper_min_success > 0.0:  # by now he has come to it
+            self_play.block_grippers(1.0)
+            self_play.start_over()
+        # It was never told of a goal, so it replays none: Bob plays those of this round's Alice.
+        snapshot = TaskGenerator(config, self_play.worlds.layout).snapshot()
+        while True:
+            yield _record(self_play, players, snapshot, rng)
+            self_play.start_over()
+
+
+class _Keeping:
+    """A policy whose actions are kept."""
+
+    def __init__(self, policy: DeterministicPolicy) -> None:
+        self._policy = policy
+        self.actions: list[FloatArray] = []
+
+    def act_deterministic(self, observation: FloatArray) -> FloatArray:
+        self.actions.append(self._policy.act_deterministic(observation))
+        return self.actions[-1]
 
 
 class _WithoutNoise:

@@ -1,0 +1,171 @@
+"""Recorded episodes and rounds as a Minari data set, for learners that learn from what was played."""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+import warnings
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from service import __version__
+from service.config import Config
+from service.envs.batch import WorldBatch
+from service.envs.gym.tabletop import action_space, goal_space
+from service.errors import TandemError
+from service.extras import needs_extra
+from service.io.files import os_errors
+from service.media.recording import RecordedEpisodes, RecordedRound
+from service.progress import counted
+from service.types import FloatArray, StateArray
+
+_NAME = re.compile(r"(?:[\w-]+/)*[\w.-]+-v[0-9]+")
+_FURTHEST_M = 10.0
+"""Bound of every position, as in the environments."""
+
+
+@dataclass(frozen=True, slots=True)
+class Played:
+    """What one player did for T steps."""
+
+    states: StateArray
+    """(T + 1, S) rows of ``WorldBatch.states``."""
+    actions: FloatArray
+    """(T, 4)."""
+    goal: StateArray
+    """(3,) metres."""
+    is_alice: bool = False
+
+
+def played_episodes(recorded: RecordedEpisodes) -> list[Played]:
+    """Bob's episodes, from a recording that has their actions and goals."""
+    assert recorded.actions is not None
+    assert recorded.goal is not None
+    return [
+        Played(recorded.states[:, index], recorded.actions[:, index], goal)
+        for index, goal in enumerate(recorded.goal)
+    ]  # fmt: skip
+
+
+def played_turns(rounds: Sequence[RecordedRound]) -> list[Played]:
+    """Alice's turns, each with where she left the object as its goal, and Bob's turns, where he had one."""
+    turns = []
+    for each in rounds:
+        turns.append(Played(each.alice_states, each.alice_actions, each.goal, is_alice=True))
+        if len(each.bob_actions):
+            turns.append(Played(each.bob_states, each.bob_actions, each.goal))
+    return turns
+
+
+def check_name(name: str) -> str:
+    """The identifier of a new data set: ``name``, with ``-v0`` where it says no version.
+
+    Raises:
+        TandemError: no name, or that of a data set that is there.
+        MissingPackageError: Minari is not installed.
+    """
+    full = name if re.search(r"-v[0-9]+$", name) else f"{name}-v0"
+    if not _NAME.fullmatch(full):
+        raise TandemError(f"--out {name!r}: write NAME, GROUP/NAME or NAME-v1, of letters, digits, dashes and dots")
+    if (place := _place(full)).exists():
+        raise TandemError(f"--out {name}: the data set {full} is there already, in {place}: choose another name")
+    return full
+
+
+def write_dataset(name: str, played: Sequence[Played], config: Config, label: str) -> Path:
+    """Write a Minari data set into the directory MINARI_DATASETS_PATH, or Minari's own; each turn is an episode.
+
+    Observations are those of ``TabletopEnv``: ``observation`` (T + 1, P), ``achieved_goal`` and ``desired_goal``
+    (T + 1, 3). Rewards (T) are 1 where the object is within the success distance after a step, else 0;
+    ``infos["is_success"]`` (T + 1) is the same with the start, ``infos["is_alice"]`` says whose turn it was. All end
+    by time.
+
+    Args:
+        name: see ``check_name``.
+        played: at least one.
+        config: of the run that the players come from.
+        label: where they come from, such as ``panda-cube@3``.
+
+    Returns:
+        The data set's directory.
+
+    Raises:
+        TandemError: a name that is none or taken, or a place that cannot be written.
+        MissingPackageError: Minari is not installed.
+    """
+    full = check_name(name)
+    place = _place(full)
+    with needs_extra("data", "tandem dataset"):
+        import h5py  # noqa: F401 - Minari would miss it only when it writes
+        import minari
+
+    description = {"players": label, "success_distance_m": config.game.success_distance_m}
+    about = {**description, "world": config.world.model_dump(mode="json")}
+    try:
+        with os_errors("write", place), warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # it asks for an author, and for more that nobody knows here
+            minari.create_dataset_from_buffers(
+                full,
+                list(_buffers(played, config)),
+                observation_space=goal_space(config.world),
+                action_space=action_space(),
+                algorithm_name="tandem",
+                description=json.dumps(about),
+                requirements=[f"tandem-skills=={__version__}"],
+                data_format="hdf5",
+            )
+    except BaseException:
+        shutil.rmtree(place, ignore_errors=True)  # half a data set looks like a whole one
+        raise
+    return place
+
+
+def _buffers(played: Sequence[Played], config: Config) -> Iterator[object]:
+    from minari.data_collector import EpisodeBuffer
+
+    blocked = config.game.blocked_gripper_fraction
+    worlds: dict[int, WorldBatch] = {}
+    try:
+        for each in counted(played, "writing the data set", len(played), "episodes"):
+            num, columns = each.states.shape
+            if num not in worlds:  # few lengths: a turn ends by time or as soon as the goal is held
+                plain = WorldBatch(config.world, num, num_threads=1)
+                if plain.states.shape[1] != columns:  # those of self-play have a column more
+                    plain.close()
+                    plain = WorldBatch(config.world, num, num_threads=1, blocked_fraction=blocked)
+                worlds[num] = plain
+            yield EpisodeBuffer(**_arrays(each, worlds[num], config.game.success_distance_m))
+    finally:
+        for each_batch in worlds.values():
+            each_batch.close()
+
+
+def _arrays(played: Played, worlds: WorldBatch, success_distance_m: float) -> dict[str, object]:
+    """An episode as ``EpisodeBuffer`` has it; what was seen follows from the states."""
+    worlds.restore(played.states)
+    num_steps = len(played.actions)
+    achieved = np.clip(worlds.object_position, -_FURTHEST_M, _FURTHEST_M)
+    success = np.linalg.norm(achieved - played.goal, axis=1) <= success_distance_m
+    return {
+        "observations": {
+            "observation": np.clip(worlds.positions(), -_FURTHEST_M, _FURTHEST_M),
+            "achieved_goal": achieved.astype(np.float32),
+            "desired_goal": np.tile(played.goal.astype(np.float32), (num_steps + 1, 1)),
+        },
+        "actions": np.clip(played.actions, -1.0, 1.0).astype(np.float32),
+        "rewards": success[1:].astype(np.float64),
+        "terminations": np.zeros(num_steps, dtype=bool),
+        "truncations": np.arange(num_steps) == num_steps - 1,
+        "infos": {"is_success": success, "is_alice": np.full(num_steps + 1, played.is_alice)},
+    }
+
+
+def _place(full: str) -> Path:
+    with needs_extra("data", "tandem dataset"):
+        from minari import storage
+    with os_errors("write", Path(full)):
+        return Path(storage.get_dataset_path(full))
