@@ -24,7 +24,7 @@ from service.actors.evaluation import evaluate, wilson_interval
 from service.robot.backends import Backend, BackendConfig, connect
 from service.robot.calibrate import calibrate
 from service.robot.errors import RobotError
-from service.robot.loop import Bridge, BridgeConfig, Matched
+from service.robot.loop import Bridge, BridgeConfig
 from service.robot.policies import RobotPolicy, load_robot_policy
 from service.robot.running import play
 from service.types import StateArray
@@ -96,20 +96,18 @@ def measure_row(row: Row, policy: RobotPolicy, settings: Settings) -> dict[str, 
     """Success, stops and motion of one row."""
     described, config = BackendConfig.model_validate(row.backend), BridgeConfig.model_validate(row.bridge)
     backend = connect(described, policy.world, seed=settings.seed)
-    share, matched = None, Matched()
+    share, gain = None, (1.0, 1.0, 1.0)
     if row.calibrated:
         undisturbed = connect(BackendConfig(backend=described.backend, parameters=described.parameters), policy.world)
         found = calibrate(described.label, undisturbed.robot, policy.world, config)
-        share, matched = found.covered_share, found.matched
+        share, gain = found.covered_share, found.gain
     motion = _Motion()
-    bridge = Bridge(
-        policy.policy, backend.robot, backend.poses, policy.world, config, matched=matched, record=motion.record
-    )
+    bridge = Bridge(policy.policy, backend.robot, backend.poses, policy.world, config, gain=gain, record=motion.record)
     num_reached, stops = _play(bridge, backend, policy, settings, motion)
     low, high = wilson_interval(num_reached, settings.num_episodes)
     return {
         "covered_share": share,
-        "gain": matched.gain if row.calibrated else None,
+        "gain": gain if row.calibrated else None,
         "success_last": num_reached / settings.num_episodes,
         "success_last_low": low,
         "success_last_high": high,

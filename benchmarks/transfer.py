@@ -231,7 +231,7 @@ def _play(policy: RobotPolicy, backend: Backend, goal: StateArray, job: Job) -> 
     config = bridge_config(job.settings)
     world = policy.world
     found = job.calibration
-    bridge = Bridge(policy.policy, backend.robot, backend.poses, world, config, matched=found.matched, record=record)
+    bridge = Bridge(policy.policy, backend.robot, backend.poses, world, config, gain=found.gain, record=record)
     stopped = ""
     try:
         bridge.run(goal, job.settings.num_steps)

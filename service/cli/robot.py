@@ -55,17 +55,17 @@ def run(
     """Bring the object to goals; Ctrl-C stops the robot first."""
     from service.robot.calibrate import read_calibration
     from service.robot.log import RobotLog
-    from service.robot.loop import Bridge, Matched
+    from service.robot.loop import Bridge
     from service.robot.policies import load_robot_policy
     from service.robot.running import parse_goal, play
 
     config, described, player = _bridge_config(overrides), _backend_config(robot), load_robot_policy(policy, registry)
     goal_m = None if goal is None else parse_goal(goal, player.world)
-    matched = Matched()
+    gain = (1.0, 1.0, 1.0)
     if calibration is not None:
         measured = read_calibration(calibration)
         measured.check(described.label, player.world, config)
-        matched = measured.matched
+        gain = measured.gain
     written = None if log is None else RobotLog(log, _header(player, described, config, calibration), player.world)
     with _connected(described, player, seed, dead_man) as (backend, held, wait):
 
@@ -84,7 +84,7 @@ def run(
 
         bridge = Bridge(
             player.policy, backend.robot, backend.poses, player.world, config,
-            matched=matched, held=held, dry_run=dry_run, record=record,
+            gain=gain, held=held, dry_run=dry_run, record=record,
         )  # fmt: skip
         outcomes = []
         for outcome in play(

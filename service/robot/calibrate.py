@@ -26,7 +26,7 @@ from service.io.files import os_errors, write_atomic
 from service.robot.backends import first_error
 from service.robot.errors import RobotError
 from service.robot.interface import RobotInterface
-from service.robot.loop import Bridge, BridgeConfig, Matched
+from service.robot.loop import Bridge, BridgeConfig
 from service.robot.safety import SafetyConfig, always_held
 from service.types import FloatArray, StateArray
 from service.world_config import WorldConfig
@@ -59,17 +59,6 @@ class Calibration(FrozenModel):
     )
     training_share: tuple[float, float, float] = Field(description="the same of the arm in training")
     delay_steps: float = Field(description="control steps from a command until the arm is seen to move")
-    training_delay_steps: float = Field(0.0, description="the same of the arm of training, behind the same bounds")
-
-    @property
-    def late_steps(self) -> int:
-        """Whole control steps by which it is later than the arm in training."""
-        return max(0, round(self.delay_steps - self.training_delay_steps))
-
-    @property
-    def matched(self) -> Matched:
-        """What a bridge needs of it."""
-        return Matched(self.gain, self.late_steps, self.covered_share)
 
     @property
     def gain(self) -> tuple[float, float, float]:
@@ -124,21 +113,17 @@ def calibrate(
 
     wanted = measure_response(MujocoRobot(world), world, _AS_IN_TRAINING)
     full = config.model_copy(update={"pace": 1.0})
-    usual = measure_response(MujocoRobot(world), world, full)  # as late as bounds alone make it
     found = measure_response(robot, world, full, held=held)
     if not all(_LEAST_SHARE <= share <= _GREATEST_SHARE for share in found.covered_share):
         raise RobotError(
             f"robot {name}: it covers {_percents(found.covered_share)} of a commanded step along x, y, z; "
             f"{_LEAST_SHARE:.0%} to {_GREATEST_SHARE:.0%} can be matched: look at its controller"
         )
-    late_steps = max(0, round(found.delay_steps - usual.delay_steps))
-    x, y, z = (_share_if_reckoned(share, late_steps) for share in found.covered_share)
     return Calibration(
         **_setting(name, world, config),
-        covered_share=(x, y, z),
+        covered_share=found.covered_share,
         training_share=wanted.covered_share,
         delay_steps=found.delay_steps,
-        training_delay_steps=usual.delay_steps,
     )
 
 
@@ -166,15 +151,6 @@ def measure_response(
             "calibration: the arm was not seen to move along any axis: look at what the robot says it is at"
         )
     return Response((x, y, z), round(float(seen.mean()) / step_s, 3))
-
-
-def _share_if_reckoned(share: float, late_steps: int) -> float:
-    """Share of the way that is still to go which an arm covers in a step, of the share that was measured.
-
-    Set-points are measured from where a late arm was d steps ago, so at a steady pace v it is asked for a - d v: from
-    v = r (a - d v), r = v / (a - d v). The bridge reckons those d steps when it runs (``loop.Bridge``).
-    """
-    return round(min(share / max(1.0 - late_steps * share, 0.1), _GREATEST_SHARE), 4)
 
 
 def write_calibration(path: Path, calibration: Calibration) -> None:

@@ -1,10 +1,10 @@
 """The control loop: what is measured becomes a policy's observation, its actions become set-points, 25 times a second.
 
-An action means what it means in training (``WorldBatch.step``): a way of the end effector from where it is, at most
-5 cm an axis, and a change of the finger width. The way to the target is spread over the step's set-points.
+An action means what it means in training (``WorldBatch.step``): a way of the end effector from where it is measured,
+at most 5 cm an axis, and a change of the finger width. The way to the target is spread over the step's set-points.
 
-What is late is late for all: a policy sees the robot as it was when the object was seen, and is told how long ago that
-was if it observes it. Where the robot itself is late, what it was commanded meanwhile says where it is by now.
+Where the object is seen late, a policy sees the robot as it was then, and is told how long ago that was if it observes
+its delay. A robot that is late itself is commanded from where it was seen, which makes it slower and keeps it stable.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from pydantic import Field
@@ -62,17 +62,6 @@ class Episode:
     """From the object, as it was last seen, to the goal; NaN where nothing sees it."""
 
 
-class Matched(NamedTuple):
-    """How a robot differs from the arm of training; see ``calibrate``."""
-
-    gain: tuple[float, float, float] = (1.0, 1.0, 1.0)
-    """By which the ways of an action are multiplied, x, y, z."""
-    late_steps: int = 0
-    """Control steps by which it is later. A policy that observes its delay is told, and of what else is late, too."""
-    covered_share: tuple[float, float, float] = (1.0, 1.0, 1.0)
-    """Of a commanded way that it covers in a control step: what it did since a late measurement is reckoned by it."""
-
-
 class Bridge:
     """Plays a policy on a robot.
 
@@ -82,7 +71,7 @@ class Bridge:
         poses: what sees the object; None where nothing has to.
         world: of the policy: its step, its workspace, what it observes.
         config: of the bridge.
-        matched: what the robot's calibration found; by default a robot as in training.
+        gain: (3,) by which the ways of an action are multiplied; see ``calibrate``.
         held: the dead-man's switch.
         dry_run: command nothing.
         record: takes every step.
@@ -99,15 +88,13 @@ class Bridge:
         world: WorldConfig,
         config: BridgeConfig,
         *,
-        matched: Matched | None = None,
+        gain: tuple[float, float, float] = (1.0, 1.0, 1.0),
         held: Callable[[], bool] = always_held,
         dry_run: bool = False,
         record: Record | None = None,
     ) -> None:
         self._policy, self._robot, self._config, self._record = policy, robot, config, record
-        matched = matched or Matched()
-        self._gain, self._late_steps = config.pace * np.array(matched.gain), matched.late_steps
-        self._covered_m = DISPLACEMENT_M * self._gain * np.array(matched.covered_share)
+        self._gain = config.pace * np.array(gain)
         self._layout = layouts(world).positions
         self._num_commands = world.observed.num_commands
         self._step_s = world.physics_step_s * world.num_substeps
@@ -134,7 +121,7 @@ class Bridge:
         begin = getattr(self._policy, "begin", None)
         if begin is not None:
             begin()
-        num = max(self._num_commands, self._late_steps)
+        num = self._num_commands
         commands = deque([np.zeros(ACTION.size)] * num, maxlen=num)
         self._states: deque[RobotState] = deque(maxlen=_KEPT_STATES)
         seen: deque[FloatArray] = deque(maxlen=self._config.observation_delay_steps + 1)
@@ -177,16 +164,14 @@ class Bridge:
         if np.isfinite(safe.object_time_s):  # nothing sees the object where an arm is calibrated
             then = min(reversed(self._states), key=lambda each: abs(each.time_s - safe.object_time_s))
         age_steps = max(0, round((state.time_s - then.time_s) / self._step_s))
-        delay_steps = self._late_steps + age_steps + self._config.observation_delay_steps
+        delay_steps = age_steps + self._config.observation_delay_steps
         seen.append(observe(self._layout, then, object_m, commands, goal_m, delay_steps))
         action = self._policy.act_deterministic(seen[0])[0].astype(np.float64)
         row["action"] = action
         safe.check_finite(action, "the policy's action")
         action = np.clip(action, -1.0, 1.0)
-        under_way = sum((each[:3] for each in list(commands)[: self._late_steps]), start=np.zeros(3))
         commands.appendleft(action)
-        here_m = state.effector_m + self._covered_m * under_way
-        target_m = here_m + DISPLACEMENT_M * self._gain * action[:3]
+        target_m = state.effector_m + DISPLACEMENT_M * self._gain * action[:3]
         width_m = float(state.fingers_m.sum() + WIDTH_CHANGE_M * action[3])
         row |= {"target_m": target_m, "tick_times_s": [], "set_points_m": [], "measured_m": []}
         num = self._config.set_points_per_step

@@ -6,7 +6,7 @@ import pytest
 from service.config import WorldConfig
 from service.errors import ConfigError
 from service.robot.errors import RobotError
-from service.robot.loop import Bridge, BridgeConfig, Matched
+from service.robot.loop import Bridge, BridgeConfig
 from service.robot.safety import SafeRobot, SafetyConfig
 from tests.robot.fakes import HOME_M, OBJECT_M, FakeRobot
 
@@ -191,7 +191,7 @@ def test_an_action_means_a_way_from_where_the_gripper_is_measured():
     robot, rows = FakeRobot(), []
     config = BridgeConfig(pace=0.5, safety=SafetyConfig(max_speed_m_s=1e3, max_acceleration_m_s2=1e6))
     policy = Steady([0.4, -2.0, 0.0, -0.2])
-    bridge = Bridge(policy, robot, robot.poses, WORLD, config, matched=Matched((0.5, 1.0, 1.0)), record=rows.append)
+    bridge = Bridge(policy, robot, robot.poses, WORLD, config, gain=(0.5, 1.0, 1.0), record=rows.append)
     bridge.run(OBJECT_M, 1)
     way = np.array([0.25 * 0.4 * 0.05, -0.5 * 0.05, 0.0])  # at half the pace; y is clipped to -1
     np.testing.assert_allclose(rows[0]["target_m"], HOME_M + way)
