@@ -48,8 +48,10 @@ def test_list(run: Run) -> None:
     assert lines[0].split("\t") == ["name", "version", "where", "created", "bytes", "aliases", "parent", "kind"]
     assert [line.split("\t")[:3] for line in lines[1:3]] == [["panda-cube", str(n), "yours"] for n in (1, 2)]
     assert lines[2].split("\t")[5:] == ["latest", "panda-cube@1", "primitives"]
-    champion = Registry(BUNDLED).resolve("panda-cube@champion")
-    assert [line.split("\t")[:3] for line in lines[3:]] == [["panda-cube", str(champion.number), "bundled"]]
+    bundled = [Registry(BUNDLED).resolve(f"{name}@champion") for name in ("panda-cube", "panda-cube-robust")]
+    assert [line.split("\t")[:3] for line in lines[3:]] == [
+        [each.name, str(each.number), "bundled"] for each in bundled
+    ]
 
 
 def test_list_json(run: Run) -> None:
@@ -70,7 +72,7 @@ def test_list_of_an_empty_registry_has_what_comes_with_tandem(tmp_path: Path, di
     assert result.stderr == f"nothing published in {path} yet\n"
     rows = json.loads(result.stdout)
     assert [(row["name"], row["aliases"], row["where"]) for row in rows] == [
-        ("panda-cube", ["champion", "latest"], "bundled")
+        (name, ["champion", "latest"], "bundled") for name in ("panda-cube", "panda-cube-robust")
     ]
     assert list(tmp_path.iterdir()) == []
 

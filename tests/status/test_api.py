@@ -115,10 +115,13 @@ def test_a_run_that_has_ended_stays_as_it_is(client, home):
 
 def test_primitives(client):
     answer = client.get("/v1/primitives").json()
-    bundled, tiny = answer["primitives"]
+    *bundled, tiny = answer["primitives"]
     aliases = {"champion": 1, "latest": 2}
     assert tiny == {"name": "tiny", "num_versions": 2, "newest": 2, "aliases": aliases, "origins": ["registry"]}
-    assert (bundled["name"], bundled["origins"]) == ("panda-cube", ["bundled"])
+    assert [(each["name"], each["origins"]) for each in bundled] == [
+        ("panda-cube", ["bundled"]),
+        ("panda-cube-robust", ["bundled"]),
+    ]
 
 
 def test_what_comes_with_tandem_is_beside_the_users_own(tmp_path):

@@ -334,7 +334,7 @@ def test_nothing_yet(browser, tmp_path):
         page.get_by_text("tandem pretrain --config configs/pretrain/panda_cube.yaml").wait_for()
         write_status(tmp_path / "runs", "first")
         page.get_by_role("link", name="first").wait_for()
-        visit.go("#/primitives").page.get_by_text("comes with tandem").wait_for()
+        visit.go("#/primitives").page.get_by_text("comes with tandem").first.wait_for()
         assert visit.complaints == []
         visit.context.close()
 
