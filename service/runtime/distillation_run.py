@@ -22,7 +22,7 @@ from service.policies.numpy_policy import NumpyMCPPolicy, numpy_bob
 from service.policies.parameters import Parameters
 from service.runtime.runner import Health, OnBeat, Runner
 from service.runtime.starting import Start
-from service.store.models import GoalCell, GoalGrid
+from service.store.models import GoalGrid
 from service.types import Metrics, StateArray
 from service.world_config import ObservedConfig
 
@@ -85,28 +85,7 @@ class DistillationRun(Runner):
 
     def grid(self) -> GoalGrid:
         """The cells of random goals, and how often Bob solved those there."""
-        centers = self._cells.centers().reshape(-1, 3)
-        rates = self._solved / np.maximum(1, self._tries)
-        cells = tuple(
-            GoalCell(
-                center_m=tuple(np.round(centers[cell], 4).tolist()),
-                num_tries=int(self._tries[cell]),
-                success_rate=float(rates[cell]),
-                learnability=float(rates[cell] * (1.0 - rates[cell])),
-            )
-            for cell in np.flatnonzero(self._tries)
-        )
-        lower, upper = self._cells.bounds_m
-        return GoalGrid(
-            iteration=self.iteration,
-            num_env_steps=self.num_env_steps,
-            cell_size_m=self._cells.cell_size_m,
-            shape=self._cells.shape,
-            num_cells=len(self._cells),
-            lower_m=lower,
-            upper_m=upper,
-            cells=cells,
-        )
+        return self._grid_of(self._cells, self._tries, self._solved / np.maximum(1, self._tries))
 
     def close(self) -> None:
         """Stop the worlds' threads; a second call does nothing."""

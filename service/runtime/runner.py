@@ -12,13 +12,14 @@ import numpy as np
 
 from service.config import Config
 from service.errors import TandemError
+from service.generator.bins import GoalCells
 from service.io.run_directory import RunDirectory
 from service.policies.parameters import Parameters
 from service.runtime.bookkeeping import Bookkeeper
 from service.runtime.timing import Timing
 from service.runtime.workers import GeneratorResult, RoundSummary, UpdateResult
-from service.store.models import ActorStatus, GoalGrid
-from service.types import Metrics
+from service.store.models import ActorStatus, GoalCell, GoalGrid
+from service.types import IntArray, Metrics, StateArray
 
 OnIteration = Callable[[Metrics], None]
 OnBeat = Callable[[], None]
@@ -157,6 +158,30 @@ class Runner(ABC):
             num_env_steps=self.num_env_steps,
         )
         return Health((actor,), num_rollouts_counted=num_rollouts_counted)
+
+    def _grid_of(self, cells: GoalCells, num_tries: IntArray, success_rate: StateArray) -> GoalGrid:
+        """The grid of a runner that counts (cells,) tries and success rates itself; untried cells are left out."""
+        centers = cells.centers().reshape(-1, 3)
+        tried = tuple(
+            GoalCell(
+                center_m=tuple(np.round(centers[cell], 4).tolist()),
+                num_tries=int(num_tries[cell]),
+                success_rate=float(success_rate[cell]),
+                learnability=float(success_rate[cell] * (1.0 - success_rate[cell])),
+            )
+            for cell in np.flatnonzero(num_tries)
+        )
+        lower, upper = cells.bounds_m
+        return GoalGrid(
+            iteration=self.iteration,
+            num_env_steps=self.num_env_steps,
+            cell_size_m=cells.cell_size_m,
+            shape=cells.shape,
+            num_cells=len(cells),
+            lower_m=lower,
+            upper_m=upper,
+            cells=tried,
+        )
 
     def _stop_reason(self) -> str | None:
         if self._stop_requested:

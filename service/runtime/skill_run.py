@@ -17,7 +17,7 @@ from service.io.run_directory import RunDirectory
 from service.io.tensors import join_parts, split_parts
 from service.policies.parameters import Parameters
 from service.runtime.runner import Health, OnBeat, Runner
-from service.store.models import GoalCell, GoalGrid
+from service.store.models import GoalGrid
 from service.types import Metrics
 
 
@@ -61,27 +61,7 @@ class SkillRun(Runner):
 
     def grid(self) -> GoalGrid:
         """The cells into which episodes brought the object; nobody tries goals, so success says nothing."""
-        centers = self._cells.centers().reshape(-1, 3)
-        cells = tuple(
-            GoalCell(
-                center_m=tuple(np.round(centers[cell], 4).tolist()),
-                num_tries=int(self._visits[cell]),
-                success_rate=0.5,
-                learnability=0.25,
-            )
-            for cell in np.flatnonzero(self._visits)
-        )
-        lower, upper = self._cells.bounds_m
-        return GoalGrid(
-            iteration=self.iteration,
-            num_env_steps=self.num_env_steps,
-            cell_size_m=self._cells.cell_size_m,
-            shape=self._cells.shape,
-            num_cells=len(self._cells),
-            lower_m=lower,
-            upper_m=upper,
-            cells=cells,
-        )
+        return self._grid_of(self._cells, self._visits, np.full(len(self._cells), 0.5))
 
     def close(self) -> None:
         """Stop the worlds' threads; a second call does nothing."""
