@@ -26,16 +26,17 @@ from service.actors.evaluation import evaluate, wilson_interval
 from service.downstream.compose import parameters_digest
 from service.envs.sampling import draw_goals, draw_starts
 from service.errors import TandemError
-from service.robot.backends import Backend, BackendConfig, connect
+from service.randomisation_config import RandomisationConfig
+from service.robot.backends import Backend, BackendConfig, Simulator, connect
 from service.robot.calibrate import Calibration, calibrate
 from service.robot.disturbed import DisturbanceConfig
 from service.robot.errors import RobotError
 from service.robot.loop import Bridge, BridgeConfig
 from service.robot.policies import RobotPolicy, load_robot_policy
-from service.robot.pybullet_robot import CONTROL_STEP_S, PyBulletParameters, world_of
+from service.robot.pybullet_robot import CONTROL_STEP_S, PyBulletParameters, PyBulletRobot, world_of
 from service.robot.safety import SafetyConfig
 from service.robot.watchdogs import WatchConfig
-from service.types import StateArray
+from service.types import BoolArray, StateArray
 
 PACKAGES = ("pybullet", "mujoco", "numpy")
 CHUNK = 25
@@ -66,7 +67,7 @@ class Settings:
     seed: int = 0
     set_points_per_step: int = 10
     max_speed_m_s: float = SPEED_M_S
-    max_acceleration_m_s2: float = ACCELERATION_M_S2
+    max_acceleration_m_s2: float = SafetyConfig().max_acceleration_m_s2
     grip_force_n: float = 140.0
     """A Franka hand's greatest: the cube is ten times as heavy as in training, and half as rough."""
     workers: int = 1
@@ -139,6 +140,8 @@ class Played:
     inside: tuple[int, int]
     """Control steps with the tip, and with the set-point, inside a Franka's limits."""
     num_steps: int
+    free: tuple[int, int] = (0, 0)
+    """Control steps in which the arm touches nothing, and those of them with the tip inside; none where unknown."""
 
 
 def bridge_config(settings: Settings) -> BridgeConfig:
@@ -222,8 +225,10 @@ def _play(policy: RobotPolicy, backend: Backend, goal: StateArray, job: Job) -> 
     distances: list[float] = []
     tip: list[StateArray] = []
     set_points: list[StateArray] = []
+    touches = [_num_touching_steps(simulator)]  # physics steps with a touch, at the start and after each step
 
     def record(step: Mapping[str, Any]) -> None:
+        touches.append(_num_touching_steps(simulator))
         distances.append(float(np.linalg.norm(simulator.object_position() - goal)))
         tip.extend(step.get("measured_m", ()))
         set_points.extend(step.get("set_points_m", ()))
@@ -241,21 +246,28 @@ def _play(policy: RobotPolicy, backend: Backend, goal: StateArray, job: Job) -> 
     num = config.set_points_per_step
     gap_s = world.physics_step_s * world.num_substeps / num
     insides = [_steps_inside(np.array(path), gap_s, num) for path in (tip, set_points)]
+    free = np.diff(touches) == 0
     return Played(
         reached=not stopped and last <= policy.success_distance_m,
         ever=min([*distances, last]) <= policy.success_distance_m,
         stopped=stopped,
-        inside=(insides[0], insides[1]),
+        inside=(int(insides[0].sum()), int(insides[1].sum())),
         num_steps=len(distances),
+        free=(int(free.sum()), int((free & insides[0]).sum())),
     )
 
 
-def _steps_inside(path: StateArray, gap_s: float, num_ticks: int) -> int:
+def _num_touching_steps(simulator: Simulator) -> float:
+    """How often the arm has touched something; NaN, unequal to itself, where that is not counted."""
+    return simulator.num_touching_steps if isinstance(simulator, PyBulletRobot) else np.nan
+
+
+def _steps_inside(path: StateArray, gap_s: float, num_ticks: int) -> BoolArray:
     """Control steps all of whose moments are inside the limits; the first two moments have no acceleration."""
     if len(path) < 3:
-        return 0
+        return np.zeros(-(-len(path) // num_ticks), dtype=np.bool_)
     inside = np.concatenate([[True, True], inside_limits(path, gap_s)])
-    return sum(bool(inside[at : at + num_ticks].all()) for at in range(0, len(inside), num_ticks))
+    return np.array([inside[at : at + num_ticks].all() for at in range(0, len(inside), num_ticks)])
 
 
 def _backend(row: Row) -> BackendConfig:
@@ -277,6 +289,8 @@ def summarise(played: Sequence[Played]) -> dict[str, Any]:
     tip, set_point = (sum(each.inside[index] for each in played) / steps for index in (0, 1))
     reasons = sorted({each.stopped for each in played if each.stopped})
     rates |= {"tip_inside": tip, "set_point_inside": set_point}
+    if num_free := sum(each.free[0] for each in played):
+        rates |= {"free": num_free / steps, "free_tip_inside": sum(each.free[1] for each in played) / num_free}
     return rates | {"num_stops": sum(bool(each.stopped) for each in played), "stops": reasons[:3]}
 
 
@@ -306,7 +320,7 @@ def benchmark(settings: Settings) -> dict[str, Any]:
             print(f"{name}: {rows[name]['success_last']:.1%} in {rows[name]['wall_s']:.0f} s", flush=True)
     without = evaluate(
         policy.policy,
-        policy.world,
+        policy.world.model_copy(update={"randomisation": RandomisationConfig()}),
         "mixed",
         num_episodes=settings.num_goals,
         num_steps=settings.num_steps,
@@ -318,7 +332,7 @@ def benchmark(settings: Settings) -> dict[str, Any]:
         "bridge": bridge_config(settings).model_dump(mode="json"),
         "engine": PyBulletParameters().model_dump(mode="json"),
         "rows": rows,
-        "training_world": without.as_dict(),
+        "nominal_world": without.as_dict(),
     }
 
 

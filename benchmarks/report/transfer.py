@@ -33,15 +33,16 @@ def transfer_words(result: Result) -> str:
     num_goals = sorted({row["num_goals"] for row in rows.values()})
     words = [
         f"{result['policy']['label']}, {', '.join(map(str, num_goals))} goals a row, {settings['num_steps']} steps; "
-        "95 % Wilson intervals. In its own world and without the bridge it reaches "
-        f"{percent(result['training_world']['success_last'], 1)} of such goals."
+        "95 % Wilson intervals. In the nominal world of training and without the bridge it reaches "
+        f"{percent(result['nominal_world']['success_last'], 1)} of such goals."
     ]
     if LIMITED in rows:
         each = rows[LIMITED]
         words.append(
             f"In the first row the set-points stay inside {SPEED_M_S:g} m/s and {ACCELERATION_M_S2:g} m/s2 in "
-            f"{percent(each['set_point_inside'], 1)} of steps and the tip itself in {percent(each['tip_inside'], 1)}; "
-            f"asked were 100 %, and {percent(LIMITED_SUCCESS)} success."
+            f"{percent(each['set_point_inside'], 1)} of steps and the tip itself in {percent(each['tip_inside'], 1)}: "
+            f"in {percent(each['free_tip_inside'], 2)} of those in which the arm touches nothing "
+            f"({percent(each['free'])} of all). Asked were 100 %, and {percent(LIMITED_SUCCESS)} success."
         )
     stops = sum(row["num_stops"] for row in rows.values())
     words.append(f"The bridge's safety stopped {stops} of {sum(row['num_goals'] for row in rows.values())} goals.")

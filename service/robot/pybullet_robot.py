@@ -93,6 +93,8 @@ class PyBulletRobot:
         self._set_joints(_NEUTRAL)
         self._home = self._solve(self._start_m())
         self._num_steps = 0
+        self.num_touching_steps = 0
+        """Physics steps in which the arm or its gripper touched the object, the table or a wall."""
         self._stopped = self._held = False
         step_s, response = self.parameters.physics_step_s, self.parameters.response
         self._follow = 1.0 if response is None else 1.0 - math.exp(-step_s / lag_s(response))
@@ -143,6 +145,7 @@ class PyBulletRobot:
             self._move_arm()
             self._bullet.stepSimulation()
             self._num_steps += 1
+            self.num_touching_steps += bool(self._bullet.getContactPoints(bodyA=self._robot))
 
     def stop(self) -> None:
         """Hold the arm where it is, and let the fingers keep what they hold; another thread may call this, too."""

@@ -25,7 +25,7 @@ _START_MARGIN_M = 0.01
 
 
 class SafetyConfig(FrozenModel):
-    """What a bridge lets through. Speed and acceleration are those of a Franka's Cartesian interface."""
+    """What a bridge lets through. Speed and acceleration are inside those of a Franka, 1.7 m/s and 13 m/s2."""
 
     lower_m: Point | None = Field(
         None, description="corner of the box of set-points; None: of the policy's workspace, less the margin"
@@ -34,7 +34,9 @@ class SafetyConfig(FrozenModel):
     margin_m: float = Field(0.05, ge=0.0, le=0.3, description="of the box around the workspace, to the sides and up")
     lowest_m: float = Field(0.012, ge=0.0, le=0.5, description="least height of a set-point above the table")
     max_speed_m_s: float = Field(1.7, gt=0.0, le=1e6, description="of the set-point")
-    max_acceleration_m_s2: float = Field(13.0, gt=0.0, le=1e6, description="of the set-point")
+    max_acceleration_m_s2: float = Field(
+        11.0, gt=0.0, le=1e6, description="of the set-point; an arm that follows goes beyond by up to a seventh"
+    )
     min_width_m: float = Field(0.0, ge=0.0, le=0.5, description="of the gripper")
     max_width_m: float = Field(0.08, ge=0.0, le=0.5)
     max_grip_force_n: float = Field(40.0, gt=0.0, le=200.0)

@@ -27,7 +27,7 @@ CALIBRATION = Calibration(
     step_s=0.04,
     set_points_per_step=10,
     max_speed_m_s=1.7,
-    max_acceleration_m_s2=13.0,
+    max_acceleration_m_s2=11.0,
     covered_share=(0.6, 0.6, 0.5),
     training_share=(0.6, 0.6, 0.6),
     delay_steps=0.4,
@@ -46,8 +46,8 @@ def test_a_tip_is_inside_the_limits_by_speed_and_acceleration():
 
 def test_rates_count_goals_stops_and_steps():
     played = [
-        Played(reached=True, ever=True, stopped="", inside=(40, 50), num_steps=50),
-        Played(reached=False, ever=True, stopped="stopped: late", inside=(10, 10), num_steps=10),
+        Played(reached=True, ever=True, stopped="", inside=(40, 50), num_steps=50, free=(30, 27)),
+        Played(reached=False, ever=True, stopped="stopped: late", inside=(10, 10), num_steps=10, free=(10, 9)),
         Played(reached=False, ever=False, stopped="", inside=(25, 50), num_steps=50),
         Played(reached=True, ever=True, stopped="", inside=(50, 50), num_steps=50),
     ]
@@ -56,6 +56,7 @@ def test_rates_count_goals_stops_and_steps():
     assert found["success_last_low"] < 0.5 < found["success_last_high"]
     assert found["tip_inside"] == pytest.approx(125 / 160)
     assert found["set_point_inside"] == 1.0
+    assert (found["free"], found["free_tip_inside"]) == (40 / 160, 36 / 40)
     assert (found["num_stops"], found["stops"]) == (1, ["stopped: late"])
 
 
@@ -74,6 +75,7 @@ def test_a_chunk_is_played_alike_again_in_the_real_engine():
     assert [each.stopped for each in first] == ["", ""]
     assert [each.num_steps for each in first] == [8, 8]
     assert play_chunk(job) == first
+    assert all(0 < each.free[0] <= 8 for each in first)  # it comes from above
 
 
 def test_an_unknown_row_is_told_in_one_line():
@@ -82,7 +84,8 @@ def test_an_unknown_row_is_told_in_one_line():
 
 
 def test_the_page_has_a_row_for_each_and_says_what_was_not_measured():
-    row = summarise([Played(reached=True, ever=True, stopped="", inside=(45, 50), num_steps=50)] * 50) | {
+    played = Played(reached=True, ever=True, stopped="", inside=(45, 50), num_steps=50, free=(20, 19))
+    row = summarise([played] * 50) | {
         "calibration": CALIBRATION.model_dump(mode="json"),
         "asked": 0.97,
     }
@@ -96,7 +99,7 @@ def test_the_page_has_a_row_for_each_and_says_what_was_not_measured():
             "max_acceleration_m_s2": 13.0,
             "grip_force_n": 140.0,
         },
-        "training_world": {"success_last": 0.98},
+        "nominal_world": {"success_last": 0.98},
         "machine": MACHINE,
     }
     text = page.transfer_table(result)
@@ -104,5 +107,5 @@ def test_the_page_has_a_row_for_each_and_says_what_was_not_measured():
     assert text.count("| not measured |") == len(ROWS) - 1
     words = page.transfer_words(result)
     assert "some-policy@1, 50 goals a row" in words
-    assert "the tip itself in 90.0 %" in words
+    assert "the tip itself in 90.0 %: in 95.00 % of those in which the arm touches nothing (40 % of all)" in words
     assert "| nominal | 100.0 % |" in report(result)
