@@ -66,6 +66,7 @@ PROGRAMS = {
     "world_speed": "benchmarks.world_speed",
     "page_speed": "benchmarks.page_speed",
     "robustness": "benchmarks.robustness",
+    "randomisation_ranges": "benchmarks.randomisation_ranges",
 }
 """Modules by the name of the recorded file that they make."""
 PAGES = {
@@ -77,7 +78,7 @@ PAGES = {
     "robots.md": ("robots",),
     "results/transfer.md": ("transfer", "transfer_champion"),
     "api.md": ("page",),
-    "results/robust.md": ("robustness",),
+    "results/robust.md": ("robustness", "randomisation_ranges"),
     "../README.md": ("headline", "controls"),
     "scaling.md": ("bottleneck", "box", "nodes", "model", "batches", "skill", "constants"),
 }
@@ -180,11 +181,12 @@ def page_blocks(found: Results) -> Blocks:
 
 
 def robustness_blocks(found: Results) -> Blocks:
-    """Parts of the block about policies in worlds that differ from those of training."""
-    recorded = found.get("robustness")
-    if recorded is None:
-        return {}
-    return {"robustness": [robustness.robustness_table(recorded), robustness.robustness_words(recorded)]}
+    """Parts of the blocks about policies in worlds that differ from those of training."""
+    parts = {
+        "robustness": (robustness.robustness_table, robustness.robustness_words),
+        "randomisation_ranges": (robustness.ranges_table, robustness.ranges_words),
+    }
+    return {name: [part(found[name]) for part in both] for name, both in parts.items() if name in found}
 
 
 class Report:
