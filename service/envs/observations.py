@@ -138,7 +138,9 @@ _GOAL = ObservationLayout(Entry("goal", VECTOR, "m", _MIDDLE_M, 0.12))
 GOAL_FROM_OBJECT = ObservationLayout(Entry("goal_from_object", VECTOR, "m", 0.0, 0.1))
 """Way that the object has to go."""
 _ELAPSED = ObservationLayout(Entry("elapsed", SCALAR, "share of the turn", 0.5, 0.5))
-_DELAY = Entry("delay", SCALAR, "control steps", 1.0, 1.0)
+DELAY = "delay"
+"""Name of the entry that says how late commands are."""
+_DELAY = Entry(DELAY, SCALAR, "control steps", 1.0, 1.0)
 COMMAND_PREFIX = "command_"
 """Begins the names of past commands; ``command_1`` is the last one."""
 OBSTACLE_PREFIX = "obstacle_"

@@ -13,6 +13,7 @@ from service.envs.batch import DISPLACEMENT_M, MAX_TURN_RAD, WIDTH_CHANGE_M, Wor
 from service.envs.observations import (
     COMMAND,
     COMMAND_PREFIX,
+    DELAY,
     PAIR,
     SCALAR,
     VECTOR,
@@ -56,6 +57,7 @@ _MEANINGS = {
     "object": "centre of the object; its orientation is not seen",
     "object_from_effector": "object minus effector",
     "goal": "where the object's centre should be",
+    DELAY: "by how many steps the positions above are late, or commands are carried out late; 0 for neither",
 }
 _COMMAND_MEANING = "the action sent {} ago, clipped to [-1, 1]; 0 where there was none yet"
 _ORIENTATIONS = {

@@ -16,10 +16,10 @@ from pydantic import Field
 from service.actors.evaluation import REPORTED_SEED, DeterministicPolicy, evaluate
 from service.config import WorldConfig
 from service.envs.batch import DISPLACEMENT_M, WIDTH_CHANGE_M, WorldBatch
-from service.envs.observations import COMMAND_PREFIX, ObservationLayout, bob_observation, layouts
+from service.envs.observations import COMMAND_PREFIX, DELAY, ObservationLayout, bob_observation, layouts
 from service.envs.sampling import GoalKind
 from service.frozen import FrozenModel
-from service.types import BoolArray, FloatArray, StateArray
+from service.types import FloatArray, StateArray
 
 _NUM_PLACES = 64
 _FROM_EDGE_M = 0.05
@@ -67,7 +67,10 @@ class Motion(FrozenModel):
 
 
 class LateObservations(FrozenModel):
-    """Success at the last step where the policy sees positions as they were some steps ago."""
+    """Success at the last step where the policy sees positions as they were some steps ago.
+
+    One that observes its delay is told it.
+    """
 
     steps: int
     success_last: float
@@ -121,7 +124,7 @@ def measure(episodes: Episodes) -> tuple[Measured, FloatArray]:
     late = []
     for steps in range(_MAX_LATE_STEPS + 1):
         found = evaluate(
-            _Late(episodes.new_player(), steps, _commands(layout)),
+            _Late(episodes.new_player(), steps, layout),
             episodes.world,
             episodes.goals,
             num_episodes=episodes.num,
@@ -160,23 +163,23 @@ def measure_response(world: WorldConfig) -> tuple[tuple[AxisResponse, ...], tupl
 
 
 class _Late:
-    """A policy that sees positions of some steps ago, but knows its own commands."""
+    """A policy that sees positions of some steps ago, but knows its own commands, and the delay if it observes it."""
 
-    def __init__(self, policy: DeterministicPolicy, num_steps: int, known: BoolArray) -> None:
-        self._policy, self._known = policy, known
+    def __init__(self, policy: DeterministicPolicy, num_steps: int, layout: ObservationLayout) -> None:
+        self._policy, self._num_steps = policy, num_steps
+        names = [entry.name for entry in layout.entries]
+        self._known = [layout[name] for name in names if name.startswith(COMMAND_PREFIX)]
+        self._delay = [layout[name] for name in names if name == DELAY]
         self._seen: deque[FloatArray] = deque(maxlen=num_steps + 1)
 
     def act_deterministic(self, observation: FloatArray) -> FloatArray:
         self._seen.append(observation)
-        return self._policy.act_deterministic(np.where(self._known, observation, self._seen[0]))
-
-
-def _commands(layout: ObservationLayout) -> BoolArray:
-    """(O,) which numbers of an observation are commands."""
-    known = np.zeros(layout.size, dtype=bool)
-    for entry in layout.entries:
-        known[layout[entry.name]] = entry.name.startswith(COMMAND_PREFIX)
-    return known
+        late = self._seen[0].copy()
+        for part in self._known:
+            late[:, part] = observation[:, part]
+        for part in self._delay:
+            late[:, part] = self._num_steps
+        return self._policy.act_deterministic(late)
 
 
 def _place(worlds: WorldBatch, rng: np.random.Generator, width_m: float) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 
+from service.envs.observations import DELAY
 from service.export.description import ArrayEntry, Description, FieldEntry
 from service.export.measurements import Distribution
 
@@ -182,6 +183,8 @@ def _late(about: Description) -> Iterator[str]:
             for late in about.measured.late_observations
         ),
     )
+    if any(field.name == DELAY for field in about.observation):
+        yield "It is told how late they are, by `delay`."
     if about.tolerated_late_steps:
         yield f"Up to {1e3 * about.tolerated_late_steps / about.rate_hz:.0f} ms cost less than 10 points."
     else:

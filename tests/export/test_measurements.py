@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 
 from service.actors.evaluation import IdlePolicy
-from service.envs.observations import ACTION
+from service.envs.observations import ACTION, layouts
 from service.export.measurements import Episodes, LateObservations, Measured, measure, measure_response
+from service.world_config import ObservedConfig
 from tests.export.policies import SEEN, WORLD
 
 
@@ -48,6 +49,13 @@ def test_late_positions_and_the_speed_of_the_tip():
     acceleration = np.linalg.norm(np.diff(velocity, axis=0), axis=2) / 0.04
     assert motion.tip_acceleration_m_s2.max == pytest.approx(acceleration.max(), rel=1e-3)
     assert motion.num_episodes == 3
+
+
+def test_a_policy_that_observes_its_delay_is_told_it():
+    world, seen = WORLD.model_copy(update={"observed": ObservedConfig(num_commands=1, delay=True)}), []
+    measure(Episodes(world, "table", 2, 3, 0.05, lambda: Upwards(seen)))
+    delay = layouts(world).bob["delay"]
+    assert [np.unique(np.array(each)[:, :, delay]).tolist() for each in seen] == [[0.0], [1.0], [2.0]]
 
 
 def test_who_stands_still():
