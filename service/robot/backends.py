@@ -11,7 +11,7 @@ from typing import Any, Protocol
 from pydantic import Field, ValidationError
 
 from service.config_tree import read_yaml
-from service.errors import TandemError
+from service.errors import TandemError, one_line
 from service.frozen import FrozenModel
 from service.robot.disturbed import DisturbanceConfig, DisturbedPoses, DisturbedRobot
 from service.robot.interface import PoseSource, RobotInterface
@@ -44,6 +44,14 @@ class Backend:
     poses: PoseSource
     simulator: Simulator | None = None
     """None for a robot that people have to put back by hand."""
+
+    def begin(self, object_m: StateArray) -> None:
+        """Begin an episode of a simulator, its object at (3,) metres; nothing is still on its way from the last one."""
+        assert self.simulator is not None
+        self.simulator.reset(object_m)
+        for part in (self.robot, self.poses):
+            if isinstance(part, (DisturbedRobot, DisturbedPoses)):
+                part.forget()
 
     def close(self) -> None:
         """Let go of both."""
@@ -100,7 +108,7 @@ def connect(config: BackendConfig, world: WorldConfig, *, seed: int = 0) -> Back
     Raises:
         TandemError: no such back-end, what it needs is not installed, or it does not answer.
     """
-    made = _factory(config.backend)(world, config.parameters)
+    made = _make(config, world)
     wanted = config.disturbance
     if wanted == DisturbanceConfig():
         return made
@@ -117,10 +125,28 @@ def first_error(error: ValidationError) -> str:
     return f"{key} = {first['input']!r}: {first['msg']}"
 
 
+def _make(config: BackendConfig, world: WorldConfig) -> Backend:
+    factory = _factory(config.backend)
+    if config.backend in BACKENDS:
+        return factory(world, config.parameters)
+    try:
+        made = factory(world, config.parameters)
+    except TandemError:
+        raise
+    except Exception as error:  # it is the user's own code
+        words = one_line(f"{type(error).__name__}: {error}", 300)
+        raise TandemError(f"robot {config.backend!r} cannot be made: {words}") from error
+    if not isinstance(made, Backend):
+        raise TandemError(
+            f"robot {config.backend!r} made {type(made).__name__}; return a service.robot.backends.Backend"
+        )
+    return made
+
+
 def _factory(reference: str) -> Factory:
     module, _, name = BACKENDS.get(reference, reference).partition(":")
     try:
         factory: Factory = getattr(importlib.import_module(module), name)
-    except (ImportError, AttributeError, ValueError) as error:
-        raise TandemError(f"robot {reference!r} cannot be loaded: {error}") from None
+    except Exception as error:  # it may be the user's own code
+        raise TandemError(f"robot {reference!r} cannot be loaded: {one_line(str(error), 300)}") from error
     return factory

@@ -47,6 +47,9 @@ class _History(Generic[_Measurement]):
     def add(self, measurement: _Measurement) -> None:
         self._kept.append(measurement)
 
+    def forget(self) -> None:
+        self._kept.clear()
+
     def read(self, now_s: float) -> _Measurement:
         """The newest that is old enough, or else the oldest that there is."""
         while len(self._kept) > 1 and self._kept[1].time_s <= now_s - self._delay_s + _SAME_TIME_S:
@@ -89,6 +92,11 @@ class DisturbedRobot:
             self._robot.command(command)
         self._robot.wait_until(time_s)
 
+    def forget(self) -> None:
+        """Begin anew: nothing was read or commanded before."""
+        self._states.forget()
+        self._commands.clear()
+
     def stop(self) -> None:
         """Forget the commands that wait, and halt."""
         self._commands.clear()
@@ -124,6 +132,10 @@ class DisturbedPoses:
             noise = self._rng.normal(0.0, self._config.pose_noise_m, 3) if self._config.pose_noise_m else 0.0
             self._seen.add(replace(pose, position_m=pose.position_m + self._config.pose_offset_m + noise))
         return self._seen.read(self._now_s())
+
+    def forget(self) -> None:
+        """Begin anew: nothing was seen before."""
+        self._seen.forget()
 
     def close(self) -> None:
         """Let go of what sees the object."""

@@ -82,7 +82,7 @@ def play(
     goals = draw_goals(policy.goals, rng, policy.world, policy.success_distance_m, start=starts, box=boxes)
     for episode in range(first, num_episodes):
         if backend.simulator is not None:
-            backend.simulator.reset(starts[episode])
+            backend.begin(starts[episode])
         elif goal_m is None and policy.world.fixture != "none":
             goals[episode] = _goal_for(_seen(backend), rng, policy)
         goal = goals[episode] if goal_m is None else goal_m

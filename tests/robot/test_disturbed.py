@@ -47,6 +47,26 @@ def test_poses_are_late_noisy_and_off_alike_for_a_seed():
     assert (read(1)[0] != places).any()
 
 
+def test_a_new_start_knows_nothing_of_the_episode_before():
+    late = {"state_delay_s": 0.04, "pose_delay_s": 0.04, "command_delay_s": 0.04}
+    backend = connect(BackendConfig(backend="mujoco", disturbance=late), WorldConfig())
+    robot, home = backend.robot, backend.robot.read().effector_m
+
+    def moved_m(duration_s):
+        for _ in range(round(duration_s / 0.01)):
+            robot.read()
+            robot.wait_until(robot.now_s() + 0.01)
+        return np.linalg.norm(robot.read().effector_m - home)
+
+    for place in ([0.0, 0.1, 0.025], [0.1, -0.1, 0.025]):
+        backend.begin(np.array(place))
+        np.testing.assert_allclose(backend.poses.read().position_m, place, atol=1e-6)
+        assert moved_m(0.2) < 2e-3
+        robot.command(Command(home + 0.05, 0.0))
+        assert moved_m(0.12) > 5e-3
+        robot.command(Command(home + 0.1, 0.0))  # is still on its way when the next episode begins
+
+
 def test_back_ends_by_name_file_and_function(tmp_path):
     assert read_backend("mujoco") == BackendConfig(backend="mujoco")
     file = tmp_path / "late.yaml"
@@ -66,6 +86,8 @@ def test_back_ends_by_name_file_and_function(tmp_path):
         ("backend: mujoco\ndisturbance: {pose_delay_s: -1}\n", r"disturbance.pose_delay_s = -1: .*greater than"),
         ("backend: mujoco\nparameters: {friction: high}\n", "robot mujoco: parameters: friction = 'high'"),
         ("backend: nowhere:at_all\n", "robot 'nowhere:at_all' cannot be loaded: No module named 'nowhere'"),
+        ("backend: os:getcwd\n", "robot 'os:getcwd' cannot be made: TypeError: "),
+        ("backend: operator:eq\n", "robot 'operator:eq' made bool; return a "),
     ],
 )
 def test_what_is_no_robot(text, match, tmp_path):
