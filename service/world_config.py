@@ -48,8 +48,8 @@ class ObservedConfig(FrozenModel):
     )
     delay: bool = Field(
         False,
-        description="policies see by how many control steps their commands are late; on a robot, tandem robot "
-        "calibrate measures it",
+        description="policies see by how many control steps their commands are late; tandem robot run tells them by "
+        "how many what is seen is late",
     )
     obstacles: bool = Field(False, description="whether policies see where the middle of each of world.obstacles is")
 

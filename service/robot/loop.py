@@ -28,6 +28,8 @@ from service.world_config import WorldConfig
 
 Record = Callable[[dict[str, Any]], None]
 """Takes what happened in a step: see ``Bridge.run``."""
+_Seen = tuple[RobotState, StateArray]
+"""The robot as it was when the object was seen at (3,) metres."""
 
 _MAX_SETTLE_S = 1.0
 _KEPT_STATES = 16
@@ -45,10 +47,14 @@ class BridgeConfig(FrozenModel):
         gt=0.0,
         le=1.0,
         description="share of an action's way that is commanded. Behind a bound on acceleration an arm turns late, and "
-        "at full pace it overshoots: of 75 goals 92 % are reached at 1, 96 % at 0.8 and at 0.65 (docs/robot.md)",
+        "at full pace it overshoots (docs/decisions/0025)",
     )
     observation_delay_steps: int = Field(
-        0, ge=0, le=10, description="act on what was seen so many steps ago, to try out what that costs"
+        0,
+        ge=0,
+        le=10,
+        description="act on what was seen so many steps ago, to try out what that costs; a policy still knows its last "
+        "commands, and its delay",
     )
     safety: SafetyConfig = SafetyConfig()
 
@@ -124,7 +130,7 @@ class Bridge:
         num = self._num_commands
         commands = deque([np.zeros(ACTION.size)] * num, maxlen=num)
         self._states: deque[RobotState] = deque(maxlen=_KEPT_STATES)
-        seen: deque[FloatArray] = deque(maxlen=self._config.observation_delay_steps + 1)
+        seen: deque[_Seen] = deque(maxlen=self._config.observation_delay_steps + 1)
         with self.safe.guarded():
             self.safe.start(self._tick_s)
             start_s = self._robot.now_s()
@@ -151,7 +157,7 @@ class Bridge:
         due_s: float,
         goal_m: StateArray,
         commands: deque[StateArray],
-        seen: deque[FloatArray],
+        seen: deque[_Seen],
     ) -> None:
         safe = self.safe
         row["time_s"] = self._robot.now_s()
@@ -164,9 +170,10 @@ class Bridge:
         if np.isfinite(safe.object_time_s):  # nothing sees the object where an arm is calibrated
             then = min(reversed(self._states), key=lambda each: abs(each.time_s - safe.object_time_s))
         age_steps = max(0, round((state.time_s - then.time_s) / self._step_s))
+        seen.append((then, object_m))
         delay_steps = age_steps + self._config.observation_delay_steps
-        seen.append(observe(self._layout, then, object_m, commands, goal_m, delay_steps))
-        action = self._policy.act_deterministic(seen[0])[0].astype(np.float64)
+        observation = observe(self._layout, *seen[0], commands, goal_m, delay_steps)
+        action = self._policy.act_deterministic(observation)[0].astype(np.float64)
         row["action"] = action
         safe.check_finite(action, "the policy's action")
         action = np.clip(action, -1.0, 1.0)

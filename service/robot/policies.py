@@ -27,6 +27,7 @@ class RobotPolicy:
     label: str
     policy: DeterministicPolicy
     world: WorldConfig
+    """The nominal one, where it was trained in worlds that are drawn."""
     goals: GoalKind
     """That it is tried on."""
     success_distance_m: float
@@ -59,9 +60,8 @@ def load_robot_policy(reference: str, registry: Path) -> RobotPolicy:
 def _bob(reference: str, registry: Path) -> RobotPolicy:
     trained = load_bob(reference, registry)
     check_robot(trained)
-    return RobotPolicy(
-        trained.label, trained.policy, trained.config.world, "mixed", trained.config.game.success_distance_m
-    )
+    config = trained.config
+    return RobotPolicy(trained.label, trained.policy, config.world.nominal, "mixed", config.game.success_distance_m)
 
 
 def _orchestrator(directory: Path, registry: Path) -> RobotPolicy:
@@ -74,4 +74,5 @@ def _orchestrator(directory: Path, registry: Path) -> RobotPolicy:
     check_robot(trained)
     task = find_task(trial.task)
     policy = load_policy(directory / "policy.safetensors", trained)
-    return RobotPolicy(trial.name, policy, task.world_from(trained.config.world), task.goals, SUCCESS_DISTANCE_M)
+    world = task.world_from(trained.config.world.nominal)
+    return RobotPolicy(trial.name, policy, world, task.goals, SUCCESS_DISTANCE_M)

@@ -54,6 +54,12 @@ def test_observations_come_as_many_steps_late_as_asked():
     _, late, rows, bridge = played(BridgeConfig(observation_delay_steps=2))
     np.testing.assert_allclose([row[:3] for row in late[2:]], [row["effector_m"] for row in rows[:3]], atol=1e-6)
     assert (late[4] != on_time[4]).any()
+    world = WorldConfig(observed={"num_commands": 2, "delay": True})
+    bob, (_, told, _, _) = layouts(world).bob, played(BridgeConfig(observation_delay_steps=2), world)
+    np.testing.assert_allclose(told[4][:3], rows[2]["effector_m"], atol=1e-6)
+    np.testing.assert_allclose(told[4][bob["command_1"]], 0.04, atol=1e-6)  # what it asked for is known at once
+    np.testing.assert_allclose(told[4][bob["command_2"]], 0.03, atol=1e-6)
+    assert told[4][bob["delay"]] == 2.0
     bridge.run(GOAL_M, 1)  # a new episode remembers nothing of the one before
     np.testing.assert_allclose(bridge._policy.seen[0][:3], rows[5]["effector_m"], atol=1e-6)
 

@@ -28,6 +28,8 @@ def write_training(path, champion, method="ours"):
 def test_a_bob_and_an_orchestrator_with_its_world(champion, tmp_path):
     bob = load_robot_policy("panda-cube@champion", tmp_path)
     assert (bob.goals, bob.world.fixture) == ("mixed", "none")
+    robust = load_robot_policy("panda-cube-robust@champion", tmp_path).world
+    assert (robust.nominal, robust.observed.delay) == (robust, True)  # a robot is one, not drawn from many
     write_training(tmp_path / "wall", champion)
     found = load_robot_policy(str(tmp_path / "wall"), BUNDLED)
     assert (found.label, found.goals, found.world.fixture) == ("wall-ours-0", "table", "wall")
