@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import yaml
@@ -37,6 +37,7 @@ _LAST_STEPS = 2
 _ACTION, _APPROACH_ACTION = 0.4, 0.5
 _MOVED_M = 5e-4
 _LEAST_SHARE, _GREATEST_SHARE = 0.1, 2.0
+_Share = Annotated[float, Field(gt=0.0)]
 _DIRECTIONS = np.concatenate([np.eye(3), -np.eye(3)])
 _AS_IN_TRAINING = BridgeConfig(
     pace=1.0,
@@ -54,10 +55,10 @@ class Calibration(FrozenModel):
     set_points_per_step: int
     max_speed_m_s: float
     max_acceleration_m_s2: float
-    covered_share: tuple[float, float, float] = Field(
+    covered_share: tuple[_Share, _Share, _Share] = Field(
         description="of a commanded way, x, y, z, that the arm covers in a control step"
     )
-    training_share: tuple[float, float, float] = Field(description="the same of the arm in training")
+    training_share: tuple[_Share, _Share, _Share] = Field(description="the same of the arm in training")
     delay_steps: float = Field(description="control steps from a command until the arm is seen to move")
 
     @property

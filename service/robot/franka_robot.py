@@ -69,7 +69,7 @@ class FrankaRobot:
         self._franky, self._parameters = franky, parameters
         self._base = np.array(parameters.base_position_m)
         self._tracker: Any = None
-        self._stopped = False
+        self._stopped = self._ended = False
         realtime = franky.RealtimeConfig.Enforce if parameters.realtime else franky.RealtimeConfig.Ignore
         with self._saying("connect"):
             self._robot = franky.Robot(parameters.host, realtime_config=realtime)
@@ -124,14 +124,13 @@ class FrankaRobot:
 
     def stop(self) -> None:
         """End the control of the arm, which brakes and holds; fingers that move halt, and those that hold go on."""
-        already, self._stopped = self._stopped, True
-        if already:
-            return
-        self._hand.halt()
+        self._stopped = True
+        self._hand.halt()  # again, too: another thread may just have handed on a command
         # Whatever the library says now, the robot brakes by itself once nobody controls it.
         with contextlib.suppress(Exception):
-            if self._tracker is not None and self._tracker.is_running:
+            if not self._ended and self._tracker is not None and self._tracker.is_running:
                 self._robot.move(self._franky.TorqueStopMotion(), asynchronous=True)
+                self._ended = True
 
     def close(self) -> None:
         """Give the robot back."""

@@ -139,9 +139,8 @@ class MujocoRobot:
 
     def stop(self) -> None:
         """Hold the joints where they are."""
-        if not self._stopped:
-            self._data.ctrl[: self._robot.num_joints] = self._joints()[0]
         self._stopped = True
+        self._data.ctrl[: self._robot.num_joints] = self._joints()[0]
 
     def close(self) -> None:
         """Nothing is left behind."""

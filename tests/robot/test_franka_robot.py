@@ -124,7 +124,9 @@ def test_set_points_go_out_in_the_frame_of_the_arm_and_begin_its_control(robot, 
 def test_stop_ends_the_control_once_and_for_all(robot, franky):
     robot.command(Command(np.zeros(3), 0.08))
     robot.stop()
+    robot._hand.go_to(0.0, 20.0)  # a command of the other thread, which was under way
     robot.stop()
+    assert robot._hand._wanted is None
     assert franky.motions == ["stop motion"]
     with pytest.raises(RobotError, match=r"franka at robot\.local: it was stopped"):
         robot.command(Command(np.zeros(3), 0.08))

@@ -90,6 +90,10 @@ def test_a_calibration_shortens_ways_and_lengthens_none(champion, tmp_path):
     (tmp_path / "bad.yaml").write_text("robot: mine\n")
     with pytest.raises(TandemError, match=r"bad\.yaml: arm"):
         read_calibration(tmp_path / "bad.yaml")
+    text = (tmp_path / "mine.yaml").read_text()
+    (tmp_path / "bad.yaml").write_text(text.replace("- 0.4\n", "- 0.0\n"))
+    with pytest.raises(TandemError, match=r"bad\.yaml: covered_share\.2 = 0\.0: .* greater than 0; calibrate again"):
+        read_calibration(tmp_path / "bad.yaml")
 
 
 def test_a_stopped_arm_holds_and_refuses():
@@ -97,6 +101,7 @@ def test_a_stopped_arm_holds_and_refuses():
     robot.command(Command(np.array([0.1, 0.1, 0.2]), 0.08))
     robot.wait_until(0.04)
     robot.stop()
+    robot._data.ctrl[:7] += 0.5  # a command of the other thread, which was under way
     robot.stop()
     robot.wait_until(0.3)
     before = robot.read().effector_m
