@@ -32,7 +32,8 @@ _Set = Annotated[
     list[str] | None, typer.Option("--set", metavar="A=B", help="Of the bridge, such as safety.max_speed_m_s=0.5.")
 ]
 _DeadMan = Annotated[
-    str | None, typer.Option(metavar="key|none", help="A key to be held; default: none for simulators, else key.")
+    str | None,
+    typer.Option(metavar="key|none", help="A key to be held; default: none for simulators and dry runs, else key."),
 ]
 
 
@@ -66,26 +67,24 @@ def run(
         measured = read_calibration(calibration)
         measured.check(described.label, player.world, config)
         gain = measured.gain
-    written = None if log is None else RobotLog(log, _header(player, described, config, calibration), player.world)
-    with _connected(described, player, seed, dead_man) as (backend, held, wait):
+    with _connected(described, player, seed, dead_man, dry_run) as (backend, held, wait):
 
         def record(row: dict[str, Any]) -> None:
             if written is not None:
                 written.record(row)
             if dry_run:
-                _print_step(row, bridge.safe.limiter.box)
+                _print_step(row, bridge.safe.limiter.box, to_stderr=as_json)
 
         def ready(episode: int, goal_m: StateArray) -> None:
             if written is not None:
                 written.episode = episode
-            if backend.simulator is None and not dry_run:
-                typer.echo(f"goal {episode + 1} of {episodes}: {_words(goal_m)}", err=True)
-                wait("put arm and object to their start")
+            wait(f"goal {episode + 1} of {episodes}, {_words(goal_m)}: put arm and object to their start")
 
         bridge = Bridge(
             player.policy, backend.robot, backend.poses, player.world, config,
             gain=gain, held=held, dry_run=dry_run, record=record,
         )  # fmt: skip
+        written = None if log is None else RobotLog(log, _header(player, described, config, calibration), player.world)
         outcomes = []
         for outcome in play(
             bridge, backend, player, goal_m=goal_m, num_episodes=episodes, num_steps=steps, seed=seed, ready=ready
@@ -117,8 +116,7 @@ def calibrate(
 
     config, described, player = _bridge_config(overrides), _backend_config(robot), load_robot_policy(policy, registry)
     with _connected(described, player, 0, dead_man) as (backend, held, wait):
-        if backend.simulator is None:
-            wait("take everything out of the arm's way")
+        wait("take everything out of the arm's way")
         found = measuring.calibrate(described.label, backend.robot, player.world, config, held=held)
     measuring.write_calibration(out, found)
     for axis, share, wanted in zip("xyz", found.covered_share, found.training_share, strict=True):
@@ -165,9 +163,12 @@ def _backend_config(reference: str) -> BackendConfig:
 
 @contextlib.contextmanager
 def _connected(
-    described: BackendConfig, player: RobotPolicy, seed: int, dead_man: str | None
+    described: BackendConfig, player: RobotPolicy, seed: int, dead_man: str | None, dry_run: bool = False
 ) -> Iterator[tuple[Backend, Callable[[], bool], Callable[[str], None]]]:
-    """A robot with its dead-man's switch, and what asks people to get ready; signals come as exceptions."""
+    """A robot with its dead-man's switch, and what asks people to get ready; signals come as exceptions.
+
+    Nobody is asked, nor has to hold a key, where nobody is in danger: by a simulator, and by a dry run.
+    """
     from service.robot.backends import connect
     from service.robot.dead_man import HeldKey
     from service.robot.safety import always_held
@@ -178,16 +179,17 @@ def _connected(
     try:
         with StopSignals(), contextlib.ExitStack() as stack:
             backend = stack.enter_context(contextlib.closing(connect(described, player.world, seed=seed)))
-            needed = dead_man == "key" or (dead_man is None and backend.simulator is None)
+            harmless = backend.simulator is not None or dry_run
+            needed = dead_man == "key" or (dead_man is None and not harmless)
             key = stack.enter_context(HeldKey()) if needed else None
 
             def wait(what: str) -> None:
-                if key is None:
+                if key is not None:
+                    typer.echo(f"{what}, then hold any key; letting go stops the robot", err=True)
+                    key.wait()
+                elif not harmless:
                     typer.echo(f"{what}, then press Enter", err=True)
                     sys.stdin.readline()
-                    return
-                typer.echo(f"{what}, then hold any key; letting go stops the robot", err=True)
-                key.wait()
 
             yield backend, key or always_held, wait
     except InterruptError as interrupt:
@@ -207,13 +209,14 @@ def _header(
     }
 
 
-def _print_step(row: dict[str, Any], box: Box) -> None:
+def _print_step(row: dict[str, Any], box: Box, *, to_stderr: bool) -> None:
     if "width_m" not in row:
         return
     typer.echo(
         f"step {row['step']:>3}  gripper {_words(row['effector_m'])}  object {_words(row['object_m'])}"
         f"  would go to {_words(box.clip(row['target_m']))}"
-        f"  width {row['width_m']:.3f} m"
+        f"  width {row['width_m']:.3f} m",
+        err=to_stderr,
     )
 
 

@@ -18,6 +18,8 @@ from service.media.recording import RecordedEpisodes
 from service.types import StateArray
 
 FORMAT_VERSION = 1
+_SIZES = {"effector_m": 3, "fingers_m": 2, "object_m": 3, "goal_m": 3}
+"""Of what is shown of a step."""
 _LONG_WAY = 30
 """Iterations that find the arm's joints from its home."""
 
@@ -64,17 +66,29 @@ def read_log(path: Path) -> LoggedRun:
         TandemError: no such file, or no log of a robot.
     """
     header, *rows = read_jsonl(path) or [{}]
-    if header.get("format_version") != FORMAT_VERSION or "world" not in header:
+    if header.get("format_version") != FORMAT_VERSION or not {"world", "success_distance_m"} <= header.keys():
         raise TandemError(f"{path} is no log of tandem robot run, format {FORMAT_VERSION}; name what --log wrote")
     try:
         world = WorldConfig.model_validate(header["world"])
     except ValidationError as error:
         raise TandemError(f"{path}: its world cannot be read: {error.errors()[0]['msg']}") from None
     episodes: dict[int, list[dict[str, Any]]] = {}
-    for row in rows:
+    for line, row in enumerate(rows, start=2):
         if "effector_m" in row:
+            _check(row, f"{path} line {line}")
             episodes.setdefault(row["episode"], []).append(row)
     return LoggedRun(header, world, list(episodes.values()))
+
+
+def _check(row: Mapping[str, Any], where: str) -> None:
+    """Assert that a step has everything that is shown of it."""
+    try:
+        sizes = {key: np.array(row[key], dtype=np.float64).shape for key in _SIZES}
+        damaged = not isinstance(row["episode"], int) or sizes != {key: (size,) for key, size in _SIZES.items()}
+    except (KeyError, TypeError, ValueError):
+        damaged = True
+    if damaged:
+        raise TandemError(f"{where} is no step of a robot: it was changed; remove that line and try again")
 
 
 def states_of(run: LoggedRun, success_distance_m: float) -> RecordedEpisodes:

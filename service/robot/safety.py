@@ -113,8 +113,8 @@ class SafeRobot:
             tick_s: time between two set-points; 0 for not known.
 
         Raises:
-            RobotError: it does not answer or answers too late, is outside its box, the switch is not held, or the
-                object is not seen.
+            RobotError: it does not answer or answers too late, is outside its box (but for a dry run, which shows
+                where it is), the switch is not held, or the object is not seen.
         """
         self._state_watch, self._pose_watch = StateWatch(self.config.watch), PoseWatch(self.config.watch)
         self.limiter.position_m = np.full(3, np.nan)  # nothing was commanded that the robot could be away from
@@ -127,7 +127,8 @@ class SafeRobot:
                 f"it answers late: reading takes {1e3 * took_s:.1f} ms, and a set-point is due every "
                 f"{1e3 * tick_s:.1f} ms: lower set_points_per_step"
             )
-        if not self.limiter.box.contains(self.state.effector_m, margin_m=_START_MARGIN_M):
+        inside = self.limiter.box.contains(self.state.effector_m, margin_m=_START_MARGIN_M)
+        if not (inside or self._dry_run):
             self._fail(f"the gripper starts at {_words(self.state.effector_m)}, outside the box {self.limiter.box}")
         self.limiter.start(self.state.effector_m)
         self._expected_s = self._robot.now_s()

@@ -1,6 +1,8 @@
+import contextlib
 import json
 import os
 import signal
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -49,6 +51,13 @@ def test_goals_are_played_logged_and_drawn_from_the_log(tmp_path):
     again = invoke("run", "--robot", "mujoco", "--log", log)
     assert again.exit_code == 2
     assert "there is a file already; name another" in again.stderr
+    lines = log.read_text().splitlines()
+    step = json.loads(lines[3])
+    for damaged in ({**step, "object_m": None}, {key: step[key] for key in step if key != "goal_m"}):
+        (tmp_path / "damaged.jsonl").write_text("\n".join([*lines[:3], json.dumps(damaged), *lines[4:], ""]))
+        replayed = invoke("replay", "damaged.jsonl")
+        assert replayed.exit_code == 2
+        assert replayed.stderr.startswith("error: damaged.jsonl line 4 is no step of a robot: ")
 
 
 def test_a_dry_run_says_where_it_would_go_and_moves_nothing():
@@ -108,16 +117,41 @@ def real(robot):
 def test_a_real_robot_wants_a_dead_mans_switch_and_a_person(monkeypatch):
     robot = FakeRobot()
     monkeypatch.setattr(backends, "_factory", lambda reference: real(robot))
-    without = invoke("run", "--robot", "their:robot", "--goal", "0,0,0.2")
+    without = invoke("run", "--robot", "their:robot", "--goal", "0,0,0.2", "--log", "log.jsonl")
     assert without.exit_code == 2
+    assert not Path("log.jsonl").exists()  # the same words work once there is a terminal
     assert "the dead-man's switch is a key" in without.stderr
     assert robot.commands == []
+    dry = invoke("run", "--robot", "their:robot", "--goal", "0,0,0.2", "--steps", "2", "--dry-run", "--json")
+    assert dry.exit_code == 0, dry.output
+    assert json.loads(dry.stdout)["goals"] == 1
+    assert dry.stderr.count("would go to") == 2
+    assert robot.commands == robot.stops == []
     ran = CliRunner().invoke(
         app, ["robot", "run", "--robot", "their:robot", "--goal", "0,0,0.2", "--steps", "3", "--dead-man", "none"], "\n"
     )
     assert ran.exit_code == 0, ran.output
     assert "put arm and object to their start, then press Enter" in ran.stderr
     assert robot.commands
+
+
+def test_a_key_that_a_simulator_is_given_is_waited_for(monkeypatch):
+    class Key(contextlib.nullcontext):
+        held = False
+
+        def __enter__(self):
+            return self
+
+        def wait(self):
+            self.held = True
+
+        def __call__(self):
+            return self.held
+
+    monkeypatch.setattr("service.robot.dead_man.HeldKey", Key)
+    ran = invoke("run", "--robot", "mujoco", "--dead-man", "key", "--steps", 1, *FAST)
+    assert ran.exit_code == 0, ran.output
+    assert "then hold any key; letting go stops the robot" in ran.stderr
 
 
 def test_ctrl_c_stops_the_robot_first(monkeypatch, default_signals):

@@ -144,6 +144,10 @@ def test_a_dry_run_commands_nothing_and_stops_nothing():
     assert robot.commands == robot.stops == []
     assert len(rows) == 5
     assert {"action", "target_m", "width_m"} <= rows[0].keys()
+    robot.effector_m = robot.set_point_m = np.array([-0.05, 0.0, 0.0])  # a person has put the tip on the table
+    played(robot, np.random.default_rng(0), 1, dry_run=True, record=rows.append)
+    np.testing.assert_array_equal(rows[-1]["effector_m"], robot.effector_m)
+    assert robot.commands == robot.stops == []
 
 
 def test_what_is_wrong_before_the_start_moves_nothing():
