@@ -5,21 +5,22 @@
 The same starts and goals in every row. What is changed is what lies between policy and arm: bounds on the set-points,
 an arm that follows its set-points as closely as real ones do, and what is seen late, with noise or an offset. What an
 arm covers of a command is measured by ``calibrate`` and matched. What the file has of rows that are not measured now
-stays.
+stays if it was measured with the same settings.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
-from dataclasses import dataclass, field
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from benchmarks.measuring import parser_of, run_benchmark
-from benchmarks.report.markdown import table
+from benchmarks.report.markdown import percent, table
 from service.actors.evaluation import evaluate, wilson_interval
 from service.robot.backends import Backend, BackendConfig, connect
 from service.robot.calibrate import calibrate
@@ -140,27 +141,36 @@ def _play(
     return num_reached, stops
 
 
-def report(result: dict[str, Any]) -> str:
+def report(result: Mapping[str, Any]) -> str:
     """A result for people."""
-    rows = [("the evaluator", f"{result['evaluator']['success_last']:.1%}", "", "")]
+    rows = [("the evaluator, without the bridge", percent(result["evaluator"]["success_last"], 1), "", "")]
     for name, row in result["rows"].items():
         motion = f"{row['max_set_point_speed_m_s']:.2f} m/s, {row['max_set_point_acceleration_m_s2']:.1f} m/s2"
-        rows.append((name, f"{row['success_last']:.1%}", str(len(row["stops"])), motion))
+        rows.append((name, percent(row["success_last"], 1), str(len(row["stops"])), motion))
     return table(("between policy and arm", "success at the last step", "stops", "most of its set-points"), rows)
 
 
 def main() -> int:
     """Parse the command line, measure, print."""
     parser = parser_of(__doc__, Settings())
-    parser.add_argument("--rows", nargs="*", type=int, metavar="N", help="numbers of rows, from 0; default: all")
+    numbers = range(len(ROWS))
+    parser.add_argument("--rows", nargs="*", type=int, choices=numbers, help="numbers of rows; default: all")
     given = parser.parse_args()
     return run_benchmark(
         "robot_bridge", ("mujoco", "numpy"), given, Settings, lambda chosen: _benchmark(chosen, given), report
     )
 
 
+def _measured_before(settings: Settings, path: Path | None) -> dict[str, Any]:
+    """Rows of an earlier result with the same settings."""
+    if path is None or not path.exists():
+        return {}
+    found = json.loads(path.read_text(encoding="utf-8"))
+    return dict(found["rows"]) if found["settings"] == asdict(settings) else {}
+
+
 def _benchmark(settings: Settings, given: argparse.Namespace) -> dict[str, Any]:
-    before = json.loads(given.json.read_text())["rows"] if given.json is not None and given.json.exists() else {}
+    before = _measured_before(settings, given.json)
     policy = load_robot_policy(settings.policy, Path("registry"))
     evaluation = evaluate(
         policy.policy,

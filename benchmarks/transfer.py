@@ -26,7 +26,6 @@ from service.actors.evaluation import evaluate, wilson_interval
 from service.downstream.compose import parameters_digest
 from service.envs.sampling import draw_goals, draw_starts
 from service.errors import TandemError
-from service.randomisation_config import RandomisationConfig
 from service.robot.backends import Backend, BackendConfig, Simulator, connect
 from service.robot.calibrate import Calibration, calibrate
 from service.robot.disturbed import DisturbanceConfig
@@ -320,7 +319,7 @@ def benchmark(settings: Settings) -> dict[str, Any]:
             print(f"{name}: {rows[name]['success_last']:.1%} in {rows[name]['wall_s']:.0f} s", flush=True)
     without = evaluate(
         policy.policy,
-        policy.world.model_copy(update={"randomisation": RandomisationConfig()}),
+        policy.world,
         "mixed",
         num_episodes=settings.num_goals,
         num_steps=settings.num_steps,

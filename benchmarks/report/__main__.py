@@ -18,7 +18,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from benchmarks import time_to_skill
+from benchmarks import robot_bridge, time_to_skill
 from benchmarks.report import (
     attacks,
     cluster,
@@ -63,6 +63,7 @@ PROGRAMS = {
     "robots": "benchmarks.robots",
     "transfer": "benchmarks.transfer",
     "transfer_champion": "benchmarks.transfer --name transfer_champion",
+    "robot_bridge": "benchmarks.robot_bridge",
     "world_speed": "benchmarks.world_speed",
     "page_speed": "benchmarks.page_speed",
     "robustness": "benchmarks.robustness",
@@ -76,7 +77,7 @@ PAGES = {
     "results/comparison.md": ("rows", "longer"),
     "downstream.md": ("headline",),
     "robots.md": ("robots",),
-    "results/transfer.md": ("transfer", "transfer_champion"),
+    "results/transfer.md": ("transfer", "transfer_champion", "robot_bridge"),
     "api.md": ("page",),
     "results/robust.md": ("robustness", "randomisation_ranges"),
     "../README.md": ("headline", "controls"),
@@ -166,12 +167,16 @@ def robots_blocks(found: Results) -> Blocks:
 
 
 def transfer_blocks(found: Results) -> Blocks:
-    """Parts of the blocks about frozen policies in another engine."""
-    return {
+    """Parts of the blocks about frozen policies in another engine, and through the bridge in ours."""
+    blocks = {
         name: [transfer.transfer_table(found[name]), transfer.transfer_words(found[name])]
-        for name in PAGES["results/transfer.md"]
+        for name in ("transfer", "transfer_champion")
         if name in found
     }
+    bridge = found.get("robot_bridge")
+    if bridge is not None:
+        blocks["robot_bridge"] = [robot_bridge.report(bridge), transfer.bridge_words(bridge)]
+    return blocks
 
 
 def page_blocks(found: Results) -> Blocks:

@@ -1,4 +1,4 @@
-"""The block of ``docs/results/transfer.md``, in Markdown, from the recorded file."""
+"""The blocks of ``docs/results/transfer.md``, in Markdown, from the recorded files."""
 
 from __future__ import annotations
 
@@ -52,6 +52,15 @@ def transfer_words(result: Result) -> str:
         + f"a grip of at most {settings['grip_force_n']:g} N.{measured_on(result['machine'])}"
     )
     return " ".join(words)
+
+
+def bridge_words(result: Result) -> str:
+    """What ``benchmarks.robot_bridge`` played, and where."""
+    settings = result["settings"]
+    return (
+        f"{settings['policy']}, {settings['num_episodes']} mixed goals a row, {settings['num_steps']} steps."
+        f"{measured_on(result['machine'])}"
+    )
 
 
 def _interval(each: Result, name: str) -> str:
