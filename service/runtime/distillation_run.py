@@ -66,9 +66,7 @@ class DistillationRun(Runner):
             self._begin_from(start)
         else:
             self._load()
-        teacher = numpy_bob(self._teacher_parameters)
-        if not isinstance(teacher, NumpyMCPPolicy):
-            raise TandemError("--from: a monolithic Bob has no primitives to teach; name a composed one")
+        teacher = self._teacher()
         taught = config.world.model_copy(update={"observed": self._observed})
         self._worlds = DistillationWorlds(config, teacher, layouts(taught), num_threads=config.run.num_threads)
         if not resume:
@@ -134,6 +132,23 @@ class DistillationRun(Runner):
         self._tries += self._cells.count(goal[inside])
         self._solved += self._cells.count(goal[inside & solved])
 
+    def _teacher(self) -> NumpyMCPPolicy:
+        """The Bob who is asked.
+
+        Raises:
+            TandemError: he has no primitives, or not as many as the student.
+        """
+        teacher = numpy_bob(self._teacher_parameters)
+        if not isinstance(teacher, NumpyMCPPolicy):
+            raise TandemError("--from: a monolithic Bob has no primitives to teach; name a composed one")
+        num = self.config.policy.bob.num_primitives
+        if teacher.num_primitives != num:
+            raise TandemError(
+                f"--from: the teacher has {teacher.num_primitives} primitives, and the student learns each of them: "
+                f"set policy.bob.num_primitives={teacher.num_primitives}; it is {num}"
+            )
+        return teacher
+
     # --- exact resume ----------------------------------------------------------------------------------------------
 
     def _begin_from(self, start: Start) -> None:
@@ -141,12 +156,17 @@ class DistillationRun(Runner):
         before = layouts(start.world)
         if start.world.num_observed_obstacles not in (0, num := len(self.config.world.obstacles)):
             raise TandemError(
-                f"--from {start.label}: it sees {start.world.num_observed_obstacles} obstacles, here are {num}: "
+                f"--from {start.reference}: it sees {start.world.num_observed_obstacles} obstacles, here are {num}: "
                 "describe as many"
+            )
+        if start.world.observed.num_commands > (kept := self.config.world.num_kept_commands):
+            raise TandemError(
+                f"--from {start.reference}: it sees its last {start.world.observed.num_commands} commands, here worlds "
+                f"remember {kept}: raise world.observed.num_commands"
             )
         said = transfer.take_over(self._distiller.student, self._teacher_parameters, before.bob, seen.bob)
         self._distiller.begin()
-        _logger.info("from %s: bob/policy: %s", start.label, said)
+        _logger.info("from %s: bob/policy: %s", start.reference, said)
         if start.published is not None:
             self.directory.write_published(start.published)
 

@@ -149,7 +149,7 @@ class LocalRun(Runner):
 
     def _begin_from(self, start: Start) -> None:
         for line in self.learner.take_over(start.networks, layouts(start.world)):
-            _logger.info("from %s: %s", start.label, line)
+            _logger.info("from %s: %s", start.reference, line)
         if start.published is not None:
             self.directory.write_published(start.published)
 

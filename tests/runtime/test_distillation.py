@@ -19,8 +19,8 @@ from service.primitives.loading import load_bob
 from service.primitives.publishing import publish_run
 from service.registry.registry import Registry
 from service.runtime.distillation_run import DistillationRun
-from service.runtime.starting import read_start
-from tests.runtime.runs import TREE, assert_same_run, play
+from service.runtime.starting import Start, read_start
+from tests.runtime.runs import TREE, assert_one_line, assert_same_run, play
 
 HOW = {"num_worlds": 8, "episode_steps": 6, "gradient_steps": 3, "batch_size": 16}
 
@@ -136,6 +136,35 @@ def test_a_run_is_published_with_its_teacher_as_parent_and_is_exact_when_resumed
     published = publish_run(whole.directory, registry, config, whole.parameters(), {})
     assert registry.manifest(str(published)).parent == str(version)
     assert load_bob(str(published), root / "registry").primitives.num_positions == 11 + 8 + 1
+
+
+def test_a_run_of_distillation_can_be_begun_from_as_well(taught, tmp_path):
+    """By self-play, or by distillation again: it has Bob's policy alone."""
+    root, version = taught
+    config = config_of({"delay_steps": [0, 1]}, total_env_steps=60)
+    first = run_to_end(tmp_path / "first", config, read_start(str(version), root / "registry", config))
+    start = read_start(str(tmp_path / "first"), tmp_path, config)
+    assert start.networks.keys() == {"bob/policy"}
+    for name, array in first.parameters().items():
+        np.testing.assert_array_equal(start.networks["bob/policy"][name], array)
+    run_to_end(tmp_path / "again", config, start)
+
+
+@pytest.mark.parametrize(
+    ("changed", "said"),
+    [
+        ({"policy": TREE["policy"] | {"bob": TREE["policy"]["bob"] | {"num_primitives": 3}}}, "num_primitives=2"),
+        ({"world": TREE["world"] | {"observed": {"num_commands": 1}}}, "raise world.observed.num_commands"),
+    ],
+)
+def test_a_teacher_that_does_not_fit_is_refused(tmp_path, changed, said):
+    teacher = config_of({})
+    parameters = networks.export_parameters(networks.make_bob(teacher.policy, layouts(teacher.world)))
+    start = Start("a test", {"bob/policy": parameters}, teacher.world, None)
+    config = parse_config(teacher.model_dump(mode="json") | changed, where="a test")
+    with pytest.raises(TandemError, match=said) as error:
+        DistillationRun(config, RunDirectory(tmp_path / "run"), start=start)
+    assert_one_line(error.value)
 
 
 def test_without_a_teacher_and_what_goes_together(tmp_path):
