@@ -18,6 +18,7 @@ from service.io.run_directory import Published, RunDirectory
 from service.off_policy_config import SkillsConfig
 from service.policies.numpy_policy import numpy_bob
 from service.policies.parameters import Parameters
+from service.primitives.bundled import find_version
 from service.primitives.loading import SKILLS
 from service.registry.blobs import sha256_of
 from service.registry.names import Version
@@ -89,7 +90,7 @@ def publish(
     parameters: Parameters,
     metrics: dict[str, float],
     *,
-    parent: str | None = None,
+    parent: str | Version | None = None,
     history: Mapping[str, Any] | None = None,
 ) -> Version:
     """Publish Bob, or the skills of a run that has ``config.skills``, with everything a user needs.
@@ -129,10 +130,12 @@ def newest_if_same(registry: Registry, name: str, parameters: Parameters) -> Ver
     return None
 
 
-def _published_before(directory: RunDirectory, registry: Registry) -> str | None:
-    """The version this run published last, if it did so in this registry."""
+def _published_before(directory: RunDirectory, registry: Registry) -> Version | None:
+    """The version this run published last, or began from, if readers of this registry find that one by its name."""
     last = directory.read_published()
     with contextlib.suppress(StorageError):
-        if last is not None and registry.manifest(last.version).blob_sha256 == last.blob_sha256:
-            return last.version
+        if last is not None:
+            found, version = find_version(last.version, registry.root)
+            if found.manifest(str(version)).blob_sha256 == last.blob_sha256:
+                return version
     return None

@@ -72,7 +72,7 @@ class Registry:
         normalisation: Mapping[str, Any],
         config: Mapping[str, Any],
         metrics: Mapping[str, float],
-        parent: str | None = None,
+        parent: str | Version | None = None,
         history: Mapping[str, Any] | None = None,
     ) -> Version:
         """Make the next version of ``name`` and move ``latest`` to it.
@@ -86,7 +86,7 @@ class Registry:
             normalisation: the network's fixed input normalisation, plain JSON values.
             config: configuration of the run, plain JSON values.
             metrics: finite numbers.
-            parent: reference of the version this one was trained on from; it must exist.
+            parent: the version this one was trained on from; a reference is looked up here, and must exist.
             history: of the run, where not all went as it was begun; plain JSON values.
 
         Raises:
@@ -104,7 +104,7 @@ class Registry:
             "normalisation": dict(normalisation),
             "config": dict(config),
             "metrics": dict(metrics),
-            "parent": str(self.resolve(parent)) if parent is not None else None,
+            "parent": str(self.resolve(parent) if isinstance(parent, str) else parent) if parent is not None else None,
             "history": dict(history) if history is not None else None,
             "git_commit": git_commit(),
         }

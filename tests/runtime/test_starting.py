@@ -10,7 +10,7 @@ from service.errors import TandemError
 from service.io.run_directory import RunDirectory
 from service.policies.numpy_policy import numpy_bob
 from service.primitives.loading import load_bob, read_parameters
-from service.primitives.publishing import publish_run
+from service.primitives.publishing import publish, publish_run
 from service.registry.registry import Registry
 from service.runtime.local import LocalRun
 from service.runtime.starting import read_start
@@ -97,3 +97,32 @@ def test_only_the_value_network_learns_at_first(tmp_path):
 def test_what_cannot_be_begun_from(tmp_path, reference, expected):
     with pytest.raises(TandemError, match=expected):
         read_start(reference, tmp_path, tiny_config())
+
+
+def test_from_an_exported_version(trained, tmp_path, monkeypatch):
+    root, _, version = trained
+    Registry(root / "registry").export(str(version), tmp_path / "exported")
+    monkeypatch.chdir(tmp_path)
+    start = read_start("exported", tmp_path / "empty", tiny_config())
+    assert start.reference == str(tmp_path / "exported")
+    assert start.published.version == str(version)
+    assert start.networks.keys() == {"bob/policy"}
+
+
+def test_a_version_that_came_with_tandem_is_the_parent_in_any_registry(trained, tmp_path, monkeypatch):
+    """But not where that registry has another version of that name and number."""
+    root, _, version = trained
+    monkeypatch.setattr("service.primitives.bundled.BUNDLED", root / "registry")
+    start = read_start("tiny", tmp_path / "empty", wider_config())
+    assert start.reference == str(version) == "tiny@1"
+    run = LocalRun(wider_config(), RunDirectory(tmp_path / "run"), start=start)
+    run.close()
+    parents = []
+    for name in ("other", "taken"):
+        registry = Registry(tmp_path / name)
+        if name == "taken":
+            publish(registry, tiny_config(), run.parameters(), {})
+        run.directory.write_published(start.published)
+        published = publish_run(run.directory, registry, run.config, run.parameters(), {})
+        parents.append(registry.manifest(str(published)).parent)
+    assert parents == ["tiny@1", None]
