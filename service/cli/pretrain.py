@@ -69,7 +69,7 @@ def pretrain(
     resume: Annotated[bool, typer.Option("--resume", help="Continue the run in --run-dir exactly.")] = False,
     start_from: Annotated[
         str | None,
-        typer.Option("--from", metavar="NAME@ALIAS|RUN_DIR", help="Begin with what that learned, as far as it fits."),
+        typer.Option("--from", metavar="NAME@ALIAS|DIR", help="Begin with what that learned, as far as it fits."),
     ] = None,
     seeds: Annotated[
         str | None, typer.Option(metavar="0,1,2|0-4", help="A study: a run for each, in DIR/seed-N; names the best.")
@@ -131,13 +131,13 @@ def pretrain(
         find_factory(each)  # now, not after Ray has started
     named = find_file(config, recipes()) if config is not None else None
     _check_used(context, choose("--runtime", runtime, ("local", "ray")), status)
+    if start_from is not None and resume:
+        raise TandemError("--from is for a run that begins, and --resume goes on with one: leave out one of them")
     if run_id is not None:
         if resume or run_dir is not None:
             raise TandemError("--run-id names the run directory, and continues what is there: leave out the other two")
         run_dir = runs / run_id
         resume = RunDirectory(run_dir).exists
-    if start_from is not None and is_study(run_dir, seeds):
-        raise TandemError("--from with --seeds: start a run for each seed with --set seed=N")
     if is_study(run_dir, seeds):
         if method is not None:
             raise TandemError(
@@ -149,6 +149,7 @@ def pretrain(
             run_dir, seeds, config=named, overrides=overrides, runs=runs, registry=registry,
             resume=None if run_id is not None else resume, publish=publish, parallel=parallel,
             cluster=cluster_options if runtime == "ray" else None, address=address, trackers=trackers,
+            start_from=start_from,
         )  # fmt: skip
         return
     if parallel is not None:

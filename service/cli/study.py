@@ -44,6 +44,7 @@ def pretrain_study(
     cluster: Callable[[], ClusterOptions] | None,
     address: str | None,
     trackers: Sequence[str] = (),
+    start_from: str | None = None,
 ) -> None:
     """Run a study and say what came out; exit code 1 where a run failed.
 
@@ -60,6 +61,7 @@ def pretrain_study(
         cluster: makes the options of each run on a Ray cluster; None: on this machine.
         address: of the cluster.
         trackers: of every run; see ``service.trackers``.
+        start_from: as typed; what the runs of a new study begin from.
     """
     from service.config import load_config
     from service.io.study_directory import StudyDirectory
@@ -68,6 +70,7 @@ def pretrain_study(
     from service.runtime.progress import StudyProgress
     from service.runtime.resuming import resumed_config
     from service.runtime.signals import InterruptError
+    from service.runtime.starting import read_start
     from service.runtime.study_plan import check_same_seeds, parse_seeds
 
     given = parse_seeds(seeds) if seeds is not None else ()
@@ -90,6 +93,8 @@ def pretrain_study(
             directory.check_free(())  # says that a study is there
         resolved, chosen = load_config(config or recipes()[DEFAULT_RECIPE], overrides), given
         directory.check_free(chosen)
+        if start_from is not None:
+            start_from = read_start(start_from, registry, resolved).reference
     options = cluster() if cluster is not None else None  # reads the status service's token
     connection: Any = nullcontext()
     if options is not None:
@@ -105,7 +110,7 @@ def pretrain_study(
             result = run(
                 resolved, directory, chosen, registry,
                 resume=resume, publish=publish, parallel=parallel, cluster=place, progress=progress,
-                trackers=trackers,
+                trackers=trackers, start=start_from,
             )  # fmt: skip
     except InterruptError as interrupt:
         typer.echo(f"stopped at once; {hint if directory.exists else _NOTHING}")

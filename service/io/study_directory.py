@@ -3,7 +3,7 @@
 | file | content |
 |---|---|
 | ``study.yaml`` | the configuration of all runs; its ``seed`` counts for none of them |
-| ``study.json`` | the seeds, how far each run is, their scores, and the best one |
+| ``study.json`` | the seeds, what runs begin from, how far each is, their scores, and the best one |
 | ``curves.png`` | the success of all runs over env steps |
 | ``seed-N/`` | the run directory of seed N; ``log.txt`` in it has what its processes said |
 | ``.lock`` | held by the process that runs the study |
@@ -96,8 +96,24 @@ class StudyDirectory:
         if self._lock is None:
             self._lock = DirectoryLock(self.path, "stop that one first, or name another --run-dir")
 
-    def begin(self, config: Config, seeds: Sequence[int]) -> None:
+    def read_start(self) -> str | None:
+        """Read what its runs begin from; None: from nothing.
+
+        Raises:
+            StorageError: the file that says so cannot be read.
+        """
+        with os_errors("read", self.results_file):
+            data = read_regular(self.results_file, MAX_RESULTS_BYTES, follow=True)
+        found = parse_json(data, self.results_file).get("from")
+        return str(found) if found is not None else None
+
+    def begin(self, config: Config, seeds: Sequence[int], start: str | None = None) -> None:
         """Begin a study here, and keep every other process from running it until ``close``.
+
+        Args:
+            config: of all runs.
+            seeds: of the runs.
+            start: reference of what they begin from.
 
         Raises:
             TandemError: a study, or a run, is here already, or the directory cannot be written.
@@ -105,7 +121,7 @@ class StudyDirectory:
         self.check_free(seeds)
         self.claim()
         self.check_free(seeds)  # of two that begin at once, the second sees here what the first has made
-        self.write_results({"seeds": list(seeds)})
+        self.write_results({"seeds": list(seeds), "from": start})
         self._write_config(config)  # last: a start that failed can be tried again
 
     def resume(self, config: Config) -> None:

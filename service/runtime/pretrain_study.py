@@ -68,6 +68,7 @@ def pretrain_study(
     cluster: StudyCluster | None = None,
     progress: StudyProgress,
     trackers: Sequence[str] = (),
+    start: str | None = None,
 ) -> StudyResult:
     """Run a run for every seed, each in a process of its own, then evaluate all, name the best and publish it.
 
@@ -84,6 +85,7 @@ def pretrain_study(
         cluster: run on it; None: on this machine, by the local runner.
         progress: where the runs are shown.
         trackers: of every run; see ``service.trackers``.
+        start: reference of what the runs of a new study begin from (``Start.reference``); one that is resumed knows.
 
     Raises:
         TandemError: see ``StudyDirectory``; a registry that is only read; or the best run cannot be published.
@@ -99,8 +101,9 @@ def pretrain_study(
         if resume:
             directory.resume(config)
         else:
-            directory.begin(config, seeds)
-        study = Study(directory, seeds, config.run.total_env_steps)
+            directory.begin(config, seeds, start)
+        start = directory.read_start()
+        study = Study(directory, seeds, config.run.total_env_steps, start)
         study.save()
         if cluster is not None and cluster.options.status is not None:
             from service.runtime.status_actor import serving
@@ -113,7 +116,10 @@ def pretrain_study(
             place += [argument for tracker in trackers for argument in ("--tracker", tracker)]
             progress.say(f"runs to go: {len(study.unfinished)}, at once: {num_parallel}")
             with progress:
-                study.run(lambda seed: _arguments(config, directory, seed, place), num_parallel, signals, progress)
+                first = ["--from", start, "--registry", str(registry)] if start is not None else []
+                study.run(
+                    lambda seed: _arguments(config, directory, seed, place, first), num_parallel, signals, progress
+                )
         if signals.first is not None:
             return StudyResult(tuple(study.runs.values()), signal=signals.first)
         return _finish(study, directory, Registry(registry) if publish else None, progress)
@@ -137,8 +143,10 @@ def _share(config: Config, num_runs: int, parallel: int | None, cluster: StudyCl
     return share.num_parallel, place
 
 
-def _arguments(config: Config, directory: StudyDirectory, seed: int, place: Sequence[str]) -> list[str]:
-    """The arguments of ``tandem`` that begin a run, or go on with it; nothing of it is published yet."""
+def _arguments(
+    config: Config, directory: StudyDirectory, seed: int, place: Sequence[str], first: Sequence[str] = ()
+) -> list[str]:
+    """The arguments of ``tandem`` that begin a run, then with ``first``, or go on with it; nothing is published yet."""
     run = directory.run(seed)
     arguments = ["pretrain", "--run-dir", str(run.path), "--no-publish"]
     if run.exists:
@@ -146,7 +154,7 @@ def _arguments(config: Config, directory: StudyDirectory, seed: int, place: Sequ
         for override in _resumable(config):
             arguments += ["--set", override]
     else:
-        arguments += ["--config", str(directory.config_file), "--set", f"seed={seed}"]
+        arguments += ["--config", str(directory.config_file), "--set", f"seed={seed}", *first]
     return [*arguments, *place]
 
 

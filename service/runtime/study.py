@@ -71,10 +71,13 @@ class Study:
         directory: of the study, which this process has claimed.
         seeds: of the runs.
         total_env_steps: of each run.
+        start: reference of what they begin from.
     """
 
-    def __init__(self, directory: StudyDirectory, seeds: Sequence[int], total_env_steps: int) -> None:
-        self._directory, self._total = directory, total_env_steps
+    def __init__(
+        self, directory: StudyDirectory, seeds: Sequence[int], total_env_steps: int, start: str | None = None
+    ) -> None:
+        self._directory, self._total, self._start_from = directory, total_env_steps, start
         self._reader = DiskReader(directory.path)
         self._processes: dict[int, subprocess.Popen[bytes]] = {}
         self._shown = dict.fromkeys(seeds, 0)
@@ -140,7 +143,9 @@ class Study:
             }
             for run in self.runs.values()
         }
-        self._directory.write_results({"seeds": list(self.runs), "runs": runs, **(more or {})})
+        self._directory.write_results(
+            {"seeds": list(self.runs), "from": self._start_from, "runs": runs, **(more or {})}
+        )
 
     def _start(self, seed: int, command: Command) -> None:
         log_file = self._directory.log_file(seed)

@@ -24,7 +24,7 @@ from service.runtime import study_results
 from service.runtime.pretrain_study import StudyCluster, _arguments, _share
 from service.runtime.ray_connection import ClusterOptions
 from service.runtime.resuming import resumed_config
-from service.runtime.study import RunEnd
+from service.runtime.study import RunEnd, Study
 from service.runtime.study_plan import Share, check_same_seeds, parse_seeds, share_cluster, share_machine
 from service.runtime.study_results import Scores, best_seed, publish_best, score
 from service.store.disk_reader import DiskReader
@@ -134,6 +134,22 @@ def test_what_a_run_on_a_cluster_is_told(tmp_path):
         f"pretrain --run-dir {tmp_path}/seed-7 --no-publish --config {tmp_path}/study.yaml --set seed=7 "
         "--runtime ray --address 10.0.0.1:6379 --status off --num-actors 4 --actor-threads 1 --learner-cpus 0.5"
     )
+
+
+def test_a_study_remembers_what_its_runs_begin_from(tmp_path):
+    directory = StudyDirectory(tmp_path)
+    directory.begin(tiny_config(), [3], "panda-cube@6")
+    start = directory.read_start()
+    assert start == "panda-cube@6"
+    Study(directory, [3], 600, start).save()
+    assert directory.read_start() == start
+    directory.close()
+    assert " ".join(_arguments(tiny_config(), directory, 3, ["--place"], ["--from", start])).endswith(
+        "--set seed=3 --from panda-cube@6 --place"
+    )
+    directory.run(3).path.mkdir()
+    directory.run(3).config_file.write_text("")
+    assert "--from" not in _arguments(tiny_config(), directory, 3, [], ["--from", start])
 
 
 def test_a_run_that_has_begun_is_resumed_with_the_budget_of_the_study(tmp_path):
