@@ -1,4 +1,4 @@
-"""Noise that is a function of a key and a count, so that a world's state says all of it ."""
+"""Noise that is a function of a key and a count, so that a world's state says all of it."""
 
 from __future__ import annotations
 

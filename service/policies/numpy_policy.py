@@ -121,7 +121,7 @@ class NumpyMCPPolicy(NumpyPolicy):
         """Mean and std, (..., A) each, of the composition at (..., O) observations.
 
         Raises:
-            PolicyError: the observation's last axis is not 14.
+            PolicyError: the observation's last axis is not O.
         """
         weights = self.gate(observation)
         return self.compose(np.asarray(observation)[..., : self.num_positions], weights)
