@@ -152,7 +152,8 @@ class WorldBatch:
         box is anywhere.
         """
         states = np.tile(self._fresh_state, (num, 1))
-        places = draw_starts(rng, num, self.config, self._gripper_at_start)
+        places = draw_starts(rng, num, self.bank.largest, self._gripper_at_start)
+        places.object[:, 2] += self.config.rest_height_m - self.bank.largest.rest_height_m
         states[:, self.layout["object"]], states[:, self.layout["box_place"]] = places.object, places.box
         obstacle_places(states, self._obstacles)[:] = places.obstacles
         self._draw_physics(rng, states)
@@ -344,9 +345,10 @@ class WorldBatch:
         state[self.layout["fingers"]] = self.robot.finger_values(np.array([self._widest_m]))[0]
         self._check_start(state)
         # Where there is no room, it is said now.
-        places = draw_starts(np.random.default_rng(0), _NUM_TRIED_STARTS, self.config, self._gripper_at_start)
+        places = draw_starts(np.random.default_rng(0), _NUM_TRIED_STARTS, self.bank.largest, self._gripper_at_start)
         if self.config.obstacles:  # before the first reset, too, nothing is inside another
             state[self.layout["object"]], state[self.layout["box_place"]] = places.object[0], places.box[0]
+            state[self.layout["object"].start + 2] = self.config.rest_height_m
             obstacle_places(state[None], self._obstacles)[:] = places.obstacles[:1]
         return state
 

@@ -12,6 +12,7 @@ import numpy as np
 from service.config import WorldConfig
 from service.envs.robot import described
 from service.envs.scene import FIXTURE_PREFIX, build_model
+from service.errors import ConfigError
 from service.object_config import ObjectConfig
 from service.types import Array, StateArray
 
@@ -27,6 +28,8 @@ class ModelBank:
 
     def __init__(self, config: WorldConfig) -> None:
         ranges = config.randomisation.model_ranges
+        self.largest = _variant(config, {name: high for name, (_, high) in ranges.items() if name == "object_size"})
+        """The world with the largest object: where that has room to start, each has."""
         self.nominal: mujoco.MjModel = build_model(config)
         """Without any of it."""
         self.drawn = _spread(ranges, config.randomisation.num_models) if ranges else {}
@@ -34,9 +37,12 @@ class ModelBank:
         num = config.randomisation.num_models if ranges else 1
         rows = [{name: float(values[index]) for name, values in self.drawn.items()} for index in range(num)]
         variants = [_variant(config, row) for row in rows]
-        self.models = [
-            self.nominal if not row else _compile(variant, row) for variant, row in zip(variants, rows, strict=True)
-        ]
+        try:
+            self.models = [
+                self.nominal if not row else _compile(variant, row) for variant, row in zip(variants, rows, strict=True)
+            ]
+        except ConfigError as error:  # of a size: the nominal world was built
+            raise ConfigError(f"world.randomisation.object_size: {error}") from None
         """M of them."""
         self.table_height_m: StateArray = self.drawn.get("table_height_m", np.zeros(num))
         """(M,) above where the configuration has it."""

@@ -10,6 +10,7 @@ from service.envs.model_bank import ModelBank
 from service.envs.noise import KEYS, normal
 from service.envs.observations import POSITIONS
 from service.errors import ConfigError
+from tests.runtime.runs import assert_one_line
 
 COARSE = {"physics_step_s": 0.005, "num_substeps": 8}
 EVERYTHING = {
@@ -98,6 +99,31 @@ def test_objects_of_every_model_lie_still_where_they_start():
         for _ in range(10):
             worlds.step(np.zeros((24, 4), np.float32))
         assert np.abs(worlds.object_position - before).max() < 1e-3
+
+
+def test_the_largest_object_starts_clear_of_the_gripper_and_of_fixtures():
+    """Objects up to 9 cm high, under fingers at 8 cm; places are drawn for the largest, 1.5 cm wider than the nominal."""
+    tall = {"shape": "cylinder", "size_m": [0.05, 0.06]}
+    block = {"shape": "box", "size_m": [0.1, 0.1, 0.02], "position_m": [0.05, 0.0]}
+    config = world(num_models=8, object_size=[1.0, 1.5])
+    config = WorldConfig.model_validate(config.model_dump() | {"object": tall, "fixtures": [block]})
+    full_physics = mujoco.mjtState.mjSTATE_FULLPHYSICS
+    with WorldBatch(config, 300, num_threads=1) as worlds:
+        worlds.reset(np.random.default_rng(0))
+        data = [mujoco.MjData(model) for model in worlds.bank.models]
+        for state in worlds.states:
+            index = int(state[worlds.layout["model"]][0])
+            model, here = worlds.bank.models[index], data[index]
+            mujoco.mj_setState(model, here, state[worlds.layout.physics], full_physics)
+            mujoco.mj_forward(model, here)
+            touched = [contact for contact in here.contact[: here.ncon] if contact.dist < -1e-4]
+            assert not touched, [model.geom(int(geom)).name for geom in touched[0].geom]
+
+
+def test_an_object_drawn_too_wide_for_the_gripper_is_one_line_that_names_the_range():
+    with pytest.raises(ConfigError) as error:
+        ModelBank(world(num_models=4, object_size=[1.0, 2.0]))
+    assert_one_line(error.value, "world.randomisation.object_size", "opens to 0.08 m")
 
 
 def test_a_late_command_does_later_what_it_would_have_done():
