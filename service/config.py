@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from copy import deepcopy
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Any, Literal, Self, get_args
 
 import yaml
 from pydantic import BaseModel, BeforeValidator, Field, PositiveInt, ValidationError, model_validator
@@ -18,7 +18,7 @@ from pydantic import BaseModel, BeforeValidator, Field, PositiveInt, ValidationE
 from service.config_tree import RENAMED, apply_override, read_yaml, updated
 from service.distillation_config import DistillationConfig
 from service.errors import ConfigError, did_you_mean
-from service.frozen import FrozenModel
+from service.frozen import FrozenModel, reason
 from service.off_policy_config import SkillsConfig
 from service.world_config import NO_KEYS, ObservedConfig
 from service.world_config import WorkspaceConfig as WorkspaceConfig
@@ -438,7 +438,7 @@ def parse_config(tree: dict[str, Any], *, where: str, recorded: bool = False) ->
             known = _known_keys(first["loc"])
             hint = _elsewhere(str(first["loc"][-1])) or did_you_mean(str(first["loc"][-1]), known)
             raise ConfigError(f"{where}: unknown key {key!r}; known there: {', '.join(known)}{more}{hint}") from None
-        raise ConfigError(f"{where}: {key}{found}: {first['msg']}{more}") from None
+        raise ConfigError(f"{where}: {key}{found}: {reason(first)}{more}") from None
 
 
 def changed_config(config: Config, overrides: Sequence[str]) -> Config:
@@ -462,7 +462,9 @@ def dump_config(config: Config) -> str:
 def _known_keys(location: tuple[int | str, ...]) -> list[str]:
     model: type[BaseModel] = Config
     for part in location[:-1]:
-        group = _groups(model).get(str(part))
+        if isinstance(part, int) or part in NO_KEYS:
+            continue
+        group = _groups(model).get(part)
         if group is None:
             break
         model = group
@@ -480,5 +482,12 @@ def _elsewhere(name: str) -> str:
 
 
 def _groups(model: type[BaseModel]) -> dict[str, type[BaseModel]]:
-    kinds = {name: field.annotation for name, field in model.model_fields.items()}
-    return {name: kind for name, kind in kinds.items() if isinstance(kind, type) and issubclass(kind, BaseModel)}
+    kinds = {name: _group_in(field.annotation) for name, field in model.model_fields.items()}
+    return {name: kind for name, kind in kinds.items() if kind is not None}
+
+
+def _group_in(annotation: Any) -> type[BaseModel] | None:
+    """The group of keys that an annotation has: itself, or in a union or a tuple."""
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        return annotation
+    return next((found for each in get_args(annotation) if (found := _group_in(each)) is not None), None)

@@ -6,10 +6,10 @@ import math
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
-from pydantic import BeforeValidator, Discriminator, Field, Tag, model_validator
+from pydantic import BeforeValidator, Discriminator, Field, Tag, ValidationError, model_validator
 
 from service.frozen import FrozenModel
-from service.mesh_files import measure
+from service.mesh_files import LEAST_M, measure
 from service.model_files import absolute
 
 Shape = Literal["box", "sphere", "cylinder", "capsule", "ellipsoid", "mesh"]
@@ -37,6 +37,12 @@ class MeshConfig(FrozenModel):
     center_m: tuple[float, float, float] = Field((0.0, 0.0, 0.0), description="middle of its extent, from its origin")
     volume_m3: float = Field(0.0, ge=0.0)
 
+    @model_validator(mode="after")
+    def _was_read(self) -> Self:
+        if self.sha256 and (len(self.sha256) != len(self.pieces) or not self.volume_m3):
+            raise ValueError("sha256, center_m and volume_m3 are read from its files: leave them out")
+        return self
+
 
 class ObjectConfig(FrozenModel):
     """A rigid object of one shape, as it starts: a cylinder stands, a capsule lies along x.
@@ -58,7 +64,7 @@ class ObjectConfig(FrozenModel):
         if len(self.size_m) != expected:
             raise ValueError(f"size_m of a {self.shape} has {expected} numbers, {what}; got {len(self.size_m)}")
         if (self.shape == "mesh") != (self.mesh is not None):
-            raise ValueError("mesh, which names files, belongs to shape: mesh and to no other")
+            raise ValueError("mesh, which names files as pieces, belongs to shape: mesh and to no other")
         if self.shape == "capsule" and self.size_m[1] <= self.size_m[0]:
             raise ValueError(f"size_m of a capsule: its length {self.size_m[1]:g} must exceed its diameter")
         if not all(0.0 <= each <= 1.0 for each in self.color):
@@ -121,11 +127,14 @@ def simple_object(name: Literal["cube", "sphere"], size_m: float) -> ObjectConfi
 
 def _read_mesh(value: Any) -> Any:
     """A description of a mesh with what is read from its files, where that has not been done."""
-    if not isinstance(value, dict) or value.get("shape") != "mesh" or not isinstance(value.get("mesh"), dict):
+    if not isinstance(value, dict) or value.get("shape") != "mesh":
         return value
-    if value["mesh"].get("sha256") or not value["mesh"].get("pieces"):
+    try:
+        mesh = MeshConfig.model_validate(value.get("mesh"))
+    except ValidationError:
+        return {"size_m": (LEAST_M,) * 3, **value}  # what is wrong with it is said with its place
+    if mesh.sha256:
         return value
-    mesh = MeshConfig.model_validate(value["mesh"])
     pieces = tuple(absolute(piece, Path()) for piece in mesh.pieces)
     found = measure(pieces, mesh.scale)
     read = {"pieces": pieces, "sha256": found.sha256, "center_m": found.center_m, "volume_m3": found.volume_m3}

@@ -8,7 +8,7 @@ from typing import Any, Literal, Self
 from pydantic import Field, ValidationError, model_validator
 
 from service.errors import ConfigError, did_you_mean
-from service.frozen import FrozenModel
+from service.frozen import FrozenModel, reason
 from service.model_files import absolute, digest_of
 from service.parsing import MAX_YAML_CHARACTERS, ParseError, parse_yaml
 from service.recipes import robots
@@ -29,6 +29,12 @@ class EffectorConfig(FrozenModel):
     frame: str = Field(description="name of a site or body of the model that it is fixed to")
     position_m: Vector = Field((0.0, 0.0, 0.0), description="in that frame")
     quaternion: Quaternion = Field((1.0, 0.0, 0.0, 0.0), description="w x y z; its rotation in that frame")
+
+    @model_validator(mode="after")
+    def _turns(self) -> Self:
+        if not any(self.quaternion):
+            raise ValueError("quaternion: all four numbers are 0; no rotation is 1 0 0 0")
+        return self
 
 
 class PadConfig(FrozenModel):
@@ -124,11 +130,17 @@ class RobotConfig(FrozenModel):
             if isinstance(value, tuple) and len(value) != expected:
                 what = "fingers" if field in _OF_FINGERS else "joints"
                 raise ValueError(f"{field} has {len(value)} numbers, there are {expected} {what}")
+            if field != "home" and value is not None and (least := _least(value)) < 0.0:
+                raise ValueError(f"{field} = {least:g} is less than 0")
         names = [*self.joints, *(finger.joint for finger in self.fingers)]
         for name in names:
             if names.count(name) > 1:
                 raise ValueError(f"joint {name!r} is named twice")
         return self
+
+
+def _least(numbers: Numbers) -> float:
+    return min(numbers, default=0.0) if isinstance(numbers, tuple) else numbers
 
 
 _OF_JOINTS = ("stiffness", "damping", "max_force", "armature", "friction_loss")
@@ -156,7 +168,7 @@ def read_robot(path: Path) -> RobotConfig:
     except ValidationError as error:
         first = error.errors()[0]
         key = ".".join(str(part) for part in first["loc"]) or "the top level"
-        raise ConfigError(f"robot {path}: {key}: {first['msg']}") from None
+        raise ConfigError(f"robot {path}: {key}: {reason(first)}") from None
     if robot.model is None:
         raise ConfigError(f"robot {path}: model is missing: name an MJCF or URDF file")
     found = {**_found(robot.model, path.parent), "hand": robot.hand}

@@ -118,6 +118,15 @@ class WorldConfig(FrozenModel):
             raise ValueError("observed.obstacles, and no obstacles: describe some, or leave it out")
         return self
 
+    @model_validator(mode="after")
+    def _object_is_lower_than_the_workspace(self) -> Self:
+        if self.rest_height_m >= self.workspace.height_m:
+            raise ValueError(
+                f"the object's centre lies {self.rest_height_m:g} m high, and the workspace ends at "
+                f"{self.workspace.height_m:g} m, so no goal is in it: raise workspace.height_m, or make the object lower"
+            )
+        return self
+
     @property
     def num_observed_obstacles(self) -> int:
         """Number of obstacles whose positions policies see."""

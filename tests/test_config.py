@@ -132,6 +132,16 @@ def test_override_through_a_value():
         ("game.bob_step=1", "'game.bob_step'", "bob_steps"),
         ("learner.bob.lr=1", "'learner.bob.lr'", "learning_rate"),
         ("world.workspace.width_m=1", "'world.workspace.width_m'", "length_x_m, length_y_m"),
+        (
+            "world.object={shape: sphere, size_m: [0.05], width_m: 1}",
+            "'world.object.width_m'",
+            "known there: color, mesh, shape, size_m",
+        ),
+        (
+            "world.obstacles=[{shape: sphere, size_m: [0.05], width_m: 1}]",
+            "'world.obstacles.0.width_m'",
+            "mass_kg, mesh, shape, size_m",
+        ),
     ],
 )
 def test_unknown_key_lists_the_known_ones(override, key, known):
@@ -156,12 +166,19 @@ def test_unknown_key_lists_the_known_ones(override, key, known):
         ("policy.alice.hidden_sizes=[64,0]", "policy.alice.hidden_sizes.1", "0"),
         ("policy.bob.log_std_min=0.5", "policy.bob", "0.5"),
         ("policy.alice_log_std_min=0.5", "policy", "0.5"),
+        ("world.workspace.height_m=0.02", "world", "lies 0.025 m high, and the workspace ends at 0.02 m"),
+        ("world.object={shape: mesh, mesh: {pieces: a.stl}}", "world.object.mesh.pieces", "a.stl"),
+        ("world.object={shape: mesh, mesh: {pieces: [a.stl], scale: 0}}", "world.object.mesh.scale", "0"),
         ("game=3", "game", "3"),
     ],
 )
 def test_a_bad_value_is_named_with_its_key(override, key, value):
     text = message(overrides=[override])
-    is_group = key in ("policy", "policy.bob")  # where two of its values do not fit together, it is not shown whole
+    is_group = key in (
+        "policy",
+        "policy.bob",
+        "world",
+    )  # where two of its values do not fit together, it is not shown whole
     assert f"{key}: " in text if is_group else f"{key} = " in text
     assert value in text
 

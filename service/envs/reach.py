@@ -103,6 +103,11 @@ def _find(robot: RobotConfig, arm: Chain) -> Reach:
         return Reach(home[:2], any_height, np.zeros(2), np.full(2, np.inf))
     axis: StateArray = arm.base_axis
     radius = float(np.linalg.norm(home[:2] - axis))
+    if radius < _MARGIN_M:
+        raise ConfigError(
+            f"robot {robot.name}: at home its end effector is at {_point(home)} m, on the axis of its base: bend the "
+            "arm, so that home is a posture in the middle of its work"
+        )
     outward = (home[:2] - axis) / radius
     heights: StateArray = np.linspace(robot.lowest_m, robot.lowest_m + _HEIGHT_M, _NUM_HEIGHTS)
 

@@ -22,6 +22,8 @@ _PREFIX, _HAND_PREFIX = "robot/", "hand/"
 """Begin the names of all that comes from a file, so that none is that of something in the scene; a hand's has both."""
 _SIDES = ("left", "right")
 _ROS_ADDRESS = re.compile(r"package:/+([^/]+)/(.+)")
+_BEYOND = 1e-4
+"""Of a joint's range, rad or m, that is rounding."""
 _HIDDEN = 4
 """Group of what is not drawn."""
 
@@ -86,6 +88,7 @@ class Robot:
             home=robot.home,
             orientation=robot.orientation,
         )
+        _check_fingers(model, robot)
         self._closed = np.array([finger.closed for finger in robot.fingers])
         self._travel = np.array([finger.open for finger in robot.fingers]) - self._closed
         on_side = np.array([[finger.side in (side, "both") for side in _SIDES] for finger in robot.fingers])
@@ -220,6 +223,18 @@ def _check_effector(spec: mujoco.MjSpec, robot: RobotConfig, config: WorldConfig
             f"robot {robot.name}: its gripper opens to {robot.opening_m:g} m, and along y the object is {width_m:g} m "
             "wide: make it smaller, turn it, or set world.gripper=blocked"
         )
+
+
+def _check_fingers(model: mujoco.MjModel, robot: RobotConfig) -> None:
+    """Refuse fingers that cannot open as far as the description says."""
+    for finger in robot.fingers:
+        joint = model.joint(_prefix(robot) + finger.joint)
+        low, high = joint.range
+        if model.jnt_limited[joint.id] and not low - _BEYOND <= finger.open <= high + _BEYOND:
+            raise ConfigError(
+                f"robot {robot.name}: finger {finger.joint!r} is described as open at {finger.open:g}, and its joint "
+                f"goes from {low:g} to {high:g}: correct open, and opening_m with it"
+            )
 
 
 def _let_touch(spec: mujoco.MjSpec, robot: RobotConfig, fingers: list[mujoco.MjsBody], pad_friction: float) -> None:

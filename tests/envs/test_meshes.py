@@ -144,7 +144,7 @@ def test_mistakes_are_one_line(tmp_path):
         world_with(tmp_path / "text.stl")
     assert_one_line(error.value, "text.stl", "MuJoCo cannot use it")
     for described, said in (
-        ("{shape: mesh, size_m: [0.05, 0.05, 0.05]}", ["mesh, which names files"]),
+        ("{shape: mesh, size_m: [0.05, 0.05, 0.05]}", ["mesh, which names files as pieces"]),
         ("{shape: box, size_m: [0.05, 0.05, 0.05], mesh: {pieces: [a.stl]}}", ["belongs to shape: mesh"]),
         ("{shape: mesh, size_m: [0.05, 0.05, 0.05], mesh: {pieces: []}}", ["world.object.mesh.pieces"]),
     ):

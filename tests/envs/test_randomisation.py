@@ -102,7 +102,7 @@ def test_objects_of_every_model_lie_still_where_they_start():
 
 
 def test_the_largest_object_starts_clear_of_the_gripper_and_of_fixtures():
-    """Objects up to 9 cm high, under fingers at 8 cm; places are drawn for the largest, 1.5 cm wider than the nominal."""
+    """Objects up to 9 cm high, under fingers at 8 cm; places are drawn for the largest, up to 7.5 cm wide."""
     tall = {"shape": "cylinder", "size_m": [0.05, 0.06]}
     block = {"shape": "box", "size_m": [0.1, 0.1, 0.02], "position_m": [0.05, 0.0]}
     config = world(num_models=8, object_size=[1.0, 1.5])
