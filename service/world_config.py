@@ -123,7 +123,7 @@ class WorldConfig(FrozenModel):
         if self.rest_height_m >= self.workspace.height_m:
             raise ValueError(
                 f"the object's centre lies {self.rest_height_m:g} m high, and the workspace ends at "
-                f"{self.workspace.height_m:g} m, so no goal is in it: raise workspace.height_m, or make the object lower"
+                f"{self.workspace.height_m:g} m, so no goal is in it: raise workspace.height_m, or lower the object"
             )
         return self
 

@@ -13,7 +13,7 @@ import numpy as np
 from service.config import Config
 from service.envs.batch import WorldBatch
 from service.envs.observations import Layouts, bob_observation
-from service.envs.sampling import sample_goals
+from service.envs.obstacles import draw_goals
 from service.liveness import count_work
 from service.policies.numpy_policy import NumpyMCPPolicy
 from service.types import BoolArray, FloatArray, IntArray, StateArray
@@ -49,6 +49,8 @@ class Round:
     solved: BoolArray
     """(M,) whether the object was there at the end."""
     num_env_steps: int
+    diverged: tuple[tuple[StateArray, FloatArray], ...]
+    """(last finite state, action) where physics diverged, which leaves a world as it was."""
 
 
 class DistillationWorlds:
@@ -83,20 +85,20 @@ class DistillationWorlds:
         num, distance_m = worlds.num_worlds, self._config.game.success_distance_m
         worlds.reset(rng)
         start = worlds.object_position.copy()
-        goal = sample_goals("mixed", rng, num, self._config.world, distance_m)
+        goal = draw_goals("mixed", rng, self._config.world, distance_m, worlds.places)
         late: IntArray = np.zeros(num, dtype=np.int64)
         if self._most_late:
             late = worlds.states[:, worlds.layout["delay"]].ravel().astype(np.int64)
         composed = rng.random(num) < how.random_fraction
         steps = [self._step(student, goal, composed, step, rng) for step in range(how.episode_steps + self._most_late)]
         reached = np.linalg.norm(worlds.object_position - goal, axis=1) <= distance_m
-        kept = np.isfinite(worlds.object_position).all(axis=1)
         answered = np.arange(how.episode_steps)[:, None] + late, np.arange(num)
         observation = np.stack([step.observation for step in steps[: how.episode_steps]])
         answers = (np.stack([getattr(step, each.name) for step in steps])[answered] for each in fields(Lesson)[1:])
-        lesson = Lesson(*(_rows(array[:, kept]) for array in (observation, *answers)))
+        lesson = Lesson(*(_rows(array) for array in (observation, *answers)))
         own = ~composed
-        return Round(lesson, start[own], goal[own], reached[own], num * len(steps))
+        diverged, worlds.diverged = tuple(worlds.diverged), []
+        return Round(lesson, start[own], goal[own], reached[own], num * len(steps), diverged)
 
     def _step(
         self, student: NumpyMCPPolicy, goal: StateArray, composed: BoolArray, step: int, rng: np.random.Generator

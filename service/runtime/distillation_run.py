@@ -61,6 +61,7 @@ class DistillationRun(Runner):
         self._rng = np.random.default_rng(config.seed)
         self._cells = GoalCells(config.world, config.generator.cell_size_m)
         self._tries, self._solved = (np.zeros(len(self._cells), dtype=np.int64) for _ in range(2))
+        self._num_broken = 0
         if start is not None and not resume:
             self._teacher_parameters, self._observed = dict(start.networks["bob/policy"]), start.world.observed
             self._begin_from(start)
@@ -98,8 +99,11 @@ class DistillationRun(Runner):
             progress = self.num_env_steps / self.config.run.total_env_steps
             learned = self._distiller.learn(played.lesson, progress, self._rng)
         self.bookkeeper.count(played.num_env_steps)
+        self.directory.dump_diverged(f"{self.iteration:06d}", played.diverged)
+        self._num_broken += len(played.diverged)
         self._count_goals(played.goal, played.solved)
         metrics = {f"learner/{name}": value for name, value in learned.items()}
+        metrics["world/num_broken"] = float(self._num_broken)
         if len(played.solved):
             metrics["bob/success_rate"] = float(played.solved.mean())
         with self.timing("evaluate"):
@@ -179,7 +183,7 @@ class DistillationRun(Runner):
                 "bob": dict(self.parameters()),  # for readers without torch: evaluate, render, coverage
             }
             meta = {"rng": self._rng.bit_generator.state, "teacher_observed": self._observed.model_dump(mode="json")}
-            self.bookkeeper.save(parts, meta)
+            self.bookkeeper.save(parts, meta | {"num_broken": self._num_broken})
 
     def _load(self) -> None:
         parts, meta = self.bookkeeper.resume()
@@ -187,4 +191,4 @@ class DistillationRun(Runner):
         self._teacher_parameters = parts["teacher"]
         self._observed = ObservedConfig.model_validate(meta["teacher_observed"])
         self._tries, self._solved = (np.array(parts["cells"][name]) for name in ("tries", "solved"))
-        self._rng.bit_generator.state = meta["rng"]
+        self._rng.bit_generator.state, self._num_broken = meta["rng"], int(meta.get("num_broken", 0))

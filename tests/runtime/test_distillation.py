@@ -9,6 +9,7 @@ from service.config import parse_config
 from service.distillation_config import DistillationConfig
 from service.envs.batch import WorldBatch
 from service.envs.observations import PAPER, POSITIONS, layouts
+from service.envs.obstacles import inside_obstacles
 from service.errors import ConfigError, TandemError
 from service.io.run_directory import RunDirectory
 from service.learner.distillation import Distiller
@@ -67,6 +68,32 @@ def test_labels_are_the_teachers_answers_when_the_command_counts():
         expected, _ = teacher.primitives(later)
         np.testing.assert_allclose(answers[:4, world], expected, atol=2e-4)
         assert np.abs(answers[:4, world] - wrong).max() > 1e-3
+
+
+def test_goals_are_outside_obstacles_and_diverged_worlds_are_told():
+    """A big obstacle in a small workspace, and an object of which MuJoCo loses hold."""
+    obstacle = {"shape": "box", "size_m": [0.06, 0.06, 0.3]}
+    config = config_of({}, {"num_worlds": 64, "episode_steps": 2, "random_fraction": 0.0})
+    world = config.world.model_dump(mode="json") | {"obstacles": [obstacle], "workspace": {"height_m": 0.3}}
+    config = parse_config(config.model_dump(mode="json") | {"world": world}, where="a test")
+    student, teacher = make_student(config, make_teacher(config))
+    worlds = DistillationWorlds(config, teacher, PAPER, num_threads=1)
+    batch, step = worlds._worlds, worlds._worlds.step
+
+    def explode(actions):
+        batch.states[:3, batch.layout["object_velocity"]] = 1e6
+        return step(actions)
+
+    batch.step = explode
+    obstacles = []
+    reset = batch.reset
+    batch.reset = lambda rng: (reset(rng), obstacles.append(batch.obstacle_positions.copy()))
+    played = worlds.play(NumpyMCPPolicy(networks.export_parameters(student)), np.random.default_rng(0))
+    worlds.close()
+    assert not inside_obstacles(played.goal, obstacles[0], config.world).any()
+    assert len(played.diverged) == 3 * 2
+    assert np.isfinite(played.lesson.observation).all()
+    assert not batch.diverged
 
 
 def test_errors_by_hand():
