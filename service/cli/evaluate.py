@@ -57,6 +57,7 @@ def evaluate(
         from service.actors.evaluation import evaluate as run
         from service.config import changed_config
         from service.downstream.skills import ZeroShotPolicy
+        from service.envs.observations import layouts
         from service.envs.sampling import GOAL_KINDS
         from service.primitives.loading import TrainedBob, load_either
 
@@ -65,6 +66,13 @@ def evaluate(
     player = trained.policy if isinstance(trained, TrainedBob) else ZeroShotPolicy(trained.skills)
     config = changed_config(trained.config, overrides or ())
     world, distance_m = config.world, config.game.success_distance_m
+    seen, known = (list(layouts(each.world).positions.columns) for each in (config, trained.config))
+    if seen != known:
+        more = ", ".join(sorted(set(seen) ^ set(known)))
+        raise TandemError(
+            f"--set: {trained.label} sees what it was trained to see, and {more} would be new or gone: leave world.observed "
+            "as it is"
+        )
     rows = {
         name: run(policy, world, kind, num_episodes=episodes, num_steps=steps, seed=seed, success_distance_m=distance_m)
         for name, policy in ((trained.label, player), ("idle", IdlePolicy()))

@@ -308,6 +308,13 @@ def test_evaluate_a_run_directory_gives_the_same(trained):
     assert from_run["idle"] == published["idle"]
 
 
+def test_evaluate_in_a_world_of_another_layout_is_refused(trained):
+    result = evaluate(trained, "tiny", "--set", "world.observed.num_commands=1")
+    assert result.exit_code == 2
+    assert_one_line(result.stderr.strip(), "--set", "tiny@1", "command_1", "world.observed")
+    assert evaluate(trained, "tiny", "--set", "world.randomisation.delay_steps=[1,1]").exit_code == 0
+
+
 def test_evaluate_follows_the_seed(trained):
     one, same, other = (evaluate(trained, "tiny", "--json", "--seed", seed).stdout for seed in (0, 0, 1))
     assert one == same != other
