@@ -70,8 +70,8 @@ def evaluate(
     if seen != known:
         more = ", ".join(sorted(set(seen) ^ set(known)))
         raise TandemError(
-            f"--set: {trained.label} sees what it was trained to see, and {more} would be new or gone: leave world.observed "
-            "as it is"
+            f"--set: {trained.label} sees what it was trained to see, and {more} would be new or gone: leave "
+            "world.observed as it is"
         )
     rows = {
         name: run(policy, world, kind, num_episodes=episodes, num_steps=steps, seed=seed, success_distance_m=distance_m)
