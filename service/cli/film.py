@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -66,10 +67,11 @@ def parse_goals(text: str, world: WorldConfig) -> GoalKind | StateArray:
     """A kind of random goals, or (N, 3) goals in metres.
 
     Raises:
-        TandemError: neither; or a goal outside of the workspace.
+        TandemError: neither; or a goal outside of the workspace, or inside a fixture.
     """
     import numpy as np
 
+    from service.envs.obstacles import inside_fixtures
     from service.envs.sampling import GOAL_KINDS, check_goals
     from service.generator.validity import in_workspace
 
@@ -86,12 +88,14 @@ def parse_goals(text: str, world: WorldConfig) -> GoalKind | StateArray:
             f"--goals {text!r}: write one of {', '.join(GOAL_KINDS)}, or points x,y,z in metres with ; between"
         )
     for point in points[~in_workspace(points, world.workspace)]:
-        low, high = (", ".join(f"{each:g}" for each in corner) for corner in _corners(world))
+        low, high = (_numbers(corner) for corner in (world.workspace.lower_m, world.workspace.upper_m))
+        raise TandemError(f"--goals: {_numbers(point)} is outside of the workspace, ({low}) to ({high}) m")
+    for point in points[inside_fixtures(points, world)]:
         raise TandemError(
-            f"--goals: {', '.join(f'{each:g}' for each in point)} is outside of the workspace, ({low}) to ({high}) m"
+            f"--goals: at {_numbers(point)} the object would be inside a fixture, or the upright box around it"
         )
     return points
 
 
-def _corners(world: WorldConfig) -> tuple[tuple[float, ...], tuple[float, ...]]:
-    return tuple(world.workspace.lower_m), tuple(world.workspace.upper_m)
+def _numbers(point: Iterable[float]) -> str:
+    return ", ".join(f"{each:g}" for each in point)

@@ -29,6 +29,8 @@ _NUM_ARRANGEMENTS = 60
 _MAX_DRAWS = 1000
 _COLUMNS_EACH = 7
 """Position and quaternion."""
+_TOUCHES_M = 0.001
+"""An object that stands on a fixture is not inside it, however its place was rounded."""
 _BESIDE_OBJECT_M = np.array([scene.GAP_M, scene.FINGER_GAP_M, scene.GAP_M])
 
 
@@ -134,6 +136,15 @@ def inside_obstacles(position: StateArray, obstacles: StateArray, config: WorldC
     """(N,) whether an object at (N, 3) would be inside one of the obstacles at (N, K, 3), metres."""
     half = np.array([each.extent_m for each in config.obstacles]).reshape(-1, 3) / 2
     return _overlap(_around(position, config.shape), Boxes(obstacles - half, obstacles + half))
+
+
+def inside_fixtures(position: StateArray, config: WorldConfig) -> BoolArray:
+    """(N,) whether an object at (N, 3) would be more than a millimetre inside a fixture or the wall, metres.
+
+    A box, which is elsewhere in every game, is none of them.
+    """
+    around = _around(position, config.shape)
+    return _overlap(Boxes(around.lower + _TOUCHES_M, around.upper - _TOUCHES_M), _around_fixtures(config))
 
 
 def _place_obstacles(rng: np.random.Generator, places: Places, config: WorldConfig, standing: Boxes) -> BoolArray:

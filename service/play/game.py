@@ -12,6 +12,7 @@ import numpy as np
 from service.downstream.orchestrators import Orchestrator
 from service.envs.batch import WorldBatch
 from service.envs.observations import bob_observation
+from service.envs.obstacles import inside_fixtures
 from service.envs.sampling import draw_goals
 from service.errors import TandemError
 from service.generator.validity import FALLEN_BELOW_M, Verdict, classify_goal
@@ -126,10 +127,16 @@ class Game:
             self._begin_turn("bob")
 
     def set_goal(self, goal: StateArray) -> None:
-        """Put the goal at (3,) metres, or the nearest place in the workspace; Bob goes there and stays."""
+        """Put the goal at (3,) metres, or the nearest place in the workspace; Bob goes there and stays.
+
+        Where the object would be inside a fixture there is no goal: it stays where it was.
+        """
         workspace = self.cast.world.workspace
         low = (*workspace.lower_m[:2], self.cast.world.rest_height_m)
-        self.goal = np.clip(np.asarray(goal, dtype=np.float64), low, workspace.upper_m)
+        place = np.clip(np.asarray(goal, dtype=np.float64), low, workspace.upper_m)
+        if inside_fixtures(place[None], self.cast.world)[0]:
+            return
+        self.goal = place
         self.new_goals = False
         if self.mode == "goals":
             self._begin_turn("bob", forget=False)

@@ -14,8 +14,9 @@ from types import SimpleNamespace
 import pytest
 from typer.testing import CliRunner
 
+from service.cli.film import parse_goals
 from service.cli.main import app
-from service.config import load_config
+from service.config import WorldConfig, load_config
 from service.errors import TandemError
 from service.io import checkpoints
 from service.io.lock import DirectoryLock
@@ -431,6 +432,13 @@ def test_a_film_that_cannot_be_made(arguments, part, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     assert_user_error(tandem("render", *arguments), part)
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_goal_of_a_film_is_in_no_fixture():
+    world = WorldConfig(fixtures=[{"shape": "box", "size_m": (0.1, 0.1, 0.1), "position_m": (0.05, 0.05)}])
+    assert parse_goals("0.05,0.05,0.2", world).tolist() == [[0.05, 0.05, 0.2]]
+    with pytest.raises(TandemError, match=r"--goals: at 0\.05, 0\.05, 0\.05 the object would be inside a fixture"):
+        parse_goals("0.05,0.05,0.2; 0.05,0.05,0.05", world)
 
 
 def test_registry_show(trained):

@@ -133,6 +133,10 @@ def test_a_task_and_its_orchestrator(champion):
     assert game.modes == ("goals", "primitives")
     assert begun
     assert game.weights_now() is None  # an orchestrator's are not known here
+    game.set_goal(np.array([0.05, 0.0, 0.1]))
+    for goal in ([-0.05, 0.0, 0.03], [-0.05, 0.0, 0.2]):  # in the wall, and above it
+        game.set_goal(np.array(goal))
+        assert game.goal.tolist() == ([0.05, 0.0, 0.1] if goal[2] < 0.1 else goal)
     go(game, 2)
     game.reset()
     assert len(begun) == 2

@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 
 from service.config import WorldConfig
-from service.envs.obstacles import Places, draw_goals, inside_obstacles
+from service.envs.obstacles import Places, draw_goals, inside_fixtures, inside_obstacles
 from service.envs.reach import Reach
-from service.envs.sampling import GOAL_KINDS, GoalKind, check_goals, clear_of_fixtures
+from service.envs.sampling import GOAL_KINDS, GoalKind, check_goals
 from service.errors import TandemError, did_you_mean
 from service.types import Array, BoolArray, StateArray
 
@@ -51,16 +51,18 @@ class GoalSource:
         """(N, 3) goals for N worlds whose things are at ``places``, metres.
 
         Raises:
-            TandemError: a function that drew something else, or goals out of reach.
+            TandemError: a function that drew something else, or goals out of reach or inside a fixture.
         """
         if isinstance(self._goals, str):
             return draw_goals(self._goals, rng, self._config, self._success_distance_m, places)
         num = len(places.object)
         if callable(self._goals):
-            return self._checked("goals: the function's goal", self._goals(rng, num, self._config), (num, 3))
+            goal = self._checked("goals: the function's goal", self._goals(rng, num, self._config), (num, 3))
+            return self._clear("goals: the function's goal", goal)
         goal = self._from_box(rng, num)
         for _ in range(_MAX_DRAWS):
-            wrong = self._out_of_reach(goal) | inside_obstacles(goal, places.obstacles, self._config)
+            wrong = self._out_of_reach(goal) | inside_fixtures(goal, self._config)
+            wrong |= inside_obstacles(goal, places.obstacles, self._config)
             if not wrong.any():
                 return goal
             goal[wrong] = self._from_box(rng, int(wrong.sum()))
@@ -70,14 +72,15 @@ class GoalSource:
         """(num, 3) goals that ``options`` of a reset give, metres; None where they give none.
 
         Raises:
-            TandemError: another option, or a goal of another shape, not finite or out of reach.
+            TandemError: another option, or a goal of another shape, not finite, out of reach or inside a fixture.
         """
         for name in options or {}:
             if name != "goal":
                 raise TandemError(f"reset: unknown option {name!r}; the only one is goal{did_you_mean(name, ['goal'])}")
         if not options or options["goal"] is None:
             return None
-        return self._checked("reset: options['goal']", options["goal"], (3,), (num, 3))
+        goal = self._checked("reset: options['goal']", options["goal"], (3,), (num, 3))
+        return self._clear("reset: options['goal']", goal)
 
     def _checked(self, what: str, value: Any, *shapes: tuple[int, ...]) -> StateArray:
         """Goals of one of these shapes as (N, 3), a copy."""
@@ -98,6 +101,14 @@ class GoalSource:
             raise TandemError(f"{what} {_point(bad)} m is out of reach: the nearest the arm comes is {near} m")
         return goal
 
+    def _clear(self, what: str, goal: StateArray) -> StateArray:
+        """Goals that are not inside a fixture."""
+        for bad in goal[inside_fixtures(goal, self._config)]:
+            raise TandemError(
+                f"{what} {_point(bad)} m: the object would be inside a fixture, or the upright box around it"
+            )
+        return goal
+
     def _checked_box(self, goals: GoalBox) -> tuple[StateArray, StateArray]:
         try:
             box = np.array(goals, dtype=np.float64)
@@ -115,7 +126,7 @@ class GoalSource:
         return box[0], box[1]
 
     def _from_box(self, rng: np.random.Generator, num: int) -> StateArray:
-        return clear_of_fixtures(lambda num: rng.uniform(self._lower, self._upper, (num, 3)), num, self._config)
+        return rng.uniform(self._lower, self._upper, (num, 3))
 
     def _nearest(self, goal: StateArray) -> StateArray:
         """(N, 3) where the object can be brought, nearest to (N, 3); on the table it may be lower than the arm."""

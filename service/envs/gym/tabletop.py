@@ -179,7 +179,7 @@ class TabletopEnv(GoalWorlds, gymnasium.Env[Any, FloatArray]):
                 same with it and without.
 
         Raises:
-            TandemError: an unknown option, a goal of another shape, not finite or out of reach.
+            TandemError: an unknown option, a goal of another shape, not finite, out of reach or inside a fixture.
         """
         goal = self._source.given(options, 1)
         super().reset(seed=seed, options=options)

@@ -80,6 +80,34 @@ def test_a_bad_goal_is_refused_in_one_line(envs, options, said):
     np.testing.assert_array_equal(envs.step(STAY)[0]["desired_goal"], before)
 
 
+SHELF = {"shape": "box", "size_m": (0.1, 0.1, 0.1), "position_m": (0.1, 0.1)}
+
+
+@pytest.mark.parametrize(
+    ("world", "fitting", "inside"),
+    [
+        ({"fixture": "wall"}, [(-0.05, 0.0, 0.2), (-0.02, 0.0, 0.025)], [(-0.05, 0.0, 0.025), (-0.022, 0.0, 0.025)]),
+        ({"fixtures": [SHELF]}, [(0.025, 0.1, 0.05), (0.1, 0.1, 0.1249)], [(0.03, 0.1, 0.05), (0.1, 0.1, 0.12)]),
+    ],
+)
+def test_a_goal_inside_a_fixture_is_refused(world, fitting, inside):
+    """A cube of 5 cm beside a wall of 1 cm, or beside and on a shelf; a height may be rounded."""
+    config = WorldConfig(start_height_m=0.15, **world)
+    drawn = []
+    given, drawing = TabletopEnv(config), TabletopEnv(config, goals=lambda rng, num, world: [drawn[-1]])
+    for goal in (*fitting, *inside):
+        drawn.append(goal)
+        for env, options, what in ((given, {"goal": goal}, r"options\['goal'\]"), (drawing, None, "function's goal")):
+            if goal in fitting:
+                np.testing.assert_array_equal(env.reset(options=options)[0]["desired_goal"], np.float32(goal))
+                continue
+            with pytest.raises(TandemError, match=rf"{what} \(.*\) m: the object would be inside a fixture") as caught:
+                env.reset(options=options)
+            assert "\n" not in str(caught.value)
+    given.close()
+    drawing.close()
+
+
 def test_a_function_draws_goals_alike_for_one_world_and_many():
     asked = []
 
@@ -119,6 +147,8 @@ def test_goals_in_a_box_are_in_it_and_clear_of_what_stands_there():
             goals.append(goal)
             for place in env._worlds.places.obstacles[0]:  # the cube's edge is 5 cm, the obstacle's 8 cm
                 assert np.abs(goal - place)[:2].max() >= 0.065 - 1e-6
+        if config.fixture == "wall":  # 1 cm thick, in the middle of the workspace
+            assert np.abs(np.array(goals)[:, 0] - config.workspace.center_x_m).min() >= 0.029
         env.close()
         assert (np.min(goals, axis=0) >= np.float32(low)).all()
         assert (np.max(goals, axis=0) <= np.float32(high)).all()
