@@ -352,6 +352,11 @@ class Config(FrozenModel):
     )
     run: RunConfig = RunConfig()
 
+    @property
+    def is_self_play(self) -> bool:
+        """Whether there is an Alice, and no skill discovery or distillation instead of her."""
+        return self.skills is None and self.distillation is None
+
     @model_validator(mode="after")
     def _distillation_is_of_primitives(self) -> Self:
         if self.distillation is not None and (self.skills is not None or self.policy.monolithic_bob is not None):

@@ -44,7 +44,7 @@ def dataset(
     config = trained.config
     if isinstance(trained, TrainedSkills):
         raise TandemError(f"{trained.label} holds skills, which have no goals: name primitives, or a run of self-play")
-    if trained.manifest is None and goals is None and config.distillation is None:
+    if trained.manifest is None and goals is None and config.is_self_play:
         alice_and_bob = load_players(RunDirectory(Path(players)))
         rounds = recording.play_rounds(config, *alice_and_bob, num_rounds=episodes, seed=seed)
         played = played_turns(rounds)

@@ -156,7 +156,7 @@ def render(
             trained.skills, config.world, num_skills=episodes, num_steps=config.skills.episode_steps, seed=seed
         )
         video.write_episode_video(recorded, config.world, out, options)
-    elif trained.manifest is None and goals is None:
+    elif trained.manifest is None and goals is None and config.is_self_play:
         players = load_players(RunDirectory(Path(primitives)))
         rounds = recording.record_rounds(config, *players, num_rounds=episodes, seed=seed)
         video.write_video(rounds, config.world, out, options)

@@ -59,7 +59,7 @@ def cast_primitives(reference: str, registry: Path, task: str | None = None) -> 
     if isinstance(trained, TrainedSkills):
         bob: DeterministicPolicy = ZeroShotPolicy(trained.skills)
         return _cast(trained.label, config, bob, task)
-    if trained.manifest is None and task is None and config.game.alice_plays:
+    if trained.manifest is None and task is None and config.is_self_play and config.game.alice_plays:
         alice, _ = load_players(RunDirectory(Path(reference)))
     primitives = trained.policy if isinstance(trained.policy, NumpyMCPPolicy) else None
     return _cast(trained.label, config, trained.policy, task, primitives, alice)

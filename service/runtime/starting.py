@@ -27,7 +27,8 @@ class Start:
     reference: str
     """That finds the same again, from any directory: a version without an alias, or an absolute path."""
     networks: Mapping[str, Mapping[str, Array]]
-    """By ``bob/policy``, ``bob/value``, ``alice/policy`` and ``alice/value``; of a published version only the first."""
+    """By ``bob/policy``, ``bob/value``, ``alice/policy`` and ``alice/value``; of a published version, and of a run of
+    distillation, only the first."""
     world: WorldConfig
     """That policies were trained in, which says what they saw."""
     published: Published | None
@@ -67,7 +68,7 @@ def read_start(reference: str, registry: Path, config: Config) -> Start:
 def _learned(directory: RunDirectory, config: Config) -> Mapping[str, Mapping[str, Array]]:
     """The networks of a run's newest checkpoint; distillation has Bob's policy alone."""
     parts = split_parts(CheckpointStore(directory.checkpoints, keep=1).load_latest().arrays)
-    if config.distillation is not None:
+    if not config.is_self_play:
         return {"bob/policy": parts["bob"]}
     learner = {player: split_parts(own) for player, own in split_parts(parts["learner"]).items()}
     return {f"{player}/{network}": learner[player][network] for player in _PLAYERS for network in _NETWORKS}

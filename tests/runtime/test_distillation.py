@@ -3,8 +3,10 @@
 import numpy as np
 import pytest
 import torch
+from typer.testing import CliRunner
 
 from service.actors.distillation import DistillationWorlds
+from service.cli.main import app
 from service.config import parse_config
 from service.distillation_config import DistillationConfig
 from service.envs.batch import WorldBatch
@@ -14,6 +16,7 @@ from service.errors import ConfigError, TandemError
 from service.io.run_directory import RunDirectory
 from service.learner.distillation import Distiller
 from service.learner.transfer import take_over
+from service.play.cast import cast_primitives
 from service.policies import networks
 from service.policies.numpy_policy import NumpyMCPPolicy
 from service.primitives.loading import load_bob
@@ -149,12 +152,17 @@ def run_to_end(path, config, start=None, *, resume=False, stop_after=None):
     return run
 
 
-def test_a_run_is_published_with_its_teacher_as_parent_and_is_exact_when_resumed(taught, tmp_path):
+def test_a_run_is_published_with_its_teacher_as_parent_and_is_exact_when_resumed(taught, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("service.media.video.write_episode_video", lambda *arguments: None)
     root, version = taught
     drawn = {"delay_steps": [0, 1], "object_noise_m": [0.0, 0.01], "friction": [0.5, 1.0], "num_models": 2}
     config = config_of(drawn, total_env_steps=220, evaluation_interval=2)
     start = read_start(str(version), root / "registry", config)
     whole = run_to_end(tmp_path / "whole", config, start)
+    assert cast_primitives(str(tmp_path / "whole"), tmp_path).alice is None
+    filmed = CliRunner().invoke(app, ["render", "--primitives", str(tmp_path / "whole"), "--episodes", "1"])
+    assert filmed.exit_code == 0, filmed.output
     run_to_end(tmp_path / "part", config, start, stop_after=2)
     run_to_end(tmp_path / "part", config, resume=True)
     assert_same_run(tmp_path / "part", tmp_path / "whole")
