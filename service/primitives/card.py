@@ -14,6 +14,10 @@ from service.registry.manifest import Manifest
 LICENCE = "apache-2.0"
 """Tandem's own, as hubs write it."""
 _PRIMITIVES = "primitives"
+_LEARNED = {
+    False: "They were learned by self-play, in which Alice proposes goals and Bob reaches them.",
+    True: "They were learned from other ones, which saw more and had been learned by self-play (distillation).",
+}
 _SUCCESS = re.compile(r"evaluation/(?:(\w+)_)?success_(last|ever)")
 
 
@@ -126,8 +130,8 @@ def _what(manifest: Manifest) -> Iterator[str]:
         num = _first(_at(config, "policy", "bob", "num_primitives"), "The")
         yield (
             f"{num} frozen primitives of Tandem, and the gate that composes them: a policy that brings an object to a "
-            "goal. They were learned by self-play, in which Alice proposes goals and Bob reaches them. No task and no "
-            "reward was written for them. New tasks are learned by composing them."
+            f"goal. {_LEARNED[_at(config, 'distillation') is not None]} No task and no reward was written for them. "
+            "New tasks are learned by composing them."
         )
     thing = _at(config, "world", "object")
     rows = [

@@ -77,6 +77,13 @@ def test_skills_and_orchestrators_have_cards_of_their_own(registry: Registry, pu
     assert body.endswith("## Licence\n\nmit\n")
 
 
+def test_a_card_says_how_primitives_were_learned():
+    manifests = Registry(BUNDLED)
+    for name, said in (("panda-cube", "learned by self-play"), ("panda-cube-robust", "learned from other ones")):
+        body = model_card(manifests.manifest(f"{name}@latest"))
+        assert [each for each in ("learned by self-play,", "learned from other ones,") if each in body] == [f"{said},"]
+
+
 def test_without_a_file_it_is_printed_and_what_is_not_there_is_refused(tmp_path, registry: Registry, publish: Publish):
     publish()
     run = CliRunner().invoke(app, ["registry", "card", "panda-cube@1", "--registry", str(registry.root)])
