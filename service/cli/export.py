@@ -7,7 +7,7 @@ from typing import Annotated, cast
 
 import typer
 
-from service.cli.common import REGISTRY, JsonOption, RegistryOption
+from service.cli.common import REGISTRY, JsonOption, QuietOption, RegistryOption, loading
 
 
 def export(
@@ -32,16 +32,18 @@ def export(
     episodes: Annotated[int, typer.Option(help="Played for each delay that is measured.", min=1)] = 100,
     as_json: JsonOption = False,
     registry: RegistryOption = REGISTRY,
+    quiet: QuietOption = False,
 ) -> None:
     """Write a policy for use elsewhere, such as on a robot: networks, what their numbers mean, a README.
 
     What is written is compared with the policy itself. The folder appears only when no output differs by more than
     1e-5; with inputs far outside of what the policy meets, 1e-4.
     """
-    from service.export.exporting import Part, find_source
-    from service.export.exporting import export as run
+    with loading():
+        from service.export.exporting import Part, find_source
+        from service.export.exporting import export as run
 
-    source = find_source(policy, registry, cast(Part, part), primitives)
+        source = find_source(policy, registry, cast(Part, part), primitives)
     about = run(source, format_name, out, num_episodes=episodes)
     if as_json:
         typer.echo(about.model_dump_json(indent=1))

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from service.cli.common import JsonOption, print_json
+from service.cli.common import JsonOption, QuietOption, loading, print_json
 from service.cli.film import (
     CAMERA,
     OUT,
@@ -44,18 +44,20 @@ def evaluate(
     primitives: ActsWithOption = None,
     registry: RegistryOption = "registry",
     as_json: JsonOption = False,
+    quiet: QuietOption = False,
 ) -> None:
     """Measure an orchestrator on its task, beside Bob as he is and a policy that does nothing.
 
     With the seed of its training, the goals are those of its result.
     """
-    import service
-    from service.actors.evaluation import DeterministicPolicy, IdlePolicy
-    from service.downstream.playing import FINAL_SEED, evaluate_on
-    from service.envs.tasks import SUCCESS_DISTANCE_M, find_task
-    from service.primitives.loading import TrainedBob
+    with loading():
+        import service
+        from service.actors.evaluation import DeterministicPolicy, IdlePolicy
+        from service.downstream.playing import FINAL_SEED, evaluate_on
+        from service.envs.tasks import SUCCESS_DISTANCE_M, find_task
+        from service.primitives.loading import TrainedBob
 
-    found = service.load_policy(reference, registry, primitives)
+        found = service.load_policy(reference, registry, primitives)
     on, trained = task or found.task, found.trained
     title = find_task(on).title
     players: dict[str, DeterministicPolicy] = {found.label: found}
@@ -89,15 +91,17 @@ def render(
     speed: SpeedOption = SPEED,
     primitives: ActsWithOption = None,
     registry: RegistryOption = "registry",
+    quiet: QuietOption = False,
 ) -> None:
     """Make a film of an orchestrator on its task."""
-    import service
-    from service.downstream.playing import FINAL_SEED, record_on
-    from service.envs.tasks import find_task
-    from service.media.video import write_episode_video
+    with loading():
+        import service
+        from service.downstream.playing import FINAL_SEED, record_on
+        from service.envs.tasks import find_task
+        from service.media.video import write_episode_video
 
-    options = film_options(size, camera, speed, out)
-    found = service.load_policy(reference, registry, primitives)
+        options = film_options(size, camera, speed, out)
+        found = service.load_policy(reference, registry, primitives)
     on, world = task or found.task, found.trained.config.world
     recorded = record_on(on, world, found, episodes, seed + FINAL_SEED)
     write_episode_video(recorded, find_task(on).world_from(world), out, options)
@@ -113,11 +117,13 @@ def publish(
         typer.Option(metavar="NAME@ALIAS", help="The published version that it acts with, if it has another name now."),
     ] = None,
     registry: RegistryOption = "registry",
+    quiet: QuietOption = False,
 ) -> None:
     """Publish an orchestrator in the registry, with a reference to the primitives that it belongs to."""
-    from service.downstream.orchestrators import publish_orchestrator
-    from service.registry.names import check_alias
-    from service.registry.registry import Registry
+    with loading():
+        from service.downstream.orchestrators import publish_orchestrator
+        from service.registry.names import check_alias
+        from service.registry.registry import Registry
 
     if alias is not None:
         check_alias(alias)

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import socket
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from service.cli.common import CHAMPION, EXIT_SIGNAL, REGISTRY, RegistryOption
+from service.cli.common import CHAMPION, EXIT_SIGNAL, REGISTRY, QuietOption, RegistryOption, loading
 from service.cli.orchestrators import ActsWithOption, ReferenceArgument
 from service.cli.orchestrators import RegistryOption as AnyRegistryOption
 
@@ -31,11 +32,16 @@ def play(
     port: _Port = None,
     seed: _Seed = 0,
     registry: RegistryOption = REGISTRY,
+    quiet: QuietOption = False,
 ) -> None:
     """Watch a live world in the browser: drag the goal, drive the primitives, see Alice propose."""
-    from service.play.cast import cast_primitives
 
-    _serve(cast_primitives(primitives, registry, task), host, port, seed)
+    def make_cast() -> Cast:
+        from service.play.cast import cast_primitives
+
+        return cast_primitives(primitives, registry, task)
+
+    _serve(make_cast, host, port, seed)
 
 
 def play_downstream(
@@ -46,22 +52,31 @@ def play_downstream(
     seed: _Seed = 0,
     primitives: ActsWithOption = None,
     registry: AnyRegistryOption = "registry",
+    quiet: QuietOption = False,
 ) -> None:
     """Watch an orchestrator on its task, live in the browser."""
-    import service
-    from service.play.cast import cast_orchestrator
 
-    _serve(cast_orchestrator(service.load_policy(reference, registry, primitives), task), host, port, seed)
+    def make_cast() -> Cast:
+        import service
+        from service.play.cast import cast_orchestrator
+
+        return cast_orchestrator(service.load_policy(reference, registry, primitives), task)
+
+    _serve(make_cast, host, port, seed)
 
 
-def _serve(cast: Cast, host: str, port: int | None, seed: int) -> None:
-    """Show a cast until Ctrl-C."""
-    from service.play.server import LiveWorld
-    from service.runtime.signals import InterruptError, StopSignals
+def _serve(make_cast: Callable[[], Cast], host: str, port: int | None, seed: int) -> None:
+    """Load a cast, and show it until Ctrl-C."""
+    with loading():
+        from service.play.server import LiveWorld
+        from service.runtime.signals import InterruptError, StopSignals
 
+        cast = make_cast()
     with StopSignals() as signals:
         try:
-            with LiveWorld(cast, host, port, seed) as live, signals.asking(lambda: None):
+            with loading():
+                world = LiveWorld(cast, host, port, seed)
+            with world as live, signals.asking(lambda: None):
                 typer.echo(f"{cast.label}: {live.url}")
                 typer.echo(
                     f"from another machine: ssh -L {live.port}:127.0.0.1:{live.port} {socket.gethostname()}, "

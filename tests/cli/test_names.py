@@ -8,6 +8,7 @@ import sys
 from pathlib import Path
 
 import pytest
+import typer
 from typer.testing import CliRunner
 
 from service import __version__
@@ -122,6 +123,18 @@ def test_options_that_would_do_nothing_are_refused(monkeypatch, tmp_path, argume
     assert result.exit_code == 2, result.exception
     assert said in result.stderr
     assert list(tmp_path.iterdir()) == []
+
+
+def test_what_takes_long_can_be_quiet():
+    root = typer.main.get_command(app)
+    for line in (
+        "pretrain", "demo", "evaluate", "coverage", "render", "play", "dataset", "export", "serve", "downstream train",
+        "downstream table", "downstream evaluate", "downstream render", "downstream play", "downstream publish",
+    ):  # fmt: skip
+        command = root
+        for word in line.split():
+            command = command.commands[word]
+        assert any("-q" in each.opts for each in command.params), line
 
 
 def test_the_version():
