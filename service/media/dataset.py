@@ -127,32 +127,26 @@ def write_dataset(name: str, played: Sequence[Played], config: Config, label: st
 def _buffers(played: Sequence[Played], config: Config) -> Iterator[object]:
     from minari.data_collector import EpisodeBuffer
 
-    blocked = config.game.blocked_gripper_fraction
-    worlds: dict[int, WorldBatch] = {}
-    try:
+    longest, columns = max(len(each.states) for each in played), played[0].states.shape[1]
+    worlds = WorldBatch(config.world, longest, num_threads=1)
+    if worlds.states.shape[1] != columns:  # those of self-play have a column more
+        worlds.close()
+        blocked = config.game.blocked_gripper_fraction
+        worlds = WorldBatch(config.world, longest, num_threads=1, blocked_fraction=blocked)
+    with worlds:
         for each in counted(played, "writing the data set", len(played), "episodes"):
-            num, columns = each.states.shape
-            if num not in worlds:  # few lengths: a turn ends by time or as soon as the goal is held
-                plain = WorldBatch(config.world, num, num_threads=1)
-                if plain.states.shape[1] != columns:  # those of self-play have a column more
-                    plain.close()
-                    plain = WorldBatch(config.world, num, num_threads=1, blocked_fraction=blocked)
-                worlds[num] = plain
-            yield EpisodeBuffer(**_arrays(each, worlds[num], config.game.success_distance_m))
-    finally:
-        for each_batch in worlds.values():
-            each_batch.close()
+            yield EpisodeBuffer(**_arrays(each, worlds, config.game.success_distance_m))
 
 
 def _arrays(played: Played, worlds: WorldBatch, success_distance_m: float) -> dict[str, object]:
     """An episode as ``EpisodeBuffer`` has it; what was seen follows from the states."""
-    worlds.restore(played.states)
-    num_steps = len(played.actions)
-    achieved = np.clip(worlds.object_position, -_FURTHEST_M, _FURTHEST_M)
+    num_steps, num = len(played.actions), len(played.states)
+    worlds.restore(played.states, np.arange(worlds.num_worlds) < num)
+    achieved = np.clip(worlds.object_position[:num], -_FURTHEST_M, _FURTHEST_M)
     success = np.linalg.norm(achieved - played.goal, axis=1) <= success_distance_m
     return {
         "observations": {
-            "observation": np.clip(worlds.positions(), -_FURTHEST_M, _FURTHEST_M),
+            "observation": np.clip(worlds.positions()[:num], -_FURTHEST_M, _FURTHEST_M),
             "achieved_goal": achieved.astype(np.float32),
             "desired_goal": np.tile(played.goal.astype(np.float32), (num_steps + 1, 1)),
         },

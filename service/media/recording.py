@@ -26,7 +26,7 @@ from service.generator.opponents import Opponents
 from service.generator.records import GoalRecords
 from service.generator.snapshot import GeneratorSnapshot
 from service.generator.validity import Verdict
-from service.progress import counted
+from service.progress import counted, doing
 from service.types import BoolArray, FloatArray, StateArray
 
 _NUM_WORLDS = 64
@@ -80,11 +80,13 @@ def play_rounds(
     Alice samples her actions as in training; Bob acts without noise.
     """
     rounds: list[RecordedRound] = []
-    for _, recorded in _play(config, alice, bob, num_worlds=min(_NUM_WORLDS, num_rounds), seed=seed):
-        rounds += recorded
-        if len(rounds) >= num_rounds:
-            break
-    return rounds[:num_rounds]
+    with doing("playing rounds", num_rounds, "rounds") as task:
+        for _, recorded in _play(config, alice, bob, num_worlds=min(_NUM_WORLDS, num_rounds), seed=seed):
+            rounds += recorded[: num_rounds - len(rounds)]
+            task.advance(len(rounds) - task.done)
+            if len(rounds) == num_rounds:
+                break
+    return rounds
 
 
 def record_rounds(
