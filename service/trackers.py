@@ -120,8 +120,8 @@ def _make(reference: str, factory: Factory, name: str, config: dict[str, Any]) -
         ) from None
     if not callable(getattr(tracker, "log", None)):
         raise TandemError(
-            f"--tracker {reference!r} made a {type(tracker).__name__}, which has no log: give an object with "
-            "log(metrics, step)"
+            f"--tracker {reference!r} made something without log, of type {type(tracker).__name__}: give an object "
+            "with log(metrics, step)"
         )
     return tracker
 

@@ -116,7 +116,7 @@ def test_a_training_downstream_has_them_too(tmp_path):
         ("no_such_module_here:File", "cannot be loaded: ModuleNotFoundError: No module named 'no_such_module_here'"),
         ("trackers_of_a_test:Nothing", "cannot be loaded: AttributeError"),
         ("trackers_of_a_test:number", "is no function"),
-        ("trackers_of_a_test:no_log", "made a int, which has no log"),
+        ("trackers_of_a_test:no_log", "made something without log, of type int"),
         ("trackers_of_a_test:refuses", "RuntimeError: log in first"),
     ],
 )
