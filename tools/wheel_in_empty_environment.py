@@ -27,10 +27,11 @@ STEPS = (
     ("evaluate", "--primitives", "panda-cube@champion", "--episodes", "50"),
     ("downstream", "methods"),
     ("serve", "--runs", "runs"),
+    ("play",),
 )
 """What is typed, one after another, in an empty directory."""
-MISSING = "pip install 'tandem-skills[serve]'"
-"""The answer to the last one."""
+MISSING = {extra: f"pip install 'tandem-skills[{extra}]'" for extra in ("serve", "play")}
+"""The answers to the last ones."""
 
 
 def main() -> None:
@@ -75,9 +76,7 @@ def build_wheel(directory: Path) -> Path:
 def _meet(tandem: list[str], here: Path) -> None:
     here.mkdir()
     for step in STEPS:
-        _run(
-            [*tandem, *step], here, expected=2 if step[0] == "serve" else 0, said=MISSING if step[0] == "serve" else ""
-        )
+        _run([*tandem, *step], here, expected=2 if step[0] in MISSING else 0, said=MISSING.get(step[0], ""))
 
 
 def _run(command: list[str], directory: Path, *, expected: int = 0, said: str = "") -> None:
