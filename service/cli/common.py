@@ -29,7 +29,8 @@ RegistryOption = Annotated[
 ]
 
 
-def _quieten(quiet: bool) -> bool:
+def quieten(quiet: bool) -> bool:
+    """Show no progress from now on, if so; no messages but warnings and errors."""
     shown = display()
     if quiet and shown is not None:
         shown.quiet = True
@@ -37,7 +38,7 @@ def _quieten(quiet: bool) -> bool:
     return quiet
 
 
-QuietOption = Annotated[bool, typer.Option("--quiet", "-q", callback=_quieten, help="Show no progress.")]
+QuietOption = Annotated[bool, typer.Option("--quiet", "-q", callback=quieten, help="Show no progress.")]
 TrackerOption = Annotated[
     list[str] | None,
     typer.Option(

@@ -11,7 +11,7 @@ from typing import Annotated
 import typer
 
 from service import __version__
-from service.cli.common import CommandGroup, QuietOption
+from service.cli.common import CommandGroup, QuietOption, quieten
 from service.cli.configs import configs_app
 from service.cli.dataset import dataset
 from service.cli.downstream import downstream_app
@@ -47,6 +47,7 @@ def options(
     ] = False,
 ) -> None:
     """Robot skills, pre-trained."""
+    quieten(quiet)  # again: when the option was read, nothing was there to be quiet
 
 
 class _Log(logging.Handler):

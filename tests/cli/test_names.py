@@ -1,6 +1,7 @@
 """Names that are typed: configurations that come with tandem, and what a misspelt name was meant to be."""
 
 import json
+import logging
 import os
 import shlex
 import subprocess
@@ -135,6 +136,20 @@ def test_what_takes_long_can_be_quiet():
         for word in line.split():
             command = command.commands[word]
         assert any("-q" in each.opts for each in command.params), line
+
+
+def test_quiet_before_and_after_the_command(monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    for limit in ("SHOWN_AFTER_S", "PLAIN_INTERVAL_S"):
+        monkeypatch.setattr(f"service.progress.{limit}", 0.0)
+    typed = ["evaluate", "--primitives", "panda-cube@champion", "--episodes", "1", "--steps", "1"]
+    assert "evaluating on mixed goals" in tandem(*typed).stderr
+    level = logging.getLogger().level
+    for arguments in (["-q", *typed], [*typed, "-q"]):
+        done = tandem(*arguments)
+        assert (done.exit_code, done.stderr) == (0, "")
+        assert "at the last step" in done.stdout
+    logging.getLogger().setLevel(level)
 
 
 def test_the_version():
