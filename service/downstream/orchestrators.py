@@ -64,7 +64,11 @@ class Orchestrator:
             self.policy.begin()
 
     def act_deterministic(self, observation: FloatArray) -> FloatArray:
-        """(N, O) positions and goal, such as (N, 14), to actions (N, 4)."""
+        """(N, O) positions and goal, such as (N, 14), to actions (N, 4).
+
+        Raises:
+            PolicyError: another shape, or another N than in the step before.
+        """
         return self.policy.act_deterministic(observation)
 
 

@@ -13,7 +13,7 @@ from service.errors import TandemError
 from service.io.files import os_errors, write_atomic
 from service.io.tensors import decode, encode, read_metadata
 from service.parsing import parse_json
-from service.policies.parameters import Parameters
+from service.policies.parameters import Parameters, PolicyError
 from service.regular_files import read_regular
 from service.sac.numpy_actor import numpy_actor
 from service.types import FloatArray
@@ -48,7 +48,18 @@ class LearnedPolicy:
         self._num_steps = 0
 
     def act_deterministic(self, observation: FloatArray) -> FloatArray:
-        """(N, O) Bob's input, positions and goal, to actions (N, 4)."""
+        """(N, O) Bob's input, positions and goal, to actions (N, 4).
+
+        Raises:
+            PolicyError: another shape, or another N than in the step before.
+        """
+        if observation.ndim != 2 or observation.shape[1] != self._seen.bob.size:
+            raise PolicyError(f"observation: expected shape (N, {self._seen.bob.size}), got {observation.shape}")
+        if self._previous is not None and len(self._previous) != len(observation):
+            raise PolicyError(
+                f"observation: {len(observation)} rows, and {len(self._previous)} in the step before: call begin() "
+                "before new episodes"
+            )
         positions = observation[:, : self._seen.positions.size]
         previous = positions if self._previous is None else self._previous
         if self._held is None or self._num_steps % self._hold_steps == 0:

@@ -121,6 +121,14 @@ def test_orchestrators_and_primitives_are_not_taken_for_each_other(finished, cha
 def test_a_policy_from_nothing_needs_the_world_alone(finished, champion, observation, tmp_path):
     found = service.load_policy(str(finished / "scratch-monolithic"), tmp_path)
     assert acted(found, observation).shape == (2, 3, 4)
+    for wrong, said in (
+        (observation[:1], r"1 rows, and 3 in the step before: call begin\(\)"),
+        (observation[0], "shape"),
+    ):
+        with pytest.raises(TandemError, match=said):
+            found.act_deterministic(wrong)
+    found.begin()
+    assert found.act_deterministic(observation[:1]).shape == (1, 4)
     copy = shutil.copytree(finished / "scratch-monolithic", tmp_path / "copy")
     recorded = json.loads((copy / "cell.json").read_text())
     recorded["world"]["object_mass_kg"] = 0.3
