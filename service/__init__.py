@@ -73,7 +73,8 @@ def load_policy(reference: str, registry: Path | str = "registry", primitives: s
     """What ``tandem downstream`` has learned, with the primitives or skills that it acts with, without torch.
 
     Args:
-        reference: directory of a training, or NAME, NAME@ALIAS or NAME@VERSION of a published orchestrator.
+        reference: directory of a training, or NAME, NAME@ALIAS or NAME@VERSION of a published orchestrator, or the
+            directory of an exported one.
         registry: see ``load_primitives``; what the orchestrator acts with is looked up there by the version that it was
             trained with, and among what comes with the package.
         primitives: what it acts with, where that has moved: a reference or a run directory. The parameters have to be

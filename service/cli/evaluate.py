@@ -21,7 +21,7 @@ from service.cli.film import (
     film_options,
     parse_goals,
 )
-from service.errors import TandemError
+from service.errors import TandemError, one_line
 
 if TYPE_CHECKING:
     from service.envs.sampling import GoalKind
@@ -52,6 +52,9 @@ def evaluate(
 
     Of skills (LSD, METRA, DIAYN) the one that leads to the goal acts, zero-shot.
     """
+    for override in overrides or ():
+        if not override.startswith("world."):
+            raise TandemError(f"--set {one_line(override, 200)}: of an evaluation only the world can be set, world.A=B")
     with loading():
         from service.actors.evaluation import IdlePolicy
         from service.actors.evaluation import evaluate as run

@@ -25,6 +25,7 @@ from service.io.run_directory import RunDirectory
 from service.primitives.bundled import BUNDLED, find_version, is_bundled
 from service.primitives.loading import ORCHESTRATOR
 from service.primitives.publishing import newest_if_same
+from service.registry.exported import is_exported
 from service.registry.manifest import Manifest
 from service.registry.names import Version, check_name
 from service.registry.registry import Registry
@@ -76,7 +77,7 @@ def load_orchestrator(reference: str, place: Path, registry: Path | str, primiti
     """Load what a training has learned; see ``service.load_policy``.
 
     Args:
-        reference: directory of a training, or a published version.
+        reference: directory of a training, a published version, or the directory of an exported one.
         place: directory of the registry that has the version.
         registry: directory or URL of the one in which to look for what it acts with.
         primitives: what it acts with, where that has moved.
@@ -85,9 +86,10 @@ def load_orchestrator(reference: str, place: Path, registry: Path | str, primiti
         TandemError: nothing there by that reference, something else, damaged, not finished, or without the primitives
             or skills it was trained with.
     """
-    if Path(reference).is_dir():
+    exported = is_exported(Path(reference))
+    if Path(reference).is_dir() and not exported:
         return _load_training(Path(reference), registry, primitives)
-    if "/" in reference:
+    if "/" in reference and not exported:
         raise TandemError(f"{reference}: no such directory of a training; for published ones write NAME@ALIAS")
     found, version = find_version(reference, place)
     manifest, parameters = found.load(str(version))

@@ -116,6 +116,7 @@ def test_what_is_like_nothing_gets_no_guess():
         (["downstream", "train", "--task", "wall", "--skill-steps", "5"], "and ours takes none: leave it out"),
         (["downstream", "train", "--task", "wall", "--method", "idle", "--steps", "900"], "idle learns nothing"),
         (["downstream", "train", "--task", "wall", "--method", "asp-only", "--set", "gamma=0.9"], "--set is about"),
+        (["evaluate", "--primitives", "panda-cube@champion", "--set", "seed=3"], "only the world can be set"),
     ],
 )
 def test_options_that_would_do_nothing_are_refused(monkeypatch, tmp_path, arguments, said):

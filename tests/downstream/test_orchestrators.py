@@ -68,6 +68,9 @@ def test_it_acts_alike_from_its_directory_a_registry_and_a_service(finished, cha
     assert Registry(registry).verify(check=network_problems) == []
     published = service.load_policy("push-orchestrator@latest", registry)
     np.testing.assert_array_equal(acted(published, observation), expected)
+    Registry(registry).export("push-orchestrator", tmp_path / "exported")
+    exported = service.load_policy(str(tmp_path / "exported"), tmp_path / "no-registry")
+    np.testing.assert_array_equal(acted(exported, observation), expected)
 
     (tmp_path / "runs").mkdir()
     with serve(tmp_path) as server, pytest.MonkeyPatch.context() as patch:
