@@ -40,6 +40,12 @@ def without(monkeypatch):
             "tandem dataset needs the package minari, .*'tandem-skills[data]'",
         ),
         (
+            "h5py",  # said before anything is played, or goals are read
+            (),
+            ["dataset", "panda-cube@champion", "--out", "some", "--goals", "nowhere"],
+            "tandem dataset needs the package h5py, .*'tandem-skills[data]'",
+        ),
+        (
             "ray",
             (),
             ["pretrain", "--runtime", "ray"],

@@ -100,7 +100,6 @@ def write_dataset(name: str, played: Sequence[Played], config: Config, label: st
     full = check_name(name)
     place = _place(full)
     with needs_extra("data", "tandem dataset"):
-        import h5py  # noqa: F401 - Minari would miss it only when it writes
         import minari
 
     description = {"players": label, "success_distance_m": config.game.success_distance_m}
@@ -160,6 +159,7 @@ def _arrays(played: Played, worlds: WorldBatch, success_distance_m: float) -> di
 
 def _place(full: str) -> Path:
     with needs_extra("data", "tandem dataset"):
+        import h5py  # noqa: F401 - Minari would miss it only when it writes, after all was played
         from minari import storage
     with os_errors("write", Path(full)):
         return Path(storage.get_dataset_path(full))
