@@ -8,9 +8,10 @@ import numpy as np
 
 from benchmarks.report.markdown import Row, table
 from service.actors.evaluation import wilson_interval
-from service.downstream.directory import TRIAL
+from service.downstream.files import TRIAL
 from service.downstream.methods import METHODS
-from service.downstream.page import PAPER, seed_interval
+from service.downstream.page import PAPER
+from service.downstream.rates import seed_interval
 from service.downstream.results import Result
 from service.envs.tasks import TASKS
 

@@ -9,7 +9,7 @@ import numpy as np
 from benchmarks.controls import OURS
 from benchmarks.report.markdown import Row, percent, table
 from benchmarks.run_files import Run
-from service.downstream.directory import TRIAL
+from service.downstream.files import TRIAL
 from service.downstream.methods import METHODS
 from service.downstream.page import BEST
 from service.downstream.results import Result

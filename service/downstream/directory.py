@@ -15,29 +15,26 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any, Self
 
-from pydantic import BaseModel, ConfigDict, ValidationError
-
+from service.downstream.files import (
+    FORMAT_VERSION,
+    RESULT_FILE,
+    TRIAL,
+    TRIAL_FILE,
+    made_with,
+    read_json,
+    write_json,
+)
 from service.downstream.settings import TrialConfig, differences, validate
 from service.errors import TRACEBACK_PREFIX, TandemError
 from service.io.checkpoints import Checkpoint, CheckpointStore
-from service.io.files import TEMPORARY_PREFIX, check_regular, os_errors, remove_temporaries, write_atomic
+from service.io.files import TEMPORARY_PREFIX, check_regular, os_errors, remove_temporaries
 from service.io.jsonl import JsonlWriter
 from service.io.lock import LOCK_FILE, DirectoryLock
-from service.io.tensorboard import EventFile
-from service.parsing import ParseError, parse_json
-from service.regular_files import read_regular
 from service.types import Arrays
 
-FORMAT_VERSION = 1
-"""Version of ``cell.json`` and ``result.json``, and of the table's files."""
-TRIAL = "cell"
-"""Key of a trial's settings in these files, which call a trial a cell."""
-MAX_BYTES = 64 * 1024 * 1024
-"""Of each of them, whose curves grow with the length of a training."""
 _ELSEWHERE = "name another directory (--run-dir, of a table --runs)"
 
 
@@ -47,10 +44,10 @@ class TrainingDirectory:
     def __init__(self, path: Path) -> None:
         """Name the files; nothing is read or written before ``start``."""
         self.path = path
-        self.trial_file = path / "cell.json"
+        self.trial_file = path / TRIAL_FILE
         self.metrics_file = path / "metrics.jsonl"
         self._checkpoints = CheckpointStore(path / "checkpoints", keep=1)
-        self.result_file = path / "result.json"
+        self.result_file = path / RESULT_FILE
         self.policy_file = path / "policy.safetensors"
         self._metrics = JsonlWriter(self.metrics_file)
         self._lock: DirectoryLock | None = None
@@ -78,6 +75,8 @@ class TrainingDirectory:
             TandemError: a training is here already and is not to be resumed, or is another one; another process is at
                 it; or the directory cannot be read or written.
         """
+        from service.io.tensorboard import EventFile  # TensorBoard's packages, which only a training needs
+
         self.check(identity, resume=resume)
         self._lock = DirectoryLock(self.path, f"stop that one first, or {_ELSEWHERE}")
         self.check(identity, resume=resume)  # of two that begin at once, the second sees here what the first has made
@@ -126,11 +125,6 @@ class TrainingDirectory:
         self._checkpoints.save(iteration, arrays, meta)
 
 
-def made_with(tree: dict[str, Any]) -> dict[str, Any]:
-    """Primitives and world in what was read from a file, as of ``methods.provenance``."""
-    return {key: tree.get(key) for key in ("primitives", "world")}
-
-
 def read_trial(tree: dict[str, Any], path: Path) -> TrialConfig:
     """The trial of what was read from a file; settings that are younger than the file have their defaults.
 
@@ -141,94 +135,3 @@ def read_trial(tree: dict[str, Any], path: Path) -> TrialConfig:
         return validate(TrialConfig, tree.get(TRIAL))
     except TandemError as error:
         raise TandemError(f"{path}: {error}; name another directory") from None
-
-
-def read_json(path: Path) -> dict[str, Any]:
-    """Read the object in a file.
-
-    Raises:
-        TandemError: there is none, or it is of another format version.
-    """
-    with os_errors("read", path):
-        data = read_regular(path, MAX_BYTES, follow=True)
-    try:
-        tree = dict(parse_json(data, path))
-    except ParseError as error:
-        raise TandemError(f"{path} is no JSON object: {error.reason}; remove it, or name another directory") from None
-    except (ValueError, TypeError) as error:
-        raise TandemError(f"{path} is no JSON object: {error}; remove it, or name another directory") from None
-    _check_version(tree, path)
-    return tree
-
-
-class _Evaluation(BaseModel):
-    success_last: float
-    success_last_low: float
-    success_last_high: float
-    success_ever: float
-    num_episodes: int
-
-
-class _Point(BaseModel):
-    env_steps: float
-    success_last: float
-
-
-class _Primitives(BaseModel):
-    name: str
-    env_steps: float | None = None
-
-
-class _Made(BaseModel):
-    git_commit: str | None
-
-
-class _Result(BaseModel):
-    """The parts of a result that commands and pages show; there are others."""
-
-    model_config = ConfigDict(allow_inf_nan=False)
-    evaluation: _Evaluation
-    primitives: _Primitives | None
-    made: _Made
-    env_steps: float
-    wall_s: float
-    curve: list[_Point]
-
-
-def read_result(path: Path) -> dict[str, Any]:
-    """Read the result of a training.
-
-    Raises:
-        TandemError: as for ``read_json``; or it is no result.
-    """
-    tree = read_json(path)
-    try:
-        _Result.model_validate(tree)
-    except ValidationError as error:
-        first = error.errors()[0]
-        where = ".".join(str(part) for part in first["loc"])
-        raise TandemError(f"{path} is no result: {where}: {first['msg']}; remove it, and it is made again") from None
-    return tree
-
-
-def _check_version(tree: dict[str, Any], path: Path) -> None:
-    found = tree.get("format_version")
-    if found != FORMAT_VERSION:
-        raise TandemError(
-            f"{path}: format version {found!r}, this program reads {FORMAT_VERSION}; name another directory"
-        )
-
-
-def write_json(path: Path, tree: dict[str, Any]) -> None:
-    """Put an object into a file in one step.
-
-    Raises:
-        TandemError: the file cannot be written.
-    """
-    with os_errors("write", path):
-        write_atomic(path, to_json(tree))
-
-
-def to_json(tree: dict[str, Any]) -> bytes:
-    """An object as the files have it."""
-    return (json.dumps(tree, indent=1, allow_nan=False) + "\n").encode()

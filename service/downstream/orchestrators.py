@@ -13,7 +13,8 @@ from typing import Any
 import service
 from service.actors.evaluation import DeterministicPolicy
 from service.config import WorldConfig
-from service.downstream.directory import TrainingDirectory, read_json, read_result, read_trial
+from service.downstream.directory import TrainingDirectory, read_trial
+from service.downstream.files import read_json, read_result
 from service.downstream.inputs import num_inputs
 from service.downstream.methods import METHODS, Method, Trained, digest_of, find_method
 from service.downstream.policy import LearnedPolicy, load_policy, read_policy

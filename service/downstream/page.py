@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from service.actors.evaluation import wilson_interval
-from service.downstream.directory import TRIAL
+from service.downstream.files import TRIAL
 from service.downstream.methods import METHODS
+from service.downstream.rates import rate_of
 from service.downstream.results import Result
 from service.envs.tasks import HARD_TASKS, TASKS, find_task
 from service.media.figures import BLUE, FAINT, GREEN, ORANGE, column, new_figure, read_records, save, style_axes
@@ -46,9 +46,6 @@ PAPER: Mapping[str, Mapping[str, float]] = {
 
 BEST: Mapping[str, float] = {"larger": 0.94, "inair": 1.00, "push": 0.92, "sphere": 1.00, "wall": 0.98, "box": 0.98}
 """The best of all the paper's methods, skill discovery included."""
-
-_STUDENT = (12.706, 4.303, 3.182, 2.776, 2.571, 2.447, 2.365, 2.306, 2.262)
-"""97.5th percentiles of Student's t for 1 to 9 degrees of freedom; 1.96 is near enough for more."""
 
 MARK = "Written by `tandem downstream table`"
 """Words in every page, to tell it from one that a person wrote."""
@@ -174,25 +171,11 @@ def _rate(key: str) -> Callable[[Seeds], str]:
     """Mean rates with their intervals, such as ``97.0 % [96, 98] (3)``."""
 
     def text(seeds: Seeds) -> str:
-        found = [result["evaluation"] for result in seeds]
-        rates = [float(each[key]) for each in found]
-        if len(found) == 1:
-            num = found[0]["num_episodes"]
-            low, high = wilson_interval(round(rates[0] * num), num)
-        else:
-            low, high = seed_interval(rates)
-        star = "\\*" if len(found) == 1 else ""
-        return f"{100 * np.mean(rates):.1f} % [{100 * low:.0f}, {100 * high:.0f}]{star} ({len(seeds)})"
+        rate = rate_of(seeds, key)
+        star = "\\*" if rate.num_seeds == 1 else ""
+        return f"{100 * rate.mean:.1f} % [{100 * rate.low:.0f}, {100 * rate.high:.0f}]{star} ({rate.num_seeds})"
 
     return text
-
-
-def seed_interval(rates: Sequence[float]) -> tuple[float, float]:
-    """Both ends of the 95 % interval for the mean of two or more seeds' rates, by Student's t, inside [0, 1]."""
-    degrees = len(rates) - 1
-    quantile = _STUDENT[degrees - 1] if degrees <= len(_STUDENT) else 1.96
-    half = quantile * float(np.std(rates, ddof=1)) / math.sqrt(len(rates))
-    return max(0.0, float(np.mean(rates)) - half), min(1.0, float(np.mean(rates)) + half)
 
 
 def _each_seed(seeds: Seeds) -> str:

@@ -6,7 +6,8 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
-from service.downstream.directory import made_with, read_result, read_trial, to_json
+from service.downstream.directory import read_trial
+from service.downstream.files import made_with, read_result, to_json
 from service.downstream.methods import METHODS, Trained, provenance
 from service.downstream.settings import TrialConfig, differences
 from service.errors import TandemError
@@ -32,8 +33,8 @@ class ResultsDirectory:
         if not path.exists():
             return None
         result = read_result(path)
-        wanted = _settings(trial) | provenance(trained, trial.method)
-        if wrong := differences(_settings(read_trial(result, path)) | made_with(result), wanted):
+        wanted = settings_of(trial) | provenance(trained, trial.method)
+        if wrong := differences(settings_of(read_trial(result, path)) | made_with(result), wanted):
             raise TandemError(f"{path} is of {'; '.join(wrong)}: give the same settings, or name another directory")
         return result
 
@@ -48,7 +49,7 @@ class ResultsDirectory:
         """
         missing = [trial for trial in trials if self.find(trial, trained) is None]
         asked = {(trial.method, trial.seed) for trial in missing}
-        of_all_seeds = {(each.method, each.task): (f"{each.name}, asked for,", _settings(each)) for each in missing}
+        of_all_seeds = {(each.method, each.task): (f"{each.name}, asked for,", settings_of(each)) for each in missing}
         for path in sorted(self.path.glob("*.json")):
             result = read_result(path)
             trial = read_trial(result, path)
@@ -58,8 +59,8 @@ class ResultsDirectory:
             )
             if wrong := differences(found, wanted):
                 raise TandemError(f"{path} is of {'; '.join(wrong)}: name another directory, or move it away")
-            other, settings = of_all_seeds.setdefault((trial.method, trial.task), (str(path), _settings(trial)))
-            if wrong := differences(_settings(trial) | {"seed": 0}, settings | {"seed": 0}):
+            other, settings = of_all_seeds.setdefault((trial.method, trial.task), (str(path), settings_of(trial)))
+            if wrong := differences(settings_of(trial) | {"seed": 0}, settings | {"seed": 0}):
                 raise TandemError(f"{path} and {other} are seeds of one method, but of {'; '.join(wrong)}")
         return missing
 
@@ -85,7 +86,7 @@ class ResultsDirectory:
         return [read_result(path) for path in sorted(self.path.glob("*.json"))]
 
 
-def _settings(trial: TrialConfig) -> dict[str, Any]:
+def settings_of(trial: TrialConfig) -> dict[str, Any]:
     """Settings that a trial's result depends on; where nothing is learned, those of learning do not count."""
     method = METHODS.get(trial.method)
     without = set() if method and method.holds else {"skill_steps"}

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from service import is_service
-from service.downstream.directory import MAX_BYTES, made_with
+from service.downstream.files import MAX_BYTES, made_with
 from service.downstream.methods import Trained, find_method, load_for, provenance
 from service.downstream.page import MARK, draw_table, write_page
 from service.downstream.results import Result, ResultsDirectory

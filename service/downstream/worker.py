@@ -21,7 +21,8 @@ import numpy as np
 import torch
 
 from service.actors.evaluation import DeterministicPolicy, wilson_interval
-from service.downstream.directory import FORMAT_VERSION, TRIAL, TrainingDirectory, read_result, write_json
+from service.downstream.directory import TrainingDirectory
+from service.downstream.files import FORMAT_VERSION, TRIAL, read_result, write_json
 from service.downstream.learner import make_loop, set_progress, spread_seed
 from service.downstream.methods import Method, Trained, find_method, provenance
 from service.downstream.page import draw_training

@@ -10,7 +10,8 @@ from typing import Literal
 
 from service.actors.evaluation import DeterministicPolicy
 from service.config import WorldConfig
-from service.downstream.directory import TrainingDirectory, read_json, read_trial
+from service.downstream.directory import TrainingDirectory, read_trial
+from service.downstream.files import read_json
 from service.downstream.methods import find_method
 from service.downstream.policy import LearnedPolicy, read_policy
 from service.envs.gym.registration import EPISODE_STEPS

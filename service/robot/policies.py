@@ -9,7 +9,8 @@ import numpy as np
 
 from service.actors.evaluation import DeterministicPolicy
 from service.downstream.compose import check_robot
-from service.downstream.directory import made_with, read_json, read_trial
+from service.downstream.directory import read_trial
+from service.downstream.files import made_with, read_json
 from service.downstream.methods import find_method, load_for
 from service.downstream.policy import load_policy
 from service.envs.observations import ACTION, layouts

@@ -42,23 +42,38 @@ def runs_router(runs: RunReader, streams: Streams, directories: RunDirectories, 
     errors = problems(UNKNOWN_RUN, INVALID, UNAVAILABLE)
 
     @lru_cache(_MAX_SPARKLINES)
-    def sparkline(run_id: str, name: str, *_stamp: object) -> tuple[float | None, ...]:
-        return tuple(runs.sample(run_id, name, _SPARKLINE_POINTS))
+    def sparkline(run_id: str, names: tuple[str, ...], *_stamp: object) -> tuple[float | None, ...]:
+        for name in names:
+            values = tuple(runs.sample(run_id, name, _SPARKLINE_POINTS))
+            if any(value is not None for value in values):
+                return values
+        return ()
 
     @router.get("", summary="All runs", responses=problems(INVALID, UNAVAILABLE))
     def list_runs(
         active: Annotated[bool | None, Query(description="only runs in progress, or only those that ended")] = None,
         limit: Annotated[int, Query(ge=1, le=1000)] = 100,
         sparkline_of: Annotated[
-            _Metric | None, Query(alias="sparkline", description="a metric to give in a few points for each run")
+            list[_Metric] | None,
+            Query(
+                alias="sparkline",
+                max_length=10,
+                description="a metric to give in a few points for each run; of several, the first that it has",
+            ),
         ] = None,
+        downstream: Annotated[bool | None, Query(description="only downstream trainings, or only pre-training")] = None,
     ) -> RunList:
         """Newest start first."""
-        found = [run for run in runs.runs() if active is None or (run.state in ACTIVE) == active]
+        found = [
+            run
+            for run in runs.runs()
+            if (active is None or (run.state in ACTIVE) == active)
+            and (downstream is None or (run.trial is not None) == downstream)
+        ]
         sparklines = {}
         for run in found[:limit] if sparkline_of is not None else ():
             with suppress(StoreError):  # it may be deleted just now
-                sparklines[run.run_id] = sparkline(run.run_id, sparkline_of, run.started, run.iteration)
+                sparklines[run.run_id] = sparkline(run.run_id, tuple(sparkline_of), run.started, run.iteration)
         return RunList(runs=tuple(found[:limit]), num_runs=len(found), sparklines=sparklines)
 
     @router.get("/{run_id}", summary="One run", responses=errors)

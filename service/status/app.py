@@ -13,6 +13,7 @@ from starlette.staticfiles import StaticFiles
 import service
 from service.registry.registry import Registry
 from service.status import openapi, problems
+from service.status.api_downstream import downstream_router
 from service.status.api_health import health_router
 from service.status.api_primitives import primitives_router
 from service.status.api_runs import runs_router
@@ -82,7 +83,9 @@ def create_app(
     )
     app.streams, app.public = streams, public
     app.include_router(health_router(runs, registry, telemetry))
-    app.include_router(runs_router(runs, streams, RunDirectories(runs_dir), registry.root))
+    directories = RunDirectories(runs_dir)
+    app.include_router(runs_router(runs, streams, directories, registry.root))
+    app.include_router(downstream_router(directories))
     app.include_router(series_router(runs))
     app.include_router(session_router(token))
     app.include_router(primitives_router(registry))

@@ -19,11 +19,13 @@ from service.regular_files import open_regular
 from service.status.openapi import problems
 from service.status.problems import ProblemError
 from service.status.schemas import RunFile
-from service.store.disk_reader import run_directories, run_id_of
+from service.store.disk_reader import run_directories
+from service.store.trial_reader import is_trial
 
 RUN_FILES = {
     "rounds.mp4": ("Alice beside Bob", "video/mp4"),
     "skills.mp4": ("Random skills", "video/mp4"),
+    "episodes.mp4": ("Episodes of the task", "video/mp4"),
     "curves.png": ("Curves", "image/png"),
     "goals.png": ("Goals", "image/png"),
     "coverage.png": ("Where random skills move the object", "image/png"),
@@ -91,11 +93,18 @@ class RunDirectories:
     def directory(self, run_id: str) -> Path | None:
         """Find the directory of a run; None if it is not on this machine."""
         try:
-            found = run_directories(self._root) if self._root is not None else []
+            # looked up instead of built from the id, so that no id leads outside the root
+            return run_directories(self._root).get(run_id) if self._root is not None else None
         except OSError:
             return None
-        # looked up instead of built from the id, so that no id leads outside the root
-        return next((path for path in found if run_id_of(path) == run_id), None)
+
+    def trials(self) -> dict[str, Path]:
+        """The directories of downstream trainings, by the ids of their runs; those that are on this machine."""
+        try:
+            found = run_directories(self._root) if self._root is not None else {}
+        except OSError:
+            return {}
+        return {run_id: path for run_id, path in found.items() if is_trial(path)}
 
     def _paths(self, run_id: str) -> dict[str, Path]:
         directory = self.directory(run_id)

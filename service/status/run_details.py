@@ -13,8 +13,10 @@ from service.io.run_log import read_log
 from service.io.study_directory import LOG_FILE, is_study
 from service.parsing import MAX_YAML_CHARACTERS, ParseError, parse_json, parse_yaml
 from service.regular_files import open_regular, read_regular
+from service.status import trial_details
 from service.status.schemas import GoalFrame, GoalFrames, LogEntry, RunLog, RunSetup
 from service.store.models import GoalGrid, RunStatus
+from service.store.trial_reader import is_trial
 
 DEFAULT_CELL_M = 0.05
 FRAME_BYTES = 256 * 1024
@@ -26,6 +28,8 @@ def setup(run: RunStatus, directory: Path | None, registry: Path) -> RunSetup:
     """Read a run's configuration, and write the commands for it."""
     if directory is None:
         return RunSetup(run_id=run.run_id, directory=None, config=None, stop_command=None, resume_command=None)
+    if is_trial(directory):
+        return trial_details.setup(run, directory, registry)
     config, problem = None, None
     try:
         tree = parse_yaml(read_regular(directory / "config.yaml", MAX_YAML_CHARACTERS, follow=True), "config.yaml")

@@ -81,8 +81,15 @@ class SeriesSet(FrozenModel):
     runs: tuple[RunSeries, ...] = Field(description="in the order of the request")
 
 
+class RunCommand(FrozenModel):
+    """A command for a shell on the machine of a run."""
+
+    what: str = Field(description="what it does", examples=["Measure what it learned"])
+    command: str
+
+
 class RunSetup(FrozenModel):
-    """What a run was started with, where it is, and the commands that stop it or go on with it."""
+    """What a run was started with, where it is, and the commands for it."""
 
     run_id: str
     directory: str | None = Field(description="on the machine of this service; null if it is on another")
@@ -90,6 +97,47 @@ class RunSetup(FrozenModel):
     problem: str | None = Field(None, description="why there is no configuration")
     stop_command: str | None = Field(description="for a shell on that machine")
     resume_command: str | None = Field(description="for a shell on that machine, once the run has ended")
+    commands: tuple[RunCommand, ...] = Field((), description="what can be done with what a downstream training learned")
+
+
+class TaskColumn(FrozenModel):
+    """A downstream task."""
+
+    task: str = Field(examples=["push"])
+    version: int = Field(ge=0, description="of its Gymnasium name; different ones are not compared")
+    title: str = Field(examples=["Push"])
+
+
+class TaskCell(FrozenModel):
+    """Success of a method on a task, at the last step of an episode."""
+
+    task: str
+    version: int
+    success: float | None = Field(description="mean over seeds; null while none has ended")
+    low: float | None = Field(description="of its 95 % interval: over seeds by Student's t, of one over its episodes")
+    high: float | None
+    num_seeds: int = Field(ge=0, description="that have ended; of two runs of one seed, the newer counts")
+    run_ids: tuple[str, ...] = Field(description="of the runs that were averaged")
+    unfinished: tuple[str, ...] = Field(description="ids of runs without a result")
+    differs: dict[str, JsonValue] = Field(description="settings that other runs of this method have otherwise")
+
+
+class TaskRow(FrozenModel):
+    """A method, with the same primitives and world in all of its cells."""
+
+    method: str = Field(examples=["ours-her"])
+    title: str = Field(examples=["ours + HER"])
+    primitives: str | None = Field(description="NAME@VERSION or directory of what it composes; null for nothing")
+    primitives_digest: str | None
+    cells: tuple[TaskCell, ...]
+
+
+class TaskTable(FrozenModel):
+    """Success of methods on tasks, from the downstream trainings of this service."""
+
+    tasks: tuple[TaskColumn, ...]
+    rows: tuple[TaskRow, ...]
+    problems: tuple[str, ...] = Field(description="why runs are left out")
 
 
 class LogEntry(FrozenModel):

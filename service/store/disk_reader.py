@@ -1,7 +1,8 @@
-"""Runs read from their directories, also those of studies, and of an older tandem, which has no ``status.json``."""
+"""Runs read from their directories: also downstream trainings, and runs of an older tandem, without ``status.json``."""
 
 from __future__ import annotations
 
+import os
 import re
 import shutil
 import socket
@@ -24,6 +25,7 @@ from service.store.errors import DamagedStoreError, StoreError, StoreUnavailable
 from service.store.models import ACTIVE, SILENT_AFTER, Columns, GoalGrid, Record, RunState, RunStatus
 from service.store.pulse import Pulse, ahead_s
 from service.store.tail import RecordFile
+from service.store.trial_reader import is_trial, read_trial_status
 
 QUIET_S = 10.0
 """A run writes its status every second; after so long something keeps it from that."""
@@ -49,17 +51,32 @@ def study_of(directory: Path) -> str | None:
     return parent.name if is_study(parent) else None
 
 
-def run_directories(root: Path) -> list[Path]:
-    """The run directories in ``root``, and those of the studies in it.
+def run_directories(root: Path) -> dict[str, Path]:
+    """The run directories in ``root`` by the ids of their runs, those of studies, and downstream trainings.
+
+    Downstream trainings may lie one directory further down, as in ``runs/downstream``, the name of which then begins
+    their ids. Of two directories with the same id, the first is found.
 
     Raises:
         OSError: ``root`` cannot be read.
     """
-    found = sorted(root.iterdir())
-    for study in filter(is_study, found):
+    found, inner = sorted(root.iterdir()), list[Path]()
+    for path in found:
+        if path.name.startswith(".") or _is_run(path):
+            continue
         with suppress(OSError):
-            found.extend(sorted(study.iterdir()))
-    return [path for path in found if _is_run(path)]
+            if is_study(path):
+                inner += filter(_is_run, sorted(path.iterdir()))
+            else:
+                inner += filter(is_trial, sorted(Path(each.path) for each in os.scandir(path) if each.is_dir()))
+    directories = [*filter(_is_run, found), *inner]
+    return {_id_in(root, path): path for path in reversed(directories)}
+
+
+def _id_in(root: Path, path: Path) -> str:
+    if path.parent == root or is_study(path.parent):
+        return run_id_of(path)
+    return run_id_of(Path(f"{path.parent.name[:60]}-{path.name}"))
 
 
 class DiskReader:
@@ -139,6 +156,10 @@ class DiskReader:
         path, records = self._find(run_id)
         if self._status(run_id, path, records).state not in ACTIVE:
             return
+        if is_trial(path):
+            raise StoreError(
+                f"run {run_id} is a downstream training: stop it with Ctrl-C there, or kill -INT its process"
+            )
         if not (path / STATUS_FILE).exists():
             raise StoreError(f"run {run_id} has no {STATUS_FILE}: an older tandem runs it; stop it with Ctrl-C there")
         try:
@@ -151,6 +172,9 @@ class DiskReader:
         self._list()
 
     def _status(self, run_id: str, path: Path, records: RecordFile) -> RunStatus:
+        if is_trial(path):
+            trained = read_trial_status(run_id, path, records)
+            return (trained.state in ACTIVE and _why_quiet(trained, path)) or trained
         status = _read_status(run_id, path, records)
         age_s = self._pulse.age_s(run_id, status.heartbeat)
         if (ahead := ahead_s(status.heartbeat)) is not None and status.state in ACTIVE:
@@ -181,16 +205,18 @@ class DiskReader:
                 f"cannot read the runs in {self.root}: {error.strerror}; name the directory that holds run directories"
             ) from error
         with self._lock:
-            self._records = {path: self._records.get(path) or RecordFile(path / "metrics.jsonl") for path in found}
+            known = self._records
+            self._records = {path: known.get(path) or RecordFile(path / "metrics.jsonl") for path in found.values()}
             there = set(self._records.values())
             self._in_columns = {each: None for each in self._in_columns if each in there}
-            # of two directories with the same id, the first is shown
-            self._found = {run_id_of(path): (path, self._records[path]) for path in reversed(found)}
+            self._found = {run_id: (path, self._records[path]) for run_id, path in found.items()}
             return self._found
 
 
 def _is_run(path: Path) -> bool:
-    return not path.name.startswith(".") and ((path / STATUS_FILE).is_file() or (path / "config.yaml").is_file())
+    if path.name.startswith("."):
+        return False
+    return (path / STATUS_FILE).is_file() or (path / "config.yaml").is_file() or is_trial(path)
 
 
 def _unavailable(path: Path, error: OSError) -> StoreUnavailableError:

@@ -76,12 +76,28 @@ class ActorStatus(FrozenModel):
     last_error: str | None = Field(None, description="why its last incarnation was replaced")
 
 
+class Trial(FrozenModel):
+    """What a downstream training learns, and how well it does in the end."""
+
+    task: str = Field(examples=["push"])
+    method: str = Field(examples=["ours-her"])
+    seed: int = Field(ge=0)
+    primitives: str | None = Field(None, description="NAME@VERSION or directory of what it composes; null for nothing")
+    primitives_digest: str | None = Field(None, description="SHA-256 of their parameters")
+    success: float | None = Field(None, description="at the last step, once it has ended; share of episodes")
+    success_low: float | None = Field(None, description="of its 95 % interval over these episodes (Wilson)")
+    success_high: float | None = None
+    success_ever: float | None = Field(None, description="at any step")
+    num_episodes: int | None = Field(None, description="of that evaluation")
+
+
 class RunStatus(FrozenModel):
     """The state of a run right now."""
 
     run_id: str = Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]{0,127}$")
-    name: str = Field(description="registry name of the primitives it makes")
+    name: str = Field(description="registry name of the primitives it makes; of a downstream training TASK-METHOD-SEED")
     study: str | None = Field(None, description="whose run of one seed it is, as far as its directory tells")
+    trial: Trial | None = Field(None, description="of a downstream training; null for pre-training")
     runtime: Literal["local", "ray"]
     state: RunState
     started: AwareDatetime = Field(description="UTC, of the process that runs it now or ran it last")

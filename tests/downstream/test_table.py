@@ -6,7 +6,8 @@ from pathlib import Path
 import pytest
 from PIL import Image
 
-from service.downstream.page import draw_table, seed_interval, steps_until, write_page
+from service.downstream.page import draw_table, steps_until, write_page
+from service.downstream.rates import seed_interval
 from service.downstream.results import ResultsDirectory
 from service.downstream.table import Source, make_table, run_here, run_on_ray
 from service.downstream.worker import Callbacks

@@ -3,7 +3,8 @@
 import torch
 
 from service.config import Config, MCPConfig, MLPConfig, PolicyConfig, RunConfig, WorldConfig
-from service.downstream.directory import TrainingDirectory, write_json
+from service.downstream.directory import TrainingDirectory
+from service.downstream.files import write_json
 from service.downstream.inputs import num_inputs
 from service.downstream.methods import provenance
 from service.downstream.policy import save_policy
