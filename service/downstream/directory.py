@@ -8,6 +8,7 @@
 | ``checkpoints/`` | the newest one: everything the training continues from exactly, replay buffer included |
 | ``result.json`` | how well it does in the end |
 | ``policy.safetensors`` | what was learned, averaged; ``policy.load_policy`` plays it without torch |
+| ``published.json`` | the version that it was published as last, and the sha256 of its parameters |
 | ``curves.png``, ``episodes.mp4`` | for people |
 | ``tandem-error-*.txt`` | traceback of an error that nobody expected |
 | ``.lock`` | held by the process that trains |

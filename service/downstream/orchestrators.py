@@ -6,6 +6,7 @@ reference and a digest of their parameters; other ones are refused.
 
 from __future__ import annotations
 
+import logging
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -22,7 +23,8 @@ from service.downstream.settings import validate
 from service.envs.observations import layouts
 from service.envs.tasks import find_task
 from service.errors import TandemError
-from service.io.run_directory import RunDirectory
+from service.io.errors import StorageError
+from service.io.run_directory import Published, RunDirectory
 from service.primitives.bundled import BUNDLED, find_version, is_bundled
 from service.primitives.loading import ORCHESTRATOR
 from service.primitives.publishing import newest_if_same
@@ -32,6 +34,7 @@ from service.registry.names import Version, check_name
 from service.registry.registry import Registry
 from service.types import FloatArray
 
+_logger = logging.getLogger(__name__)
 _SHOWN = 12
 """Characters of a digest in messages."""
 
@@ -157,6 +160,10 @@ def publish_orchestrator(
         config={"trial": trial.model_dump(mode="json"), "world": world.model_dump(mode="json")},
         metrics={**numbers, "env_steps": float(result["env_steps"])},
     )
+    try:
+        RunDirectory(run).write_published(Published(str(published), target.manifest(str(published)).blob_sha256))
+    except StorageError as error:  # it is published all the same
+        _logger.warning("the training does not know what it was published as: %s", error)
     return found, published
 
 

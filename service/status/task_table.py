@@ -13,10 +13,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from service.downstream.files import RESULT_FILE, TRIAL_FILE, made_with
+from service.downstream.files import RESULT_FILE
 from service.errors import TandemError
 from service.status.schemas import TaskCell, TaskColumn, TaskRow, TaskTable
-from service.store.trial_reader import read_trial_result, read_trial_settings
+from service.status.trial_details import resolved
+from service.store.trial_reader import read_trial_result
 
 Column = tuple[str, int]
 """A task and its version."""
@@ -80,19 +81,17 @@ def task_table(trials: Mapping[str, Path]) -> TaskTable:
 
 
 def _read(run_id: str, path: Path) -> _Run:
-    from service.downstream.directory import read_trial
     from service.downstream.results import settings_of
 
-    recorded, result = read_trial_settings(path), read_trial_result(path)
-    trial, made = read_trial(recorded, path / TRIAL_FILE), made_with(recorded)
+    (trial, primitives, world), result = resolved(path), read_trial_result(path)
     settings = {key: value for key, value in settings_of(trial).items() if key not in _PLACE}
     return _Run(
         run_id,
         trial.method,
         (trial.task, trial.task_version),
         trial.seed,
-        _flat({**settings, "world": made["world"]}),
-        made["primitives"] if isinstance(made["primitives"], dict) else {},
+        _flat({**settings, "world": world}),
+        primitives or {},
         (path / RESULT_FILE).stat().st_mtime if result is not None else 0.0,
         result,
     )

@@ -6,10 +6,12 @@ import json
 import re
 import shlex
 import socket
+from contextlib import suppress
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
-from service.downstream.files import TRIAL, TRIAL_FILE
+from service.config import WorldConfig
+from service.downstream.files import TRIAL_FILE, made_with
 from service.errors import TandemError
 from service.io.lock import holder
 from service.status.schemas import RunCommand, RunSetup
@@ -27,13 +29,10 @@ def setup(run: RunStatus, directory: Path, registry: Path) -> RunSetup:
     path = directory.absolute()
     nothing = RunSetup(run_id=run.run_id, directory=str(path), config=None, stop_command=None, resume_command=None)
     try:
-        from service.downstream.directory import read_trial  # with Gymnasium, which few views need
-
-        tree = read_trial_settings(directory)
-        trial = read_trial(tree, directory / TRIAL_FILE)
+        trial, primitives, world = resolved(directory)
     except TandemError as error:
         return nothing.model_copy(update={"problem": str(error)})
-    config = {"trial" if key == TRIAL else key: value for key, value in tree.items() if key != "format_version"}
+    config = {"trial": trial.model_dump(mode="json"), "primitives": primitives, "world": world}
     place = ["--registry", str(registry.absolute())]
     active, ended = run.state in ACTIVE, run.state == "finished"
     return RunSetup(
@@ -44,6 +43,23 @@ def setup(run: RunStatus, directory: Path, registry: Path) -> RunSetup:
         resume_command=None if ended else _resume(run, trial, path, place),
         commands=_uses(run, trial, path, place) if ended else (),
     )
+
+
+def resolved(directory: Path) -> tuple[TrialConfig, dict[str, Any] | None, dict[str, Any] | None]:
+    """A training's settings, primitives and world; settings that are younger than its files have their defaults.
+
+    Raises:
+        TandemError: there are none, or they are damaged.
+    """
+    from service.downstream.directory import read_trial  # with Gymnasium, which few views need
+    from service.downstream.settings import validate
+
+    tree = read_trial_settings(directory)
+    made = made_with(tree)
+    primitives, world = (found if isinstance(found, dict) else None for found in made.values())
+    with suppress(TandemError, OSError):  # such as the file of a robot that is not here
+        world = validate(WorldConfig, world).model_dump(mode="json") if world is not None else None
+    return read_trial(tree, directory / TRIAL_FILE), primitives, world
 
 
 def _stop(directory: Path) -> str | None:

@@ -20,6 +20,7 @@ from pydantic import BaseModel, ValidationError
 
 from service.io.epoch import Epoch
 from service.io.files import write_atomic
+from service.parsing import parse_json
 from service.regular_files import read_regular
 from service.store.models import GoalGrid, Record, RunStatus, Trouble
 
@@ -38,6 +39,14 @@ def read_status(directory: Path) -> RunStatus | None:
     try:
         return RunStatus.model_validate_json(read_regular(directory / STATUS_FILE, MAX_BYTES))
     except (OSError, ValidationError):
+        return None
+
+
+def read_published(directory: Path) -> str | None:
+    """``NAME@VERSION`` of what a run published last; None where there is none, or where that cannot be read."""
+    try:
+        return str(parse_json(read_regular(directory / "published.json", MAX_BYTES), directory)["version"])
+    except (OSError, KeyError, TypeError, ValueError):
         return None
 
 

@@ -18,9 +18,9 @@ from pydantic import ValidationError
 from service.io.epoch import newest_epoch
 from service.io.lock import holder, is_locked
 from service.io.study_directory import is_study
-from service.parsing import MAX_YAML_CHARACTERS, parse_json, parse_yaml
+from service.parsing import MAX_YAML_CHARACTERS, parse_yaml
 from service.regular_files import read_regular
-from service.store.disk import GOALS_FILE, MAX_BYTES, STATUS_FILE, STOP_FILE
+from service.store.disk import GOALS_FILE, MAX_BYTES, STATUS_FILE, STOP_FILE, read_published
 from service.store.errors import DamagedStoreError, StoreError, StoreUnavailableError, UnknownRunError
 from service.store.models import ACTIVE, SILENT_AFTER, Columns, GoalGrid, Record, RunState, RunStatus
 from service.store.pulse import Pulse, ahead_s
@@ -298,7 +298,7 @@ def _guess_status(run_id: str, path: Path, records: RecordFile) -> RunStatus:
         policy_version=_whole(record, "learner/version"),
         policy_lag=_positive(record, "learner/policy_lag"),
         num_rollouts_counted=max(0, _whole(record, "iteration") - 1),
-        published=_read_published(path),
+        published=read_published(path),
     )
 
 
@@ -319,13 +319,6 @@ def _read_config(path: Path, modified: datetime) -> tuple[str | None, int | None
         return str(tree["name"]), max(1, int(tree["run"]["total_env_steps"]))
     except (OSError, KeyError, TypeError, ValueError, OverflowError):
         return None, None
-
-
-def _read_published(path: Path) -> str | None:
-    try:
-        return str(parse_json(read_regular(path / "published.json", MAX_BYTES), path)["version"])
-    except (OSError, KeyError, TypeError, ValueError):
-        return None
 
 
 def _modified(path: Path) -> datetime:

@@ -13,6 +13,7 @@ from typing import Any
 from service.downstream.files import RESULT_FILE, TRIAL, TRIAL_FILE, read_json, read_result
 from service.errors import TRACEBACK_PREFIX, TandemError
 from service.io.lock import is_locked
+from service.store.disk import read_published
 from service.store.models import RunState, RunStatus, Trial
 from service.store.tail import RecordFile
 
@@ -40,7 +41,8 @@ def read_trial_status(run_id: str, path: Path, records: RecordFile) -> RunStatus
     started = _modified(path / TRIAL_FILE)
     heard = max(started, _modified(path / "metrics.jsonl"), _modified(path / RESULT_FILE))
     steps = max(0, int(float(result["env_steps"] if result is not None else record.get("env_steps") or 0)))
-    state, error = ("finished", None) if result is not None else _unfinished(path, started)
+    state: RunState
+    state, last_error = ("finished", None) if result is not None else _unfinished(path, started)
     trial = _trial(settings, result)
     return RunStatus(
         run_id=run_id,
@@ -54,7 +56,8 @@ def read_trial_status(run_id: str, path: Path, records: RecordFile) -> RunStatus
         num_env_steps=steps,
         total_env_steps=max(1, steps if result is not None else _whole(settings.get(TRIAL, {}).get("num_env_steps"))),
         env_steps_per_s=max(0.0, record.get("time/env_steps_per_s") or 0.0),
-        last_error=error,
+        published=read_published(path),
+        last_error=last_error,
         warnings=warnings,
     )
 

@@ -331,7 +331,7 @@ def test_nothing_yet(browser, tmp_path):
     with serve(tmp_path) as server:
         visit = Visit(browser, server.url)
         page = visit.go().page
-        page.get_by_text("tandem pretrain --config configs/pretrain/panda_cube.yaml").wait_for()
+        page.get_by_text("tandem pretrain --run-dir runs/cube").wait_for()
         write_status(tmp_path / "runs", "first")
         page.get_by_role("link", name="first").wait_for()
         visit.go("#/primitives").page.get_by_text("comes with tandem").first.wait_for()

@@ -1,4 +1,4 @@
-// The commands that stop a run or go on with it, ready to copy: the page itself changes nothing.
+// The commands for a run, ready to copy: the page itself changes nothing.
 
 import { address } from "./api.js";
 import { el, note } from "./dom.js";
@@ -13,7 +13,7 @@ export class Commands {
     const key = JSON.stringify([isActive(run), setup]);
     if (key === this.shown) return;
     this.shown = key;
-    const parts = isActive(run) ? this.stop(run, setup) : this.resume(setup);
+    const parts = isActive(run) ? this.stop(run, setup) : this.resume(run, setup);
     const where = setup.directory ? [note("Its directory is ", el("code", {}, setup.directory), ".")] : [];
     this.root.replaceChildren(...parts, ...where);
   }
@@ -23,13 +23,15 @@ export class Commands {
     const remote = `curl -X POST -H "Authorization: Bearer $TANDEM_TOKEN" ${url}`;
     return [
       ...(setup.stop_command ? [command("Stop it after this iteration, saved, on its machine", setup.stop_command)] : []),
-      command("The same from anywhere, if this service has a token", remote),
+      ...(run.trial ? [] : [command("The same from anywhere, if this service has a token", remote)]),
     ];
   }
 
-  resume(setup) {
-    if (!setup.resume_command) return [note("Its directory is on another machine; go on with it there.")];
-    return [command("Go on with it, from its last checkpoint", setup.resume_command)];
+  resume(run, setup) {
+    if (!setup.directory) return [note("Its directory is on another machine; go on with it there.")];
+    const uses = setup.commands.map((each) => command(each.what, each.command));
+    if (setup.resume_command) return [command("Go on with it, from its last checkpoint", setup.resume_command), ...uses];
+    return uses.length ? uses : [note("It was begun with settings that no option has: go on with it by the program that began it.")];
   }
 }
 

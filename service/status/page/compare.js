@@ -7,11 +7,11 @@ import { el, note, runLink, section } from "./dom.js";
 import { every, isActive } from "./follow.js";
 import { count, counted, percent } from "./format.js";
 import { NUM_COLOURS } from "./library.js";
-import { COMPARED } from "./metrics.js";
-import { stateChip, Table } from "./widgets.js";
+import { comparedPanels } from "./metrics.js";
+import { stateChip, Table, trialText } from "./widgets.js";
 
 const EVERY_MS = 5000;
-const BOB = "bob/success_rate";
+const SUCCESS = ["bob/success_rate", "evaluation/success_last"];
 
 /** Compare the runs with these ids until ``signal`` aborts. */
 export async function compareView(root, ids, signal) {
@@ -20,12 +20,12 @@ export async function compareView(root, ids, signal) {
   const statuses = await asked(root, signal);
   if (!statuses) return;
   const runs = ids.map((id) => ({ id, label: id, study: statuses.get(id)?.study ?? null, hidden: false }));
-  const board = new Board(runs, COMPARED, signal);
+  const board = new Board(runs, comparedPanels(ids.map((id) => statuses.get(id)).filter(Boolean)), signal);
   const table = runTable(board);
   const [curves, setups] = [section("Curves", "wide"), section("What differs", "wide")];
   curves.body.append(board.root);
   root.replaceChildren(el("h1", {}, `${counted(ids.length, "run")} compared`), el("div", { class: "scroll" }, table.root), curves.root, setups.root);
-  const show = (found) => table.update(runs.map((run) => ({ ...run, run, status: found.get(run.id), success: newest(board, run.id) })));
+  const show = (found) => table.update(runs.map((run) => ({ ...run, run, status: found.get(run.id), success: found.get(run.id)?.trial?.success ?? newest(board, run.id) })));
   show(statuses);
   compareConfigurations(setups.body, ids, signal);
   await every(EVERY_MS, signal, async () => {
@@ -46,7 +46,8 @@ async function asked(root, signal) {
 }
 
 function newest(board, id) {
-  return board.data.get(id)?.curves[BOB]?.mean.findLast((value) => value !== null);
+  const curves = board.data.get(id)?.curves ?? {};
+  return SUCCESS.map((name) => curves[name]?.mean.findLast((value) => value !== null)).find(Number.isFinite);
 }
 
 async function compareConfigurations(body, ids, signal) {
@@ -59,10 +60,10 @@ function runTable(board) {
   const columns = [
     { label: "Run", changed: ({ id, hidden }) => [id, hidden], node: ({ run }) => chooser(run, board) },
     { label: "State", changed: ({ status }) => [status?.state, status?.stopping], node: ({ status }) => (status ? stateChip(status) : el("span", { class: "chip lost" }, "not there")) },
-    { label: "Study", text: ({ study }) => study ?? "\u2013" },
+    { label: "Study or task", text: ({ study, status }) => study ?? (status?.trial ? trialText(status.trial) : "\u2013") },
     { label: "Env steps", text: ({ status }) => count(status?.num_env_steps), number: true },
     { label: "Env steps/s", text: ({ status }) => (status && isActive(status) ? count(status.env_steps_per_s) : "\u2013"), number: true },
-    { label: "Bob's success", text: ({ success }) => percent(success), number: true },
+    { label: "Success", text: ({ success }) => percent(success), number: true },
     { label: "Published", text: ({ status }) => status?.published ?? "\u2013" },
   ];
   return new Table("Compared runs", columns, (row) => row.id);

@@ -38,7 +38,13 @@ export function note(...content) {
   return el("p", { class: "note" }, ...content);
 }
 
-/** A link within the page. */
+/** A link to a run. */
 export function runLink(runId, text = runId) {
   return el("a", { href: `#/runs/${encodeURIComponent(runId)}` }, text);
+}
+
+/** A link to the comparison of several runs, or to the one that there is, with its id as text. */
+export function runsLink(ids, text, single = ids[0]) {
+  if (ids.length === 1) return runLink(ids[0], single);
+  return el("a", { href: `#/compare/${ids.map(encodeURIComponent).join(",")}` }, text);
 }

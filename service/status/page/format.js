@@ -1,6 +1,6 @@
 // Numbers, times and sizes as text.
 
-const NBSP = "\u00a0";
+export const NBSP = "\u00a0";
 const PREFIXES = [[1e12, "T"], [1e9, "G"], [1e6, "M"], [1e3, "k"]];
 const NONE = "\u2013";
 
@@ -49,6 +49,12 @@ export function bytes(value) {
 /** "1 run", "2 runs". */
 export function counted(number, noun) {
   return `${count(number)} ${noun}${number === 1 ? "" : "s"}`;
+}
+
+/** A setting that is not usual, such as "300 k env steps". */
+export function setting(key, value) {
+  if (key === "num_env_steps") return `${count(value)} env steps`;
+  return `${key} ${typeof value === "string" ? value : JSON.stringify(value)}`;
 }
 
 function joined(large, largeUnit, small, smallUnit) {

@@ -1,6 +1,6 @@
 // The form that asks for the service's token, where one is needed to read.
 
-import { address, connection } from "./api.js";
+import { address, connection, sentence } from "./api.js";
 import { el, note, setText } from "./dom.js";
 
 /** Show the form in place of the page; ``entered`` is called once the service has taken the token. */
@@ -33,7 +33,7 @@ async function enter(token) {
     const headers = { "Content-Type": "application/json" };
     const response = await fetch(address("v1", "session"), { method: "POST", headers, body: JSON.stringify({ token }) });
     if (response.ok) return null;
-    return (await response.json().catch(() => ({}))).detail ?? `the service answers ${response.status}`;
+    return sentence((await response.json().catch(() => ({}))).detail ?? `the service answers ${response.status}`);
   } catch {
     return "No answer from the service: is it still running?";
   }

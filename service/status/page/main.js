@@ -1,12 +1,15 @@
-// Show the view of the address: #/ has all runs, #/runs/ID one run, #/compare/ID,ID several, #/primitives the registry.
+// Show the view of the address: #/ has all runs, #/runs/ID one run, #/compare/ID,ID several, #/tasks the table of
+// downstream tasks, #/primitives the registry.
 
-import { connection } from "./api.js";
+import { connection, get } from "./api.js";
 import { el, note } from "./dom.js";
+import { every } from "./follow.js";
 import { library } from "./library.js";
 import { loginView } from "./login.js";
 import { runsView } from "./runs.js";
 import { startAges } from "./widgets.js";
 
+const AGAIN_MS = 2000;
 const main = document.getElementById("main");
 let left = new AbortController();
 
@@ -21,6 +24,7 @@ function show() {
   if (page === "runs" && id && parts.length === 2) load("./run.js", ({ runView }) => runView(main, id, signal), true);
   else if (page === "compare" && id && parts.length === 2) load("./compare.js", ({ compareView }) => compareView(main, ids(id), signal), true);
   else if (page === "primitives" && parts.length === 1) load("./primitives.js", ({ primitivesView }) => primitivesView(main, signal));
+  else if (page === "tasks" && parts.length === 1) load("./tasks.js", ({ tasksView }) => tasksView(main, signal));
   else if (page === "" || (page === "runs" && !id)) runsView(main, left.signal);
   else main.replaceChildren(el("h1", {}, "Nothing here"), note("There is no page at this address. ", el("a", { href: "#/" }, "All runs")));
 }
@@ -34,7 +38,13 @@ async function load(module, view, curves = false) {
     const loaded = await import(module);
     if (!signal.aborted) await view(loaded);
   } catch (error) {
-    if (!signal.aborted) main.replaceChildren(note(`This view cannot be shown: ${error.message ?? error}`));
+    if (signal.aborted) return;
+    console.warn(error);
+    main.replaceChildren(note("This view could not be loaded. It is loaded again as soon as the service answers."));
+    await every(AGAIN_MS, signal, async () => {
+      await get(["livez"], [], signal);
+      location.reload(); // a browser may not ask twice for a module that did not come
+    });
   }
 }
 
@@ -44,7 +54,7 @@ function ids(text) {
 }
 
 function markCurrent(page) {
-  const current = page === "primitives" ? "#/primitives" : "#/";
+  const current = ["primitives", "tasks"].includes(page) ? `#/${page}` : "#/";
   for (const link of document.querySelectorAll(".top nav a")) {
     if (link.getAttribute("href") === current) link.setAttribute("aria-current", "page");
     else link.removeAttribute("aria-current");

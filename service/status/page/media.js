@@ -20,7 +20,7 @@ export class Media {
     const isVideo = (file) => file.media_type.startsWith("video/");
     const videos = files.filter(isVideo).sort((a, b) => Date.parse(b.modified) - Date.parse(a.modified));
     const pictures = files.filter((file) => !isVideo(file));
-    const film = videos.length ? this.film(videos) : note("No video yet: a run records a few rounds at its end.");
+    const film = videos.length ? this.film(videos) : note("No video yet: a run makes one at its end.");
     this.root.replaceChildren(film, el("ul", { class: "pictures" }, ...pictures.map((file) => this.picture(file))));
   }
 

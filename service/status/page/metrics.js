@@ -20,15 +20,42 @@ export const OVERVIEW = [
   { title: "Policy lag", hint: "versions between acting and learning", curves: [["learner/policy_lag", "versions"]] },
 ];
 
+/** The panels of a downstream training. */
+export const TRIAL = [
+  {
+    title: "Success",
+    hint: "in evaluations on the way; with noise while it learns",
+    curves: [["evaluation/success_last", "last step"], ["evaluation/success_ever", "any step"], ["rollout/success_last", "with noise"]],
+  },
+  { title: "Return", hint: "steps of an episode at the goal, with noise; grows", curves: [["rollout/return", "return"]] },
+  { title: "Entropy coefficient", hint: "falls as the policy gets surer", curves: [["learner/entropy_coefficient", "coefficient"]] },
+  { title: "Throughput", hint: "env steps per second", curves: [["time/env_steps_per_s", "env steps/s"]] },
+];
+
 /** The metrics of several runs that are always there: one a panel. */
-export const COMPARED = [
+const COMPARED = [
   ["bob/success_rate", "Bob on Alice's goals"],
   ["bob/success_rate_air", "Bob on her goals in the air"],
   ["evaluation/mixed_success_last", "Bob on random goals"],
   ["alice/lifted_fraction", "Alice lifts"],
   ["alice/goal_height_m", "Height of goals"],
   ["time/env_steps_per_s", "Throughput"],
-].map(([name, title]) => ({ title, hint: name, curves: [[name, title]] }));
+];
+
+/** The metrics of several downstream trainings that are always there: one a panel. */
+const COMPARED_TRIALS = [
+  ["evaluation/success_last", "Success at the last step"],
+  ["evaluation/success_ever", "Success at any step"],
+  ["rollout/return", "Return"],
+  ["time/env_steps_per_s", "Throughput"],
+];
+
+/** Panels for runs that are compared: of pre-training, of downstream trainings, or of both. */
+export function comparedPanels(statuses) {
+  const [trials, others] = [statuses.some((run) => run.trial), statuses.some((run) => !run.trial)];
+  const metrics = [...(others || !trials ? COMPARED : []), ...(trials ? COMPARED_TRIALS : [])];
+  return [...new Map(metrics)].map(([name, title]) => ({ title, hint: name, curves: [[name, title]] }));
+}
 
 /** One panel for each metric of a group. */
 export function panelsOf(names) {

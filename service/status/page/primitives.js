@@ -1,13 +1,15 @@
 // The page of all primitives, and the table of the versions of a name, which a run's page shows too.
 
 import { address, ApiError, get, sentence } from "./api.js";
-import { el, note, runLink, section, setText } from "./dom.js";
+import { el, note, runsLink, section, setText } from "./dom.js";
 import { every } from "./follow.js";
 import { bytes, counted, percent } from "./format.js";
 import { age, Table } from "./widgets.js";
 
 const EVERY_MS = 10_000;
 const RATES = [["Mixed", "evaluation/mixed_success_last"], ["Table", "evaluation/table_success_last"], ["Air", "evaluation/air_success_last"]];
+const TASK_RATES = [["Last step", "evaluation/success_last"], ["Any step", "evaluation/success_ever"]];
+const LOADERS = { primitives: "load_primitives", skills: "load_skills", orchestrator: "load_policy" };
 
 /** Every name in the registry, each with its versions. */
 export function primitivesView(root, signal) {
@@ -23,8 +25,8 @@ export function primitivesView(root, signal) {
     }
     await Promise.all(parts.map((part) => part.refresh(signal, runs)));
     const users = usersOf(parts);
-    parts.forEach((part) => part.table.update(part.found, runs, users));
-    const nodes = parts.length ? parts.map((part) => part.root) : [nothing()];
+    parts.forEach((part) => part.show(runs, users));
+    const nodes = parts.map((part) => part.root);
     if (nodes.length !== list.children.length || nodes.some((node, i) => node !== list.children[i])) list.replaceChildren(...nodes);
   });
 }
@@ -34,18 +36,26 @@ export class Versions {
   constructor(name, title) {
     Object.assign(this, { name, ...section(title) });
     this.summary = el("p", { class: "summary" });
-    this.table = new VersionTable(name);
+    this.table = null;
   }
 
-  /** Ask for the versions; ``runs`` as of ``publishers``, asked for where it is null. */
+  /** Show what was found; ``runs`` and ``users`` as of ``publishers`` and ``usersOf``. */
+  show(runs, users) {
+    if (!this.found) return;
+    const kind = this.found.versions[0]?.kind ?? "primitives"; // all versions of a name are of one kind
+    if (this.table?.kind !== kind) this.table = new VersionTable(this.name, kind);
+    this.table.update(this.found, runs, users);
+    if (!this.body.contains(this.table.root)) this.body.replaceChildren(this.summary, this.table.root);
+  }
+
+  /** Ask for the versions, and show them where ``runs``, as of ``publishers``, is null. */
   async refresh(signal, runs = null) {
     try {
       const found = await get(["v1", "primitives", this.name], [], signal);
       this.found = found;
       const more = found.num_versions > found.versions.length ? `, the newest ${found.versions.length} here` : "";
-      setText(this.summary, `${counted(found.num_versions, "version")}${more}. In Python: service.load_primitives("${this.name}@latest").`);
-      this.table.update(found, runs ?? (await publishers(signal)), new Map());
-      if (!this.table.root.isConnected || !this.body.contains(this.table.root)) this.body.replaceChildren(this.summary, this.table.root);
+      setText(this.summary, `${counted(found.num_versions, "version")}${more}. In Python: service.${LOADERS[found.versions[0]?.kind] ?? LOADERS.primitives}("${this.name}@latest").`);
+      if (!runs) this.show(await publishers(signal), new Map());
     } catch (error) {
       if (!(error instanceof ApiError) || error.status === 0) throw error;
       const text = error.status === 404 ? `No version of ${this.name} is published yet.` : sentence(error.message);
@@ -54,10 +64,14 @@ export class Versions {
   }
 }
 
-/** The runs that published something, by NAME@VERSION. */
+/** By NAME@VERSION, the run that published it, and the downstream trainings that compose it. */
 async function publishers(signal) {
   const { runs } = await get(["v1", "runs"], [["limit", 1000]], signal).catch(() => ({ runs: [] }));
-  return new Map(runs.filter((run) => run.published).map((run) => [run.published, run.run_id]));
+  const trainings = new Map();
+  for (const { run_id: id, trial } of runs) {
+    if (trial?.primitives) trainings.set(trial.primitives, [...(trainings.get(trial.primitives) ?? []), id]);
+  }
+  return { by: new Map(runs.filter((run) => run.published).map((run) => [run.published, run.run_id])), trainings };
 }
 
 /** Which versions belong to which primitives, or were trained on from which: NAME@VERSION to a list of them. */
@@ -73,23 +87,21 @@ function usersOf(parts) {
   return users;
 }
 
-function nothing() {
-  const command = el("code", {}, "tandem pretrain --config configs/pretrain/panda_cube.yaml --run-dir runs/cube");
-  return note("The registry is empty. A run publishes its primitives at its end; start one with ", command, ".");
-}
-
 /** The table of the versions of a name, from PrimitiveVersions. */
 class VersionTable {
-  constructor(name) {
-    const rates = RATES.map(([label, metric]) => ({ label, number: true, text: ({ metrics }) => percent(metrics[metric]) }));
+  constructor(name, kind) {
+    this.kind = kind;
+    const task = { label: "Task", short: true, text: (version) => version.task ?? "\u2013" };
+    const rates = (kind === "orchestrator" ? TASK_RATES : RATES).map(([label, metric]) => ({ label, number: true, text: ({ metrics }) => percent(metrics[metric]) }));
     const columns = [
       { label: "Version", changed: (version) => [version.version, version.problem], node: (version) => reference(name, version) },
       { label: "Aliases", changed: (version) => version.aliases, node: aliases },
+      ...(kind === "orchestrator" ? [task] : []),
       ...rates,
       { label: "Where", changed: (version) => [version.origin, version.directory], node: where },
       { label: "Published", changed: (version) => version.created, node: created },
-      { label: "Lineage", changed: (version) => [version.lineage.map(([text, id]) => `${text} ${id}`)], node: lineage },
-      { label: "Commit", text: (version) => version.git_commit?.slice(0, 8) ?? "\u2013" },
+      { label: "Lineage", changed: (version) => version.lineage, node: lineage },
+      { label: "Commit", short: true, text: (version) => version.git_commit?.slice(0, 8) ?? "\u2013" },
       { label: "Size", text: (version) => bytes(version.blob_bytes), number: true },
       { label: "Download", changed: (version) => version.blob_sha256, node: (version) => downloads(name, version) },
     ];
@@ -99,7 +111,6 @@ class VersionTable {
 
   /** ``runs`` and ``users`` as of ``publishers`` and ``usersOf``. */
   update(primitive, runs, users) {
-    if (!primitive) return;
     const rows = primitive.versions.map((version) => ({ ...version, lineage: lineageOf(`${primitive.name}@${version.version}`, version, runs, users) }));
     this.table.update(rows);
   }
@@ -115,21 +126,23 @@ function aliases(version) {
   return el("span", { class: "chips" }, ...version.aliases.map((alias) => el("span", { class: "chip alias" }, alias)));
 }
 
-/** What is known of where a version comes from and what was made with it: [text, id of a run or null] each. */
+/** What is known of where a version comes from and what was made with it: [text, ids of runs] each. */
 function lineageOf(reference, version, runs, users) {
-  const run = version.run ?? (version.origin === "registry" ? runs.get(reference) : null);
+  const run = version.run ?? (version.origin === "registry" ? runs.by.get(reference) : null);
+  const trainings = runs.trainings.get(reference);
   return [
-    ...(version.kind === "primitives" ? [] : [[version.kind, null]]),
+    ...(version.kind === "primitives" ? [] : [[version.kind]]),
     ...(run ? [["made by run ", run]] : []),
-    ...(version.parent ? [[`trained on from ${version.parent}`, null]] : []),
-    ...(version.primitives ? [[`composes ${version.primitives}`, null]] : []),
-    ...(users.get(reference) ?? []).map((user) => [`used by ${user}`, null]),
+    ...(version.parent ? [[`trained on from ${version.parent}`]] : []),
+    ...(version.primitives ? [[`composes ${version.primitives}`]] : []),
+    ...(users.get(reference) ?? []).map((user) => [`used by ${user}`]),
+    ...(trainings ? [["composed by ", ...trainings]] : []),
   ];
 }
 
 function lineage(version) {
   if (!version.lineage.length) return document.createTextNode("\u2013");
-  return el("span", { class: "lines" }, ...version.lineage.map(([text, id]) => el("small", {}, text, id && runLink(id))));
+  return el("span", { class: "lines" }, ...version.lineage.map(([text, ...ids]) => el("small", {}, text, ids.length ? runsLink(ids, counted(ids.length, "downstream run")) : null)));
 }
 
 function where(version) {

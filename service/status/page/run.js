@@ -6,14 +6,14 @@ import { Commands } from "./commands.js";
 import { ConfigList } from "./config.js";
 import { el, note, section, setText } from "./dom.js";
 import { every, follow, isActive } from "./follow.js";
-import { count, percent, quantity } from "./format.js";
+import { count, NBSP, percent, quantity } from "./format.js";
 import { GoalMap } from "./goals.js";
 import { Log } from "./log.js";
 import { Media } from "./media.js";
-import { OVERVIEW } from "./metrics.js";
+import { OVERVIEW, TRIAL } from "./metrics.js";
 import { Versions } from "./primitives.js";
 import { GoalSpace } from "./space.js";
-import { age, progressBar, share, stateChip, Table, timeLeft } from "./widgets.js";
+import { age, progressBar, share, stateChip, Table, timeLeft, trialText } from "./widgets.js";
 
 const GOALS_MS = 5000;
 const FILES_MS = 15_000;
@@ -31,7 +31,6 @@ class RunPage {
   constructor(root, runId, signal) {
     Object.assign(this, { root, runId, signal, begun: false });
     this.summary = new Summary(runId);
-    this.board = new Board([{ id: runId, label: runId, study: null }], OVERVIEW, signal);
     [this.goals, this.space] = [new GoalMap(), new GoalSpace(signal)];
     this.actors = new ActorTable();
     this.media = new Media(runId);
@@ -46,27 +45,30 @@ class RunPage {
   /** Put the parts together, once the run is known to exist. */
   begin(run) {
     this.begun = true;
+    this.board = new Board([{ id: this.runId, label: this.runId, study: null }], run.trial ? TRIAL : OVERVIEW, this.signal);
     const parts = {
       curves: section("Curves", "wide"), space: section("Goals over the run", "wide"), map: section("Goal map", "wide"),
       media: section("Recordings"), actors: section("Actors"), log: section("Log"), commands: section("Commands"), config: section("Configuration"),
     };
-    this.primitives = new Versions(run.name, `Primitives ${run.name}`);
+    for (const name of run.trial ? ["space", "map", "actors", "log"] : []) delete parts[name]; // which pre-training has
+    const [name, published] = run.trial ? (run.trial.primitives ?? "").split("@") : [run.name, true];
+    this.primitives = published ? new Versions(name, `Primitives ${name}`) : null;
     parts.curves.body.append(this.board.root);
-    this.actorsBody = parts.actors.body;
-    const bodies = Object.fromEntries(Object.entries(parts).map(([name, part]) => [name, part.body]));
-    this.root.replaceChildren(this.summary.root, ...[...Object.values(parts), this.primitives].map((part) => part.root));
+    this.actorsBody = parts.actors?.body;
+    const bodies = Object.fromEntries(Object.entries(parts).map(([key, part]) => [key, part.body]));
+    this.root.replaceChildren(this.summary.root, ...[...Object.values(parts), ...(this.primitives ? [this.primitives] : [])].map((part) => part.root));
     this.ask(bodies);
   }
 
   ask(bodies) {
     const { signal, runId } = this;
     const part = (...names) => get(["v1", "runs", runId, ...names], [], signal);
-    const keep = (milliseconds, name, shown, ...path) => every(milliseconds, signal, () => show(bodies[name], shown, () => part(...path)));
+    const keep = (milliseconds, name, shown, ...path) => bodies[name] && every(milliseconds, signal, () => show(bodies[name], shown, () => part(...path)));
     keep(GOALS_MS, "map", this.goals, "goals");
     keep(FILES_MS, "space", this.space, "goals", "history");
     keep(FILES_MS, "media", this.media, "files");
     keep(GOALS_MS, "log", this.log, "log");
-    every(FILES_MS, signal, () => this.primitives.refresh(signal));
+    if (this.primitives) every(FILES_MS, signal, () => this.primitives.refresh(signal));
     every(FILES_MS, signal, async () => {
       this.setup = await part("setup");
       await show(bodies.config, this.config, () => this.setup);
@@ -79,8 +81,9 @@ class RunPage {
     this.run = run;
     if (!this.begun) this.begin(run);
     this.summary.update(run);
-    this.actors.update(run);
     if (this.setup) this.commands.update(run, this.setup);
+    if (!this.actorsBody) return;
+    this.actors.update(run);
     const there = run.actors.length ? this.actors.root : note("No actors of this run are known.");
     if (this.actorsBody.firstChild !== there) this.actorsBody.replaceChildren(there);
   }
@@ -144,21 +147,30 @@ class Summary {
       lag: tile("Policy lag"),
       rollouts: tile("Rollouts"),
     };
-    const { progress, ...others } = this.tiles;
-    this.numbers.append(progress.root, this.bob.root, ...Object.values(others).map((each) => each.root));
+    this.final = { last: tile("Final success"), ever: tile("At any step") };
+  }
+
+  /** Put the tiles there, once it is known what kind of run it is. */
+  begin(run) {
+    const { progress, rate, iteration, ...others } = this.tiles;
+    const shown = run.trial ? [progress, ...Object.values(this.final), rate, iteration] : [progress, this.bob, rate, iteration, ...Object.values(others)];
+    this.numbers.append(...shown.map((each) => each.root));
   }
 
   update(run) {
+    if (!this.run) this.begin(run);
     this.run = run;
     this.chip.replaceChildren(stateChip(run));
     const published = run.published ? [`, published ${run.published}`] : [];
-    this.sub.replaceChildren(`${run.name}, ${run.runtime} runtime, started `, age(run.started), ", heard of ", age(run.heartbeat), ...published);
+    const what = run.trial ? trialText(run.trial) : `${run.name}, ${run.runtime} runtime`;
+    this.sub.replaceChildren(`${what}, started `, age(run.started), ", heard of ", age(run.heartbeat), ...published);
+    if (run.trial) this.finally(run.trial);
     const { progress, rate, iteration, lag, rollouts } = this.tiles;
     const left = timeLeft(run);
     progress.set(percent(share(run)), left ? `about ${left} to go` : "");
     progress.bar.replaceChildren(progressBar(run));
     rate.set(count(run.env_steps_per_s), isActive(run) ? "newest iteration" : "last iteration");
-    iteration.set(count(run.iteration), `policy version ${count(run.policy_version)}`);
+    iteration.set(count(run.iteration), run.trial ? "" : `policy version ${count(run.policy_version)}`);
     lag.set(quantity(run.policy_lag), "versions");
     rollouts.set(count(run.num_rollouts_counted), `${count(run.num_rollouts_refused)} refused`);
     this.show();
@@ -175,6 +187,13 @@ class Summary {
     if (key === this.shown) return; // so that a screen reader says it once
     this.shown = key;
     this.troubles.replaceChildren(...boxes.map(([kind, title, text]) => el("p", { class: kind }, el("strong", {}, `${title}: `), text)));
+  }
+
+  /** Show how well a downstream training does in the end. */
+  finally({ success, success_low: low, success_high: high, success_ever: ever, num_episodes: episodes }) {
+    const known = Number.isFinite(success);
+    this.final.last.set(percent(success), known ? `last step, ${(100 * low).toFixed(0)} to ${(100 * high).toFixed(0)}${NBSP}%` : "once it has ended");
+    this.final.ever.set(percent(ever), known ? `of ${count(episodes)} episodes` : "once it has ended");
   }
 
   /** Show Bob's success in the newest iteration. */

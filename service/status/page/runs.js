@@ -1,24 +1,26 @@
-// The page of all runs, with a small curve of Bob's success for each: search, filter, sort, and choose some to compare.
+// The page of all runs, with a small curve of success for each: search, filter, sort, and choose some to compare.
 
 import { ApiError, get, sentence } from "./api.js";
 import { el, note, runLink, setText, svg } from "./dom.js";
 import { every, isActive } from "./follow.js";
 import { count, counted, percent } from "./format.js";
-import { age, progressBar, share, stateChip, Table } from "./widgets.js";
+import { age, progressBar, share, stateChip, Table, trialText } from "./widgets.js";
 
 const EVERY_MS = 2000;
-const NAME = "bob/success_rate";
+const SPARKLINES = ["bob/success_rate", "rollout/success_last"].map((name) => ["sparkline", name]);
 const LIMIT = 1000;
 const [WIDTH, HEIGHT] = [96, 24];
 const SORTS = {
   "newest start": (a, b) => Date.parse(b.started) - Date.parse(a.started),
   name: (a, b) => a.run_id.localeCompare(b.run_id, "en", { numeric: true }),
-  "Bob's success": (a, b) => (newest(b) ?? -1) - (newest(a) ?? -1),
+  success: (a, b) => (success(b) ?? -1) - (success(a) ?? -1),
   "env steps": (a, b) => b.num_env_steps - a.num_env_steps,
   progress: (a, b) => share(b) - share(a),
 };
 const FILTERS = {
-  "all states": () => true,
+  "all runs": () => true,
+  "pre-training": (run) => !run.trial,
+  downstream: (run) => Boolean(run.trial),
   active: isActive,
   ended: (run) => !isActive(run),
   failed: (run) => run.state === "failed",
@@ -49,7 +51,7 @@ class RunsPage {
   follow(signal) {
     return every(EVERY_MS, signal, async () => {
       try {
-        this.found = await get(["v1", "runs"], [["limit", LIMIT], ["sparkline", NAME]], signal);
+        this.found = await get(["v1", "runs"], [["limit", LIMIT], ...SPARKLINES], signal);
       } catch (error) {
         if (error instanceof ApiError && error.status) setText(this.summary, sentence(error.message));
         return;
@@ -77,7 +79,7 @@ class RunsPage {
 
   matching(runs) {
     const words = this.search.value.trim().toLowerCase().split(/\s+/);
-    const has = (run) => words.every((word) => `${run.run_id} ${run.name} ${run.study ?? ""} ${run.published ?? ""} ${run.state}`.toLowerCase().includes(word));
+    const has = (run) => words.every((word) => [run.run_id, run.name, run.study, run.published, run.state, run.trial?.primitives].join(" ").toLowerCase().includes(word));
     return runs.filter(has).filter(FILTERS[this.filter.value]).sort(SORTS[this.sort.value]);
   }
 
@@ -113,7 +115,7 @@ function columns(page) {
     { label: "State", changed: (run) => [run.state, run.condition, run.stopping, run.last_error, run.warnings], node: state },
     { label: "Env steps", changed: (run) => [run.num_env_steps, run.total_env_steps], node: progressBar },
     { label: "Env steps/s", text: (run) => (isActive(run) ? count(run.env_steps_per_s) : "\u2013"), number: true },
-    { label: "Bob's success", changed: (run) => run.values, node: (run) => el("span", { class: "spark" }, curve(run.values), percent(newest(run))) },
+    { label: "Success", changed: (run) => [run.values, run.trial?.success], node: (run) => el("span", { class: "spark" }, curve(run.values), percent(success(run))) },
     { label: "Started", changed: (run) => run.started, node: (run) => age(run.started) },
     { label: "Heard of", changed: (run) => run.heartbeat, node: (run) => age(run.heartbeat) },
   ];
@@ -122,11 +124,12 @@ function columns(page) {
 function title(run, page) {
   const box = el("input", { type: "checkbox", checked: page.chosen.has(run.run_id), "aria-label": `Choose ${run.run_id}` });
   box.addEventListener("change", () => page.choose(run.run_id, box.checked));
-  return el("span", { class: "chooser" }, box, el("span", { class: "two" }, runLink(run.run_id), el("small", {}, `${run.name}, ${run.runtime}`)));
+  return el("span", { class: "chooser" }, box, el("span", { class: "two" }, runLink(run.run_id), el("small", {}, run.trial ? trialText(run.trial) : `${run.name}, ${run.runtime}`)));
 }
 
-function newest(run) {
-  return run.values.findLast((value) => value !== null);
+/** Bob's on Alice's goals; of a downstream training that of its final evaluation, until then with noise. */
+function success(run) {
+  return run.trial?.success ?? run.values.findLast((value) => value !== null);
 }
 
 function trouble(run) {
@@ -140,7 +143,7 @@ function state(run) {
 }
 
 function nothing() {
-  const command = el("code", {}, "tandem pretrain --config configs/pretrain/panda_cube.yaml --run-dir runs/cube");
+  const command = el("code", {}, "tandem pretrain --run-dir runs/cube");
   return note("No runs yet. Start one with ", command, ": it appears here when it has started. Runs that are somewhere else are shown by ", el("code", {}, "tandem serve --runs DIR"), ".");
 }
 

@@ -8,7 +8,7 @@ import { count, duration, percent } from "./format.js";
 /**
  * A table that keeps its rows while their cells change, so that focus, selection and scrolling stay; cards on narrow
  * screens. A column is {label, text(row)}, or {label, node(row), changed(row)}: the node is made again if ``changed``
- * differs. ``number: true`` aligns it right.
+ * differs. ``number: true`` aligns it right, ``short: true`` keeps it on one line.
  */
 export class Table {
   constructor(label, columns, key) {
@@ -47,7 +47,7 @@ export class Table {
 }
 
 function kind(column) {
-  return column.number ? "number" : null;
+  return column.number ? "number" : column.short ? "short" : null;
 }
 
 function cell(column) {
@@ -64,6 +64,7 @@ function fillCell(element, column, item) {
 
 /** A progress bar, and the env steps under it. */
 export function progressBar(run) {
+  if (run.trial && run.state === "finished" && !run.num_env_steps) return el("small", {}, "learns nothing");
   const label = `${percent(share(run))} of the env steps`;
   return el(
     "span",
@@ -71,6 +72,11 @@ export function progressBar(run) {
     el("progress", { max: 1, value: share(run), "aria-label": label }),
     el("span", {}, `${count(run.num_env_steps)} of ${count(run.total_env_steps)}`),
   );
+}
+
+/** What a downstream training learns, such as "push, ours-her, seed 0, with panda-cube@3". */
+export function trialText({ task, method, seed, primitives }) {
+  return `${task}, ${method}, seed ${seed}${primitives ? `, with ${primitives}` : ""}`;
 }
 
 /** The finished fraction of a run. */
