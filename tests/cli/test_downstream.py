@@ -1,5 +1,6 @@
 import json
 import os
+import shlex
 import shutil
 import signal
 
@@ -10,6 +11,8 @@ from service.cli.main import app
 from service.downstream.directory import TrainingDirectory
 from service.primitives.bundled import BUNDLED
 from service.registry.registry import Registry
+from service.status.run_details import setup
+from service.store.disk_reader import DiskReader
 from tests.downstream.trials import SETS
 from tests.status.conftest import serve
 
@@ -42,7 +45,16 @@ def test_a_signal_saves_and_the_same_command_continues(tmp_path, monkeypatch):
     assert (path / "checkpoints").exists()
     assert not (path / "result.json").exists()
     monkeypatch.setattr("service.downstream.worker._record_video", lambda *arguments: path)
-    done = train("--task", "wall", "--resume", "--json")
+    seen = DiskReader(tmp_path / "runs").run("downstream-wall-ours-0")
+    assert (seen.state, seen.num_env_steps, seen.total_env_steps, seen.trial.primitives) == (
+        *("interrupted", 200, 600),
+        CHAMPION,
+    )
+    shown = setup(seen, path, tmp_path / "registry")  # what the status page gives to copy
+    words = shlex.split(shown.resume_command)
+    assert words[:3] == ["tandem", "downstream", "train"]
+    assert sum(word == "--set" for word in words) == len(SETS)
+    done = invoke(*words[2:], "--json")
     assert done.exit_code == 0, done.output
     assert json.loads(done.stdout)["env_steps"] == 600
 

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from service.actors.evaluation import wilson_interval
 from service.registry.names import Version
 from service.registry.registry import Registry
 from service.store.models import ActorStatus, GoalCell, GoalGrid, RunStatus
@@ -112,12 +113,34 @@ def write_runs(root: Path) -> None:
     (root / "old" / "curves.png").write_bytes(b"\x89PNG picture")
 
 
-def publish(registry: Registry, name: str = "tiny", value: float = 0.0) -> Version:
-    """Publish a small version."""
+def write_trial(
+    root: Path, run_id: str, task: str, method: str, seed: int, success: float | None, **changes: Any
+) -> Path:
+    """Write a downstream training of two iterations; it has ended where ``success``, over 300 episodes, is a number."""
+    path = root / run_id
+    path.mkdir(parents=True)
+    primitives = {"name": "tiny@1", "digest": "0" * 64, "env_steps": 1000.0}
+    made = {"primitives": primitives, "world": {"robot": "panda"}} | changes.pop("made", {})
+    trial = {"task": task, "method": method, "seed": seed, "num_env_steps": 2000, "task_version": 1} | changes
+    tree = {"format_version": 1, "cell": trial, **made}
+    (path / "cell.json").write_text(json.dumps(tree))
+    names = {"rollout/success_last": 0.25, "evaluation/success_last": success, "time/env_steps_per_s": 50.0}
+    append(root, run_id, *({"iteration": i, "env_steps": 1000 * i, **names} for i in (1, 2)))
+    if success is not None:
+        low, high = wilson_interval(round(300 * success), 300)
+        ever = {"success_ever": 1.0, "num_episodes": 300}
+        evaluation = {"success_last": success, "success_last_low": low, "success_last_high": high, **ever}
+        result = {"evaluation": evaluation, "made": {"git_commit": None}, "env_steps": 2000, "wall_s": 9.0, "curve": []}
+        (path / "result.json").write_text(json.dumps(tree | result))
+    return path
+
+
+def publish(registry: Registry, name: str = "tiny", value: float = 0.0, **spaces: Any) -> Version:
+    """Publish a small version, with more ``spaces``."""
     return registry.publish(
         name,
         {"gate.weight": np.full((2, 3), value, np.float32)},
-        spaces={"action": 4},
+        spaces={"action": 4, **spaces},
         normalisation={"offset": [0.0]},
         config={"seed": 3},
         metrics={"evaluation/mixed_success_last": 0.5},

@@ -15,7 +15,7 @@ from service.store.disk_reader import DiskReader
 from service.store.models import ActorStatus
 from tests.status.browser import CHROMIUM, Visit, chromium
 from tests.status.conftest import serve
-from tests.status.runs import TOKEN, VIDEO, WRONG, append, grid, publish, record, write_runs, write_status
+from tests.status.runs import TOKEN, VIDEO, WRONG, append, grid, publish, record, write_runs, write_status, write_trial
 
 pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="no chromium on PATH; on Debian: apt-get install chromium")
 
@@ -95,6 +95,33 @@ def test_a_run(visit):
     assert tiles["Progress"].startswith(f"30.0{NBSP}%")
     assert f"about 14{NBSP}s to go" in tiles["Progress"]  # 7,000 env steps at 500 a second
     assert "6\n1 refused" in re.sub("\n+", "\n", tiles["Rollouts"])
+
+
+def test_downstream_trainings(own):
+    visit, home, _ = own
+    for seed, success in enumerate((0.80, 0.82, 0.84)):
+        write_trial(home / "runs" / "downstream", f"push-ours-{seed}", "push", "ours", seed, success)
+    (write_trial(home / "runs", "wall", "wall", "idle", 0, 0.5) / "episodes.mp4").write_bytes(VIDEO)
+    publish(Registry(home / "registry"), "push-orchestrator", kind="orchestrator", task="push", primitives="tiny@1")
+    page = visit.go("#/tasks").page
+    page.get_by_role("table", name="Tasks").wait_for()
+    ours, idle = (text.split() for text in page.locator("tbody tr").all_inner_texts())
+    assert ours == f"ours tiny@1 3 runs 82.0{NBSP}% 77 to 87, 3 seeds \u2013".split()
+    assert idle == f"idle tiny@1 wall \u2013 50.0{NBSP}% 44 to 56, 1 seed".split()
+    page.get_by_role("link", name=f"82.0{NBSP}%").click()
+    page.get_by_role("heading", name="3 runs compared").wait_for()
+    name = "downstream-push-ours-2"
+    assert visit.points("evaluation/success_last", 2, name)[-1] == (2000, 0.84)
+    visit.go("#/runs/wall").page.get_by_text("tandem downstream evaluate").wait_for()
+    assert f"50.0{NBSP}%" in page.locator(".tile").nth(1).inner_text()
+    assert f"last step, 44 to 56{NBSP}%" in page.locator(".tile").nth(1).inner_text()
+    parts = ["Curves", "Recordings", "Commands", "Configuration", "Primitives tiny"]  # no goals, no actors
+    assert page.locator("h2").all_inner_texts() == parts
+    versions = visit.go("#/primitives").page.get_by_role("table", name="Versions of push-orchestrator")
+    assert versions.locator("tbody td").nth(2).inner_text() == "push"
+    visit.go("#/").page.get_by_label("Show").select_option("downstream")
+    visit.wait("document.querySelectorAll('tbody tr').length === 4")
+    assert [said for said in visit.complaints if "Failed to load resource" not in said] == []
 
 
 def test_the_goal_map(visit):
@@ -283,6 +310,17 @@ def test_a_run_is_deleted_while_it_is_looked_at(own):
 # --- where one is ---------------------------------------------------------------------------------------------------
 
 
+def test_a_view_that_did_not_load_comes_when_the_service_is_back(own):
+    visit, home, server = own
+    page = visit.go().page
+    page.get_by_role("link", name="cube", exact=True).wait_for()
+    server.stop()
+    visit.go("#/tasks")
+    page.get_by_text("This view could not be loaded.").wait_for()
+    with StatusServer(DiskReader(home / "runs"), Registry(home / "registry"), port=server.port, runs_dir=home / "runs"):
+        page.get_by_role("heading", name="Tasks").wait_for()
+
+
 def test_links_are_permanent(visit):
     page = visit.go().page
     page.get_by_role("link", name="old", exact=True).click()
@@ -375,7 +413,13 @@ def test_a_phone_need_not_scroll_sideways(own, browser):
     _, home, server = own
     make_hostile(home)
     visit = Visit(browser, server.url, **PHONE)
-    for place, table in (("#/", "Runs"), ("#/runs/cube", "Actors"), ("#/primitives", "Versions of panda-cube")):
+    write_trial(home / "runs", "x" * 100, HOSTILE, "ours", 0, 0.5, made={"primitives": {"name": f"{HOSTILE}@1"}})
+    for place, table in (
+        ("#/", "Runs"),
+        ("#/runs/cube", "Actors"),
+        ("#/tasks", "Tasks"),
+        ("#/primitives", "Versions of panda-cube"),
+    ):
         page = visit.go(place).page
         page.get_by_role("table", name=table, exact=True).wait_for()
         if place == "#/runs/cube":
