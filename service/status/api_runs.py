@@ -71,9 +71,9 @@ def runs_router(runs: RunReader, streams: Streams, directories: RunDirectories, 
             and (downstream is None or (run.trial is not None) == downstream)
         ]
         sparklines = {}
-        for run in found[:limit] if sparkline_of is not None else ():
+        for run in found[:limit] if sparkline_of else ():
             with suppress(StoreError):  # it may be deleted just now
-                sparklines[run.run_id] = sparkline(run.run_id, tuple(sparkline_of), run.started, run.iteration)
+                sparklines[run.run_id] = sparkline(run.run_id, tuple(sparkline_of or ()), run.started, run.iteration)
         return RunList(runs=tuple(found[:limit]), num_runs=len(found), sparklines=sparklines)
 
     @router.get("/{run_id}", summary="One run", responses=errors)
@@ -194,7 +194,7 @@ def runs_router(runs: RunReader, streams: Streams, directories: RunDirectories, 
         },
     )
     def get_video(request: Request, run_id: _Run) -> Response:
-        """Alice beside Bob, or random skills; the same as `files/rounds.mp4` or `files/skills.mp4`."""
+        """Alice beside Bob, random skills, or episodes of a downstream task: the first that `files` lists."""
         names = [file.name for file in directories.files(run_id) if file.media_type == "video/mp4"]
         return get_file(request, run_id, names[0] if names else "rounds.mp4")
 

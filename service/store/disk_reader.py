@@ -61,6 +61,7 @@ def run_directories(root: Path) -> dict[str, Path]:
         OSError: ``root`` cannot be read.
     """
     found, inner = sorted(root.iterdir()), list[Path]()
+    seen = {path.resolve() for path in found}  # a link leads to what is there by its own name
     for path in found:
         if path.name.startswith(".") or _is_run(path):
             continue
@@ -68,7 +69,10 @@ def run_directories(root: Path) -> dict[str, Path]:
             if is_study(path):
                 inner += filter(_is_run, sorted(path.iterdir()))
             else:
-                inner += filter(is_trial, sorted(Path(each.path) for each in os.scandir(path) if each.is_dir()))
+                there = sorted(Path(each.path) for each in os.scandir(path) if each.is_dir())
+                new = [each for each in there if is_trial(each) and each.resolve() not in seen]
+                seen.update(each.resolve() for each in new)
+                inner += new
     directories = [*filter(_is_run, found), *inner]
     return {_id_in(root, path): path for path in reversed(directories)}
 

@@ -230,7 +230,7 @@ def test_openapi_lists_every_route(client, server):
         "/v1/runs/{run_id}/files", "/v1/runs/{run_id}/files/{file}", "/v1/runs/{run_id}/video", "/v1/primitives",
         "/v1/primitives/{name}", "/v1/primitives/{name}/versions/{version}", "/v1/blobs/sha256/{digest}",
         "/v1/primitives/{name}/aliases/{alias}", "/v1/series", "/v1/series.csv", "/v1/session",
-        "/v1/runs/{run_id}/setup", "/v1/runs/{run_id}/log", "/v1/runs/{run_id}/goals/history",
+        "/v1/runs/{run_id}/setup", "/v1/runs/{run_id}/log", "/v1/runs/{run_id}/goals/history", "/v1/downstream",
     }  # fmt: skip
     assert json.loads(json.dumps(server.app.openapi()))["paths"] == paths
     for path, methods in paths.items():

@@ -121,6 +121,8 @@ def test_trainings_are_runs(root, ask):
     write_trial(root / "downstream", "push-ours-3", "push", "ours", 3, 0.75)
     (root / "downstream" / "push-ours-3" / "episodes.mp4").write_bytes(VIDEO)
     (root / "downstream" / "notes").mkdir()
+    (root / "here").symlink_to(root)
+    (root / "linked").symlink_to(root / "downstream")
     assert ask("runs")["num_runs"] == 3
     assert {run["run_id"] for run in ask("runs", downstream=False)["runs"]} == {"cube", "old"}
     found = ask("runs", downstream=True, sparkline=["bob/success_rate", "rollout/success_last"])

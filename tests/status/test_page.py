@@ -112,6 +112,10 @@ def test_downstream_trainings(own):
     page.get_by_role("heading", name="3 runs compared").wait_for()
     name = "downstream-push-ours-2"
     assert visit.points("evaluation/success_last", 2, name)[-1] == (2000, 0.84)
+    page.get_by_label("seeds as a band").check()
+    visit.wait(
+        "document.querySelectorAll('.canvas')[0].data.some(({name}) => name === 'push, ours, with tiny@1 highest')"
+    )
     visit.go("#/runs/wall").page.get_by_text("tandem downstream evaluate").wait_for()
     assert f"50.0{NBSP}%" in page.locator(".tile").nth(1).inner_text()
     assert f"last step, 44 to 56{NBSP}%" in page.locator(".tile").nth(1).inner_text()
@@ -354,6 +358,22 @@ def test_views_and_runs_that_do_not_exist(visit):
         assert page.get_by_role("link", name="All runs").count() == 1
         assert page.locator("main img, main script").count() == 0
     assert [said for said in visit.complaints if "Failed to load resource" not in said] == []
+
+
+def test_goals_of_a_run_that_had_none_when_it_was_opened(visit):
+    page = visit.go("#/primitives").page
+    there = page.evaluate(
+        """async () => {
+            const { GoalSpace } = await import('/page/space.js')
+            const space = new GoalSpace(new AbortController().signal)
+            const frame = { first_env_steps: 0, last_env_steps: 9, num_goals: 1, centers_m: [[0, 0, 0]], num_tries: [1], success_rate: [1] }
+            return [[], [frame]].map(frames => {
+                space.update({ frames, cell_size_m: 0.05 })
+                return [space.root.textContent.includes('No goals'), space.root.contains(space.canvas)]
+            })
+        }"""
+    )
+    assert there == [[True, False], [False, True]]
 
 
 def test_a_run_that_does_not_exist_yet(own):

@@ -19,7 +19,7 @@ export async function compareView(root, ids, signal) {
   root.replaceChildren(el("h1", {}, counted(ids.length, "run")), note("Asking \u2026"));
   const statuses = await asked(root, signal);
   if (!statuses) return;
-  const runs = ids.map((id) => ({ id, label: id, study: statuses.get(id)?.study ?? null, hidden: false }));
+  const runs = ids.map((id) => ({ id, label: id, study: studyOf(statuses.get(id)), hidden: false }));
   const board = new Board(runs, comparedPanels(ids.map((id) => statuses.get(id)).filter(Boolean)), signal);
   const table = runTable(board);
   const [curves, setups] = [section("Curves", "wide"), section("What differs", "wide")];
@@ -33,6 +33,11 @@ export async function compareView(root, ids, signal) {
     const found = await get(["v1", "runs"], [["limit", 1000]], signal);
     show(new Map(found.runs.map((run) => [run.run_id, run])));
   });
+}
+
+/** What runs that differ in their seed alone have in common: their study, or what they learn downstream. */
+function studyOf(run) {
+  return run?.study ?? (run?.trial ? trialText({ ...run.trial, seed: null }) : null);
 }
 
 async function asked(root, signal) {
@@ -60,7 +65,7 @@ function runTable(board) {
   const columns = [
     { label: "Run", changed: ({ id, hidden }) => [id, hidden], node: ({ run }) => chooser(run, board) },
     { label: "State", changed: ({ status }) => [status?.state, status?.stopping], node: ({ status }) => (status ? stateChip(status) : el("span", { class: "chip lost" }, "not there")) },
-    { label: "Study or task", text: ({ study, status }) => study ?? (status?.trial ? trialText(status.trial) : "\u2013") },
+    { label: "Study or task", text: ({ study }) => study ?? "\u2013" },
     { label: "Env steps", text: ({ status }) => count(status?.num_env_steps), number: true },
     { label: "Env steps/s", text: ({ status }) => (status && isActive(status) ? count(status.env_steps_per_s) : "\u2013"), number: true },
     { label: "Success", text: ({ success }) => percent(success), number: true },

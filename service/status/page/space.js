@@ -19,7 +19,8 @@ export class GoalSpace {
     this.button.addEventListener("click", () => (this.timer ? this.stop() : this.play()));
     this.text = el("output", {});
     const legend = el("p", { class: "scale" }, "dark: Bob never reaches it, yellow: always. Larger: more goals. Drag to turn.");
-    this.root = el("div", {}, el("p", { class: "controls" }, this.button, this.slider, this.text), this.canvas, legend);
+    this.parts = [el("p", { class: "controls" }, this.button, this.slider, this.text), this.canvas, legend];
+    this.root = el("div", {});
     onTheme(() => this.draw(), signal);
     signal.addEventListener("abort", () => {
       this.stop();
@@ -33,6 +34,7 @@ export class GoalSpace {
     Object.assign(this, { frames, cellSize });
     this.slider.max = Math.max(0, frames.length - 1);
     if (!frames.length) return this.root.replaceChildren(note("No goals are recorded yet."));
+    if (!this.root.contains(this.canvas)) this.root.replaceChildren(...this.parts); // a run that has just begun had none
     return this.show(newest ? frames.length - 1 : this.at);
   }
 

@@ -74,9 +74,9 @@ export function progressBar(run) {
   );
 }
 
-/** What a downstream training learns, such as "push, ours-her, seed 0, with panda-cube@3". */
+/** What a downstream training learns, such as "push, ours-her, seed 0, with panda-cube@3"; without a seed of null. */
 export function trialText({ task, method, seed, primitives }) {
-  return `${task}, ${method}, seed ${seed}${primitives ? `, with ${primitives}` : ""}`;
+  return [task, method, ...(seed === null ? [] : [`seed ${seed}`]), ...(primitives ? [`with ${primitives}`] : [])].join(", ");
 }
 
 /** The finished fraction of a run. */
