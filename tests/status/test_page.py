@@ -366,7 +366,8 @@ def test_goals_of_a_run_that_had_none_when_it_was_opened(visit):
         """async () => {
             const { GoalSpace } = await import('/page/space.js')
             const space = new GoalSpace(new AbortController().signal)
-            const frame = { first_env_steps: 0, last_env_steps: 9, num_goals: 1, centers_m: [[0, 0, 0]], num_tries: [1], success_rate: [1] }
+            const goals = { num_goals: 1, centers_m: [[0, 0, 0]], num_tries: [1], success_rate: [1] }
+            const frame = { first_env_steps: 0, last_env_steps: 9, ...goals }
             return [[], [frame]].map(frames => {
                 space.update({ frames, cell_size_m: 0.05 })
                 return [space.root.textContent.includes('No goals'), space.root.contains(space.canvas)]
