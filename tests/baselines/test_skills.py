@@ -81,7 +81,7 @@ def test_skills_of_a_point_mass_differ(method):
     left = ends - np.column_stack((skills, np.ones(len(skills)))) @ fit
     explained = 1.0 - left.var(axis=0) / ends.var(axis=0)
     assert explained.min() > 0.5
-    if method != "dads":  # its skills may differ along one line: what it is paid for grows with far ends, not with all sides
+    if method != "dads":  # its skills may differ along one line: it is paid for far ends, not for all sides
         assert abs(np.linalg.det(fit[:2])) > 0.05
 
 
