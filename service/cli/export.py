@@ -14,7 +14,7 @@ def export(
     policy: Annotated[
         str,
         typer.Argument(
-            metavar="NAME@ALIAS|RUN_DIR", help="Whose Bob; or the directory of a downstream training: its orchestrator."
+            metavar="NAME@ALIAS|RUN_DIR", help="Whose Bob; or an orchestrator: published, or the directory of its training."
         ),
     ],
     format_name: Annotated[str, typer.Option("--format", help="onnx, numpy or torchscript.")],

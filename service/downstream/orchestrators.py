@@ -48,6 +48,8 @@ class Orchestrator:
 
     label: str
     """Where it comes from, such as ``push-orchestrator@1``."""
+    name: str
+    """What it is called elsewhere, where paths of this machine mean nothing: its version, or its trial."""
     task: str
     """Name of the task it was trained on, such as ``push``."""
     method: str
@@ -75,6 +77,25 @@ class Orchestrator:
             PolicyError: another shape, or another N than in the step before.
         """
         return self.policy.act_deterministic(observation)
+
+
+def method_of(reference: str, place: Path) -> Method | None:
+    """The method of a downstream training, or of a version that one has published; None for what is neither.
+
+    Args:
+        reference: as of ``load_orchestrator``, or of something else.
+        place: directory of the registry to look in first.
+
+    Raises:
+        TandemError: no such version, or a damaged training.
+    """
+    path = Path(reference)
+    if not is_exported(path) and (path.is_dir() or "/" in reference):
+        file = TrainingDirectory(path).trial_file
+        return find_method(read_trial(read_json(file), file).method) if file.exists() else None
+    found, version = find_version(reference, place)
+    spaces: dict[str, Any] = dict(found.manifest(str(version)).spaces)
+    return find_method(str(spaces.get("method"))) if spaces.get("kind") == ORCHESTRATOR else None
 
 
 def load_orchestrator(reference: str, place: Path, registry: Path | str, primitives: str | None = None) -> Orchestrator:
@@ -112,7 +133,7 @@ def load_orchestrator(reference: str, place: Path, registry: Path | str, primiti
         raise TandemError(f"{label}: its manifest lacks {error}; publish it again") from None
     trained = _find_frozen(label, method, recorded, registry, primitives)
     policy = LearnedPolicy(parameters, method, trained, hold_steps)
-    return Orchestrator(label, task, spaces["method"], policy, trained, manifest)
+    return Orchestrator(label, str(version), task, spaces["method"], policy, trained, manifest)
 
 
 def publish_orchestrator(
@@ -214,7 +235,7 @@ def _load_training(run: Path, registry: Path | str, primitives: str | None) -> O
             "--primitives"
         )
     policy = method.player(trained) if method.player is not None else load_policy(directory.policy_file, trained)
-    return Orchestrator(str(run), trial.task, trial.method, policy, trained)
+    return Orchestrator(str(run), trial.name, trial.task, trial.method, policy, trained)
 
 
 def _find_frozen(
@@ -224,7 +245,11 @@ def _find_frozen(
     load = service.load_skills if method.takes == "skills" else service.load_primitives
     if wanted is None:
         return load(named, registry) if named is not None else service.load_primitives(registry=registry)
-    places = [(named, registry)] if named is not None else [(wanted["name"], registry), (wanted["name"], BUNDLED)]
+    try:
+        name, wanted_digest = str(wanted["name"]), str(wanted["digest"])
+    except (KeyError, TypeError):
+        raise TandemError(f"{label} does not say by name and digest what it acts with; train it again") from None
+    places = [(named, registry)] if named is not None else [(name, registry), (name, BUNDLED)]
     problems = []
     for reference, place in places:
         try:
@@ -233,11 +258,11 @@ def _find_frozen(
             problems.append(str(error))
             continue
         digest = digest_of(trained)
-        if digest == wanted["digest"]:
+        if digest == wanted_digest:
             return trained
         problems.append(f"{trained.label} has other parameters, digest {digest[:_SHOWN]}")
     raise TandemError(
-        f"{label} acts with {wanted['name']} of digest {wanted['digest'][:_SHOWN]}, which is not here: {problems[0]}; "
+        f"{label} acts with {name} of digest {wanted_digest[:_SHOWN]}, which is not here: {problems[0]}; "
         "name it with --primitives, or the registry that has it with --registry"
     )
 

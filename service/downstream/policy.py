@@ -36,6 +36,7 @@ class LearnedPolicy:
     """
 
     def __init__(self, parameters: Parameters, method: Method, trained: Trained, hold_steps: int = 1) -> None:
+        self.parameters = parameters
         self._actor, self._method, self._trained = numpy_actor(parameters), method, trained
         self._hold_steps = hold_steps
         self._seen = layouts(trained.config.world)

@@ -10,10 +10,9 @@ from typing import Literal
 
 from service.actors.evaluation import DeterministicPolicy
 from service.config import WorldConfig
-from service.downstream.directory import TrainingDirectory, read_trial
-from service.downstream.files import read_json
-from service.downstream.methods import find_method
-from service.downstream.policy import LearnedPolicy, read_policy
+from service.downstream.methods import Method
+from service.downstream.orchestrators import load_orchestrator, method_of
+from service.downstream.policy import LearnedPolicy
 from service.envs.gym.registration import EPISODE_STEPS
 from service.envs.observations import layouts
 from service.envs.sampling import GoalKind
@@ -28,7 +27,7 @@ from service.export.parity import check_parity, make_inputs
 from service.export.readme import make_readme
 from service.io.files import new_directory, os_errors
 from service.io.tensors import digest_of
-from service.primitives.loading import TrainedBob, read_bob
+from service.primitives.loading import TrainedBob, load_bob
 
 Part = Literal["all", "policy", "primitives"]
 PARTS: tuple[Part, ...] = ("all", "policy", "primitives")
@@ -59,7 +58,7 @@ def find_source(reference: str, registry: Path, part: Part, primitives: str | No
     """Find what to export.
 
     Args:
-        reference: of a published Bob or a run directory; or the directory of a downstream training.
+        reference: of a published Bob or orchestrator; or the directory of a run, or of a downstream training.
         registry: that versions are in.
         part: one of ``PARTS``.
         primitives: that an orchestrator composes, where they are not where its training found them.
@@ -69,15 +68,14 @@ def find_source(reference: str, registry: Path, part: Part, primitives: str | No
     """
     if part not in PARTS:
         raise ExportError(f"unknown part {part!r}; choose one of {', '.join(PARTS)}")
-    training = TrainingDirectory(Path(reference))
-    if training.trial_file.exists():
-        return _orchestrator(training, registry, part, primitives)
+    if (method := method_of(reference, registry)) is not None:
+        return _orchestrator(reference, method, registry, part, primitives)
     if primitives is not None:
-        raise ExportError(f"{reference} is no downstream training: primitives are named for its orchestrator only")
-    trained, parameters = read_bob(reference, registry)
-    networks = networks_of_bob(trained, parameters) if part != "primitives" else []
+        raise ExportError(f"{reference} is no orchestrator: primitives are named for one only")
+    trained = load_bob(reference, registry)
+    networks = networks_of_bob(trained) if part != "primitives" else []
     if part == "primitives" or (part == "all" and networks[0].function == "bob"):
-        networks += networks_of_primitives(trained, parameters)
+        networks += networks_of_primitives(trained)
     config = trained.config
     return Source(
         name=_name(trained),
@@ -88,7 +86,7 @@ def find_source(reference: str, registry: Path, part: Part, primitives: str | No
         num_steps=config.run.evaluation_steps,
         success_distance_m=config.game.success_distance_m,
         players=partial(_same, trained),
-        digests={"policy": digest_of("", parameters)},
+        digests={"policy": digest_of("", trained.parameters)},
     )
 
 
@@ -134,33 +132,27 @@ def export(source: Source, format_name: str, folder: Path, *, num_episodes: int 
     return description
 
 
-def _orchestrator(training: TrainingDirectory, registry: Path, part: Part, primitives: str | None) -> Source:
-    recorded = read_json(training.trial_file)
-    trial = read_trial(recorded, training.trial_file)
-    method = find_method(trial.method)
+def _orchestrator(reference: str, method: Method, registry: Path, part: Part, primitives: str | None) -> Source:
     if not method.composes:
-        raise ExportError(
-            f"{training.path} was trained with {trial.method}, which composes no primitives: export one of ours"
-        )
-    if not training.policy_file.exists():
-        raise ExportError(f"{training.path} has no {training.policy_file.name}: continue the training to its end")
-    trained, parameters = read_bob(primitives or str(recorded["primitives"]["name"]), registry)
-    _, actor_parameters, _ = read_policy(training.policy_file, trained)
-    network = network_of_orchestrator(trained, parameters, trial.method, actor_parameters)
-    networks = [network] if part != "primitives" else []
+        raise ExportError(f"{reference} was trained with a method that composes no primitives: export one of ours")
+    found = load_orchestrator(reference, registry, registry, primitives)
+    trained, player = found.trained, found.policy
+    assert isinstance(trained, TrainedBob)
+    assert isinstance(player, LearnedPolicy)
+    networks = [network_of_orchestrator(trained, found.method, player.parameters)] if part != "primitives" else []
     if part != "policy":
-        networks += networks_of_primitives(trained, parameters)
-    task = find_task(trial.task)
+        networks += networks_of_primitives(trained)
+    task = find_task(found.task)
     return Source(
-        name=f"{trial.name} with {_name(trained)}",
+        name=f"{found.name} with {_name(trained)}",
         networks=tuple(networks),
         world=task.world_from(trained.config.world.nominal),
         goals=task.goals,
-        task=trial.task,
+        task=found.task,
         num_steps=EPISODE_STEPS,
         success_distance_m=SUCCESS_DISTANCE_M,
-        players=partial(LearnedPolicy, actor_parameters, method, trained),
-        digests={"orchestrator": digest_of("", actor_parameters), "primitives": digest_of("", parameters)},
+        players=partial(LearnedPolicy, player.parameters, method, trained),
+        digests={"orchestrator": digest_of("", player.parameters), "primitives": digest_of("", trained.parameters)},
     )
 
 

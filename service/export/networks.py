@@ -43,10 +43,10 @@ class Network:
     """Its outputs as the evaluator's own policy computes them."""
 
 
-def networks_of_bob(trained: TrainedBob, parameters: Parameters) -> list[Network]:
+def networks_of_bob(trained: TrainedBob) -> list[Network]:
     """The network of a whole Bob, composed or monolithic."""
     seen = layouts(trained.config.world)
-    policy = trained.policy
+    policy, parameters = trained.policy, trained.parameters
     if not isinstance(policy, NumpyMCPPolicy):
 
         def act(observation: FloatArray) -> Outputs:
@@ -64,24 +64,21 @@ def networks_of_bob(trained: TrainedBob, parameters: Parameters) -> list[Network
     return [Network("policy", "bob", title, parameters, _columns(seen), _sees(seen), _composed_shapes(policy), compose)]
 
 
-def networks_of_primitives(trained: TrainedBob, parameters: Parameters) -> list[Network]:
+def networks_of_primitives(trained: TrainedBob) -> list[Network]:
     """A network for each primitive.
 
     Raises:
         TandemError: this Bob is monolithic.
     """
     policy, seen = trained.primitives, layouts(trained.config.world)
-    return [_primitive(policy, parameters, number, seen) for number in range(policy.num_primitives)]
+    return [_primitive(policy, trained.parameters, number, seen) for number in range(policy.num_primitives)]
 
 
-def network_of_orchestrator(
-    trained: TrainedBob, parameters: Parameters, method_name: str, actor_parameters: Parameters
-) -> Network:
+def network_of_orchestrator(trained: TrainedBob, method_name: str, actor_parameters: Parameters) -> Network:
     """The network of an orchestrator, with the primitives that it composes.
 
     Args:
         trained: the primitives.
-        parameters: of them.
         method_name: that it was learned by, one that composes.
         actor_parameters: that were learned.
 
@@ -108,7 +105,7 @@ def network_of_orchestrator(
     moved_size = sum(seen.positions[name].stop - seen.positions[name].start for name in moved)
     layers = [name for name in actor_parameters if name.endswith(".weight")]
     shown = {
-        **{name: array for name, array in parameters.items() if name.startswith("primitives.")},
+        **{name: array for name, array in trained.parameters.items() if name.startswith("primitives.")},
         **{
             f"actor.layers.{place}.{kind}": actor_parameters[f"layers.{2 * place}.{kind}"]  # ReLUs stand in between
             for place in range(len(layers))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from service.baselines.frozen import FrozenSkills
@@ -42,6 +42,8 @@ class TrainedBob:
     label: str
     """Where he comes from, such as ``panda-cube@3``."""
     policy: NumpyPolicy
+    parameters: Parameters = field(compare=False, repr=False)
+    """That the policy was made of."""
     config: Config
     manifest: Manifest | None = None
     """His manifest in the registry; None for the Bob of a run directory."""
@@ -69,11 +71,6 @@ def load_bob(reference: str, registry: Path) -> TrainedBob:
     Raises:
         TandemError: neither a run directory nor a published version, or damaged.
     """
-    return read_bob(reference, registry)[0]
-
-
-def read_bob(reference: str, registry: Path) -> tuple[TrainedBob, Parameters]:
-    """Load a Bob and the parameters that he was made of; see ``load_bob``."""
     label, config, tensors, manifest = _load(reference, registry, "bob")
     if config.skills is not None:
         raise TandemError(
@@ -81,9 +78,9 @@ def read_bob(reference: str, registry: Path) -> tuple[TrainedBob, Parameters]:
             "name primitives"
         )
     if manifest is None:
-        return TrainedBob(label, numpy_bob(tensors), config), tensors
+        return TrainedBob(label, numpy_bob(tensors), tensors, config)
     try:
-        return TrainedBob(label, NumpyMCPPolicy(tensors), config, manifest), tensors
+        return TrainedBob(label, NumpyMCPPolicy(tensors), tensors, config, manifest)
     except PolicyError as error:
         raise TandemError(f"{label} holds no primitives: {error}") from None
 

@@ -9,10 +9,8 @@ import numpy as np
 
 from service.actors.evaluation import DeterministicPolicy
 from service.downstream.compose import check_robot
-from service.downstream.directory import read_trial
-from service.downstream.files import made_with, read_json
-from service.downstream.methods import find_method, load_for
-from service.downstream.policy import load_policy
+from service.downstream.methods import Method
+from service.downstream.orchestrators import load_orchestrator, method_of
 from service.envs.observations import ACTION, layouts
 from service.envs.sampling import GoalKind
 from service.envs.tasks import SUCCESS_DISTANCE_M, find_task
@@ -38,14 +36,15 @@ def load_robot_policy(reference: str, registry: Path) -> RobotPolicy:
     """Load what ``--policy`` names.
 
     Args:
-        reference: NAME@ALIAS, a run directory, or a directory of ``tandem downstream train``.
-        registry: where primitives are looked up first.
+        reference: NAME@ALIAS of primitives or of an orchestrator, a run directory, or a directory of
+            ``tandem downstream train``.
+        registry: where they are looked up first.
 
     Raises:
         TandemError: nothing there, damaged, or a policy of another robot or layout.
     """
-    directory = Path(reference)
-    found = _orchestrator(directory, registry) if (directory / "cell.json").is_file() else _bob(reference, registry)
+    method = method_of(reference, registry)
+    found = _bob(reference, registry) if method is None else _orchestrator(reference, method, registry)
     if found.world.num_observed_obstacles:
         raise TandemError(f"{found.label} observes obstacles, and the bridge measures the object alone; train without")
     size = layouts(found.world).bob.size
@@ -65,15 +64,11 @@ def _bob(reference: str, registry: Path) -> RobotPolicy:
     return RobotPolicy(trained.label, trained.policy, config.world.nominal, "mixed", config.game.success_distance_m)
 
 
-def _orchestrator(directory: Path, registry: Path) -> RobotPolicy:
-    tree = read_json(directory / "cell.json")
-    trial = read_trial(tree, directory / "cell.json")
-    primitives = made_with(tree)["primitives"]
-    if find_method(trial.method).takes is None or primitives is None:
-        raise TandemError(f"{directory}: {trial.method} acts without primitives; a bridge plays what composes them")
-    trained = load_for([trial.method], primitives["name"], registry)
-    check_robot(trained)
-    task = find_task(trial.task)
-    policy = load_policy(directory / "policy.safetensors", trained)
-    world = task.world_from(trained.config.world.nominal)
-    return RobotPolicy(trial.name, policy, world, task.goals, SUCCESS_DISTANCE_M)
+def _orchestrator(reference: str, method: Method, registry: Path) -> RobotPolicy:
+    if method.takes is None:
+        raise TandemError(f"{reference}: {method.title} acts without primitives; a bridge plays what composes them")
+    found = load_orchestrator(reference, registry, registry)
+    check_robot(found.trained)
+    task = find_task(found.task)
+    world = task.world_from(found.trained.config.world.nominal)
+    return RobotPolicy(found.name, found.policy, world, task.goals, SUCCESS_DISTANCE_M)

@@ -16,7 +16,7 @@ def still_bob():
     parameters = dict(Learner(load_config(None, ["policy.bob.num_primitives=2"])).weights().bob)
     for name in ("primitives.output_weight", "primitives.output_bias"):
         parameters[name] = np.zeros_like(parameters[name])
-    return TrainedBob("by hand", numpy_bob(parameters), load_config())
+    return TrainedBob("by hand", numpy_bob(parameters), parameters, load_config())
 
 
 def test_plans_reach_goals_with_primitives_that_push_and_none_with_those_that_rest():

@@ -49,7 +49,7 @@ def test_what_no_composition_does_is_impossible():
     bias = np.zeros_like(parameters["primitives.output_bias"])
     bias[0, 0] = bias[1, 1] = 3.0
     parameters["primitives.output_bias"] = bias
-    bob = TrainedBob("by hand", numpy_bob(parameters), load_config())
+    bob = TrainedBob("by hand", numpy_bob(parameters), parameters, load_config())
     found = measure(bob, num_places=7, num_weights=40, seed=0)
     assert found == {"+x": 0.0, "-x": 1.0, "+y": 0.0, "-y": 1.0}
 

@@ -12,9 +12,11 @@ from service.downstream.orchestrators import publish_orchestrator
 from service.downstream.worker import RunOptions, run_trial
 from service.envs.observations import layouts
 from service.errors import TandemError
+from service.export.exporting import find_source
 from service.primitives.bundled import BUNDLED
 from service.primitives.verification import network_problems
 from service.registry.registry import Registry
+from service.robot.policies import load_robot_policy
 from tests.downstream.trials import small_trial
 from tests.registry.helpers import files_in
 from tests.status.conftest import serve
@@ -68,6 +70,11 @@ def test_it_acts_alike_from_its_directory_a_registry_and_a_service(finished, cha
     assert Registry(registry).verify(check=network_problems) == []
     published = service.load_policy("push-orchestrator@latest", registry)
     np.testing.assert_array_equal(acted(published, observation), expected)
+    for reference, name in ((str(finished / "ours"), "push-ours-0"), ("push-orchestrator@latest", str(version))):
+        on_robot, source = load_robot_policy(reference, registry), find_source(reference, registry, "policy")
+        assert (on_robot.label, source.name) == (name, f"{name} with {champion.manifest.reference}")
+        assert on_robot.world == source.world == local.world
+        np.testing.assert_array_equal(source.players().act_deterministic(observation), expected[0])
     Registry(registry).export("push-orchestrator", tmp_path / "exported")
     exported = service.load_policy(str(tmp_path / "exported"), tmp_path / "no-registry")
     np.testing.assert_array_equal(acted(exported, observation), expected)

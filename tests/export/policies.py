@@ -13,7 +13,7 @@ from service.envs.observations import layouts
 from service.io.checkpoints import CheckpointStore
 from service.io.run_directory import RunDirectory
 from service.policies.networks import export_parameters, make_bob
-from service.primitives.loading import read_bob
+from service.primitives.loading import load_bob
 from service.primitives.publishing import publish
 from service.sac.networks import GaussianActor
 
@@ -50,9 +50,9 @@ def actor_of(residual):
 
 
 def publish_bob(registry, parameters=None):
-    """Publish a Bob as made@1; he and his parameters."""
+    """Publish a Bob as made@1, and load him."""
     publish(registry, CONFIG, parameters or parameters_of(CONFIG), {})
-    return read_bob("made@1", registry.root)
+    return load_bob("made@1", registry.root)
 
 
 def write_training(path, trained, method="ours-residual-her", task="push"):

@@ -15,15 +15,15 @@ from tests.export.policies import CONFIG, MONOLITHIC, SEEN, actor_of, parameters
 
 def networks():
     parameters = parameters_of(CONFIG)
-    bob = TrainedBob("made", numpy_bob(parameters), CONFIG)
+    bob = TrainedBob("made", numpy_bob(parameters), parameters, CONFIG)
     other = parameters_of(MONOLITHIC)
-    alone = TrainedBob("made", numpy_bob(other), MONOLITHIC)
+    alone = TrainedBob("made", numpy_bob(other), other, MONOLITHIC)
     return {
-        "bob": networks_of_bob(bob, parameters)[0],
-        "primitive": networks_of_primitives(bob, parameters)[1],
-        "orchestrator": network_of_orchestrator(bob, parameters, "ours-residual-her", actor_of(residual=True)),
-        "orchestrator of weights alone": network_of_orchestrator(bob, parameters, "ours", actor_of(residual=False)),
-        "monolithic": networks_of_bob(alone, other)[0],
+        "bob": networks_of_bob(bob)[0],
+        "primitive": networks_of_primitives(bob)[1],
+        "orchestrator": network_of_orchestrator(bob, "ours-residual-her", actor_of(residual=True)),
+        "orchestrator of weights alone": network_of_orchestrator(bob, "ours", actor_of(residual=False)),
+        "monolithic": networks_of_bob(alone)[0],
     }
 
 

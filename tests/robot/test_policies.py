@@ -55,4 +55,4 @@ def test_what_is_no_policy_for_a_robot(champion, tmp_path, monkeypatch):
         )(),
     )
     with pytest.raises(TandemError, match="narrow does not take 14 numbers"):
-        load_robot_policy("narrow", BUNDLED)
+        load_robot_policy("panda-cube", BUNDLED)
