@@ -14,7 +14,8 @@ def export(
     policy: Annotated[
         str,
         typer.Argument(
-            metavar="NAME@ALIAS|RUN_DIR", help="Whose Bob; or an orchestrator: published, or the directory of its training."
+            metavar="NAME@ALIAS|RUN_DIR",
+            help="Whose Bob; or an orchestrator, published or in its training.",
         ),
     ],
     format_name: Annotated[str, typer.Option("--format", help="onnx, numpy or torchscript.")],

@@ -23,7 +23,8 @@ if TYPE_CHECKING:
 robot_app = typer.Typer(name="robot", help="Frozen policies on a robot.", cls=CommandGroup, no_args_is_help=True)
 
 _Policy = Annotated[
-    str, typer.Option(metavar="NAME@ALIAS|RUN_DIR", help="Whose Bob, or an orchestrator: published, or the directory of its training.")
+    str,
+    typer.Option(metavar="NAME@ALIAS|RUN_DIR", help="Whose Bob; or an orchestrator, published or in its training."),
 ]
 _Robot = Annotated[
     str, typer.Option(metavar="NAME|FILE", help="mujoco, pybullet, franka, module:function, or a YAML file.")
