@@ -434,6 +434,8 @@ def test_a_phone_need_not_scroll_sideways(own, browser):
     _, home, server = own
     make_hostile(home)
     visit = Visit(browser, server.url, **PHONE)
+    settings = "".join(f"setting_{number}: {number}\n" for number in range(100))
+    (home / "runs" / "cube" / "config.yaml").write_text(settings)
     write_trial(home / "runs", "x" * 100, HOSTILE, "ours", 0, 0.5, made={"primitives": {"name": f"{HOSTILE}@1"}})
     for place, table in (
         ("#/", "Runs"),
@@ -446,11 +448,12 @@ def test_a_phone_need_not_scroll_sideways(own, browser):
         if place == "#/runs/cube":
             visit.points("alice/valid_fraction", 3)
             page.locator("rect.cell").first.wait_for()
+            page.locator(".settings dt").nth(99).wait_for()
         assert (
             page.evaluate("[document.documentElement.scrollWidth, document.body.scrollWidth, innerWidth]") == [360] * 3
         )
         assert page.locator("td").first.evaluate("cell => getComputedStyle(cell).display") == "flex"
-        inner = "[...document.querySelectorAll('.scroll')].every(part => part.scrollWidth <= part.clientWidth)"
+        inner = "[...document.querySelectorAll('.scroll, .settings')].every(part => part.scrollWidth <= part.clientWidth)"
         assert page.evaluate(inner), place
     visit.context.close()
 

@@ -7,6 +7,8 @@ import { library, onTheme, theme } from "./library.js";
 const STEP_MS = 700;
 const SIZES = [4, 14];
 const SCALE = "Viridis";
+const HEIGHT = 420;
+const EYE = { x: 1.3, y: -1.56, z: 0.7 }; // so far away that the titles of the axes are in the picture
 
 export class GoalSpace {
   constructor(signal) {
@@ -87,7 +89,14 @@ export class GoalSpace {
     const all = this.frames.flatMap((frame) => frame.centers_m);
     const range = (i) => [Math.min(...all.map((center) => center[i])) - this.cellSize, Math.max(...all.map((center) => center[i])) + this.cellSize];
     const axis = (title, i) => ({ title: { text: title }, range: i === 2 ? [0, range(2)[1]] : range(i), color: colours.soft, gridcolor: colours.line, zerolinecolor: colours.line, backgroundcolor: "rgba(0,0,0,0)" });
-    const scene = { xaxis: axis("x (m)", 0), yaxis: axis("y (m)", 1), zaxis: axis("height (m)", 2), aspectmode: "data", camera: { eye: { x: 1, y: -1.2, z: 0.6 } }, dragmode: "turntable" };
-    return { uirevision: "turned", scene, height: 420, margin: { l: 0, r: 0, t: 0, b: 0 }, paper_bgcolor: "rgba(0,0,0,0)", font: { color: colours.soft, size: 11 } };
+    const scene = { xaxis: axis("x (m)", 0), yaxis: axis("y (m)", 1), zaxis: axis("height (m)", 2), aspectmode: "data", camera: this.camera(), dragmode: "turntable" };
+    return { uirevision: "turned", scene, height: HEIGHT, margin: { l: 0, r: 0, t: 0, b: 0 }, paper_bgcolor: "rgba(0,0,0,0)", font: { color: colours.soft, size: 11 } };
+  }
+
+  /** Where one looks from at first: further away where the picture is narrow, as on a phone. */
+  camera() {
+    const far = Math.max(1, (1.25 * HEIGHT) / (this.canvas.clientWidth || HEIGHT));
+    const eye = Object.fromEntries(Object.entries(EYE).map(([axis, value]) => [axis, far * value]));
+    return { eye, center: { x: 0, y: 0, z: -0.12 } };
   }
 }
