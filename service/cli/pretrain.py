@@ -226,6 +226,11 @@ def demo(
 
     paths = (Path("runs") / f"demo-{number}" for number in count(1))
     path = run_dir or next(path for path in paths if not path.exists())
+    if RunDirectory(path).exists:
+        raise TandemError(
+            f"{path} holds a run already, and a demo begins a new one: leave --run-dir out, or name another; or "
+            f"{how_to_go_on(path, path / 'registry')}"
+        )
     typer.echo("A robot arm is about to teach itself: Alice proposes goals, Bob learns to reach them.")
     overrides = [f"run.total_env_steps={env_steps}", "name=panda-cube-demo"]
     config = load_config(recipes()[DEFAULT_RECIPE], overrides)
@@ -237,9 +242,11 @@ def demo(
     typer.echo(f"  tandem evaluate --primitives {CHAMPION} --goals mixed --episodes 300")
     typer.echo(f"  tandem render   --primitives {CHAMPION} --out champion.mp4")
     typer.echo(f"  tandem coverage --primitives {CHAMPION} --out champion.png")
+    typer.echo(f"  tandem play     --primitives {CHAMPION}")
     typer.echo(f"  {shlex.join(['tandem', 'serve', '--runs', str(path.parent)])}")
-    if find_spec("fastapi") is None:
-        typer.echo("The last one needs: pip install 'tandem-skills[serve]'")
+    missing = [extra for extra, package in (("play", "viser"), ("serve", "fastapi")) if find_spec(package) is None]
+    if missing:
+        typer.echo(f"tandem {' and '.join(missing)} need: pip install 'tandem-skills[{','.join(missing)}]'")
 
 
 def _in_words(done: Pretrained) -> str:

@@ -23,7 +23,6 @@ from service.downstream.files import (
     FORMAT_VERSION,
     RESULT_FILE,
     TRIAL,
-    TRIAL_FILE,
     made_with,
     read_json,
     write_json,
@@ -34,6 +33,7 @@ from service.io.checkpoints import Checkpoint, CheckpointStore
 from service.io.files import TEMPORARY_PREFIX, check_regular, os_errors, remove_temporaries
 from service.io.jsonl import JsonlWriter
 from service.io.lock import LOCK_FILE, DirectoryLock
+from service.io.run_directory import TRIAL_FILE
 from service.types import Arrays
 
 _ELSEWHERE = "name another directory (--run-dir, of a table --runs)"

@@ -13,7 +13,7 @@ from service.io.files import os_errors, write_atomic
 from service.parsing import ParseError, parse_json
 from service.regular_files import read_regular
 
-TRIAL_FILE, RESULT_FILE = "cell.json", "result.json"
+RESULT_FILE = "result.json"
 FORMAT_VERSION = 1
 """Version of both, and of the table's files."""
 TRIAL = "cell"

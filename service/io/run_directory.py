@@ -58,6 +58,8 @@ _logger = logging.getLogger(__name__)
 MAX_DIVERGED_FILES = 100
 MAX_NOTE_BYTES = 10_000
 RECORDINGS = "recordings"
+TRIAL_FILE = "cell.json"
+"""Settings of a downstream training: its directory is another kind than that of a run."""
 MAX_RECORDINGS = 20
 
 
@@ -110,6 +112,11 @@ class RunDirectory:
         Raises:
             ConfigError: no run here, or its configuration cannot be read.
         """
+        if not self.exists and (self.path / TRIAL_FILE).exists():
+            raise ConfigError(
+                f"{self.path} is a downstream training, not a run of tandem pretrain: name it to tandem downstream "
+                "evaluate, render, play or publish"
+            )
         if not self.exists:
             raise ConfigError(f"no run in {self.path}: {self.config_file.name} is missing; name the directory of a run")
         return load_config(self.config_file, overrides, recorded=True)

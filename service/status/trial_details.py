@@ -11,9 +11,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from service.config import WorldConfig
-from service.downstream.files import TRIAL_FILE, made_with
+from service.downstream.files import made_with
 from service.errors import TandemError
 from service.io.lock import holder
+from service.io.run_directory import TRIAL_FILE
 from service.status.schemas import RunCommand, RunSetup
 from service.store.models import ACTIVE, RunStatus
 from service.store.trial_reader import read_trial_settings

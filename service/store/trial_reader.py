@@ -10,9 +10,10 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
-from service.downstream.files import RESULT_FILE, TRIAL, TRIAL_FILE, read_json, read_result
+from service.downstream.files import RESULT_FILE, TRIAL, read_json, read_result
 from service.errors import TRACEBACK_PREFIX, TandemError
 from service.io.lock import is_locked
+from service.io.run_directory import TRIAL_FILE
 from service.store.disk import read_published
 from service.store.models import RunState, RunStatus, Trial
 from service.store.tail import RecordFile

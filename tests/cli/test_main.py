@@ -186,6 +186,11 @@ def test_demo_is_a_short_pretraining_with_a_registry_of_its_own(monkeypatch, tmp
     tandem("demo", "--env-steps", "8")
     one, two = Path("runs/demo-1"), Path("runs/demo-2")
     assert asked == [("panda-cube-demo", 7, one, one / "registry"), ("panda-cube-demo", 8, two, two / "registry")]
+    (one / "config.yaml").touch()
+    refused = tandem("demo", "--run-dir", one)
+    assert refused.exit_code == 2
+    hint = "leave --run-dir out, or name another; or continue with: tandem pretrain --resume --run-dir runs/demo-1"
+    assert_one_line(refused.stderr, hint, "runs/demo-1/registry")
 
 
 def test_demo_ends_with_what_comes_with_tandem_and_what_to_type(monkeypatch, tmp_path):
@@ -210,7 +215,7 @@ def test_demo_ends_with_what_comes_with_tandem_and_what_to_type(monkeypatch, tmp
     assert f"\n  {champion} (bundled) " in shown
     assert "\n  idle " in shown
     commands = [shlex.split(line)[1:] for line in re.findall(r"^ +(tandem .*)$", shown, re.MULTILINE)]
-    assert [command[0] for command in commands] == ["evaluate", "render", "coverage", "serve"]
+    assert [command[0] for command in commands] == ["evaluate", "render", "coverage", "play", "serve"]
     assert commands[-1] == ["serve", "--runs", "runs"]
     assert "Bob has practised for 7 steps, and now reaches 12% of random goals on the table and 3% " in shown
     evaluated = tandem(*commands[0])

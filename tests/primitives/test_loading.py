@@ -130,6 +130,10 @@ def test_a_directory_without_a_run(tmp_path):
     with pytest.raises(TandemError) as error:
         load_bob(str(tmp_path), tmp_path)
     assert_one_line(error.value, "no run in", tmp_path)
+    (tmp_path / "cell.json").touch()
+    with pytest.raises(TandemError) as error:
+        load_bob(str(tmp_path), tmp_path)
+    assert_one_line(error.value, "is a downstream training", "tandem downstream evaluate, render, play or publish")
 
 
 def test_a_run_without_a_checkpoint(tmp_path):
