@@ -454,7 +454,7 @@ def test_a_phone_need_not_scroll_sideways(own, browser):
             page.evaluate("[document.documentElement.scrollWidth, document.body.scrollWidth, innerWidth]") == [360] * 3
         )
         assert page.locator("td").first.evaluate("cell => getComputedStyle(cell).display") == "flex"
-        inner = "[...document.querySelectorAll('.scroll, .settings')].every(part => part.scrollWidth <= part.clientWidth)"
+        inner = "[...document.querySelectorAll('.scroll, .settings')].every(one => one.scrollWidth <= one.clientWidth)"
         assert page.evaluate(inner), place
     visit.context.close()
 
