@@ -381,8 +381,9 @@ def test_a_run_that_does_not_exist_yet(own):
     visit, home, _ = own
     page = visit.go("#/runs/soon").page
     page.get_by_text("No run 'soon' in").wait_for()
-    write_status(home / "runs", "soon")
+    write_status(home / "runs", "soon", name="elsewhere", published="elsewhere@1")
     page.get_by_role("heading", name="soon running").wait_for()
+    page.get_by_text("The registry of this service has no version of elsewhere.").wait_for()
 
 
 def test_nothing_yet(browser, tmp_path):
@@ -453,7 +454,7 @@ def test_a_phone_need_not_scroll_sideways(own, browser):
             page.evaluate("[document.documentElement.scrollWidth, document.body.scrollWidth, innerWidth]") == [360] * 3
         )
         assert page.locator("td").first.evaluate("cell => getComputedStyle(cell).display") == "flex"
-        inner = "[...document.querySelectorAll('.scroll, .settings')].every(part => part.scrollWidth <= part.clientWidth)"
+        inner = "[...document.querySelectorAll('.scroll, .settings')].every(one => one.scrollWidth <= one.clientWidth)"
         assert page.evaluate(inner), place
     visit.context.close()
 

@@ -58,7 +58,7 @@ export class Versions {
       if (!runs) this.show(await publishers(signal), new Map());
     } catch (error) {
       if (!(error instanceof ApiError) || error.status === 0) throw error;
-      const text = error.status === 404 ? `No version of ${this.name} is published yet.` : sentence(error.message);
+      const text = error.status === 404 ? `The registry of this service has no version of ${this.name}.` : sentence(error.message);
       this.body.replaceChildren(note(text));
     }
   }
