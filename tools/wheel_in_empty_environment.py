@@ -119,7 +119,7 @@ def _serve(command: list[str], url: str, here: Path) -> None:
         else:
             sys.exit(f"nothing at {url} after {WAIT_S} s")
         server.send_signal(signal.SIGINT)
-        if code := server.wait(timeout=WAIT_S):
+        if (code := server.wait(timeout=WAIT_S)) not in (0, 130):  # 130: ended by Ctrl-C, as shells have it
             sys.exit(f"{' '.join(command)} ended with {code}")
     print(f"{time.monotonic() - begun_s:7.1f} s  {' '.join(command[1:])}: {size:,} bytes at {url}", flush=True)
 

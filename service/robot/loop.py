@@ -43,7 +43,7 @@ class BridgeConfig(FrozenModel):
         10, ge=1, le=100, description="of a control step, evenly spread: 10 are 250 a second; 1 is a jump, as training"
     )
     pace: float = Field(
-        0.65,
+        0.7,
         gt=0.0,
         le=1.0,
         description="share of an action's way that is commanded. Behind a bound on acceleration an arm turns late, and "
