@@ -103,6 +103,7 @@ class Bridge:
         self._gain = config.pace * np.array(gain)
         self._layout = layouts(world).positions
         self._num_commands = world.observed.num_commands
+        self._blocked = world.gripper == "blocked"
         self._step_s = world.physics_step_s * world.num_substeps
         self._tick_s = self._step_s / config.set_points_per_step
         box = config.safety.box(world.workspace)
@@ -179,7 +180,8 @@ class Bridge:
         action = np.clip(action, -1.0, 1.0)
         commands.appendleft(action)
         target_m = state.effector_m + DISPLACEMENT_M * self._gain * action[:3]
-        width_m = float(state.fingers_m.sum() + WIDTH_CHANGE_M * action[3])
+        # What a policy of a gripper held closed says of its width never meant anything.
+        width_m = 0.0 if self._blocked else float(state.fingers_m.sum() + WIDTH_CHANGE_M * action[3])
         row |= {"target_m": target_m, "tick_times_s": [], "set_points_m": [], "measured_m": []}
         num = self._config.set_points_per_step
         for tick in range(num):

@@ -64,6 +64,12 @@ def test_observations_come_as_many_steps_late_as_asked():
     np.testing.assert_allclose(bridge._policy.seen[0][:3], rows[5]["effector_m"], atol=1e-6)
 
 
+def test_a_gripper_that_was_held_closed_in_training_stays_closed():
+    robot, _, rows, _ = played(BridgeConfig(), WorldConfig(gripper="blocked"))
+    assert rows[-1]["action"][3] > 0.0  # it asks to open
+    assert {command.width_m for _, command in robot.commands[: 5 * 10]} == {0.0}
+
+
 def test_steps_are_40_ms_and_end_at_rest():
     robot, _, rows, bridge = played(BridgeConfig(set_points_per_step=4), num_steps=3)
     np.testing.assert_allclose([row["time_s"] for row in rows], [0.0, 0.04, 0.08], atol=1e-9)
