@@ -8,7 +8,7 @@ from service.errors import ConfigError
 from service.robot.errors import RobotError
 from service.robot.loop import Bridge, BridgeConfig
 from service.robot.safety import SafeRobot, SafetyConfig
-from tests.robot.fakes import HOME_M, OBJECT_M, FakeRobot
+from tests.robot.fakes import HOME_M, OBJECT_M, FakeRobot, Steady
 
 WORLD = WorldConfig()
 CONFIG = BridgeConfig(set_points_per_step=5)
@@ -215,11 +215,3 @@ def test_an_action_means_a_way_from_where_the_gripper_is_measured():
 def test_a_box_with_nothing_in_it(wrong, match):
     with pytest.raises(ConfigError, match=match):
         SafetyConfig(**wrong).box(WORLD.workspace)
-
-
-class Steady:
-    def __init__(self, action):
-        self.action = np.array([action], dtype=np.float32)
-
-    def act_deterministic(self, observation):
-        return self.action
