@@ -23,7 +23,7 @@ FAULTS = {
     "late": "late: a step came",
     "frozen pose": "the object's pose is frozen",
     "ageing pose": "the object's newest pose is",
-    "unseen": "the object's newest pose is",
+    "unseen": "the object is not seen",
     "jumping pose": "the object's pose jumps",
     "early pose": "set the clocks alike",
     "switch": "the dead-man's switch was let go",
@@ -36,7 +36,6 @@ FAULTS = {
 ALLOWED_S = {
     "stale state": CONFIG.safety.watch.max_state_age_s,
     "ageing pose": CONFIG.safety.watch.max_pose_age_s / 0.9,  # its age grows by 0.9 s in a second
-    "unseen": CONFIG.safety.watch.max_pose_age_s,
 }
 """What a measurement may be late by before that is a fault."""
 
