@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from datetime import UTC, datetime
 
+import mujoco
 import numpy as np
 
 import service
@@ -24,6 +25,7 @@ from service.envs.observations import (
 )
 from service.envs.reach import Reach
 from service.envs.robot import described
+from service.envs.scene import FIXTURE_PREFIX
 from service.export.description import (
     ActionEntry,
     ArrayEntry,
@@ -32,6 +34,7 @@ from service.export.description import (
     Description,
     FieldEntry,
     Fingers,
+    FixtureEntry,
     Home,
     Made,
     NetworkEntry,
@@ -93,7 +96,7 @@ def describe(
     robot, seen, workspace = described(world), layouts(world), world.workspace
     with WorldBatch(world, 1) as worlds:
         joints = dict(zip(robot.joints, map(float, worlds.joints[0]), strict=True))
-        effector_m, reach = worlds.ee_position[0], worlds.reach
+        effector_m, reach, fixtures = worlds.ee_position[0], worlds.reach, _fixtures(worlds.model)
         width_m = float(worlds.robot.openings(worlds.states[:, worlds.layout["fingers"]]).sum())
     return Description(
         name=name,
@@ -144,10 +147,26 @@ def describe(
             friction=world.friction,
             pad_friction=world.pad_friction,
         ),
+        fixtures=fixtures,
         success_distance_m=success_distance_m,
         measured=measured,
         tolerated_late_steps=measured.tolerated_late_steps,
     )
+
+
+def _fixtures(model: mujoco.MjModel) -> tuple[FixtureEntry, ...]:
+    """Fixtures that do not move from episode to episode."""
+    data, found = mujoco.MjData(model), []
+    mujoco.mj_kinematics(model, data)
+    for geom in range(model.ngeom):
+        name = model.geom(geom).name
+        if not name.startswith(FIXTURE_PREFIX) or model.body_mocapid[model.geom_bodyid[geom]] >= 0:
+            continue
+        turn, (middle, half) = data.geom_xmat[geom].reshape(3, 3), model.geom_aabb[geom].reshape(2, 3)
+        middle, half = data.geom_xpos[geom] + turn @ middle, np.abs(turn) @ half
+        corners = _vector((middle - half).round(6)), _vector((middle + half).round(6))
+        found.append(FixtureEntry(name=name.removeprefix(FIXTURE_PREFIX), lower_m=corners[0], upper_m=corners[1]))
+    return tuple(found)
 
 
 def _network(file: str, network: Network, differences: Differences) -> NetworkEntry:

@@ -107,7 +107,7 @@ class Fingers(FrozenModel):
 
 
 class Box(FrozenModel):
-    """The box in which goals and objects were in training."""
+    """A box along the axes of the world."""
 
     lower_m: Vector
     upper_m: Vector
@@ -121,6 +121,12 @@ class TrainedObject(FrozenModel):
     mass_kg: float
     friction: float
     pad_friction: float = Field(description="of the fingertips on it")
+
+
+class FixtureEntry(Box):
+    """A part of what stands on the table and cannot be moved, by the upright box around it."""
+
+    name: str = Field(description="of the task's, or NUMBER-PIECE of world.fixtures, both from 0")
 
 
 class Made(FrozenModel):
@@ -154,8 +160,11 @@ class Description(FrozenModel):
     home: Home
     clips: Clips
     gripper: Fingers
-    workspace: Box
+    workspace: Box = Field(description="in which goals and objects were in training")
     object: TrainedObject
+    fixtures: tuple[FixtureEntry, ...] = Field(
+        (), description="that stand where they stand in every episode; the box of the task box is elsewhere in each"
+    )
     success_distance_m: float
     measured: Measured
     tolerated_late_steps: int

@@ -25,7 +25,7 @@ _NEEDS = {
 
 def make_readme(about: Description) -> str:
     """The text of the README."""
-    sections = (_networks, _how_to_run, _observation, _action, _arm, _late, _training)
+    sections = (_networks, _how_to_run, _observation, _action, _arm, _late, _training, _fixtures)
     return "\n\n".join(text for section in sections for text in section(about)) + "\n"
 
 
@@ -203,6 +203,18 @@ def _training(about: Description) -> Iterator[str]:
         f"tip at {home} m and the gripper open by {1e3 * about.home.width_m:.0f} mm."
         + ("" if about.task is None else f" The task: {about.task}.")
     )
+
+
+def _fixtures(about: Description) -> Iterator[str]:
+    if about.fixtures:
+        yield "These stand on the table, here by the upright boxes around them; it does not see them:"
+        yield _table(
+            ("fixture", "x, m", "y, m", "z, m"),
+            (
+                (each.name, *(f"{low:g} to {high:g}" for low, high in zip(each.lower_m, each.upper_m, strict=True)))
+                for each in about.fixtures
+            ),
+        )
 
 
 def _spread(title: str, values: Distribution) -> tuple[str, ...]:

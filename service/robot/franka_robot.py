@@ -249,8 +249,13 @@ def connect(world: WorldConfig, parameters: Mapping[str, Any]) -> Backend:
     """Make the back-end ``franka``.
 
     Raises:
-        TandemError: the library is not installed, unknown parameters, no such pose source, or no answer.
+        TandemError: a policy of another arm, the library is not installed, unknown parameters, no such pose source, or
+            no answer.
     """
+    if world.robot != "panda":
+        raise TandemError(
+            f"robot franka: the policy was trained with the arm {world.robot.name!r}; take one of the panda"
+        )
     try:
         given = FrankaParameters.model_validate(dict(parameters))
     except ValidationError as error:

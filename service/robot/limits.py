@@ -41,7 +41,8 @@ class SetPointLimiter:
 
     It can always stop inside the box: the point where braking along the present velocity would end, ``v^2 / 2a`` ahead,
     is inside before and after every move. If a wanted velocity would end that, it is mixed with braking until it does
-    not; braking alone never does, as its end stays where it was, and a box is convex.
+    not; braking alone never does, as its end stays where it was, and a box is convex. One that starts outside comes in
+    within its bounds, too, and stays inside from then on.
 
     Args:
         box: of the set-point.
@@ -56,10 +57,12 @@ class SetPointLimiter:
         """(3,) the set-point."""
         self.velocity_m_s: StateArray = np.zeros(3)
         """(3,) with which it came there."""
+        self._allowed = box
 
     def start(self, position_m: StateArray) -> None:
-        """Rest at a point, which is moved into the box."""
-        self.position_m, self.velocity_m_s = self.box.clip(position_m), np.zeros(3)
+        """Rest at a point; one outside the box is come back from, without a jump."""
+        self.position_m, self.velocity_m_s = np.array(position_m), np.zeros(3)
+        self._allowed = Box(np.minimum(self.box.lower_m, position_m), np.maximum(self.box.upper_m, position_m))
 
     @property
     def is_still(self) -> bool:
@@ -96,19 +99,22 @@ class SetPointLimiter:
         braking = _shortened(-self.velocity_m_s, most)
         share = 1.0
         for _ in range(_NUM_HALVINGS):
-            if self._can_stop(self.velocity_m_s + share * change + (1.0 - share) * braking, gap_s):
+            if self._can_stop(self.velocity_m_s + share * change + (1.0 - share) * braking, gap_s, self._allowed):
                 break
             share /= 2
         else:
             share = 0.0
         self.velocity_m_s = self.velocity_m_s + share * change + (1.0 - share) * braking
         # The box holds to the last bit, too.
-        self.position_m = self.box.clip(self.position_m + self.velocity_m_s * gap_s)
+        self.position_m = self._allowed.clip(self.position_m + self.velocity_m_s * gap_s)
+        if self._allowed is not self.box and self.box.contains(self.position_m):
+            came_in = self._can_stop(self.velocity_m_s, 0.0, self.box)
+            self._allowed = self.box if came_in else self._allowed
         return self.position_m
 
-    def _can_stop(self, velocity: StateArray, gap_s: float) -> bool:
+    def _can_stop(self, velocity: StateArray, gap_s: float, box: Box) -> bool:
         ahead_s = gap_s + _length(velocity) / (2.0 * self._max_acceleration)
-        return self.box.contains(self.position_m + velocity * ahead_s)
+        return box.contains(self.position_m + velocity * ahead_s)
 
 
 def _length(vector: StateArray) -> float:

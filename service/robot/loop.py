@@ -9,6 +9,7 @@ its delay. A robot that is late itself is commanded from where it was seen, whic
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -31,7 +32,8 @@ Record = Callable[[dict[str, Any]], None]
 _Seen = tuple[RobotState, StateArray]
 """The robot as it was when the object was seen at (3,) metres."""
 
-_MAX_SETTLE_S = 1.0
+_MORE_SETTLE_S = 0.5
+"""Beyond the time that braking from the greatest speed takes."""
 _KEPT_STATES = 16
 """States of the robot that an object's pose may belong to, one a control step."""
 
@@ -103,6 +105,7 @@ class Bridge:
         self._gain = config.pace * np.array(gain)
         self._layout = layouts(world).positions
         self._num_commands = world.observed.num_commands
+        self._blocked = world.gripper == "blocked"
         self._step_s = world.physics_step_s * world.num_substeps
         self._tick_s = self._step_s / config.set_points_per_step
         box = config.safety.box(world.workspace)
@@ -179,7 +182,8 @@ class Bridge:
         action = np.clip(action, -1.0, 1.0)
         commands.appendleft(action)
         target_m = state.effector_m + DISPLACEMENT_M * self._gain * action[:3]
-        width_m = float(state.fingers_m.sum() + WIDTH_CHANGE_M * action[3])
+        # What a policy of a gripper held closed says of its width never meant anything.
+        width_m = 0.0 if self._blocked else float(state.fingers_m.sum() + WIDTH_CHANGE_M * action[3])
         row |= {"target_m": target_m, "tick_times_s": [], "set_points_m": [], "measured_m": []}
         num = self._config.set_points_per_step
         for tick in range(num):
@@ -196,7 +200,9 @@ class Bridge:
     def _settle(self, now_s: float) -> None:
         """Bring the set-point to rest with the gripper as wide as it is."""
         width_m = float(self.safe.state.fingers_m.sum())
-        for tick in range(1, int(_MAX_SETTLE_S / self._tick_s)):
+        safety = self._config.safety
+        most_s = safety.max_speed_m_s / safety.max_acceleration_m_s2 + _MORE_SETTLE_S
+        for tick in range(1, math.ceil(most_s / self._tick_s)):
             self.safe.brake(width_m)
             if self.safe.limiter.is_still:
                 return

@@ -16,7 +16,9 @@ class WatchConfig(FrozenModel):
     """How old and how wrong measurements may be before the robot is stopped."""
 
     max_pose_age_s: float = Field(0.15, gt=0.0, le=2.0, description="of the newest pose that can be believed")
-    max_frozen_s: float = Field(0.08, gt=0.0, le=2.0, description="for which poses may keep the same time stamp")
+    max_frozen_s: float = Field(
+        0.08, gt=0.0, le=2.0, description="for which poses may keep the same time stamp, or be missing"
+    )
     max_object_speed_m_s: float = Field(3.0, gt=0.0, le=100.0, description="a cube that falls from 35 cm has 2.6")
     jump_allowance_m: float = Field(0.05, ge=0.0, le=1.0, description="added to what that speed allows: noise")
     max_jump_s: float = Field(0.08, gt=0.0, le=2.0, description="for which poses that jump are passed over")
@@ -57,6 +59,7 @@ class PoseWatch:
         """When that was measured."""
         self._stamp_s, self._new_s = -np.inf, -np.inf
         self._jumping_since_s: float | None = None
+        self._missing_since_s: float | None = None
         self._gap_s = 0.0
 
     def check(self, pose: ObjectPose, now_s: float) -> str | None:
@@ -70,6 +73,8 @@ class PoseWatch:
             return "the object is not seen"
         if now_s - self._new_s > self._config.max_frozen_s:
             return f"the object's pose is frozen: no new one for {1e3 * (now_s - self._new_s):.0f} ms"
+        if self._missing_since_s is not None and now_s - self._missing_since_s > self._config.max_frozen_s:
+            return f"the object is not seen, for {1e3 * (now_s - self._missing_since_s):.0f} ms already"
         if self._jumping_since_s is not None and now_s - self._jumping_since_s > self._config.max_jump_s:
             return f"the object's pose jumps, for {1e3 * (now_s - self._jumping_since_s):.0f} ms already"
         if now_s - self.time_s > self._config.max_pose_age_s:
@@ -78,7 +83,9 @@ class PoseWatch:
 
     def _take(self, pose: ObjectPose, now_s: float) -> None:
         if not np.isfinite(pose.position_m).all():
+            self._missing_since_s = now_s if self._missing_since_s is None else self._missing_since_s
             return
+        self._missing_since_s = None
         if np.isfinite(self.time_s):
             far_m = float(np.linalg.norm(pose.position_m - self.position_m))
             if self._jumping_since_s is None:

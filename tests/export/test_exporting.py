@@ -125,6 +125,8 @@ def test_an_orchestrator_with_its_primitives(run, registry, tmp_path, monkeypatc
     assert (about["name"], about["task"]) == ("wall-ours-residual-her-0 with made@1", "wall")
     assert [each["file"] for each in about["networks"]] == ["policy.pt", "primitive_0.pt", "primitive_1.pt"]
     assert about["home"]["effector_m"][2] == pytest.approx(0.12, abs=1e-3)  # of the task's world
+    assert about["fixtures"] == [{"lower_m": [-0.055, -0.175, 0.0], "upper_m": [-0.045, 0.175, 0.07], "name": "wall"}]
+    assert "| wall | -0.055 to -0.045 |" in (tmp_path / "out" / "README.md").read_text()
     assert set(about["made"]["sha256"]) == {"orchestrator", "primitives"}
     (program,) = programs(tmp_path / "out")
     monkeypatch.chdir(tmp_path / "out")

@@ -83,3 +83,13 @@ class FakePoses:
 
     def close(self):
         pass
+
+
+class Steady:
+    """A policy of one action."""
+
+    def __init__(self, action):
+        self.action = np.array([action], dtype=np.float32)
+
+    def act_deterministic(self, observation):
+        return self.action

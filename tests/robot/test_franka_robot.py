@@ -8,6 +8,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from service.envs import panda
 from service.errors import TandemError
 from service.robot.backends import BackendConfig, connect
 from service.robot.errors import RobotError
@@ -239,6 +240,12 @@ def test_a_missing_library_or_address_is_told_in_one_line(monkeypatch):
         with pytest.raises(TandemError, match=message) as caught:
             connect(BackendConfig(backend="franka", parameters=parameters), WorldConfig())
         assert "\n" not in str(caught.value)
+
+
+def test_a_policy_of_another_arm_is_refused():
+    other = WorldConfig.model_construct(robot=panda.PANDA.model_copy(update={"name": "my-arm"}))
+    with pytest.raises(TandemError, match="the policy was trained with the arm 'my-arm'"):
+        connect(BackendConfig(backend="franka", parameters={"host": "a"}), other)
 
 
 def test_the_library_has_what_is_called():

@@ -41,6 +41,19 @@ def test_ten_thousand_adversarial_targets_never_leave_the_bounds():
     assert 12.9 < hardest <= 13.0 * (1 + 1e-6)
 
 
+def test_from_outside_it_comes_in_without_a_jump_and_stays_inside():
+    limiter = SetPointLimiter(BOX, 1.7, 13.0)
+    begin = np.array([-0.21, 0.0, 0.004])
+    limiter.start(begin)
+    way = np.array([begin, begin, *(limiter.move(np.array([-1.0, 0.1, -1.0]), 0.04, 0.004) for _ in range(100))])
+    assert np.linalg.norm(np.diff(way, 2, axis=0), axis=1).max() <= 13.0 * 0.004**2 * (1 + 1e-6)
+    assert BOX.contains(way[-1], margin_m=1e-6)
+    limiter.move(np.array([0.0, 0.1, 0.1]), 0.04, 0.004)
+    for _ in range(200):
+        way = limiter.move(np.array([-1.0, -1.0, -1.0]), 0.04, 0.004)
+    assert BOX.contains(way)
+
+
 def test_a_way_within_the_bounds_takes_its_time_and_no_longer():
     limiter = SetPointLimiter(BOX, 100.0, 1e6)
     limiter.start(np.array([0.0, 0.0, 0.1]))

@@ -6,7 +6,7 @@ from service.config import WorldConfig
 from service.envs.observations import Layouts, layouts
 from service.robot.interface import RobotState
 from service.robot.loop import Bridge, BridgeConfig, observe
-from tests.robot.fakes import HOME_M, OBJECT_M, FakeRobot
+from tests.robot.fakes import HOME_M, OBJECT_M, FakeRobot, Steady
 
 GOAL_M = np.array([0.0, 0.1, 0.2])
 
@@ -64,12 +64,27 @@ def test_observations_come_as_many_steps_late_as_asked():
     np.testing.assert_allclose(bridge._policy.seen[0][:3], rows[5]["effector_m"], atol=1e-6)
 
 
+def test_a_gripper_that_was_held_closed_in_training_stays_closed():
+    robot, _, rows, _ = played(BridgeConfig(), WorldConfig(gripper="blocked"))
+    assert rows[-1]["action"][3] > 0.0  # it asks to open
+    assert {command.width_m for _, command in robot.commands[: 5 * 10]} == {0.0}
+
+
 def test_steps_are_40_ms_and_end_at_rest():
     robot, _, rows, bridge = played(BridgeConfig(set_points_per_step=4), num_steps=3)
     np.testing.assert_allclose([row["time_s"] for row in rows], [0.0, 0.04, 0.08], atol=1e-9)
     np.testing.assert_allclose(rows[1]["tick_times_s"], [0.04, 0.05, 0.06, 0.07], atol=1e-9)
     assert bridge.safe.limiter.is_still
     assert len(robot.commands) > 12  # it braked
+
+
+def test_it_comes_to_rest_however_slowly_it_may_brake():
+    slow = BridgeConfig(set_points_per_step=4, safety={"max_acceleration_m_s2": 0.05})
+    robot, policy = FakeRobot(), Steady([-1.0, 0.0, 0.0, 0.0])
+    bridge = Bridge(policy, robot, robot.poses, WorldConfig(), slow)
+    bridge.run(GOAL_M, 60)
+    assert len(robot.commands) > 60 * 4 + 100  # braking took more than a second
+    assert bridge.safe.limiter.is_still
 
 
 def test_a_policy_that_observes_its_delay_and_commands_is_told():

@@ -8,7 +8,7 @@ from service.errors import ConfigError
 from service.robot.errors import RobotError
 from service.robot.loop import Bridge, BridgeConfig
 from service.robot.safety import SafeRobot, SafetyConfig
-from tests.robot.fakes import HOME_M, OBJECT_M, FakeRobot
+from tests.robot.fakes import HOME_M, OBJECT_M, FakeRobot, Steady
 
 WORLD = WorldConfig()
 CONFIG = BridgeConfig(set_points_per_step=5)
@@ -23,7 +23,7 @@ FAULTS = {
     "late": "late: a step came",
     "frozen pose": "the object's pose is frozen",
     "ageing pose": "the object's newest pose is",
-    "unseen": "the object's newest pose is",
+    "unseen": "the object is not seen",
     "jumping pose": "the object's pose jumps",
     "early pose": "set the clocks alike",
     "switch": "the dead-man's switch was let go",
@@ -36,7 +36,6 @@ FAULTS = {
 ALLOWED_S = {
     "stale state": CONFIG.safety.watch.max_state_age_s,
     "ageing pose": CONFIG.safety.watch.max_pose_age_s / 0.9,  # its age grows by 0.9 s in a second
-    "unseen": CONFIG.safety.watch.max_pose_age_s,
 }
 """What a measurement may be late by before that is a fault."""
 
@@ -215,11 +214,3 @@ def test_an_action_means_a_way_from_where_the_gripper_is_measured():
 def test_a_box_with_nothing_in_it(wrong, match):
     with pytest.raises(ConfigError, match=match):
         SafetyConfig(**wrong).box(WORLD.workspace)
-
-
-class Steady:
-    def __init__(self, action):
-        self.action = np.array([action], dtype=np.float32)
-
-    def act_deterministic(self, observation):
-        return self.action
