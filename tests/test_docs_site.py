@@ -4,6 +4,7 @@ import re
 import shlex
 from pathlib import Path
 
+import numpy as np
 import pytest
 import typer
 from typer.testing import CliRunner
@@ -11,6 +12,7 @@ from typer.testing import CliRunner
 import service
 from service.cli.main import app
 from service.config import Config
+from tests.downstream.trials import SETS
 from tools import docs_reference
 from tools.docs_site import SiteError, build
 
@@ -137,6 +139,38 @@ def test_start_here_measures_what_comes_with_tandem(tmp_path, monkeypatch):
     result = CliRunner().invoke(app, [*words[:-1], "4", "--json"])
     assert result.exit_code == 0, result.output
     assert '"num_episodes": 4' in result.stdout
+
+
+def test_start_heres_task_is_learned_measured_and_loaded(tmp_path, monkeypatch):
+    """Its commands, in order, with a tiny training; then what downstream.md does with the result."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("service.downstream.worker._record_video", lambda *arguments: None)
+    small = {"train": [*SETS, "--steps", "600", "--threads", "1"], "evaluate": []}
+    typed = [words for words in commands(START) if words[0] == "downstream" and words[1] in small]
+    assert [words[1] for words in typed] == ["train", "evaluate"]
+    for words in typed:
+        result = CliRunner().invoke(app, [*words, *small[words[1]], "--episodes", "2"])
+        assert result.exit_code == 0, result.output
+    *_, load = blocks((ROOT / "docs" / "downstream.md").read_text(), "python")
+    assert '"wall-orchestrator@best"' in load
+    code = load.replace("wall-orchestrator@best", typed[1][-1])
+    names = {"observation": np.zeros((3, 14), np.float32)}
+    exec(compile(code, "downstream.md", "exec"), names)
+    assert names["action"].shape == (3, 4)
+
+
+def test_the_readmes_snippets_run(capsys):
+    measure, world, act = blocks((ROOT / "README.md").read_text(), "python")
+    names = {"positions": np.zeros((2, 11)), "positions_and_goal": np.zeros((2, 14))}
+    assert '"mixed", 100' in measure
+    exec(compile(measure.replace('"mixed", 100', '"mixed", 4'), "README.md", "exec"), names)
+    assert re.match(r"Bob takes the cube to \d+% of them, within \d\.\d{3} m", capsys.readouterr().out)
+    exec(compile(world, "README.md", "exec"), names)
+    assert names["observation"]["observation"].shape == (11,)
+    names["weights"] = np.ones((2, names["bob"].primitives.num_primitives))
+    exec(compile(act, "README.md", "exec"), names)
+    assert names["means"].shape == (2, names["weights"].shape[1], 4)
+    assert names["action"].shape == (2, 4)
 
 
 def test_start_here_runs_as_a_program(tmp_path, monkeypatch, capsys):

@@ -163,6 +163,9 @@ def test_a_missing_value_is_a_gap_and_a_new_one_is_drawn(browser, tmp_path):
     with serve(tmp_path) as server:
         visit = Visit(browser, server.url).go("#/runs/cube")
         assert visit.points("bob/success_rate", 5)[3:] == [(4000, None), (5000, 0.625)]
+        (dot,) = visit.traces("bob/success_rate alone")  # which no line goes to
+        assert (dot["x"], dot["y"]) == ([5000], [0.625])
         append(tmp_path / "runs", "cube", record(6))
         assert visit.points("bob/success_rate", 6)[5] == (6000, 0.75)
+        assert visit.traces("bob/success_rate alone") == []
         visit.context.close()

@@ -133,8 +133,9 @@ export class Panel {
     const raw = curve.low ? extremes(x, curve.low, curve.high) : { x, y: curve.mean };
     const alone = board.span <= 1;
     const thin = { ...common, ...raw, mode: "lines", opacity: alone ? 0.9 : 0.28, line: { color: colour, width: alone ? 1.4 : 1 } };
-    if (raw.y.length === 1) Object.assign(thin, { mode: "markers", marker: { color: colour } });
-    return alone ? [thin] : [thin, { ...common, x, y: smooth, mode: "lines", line: { color: colour, width: 2 } }];
+    const lone = known.filter((i) => (curve.mean[i - 1] ?? null) === null && (curve.mean[i + 1] ?? null) === null); // a line does not show them
+    const dots = { ...common, name: `${common.name} alone`, x: lone.map((i) => x[i]), y: lone.map((i) => smooth[i]), mode: "markers", marker: { color: colour, size: 5 } };
+    return [thin, ...(alone ? [] : [{ ...common, x, y: smooth, mode: "lines", line: { color: colour, width: 2 } }]), ...(lone.length ? [dots] : [])];
   }
 
   /** One band for each study: the lowest, the mean and the highest of its seeds. */
