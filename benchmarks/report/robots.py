@@ -13,17 +13,26 @@ Result = Mapping[str, Any]
 def robots_table(result: Result) -> str:
     """Picks, speed and self-play of every robot."""
     rows = []
+    panda = 9  # joints, with those of the fingers
     for name, each in result["robots"].items():
         picks, speed, run = (each.get(key) for key in ("picks", "speed_to_panda", "run"))
         rows.append(
             (
                 name,
                 f"{picks['held']} of {picks['num']}" if picks else "",
-                ", ".join(f"{each['median']:.2f} with {num} worlds" for num, each in speed.items()) if speed else "",
+                ", ".join(
+                    f"{ratio['median']:.2f} ({ratio['median'] * each['num_joints'] / panda:.2f}) with {num} worlds"
+                    for num, ratio in (speed or {}).items()
+                ),
                 _self_play(run) if run else "not run",
             )
         )
-    head = ("robot", "cubes picked, carried and held", "env steps, the Panda's = 1", "self-play")
+    head = (
+        "robot",
+        "cubes picked, carried and held",
+        "env steps (times joints, with fingers), the Panda's = 1",
+        "self-play",
+    )
     return table(head, rows)
 
 

@@ -28,9 +28,12 @@ def test_a_run_is_summarised_by_its_end(tmp_path, monkeypatch):
 def test_the_page_has_a_row_for_each():
     run = {"env_steps": 2_000_000, "valid_fraction": 0.42, "lifted_fraction": 0.3, "success_rate": 0.65}
     speed = {"8": {"median": 0.5}, "240": {"median": 1.25}}
-    robots = {"one": {"picks": {"num": 100, "held": 99}, "speed_to_panda": speed}, "other": {"run": run}}
+    robots = {
+        "one": {"num_joints": 6, "picks": {"num": 100, "held": 99}, "speed_to_panda": speed},
+        "other": {"run": run},
+    }
     text = page.robots_table({"robots": robots})
-    assert "| one | 99 of 100 | 0.50 with 8 worlds, 1.25 with 240 worlds | not run |" in text
+    assert "| one | 99 of 100 | 0.50 (0.33) with 8 worlds, 1.25 (0.83) with 240 worlds | not run |" in text
     assert (
         "| other |  |  | after 2.0 M env steps 42 % of Alice's goals are valid and 30 % in the air; Bob reaches 65 % |"
         in text
