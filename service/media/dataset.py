@@ -23,7 +23,7 @@ from service.media.recording import RecordedEpisodes, RecordedRound
 from service.progress import counted
 from service.types import FloatArray, StateArray
 
-_NAME = re.compile(r"(?:[\w-]+/)*[\w.-]+-v[0-9]+")
+_NAME = re.compile(r"(?![\w-]/[\w-]+$)(?:[\w-]+/)*[\w-]+-v[0-9]+")  # what Minari takes
 _FURTHEST_M = 10.0
 """Bound of every position, as in the environments."""
 
@@ -70,7 +70,9 @@ def check_name(name: str) -> str:
     """
     full = name if re.search(r"-v[0-9]+$", name) else f"{name}-v0"
     if not _NAME.fullmatch(full):
-        raise TandemError(f"--out {name!r}: write NAME, GROUP/NAME or NAME-v1, of letters, digits, dashes and dots")
+        raise TandemError(
+            f"--out {name!r}: write NAME, GROUP/NAME or NAME-v1, of letters, digits and dashes; a GROUP has two or more"
+        )
     if (place := _place(full)).exists():
         raise TandemError(f"--out {name}: the data set {full} is there already, in {place}: choose another name")
     return full
