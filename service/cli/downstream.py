@@ -90,7 +90,7 @@ def train(
     run_dir: Annotated[
         Path | None, typer.Option(metavar="DIR", help="Default: runs/downstream/TASK-METHOD-SEED.")
     ] = None,
-    resume: Annotated[bool, typer.Option("--resume", help="Continue the training in the directory exactly.")] = False,
+    resume: Annotated[bool, typer.Option("--resume", help="Continue exactly; where nothing is, begin.")] = False,
     overrides: _Set = None,
     registry: _Registry = "registry",
     threads: _Threads = None,
