@@ -103,6 +103,8 @@ def coverage(
     quiet: QuietOption = False,
 ) -> None:
     """Plot where random compositions of the primitives, or random skills, move the object, beside a random policy."""
+    if out.suffix.lower() != ".png":
+        raise TandemError(f"--out {out}: the picture is a PNG; name a file that ends in .png")
     with loading():
         from service.actors.coverage import RandomPolicy, skill_trajectories, visited_share
         from service.baselines.coverage import skill_paths

@@ -226,6 +226,8 @@ def _load_training(run: Path, registry: Path | str, primitives: str | None) -> O
     trial = read_trial(recorded, directory.trial_file)
     method = find_method(trial.method)
     if method.player is None and not directory.policy_file.exists():
+        if directory.result_file.exists():
+            raise TandemError(f"{run} has ended, but its {directory.policy_file.name} is gone: train it again")
         raise TandemError(f"{run} has not ended: continue it with tandem downstream train --resume --run-dir {run}")
     wanted = recorded.get("primitives")
     trained = _find_frozen(str(run), method, wanted, registry, primitives)

@@ -544,6 +544,7 @@ def test_a_run_directory_that_is_a_file(tmp_path):
         (["evaluate", "--primitives", "tiny", "--goals", "sky"], ["'sky'", "table, air, mixed"]),
         (["coverage", "--primitives", "tiny@best"], ["no alias 'best'"]),
         (["coverage", "--primitives", "tiny", "--skills", "2", "--steps", "1", "--out", "file/x.png"], ["file/x.png"]),
+        (["coverage", "--primitives", "tiny", "--out", "x.txt"], ["--out x.txt", "ends in .png"]),
         (["render", "--primitives", "no/where"], ["no/where", "no such run directory"]),
         (["registry", "show", "tiny@best"], ["no alias 'best'"]),
     ],

@@ -153,4 +153,6 @@ def test_what_holds_no_training(finished, tmp_path):
     assert "is a run of tandem pretrain, not a downstream training" in refused(tmp_path, tmp_path)
     copy = shutil.copytree(finished / "ours", tmp_path / "copy")
     (copy / "policy.safetensors").unlink()
+    assert f"{copy} has ended, but its policy.safetensors is gone" in refused(copy, tmp_path)
+    (copy / "result.json").unlink()
     assert f"{copy} has not ended: continue it with tandem downstream train --resume" in refused(copy, tmp_path)
