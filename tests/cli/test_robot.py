@@ -95,7 +95,7 @@ def test_what_calibrate_writes_run_reads(tmp_path):
         (["--robot", "mujoco", "--policy", "nobody@1"], "nobody"),
         (["--robot", "mujoco", "--set", "safety.max_speed=1"], "--set: unknown key 'safety.max_speed'"),
         (["--robot", "mujoco", "--set", "safety.lowest_m=0.49"], "safety: the box .* is empty"),
-        (["--robot", "mujoco", "--calibration", "none.yaml"], "no configuration file none.yaml"),
+        (["--robot", "mujoco", "--calibration", "none.yaml"], "no calibration none.yaml: tandem robot calibrate --out"),
         (["--robot", "mujoco", "--dead-man", "button"], "choose key or none"),
     ],
 )

@@ -17,7 +17,7 @@ FAULTS = {
     "read fails": "no answer",
     "command fails": "refused",
     "slow read": "late: reading took until",
-    "stale state": "the robot's state is",
+    "stale state": "the robot's state is frozen",
     "lost joints": "the robot's state is not finite",
     "disconnected": "the robot takes no more commands",
     "late": "late: a step came",
@@ -33,10 +33,7 @@ FAULTS = {
     "policy is slow": "late",
     "interrupt": "KeyboardInterrupt",
 }
-ALLOWED_S = {
-    "stale state": CONFIG.safety.watch.max_state_age_s,
-    "ageing pose": CONFIG.safety.watch.max_pose_age_s / 0.9,  # its age grows by 0.9 s in a second
-}
+ALLOWED_S = {"ageing pose": CONFIG.safety.watch.max_pose_age_s / 0.9}  # its age grows by 0.9 s in a second
 """What a measurement may be late by before that is a fault."""
 
 
