@@ -10,6 +10,8 @@ from service.robot.interface import ObjectPose, RobotState
 from service.types import StateArray
 
 _CLOCKS_AGREE_S = 0.02
+_ROUNDING_S = 1e-6
+"""Of times that are differences: what is 80 ms late has, at first, kept its time stamp for 80 ms."""
 
 
 class WatchConfig(FrozenModel):
@@ -45,7 +47,7 @@ class StateWatch:
             return f"the robot's state is of {-1e3 * age_s:.0f} ms in the future"
         if state.time_s != self._stamp_s:
             self._stamp_s, self._new_s = state.time_s, now_s
-        if now_s - self._new_s > self._config.max_frozen_s:
+        if now_s - self._new_s > self._config.max_frozen_s + _ROUNDING_S:
             return f"the robot's state is frozen: no new one for {1e3 * (now_s - self._new_s):.0f} ms"
         return None
 
@@ -76,7 +78,7 @@ class PoseWatch:
             self._take(pose, now_s)
         if not np.isfinite(self.time_s):
             return "the object is not seen"
-        if now_s - self._new_s > self._config.max_frozen_s:
+        if now_s - self._new_s > self._config.max_frozen_s + _ROUNDING_S:
             return f"the object's pose is frozen: no new one for {1e3 * (now_s - self._new_s):.0f} ms"
         if self._missing_since_s is not None and now_s - self._missing_since_s > self._config.max_frozen_s:
             return f"the object is not seen, for {1e3 * (now_s - self._missing_since_s):.0f} ms already"
