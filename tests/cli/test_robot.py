@@ -10,9 +10,12 @@ import yaml
 from typer.testing import CliRunner
 
 from service.cli.main import app
+from service.config import WorldConfig
+from service.errors import TandemError
 from service.robot import backends
 from service.robot.backends import Backend
 from service.robot.log import read_log, states_of
+from service.robot.running import parse_goal
 from tests.robot.fakes import FakeRobot
 
 FAST = ["--set", "set_points_per_step=2"]
@@ -107,6 +110,13 @@ def test_what_cannot_be_run_is_one_line(arguments, match):
     import re
 
     assert re.search(match, ran.stderr), ran.stderr
+
+
+def test_a_goal_inside_the_wall_is_refused_and_one_behind_it_is_not():
+    wall = WorldConfig(fixture="wall")
+    with pytest.raises(TandemError, match=r"^--goal -0.05,0,0.025: the object would be inside a fixture"):
+        parse_goal("-0.05,0,0.025", wall)
+    np.testing.assert_array_equal(parse_goal("0.05,0,0.025", wall), [0.05, 0.0, 0.025])
 
 
 def real(robot):
