@@ -26,6 +26,7 @@ FAULTS = {
     "ageing pose": "the object's newest pose is",
     "unseen": "the object is not seen",
     "jumping pose": "the object's pose jumps",
+    "no pose": "no pose was read",
     "early pose": "set the clocks alike",
     "switch": "the dead-man's switch was let go",
     "NaN": "the policy's action is not finite",
