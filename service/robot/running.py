@@ -105,6 +105,8 @@ def _seen(backend: Backend) -> StateArray:
 
 def _goal_for(object_m: StateArray, rng: np.random.Generator, policy: RobotPolicy) -> StateArray:
     """(3,) a goal for an object that lies somewhere; behind a wall it depends on that."""
+    if policy.world.fixture == "box":
+        raise RobotError(f"{policy.label} brings the object into a box, and nothing tells a bridge where it is: --goal")
     start = object_m[None]
     goal: StateArray = draw_goals(
         policy.goals, rng, policy.world, policy.success_distance_m, start=start, box=np.empty((1, 0))

@@ -14,9 +14,12 @@ from service.config import WorldConfig
 from service.errors import TandemError
 from service.robot import backends
 from service.robot.backends import Backend
+from service.robot.errors import RobotError
 from service.robot.log import read_log, states_of
-from service.robot.running import parse_goal
-from tests.robot.fakes import FakeRobot
+from service.robot.loop import Bridge, BridgeConfig
+from service.robot.policies import RobotPolicy
+from service.robot.running import parse_goal, play
+from tests.robot.fakes import FakeRobot, Steady
 
 FAST = ["--set", "set_points_per_step=2"]
 
@@ -117,6 +120,18 @@ def test_a_goal_inside_the_wall_is_refused_and_one_behind_it_is_not():
     with pytest.raises(TandemError, match=r"^--goal -0.05,0,0.025: the object would be inside a fixture"):
         parse_goal("-0.05,0,0.025", wall)
     np.testing.assert_array_equal(parse_goal("0.05,0,0.025", wall), [0.05, 0.0, 0.025])
+
+
+def test_a_robot_that_cannot_know_where_the_box_is_wants_a_goal():
+    robot, world = FakeRobot(), WorldConfig(fixture="box")
+    policy = RobotPolicy("into-it", Steady([0.1, 0.0, 0.0, 0.0]), world, "table", 0.05)
+    bridge = Bridge(policy.policy, robot, robot.poses, world, BridgeConfig())
+    given = {"num_episodes": 1, "num_steps": 2, "seed": 0, "ready": lambda episode, goal_m: None}
+    with pytest.raises(RobotError, match=r"into-it brings the object into a box, .*: --goal"):
+        next(play(bridge, Backend(robot, robot.poses), policy, goal_m=None, **given))
+    assert robot.commands == []
+    goal_m = np.array([0.0, 0.0, 0.025])
+    assert next(play(bridge, Backend(robot, robot.poses), policy, goal_m=goal_m, **given)).distance_m > 0.0
 
 
 def real(robot):
