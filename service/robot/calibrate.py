@@ -170,6 +170,8 @@ def read_calibration(path: Path) -> Calibration:
     Raises:
         TandemError: no such file, or none of these.
     """
+    if not path.exists():
+        raise TandemError(f"no calibration {path}: tandem robot calibrate --out {path} measures and writes one")
     try:
         return Calibration.model_validate(read_yaml(path))
     except ValidationError as error:

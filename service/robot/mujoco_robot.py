@@ -206,9 +206,13 @@ def connect(world: WorldConfig, parameters: Mapping[str, Any]) -> Backend:
     """
     if world.fixture == "box":
         raise TandemError("robot mujoco: the box is elsewhere in every episode, and nothing tells a bridge where")
+    if world.obstacles:  # starts would be drawn into them
+        raise TandemError("robot mujoco: obstacles are elsewhere in every episode, and nothing tells a bridge where")
     try:
         given = MujocoParameters.model_validate(dict(parameters))
     except ValidationError as error:
         raise TandemError(f"robot mujoco: parameters: {first_error(error)}") from None
+    if given.object_size_m is not None and not isinstance(world.object, str):
+        raise TandemError("robot mujoco: parameters: object_size_m is of a cube or sphere; this object has its own")
     robot = MujocoRobot(world, given)
     return Backend(robot, robot.poses, robot)

@@ -305,7 +305,7 @@ def world_of(world: WorldConfig, parameters: PyBulletParameters) -> WorldConfig:
     """The world that the back-end shows: the given one, with panda-gym's cube where the configuration says so.
 
     Raises:
-        ConfigError: not the Panda, no cube, or a fixture other than the wall.
+        ConfigError: not the Panda, no cube, a fixture other than the wall, or obstacles.
     """
     if parameters.cube == "panda-gym":
         world = WorldConfig.model_validate({**world.model_dump(), **PANDA_GYM_CUBE})
@@ -315,6 +315,8 @@ def world_of(world: WorldConfig, parameters: PyBulletParameters) -> WorldConfig:
         raise ConfigError("world.object: PyBullet has a cube only; set world.object = cube")
     if world.fixture == "box" or world.fixtures:
         raise ConfigError("world.fixture, world.fixtures: PyBullet has no fixture or the wall; choose none or wall")
+    if world.obstacles:
+        raise ConfigError("world.obstacles: PyBullet has the object alone; play a policy that was trained without")
     return world
 
 

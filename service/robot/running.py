@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from service.envs.obstacles import inside_fixtures
 from service.envs.sampling import draw_goals, draw_starts
 from service.errors import TandemError
 from service.robot.backends import Backend
@@ -33,7 +34,7 @@ def parse_goal(text: str, world: WorldConfig) -> StateArray:
     """(3,) a goal written as ``x,y,z``, metres.
 
     Raises:
-        TandemError: no three numbers, or outside the box of training.
+        TandemError: no three numbers, outside the box of training, or where the object would be inside a fixture.
     """
     try:
         goal = np.array([float(part) for part in text.split(",")])
@@ -46,6 +47,8 @@ def parse_goal(text: str, world: WorldConfig) -> StateArray:
     if ((goal < lower - _ROUNDING_M) | (goal > upper + _ROUNDING_M)).any():
         box = ", ".join(f"{axis} {low:g} to {high:g}" for axis, low, high in zip("xyz", lower, upper, strict=True))
         raise TandemError(f"--goal {text}: outside the box that the policy was trained in: {box} m")
+    if inside_fixtures(goal[None], world)[0]:
+        raise TandemError(f"--goal {text}: the object would be inside a fixture, or the upright box around it")
     return goal
 
 
@@ -102,6 +105,8 @@ def _seen(backend: Backend) -> StateArray:
 
 def _goal_for(object_m: StateArray, rng: np.random.Generator, policy: RobotPolicy) -> StateArray:
     """(3,) a goal for an object that lies somewhere; behind a wall it depends on that."""
+    if policy.world.fixture == "box":
+        raise RobotError(f"{policy.label} brings the object into a box, and nothing tells a bridge where it is: --goal")
     start = object_m[None]
     goal: StateArray = draw_goals(
         policy.goals, rng, policy.world, policy.success_distance_m, start=start, box=np.empty((1, 0))

@@ -175,8 +175,9 @@ class SafeRobot:
         if now_s - due_s > self.config.max_late_s:
             return f"late: reading took until {1e3 * (now_s - due_s):.0f} ms after it was due"
         fault = self._state_watch.check(self.state, now_s)
-        if fault is None and pose is not None:
-            fault = self._pose_watch.check(pose, now_s)
+        if fault is None and self._poses is not None:
+            # A source of the user's own may return nothing once it sees nothing.
+            fault = "no pose was read: return one of NaN" if pose is None else self._pose_watch.check(pose, now_s)
         if fault is not None:
             return fault
         away_m = float(np.linalg.norm(self.state.effector_m - self.limiter.position_m))

@@ -10,6 +10,8 @@ from service.robot.interface import ObjectPose, RobotState
 from service.types import StateArray
 
 _CLOCKS_AGREE_S = 0.02
+_ROUNDING_S = 1e-6
+"""Of times that are differences: what is 80 ms late has, at first, kept its time stamp for 80 ms."""
 
 
 class WatchConfig(FrozenModel):
@@ -17,7 +19,7 @@ class WatchConfig(FrozenModel):
 
     max_pose_age_s: float = Field(0.15, gt=0.0, le=2.0, description="of the newest pose that can be believed")
     max_frozen_s: float = Field(
-        0.08, gt=0.0, le=2.0, description="for which poses may keep the same time stamp, or be missing"
+        0.08, gt=0.0, le=2.0, description="for which measurements may keep their time stamp, or poses be missing"
     )
     max_object_speed_m_s: float = Field(3.0, gt=0.0, le=100.0, description="a cube that falls from 35 cm has 2.6")
     jump_allowance_m: float = Field(0.05, ge=0.0, le=1.0, description="added to what that speed allows: noise")
@@ -30,6 +32,7 @@ class StateWatch:
 
     def __init__(self, config: WatchConfig) -> None:
         self._config = config
+        self._stamp_s, self._new_s = -np.inf, -np.inf
 
     def check(self, state: RobotState, now_s: float) -> str | None:
         """What is wrong with a measurement, if anything."""
@@ -42,6 +45,10 @@ class StateWatch:
             return f"the robot's state is {1e3 * age_s:.0f} ms old"
         if age_s < -_CLOCKS_AGREE_S:
             return f"the robot's state is of {-1e3 * age_s:.0f} ms in the future"
+        if state.time_s != self._stamp_s:
+            self._stamp_s, self._new_s = state.time_s, now_s
+        if now_s - self._new_s > self._config.max_frozen_s + _ROUNDING_S:
+            return f"the robot's state is frozen: no new one for {1e3 * (now_s - self._new_s):.0f} ms"
         return None
 
 
@@ -71,7 +78,7 @@ class PoseWatch:
             self._take(pose, now_s)
         if not np.isfinite(self.time_s):
             return "the object is not seen"
-        if now_s - self._new_s > self._config.max_frozen_s:
+        if now_s - self._new_s > self._config.max_frozen_s + _ROUNDING_S:
             return f"the object's pose is frozen: no new one for {1e3 * (now_s - self._new_s):.0f} ms"
         if self._missing_since_s is not None and now_s - self._missing_since_s > self._config.max_frozen_s:
             return f"the object is not seen, for {1e3 * (now_s - self._missing_since_s):.0f} ms already"

@@ -14,7 +14,7 @@ from service.actors.evaluation import EVALUATED_GOALS
 from service.actors.rollout import Rollout, from_arrays, to_arrays
 from service.config import Config
 from service.envs.observations import layouts
-from service.errors import ConfigError
+from service.errors import ConfigError, TandemError
 from service.generator.opponents import Opponents
 from service.io.run_directory import RunDirectory
 from service.policies.parameters import Parameters
@@ -52,7 +52,7 @@ class LocalRun(Runner):
         start: what a new run begins from; None: from nothing.
 
     Raises:
-        TandemError: see ``RunDirectory.claim`` and ``check_one_learner``.
+        TandemError: see ``RunDirectory.claim`` and ``check_one_learner``; or nothing of ``start`` fits.
         CheckpointError: ``resume`` without a usable checkpoint.
     """
 
@@ -148,7 +148,13 @@ class LocalRun(Runner):
             self.bookkeeper.save(parts, meta)
 
     def _begin_from(self, start: Start) -> None:
-        for line in self.learner.take_over(start.networks, layouts(start.world)):
+        lines = self.learner.take_over(start.networks, layouts(start.world))
+        if not any(": taken" in line for line in lines):  # or a run from nothing would have it as its parent
+            raise TandemError(
+                f"--from {start.reference}: nothing of it fits: {lines[0]}; give this run the sizes of that one's "
+                "networks (policy), or leave out --from"
+            )
+        for line in lines:
             _logger.info("from %s: %s", start.reference, line)
         if start.published is not None:
             self.directory.write_published(start.published)

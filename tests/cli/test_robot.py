@@ -10,10 +10,16 @@ import yaml
 from typer.testing import CliRunner
 
 from service.cli.main import app
+from service.config import WorldConfig
+from service.errors import TandemError
 from service.robot import backends
 from service.robot.backends import Backend
+from service.robot.errors import RobotError
 from service.robot.log import read_log, states_of
-from tests.robot.fakes import FakeRobot
+from service.robot.loop import Bridge, BridgeConfig
+from service.robot.policies import RobotPolicy
+from service.robot.running import parse_goal, play
+from tests.robot.fakes import FakeRobot, Steady
 
 FAST = ["--set", "set_points_per_step=2"]
 
@@ -95,7 +101,7 @@ def test_what_calibrate_writes_run_reads(tmp_path):
         (["--robot", "mujoco", "--policy", "nobody@1"], "nobody"),
         (["--robot", "mujoco", "--set", "safety.max_speed=1"], "--set: unknown key 'safety.max_speed'"),
         (["--robot", "mujoco", "--set", "safety.lowest_m=0.49"], "safety: the box .* is empty"),
-        (["--robot", "mujoco", "--calibration", "none.yaml"], "no configuration file none.yaml"),
+        (["--robot", "mujoco", "--calibration", "none.yaml"], "no calibration none.yaml: tandem robot calibrate --out"),
         (["--robot", "mujoco", "--dead-man", "button"], "choose key or none"),
     ],
 )
@@ -107,6 +113,25 @@ def test_what_cannot_be_run_is_one_line(arguments, match):
     import re
 
     assert re.search(match, ran.stderr), ran.stderr
+
+
+def test_a_goal_inside_the_wall_is_refused_and_one_behind_it_is_not():
+    wall = WorldConfig(fixture="wall")
+    with pytest.raises(TandemError, match=r"^--goal -0.05,0,0.025: the object would be inside a fixture"):
+        parse_goal("-0.05,0,0.025", wall)
+    np.testing.assert_array_equal(parse_goal("0.05,0,0.025", wall), [0.05, 0.0, 0.025])
+
+
+def test_a_robot_that_cannot_know_where_the_box_is_wants_a_goal():
+    robot, world = FakeRobot(), WorldConfig(fixture="box")
+    policy = RobotPolicy("into-it", Steady([0.1, 0.0, 0.0, 0.0]), world, "table", 0.05)
+    bridge = Bridge(policy.policy, robot, robot.poses, world, BridgeConfig())
+    given = {"num_episodes": 1, "num_steps": 2, "seed": 0, "ready": lambda episode, goal_m: None}
+    with pytest.raises(RobotError, match=r"into-it brings the object into a box, .*: --goal"):
+        next(play(bridge, Backend(robot, robot.poses), policy, goal_m=None, **given))
+    assert robot.commands == []
+    goal_m = np.array([0.0, 0.0, 0.025])
+    assert next(play(bridge, Backend(robot, robot.poses), policy, goal_m=goal_m, **given)).distance_m > 0.0
 
 
 def real(robot):

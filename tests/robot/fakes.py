@@ -77,6 +77,8 @@ class FakePoses:
             return ObjectPose(robot.time_s, np.full(3, np.nan))
         if robot.has("jumping pose"):
             return ObjectPose(robot.time_s, self.position_m + np.array([0.0, 0.3, 0.0]))
+        if robot.has("no pose"):
+            return None
         if robot.has("early pose"):
             return ObjectPose(robot.time_s + 5.0, self.position_m)
         return ObjectPose(robot.time_s, self.position_m)

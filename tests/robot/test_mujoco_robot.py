@@ -1,13 +1,14 @@
 import numpy as np
 import pytest
 
+from service.config import WorldConfig
 from service.envs.batch import WorldBatch
 from service.errors import TandemError
 from service.robot.calibrate import Calibration, read_calibration, write_calibration
 from service.robot.errors import RobotError
 from service.robot.interface import Command
 from service.robot.loop import Bridge, BridgeConfig
-from service.robot.mujoco_robot import MujocoParameters, MujocoRobot
+from service.robot.mujoco_robot import MujocoParameters, MujocoRobot, connect
 
 JUMPS = BridgeConfig(
     pace=1.0,
@@ -128,3 +129,16 @@ def _world():
     from service.config import WorldConfig
 
     return WorldConfig(physics_step_s=0.005, num_substeps=8)
+
+
+@pytest.mark.parametrize(
+    ("world", "parameters", "match"),
+    [
+        ({"fixture": "box"}, {}, "the box is elsewhere"),
+        ({"obstacles": ({"shape": "box", "size_m": (0.06, 0.06, 0.06)},)}, {}, "obstacles are elsewhere"),
+        ({"object": {"shape": "cylinder", "size_m": (0.05, 0.06)}}, {"object_size_m": 0.04}, "has its own"),
+    ],
+)
+def test_what_it_cannot_show_is_refused_before_anything_moves(world, parameters, match):
+    with pytest.raises(TandemError, match=f"^robot mujoco: .*{match}"):
+        connect(WorldConfig(**world), parameters)

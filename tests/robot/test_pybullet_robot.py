@@ -161,6 +161,7 @@ def test_numbers_are_those_of_panda_gym(robot):
     [
         ({"object": "sphere"}, "has a cube only"),
         ({"fixture": "box"}, "no fixture or the wall"),
+        ({"obstacles": ({"shape": "box", "size_m": (0.06, 0.06, 0.06)},)}, "has the object alone"),
     ],
 )
 def test_worlds_that_it_cannot_show_are_refused(world, message):

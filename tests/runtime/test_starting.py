@@ -99,6 +99,19 @@ def test_what_cannot_be_begun_from(tmp_path, reference, expected):
         read_start(reference, tmp_path, tiny_config())
 
 
+def test_nothing_that_fits_is_refused_and_another_try_can_begin(trained, tmp_path):
+    root, _, version = trained
+    start = read_start(str(version), root / "registry", tiny_config())
+    larger = tiny_config(seed=5)
+    bob = larger.policy.bob.model_copy(update={"primitive_hidden_size": larger.policy.bob.primitive_hidden_size + 1})
+    larger = larger.model_copy(update={"policy": larger.policy.model_copy(update={"bob": bob})})
+    directory = RunDirectory(tmp_path / "run")
+    with pytest.raises(TandemError, match=r"^--from tiny@1: nothing of it fits: bob/policy: not taken, .* is of shape"):
+        LocalRun(larger, directory, start=start)
+    directory.close()
+    LocalRun(tiny_config(seed=5), RunDirectory(tmp_path / "run"), start=start).close()
+
+
 def test_from_an_exported_version(trained, tmp_path, monkeypatch):
     root, _, version = trained
     Registry(root / "registry").export(str(version), tmp_path / "exported")
