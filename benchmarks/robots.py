@@ -4,9 +4,9 @@
     python -m benchmarks.robots --run viperx=runs/viperx --run jaco=runs/jaco --json docs/results/robots.json
 
 Each of ``configs/robots`` picks a cube up, carries it to a random place in the air and holds it there for 5 s, by a
-hand-written policy. Env steps are of random actions with one thread, in turn with the Panda's. A run is one of
-``tandem pretrain`` with that robot, or with another object: ``panda with a mesh`` is of the one that ``--frustum``
-writes. What the file has of robots that are not measured now stays.
+hand-written policy; with ``--objects`` the Panda does so with other objects. Env steps are of random actions with one
+thread, in turn with the Panda's. A run is one of ``tandem pretrain`` with that robot, or with another object: ``panda
+with a mesh`` is of the one that ``--frustum`` writes. What the file has of robots that are not measured now stays.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ from __future__ import annotations
 import argparse
 import importlib
 import json
+import tempfile
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -31,6 +32,12 @@ from service.io.run_directory import RunDirectory
 ROBOTS = ROOT / "configs" / "robots"
 OVERRIDES = {"viperx": ("world.workspace.height_m=0.25",), "jaco": ("world.workspace.height_m=0.25",)}
 """What these arms need of a world: they do not reach the upper corners of the usual one."""
+OBJECTS = {
+    "panda with a cylinder": "{shape: cylinder, size_m: [0.05, 0.06]}",
+    "panda with a flat box": "{shape: box, size_m: [0.08, 0.05, 0.03]}",
+    "panda with a mesh": "{shape: mesh, mesh: {pieces: [FILE]}}",
+}
+"""Objects of the recorded runs; FILE is that of ``--frustum``."""
 NUM_WORLDS = (8, 240)
 WITHIN_M, SLIP_M = 0.01, 0.005
 LAST_STEPS = 200_000
@@ -50,9 +57,7 @@ class Settings:
 def measure_robot(name: str, settings: Settings) -> dict[str, Any]:
     """Picks and speed of one robot."""
     world = world_of(name)
-    placement = importlib.import_module("tests.envs.scripted").place_in_air(world, settings.num_picks, seed=0)
-    arrived, stayed = (each < WITHIN_M for each in (placement.distance_m, placement.distance_after_hold_m))
-    held = arrived & stayed & (placement.slip_m <= SLIP_M)
+    picks = count_picks(world, settings.num_picks)
     with WorldBatch(world, 1) as worlds:
         num_joints = worlds.robot.num_joints + worlds.robot.num_fingers
     panda = load_config(RECIPE_FILE, OVERRIDES.get(name, ())).world
@@ -65,11 +70,14 @@ def measure_robot(name: str, settings: Settings) -> dict[str, Any]:
             {each: row.episode for each, row in rows.items()}, settings.num_pairs, settings.seconds
         )
         speeds[str(num)] = ratio(samples[name], samples["panda"])
-    return {
-        "num_joints": num_joints,
-        "picks": {"num": settings.num_picks, "held": int(held.sum())},
-        "speed_to_panda": speeds,
-    }
+    return {"num_joints": num_joints, "picks": picks, "speed_to_panda": speeds}
+
+
+def count_picks(world: WorldConfig, num: int) -> dict[str, int]:
+    """How many objects of a world a hand-written policy picks up, carries and holds."""
+    placement = importlib.import_module("tests.envs.scripted").place_in_air(world, num, seed=0)
+    arrived, stayed = (each < WITHIN_M for each in (placement.distance_m, placement.distance_after_hold_m))
+    return {"num": num, "held": int((arrived & stayed & (placement.slip_m <= SLIP_M)).sum())}
 
 
 def summarise_run(path: Path) -> dict[str, Any]:
@@ -121,6 +129,7 @@ def main() -> int:
     parser = parser_of(__doc__, Settings())
     parser.add_argument("--run", action="append", default=[], metavar="NAME=DIR", help="a run with that robot")
     parser.add_argument("--robots", nargs="*", metavar="NAME", help="default: all whose models are installed")
+    parser.add_argument("--objects", action="store_true", help="pick other objects, too, with the Panda")
     parser.add_argument("--frustum", type=Path, metavar="FILE", help="write the mesh of the recorded run, and stop")
     given = parser.parse_args()
     if given.frustum is not None:
@@ -144,10 +153,16 @@ def _benchmark(settings: Settings, given: argparse.Namespace) -> dict[str, Any]:
             print(f"without {name}: {error}", flush=True)
             continue
         robots.setdefault(name, {}).update(measure_robot(name, settings))
+    if given.objects:
+        with tempfile.TemporaryDirectory() as directory:
+            write_frustum(mesh := Path(directory) / "frustum.obj")
+            for name, shape in OBJECTS.items():
+                world = load_config(RECIPE_FILE, [f"world.object={shape.replace('FILE', str(mesh))}"]).world
+                robots.setdefault(name, {})["picks"] = count_picks(world, settings.num_picks)
     for run in given.run:
         name, _, path = run.partition("=")
         robots.setdefault(name, {})["run"] = summarise_run(Path(path))
-    # Where only runs are added, the machine is still the one on which the others were measured.
+    # Where only runs and picks are added, the machine is still the one on which the others were measured.
     kept = {} if names else {key: before[key] for key in ("machine", "settings") if key in before}
     return {**kept, "robots": robots}
 
