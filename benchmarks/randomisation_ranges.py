@@ -12,7 +12,6 @@ from __future__ import annotations
 import functools
 import multiprocessing
 import tempfile
-import time
 from collections.abc import Iterator, Mapping
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
@@ -64,9 +63,7 @@ def measure_range(name: str, settings: Settings) -> dict[str, Any]:
             "run": recipe.run.model_copy(update={"num_threads": 1}),
         }
     )
-    begun = time.process_time()
     student = _learn(config, settings)
-    learned_s = time.process_time() - begun
     teacher = load_bob(settings.teacher, Path(settings.registry))
     players: Mapping[str, tuple[DeterministicPolicy, Config]] = {
         "student": (student, config),
@@ -84,7 +81,7 @@ def measure_range(name: str, settings: Settings) -> dict[str, Any]:
         for player, (policy, seen) in players.items()
         for world, given in (("nominal", RandomisationConfig()), ("drawn", randomisation))
     }
-    return {"ranges": randomisation.model_dump(mode="json", exclude_none=True), "cpu_s": round(learned_s), **rates}
+    return {"ranges": randomisation.model_dump(mode="json", exclude_none=True), **rates}
 
 
 def benchmark(settings: Settings) -> dict[str, Any]:

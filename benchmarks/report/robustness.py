@@ -35,16 +35,13 @@ def robustness_words(result: Result) -> str:
 
 def ranges_table(result: Result) -> str:
     """What students of worlds with one range have in the nominal world and in theirs, beside their teacher."""
-    head = ("drawn", "range", "student, nominal world", "student, worlds that draw it", "teacher there", "CPU time")
+    head = ("drawn", "range", "student, nominal world", "student, worlds that draw it", "teacher there")
     rows = []
-    least_s = min(row["cpu_s"] for row in result["rows"].values())
     for name, row in result["rows"].items():
         drawn = [value for key, value in row["ranges"].items() if key != "num_models"]
         span = f"{drawn[0][0]:g} to {drawn[0][1]:g}" if len(drawn) == 1 else ""
         shares = (row[each]["success_last"] for each in ("student_nominal", "student_drawn", "teacher_drawn"))
-        rows.append(
-            (name.replace("_", " "), span, *(percent(share, 1) for share in shares), f"{row['cpu_s'] / least_s:.2f}")
-        )
+        rows.append((name.replace("_", " "), span, *(percent(share, 1) for share in shares)))
     return table(head, rows)
 
 
@@ -55,6 +52,5 @@ def ranges_words(result: Result) -> str:
     teacher = percent(next(iter(result["rows"].values()))["teacher_nominal"]["success_last"], 1)
     return (
         f"Success at the last step of {settings['episodes']} mixed goals. Each student learned for {steps}, one seed, "
-        f"from `{settings['teacher']}`, who has {teacher} in the nominal world. CPU time is that of learning, over the "
-        f"least of the column.{measured_on(result['machine'])}"
+        f"from `{settings['teacher']}`, who has {teacher} in the nominal world.{measured_on(result['machine'])}"
     )
