@@ -77,7 +77,10 @@ def test_configs_are_listed_and_shown():
         ),
         (["pretrain", "--set", "world.robot=ur5"], "did you mean 'ur5e'?"),
         (["pretrain", "--set", "learner.bob.num_epoch=3"], "did you mean 'num_epochs'?"),
-        (["pretrain", "--set", "num_worlds=3"], "did you mean game.num_worlds?"),
+        (
+            ["pretrain", "--set", "num_worlds=3"],
+            "did you mean distillation.num_worlds or game.num_worlds or skills.sac.num_worlds?",
+        ),
         (
             ["pretrain", "--set", "learner.gae_lambda=0.9"],
             "did you mean learner.alice.gae_lambda or learner.bob.gae_lambda?",

@@ -126,7 +126,7 @@ def test_a_task_and_its_orchestrator(champion):
         def begin(self):
             begun.append(1)
 
-    bob = Counting("mine@1", "wall", "ours", champion.policy, champion)
+    bob = Counting("mine@1", "mine@1", "wall", "ours", champion.policy, champion)
     game = Game(cast_orchestrator(bob), seed=0)
     assert game.cast.label == "mine@1 on Wall"
     assert game.cast.world.fixture == "wall"
