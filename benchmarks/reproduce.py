@@ -17,12 +17,13 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from benchmarks.controls import CONTROLS
 from benchmarks.measuring import RECIPE_FILE, ROOT
-from service.envs.tasks import TASKS
+from service.downstream.methods import METHODS
+from service.envs.tasks import TASKS, find_task
 
 PRIMITIVES = {0: "panda-cube@seed-0", 1: "panda-cube@seed-2", 2: "panda-cube@seed-3"}
 """Versions in ``docs/results/primitives`` by the seed of the trials that take them: each has its own pre-training."""
@@ -53,6 +54,11 @@ class Experiment:
     name: str
     file: Path
     """It has been run if this is there."""
+    group: str
+    """What a page counts it under."""
+    part: str
+    """What it is in its group, besides its seed."""
+    seed: int
     commands: Callable[[], Sequence[Command]]
     """What to run, in this order, which may depend on what is there already."""
     needs: Path | None = None
@@ -94,7 +100,8 @@ def _trial(places: Places, task: str, method: str, seed: int) -> Experiment:
 
 def _longer(places: Places, task: str, method: str) -> Experiment:
     extra = ("--steps", str(LONGER_ENV_STEPS))
-    return _table(places, places.out / "downstream_longer", task, method, 0, PRIMITIVES[0], extra)
+    found = _table(places, places.out / "downstream_longer", task, method, 0, PRIMITIVES[0], extra)
+    return replace(found, group="a million env steps", part=f"{task}-{method}")
 
 
 def _table(
@@ -109,7 +116,9 @@ def _table(
         *extra,
     )
     versions = places.out / "primitives" / "models" / reference.partition("@")[0]
-    return Experiment(f"{out.name}/{name}", out / "downstream" / f"{name}.json", lambda: [command], versions)
+    group, part = (METHODS[method].title, task) if task in TASKS else (find_task(task).title, method)
+    file = out / "downstream" / f"{name}.json"
+    return Experiment(f"{out.name}/{name}", file, group, part, seed, lambda: [command], versions)
 
 
 def _control(places: Places, name: str, seed: int) -> Experiment:
@@ -118,7 +127,8 @@ def _control(places: Places, name: str, seed: int) -> Experiment:
         *("-m", "benchmarks.controls", name, "--seed", str(seed)),
         *("--run-dir", str(places.runs / "controls"), "--out", str(out), "--set", "run.num_threads=1"),
     )
-    return Experiment(f"controls/{name}-{seed}", out / f"{name}-{seed}.json", lambda: [command])
+    file = out / f"{name}-{seed}.json"
+    return Experiment(f"controls/{name}-{seed}", file, "controls of self-play", name, seed, lambda: [command])
 
 
 def _skills(places: Places, seed: int) -> Iterator[Experiment]:
@@ -149,7 +159,7 @@ def _discover(places: Places, method: str, seed: int) -> Experiment:
     def commands() -> Sequence[Command]:
         return [(*train, "--resume") if run.exists() else train, record]
 
-    return Experiment(f"skills/{method}-{seed}", file, commands)
+    return Experiment(f"skills/{method}-{seed}", file, "skill discovery", method, seed, commands)
 
 
 def _python(*arguments: str) -> Command:

@@ -43,6 +43,7 @@ from benchmarks.report.figures import (
     draw_skills,
     draw_soak,
 )
+from benchmarks.reproduce import Places, experiments
 from benchmarks.run_files import Run, read_run
 from service.downstream.page import draw_table
 from service.downstream.results import Result, ResultsDirectory
@@ -74,7 +75,7 @@ PAGES = {
     "results/pretraining.md": ("skill", "tasks", "curves", "curriculum", "coverage", "ablations", "throughput"),
     "results/cluster.md": ("targets", "throughput", "chaos", "strikes", "rest", "flood", "soak"),
     "results/skills.md": ("coverage", "curves", "controls"),
-    "results/comparison.md": ("rows", "longer"),
+    "results/comparison.md": ("rows", "longer", "missing"),
     "downstream.md": ("headline",),
     "robots.md": ("robots",),
     "results/transfer.md": ("transfer", "transfer_champion", "robot_bridge"),
@@ -302,7 +303,8 @@ class Report:
 
     def comparison_blocks(self, trials: Sequence[Result], longer: Sequence[Result]) -> Blocks:
         """Parts of the blocks that compare with the paper."""
-        blocks = {}
+        places = Places(self._results, self._results)
+        blocks = {"missing": [comparison.missing_table(list(experiments(places)))]}
         if trials:
             blocks["rows"] = [comparison.comparison_table(trials)]
         if longer:

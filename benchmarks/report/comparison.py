@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Sequence
 
 import numpy as np
 
 from benchmarks.report.markdown import Row, table
+from benchmarks.reproduce import Experiment
 from service.actors.evaluation import wilson_interval
 from service.downstream.files import TRIAL
 from service.downstream.methods import METHODS
@@ -41,6 +43,37 @@ def longer_table(results: Sequence[Result], longer: Sequence[Result]) -> str:
             cells = [f"{_mean(before)} to {_mean(after)} ({len(after)})" if after else "" for before, after in pairs]
             rows.append((METHODS[method].title, *cells))
     return table(("", *(TASKS[task].title for task in tasks)), rows)
+
+
+def missing_table(planned: Sequence[Experiment]) -> str:
+    """How many of the planned experiments have their file, and which lack it, in the order of their plan."""
+    groups = defaultdict[str, list[Experiment]](list)
+    for experiment in planned:
+        groups[experiment.group].append(experiment)
+    done = {title: sum(each.file.exists() for each in group) for title, group in groups.items()}
+    rows = [
+        (title, f"{done[title]} of {len(group)}", _missing(group))
+        for title, group in groups.items()
+        if done[title] < len(group)
+    ]
+    words = f"{sum(done.values())} of {len(planned)} experiments are recorded."
+    return f"{words} Missing:\n\n{table(('', 'recorded', 'missing'), rows)}" if rows else words
+
+
+def _missing(group: Sequence[Experiment]) -> str:
+    """Parts that lack their file, those with the same seeds together."""
+    seeds = defaultdict[str, list[str]](list)
+    for each in group:
+        if not each.file.exists():
+            seeds[each.part].append(str(each.seed))
+    parts = defaultdict[str, list[str]](list)
+    for part, numbers in seeds.items():
+        parts[", ".join(numbers)].append(part)
+    num = len({each.part for each in group})
+    return "; ".join(
+        f"{'all' if len(names) == num else ', '.join(names)}: {'seeds' if ',' in numbers else 'seed'} {numbers}"
+        for numbers, names in parts.items()
+    )
 
 
 def _mean(seeds: Sequence[tuple[float, int]]) -> str:

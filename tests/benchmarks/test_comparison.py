@@ -1,6 +1,7 @@
 """The page that compares with the paper, by hand."""
 
-from benchmarks.report.comparison import comparison_table, longer_table
+from benchmarks.report.comparison import comparison_table, longer_table, missing_table
+from benchmarks.reproduce import Experiment
 
 
 def trial(method, task, seed, rate):
@@ -33,3 +34,25 @@ def test_longer_trials_by_hand():
         "| ours | not run to 100.0 (1) | 91.0 to 97.0 (1) |",
         "| ASP only | not run to 25.0 (1) |  |",
     ]
+
+
+def test_what_is_missing_by_hand(tmp_path):
+    def planned(group, part, seed, *, done):
+        file = tmp_path / f"{part}-{seed}.json"
+        if done:
+            file.touch()
+        return Experiment(file.stem, file, group, part, seed, lambda: [])
+
+    some = [planned("ours", "box", 0, done=True), planned("controls", "uniform", 0, done=False)]
+    some += [planned("ours", part, seed, done=False) for seed in (1, 2) for part in ("box", "wall", "push")]
+    some += [planned("ours", "wall", 0, done=False), planned("ours", "push", 0, done=True)]
+    some += [planned("idle", "inair", 0, done=True), planned("controls", "uniform", 2, done=False)]
+    assert missing_table(some).splitlines() == [
+        "3 of 12 experiments are recorded. Missing:",
+        "",
+        "|  | recorded | missing |",
+        "| --- | --- | --- |",
+        "| ours | 2 of 9 | box, push: seeds 1, 2; wall: seeds 1, 2, 0 |",
+        "| controls | 0 of 2 | all: seeds 0, 2 |",
+    ]
+    assert missing_table(some[:1]) == "1 of 1 experiments are recorded."

@@ -25,7 +25,7 @@ def test_every_method_is_run_on_every_task(places):
 def making(tmp_path, name, *, needs=None, code=0):
     """An experiment that writes its name, unless it fails."""
     program = f"import pathlib, sys; {code} or pathlib.Path({str(tmp_path / name)!r}).touch(); sys.exit({code})"
-    return Experiment(name, tmp_path / name, lambda: [(sys.executable, "-c", program)], needs)
+    return Experiment(name, tmp_path / name, "", name, 0, lambda: [(sys.executable, "-c", program)], needs)
 
 
 def test_one_waits_for_what_it_needs_and_failures_are_named(tmp_path):
