@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks import robot_bridge, time_to_skill
+from benchmarks.controls import OURS
 from benchmarks.report import (
     attacks,
     cluster,
@@ -322,7 +323,7 @@ def summary_blocks(trials: Sequence[Result], controls: Sequence[Run]) -> Blocks:
     blocks = {}
     if trials:
         blocks["headline"] = [summary.headline_table(trials)]
-    if controls:
+    if any(run["control"] == OURS for run in controls):
         blocks["controls"] = [summary.controls_words(controls)]
     return blocks
 

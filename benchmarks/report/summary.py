@@ -51,9 +51,11 @@ def controls_words(runs: Sequence[Run]) -> str:
     seeds = {name: [run for run in runs if run["control"] == name] for name in (OURS, *_NAMES)}
     other = ", ".join(f"{_mixed(seeds[name])} with {words}" for name, words in _NAMES.items() if seeds[name])
     steps = np.mean([run["bob_env_steps"] for run in seeds[OURS]]) / 1e6
+    low, *_, high = sorted(len(each) for each in (*seeds.values(), seeds[OURS]) if each)
+    how = "one seed of each" if high == 1 else f"mean of {high if low == high else f'{low} to {high}'} seeds"
     return (
         f"After {steps:.1f} million env steps of his own Bob solves {_mixed(seeds[OURS])} of random goals with those "
-        f"that Alice proposes, {other} (mean of {len(seeds[OURS])} seeds; [all controls](docs/results/skills.md))."
+        f"that Alice proposes, {other} ({how}; [all controls](docs/results/skills.md))."
     )
 
 
