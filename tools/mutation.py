@@ -30,7 +30,7 @@ import numpy as np
 from benchmarks.measuring import ROOT, machine, write_json
 
 PACKAGES = ("learner", "actors", "generator", "downstream", "sac", "baselines")
-RUNS = ("tests/runtime/test_local.py", "tests/runtime/test_skill_run.py")
+RUNS = tuple(f"tests/runtime/test_{name}.py" for name in ("local", "skill_run", "distillation"))
 """Asked where a package's own tests have noticed nothing."""
 TIMEOUT_S = 400.0
 

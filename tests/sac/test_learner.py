@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from service.off_policy_config import SACConfig
-from service.sac.learner import Batch, SACLearner
+from service.sac.learner import Batch, SACLearner, actions_at_random
 from service.sac.networks import GaussianActor, sample_actions
 
 CONFIG = SACConfig(batch_size=6, gradient_steps=2, hidden_sizes=(8,), learning_rate=0.01, gamma=0.9, tau=0.2)
@@ -91,6 +91,15 @@ def test_sampled_actions_follow_the_actor():
     before = np.arctanh(learner.act(inputs).astype(np.float64))
     np.testing.assert_allclose(before.mean(0), mean[0], atol=0.03)
     np.testing.assert_allclose(before.std(0), log_std.exp()[0], rtol=0.03)
+
+
+def test_actions_at_random_are_uniform():
+    actions = actions_at_random((1000, 4), np.random.default_rng(0))
+    assert actions.dtype == np.float32
+    assert actions.shape == (1000, 4)
+    assert -1.0 <= actions.min() < -0.99
+    assert 0.99 < actions.max() <= 1.0
+    np.testing.assert_allclose(actions.mean(0), 0.0, atol=0.06)  # three standard errors: 3 / sqrt(3 * 1000)
 
 
 def test_the_average_of_the_actor():
