@@ -106,6 +106,10 @@ def _mutate(code: str, operator: Any, occurrence: int) -> str | None:
     from cosmic_ray.mutating import mutate_code
 
     changed = mutate_code(code, operator, occurrence)
+    try:
+        ast.parse(changed or "")
+    except SyntaxError:  # such as {|x} of {**x}
+        return None
     return None if changed is None else str(changed)
 
 

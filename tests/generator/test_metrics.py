@@ -111,5 +111,7 @@ def test_the_height_up_to_which_nine_of_ten_lie(make_records: Callable[..., Goal
     assert np.isnan(height_percentile(count_heights(make_records([])), 90.0))
     past = make_records([(0.1, 0.0, 0.2)] * 2, alice_past=[True, False], verdict=np.array([0, 1], dtype=np.int8))
     assert not count_heights(past).any()
-    highest = count_heights(make_records([(0.0, 0.0, 0.8)]))  # the upper face of the highest workspace there may be
-    assert np.flatnonzero(highest).tolist() == [800]
+    # the upper face of the highest workspace there may be, and what is nowhere in it
+    outermost = count_heights(make_records([(0.0, 0.0, 0.8), (0.0, 0.0, 0.9), (0.0, 0.0, -0.1)]))
+    assert np.flatnonzero(outermost).tolist() == [0, 800]
+    assert len(outermost) == 801
