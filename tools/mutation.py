@@ -5,8 +5,8 @@
 
 It draws places in the code, all alike, and for each one of the operators of Cosmic Ray that change something there. A
 mutant whose syntax tree is the same without its annotations is drawn again: nothing of it would ever run. The tests of
-the mutant's own package come first, then the short runs of ``tests/runtime``. What no test notices survives: either it
-behaves as before, or a test is missing. That takes about half a minute a mutant.
+the mutant's own package come first, then those of the others and the short runs of ``tests/runtime``. What no test
+notices survives: either it behaves as before, or a test is missing. That takes about half a minute a mutant.
 """
 
 from __future__ import annotations
@@ -30,8 +30,8 @@ import numpy as np
 from benchmarks.measuring import ROOT, machine, write_json
 
 PACKAGES = ("learner", "actors", "generator", "downstream", "sac", "baselines")
-RUNS = tuple(f"tests/runtime/test_{name}.py" for name in ("local", "skill_run", "distillation"))
-"""Asked where a package's own tests have noticed nothing."""
+RUNS = tuple(f"tests/runtime/test_{name}.py" for name in ("local", "skill_run", "distillation", "study"))
+"""Asked, with the tests of the other packages, where a package's own tests have noticed nothing."""
 TIMEOUT_S = 400.0
 
 
@@ -76,7 +76,9 @@ def judge(mutant: Mutant, copy: Path, python: Path) -> str:
     original = target.read_text(encoding="utf-8")
     target.write_text(mutant.code, encoding="utf-8")
     try:
-        for tests in (f"tests/{Path(mutant.file).parts[1]}",), RUNS:
+        own = Path(mutant.file).parts[1]
+        others = [f"tests/{package}" for package in PACKAGES if package != own]
+        for tests in (f"tests/{own}",), (*others, *RUNS):
             if not _pass(tests, copy, python):
                 return f"killed by {' '.join(tests)}"
         return "survived"

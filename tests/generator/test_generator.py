@@ -140,6 +140,8 @@ def test_replayed_goals_may_start_where_a_game_did(make_records: MakeRecords) ->
     assert (first.start_state[:, 0] == np.where(first.from_reset, 1.0, 7.0)).all()
     assert first.replayed.all()
     assert (first.goal == OLD_GOAL).all()
+    switched_off = filled(make_records, starts=ONE_GAME, replay_fraction=1.0, replay_from_reset=False)
+    assert not choose(switched_off, [VALID] * num).from_reset.any()
 
 
 def test_tasks_from_a_reset_wait_until_bob_is_ready(make_records: MakeRecords) -> None:

@@ -118,14 +118,15 @@ def learn_alone(config, updates, state=None):
     return learn(ALONE, config, updates, state)
 
 
-def advance_random_numbers(group, config, rollouts):
-    """Rank 1 draws once more than the others before an update."""
+def advance_random_numbers(group, config, updates):
+    """Rank 1 draws once more than the others before the second update."""
     learner = Learner(config, group)
-    if group.rank == 1:
-        learner._rng.random()
-    for rollout in share_out(rollouts, group.rank, group.size):
-        learner.ingest(rollout)
-    return learner.update()
+    for rollouts in updates:
+        if group.rank == 1:
+            learner._rng.random(learner.version)
+        for rollout in share_out(rollouts, group.rank, group.size):
+            learner.ingest(rollout)
+        learner.update()
 
 
 def _cut(rollouts, cut, group):

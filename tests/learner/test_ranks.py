@@ -150,11 +150,13 @@ def test_the_number_of_ranks_may_change(pair):
 
 def test_ranks_that_are_not_at_one_point_do_not_learn(pair):
     config = make_config()
-    answers = pair.run(work.advance_random_numbers, config, play(config, num_updates=1)[0])
+    answers = pair.run(work.advance_random_numbers, config, play(config, num_updates=2))
     for error in answers:
         assert isinstance(error, LearnerError)
-        numbers = "version 0 with random numbers and learning rates [0-9a-f]{8}, rank 0 at 0 with [0-9a-f]{8}"
-        assert re.fullmatch(f"learner rank 1 is at {numbers}: start all ranks from one state", str(error))
+        numbers = "version 1 with random numbers and learning rates ([0-9a-f]{8}), rank 0 at 1 with ([0-9a-f]{8})"
+        found = re.fullmatch(f"learner rank 1 is at {numbers}: start all ranks from one state", str(error))
+        assert found
+        assert found[1] != found[2]
 
 
 def test_a_rank_that_hangs_is_an_error_of_the_other_and_a_new_group_works(pair):
