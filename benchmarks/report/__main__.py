@@ -76,7 +76,7 @@ PAGES = {
     "results/pretraining.md": ("skill", "tasks", "curves", "curriculum", "coverage", "ablations", "throughput"),
     "results/cluster.md": ("targets", "throughput", "chaos", "strikes", "rest", "flood", "soak"),
     "results/skills.md": ("coverage", "curves", "controls"),
-    "results/comparison.md": ("rows", "longer", "missing"),
+    "results/comparison.md": ("rows", "longer", "below", "missing"),
     "downstream.md": ("headline",),
     "robots.md": ("robots",),
     "results/transfer.md": ("transfer", "transfer_champion", "robot_bridge"),
@@ -308,6 +308,7 @@ class Report:
         blocks = {"missing": [comparison.missing_table(list(experiments(places)))]}
         if trials:
             blocks["rows"] = [comparison.comparison_table(trials)]
+            blocks["below"] = [comparison.distances_table(trials)]
         if longer:
             picture = self._show("Success over more env steps", "downstream-longer", draw_table, longer)
             blocks["longer"] = [comparison.longer_table(trials, longer), picture]

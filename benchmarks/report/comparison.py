@@ -45,6 +45,18 @@ def longer_table(results: Sequence[Result], longer: Sequence[Result]) -> str:
     return table(("", *(TASKS[task].title for task in tasks)), rows)
 
 
+def distances_table(results: Sequence[Result]) -> str:
+    """Mean distance between object and goal at the end of the final episodes, of what learns from nothing."""
+    rows: list[Row] = []
+    for name, method in METHODS.items():
+        if method.takes is None and method.player is None:
+            found = [_trials(results, name, task) for task in TASKS]
+            cells = [_mean_distance(trials) if trials else "" for trials in found]
+            rows += [(method.title, *cells)] if any(cells) else []
+    words = "Distance of the object from the goal at the end of the final episodes, mean of episodes and seeds:"
+    return f"{words}\n\n{table(('', *(task.title for task in TASKS.values())), rows)}" if rows else ""
+
+
 def missing_table(planned: Sequence[Experiment]) -> str:
     """How many of the planned experiments have their file, and which lack it, in the order of their plan."""
     groups = defaultdict[str, list[Experiment]](list)
@@ -82,8 +94,16 @@ def _mean(seeds: Sequence[tuple[float, int]]) -> str:
 
 def _rates(results: Sequence[Result], method: str, task: str) -> list[tuple[float, int]]:
     """Success at the last step and number of episodes of each seed."""
-    trials = [each for each in results if (each[TRIAL]["method"], each[TRIAL]["task"]) == (method, task)]
-    return [(float(each["evaluation"]["success_last"]), int(each["evaluation"]["num_episodes"])) for each in trials]
+    found = [each["evaluation"] for each in _trials(results, method, task)]
+    return [(float(each["success_last"]), int(each["num_episodes"])) for each in found]
+
+
+def _trials(results: Sequence[Result], method: str, task: str) -> list[Result]:
+    return [each for each in results if (each[TRIAL]["method"], each[TRIAL]["task"]) == (method, task)]
+
+
+def _mean_distance(trials: Sequence[Result]) -> str:
+    return f"{np.mean([each['evaluation']['mean_distance_m'] for each in trials]):.2f} m"
 
 
 def _cell(seeds: Sequence[tuple[float, int]], paper: float) -> str:

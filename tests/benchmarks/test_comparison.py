@@ -1,6 +1,6 @@
 """The page that compares with the paper, by hand."""
 
-from benchmarks.report.comparison import comparison_table, longer_table, missing_table
+from benchmarks.report.comparison import comparison_table, distances_table, longer_table, missing_table
 from benchmarks.reproduce import Experiment
 
 
@@ -34,6 +34,15 @@ def test_longer_trials_by_hand():
         "| ours | not run to 100.0 (1) | 91.0 to 97.0 (1) |",
         "| ASP only | not run to 25.0 (1) |  |",
     ]
+
+
+def test_distances_by_hand():
+    far = [trial("scratch-monolithic-her", "sphere", seed, 0.0) for seed in (0, 1)]
+    for each, distance_m in zip(far, (0.5, 0.8), strict=True):
+        each["evaluation"]["mean_distance_m"] = distance_m
+    ours = trial("ours", "sphere", 0, 1.0)
+    assert distances_table([*far, ours]).splitlines()[-1] == "| scratch monolithic + HER |  |  |  | 0.65 m |  |  |"
+    assert distances_table([ours]) == ""
 
 
 def test_what_is_missing_by_hand(tmp_path):

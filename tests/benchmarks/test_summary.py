@@ -21,6 +21,8 @@ def test_rows_by_hand():
         "| learned from nothing, the best of 2 on each task |  |  |  |  | 50 % | 31 % |",
         "| *the best of the paper* | *94 %* | *100 %* | *92 %* | *100 %* | *98 %* | *98 %* |",
     ]
+    (only,) = [line for line in headline_table(results[:6]).splitlines() if "nothing" in line]
+    assert only == "| learned from nothing: scratch MCP |  |  |  |  |  | 31 % |"
 
 
 def control(name, seed, mixed):
