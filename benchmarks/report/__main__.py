@@ -24,6 +24,7 @@ from benchmarks.report import (
     attacks,
     cluster,
     comparison,
+    mutation,
     page_speed,
     pretraining,
     robots,
@@ -60,6 +61,7 @@ PROGRAMS = {
     "soak": "benchmarks.soak of commit ddd0770",
     "strikes": "tools.strikes",
     "flood": "tools.flood",
+    "mutation": "tools.mutation",
     "scaling": "benchmarks.scaling",
     "ranks_on_nodes": "tools.ranks_on_nodes",
     "robots": "benchmarks.robots",
@@ -81,6 +83,7 @@ PAGES = {
     "robots.md": ("robots",),
     "results/transfer.md": ("transfer", "transfer_champion", "robot_bridge"),
     "api.md": ("page",),
+    "results/README.md": ("mutation",),
     "results/robust.md": ("robustness", "randomisation_ranges"),
     "../README.md": ("headline", "controls"),
     "scaling.md": ("bottleneck", "box", "nodes", "model", "batches", "skill", "constants"),
@@ -187,6 +190,12 @@ def page_blocks(found: Results) -> Blocks:
     return {"page": [page_speed.page_table(recorded), page_speed.page_words(recorded)]} if recorded is not None else {}
 
 
+def mutation_blocks(found: Results) -> Blocks:
+    """Parts of the block about mutation testing."""
+    recorded = found.get("mutation")
+    return {"mutation": [mutation.mutation_words(recorded), mutation.mutation_table(recorded)]} if recorded else {}
+
+
 def robustness_blocks(found: Results) -> Blocks:
     """Parts of the blocks about policies in worlds that differ from those of training."""
     parts = {
@@ -227,6 +236,7 @@ class Report:
             robots_blocks(found),
             transfer_blocks(found),
             page_blocks(found),
+            mutation_blocks(found),
             robustness_blocks(found),
             summary_blocks(trials, controls),
             scaling_blocks(found, studies),

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 from PIL import Image
 
-from service.downstream.page import draw_table, steps_until, write_page
+from service.downstream.page import BEST, PAPER, draw_table, steps_until, write_page
 from service.downstream.rates import seed_interval
 from service.downstream.results import ResultsDirectory
 from service.downstream.table import Source, make_table, run_here, run_on_ray
@@ -295,6 +295,9 @@ def test_what_a_page_says_of_its_origin_by_hand():
     assert "Recorded before `tandem/Box-v1` (ours)" in write_page([first, second], "picture.png")
     first["cell"]["task_version"] = 1
     assert "Recorded before" not in write_page([first, second], "picture.png")
+    lines = write_page([first, second, result("ours", "wall", 0, 0.5, 0.5)], "picture.png").splitlines()
+    (old,) = [line for line in lines if "Recorded before" in line]
+    assert old.startswith("Recorded before `tandem/Wall-v1` (all methods), ")
 
 
 def test_the_recorded_page_is_what_its_files_give():
@@ -332,3 +335,12 @@ def test_how_soon_by_hand():
     assert steps_until(curve, 0.6) == 4
     assert steps_until(curve, 0.9) is None
     assert steps_until(curve, 0.0) is None
+
+
+def test_the_papers_rates():
+    """Shares of 16 episodes of three seeds, to two digits: all but one."""
+    of_48 = {round(num / 48, 2) for num in range(49)}
+    rates = [rate for row in PAPER.values() for rate in row.values()]
+    assert [rate for rate in rates if rate not in of_48] == [0.36]
+    assert [len(row) for row in PAPER.values()] == [6] * 9
+    assert dict(BEST) == {"larger": 0.94, "inair": 1.00, "push": 0.92, "sphere": 1.00, "wall": 0.98, "box": 0.98}

@@ -5,7 +5,7 @@ import pytest
 import torch
 from typer.testing import CliRunner
 
-from service.actors.distillation import DistillationWorlds
+from service.actors.distillation import _LEAST_LOG_WEIGHT, _NOISY_SHARE, DistillationWorlds
 from service.cli.main import app
 from service.config import parse_config
 from service.distillation_config import DistillationConfig
@@ -71,6 +71,53 @@ def test_labels_are_the_teachers_answers_when_the_command_counts():
         expected, _ = teacher.primitives(later)
         np.testing.assert_allclose(answers[:4, world], expected, atol=2e-4)
         assert np.abs(answers[:4, world] - wrong).max() > 1e-3
+
+
+def acting_student(config):
+    torch.manual_seed(0)
+    return NumpyMCPPolicy(networks.export_parameters(networks.make_bob(config.policy, layouts(config.world))))
+
+
+def played_actions(config, student):
+    """Observations (T, N, O) and actions (T, N, 4) of a round, and the worlds after it."""
+    _, teacher = make_student(config, make_teacher(config))
+    worlds = DistillationWorlds(config, teacher, PAPER, num_threads=1)
+    actions, step = [], worlds._worlds.step
+    worlds._worlds.step = lambda given: (actions.append(given.copy()), step(given))
+    played = worlds.play(student, np.random.default_rng(1))
+    worlds.close()
+    seen = layouts(config.world).bob.size
+    return played.lesson.observation.reshape(len(actions), -1, seen), np.stack(actions), worlds
+
+
+def test_a_student_acts_with_noise_at_some_steps():
+    config = config_of({}, {"num_worlds": 64, "random_fraction": 0.0, "action_noise": 0.1})
+    student = acting_student(config)
+    observation, actions, _ = played_actions(config, student)
+    noise = actions - np.stack([student.act_deterministic(each) for each in observation])
+    noisy = (np.abs(noise) > 1e-5).any(axis=-1)
+    share = _NOISY_SHARE
+    assert noisy.mean() == pytest.approx(share, abs=3 * np.sqrt(share * (1 - share) / noisy.size))
+    assert noise[noisy].std() == pytest.approx(0.1, rel=0.15)
+    assert (np.abs(noise[noisy]) > 1e-5).mean() > 0.99  # all four numbers at once
+
+
+def test_random_weights_are_held():
+    how = {"num_worlds": 64, "random_fraction": 0.9, "action_noise": 0.0, "random_hold_steps": 3}
+    config = config_of({}, how)
+    student = acting_student(config)
+    observation, actions, worlds = played_actions(config, student)
+    for step in (3, 4, 5):  # of six; the weights of the last three are still there
+        expected, _ = student.compose(observation[step][:, : student_positions(config)], worlds._weights)
+        random = np.isclose(actions[step], expected, atol=1e-6).all(axis=1)
+        assert random.mean() == pytest.approx(0.9, abs=3 * np.sqrt(0.9 * 0.1 / 64))
+    assert np.exp(_LEAST_LOG_WEIGHT) <= worlds._weights.min()
+    assert 0.9 < worlds._weights.max() <= 1.0
+
+
+def student_positions(config):
+    """Numbers of an observation that primitives see: all but the goal."""
+    return layouts(config.world).bob.size - 3
 
 
 def test_goals_are_outside_obstacles_and_diverged_worlds_are_told():
