@@ -19,6 +19,11 @@ AS_BEFORE = {
     "(place >= lower) * (place <= upper)": "the product of booleans is their conjunction",
     "self.tensors()[ -1].device": "all tensors are on one device",
     "[from_own_start], axis=1)": "the last axis of two",
+    "spread_seed(trial.seed, 4)": "another stream of random numbers, as good as this",
+    "+ /,": "a guard: all name these arguments",
+    "rate.num_seeds <= 1": "there is at least one seed",
+    "default= 1) / 1e3": "without results nothing is drawn",
+    "-@torch.no_grad()": "the tensors of a state_dict ask for no gradient",
     "self._group.rank != 0": "a rank is never negative",
     '-            rows["reward"][:, 0],': "there is one column",
 }

@@ -277,6 +277,8 @@ def test_intervals_by_hand():
     )
     assert seed_interval([0.0, 0.5, 1.0]) == (0.0, 1.0)
     assert seed_interval([0.5, 0.5]) == (0.5, 0.5)
+    # four: Student's t of three degrees of freedom is 3.182, the standard error 0.11547 / 2
+    assert seed_interval([0.4, 0.6] * 2) == pytest.approx((0.5 - 3.182 * 0.057735, 0.5 + 3.182 * 0.057735), abs=1e-5)
     assert seed_interval([0.0, 1.0] * 8) == pytest.approx((0.5 - 1.96 * 0.516398 / 4, 0.5 + 1.96 * 0.516398 / 4))
     # a single seed: 96 of 100, Wilson (z = 1.96) is 0.902 to 0.984
     page = write_page([result("ours", "wall", 0, 0.96, 0.96)], "picture.png")
