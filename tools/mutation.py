@@ -108,11 +108,13 @@ def _mutate(code: str, operator: Any, occurrence: int) -> str | None:
     from cosmic_ray.mutating import mutate_code
 
     changed = mutate_code(code, operator, occurrence)
+    if changed is None:
+        return None
     try:
-        ast.parse(changed or "")
+        ast.parse(changed)
     except SyntaxError:  # such as {|x} of {**x}
         return None
-    return None if changed is None else str(changed)
+    return str(changed)
 
 
 def _without_annotations(code: str) -> str:

@@ -108,16 +108,11 @@ def test_random_weights_are_held():
     student = acting_student(config)
     observation, actions, worlds = played_actions(config, student)
     for step in (3, 4, 5):  # of six; the weights of the last three are still there
-        expected, _ = student.compose(observation[step][:, : student_positions(config)], worlds._weights)
+        expected, _ = student.compose(observation[step][:, : layouts(config.world).positions.size], worlds._weights)
         random = np.isclose(actions[step], expected, atol=1e-6).all(axis=1)
         assert random.mean() == pytest.approx(0.9, abs=3 * np.sqrt(0.9 * 0.1 / 64))
     assert np.exp(_LEAST_LOG_WEIGHT) <= worlds._weights.min()
     assert 0.9 < worlds._weights.max() <= 1.0
-
-
-def student_positions(config):
-    """Numbers of an observation that primitives see: all but the goal."""
-    return layouts(config.world).bob.size - 3
 
 
 def test_goals_are_outside_obstacles_and_diverged_worlds_are_told():
