@@ -188,7 +188,7 @@ def test_without_panda_gym_one_line_says_how_to_get_it(monkeypatch, capsys):
 
 
 def test_panda_gym_plays_where_it_is_installed():
-    pytest.importorskip("panda_gym", reason="panda-gym, to compare with, comes with make bench only")
+    pytest.importorskip("panda_gym", reason="needs panda-gym: pip install -e '.[bench]'")
     contender = env_throughput.panda_gym(env_throughput.PANDA_GYM_IDS[0])
     assert contender.episode() == env_throughput.EPISODE_STEPS
 

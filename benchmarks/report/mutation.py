@@ -10,24 +10,26 @@ from benchmarks.report.markdown import measured_on, percent, table
 Result = Mapping[str, Any]
 SURVIVED = "survived"
 AS_BEFORE = {
-    "keep_vars=False)": "the same numbers are saved",
-    "num_threads: int = 1": "how many threads, not what they compute",
-    "requires_grad_(requires_grad=True)": "no gradient reaches the targets anyway",
-    "snapshot, strict=False)": "a guard: the lengths never differ",
-    "rates, strict=True))": "a guard: the lengths never differ",
-    "@dataclass(frozen=False": "a guard: nobody sets a field",
-    "(place >= lower) * (place <= upper)": "the product of booleans is their conjunction",
-    "self.tensors()[ -1].device": "all tensors are on one device",
-    "[from_own_start], axis=1)": "the last axis of two",
-    "spread_seed(trial.seed, 4)": "another stream of random numbers, as good as this",
-    "+ /,": "a guard: all name these arguments",
-    "rate.num_seeds <= 1": "there is at least one seed",
-    "default= 1) / 1e3": "without results nothing is drawn",
-    "-@torch.no_grad()": "the tensors of a state_dict ask for no gradient",
-    "self._group.rank != 0": "a rank is never negative",
-    '-            rows["reward"][:, 0],': "there is one column",
+    ("baselines/rewards.py", "keep_vars=False)"): "the same numbers are saved",
+    ("actors/coverage.py", "num_threads: int = 1"): "how many threads, not what they compute",
+    ("actors/evaluation.py", "num_threads: int = 1"): "how many threads, not what they compute",
+    ("sac/learner.py", "requires_grad_(requires_grad=True)"): "no gradient reaches the targets anyway",
+    ("learner/player.py", "snapshot, strict=False)"): "a guard: the lengths never differ",
+    ("downstream/page.py", "rates, strict=False)"): "a guard: the lengths never differ",
+    ("actors/rollout.py", "@dataclass(frozen=False"): "a guard: nobody sets a field",
+    ("generator/snapshot.py", "@dataclass(frozen=False"): "a guard: nobody sets a field",
+    ("baselines/skills.py", "(place >= lower) * (place <= upper)"): "the product of booleans is their conjunction",
+    ("learner/samples.py", "self.tensors()[ -1].device"): "all tensors are on one device",
+    ("generator/records.py", "[from_own_start], axis=1)"): "the last axis of two",
+    ("downstream/worker.py", "spread_seed(trial.seed, 4)"): "another stream of random numbers, as good as this",
+    ("downstream/page.py", "/,"): "a guard: all name these arguments",
+    ("downstream/page.py", "rate.num_seeds <= 1"): "there is at least one seed",
+    ("downstream/page.py", "default= 1) / 1e3"): "without results nothing is drawn",
+    ("learner/transfer.py", "@torch.no_grad()"): "the tensors of a state_dict ask for no gradient",
+    ("learner/learner.py", "self._group.rank != 0"): "a rank is never negative",
+    ("downstream/learner.py", 'rows["reward"][:, -1]'): "there is one column",
 }
-"""Why a survivor behaves as before, by a part of its changed line."""
+"""Why a survivor behaves as before, judged by hand, by its file and a part of its changed line."""
 
 
 def mutation_words(result: Result) -> str:
@@ -48,8 +50,8 @@ def mutation_table(result: Result) -> str:
     """Every survivor: where, its changed line, and why it behaves as before, if it does."""
     rows = [
         (
-            f"{each['file'].removeprefix('service/')}:{each['line']}",
-            " ".join(f"`{_escape(line[1:].strip())}`" for line in _changed(each)),
+            f"{_file(each)}:{each['line']}",
+            " ".join(f"`{_escape(line)}`" for line in _changed(each)),
             _reason(each) or "**no test**",
         )
         for each in result["mutants"]
@@ -58,14 +60,22 @@ def mutation_table(result: Result) -> str:
     return table(("in `service/`", "survived", "why"), rows)
 
 
+def _file(mutant: Result) -> str:
+    return str(mutant["file"]).removeprefix("service/")
+
+
 def _changed(mutant: Result) -> list[str]:
-    added = [line for line in mutant["diff"] if line.startswith("+")]
-    return added or [line for line in mutant["diff"] if line[1:].strip()]
+    """Its changed lines; those that were taken away, where nothing was written instead."""
+    for sign in "+-":
+        lines = [line[1:].strip() for line in mutant["diff"] if line.startswith(sign)]
+        if any(lines):
+            return [line for line in lines if line]
+    raise AssertionError(f"{mutant['file']}:{mutant['line']} changes nothing")
 
 
 def _reason(mutant: Result) -> str | None:
-    text = "\n".join(mutant["diff"])
-    return next((why for part, why in AS_BEFORE.items() if part in text), None)
+    text = "\n".join(_changed(mutant))
+    return next((why for (file, part), why in AS_BEFORE.items() if file == _file(mutant) and part in text), None)
 
 
 def _escape(code: str) -> str:

@@ -18,11 +18,11 @@ from service.envs.tasks import TASKS
 _OWN = "ours-her"
 """The composing method of the summary."""
 _NAMES = {
-    "uniform": "goals uniform in the workspace",
-    "uniform-alice": "the same beside a playing Alice",
-    "table": "goals uniform on the table",
-    "learnable": "goals he solves half the time",
-    "learnable-alice": "the same beside a playing Alice",
+    "uniform": "uniform goals without her",
+    "uniform-alice": "uniform goals beside hers",
+    "table": "uniform goals on the table without her",
+    "learnable": "goals he solves half the time without her",
+    "learnable-alice": "goals he solves half the time beside hers",
 }
 
 
@@ -51,13 +51,12 @@ def headline_table(results: Sequence[Result]) -> str:
 def controls_words(runs: Sequence[Run]) -> str:
     """One sentence: what Bob has with Alice's goals, and with others, after as many env steps of his own."""
     seeds = {name: [run for run in runs if run["control"] == name] for name in (OURS, *_NAMES)}
-    other = ", ".join(f"{_mixed(seeds[name])} with {words}" for name, words in _NAMES.items() if seeds[name])
+    others = [f"{_mixed(seeds[name])} with {words}" for name, words in _NAMES.items() if seeds[name]]
     steps = np.mean([run["bob_env_steps"] for run in seeds[OURS]]) / 1e6
-    low, *_, high = sorted(len(each) for each in (*seeds.values(), seeds[OURS]) if each)
-    how = "one seed of each" if high == 1 else f"mean of {high if low == high else f'{low} to {high}'} seeds"
     return (
         f"After {steps:.1f} million env steps of his own Bob solves {_mixed(seeds[OURS])} of random goals with those "
-        f"that Alice proposes, {other} ({how}; [all controls](docs/results/skills.md))."
+        f"that Alice proposes, {', '.join(others)} (mean, and in brackets the number of seeds; "
+        "[all controls](docs/results/skills.md))."
     )
 
 
@@ -80,4 +79,4 @@ def _mixed(runs: Sequence[Run]) -> str:
         for row in run["evaluations"]
         if (row["policy"], row["goals"]) == ("bob", "mixed")
     ]
-    return percent(float(np.mean(shares)), 1)
+    return f"{percent(float(np.mean(shares)), 1)} ({len(shares)})"

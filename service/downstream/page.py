@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from matplotlib.lines import Line2D
 
 _COLOURS = (BLUE, "#56B4E9", "#7B3FBF", "#000000", GREEN, ORANGE, "#CC79A7", "#E69F00", "#999999")
+_LEGEND_COLUMNS = 6
 Seeds = Sequence[Result]
 """Results of one method on one task."""
 
@@ -293,7 +294,9 @@ def draw_table(results: Sequence[Result], path: Path) -> Path:
     run = {task for _, task in of}
     tasks = [name for name in (*TASKS, *HARD_TASKS) if name in run]
     rows = max(1, math.ceil(len(tasks) / 3))
-    height_inch = 1.4 + 3.3 * rows
+    legend_rows = max(1, math.ceil(len({method for method, _ in of}) / _LEGEND_COLUMNS))
+    above_inch = 1.0 + 0.22 * legend_rows
+    height_inch = above_inch + 0.5 + 3.1 * rows
     figure = new_figure(14.0, height_inch, "Success at the last step, over thousands of env steps")
     longest = max((each["env_steps"] for each in results), default=0) / 1e3
     styles = _line_styles()
@@ -308,8 +311,19 @@ def draw_table(results: Sequence[Result], path: Path) -> Path:
         axes.set_ylim(-0.02, 1.02)
         axes.set_xlim(0.0, 1.02 * longest or 1.0)
     titles = [described.title for described in METHODS.values() if described.title in lines]
-    figure.legend([lines[title] for title in titles], titles, loc="upper right", ncols=4, fontsize=9, frameon=False)
-    figure.subplots_adjust(left=0.05, right=0.98, top=1 - 1.12 / height_inch, bottom=0.56 / height_inch, hspace=0.3)
+    anchor = (0.015, 1 - 0.5 / height_inch)  # under the title
+    figure.legend(
+        [lines[title] for title in titles],
+        titles,
+        loc="upper left",
+        bbox_to_anchor=anchor,
+        ncols=_LEGEND_COLUMNS,
+        fontsize=9,
+        frameon=False,
+    )
+    figure.subplots_adjust(
+        left=0.05, right=0.98, top=1 - above_inch / height_inch, bottom=0.5 / height_inch, hspace=0.3
+    )
     return save(figure, path)
 
 

@@ -115,7 +115,7 @@ def test_every_trouble_has_an_alert_that_was_seen_to_fire():
     assert {rule["alert"] for _, rule in ALERTS} <= fired
 
 
-@pytest.mark.skipif(shutil.which("promtool") is None, reason="promtool, of the prometheus package, is not on PATH")
+@pytest.mark.skipif(shutil.which("promtool") is None, reason="needs promtool, which comes with Prometheus, on PATH")
 def test_promtool_agrees(tmp_path):
     for name in ("prometheus.yml", "alerts.yml"):
         text = (DEPLOY / "prometheus" / name).read_text()

@@ -47,7 +47,7 @@ def series(strike):
     yield {"series": "tandem_store_up", "values": f"1x{calm + STAYS}"}
 
 
-@pytest.mark.skipif(shutil.which("promtool") is None, reason="promtool, of the prometheus package, is not on PATH")
+@pytest.mark.skipif(shutil.which("promtool") is None, reason="needs promtool, which comes with Prometheus, on PATH")
 def test_the_alert_that_fits_fires_if_the_trouble_stays_and_no_other(tmp_path):
     shutil.copy(DEPLOY / "prometheus" / "alerts.yml", tmp_path)
     tests = []
