@@ -50,7 +50,7 @@ def distances_table(results: Sequence[Result]) -> str:
     rows: list[Row] = []
     for name, method in METHODS.items():
         if method.takes is None and method.player is None:
-            found = [_trials(results, name, task) for task in TASKS]
+            found = [trials_of(results, name, task) for task in TASKS]
             cells = [_mean_distance(trials) if trials else "" for trials in found]
             rows += [(method.title, *cells)] if any(cells) else []
     words = "Distance of the object from the goal at the end of the final episodes, mean of episodes and seeds:"
@@ -94,11 +94,12 @@ def _mean(seeds: Sequence[tuple[float, int]]) -> str:
 
 def _rates(results: Sequence[Result], method: str, task: str) -> list[tuple[float, int]]:
     """Success at the last step and number of episodes of each seed."""
-    found = [each["evaluation"] for each in _trials(results, method, task)]
+    found = [each["evaluation"] for each in trials_of(results, method, task)]
     return [(float(each["success_last"]), int(each["num_episodes"])) for each in found]
 
 
-def _trials(results: Sequence[Result], method: str, task: str) -> list[Result]:
+def trials_of(results: Sequence[Result], method: str, task: str) -> list[Result]:
+    """Results of a method on a task."""
     return [each for each in results if (each[TRIAL]["method"], each[TRIAL]["task"]) == (method, task)]
 
 

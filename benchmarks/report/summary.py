@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from benchmarks.controls import OURS
+from benchmarks.report.comparison import trials_of
 from benchmarks.report.markdown import Row, percent, table
 from benchmarks.run_files import Run
 from service.downstream.files import TRIAL
@@ -63,11 +64,7 @@ def controls_words(runs: Sequence[Run]) -> str:
 def _best(results: Sequence[Result], methods: Sequence[str], task: str) -> str:
     means = []
     for method in methods:
-        rates = [
-            each["evaluation"]["success_last"]
-            for each in results
-            if (each[TRIAL]["method"], each[TRIAL]["task"]) == (method, task)
-        ]
+        rates = [each["evaluation"]["success_last"] for each in trials_of(results, method, task)]
         means += [float(np.mean(rates))] if rates else []
     return percent(max(means)) if means else ""
 
