@@ -350,24 +350,25 @@ def draw_skills(runs: Sequence[Run], path: Path) -> Path:
 
 
 def draw_skill_curves(runs: Sequence[Run], path: Path) -> Path:
-    """Draw over env steps what random skills of every run cover, and what episodes with noise did to the object."""
+    """Draw over env steps the coverage of random skills, and shares of episodes by where the object is at their end."""
     learned = by_method(runs)
     colours = dict(zip(learned, COLORS, strict=False))
-    figure = new_figure(WIDTH, 4.6, "Skill discovery over env steps, a line for each seed")
+    figure = new_figure(WIDTH, 8.0, "Skill discovery over env steps, a line for each seed")
     panels = (
         ("evaluation/coverage", "Random skills: table cells visited"),
-        ("skills/moved_fraction", "Episodes that move the object"),
-        ("skills/outside_fraction", "Episodes that end outside the workspace"),
+        ("skills/moved_fraction", "Object moved, and inside at the end"),
+        ("skills/lifted_fraction", "Object in the air, and inside at the end"),
+        ("skills/outside_fraction", "Object outside the workspace at the end"),
     )
-    for axes, (key, title) in zip(figure.subplots(1, 3), panels, strict=True):
+    for axes, (key, title) in zip(figure.subplots(2, 2).flat, panels, strict=True):
         _panel(axes, title, MILLIONS.unit, "share")
         for method, seeds in learned.items():
             for run in seeds:
                 draw_curve(axes, unthin(run["series"]), key, MILLIONS, colours[method])
         axes.set_ylim(0.0, 1.0)
         axes.set_xlim(left=0.0)
-    _legend(figure, [(METHODS[method], {"color": colours[method]}) for method in learned], 0.93, len(learned))
-    figure.subplots_adjust(left=0.05, right=0.98, top=0.78, bottom=0.13)
+    _legend(figure, [(METHODS[method], {"color": colours[method]}) for method in learned], 0.95, len(learned))
+    figure.subplots_adjust(left=0.05, right=0.98, top=0.87, bottom=0.08, hspace=0.35, wspace=0.12)
     return save(figure, path)
 
 
