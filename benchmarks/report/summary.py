@@ -33,10 +33,8 @@ def headline_table(results: Sequence[Result]) -> str:
     groups = {
         "composing frozen primitives, with hindsight": [_OWN],
         "Bob alone, no downstream step": ["asp-only"],
-        "learned from nothing": [
-            name for name, method in METHODS.items() if method.takes is None and method.player is None
-        ],
-        "other skill discovery, composed alike": [name for name, method in METHODS.items() if method.takes == "skills"],
+        "learned from nothing": _learning(None),
+        "skills of other methods, without hindsight": _learning("skills"),
     }
     rows: list[Row] = []
     for title, names in groups.items():
@@ -59,6 +57,11 @@ def controls_words(runs: Sequence[Run]) -> str:
         f"that Alice proposes, {', '.join(others)} (mean, and in brackets the number of seeds; "
         "[all controls](docs/results/skills.md))."
     )
+
+
+def _learning(takes: str | None) -> list[str]:
+    """Methods that learn downstream with what ``takes`` says."""
+    return [name for name, method in METHODS.items() if method.takes == takes and method.player is None]
 
 
 def _best(results: Sequence[Result], methods: Sequence[str], task: str) -> str:

@@ -29,7 +29,7 @@ def test_the_committed_page_is_what_the_recorded_files_give(made, page):
 
 def test_the_committed_pictures_show_what_the_recorded_files_give(made):
     pictures = sorted((made / "results").glob("*.png"))
-    assert len(pictures) == 24
+    assert len(pictures) == 25
     for picture in pictures:
         ours, theirs = (
             np.asarray(Image.open(path).convert("RGB"), dtype=np.int16)
