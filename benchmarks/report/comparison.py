@@ -48,11 +48,10 @@ def longer_table(results: Sequence[Result], longer: Sequence[Result]) -> str:
 def distances_table(results: Sequence[Result]) -> str:
     """Mean distance between object and goal at the end of the final episodes, of what learns from nothing."""
     rows: list[Row] = []
-    for name, method in METHODS.items():
-        if method.takes is None and method.player is None:
-            found = [trials_of(results, name, task) for task in TASKS]
-            cells = [_mean_distance(trials) if trials else "" for trials in found]
-            rows += [(method.title, *cells)] if any(cells) else []
+    for name in learning(None):
+        found = [trials_of(results, name, task) for task in TASKS]
+        cells = [_mean_distance(trials) if trials else "" for trials in found]
+        rows += [(METHODS[name].title, *cells)] if any(cells) else []
     words = "Distance of the object from the goal at the end of the final episodes, mean of episodes and seeds:"
     return f"{words}\n\n{table(('', *(task.title for task in TASKS.values())), rows)}" if rows else ""
 
@@ -96,6 +95,11 @@ def _rates(results: Sequence[Result], method: str, task: str) -> list[tuple[floa
     """Success at the last step and number of episodes of each seed."""
     found = [each["evaluation"] for each in trials_of(results, method, task)]
     return [(float(each["success_last"]), int(each["num_episodes"])) for each in found]
+
+
+def learning(takes: str | None) -> list[str]:
+    """Names of the methods that learn downstream with what they take, ``"skills"`` for one; None: from nothing."""
+    return [name for name, method in METHODS.items() if method.takes == takes and method.player is None]
 
 
 def trials_of(results: Sequence[Result], method: str, task: str) -> list[Result]:

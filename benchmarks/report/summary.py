@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from benchmarks.controls import OURS
-from benchmarks.report.comparison import trials_of
+from benchmarks.report.comparison import learning, trials_of
 from benchmarks.report.markdown import Row, percent, table
 from benchmarks.run_files import Run
 from service.downstream.files import TRIAL
@@ -33,8 +33,8 @@ def headline_table(results: Sequence[Result]) -> str:
     groups = {
         "composing frozen primitives, with hindsight": [_OWN],
         "Bob alone, no downstream step": ["asp-only"],
-        "learned from nothing": _learning(None),
-        "skills of other methods, without hindsight": _learning("skills"),
+        "learned from nothing": learning(None),
+        "skills of other methods, without hindsight": learning("skills"),
     }
     rows: list[Row] = []
     for title, names in groups.items():
@@ -57,11 +57,6 @@ def controls_words(runs: Sequence[Run]) -> str:
         f"that Alice proposes, {', '.join(others)} (mean, and in brackets the number of seeds; "
         "[all controls](docs/results/skills.md))."
     )
-
-
-def _learning(takes: str | None) -> list[str]:
-    """Methods that learn downstream with what ``takes`` says."""
-    return [name for name, method in METHODS.items() if method.takes == takes and method.player is None]
 
 
 def _best(results: Sequence[Result], methods: Sequence[str], task: str) -> str:
