@@ -176,7 +176,8 @@ def test_demo_is_a_short_pretraining_with_a_registry_of_its_own(monkeypatch, tmp
     asked = []
 
     def pretrain(config, directory, registry, **kwargs):
-        asked.append((config.name, config.run.total_env_steps, directory.path, registry))
+        run = config.run
+        asked.append((config.name, run.total_env_steps, run.evaluation_interval, directory.path, registry))
         directory.path.mkdir(parents=True)
         raise KeyboardInterrupt
 
@@ -185,7 +186,8 @@ def test_demo_is_a_short_pretraining_with_a_registry_of_its_own(monkeypatch, tmp
     tandem("demo", "--env-steps", "7")
     tandem("demo", "--env-steps", "8")
     one, two = Path("runs/demo-1"), Path("runs/demo-2")
-    assert asked == [("panda-cube-demo", 7, one, one / "registry"), ("panda-cube-demo", 8, two, two / "registry")]
+    name, interval = "panda-cube-demo", 25
+    assert asked == [(name, 7, interval, one, one / "registry"), (name, 8, interval, two, two / "registry")]
     (one / "config.yaml").touch()
     refused = tandem("demo", "--run-dir", one)
     assert refused.exit_code == 2

@@ -112,7 +112,7 @@ def test_many_at_once_on_ray(source, tmp_path):
         assert table(TRIALS[:2], source, tmp_path, ON_RAY)
         other = [small_trial("idle", num_episodes=9)]  # where a training directory of that name is of other settings
         with pytest.raises(TandemError, match="num_episodes 6, not 9") as caught:
-            make_table(other, source, tmp_path / "other", ON_RAY, Callbacks())
+            make_table(other, source, tmp_path / "other", run_on_ray, Callbacks())
     assert "\n" not in str(caught.value)
     assert not list((tmp_path / "other").rglob("*.json"))
     found = ResultsDirectory(tmp_path / "out" / "downstream").read_all()

@@ -150,7 +150,9 @@ def test_the_number_of_ranks_may_change(pair):
 
 def test_ranks_that_are_not_at_one_point_do_not_learn(pair):
     config = make_config()
-    answers = pair.run(work.advance_random_numbers, config, play(config, num_updates=2))
+    first, late = play(config, num_updates=2)
+    late = [replace(each, policy_version=0) for each in late]  # the message tells the learner's version
+    answers = pair.run(work.advance_random_numbers, config, [first, late])
     for error in answers:
         assert isinstance(error, LearnerError)
         numbers = "version 1 with random numbers and learning rates ([0-9a-f]{8}), rank 0 at 1 with ([0-9a-f]{8})"

@@ -138,7 +138,8 @@ class Summary {
     this.troubles = el("div", { class: "troubles", role: "status" });
     this.numbers = el("dl", { class: "tiles" });
     this.bob = tile("Bob's success", "on Alice's goals");
-    const trail = el("nav", { class: "trail", "aria-label": "Breadcrumb" }, el("a", { href: "#/" }, "Runs"), " / ");
+    const here = el("span", { "aria-current": "page" }, runId);
+    const trail = el("nav", { class: "trail", "aria-label": "Breadcrumb" }, el("a", { href: "#/" }, "Runs"), " / ", here);
     this.root = el("div", {}, trail, el("h1", {}, runId, " ", this.chip), this.sub, this.troubles, this.numbers);
     this.tiles = {
       progress: tile("Progress"),
