@@ -326,27 +326,34 @@ def _stage_words(name: str, stage: dict[str, Any], random: dict[str, Any]) -> st
 
 
 def draw_skills(runs: Sequence[Run], path: Path) -> Path:
-    """Draw random skills from above: a row for each method's first seed, a column for each stage."""
-    rows = [seeds[0] for seeds in by_method(runs).values()]
-    columns = (RANDOM, *STAGES)
-    height = 1.1 + 3.3 * len(rows)
-    figure = _tall_figure(height, "Where random skills take the object, seen from above")
-    words = f"{rows[0]['coverage']['num_skills']} skills of {rows[0]['coverage']['num_steps']} steps"
-    figure.text(0.98, 1.0 - 0.35 / height, words, ha="right", va="center", color=FAINT)
-    grid = figure.subplots(len(rows), len(columns), squeeze=False)
-    for run, line in zip(rows, grid, strict=True):
-        workspace = WorkspaceConfig.model_validate(run["config"]["world"]["workspace"])
-        stages = run["coverage"]["stages"]
-        for name, axes in zip(columns, line, strict=True):
-            if name not in stages:
-                axes.set_visible(False)
-                continue
-            draw_paths_above(axes, paths_m(stages[name]), workspace)
-            _draw_table_cells(axes, workspace)
-            axes.set(xlabel="", ylabel="")
-            axes.set_title(f"{METHODS[run['method']]}, {_stage_words(name, stages[name], stages[RANDOM])}", fontsize=9)
-    figure.subplots_adjust(left=0.04, right=0.99, bottom=0.4 / height, top=1.0 - 1.0 / height, hspace=0.35)
+    """Draw random skills from above: the random policy, and a column for each method's first seed with its stages."""
+    columns = [seeds[0] for seeds in by_method(runs).values()]
+    coverage = columns[0]["coverage"]
+    figure = new_figure(WIDTH, 8.2, "Where random skills take the object, seen from above")
+    words = f"{coverage['num_skills']} skills of {coverage['num_steps']} steps; a dot is where the object ends"
+    figure.text(0.98, 0.955, words, ha="right", va="center", color=FAINT)
+    grid = figure.subplots(len(STAGES), 1 + len(columns), squeeze=False, sharex=True, sharey=True)
+    for axes in grid[1:, 0]:
+        axes.set_visible(False)
+    _draw_skills_of(grid[0, 0], columns[0], RANDOM, "")  # one for all: its seed is that of every run
+    for run, line in zip(columns, grid[:, 1:].T, strict=True):
+        for name, axes in zip(STAGES, line, strict=True):
+            _draw_skills_of(axes, run, name, f"{METHODS[run['method']]}, ")
+    figure.subplots_adjust(left=0.035, right=0.995, bottom=0.04, top=0.86, hspace=0.3, wspace=0.08)
     return save(figure, path)
+
+
+def _draw_skills_of(axes: Axes, run: Run, name: str, method: str) -> None:
+    """Draw the paths of a stage, where the run has it."""
+    stages = run["coverage"]["stages"]
+    if name not in stages:
+        axes.set_visible(False)
+        return
+    workspace = WorkspaceConfig.model_validate(run["config"]["world"]["workspace"])
+    draw_paths_above(axes, paths_m(stages[name]), workspace)
+    _draw_table_cells(axes, workspace)
+    axes.set(xlabel="", ylabel="")
+    axes.set_title(f"{method}{_stage_words(name, stages[name], stages[RANDOM])}", fontsize=8)
 
 
 def draw_skill_curves(runs: Sequence[Run], path: Path) -> Path:
