@@ -135,7 +135,8 @@ def test_the_demo_needs_no_checkout(installed, tmp_path):
     assert "panda-cube-demo@1 in runs/demo-1/registry" in said
     assert "tandem serve --runs runs" in said
     config = load_config(tmp_path / "runs" / "demo-1" / "config.yaml")
-    assert config == load_config(recipes()["panda-cube"], ["name=panda-cube-demo", "run.total_env_steps=1"])
+    chosen = ["name=panda-cube-demo", "run.total_env_steps=1", "run.evaluation_interval=25"]
+    assert config == load_config(recipes()["panda-cube"], chosen)
 
 
 def test_the_web_page_is_in_it(installed):
