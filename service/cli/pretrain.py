@@ -213,7 +213,7 @@ def _method_overrides(method: str | None) -> list[str]:
 
 
 _DEMO_SETTINGS = ("run.evaluation_interval=25",)
-"""So that a run of three minutes, some 220 iterations, has a curve of Bob on random goals and not a point."""
+"""So that a run of three minutes, about 200 iterations, has a curve of Bob on random goals and not a point."""
 
 
 def demo(
