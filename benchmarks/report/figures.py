@@ -335,7 +335,7 @@ def draw_skills(runs: Sequence[Run], path: Path) -> Path:
     grid = figure.subplots(len(STAGES), 1 + len(columns), squeeze=False, sharex=True, sharey=True)
     for axes in grid[1:, 0]:
         axes.set_visible(False)
-    _draw_skills_of(grid[0, 0], columns[0], RANDOM, "")  # one for all: its seed is that of every run
+    _draw_skills_of(grid[0, 0], columns[0], RANDOM, "")  # the same in every run: its seed is fixed
     for run, line in zip(columns, grid[:, 1:].T, strict=True):
         for name, axes in zip(STAGES, line, strict=True):
             _draw_skills_of(axes, run, name, f"{METHODS[run['method']]}, ")

@@ -91,6 +91,7 @@ def test_a_run(visit):
     page = visit.go("#/runs/cube").page
     page.get_by_role("heading", name="cube running").wait_for()
     assert page.title() == "cube \u00b7 Tandem"
+    assert page.get_by_role("navigation", name="Breadcrumb").inner_text() == "Runs / cube"
     tiles = dict(text.split("\n", 1) for text in page.locator(".tile").all_inner_texts())
     assert tiles["Progress"].startswith(f"30.0{NBSP}%")
     assert f"about 14{NBSP}s to go" in tiles["Progress"]  # 7,000 env steps at 500 a second
