@@ -39,7 +39,7 @@ def headline_table(results: Sequence[Result]) -> str:
     rows: list[Row] = []
     for title, names in groups.items():
         if found := [name for name in names if name in known]:
-            words = f"{title}, the best of {len(found)} on each task"
+            words = f"{title}, the best of up to {len(found)} on each task"
             if len(found) == 1:
                 words = title if len(names) == 1 else f"{title}: {METHODS[found[0]].title}"
             rows.append((words, *(_best(results, found, task) for task in TASKS)))
