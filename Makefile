@@ -19,13 +19,13 @@ index_url   = $(lastword $(call pip_setting,index-url))
 uv_flags    = $(addprefix --default-index ,$(index_url)) \
               $(if $(TORCH_BACKEND),--torch-backend=$(TORCH_BACKEND),$(or $(addprefix --find-links ,$(find_links)),--torch-backend=cpu))
 
-.PHONY: help setup demo check test docs bench clean
+.PHONY: help setup demo check pytest test docs bench clean
 
 help:
 	@echo "make setup   make $(VENV) and install everything into it"
 	@echo "make demo    a short pre-training from scratch, about three minutes of self-play"
 	@echo "make check   ruff and mypy"
-	@echo "make test    check, then every test"
+	@echo "make test    check and every test"
 	@echo "make docs    the docs site, into build/docs-site/site"
 	@echo "make bench   the throughput benchmarks, against panda-gym"
 	@echo "make clean   remove $(VENV) and the caches; runs/ stays"
@@ -55,8 +55,12 @@ check: $(STAMP)
 	$(PY) -m ruff format --check
 	$(PY) -m mypy
 
-test: check
+pytest: $(STAMP)
 	$(PY) -m pytest -n $(JOBS) --maxprocesses 8 --dist worksteal
+
+# Both at once: mypy takes a core for half a minute.
+test: $(STAMP)
+	@$(MAKE) -j 2 --no-print-directory check pytest
 
 docs: $(STAMP)
 	$(PY) -m tools.docs_site

@@ -40,6 +40,7 @@ CLUSTER_MODULES = (
     "remote_worker",
     "status_actor",
     "watch",
+    "worker_variables",
 )
 ROOMS_WITHOUT_TORCH = ("actors", "envs", "generator", "play", "registry", "status")
 ROOMS = (

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 import ray
 from ray.util.metrics import Counter, Histogram
 
+import service.runtime.worker_variables  # noqa: F401  before NumPy and MuJoCo are imported  # isort: split
 from service.actors.rollout import Rollout
 from service.config import Config
 from service.errors import GroupError
@@ -42,8 +43,6 @@ NICENESS = 10
 """Of workers that compute, above that of processes that answer: a tenth of the share of a core that both want."""
 
 
-THREAD_VARIABLES = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
-"""NumPy's own threads would fight with those that step the worlds and with the other actors."""
 QUIET = {"enable_task_events": False}
 """Else Ray's head keeps the last 100,000 calls, some 350 MB: a run makes as many in half a day."""
 PROBE_GROUP = {"probe": 1}
@@ -75,7 +74,7 @@ def lower_priority() -> None:
 def remote_actor(kind: type[Watched], **options: Any) -> Any:
     """Ray's actor class of a worker, with options of its own beside those that all have."""
     actor = ray.remote(concurrency_groups=PROBE_GROUP)(kind)  # type: ignore[call-overload]
-    return actor.options(runtime_env={"env_vars": THREAD_VARIABLES}, **QUIET, **options)
+    return actor.options(**QUIET, **options)
 
 
 class Watched:

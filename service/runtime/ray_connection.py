@@ -102,7 +102,7 @@ def connected(address: str | None, num_cpus: int | None = None) -> Iterator[None
     if address is None:
         os.environ.setdefault(_CLUSTERS_VARIABLE, "0")
         os.environ.setdefault("RAY_worker_niceness", "0")  # not 15 for all: see ``ray_actors.lower_priority``
-        # No spare worker for every core: ours have environment variables of their own, so none would fit.
+        # No spare worker for every core: a run begins no sooner with them, and may need fewer.
         os.environ.setdefault("RAY_prestart_worker_first_driver", "0")
     with needs_extra("cluster", "--runtime ray"):
         import ray

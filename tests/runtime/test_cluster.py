@@ -3,7 +3,6 @@
 import os
 import re
 import signal
-from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 
@@ -20,6 +19,7 @@ from service.runtime.learner_group import LearnerGroup
 from service.runtime.ray_actors import NICENESS
 from service.runtime.ray_connection import ClusterOptions, connected
 from service.runtime.runner import ClusterError, StateLostError
+from service.runtime.worker_variables import WORKER_VARIABLES
 from tests.runtime.runs import is_alive, newest, play, read_lines, tiny_config
 
 TOGETHER = ("learner/", "alice/", "bob/", "generator/")
@@ -182,38 +182,51 @@ def test_updates_go_on_without_an_actor_that_is_late_and_one_that_hangs_is_repla
     assert counted - health.num_rollouts_counted in (0, 1)  # the refused one is left out, unless a later one covers it
 
 
-@pytest.mark.parametrize("name", ["generator", "learner"])
-def test_no_round_notices_a_worker_that_is_frozen(tmp_path, monkeypatch, name):
+def test_no_round_notices_workers_that_are_frozen(tmp_path, monkeypatch):
     """Iterations wait until another takes its place; no actor is replaced, no rollout is lost or counted twice."""
     monkeypatch.setattr("service.runtime.watch.STALL_S", 10.0)
     monkeypatch.setattr("service.runtime.watch.MAX_STALL_S", 10.0)
-    frozen, played = [], []
+    frozen, since, errors, played = {}, [], [], {"generator": [], "learner": []}
+    names = list(played)
 
-    def worker(run):
+    def worker(run, name):
         return run._generator if name == "generator" else run._learner
 
     def freeze(run, metrics):
-        actors = run.health().actors
-        if not frozen and metrics["iteration"] >= 4 and not any(actor.pid is None for actor in actors):
-            frozen.append(pid_of(run, name))
-            os.kill(frozen[0], signal.SIGSTOP)
-        elif frozen and worker(run).incarnation == 1 and metrics["iteration"] >= 12:
+        """One after the other, each when all have been there for some iterations."""
+        since.append(metrics["iteration"])
+        waited_for = [name for name in frozen if worker(run, name).incarnation == 0]
+        if waited_for or any(actor.pid is None for actor in run.health().actors):
+            since.clear()
+        if len(since) < 4:
+            return
+        since.clear()
+        errors.append({actor.name: actor.last_error for actor in run.health().actors})
+        if not names:
             run.request_stop()
+            return
+        name = names.pop(0)
+        frozen[name] = pid_of(run, name)
+        os.kill(frozen[name], signal.SIGSTOP)
 
     def look(run):
-        if frozen and worker(run).incarnation == 0:
-            played.append((run.iteration, run._slots.num_taken, len(run._slots._began)))
+        for name in frozen:
+            if worker(run, name).incarnation == 0:
+                played[name].append((run.iteration, run._slots.num_taken, len(run._slots._began)))
 
     run, result = run_cluster(tmp_path, tiny_config(total_env_steps=10**9), on_iteration=freeze, on_beat=look)
     assert result.reason == "interrupted"
-    # All that the policy lag allows was played: two rollouts wait for the worker, and two for the next iteration.
-    assert played[-1][1:] == (4, 0)
-    assert len({iteration for iteration, _, _ in played}) <= 2
-    assert not is_alive(frozen[0])
+    before, after_first, after_both = errors
+    assert set(before.values()) == {None}
+    assert [name for name, error in after_first.items() if error] == ["generator"]
+    assert {name for name, error in after_both.items() if error} == {"generator", "learner"}
+    for name, pid in frozen.items():
+        # All that the policy lag allows was played: two rollouts wait for the worker, and two for the next iteration.
+        assert played[name][-1][1:] == (4, 0)
+        assert len({iteration for iteration, _, _ in played[name]}) <= 2
+        assert not is_alive(pid)
+        assert re.match(r"no progress for 1\d s", after_both[name])
     health = run.health()
-    errors = {actor.name: actor.last_error for actor in health.actors}
-    assert re.match(r"no progress for 1\d s", errors.pop(name))
-    assert set(errors.values()) == {None}
     assert health.num_rollouts_refused == 0
     counted = ids(tmp_path)
     assert {incarnation for _, incarnation, _ in counted} == {0}
@@ -223,11 +236,20 @@ def test_no_round_notices_a_worker_that_is_frozen(tmp_path, monkeypatch, name):
     assert [row["learner/version"] for row in rows] == list(range(1, len(rows) + 1))
 
 
-def test_learners_that_die_while_they_start_lose_nothing(tmp_path):
-    struck = []
+def test_learners_that_die_before_the_run_has_begun_and_while_they_start_lose_nothing(tmp_path, monkeypatch):
+    ready, early, struck = LearnerGroup.wait_ready, [], []
+
+    def kill_first(group):
+        if not early:
+            early.append(ray.get(group._ranks[0].ping.remote()).pid)
+            os.kill(early[0], signal.SIGKILL)
+        ready(group)
+
+    monkeypatch.setattr(LearnerGroup, "wait_ready", kill_first)
 
     def strike(run, metrics):
         if metrics["iteration"] == 4:
+            assert pid_of(run, "learner") not in early
             ask = run._learner._ask
 
             def ask_and_strike(timeout_s, answers, what):
@@ -244,8 +266,9 @@ def test_learners_that_die_while_they_start_lose_nothing(tmp_path):
 
     run, result = run_cluster(tmp_path, tiny_config(total_env_steps=10**9), num_actors=1, on_iteration=strike)
     assert result.reason == "interrupted"
+    assert len(early) == 1
     assert len(struck) == 2
-    assert run._learner.incarnation == 3
+    assert run._learner.incarnation == 4
     rows = read_lines(tmp_path / "metrics.jsonl")
     assert [row["learner/version"] for row in rows] == list(range(1, len(rows) + 1))
     assert sum(highest + 1 for _, _, highest in ids(tmp_path)) == run.health().num_rollouts_counted
@@ -276,6 +299,20 @@ def test_a_stop_ends_it_at_once_and_saved(tmp_path):
     assert answers < 19
 
 
+def test_a_worker_computes_with_one_thread_and_looks_for_no_window():
+    def look():
+        import sys
+
+        before = sorted({"numpy", "torch", "mujoco"} & sys.modules.keys())
+        import service.runtime.ray_actors  # noqa: F401  as unpickling an actor does
+
+        return before, {name: os.environ.get(name) for name in WORKER_VARIABLES}, "mujoco.glfw" in sys.modules
+
+    elsewhere = {"OPENBLAS_NUM_THREADS": "7", "MUJOCO_GL": "glfw"}
+    task = ray.remote(num_cpus=0, runtime_env={"env_vars": elsewhere})(look)
+    assert ray.get(task.remote()) == ([], WORKER_VARIABLES, False)
+
+
 def test_a_learner_that_dies_of_every_batch_ends_the_run_with_one_line(tmp_path, monkeypatch):
     monkeypatch.setattr("service.runtime.cluster.MAX_ATTEMPTS", 2)
 
@@ -293,23 +330,6 @@ def test_a_learner_that_dies_of_every_batch_ends_the_run_with_one_line(tmp_path,
     with pytest.raises(ClusterError, match=r"2 times in a row the learner failed") as error:
         run_cluster(tmp_path, tiny_config(total_env_steps=10**9), num_actors=1, on_iteration=strike)
     assert "\n" not in str(error.value)
-
-
-def test_a_learner_that_is_killed_before_the_run_has_begun_is_started_again(tmp_path, monkeypatch):
-    ready, killed = LearnerGroup.wait_ready, []
-
-    def kill_first(group):
-        if not killed:
-            killed.append(ray.get(group._ranks[0].ping.remote()).pid)
-            os.kill(killed[0], signal.SIGKILL)
-        ready(group)
-
-    monkeypatch.setattr(LearnerGroup, "wait_ready", kill_first)
-    directory = RunDirectory(tmp_path)
-    directory.claim(resume=False)
-    with closing(directory), closing(ClusterRun(tiny_config(), directory, ClusterOptions(num_actors=1))) as run:
-        assert pid_of(run, "learner") not in killed
-    assert newest(tmp_path).step == 0
 
 
 def test_a_policy_that_diverges_ends_the_run_with_how_to_go_on(tmp_path):
