@@ -72,7 +72,7 @@ def head():
     ports.append(f"--dashboard-agent-listen-port={agent}")
     command = [RAY, "start", "--head", "--block", "--num-cpus=3", f"--temp-dir={scratch}", *ports]
     # Else Ray kills a job that still saves; it wants whole seconds.
-    settings = {"RAY_JOB_STOP_WAIT_TIME_S": f"{PATIENCE_S:.0f}", "RAY_prestart_worker_first_driver": "0"}
+    settings = {"RAY_JOB_STOP_WAIT_TIME_S": f"{PATIENCE_S:.0f}"}
     with (scratch / "head.log").open("wb") as log:
         process = subprocess.Popen(command, stdout=log, stderr=log, env=os.environ | settings)
         try:
