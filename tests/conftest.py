@@ -30,7 +30,7 @@ for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "
 os.environ["MPLBACKEND"] = "agg"
 # Ray reads these at import, too. With a token of our own it leaves none in the home directory.
 os.environ |= {"RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN": secrets.token_hex(32), "RAY_USAGE_STATS_ENABLED": "0"}
-os.environ |= {"RAY_prestart_worker_first_driver": "0"}  # spare workers for every core, a second of a core each
+os.environ |= {"RAY_prestart_worker_first_driver": "0"}  # no spare workers, a second of a core each
 # Else every call of CliRunner builds all commands anew: 30 ms, some thousand times.
 typer.testing._get_command = functools.cache(typer.testing._get_command)
 

@@ -248,7 +248,9 @@ def test_learners_that_die_before_the_run_has_begun_and_while_they_start_lose_no
     monkeypatch.setattr(LearnerGroup, "wait_ready", kill_first)
 
     def strike(run, metrics):
-        if metrics["iteration"] == 4:
+        if metrics["iteration"] == 1:
+            assert newest(tmp_path).step == 0  # of the learner that came after the first one
+        elif metrics["iteration"] == 4:
             assert pid_of(run, "learner") not in early
             ask = run._learner._ask
 
