@@ -22,13 +22,14 @@ uv_flags    = $(addprefix --default-index ,$(index_url)) \
 .PHONY: help setup demo check pytest test docs bench clean
 
 help:
-	@echo "make setup   make $(VENV) and install everything into it"
-	@echo "make demo    a short pre-training from scratch, about three minutes of self-play"
-	@echo "make check   ruff and mypy"
-	@echo "make test    check and every test"
+	@echo "make demo    a short pre-training from scratch: about five minutes, ends with what Bob has learned"
+	@echo "make test    check and every test: about nine minutes, ends with how many passed"
+	@echo "make setup   make $(VENV) and install everything into it: a minute or two, 2.5 GB; the others do it first"
+	@echo "make check   ruff and mypy: about a minute"
 	@echo "make docs    the docs site, into build/docs-site/site"
 	@echo "make bench   the throughput benchmarks, against panda-gym"
 	@echo "make clean   remove $(VENV) and the caches; runs/ stays"
+	@echo "Times are of two quiet cores. README.md says what to do first."
 
 setup: $(STAMP)
 

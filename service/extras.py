@@ -1,4 +1,7 @@
-"""Packages that only some commands need, and what to type where they are not installed."""
+"""Packages that only some commands need, and what to type where they are not installed.
+
+What is typed names the project, not an index or a clone: pip and uv take the one that is installed, and add its extra.
+"""
 
 from __future__ import annotations
 

@@ -106,10 +106,10 @@ def blocks(text, *languages):
 def commands(text):
     """The ``tandem`` commands in a page's blocks of code, without ``tandem``."""
     for block in blocks(text, "", "console"):
+        prompt = "$ " if re.search(r"^\$ ", block, re.MULTILINE) else ""  # with one, other lines are answers
         for line in block.replace("\\\n", " ").splitlines():
-            typed = line.removeprefix("$ ")
-            if typed.startswith("tandem "):
-                yield shlex.split(typed, comments=True)[1:]
+            if line.startswith(f"{prompt}tandem "):
+                yield shlex.split(line.removeprefix(prompt), comments=True)[1:]
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda path: path.stem)
@@ -159,27 +159,20 @@ def test_start_heres_task_is_learned_measured_and_loaded(tmp_path, monkeypatch):
     assert names["action"].shape == (3, 4)
 
 
-def test_the_readmes_snippets_run(capsys):
-    measure, world, act = blocks((ROOT / "README.md").read_text(), "python")
-    names = {"positions": np.zeros((2, 11)), "positions_and_goal": np.zeros((2, 14))}
-    assert '"mixed", 100' in measure
-    exec(compile(measure.replace('"mixed", 100', '"mixed", 4'), "README.md", "exec"), names)
-    assert re.match(r"Bob takes the cube to \d+% of them, within \d\.\d{3} m", capsys.readouterr().out)
-    exec(compile(world, "README.md", "exec"), names)
-    assert names["observation"]["observation"].shape == (11,)
-    names["weights"] = np.ones((2, names["bob"].primitives.num_primitives))
-    exec(compile(act, "README.md", "exec"), names)
-    assert names["means"].shape == (2, names["weights"].shape[1], 4)
-    assert names["action"].shape == (2, 4)
-
-
 def test_start_here_runs_as_a_program(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    goal, task = blocks(START, "python")
+    measure, goal, mix, task = blocks(START, "python")
+    assert '"mixed", 100' in measure
+    exec(compile(measure.replace('"mixed", 100', '"mixed", 4'), "start.md", "exec"), {})
+    assert re.match(r"Bob takes the cube to \d+% of them, within \d\.\d{3} m", capsys.readouterr().out)
     exec(compile(goal, "start.md", "exec"), {})
     found = re.fullmatch(r"the cube is (\d+\.\d) cm from the goal\n", capsys.readouterr().out)
     assert found is not None
     assert float(found[1]) < 5.0
+    names = {}
+    exec(compile(mix, "start.md", "exec"), names)
+    assert (names["means"].shape, names["mean"].shape) == ((8, 4), (4,))
+    assert not np.array_equal(names["observation"]["observation"], names["positions"])
     assert "learn(10_000)" in task
     names = {}
     exec(compile(task.replace("10_000", "110"), "start.md", "exec"), names)

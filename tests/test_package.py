@@ -2,10 +2,13 @@
 
 import json
 import os
+import re
+import shlex
 import shutil
 import subprocess
 import sys
 import sysconfig
+from importlib import import_module
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +17,7 @@ import pytest
 import service
 from service.config import load_config, parse_config
 from service.errors import TandemError
+from service.extras import MissingPackageError, needs_extra
 from service.policies.numpy_policy import NumpyMCPPolicy
 from service.primitives.bundled import BUNDLED
 from service.recipes import recipes, robots
@@ -74,6 +78,21 @@ def run(installed, directory, *arguments, program="python"):
 def test_the_wheel_has_the_primitives_byte_for_byte(installed):
     assert files_in(installed / "service" / "primitives" / "data") == files_in(BUNDLED)
     assert (installed / "service" / "py.typed").exists()
+
+
+def test_what_a_missing_package_asks_for_needs_no_index(installed, tmp_path):
+    with pytest.raises(MissingPackageError) as error, needs_extra("play", "this"):
+        import_module("nothing.at.all")
+    said = re.search(r"pip install .*", str(error.value))
+    assert said is not None
+    pip = [sys.executable, "-m", "pip", "--python", installed.parents[2] / "bin" / "python"]
+    options = ["--no-index", "--disable-pip-version-check"]
+    environment = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
+    done = subprocess.run(
+        [*pip, *shlex.split(said[0])[1:], *options], cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=600
+    )
+    assert done.returncode == 0, done.stderr
+    assert f"already satisfied: tandem-skills[play] in {installed}" in done.stdout
 
 
 def test_an_installed_tandem_evaluates_them_in_any_directory(installed, tmp_path):

@@ -9,6 +9,7 @@ import tomllib
 from pathlib import Path
 
 import pytest
+import yaml
 
 import service
 
@@ -202,7 +203,18 @@ def test_no_module_is_long():
 def test_one_version_everywhere():
     latest = re.search(r"^## \[([^\]]+)\]", (ROOT / "CHANGELOG.md").read_text(), re.MULTILINE)
     assert latest is not None
-    assert project_table()["version"] == latest[1] == service.__version__
+    assert project_table()["version"] == latest[1] == service.__version__ == citation()["version"]
+
+
+def citation():
+    return yaml.safe_load((ROOT / "CITATION.cff").read_text())
+
+
+def test_a_citation_credits_this_project():
+    """With ``preferred-citation`` the paper would be cited in its place, which is by others."""
+    assert "preferred-citation" not in citation()
+    assert citation()["title"].startswith("Tandem: ")
+    assert [each["url"] for each in citation()["references"]] == ["https://arxiv.org/abs/2410.04855"]
 
 
 def test_mujoco_has_an_upper_bound():
@@ -218,15 +230,34 @@ def test_links_lead_somewhere(document):
     assert [target for target in local if not (document.parent / target).exists()] == []
 
 
-def test_the_readme_names_only_verbs_that_exist():
+def test_the_readme_begins_with_commands_that_exist():
     text = (ROOT / "README.md").read_text()
+    first = re.search(r"```\n(.*?)```", text, re.DOTALL)
+    assert first is not None
+    lines = [line.partition("#")[0].split() for line in first[1].splitlines()]
+    assert [line[:2] for line in lines] == [["git", "clone"], ["cd", "tandem"], ["make", "demo"], ["make", "test"]]
     phony = re.search(r"^\.PHONY: (.*)$", (ROOT / "Makefile").read_text(), re.MULTILINE)
     assert phony is not None
-    named = set(re.findall(r"(?:^|`)make ([a-z]+)", text, re.MULTILINE))
-    assert {"demo", "test"} <= named <= set(phony[1].split())
-    commands = set(re.findall(r"(?:^|`)tandem ([a-z]+)", text, re.MULTILINE))
+    assert set(re.findall(r"(?:^|`)make ([a-z]+)", text, re.MULTILINE)) <= set(phony[1].split())
+    commands = set(re.findall(r"(?:^ *|`)tandem ([a-z]+)", text, re.MULTILINE))
     assert commands
     assert commands <= set(VERBS)
+
+
+def test_the_readme_is_short():
+    lines = (ROOT / "README.md").read_text().splitlines()
+    assert len(lines) <= 120
+    assert [line for line in lines if len(line) > 160 and not line.startswith("|")] == []
+
+
+@pytest.mark.parametrize("document", DOCUMENTS, ids=lambda path: str(path.relative_to(ROOT)))
+def test_no_page_installs_from_an_index(document):
+    """No index has the package: a page that names it to an installer sends readers to nothing, or to a stranger's."""
+    text = document.read_text()
+    installer = r"(?:pip3? install|pipx|uvx|uv (?:tool|add|pip))"
+    assert re.findall(rf"\b{installer}\b[^\n`]*\btandem-skills\b.*", text) == []
+    wheels = re.findall(r"tandem_skills-(.+?)-py3", text)
+    assert set(wheels) <= {service.__version__}
 
 
 def test_ci_runs_what_the_readme_says():

@@ -85,7 +85,7 @@ PAGES = {
     "api.md": ("page",),
     "results/README.md": ("mutation",),
     "results/robust.md": ("robustness", "randomisation_ranges"),
-    "../README.md": ("headline", "controls"),
+    "../README.md": ("headline",),
     "scaling.md": ("bottleneck", "box", "nodes", "model", "batches", "skill", "constants"),
 }
 """Blocks of every page."""

@@ -197,7 +197,8 @@ def _how_to_load(manifest: Manifest) -> Iterator[str]:
     kind, name = _kind(manifest), manifest.reference
     size = manifest.spaces.get("observation", "O")
     yield "## How to load it"
-    yield _fenced("sh", "pip install tandem-skills")
+    yield "No index of packages has Tandem yet. In a clone of its repository:"
+    yield _fenced("sh", "pip install .")
     if kind == ORCHESTRATOR:
         code = [
             f'policy = service.load_policy("{name}", registry="registry")',

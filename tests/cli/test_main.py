@@ -29,7 +29,7 @@ from service.runtime.signals import InterruptError
 from tests.runtime.runs import TREE, assert_one_line, no_room_above, tiny_config, write_yaml
 
 ROOT = Path(__file__).parents[2]
-README = (ROOT / "README.md").read_text()
+EXAMPLES = (ROOT / "docs" / "cli.md").read_text()
 EVALUATION_KEYS = {
     "goals", "num_episodes", "num_steps", "success_last", "success_last_low", "success_last_high", "success_ever",
     "mean_distance_m",
@@ -111,7 +111,7 @@ def test_pretrain_refuses_a_directory_with_a_run(trained):
     assert (trained.run / "metrics.jsonl").read_bytes() == before
 
 
-def test_the_readmes_commands_of_pretraining(monkeypatch, tmp_path):
+def test_the_examples_of_pretraining(monkeypatch, tmp_path):
     """As they stand there, one after the other, with a tiny configuration where the shipped one would be.
 
     What they do with ``--runtime ray`` is shown in tests/runtime.
@@ -120,7 +120,7 @@ def test_the_readmes_commands_of_pretraining(monkeypatch, tmp_path):
     monkeypatch.setattr("service.runtime.pretrain.make_artifacts", lambda directory: {})
     monkeypatch.chdir(tmp_path)
     commands = [
-        shlex.split(line, comments=True) for line in re.findall(r"^tandem (pretrain .*)$", README, re.MULTILINE)
+        shlex.split(line, comments=True) for line in re.findall(r"^\$ tandem (pretrain .*)$", EXAMPLES, re.MULTILINE)
     ]
     commands = [command for command in commands if "--runtime" not in command]
     write_yaml(tmp_path / "tiny.yaml", TREE | {"name": "panda-cube"})
@@ -134,7 +134,7 @@ def test_the_readmes_commands_of_pretraining(monkeypatch, tmp_path):
     rows = json.loads(tandem("registry", "list", "--json").stdout)
     own = [(row["name"], row["version"], row["parent"]) for row in rows if row["where"] == "yours"]
     assert own == [("panda-cube", 1, None), ("panda-sphere", 1, None)]  # resuming what was finished made no version
-    few = ("--episodes", 2, "--steps", 2, "--json")  # after which the README's primitives are still there
+    few = ("--episodes", 2, "--steps", 2, "--json")  # after which the bundled primitives are still there
     evaluated = json.loads(tandem("evaluate", "--primitives", "panda-cube@champion", *few).stdout)
     assert list(evaluated) == [f"{Registry(BUNDLED).resolve('panda-cube@champion')} (bundled)", "idle"]
     evaluated = json.loads(tandem("evaluate", "--primitives", "panda-cube", *few).stdout)
