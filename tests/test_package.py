@@ -86,10 +86,15 @@ def test_what_a_missing_package_asks_for_needs_no_index(installed, tmp_path):
     said = re.search(r"pip install .*", str(error.value))
     assert said is not None
     pip = [sys.executable, "-m", "pip", "--python", installed.parents[2] / "bin" / "python"]
-    options = ["--no-index", "--disable-pip-version-check"]
+    options = ["--no-deps", "--no-index", "--disable-pip-version-check"]
     environment = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
     done = subprocess.run(
-        [*pip, *shlex.split(said[0])[1:], *options], cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=600
+        [*pip, *shlex.split(said[0])[1:], *options],
+        cwd=tmp_path,
+        env=environment,
+        capture_output=True,
+        text=True,
+        timeout=600,
     )
     assert done.returncode == 0, done.stderr
     assert f"already satisfied: tandem-skills[play] in {installed}" in done.stdout
