@@ -19,14 +19,15 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks import robot_bridge, time_to_skill
-from benchmarks.controls import OURS
 from benchmarks.report import (
     attacks,
+    champion,
     cluster,
     comparison,
     mutation,
     page_speed,
     pretraining,
+    recipe,
     robots,
     robustness,
     scaling,
@@ -75,10 +76,12 @@ PROGRAMS = {
 }
 """Modules by the name of the recorded file that they make."""
 PAGES = {
-    "results/pretraining.md": ("skill", "tasks", "curves", "curriculum", "coverage", "ablations", "throughput"),
+    "results/pretraining.md": (
+        *("skill", "champion", "tasks", "curves", "curriculum", "coverage", "ablations", "throughput"),
+    ),
     "results/cluster.md": ("targets", "throughput", "chaos", "strikes", "rest", "flood", "soak"),
     "results/skills.md": ("coverage", "curves", "controls"),
-    "results/comparison.md": ("rows", "longer", "below", "missing"),
+    "results/comparison.md": ("rows", "longer", "below", "harder", "missing"),
     "downstream.md": ("headline",),
     "robots.md": ("robots",),
     "results/transfer.md": ("transfer", "transfer_champion", "robot_bridge"),
@@ -90,7 +93,9 @@ PAGES = {
 }
 """Blocks of every page."""
 RECIPE = "recipe"
-"""Name of the recorded time to a skill with the shipped recipe."""
+"""Name of the recorded time to a skill with the recipe, without any change."""
+ABOUT_THE_RECIPE = ("results/pretraining.md", "scaling.md")
+"""Pages that show it, and so may call it the shipped recipe only while it is."""
 Results = Mapping[str, Mapping[str, Any]]
 """Recorded files by the name of their benchmark."""
 Blocks = Mapping[str, Sequence[str]]
@@ -230,20 +235,22 @@ class Report:
         made = (
             self.pretraining_blocks(runs, ablations, found, studies),
             self.cluster_blocks(found),
-            self.skills_blocks(recorded_skills, controls),
+            self.skills_blocks(recorded_skills, controls, runs),
             self.comparison_blocks(trials, longer),
-            summary_blocks(trials, ()),
+            summary_blocks(trials),
             robots_blocks(found),
             transfer_blocks(found),
             page_blocks(found),
             mutation_blocks(found),
             robustness_blocks(found),
-            summary_blocks(trials, controls),
+            summary_blocks(trials),
             scaling_blocks(found, studies),
         )
         for (page, names), blocks in zip(PAGES.items(), made, strict=True):
             path = self._docs / page
             text = replace_blocks(path, {name: "\n\n".join(blocks.get(name, ())) for name in names})
+            if page in ABOUT_THE_RECIPE and RECIPE in studies:
+                recipe.check_words(path, text, studies[RECIPE])
             with os_errors("write", path):
                 write_atomic(path, text.encode())
             self.files.append(path)
@@ -255,8 +262,9 @@ class Report:
         """Parts of the blocks about pre-training."""
         show, blocks = self._show, defaultdict[str, list[str]](list)
         if RECIPE in studies:
-            blocks["skill"] = [time_to_skill.report(studies[RECIPE])]
+            blocks["skill"] = [recipe.recipe_words(studies[RECIPE]), time_to_skill.report(studies[RECIPE])]
         if runs:
+            blocks["champion"] = [champion.champion_words(runs)]
             blocks["tasks"] = [pretraining.tasks_table(runs)]
             blocks["curves"] = [
                 show("Over env steps", "pretraining", draw_curves, runs),
@@ -299,7 +307,7 @@ class Report:
             blocks["soak"] = [cluster.soak_words(soak), picture, cluster.soak_table(soak)]
         return blocks
 
-    def skills_blocks(self, runs: Sequence[Run], controls: Sequence[Run]) -> Blocks:
+    def skills_blocks(self, runs: Sequence[Run], controls: Sequence[Run], pretrained: Sequence[Run]) -> Blocks:
         """Parts of the blocks about skills, and about controls of self-play."""
         blocks = {}
         if runs:
@@ -309,7 +317,7 @@ class Report:
             picture = self._show("Skill discovery over env steps", "skills-curves", draw_skill_curves, learned)
             blocks["curves"] = [picture]
         if controls:
-            blocks["controls"] = [skills.controls_table(controls)]
+            blocks["controls"] = [skills.controls_table(controls), skills.alike_table([*pretrained, *controls])]
         return blocks
 
     def comparison_blocks(self, trials: Sequence[Result], longer: Sequence[Result]) -> Blocks:
@@ -319,6 +327,7 @@ class Report:
         if trials:
             blocks["rows"] = [comparison.comparison_table(trials)]
             blocks["below"] = [comparison.distances_table(trials)]
+            blocks["harder"] = [comparison.harder_table(trials)]
         if longer:
             picture = self._show("Success over more env steps", "downstream-longer", draw_table, longer)
             blocks["longer"] = [comparison.longer_table(trials, longer), picture]
@@ -329,14 +338,9 @@ class Report:
         return f"![{words}]({name}.png)"
 
 
-def summary_blocks(trials: Sequence[Result], controls: Sequence[Run]) -> Blocks:
-    """Parts of the blocks that say the whole in a few words."""
-    blocks = {}
-    if trials:
-        blocks["headline"] = [summary.headline_table(trials)]
-    if any(run["control"] == OURS for run in controls):
-        blocks["controls"] = [summary.controls_words(controls)]
-    return blocks
+def summary_blocks(trials: Sequence[Result]) -> Blocks:
+    """Parts of the block that says the whole in one table."""
+    return {"headline": [summary.headline_table(trials)]} if trials else {}
 
 
 def scaling_blocks(found: Results, studies: Results) -> Blocks:
@@ -351,7 +355,7 @@ def scaling_blocks(found: Results, studies: Results) -> Blocks:
     if "ranks_on_nodes" in found:
         blocks["nodes"] = [scaling.nodes_block(found["ranks_on_nodes"])]
     if studies:
-        blocks["batches"] = [scaling.batches_block(studies)]
+        blocks["batches"] = [scaling.batches_block(studies), recipe.recipe_words(studies[RECIPE])]
     if studies and "scaling" in found:
         blocks["skill"] = [scaling.skill_block(found["scaling"], studies)]
     return blocks

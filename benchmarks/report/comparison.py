@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 
@@ -24,13 +24,17 @@ PAPER_EPISODES = 48
 def comparison_table(results: Sequence[Result]) -> str:
     """Every method of the paper, every task: our mean of the seeds, and in brackets the paper's and the difference.
 
+    The last column has our seeds: their number on every task, or the least and the greatest of the tasks that were run.
+
     Bold where it is no accident: the paper's interval, Wilson's of 48 episodes, and ours have nothing in common.
     """
     rows: list[Row] = []
     for method, rates in PAPER.items():
-        cells = [_cell(_rates(results, method, task), rates[task]) for task in TASKS]
-        rows.append((METHODS[method].title, *cells))
-    return table(("", *(task.title for task in TASKS.values())), rows)
+        found = [_rates(results, method, task) for task in TASKS]
+        cells = [_cell(seeds, rates[task]) for seeds, task in zip(found, TASKS, strict=True)]
+        counts = sorted({len(seeds) for seeds in found if seeds})
+        rows.append((METHODS[method].title, *cells, " to ".join(map(str, counts)) or "0"))
+    return table(("", *(task.title for task in TASKS.values()), "our seeds"), rows)
 
 
 def longer_table(results: Sequence[Result], longer: Sequence[Result]) -> str:
@@ -56,6 +60,17 @@ def distances_table(results: Sequence[Result]) -> str:
     return f"{words}\n\n{table(('', *(task.title for task in TASKS.values())), rows)}" if rows else ""
 
 
+def harder_table(results: Sequence[Result]) -> str:
+    """Success at the last step on *HardPush* and, of the same seeds, on *Push*: each seed."""
+    rows: list[Row] = []
+    for method in METHODS:
+        hard = {each[TRIAL]["seed"]: each for each in trials_of(results, method, "hard-push")}
+        plain = {each[TRIAL]["seed"]: each for each in trials_of(results, method, "push")}
+        if hard:
+            rows.append((METHODS[method].title, _each(hard.values()), _each(plain[s] for s in hard if s in plain)))
+    return table(("", "HardPush", "Push, the same seeds"), rows) if rows else ""
+
+
 def missing_table(planned: Sequence[Experiment]) -> str:
     """How many of the planned experiments have their file, and which lack it, in the order of their plan."""
     groups = defaultdict[str, list[Experiment]](list)
@@ -69,6 +84,10 @@ def missing_table(planned: Sequence[Experiment]) -> str:
     ]
     words = f"{sum(done.values())} of {len(planned)} experiments are recorded."
     return f"{words} Missing:\n\n{table(('', 'recorded', 'missing'), rows)}" if rows else words
+
+
+def _each(trials: Iterable[Result]) -> str:
+    return ", ".join(f"{100 * each['evaluation']['success_last']:.1f}" for each in trials)
 
 
 def _missing(group: Sequence[Experiment]) -> str:

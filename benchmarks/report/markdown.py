@@ -37,6 +37,9 @@ def commit(name: str) -> str:
 
 
 def measured_on(machine: Mapping[str, Any]) -> str:
-    """The last sentence of a block: machine, commit and day of a measurement."""
-    where = f"{machine['num_cpus']} cores of {machine['cpu']}"
-    return f" On {where}, {commit(machine['git_commit'])}, {machine['time'][:10]}."
+    """The last sentence of a block: machine, commit and day of a measurement, and how busy the machine was before."""
+    now, _, quarter = machine["load_average"]
+    return (
+        f" On {machine['num_cpus']} cores of {machine['cpu']}, {commit(machine['git_commit'])}, "
+        f"{machine['time'][:10]}; load when it began {now:.1f}, over the 15 minutes before {quarter:.1f}."
+    )

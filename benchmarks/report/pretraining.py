@@ -15,9 +15,12 @@ NUM_BINS = 10
 
 
 def tasks_table(runs: Sequence[Run]) -> str:
-    """Bob on every task, at the last step, with the 95 % Wilson interval; below, what is asked, and doing nothing."""
+    """Bob on every task, at the last step, with the 95 % Wilson interval; below, what is asked, and doing nothing.
+
+    Bold is what is below what was asked.
+    """
     head = ("run", *TASKS, f"env steps until {percent(ASKED)} of mixed")
-    rows = [(_label(run), *tasks_cells(run["evaluations"]), _steps_to_asked(run)) for run in runs]
+    rows = [(_label(run), *_judged(run["evaluations"]), _steps_to_asked(run)) for run in runs]
     idle = max((tasks_cells(run["evaluations"], idle=True) for run in runs), key=lambda cells: sum(map(bool, cells)))
     asked = (percent(ASKED_RATES[task]) for task in TASKS)
     return table(head, [*rows, ("asked for", *asked, millions(ASKED_STEPS)), ("doing nothing", *idle, "")])
@@ -29,15 +32,21 @@ def tasks_cells(evaluations: Records, tasks: Iterable[str] = TASKS, *, idle: boo
     return [_success(rows[task]) if task in rows else "" for task in tasks]
 
 
+def _judged(evaluations: Records) -> list[str]:
+    rates = {row["goals"]: row["success_last"] for row in evaluations if row["policy"] != "idle"}
+    cells = zip(TASKS, tasks_cells(evaluations), strict=True)
+    return [f"**{cell}**" if cell and rates[task] < ASKED_RATES[task] else cell for task, cell in cells]
+
+
 def training_table(runs: Sequence[Run]) -> str:
-    """Time of each run, and rates of its Alice and Bob in the last tenth of it."""
-    head = ("run", "env steps", "time", "valid goals", "of those, lifted", "Bob on valid goals", "goal distance",
-            "goal height, 9 of 10 below")  # fmt: skip
+    """What each run was, its time, and rates of its Alice and Bob in the last tenth of it."""
+    head = ("run", "seed", "primitives", "worlds", "env steps", "time", "valid goals", "of those, lifted",
+            "Bob on valid goals", "goal distance", "goal height, 9 of 10 below")  # fmt: skip
     return table(head, [_training_row(run) for run in runs])
 
 
 def _training_row(run: Run) -> Row:
-    records = unthin(run["series"])
+    records, config = unthin(run["series"]), run["config"]
 
     def change(key: str) -> str:
         first, *_, last = 100 * binned(records, key, NUM_BINS)
@@ -45,6 +54,8 @@ def _training_row(run: Run) -> Row:
 
     return (
         str(run["name"]),
+        *(str(number) for number in (config["seed"], config["policy"]["bob"]["num_primitives"])),
+        str(config["game"]["num_worlds"]),
         millions(records[-1]["env_steps"]),
         duration(records[-1]["time/wall_s"]),
         *(_at_end(records, key) for key in ("alice/valid_fraction", "alice/lifted_fraction", "bob/success_rate")),

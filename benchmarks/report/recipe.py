@@ -1,0 +1,67 @@
+"""How a recorded recipe differs from the one that ships, and which page may speak of the shipped recipe."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from benchmarks.measuring import RECIPE_FILE
+from benchmarks.report.markdown import commit
+from service.config import load_config, parse_config
+from service.errors import TandemError
+
+SHIPPED = "the shipped recipe"
+_OF_ONE_RUN = ("name", "seed", "run.")
+"""Keys that may differ between two runs of the same recipe."""
+
+
+def differences(recorded: Mapping[str, Any], other: Mapping[str, Any] | None = None) -> dict[str, tuple[Any, Any]]:
+    """Keys by which a recorded configuration differs from another one, with its value and the other's.
+
+    Args:
+        recorded: as the recorded file has it; keys that are newer have their defaults.
+        other: the same; None: the shipped recipe.
+    """
+    mine = _leaves(_tree(recorded))
+    others = _leaves(_tree(other) if other is not None else load_config(RECIPE_FILE).model_dump(mode="json"))
+    return {
+        key: (mine.get(key), others.get(key))
+        for key in sorted({*mine, *others})
+        if mine.get(key) != others.get(key) and not key.startswith(_OF_ONE_RUN)
+    }
+
+
+def recipe_words(study: Mapping[str, Any]) -> str:
+    """Which recipe a time to a skill was measured with, and when."""
+    when = ", ".join(sorted({run["machine"]["time"][:10] for run in study["runs"]}))
+    where = ", ".join(sorted({commit(run["machine"]["git_commit"]) for run in study["runs"]}))
+    differing = differences(study["settings"]["recipe"])
+    if not differing:
+        return f"Measured on {when}, {where}, with {SHIPPED}."
+    keys = ", ".join(f"`{key}` {had} (today {ships})" for key, (had, ships) in differing.items())
+    return f"Measured on {when}, {where}. **The recipe was another one than today's**: {keys}."
+
+
+def check_words(path: Path, page: str, study: Mapping[str, Any]) -> None:
+    """Refuse a page that calls the recipe of a study the shipped one, where it is another.
+
+    Raises:
+        TandemError: it does; the message names the keys that differ.
+    """
+    if SHIPPED in " ".join(page.lower().split()) and (differing := differences(study["settings"]["recipe"])):
+        raise TandemError(
+            f"{path}: it says {SHIPPED!r}, but what it shows was recorded with another {', '.join(differing)}; "
+            "record it anew, or say which recipe it was"
+        )
+
+
+def _tree(recorded: Mapping[str, Any]) -> dict[str, Any]:
+    return parse_config(dict(recorded), where="a recorded recipe", recorded=True).model_dump(mode="json")
+
+
+def _leaves(tree: Mapping[str, Any], above: str = "") -> dict[str, Any]:
+    found = dict[str, Any]()
+    for key, value in tree.items():
+        found |= _leaves(value, f"{above}{key}.") if isinstance(value, dict) else {f"{above}{key}": value}
+    return found
