@@ -32,6 +32,7 @@ from benchmarks.report import (
     robustness,
     scaling,
     skills,
+    speed,
     summary,
     transfer,
 )
@@ -55,6 +56,8 @@ from service.errors import TandemError
 from service.io.files import os_errors, write_atomic
 
 PROGRAMS = {
+    "env_throughput": "benchmarks.env_throughput",
+    "selfplay_throughput": "benchmarks.selfplay_throughput",
     "throughput": "benchmarks.compare_commits",
     "cluster_throughput": "benchmarks.cluster_throughput",
     "chaos": "benchmarks.chaos of commit ddd0770",
@@ -86,7 +89,7 @@ PAGES = {
     "robots.md": ("robots",),
     "results/transfer.md": ("transfer", "transfer_champion", "robot_bridge"),
     "api.md": ("page",),
-    "results/README.md": ("mutation",),
+    "results/README.md": ("throughput", "mutation"),
     "results/robust.md": ("robustness", "randomisation_ranges"),
     "../README.md": ("headline",),
     "scaling.md": ("bottleneck", "box", "nodes", "model", "batches", "skill", "constants"),
@@ -170,9 +173,9 @@ def read_runs(directory: Path) -> tuple[list[Run], list[Run]]:
 
 def robots_blocks(found: Results) -> Blocks:
     """Parts of the block about robots by description."""
-    recorded, speed = found.get("robots"), found.get("world_speed")
+    recorded, worlds = found.get("robots"), found.get("world_speed")
     parts = [robots.robots_table(recorded), robots.robots_words(recorded)] if recorded is not None else []
-    parts += [robots.speed_words(speed)] if speed is not None else []
+    parts += [robots.speed_words(worlds)] if worlds is not None else []
     return {"robots": parts} if parts else {}
 
 
@@ -195,10 +198,14 @@ def page_blocks(found: Results) -> Blocks:
     return {"page": [page_speed.page_table(recorded), page_speed.page_words(recorded)]} if recorded is not None else {}
 
 
-def mutation_blocks(found: Results) -> Blocks:
-    """Parts of the block about mutation testing."""
-    recorded = found.get("mutation")
-    return {"mutation": [mutation.mutation_words(recorded), mutation.mutation_table(recorded)]} if recorded else {}
+def index_blocks(found: Results) -> Blocks:
+    """Parts of the blocks of the index of results: speed, and mutation testing."""
+    blocks = {}
+    if speeds := [found[name] for name in ("env_throughput", "selfplay_throughput") if name in found]:
+        blocks["throughput"] = [speed.ratios_block(speeds)]
+    if (recorded := found.get("mutation")) is not None:
+        blocks["mutation"] = [mutation.mutation_words(recorded), mutation.mutation_table(recorded)]
+    return blocks
 
 
 def robustness_blocks(found: Results) -> Blocks:
@@ -241,7 +248,7 @@ class Report:
             robots_blocks(found),
             transfer_blocks(found),
             page_blocks(found),
-            mutation_blocks(found),
+            index_blocks(found),
             robustness_blocks(found),
             summary_blocks(trials),
             scaling_blocks(found, studies),

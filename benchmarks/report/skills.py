@@ -60,7 +60,7 @@ def coverage_table(runs: Sequence[Run]) -> str:
 
 def controls_table(runs: Sequence[Run]) -> str:
     """A row for each control: its Bob on random goals, then his primitives downstream."""
-    head = ("goals proposed by", "seeds", "Bob's env steps", "all env steps", *_EVALUATED,
+    head = ("goals proposed by", "seeds", "Bob's env steps", "all env steps", "updates", *_EVALUATED,
             *(DOWNSTREAM[task].title for task in TASKS))  # fmt: skip
     rows = []
     for name in CONTROLS:
@@ -73,6 +73,7 @@ def controls_table(runs: Sequence[Run]) -> str:
                 _PROPOSERS[name],
                 str(len(seeds)),
                 *(millions(float(np.mean([run[key] for run in seeds]))) for key in ("bob_env_steps", "env_steps")),
+                f"{np.mean([run['series']['iteration'][-1] for run in seeds]):,.0f}",
                 *(each([bob[goals]["success_last"] for bob in bobs]) for goals in _EVALUATED),
                 *(each([run["downstream"][task]["evaluation"]["success_last"] for run in seeds]) for task in TASKS),
             )
