@@ -80,6 +80,8 @@ def experiments(places: Places) -> Iterator[Experiment]:
     yield from _skills(places, 1)
     yield from (_trial(places, task, f"scratch-{net}-her", 2) for net in ("monolithic", "mcp") for task in tasks)
     yield from _skills(places, 2)
+    for seed in (1, 2):
+        yield from (_trial(places, task, f"scratch-{net}", seed) for net in ("monolithic", "mcp") for task in tasks)
     for seed in (0, 1):
         for method in ("ours-her", "ours", "scratch-monolithic-her", "scratch-monolithic"):
             yield _trial(places, "hard-push", method, seed)

@@ -501,8 +501,8 @@ def test_every_task_is_measured_beside_a_policy_that_does_nothing():
             seed=0,
         )
         assert row == {**found.as_dict(), "goals": row["goals"], "policy": row["policy"]}
-    last = {policy: sum(row["success_last"] for row in rows if row["policy"] == policy) for policy in ("bob", "idle")}
-    assert last["bob"] > 2.5 > 0.5 > last["idle"]  # of 5: one for each task
+    # 90 % and more of each as it is; two of 20 goals are left to rounding on other processors
+    assert all(row["success_last"] >= 0.8 if row["policy"] == "bob" else row["success_last"] <= 0.2 for row in rows)
 
 
 def test_stages_are_the_nearest_snapshots():

@@ -122,14 +122,21 @@ def test_load_primitives(tmp_path, monkeypatch):
         service.load_primitives("nobody", registry="here")
 
 
-def test_they_do_more_than_nothing():
-    """The champion, whichever he is, moves the object to random goals on the table and above it."""
-    from service.actors.evaluation import IdlePolicy, evaluate
+def test_the_champion_has_what_its_manifest_says():
+    """Its rate, which pages repeat, on other goals: not lower than chance explains."""
+    from service.actors.evaluation import evaluate, wilson_interval
+    from service.primitives.publishing import FINAL_EVALUATION_EPISODES
 
-    bob = service.load_primitives()
-    common = {"num_episodes": 60, "num_steps": 50, "success_distance_m": bob.config.game.success_distance_m, "seed": 3}
-    champion, idle = (evaluate(policy, bob.config.world, "mixed", **common) for policy in (bob.policy, IdlePolicy()))
-    assert champion.success_ever > idle.success_ever + 0.1
+    bob, num = service.load_primitives(), 60
+    said = bob.manifest.metrics["evaluation/mixed_success_last"]
+    assert said >= 0.95  # what was asked for
+    reach_m = bob.config.game.success_distance_m
+    found = evaluate(
+        bob.policy, bob.config.world, "mixed", num_episodes=num, num_steps=50, success_distance_m=reach_m, seed=3
+    )
+    least, _ = wilson_interval(round(said * FINAL_EVALUATION_EPISODES), FINAL_EVALUATION_EPISODES)
+    _, most = wilson_interval(round(found.success_last * num), num)
+    assert most >= least, found.success_last  # of 98 % said, 54 of 60 fail
 
 
 def test_the_recipes_and_robots_are_in_it(installed, tmp_path):

@@ -237,8 +237,10 @@ class Report:
             ResultsDirectory(self._results / name).read_all() for name in ("downstream", "downstream_longer")
         )
         recorded_skills, controls = (read_all(self._results / name) for name in ("skills", "controls"))
-        for page, names in PAGES.items():  # a page that lacks a marker is found before anything is drawn
-            replace_blocks(self._docs / page, dict.fromkeys(names, ""))
+        for page, names in PAGES.items():  # what is wrong with a page is found before anything is drawn
+            words = replace_blocks(self._docs / page, dict.fromkeys(names, ""))
+            if page in ABOUT_THE_RECIPE and RECIPE in studies:
+                recipe.check_words(self._docs / page, words, studies[RECIPE])
         made = (
             self.pretraining_blocks(runs, ablations, found, studies),
             self.cluster_blocks(found),
@@ -256,8 +258,6 @@ class Report:
         for (page, names), blocks in zip(PAGES.items(), made, strict=True):
             path = self._docs / page
             text = replace_blocks(path, {name: "\n\n".join(blocks.get(name, ())) for name in names})
-            if page in ABOUT_THE_RECIPE and RECIPE in studies:
-                recipe.check_words(path, text, studies[RECIPE])
             with os_errors("write", path):
                 write_atomic(path, text.encode())
             self.files.append(path)

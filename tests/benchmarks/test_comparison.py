@@ -1,6 +1,12 @@
 """The page that compares with the paper, by hand."""
 
-from benchmarks.report.comparison import comparison_table, distances_table, longer_table, missing_table
+from benchmarks.report.comparison import (
+    comparison_table,
+    distances_table,
+    harder_table,
+    longer_table,
+    missing_table,
+)
 from benchmarks.reproduce import Experiment
 
 
@@ -15,13 +21,21 @@ def test_cells_by_hand():
     results = [trial("ours", "push", seed, rate) for seed, rate in enumerate((0.90, 0.92, 0.94))]
     results += [trial("ours", "larger", 0, 0.80), trial("asp-only", "push", 0, 0.0)]
     lines = comparison_table(results).splitlines()
-    assert lines[0] == "|  | Larger | InAir | Push | Sphere | Wall | Box |"
+    assert lines[0] == "|  | Larger | InAir | Push | Sphere | Wall | Box | our seeds |"
     # Push: 0.92 +- 0.0497 of ours, 25 of 48 are 0.38 to 0.66; Larger: 0.77 to 0.82 of ours, 40 of 48 are 0.70 to 0.91
     ours = ["80.0 (83, -3)", "not run (100)", "**92.0 (52, +40)**", "not run (100)", "not run (98)", "not run (98)"]
-    assert lines[2] == f"| ours | {' | '.join(ours)} |"
+    assert lines[2] == f"| ours | {' | '.join(ours)} | 1 to 3 |"
     # none of 1,000 is up to 0.00383, 1 of 48 from 0.00369 on: in common
     assert lines[6].startswith("| ASP only | not run (94) | not run (94) | 0.0 (2, -2) |")
+    assert (lines[3].split(" | ")[-1], lines[6].split(" | ")[-1]) == ("0 |", "1 |")
     assert len(lines) == 2 + 9
+
+
+def test_the_harder_push_by_hand():
+    results = [trial("ours", "hard-push", seed, rate) for seed, rate in ((0, 0.9), (2, 0.8))]
+    results += [trial("ours", "push", seed, 0.1 * seed) for seed in (0, 1, 2)] + [trial("idle", "push", 0, 0.1)]
+    assert harder_table(results).splitlines()[2:] == ["| ours | 90.0, 80.0 | 0.0, 20.0 |"]
+    assert harder_table(results[2:]) == ""
 
 
 def test_longer_trials_by_hand():

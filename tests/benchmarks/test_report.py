@@ -1,5 +1,7 @@
-"""The committed pages and pictures are what their recorded files give."""
+"""The committed pages and pictures are what their recorded files give, and their words by hand do not go beyond."""
 
+import json
+import re
 import shutil
 from pathlib import Path
 
@@ -7,7 +9,13 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from benchmarks.report.__main__ import PAGES, Report
+import service
+from benchmarks.measuring import RECIPE_FILE
+from benchmarks.report.__main__ import ABOUT_THE_RECIPE, PAGES, Report, begin, end
+from benchmarks.report.recipe import SHIPPED, check_words, differences, recipe_words
+from service.config import load_config
+from service.downstream.compose import parameters_digest
+from service.errors import TandemError
 
 DOCS = Path(__file__).parents[2] / "docs"
 
@@ -38,3 +46,73 @@ def test_the_committed_pictures_show_what_the_recorded_files_give(made):
         assert ours.shape == theirs.shape, picture.name
         # another version of the fonts may move the edges of letters
         assert np.mean(np.abs(ours - theirs).max(axis=2) > 64) < 0.005, picture.name
+
+
+# --- words by hand ----------------------------------------------------------------------------------------------------
+
+STUDY = json.loads((DOCS / "results" / "time_to_skill" / "recipe.json").read_text())
+SHIPS = load_config(RECIPE_FILE).model_dump(mode="json")
+
+
+def study_of(recipe):
+    return STUDY | {"settings": STUDY["settings"] | {"recipe": recipe}}
+
+
+@pytest.mark.parametrize("page", ABOUT_THE_RECIPE)
+def test_a_page_that_says_the_shipped_recipe_is_not_made_where_another_one_was_recorded(tmp_path, page):
+    docs = tmp_path / "docs"
+    shutil.copytree(DOCS, docs, ignore=shutil.ignore_patterns("*.png", "primitives"))
+    shutil.copy(DOCS.parent / "README.md", tmp_path)
+    recorded = docs / "results" / "time_to_skill" / "recipe.json"
+    recipe = SHIPS | {"policy": SHIPS["policy"] | {"bob": SHIPS["policy"]["bob"] | {"num_primitives": 5}}}
+    recorded.write_text(json.dumps(study_of(recipe)))
+    (docs / page).write_text((docs / page).read_text() + "\nIt is The\nshipped recipe.\n")
+    with pytest.raises(TandemError, match=rf"{page}: it says '{SHIPPED}', .* policy\.bob\.num_primitives;"):
+        Report(docs).write()
+
+
+def test_which_recipe_a_time_to_skill_was_measured_with():
+    same = study_of(SHIPS | {"seed": 7, "name": "other", "run": SHIPS["run"] | {"total_env_steps": 5}})
+    assert differences(same["settings"]["recipe"]) == {}
+    assert recipe_words(same).endswith(f", with {SHIPPED}.")
+    check_words(Path("page.md"), f"this is {SHIPPED}", same)
+    other = study_of(SHIPS | {"learner": SHIPS["learner"] | {"bob_ema_decay": 0.5}})
+    assert differences(other["settings"]["recipe"]) == {"learner.bob_ema_decay": (0.5, 0.998)}
+    assert recipe_words(other).endswith(
+        "**The recipe was another one than today's**: `learner.bob_ema_decay` 0.5 (today 0.998)."
+    )
+
+
+def test_the_digest_that_a_page_calls_the_champion_is_the_bundled_ones():
+    digest = parameters_digest(service.load_primitives("panda-cube@champion", registry="no registry here").primitives)
+    page = (DOCS / "results" / "pretraining.md").read_text()
+    ((run, words),) = re.findall(r"`panda-cube@champion`, in the package, is version \d+, the run (\S+): (.*)", page)
+    assert f"parameters `{digest[:12]}`" in words
+    recorded = json.loads((DOCS / "results" / "runs" / f"{run}.json").read_text())
+    assert differences(recorded["config"]) == {}  # of today's recipe, as the page says
+    trial = json.loads((DOCS / "results" / "downstream" / "larger-asp-only-0.json").read_text())
+    assert trial["primitives"]["digest"] == digest  # seed 0 of the table rests on it, as the page says
+
+
+def without_blocks(page):
+    text = (DOCS / page).read_text()
+    for block in PAGES[page]:
+        before, _, rest = text.partition(begin(block))
+        text = before + rest.partition(end(block))[2]
+    return text
+
+
+def test_every_rate_of_a_table_in_the_readme_has_its_number_of_seeds():
+    lines = (DOCS.parent / "README.md").read_text().splitlines()
+    rows = [line.strip("|").split("|")[1:] for line in lines if line.startswith("|")]
+    rates = [cell.strip(" *") for row in rows for cell in row if re.search(r"\d %", cell)]
+    assert len(rates) >= 5 * 6
+    assert [rate for rate in rates if not re.fullmatch(r"\d+ % \([1-9]\d*\)", rate)] == []
+
+
+# the words of cluster.md name targets
+@pytest.mark.parametrize("page", [page for page in PAGES if page.startswith("results/") and "cluster" not in page])
+def test_words_by_hand_have_no_rates_of_their_own(page):
+    asked = re.compile("9[05] %")  # what was asked for, and how sure an interval is, are no results
+    lines = [line for line in without_blocks(page).splitlines() if re.search(r"\d %", asked.sub("", line))]
+    assert lines == []

@@ -14,12 +14,12 @@ def places(tmp_path):
     return Places(tmp_path / "out", tmp_path / "runs")
 
 
-def test_every_method_is_run_on_every_task(places):
+def test_every_method_is_run_on_every_task_with_three_seeds(places):
     everything = list(experiments(places))
     names = [each.name for each in everything]
     assert len(set(names)) == len(names) == len({each.file for each in everything})
-    table = {name.removeprefix("out/").rpartition("-")[0] for name in names if name.startswith("out/")}
-    assert {f"{task}-{method}" for task in TASKS for method in METHODS} <= table
+    table = {name.removeprefix("out/") for name in names if name.startswith("out/")}
+    assert {f"{task}-{method}-{seed}" for task in TASKS for method in METHODS for seed in range(3)} <= table
 
 
 def making(tmp_path, name, *, needs=None, code=0):

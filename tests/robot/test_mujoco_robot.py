@@ -36,13 +36,15 @@ def test_without_bounds_the_bridge_plays_what_the_evaluator_plays(champion):
     assert np.linalg.norm(robot.object_position() - goal[0]) < 0.05
 
 
-def test_the_champion_reaches_a_goal_within_the_bounds_of_a_franka(champion):
-    world, goal = champion.config.world, np.array([-0.1, 0.05, 0.2])
+def test_the_champion_reaches_goals_within_the_bounds_of_a_franka(champion):
+    """As recorded, 97 % and more of goals: none of these may be missed."""
+    world = champion.config.world
     robot = MujocoRobot(world, MujocoParameters(feed_forward=1.0))
-    robot.reset(np.array([0.0, 0.05, 0.025]))
     bridge = Bridge(champion.policy, robot, robot.poses, world, SMOOTH, gain=(0.62, 0.62, 0.62))
-    episode = bridge.run(goal, 50)
-    assert episode.distance_m < 0.05
+    goals = np.array([[-0.1, 0.05, 0.2], [0.05, -0.1, 0.025], [-0.15, -0.1, 0.1]])
+    for goal in goals:
+        robot.reset(np.array([0.0, 0.05, 0.025]))
+        assert bridge.run(goal, 50).distance_m < 0.05
     assert robot.now_s() >= 2.0
 
 

@@ -316,12 +316,20 @@ def test_nobody_waits_for_a_fifo(old_run, name):
             read("old-one")
 
 
-@pytest.mark.parametrize("heartbeat", ["0001-01-01T00:00:00+14:00", "9999-12-31T23:59:59-14:00"])
-def test_a_heartbeat_of_no_time_there_is(tmp_path, heartbeat):
+@pytest.mark.parametrize(
+    ("heartbeat", "state", "condition", "said"),
+    [
+        ("0001-01-01T00:00:00+14:00", "interrupted", "well", "vanished without a word, last heard of at 1970-01-01"),
+        ("9999-12-31T23:59:59-14:00", "running", "clock", "s in the future"),
+    ],
+)
+def test_a_heartbeat_of_no_time_there_is(tmp_path, heartbeat, state, condition, said):
     (tmp_path / "cube").mkdir()
     tree = json.loads(a_silent_status().model_dump_json()) | {"heartbeat": heartbeat}
     (tmp_path / "cube" / "status.json").write_text(json.dumps(tree))
-    assert DiskReader(tmp_path).run("cube").model_dump_json()
+    status = DiskReader(tmp_path).run("cube")
+    assert (status.state, status.condition) == (state, condition)
+    assert said in f"{status.last_error} {status.warnings}"
 
 
 @pytest.mark.parametrize("number", ["1e999", "-1e999", "NaN"])
