@@ -27,6 +27,7 @@ def champion_words(runs: Sequence[Run]) -> str:
     ]
     made_by = f"the run {alike[0]}" if alike else "made by no run that is recorded here"
     manifest, config = bob.manifest, bob.config
+    assert manifest is not None  # it is a published version
     rates = ", ".join(
         f"{percent(manifest.metrics[f'evaluation/{goals}_success_last'], 1)} of {goals}"
         for goals in ("mixed", "air", "table")

@@ -17,7 +17,7 @@ CORES = (2, 4, 16, 64, 256)
 NAMED = (16, 256, 4096)
 """Numbers of actors for which the time of every part is shown."""
 RECIPE = "recipe"
-"""Name of the file of the shipped recipe, which other sizes of update are compared with."""
+"""Name of the file of the recipe without any change, which other sizes of update are compared with."""
 MIN_SEEDS = 3
 """Seeds that a size of update needs to be called faster than another: they differ by millions of env steps."""
 
