@@ -12,6 +12,7 @@ DEPLOY = ROOT / "deploy"
 KUBERNETES = DEPLOY / "kubernetes"
 DOCUMENTS = [DEPLOY / "README.md", ROOT / "docs" / "cluster.md", ROOT / "docs" / "operations.md"]
 COMPOSE = DEPLOY / "compose" / "compose.yaml"
+NGINX = DEPLOY / "nginx" / "nginx.conf"
 PROMETHEUS = DEPLOY / "prometheus" / "prometheus.yml"
 YAML = sorted([*DEPLOY.rglob("*.yaml"), *DEPLOY.rglob("*.yml")])
 SCRIPTS = sorted(DEPLOY.rglob("*.sh"))
@@ -51,6 +52,12 @@ def pod_templates(document):
         return []
     here = [document["template"]] if "containers" in document.get("template", {}).get("spec", {}) else []
     return here + [found for each in document.values() for found in pod_templates(each)]
+
+
+def container(template, name):
+    """The one container of this name."""
+    (found,) = [each for each in template["spec"]["containers"] if each["name"] == name]
+    return found
 
 
 def ports(template):

@@ -48,6 +48,7 @@ VOLUME = {
     "name!": str,
     "emptyDir": {},
     "persistentVolumeClaim": {"claimName!": str},
+    "configMap": {"name!": str},
     "secret": {"secretName!": str, "items": [{"key!": str, "path!": str}]},
 }
 POD_TEMPLATE = {
@@ -55,6 +56,7 @@ POD_TEMPLATE = {
     "spec!": {
         "automountServiceAccountToken": bool,
         "enableServiceLinks": bool,
+        "hostAliases": [{"ip!": str, "hostnames!": [str]}],
         "terminationGracePeriodSeconds": int,
         "securityContext!": SECURITY,
         "containers!": [CONTAINER],

@@ -14,12 +14,12 @@ from service.config import dump_config
 from service.io.checkpoints import CheckpointStore
 from service.recipes import recipes
 from service.runtime.pretrain_study import StudyResult
-from tests.deploy.files import DEPLOY, DOCUMENTS, commands, compose, manifest, manifests, pod_templates
+from tests.deploy.files import DEPLOY, DOCUMENTS, commands, compose, container, manifest, manifests, pod_templates
 
 
 def tandem_commands():
     """Where a call of tandem stands, and its arguments."""
-    (status,) = manifest("Deployment", "status")["spec"]["template"]["spec"]["containers"]
+    status = container(manifest("Deployment", "status")["spec"]["template"], "status")
     found = [
         ("compose status", compose()["services"]["status"]["command"]),
         ("kubernetes status", status["args"]),
@@ -128,7 +128,5 @@ def test_configurations_that_are_named_are_in_the_image():
 
 def test_ray_containers_leave_the_command_to_the_operator():
     for template in pod_templates(manifests()):
-        (box,) = template["spec"]["containers"]
-        if box["name"].startswith("ray-"):
-            assert "command" not in box
-            assert "args" not in box
+        for box in template["spec"]["containers"]:
+            assert not (box["name"].startswith("ray-") and {"command", "args"} & set(box))

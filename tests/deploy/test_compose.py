@@ -5,7 +5,7 @@ import re
 
 import pytest
 
-from tests.deploy.files import DEPLOY, PROMETHEUS, ROOT, compose, scrape_job
+from tests.deploy.files import DEPLOY, NGINX, PROMETHEUS, ROOT, compose, scrape_job
 from tests.deploy.shapes import COMPOSE, mistakes
 
 SERVICES = compose()["services"]
@@ -17,7 +17,8 @@ HERE = DEPLOY / "compose"
 def container_ports(service):
     """Ports that something inside a service listens at, by its own command or its image's habit."""
     by_option = re.findall(r"--(?:dashboard-|metrics-export-)?port=(\d+)", " ".join(service.get("command", [])))
-    by_image = {"redis": "6379", "prom": "9090", "grafana": "3000"}
+    (listen,) = re.findall(r"^ *listen (\d+);$", NGINX.read_text(), re.MULTILINE)
+    by_image = {"redis": "6379", "prom": "9090", "grafana": "3000", "nginx": listen}
     return {*by_option, *(port for name, port in by_image.items() if service["image"].startswith(name))}
 
 
@@ -39,7 +40,7 @@ def test_only_this_machine_reaches_it(name):
     for port in SERVICES[name].get("ports", []):
         host, outside, inside = port.split(":")
         assert host == "127.0.0.1"
-        assert outside == inside
+        assert outside == inside or name == "nginx"  # which stands for the status service
         assert inside in container_ports(SERVICES[name])
 
 
@@ -105,6 +106,7 @@ def test_names_in_addresses_are_services():
     addresses += re.findall(r'"(\w+):(\d+)"', PROMETHEUS.read_text())
     datasource = (DEPLOY / "grafana" / "provisioning" / "datasources" / "prometheus.yaml").read_text()
     addresses += re.findall(r"http://(\w+):(\d+)", datasource)
+    addresses += re.findall(r"^ *server (\w+):(\d+);$", NGINX.read_text(), re.MULTILINE)
     assert {name for name, _ in addresses} == {"redis", "head", "worker", "gpu-worker", "status", "prometheus"}
     for name, port in addresses:
         assert port in container_ports(SERVICES[name]), (name, port)

@@ -12,6 +12,7 @@ import yaml
 from tests.deploy.files import (
     DEPLOY,
     KUBERNETES,
+    NGINX,
     ROOT,
     load,
     manifest,
@@ -95,6 +96,8 @@ def test_secrets_claims_and_volumes_are_there(document):
             assert value in SECRET_KEYS, path
         if path[-1] == "claimName":
             assert manifest("PersistentVolumeClaim", value)
+        if path[-2:] == ("configMap", "name"):
+            assert value in {each["name"] for each in load(NGINX.parent / "kustomization.yaml")["configMapGenerator"]}
     own_claims = [each["metadata"]["name"] for each in document.get("spec", {}).get("volumeClaimTemplates", [])]
     for template in pod_templates(document):
         volumes = [each["name"] for each in template["spec"].get("volumes", [])] + own_claims
@@ -194,7 +197,7 @@ def test_a_retried_job_goes_on_with_the_same_run():
 
 def test_the_status_service_reads_where_the_driver_writes():
     def mounts(template):
-        (box,) = template["spec"]["containers"]
+        box = template["spec"]["containers"][0]
         claims = {each["name"]: each.get("persistentVolumeClaim") for each in template["spec"]["volumes"]}
         return {
             (each["mountPath"], each["subPath"], claims[each["name"]]["claimName"])
@@ -202,6 +205,7 @@ def test_the_status_service_reads_where_the_driver_writes():
             if claims[each["name"]] is not None
         }
 
+    assert manifest("Deployment", "status")["spec"]["template"]["spec"]["containers"][0]["name"] == "status"
     status = mounts(manifest("Deployment", "status")["spec"]["template"])
     assert len(status) == 2
     for spec in ray_specs().values():
@@ -301,7 +305,9 @@ def test_kustomize_builds_it(folder):
     )
     assert result.returncode == 0, result.stderr
     built = list(yaml.safe_load_all(result.stdout))
-    assert len(built) == len(manifests(folder))
+    assert len(built) == len(manifests(folder)) + (folder == "base")  # nginx.conf
+    for document in built:
+        assert document["kind"] != "ConfigMap" or document["data"] == {NGINX.name: NGINX.read_text()}
     for document in built:
         assert document["kind"] == "Namespace" or document["metadata"]["namespace"] == "tandem"
     for template in pod_templates(built):
