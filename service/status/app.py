@@ -24,7 +24,6 @@ from service.status.errors import StatusError
 from service.status.files import RunDirectories, file_response
 from service.status.metrics import Telemetry
 from service.status.problems import ProblemError
-from service.status.response_cache import ResponseCache
 from service.status.stream import Streams
 from service.status.token import VARIABLE, check_token
 from service.store.models import RunReader
@@ -100,7 +99,6 @@ def create_app(
 
     app.mount("/page", _PageFiles(directory=PAGE))
     problems.add_handlers(app)
-    app.add_middleware(ResponseCache)
     app.add_middleware(AuthMiddleware, token=token, public=public, observe=telemetry.observe)
     return app
 

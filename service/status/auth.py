@@ -1,23 +1,21 @@
 """ASGI middleware before every route: who may ask, from where, how large a body, and with which headers.
 
 A new route cannot forget its token: everything needs it except what ``OPEN`` lists. The table "Access" of docs/api.md
-says who may do what. GET also takes the token as the password of HTTP Basic, so that a browser can show the page.
-Requests that change something do not: any web site could make such a browser send them.
+says who may do what. Slow clients and floods are kept away by the proxy in front, deploy/nginx.
 """
 
 from __future__ import annotations
 
-import asyncio
 import ipaddress
 import logging
 import re
 import time
 from collections.abc import Callable
-from http import HTTPStatus
 from http.cookies import CookieError, SimpleCookie
 
 from anyio import BrokenResourceError
 from starlette.datastructures import Headers, MutableHeaders
+from starlette.exceptions import HTTPException
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from service.status.problems import ProblemError
@@ -31,7 +29,6 @@ SESSION = "/v1/session"
 PROBES = frozenset({"/readyz", "/healthz"})
 """Paths for Kubernetes, which cannot send a secret."""
 MAX_BODY_BYTES = 64 * 1024
-BODY_TIMEOUT_S = 10.0
 TRUSTED = "tandem.trusted"
 """Key of the ASGI scope: whether the client may know why something is not ready."""
 _SAFE = frozenset({"GET", "HEAD", "OPTIONS"})
@@ -47,8 +44,6 @@ _HEADERS = {
 }
 """Headers of every answer that does not set them itself."""
 _HOST = re.compile(r"(?:\[([0-9A-Fa-f:.]+)\]|([^:@/\[\]\s]+))(?::[0-9]{1,5})?")
-_BASIC = 'Basic realm="tandem", charset="UTF-8"'
-"""Sent as a header of its own: Chromium ignores it behind another challenge in the same header."""
 _logger = logging.getLogger(__name__)
 
 
@@ -65,8 +60,11 @@ class AuthMiddleware:
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Answer the HTTP request, or pass it on if it is allowed; the server passes on nothing else."""
         inner = dict(scope)  # uvicorn and the router both write into theirs
-        if scope["method"] == "HEAD" and not scope["path"].endswith("/stream"):
-            inner["method"] = "GET"  # uvicorn leaves the body out
+        if not scope["path"].endswith("/stream"):
+            # or Starlette waits for the client to go while it sends a file, and uvicorn reads its next requests meanwhile
+            inner["asgi"] = {**scope["asgi"], "spec_version": "2.4"}
+            if scope["method"] == "HEAD":
+                inner["method"] = "GET"  # uvicorn leaves the body out
         begun_s, status = time.perf_counter(), 0
 
         async def answer(message: Message) -> None:
@@ -76,8 +74,6 @@ class AuthMiddleware:
                 headers = MutableHeaders(scope=message)
                 for name, value in _HEADERS.items():
                     headers.setdefault(name, value)
-                if status == HTTPStatus.UNAUTHORIZED and scope["method"] in _SAFE and not _by_script(scope):
-                    headers.append("www-authenticate", _BASIC)
                 self._observe(scope["method"], _template(inner), status, time.perf_counter() - begun_s)
             await send(message)
 
@@ -104,9 +100,7 @@ class AuthMiddleware:
                 421, "wrong-host", "ask for localhost or 127.0.0.1: this service is for its machine alone"
             )
         scope[TRUSTED] = self._is_trusted(scope["method"], scope["path"], headers)
-        if "content-length" in headers or "transfer-encoding" in headers:
-            receive = _replay(await _read_body(headers, receive), receive)
-        await self._app(scope, receive, send)
+        await self._app(scope, _bounded(receive), send)
 
     def _is_trusted(self, method: str, path: str, headers: Headers) -> bool:
         """Whether an allowed request may see everything; raises ``ProblemError`` for one that is not allowed."""
@@ -119,7 +113,7 @@ class AuthMiddleware:
             raise ProblemError(
                 403, "read-only", f"this service has no token and so changes nothing; start it with {VARIABLE} set"
             )
-        verdict = check_authorization(headers.get("authorization"), self._token, basic=safe)
+        verdict = check_authorization(headers.get("authorization"), self._token)
         if verdict == "missing" and safe and check_session(_cookie(headers), self._token):
             return True
         if verdict == "right" or (verdict == "missing" and safe and not self._public):
@@ -164,41 +158,21 @@ def _cookie(headers: Headers) -> str | None:
     return found.value if found is not None else None
 
 
-def _by_script(scope: Scope) -> bool:
-    """Whether a page's script asks, which has a form of its own: for a challenge, browsers open a window before it."""
-    return Headers(scope=scope).get("sec-fetch-mode", "navigate") != "navigate"
-
-
 def _template(scope: Scope) -> str:
     """The template of the request's route, such as ``/v1/runs/{run_id}``; "other" if there is no route."""
     return str(getattr(scope.get("route"), "path", "")) or "other"
 
 
-async def _read_body(headers: Headers, receive: Receive) -> bytes:
-    """Read the whole body, so that the limits hold for every route."""
-    declared = headers.get("content-length", "0")
-    too_large = ProblemError(413, "too-large", f"a body may have {MAX_BODY_BYTES} bytes; this API needs far fewer")
-    if not declared.isdecimal() or int(declared) > MAX_BODY_BYTES:
-        raise too_large
-    body = b""
-    try:
-        async with asyncio.timeout(BODY_TIMEOUT_S):
-            while True:
-                message = await receive()
-                body += bytes(message.get("body", b""))
-                if len(body) > MAX_BODY_BYTES:
-                    raise too_large
-                if not message.get("more_body", False):
-                    return body
-    except TimeoutError:
-        raise ProblemError(408, "too-slow", f"the body did not come within {BODY_TIMEOUT_S:g} s") from None
+def _bounded(receive: Receive) -> Receive:
+    """A ``receive`` that ends the request with 413 once more than ``MAX_BODY_BYTES`` of its body have come."""
+    num_bytes = 0
 
+    async def bounded() -> Message:
+        nonlocal num_bytes
+        message = await receive()
+        num_bytes += len(message.get("body", b""))
+        if num_bytes > MAX_BODY_BYTES:
+            raise HTTPException(413, f"a body may have {MAX_BODY_BYTES} bytes; this API needs far fewer")
+        return message
 
-def _replay(body: bytes, receive: Receive) -> Receive:
-    """A ``receive`` that gives a body that was read already."""
-    messages: list[Message] = [{"type": "http.request", "body": body, "more_body": False}]
-
-    async def replay() -> Message:
-        return messages.pop() if messages else await receive()
-
-    return replay
+    return bounded

@@ -6,22 +6,23 @@ from typing import Any
 
 from service.status.auth import OPEN, PROBES, SESSION
 from service.status.problems import MEDIA_TYPE, Problem
+from service.status.token import SESSION_COOKIE
 
 _CONTENT = {MEDIA_TYPE: {"schema": {"$ref": "#/components/schemas/Problem"}}}
 _COMMON = {
     "400": "The request is malformed HTTP.",
     "401": "A token is needed, or it is the wrong one.",
-    "408": "The body did not arrive in time.",
     "413": "The body is too large.",
     "421": "The host is not localhost.",
     "500": "A file of the service is damaged, or the service failed.",
 }
 _SCHEMES = {
     "bearer": {"type": "http", "scheme": "bearer", "description": "The token the service was started with."},
-    "basic": {
-        "type": "http",
-        "scheme": "basic",
-        "description": "The same token as the password, for browsers; GET only.",
+    "session": {
+        "type": "apiKey",
+        "in": "cookie",
+        "name": SESSION_COOKIE,
+        "description": "Set by POST /v1/session, for browsers; GET only.",
     },
 }
 DESCRIPTION = """
@@ -63,5 +64,5 @@ def _security(path: str, *, reading: bool, public: bool) -> list[dict[str, list[
         return []
     if not reading:
         return [{"bearer": []}]
-    schemes: list[dict[str, list[str]]] = [{"bearer": []}, {"basic": []}]
+    schemes: list[dict[str, list[str]]] = [{"bearer": []}, {"session": []}]
     return schemes if public and path not in PROBES else [{}, *schemes]

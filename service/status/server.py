@@ -16,13 +16,16 @@ import uvicorn
 from service.registry.registry import Registry
 from service.status.app import create_app
 from service.status.auth import is_loopback
-from service.status.connections import BoundedConnection
 from service.status.errors import StatusError
 from service.status.ports import DEFAULT_PORT
 from service.store.models import RunReader
 
 START_TIMEOUT_S = 10.0
 STOP_TIMEOUT_S = 5.0
+MAX_CONNECTIONS = 512
+"""Open at once; of one more, a request is answered with 503."""
+MAX_HEAD_BYTES = 64 * 1024
+"""Request line and headers; a browser's have one or two kilobytes."""
 _GRACE_S = 2
 _logger = logging.getLogger(__name__)
 
@@ -60,12 +63,14 @@ class StatusServer:
         self.app = app
         config = uvicorn.Config(
             app,
-            http=BoundedConnection,
+            http="h11",  # of requests that come faster than they are answered, httptools keeps all in memory
+            h11_max_incomplete_event_size=MAX_HEAD_BYTES,
+            limit_concurrency=MAX_CONNECTIONS,
             log_config=None,  # keep the program's own logging
-            log_level="warning",
+            log_level="error",  # a client could fill the log with warnings
             access_log=False,  # /metrics counts requests
             server_header=False,
-            proxy_headers=False,
+            proxy_headers=False,  # nothing depends on them but the cookie, which reads them itself
             lifespan="off",
             ws="none",
             timeout_graceful_shutdown=_GRACE_S,

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import base64
 import hmac
 import os
 from pathlib import Path
@@ -46,21 +45,14 @@ def check_token(token: str, source: str) -> str:
     return token
 
 
-def check_authorization(authorization: str | None, token: str, *, basic: bool) -> Literal["missing", "wrong", "right"]:
-    """Compare an ``Authorization`` header with the token; if ``basic``, it may also be the password of HTTP Basic."""
+def check_authorization(authorization: str | None, token: str) -> Literal["missing", "wrong", "right"]:
+    """Compare an ``Authorization`` header with the token."""
     if authorization is None:
         return "missing"
     scheme, _, rest = authorization.strip().partition(" ")
-    given = rest.strip()
-    if scheme.lower() == "basic" and basic:
-        try:
-            given = base64.b64decode(given, validate=True).decode("latin-1").partition(":")[2]
-        except ValueError:
-            return "wrong"
-    elif scheme.lower() != "bearer":
-        return "wrong"
     # as bytes: compare_digest raises for text that is not ASCII, which is only a wrong token here
-    return "right" if hmac.compare_digest(given.encode(), token.encode()) else "wrong"
+    is_same = hmac.compare_digest(rest.strip().encode(), token.encode())
+    return "right" if is_same and scheme.lower() == "bearer" else "wrong"
 
 
 def session_secret(token: str) -> str:

@@ -11,7 +11,7 @@ import pytest
 from fastapi import routing
 
 from service.registry.registry import Registry
-from service.status import auth, stream
+from service.status import auth, server, stream
 from service.status.stream import EVENT_SCHEMA
 from tests.status.conftest import serve
 from tests.status.runs import TOKEN, VIDEO, append, grid, publish, record, write_status
@@ -68,7 +68,7 @@ def test_there_are_examples():
 def test_every_kind_of_problem_is_listed():
     sources = [path.read_text() for path in (ROOT / "service" / "status").glob("*.py")]
     kinds = {kind for text in sources for kind in re.findall(r"(?:ProblemError\(\s*|, )\d{3}, \"([a-z-]+)\"", text)}
-    assert {"unknown-run", "too-large", "no-such-range", "read-only", "damaged"} <= kinds
+    assert {"unknown-run", "no-such-range", "read-only", "damaged"} <= kinds
     table = TEXT[TEXT.index("## Errors") : TEXT.index("## The client")]
     assert {kind for kind in kinds if f"`{kind}`" not in table} == set()
 
@@ -78,7 +78,7 @@ def test_every_event_is_listed():
 
 
 def test_numbers():
-    assert f"more than {auth.BODY_TIMEOUT_S:g} s" in TEXT
     assert f"more than {auth.MAX_BODY_BYTES // 1024} KiB" in TEXT
+    assert f"{server.MAX_HEAD_BYTES // 1024} KiB of headers, {server.MAX_CONNECTIONS} connections" in TEXT
     assert f"At most {stream.MAX_STREAMS} streams" in TEXT
     assert f"After {routing._PING_INTERVAL:g} seconds without an event" in TEXT
