@@ -61,7 +61,7 @@ class AuthMiddleware:
         """Answer the HTTP request, or pass it on if it is allowed; the server passes on nothing else."""
         inner = dict(scope)  # uvicorn and the router both write into theirs
         if not scope["path"].endswith("/stream"):
-            # or Starlette waits for the client to go while it sends a file, and uvicorn reads its next requests meanwhile
+            # or Starlette listens for the end of the client while it sends a file, and uvicorn reads on meanwhile
             inner["asgi"] = {**scope["asgi"], "spec_version": "2.4"}
             if scope["method"] == "HEAD":
                 inner["method"] = "GET"  # uvicorn leaves the body out

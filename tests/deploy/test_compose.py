@@ -17,7 +17,7 @@ HERE = DEPLOY / "compose"
 def container_ports(service):
     """Ports that something inside a service listens at, by its own command or its image's habit."""
     by_option = re.findall(r"--(?:dashboard-|metrics-export-)?port=(\d+)", " ".join(service.get("command", [])))
-    (listen,) = re.findall(r"^ *listen (\d+);$", NGINX.read_text(), re.MULTILINE)
+    (listen,) = re.findall(r"^ *listen (\d+)\b", NGINX.read_text(), re.MULTILINE)
     by_image = {"redis": "6379", "prom": "9090", "grafana": "3000", "nginx": listen}
     return {*by_option, *(port for name, port in by_image.items() if service["image"].startswith(name))}
 
