@@ -64,7 +64,6 @@ PROGRAMS = {
     "rest_load": "benchmarks.rest_load of commit ddd0770",
     "soak": "benchmarks.soak of commit ddd0770",
     "strikes": "tools.strikes",
-    "flood": "tools.flood",
     "mutation": "tools.mutation",
     "scaling": "benchmarks.scaling",
     "ranks_on_nodes": "tools.ranks_on_nodes",
@@ -82,7 +81,7 @@ PAGES = {
     "results/pretraining.md": (
         *("skill", "champion", "tasks", "curves", "curriculum", "coverage", "ablations", "throughput"),
     ),
-    "results/cluster.md": ("targets", "throughput", "chaos", "strikes", "rest", "flood", "soak"),
+    "results/cluster.md": ("targets", "throughput", "chaos", "strikes", "rest", "soak"),
     "results/skills.md": ("coverage", "curves", "controls"),
     "results/comparison.md": ("rows", "longer", "below", "harder", "missing"),
     "downstream.md": ("headline",),
@@ -305,8 +304,6 @@ class Report:
             blocks["chaos"] = [cluster.chaos_words(chaos), picture, cluster.faults_table(chaos)]
         if (strikes := found.get("strikes")) is not None:
             blocks["strikes"] = [attacks.strikes_words(strikes), attacks.strikes_table(strikes)]
-        if (flood := found.get("flood")) is not None:
-            blocks["flood"] = [attacks.flood_table(flood), attacks.flood_words(flood)]
         if (rest := found.get("rest_load")) is not None:
             blocks["rest"] = [cluster.latency_table(rest), cluster.rest_words(rest)]
         if (soak := found.get("soak")) is not None:

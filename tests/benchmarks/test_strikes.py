@@ -1,4 +1,4 @@
-"""Strikes and floods: what they are made of, a small flood, and their pages."""
+"""Strikes: what they are made of, and their page."""
 
 import json
 import socket
@@ -11,7 +11,6 @@ import pytest
 from benchmarks.report import attacks
 from service.store.models import RunStatus
 from tests.status.runs import status
-from tools.flood import Settings, measure
 from tools.strike_runs import Network, Strike, Watcher, changed
 from tools.strikes import ROOT, strikes
 
@@ -98,34 +97,6 @@ def test_the_recorded_strikes_are_those_there_are():
     recorded = json.loads((ROOT / "docs" / "results" / "strikes.json").read_text())["strikes"]
     asked = {name: must for name, (must, _) in strikes(600.0).items()}
     assert {each["name"]: each["must"] for each in recorded} == asked
-
-
-def test_a_small_flood_is_measured():
-    found = measure(Settings(num_half_open=30, header_mb=0.5, hold_s=0.5, calm_s=0.5))
-    assert found["half_open"]["num_opened"] == 30
-    assert found["endless_headers"]["num_bytes"] >= 500_000
-    assert found["endless_headers"]["num_opened"] >= 50
-    for each in found.values():
-        assert each["num_failed"] == 0
-        assert 0.0 < each["memory_mb"]["before"] < 1000.0
-        assert each["livez"]["num"] > 0
-
-
-def test_a_flood_is_judged_by_memory_and_latency():
-    def flooded(most, slowest, failed=0):
-        each = {
-            "num_opened": 3000,
-            "num_bytes": 2_000_000,
-            "memory_mb": {"before": 50.0, "most": most, "after": 50.0},
-            "livez": {"num": 100, "p50_ms": 1.0, "max_ms": slowest},
-            "num_failed": failed,
-        }
-        return {"half_open": each, "endless_headers": each, "machine": MACHINE}
-
-    assert attacks.flood_table(flooded(60.0, 99.0)).count("reached") == 2
-    assert "2 MB of headers over 3,000 connections | 50.0 MB, +10.0 MB |" in attacks.flood_table(flooded(60.0, 99.0))
-    for worse in (flooded(70.0, 99.0), flooded(60.0, 100.0), flooded(60.0, 99.0, failed=1)):
-        assert attacks.flood_table(worse).count("**missed**") == 2
 
 
 def test_the_page_says_what_each_strike_came_to():
