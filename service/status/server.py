@@ -67,7 +67,7 @@ class StatusServer:
             h11_max_incomplete_event_size=MAX_HEAD_BYTES,
             limit_concurrency=MAX_CONNECTIONS,
             log_config=None,  # keep the program's own logging
-            log_level="error",  # a client could fill the log with warnings
+            log_level="critical",  # AuthMiddleware logs what fails; the rest is about clients, who could fill the log
             access_log=False,  # /metrics counts requests
             server_header=False,
             proxy_headers=False,  # nothing depends on them but the cookie, which reads them itself

@@ -14,6 +14,7 @@ from tests.deploy.files import (
     KUBERNETES,
     NGINX,
     ROOT,
+    container,
     load,
     manifest,
     manifests,
@@ -123,6 +124,18 @@ def test_services_lead_to_pods_and_ports():
 @pytest.mark.parametrize("document", [each for each in manifests() if each["kind"] in ("Deployment", "StatefulSet")])
 def test_workloads_select_their_own_pods(document):
     assert selects(document["spec"]["selector"], document["spec"]["template"])
+
+
+def test_nginx_is_before_the_status_service():
+    template = manifest("Deployment", "status")["spec"]["template"]
+    ((name, port),) = re.findall(r"^ *server (\w+):(\d+);$", NGINX.read_text(), re.MULTILINE)
+    assert template["spec"]["hostAliases"] == [{"ip": "127.0.0.1", "hostnames": [name]}]
+    assert ports(template) == {
+        "rest": int(port),
+        "http": int(re.findall(r"^ *listen (\d+)\b", NGINX.read_text(), re.M)[0]),
+    }
+    assert f"--port={port}" in container(template, "status")["args"]
+    assert {each["targetPort"] for each in manifest("Service", "status")["spec"]["ports"]} == {"http"}
 
 
 def test_redis_is_where_it_is_looked_for():

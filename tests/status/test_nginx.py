@@ -21,7 +21,7 @@ NGINX = shutil.which("nginx", path="/usr/sbin:/usr/local/sbin:/usr/bin:/usr/loca
 NUM_CLIENTS = 512
 HEAD = b"host: lab.example\r\n"
 
-pytestmark = pytest.mark.skipif(NGINX is None, reason="nginx is not installed; on Debian: apt-get install nginx-light")
+pytestmark = pytest.mark.skipif(NGINX is None, reason="nginx is not installed; on Debian: apt-get install nginx")
 
 
 @pytest.fixture(scope="module")
@@ -77,7 +77,8 @@ def crowd(port):
                 address = source or f"127.1.{index // 250}.{1 + index % 250}"
                 connection = socket.create_connection(("127.0.0.1", port), 60.0, (address, 0))
                 made.append(stack.enter_context(connection))
-                connection.sendall(data)
+                with suppress(ConnectionError):  # refused before it had all
+                    connection.sendall(data)
             return made
 
         yield connect
@@ -129,11 +130,10 @@ def test_heads_that_do_not_end(client, service, crowd):
     assert_others_are_served(client, service)
 
 
-def test_heads_without_end(client, service, crowd):
-    for connection in crowd(50, data=b"GET /livez HTTP/1.1\r\n" + HEAD):
-        with suppress(ConnectionError):
-            for _ in range(20):
-                connection.sendall(b"x: " + b"a" * 5000 + b"\r\n")
+def test_heads_that_are_too_large(client, service, crowd):
+    """The service itself would take them."""
+    head = b"GET /livez HTTP/1.1\r\n" + HEAD + b"connection: close\r\n" + (b"x: " + b"a" * 5000 + b"\r\n") * 10
+    for connection in crowd(50, data=head + b"\r\n"):
         assert received(connection)[:12] in (b"HTTP/1.1 400", b"")  # or the answer was lost, as nginx had closed
     assert_others_are_served(client, service)
 
@@ -174,6 +174,8 @@ def test_slow_clients_are_ended(port, crowd):
     (no_head,) = crowd(data=b"GET /livez HTTP/1.1\r\nx: ")
     (no_body,) = crowd(data=b"POST /v1/session HTTP/1.1\r\n" + HEAD + b"content-length: 100\r\n\r\n{")
     (no_reader,) = crowd(data=b"GET /page/plotly.js HTTP/1.1\r\n" + HEAD + b"\r\n")
+    for connection in (no_head, no_body, no_reader):
+        connection.settimeout(40.0)  # in which nginx has to end it
     assert received(no_head)[:12] in (b"", b"HTTP/1.1 408")
     assert received(no_body)[:12] in (b"", b"HTTP/1.1 408")
     size = int(httpx.head(f"http://127.0.0.1:{port}/page/plotly.js", **CLIENT).headers["content-length"])
@@ -219,4 +221,5 @@ def test_a_page_that_has_not_changed_is_not_sent_again(client):
 
 
 def test_a_body_that_is_too_large(client):
-    assert client.put("/v1/primitives/tiny/aliases/best", content=b" " * 70_000, headers=BEARER).status_code == 413
+    answer = client.put("/v1/primitives/tiny/aliases/best", content=b" " * 70_000, headers=BEARER)
+    assert (answer.status_code, answer.headers["content-type"]) == (413, "text/html")  # nginx's own
