@@ -15,7 +15,7 @@ from typing import Annotated, Any, Literal, Self, get_args
 import yaml
 from pydantic import BaseModel, BeforeValidator, Field, PositiveInt, ValidationError, model_validator
 
-from service.config_tree import RENAMED, apply_override, read_yaml, updated
+from service.config_tree import RENAMED, apply_override, check_numbers, read_yaml, updated
 from service.distillation_config import DistillationConfig
 from service.errors import ConfigError, did_you_mean
 from service.frozen import FrozenModel, reason
@@ -431,7 +431,9 @@ def parse_config(tree: dict[str, Any], *, where: str, recorded: bool = False) ->
         ConfigError: unknown key, value out of range, or a recorded key whose effect is no longer there.
     """
     try:
-        return Config.model_validate(updated(tree, where=where) if recorded else tree)
+        config = Config.model_validate(updated(tree, where=where) if recorded else tree)
+        check_numbers(tree, config.model_dump(mode="json"), where=where)
+        return config
     except ValidationError as error:
         first = error.errors()[0]
         key = ".".join(str(part) for part in first["loc"] if part not in NO_KEYS) or "the top level"

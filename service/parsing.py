@@ -9,11 +9,13 @@ from __future__ import annotations
 
 import json
 import math
-from typing import Any
+from collections import Counter
+from collections.abc import Callable
+from typing import Any, TypeVar
 
 import yaml
 
-from service.errors import TandemError
+from service.errors import TandemError, one_line
 
 MAX_DEPTH = 64
 """Groups within groups; a configuration has five."""
@@ -24,6 +26,9 @@ MAX_YAML_NUMBER = 2**63 - 1
 MAX_YAML_CHARACTERS = 256 * 1024
 MAX_YAML_VALUES = 5000
 """Values of a YAML text, those that aliases repeat included; a configuration has 200."""
+
+
+_Value = TypeVar("_Value")
 
 
 class ParseError(TandemError):
@@ -39,6 +44,26 @@ class ParseError(TandemError):
         self.reason = reason
 
 
+def parse_with(parser: Callable[[Any], _Value], text: str | bytes, where: object, kind: str = "JSON") -> _Value:
+    """What a parser makes of a text: the one place where texts of others meet a parser.
+
+    Args:
+        parser: called with the text, such as ``json.loads`` or the ``model_validate_json`` of a model.
+        text: what it parses.
+        where: its origin, named in errors.
+        kind: what it should be, named in errors.
+
+    Raises:
+        ParseError: it is not that.
+    """
+    try:
+        return parser(text)
+    except RecursionError:
+        raise ParseError(where, _TOO_DEEP) from None
+    except Exception as error:  # beside their own errors whatever they meet: "!!bool x" is a KeyError of PyYAML's
+        raise ParseError(where, f"not {kind} ({one_line(str(error), 300)})") from None
+
+
 def parse_json(text: str | bytes, where: object, *, allow_nan: bool = False) -> Any:
     """The value of a JSON text.
 
@@ -50,12 +75,7 @@ def parse_json(text: str | bytes, where: object, *, allow_nan: bool = False) -> 
     Raises:
         ParseError: no JSON; or nested too deep, a number that no float holds, or text that is no Unicode.
     """
-    try:
-        tree = json.loads(text)
-    except RecursionError:
-        raise ParseError(where, _TOO_DEEP) from None
-    except ValueError as error:  # also for bytes that are no UTF-8, and for numbers of thousands of digits
-        raise ParseError(where, f"not JSON ({_described(error)})") from None
+    tree = parse_with(json.loads, text, where)
     _check(tree, where, MAX_JSON_NUMBER, allow_nan=allow_nan)
     return tree
 
@@ -73,23 +93,12 @@ def parse_yaml(text: str | bytes, where: object) -> Any:
     """
     if len(text) > MAX_YAML_CHARACTERS:
         raise ParseError(where, f"too long for YAML ({len(text)} characters; {MAX_YAML_CHARACTERS} are the most)")
-    try:
-        loader = _BoundedLoader(text)
-        try:
-            tree = loader.get_single_data()
-        finally:
-            loader.dispose()
-    except Exception as error:  # beside its own errors whatever its constructors meet: "!!bool x" is a KeyError
-        raise ParseError(where, f"not YAML ({_described(error)})") from None
+    tree = parse_with(lambda text: yaml.load(text, _BoundedLoader), text, where, "YAML")
     _check(tree, where, MAX_YAML_NUMBER, allow_nan=True)  # whose fields they are refuses them where they are no good
     return tree
 
 
 _TOO_DEEP = f"nested more than {MAX_DEPTH} deep"
-
-
-def _described(error: Exception) -> str:
-    return " ".join(str(error).split())[:300]
 
 
 class _BoundedLoader(yaml.SafeLoader):
@@ -116,10 +125,19 @@ class _BoundedLoader(yaml.SafeLoader):
         else:
             self._num_values += 1
             self._sizes[id(node)] = self._num_values - before
+            if isinstance(node, yaml.MappingNode):
+                self._check_keys(node)
         if self._num_values > MAX_YAML_VALUES:
             raise yaml.YAMLError(f"more than {MAX_YAML_VALUES} values")
         self._depth -= 1
         return node
+
+    def _check_keys(self, node: yaml.MappingNode) -> None:
+        """Refuse a key that is there twice, of which PyYAML would take the last."""
+        counts = Counter((key.tag, key.value) for key, _ in node.value if isinstance(key, yaml.ScalarNode))
+        for (_, key), count in counts.items():
+            if count > 1:
+                raise yaml.YAMLError(f"the key {key!r} is there {count} times")
 
 
 def _check(tree: Any, where: object, greatest: int, *, allow_nan: bool) -> None:

@@ -1,10 +1,14 @@
-"""Regular files, opened without waiting: a FIFO has nobody at its other end, and a device may never end."""
+"""Regular files, opened without waiting: whatever a user names, or a run finds in its directory, is opened here.
+
+Anybody may have put something else there. A FIFO has nobody at its other end, and a device may never end.
+"""
 
 from __future__ import annotations
 
 import errno
 import os
 import stat
+from io import FileIO
 from pathlib import Path
 from typing import BinaryIO
 
@@ -19,15 +23,16 @@ def open_regular(path: Path, *, follow: bool = False) -> BinaryIO:
     Raises:
         OSError: it cannot be opened, or is something else than a regular file; ``strerror`` says which.
     """
-    flags = os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC | (0 if follow else os.O_NOFOLLOW)
-    descriptor = os.open(path, flags)
-    try:
-        if not stat.S_ISREG(os.fstat(descriptor).st_mode):
-            raise OSError(errno.EINVAL, "not a regular file", str(path))
-    except BaseException:
-        os.close(descriptor)
-        raise
-    return open(descriptor, "rb")
+    return open(_descriptor(path, os.O_RDONLY, follow=follow), "rb")
+
+
+def open_to_append(path: Path) -> FileIO:
+    """Open a regular file to append to it, and make it when missing; what a link leads to is not ours to change.
+
+    Raises:
+        OSError: as for ``open_regular``.
+    """
+    return FileIO(_descriptor(path, os.O_RDWR | os.O_APPEND | os.O_CREAT, follow=False), "a")
 
 
 def read_regular(path: Path, max_bytes: int, *, follow: bool = False) -> bytes:
@@ -49,3 +54,19 @@ def read_regular(path: Path, max_bytes: int, *, follow: bool = False) -> bytes:
         if max(size, len(data)) > max_bytes:
             raise OSError(errno.EFBIG, f"longer than {max_bytes} bytes", str(path))
         return data
+
+
+def _descriptor(path: Path, flags: int, *, follow: bool) -> int:
+    try:
+        descriptor = os.open(path, flags | os.O_NONBLOCK | os.O_CLOEXEC | (0 if follow else os.O_NOFOLLOW), 0o666)
+    except OSError as error:
+        if error.errno != errno.ELOOP or follow:
+            raise
+        raise OSError(errno.ELOOP, "a symbolic link, which is not followed", str(path)) from None
+    try:
+        if not stat.S_ISREG(os.fstat(descriptor).st_mode):
+            raise OSError(errno.EINVAL, "not a regular file", str(path))
+    except BaseException:
+        os.close(descriptor)
+        raise
+    return descriptor

@@ -7,6 +7,7 @@ from typing import Any, Literal, Self
 
 from pydantic import Field, ValidationError, model_validator
 
+from service.config_tree import check_numbers
 from service.errors import ConfigError, did_you_mean
 from service.frozen import FrozenModel, reason
 from service.model_files import absolute, digest_of
@@ -165,6 +166,7 @@ def read_robot(path: Path) -> RobotConfig:
         raise ConfigError(f"robot {path}: {error.reason}") from None
     try:
         robot = RobotConfig.model_validate(tree)
+        check_numbers(tree, robot.model_dump(mode="json"), where=f"robot {path}")
     except ValidationError as error:
         first = error.errors()[0]
         key = ".".join(str(part) for part in first["loc"]) or "the top level"

@@ -11,6 +11,7 @@ from service.config import Config, WorkspaceConfig, dump_config, load_config, pa
 from service.errors import ConfigError
 from service.parsing import parse_yaml
 from service.robot_config import RobotConfig
+from tests.runtime.runs import assert_one_line
 
 CONFIGS = Path(__file__).parents[1] / "configs"
 
@@ -62,10 +63,33 @@ def test_a_file_may_name_only_what_differs(tmp_path):
     assert config.game == Config().game
 
 
-def test_an_empty_file_is_the_defaults(tmp_path):
+@pytest.mark.parametrize("text", ["", "# nothing here\n", "null", "---\n"])
+def test_an_empty_file_is_refused(tmp_path, text):
+    """It is what a full disk leaves of a file."""
     path = tmp_path / "empty.yaml"
-    path.write_text("# nothing here\n")
+    path.write_text(text)
+    with pytest.raises(ConfigError) as error:
+        load_config(path)
+    assert_one_line(error.value, path, "holds no key", "write {}")
+    path.write_text("{}")
     assert load_config(path) == Config()
+
+
+@pytest.mark.parametrize(
+    "override",
+    [
+        "game.num_worlds=true",
+        "game.alice_steps_min=true",
+        "generator.replay_fraction=false",
+        "policy.alice.hidden_sizes=[true, 64]",
+        "world.randomisation.action_delay_steps=[false, true]",
+        "skills.skill_dim=true",
+    ],
+)
+def test_true_and_false_are_no_numbers(override):
+    with pytest.raises(ConfigError) as error:
+        load_config(None, [override])
+    assert_one_line(error.value, override.partition("=")[0], "expected a number, not true or false")
 
 
 def test_frozen():

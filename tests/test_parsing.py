@@ -83,6 +83,8 @@ LAUGHS = "a: &a [x, x, x]\n" + "".join(
         ("0x" + "f" * 20, "a whole number beyond 9.22e+18"),
         ("9" * 10_000, "not YAML (Exceeds the limit"),
         ('"\\ud800"', "text that is no Unicode"),
+        ("name: x\nseed: 1\nname: y\n", "not YAML (the key 'name' is there 2 times)"),
+        ("game: {a: 1, b: {c: 2, 'c': 3}}", "not YAML (the key 'c' is there 2 times)"),
     ],
 )
 def test_yaml_that_is_refused(text, reason):

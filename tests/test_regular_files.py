@@ -4,7 +4,7 @@ import os
 
 import pytest
 
-from service.regular_files import open_regular, read_regular
+from service.regular_files import open_regular, open_to_append, read_regular
 
 
 @pytest.fixture
@@ -39,8 +39,8 @@ def test_links_are_followed_where_they_may_be(path, tmp_path):
     link = tmp_path / "link"
     link.symlink_to(path)
     assert read_regular(link, 5, follow=True) == b"12345"
-    for read in (open_regular, lambda path: read_regular(path, 5)):
-        with pytest.raises(OSError, match="symbolic links"):
+    for read in (open_regular, open_to_append, lambda path: read_regular(path, 5)):
+        with pytest.raises(OSError, match="a symbolic link, which is not followed"):
             read(link)
 
 
@@ -52,4 +52,6 @@ def test_what_is_no_file(tmp_path, make):
     for _ in range(3):
         with pytest.raises(OSError, match="not a regular file"):
             open_regular(path, follow=True)
+        with pytest.raises(OSError, match=r"not a regular file|Is a directory|not followed"):
+            open_to_append(path)
     assert len(os.listdir("/proc/self/fd")) == before

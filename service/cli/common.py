@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import logging
+import re
 import shlex
 import sys
 from collections.abc import Iterable, Iterator, Sequence
@@ -91,8 +92,14 @@ class CommandGroup(TyperGroup):
     """
 
     def make_context(self, info_name: str | None, args: list[str], parent: Any = None, **extra: Any) -> Any:
-        """Read what was typed."""
+        """Read what was typed; nothing that can be typed means something when it is empty."""
         with _one_line():
+            for before, argument in zip(["", *args], args, strict=False):
+                if argument == "" or re.fullmatch(r"--[a-z-]+=", argument):
+                    raise TandemError(
+                        f"{argument or before}: an argument is empty; is a variable of the shell not set? Give it a "
+                        "value, or leave it out"
+                    )
             return super().make_context(info_name, args, parent, **extra)
 
     def invoke(self, ctx: Any) -> Any:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import shlex
 from collections.abc import Sequence
 from contextlib import closing
@@ -118,6 +119,7 @@ def pretrain(
     from service.io.run_directory import RunDirectory
     from service.runtime.pretrain import prepare
     from service.runtime.resuming import resumed_config
+    from service.store.models import RUN_ID
 
     def cluster_options() -> ClusterOptions:
         from service.runtime.ray_connection import ClusterOptions, parse_status
@@ -136,6 +138,11 @@ def pretrain(
     if run_id is not None:
         if resume or run_dir is not None:
             raise TandemError("--run-id names the run directory, and continues what is there: leave out the other two")
+        if re.fullmatch(RUN_ID, run_id) is None:
+            raise TandemError(
+                f"--run-id {run_id!r}: use 1 to 128 letters, digits, '.', '_' and '-', the first a letter or digit; "
+                "for another place there is --run-dir"
+            )
         run_dir = runs / run_id
         resume = RunDirectory(run_dir).exists
     if is_study(run_dir, seeds):

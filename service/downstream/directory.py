@@ -30,7 +30,7 @@ from service.downstream.files import (
 from service.downstream.settings import TrialConfig, differences, validate
 from service.errors import TRACEBACK_PREFIX, TandemError
 from service.io.checkpoints import Checkpoint, CheckpointStore
-from service.io.files import TEMPORARY_PREFIX, check_regular, os_errors, remove_temporaries
+from service.io.files import TEMPORARY_PREFIX, os_errors, remove_temporaries
 from service.io.jsonl import JsonlWriter
 from service.io.lock import LOCK_FILE, DirectoryLock
 from service.io.run_directory import TRIAL_FILE
@@ -85,7 +85,6 @@ class TrainingDirectory:
         with os_errors("write", self.path):
             remove_temporaries(self.path)
         write_json(self.trial_file, {"format_version": FORMAT_VERSION, **identity})  # first: it says whose the rest is
-        check_regular(self.metrics_file)
         self._metrics.truncate_after(saved.step if saved else 0)
         with os_errors("write", self.path):
             self._events = EventFile(self.path / "tensorboard", after_step=saved.meta["env_steps"] if saved else None)

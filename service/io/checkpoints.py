@@ -25,7 +25,7 @@ FORMAT_VERSION = 1
 MAX_BYTES = 8 * 1024**3
 """Of a checkpoint; a replay buffer of a million steps has half a gigabyte."""
 _HEADER_KEY = "tandem_checkpoint"
-_FILE_PATTERN = re.compile(r"checkpoint-(?:e([0-9]{8})-)?([0-9]{8,})\.safetensors")
+_FILE_PATTERN = re.compile(r"checkpoint-(?:e([0-9]{8,})-)?([0-9]{8,})\.safetensors")
 _logger = logging.getLogger(__name__)
 
 

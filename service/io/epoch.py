@@ -82,4 +82,4 @@ def _numbers(directory: Path) -> list[int]:
         names = os.listdir(directory / DIRECTORY)
     except OSError:
         return []
-    return sorted(int(name) for name in names if len(name) == 8 and name.isdecimal())
+    return sorted(int(name) for name in names if len(name) >= 8 and name.isdecimal())

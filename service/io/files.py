@@ -12,7 +12,6 @@ import errno
 import os
 import secrets
 import shutil
-import stat
 from collections import deque
 from collections.abc import Iterator
 from io import FileIO
@@ -20,7 +19,7 @@ from pathlib import Path
 from typing import Literal
 
 from service.io.errors import StorageError
-from service.regular_files import open_regular
+from service.regular_files import open_regular, open_to_append
 
 TEMPORARY_PREFIX = ".tmp-"
 
@@ -99,32 +98,6 @@ def remove_temporaries(directory: Path) -> None:
         path.unlink(missing_ok=True)
 
 
-def open_to_append(path: Path) -> FileIO:
-    """Open a file to append to it, and make it when missing; never wait, as for the reader of a FIFO.
-
-    Raises:
-        OSError: it cannot be opened, or is a FIFO.
-    """
-    descriptor = os.open(path, os.O_WRONLY | os.O_APPEND | os.O_CREAT | os.O_NONBLOCK | os.O_CLOEXEC, 0o666)
-    try:
-        if stat.S_ISFIFO(os.fstat(descriptor).st_mode):
-            raise OSError(errno.EINVAL, "not a regular file", str(path))
-    except BaseException:
-        os.close(descriptor)
-        raise
-    return FileIO(descriptor, "a")
-
-
-def check_regular(path: Path) -> None:
-    """Check that there is nothing at ``path``, or a file that can be read without waiting for anybody.
-
-    Raises:
-        StorageError: something else is there.
-    """
-    with os_errors("read", path), contextlib.suppress(FileNotFoundError):
-        open_regular(path, follow=True).close()
-
-
 class Appender:
     """Appends pieces to one file; a piece that does not fit waits, and comes before the next one.
 
@@ -163,7 +136,7 @@ class Appender:
         """
         self._flush()
         if self.path.is_file():
-            with os_errors("write", self.path), self.path.open("rb") as file:
+            with os_errors("write", self.path), open_regular(self.path) as file:
                 os.fsync(file.fileno())
 
     def _flush(self) -> None:

@@ -17,7 +17,7 @@ from service.errors import TandemError
 from service.io.errors import RunTakenError
 from service.io.files import os_errors
 from service.parsing import parse_json
-from service.regular_files import open_regular, read_regular
+from service.regular_files import open_regular, open_to_append, read_regular
 
 LOCK_FILE = ".lock"
 WITHOUT_LOCKS = "TANDEM_WITHOUT_LOCKS"
@@ -44,7 +44,7 @@ class DirectoryLock:
         path = directory / LOCK_FILE
         with os_errors("write", path):
             directory.mkdir(parents=True, exist_ok=True)
-            self._file = FileIO(path, "a+")
+            self._file = open_to_append(path)
         try:
             taken = _take(self._file, fcntl.LOCK_EX, WAIT_S)
         except OSError as error:
@@ -74,7 +74,7 @@ class DirectoryLock:
 def is_locked(directory: Path) -> bool:
     """Whether some process holds the directory's lock now."""
     try:
-        with open_regular(directory / LOCK_FILE, follow=True) as file:
+        with open_regular(directory / LOCK_FILE) as file:
             return not _take(file, fcntl.LOCK_SH, 0.0)
     except OSError:  # nobody ever locked it, or nobody can
         return False

@@ -42,7 +42,7 @@ from service.errors import ConfigError, TandemError
 from service.io.checkpoints import CheckpointStore
 from service.io.epoch import Epoch
 from service.io.errors import StorageError
-from service.io.files import Appender, check_regular, os_errors, remove_temporaries, write_atomic
+from service.io.files import Appender, os_errors, remove_temporaries, write_atomic
 from service.io.git import git_commit
 from service.io.jsonl import JsonlWriter
 from service.io.lock import LOCK_FILE, DirectoryLock
@@ -93,7 +93,7 @@ class RunDirectory:
         self._metrics = JsonlWriter(self.metrics_file)
         self._goals = JsonlWriter(self.goals_file)
         self._events: EventFile | None = None
-        self._failing: set[Path] = set()
+        self._failing: dict[Path, str] = {}
         self._lock: DirectoryLock | None = None
         self._history: RunHistory | None = None
         self._changed: dict[str, tuple[JsonValue, JsonValue]] = {}
@@ -137,8 +137,6 @@ class RunDirectory:
         if after_iteration is None:
             self.check_free()
         else:
-            for file in (self.metrics_file, self.goals_file):
-                check_regular(file)
             self._metrics.truncate_after(after_iteration)
             self._goals.truncate_after(after_iteration)
         with os_errors("write", self.path):
@@ -328,17 +326,31 @@ class RunDirectory:
     def _writers(self) -> list[Appender]:
         return [self._metrics, self._goals, *([self._events] if self._events is not None else [])]
 
+    def problems(self) -> list[str]:
+        """Why records or checkpoints cannot be written at the moment; empty when all is well."""
+        kept = (*(writer.path for writer in self._writers()), self.checkpoints)
+        return [self._failing[path] for path in kept if path in self._failing]
+
     @contextmanager
-    def _keep_running(self, path: Path) -> Iterator[None]:
-        """Turn a full disk into one warning for ``path`` until a write succeeds again: the run does not end for it."""
+    def noting(self, path: Path) -> Iterator[None]:
+        """Keep among the `problems` why ``path`` cannot be written, until it can be again."""
         try:
             yield
         except StorageError as error:
-            if path not in self._failing:
+            self._failing[path] = str(error)
+            raise
+        self._failing.pop(path, None)
+
+    @contextmanager
+    def _keep_running(self, path: Path) -> Iterator[None]:
+        """Turn a full disk into one warning for ``path`` until a write succeeds again: the run does not end for it."""
+        known = path in self._failing
+        try:
+            with self.noting(path):
+                yield
+        except StorageError as error:
+            if not known:
                 _logger.warning("%s; the run goes on", error)
-            self._failing.add(path)
-        else:
-            self._failing.discard(path)
 
 
 def _environment() -> dict[str, object]:

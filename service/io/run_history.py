@@ -6,11 +6,12 @@ import secrets
 from datetime import datetime
 from pathlib import Path
 
-from pydantic import AwareDatetime, Field, JsonValue, ValidationError
+from pydantic import AwareDatetime, Field, JsonValue
 
 from service.frozen import FrozenModel
 from service.io.errors import StorageError
 from service.io.files import os_errors, write_atomic
+from service.parsing import ParseError, parse_with
 from service.regular_files import read_regular
 
 FILE = "run.json"
@@ -68,6 +69,6 @@ def read_history(directory: Path) -> RunHistory | None:
         except FileNotFoundError:
             return None
     try:
-        return RunHistory.model_validate_json(data)
-    except ValidationError:
+        return parse_with(RunHistory.model_validate_json, data, path)
+    except ParseError:
         raise StorageError(f"{path} is damaged; restore it from a copy, or remove it to go on without it") from None

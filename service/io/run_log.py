@@ -8,15 +8,17 @@ from __future__ import annotations
 import json
 import logging
 from datetime import UTC, datetime
+from io import BufferedWriter, TextIOWrapper
 from logging.handlers import RotatingFileHandler
 from pathlib import Path
 from types import TracebackType
 from typing import Literal, Self
 
-from pydantic import AwareDatetime, ValidationError
+from pydantic import AwareDatetime
 
 from service.frozen import FrozenModel
-from service.regular_files import read_regular
+from service.parsing import ParseError, parse_with
+from service.regular_files import open_to_append, read_regular
 
 FILE = "log.jsonl"
 MAX_FILE_BYTES = 1024 * 1024
@@ -64,6 +66,9 @@ class RunLog:
 
 
 class _Handler(RotatingFileHandler):
+    def _open(self) -> TextIOWrapper:
+        return TextIOWrapper(BufferedWriter(open_to_append(Path(self.baseFilename))), encoding="utf-8")
+
     def handleError(self, record: logging.LogRecord) -> None:  # noqa: N802 - logging's name
         """Go on without the line."""
 
@@ -86,7 +91,7 @@ def read_log(directory: Path) -> list[LogLine]:
             continue
         for line in data.splitlines():
             try:
-                lines.append(LogLine.model_validate_json(line))
-            except ValidationError:  # a torn line of a process that was killed
+                lines.append(parse_with(LogLine.model_validate_json, line, name))
+            except ParseError:  # a torn line of a process that was killed
                 continue
     return lines

@@ -12,6 +12,7 @@
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
@@ -34,7 +35,7 @@ MAX_RESULTS_BYTES = 16 * 1024 * 1024
 
 def is_study(path: Path) -> bool:
     """Whether a study has begun in this directory."""
-    return (path / STUDY_FILE).is_file()
+    return os.path.isfile(path / STUDY_FILE)
 
 
 class StudyDirectory:

@@ -162,10 +162,11 @@ def _free_port(host: str, port: int | None) -> int:
         try:
             with contextlib.closing(socket.create_server((host, candidate), reuse_port=False)) as found:
                 return int(found.getsockname()[1])
-        except OSError as error:
-            if error.errno == errno.EADDRINUSE and port is None:
+        except (OSError, UnicodeError) as error:
+            number = error.errno if isinstance(error, OSError) else None
+            if number == errno.EADDRINUSE and port is None:
                 continue
-            advice = "take another --port, or leave it out" if error.errno == errno.EADDRINUSE else "check --host"
-            reason = os.strerror(error.errno) if error.errno else str(error)
+            advice = "take another --port, or leave it out" if number == errno.EADDRINUSE else "check --host"
+            reason = os.strerror(number) if number else str(error)
             raise TandemError(f"cannot listen on {host}:{candidate}: {reason}; {advice}") from None
     raise TandemError(f"ports {PORT} to {PORT + _NUM_PORTS - 1} are all taken; name a free one with --port")

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import fcntl
-import os
 from pathlib import Path
 
 from service.io.files import os_errors, write_atomic
 from service.registry.errors import RegistryError
 from service.registry.names import check_alias, is_name, is_number
-from service.regular_files import read_regular
+from service.regular_files import open_to_append, read_regular
 
 MAX_BYTES = 100
 """Of an alias' file, which holds a number."""
@@ -56,9 +55,7 @@ def move_alias(directory: Path, alias: str, number: int, *, back: bool = True) -
     path = directory / check_alias(alias)
     with os_errors("write", path):
         directory.mkdir(parents=True, exist_ok=True)
-        # to read it as well, so that opening a FIFO does not wait for a reader
-        descriptor = os.open(directory / ".lock", os.O_RDWR | os.O_CREAT, 0o666)
-        with open(descriptor, "a") as lock:
+        with open_to_append(directory / ".lock") as lock:
             fcntl.flock(lock, fcntl.LOCK_EX)  # closing the file frees it, and so does the process's death
             if back or (read_alias(directory, alias) or 0) < number:
                 write_atomic(path, f"{number}\n".encode())

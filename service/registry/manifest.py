@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from pydantic import Field, JsonValue, ValidationError
+from pydantic import Field, JsonValue, StrictInt, ValidationError
 
 from service.frozen import FrozenModel
 from service.io.errors import FormatVersionError
@@ -25,19 +25,19 @@ _MEND = "restore the file from a copy, or publish the version again"
 class TensorDescription(FrozenModel):
     """Shape and dtype of one tensor."""
 
-    shape: tuple[int, ...]
+    shape: tuple[StrictInt, ...]
     dtype: str
 
 
 class Manifest(FrozenModel):
     """Everything known about one immutable version."""
 
-    format_version: int = FORMAT_VERSION
+    format_version: StrictInt = FORMAT_VERSION
     name: str
-    version: int = Field(ge=1)
+    version: StrictInt = Field(ge=1)
     created: str = Field(description="UTC, ISO 8601")
     blob_sha256: str = Field(pattern=r"^[0-9a-f]{64}$", description="digest of the safetensors bytes")
-    blob_bytes: int = Field(ge=0)
+    blob_bytes: StrictInt = Field(ge=0)
     tensors: dict[str, TensorDescription]
     spaces: dict[str, JsonValue] = Field(description="the action and observation spaces")
     normalisation: dict[str, JsonValue] = Field(description="fixed normalisation of the network's input")

@@ -165,7 +165,15 @@ class Registry:
         return manifest, arrays
 
     def names(self) -> list[str]:
-        """Every name that has a version, sorted."""
+        """Every name that has a version, sorted.
+
+        Raises:
+            RegistryError: something else than a directory is at the registry's path.
+        """
+        if self.root.exists() and not self.root.is_dir():
+            raise RegistryError(
+                f"{self.root} is no directory, as a registry is; name one with --registry or TANDEM_REGISTRY"
+            )
         directory = self.root / "models"
         found = [entry.name for entry in directory.iterdir()] if directory.is_dir() else []
         return sorted(name for name in found if names.is_name(name) and self.versions(name))

@@ -132,7 +132,8 @@ class Bookkeeper:
         assert self.directory.history is not None
         own |= {"run": self.directory.history.run, "records": self.directory.checksums()}
         self.directory.sync()
-        self.checkpoints.save(self.iteration, arrays, {**own, **meta})
+        with self.directory.noting(self.directory.checkpoints):
+            self.checkpoints.save(self.iteration, arrays, {**own, **meta})
         self._saved = self.iteration
 
     @property

@@ -104,7 +104,7 @@ def pretrain(
         run_id = run_id_of(directory.path)
         redis = address_from_environment()
         previous = read_status(directory.path) if resume else None
-        writer = RunWriter(directory.path, run_id, redis, directory.epoch)
+        writer = RunWriter(directory, run_id, redis)
         published = last.version if last is not None else None
         assert directory.epoch is not None
         epoch = directory.epoch.number

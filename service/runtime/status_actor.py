@@ -78,7 +78,10 @@ def place(options: StatusOptions) -> StatusOptions:
     """The options with the port that is taken in the end: a service that is restarted must be where it was."""
     if options.port != 0 and not options.or_next:
         return options
-    port = free_port(options.host, options.port)
+    try:
+        port = free_port(options.host, options.port)
+    except OSError:  # what is wrong with the host is said where the service begins
+        return options
     if options.port not in (0, port):
         _logger.info("port %d is taken, so the status service is at port %d", options.port, port)
     return replace(options, port=port)

@@ -17,10 +17,10 @@ from dataclasses import dataclass
 from signal import SIGKILL, SIGTERM, Signals
 
 from service.io.errors import StorageError
-from service.io.files import open_to_append, os_errors
+from service.io.files import os_errors
 from service.io.study_directory import StudyDirectory
 from service.progress import answer
-from service.regular_files import open_regular
+from service.regular_files import open_regular, open_to_append
 from service.runtime.progress import StudyProgress
 from service.runtime.signals import PASSED_ON, STOPPING, StopSignals
 from service.store.disk_reader import DiskReader, run_id_of
@@ -184,7 +184,7 @@ class Study:
             said = f"ended by {Signals(-code).name}"
         else:
             try:
-                with open_regular(log_file, follow=True) as file:
+                with open_regular(log_file) as file:
                     file.seek(max(0, file.seek(0, os.SEEK_END) - LAST_WORDS_BYTES))
                     text = file.read(LAST_WORDS_BYTES).decode(errors="replace")
             except OSError:

@@ -100,6 +100,6 @@ def publish_best(directory: StudyDirectory, registry: Registry, run: RunEnd, sco
     metrics = scores.metrics() | {"env_steps": float(run.num_env_steps)}
     version = publish_run(place, registry, config, read_parameters(place, "bob"), metrics)
     run_id = run_id_of(place.path)
-    with suppress(StoreError), closing(RunWriter(place.path, run_id, address_from_environment())) as writer:
+    with suppress(StoreError), closing(RunWriter(place, run_id, address_from_environment())) as writer:
         writer.status(DiskReader(directory.path).run(run_id).model_copy(update={"published": str(version)}))
     return version

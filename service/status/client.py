@@ -4,16 +4,16 @@ from __future__ import annotations
 
 import asyncio
 import hashlib
-import json
 import os
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from service.errors import TandemError
+from service.errors import TandemError, one_line
 from service.extras import needs_extra
 from service.io.files import os_errors, write_atomic
+from service.parsing import ParseError, parse_json
 from service.registry.blobs import BlobStore, check_digest
 from service.registry.errors import DamagedBlobError, UnknownVersionError
 from service.registry.manifest import Manifest, parse_manifest
@@ -137,7 +137,7 @@ def _reason(error: BaseException) -> str:
     while (cause := error.__cause__ or error.__context__) is not None:
         error = cause.exceptions[0] if isinstance(cause, BaseExceptionGroup) else cause
     text = os.strerror(error.errno) if isinstance(error, OSError) and error.errno else str(error)
-    return " ".join(text.split()) or type(error).__name__
+    return one_line(text, 500) or type(error).__name__
 
 
 def _is_configured(base: str) -> bool:
@@ -152,7 +152,7 @@ def _is_configured(base: str) -> bool:
 
 def _refusal(base: str, path: str, response: httpx.Response, data: bytes) -> TandemError:
     problem = _problem(response, data)
-    detail = " ".join(str(problem.get("detail", "")).split())[:500]
+    detail = one_line(str(problem.get("detail", "")), 500)
     match response.status_code:
         case 401:
             wanted = "a token" if problem.get("type") == "urn:tandem:missing-token" else "another token"
@@ -167,7 +167,7 @@ def _refusal(base: str, path: str, response: httpx.Response, data: bytes) -> Tan
     if not problem:
         kind = response.headers.get("content-type", "nothing")
         return FetchError(
-            f"{base}{path} gave {response.status_code} and {kind[:60]}: is this the URL of a `tandem serve`?"
+            f"{base}{path} gave {response.status_code} and {one_line(kind, 60)}: is this the URL of a `tandem serve`?"
         )
     return FetchError(f"{base}{path} gave {response.status_code}: {detail}")
 
@@ -175,8 +175,8 @@ def _refusal(base: str, path: str, response: httpx.Response, data: bytes) -> Tan
 def _problem(response: httpx.Response, data: bytes) -> dict[str, Any]:
     """The problem in the answer; empty if it is something else."""
     try:
-        tree = json.loads(data)
-    except ValueError:
+        tree = parse_json(data, "the answer")
+    except ParseError:
         return {}
     is_problem = response.headers.get("content-type", "").startswith("application/problem+json")
     return tree if is_problem and isinstance(tree, dict) else {}

@@ -18,7 +18,10 @@ def free_port(host: str, first: int = 0) -> int:
     Raises:
         OSError: there is no such host here.
     """
-    family, _, _, _, address = socket.getaddrinfo(host, first, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)[0]
+    try:
+        family, _, _, _, address = socket.getaddrinfo(host, first, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)[0]
+    except UnicodeError as error:
+        raise OSError(f"{host!r} is no name of a host") from error
     for port in range(first, min(first + MAX_TRIED, 65536)):
         with socket.socket(family) as probe:
             probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)  # as the service itself

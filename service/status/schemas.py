@@ -257,7 +257,7 @@ class ManifestDocument(Manifest):
 class AliasChange(FrozenModel):
     """The version an alias shall point to."""
 
-    version: int = Field(ge=1, le=1_000_000_000, examples=[1])
+    version: int = Field(ge=1, le=1_000_000_000, strict=True, examples=[1])
 
 
 class AliasState(FrozenModel):

@@ -7,11 +7,14 @@ import os
 from pathlib import Path
 from typing import Literal
 
+from service.regular_files import read_regular
 from service.status.errors import StatusError
 
 VARIABLE = "TANDEM_TOKEN"
 SESSION_COOKIE = "tandem_session"
 MIN_CHARACTERS = 16
+MAX_BYTES = 4096
+"""Of its file."""
 _MAKE = "make one with: openssl rand -hex 32"
 
 
@@ -25,7 +28,8 @@ def read_token(file: Path | None = None) -> str | None:
         text, source = os.environ.get(VARIABLE, ""), VARIABLE
         return check_token(text.strip(), source) if text.strip() else None
     try:
-        return check_token(file.read_text(encoding="ascii").strip(), f"--token-file {file}")
+        text = read_regular(file, MAX_BYTES, follow=True).decode("ascii")
+        return check_token(text.strip(), f"--token-file {file}")
     except OSError as error:
         raise StatusError(f"--token-file {file}: {error.strerror}; name a file that holds one token") from None
     except UnicodeDecodeError:

@@ -2,7 +2,7 @@
 
 | file | content |
 |---|---|
-| ``status.json`` | ``RunStatus``, at every change of state and else about once a second |
+| ``status.json`` | ``RunStatus``, at every change of state or condition and else about once a second |
 | ``goals.json`` | ``GoalGrid``, about every five seconds |
 | ``stop`` | is there when somebody asked the run to stop |
 
@@ -16,13 +16,13 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-from pydantic import BaseModel, ValidationError
+from pydantic import BaseModel
 
-from service.io.epoch import Epoch
 from service.io.files import write_atomic
-from service.parsing import parse_json
+from service.io.run_directory import RunDirectory
+from service.parsing import ParseError, parse_json, parse_with
 from service.regular_files import read_regular
-from service.store.models import GoalGrid, Record, RunStatus, Trouble
+from service.store.models import Condition, GoalGrid, Record, RunState, RunStatus, Trouble
 
 MAX_BYTES = 64 * 1024 * 1024
 """Of a run's status, its grid of goals and its note of what it published."""
@@ -37,8 +37,9 @@ _logger = logging.getLogger(__name__)
 def read_status(directory: Path) -> RunStatus | None:
     """The status that the last process of a run left in its directory; None where there is none that can be read."""
     try:
-        return RunStatus.model_validate_json(read_regular(directory / STATUS_FILE, MAX_BYTES))
-    except (OSError, ValidationError):
+        data = read_regular(directory / STATUS_FILE, MAX_BYTES)
+        return parse_with(RunStatus.model_validate_json, data, STATUS_FILE)
+    except (OSError, ParseError):
         return None
 
 
@@ -56,15 +57,13 @@ class DiskWriter:
     A few small files a second are written without waiting for the disk, so the training thread does it by the way.
     """
 
-    def __init__(
-        self, directory: Path, epoch: Epoch | None = None, *, clock: Callable[[], float] = time.monotonic
-    ) -> None:
+    def __init__(self, directory: RunDirectory, *, clock: Callable[[], float] = time.monotonic) -> None:
         """Take back the stop request of an earlier process; ``clock`` counts seconds."""
-        self._epoch = epoch
-        self._stop_file = directory / STOP_FILE
-        self._status = _LatestFile(directory / STATUS_FILE, STATUS_INTERVAL_S, clock)
-        self._goals = _LatestFile(directory / GOALS_FILE, GOALS_INTERVAL_S, clock)
-        self._state: str | None = None
+        self._directory = directory
+        self._stop_file = directory.path / STOP_FILE
+        self._status = _LatestFile(directory.path / STATUS_FILE, STATUS_INTERVAL_S, clock)
+        self._goals = _LatestFile(directory.path / GOALS_FILE, GOALS_INTERVAL_S, clock)
+        self._told: tuple[RunState, Condition] | None = None
         try:
             self._stop_file.unlink(missing_ok=True)
         except OSError as error:
@@ -72,8 +71,9 @@ class DiskWriter:
 
     def status(self, status: RunStatus) -> None:
         """Replace what is known about the run."""
-        self._status.put(status, now=status.state != self._state)
-        self._state = status.state
+        told = status.state, status.condition
+        self._status.put(status, now=told != self._told)
+        self._told = told
 
     def metrics(self, record: Record) -> None:
         """Do nothing: the run directory has its own ``metrics.jsonl``."""
@@ -92,12 +92,11 @@ class DiskWriter:
         Raises:
             RunTakenError: another one has taken it over.
         """
-        if self._epoch is not None:
-            self._epoch.check()
+        self._directory.check_owner()
 
     def troubles(self) -> list[Trouble]:
-        """Files that cannot be written at the moment."""
-        problems = [file.problem for file in (self._status, self._goals)]
+        """Files that cannot be written at the moment, those that the run writes for itself among them."""
+        problems = [self._status.problem, self._goals.problem, *self._directory.problems()]
         return [Trouble("disk", problem) for problem in problems if problem is not None]
 
     def close(self) -> None:

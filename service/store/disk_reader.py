@@ -13,12 +13,12 @@ from functools import lru_cache
 from pathlib import Path
 from threading import Lock
 
-from pydantic import ValidationError
-
+from service.errors import one_line
 from service.io.epoch import newest_epoch
 from service.io.lock import holder, is_locked
+from service.io.run_directory import TRIAL_FILE
 from service.io.study_directory import is_study
-from service.parsing import MAX_YAML_CHARACTERS, parse_yaml
+from service.parsing import MAX_YAML_CHARACTERS, ParseError, parse_with, parse_yaml
 from service.regular_files import read_regular
 from service.store.disk import GOALS_FILE, MAX_BYTES, STATUS_FILE, STOP_FILE, read_published
 from service.store.errors import DamagedStoreError, StoreError, StoreUnavailableError, UnknownRunError
@@ -40,14 +40,14 @@ def run_id_of(directory: Path) -> str:
 
     That of a study's run begins with the name of the study.
     """
-    path = directory.resolve()
+    path = _real(directory)
     name = f"{path.parent.name[:100]}-{path.name}" if is_study(path.parent) else path.name
     return re.sub(r"[^A-Za-z0-9._-]", "-", name).lstrip("._-")[:128] or "run"
 
 
 def study_of(directory: Path) -> str | None:
     """The name of the study whose run this is; None for a run of its own."""
-    parent = directory.resolve().parent
+    parent = _real(directory).parent
     return parent.name if is_study(parent) else None
 
 
@@ -61,7 +61,7 @@ def run_directories(root: Path) -> dict[str, Path]:
         OSError: ``root`` cannot be read.
     """
     found, inner = sorted(root.iterdir()), list[Path]()
-    seen = {path.resolve() for path in found}  # a link leads to what is there by its own name
+    seen = {_real(path) for path in found}  # a link leads to what is there by its own name
     for path in found:
         if path.name.startswith(".") or _is_run(path):
             continue
@@ -69,9 +69,9 @@ def run_directories(root: Path) -> dict[str, Path]:
             if is_study(path):
                 inner += filter(_is_run, sorted(path.iterdir()))
             else:
-                there = sorted(Path(each.path) for each in os.scandir(path) if each.is_dir())
-                new = [each for each in there if is_trial(each) and each.resolve() not in seen]
-                seen.update(each.resolve() for each in new)
+                there = sorted(Path(each.path) for each in os.scandir(path) if not each.is_file(follow_symlinks=False))
+                new = [each for each in there if is_trial(each) and _real(each) not in seen]
+                seen.update(map(_real, new))
                 inner += new
     directories = [*filter(_is_run, found), *inner]
     return {_id_in(root, path): path for path in reversed(directories)}
@@ -143,12 +143,12 @@ class DiskReader:
         """The newest grid; None before the first."""
         path = self._find(run_id)[0] / GOALS_FILE
         try:
-            return GoalGrid.model_validate_json(read_regular(path, MAX_BYTES))
+            return parse_with(GoalGrid.model_validate_json, read_regular(path, MAX_BYTES), path)
         except FileNotFoundError:
             return None
         except OSError as error:
             raise _unavailable(path, error) from error
-        except ValidationError:
+        except ParseError:
             raise DamagedStoreError(f"{path} is no goal grid; delete it, a run writes it anew every few s") from None
 
     def request_stop(self, run_id: str) -> None:
@@ -176,6 +176,17 @@ class DiskReader:
         self._list()
 
     def _status(self, run_id: str, path: Path, records: RecordFile) -> RunStatus:
+        try:
+            if (cause := _why_closed(path)) is not None:
+                return _damaged(run_id, path, cause)
+            status = self._read_status(run_id, path, records)
+        except Exception as error:  # whatever a directory holds, it must not hide the other runs
+            return _damaged(run_id, path, f"{type(error).__name__}: {error}")
+        if (number := records.num_passed_over) > 0:
+            status = status.suffering("well", f"metrics.jsonl: lines that are no records and are passed over: {number}")
+        return status
+
+    def _read_status(self, run_id: str, path: Path, records: RecordFile) -> RunStatus:
         if is_trial(path):
             trained = read_trial_status(run_id, path, records)
             return (trained.state in ACTIVE and _why_quiet(trained, path)) or trained
@@ -218,9 +229,45 @@ class DiskReader:
 
 
 def _is_run(path: Path) -> bool:
+    """Whether it is a run's directory, or one that cannot be looked into, which may be a run's."""
     if path.name.startswith("."):
         return False
-    return (path / STATUS_FILE).is_file() or (path / "config.yaml").is_file() or is_trial(path)
+    files = (path / STATUS_FILE, path / "config.yaml", path / TRIAL_FILE)
+    return any(map(os.path.isfile, files)) or _why_closed(path) is not None
+
+
+def _why_closed(path: Path) -> str | None:
+    """Why a directory cannot be looked into, such as a loop of links; None where it can, or is none."""
+    try:
+        os.stat(f"{path}/.")
+    except (FileNotFoundError, NotADirectoryError):
+        return None
+    except OSError as error:
+        return error.strerror
+    return None
+
+
+def _real(path: Path) -> Path:
+    """A path without links; of a loop of links, which ``Path.resolve`` does not survive, some path in it."""
+    return Path(os.path.realpath(path))
+
+
+def _damaged(run_id: str, path: Path, cause: str) -> RunStatus:
+    """The status of a directory of which nothing can be said but why."""
+    try:
+        changed = datetime.fromtimestamp(path.lstat().st_mtime, UTC)
+    except OSError:
+        changed = datetime.fromtimestamp(0, UTC)
+    return RunStatus(
+        run_id=run_id,
+        name=run_id,
+        runtime="local",
+        state="interrupted",
+        started=changed,
+        heartbeat=changed,
+        total_env_steps=1,
+        last_error=f"{path} cannot be read: {one_line(cause, 300)}; mend it, or remove it",
+    )
 
 
 def _unavailable(path: Path, error: OSError) -> StoreUnavailableError:
@@ -229,10 +276,10 @@ def _unavailable(path: Path, error: OSError) -> StoreUnavailableError:
 
 def _read_status(run_id: str, path: Path, records: RecordFile) -> RunStatus:
     try:
-        status = RunStatus.model_validate_json(read_regular(path / STATUS_FILE, MAX_BYTES))
+        status = parse_with(RunStatus.model_validate_json, read_regular(path / STATUS_FILE, MAX_BYTES), STATUS_FILE)
     except FileNotFoundError:
         return _guess_status(run_id, path, records)
-    except (OSError, ValidationError) as error:
+    except (OSError, ParseError) as error:
         reason = error.strerror if isinstance(error, OSError) else "it is no run's status"
         note = f"{STATUS_FILE} cannot be read: {reason}; what is shown comes from metrics.jsonl"
         return _guess_status(run_id, path, records).model_copy(update={"warnings": (note,)})

@@ -30,6 +30,7 @@ Condition = Literal["well", "clock", "redis", "disk", "stuck", "silent"]
 | ``silent`` | it says nothing, and nobody here knows whether its process lives |
 """
 CONDITIONS: tuple[Condition, ...] = get_args(Condition)
+RUN_ID = r"^[A-Za-z0-9][A-Za-z0-9._-]{0,127}$"
 Record = dict[str, float | None]
 """One iteration's metrics; ``iteration`` and ``env_steps`` are always there. Null: JSON has no number for it."""
 
@@ -94,7 +95,7 @@ class Trial(FrozenModel):
 class RunStatus(FrozenModel):
     """The state of a run right now."""
 
-    run_id: str = Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]{0,127}$")
+    run_id: str = Field(pattern=RUN_ID)
     name: str = Field(description="registry name of the primitives it makes; of a downstream training TASK-METHOD-SEED")
     study: str | None = Field(None, description="whose run of one seed it is, as far as its directory tells")
     trial: Trial | None = Field(None, description="of a downstream training; null for pre-training")

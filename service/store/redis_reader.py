@@ -6,9 +6,9 @@ import logging
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 
-from pydantic import ValidationError
 from redis.exceptions import RedisError, ResponseError
 
+from service.parsing import ParseError, parse_with
 from service.store import keys
 from service.store.address import RedisAddress
 from service.store.errors import DamagedStoreError, UnknownRunError
@@ -92,8 +92,8 @@ class RedisReader:
             known, text = pipe.execute()
             self._check_known(run_id, bool(known))
         try:
-            return GoalGrid.model_validate_json(text) if text is not None else None
-        except ValidationError:
+            return parse_with(GoalGrid.model_validate_json, text, "grid") if text is not None else None
+        except ParseError:
             raise _damaged(keys.run_key(run_id, "goals"), "goal grid") from None
 
     def request_stop(self, run_id: str) -> None:
@@ -164,8 +164,8 @@ def _parse_status(run_id: str, text: bytes | None) -> RunStatus:
     if text is None:
         raise UnknownRunError(f"run {run_id} is in {keys.RUNS}, but {key} is missing; start it again")
     try:
-        return RunStatus.model_validate_json(text)
-    except ValidationError:
+        return parse_with(RunStatus.model_validate_json, text, key)
+    except ParseError:
         raise _damaged(key, "run's status") from None
 
 

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 from contextlib import ExitStack
-from pathlib import Path
 from typing import TYPE_CHECKING
 
-from service.io.epoch import Epoch
+from service.io.run_directory import RunDirectory
 from service.store.address import RedisAddress
 from service.store.disk import DiskWriter
 from service.store.models import GoalGrid, Record, RunStatus, Trouble
@@ -19,23 +18,22 @@ class RunWriter:
     """The place a runner reports to. No method raises for a store that is away or full: training goes on.
 
     Args:
-        directory: the run's; the caller has its lock.
+        directory: the run's; the caller has claimed it.
         run_id: id of the run.
         redis: a Redis to report to as well.
-        epoch: of this process in the directory.
 
     Raises:
         RunTakenError: another driver runs this run; the directory is then as it was.
         StoreUnavailableError: Redis is not there, or does not let us in.
     """
 
-    def __init__(self, directory: Path, run_id: str, redis: RedisAddress | None, epoch: Epoch | None = None) -> None:
+    def __init__(self, directory: RunDirectory, run_id: str, redis: RedisAddress | None) -> None:
         remote: list[RedisWriter] = []
         if redis is not None:
             from service.store.redis_writer import RedisWriter  # where there is no Redis, its package is not needed
 
             remote.append(RedisWriter(redis, run_id))
-        self._writers: list[DiskWriter | RedisWriter] = [DiskWriter(directory, epoch), *remote]
+        self._writers: list[DiskWriter | RedisWriter] = [DiskWriter(directory), *remote]
 
     def check(self) -> None:
         """Assert that this process is still the one that runs the run.

@@ -8,6 +8,7 @@ from array import array
 from bisect import bisect_left, bisect_right
 from collections.abc import Callable, Iterator, Sequence
 from functools import lru_cache
+from io import BytesIO
 from pathlib import Path
 from threading import Lock
 from typing import Any, BinaryIO
@@ -15,7 +16,7 @@ from typing import Any, BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
-from service.parsing import ParseError, parse_json
+from service.parsing import ParseError, parse_json, parse_with
 from service.regular_files import open_regular
 from service.store.models import Columns, Record
 
@@ -123,7 +124,7 @@ class RecordFile:
         try:
             return open_regular(self._path)
         except FileNotFoundError:
-            return open("/dev/null", "rb")
+            return BytesIO()
 
     def _forget(self) -> None:
         self._iterations = array("q")
@@ -133,6 +134,8 @@ class RecordFile:
         self._names: set[str] = set()
         self._num_keys = self._num_same = 0
         self._end, self._seal = 0, b""
+        self.num_passed_over = 0
+        """Lines that are no records, of those that were read."""
 
     def _catch_up(self, file: BinaryIO) -> None:
         """Find the lines that are new; a torn last one waits for its end."""
@@ -148,6 +151,7 @@ class RecordFile:
         while (line := file.readline(_MAX_LINE_BYTES)).endswith(b"\n"):
             row = _row(decode, names, line)
             if row is None:
+                self.num_passed_over += 1
                 _logger.warning("%s: passing over what is no record: %r", self._path, line[:60])
             else:
                 iteration = int(row[0] or 0)
@@ -255,16 +259,16 @@ def keys_of(line: bytes) -> set[str]:
     import msgspec
 
     try:
-        return set(msgspec.json.decode(line, type=dict[str, msgspec.Raw]))
-    except (msgspec.MsgspecError, UnicodeDecodeError):
+        return set(parse_with(lambda text: msgspec.json.decode(text, type=dict[str, msgspec.Raw]), line, "record"))
+    except ParseError:
         return set(parse_record(line) or ())
 
 
 def _row(decode: Callable[[bytes], _Row], names: Sequence[str], line: bytes) -> _Row | None:
     """The iteration of a line and its metrics; None where it is no record."""
     try:
-        row = decode(line)
-    except ValueError:  # also msgspec's: NaN, or text where a number should be
+        row = parse_with(decode, line, "record")
+    except ParseError:  # NaN, or text where a number should be
         record = parse_record(line)
         if record is None:
             return None

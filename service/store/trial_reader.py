@@ -5,6 +5,7 @@ Nothing writes ``status.json`` there: what is known comes from the settings, the
 
 from __future__ import annotations
 
+import os
 from datetime import UTC, datetime
 from functools import lru_cache
 from pathlib import Path
@@ -24,7 +25,7 @@ _MAX_TEXT = 500
 
 def is_trial(path: Path) -> bool:
     """Whether a directory is that of a downstream training."""
-    return (path / TRIAL_FILE).is_file()
+    return os.path.isfile(path / TRIAL_FILE)
 
 
 def read_trial_status(run_id: str, path: Path, records: RecordFile) -> RunStatus:

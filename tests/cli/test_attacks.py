@@ -89,6 +89,8 @@ NO_CONTENT = {
     "wrong types": b'{"version": [1], "seeds": "x", "name": {"a": 1}, "format_version": 1, "run": 4, "cell": 3}',
     "keys that are no text": b"{1: 2, null: 3, 2026-01-01: 4}",
     "iteration that no computer counts to": b'{"iteration": %s, "version": 1}' % (b"9" * 100),
+    "nothing": b"",
+    "a key twice": b"name: x\nname: y\nname: x\n",
     "lines for a terminal": b'name: "x\\nTraceback (most recent call last):\\n\\e[2J"',
 }
 EVALUATE = ("evaluate", "--episodes", "2", "--steps", "2", "--registry", "registry", "--primitives")
@@ -205,3 +207,45 @@ def test_a_file_with_something_else_in_it(home, place):
     with path.open("wb") as huge:
         huge.truncate(1 << 36)  # without a block on the disk
     assert path.name in refuse(arguments)
+
+
+NOT_UTF8 = os.fsdecode(b"\xb2")
+PRETRAIN = ("pretrain", "--config", "tiny.yaml", "--registry", "new", "--set", "run.total_env_steps=200")
+TYPED = {
+    "no id": ((*PRETRAIN, "--run-id", ""), "--run-id: an argument is empty"),
+    "no id, joined": ((*PRETRAIN, "--run-id="), "--run-id=: an argument is empty"),
+    "no directory": ((*PRETRAIN, "--run-dir", ""), "--run-dir: an argument is empty"),
+    "no host": (("serve", "--runs", ".", "--host", ""), "--host: an argument is empty"),
+    "an id that leads out": ((*PRETRAIN, "--run-id", "../../etc"), "--run-id '../../etc': use 1 to 128 letters"),
+    "an id of a parent": ((*PRETRAIN, "--run-id", ".."), "--run-id '..'"),
+    "an absolute id": ((*PRETRAIN, "--run-id", "/tmp/x"), "--run-id '/tmp/x'"),
+    "an id with a line end": ((*PRETRAIN, "--run-id", "x\n"), "--run-id 'x\\\\n'"),
+    "true as a number": ((*PRETRAIN, "--run-dir", "new", "--set", "game.num_worlds=true"), "expected a number"),
+    "a lock that is a link": ((*PRETRAIN, "--run-dir", "locked"), "locked/.lock: a symbolic link"),
+    "a host that is no text": (("serve", "--runs", ".", "--host", NOT_UTF8), "--host is a name or address"),
+    "a host that is no text, to play": (("play", "--primitives", "tiny", "--registry", "registry", "--host", NOT_UTF8),
+        "check --host"),
+    "a file as registry": (("registry", "list", "--registry", "tiny.yaml"), "tiny.yaml is no directory"),
+    "a file as registry, to show": (("registry", "show", "tiny", "--registry", "tiny.yaml"), "is no directory"),
+    "a token from a FIFO": (("serve", "--runs", ".", "--token-file", "fifo"), "--token-file fifo: not a regular file"),
+    "a token from a device": (("serve", "--runs", ".", "--token-file", "/dev/zero"), "/dev/zero: not a regular file"),
+    "a token that never ends": (("serve", "--runs", ".", "--token-file", "huge"), "huge: longer than 4096 bytes"),
+}  # fmt: skip
+
+
+def content_of(home):
+    """Every path with its size, time, and where it leads; a file is not read, for it may be huge."""
+    return {path: (path.lstat().st_mtime_ns, path.lstat().st_size, path.is_symlink()) for path in home.rglob("*")}
+
+
+@pytest.mark.parametrize("what", TYPED)
+def test_what_is_typed_wrongly_is_one_line_and_overwrites_nothing(home, what):
+    (home / "locked").mkdir()
+    (home / "locked" / ".lock").symlink_to("../tiny.yaml")
+    os.mkfifo(home / "fifo")
+    with (home / "huge").open("wb") as huge:
+        huge.truncate(1 << 36)
+    before = content_of(home.parent)
+    arguments, part = TYPED[what]
+    assert part in refuse(arguments)
+    assert content_of(home.parent) == before

@@ -20,6 +20,21 @@ def test_each_number_is_claimed_once(tmp_path):
     assert len(list((tmp_path / "epochs").iterdir())) == 10
 
 
+def test_a_number_beyond_eight_digits(tmp_path):
+    """It once made a run that was resumed hang for ever."""
+    (tmp_path / "epochs").mkdir()
+    (tmp_path / "epochs" / "99999999").touch()
+    epoch = Epoch(tmp_path)
+    assert (epoch.number, Epoch(tmp_path).number) == (10**8, 10**8 + 1)
+    CheckpointStore(tmp_path, keep=1, epoch=epoch.number).save(20, {}, {})
+    CheckpointStore(tmp_path, keep=1).save(30, {}, {})
+    assert CheckpointStore(tmp_path, keep=1).load_latest().step == 20
+    (tmp_path / "epochs" / ("9" * 255)).touch()
+    with pytest.raises(StorageError) as error:
+        Epoch(tmp_path)
+    assert_one_line(error.value, tmp_path, "File name too long")
+
+
 def test_only_the_highest_may_write(tmp_path):
     first = Epoch(tmp_path)
     first.check()

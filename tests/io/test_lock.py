@@ -10,7 +10,7 @@ import time
 import pytest
 
 from service.io import lock
-from service.io.errors import RunTakenError
+from service.io.errors import RunTakenError, StorageError
 from service.io.lock import DirectoryLock, is_locked
 from tests.runtime.runs import assert_one_line
 
@@ -75,6 +75,17 @@ def test_a_damaged_lock_file_is_as_good_as_any(tmp_path):
     with pytest.raises(RunTakenError, match="in use by another process"):
         DirectoryLock(tmp_path, "")
     first.release()
+
+
+@pytest.mark.parametrize("make", [lambda path: path.symlink_to(path.with_name("precious")), os.mkfifo])
+def test_what_is_no_lock_file_is_not_written(tmp_path, make):
+    (tmp_path / "precious").write_text("precious")
+    make(tmp_path / ".lock")
+    with pytest.raises(StorageError) as error:
+        DirectoryLock(tmp_path, "")
+    assert_one_line(error.value, "cannot write", tmp_path / ".lock", "symbolic link|not a regular file")
+    assert not is_locked(tmp_path)
+    assert (tmp_path / "precious").read_text() == "precious"
 
 
 def test_a_file_system_without_locks_is_refused_unless_one_says_so(tmp_path, monkeypatch, caplog):

@@ -211,6 +211,21 @@ def test_another_format_version_is_named(registry: Registry, publish: Publish, t
     assert "format version 2" in registry.verify()[0]
 
 
+@pytest.mark.parametrize(
+    ("key", "value"), [("version", "1"), ("version", 1.0), ("version", True), ("blob_bytes", 1e18), ("blob_bytes", "9")]
+)
+def test_a_number_in_a_manifest_is_a_number(registry: Registry, publish: Publish, key: str, value: object) -> None:
+    """Somebody wrote it, and its digest."""
+    publish()
+    path = registry.root / "models" / "panda-cube" / "versions" / "1"
+    tree = json.loads(path.read_text()) | {key: value}
+    del tree["manifest_sha256"]
+    text = json.dumps(tree, sort_keys=True, separators=(",", ":"))
+    path.write_text(json.dumps({**tree, "manifest_sha256": hashlib.sha256(text.encode()).hexdigest()}))
+    with pytest.raises(DamagedBlobError, match=f"is not valid: .*{key}"):
+        registry.manifest("panda-cube")
+
+
 def test_a_partial_publish_is_invisible(registry: Registry, publish: Publish, monkeypatch: pytest.MonkeyPatch) -> None:
     publish(value=1.0)
     before = files_in(registry.root / "models")

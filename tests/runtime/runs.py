@@ -9,7 +9,7 @@ import resource
 import subprocess
 import sys
 import time
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +19,9 @@ from service.config import parse_config
 from service.io.checkpoints import CheckpointStore
 from service.io.run_directory import RunDirectory
 from service.runtime.local import LocalRun
+from service.runtime.reporting import Report
+from service.store.disk_reader import DiskReader
+from service.store.run_writer import RunWriter
 
 ROOT = Path(__file__).parents[2]
 TREE = {
@@ -108,6 +111,41 @@ def no_room_above(num_bytes):
         yield
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, before)
+
+
+class FullForAWhile:
+    """Tells of a run as ``pretrain`` does, of which no checkpoint fits after iterations 3 to 5, and reads its status.
+
+    To be called at every iteration of a run whose checkpoints are due at even ones.
+    """
+
+    def __init__(self, runtime):
+        self.runtime, self.report, self.seen = runtime, None, {}
+        self._limit = ExitStack()
+
+    def __call__(self, run, metrics):
+        path, iteration = run.directory.path, run.iteration
+        if self.report is None:
+            writer, epoch = RunWriter(run.directory, path.name, None), run.directory.epoch.number
+            self.report = Report(run.config, path.name, self.runtime, writer, epoch=epoch)
+            self.report.begin(run)
+        self.report.iteration(run, metrics)
+        self.seen[iteration] = DiskReader(path.parent).run(path.name)
+        if iteration == 3:
+            self._limit.enter_context(no_room_above(100_000))
+        if iteration == 6:
+            self._limit.close()
+
+    def check(self):
+        """The run was well, then said for two iterations that it cannot write, and why, and was well again."""
+        assert len(self.seen) >= 8
+        suffering = [iteration for iteration, status in self.seen.items() if status.condition != "well"]
+        assert suffering == [5, 6]
+        for iteration in suffering:
+            assert self.seen[iteration].condition == "disk"
+            (warning,) = self.seen[iteration].warnings
+            assert_one_line(warning, "cannot write", "checkpoint-e00000001-00000004", "File too large")
+        self.report.end("finished")
 
 
 def start_endless_run(home):

@@ -20,7 +20,7 @@ from service.runtime.ray_actors import NICENESS
 from service.runtime.ray_connection import ClusterOptions, connected
 from service.runtime.runner import ClusterError, StateLostError
 from service.runtime.worker_variables import WORKER_VARIABLES
-from tests.runtime.runs import is_alive, newest, play, read_lines, tiny_config
+from tests.runtime.runs import FullForAWhile, is_alive, newest, play, read_lines, tiny_config
 
 TOGETHER = ("learner/", "alice/", "bob/", "generator/")
 
@@ -81,10 +81,14 @@ def test_one_actor_plays_and_learns_what_the_local_runner_does(tmp_path):
 
 
 def test_worlds_are_shared_out_and_every_rollout_counts_once(tmp_path):
-    seen = []
-    run, result = run_cluster(
-        tmp_path, tiny_config(total_env_steps=1500), num_actors=3, on_iteration=lambda run, m: seen.append(m)
-    )
+    seen, told = [], FullForAWhile("ray")
+
+    def look(run, metrics):
+        seen.append(metrics)
+        told(run, metrics)
+
+    run, result = run_cluster(tmp_path, tiny_config(total_env_steps=1500), num_actors=3, on_iteration=look)
+    told.check()
     assert result.reason == "finished"
     assert run._pool.num_worlds == 8
     health = run.health()

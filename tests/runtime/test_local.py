@@ -18,6 +18,7 @@ from service.runtime.bookkeeping import UnsavedError
 from service.runtime.local import LocalRun
 from service.runtime.resuming import resumed_config
 from tests.runtime.runs import (
+    FullForAWhile,
     KilledError,
     assert_one_line,
     assert_same_run,
@@ -389,6 +390,23 @@ def test_a_disk_that_was_full_for_a_while_costs_nothing(uninterrupted, tmp_path,
     for name in ("e00000001-00000004", "e00000001-00000008", "metrics.jsonl", "goals.jsonl", "snapshots"):
         assert name in caplog.text
     assert "e00000001-00000010" not in caplog.text
+
+
+def test_a_checkpoint_that_does_not_fit_is_said_until_one_does(tmp_path):
+    told = FullForAWhile("local")
+    play(tmp_path / "run", tiny_config(total_env_steps=1000), on_iteration=told)
+    told.check()
+
+
+def test_records_that_do_not_fit_are_said_until_they_do(tmp_path):
+    directory = RunDirectory(tmp_path)
+    directory.record({"iteration": 1, "env_steps": 100})
+    with no_room_above(40):
+        directory.record({"iteration": 2, "env_steps": 200})
+        (problem,) = directory.problems()
+        assert_one_line(problem, "cannot write", "metrics.jsonl", "File too large")
+    directory.sync()
+    assert directory.problems() == []
 
 
 def test_the_last_checkpoint_is_not_written_twice(tmp_path, monkeypatch):

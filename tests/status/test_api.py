@@ -192,6 +192,12 @@ def test_aliases_move_forward_and_back(client, home):
         assert registry.aliases("moving")["best"] == number
 
 
+@pytest.mark.parametrize("version", [True, "1", 1.0, None])
+def test_an_alias_is_moved_to_a_number_only(client, version):
+    answer = client.put("/v1/primitives/tiny/aliases/best", json={"version": version})
+    assert (answer.status_code, answer.json()["type"]) == (422, "urn:tandem:invalid")
+
+
 def test_the_bundled_registry_is_read_only(tmp_path):
     with StatusServer(DiskReader(tmp_path), Registry(BUNDLED), token=TOKEN, port=0) as server:
         url = f"{server.url}/v1/primitives/panda-cube/aliases/mine"

@@ -290,6 +290,10 @@ def test_no_service_at_the_url(home, tmp_path):
         ((302, "text/html", b""), "302"),
         ((500, "application/problem+json", b"{"), "500"),
         ((503, "application/problem+json", b'{"detail": "the store\\nis away"}'), "the store is away"),
+        ((503, "application/problem+json", b'{"detail": "\\u001b]0;owned\\u0007"}'), r"\x1b]0;owned\x07"),
+        ((503, "application/problem+json", b"[" * 60_000), "503"),
+        ((503, "text/\x1b[2J", b""), "503"),
+        ((200, "application/json", b"[" * 60_000), "nested more than 64 deep"),
         ((200, "application/json", b"[]"), "not a JSON object"),
         ((500, "text/plain", b"x" * 200_000), "too long"),
     ],
@@ -298,6 +302,7 @@ def test_something_else_at_the_url(tmp_path, answer, part):
     with answering({"/v1/primitives/tiny/versions/1": answer}) as url, pytest.raises(TandemError) as error:
         fetch_primitives(url, "tiny@1", cache_dir=tmp_path)
     assert_one_line(error.value, part)
+    assert str(error.value).isprintable()
 
 
 @pytest.mark.parametrize(

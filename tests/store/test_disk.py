@@ -16,6 +16,7 @@ import pytest
 
 from service.io.jsonl import JsonlWriter
 from service.io.lock import DirectoryLock
+from service.io.run_directory import RunDirectory
 from service.store import disk_reader
 from service.store.disk import DiskWriter
 from service.store.disk_reader import DiskReader, run_id_of
@@ -45,7 +46,7 @@ def read_status(directory):
 
 def test_status_is_written_once_a_second_and_at_changes_of_state(tmp_path):
     clock = Clock()
-    writer = DiskWriter(tmp_path, clock=clock)
+    writer = DiskWriter(RunDirectory(tmp_path), clock=clock)
     seen = []
     for now_s, iteration, state in [(0.0, 1, "running"), (0.9, 2, "running"), (1.0, 3, "running"), (1.1, 4, "failed")]:
         clock.now_s = now_s
@@ -59,7 +60,7 @@ def test_status_is_written_once_a_second_and_at_changes_of_state(tmp_path):
 
 def test_the_grid_is_written_every_five_seconds_and_at_the_end(tmp_path):
     clock, seen = Clock(), []
-    writer = DiskWriter(tmp_path, clock=clock)
+    writer = DiskWriter(RunDirectory(tmp_path), clock=clock)
     for number in range(1, 8):
         writer.goals(a_grid(number))
         seen.append(json.loads((tmp_path / "goals.json").read_text())["iteration"])
@@ -72,7 +73,7 @@ def test_the_grid_is_written_every_five_seconds_and_at_the_end(tmp_path):
 
 def test_a_full_disk_is_a_warning_and_passes(tmp_path, caplog):
     clock = Clock()
-    writer = DiskWriter(tmp_path, clock=clock)
+    writer = DiskWriter(RunDirectory(tmp_path), clock=clock)
     writer.status(a_status(iteration=1))
     with no_room_above(10):
         for _ in range(3):
@@ -162,7 +163,7 @@ def test_a_date_without_a_time_zone_is_damage(old_run):
 
 def test_a_copied_directory_is_another_run(tmp_path):
     (tmp_path / "a").mkdir()
-    writer = DiskWriter(tmp_path / "a")
+    writer = DiskWriter(RunDirectory(tmp_path / "a"))
     writer.status(a_status("a", state="finished"))
     shutil.copytree(tmp_path / "a", tmp_path / "b")
     assert {run.run_id for run in DiskReader(tmp_path).runs()} == {"a", "b"}
@@ -180,7 +181,7 @@ def test_the_runs_of_a_study_are_listed_with_the_others_under_its_name(tmp_path)
     study = tmp_path / "night 1"
     for path in (tmp_path / "cube", study / "seed-0", study / "seed-12"):
         path.mkdir(parents=True)
-        DiskWriter(path).status(a_status(run_id_of(path), state="finished", iteration=len(path.name)))
+        DiskWriter(RunDirectory(path)).status(a_status(run_id_of(path), state="finished", iteration=len(path.name)))
     assert {run.run_id for run in DiskReader(tmp_path).runs()} == {"cube"}
     (study / "study.yaml").touch()
     (study / "seed-99").mkdir()  # not begun
@@ -208,7 +209,7 @@ def test_run_ids_of_directories(tmp_path, name, run_id):
 
 def test_a_silent_run_that_nobody_locks_has_vanished_and_is_not_asked_to_stop(tmp_path):
     (tmp_path / "cube").mkdir()
-    writer = DiskWriter(tmp_path / "cube")
+    writer = DiskWriter(RunDirectory(tmp_path / "cube"))
     writer.status(a_silent_status())
     reader = DiskReader(tmp_path)
     reader.request_stop("cube")
@@ -222,7 +223,7 @@ def test_a_silent_run_that_nobody_locks_has_vanished_and_is_not_asked_to_stop(tm
 def held(tmp_path):
     """A run directory that a process has, which has said nothing for a minute."""
     lock = DirectoryLock(tmp_path / "cube", "")
-    DiskWriter(tmp_path / "cube").status(a_silent_status())
+    DiskWriter(RunDirectory(tmp_path / "cube")).status(a_silent_status())
     yield DiskReader(tmp_path)
     lock.release()
 
@@ -238,7 +239,7 @@ def test_a_frozen_process_is_stuck_and_named(held, monkeypatch):
 def test_a_frozen_process_is_seen_long_before_it_is_silent(tmp_path, monkeypatch):
     lock = DirectoryLock(tmp_path / "cube", "")
     heartbeat = datetime.now(UTC) - timedelta(seconds=disk_reader.QUIET_S + 2)
-    DiskWriter(tmp_path / "cube").status(a_status(heartbeat=heartbeat))
+    DiskWriter(RunDirectory(tmp_path / "cube")).status(a_status(heartbeat=heartbeat))
     reader = DiskReader(tmp_path)
     assert reader.run("cube").condition == "well"
     monkeypatch.setattr(disk_reader, "_is_stopped", lambda pid: pid == os.getpid())
@@ -248,7 +249,7 @@ def test_a_frozen_process_is_seen_long_before_it_is_silent(tmp_path, monkeypatch
 
 def test_a_run_that_vanished_while_its_disk_was_full_has_vanished(tmp_path):
     (tmp_path / "cube").mkdir()
-    DiskWriter(tmp_path / "cube").status(a_silent_status().suffering("disk", "no room"))
+    DiskWriter(RunDirectory(tmp_path / "cube")).status(a_silent_status().suffering("disk", "no room"))
     seen = DiskReader(tmp_path).run("cube")
     assert (seen.state, seen.condition) == ("interrupted", "well")
     assert "vanished" in seen.last_error
@@ -274,7 +275,7 @@ def test_a_full_disk_is_what_it_is(held, monkeypatch):
 def test_a_heartbeat_from_the_future_is_no_sign_of_life(tmp_path, monkeypatch, locked):
     clock = Clock()
     lock = DirectoryLock(tmp_path / "cube", "")
-    DiskWriter(tmp_path / "cube").status(a_status(heartbeat=datetime.now(UTC) + timedelta(hours=1)))
+    DiskWriter(RunDirectory(tmp_path / "cube")).status(a_status(heartbeat=datetime.now(UTC) + timedelta(hours=1)))
     if not locked:
         lock.release()
     reader = DiskReader(tmp_path)
@@ -402,6 +403,66 @@ def test_a_file_that_a_resume_has_cut(growing):
     found = records.after(0)
     assert [each["iteration"] for each in found] == list(range(1, 12))
     assert [each["past"] for each in found] == [0] * 3 + [1] * 8
+
+
+DEEP = {
+    "a line of 1,000 lists": '{"iteration": 1, "x": ' + "[" * 1000 + "]" * 1000 + "}",
+    "a line of 100,000 brackets": "[" * 100_000,
+}
+
+
+@pytest.mark.parametrize("line", DEEP)
+def test_a_deep_line_is_damage_of_its_run_alone(old_run, line):
+    """Parsers that call themselves end with a RecursionError, which is no ValueError."""
+    with (old_run / "metrics.jsonl").open("a") as file:
+        file.write(DEEP[line] + "\n" + json.dumps(a_record(5)) + "\n")
+    reader = DiskReader(old_run.parent)
+    (run,) = reader.runs()
+    assert run.iteration == 5
+    assert_one_line(run.warnings[-1], "metrics.jsonl", "no records", "1")
+    assert [record["iteration"] for record in reader.metrics("old-one")][-1] == 5
+    assert reader.columns("old-one", None).iteration[-1] == 5
+    assert reader.sample("old-one", "env_steps", 5)
+
+
+def test_a_directory_that_cannot_be_read_is_a_damaged_run_beside_the_others(old_run, monkeypatch):
+    root = old_run.parent
+    (root / "loop-1").symlink_to("loop-2")
+    (root / "loop-2").symlink_to("loop-1")
+    (root / "trainings").mkdir()
+    (root / "trainings" / "push").mkdir()
+    (root / "trainings" / "push" / "cell.json").write_text("{}")
+    (root / "trainings" / "loop").symlink_to("loop")
+    runs = {run.run_id: run for run in DiskReader(root).runs()}
+    assert runs.keys() == {"old-one", "loop-1", "loop-2", "trainings-push"}
+    assert runs["old-one"].last_error is None
+    for name in ("loop-1", "loop-2"):
+        assert runs[name].state == "interrupted"
+        assert_one_line(runs[name].last_error, root / name, "cannot be read", "symbolic links")
+        assert DiskReader(root).run(name) == runs[name]
+
+    def no_permission(path, *args, **kwargs):  # which root always has
+        if str(path).startswith(str(old_run)):
+            raise PermissionError(13, "Permission denied", str(path))
+        return stat(path, *args, **kwargs)
+
+    stat = os.stat
+    monkeypatch.setattr(os, "stat", no_permission)
+    runs = {run.run_id: run for run in DiskReader(root).runs()}
+    assert_one_line(runs["old-one"].last_error, old_run, "Permission denied")
+    assert "trainings-push" in runs
+
+
+def test_whatever_is_wrong_with_a_run_it_hides_no_other(old_run, monkeypatch):
+    """A record that nobody thought of, say."""
+    shutil.copytree(old_run, old_run.parent / "other")
+    guess = disk_reader._guess_status
+    monkeypatch.setattr(
+        disk_reader, "_guess_status", lambda run_id, *rest: 1 / 0 if run_id == "other" else guess(run_id, *rest)
+    )
+    runs = {run.run_id: run for run in DiskReader(old_run.parent).runs()}
+    assert runs["old-one"].last_error is None
+    assert_one_line(runs["other"].last_error, "other", "ZeroDivisionError: division by zero")
 
 
 def test_a_file_that_is_not_there_and_then_is(growing):

@@ -7,6 +7,7 @@ import pytest
 
 from service.io.jsonl import JsonlWriter
 from service.io.lock import DirectoryLock
+from service.io.run_directory import RunDirectory
 from service.store.disk import DiskWriter
 from service.store.disk_reader import DiskReader
 from service.store.errors import DamagedStoreError, StoreUnavailableError, UnknownRunError
@@ -38,7 +39,7 @@ class Disk:
                 super().close()
                 lock.release()
 
-        return Writer(directory)
+        return Writer(RunDirectory(directory))
 
     def damage(self, run_id, what):
         (self.root / run_id / {"status": "status.json", "goals": "goals.json"}[what]).write_text('{"a": 1}')

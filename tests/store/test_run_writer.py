@@ -5,6 +5,7 @@ import json
 import pytest
 
 from service.io.errors import RunTakenError
+from service.io.run_directory import RunDirectory
 from service.store.disk import DiskWriter
 from service.store.keys import run_key
 from service.store.redis_reader import RedisReader
@@ -14,7 +15,7 @@ from tests.store.stores import a_grid, a_record, a_status, wait_until
 
 
 def test_a_writer_to_disk_and_redis(redis, tmp_path):
-    writer = RunWriter(tmp_path / "run", "cube", redis.address)
+    writer = RunWriter(RunDirectory(tmp_path / "run"), "cube", redis.address)
     reader = RedisReader(redis.address)
     writer.status(a_status(iteration=1))
     writer.metrics(a_record(1))
@@ -33,7 +34,7 @@ def test_a_writer_to_disk_and_redis(redis, tmp_path):
 
 
 def test_a_stop_file_stops_a_run_that_tells_redis_too(redis, tmp_path):
-    writer = RunWriter(tmp_path, "cube", redis.address)
+    writer = RunWriter(RunDirectory(tmp_path), "cube", redis.address)
     (tmp_path / "stop").touch()
     assert writer.stop_requested()
     writer.close()
@@ -45,13 +46,13 @@ def test_a_run_that_another_driver_has_leaves_the_directory_alone(redis, tmp_pat
     directory.mkdir()
     (directory / "stop").touch()
     with pytest.raises(RunTakenError):
-        RunWriter(directory, "cube", redis.address)
+        RunWriter(RunDirectory(directory), "cube", redis.address)
     assert [path.name for path in directory.iterdir()] == ["stop"]
     other.close()
 
 
 def test_all_are_closed_though_one_fails(redis, tmp_path, monkeypatch):
-    writer = RunWriter(tmp_path, "cube", redis.address)
+    writer = RunWriter(RunDirectory(tmp_path), "cube", redis.address)
     writer.goals(a_grid(1))
     writer.goals(a_grid(2))
     close = RedisWriter.close
@@ -65,7 +66,7 @@ def test_all_are_closed_though_one_fails(redis, tmp_path, monkeypatch):
         writer.close()
     assert json.loads((tmp_path / "goals.json").read_text())["iteration"] == 2
     monkeypatch.undo()
-    other, close_on_disk = RunWriter(tmp_path, "cube", redis.address), DiskWriter.close
+    other, close_on_disk = RunWriter(RunDirectory(tmp_path), "cube", redis.address), DiskWriter.close
     monkeypatch.setattr(DiskWriter, "close", lambda self: [close_on_disk(self), 1 / 0])
     with pytest.raises(ZeroDivisionError):
         other.close()
