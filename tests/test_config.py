@@ -82,8 +82,8 @@ def test_an_empty_file_is_refused(tmp_path, text):
         "game.alice_steps_min=true",
         "generator.replay_fraction=false",
         "policy.alice.hidden_sizes=[true, 64]",
-        "world.randomisation.action_delay_steps=[false, true]",
-        "skills.skill_dim=true",
+        "world.randomisation.delay_steps=[false, true]",
+        "skills.size=true",
     ],
 )
 def test_true_and_false_are_no_numbers(override):

@@ -194,6 +194,38 @@ def test_only_the_cluster_knows_ray_and_only_the_store_knows_redis():
     assert {room_of(one) for package, one in users if package == "redis"} == {"store"}
 
 
+OPENS_OR_PARSES = re.compile(
+    r"(.*\.)?(open|read_text|read_bytes|FileIO|model_validate_json)|np\.(load|loadtxt|fromfile)|yaml\.\w*load"
+    r"|json\.loads?|msgspec\.json\.(decode|Decoder)"
+)
+ALLOWED = {
+    "service/regular_files.py": {"open", "os.open", "FileIO"},
+    "service/parsing.py": {"yaml.load"},
+    "service/store/tail.py": {"msgspec.json.decode", "msgspec.json.Decoder"},  # which parse_with calls
+    # what comes with the package, or is the kernel's
+    "service/recipes.py": {"path.read_text"},
+    "service/cli/configs.py": {"known[name].read_text"},
+    "service/export/formats.py": {"Path(standalone.__file__).read_text"},
+    "service/store/disk_reader.py": {"Path(f'/proc/{pid}/stat').read_text"},
+    "service/export/standalone.py": {"np.load"},  # runs where this package is not
+    # makes a file that must not be there yet, or opens a directory
+    "service/cli/unexpected.py": {"open", "os.open"},
+    "service/io/epoch.py": {"os.open"},
+    "service/io/files.py": {"os.open"},
+}
+"""Where files are opened and texts are parsed, and why it is not by the functions that all others use."""
+
+
+def test_one_module_opens_what_others_wrote_and_one_parses_it():
+    """There a FIFO is not waited for, a device not read for ever, and a deep text ends with no RecursionError."""
+    found = {}
+    for path in sorted((ROOT / "service").rglob("*.py")):
+        calls = (ast.unparse(node.func) for node in ast.walk(ast.parse(path.read_text())) if isinstance(node, ast.Call))
+        if used := {call for call in calls if OPENS_OR_PARSES.fullmatch(call)}:
+            found[str(path.relative_to(ROOT))] = used
+    assert found == ALLOWED
+
+
 def test_no_module_is_long():
     lengths = {path: len(path.read_text().splitlines()) for path in (ROOT / "service").rglob("*.py")}
     assert lengths

@@ -48,6 +48,8 @@ TrackerOption = Annotated[
 ]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON.")]
 REGISTRY = Path("registry")
+MAX_CELL = 100_000
+"""Characters of a cell of a table."""
 
 
 def shown() -> Display:
@@ -139,7 +141,8 @@ def print_json(tree: Any) -> None:
 
 
 def print_table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
-    """Print a table on a terminal, and lines of cells with tabs between elsewhere."""
+    """Print a table on a terminal, and lines of cells with tabs between elsewhere; what files hold moves no cursor."""
+    rows = [[one_line(cell, MAX_CELL) for cell in row] for row in rows]
     if not sys.stdout.isatty():
         for row in (header, *rows):
             typer.echo("\t".join(row))

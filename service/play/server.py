@@ -162,7 +162,7 @@ def _free_port(host: str, port: int | None) -> int:
         try:
             with contextlib.closing(socket.create_server((host, candidate), reuse_port=False)) as found:
                 return int(found.getsockname()[1])
-        except (OSError, UnicodeError) as error:
+        except (OSError, UnicodeError, TypeError) as error:  # the last two: a host that is no text
             number = error.errno if isinstance(error, OSError) else None
             if number == errno.EADDRINUSE and port is None:
                 continue

@@ -25,7 +25,7 @@ from service.store.errors import DamagedStoreError, StoreError, StoreUnavailable
 from service.store.models import ACTIVE, SILENT_AFTER, Columns, GoalGrid, Record, RunState, RunStatus
 from service.store.pulse import Pulse, ahead_s
 from service.store.tail import RecordFile
-from service.store.trial_reader import is_trial, read_trial_status
+from service.store.trial_reader import is_trial, modified, read_trial_status
 
 QUIET_S = 10.0
 """A run writes its status every second; after so long something keeps it from that."""
@@ -254,10 +254,7 @@ def _real(path: Path) -> Path:
 
 def _damaged(run_id: str, path: Path, cause: str) -> RunStatus:
     """The status of a directory of which nothing can be said but why."""
-    try:
-        changed = datetime.fromtimestamp(path.lstat().st_mtime, UTC)
-    except OSError:
-        changed = datetime.fromtimestamp(0, UTC)
+    changed = modified(path)
     return RunStatus(
         run_id=run_id,
         name=run_id,
@@ -326,8 +323,8 @@ def _is_stopped(pid: int) -> bool:
 def _guess_status(run_id: str, path: Path, records: RecordFile) -> RunStatus:
     """The status as the configuration and the newest record show it."""
     config, metrics = path / "config.yaml", path / "metrics.jsonl"
-    started = _modified(config)
-    heartbeat = _modified(metrics if metrics.exists() else config)
+    started = modified(config)
+    heartbeat = modified(metrics if metrics.exists() else config)
     name, total = _read_config(config, started)
     try:
         record = records.last() or {}
@@ -359,7 +356,7 @@ def _guess_state(path: Path, steps: int, total: int | None, heartbeat: datetime)
     if datetime.now(UTC) - heartbeat < SILENT_AFTER:
         return "running"
     published = path / "published.json"
-    return "converged" if published.exists() and _modified(published) >= heartbeat else "interrupted"
+    return "converged" if published.exists() and modified(published) >= heartbeat else "interrupted"
 
 
 @lru_cache(maxsize=1024)
@@ -370,14 +367,6 @@ def _read_config(path: Path, modified: datetime) -> tuple[str | None, int | None
         return str(tree["name"]), max(1, int(tree["run"]["total_env_steps"]))
     except (OSError, KeyError, TypeError, ValueError, OverflowError):
         return None, None
-
-
-def _modified(path: Path) -> datetime:
-    """Time at which a file was last written; 1970 where there is none."""
-    try:
-        return datetime.fromtimestamp(path.stat().st_mtime, UTC)
-    except OSError:
-        return datetime.fromtimestamp(0, UTC)
 
 
 def _whole(record: Record, name: str) -> int:

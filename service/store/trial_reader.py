@@ -40,8 +40,8 @@ def read_trial_status(run_id: str, path: Path, records: RecordFile) -> RunStatus
         record = records.last() or {}
     except OSError:
         record = {}
-    started = _modified(path / TRIAL_FILE)
-    heard = max(started, _modified(path / "metrics.jsonl"), _modified(path / RESULT_FILE))
+    started = modified(path / TRIAL_FILE)
+    heard = max(started, modified(path / "metrics.jsonl"), modified(path / RESULT_FILE))
     steps = max(0, int(float(result["env_steps"] if result is not None else record.get("env_steps") or 0)))
     state: RunState
     state, last_error = ("finished", None) if result is not None else _unfinished(path, started)
@@ -134,14 +134,14 @@ def _trial(settings: dict[str, Any], result: dict[str, Any] | None) -> Trial | N
 def _unfinished(path: Path, started: datetime) -> tuple[RunState, str | None]:
     if is_locked(path):
         return "running", None
-    traceback = max(path.glob(f"{TRACEBACK_PREFIX}*"), key=_modified, default=None)
-    if traceback is not None and _modified(traceback) >= started:
+    traceback = max(path.glob(f"{TRACEBACK_PREFIX}*"), key=modified, default=None)
+    if traceback is not None and modified(traceback) >= started:
         return "failed", f"an error that nobody expected; {traceback} has its traceback"
     return "interrupted", None
 
 
-def _modified(path: Path) -> datetime:
-    """Time at which a file was last written; 1970 where there is none."""
+def modified(path: Path) -> datetime:
+    """Time at which a file, or what a link leads to, was last written; 1970 where that cannot be told."""
     try:
         return datetime.fromtimestamp(path.stat().st_mtime, UTC)
     except OSError:

@@ -32,6 +32,15 @@ def test_a_run_that_fails_says_why(tmp_path):
     assert said(tmp_path) == [("error", "the run failed: it broke")]
 
 
+@pytest.mark.parametrize("make", [os.mkfifo, lambda path: path.symlink_to("precious")])
+def test_what_is_no_log_is_neither_waited_for_nor_written(tmp_path, make):
+    (tmp_path / "precious").write_text("precious")
+    make(tmp_path / "log.jsonl")
+    with RunLog(tmp_path) as log:
+        log.note("this line is lost")
+    assert (tmp_path / "precious").read_text() == "precious"
+
+
 def test_a_log_is_bounded(tmp_path, monkeypatch):
     monkeypatch.setattr(run_log, "MAX_FILE_BYTES", 1000)
     with RunLog(tmp_path) as log:

@@ -195,7 +195,7 @@ def test_aliases_move_forward_and_back(client, home):
 @pytest.mark.parametrize("version", [True, "1", 1.0, None])
 def test_an_alias_is_moved_to_a_number_only(client, version):
     answer = client.put("/v1/primitives/tiny/aliases/best", json={"version": version})
-    assert (answer.status_code, answer.json()["type"]) == (422, "urn:tandem:invalid")
+    assert (answer.status_code, answer.json()["type"]) == (422, "urn:tandem:invalid-request")
 
 
 def test_the_bundled_registry_is_read_only(tmp_path):
