@@ -254,7 +254,10 @@ def _real(path: Path) -> Path:
 
 def _damaged(run_id: str, path: Path, cause: str) -> RunStatus:
     """The status of a directory of which nothing can be said but why."""
-    changed = modified(path)
+    try:
+        changed = datetime.fromtimestamp(path.lstat().st_mtime, UTC)
+    except OSError:
+        changed = datetime.fromtimestamp(0, UTC)
     return RunStatus(
         run_id=run_id,
         name=run_id,

@@ -211,6 +211,16 @@ def test_another_format_version_is_named(registry: Registry, publish: Publish, t
     assert "format version 2" in registry.verify()[0]
 
 
+def test_a_lock_that_is_a_link_is_not_followed(registry: Registry, publish: Publish, tmp_path: Path) -> None:
+    publish()
+    lock = registry.root / "models" / "panda-cube" / "aliases" / ".lock"
+    lock.unlink()
+    lock.symlink_to(tmp_path / "elsewhere")
+    with pytest.raises(StorageError, match="a symbolic link, which is not followed"):
+        registry.set_alias("panda-cube", "best", 1)
+    assert not (tmp_path / "elsewhere").exists()
+
+
 @pytest.mark.parametrize(
     ("key", "value"), [("version", "1"), ("version", 1.0), ("version", True), ("blob_bytes", 1e18), ("blob_bytes", "9")]
 )
