@@ -60,6 +60,8 @@ def parse_with(parser: Callable[[Any], _Value], text: str | bytes, where: object
         return parser(text)
     except RecursionError:
         raise ParseError(where, _TOO_DEEP) from None
+    except MemoryError:  # nothing is wrong with the text
+        raise
     except Exception as error:  # beside their own errors whatever they meet: "!!bool x" is a KeyError of PyYAML's
         raise ParseError(where, f"not {kind} ({one_line(str(error), 300)})") from None
 

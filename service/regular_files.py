@@ -60,7 +60,7 @@ def _descriptor(path: Path, flags: int, *, follow: bool) -> int:
     try:
         descriptor = os.open(path, flags | os.O_NONBLOCK | os.O_CLOEXEC | (0 if follow else os.O_NOFOLLOW), 0o666)
     except OSError as error:
-        if follow or not os.path.islink(path):
+        if error.errno != errno.ELOOP or follow or not os.path.islink(path):
             raise
         raise OSError(errno.ELOOP, "a symbolic link, which is not followed", str(path)) from None
     try:

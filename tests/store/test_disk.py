@@ -44,15 +44,16 @@ def read_status(directory):
 # --- writing ---------------------------------------------------------------------------------------------------------
 
 
-def test_status_is_written_once_a_second_and_at_changes_of_state(tmp_path):
+def test_status_is_written_once_a_second_and_at_changes_of_state_or_condition(tmp_path):
     clock = Clock()
     writer = DiskWriter(RunDirectory(tmp_path), clock=clock)
-    seen = []
-    for now_s, iteration, state in [(0.0, 1, "running"), (0.9, 2, "running"), (1.0, 3, "running"), (1.1, 4, "failed")]:
+    seen, told = [], [(0.0, 1, "running"), (0.9, 2, "running"), (1.0, 3, "running"), (1.1, 4, "failed")]
+    for now_s, iteration, state in told:
         clock.now_s = now_s
         writer.status(a_status(iteration=iteration, state=state))
         seen.append(read_status(tmp_path)["iteration"])
-    assert seen == [1, 1, 3, 4]
+    writer.status(a_status(iteration=4, state="failed").suffering("disk", "no room"))
+    assert (seen, read_status(tmp_path)["condition"]) == ([1, 1, 3, 4], "disk")
     writer.status(a_status(iteration=5, state="failed"))
     writer.close()
     assert read_status(tmp_path)["iteration"] == 5
