@@ -38,8 +38,8 @@ def commit(name: str) -> str:
 
 def measured_on(machine: Mapping[str, Any]) -> str:
     """The last sentence of a block: machine, commit and day of a measurement, and how busy the machine was before."""
-    now, _, quarter = machine["load_average"]
-    return (
-        f" On {machine['num_cpus']} cores of {machine['cpu']}, {commit(machine['git_commit'])}, "
-        f"{machine['time'][:10]}; load when it began {now:.1f}, over the 15 minutes before {quarter:.1f}."
-    )
+    busy = ""
+    if load := machine.get("load_average"):
+        busy = f"; load when it began {load[0]:.1f}, over the 15 minutes before {load[2]:.1f}"
+    where = f"{machine['num_cpus']} cores of {machine['cpu']}, {commit(machine['git_commit'])}"
+    return f" On {where}, {machine['time'][:10]}{busy}."
