@@ -17,7 +17,7 @@ from tests.status.conftest import serve
 from tests.status.runs import BEARER, CLIENT, TOKEN, VIDEO
 
 DEPLOYED = Path(__file__).parents[2] / "deploy" / "nginx" / "nginx.conf"
-NGINX = shutil.which("nginx", path="/usr/sbin:/usr/local/sbin:/usr/bin:/usr/local/bin:/opt/homebrew/bin")
+NGINX = shutil.which("nginx", path="/usr/sbin:/usr/local/sbin:/usr/bin:/usr/local/bin")
 NUM_CLIENTS = 512
 HEAD = b"host: lab.example\r\n"
 
