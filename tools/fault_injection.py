@@ -25,10 +25,8 @@ from benchmarks.measuring import RECIPE_FILE, parser_of, run_benchmark
 from benchmarks.processes import descendants
 from benchmarks.report.cluster import faults_table
 from benchmarks.training_process import ENDLESS, Training, overrides, scratch
-from service.io.checkpoints import CheckpointStore
-from service.io.jsonl import read_jsonl
 from service.store.models import ActorStatus, RunStatus
-from tools.rollout_audit import audit_rollouts, ledger_of, stretches_of
+from tools.rollout_audit import audit_run
 
 PACKAGES = ("ray", "torch", "mujoco", "numpy")
 TICK_S = 0.1
@@ -192,12 +190,10 @@ def benchmark(config: Path, settings: Settings) -> dict[str, Any]:
         injection = FaultInjection(training, plan, random.Random(settings.seed))
         injection.run(seconds)
         training.stop()
-        end, rows = training.status(), read_jsonl(training.directory.metrics_file)
+        end = training.status()
         assert end is not None
-        newest = CheckpointStore(training.directory.checkpoints, keep=1).load_latest()
-        ledger = ledger_of(newest.arrays["learner/counted"].tolist())
+        account = audit_run(training.directory, end, [status for _, status in injection.seen])
     faults, recoveries, (began, _) = injection.faults, injection.recoveries(), injection.seen[0]
-    stretches = stretches_of([*(status for _, status in injection.seen), end])
     return {
         "ended": {"exit_code": training.ended, "state": end.state, "env_steps": end.num_env_steps},
         "num_planned": len(plan),
@@ -205,7 +201,7 @@ def benchmark(config: Path, settings: Settings) -> dict[str, Any]:
             {**asdict(fault), "at": round(fault.at - began, 2), **asdict(back)}
             for fault, back in zip(faults, recoveries, strict=True)
         ],
-        "account": audit_rollouts(rows, ledger, end, stretches),
+        "account": account,
     }
 
 

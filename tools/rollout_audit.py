@@ -15,6 +15,9 @@ from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any
 
+from service.io.checkpoints import CheckpointStore
+from service.io.jsonl import read_jsonl
+from service.io.run_directory import RunDirectory
 from service.store.models import RunStatus
 
 Ledger = Mapping[tuple[int, int], int]
@@ -65,7 +68,12 @@ def stretches_of(statuses: Sequence[RunStatus]) -> list[Stretch]:
 
 
 def audit_rollouts(
-    rows: Sequence[Mapping[str, Any]], ledger: Ledger, end: RunStatus, stretches: Sequence[Stretch]
+    rows: Sequence[Mapping[str, Any]],
+    ledger: Ledger,
+    end: RunStatus,
+    stretches: Sequence[Stretch],
+    *,
+    late: bool = False,
 ) -> dict[str, Any]:
     """Compare all of them, of a run that one driver ran from its beginning to its end.
 
@@ -74,6 +82,7 @@ def audit_rollouts(
         ledger: in the last checkpoint.
         end: the last status.
         stretches: see ``stretches_of``.
+        late: whether workers were frozen: rollouts that come too late are refused then, and told of.
 
     Returns:
         For JSON: what was compared, and whether it is ``complete``: nothing lost, nothing counted twice, nothing
@@ -98,9 +107,18 @@ def audit_rollouts(
         found["iterations_contiguous"]
         and found["versions_contiguous"]
         and found["env_steps_rise"]
-        and found["num_counted"] == found["num_in_ledger"]
-        and found["num_refused"] == 0
+        and 0 <= found["num_in_ledger"] - found["num_counted"] <= found["num_refused"]
+        and (late or found["num_refused"] == 0)
         and found["num_handed_by_the_dead"] == found["num_counted_of_the_dead"]
         and found["num_left_at_the_end"] >= 0
     )
     return {**found, "complete": complete}
+
+
+def audit_run(
+    directory: RunDirectory, end: RunStatus, seen: Sequence[RunStatus], *, late: bool = False
+) -> dict[str, Any]:
+    """Audit a run that has ended, see ``audit_rollouts``, from its directory and the statuses seen on its way."""
+    newest = CheckpointStore(directory.checkpoints, keep=1).load_latest()
+    ledger = ledger_of(newest.arrays["learner/counted"].tolist())
+    return audit_rollouts(read_jsonl(directory.metrics_file), ledger, end, stretches_of([*seen, end]), late=late)

@@ -53,6 +53,8 @@ class Strike:
     """Seconds from the strike to the last look."""
     commit: str = ""
     """Of the code that was struck."""
+    details: dict[str, Any] = field(default_factory=dict)
+    """What else was seen, of strikes at random."""
 
     def judge(self, measured: str, reached: bool, seconds: float | None = None) -> None:
         """Note the outcome; with a traceback anywhere it is not reached."""
@@ -64,6 +66,8 @@ class Watcher:
 
     def __init__(self, training: Training, strike: Strike) -> None:
         self._training, self._strike = training, strike
+        self.seen: list[RunStatus] = []
+        """Every status that was not the one before it."""
         self.struck = time.monotonic()
 
     def since(self) -> float:
@@ -75,6 +79,8 @@ class Watcher:
         status, strike = self._training.status(), self._strike
         strike.lasted_s = round(self.since(), 1)
         if status is not None:
+            if not self.seen or self.seen[-1].heartbeat != status.heartbeat:
+                self.seen.append(status)
             if not strike.conditions or strike.conditions[-1][1:] != (status.state, status.condition):
                 strike.conditions.append((round(self.since(), 1), status.state, status.condition))
             strike.warnings += [text for text in status.warnings if _kind(text) not in map(_kind, strike.warnings)]

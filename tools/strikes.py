@@ -2,11 +2,12 @@
 
     python -m tools.strikes --json docs/results/strikes.json
     python -m tools.strikes --only learner-frozen,driver-killed
+    python -m tools.strikes --only freezes --freezes-s 3600 --json docs/results/strikes.json
 
 Each strike is a real ``tandem pretrain`` of its own, seen from outside: pids, REST, files. What has to hold is judged
 here, and written after each strike, so a program that is ended keeps what it has. Only processes that this program
 started are struck. All of them take about half an hour on two cores that nobody else wants; the spinning processes ten
-minutes of it (``--spin-s``).
+minutes of it (``--spin-s``), freezes at random five (``--freezes-s``).
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ import argparse
 import itertools
 import json
 import os
+import random
 import shutil
 import signal
 import statistics
@@ -28,8 +30,10 @@ from dataclasses import asdict
 from pathlib import Path
 
 from benchmarks.measuring import ROOT, machine, write_json
-from benchmarks.training_process import Training, environment, scratch
+from benchmarks.training_process import Training, environment, overrides, scratch
 from service.store.models import RunStatus
+from tools.rollout_audit import audit_run
+from tools.strike_freezes import busy, endings, freeze_at_random
 from tools.strike_runs import (
     ARGUMENTS,
     CALM,
@@ -134,19 +138,35 @@ def spinning(strike: Strike, seconds: float) -> None:
     with run_of(strike) as training:
         before = wait_for_all(training)
         watcher = Watcher(training, strike)
-        spinners = [subprocess.Popen([sys.executable, "-c", "while True: pass"]) for _ in range(8)]
-        try:
+        with busy(8):
             watcher.until(lambda status: False, seconds)
-            status = watcher.look()
-        finally:
-            for spinner in spinners:
-                spinner.kill()
-                spinner.wait()
-        after = workers_of(status)
+            after = workers_of(watcher.look())
     killed = changed(before, after)
     bad = sorted({condition for _, _, condition in strike.conditions} - {"well"})
     said = f"{', '.join(killed) or 'nobody'} killed, conditions besides well: {', '.join(bad) or 'none'}"
     strike.judge(f"{said}, in {seconds:.0f} s", not killed and not bad)
+
+
+def random_freezes(strike: Strike, seconds: float, num_busy: int) -> None:
+    """Freeze processes at random, one of them for up to 25 s or all for up to 30 s, beside others that spin."""
+    settings = overrides({"game.num_worlds": 16, "run.evaluation_interval": 50})
+    with run_of(strike, arguments=settings) as training, busy(num_busy):
+        wait_for_all(training)
+        watcher = Watcher(training, strike)
+        freezes = list(freeze_at_random(training, watcher, seconds, random.Random(int(seconds))))
+        went_on = training.ended is None and watcher.until_iterations(3) is not None
+        ended = endings(training, freezes)
+        training.stop()
+        account = audit_run(training.directory, watcher.look() or no_status(), watcher.seen, late=True)
+    unjustified = [f"{each['worker']} ({each['reason']})" for each in ended if not each["justified"]]
+    strike.details = {"freezes": [asdict(each) for each in freezes], "endings": ended, "account": account}
+    measured = (
+        f"{len(freezes)} freezes in {seconds / 60.0:.0f} min beside {num_busy} that spin: {len(ended)} workers ended, "
+        f"{len(unjustified)} of them healthy{': ' * bool(unjustified)}{'; '.join(unjustified[:3])}; "
+        f"{account['num_iterations']} iterations, {account['num_counted']} rollouts counted, {account['num_refused']} "
+        f"came too late, records and ledger {'agree' if account['complete'] else 'do not agree'}"
+    )
+    strike.judge(measured, went_on and not unjustified and bool(account["complete"]))
 
 
 def frozen_driver(strike: Strike, seconds: float = 67.0) -> None:
@@ -358,7 +378,7 @@ def _change_identity(path: Path) -> None:
     (path / "run.json").write_text(json.dumps(tree | {"run": "0" * 32}))
 
 
-def strikes(spin_s: float) -> dict[str, tuple[str, Callable[[Strike], None]]]:
+def strikes(spin_s: float, freezes_s: float, num_busy: int) -> dict[str, tuple[str, Callable[[Strike], None]]]:
     """What must hold, and the strike, by name."""
     replaced = "replaced in <= 60 s, nobody else killed, named"
     away = "what was on it is replaced in <= 60 s, nothing lost"
@@ -368,6 +388,10 @@ def strikes(spin_s: float) -> dict[str, tuple[str, Callable[[Strike], None]]]:
         "generator-frozen": (replaced, lambda s: frozen_worker(s, "generator")),
         "actor-frozen": ("updates go on after <= 3 x its round + 2 s, replaced later", frozen_actor),
         "spinning": ("nobody is killed, no alert of a hang", lambda s: spinning(s, spin_s)),
+        "freezes": (
+            "every ending of a worker justified, nothing lost or counted twice",
+            lambda s: random_freezes(s, freezes_s, num_busy),
+        ),
         "driver-frozen": ("the status says stuck, nobody is killed", frozen_driver),
         "learner-killed-twice": ("nothing lost, <= 20 s", killed_twice),
         "driver-killed": ("back at the same iteration in <= 20 s", killed_driver),
@@ -396,9 +420,11 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--only", metavar="A,B", help="names with commas between; default: all")
     parser.add_argument("--spin-s", type=float, default=600.0, help="default: %(default)s")
+    parser.add_argument("--freezes-s", type=float, default=300.0, help="default: %(default)s")
+    parser.add_argument("--busy", type=int, default=4, help="processes that spin beside; default: %(default)s")
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the result, after each strike")
     given = parser.parse_args()
-    known = strikes(given.spin_s)
+    known = strikes(given.spin_s, given.freezes_s, given.busy)
     names = given.only.split(",") if given.only else list(known)
     if wrong := [name for name in names if name not in known]:
         parser.error(f"--only: no strike {wrong[0]!r}; choose of {', '.join(known)}")

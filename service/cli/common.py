@@ -19,6 +19,7 @@ from typer.core import TyperGroup
 from service.cli.unexpected import UsageError, traceback_in
 from service.errors import TandemError, did_you_mean, one_line
 from service.progress import Display, Task, display, doing
+from service.runtime.signals import InterruptError
 
 CHAMPION = "panda-cube@champion"
 """The primitives that come with the package."""
@@ -118,6 +119,9 @@ def _one_line() -> Iterator[None]:
     except TandemError as error:
         typer.echo(f"error: {one_line(str(error))}", err=True)
         raise typer.Exit(error.exit_code) from None
+    except InterruptError as interrupt:
+        typer.echo("stopped at once", err=True)
+        raise typer.Exit(EXIT_SIGNAL + interrupt.number) from None
     except UsageError as error:
         said: Any = error
         text = said.format_message().strip()

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 import shlex
 from collections.abc import Sequence
-from contextlib import closing
+from contextlib import AbstractContextManager, closing, nullcontext
 from importlib.util import find_spec
 from itertools import count
 from pathlib import Path
@@ -182,11 +182,10 @@ def pretrain(
     options = cluster_options()
     with closing(directory), traceback_in(run_dir):
         prepare(resolved, directory, registry, resume=resume, publish=publish, runtime=runtime)
-        with connected(address):
-            _pretrain(
-                resolved, directory, registry,
-                resume=resume, publish=publish, cluster=options, address=address, start=start, trackers=trackers,
-            )  # fmt: skip
+        _pretrain(
+            resolved, directory, registry, resume=resume, publish=publish, start=start, trackers=trackers,
+            cluster=options, address=address, connection=connected(address),
+        )  # fmt: skip
 
 
 def _check_used(context: typer.Context, runtime: str, status: str | None) -> None:
@@ -279,6 +278,7 @@ def _pretrain(
     address: str | None = None,
     start: Start | None = None,
     trackers: Sequence[str] = (),
+    connection: AbstractContextManager[None] | None = None,
 ) -> Pretrained:
     with loading():
         from service.runtime.pretrain import pretrain as run
@@ -295,6 +295,7 @@ def _pretrain(
 
     try:
         with (
+            connection or nullcontext(),
             traceback_in(directory.path),
             Trackers(trackers, run_id_of(directory.path), config.model_dump(mode="json")) as tracked,
             Progress(config.run.total_env_steps, shown()) as progress,

@@ -13,7 +13,7 @@ import ray
 
 from service.config import Config
 from service.runtime.ray_actors import Location, RolloutActor, remote_actor
-from service.runtime.watch import Watch
+from service.runtime.watch import Clock, Watch
 from service.runtime.workers import RoundSummary
 from service.store.models import ActorStatus
 
@@ -33,7 +33,7 @@ class ActorSlot:
     incarnation: int
     handle: Any
     spawned: float
-    """``time.monotonic()``, as all times here that are no dates."""
+    """By the clock of the driver."""
     watch: Watch
     may_start_s: float = RESTART_S
     """Time from which on it is started anew."""
@@ -45,6 +45,7 @@ class ActorSlot:
     ticket: int | None = None
     """Rollout slot of the round it plays."""
     round_started: float = 0.0
+    """``time.monotonic()``."""
     rounds_s: deque[float] = field(default_factory=lambda: deque(maxlen=10))
     """Durations of its last rounds."""
     num_evaluations: int = 0
@@ -61,10 +62,6 @@ class ActorSlot:
     def idle(self) -> bool:
         """Whether it has started and plays no round."""
         return self.alive and self.ticket is None
-
-    def join(self, location: Location) -> None:
-        """Note that it has started."""
-        self.location = location
 
     def start_round(self, ticket: int) -> None:
         """Note that it was given a round."""
@@ -95,21 +92,13 @@ class ActorSlot:
         """Whether its round takes far longer than its last ones did; of its first one nobody knows."""
         if self.ticket is None or self.num_evaluations or not self.rounds_s:
             return False
-        return time.monotonic() - self.round_started > LATE_ROUNDS * median(self.rounds_s) + LATE_S
+        return self.watch.call_s > LATE_ROUNDS * median(self.rounds_s) + LATE_S
 
     def status(self) -> ActorStatus:
         """The slot's state for the status service."""
-        return ActorStatus(
-            name=f"rollout-{self.index}",
-            incarnation=self.incarnation,
-            state="alive" if self.location is not None else "starting",
-            node=self.location.node if self.location is not None else "",
-            pid=self.location.pid if self.location is not None else None,
-            heartbeat=self.watch.heartbeat,
-            num_rollouts=self.num_rollouts,
-            num_env_steps=self.num_env_steps,
-            last_error=self.last_error,
-        )
+        counted = {"num_rollouts": self.num_rollouts, "num_env_steps": self.num_env_steps}
+        name = f"rollout-{self.index}"
+        return self.watch.status(name, self.incarnation, self.location, self.last_error, **counted)
 
 
 class ActorPool:
@@ -119,12 +108,13 @@ class ActorPool:
         config: the run; ``game.num_worlds`` are one actor's.
         num_threads: of each actor, and as many cores are reserved for it.
         first_incarnation: above that of any actor this run had before, so that no rollout id comes twice.
+        clock: of the driver.
     """
 
-    def __init__(self, config: Config, num_threads: int, first_incarnation: int) -> None:
+    def __init__(self, config: Config, num_threads: int, first_incarnation: int, clock: Clock) -> None:
         self.num_worlds = config.game.num_worlds
         """Worlds of each actor."""
-        self._config, self._num_threads = config, num_threads
+        self._config, self._num_threads, self._clock = config, num_threads, clock
         self._slots: dict[int, ActorSlot] = {}
         self._incarnations: dict[int, int] = defaultdict(lambda: first_incarnation)
         """The next incarnation of every place; one that goes and comes again begins no rollout id anew."""
@@ -144,7 +134,7 @@ class ActorPool:
     @property
     def num_counted_on(self) -> int:
         """Actors that have started, or may any moment, and are not late; at least 1: so many rollouts of an update."""
-        now = time.monotonic()
+        now = self._clock.now
         return max(1, sum(not slot.late if slot.alive else now - slot.spawned < START_GRACE_S for slot in self))
 
     @property
@@ -155,7 +145,7 @@ class ActorPool:
     @property
     def num_waiting(self) -> int:
         """Actors that have not started for long."""
-        now = time.monotonic()
+        now = self._clock.now
         return sum(not slot.alive and now - slot.spawned >= START_GRACE_S for slot in self)
 
     def resize(self, num: int) -> list[ActorSlot]:
@@ -166,7 +156,7 @@ class ActorPool:
         """
         for index in sorted(self._slots, reverse=True):
             if len(self._slots) > num and not self._slots[index].alive:
-                self._kill(self._slots.pop(index))
+                ray.kill(self._slots.pop(index).handle)
         free = [index for index in range(num) if index not in self._slots]
         new = [self._spawn(index) for index in free[: max(0, num - len(self._slots))]]
         self._slots |= {slot.index: slot for slot in new}
@@ -174,7 +164,7 @@ class ActorPool:
 
     def replace(self, slot: ActorSlot, reason: str) -> ActorSlot:
         """Kill a slot's actor and spawn the next incarnation."""
-        self._kill(slot)
+        ray.kill(slot.handle)
         new = self._spawn(slot.index)
         new.num_rollouts, new.num_env_steps, new.last_error = slot.num_rollouts, slot.num_env_steps, reason
         if not slot.alive:
@@ -198,29 +188,18 @@ class ActorPool:
             slot.late = True
         return new
 
-    def forgive(self, seconds: float) -> None:
-        """Leave out a time in which the driver did not look."""
-        for slot in self:
-            slot.round_started += seconds
-            slot.spawned += seconds
-            slot.watch.forgive(seconds)
-
     def close(self) -> None:
         """Kill all actors."""
         for slot in self:
-            self._kill(slot)
+            ray.kill(slot.handle)
         self._slots.clear()
-
-    def _kill(self, slot: ActorSlot) -> None:
-        ray.kill(slot.handle, no_restart=True)
 
     def _spawn(self, index: int) -> ActorSlot:
         incarnation = self._incarnations[index]
         self._incarnations[index] = incarnation + 1
         handle = self._actor.remote(self._config, index, incarnation, self._num_threads)
-        return ActorSlot(index, incarnation, handle, time.monotonic(), Watch(handle.progress.remote))
+        return ActorSlot(index, incarnation, handle, self._clock.now, Watch(handle.progress.remote, self._clock))
 
-    @staticmethod
-    def _late_start(slot: ActorSlot) -> str | None:
-        waited_s = time.monotonic() - slot.spawned
+    def _late_start(self, slot: ActorSlot) -> str | None:
+        waited_s = self._clock.now - slot.spawned
         return f"it did not start for {waited_s:.0f} s" if waited_s > slot.may_start_s else None

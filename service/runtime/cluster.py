@@ -17,7 +17,7 @@ rollouts in hand: what an actor handed over is neither lost, but with its own no
 learner that dies or hangs ends all of them, and as many others go on.
 
 A worker hangs when it makes no progress (``watch``): it is ended, and then it is like one that died. Before that, an
-actor that is late no longer holds back updates. Time in which the driver itself did not run counts for nobody.
+actor that is late no longer holds back updates. Only time in which the driver looks after its workers counts.
 """
 
 from __future__ import annotations
@@ -45,9 +45,11 @@ from service.runtime.iteration import Iteration, PendingRollout
 from service.runtime.learner_group import LearnerGroup, Update, check_room, num_gpus
 from service.runtime.ray_actors import GeneratorActor, LearnerActor, remote_actor
 from service.runtime.ray_connection import ClusterOptions
+from service.runtime.raylet import RayletWatch
 from service.runtime.remote_worker import POLL_S, START_S, RemoteWorker, Worker, lost, one_line, pause, wait_for
 from service.runtime.runner import ClusterError, Health, IterationResult, OnBeat, Runner, StateLostError
 from service.runtime.slots import RolloutSlots
+from service.runtime.watch import Clock
 from service.runtime.workers import GeneratorResult, RoundSummary, UpdateResult
 from service.store.models import GoalGrid
 from service.types import Metrics
@@ -58,14 +60,12 @@ BEAT_S = 1.0
 """Time between two heartbeats of the run."""
 RESIZE_S = 5.0
 """Time between two looks at the size of the cluster."""
-PAUSE_S = 5.0
-"""A driver that did not look for so long was paused, alone or with its machine."""
 MAX_ATTEMPTS = 3
 """Learners or generators in a row that may die of the same iteration."""
 RETRY_S = 1.0
 """Pause before the second of them is asked; it doubles."""
 MAX_FAILED_ROUNDS = 20
-"""Rounds in a row that may fail."""
+"""Rounds, or starts of actors, in a row that may fail."""
 
 
 class ClusterRun(Runner):
@@ -79,6 +79,7 @@ class ClusterRun(Runner):
         directory: where it keeps everything.
         options: of the cluster.
         resume: continue from the newest checkpoint, whichever runner and however many actors wrote it.
+        raylet: watch over that of this machine; None where there is none.
 
     Raises:
         CheckpointError: ``resume`` without a usable checkpoint.
@@ -86,10 +87,16 @@ class ClusterRun(Runner):
     """
 
     def __init__(
-        self, config: Config, directory: RunDirectory, options: ClusterOptions, *, resume: bool = False
+        self,
+        config: Config,
+        directory: RunDirectory,
+        options: ClusterOptions,
+        *,
+        resume: bool = False,
+        raylet: RayletWatch | None = None,
     ) -> None:
         super().__init__(config, directory)
-        self._options = options
+        self._options, self._raylet, self._clock = options, raylet, Clock()
         self._waiting: dict[Any, Callable[[Any], None]] = {}
         self._copies = Copies()
         self._slots = RolloutSlots()
@@ -99,7 +106,7 @@ class ClusterRun(Runner):
         self._grid: GoalGrid | None = None
         self._num_failed_rounds = self._num_counted = self._num_refused = 0
         self._last_error: str | None = None
-        self._last_iteration = self._last_beat = self._last_resize = self._last_look = time.monotonic()
+        self._last_iteration = self._last_beat = self._last_resize = time.monotonic()
         self._on_beat: OnBeat = lambda: None
         learner = config.learner
         self._rank_cpus = options.rank_cpus(learner)
@@ -117,7 +124,7 @@ class ClusterRun(Runner):
         self._learner.start()
         self._generator.start()
         self._weights, *states = self._begin(self._learner, self._learner.begin)
-        self._learner.keep_first(states)
+        self._learner.states = states
         begun = self._begin(self._generator, self._generator.handle.begin.options(num_returns=3).remote)
         self._generator.state, self._snapshot, self._opponents = begun
         self._version: int = ray.get(self._weights).version
@@ -159,7 +166,6 @@ class ClusterRun(Runner):
         self._on_beat = on_beat
         self._start_iteration()
         self._start_rounds()
-        self._forgive_pause()
         with self.timing("wait"):
             ray.wait(list(self._waiting), timeout=POLL_S)
             # All that is there, before anybody is called late or hung: after a pause that may be everything.
@@ -167,9 +173,9 @@ class ClusterRun(Runner):
         with self.bookkeeper.explaining_divergence():
             for reference in ready:
                 self._waiting.pop(reference)(reference)
-        self._check_learner()
-        self._check_generator()
-        self._check_actors()
+        if self._raylet is None or not self._raylet.silent:  # else they may all wait for it
+            self._clock.look()
+            self._check_workers()
         self._beat()
 
     def _beat(self) -> None:
@@ -177,15 +183,6 @@ class ClusterRun(Runner):
         if time.monotonic() - self._last_beat >= BEAT_S:
             self._last_beat = time.monotonic()
             self._on_beat()
-
-    def _forgive_pause(self) -> None:
-        """Leave out a time in which the driver did not look: it was frozen, or busy with starting a worker."""
-        now = time.monotonic()
-        paused_s, self._last_look = now - self._last_look, now
-        if paused_s > PAUSE_S:
-            _logger.warning("the driver did not look after its workers for %.0f s; they get that time", paused_s)
-            for each in (self._learner, self._generator, self._pool):
-                each.forgive(paused_s)
 
     # --- rounds ----------------------------------------------------------------------------------------------------
 
@@ -228,15 +225,12 @@ class ClusterRun(Runner):
                 "its newest checkpoint"
             ) from None
         self._slots.lose(ticket)
-        self._num_failed_rounds += 1
-        reason = one_line(error)
-        if self._num_failed_rounds > MAX_FAILED_ROUNDS:
-            raise ClusterError(
-                f"{self._num_failed_rounds} rounds in a row failed, the last one with: {reason}"
-            ) from error
-        self._replace(slot, reason)
+        self._replace(slot, one_line(error))
 
     def _replace(self, slot: ActorSlot, reason: str) -> None:
+        self._num_failed_rounds += 1
+        if self._num_failed_rounds > MAX_FAILED_ROUNDS:
+            raise ClusterError(f"{MAX_FAILED_ROUNDS + 1} rollout actors in a row failed, at last with: {reason}")
         _logger.warning("rollout actor %d is gone (%s); another takes its place", slot.index, reason)
         self._last_error = f"rollout-{slot.index}: {reason}"
         self._await_start(self._pool.replace(slot, reason))
@@ -249,13 +243,10 @@ class ClusterRun(Runner):
         if not self._pool.holds(slot):
             return
         try:
-            slot.join(ray.get(reference))
+            slot.location = ray.get(reference)
             if slot.incarnation > 0:
                 _logger.info("rollout actor %d is back, as its incarnation %d", slot.index, slot.incarnation)
         except RayError as error:
-            self._num_failed_rounds += 1
-            if self._num_failed_rounds > MAX_FAILED_ROUNDS:
-                raise ClusterError(f"rollout actors do not come up: {one_line(error)}") from error
             self._replace(slot, one_line(error))
 
     # --- iterations ------------------------------------------------------------------------------------------------
@@ -324,15 +315,6 @@ class ClusterRun(Runner):
             return
         self._generator.watch.end()
         self._finish_if_done(iteration)
-
-    def _check_learner(self) -> None:
-        """End a learner that hangs: then its answer fails, and another takes its place."""
-        if (hung := self._learner.hangs()) is not None:
-            self._learner.end_hung(hung)
-        iteration = self._current
-        update = iteration.update if iteration is not None and iteration.updated is None else None
-        if iteration is not None and update is not None and update.overdue:
-            self._on_failed_answer(iteration, self._learner, GroupError("a rank does not hand back its state"))
 
     def _on_failed_answer(self, iteration: Iteration, worker: Worker, error: Exception) -> None:
         """Start another learner or generator from the state before the iteration, and ask it what is left of that."""
@@ -425,10 +407,12 @@ class ClusterRun(Runner):
         needed = [self._weights, self._snapshot, self._opponents, self._generator.state, *self._learner.states]
         self._waiting |= self._copies.keep(needed)
 
-    # --- looking after actors --------------------------------------------------------------------------------------
+    # --- looking after workers -------------------------------------------------------------------------------------
 
-    def _check_actors(self) -> None:
-        """Go on without actors that are late, replace those that hang, and follow the cluster's size."""
+    def _check_workers(self) -> None:
+        """Go on without actors that are late, replace workers that hang, and follow the cluster's size."""
+        for worker in (self._learner, self._generator):
+            worker.end_if_hung()  # then its answer fails, and another takes its place
         for slot in self._pool.become_late():
             assert slot.ticket is not None
             self._slots.release(slot.ticket)
@@ -443,11 +427,6 @@ class ClusterRun(Runner):
             for slot in self._pool.resize(self._num_actors()):
                 self._await_start(slot)
 
-    def _check_generator(self) -> None:
-        """End a task generator that hangs: then its answer fails, and another takes its place."""
-        if (hung := self._generator.hangs()) is not None:
-            self._generator.end_hung(hung)
-
     def _num_actors(self) -> int:
         if self._options.num_actors is not None:
             return self._options.num_actors
@@ -457,7 +436,8 @@ class ClusterRun(Runner):
     def _start_actors(self, first_incarnation: int) -> ActorPool:
         num = self._num_actors()
         game = self.config.game.model_copy(update={"num_worlds": -(-self.config.game.num_worlds // num)})
-        pool = ActorPool(self.config.model_copy(update={"game": game}), self._options.actor_threads, first_incarnation)
+        config = self.config.model_copy(update={"game": game})
+        pool = ActorPool(config, self._options.actor_threads, first_incarnation, self._clock)
         for slot in pool.resize(num):
             self._await_start(slot)
         return pool
@@ -485,11 +465,12 @@ class ClusterRun(Runner):
                 worker.restart(worker.explain(error))
         raise ClusterError(f"the {worker.name} fails as it begins, {MAX_ATTEMPTS} times in a row")
 
-    def _start_learner(self, *arguments: Any) -> LearnerGroup:
+    def _start_learner(self, state: Any, pending: Any) -> LearnerGroup:
         learner = self.config.learner
         gpus = num_gpus(learner.device, learner.num_learners)
         actor = remote_actor(LearnerActor, num_cpus=self._rank_cpus, num_gpus=gpus)
-        return LearnerGroup(actor, self.config, *arguments, on_wait=self._beat)
+        return LearnerGroup(actor, self.config, state, pending, self._clock, self._beat)
 
     def _start_generator(self, state: Any) -> RemoteWorker:
-        return RemoteWorker("generator", remote_actor(GeneratorActor, num_cpus=0), self.config, state, self._beat)
+        actor = remote_actor(GeneratorActor, num_cpus=0)
+        return RemoteWorker("generator", actor, self.config, state, self._clock, self._beat)

@@ -6,30 +6,26 @@ start others from that under a new group id, which is the address of a new store
 
 from __future__ import annotations
 
-import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
 import ray
-from ray.exceptions import GetTimeoutError, RayActorError, RayError, RayTaskError
+from ray.exceptions import GetTimeoutError, RayActorError, RayTaskError
 
 from service.config import Config
 from service.errors import TandemError
 from service.learner.shares import join_states, share_out
 from service.runtime.ray_actors import Location
-from service.runtime.remote_worker import ANSWER_S, START_S, OnWait, Worker, one_line, wait_for
+from service.runtime.remote_worker import ANSWER_S, RANK_ANSWER_S, START_S, OnWait, Worker, one_line, wait_for
 from service.runtime.runner import ClusterError
-from service.runtime.watch import Watch
+from service.runtime.watch import Clock, Watch
 from service.runtime.workers import UpdateResult
 from service.store.models import ActorStatus
 from service.types import Arrays
 
-RANK_ANSWER_S = 25.0
-"""A rank that does not take part in a gradient step for so long hangs; a step takes a tenth of a second, and some
-seconds where other programs take nearly all of the machine."""
 PING_S = 3.0
-"""Ranks that have given up answer within it, so that the one that hangs can be named."""
+"""Ranks that have given up answer within it, and those that died are named."""
 
 
 @dataclass(slots=True)
@@ -44,23 +40,15 @@ class Update:
     """References to the ranks' results."""
     results: dict[int, UpdateResult] = field(default_factory=dict)
     """Results that are there, by rank."""
-    first_answer: float = 0.0
-    """``time.monotonic()`` of the first of them."""
 
     def add(self, rank: int, result: UpdateResult) -> None:
         """Note the result of a rank."""
-        self.first_answer = self.first_answer or time.monotonic()
         self.results[rank] = result
 
     @property
     def done(self) -> bool:
         """Whether all ranks are."""
         return len(self.results) == len(self.answers)
-
-    @property
-    def overdue(self) -> bool:
-        """Whether a rank hangs after the last gradient step, where the others do not wait for it."""
-        return bool(self.results) and time.monotonic() - self.first_answer > RANK_ANSWER_S
 
     def joined(self) -> UpdateResult:
         """The results of all ranks as one; their metrics are equal."""
@@ -82,11 +70,14 @@ class LearnerGroup(Worker):
         config: the run; ``learner.num_learners`` ranks.
         state: one learner's, to start from, or None.
         pending: rollout to be learned from with the first ones.
+        clock: of the driver.
         on_wait: called again and again while the driver waits for them to start.
     """
 
-    def __init__(self, actor: Any, config: Config, state: Arrays | None, pending: Any, *, on_wait: OnWait) -> None:
-        super().__init__("learner", on_wait)
+    def __init__(
+        self, actor: Any, config: Config, state: Arrays | None, pending: Any, clock: Clock, on_wait: OnWait
+    ) -> None:
+        super().__init__("learner", clock, on_wait)
         self.size = config.learner.num_learners
         self.locations: list[Location]
         """By rank, once all have started; empty before."""
@@ -99,7 +90,7 @@ class LearnerGroup(Worker):
     def wait_ready(self) -> None:
         """Wait until all ranks have started, found each other, and loaded the state."""
         try:
-            self.locations = self._ask(START_S, [rank.ping.remote() for rank in self._ranks], "start")
+            self.locations = self._ask(START_S, self._pings(), "start")
             address = None
             if self.size > 1:
                 (address,) = self._ask(ANSWER_S, [self._ranks[0].open_store.remote(RANK_ANSWER_S)], "open a port")
@@ -118,10 +109,6 @@ class LearnerGroup(Worker):
         """References to the weights before the first update, and to the state of each rank."""
         answers = [rank.begin.options(num_returns=2).remote() for rank in self._ranks]
         return [answers[0][0], *(state for _, state in answers)]
-
-    def keep_first(self, states: list[Any]) -> None:
-        """Go on from these states, of before the first update."""
-        self.states = states
 
     def update(self, rollouts: Sequence[Any]) -> Update:
         """Ask all ranks to learn from their shares of rollouts, given as references in the order of their ids."""
@@ -146,39 +133,14 @@ class LearnerGroup(Worker):
         """Note that a rank has answered an update."""
         self._watches[rank].end()
 
-    def hangs(self) -> str | None:
-        """The reason in a few words why a rank hangs, if one does; where several stand still, one that is silent."""
-        reasons = {rank: reason for rank, watch in enumerate(self._watches) if (reason := watch.look()) is not None}
-        if not reasons or self._hung is not None:
-            return None
-        first = min(reasons, key=lambda rank: not self._watches[rank].silent)
-        return reasons[first] if self.size == 1 else f"{self._describe([first])}: {reasons[first]}"
-
-    def forgive(self, seconds: float) -> None:
-        """Leave out a time in which the driver did not look."""
-        for watch in self._watches:
-            watch.forgive(seconds)
-
-    @property
-    def alive(self) -> bool:
-        """Whether all ranks answer. Only to be asked when they have, or will soon have, nothing to do."""
-        try:
-            wait_for([rank.ping.remote() for rank in self._ranks], RANK_ANSWER_S + ANSWER_S, self._on_wait)
-        except RayError:
-            return False
-        return True
-
     def explain(self, error: BaseException) -> str:
         """The reason in a line why an update failed: the ranks that are gone or hang, else the error."""
         if self._hung is not None or self.size == 1:
             return self._hung or one_line(error)
-        pings = [rank.ping.remote() for rank in self._ranks]
+        pings = self._pings()
         ready, _ = ray.wait(pings, num_returns=self.size, timeout=PING_S)
-        silent = [rank for rank, ping in enumerate(pings) if ping not in ready]
         dead = [rank for rank, ping in enumerate(pings) if ping in ready and _is_dead(ping)]
-        if dead:
-            return f"{self._describe(dead)} died"
-        return f"{self._describe(silent)} did not answer for {RANK_ANSWER_S:g} s" if silent else one_line(error)
+        return f"{self._describe(dead)} died" if dead else one_line(error)
 
     def close(self) -> None:
         """Kill all ranks."""
@@ -188,22 +150,27 @@ class LearnerGroup(Worker):
     def statuses(self) -> tuple[ActorStatus, ...]:
         """The ranks' states for the status service."""
         return tuple(
-            ActorStatus(
-                name=self.name if self.size == 1 else f"{self.name}-{rank}",
-                incarnation=self.incarnation,
-                state="alive" if self.locations else "starting",
-                node=self.locations[rank].node if self.locations else "",
-                pid=self.locations[rank].pid if self.locations else None,
-                heartbeat=watch.heartbeat,
-                last_error=self._last_error,
+            watch.status(
+                self.name if self.size == 1 else f"{self.name}-{rank}",
+                self.incarnation,
+                self.locations[rank] if self.locations else None,
+                self._last_error,
             )
             for rank, watch in enumerate(self._watches)
         )
 
+    def _look(self) -> str | None:
+        reason = next(filter(None, [watch.look() for watch in self._watches]), None)
+        silent = [rank for rank, watch in enumerate(self._watches) if watch.silent]  # the others wait for it
+        return f"{self._describe(silent)}: {reason}" if reason and silent and self.size > 1 else reason
+
+    def _pings(self) -> list[Any]:
+        return [rank.ping.remote() for rank in self._ranks]
+
     def _spawn(self) -> None:
         self._ranks = [self._actor.remote(self._config, rank, self.size) for rank in range(self.size)]
         self.locations = []
-        self._watches = [Watch(rank.progress.remote) for rank in self._ranks]
+        self._watches = [Watch(rank.progress.remote, self._clock) for rank in self._ranks]
 
     def _ask(self, timeout_s: float, answers: list[Any], what: str) -> list[Any]:
         """Wait for what all ranks were asked."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import os
 import socket
+import sys
 import time
 from contextlib import ExitStack, closing, suppress
 from dataclasses import dataclass, replace
@@ -13,6 +14,7 @@ from typing import TYPE_CHECKING, Literal, cast
 
 from service.config import Config
 from service.errors import ConfigError, TandemError
+from service.io.checkpoints import CheckpointStore
 from service.io.run_directory import Published, RunDirectory
 from service.io.run_log import RunLog
 from service.learner.learner import torch_device
@@ -23,7 +25,7 @@ from service.registry.names import Version
 from service.registry.registry import Registry
 from service.runtime.local import LocalRun, check_one_learner
 from service.runtime.reporting import Report
-from service.runtime.runner import OnIteration, Runner, RunResult, StateLostError
+from service.runtime.runner import ClusterError, OnIteration, Runner, RunResult, StateLostError
 from service.runtime.signals import InterruptError, StopSignals
 from service.store.address import address_from_environment
 from service.store.disk import read_status
@@ -32,6 +34,7 @@ from service.store.run_writer import RunWriter
 
 if TYPE_CHECKING:
     from service.runtime.ray_connection import ClusterOptions
+    from service.runtime.raylet import RayletWatch
     from service.runtime.starting import Start
     from service.store.models import RunState
 
@@ -118,14 +121,17 @@ def pretrain(
 
             url = stack.enter_context(serving(cluster.status, directory.path.absolute().parent, registry, redis))
             _logger.info("status: %s/v1/runs/%s", url, run_id)
+        raylet = None
         if cluster is not None:
             from service.runtime.ray_connection import explaining_ray_errors
+            from service.runtime.raylet import RayletWatch
 
             stack.enter_context(explaining_ray_errors())  # before the report has them
+            raylet = stack.enter_context(RayletWatch(lambda what: _end_now(report, directory, what)))
         num_lost, furthest = 0, -1
         while True:
             with doing("starting", aloud=False):
-                started = _start(config, directory, cluster, resume=resume, start=start)
+                started = _start(config, directory, cluster, raylet, resume=resume, start=start)
             with closing(started) as run:
                 try:
                     to = Registry(registry) if publish else None
@@ -174,7 +180,13 @@ def prepare(
 
 
 def _start(
-    config: Config, directory: RunDirectory, cluster: ClusterOptions | None, *, resume: bool, start: Start | None
+    config: Config,
+    directory: RunDirectory,
+    cluster: ClusterOptions | None,
+    raylet: RayletWatch | None,
+    *,
+    resume: bool,
+    start: Start | None,
 ) -> Runner:
     if config.skills is not None:
         from service.runtime.skill_run import SkillRun
@@ -194,7 +206,17 @@ def _start(
         one = config.learner.model_copy(update={"num_learners": 1, "device": "cpu"})
         LocalRun(config.model_copy(update={"learner": one}), directory, start=start).close()
         resume = True
-    return ClusterRun(config, directory, cluster, resume=resume)
+    return ClusterRun(config, directory, cluster, resume=resume, raylet=raylet)
+
+
+def _end_now(report: Report, directory: RunDirectory, what: str) -> None:
+    """End this process from a thread while Ray is frozen: no call of the main thread may ever come back."""
+    saved = next(reversed(CheckpointStore(directory.checkpoints, keep=1).steps()), None)
+    text = f"{what}; " + ("nothing is saved yet" if saved is None else f"--resume goes on from iteration {saved}")
+    with suppress(Exception):
+        report.end("failed", error=f"ClusterError: {text}")
+    print(f"error: {text}", file=sys.stderr, flush=True)
+    os._exit(ClusterError.exit_code)
 
 
 def _run(

@@ -10,13 +10,15 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any
 
 from service.config import LearnerConfig
 from service.errors import TandemError, one_line
 from service.extras import needs_extra
-from service.progress import doing
+from service.progress import answer, doing
 from service.runtime.runner import ClusterError
+from service.runtime.signals import InterruptError, StopSignals
 from service.status.ports import DEFAULT_PORT
 
 CONNECT_S = 5.0
@@ -92,6 +94,7 @@ def connected(address: str | None, num_cpus: int | None = None) -> Iterator[None
     Raises:
         ClusterError: nobody there, another version of Ray or Python there, or it does not let us in; or Ray fails
             while the block runs.
+        InterruptError: a signal that nobody else has taken over.
     """
     address = address or ("auto" if os.environ.get("RAY_ADDRESS") else None)
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
@@ -102,6 +105,8 @@ def connected(address: str | None, num_cpus: int | None = None) -> Iterator[None
     if address is None:
         os.environ.setdefault(_CLUSTERS_VARIABLE, "0")
         os.environ.setdefault("RAY_worker_niceness", "0")  # not 15 for all: see ``ray_actors.lower_priority``
+        # Else Ray gives its only node up once it was frozen for ten seconds for the fifth time; ``raylet`` watches it.
+        os.environ.setdefault("RAY_health_check_failure_threshold", "1000000")
         # No spare worker for every core: a run begins no sooner with them, and may need fewer.
         os.environ.setdefault("RAY_prestart_worker_first_driver", "0")
     with needs_extra("cluster", "--runtime ray"):
@@ -109,18 +114,23 @@ def connected(address: str | None, num_cpus: int | None = None) -> Iterator[None
     _check_reachable(address)
     _check_token(address)
     options: dict[str, Any] = {"num_cpus": num_cpus, "include_dashboard": False} if address is None else {}
-    with doing("starting Ray" if address is None else f"connecting to Ray at {address}"):
-        _init(address, options)
-    try:
-        with explaining_ray_errors():
-            yield
-    finally:
-        ray.shutdown()
+    with StopSignals() as signals:
+        wait = partial(answer, "stopping once Ray has started; again to end now")  # else some processes of its stay
+        try:
+            with doing("starting Ray" if address is None else f"connecting to Ray at {address}"), signals.asking(wait):
+                _init(address, options)
+            if signals.first is not None:
+                raise InterruptError(signals.first)
+            with explaining_ray_errors():
+                yield
+        finally:
+            ray.shutdown()
 
 
 def _init(address: str | None, options: dict[str, Any]) -> None:
     import ray
 
+    ray._private.utils.set_sigterm_handler = lambda handler: None  # Ray's own would end the process without a word
     for attempt in range(START_ATTEMPTS, 0, -1):
         try:
             ray.init(address or "local", logging_level=logging.WARNING, **options)
@@ -129,9 +139,6 @@ def _init(address: str | None, options: dict[str, Any]) -> None:
             ray.shutdown()
             if attempt == 1 or address is not None or "timed out during startup" not in str(error):
                 raise ClusterError(_explained(address, error)) from None
-        except BaseException:  # a signal's
-            ray.shutdown()
-            raise
 
 
 @contextmanager
@@ -151,7 +158,9 @@ def explaining_ray_errors() -> Iterator[None]:
         if isinstance(error.cause, TandemError):
             raise error.cause from None
         raise RuntimeError(f"a worker failed: {type(error.cause).__name__}: {error.cause}") from error
-    except RayError as error:
+    except (RayError, OSError) as error:
+        if isinstance(error, OSError) and (type(error) is not OSError or error.errno is not None):  # none of Ray's
+            raise
         raise ClusterError(
             f"Ray gave up: {_last_line(error)}; see ray status, and continue with --resume from what was saved"
         ) from error

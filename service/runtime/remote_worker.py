@@ -13,13 +13,16 @@ from ray.exceptions import GetTimeoutError, ObjectLostError, RayActorError, RayE
 
 from service.runtime.ray_actors import Location
 from service.runtime.runner import ClusterError, StateLostError
-from service.runtime.watch import Watch
+from service.runtime.watch import Clock, Watch
 from service.store.models import ActorStatus
 
 START_S = 120.0
 """A worker that has not started by then will not; torch is imported within it, and images are loaded on a new node."""
 ANSWER_S = 20.0
 """A worker that is alive and has nothing to do answers within it."""
+RANK_ANSWER_S = 60.0
+"""A rank gives up one that does not take part in a gradient step for so long: long after the driver would have ended
+it, and longer than a machine may sleep."""
 START_ATTEMPTS = 4
 """Times that a worker is started in place of one, before its state is given up."""
 BACK_OFF_S = 0.5
@@ -34,11 +37,12 @@ class Worker(ABC):
 
     Args:
         name: of the worker, for people.
+        clock: of the driver.
         on_wait: called again and again while the driver waits for it to start.
     """
 
-    def __init__(self, name: str, on_wait: OnWait) -> None:
-        self.name, self._on_wait = name, on_wait
+    def __init__(self, name: str, clock: Clock, on_wait: OnWait) -> None:
+        self.name, self._clock, self._on_wait = name, clock, on_wait
         self.incarnation = 0
         self._last_error: str | None = None
         self._hung: str | None = None
@@ -84,11 +88,21 @@ class Worker(ABC):
             f"the {self.name} cannot go on from its last state ({reason}); the run goes back to its newest checkpoint"
         )
 
-    def end_hung(self, reason: str) -> None:
-        """Kill it because it hangs; what it was asked then fails."""
-        _logger.warning("the %s hangs: %s", self.name, reason)
-        self._hung = reason
-        self.close()
+    def end_if_hung(self) -> None:
+        """Kill it if it hangs; what it was asked then fails. To be asked often."""
+        if self._hung is None and (reason := self._look()) is not None:
+            _logger.warning("the %s hangs: %s", self.name, reason)
+            self._hung = reason
+            self.close()
+
+    @property
+    def alive(self) -> bool:
+        """Whether all its processes answer. Only to be asked while they have nothing to do, or soon will."""
+        try:
+            wait_for(self._pings(), RANK_ANSWER_S + ANSWER_S, self._on_wait)
+        except RayError:
+            return False
+        return True
 
     def _start_next(self, pause_s: float) -> None:
         self.close()
@@ -107,21 +121,16 @@ class Worker(ABC):
         """
 
     @abstractmethod
-    def hangs(self) -> str | None:
-        """The reason in a few words why it hangs, if it does; to be asked often."""
+    def _look(self) -> str | None:
+        """The reason in a few words why it hangs, if it does."""
 
     @abstractmethod
-    def forgive(self, seconds: float) -> None:
-        """Leave out a time in which the driver did not look."""
+    def _pings(self) -> list[Any]:
+        """Ask all its processes whether they live; references to their answers."""
 
     @abstractmethod
     def explain(self, error: BaseException) -> str:
         """The reason in a line why it failed."""
-
-    @property
-    @abstractmethod
-    def alive(self) -> bool:
-        """Whether it answers. Only to be asked while it has nothing to do, or soon will."""
 
     @abstractmethod
     def close(self) -> None:
@@ -140,11 +149,12 @@ class RemoteWorker(Worker):
         actor: Ray's actor class, with its options.
         config: first argument of the worker.
         state: second one: the state to start from, or None.
+        clock: of the driver.
         on_wait: called again and again while the driver waits for it to start.
     """
 
-    def __init__(self, name: str, actor: Any, config: Any, state: Any, on_wait: OnWait) -> None:
-        super().__init__(name, on_wait)
+    def __init__(self, name: str, actor: Any, config: Any, state: Any, clock: Clock, on_wait: OnWait) -> None:
+        super().__init__(name, clock, on_wait)
         self.state = ray.put(state)
         """Reference to its newest state."""
         self._actor, self._config = actor, config
@@ -154,30 +164,13 @@ class RemoteWorker(Worker):
     def wait_ready(self) -> None:
         """Wait until it has started."""
         try:
-            (found,) = wait_for([self.handle.ping.remote()], START_S, self._on_wait)
+            (found,) = wait_for(self._pings(), START_S, self._on_wait)
         except GetTimeoutError:
             raise ClusterError(
                 f"the {self.name} did not start within {START_S:.0f} s: does a node of the cluster answer? see ray "
                 "status"
             ) from None
         self._location = found
-
-    def hangs(self) -> str | None:
-        """The reason in a few words why it hangs, if it does."""
-        return self.watch.look() if self._hung is None else None
-
-    def forgive(self, seconds: float) -> None:
-        """Leave out a time in which the driver did not look."""
-        self.watch.forgive(seconds)
-
-    @property
-    def alive(self) -> bool:
-        """Whether it answers. Only to be asked while it has nothing to do."""
-        try:
-            wait_for([self.handle.ping.remote()], ANSWER_S, self._on_wait)
-        except RayError:
-            return False
-        return True
 
     def explain(self, error: BaseException) -> str:
         """The reason in a line why it failed."""
@@ -189,19 +182,17 @@ class RemoteWorker(Worker):
 
     def status(self) -> ActorStatus:
         """The worker's state for the status service."""
-        return ActorStatus(
-            name=self.name,
-            incarnation=self.incarnation,
-            state="alive" if self._location is not None else "starting",
-            node=self._location.node if self._location is not None else "",
-            pid=self._location.pid if self._location is not None else None,
-            heartbeat=self.watch.heartbeat,
-            last_error=self._last_error,
-        )
+        return self.watch.status(self.name, self.incarnation, self._location, self._last_error)
+
+    def _look(self) -> str | None:
+        return self.watch.look()
+
+    def _pings(self) -> list[Any]:
+        return [self.handle.ping.remote()]
 
     def _spawn(self) -> None:
         self.handle = self._actor.remote(self._config, self.state)
-        self.watch = Watch(self.handle.progress.remote)
+        self.watch = Watch(self.handle.progress.remote, self._clock)
         self._location = None
 
 
@@ -212,13 +203,14 @@ def wait_for(answers: Sequence[Any], timeout_s: float, on_wait: OnWait) -> list[
         GetTimeoutError: one of them has not answered in time.
         RayError: one of them failed.
     """
-    deadline_s = time.monotonic() + timeout_s
+    clock = Clock()
     while True:
         ready, missing = ray.wait(list(answers), num_returns=len(answers), timeout=POLL_S)
         ray.get(ready)  # one that failed ends the wait for the others
         if not missing:
             return list(ray.get(list(answers)))
-        if time.monotonic() > deadline_s:
+        clock.look()
+        if clock.now > timeout_s:
             raise GetTimeoutError
         on_wait()
 

@@ -14,8 +14,11 @@ jobs, signals a process and those below it, and what comes twice that way must n
 STOPPING = (signal.SIGINT, signal.SIGTERM, PASSED_ON)
 
 
-class InterruptError(BaseException):
-    """A signal that ends everything at once. No ``Exception``, so that nothing takes it for an error of its own."""
+class InterruptError(KeyboardInterrupt):
+    """A signal that ends everything at once. No ``Exception``, so that nothing takes it for an error of its own.
+
+    Ray's own code lets only a ``KeyboardInterrupt`` through, and raises another one of those in its place.
+    """
 
     def __init__(self, number: int) -> None:
         """Keep the signal's number."""
@@ -45,6 +48,8 @@ class StopSignals:
     ) -> None:
         for number, handler in self._previous.items():
             signal.signal(number, handler)
+        if kind is KeyboardInterrupt and self.first is not None:
+            raise InterruptError(self.first) from None
 
     @contextmanager
     def asking(self, ask: Callable[[], None]) -> Iterator[None]:

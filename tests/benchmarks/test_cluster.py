@@ -97,6 +97,11 @@ def test_nothing_was_lost_or_counted_twice():
     )
     lost = audit_rollouts(rows, ledger_of([[0, 0, 3], [0, 1, 2], [1, 0, 5]]), end, stretches)
     assert (lost["num_counted_of_the_dead"], lost["complete"]) == (4, False)
+    late = seen(4, num_rollouts_counted=12, num_rollouts_refused=1)[
+        1
+    ]  # one that came too late, of the 13 in the ledger
+    assert audit_rollouts(rows, ledger, late, stretches, late=True)["complete"]
+    assert not audit_rollouts(rows, ledger, late, stretches)["complete"]
     twice = audit_rollouts(rows, ledger, seen(4, num_rollouts_counted=14)[1], stretches)
     assert not twice["complete"]
     torn = audit_rollouts(rows[::2], ledger, end, stretches)

@@ -5,12 +5,15 @@ import socket
 import subprocess
 import sys
 import threading
+from datetime import UTC, datetime
+from types import SimpleNamespace
 
 import pytest
 
 from benchmarks.report import attacks
 from service.store.models import RunStatus
 from tests.status.runs import status
+from tools.strike_freezes import Freeze, endings
 from tools.strike_runs import Network, Strike, Watcher, changed
 from tools.strikes import ROOT, strikes
 
@@ -93,9 +96,26 @@ def test_an_unknown_strike_is_refused_with_those_there_are():
     assert "two-drivers" in done.stderr
 
 
+def test_endings_that_no_freeze_justifies(tmp_path):
+    gone = ["the learner is gone (no progress for 31 s); another goes on from its last state"] * 2
+    gone += ["rollout actor 1 is gone (it died); another takes its place", "the learner is back, as its incarnation 1"]
+    lines = [
+        {"at": f"2026-11-26T10:0{minute}:00+00:00", "level": "warning", "text": text}
+        for minute, text in enumerate(gone)
+    ]
+    (tmp_path / "log.jsonl").write_text("".join(f"{json.dumps(line)}\n" for line in lines))
+    training = SimpleNamespace(directory=SimpleNamespace(path=tmp_path))
+    at = datetime(2026, 11, 26, 10, tzinfo=UTC).timestamp()
+    freezes = [Freeze(at - 200.0, "learner", "learner", 25.0), Freeze(at + 28.0, "learner", "learner", 31.0)]
+    found = endings(training, freezes)
+    assert [(each["worker"], each["justified"]) for each in found] == [
+        ("learner", False), ("learner", True), ("1", False)
+    ]  # fmt: skip
+
+
 def test_the_recorded_strikes_are_those_there_are():
     recorded = json.loads((ROOT / "docs" / "results" / "strikes.json").read_text())["strikes"]
-    asked = {name: must for name, (must, _) in strikes(600.0).items()}
+    asked = {name: must for name, (must, _) in strikes(600.0, 300.0, 4).items()}
     assert {each["name"]: each["must"] for each in recorded} == asked
 
 

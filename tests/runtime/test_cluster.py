@@ -3,21 +3,27 @@
 import os
 import re
 import signal
+import time
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import ray
 from ray.exceptions import ObjectLostError
 
+from benchmarks.processes import descendants
 from service.errors import DivergedError
 from service.io.checkpoints import CheckpointStore
 from service.io.run_directory import RunDirectory
+from service.runtime import watch
 from service.runtime.cluster import ClusterRun
 from service.runtime.learner_group import LearnerGroup
 from service.runtime.ray_actors import NICENESS
 from service.runtime.ray_connection import ClusterOptions, connected
+from service.runtime.raylet import RayletWatch
+from service.runtime.remote_worker import RemoteWorker
 from service.runtime.runner import ClusterError, StateLostError
 from service.runtime.worker_variables import WORKER_VARIABLES
 from tests.runtime.runs import FullForAWhile, is_alive, newest, play, read_lines, tiny_config
@@ -117,9 +123,21 @@ def test_a_checkpoint_belongs_to_no_topology_and_no_runner(tmp_path):
     assert {incarnation for _, incarnation, _ in ids(tmp_path)} == {0, 1, 2, 3}  # one for each process
 
 
-def test_whoever_is_killed_is_replaced(tmp_path):
+def test_whoever_is_killed_is_replaced_and_nobody_else(tmp_path, monkeypatch):
+    """Each save takes a minute, by the clock that workers are judged by, and so does the start of each successor."""
     strikes = [["learner"], ["rollout-1", "generator"], ["rollout-1", "learner", "generator"]]
-    killed, since = [], []
+    killed, since, lost_s, incarnations = [], [], [0.0], {}
+    monkeypatch.setattr(watch, "time", SimpleNamespace(monotonic=lambda: time.monotonic() + lost_s[0]))
+
+    def lose_a_minute(function):
+        def slow(*args):
+            lost_s[0] += 60.0
+            return function(*args)
+
+        return slow
+
+    for kind, name in ((ClusterRun, "_save"), (LearnerGroup, "wait_ready"), (RemoteWorker, "wait_ready")):
+        monkeypatch.setattr(kind, name, lose_a_minute(getattr(kind, name)))
 
     def strike(run, metrics):
         """Some, others, then all at once; six iterations with everybody there end the run."""
@@ -131,6 +149,7 @@ def test_whoever_is_killed_is_replaced(tmp_path):
             return
         since.clear()
         if not strikes:
+            incarnations.update({actor.name: actor.incarnation for actor in run.health().actors})
             run.request_stop()
             return
         for name in strikes.pop(0):
@@ -143,16 +162,17 @@ def test_whoever_is_killed_is_replaced(tmp_path):
     rows = read_lines(tmp_path / "metrics.jsonl")
     assert [row["learner/version"] for row in rows] == list(range(1, len(rows) + 1))  # no update lost or made twice
     assert (np.diff([row["env_steps"] for row in rows]) > 0).all()
+    assert lost_s[0] >= 60.0 * 6
+    assert incarnations == {"rollout-0": 0, "rollout-1": 2, "learner": 2, "generator": 2}  # each as often as killed
     counted = ids(tmp_path)
-    assert {(actor, incarnation) for actor, incarnation, _ in counted} >= {(0, 0), (1, 0), (1, 1), (1, 2)}
+    assert {(actor, incarnation) for actor, incarnation, _ in counted} == {(0, 0), (1, 0), (1, 1), (1, 2)}
     # Not one of the rollouts that the actors handed over is missing.
     assert sum(highest + 1 for _, _, highest in counted) == run.health().num_rollouts_counted
     assert run.iteration == result.iteration == rows[-1]["iteration"]
 
 
 def test_updates_go_on_without_an_actor_that_is_late_and_one_that_hangs_is_replaced(tmp_path, monkeypatch):
-    monkeypatch.setattr("service.runtime.watch.STALL_S", 10.0)
-    monkeypatch.setattr("service.runtime.watch.MAX_STALL_S", 10.0)
+    monkeypatch.setattr(watch, "STALL_S", 10.0)
     late, frozen, said = [], [], []
 
     def freeze(run, metrics):
@@ -188,8 +208,7 @@ def test_updates_go_on_without_an_actor_that_is_late_and_one_that_hangs_is_repla
 
 def test_no_round_notices_workers_that_are_frozen(tmp_path, monkeypatch):
     """Iterations wait until another takes its place; no actor is replaced, no rollout is lost or counted twice."""
-    monkeypatch.setattr("service.runtime.watch.STALL_S", 10.0)
-    monkeypatch.setattr("service.runtime.watch.MAX_STALL_S", 10.0)
+    monkeypatch.setattr(watch, "STALL_S", 10.0)
     frozen, since, errors, played = {}, [], [], {"generator": [], "learner": []}
     names = list(played)
 
@@ -365,3 +384,31 @@ def test_a_snapshot_lost_with_its_machine_sends_the_run_back(tmp_path):
     with pytest.raises(StateLostError, match=r"goes back to its newest checkpoint") as error:
         run_cluster(tmp_path, tiny_config(total_env_steps=10**9), num_actors=1, on_iteration=lose)
     assert "\n" not in str(error.value)
+
+
+def test_a_raylet_that_is_frozen_is_silent_and_one_that_stays_so_is_given_up(monkeypatch):
+    monkeypatch.setattr("service.runtime.raylet.SILENT_S", 1.0)
+    pid = next(pid for pid, role in descendants(os.getpid()).items() if role == "raylet")
+    lost = []
+
+    def wait_until(holds):
+        deadline_s = time.monotonic() + 60.0
+        while not holds() and time.monotonic() < deadline_s:
+            time.sleep(0.05)
+        assert holds()
+
+    with RayletWatch(lost.append) as raylet:
+        time.sleep(1.5)
+        assert not raylet.silent
+        os.kill(pid, signal.SIGSTOP)
+        try:
+            wait_until(lambda: raylet.silent)
+            os.kill(pid, signal.SIGCONT)
+            wait_until(lambda: not raylet.silent)
+            assert lost == []
+            monkeypatch.setattr("service.runtime.raylet.LOST_S", 2.0)
+            os.kill(pid, signal.SIGSTOP)
+            wait_until(lambda: lost)
+        finally:
+            os.kill(pid, signal.SIGCONT)
+    assert lost == ["Ray's process for this machine, the raylet, has not answered for 2 s"]

@@ -1,4 +1,4 @@
-"""Which workers hang: those that count no further, however slow the others are."""
+"""Which workers hang: those that count no further while the driver looks, however slow the others are."""
 
 from types import SimpleNamespace
 
@@ -6,38 +6,48 @@ import pytest
 from ray.exceptions import RayError
 
 from service.runtime import watch
-from service.runtime.watch import Watch
+from service.runtime.watch import FIRST_S, LOOK_S, STALL_S, Clock, Watch
 
 
 class Worker:
-    """A worker that is asked at once, with a clock of its own."""
+    """A worker, and a driver that looks after it; both have the same clock, which stands still by itself."""
 
     def __init__(self, monkeypatch):
         self.now, self.count, self.answers, self.num_asked = 1000.0, 0, True, 0
         monkeypatch.setattr(watch, "time", SimpleNamespace(monotonic=lambda: self.now))
         ready = lambda references, timeout: (references, []) if self.answers else ([], references)  # noqa: E731
         monkeypatch.setattr(watch, "ray", SimpleNamespace(wait=ready, get=lambda reference: reference()))
-        self.watch = Watch(self.ask)
+        self.clock = Clock()
+        self.watch = Watch(self.ask, self.clock)
 
     def ask(self):
         self.num_asked += 1
-        count = self.count
+        count = int(self.count)
         return lambda: count
 
-    def call(self, seconds):
+    def call(self):
+        """A call, after which it has loaded its libraries."""
         self.watch.begin()
-        self.now += seconds
+        self.looks(0.5, counts=10.0)
         self.watch.end()
 
-    def looks(self, seconds, *, counts=0.0):
-        """Look five times a second for so long, while it counts so much a second; what the last look said."""
-        begun = self.now
-        while self.now < begun + seconds:
-            self.now += 0.2
-            self.count = int((self.now - begun) * counts)
+    def passes(self, num, seconds, *, counts=0.0):
+        """The driver passes so often, each time after so many seconds, in which the worker counts so much a second.
+
+        Returns:
+            What the last look said.
+        """
+        for _ in range(num):
+            self.now += seconds
+            self.count += seconds * counts
+            self.clock.look()
             if (reason := self.watch.look()) is not None:
                 return reason
         return None
+
+    def looks(self, seconds, *, counts=0.0):
+        """The driver looks five times a second for so long."""
+        return self.passes(round(seconds / 0.2), 0.2, counts=counts)
 
 
 @pytest.fixture
@@ -47,36 +57,26 @@ def worker(monkeypatch):
 
 @pytest.mark.parametrize("answers", [True, False])
 def test_one_that_counts_no_further_hangs_whether_it_answers_or_not(worker, answers):
-    worker.call(0.5)
+    worker.call()
     worker.watch.begin()
     worker.answers = answers
-    assert worker.looks(19.5) is None
-    assert worker.looks(3.0) in {f"no progress for {seconds} s" for seconds in (20, 21, 22)}
+    assert worker.looks(STALL_S - 0.5) is None
+    assert worker.looks(4.0) in {f"no progress for {seconds} s" for seconds in (30, 31, 32)}
     assert worker.watch.silent is not answers
 
 
-def test_one_that_counts_slowly_is_left_alone(worker):
-    worker.call(0.5)
+@pytest.mark.parametrize("per_s", [0.1, 5.0])
+def test_one_that_counts_is_left_alone_however_slowly_and_however_long(worker, per_s):
+    """As in an evaluation of 20,000 episodes, which takes an hour where a round takes a second."""
+    worker.call()
     worker.watch.begin()
-    assert worker.looks(300.0, counts=0.1) is None
+    assert worker.looks(3600.0, counts=per_s) is None
 
 
-def test_a_call_that_counts_for_ever_hangs_too(worker):
-    worker.call(0.5)
+def test_the_first_call_may_stand_still_for_longer(worker):
     worker.watch.begin()
-    assert worker.looks(700.0, counts=5.0) == "a call that usually takes 0.5 s has taken 600 s"
-
-
-def test_the_bound_follows_its_own_calls_and_leaves_time_for_the_first(worker):
-    assert worker.watch.bound_s == 120.0
-    worker.call(1.0)
-    assert worker.watch.bound_s == 20.0
-    for _ in range(3):
-        worker.call(3.0)
-    assert worker.watch.bound_s == 30.0
-    for _ in range(9):
-        worker.call(60.0)
-    assert worker.watch.bound_s == 40.0
+    assert worker.looks(FIRST_S - 1.0) is None
+    assert worker.looks(5.0) is not None
 
 
 def test_one_that_has_nothing_to_do_or_answers_soon_is_not_even_asked(worker):
@@ -88,21 +88,49 @@ def test_one_that_has_nothing_to_do_or_answers_soon_is_not_even_asked(worker):
     assert worker.num_asked == 0
 
 
-def test_time_in_which_nobody_looked_counts_for_nobody(worker):
-    worker.call(0.5)
+@pytest.mark.parametrize("pause_s", [26.0, 30.0, 3600.0])
+def test_time_in_which_the_driver_does_not_look_counts_for_nobody(worker, pause_s):
+    """It was frozen with everybody else, waited for another worker to start, or for a disk: that is one look."""
+    worker.call()
     worker.watch.begin()
-    worker.looks(5.0)
-    worker.now += 67.0
-    worker.watch.forgive(67.0)
-    assert worker.looks(10.0) is None
-    assert worker.looks(10.0) is not None
+    assert worker.looks(5.0) is None
+    assert worker.passes(1, pause_s) is None
+    assert worker.looks(STALL_S - 5.0 - LOOK_S - 0.5) is None
+    assert worker.looks(4.0) is not None
+
+
+def test_a_driver_that_is_slow_takes_longer_to_call_a_worker_hung(worker):
+    """Each of its passes takes 5 s on a busy machine: 29 of them are no 30 s of looking."""
+    worker.call()
+    worker.watch.begin()
+    assert worker.passes(29, 5.0) is None
+    assert worker.passes(5, 5.0) is not None
+
+
+def test_one_that_was_frozen_for_less_than_that_is_left_alone(worker):
+    worker.call()
+    worker.watch.begin()
+    for _ in range(10):
+        worker.answers = False
+        assert worker.looks(25.0) is None
+        worker.answers = True
+        assert worker.looks(5.0, counts=10.0) is None
+
+
+def test_a_call_begins_anew_with_the_next_one(worker):
+    worker.watch.begin()
+    worker.watch.begin()
+    worker.looks(7.0, counts=10.0)
+    assert worker.watch.call_s == pytest.approx(7.0)
+    worker.watch.end()
+    assert worker.watch.call_s == 0.0
 
 
 def test_a_process_that_is_gone_is_left_to_its_call(worker, monkeypatch):
     def fail(reference):
         raise RayError
 
-    worker.call(0.5)
+    worker.call()
     worker.watch.begin()
     monkeypatch.setattr(watch.ray, "get", fail)
     assert worker.looks(10.0) is None
