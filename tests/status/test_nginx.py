@@ -1,5 +1,6 @@
 """Debian's nginx with the deployed file in front of a service: attacks from many addresses, and what has to pass."""
 
+import os
 import re
 import selectors
 import shutil
@@ -17,7 +18,7 @@ from tests.status.conftest import serve
 from tests.status.runs import BEARER, CLIENT, TOKEN, VIDEO
 
 DEPLOYED = Path(__file__).parents[2] / "deploy" / "nginx" / "nginx.conf"
-NGINX = shutil.which("nginx", path="/usr/sbin:/usr/local/sbin:/usr/bin:/usr/local/bin")
+NGINX = shutil.which("nginx", path=f"{os.environ['PATH']}:/usr/sbin")
 NUM_CLIENTS = 512
 HEAD = b"host: lab.example\r\n"
 
