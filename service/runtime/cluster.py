@@ -40,7 +40,7 @@ from service.io.run_directory import RunDirectory
 from service.learner.weights import MAX_POLICY_LAG
 from service.policies.parameters import Parameters, PolicyError
 from service.runtime.actor_pool import ActorPool, ActorSlot
-from service.runtime.copies import Copies
+from service.runtime.copies import Copies, going_back
 from service.runtime.iteration import Iteration, PendingRollout
 from service.runtime.learner_group import LearnerGroup, Update, check_room, num_gpus
 from service.runtime.ray_actors import GeneratorActor, LearnerActor, remote_actor
@@ -137,7 +137,8 @@ class ClusterRun(Runner):
 
     def parameters(self) -> Parameters:
         """The newest Bob, as he is evaluated and published."""
-        parameters: Parameters = ray.get(self._weights).bob_ema
+        with going_back():
+            parameters: Parameters = ray.get(self._weights).bob_ema
         return parameters
 
     def health(self) -> Health:
@@ -446,7 +447,7 @@ class ClusterRun(Runner):
 
     def _save(self) -> None:
         """Write a checkpoint of the last iteration; rounds being played and their actors are no part of it."""
-        with self.timing("checkpoint"):
+        with self.timing("checkpoint"), going_back():
             weights = ray.get(self._weights)
             parts = {"learner": self._learner.state(), "generator": ray.get(self._generator.state)}
             parts |= {"alice": weights.alice, "bob": weights.bob_ema}  # for readers without torch

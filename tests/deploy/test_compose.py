@@ -72,6 +72,19 @@ def test_secrets_and_volumes_and_files_are_there(name):
             assert "healthcheck" in SERVICES[dependency]
 
 
+@pytest.mark.parametrize("name", SERVICES)
+def test_secrets_can_be_copied_into_it(name):
+    """Compose copies secrets of variables into a container, and refuses a read_only one (docker/compose#12031)."""
+    assert not (SERVICES[name].get("read_only") and SERVICES[name].get("secrets"))
+
+
+def test_every_node_may_fetch_from_the_registry():
+    for name in ("head", "worker", "gpu-worker"):
+        environment = SERVICES[name]["environment"]
+        assert environment["TANDEM_URL"] == "http://status:8321"
+        assert environment["TANDEM_TOKEN"].startswith("${TANDEM_TOKEN:?")
+
+
 def test_no_secret_or_volume_is_left_over():
     tree = compose()
     assert set(tree["secrets"]) == {each for service in SERVICES.values() for each in service.get("secrets", [])}
@@ -122,7 +135,10 @@ def test_images_are_built_here_or_pinned():
         if "build" in service:
             assert (HERE / service["build"]["context"]).resolve() == ROOT
             assert (ROOT / service["build"]["dockerfile"]).is_file()
-            torch = service["build"].get("args", {}).get("TORCH", "cpu")
-            assert service["image"] == f"tandem:{torch}"
+            with_cuda = {"TORCH_INDEX": "https://pypi.org/simple"}  # whose torch is the CUDA build
+            assert (service["image"], service["build"].get("args")) in {
+                "tandem:cpu": None,
+                "tandem:cuda": with_cuda,
+            }.items()
         else:
             assert re.fullmatch(r"[\w/]+:v?\d+\.\d+[\w.-]*", service["image"])

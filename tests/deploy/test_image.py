@@ -1,4 +1,4 @@
-"""The Dockerfile, read line by line: nothing can build it here."""
+"""The Dockerfile, read line by line. ``tools/deployed.py`` builds it, which takes too long for a test."""
 
 import re
 import shlex
@@ -49,19 +49,19 @@ def test_instructions_are_known():
     assert {word for word, _ in instructions()} == INSTRUCTIONS
 
 
-def test_both_builds_of_torch_have_a_stage():
-    assert ("ARG", "TORCH=cpu") in instructions()
-    found = stages()
-    assert found["packages"][0] == "torch-${TORCH}"
-    indexes = {name: dict(found[name][1])["ENV"] for name in found if name.startswith("torch-")}
-    assert set(indexes) == {"torch-cpu", "torch-cuda"}
-    assert indexes["torch-cpu"].endswith("/whl/cpu")
+def test_indexes_are_arguments():
+    values = {rest.split("=")[0]: rest.split("=")[1] for word, rest in stages()["packages"][1] if word == "ARG"}
+    assert values == {
+        "TORCH_INDEX": "https://download.pytorch.org/whl/cpu", "PIP_INDEX_URL": "https://pypi.org/simple",
+    }  # fmt: skip
+    (run,) = [shell(rest) for word, rest in stages()["packages"][1] if word == "RUN"]
+    assert '--index-url "$TORCH_INDEX" --no-deps torch' in run  # pip takes the other from the environment
 
 
 def test_stages_build_on_stages():
     known = set()
     for name, (base, body) in stages().items():
-        assert base in known or base in {"${PYTHON}", "torch-${TORCH}"}, base
+        assert base in known or base == "${PYTHON}", base
         sources = [match for _, rest in body for match in re.findall(r"(?:--from=|,?from=)([a-z]+)", rest)]
         assert set(sources) <= known
         known.add(name)

@@ -371,15 +371,21 @@ def test_a_policy_that_diverges_ends_the_run_with_how_to_go_on(tmp_path):
     assert "\n" not in str(error.value)
 
 
-def test_a_snapshot_lost_with_its_machine_sends_the_run_back(tmp_path):
-    """No other round could be played: its actor is not to blame."""
+def lost_object():
+    """A reference to what went with its machine."""
 
     def lost():
         raise ObjectLostError("ab" * 28, "", "")
 
+    return ray.remote(lost).options(num_cpus=0, max_retries=0).remote()
+
+
+def test_a_snapshot_lost_with_its_machine_sends_the_run_back(tmp_path):
+    """No other round could be played: its actor is not to blame."""
+
     def lose(run, metrics):
         if metrics["iteration"] == 3:
-            run._snapshot = ray.remote(lost).options(num_cpus=0, max_retries=0).remote()
+            run._snapshot = lost_object()
 
     with pytest.raises(StateLostError, match=r"goes back to its newest checkpoint") as error:
         run_cluster(tmp_path, tiny_config(total_env_steps=10**9), num_actors=1, on_iteration=lose)
@@ -398,8 +404,7 @@ def test_a_raylet_that_is_frozen_is_silent_and_one_that_stays_so_is_given_up(mon
         assert holds()
 
     with RayletWatch(lost.append) as raylet:
-        time.sleep(1.5)
-        assert not raylet.silent
+        wait_until(lambda: not raylet.silent)
         os.kill(pid, signal.SIGSTOP)
         try:
             wait_until(lambda: raylet.silent)
@@ -411,4 +416,16 @@ def test_a_raylet_that_is_frozen_is_silent_and_one_that_stays_so_is_given_up(mon
             wait_until(lambda: lost)
         finally:
             os.kill(pid, signal.SIGCONT)
-    assert lost == ["Ray's process for this machine, the raylet, has not answered for 2 s"]
+    (reason,) = lost
+    assert reason.startswith("Ray's process for this machine, the raylet, has not answered for ")
+
+
+def test_a_state_lost_before_it_was_saved_sends_the_run_back(tmp_path):
+    def lose(run, metrics):
+        if metrics["iteration"] == 3:
+            run._generator.state = lost_object()
+
+    config = tiny_config(total_env_steps=10**9, checkpoint_interval=3)
+    with pytest.raises(StateLostError, match=r"newest state is lost .* goes back to its newest checkpoint") as error:
+        run_cluster(tmp_path, config, num_actors=1, on_iteration=lose)
+    assert "\n" not in str(error.value)
