@@ -30,17 +30,18 @@ from typing import Any
 
 import numpy as np
 import ray
-from ray.exceptions import RayError
+from ray.exceptions import ObjectLostError, RayError
 
 from service.actors.evaluation import EVALUATED_GOALS
 from service.actors.rollout import from_arrays
 from service.config import Config
 from service.errors import DivergedError, GroupError
 from service.io.run_directory import RunDirectory
+from service.learner.shares import join_states
 from service.learner.weights import MAX_POLICY_LAG
 from service.policies.parameters import Parameters, PolicyError
 from service.runtime.actor_pool import ActorPool, ActorSlot
-from service.runtime.copies import Copies, going_back
+from service.runtime.copies import Copies
 from service.runtime.iteration import Iteration, PendingRollout
 from service.runtime.learner_group import LearnerGroup, Update, check_room, num_gpus
 from service.runtime.ray_actors import GeneratorActor, LearnerActor, remote_actor
@@ -137,8 +138,7 @@ class ClusterRun(Runner):
 
     def parameters(self) -> Parameters:
         """The newest Bob, as he is evaluated and published."""
-        with going_back():
-            parameters: Parameters = ray.get(self._weights).bob_ema
+        parameters: Parameters = _fetch(self._weights).bob_ema
         return parameters
 
     def health(self) -> Health:
@@ -221,10 +221,7 @@ class ClusterRun(Runner):
         if isinstance(error, (DivergedError, PolicyError)):
             raise error
         if lost(error):
-            raise StateLostError(
-                f"weights or goals were lost with the machine that kept them ({one_line(error)}); the run goes back to "
-                "its newest checkpoint"
-            ) from None
+            raise StateLostError(f"weights or goals went with the machine that kept them ({one_line(error)})") from None
         self._slots.lose(ticket)
         self._replace(slot, one_line(error))
 
@@ -447,9 +444,9 @@ class ClusterRun(Runner):
 
     def _save(self) -> None:
         """Write a checkpoint of the last iteration; rounds being played and their actors are no part of it."""
-        with self.timing("checkpoint"), going_back():
-            weights = ray.get(self._weights)
-            parts = {"learner": self._learner.state(), "generator": ray.get(self._generator.state)}
+        with self.timing("checkpoint"):
+            weights, generator, *states = _fetch([self._weights, self._generator.state, *self._learner.states])
+            parts = {"learner": join_states(states), "generator": generator}
             parts |= {"alice": weights.alice, "bob": weights.bob_ema}  # for readers without torch
             rng = np.random.default_rng([self.config.seed, self.iteration])  # what a local runner goes on with
             meta = {"next_incarnation": self._next_incarnation, "rng": rng.bit_generator.state}
@@ -475,3 +472,10 @@ class ClusterRun(Runner):
     def _start_generator(self, state: Any) -> RemoteWorker:
         actor = remote_actor(GeneratorActor, num_cpus=0)
         return RemoteWorker("generator", actor, self.config, state, self._clock, self._beat)
+
+
+def _fetch(state: Any) -> Any:
+    try:
+        return ray.get(state)
+    except ObjectLostError as error:  # it went with its node, before it was copied to this one
+        raise StateLostError(f"the newest state is lost ({one_line(error)})") from None

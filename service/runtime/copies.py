@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Iterable
+from contextlib import suppress
 from typing import Any
 
 import ray
-from ray.exceptions import ObjectLostError, RayError
-
-from service.runtime.remote_worker import one_line
-from service.runtime.runner import StateLostError
+from ray.exceptions import RayError
 
 
 class Copies:
@@ -32,18 +29,3 @@ class Copies:
         if reference in self._values:
             with suppress(RayError):  # it went with its node, and who needs it will say so
                 self._values[reference] = ray.get(reference)
-
-
-@contextmanager
-def going_back() -> Iterator[None]:
-    """Say that the run has to go back where the newest state went with its node, before it was copied here.
-
-    Raises:
-        StateLostError: it did.
-    """
-    try:
-        yield
-    except ObjectLostError as error:
-        raise StateLostError(
-            f"the newest state is lost ({one_line(error)}); the run goes back to its newest checkpoint"
-        ) from error

@@ -15,7 +15,7 @@ from ray.exceptions import GetTimeoutError, RayActorError, RayTaskError
 
 from service.config import Config
 from service.errors import TandemError
-from service.learner.shares import join_states, share_out
+from service.learner.shares import share_out
 from service.runtime.ray_actors import Location
 from service.runtime.remote_worker import ANSWER_S, RANK_ANSWER_S, START_S, OnWait, Worker, one_line, wait_for
 from service.runtime.runner import ClusterError
@@ -124,10 +124,6 @@ class LearnerGroup(Worker):
     def keep(self, update: Update) -> None:
         """Go on from the states after an update that is done."""
         self.states, self._pending = update.states, None
-
-    def state(self) -> Arrays:
-        """The newest state, as one learner would have it."""
-        return join_states(ray.get(self.states))
 
     def note_answer(self, rank: int) -> None:
         """Note that a rank has answered an update."""

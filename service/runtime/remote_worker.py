@@ -84,9 +84,7 @@ class Worker(ABC):
                 _logger.warning("the %s did not start (%s)", self.name, reason)
                 if lost(error):
                     break
-        raise StateLostError(
-            f"the {self.name} cannot go on from its last state ({reason}); the run goes back to its newest checkpoint"
-        )
+        raise StateLostError(f"the {self.name} cannot go on from its last state ({reason})")
 
     def end_if_hung(self) -> None:
         """Kill it if it hangs; what it was asked then fails. To be asked often."""

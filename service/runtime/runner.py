@@ -32,7 +32,11 @@ class ClusterError(TandemError):
 
 
 class StateLostError(ClusterError):
-    """The state of learner or generator was lost with the machine that kept it; the newest checkpoint has it."""
+    """A state was lost with the machine that kept it; the newest checkpoint has one."""
+
+    def __init__(self, lost: str) -> None:
+        """Say what was lost, and how the run goes on."""
+        super().__init__(f"{lost}; the run goes back to its newest checkpoint")
 
 
 @dataclass(frozen=True, slots=True)
