@@ -34,6 +34,8 @@ class RayletWatch:
         self._on_lost = on_lost
         self._channel = init_grpc_channel(f"{node['NodeManagerAddress']}:{node['NodeManagerPort']}")
         self._over = Event()
+        self.answers = False
+        """Whether it has ever answered; one that has not may be out of reach, and well."""
         self.silent = False
         """Whether it has not answered for some seconds."""
         self._thread = Thread(target=self._watch, name="raylet", daemon=True)
@@ -49,14 +51,14 @@ class RayletWatch:
 
     def _watch(self) -> None:
         ask = self._channel.unary_unary("/grpc.health.v1.Health/Check")
-        clock, answer, ever = Clock(), ask.future(b""), False
+        clock, answer = Clock(), ask.future(b"")
         while not self._over.wait(PROBE_S):
             clock.look()
             if answer.done():
                 if answer.exception() is None:
-                    clock, ever = Clock(), True
+                    clock, self.answers = Clock(), True
                 answer = ask.future(b"")
-            self.silent = ever and clock.now > SILENT_S  # one that never answered may be out of reach, and well
-            if ever and clock.now > LOST_S:
+            self.silent = self.answers and clock.now > SILENT_S
+            if self.answers and clock.now > LOST_S:
                 self._on_lost(f"Ray's process for this machine, the raylet, has not answered for {clock.now:.0f} s")
                 return

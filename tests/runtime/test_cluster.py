@@ -404,7 +404,7 @@ def test_a_raylet_that_is_frozen_is_silent_and_one_that_stays_so_is_given_up(mon
         assert holds()
 
     with RayletWatch(lost.append) as raylet:
-        wait_until(lambda: not raylet.silent)
+        wait_until(lambda: raylet.answers)
         os.kill(pid, signal.SIGSTOP)
         try:
             wait_until(lambda: raylet.silent)
