@@ -38,6 +38,7 @@ CLUSTER_MODULES = (
     "learner_group",
     "ray_actors",
     "ray_connection",
+    "raylet",
     "remote_worker",
     "status_actor",
     "watch",

@@ -1,6 +1,6 @@
 """The services of a compose file as Docker Compose reads them: variables put in, secrets and mounts looked up.
 
-What this cannot do as Compose does is an error, so that no key of the file is left out unseen.
+A key of a service that is not known here is an error. Of the keys below it only those are read that are needed here.
 """
 
 from __future__ import annotations
@@ -46,11 +46,10 @@ class Port:
 
 @dataclass(frozen=True, slots=True)
 class Dependency:
-    """What a service waits for, and whether it is restarted with it."""
+    """What a service waits for."""
 
     service: str
     healthy: bool
-    restart: bool
 
 
 @dataclass(frozen=True, slots=True)
@@ -140,8 +139,7 @@ def _service(name: str, tree: Mapping[str, Any], directory: Path, secrets: Mappi
         secrets={each: secrets[each] for each in tree.get("secrets", [])},
         ports=[_port(text) for text in tree.get("ports", [])],
         depends_on=[
-            Dependency(other, each.get("condition") == "service_healthy", each.get("restart", False))
-            for other, each in depends_on.items()
+            Dependency(other, each.get("condition") == "service_healthy") for other, each in depends_on.items()
         ],
         health=_health(tree["healthcheck"]["test"]) if "healthcheck" in tree else None,
         num_containers=int(deploy.get("replicas", 1)),

@@ -89,7 +89,7 @@ class Store:
         run([*self._buildah, "rm", "--all"], check=False)
 
     def describe(self) -> dict[str, Any]:
-        """Id and size of Tandem's image, and the versions of the programs in the other."""
+        """Id and size of Tandem's image."""
         row = run([*self._buildah, "images", "--format", "{{.ID}} {{.Size}}", TANDEM]).stdout.split(maxsplit=1)
         return {"id": row[0], "size": row[1].strip()}
 

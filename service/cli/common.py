@@ -100,8 +100,8 @@ class CommandGroup(TyperGroup):
             for before, argument in zip(["", *args], args, strict=False):
                 if argument == "" or re.fullmatch(r"--[a-z-]+=", argument):
                     raise TandemError(
-                        f"{argument or before}: an argument is empty; is a variable of the shell not set? Give it a "
-                        "value, or leave it out"
+                        f"{argument or before or 'the first word'}: an argument is empty; is a variable of the shell "
+                        "not set? Give it a value, or leave it out"
                     )
             return super().make_context(info_name, args, parent, **extra)
 

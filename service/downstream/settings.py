@@ -6,6 +6,7 @@ from typing import Any, TypeVar
 
 from pydantic import Field, ValidationError
 
+from service.config_tree import check_numbers
 from service.downstream.methods import find_method
 from service.envs.gym.registration import EPISODE_STEPS
 from service.envs.tasks import SUCCESS_DISTANCE_M, find_task
@@ -77,7 +78,9 @@ def validate(kind: type[_Settings], values: Any) -> _Settings:
         TandemError: the first thing that is wrong, as ``key = value: why``.
     """
     try:
-        return kind.model_validate(values)
+        read = kind.model_validate(values)
+        check_numbers(values, read.model_dump(), where="settings")
+        return read
     except ValidationError as error:
         first = error.errors()[0]
         where = ".".join(str(part) for part in first["loc"])

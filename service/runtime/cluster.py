@@ -223,12 +223,15 @@ class ClusterRun(Runner):
         if lost(error):
             raise StateLostError(f"weights or goals went with the machine that kept them ({one_line(error)})") from None
         self._slots.lose(ticket)
-        self._replace(slot, one_line(error))
+        self._on_failed_actor(slot, one_line(error))
 
-    def _replace(self, slot: ActorSlot, reason: str) -> None:
+    def _on_failed_actor(self, slot: ActorSlot, reason: str) -> None:
         self._num_failed_rounds += 1
         if self._num_failed_rounds > MAX_FAILED_ROUNDS:
             raise ClusterError(f"{MAX_FAILED_ROUNDS + 1} rollout actors in a row failed, at last with: {reason}")
+        self._replace(slot, reason)
+
+    def _replace(self, slot: ActorSlot, reason: str) -> None:
         _logger.warning("rollout actor %d is gone (%s); another takes its place", slot.index, reason)
         self._last_error = f"rollout-{slot.index}: {reason}"
         self._await_start(self._pool.replace(slot, reason))
@@ -245,7 +248,7 @@ class ClusterRun(Runner):
             if slot.incarnation > 0:
                 _logger.info("rollout actor %d is back, as its incarnation %d", slot.index, slot.incarnation)
         except RayError as error:
-            self._replace(slot, one_line(error))
+            self._on_failed_actor(slot, one_line(error))
 
     # --- iterations ------------------------------------------------------------------------------------------------
 

@@ -10,6 +10,7 @@ import time
 from contextlib import ExitStack, closing, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
+from threading import Thread
 from typing import TYPE_CHECKING, Literal, cast
 
 from service.config import Config
@@ -42,6 +43,8 @@ MAX_STATES_LOST = 5
 """Times in a row that a run goes back to a checkpoint without getting beyond it."""
 BACK_OFF_S = 2.0
 """Pause before the second time; it doubles."""
+END_S = 5.0
+"""Most time to tell how a run ended whose process is ended at once."""
 _logger = logging.getLogger(__name__)
 
 
@@ -116,11 +119,6 @@ def pretrain(
         begins = "goes on with" if resume else "begins"
         log.note(f"process {os.getpid()} on {socket.gethostname()} {begins} the run ({runtime} runtime)")
         stack.enter_context(report)
-        if cluster is not None and cluster.status is not None:
-            from service.runtime.status_actor import serving
-
-            url = stack.enter_context(serving(cluster.status, directory.path.absolute().parent, registry, redis))
-            _logger.info("status: %s/v1/runs/%s", url, run_id)
         raylet = None
         if cluster is not None:
             from service.runtime.ray_connection import explaining_ray_errors
@@ -128,6 +126,11 @@ def pretrain(
 
             stack.enter_context(explaining_ray_errors())  # before the report has them
             raylet = stack.enter_context(RayletWatch(lambda what: _end_now(report, directory, what)))
+        if cluster is not None and cluster.status is not None:
+            from service.runtime.status_actor import serving
+
+            url = stack.enter_context(serving(cluster.status, directory.path.absolute().parent, registry, redis))
+            _logger.info("status: %s/v1/runs/%s", url, run_id)
         num_lost, furthest = 0, -1
         while True:
             with doing("starting", aloud=False):
@@ -211,12 +214,15 @@ def _start(
 
 def _end_now(report: Report, directory: RunDirectory, what: str) -> None:
     """End this process from a thread while Ray is frozen: no call of the main thread may ever come back."""
-    saved = next(reversed(CheckpointStore(directory.checkpoints, keep=1).steps()), None)
-    text = f"{what}; " + ("nothing is saved yet" if saved is None else f"--resume goes on from iteration {saved}")
-    with suppress(Exception):
-        report.end("failed", error=f"ClusterError: {text}")
-    print(f"error: {text}", file=sys.stderr, flush=True)
-    os._exit(ClusterError.exit_code)
+    try:
+        saved = next(reversed(CheckpointStore(directory.checkpoints, keep=1).steps()), None)
+        text = f"{what}; " + ("nothing is saved yet" if saved is None else f"--resume goes on from iteration {saved}")
+        print(f"error: {text}", file=sys.stderr, flush=True)
+        ending = Thread(target=report.__exit__, args=(ClusterError, ClusterError(text), None), daemon=True)
+        ending.start()
+        ending.join(END_S)  # a disk or a Redis may stand still, too
+    finally:
+        os._exit(ClusterError.exit_code)
 
 
 def _run(

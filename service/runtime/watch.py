@@ -82,6 +82,7 @@ class Watch:
         """Note that it has answered a call."""
         self._num_calls = max(0, self._num_calls - 1)
         self._bound_s = STALL_S
+        self.silent = False
         self._began = self._moved = self._clock.now
         self.heartbeat = datetime.now(UTC)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import socket
 
 DEFAULT_PORT = 8321
@@ -21,7 +22,7 @@ def free_port(host: str, first: int = 0) -> int:
     try:
         family, _, _, _, address = socket.getaddrinfo(host, first, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)[0]
     except UnicodeError as error:
-        raise OSError(f"{host!r} is no name of a host") from error
+        raise OSError(errno.EINVAL, f"{host!r} is no name of a host") from error
     for port in range(first, min(first + MAX_TRIED, 65536)):
         with socket.socket(family) as probe:
             probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)  # as the service itself

@@ -230,7 +230,7 @@ class DiskReader:
 
 def _is_run(path: Path) -> bool:
     """Whether it is a run's directory, or one that cannot be looked into, which may be a run's."""
-    if path.name.startswith("."):
+    if path.name.startswith(".") or path.name == "lost+found":  # the latter is of the file system
         return False
     files = (path / STATUS_FILE, path / "config.yaml", path / TRIAL_FILE)
     return any(map(os.path.isfile, files)) or _why_closed(path) is not None

@@ -214,6 +214,7 @@ PRETRAIN = ("pretrain", "--config", "tiny.yaml", "--registry", "new", "--set", "
 TYPED = {
     "no id": ((*PRETRAIN, "--run-id", ""), "--run-id: an argument is empty"),
     "no id, joined": ((*PRETRAIN, "--run-id="), "--run-id=: an argument is empty"),
+    "no command": (("",), "the first word: an argument is empty"),
     "no directory": ((*PRETRAIN, "--run-dir", ""), "--run-dir: an argument is empty"),
     "no host": (("serve", "--runs", ".", "--host", ""), "--host: an argument is empty"),
     "an id that leads out": ((*PRETRAIN, "--run-id", "../../etc"), "--run-id '../../etc': use 1 to 128 letters"),
@@ -221,6 +222,8 @@ TYPED = {
     "an absolute id": ((*PRETRAIN, "--run-id", "/tmp/x"), "--run-id '/tmp/x'"),
     "an id with a line end": ((*PRETRAIN, "--run-id", "x\n"), "--run-id 'x\\n'"),
     "true as a number": ((*PRETRAIN, "--run-dir", "new", "--set", "game.num_worlds=true"), "expected a number"),
+    "true as a number of a task": (("downstream", "train", "--task", "push", "--method", "scratch-monolithic",
+        "--run-dir", "new", "--set", "num_worlds=true"), "expected a number"),
     "a lock that is a link": ((*PRETRAIN, "--run-dir", "locked"), "locked/.lock: a symbolic link"),
     "a host that is no text": (("serve", "--runs", ".", "--host", NOT_UTF8), "--host is a name or address"),
     "a host that is no text, to play": (("play", "--primitives", "tiny", "--registry", "registry", "--host", NOT_UTF8),

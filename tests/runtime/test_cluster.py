@@ -18,7 +18,7 @@ from service.errors import DivergedError
 from service.io.checkpoints import CheckpointStore
 from service.io.run_directory import RunDirectory
 from service.runtime import watch
-from service.runtime.cluster import ClusterRun
+from service.runtime.cluster import MAX_FAILED_ROUNDS, ClusterRun
 from service.runtime.learner_group import LearnerGroup
 from service.runtime.ray_actors import NICENESS
 from service.runtime.ray_connection import ClusterOptions, connected
@@ -390,6 +390,21 @@ def test_a_snapshot_lost_with_its_machine_sends_the_run_back(tmp_path):
     with pytest.raises(StateLostError, match=r"goes back to its newest checkpoint") as error:
         run_cluster(tmp_path, tiny_config(total_env_steps=10**9), num_actors=1, on_iteration=lose)
     assert "\n" not in str(error.value)
+
+
+def test_actors_that_wait_for_a_core_do_not_end_the_run(tmp_path):
+    """However many they are, and however often they are started anew."""
+    num_replaced = []
+
+    def hurry(run, metrics):
+        num_replaced.append(sum(slot.incarnation for slot in run._pool))
+        for slot in run._pool:
+            if not slot.alive:
+                slot.may_start_s = 0.01
+
+    _, result = run_cluster(tmp_path, tiny_config(total_env_steps=600), num_actors=26, on_iteration=hurry)
+    assert result.reason == "finished"
+    assert num_replaced[-1] > MAX_FAILED_ROUNDS
 
 
 def test_a_raylet_that_is_frozen_is_silent_and_one_that_stays_so_is_given_up(monkeypatch):
