@@ -31,8 +31,8 @@ def strikes_words(result: Result) -> str:
     commits = Counter(f"at `{each['commit'][:7]}`" if each.get("commit") else "without a commit" for each in judged)
     recorded = ", ".join(f"{num} {where}" for where, num in commits.items())
     return (
-        f"{reached} of {len(judged)} strikes ended as they must; {tracebacks} tracebacks in all logs. Rows were recorded one "
-        f"by one: {recorded}. The newest was recorded here:{measured_on(result['machine'])}"
+        f"{reached} of {len(judged)} strikes ended as they must; {tracebacks} tracebacks in all logs. Rows were "
+        f"recorded one by one: {recorded}. The newest was recorded here:{measured_on(result['machine'])}"
     )
 
 
