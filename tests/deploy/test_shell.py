@@ -127,7 +127,9 @@ def test_redis_starts_with_a_password_and_keeps_what_it_is_told(where, tmp_path)
         assert server.wait(300) == 0
 
 
-@pytest.mark.skipif(shutil.which("redis-check-aof") is None, reason="it comes with Redis itself")
+@pytest.mark.skipif(
+    shutil.which("redis-check-aof") is None, reason="needs redis-check-aof; on Debian: apt-get install redis-server"
+)
 @pytest.mark.parametrize("where", ["compose", "kubernetes"])
 def test_a_damaged_file_of_redis_is_set_aside_and_it_starts(where, tmp_path):
     """Bytes in the middle that nobody wrote; what came before them is kept."""
