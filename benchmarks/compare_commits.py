@@ -1,18 +1,24 @@
-"""Env steps a second of the whole learning loop at two commits, measured in turn on the same cores.
+"""Env steps a second at two commits, of the whole learning loop or of bare worlds, in turn on the same cores.
 
     python -m benchmarks.compare_commits 10399f0 HEAD --json docs/results/throughput.json
+    python -m benchmarks.compare_commits 2b220b3^ HEAD --worlds --json docs/results/world_speed.json
 
 Each commit is checked out into a worktree of its own and trains with its own shipped configuration for the same number
 of env steps, since policies that touch the object make its physics dearer. From there a number of iterations is
 measured, old, new, old, new, each time in a new process and from the same checkpoint: each repeats the same work bit
 for bit, so what differs between them is the machine. Learning is part of it, and so are the evaluations, checkpoints
 and records that fall into 20 iterations. Only the command line is used, which all commits have.
+
+Bare worlds play episodes of random actions in the world of their commit's recipe, with one thread: what an actor does
+but for its policies. With few worlds NumPy's calls weigh most, with many its arithmetic.
 """
 
 from __future__ import annotations
 
+import json
 import shutil
 import subprocess
+import sys
 import tempfile
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -31,11 +37,31 @@ from benchmarks.measuring import (
     ratio,
     run_benchmark,
 )
-from benchmarks.training_process import ENDLESS, Training, copy_run, measure_training, overrides, scratch
+from benchmarks.training_process import (
+    ENDLESS,
+    Training,
+    copy_run,
+    environment,
+    measure_training,
+    overrides,
+    scratch,
+)
 from service.errors import TandemError
 from service.io.run_directory import RunDirectory
 
 PACKAGES = ("mujoco", "numpy", "torch")
+NUM_WORLDS = (8, 240)
+_PLAY_WORLDS = """
+import json, sys
+from dataclasses import asdict
+from benchmarks.env_throughput import BatchContender
+from benchmarks.measuring import RECIPE_FILE, measure
+from service.config import load_config
+play = BatchContender(load_config(RECIPE_FILE).world, int(sys.argv[1])).episode
+play()
+print(json.dumps(asdict(measure(play, float(sys.argv[2])))))
+"""
+"""What runs with the code of a commit."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,6 +73,8 @@ class Settings:
     num_pairs: int = 5
     num_iterations: int = 20
     """Iterations of each measurement, with the evaluations and checkpoints that fall into them."""
+    seconds: float = 2.0
+    """Length of each measurement of bare worlds."""
 
 
 @contextmanager
@@ -107,23 +135,50 @@ def compare(trees: Mapping[str, Path], home: Path, settings: Settings) -> dict[s
     return samples
 
 
-def benchmark(old: str, new: str, settings: Settings) -> dict[str, Any]:
-    """Compare two commits in directories that are deleted at the end; the ratio is the new one's speed by the old's."""
-    commits = [full_name(commit) for commit in (old, new)]
-    if commits[0] == commits[1]:
+def sample_of(program: str, tree: Path, home: Path, *arguments: object) -> Sample:
+    """Run a program with the code of a checkout; the sample that it prints.
+
+    Raises:
+        TandemError: it fails.
+    """
+    command = [sys.executable, "-c", program, *map(str, arguments)]
+    done = subprocess.run(command, cwd=tree, env=environment(home, tree), capture_output=True, text=True, check=False)
+    if done.returncode:
+        raise TandemError(f"the code in {tree} cannot be measured: {' '.join(done.stderr.split()[-30:])}")
+    return Sample(**json.loads(done.stdout.splitlines()[-1]))
+
+
+def compare_worlds(trees: Mapping[str, Path], home: Path, settings: Settings) -> dict[str, dict[str, list[Sample]]]:
+    """Samples of the bare worlds of every tree in turn, by the number of worlds and by the name of the tree."""
+    found: dict[str, dict[str, list[Sample]]] = {str(num): {name: [] for name in trees} for num in NUM_WORLDS}
+    for num, samples in found.items():
+        for _ in range(settings.num_pairs):
+            for name, tree in trees.items():
+                samples[name].append(sample_of(_PLAY_WORLDS, tree, home, num, settings.seconds))
+    return found
+
+
+def benchmark(old: str, new: str, settings: Settings, *, worlds: bool = False) -> dict[str, Any]:
+    """Compare two commits in directories that are deleted at the end; a ratio is the new one's speed by the old's."""
+    commits = {"old": full_name(old), "new": full_name(new)}
+    if commits["old"] == commits["new"]:
         raise TandemError(f"{old} and {new} are the same commit; name two")
-    names = [commit[:7] for commit in commits]
-    with worktree(commits[0]) as before, worktree(commits[1]) as after, scratch() as home:
+    first, last = names = [commit[:7] for commit in commits.values()]
+    with worktree(commits["old"]) as before, worktree(commits["new"]) as after, scratch() as home:
+        if worlds:
+            found = compare_worlds({"old": before, "new": after}, home, settings)
+            rows = {num: {name: rates(each) for name, each in samples.items()} for num, samples in found.items()}
+            ratios = {num: ratio(samples["new"], samples["old"]) for num, samples in found.items()}
+            return {"commits": commits, "rows": rows, "ratios": ratios}
         samples = compare(dict(zip(names, (before, after), strict=True)), home, settings)
-    return {
-        "commits": {"old": commits[0], "new": commits[1]},
-        "rows": {name: rates(each) for name, each in samples.items()},
-        "ratio": ratio(samples[names[1]], samples[names[0]]),
-    }
+    rows = {name: rates(each) for name, each in samples.items()}
+    return {"commits": commits, "rows": rows, "ratio": ratio(samples[last], samples[first])}
 
 
 def report(result: dict[str, Any]) -> str:
     """A result for people."""
+    if "ratios" in result:
+        return "\n".join(describe_ratio(f"new / old, {num} worlds", each) for num, each in result["ratios"].items())
     return f"{rates_table(result['rows'])}\n{describe_ratio('new / old', result['ratio'])}"
 
 
@@ -132,10 +187,13 @@ def main() -> int:
     parser = parser_of(__doc__, Settings())
     parser.add_argument("old", metavar="OLD", help="a commit")
     parser.add_argument("new", metavar="NEW", nargs="?", default="HEAD", help="a later one (default: %(default)s)")
+    parser.add_argument("--worlds", action="store_true", help="bare worlds, not the whole loop")
     given = parser.parse_args()
-    return run_benchmark(
-        "throughput", PACKAGES, given, Settings, lambda settings: benchmark(given.old, given.new, settings), report
-    )
+
+    def run(settings: Settings) -> dict[str, Any]:
+        return benchmark(given.old, given.new, settings, worlds=given.worlds)
+
+    return run_benchmark("world_speed" if given.worlds else "throughput", PACKAGES, given, Settings, run, report)
 
 
 if __name__ == "__main__":

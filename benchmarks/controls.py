@@ -25,9 +25,9 @@ from service.downstream.worker import RunOptions, run_trial
 from service.errors import TandemError
 from service.io.run_directory import RunDirectory
 from service.media.figures import read_records
-from service.primitives.loading import load_bob
-from service.runtime.pretrain import pretrain
-from service.runtime.resuming import resumed_config
+from service.primitives.loading import load
+from service.runs.resuming import resumed_config
+from service.runs.train import train
 
 OURS = "ours"
 _WITHOUT_ALICE = ("game.alice_plays=false", "generator.past_opponent_fraction=0")
@@ -51,11 +51,7 @@ _KEPT = (*COUNTERS, "evaluation/", "bob/", "alice/valid_fraction", "alice/lifted
 
 
 def control_config(recipe: Path, name: str, seed: int, bob_steps: int, settings: list[str]) -> Config:
-    """The recipe as a control has it.
-
-    Raises:
-        TandemError: no such control, or a setting that is wrong.
-    """
+    """The recipe as a control has it."""
     if name not in CONTROLS:
         raise TandemError(f"no control {name!r}; choose one of {', '.join(CONTROLS)}")
     alone = "game.alice_plays=false" in CONTROLS[name]
@@ -66,16 +62,10 @@ def control_config(recipe: Path, name: str, seed: int, bob_steps: int, settings:
 
 
 def record_control(directory: RunDirectory, name: str, downstream: dict[str, Any]) -> Run:
-    """Everything that is kept of a control.
-
-    Args:
-        directory: of its run, which has ended.
-        name: in ``CONTROLS``.
-        downstream: results of its trials by task.
-    """
+    """Everything that is kept of a control whose run has ended; ``downstream`` has results of its trials by task."""
     config, records = directory.read_config(), read_records(directory.metrics_file)
     kept = [{key: value for key, value in record.items() if key.startswith(_KEPT)} for record in records]
-    bob = load_bob(str(directory.path), directory.path).policy
+    bob = load(str(directory.path)).policy
     return {
         "format_version": FORMAT_VERSION,
         "name": f"{name}-{config.seed}",
@@ -111,10 +101,10 @@ def run_control(config: Config, name: str, given: argparse.Namespace) -> Run:
         raise TandemError(
             f"{directory.path} holds a run of another configuration; remove it, or name another --run-dir"
         )
-    done = pretrain(config, directory, directory.path, resume=resume, publish=False, on_iteration=_show)
+    done = train(config, directory, directory.path, resume=resume, publish=False, on_iteration=_show)
     if done.result.reason == "interrupted":  # what it learned so far is no result
         raise TandemError(f"stopped at {done.result.num_env_steps:,} env steps; the same command goes on from there")
-    bob = load_bob(str(directory.path), directory.path)
+    bob = load(str(directory.path))
     found = {}
     for task in TASKS:
         trial = make_trial(
@@ -136,7 +126,17 @@ def _show(metrics: dict[str, float]) -> None:
 
 def main() -> int:
     """Parse the command line, run and record what is not there yet."""
-    given = _parser().parse_args()
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    add, out = parser.add_argument, ROOT / "docs" / "results" / "controls"
+    add("names", metavar="NAME", nargs="+", help=", ".join(CONTROLS))
+    add("--seed", type=int, default=0, help="of the run and of its trials (default: %(default)s)")
+    add("--bob-steps", type=int, default=BOB_STEPS, help="Bob's env steps of each run (default: %(default)s)")
+    add("--steps", type=int, default=300_000, help="env steps of each downstream training (default: %(default)s)")
+    add("--config", type=Path, metavar="FILE", default=RECIPE_FILE)
+    add("--set", dest="overrides", metavar="A.B=C", action="append", default=[], help="repeatable")
+    add("--run-dir", type=Path, metavar="DIR", default=Path("runs") / "controls", help="default: %(default)s")
+    add("--out", type=Path, metavar="DIR", default=out, help="for the recorded files")
+    given = parser.parse_args()
     try:
         configs = {
             name: control_config(given.config, name, given.seed, given.bob_steps, given.overrides)
@@ -154,22 +154,6 @@ def main() -> int:
         print(f"error: {error}", file=sys.stderr)
         return 2
     return 0
-
-
-def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    add = parser.add_argument
-    add("names", metavar="NAME", nargs="+", help=", ".join(CONTROLS))
-    add("--seed", type=int, default=0, help="of the run and of its trials (default: %(default)s)")
-    add("--bob-steps", type=int, default=BOB_STEPS, help="Bob's env steps of each run (default: %(default)s)")
-    add("--steps", type=int, default=300_000, help="env steps of each downstream training (default: %(default)s)")
-    add("--config", type=Path, metavar="FILE", default=RECIPE_FILE)
-    add("--set", dest="overrides", metavar="A.B=C", action="append", default=[], help="repeatable")
-    add("--run-dir", type=Path, metavar="DIR", default=Path("runs") / "controls", help="default: %(default)s")
-    add(
-        "--out", type=Path, metavar="DIR", default=ROOT / "docs" / "results" / "controls", help="for the recorded files"
-    )
-    return parser
 
 
 if __name__ == "__main__":

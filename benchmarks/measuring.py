@@ -14,7 +14,6 @@ import os
 import platform
 import re
 import statistics
-import subprocess
 import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -190,8 +189,9 @@ def run_benchmark(
     settings: type[_Settings],
     benchmark: Callable[[_Settings], dict[str, Any]],
     report: Callable[[dict[str, Any]], str],
+    failed: Callable[[dict[str, Any]], bool] = lambda result: False,
 ) -> int:
-    """Measure, write ``--json`` under the benchmark's name, print the report; the exit code.
+    """Measure, write ``--json`` under the benchmark's name, print the report; the exit code, 1 where it has failed.
 
     ``settings`` is the dataclass that ``parser_of`` had, and what ``benchmark`` takes; ``packages`` are those whose
     versions matter.
@@ -208,21 +208,7 @@ def run_benchmark(
         print(f"error: {error}", file=sys.stderr)
         return 2
     print(report(result))
-    return 0
-
-
-def ask_module(module: str, *arguments: object, environment: Mapping[str, str] | None = None) -> dict[str, Any]:
-    """Run a module of this repository in a process of its own; the last line it printed, parsed.
-
-    Raises:
-        TandemError: it failed.
-    """
-    command = [sys.executable, "-m", module, *map(str, arguments)]
-    result = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True)
-    if result.returncode:
-        last = (result.stderr.strip().splitlines() or ["no message"])[-1]
-        raise TandemError(f"python -m {module} failed: {last}; try it by hand")
-    return dict(json.loads(result.stdout.strip().splitlines()[-1]))
+    return int(failed(result))
 
 
 def _cpu_model() -> str:

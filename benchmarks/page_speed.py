@@ -153,18 +153,10 @@ def _answers(url: str) -> bool:
 
 
 def paint(runs: Path, place: str, mark: str) -> dict[str, float]:
-    """Open one view with a new service and a new browser.
-
-    Args:
-        runs: directory of the runs.
-        place: address of the view.
-        mark: that the page sets when everything is painted.
+    """Open the view at ``place`` with a new service and a new browser, until the page sets ``mark``: it is painted.
 
     Returns:
-        Seconds until it is painted, and CPU seconds of the browser's main thread and of the service by then.
-
-    Raises:
-        TandemError: no Chromium, or the view is not painted in time.
+        Seconds until then, and CPU seconds of the browser's main thread and of the service.
     """
     from playwright.sync_api import sync_playwright
 

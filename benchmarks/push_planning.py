@@ -18,18 +18,18 @@ import numpy as np
 import service
 from benchmarks.measuring import parser_of, run_benchmark
 from service.actors.evaluation import wilson_interval
-from service.downstream.compose import check_primitives, compose_actions
+from service.downstream.compose import check_primitives
 from service.downstream.methods import provenance
 from service.envs.batch import WorldBatch
-from service.envs.gym.registration import EPISODE_STEPS
 from service.envs.sampling import draw_goals
-from service.envs.tasks import SUCCESS_DISTANCE_M, find_task
+from service.envs.tasks import EPISODE_STEPS, SUCCESS_DISTANCE_M, find_task
+from service.primitives.learned import compose_actions
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from service.policies.numpy_policy import NumpyMCPPolicy
-    from service.primitives.loading import TrainedBob
+    from service.primitives.loading import Trained
 
 PACKAGES = ("mujoco", "numpy")
 _HELD_STEPS = 5
@@ -99,7 +99,7 @@ class _Search:
         return distance.reshape(plans.shape[:2]), (cost + distance).reshape(plans.shape[:2])
 
 
-def measure(trained: TrainedBob, task_name: str, settings: Settings) -> dict[str, Any]:
+def measure(trained: Trained, task_name: str, settings: Settings) -> dict[str, Any]:
     """Share of the goals of a task that plans reach at the last step."""
     task, primitives = find_task(task_name), check_primitives(trained)
     rng = np.random.default_rng(settings.seed)

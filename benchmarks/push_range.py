@@ -15,13 +15,14 @@ import numpy as np
 
 import service
 from benchmarks.measuring import parser_of, run_benchmark
-from service.downstream.compose import action_weights, check_primitives
+from service.downstream.compose import check_primitives
 from service.downstream.methods import provenance
+from service.primitives.learned import action_weights
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from service.primitives.loading import TrainedBob
+    from service.primitives.loading import Trained
 
 PACKAGES = ("numpy",)
 DIRECTIONS = {"+x": (1.0, 0.0), "-x": (-1.0, 0.0), "+y": (0.0, 1.0), "-y": (0.0, -1.0)}
@@ -72,7 +73,7 @@ def best_pushes(means: NDArray[np.float32], direction: tuple[float, float]) -> N
     return best
 
 
-def measure(trained: TrainedBob, *, num_places: int, num_weights: int, seed: int) -> dict[str, float]:
+def measure(trained: Trained, *, num_places: int, num_weights: int, seed: int) -> dict[str, float]:
     """Share of places in which no composition pushes straight, for each direction."""
     primitives, rng = check_primitives(trained), np.random.default_rng(seed)
     k = primitives.num_primitives

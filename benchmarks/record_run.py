@@ -1,10 +1,14 @@
 """Make the small file of a run that ``docs/results`` keeps and the report is made from.
 
     python -m benchmarks.record_run runs/cube --out docs/results/runs/cube-0.json
+    python -m benchmarks.record_run runs/lsd-0 --skills --out docs/results/skills/lsd-0.json
 
 It holds the configuration, the metrics thinned to at most 300 points, a sample of the goals in the layout of
 ``goals.jsonl`` and counts of all of them, and what is measured here: the newest Bob on every task (``tasks.py``), and
-the coverage of random compositions at three stages of training (``stages.py``). That takes a minute or two.
+the coverage of random compositions at three stages of training (``coverage.py``). That takes a minute or two.
+
+With ``--skills`` it holds less: at most 100 points, and the coverage of random skills of 50 steps, an episode of the
+downstream tasks. Of self-play a skill is a random composition of the primitives.
 """
 
 from __future__ import annotations
@@ -18,10 +22,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from benchmarks.coverage import measure_coverage
 from benchmarks.measuring import machine, write_json
-from benchmarks.run_files import FORMAT_VERSION, Records, Run, blocks, thin
-from benchmarks.stages import measure_coverage
+from benchmarks.run_files import COUNTERS, FORMAT_VERSION, Records, Run, blocks, thin
 from benchmarks.tasks import measure_tasks
+from service.envs.tasks import EPISODE_STEPS
 from service.errors import TandemError
 from service.io.run_directory import RunDirectory
 from service.media.figures import read_records
@@ -37,6 +42,11 @@ NUM_SLICES = 30
 BIN_M = 0.025
 NUM_BINS = {"height": 13, "distance": 16}
 """The last one also holds what is beyond it."""
+OURS = "ours"
+"""Name of self-play among the methods of skills."""
+SKILL_POINTS = 100
+KEPT_OF_SKILLS = (*COUNTERS, "evaluation/coverage", "skills/", "bob/env_steps_fraction")
+"""Beginnings of the names of metrics that are kept of skills."""
 
 
 def record_run(directory: RunDirectory, name: str, note: str = "") -> Run:
@@ -61,6 +71,32 @@ def measure_run(directory: RunDirectory) -> dict[str, Any]:
     config, bobs = directory.read_config(), read_stages(directory)
     newest = numpy_bob(bobs[max(bobs)])
     return {"evaluations": measure_tasks(newest, config), "coverage": measure_coverage(bobs, config)}
+
+
+def record_skills(directory: RunDirectory, name: str, note: str = "") -> Run:
+    """Everything that is kept of a run of skills, or of self-play as skills.
+
+    Raises:
+        TandemError: no run, or one of a monolithic Bob, who has no skills.
+    """
+    config = directory.read_config()
+    coverage = measure_coverage(read_stages(directory), config, num_steps=EPISODE_STEPS)
+    if coverage is None:
+        raise TandemError(f"{directory.path} has a monolithic Bob, who has no skills; name another run")
+    kept = [
+        {key: value for key, value in record.items() if key.startswith(KEPT_OF_SKILLS)}
+        for record in read_records(directory.metrics_file)
+    ]
+    return {
+        "format_version": FORMAT_VERSION,
+        "name": name,
+        "note": note,
+        "method": OURS if config.skills is None else config.skills.method,
+        "recorded": machine(*PACKAGES),
+        "config": config.model_dump(mode="json"),
+        "series": thin(kept, SKILL_POINTS),
+        "coverage": coverage,
+    }
 
 
 def count_goals(records: Records, rest_height_m: float) -> dict[str, Any]:
@@ -115,10 +151,15 @@ def main() -> int:
     parser.add_argument("run_dir", type=Path, metavar="RUN_DIR")
     parser.add_argument("--out", type=Path, metavar="FILE", required=True, help="its stem is the run's name")
     parser.add_argument("--note", default="", help="a sentence for people")
+    parser.add_argument("--skills", action="store_true", help="where its random skills take the object, and less else")
     given = parser.parse_args()
-    directory = RunDirectory(given.run_dir)
+    directory, name = RunDirectory(given.run_dir), given.out.stem
     try:
-        write_json(given.out, record_run(directory, given.out.stem, given.note) | measure_run(directory))
+        if given.skills:
+            run = record_skills(directory, name, given.note)
+        else:
+            run = record_run(directory, name, given.note) | measure_run(directory)
+        write_json(given.out, run)
     except TandemError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2

@@ -14,9 +14,9 @@ import argparse
 import os
 import subprocess
 import sys
-import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -73,7 +73,8 @@ def experiments(places: Places) -> Iterator[Experiment]:
             yield from (_trial(places, task, method, seed) for task in tasks)
         yield from (_trial(places, task, method, seed) for method in ("asp-only", "idle") for task in tasks)
     yield from (_control(places, name, CONTROL_SEEDS[0]) for name in CONTROLS)
-    yield from _from_nothing(places, 0)
+    nothing = ("scratch-monolithic-her", "scratch-monolithic", "scratch-mcp-her", "scratch-mcp")
+    yield from (_trial(places, task, method, 0) for method in nothing for task in tasks)
     yield from _skills(places, 0)
     yield from (_trial(places, task, f"scratch-{net}-her", 1) for net in ("monolithic", "mcp") for task in tasks)
     yield from (_control(places, name, CONTROL_SEEDS[1]) for name in CONTROLS)
@@ -88,12 +89,6 @@ def experiments(places: Places) -> Iterator[Experiment]:
     for task in ("push", "inair", "sphere"):
         yield from (_longer(places, task, f"scratch-{net}-her") for net in ("monolithic", "mcp"))
     yield from (_longer(places, "push", method) for method in ("ours-her", "ours-residual-her"))
-
-
-def _from_nothing(places: Places, seed: int) -> Iterator[Experiment]:
-    for network in ("monolithic", "mcp"):
-        for method in (f"scratch-{network}-her", f"scratch-{network}"):
-            yield from (_trial(places, task, method, seed) for task in TASKS)
 
 
 def _trial(places: Places, task: str, method: str, seed: int) -> Experiment:
@@ -156,7 +151,7 @@ def _discover(places: Places, method: str, seed: int) -> Experiment:
         *("--registry", str(places.out / "primitives"), "--set", f"name={_skills_name(method, seed)}"),
         *("--set", f"seed={seed}", "--set", f"run.total_env_steps={SKILL_ENV_STEPS}", "--set", "run.num_threads=1"),
     )
-    record = _python("-m", "benchmarks.record_skills", str(run), "--out", str(file))
+    record = _python("-m", "benchmarks.record_run", str(run), "--skills", "--out", str(file))
 
     def commands() -> Sequence[Command]:
         return [(*train, "--resume") if run.exists() else train, record]
@@ -172,64 +167,29 @@ def _tandem(*arguments: str) -> Command:
     return _python("-m", "service", *arguments)
 
 
-class Schedule:
-    """Experiments that several threads take from, the first that can be run."""
-
-    def __init__(self, waiting: Sequence[Experiment]) -> None:
-        self._waiting, self._running = list(waiting), 0
-        self._changed = threading.Condition()
-        self.failed = list[str]()
-
-    def take(self) -> Experiment | None:
-        """Take the next one away, waiting for what it needs; None where nothing is left that can ever be run."""
-        with self._changed:
-            while True:
-                for experiment in self._waiting:
-                    if experiment.needs is None or experiment.needs.exists():
-                        self._waiting.remove(experiment)
-                        self._running += 1
-                        return experiment
-                if not self._running:
-                    self.failed += [each.name for each in self._waiting]
-                    self._waiting.clear()
-                    return None
-                self._changed.wait()
-
-    def give_back(self, experiment: Experiment) -> None:
-        """Say that one that was taken has ended; what has not made its file has failed."""
-        with self._changed:
-            self._running -= 1
-            if not experiment.file.exists():
-                self.failed.append(experiment.name)
-            self._changed.notify_all()
-
-
 def run_all(waiting: Sequence[Experiment], parallel: int, logs: Path) -> list[str]:
     """Run experiments, ``parallel`` at once, each with one thread and its output in a file of ``logs``.
+
+    What needs another one's files comes after all that can be run before.
 
     Returns:
         Names of those that failed, or that needed what failed.
     """
-    schedule = Schedule(waiting)
     logs.mkdir(parents=True, exist_ok=True)
-    threads = [threading.Thread(target=_work, args=(schedule, logs)) for _ in range(parallel)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-    return schedule.failed
+    left = list(waiting)
+    with ThreadPoolExecutor(parallel) as pool:
+        while ready := [each for each in left if each.needs is None or each.needs.exists()]:
+            left = [each for each in left if each not in ready]
+            list(pool.map(lambda each: _run_one(each, logs), ready))
+    return [each.name for each in waiting if not each.file.exists()]
 
 
-def _work(schedule: Schedule, logs: Path) -> None:
-    while (experiment := schedule.take()) is not None:
-        started = time.monotonic()
-        print(f"{experiment.name} ...", flush=True)
-        try:
-            with (logs / f"{experiment.name.replace('/', '-')}.log").open("ab") as log:
-                code = _run(experiment.commands(), log.fileno())
-        finally:
-            schedule.give_back(experiment)
-        print(f"{experiment.name}: exit code {code}, {(time.monotonic() - started) / 60:.1f} min", flush=True)
+def _run_one(experiment: Experiment, logs: Path) -> None:
+    started = time.monotonic()
+    print(f"{experiment.name} ...", flush=True)
+    with (logs / f"{experiment.name.replace('/', '-')}.log").open("ab") as log:
+        code = _run(experiment.commands(), log.fileno())
+    print(f"{experiment.name}: exit code {code}, {(time.monotonic() - started) / 60:.1f} min", flush=True)
 
 
 def _run(commands: Sequence[Command], log: int) -> int:

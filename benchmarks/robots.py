@@ -4,9 +4,9 @@
     python -m benchmarks.robots --run viperx=runs/viperx --run jaco=runs/jaco --json docs/results/robots.json
 
 Each of ``configs/robots`` picks a cube up, carries it to a random place in the air and holds it there for 5 s, by a
-hand-written policy; with ``--objects`` the Panda does so with other objects. Env steps are of random actions with one
-thread, in turn with the Panda's. A run is one of ``tandem pretrain`` with that robot, or with another object: ``panda
-with a mesh`` is of the one that ``--frustum`` writes. What the file has of robots that are not measured now stays.
+hand-written policy. Env steps are of random actions with one thread, in turn with the Panda's. A run is one of
+``tandem pretrain`` with that robot. What the file has of robots that are not measured now stays: the Panda with other
+objects was measured by this program of 82ca6fd.
 """
 
 from __future__ import annotations
@@ -14,7 +14,6 @@ from __future__ import annotations
 import argparse
 import importlib
 import json
-import tempfile
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -32,12 +31,6 @@ from service.io.run_directory import RunDirectory
 ROBOTS = ROOT / "configs" / "robots"
 OVERRIDES = {"viperx": ("world.workspace.height_m=0.25",), "jaco": ("world.workspace.height_m=0.25",)}
 """What these arms need of a world: they do not reach the upper corners of the usual one."""
-OBJECTS = {
-    "panda with a cylinder": "{shape: cylinder, size_m: [0.05, 0.06]}",
-    "panda with a flat box": "{shape: box, size_m: [0.08, 0.05, 0.03]}",
-    "panda with a mesh": "{shape: mesh, mesh: {pieces: [FILE]}}",
-}
-"""Objects of the recorded runs; FILE is that of ``--frustum``."""
 NUM_WORLDS = (8, 240)
 WITHIN_M, SLIP_M = 0.01, 0.005
 LAST_STEPS = 200_000
@@ -96,24 +89,6 @@ def summarise_run(path: Path) -> dict[str, Any]:
     }
 
 
-def write_frustum(path: Path) -> None:
-    """Write the mesh of the recorded run: a hexagonal frustum, 60 mm wide below, 44 above and 45 high, as OBJ."""
-    num = 6
-    angles = np.arange(num) * 2 * np.pi / num
-    ring = np.column_stack([np.cos(angles), np.sin(angles)])
-    lines = [
-        f"v {radius * x:.6f} {radius * y:.6f} {z:.6f}" for radius, z in ((0.030, 0.0), (0.022, 0.045)) for x, y in ring
-    ]
-    faces = []
-    for this in range(num):
-        after = (this + 1) % num
-        faces += [(this, after, num + after), (this, num + after, num + this)]
-    faces += [(0, each + 1, each) for each in range(1, num - 1)]
-    faces += [(num, num + each, num + each + 1) for each in range(1, num - 1)]
-    lines += ["f " + " ".join(str(corner + 1) for corner in face) for face in faces]
-    path.write_text("\n".join(lines) + "\n")
-
-
 def world_of(name: str) -> WorldConfig:
     """The world of the recipe with another robot."""
     return load_config(RECIPE_FILE, [f"world.robot={ROBOTS / name}.yaml", *OVERRIDES.get(name, ())]).world
@@ -129,12 +104,7 @@ def main() -> int:
     parser = parser_of(__doc__, Settings())
     parser.add_argument("--run", action="append", default=[], metavar="NAME=DIR", help="a run with that robot")
     parser.add_argument("--robots", nargs="*", metavar="NAME", help="default: all whose models are installed")
-    parser.add_argument("--objects", action="store_true", help="pick other objects, too, with the Panda")
-    parser.add_argument("--frustum", type=Path, metavar="FILE", help="write the mesh of the recorded run, and stop")
     given = parser.parse_args()
-    if given.frustum is not None:
-        write_frustum(given.frustum)
-        return 0
     return run_benchmark(
         "robots", ("mujoco", "numpy"), given, Settings, lambda chosen: _benchmark(chosen, given), report
     )
@@ -153,12 +123,6 @@ def _benchmark(settings: Settings, given: argparse.Namespace) -> dict[str, Any]:
             print(f"without {name}: {error}", flush=True)
             continue
         robots.setdefault(name, {}).update(measure_robot(name, settings))
-    if given.objects:
-        with tempfile.TemporaryDirectory() as directory:
-            write_frustum(mesh := Path(directory) / "frustum.obj")
-            for name, shape in OBJECTS.items():
-                world = load_config(RECIPE_FILE, [f"world.object={shape.replace('FILE', str(mesh))}"]).world
-                robots.setdefault(name, {})["picks"] = count_picks(world, settings.num_picks)
     for run in given.run:
         name, _, path = run.partition("=")
         robots.setdefault(name, {})["run"] = summarise_run(Path(path))

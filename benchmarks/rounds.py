@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from dataclasses import dataclass
 from functools import partial
 
@@ -11,11 +10,12 @@ from numpy.typing import NDArray
 
 from benchmarks.measuring import Sample, Stopwatch, measure, total
 from service.actors.rollout import Rollout
-from service.actors.self_play import Players, SelfPlay
+from service.actors.self_play import Players
 from service.envs.batch import WorldBatch
 from service.envs.observations import ACTION
+from service.methods.self_play import LocalSelfPlay
 from service.policies.numpy_policy import NumpyGaussianPolicy, numpy_bob
-from service.runtime.local import LocalRun
+from service.runs.run import Run
 
 RANDOM_STEPS = 50
 """Length of an episode of random actions."""
@@ -39,8 +39,8 @@ class Rounds:
         run: its game goes on, its learner never hears of it.
     """
 
-    def __init__(self, run: LocalRun) -> None:
-        self._run = run
+    def __init__(self, run: Run) -> None:
+        self._run, self._play = run, self_play(run)
         self._rng = np.random.default_rng(0)
         game = run.config.game
         self._worlds = WorldBatch(
@@ -74,7 +74,7 @@ class Rounds:
         return measure(self._random_episode, seconds)
 
     def _play_round(self, players: Players) -> int:
-        game, generator = self._run.game, self._run.generator
+        game, generator = self._play.game, self._play.generator
         start_state = game.worlds.states.copy()
         fraction = self._run.config.generator.past_opponent_fraction
         plan = generator.opponents.freeze(0).plan(game.worlds.num_worlds, fraction, self._rng)
@@ -92,9 +92,15 @@ class Rounds:
         return shape[0] * shape[1]
 
 
-def players_of(run: LocalRun) -> Players:
+def self_play(run: Run) -> LocalSelfPlay:
+    """The method of a run of self-play in this process."""
+    assert isinstance(run.method, LocalSelfPlay)
+    return run.method
+
+
+def players_of(run: Run) -> Players:
     """The newest policies of a run, and its past opponents."""
-    weights, pool = run.learner.weights(), run.generator.opponents
+    weights, pool = self_play(run).learner.weights(), self_play(run).generator.opponents
     return Players(
         version=weights.version,
         alice=NumpyGaussianPolicy(weights.alice),
@@ -104,29 +110,10 @@ def players_of(run: LocalRun) -> Players:
     )
 
 
-def round_cpu_s(run: LocalRun, num_worlds: int) -> float:
-    """Mean CPU seconds of a round of ``num_worlds`` in this process, on one thread, after one game in every world."""
-    players, rng = players_of(run), np.random.default_rng(0)
-    config = run.config.model_copy(update={"game": run.config.game.model_copy(update={"num_worlds": num_worlds})})
-    game = SelfPlay(config, rng, num_threads=1)
-    opponents, snapshot = run.generator.opponents.freeze(0), run.generator.snapshot()
-    game.block_grippers(float(snapshot.success_rate))
-    num_rounds, start_s = max(10, 2400 // num_worlds), 0.0
-    for index in range(-config.game.num_goals, num_rounds):
-        if index == 0:
-            start_s = time.process_time()
-        plan = opponents.plan(num_worlds, config.generator.past_opponent_fraction, rng)
-        game.play_round(players, plan, partial(snapshot.choose_goals, plan, rng=rng))
-    used_s = time.process_time() - start_s
-    game.close()
-    return used_s / num_rounds
-
-
 def repeat_physics(worlds: WorldBatch, played: Round) -> int:
     """Step ``worlds`` through both turns of a round, to the very states in which Bob's turns ended.
 
-    Returns:
-        The env steps made, as many as the round's.
+    It returns the env steps made, as many as the round's.
     """
     alice, bob = played.rollout.alice, played.rollout.bob
     worlds.restore(played.start_state)

@@ -8,7 +8,7 @@ time).
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +23,11 @@ FORMAT_VERSION = 1
 MAX_POINTS = 300
 """Most points of a series."""
 COUNTERS = ("iteration", "env_steps", "time/wall_s")
+CELL_SIZE_M = 0.05
+"""Of the table's cells that coverage counts."""
+STAGES = {"beginning": 0.0, "middle": 0.5, "end": 1.0}
+"""Shares of the run at which coverage is measured."""
+RANDOM = "random policy"
 _DIGITS = 5
 
 Run = dict[str, Any]
@@ -30,7 +35,7 @@ Records = Sequence[dict[str, Any]]
 
 
 def read_run(path: Path) -> Run:
-    """A file that ``record_run.py`` or ``ablations.py`` made.
+    """A file that ``record_run.py`` made.
 
     Raises:
         TandemError: it cannot be read, or is of another format.
@@ -88,6 +93,17 @@ def steps_until(records: Records, key: str, level: float, *, num_in_a_row: int =
         if float(np.mean([record[key] for record in row])) >= level:
             return int(row[-1]["env_steps"])
     return None
+
+
+def mean_share(stage: Mapping[str, Any]) -> float:
+    """Mean share of the cells visited, over all sets of a stage."""
+    return float(np.mean(stage["shares"]))
+
+
+def paths_m(stage: Mapping[str, Any]) -> StateArray:
+    """The kept paths of a stage, (number, points, 3) metres."""
+    flat = np.array(stage["paths_mm"], dtype=np.float64) / 1000
+    return flat.reshape(len(flat), -1, 3)
 
 
 def _rounded(values: StateArray, key: str) -> float | None:

@@ -9,8 +9,7 @@ with W worlds for each actor. Actors work at the same time and pay for their own
 the slowest, N actors are N times as fast as one; the first part that takes longer than they do is the first
 bottleneck, and from there on more actors help no more.
 
-A learner of R ranks shares out what rollouts cost, not what an update costs by itself, and pays for the messages of
-its gradient steps (``Ranks``). Every actor and every rank is counted as a core.
+Every actor is counted as a core, and the learner as one.
 """
 
 from __future__ import annotations
@@ -18,7 +17,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
-ACTORS, LEARNER, ROLLOUTS_IN = "actors", "learner", "rollouts to the learner's node"
+ACTORS = "actors"
 MAX_ACTORS = 1 << 24
 
 
@@ -46,53 +45,22 @@ class Cost:
 
 
 @dataclass(frozen=True, slots=True)
-class Ranks:
-    """Messages of a learner of several ranks: each gradient step sends gradients round a ring of all ranks, twice.
-
-    A ring's all-reduce takes ``2 (R - 1)`` hops one after the other, each with ``1 / R`` of the gradients
-    (Patarasuk and Yuan 2009).
-    """
-
-    num_messages: float = 0.0
-    """Messages of an update: its gradient steps, and a few more."""
-    hop_s: float = 0.0
-    """Seconds of a hop, whatever is sent."""
-    gradient_s: float = 0.0
-    """Seconds to send all gradients once."""
-
-    def seconds(self, num_ranks: int) -> float:
-        """Seconds of an update's messages."""
-        hops = 2 * (num_ranks - 1)
-        return self.num_messages * hops * (self.hop_s + self.gradient_s / num_ranks)
-
-
-def ring(small_s: float, whole_s: float) -> tuple[float, float]:
-    """``hop_s`` and ``gradient_s`` from the seconds of a small message and of a gradient's, between two ranks."""
-    small_s = min(small_s, whole_s)
-    return small_s / 2.0, whole_s - small_s
-
-
-@dataclass(frozen=True, slots=True)
 class Model:
     """Costs of every part."""
 
     actor: Cost
     """Cost of one actor for its own rollout."""
     parts: Mapping[str, Cost]
-    """Everything there is only one of, by name; the learner as one rank."""
+    """Everything there is only one of, by name."""
     env_steps: float
     """Env steps of one world in a round."""
-    ranks: Ranks = Ranks()
-    ranks_per_node: int = 1
-    """Ranks that get their rollouts through one node's network."""
 
 
 @dataclass(frozen=True, slots=True)
 class Prediction:
-    """A run with so many actors and ranks."""
+    """A run with so many actors."""
 
     num_actors: int
-    num_ranks: int
     num_worlds: float
     """Worlds of each actor."""
     seconds: Mapping[str, float]
@@ -106,8 +74,8 @@ class Prediction:
 
     @property
     def num_cores(self) -> int:
-        """One for every actor and every rank."""
-        return self.num_actors + self.num_ranks
+        """One for every actor, and one for the learner."""
+        return self.num_actors + 1
 
     @property
     def bottleneck(self) -> str:
@@ -119,37 +87,12 @@ class Prediction:
         return self.seconds[name] / self.update_s
 
 
-def predict(model: Model, num_actors: int, num_worlds: float, num_ranks: int = 1) -> Prediction:
-    """Predict a run with ``num_actors`` of ``num_worlds`` each, and a learner of ``num_ranks``."""
+def predict(model: Model, num_actors: int, num_worlds: float) -> Prediction:
+    """Predict a run with ``num_actors`` of ``num_worlds`` each."""
     seconds = {ACTORS: model.actor.seconds(1, num_worlds)}
     seconds |= {name: cost.seconds(num_actors, num_worlds) for name, cost in model.parts.items()}
-    if num_ranks > 1:
-        alone_s = model.parts[LEARNER].update_s
-        shared_s = (seconds[LEARNER] - alone_s) / num_ranks
-        seconds[LEARNER] = alone_s + shared_s + model.ranks.seconds(num_ranks)
-    if ROLLOUTS_IN in seconds:
-        seconds[ROLLOUTS_IN] /= -(-num_ranks // model.ranks_per_node)
     steps = num_actors * num_worlds * model.env_steps
-    return Prediction(num_actors, num_ranks, num_worlds, seconds, steps / max(seconds.values()))
-
-
-def with_ranks(model: Model, num_actors: int, num_worlds: float, max_ranks: int) -> Prediction:
-    """Predict a run with as few ranks as keep up with the actors; if none do, with those that are fastest.
-
-    Args:
-        model: costs.
-        num_actors: and no more ranks than these.
-        num_worlds: of each actor.
-        max_ranks: ranks that a minibatch has enough rows for.
-    """
-    best = predict(model, num_actors, num_worlds)
-    for num_ranks in range(2, min(num_actors, max_ranks) + 1):
-        if best.seconds[LEARNER] <= best.seconds[ACTORS]:
-            break
-        more = predict(model, num_actors, num_worlds, num_ranks)
-        if more.seconds[LEARNER] < best.seconds[LEARNER]:
-            best = more
-    return best
+    return Prediction(num_actors, num_worlds, seconds, steps / max(seconds.values()))
 
 
 @dataclass(frozen=True, slots=True)
@@ -159,8 +102,6 @@ class Batch:
     num_worlds: int
     """Of all actors together."""
     num_updates: float
-    max_ranks: int
-    """Ranks that a minibatch has enough rows for."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -177,12 +118,11 @@ class Skill:
 
 
 def fastest(model: Model, batches: Iterable[Batch], num_cores: int) -> Skill:
-    """The fastest way to a skill on ``num_cores``: which batch, how many actors and ranks. Cores may be left over."""
+    """The fastest way to a skill on ``num_cores``: which batch, how many actors. Cores may be left over."""
     ways = (
-        Skill(batch, predict(model, num_actors, batch.num_worlds / num_actors, num_ranks))
+        Skill(batch, predict(model, num_actors, batch.num_worlds / num_actors))
         for batch in batches
         for num_actors in range(1, min(num_cores - 1, batch.num_worlds) + 1)
-        for num_ranks in range(1, min(num_cores - num_actors, batch.max_ranks) + 1)
     )
     return min(ways, key=lambda way: (way.seconds, way.run.num_cores))
 
@@ -204,10 +144,3 @@ def limit(model: Model, part: str, num_worlds: float) -> int | None:
         else:
             high = middle
     return low
-
-
-def line(few: tuple[float, float], many: tuple[float, float]) -> tuple[float, float]:
-    """Intercept and slope through two points, neither below 0: a cost that seems to fall with its number is noise."""
-    (x0, y0), (x1, y1) = few, many
-    slope = max(0.0, (y1 - y0) / (x1 - x0))
-    return max(0.0, y0 - slope * x0), slope

@@ -32,7 +32,7 @@ from benchmarks.measuring import (
 from benchmarks.rounds import Rounds
 from benchmarks.training_process import ENDLESS, Measured, Training, copy_run, measure_training, overrides, scratch
 from service.io.run_directory import RunDirectory
-from service.runtime.local import LocalRun
+from service.runs.train import open_run
 
 BARE = "bare world"
 BARE_RANDOM = "bare world, random actions"
@@ -67,7 +67,7 @@ def compare(source: RunDirectory, home: Path, settings: Settings) -> dict[str, A
     loops: list[Measured] = []
     contacts: list[float] = []
     copy = copy_run(source, home, "rounds")
-    run = LocalRun(copy.read_config(), copy, resume=True)
+    run = open_run(copy.read_config(), copy, resume=True)
     rounds = Rounds(run)
     for _ in range(settings.num_pairs):
         loop_copy = copy_run(source, home, "loop")

@@ -74,15 +74,13 @@ def report(result: Mapping[str, Any]) -> str:
     """A row for each seed, as Markdown, and the median of their times."""
     lines = ["| seed | minutes | env steps | updates | CPU minutes |", "| --- | --- | --- | --- | --- |"]
     for run in result["runs"]:
-        at = run["at"]
-        if at is None:
+        if (at := run["at"]) is None:
             last = run["curve"][-1] if run["curve"] else {"env_steps": 0}
-            lines.append(f"| {run['seed']} | not within {last['env_steps'] / 1e6:.1f} M env steps | | | |")
-            continue
-        cells = (
-            f"{at['wall_s'] / 60:.1f} | {at['env_steps'] / 1e6:.2f} M | {at['iteration']:.0f} | {at['cpu_s'] / 60:.1f}"
-        )
-        lines.append(f"| {run['seed']} | {cells} |")
+            cells = f"not within {last['env_steps'] / 1e6:.1f} M env steps | | | "
+        else:
+            steps = f"{at['env_steps'] / 1e6:.2f} M | {at['iteration']:.0f}"
+            cells = f"{at['wall_s'] / 60:.1f} | {steps} | {at['cpu_s'] / 60:.1f} "
+        lines.append(f"| {run['seed']} | {cells}|")
     times_s = [run["at"]["wall_s"] if run["reached"] else math.inf for run in result["runs"]]
     median_s = statistics.median(times_s)
     if math.isfinite(median_s):

@@ -22,7 +22,7 @@ from dataclasses import dataclass
 from http.client import HTTPException
 from pathlib import Path
 from tempfile import mkdtemp
-from types import MappingProxyType, TracebackType
+from types import MappingProxyType
 from typing import Any, Literal, Self, TypeVar
 
 from pydantic import ValidationError
@@ -84,11 +84,13 @@ class Training:
             command += ["--runtime", "ray", "--status", "{}:{}".format(*self.address)]
         self.records = Records(self.directory.metrics_file)
         self._reader = DiskReader(self.directory.path.parent)
+        # with less, further actors would wait for a core for ever
+        cores = {} if num_cores is None else {"RAY_OVERRIDE_RESOURCES": json.dumps({"CPU": num_cores})}
         with self.log_file.open("ab") as log:
             self._process = subprocess.Popen(
                 [*command, *arguments],
                 cwd=tree,
-                env=environment(home, tree) | ({} if num_cores is None else _cores(num_cores)) | dict(variables),
+                env=environment(home, tree) | cores | dict(variables),
                 stdin=subprocess.DEVNULL,
                 stdout=log,
                 stderr=log,
@@ -97,9 +99,7 @@ class Training:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         self.stop()
 
     @property
@@ -208,8 +208,6 @@ class Measured:
     """Worlds of each actor."""
     play_s: float
     """Mean duration of a round; 0 where play and learning share a process."""
-    hand_over_s: float
-    """Mean of what a round costs its actor beside playing it: weights, assignment, results, a driver that is busy."""
     learn_s: float
     """Mean duration of an update."""
     mean_policy_lag: float
@@ -232,26 +230,13 @@ class Measured:
         """Share of the actors' wall time without a round; evaluations, which actors make too, count as idle."""
         return 1.0 - self.num_rollouts * self.play_s / (self.num_actors * self.wall_s)
 
-    @property
-    def slot_wait_s(self) -> float:
-        """Seconds, of all actors together, in which they had handed everything over and were given nothing.
-
-        They wait for a slot, which an update frees: it is what acting and learning do not overlap.
-        """
-        busy_s = self.num_rollouts * (self.play_s + self.hand_over_s)
-        return max(0.0, self.num_actors * self.wall_s - busy_s)
-
 
 def measure_training(
     training: Training, num_iterations: int, num_actors: int = 1, num_warmup: int = NUM_WARMUP_ITERATIONS
 ) -> Measured:
-    """Measure about ``num_iterations`` iterations of a run, then end it.
+    """Measure about ``num_iterations`` iterations of a run that has just been started, then end it.
 
-    Args:
-        training: a run that has just been started.
-        num_iterations: at least 1; more are measured where they are shorter than it takes to see them.
-        num_actors: it is measured from when so many are alive.
-        num_warmup: iterations before, at least 1.
+    It is measured from when ``num_actors`` are alive and ``num_warmup`` iterations, at least 1, are over.
 
     Raises:
         TandemError: the run ended before.
@@ -276,16 +261,7 @@ def summarise_rows(
     rows: Sequence[Mapping[str, float]], num_before: int, wall_s: float, role_cpu_s: Mapping[str, float],
     num_actors: int, num_worlds: int,
 ) -> Measured:  # fmt: skip
-    """Costs of the iterations of ``rows`` after the first ``num_before``, at least 1.
-
-    Args:
-        rows: records of iterations.
-        num_before: of them, made before ``wall_s`` and ``role_cpu_s`` began.
-        wall_s: seconds that the others took together.
-        role_cpu_s: CPU seconds by role in that time.
-        num_actors: of the run.
-        num_worlds: of each actor.
-    """
+    """Costs of the records after the first ``num_before``, at least 1, which took ``wall_s`` and ``role_cpu_s``."""
     measured = rows[num_before:]
     rollouts = [row.get("actor/num_rollouts", 1.0) for row in measured]
     lags = [row["learner/policy_lag"] for row in measured if "learner/policy_lag" in row]
@@ -302,7 +278,6 @@ def summarise_rows(
         num_actors=num_actors,
         num_worlds=num_worlds,
         play_s=mean_of_rounds("time/play_s"),
-        hand_over_s=mean_of_rounds("time/hand_over_s"),
         learn_s=statistics.fmean(row.get("time/learn_s", 0.0) for row in measured),
         mean_policy_lag=statistics.fmean(lags),
         max_policy_lag=max(
@@ -318,11 +293,6 @@ def environment(home: Path, tree: Path = ROOT) -> dict[str, str]:
     ray = {"RAY_TMPDIR": str(home), "RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN": secrets.token_hex(32)}
     kept = {name: value for name, value in os.environ.items() if name not in unset}
     return {**kept, **ray, "RAY_USAGE_STATS_ENABLED": "0", "PYTHONPATH": str(tree)}
-
-
-def _cores(num: int) -> dict[str, str]:
-    """Let a new Ray believe that it has so many cores; with less, further actors wait for one for ever."""
-    return {"RAY_OVERRIDE_RESOURCES": json.dumps({"CPU": num})}
 
 
 @contextmanager

@@ -3,19 +3,14 @@
     python -m benchmarks.transfer --policy panda-cube@champion --json docs/results/transfer.json
 
 Every row has the same policy and the same bridge; rows differ in the back-end, and in what ``calibrate`` measures of
-it. Goals are played in chunks, each with an engine and noise of its own, so no result depends on ``--workers``.
+it. Goals are played in chunks, each with an engine and noise of its own.
 """
 
 from __future__ import annotations
 
-import contextlib
-import functools
-import multiprocessing
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
@@ -23,21 +18,22 @@ import numpy as np
 from benchmarks.measuring import parser_of, run_benchmark
 from benchmarks.report.markdown import percent, table
 from service.actors.evaluation import evaluate, wilson_interval
-from service.downstream.compose import parameters_digest
 from service.envs.sampling import draw_goals, draw_starts
 from service.errors import TandemError
+from service.primitives.loading import Trained, load
 from service.robot.backends import Backend, BackendConfig, Simulator, connect
 from service.robot.calibrate import Calibration, calibrate
 from service.robot.disturbed import DisturbanceConfig
 from service.robot.errors import RobotError
 from service.robot.loop import Bridge, BridgeConfig
-from service.robot.policies import RobotPolicy, load_robot_policy
+from service.robot.policies import for_robot
 from service.robot.pybullet_robot import CONTROL_STEP_S, PyBulletParameters, PyBulletRobot, world_of
 from service.robot.safety import SafetyConfig
 from service.robot.watchdogs import WatchConfig
 from service.types import BoolArray, StateArray
 
 PACKAGES = ("pybullet", "mujoco", "numpy")
+Gain = tuple[float, float, float]
 CHUNK = 25
 """Goals of one engine."""
 SPEED_M_S, ACCELERATION_M_S2 = 1.7, 13.0
@@ -69,7 +65,6 @@ class Settings:
     max_acceleration_m_s2: float = SafetyConfig().max_acceleration_m_s2
     grip_force_n: float = 140.0
     """A Franka hand's greatest: the cube is ten times as heavy as in training, and half as rough."""
-    workers: int = 1
 
 
 @dataclass(frozen=True, slots=True)
@@ -118,16 +113,6 @@ LIMITED_SUCCESS = 0.95
 
 
 @dataclass(frozen=True, slots=True)
-class Job:
-    """One chunk of a row, for a process of its own."""
-
-    row: str
-    chunk: int
-    settings: Settings
-    calibration: Calibration
-
-
-@dataclass(frozen=True, slots=True)
 class Played:
     """One goal."""
 
@@ -154,12 +139,13 @@ def bridge_config(settings: Settings) -> BridgeConfig:
     return BridgeConfig(set_points_per_step=settings.set_points_per_step, safety=safety)
 
 
-def policy_of(row: Row, settings: Settings) -> RobotPolicy:
+def policy_of(row: Row, settings: Settings) -> Trained:
     """The policy of a row, in the world of its back-end."""
-    found = load_robot_policy(getattr(settings, row.policy), Path(settings.registry))
+    found = for_robot(load(getattr(settings, row.policy), settings.registry))
     if row.backend != "pybullet":
         return found
-    return replace(found, world=world_of(found.world, PyBulletParameters(**row.parameters)))
+    world = world_of(found.config.world, PyBulletParameters(**row.parameters))
+    return replace(found, config=found.config.model_copy(update={"world": world}))
 
 
 def calibrate_row(row: Row, settings: Settings) -> Calibration:
@@ -174,26 +160,25 @@ def calibrate_row(row: Row, settings: Settings) -> Calibration:
         backend.close()
 
 
-def play_chunk(job: Job) -> list[Played]:
-    """Play the goals of a chunk, one after the other."""
-    row, settings = ROWS[job.row], job.settings
+def play_chunk(row: Row, chunk: int, settings: Settings, gain: Gain) -> list[Played]:
+    """Play the goals of a chunk, one after the other; ``gain`` is what was calibrated."""
     policy = policy_of(row, settings)
     starts, goals = draw_episodes(policy, settings)
-    mine = slice(job.chunk * CHUNK, (job.chunk + 1) * CHUNK)
-    backend = connect(_backend(row), policy.world, seed=settings.seed + job.chunk)
+    mine = slice(chunk * CHUNK, (chunk + 1) * CHUNK)
+    backend = connect(_backend(row), policy.world, seed=settings.seed + chunk)
     try:
         assert backend.simulator is not None
         played = []
         for start, goal in zip(starts[mine], goals[mine], strict=True):
             backend.simulator.reset(start)
             _rest(backend)
-            played.append(_play(policy, backend, goal, job))
+            played.append(_play(policy, backend, goal, settings, gain))
         return played
     finally:
         backend.close()
 
 
-def draw_episodes(policy: RobotPolicy, settings: Settings) -> tuple[StateArray, StateArray]:
+def draw_episodes(policy: Trained, settings: Settings) -> tuple[StateArray, StateArray]:
     """(N, 3) places of the object at first, and (N, 3) goals, metres: the same as of an evaluation in MuJoCo."""
     rng = np.random.default_rng(settings.seed)
     starts, boxes = draw_starts(rng, settings.num_goals, policy.world)
@@ -218,7 +203,7 @@ def _rest(backend: Backend) -> None:
         backend.robot.wait_until(backend.robot.now_s() + CONTROL_STEP_S)
 
 
-def _play(policy: RobotPolicy, backend: Backend, goal: StateArray, job: Job) -> Played:
+def _play(policy: Trained, backend: Backend, goal: StateArray, settings: Settings, gain: Gain) -> Played:
     simulator = backend.simulator
     assert simulator is not None
     distances: list[float] = []
@@ -232,13 +217,11 @@ def _play(policy: RobotPolicy, backend: Backend, goal: StateArray, job: Job) -> 
         tip.extend(step.get("measured_m", ()))
         set_points.extend(step.get("set_points_m", ()))
 
-    config = bridge_config(job.settings)
-    world = policy.world
-    found = job.calibration
-    bridge = Bridge(policy.policy, backend.robot, backend.poses, world, config, gain=found.gain, record=record)
+    config, world = bridge_config(settings), policy.world
+    bridge = Bridge(policy.policy, backend.robot, backend.poses, world, config, gain=gain, record=record)
     stopped = ""
     try:
-        bridge.run(goal, job.settings.num_steps)
+        bridge.run(goal, settings.num_steps)
     except RobotError as error:
         stopped = str(error)
     last = float(np.linalg.norm(simulator.object_position() - goal))
@@ -299,24 +282,20 @@ def benchmark(settings: Settings) -> dict[str, Any]:
     if unknown := [name for name in names if name not in ROWS]:
         raise TandemError(f"--rows: no row {unknown[0]!r}; choose of {', '.join(ROWS)}")
     names = [name for name in names if getattr(settings, ROWS[name].policy)]
-    policy = load_robot_policy(settings.policy, Path(settings.registry))
-    num_chunks = -(-settings.num_goals // CHUNK)
+    policy = for_robot(load(settings.policy, settings.registry))
     rows: dict[str, Any] = {}
-    with contextlib.ExitStack() as stack:
-        play_all: Callable[[Sequence[Job]], Iterable[list[Played]]] = functools.partial(map, play_chunk)
-        if settings.workers > 1:
-            context = multiprocessing.get_context("spawn")  # an engine does not survive a fork
-            pool = stack.enter_context(ProcessPoolExecutor(settings.workers, mp_context=context))
-            play_all = functools.partial(pool.map, play_chunk)
-        for name in names:
-            begun = time.perf_counter()
-            calibration = calibrate_row(ROWS[name], settings)
-            jobs = [Job(name, chunk, settings, calibration) for chunk in range(num_chunks)]
-            rows[name] = summarise([each for chunk in play_all(jobs) for each in chunk])
-            rows[name] |= {"title": ROWS[name].title, "asked": ROWS[name].asked, "policy": _label(name, settings)}
-            rows[name] |= {"calibration": calibration.model_dump(mode="json"), "gain": list(calibration.gain)}
-            rows[name]["wall_s"] = round(time.perf_counter() - begun, 1)
-            print(f"{name}: {rows[name]['success_last']:.1%} in {rows[name]['wall_s']:.0f} s", flush=True)
+    for name in names:
+        begun, row = time.perf_counter(), ROWS[name]
+        calibration = calibrate_row(row, settings)
+        chunks = range(-(-settings.num_goals // CHUNK))
+        played = [each for chunk in chunks for each in play_chunk(row, chunk, settings, calibration.gain)]
+        rows[name] = {
+            **summarise(played),
+            **{"title": row.title, "asked": row.asked, "policy": getattr(settings, row.policy)},
+            **{"calibration": calibration.model_dump(mode="json"), "gain": list(calibration.gain)},
+            "wall_s": round(time.perf_counter() - begun, 1),
+        }
+        print(f"{name}: {rows[name]['success_last']:.1%} in {rows[name]['wall_s']:.0f} s", flush=True)
     without = evaluate(
         policy.policy,
         policy.world,
@@ -327,7 +306,7 @@ def benchmark(settings: Settings) -> dict[str, Any]:
         seed=settings.seed,
     )
     return {
-        "policy": {"label": policy.label, "digest": parameters_digest(policy.policy)},
+        "policy": {"label": policy.label, "digest": policy.digest},
         "bridge": bridge_config(settings).model_dump(mode="json"),
         "engine": PyBulletParameters().model_dump(mode="json"),
         "rows": rows,
@@ -342,10 +321,6 @@ def report(result: dict[str, Any]) -> str:
         for name, row in result["rows"].items()
     )
     return table(("row", "last", "ever", "tip inside limits", "asked"), cells)
-
-
-def _label(name: str, settings: Settings) -> str:
-    return str(getattr(settings, ROWS[name].policy))
 
 
 def main() -> int:

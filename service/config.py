@@ -10,12 +10,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from copy import deepcopy
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self, get_args
+from typing import Any, Literal, Self, get_args
 
 import yaml
-from pydantic import BaseModel, BeforeValidator, Field, PositiveInt, ValidationError, model_validator
+from pydantic import BaseModel, Field, PositiveInt, ValidationError, model_validator
 
-from service.config_tree import RENAMED, apply_override, check_numbers, read_yaml, updated
+from service.config_tree import apply_override, check_numbers, read_yaml
 from service.distillation_config import DistillationConfig
 from service.errors import ConfigError, did_you_mean
 from service.frozen import FrozenModel, reason
@@ -23,9 +23,6 @@ from service.off_policy_config import SkillsConfig
 from service.world_config import NO_KEYS, ObservedConfig
 from service.world_config import WorkspaceConfig as WorkspaceConfig
 from service.world_config import WorldConfig as WorldConfig
-
-MIN_ROWS = 32
-"""Least rows of a minibatch for each of several learners. Ranks pay off from about a thousand on."""
 
 
 class GameConfig(FrozenModel):
@@ -182,11 +179,6 @@ class PolicyConfig(FrozenModel):
         return self
 
 
-def _mirror(value: object) -> object:
-    """True and false, which recorded runs have, in today's words."""
-    return {True: "both", False: "none"}[value] if isinstance(value, bool) else value
-
-
 class PPOConfig(FrozenModel):
     """One player's PPO (Schulman et al. 2017)."""
 
@@ -210,17 +202,16 @@ class PPOConfig(FrozenModel):
         description="first updates of a run in which the value network learns and the policy stays: one that begins "
         "from a trained policy (--from) would else be led by a network that knows nothing",
     )
-    mirror: Annotated[Literal["none", "both", "random"], BeforeValidator(_mirror)] = Field(
-        "none",
-        description="symmetry augmentation, since the task is the same from left and right: learn from every sample "
-        "and its reflection in y (both, or true), or at random from one of the two, which is half the work (random). "
-        "Turns of her own that Alice clones stay as they are",
-    )
 
-    @property
-    def mirrors(self) -> bool:
-        """Whether reflections are learned from."""
-        return self.mirror != "none"
+
+class BobPPOConfig(PPOConfig):
+    """Bob's PPO."""
+
+    mirror: Literal["none", "random"] = Field(
+        "none",
+        description="symmetry augmentation, since the task is the same from left and right. random: learn from each "
+        "sample or, as likely, from its reflection in y, and from both of each demonstration",
+    )
 
 
 class CloningConfig(FrozenModel):
@@ -268,12 +259,6 @@ class ABCConfig(CloningConfig):
 class LearnerConfig(FrozenModel):
     """Central learner."""
 
-    num_learners: int = Field(
-        1,
-        ge=1,
-        description="processes that learn together on a cluster, its ranks: each from its share of the rollouts, with "
-        "gradients averaged. How many is no part of what is learned, and may change when a run is resumed",
-    )
     device: Literal["cpu", "cuda", "auto"] = Field(
         "cpu", description="of the learner; auto: cuda where there is one, else cpu. These networks gain little from it"
     )
@@ -286,13 +271,7 @@ class LearnerConfig(FrozenModel):
         "what is learned then depends on the machine",
     )
     alice: PPOConfig = PPOConfig()
-    bob: PPOConfig = PPOConfig()
-    bob_window: int = Field(
-        1,
-        ge=1,
-        description="Bob learns from the rollouts of so many iterations at once, older ones weighted by what he has "
-        "changed since; instead of more epochs over the newest",
-    )
+    bob: BobPPOConfig = BobPPOConfig()
     bob_ema_decay: float = Field(
         0.0,
         ge=0.0,
@@ -303,17 +282,6 @@ class LearnerConfig(FrozenModel):
     )
     abc: ABCConfig = ABCConfig()
     self_imitation: SelfImitationConfig = SelfImitationConfig()
-
-    @model_validator(mode="after")
-    def _enough_rows(self) -> Self:
-        for name, size in (("alice", self.alice.minibatch_size), ("bob", self.bob.minibatch_size)):
-            if self.num_learners > 1 and size < MIN_ROWS * self.num_learners:
-                raise ValueError(
-                    f"{self.num_learners} learners have {size // self.num_learners} rows each of a minibatch of "
-                    f"{name}'s, {size}; less than {MIN_ROWS} are not worth a message: use at most "
-                    f"{max(1, size // MIN_ROWS)} learners, or raise learner.{name}.minibatch_size"
-                )
-        return self
 
 
 class RunConfig(FrozenModel):
@@ -391,20 +359,17 @@ class Config(FrozenModel):
         return self
 
 
-def load_config(path: Path | str | None = None, overrides: Sequence[str] = (), *, recorded: bool = False) -> Config:
+def load_config(path: Path | str | None = None, overrides: Sequence[str] = ()) -> Config:
     """Read a run's configuration.
 
     Args:
         path: YAML file; None for the defaults.
         overrides: ``a.b=c`` strings, applied in order; the value is parsed as YAML.
-        recorded: the file was written by a run, maybe of an earlier version; see ``parse_config``.
 
     Raises:
         ConfigError: file missing or not YAML, unknown key, value out of range; one line a user can act on.
     """
     tree = read_yaml(Path(path)) if path is not None else {}
-    if recorded:
-        tree = updated(tree, where=str(path))
     whole = deepcopy(tree)
     for override in overrides:
         apply_override(whole, override)
@@ -418,20 +383,18 @@ def load_config(path: Path | str | None = None, overrides: Sequence[str] = (), *
         raise
 
 
-def parse_config(tree: dict[str, Any], *, where: str, recorded: bool = False) -> Config:
+def parse_config(tree: dict[str, Any], *, where: str) -> Config:
     """Validate a plain tree.
 
     Args:
         tree: nested as ``Config``.
         where: its origin, named in errors.
-        recorded: a run of this or an earlier version wrote it: renamed keys get their new names, and removed keys are
-            dropped where they have their defaults.
 
     Raises:
-        ConfigError: unknown key, value out of range, or a recorded key whose effect is no longer there.
+        ConfigError: unknown key, or value out of range.
     """
     try:
-        config = Config.model_validate(updated(tree, where=where) if recorded else tree)
+        config = Config.model_validate(tree)
         check_numbers(tree, config.model_dump(mode="json"), where=where)
         return config
     except ValidationError as error:
@@ -439,8 +402,6 @@ def parse_config(tree: dict[str, Any], *, where: str, recorded: bool = False) ->
         key = ".".join(str(part) for part in first["loc"] if part not in NO_KEYS) or "the top level"
         found = "" if isinstance(first["input"], dict) else f" = {first['input']!r}"  # a whole group says nothing
         more = f" (and {error.error_count() - 1} more)" if error.error_count() > 1 else ""
-        if key in RENAMED:
-            raise ConfigError(f"{where}: {key!r} is now called {RENAMED[key]!r}{more}") from None
         if first["type"] == "extra_forbidden":
             known = _known_keys(first["loc"])
             hint = _elsewhere(str(first["loc"][-1])) or did_you_mean(str(first["loc"][-1]), known)

@@ -1,9 +1,8 @@
-"""Configurations as plain trees: read from YAML, changed by overrides, and brought up to date where old ones differ."""
+"""Configurations as plain trees: read from YAML, changed by overrides."""
 
 from __future__ import annotations
 
 from contextlib import suppress
-from copy import deepcopy
 from pathlib import Path
 from typing import Any
 
@@ -11,16 +10,6 @@ from service.errors import ConfigError, did_you_mean, one_line
 from service.parsing import MAX_YAML_CHARACTERS, ParseError, parse_yaml
 from service.recipes import recipes
 from service.regular_files import read_regular
-
-RENAMED = {"learner.bob_average_decay": "learner.bob_ema_decay", "learner.mirror": "learner.bob.mirror"}
-"""Keys that had another name in version 0.1.0."""
-REMOVED = {
-    "game.alice_outside_reward": 0.0,
-    "game.alice_outside_from_valid_fraction": 0.0,
-    "game.alice_proximity_reward": 0.0,
-    "learner.alice_interval": 1,
-}
-"""Keys that only version 0.1.0 has, each with its default, at which it did nothing."""
 
 
 def read_yaml(path: Path) -> dict[str, Any]:
@@ -80,22 +69,6 @@ def check_numbers(tree: Any, read: Any, *, where: str, key: str = "") -> None:
         inner = [(index, *pair) for index, pair in enumerate(zip(tree, read, strict=False))]
     for name, value, found in inner:
         check_numbers(value, found, where=where, key=f"{key}.{name}" if key else str(name))
-
-
-def updated(recorded: dict[str, Any], *, where: str) -> dict[str, Any]:
-    """A copy of a recorded tree, with the keys of this version."""
-    tree = deepcopy(recorded)
-    for key, default in REMOVED.items():
-        group, name = group_of(tree, key, where=where)
-        value = group.pop(name, default)
-        if value != default:
-            raise ConfigError(f"{where}: {key} = {value!r}: this key was removed; tandem 0.1.0 still reads it")
-    for old, new in RENAMED.items():
-        group, name = group_of(tree, old, where=where)
-        if name in group:
-            new_group, new_name = group_of(tree, new, where=where)
-            new_group[new_name] = group.pop(name)
-    return tree
 
 
 def group_of(tree: dict[str, Any], key: str, *, where: str) -> tuple[dict[str, Any], str]:

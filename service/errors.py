@@ -38,12 +38,6 @@ class DivergedError(TandemError):
     exit_code = 1
 
 
-class GroupError(TandemError):
-    """The ranks of a learner do not hear each other; the message says which rank noticed it."""
-
-    exit_code = 1
-
-
 def one_line(text: str, max_characters: int = 2000) -> str:
     """A message as one line of printable characters; of one that is too long, the middle is left out.
 

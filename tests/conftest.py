@@ -20,7 +20,7 @@ import pytest
 import typer.testing
 
 if TYPE_CHECKING:
-    from service.primitives.loading import TrainedBob
+    from service.primitives.loading import Trained
     from service.registry.names import Version
     from service.registry.registry import Registry
     from tests.registry.helpers import Publish
@@ -80,11 +80,11 @@ def publish(registry: Registry) -> Publish:
 
 
 @pytest.fixture(scope="session")
-def champion() -> TrainedBob:
+def champion() -> Trained:
     """The primitives in the box."""
     import service
 
-    return service.load_primitives("panda-cube@champion", registry="no registry here")
+    return service.load("panda-cube@champion", "no registry here")
 
 
 @pytest.fixture

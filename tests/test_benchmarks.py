@@ -3,50 +3,39 @@
 import json
 import subprocess
 import sys
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-import service
 from benchmarks import (
-    ablations,
     compare_commits,
-    contact_solver,
+    coverage,
     env_throughput,
-    learner_ranks,
     measuring,
     record_run,
     rounds,
     run_files,
     selfplay_throughput,
-    stages,
-    tasks,
     time_to_skill,
 )
 from benchmarks.measuring import Sample
 from benchmarks.report.__main__ import PAGES, Report, begin, end
 from benchmarks.report.figures import quantiles
-from benchmarks.report.markdown import commit, duration
-from benchmarks.report.pretraining import throughput_words
-from benchmarks.training_process import copy_run
 from service.actors.coverage import RandomPolicy, skill_trajectories, visited_share
-from service.actors.evaluation import IdlePolicy, evaluate
 from service.config import WorldConfig, dump_config, load_config
 from service.envs.batch import WorldBatch
 from service.envs.gym.registration import TABLETOP_ID
 from service.errors import TandemError
 from service.io.jsonl import JsonlWriter
 from service.io.run_directory import RunDirectory
-from service.learner.group import ALONE
+from service.io.run_history import RunHistory
 from service.learner.learner import Learner
-from service.policies.networks import make_bob, make_bob_value
 from service.policies.numpy_policy import numpy_bob
 from service.primitives.bundled import BUNDLED
-from service.primitives.loading import read_parameters, read_stages
+from service.primitives.loading import load, read_stages
 from service.registry.registry import Registry
-from service.runtime.local import LocalRun
+from service.runs.train import open_run
 from tests.runtime.runs import tiny_config
 
 ROOT = Path(__file__).parents[1]
@@ -103,41 +92,6 @@ def test_json_has_plain_lists_on_one_line_and_reads_back():
         measuring.to_text({"a": float("nan")})
 
 
-def test_the_machine_is_described_in_one_line():
-    where = measuring.machine("numpy")
-    assert where["versions"]["numpy"] == np.__version__
-    assert where["cpu"] in measuring.describe(where)
-    assert "\n" not in measuring.describe(where)
-    json.dumps(where)
-
-
-# --- ranks of the learner ---------------------------------------------------------------------------------------------
-
-
-def test_one_rank_learns_from_all_that_is_made_up():
-    settings = learner_ranks.Settings(num_worlds=5, num_rollouts=2, minibatch_rows=64, num_updates=1, num_messages=2)
-    config = learner_ranks.make_config(settings)
-    in_proportion = learner_ranks.make_config(replace(settings, num_worlds=30, minibatch_rows=0)).learner
-    assert (in_proportion.alice.minibatch_size, in_proportion.bob.minibatch_size) == (400, 128)  # of 120: 1600 and 512
-    rollouts = learner_ranks.make_rollouts(config, settings, 0)
-    assert [len(rollout.bob.learn) for rollout in rollouts] == [2, 3]
-    measured = learner_ranks.measure(ALONE, settings, 1)
-    assert len(measured.update_s) == len(measured.cpu_s) == 1
-    # Alice: 5 x 20 steps in 2 minibatches, 3 epochs. Bob: 2 x 5 x 40 in 6, 3 epochs. Then moments, KLs, metrics.
-    assert measured.num_sums >= 3 * 2 + 3 * 6
-    bob = make_bob(config.policy), make_bob_value(config.policy)
-    assert measured.num_parameters == sum(each.numel() for network in bob for each in network.parameters())
-
-
-def test_ranks_are_reported_beside_threads():
-    each = {"num_ranks": 1, "num_threads": 1, "update_s": 0.5, "cpu_s": 0.5, "messages_s": 0.0, "message_s": 0.0}
-    two = each | {"num_ranks": 2, "update_s": 0.3125, "cpu_s": 0.6, "messages_s": 0.0625, "message_s": 0.002}
-    ranks = [each | {"efficiency": 1.0}, two | {"efficiency": 0.8}]
-    text = learner_ranks.report({"ranks": ranks, "threads": [each | {"num_threads": 2}]})
-    assert "| 2 x 1 | 0.312 | 0.600 | 80 % | 2.00 | 20 % |" in text
-    assert "| 1 x 2 | 0.500 | 0.500 |  |  |  |" in text
-
-
 # --- env throughput ---------------------------------------------------------------------------------------------------
 
 
@@ -155,14 +109,6 @@ def test_env_throughput_measures_all_rows_in_turn():
     json.loads(measuring.to_text(result))
 
 
-def test_grasping_arms_go_to_the_object_and_then_close():
-    action = np.array([[0.2, -1.0, 0.0, 0.3]] * 2, dtype=np.float32)
-    env_throughput.reach(action, np.array([[0.025, 0.0, -0.2], [0.0, 0.0, 0.0]]), step=1)
-    np.testing.assert_allclose(action, [[0.6, -0.5, -1.0, 1.0], [0.1, -0.5, 0.0, 1.0]])
-    env_throughput.reach(action, np.zeros((2, 3)), step=20)
-    np.testing.assert_array_equal(action[:, 3], -1.0)
-
-
 def test_only_grasping_arms_lift_the_object():
     heights = []
     for grasping in (False, True):
@@ -171,11 +117,6 @@ def test_only_grasping_arms_lift_the_object():
         heights.append(batch._worlds.object_position[:, 2].max())
     assert heights[0] < 0.04  # at rest the centre of the cube is 0.025 m high
     assert heights[1] > 0.06
-
-
-def test_an_episode_ends_with_the_environments_time_limit():
-    contender = env_throughput.GymnasiumContender(TABLETOP_ID, num_steps=60, grasping=True)
-    assert contender.episode() == env_throughput.EPISODE_STEPS
 
 
 def test_without_panda_gym_one_line_says_how_to_get_it(monkeypatch, capsys):
@@ -227,41 +168,11 @@ def test_time_to_skill_stops_a_seed_that_is_there_and_skips_it_later(tmp_path, c
     assert "something else as recipe; name another file" in capsys.readouterr().err
 
 
-def test_the_contact_solver_is_compared_on_recorded_states(config, tmp_path):
-    run = LocalRun(config, RunDirectory(tmp_path / "run"))
-    run.run(lambda metrics: run.request_stop())
-    run.close()
-    run.directory.close()
-    settings = contact_solver.Settings(num_pairs=1, seconds=0.0, num_states=20, hold_s=0.1)
-    result = contact_solver.compare(run.directory, tmp_path, settings)
-    assert result["num_states"] == 20
-    assert result["cpu_ratio"] > 0.0
-    assert "today / version 0.1" in contact_solver.report(result)
-    old, new = (
-        contact_solver.build_model(config.world, name) for name in (contact_solver.VERSION_0_1, contact_solver.TODAY)
-    )
-    assert (old.opt.impratio, old.opt.noslip_iterations, old.opt.gravity[2]) == (100.0, 0, -9.81)
-    assert (new.opt.impratio, new.opt.noslip_iterations, new.opt.gravity[2]) == (1.0, 5, 0.0)
-
-
-def test_a_held_object_slips_less_than_one_that_is_dropped(config):
-    world = config.world
-    with WorldBatch(world, 2) as worlds:
-        worlds.reset(np.random.default_rng(0))
-        states = worlds.states.copy()
-        away = np.array([[0.0, 0.0, 0.0], [0.0, 0.3, 1.0]])  # in the gripper; high up
-        states[:, worlds.layout["object"]] = worlds.ee_position + away
-    for solver in (contact_solver.TODAY, contact_solver.VERSION_0_1):
-        held, dropped = contact_solver.slip_m(world, 0.0, states, solver, 0.5)
-        assert held < 0.005
-        assert dropped > 0.05
-
-
 # --- self-play throughput ---------------------------------------------------------------------------------------------
 
 
 def test_repeated_physics_ends_in_the_same_bits(config, tmp_path):
-    run = LocalRun(config, RunDirectory(tmp_path))
+    run = open_run(config, RunDirectory(tmp_path))
     made = []
 
     def play(metrics):
@@ -306,44 +217,14 @@ def test_selfplay_throughput_measures_all_three_and_leaves_the_run_alone(config,
     json.loads(measuring.to_text(result))
 
 
-def test_only_a_run_with_a_checkpoint_can_be_gone_on_from(config, tmp_path):
-    with pytest.raises(TandemError, match="no run in"):
-        copy_run(RunDirectory(tmp_path / "none"), tmp_path / "copy")
-    (tmp_path / "config.yaml").write_text(dump_config(config))
-    with pytest.raises(TandemError, match="no checkpoint in"):
-        copy_run(RunDirectory(tmp_path), tmp_path / "copy")
-
-
 # --- recorded runs ----------------------------------------------------------------------------------------------------
-
-
-def _evaluation(policy, goals, last, ever=0.5, num_steps=50):
-    interval = {"success_last_low": last - 0.05, "success_last_high": last + 0.054}
-    return {"policy": policy, "goals": goals, "num_episodes": 300, "num_steps": num_steps, "success_last": last,
-            "success_ever": ever, "mean_distance_m": 0.1, **interval}  # fmt: skip
-
-
-EVALUATIONS = [
-    _evaluation(policy, goals, last)
-    for policy, lasts in {"bob": (0.91, 0.88, 0.95, 0.7, 0.66), "idle": (0.06, 0.05, 0.07, 0.05, 0.06)}.items()
-    for goals, last in zip(tasks.TASKS, lasts, strict=True)
-]
-PATHS_MM = [[0, 0, 25, 10 * index, 0, 25] for index in range(3)]
-COVERAGE = {
-    "num_skills": 3, "num_steps": 4, "cell_size_m": 0.05,
-    "stages": {
-        "random policy": {"shares": [0.1, 0.3], "paths_mm": PATHS_MM},
-        "beginning": {"env_steps": 0, "shares": [0.1, 0.2], "paths_mm": PATHS_MM},
-        "middle": {"env_steps": 3_500_000, "shares": [0.5, 0.4], "paths_mm": PATHS_MM},
-        "end": {"env_steps": 7_000_000, "shares": [0.7, 0.8], "paths_mm": PATHS_MM},
-    },
-}  # fmt: skip
 
 
 def _run_directory(path, num_iterations=700):
     (path / "run").mkdir(parents=True)
     directory = RunDirectory(path / "run")
     directory.config_file.write_text(dump_config(load_config()))
+    RunHistory.new().write(directory.path)
     metrics, goals = JsonlWriter(directory.metrics_file), JsonlWriter(directory.goals_file)
     for index in range(1, num_iterations + 1):
         share = index / num_iterations
@@ -370,14 +251,6 @@ def _record(path, name="cube-0", **more):
     record = record_run.record_run(_run_directory(path), name) | {"evaluations": [], "coverage": None} | more
     measuring.write_json(path / f"{name}.json", record)
     return path / f"{name}.json"
-
-
-def _record_ablation(path, name, overrides=(), seed=0):
-    file = _record(path, f"ablation-{name}-{seed}", evaluations=EVALUATIONS, coverage=COVERAGE)
-    record = json.loads(file.read_text()) | {"ablation": {"name": name, "overrides": list(overrides)}}
-    record["config"]["seed"] = seed
-    measuring.write_json(file, record)
-    return file
 
 
 def test_a_run_is_thinned_by_hand_computed_means():
@@ -470,76 +343,41 @@ def test_quantiles_by_hand():
 # --- what is measured of a run ----------------------------------------------------------------------------------------
 
 
-def test_tasks_have_worlds_of_their_own():
-    trained = load_config(None, ["world.object_mass_kg=0.2", "world.workspace.center_x_m=-0.02"]).world
-    worlds = {name: task.world_from(trained) for name, task in tasks.TASKS.items()}
-    assert [worlds[name] for name in ("mixed", "air", "table")] == [trained] * 3
-    workspace = worlds["larger"].workspace
-    size = (workspace.length_x_m, workspace.length_y_m, workspace.height_m)
-    assert (size, workspace.center_x_m, worlds["larger"].object_mass_kg) == ((0.45, 0.45, 0.40), -0.02, 0.2)
-    assert worlds["sphere"] == trained.model_copy(update={"object": "sphere"})
-
-
-def test_every_task_is_measured_beside_a_policy_that_does_nothing():
-    champion = service.load_primitives("panda-cube@champion", registry="no registry here")
-    config = champion.config
-    rows = tasks.measure_tasks(champion.policy, config, num_episodes=20, num_steps=30)
-    assert [(row["goals"], row["policy"]) for row in rows] == [
-        (name, policy) for name in ("mixed", "air", "table", "larger", "sphere") for policy in ("bob", "idle")
-    ]
-    larger = config.world.workspace.model_copy(update={"length_x_m": 0.45, "length_y_m": 0.45, "height_m": 0.40})
-    worlds = {"larger": {"workspace": larger}, "sphere": {"object": "sphere"}}
-    goals = {"larger": "mixed", "sphere": "mixed"}
-    for row in rows:
-        found = evaluate(
-            champion.policy if row["policy"] == "bob" else IdlePolicy(),
-            config.world.model_copy(update=worlds.get(row["goals"], {})),
-            goals.get(row["goals"], row["goals"]),
-            num_episodes=20,
-            num_steps=30,
-            success_distance_m=0.05,
-            seed=0,
-        )
-        assert row == {**found.as_dict(), "goals": row["goals"], "policy": row["policy"]}
-    # 90 % and more of each as it is; two of 20 goals are left to rounding on other processors
-    assert all(row["success_last"] >= 0.8 if row["policy"] == "bob" else row["success_last"] <= 0.2 for row in rows)
-
-
 def test_stages_are_the_nearest_snapshots():
-    assert stages.pick_stages([0, 12, 31, 44, 60]) == {"beginning": 0, "middle": 31, "end": 60}
-    assert stages.pick_stages({60: "b", 4: "a"}) == {"middle": 4, "end": 60}
-    assert stages.pick_stages([60]) == {"end": 60}
+    assert coverage.pick_stages([0, 12, 31, 44, 60]) == {"beginning": 0, "middle": 31, "end": 60}
+    assert coverage.pick_stages({60: "b", 4: "a"}) == {"middle": 4, "end": 60}
+    assert coverage.pick_stages([60]) == {"end": 60}
 
 
 def test_coverage_is_measured_at_each_stage_beside_a_random_policy(config):
     untrained, other = (Learner(config.model_copy(update={"seed": seed})).weights().bob for seed in (0, 1))
     _, champion = Registry(BUNDLED).load("panda-cube@champion")
     bobs = {0: untrained, 500: champion, 900: other}
-    coverage = stages.measure_coverage(bobs, config, num_sets=2, num_steps=24)
-    assert {name: stage.get("env_steps") for name, stage in coverage["stages"].items()} == {
+    found = coverage.measure_coverage(bobs, config, num_sets=2, num_steps=24)
+    assert {name: stage.get("env_steps") for name, stage in found["stages"].items()} == {
         "random policy": None, "beginning": 0, "middle": 500, "end": 900,
     }  # fmt: skip
     policies = [RandomPolicy(), *map(numpy_bob, bobs.values())]
-    for policy, stage in zip(policies, coverage["stages"].values(), strict=True):
+    for policy, stage in zip(policies, found["stages"].values(), strict=True):
         paths = [
             skill_trajectories(policy, config.world, num_skills=32, num_steps=24, seed=seed, num_threads=1)
             for seed in (0, 1)
         ]
         assert stage["shares"] == [round(visited_share(each, config.world.workspace), 4) for each in paths]
-        assert stages.mean_share(stage) == np.mean(stage["shares"])
-        np.testing.assert_allclose(stages.paths_m(stage), paths[0][:, ::4], atol=0.0005)
-    assert len({tuple(stage["shares"]) for stage in coverage["stages"].values()}) == 4  # no policy stands for another
-    json.loads(measuring.to_text(coverage))
+        assert run_files.mean_share(stage) == np.mean(stage["shares"])
+        np.testing.assert_allclose(run_files.paths_m(stage), paths[0][:, ::4], atol=0.0005)
+    assert len({tuple(stage["shares"]) for stage in found["stages"].values()}) == 4  # no policy stands for another
+    json.loads(measuring.to_text(found))
 
 
 def test_a_monolithic_bob_has_no_coverage():
     config = load_config(None, [*TINY, "policy.monolithic_bob={hidden_sizes: [8]}"])
-    assert stages.measure_coverage({5: Learner(config).weights().bob}, config, num_sets=1, num_steps=1) is None
+    assert coverage.measure_coverage({5: Learner(config).weights().bob}, config, num_sets=1, num_steps=1) is None
 
 
 def test_a_run_is_measured_from_its_snapshots_and_its_checkpoint(tmp_path, monkeypatch):
     config = tiny_config(total_env_steps=600)
-    run = LocalRun(config, RunDirectory(tmp_path))
+    run = open_run(config, RunDirectory(tmp_path))
     run.run(lambda metrics: run.request_stop() if metrics["iteration"] == 3 else None)
     run.directory.close()
     seen = np.random.default_rng(0).normal(size=(8, 14)).astype(np.float32)
@@ -552,7 +390,7 @@ def test_a_run_is_measured_from_its_snapshots_and_its_checkpoint(tmp_path, monke
         record_run, "measure_coverage", lambda bobs, _: {at: acts(numpy_bob(bob)) for at, bob in bobs.items()}
     )
     measured = record_run.measure_run(RunDirectory(tmp_path))
-    newest = acts(numpy_bob(read_parameters(RunDirectory(tmp_path), "bob")))
+    newest = acts(load(str(tmp_path)).policy)
     first = acts(numpy_bob(Learner(config).weights().bob))
     assert measured["evaluations"] == [newest]
     assert (measured["coverage"][0], measured["coverage"][run.num_env_steps]) == (first, newest)
@@ -571,72 +409,6 @@ def _documents(path):
     return path
 
 
-def _write_report(docs):
-    report = Report(docs)
-    report.write()
-    return [file for file in report.files if file.name.startswith("pretraining")]
-
-
-@pytest.mark.filterwarnings("error")
-def test_the_page_and_its_pictures_are_made_again_and_again(tmp_path):
-    docs = _documents(tmp_path / "docs")
-    for file in (
-        _record(tmp_path / "0", "cube-0", evaluations=EVALUATIONS, coverage=COVERAGE),
-        _record(tmp_path / "1", "cube-1", evaluations=[_evaluation("runs/cube", "air", 0.0, num_steps=60)]),
-        _record_ablation(tmp_path / "2", "no-abc", ["learner.abc.weight=0"], seed=1),
-        _record_ablation(tmp_path / "3", "recipe"),
-    ):
-        file.rename(docs / "results" / "runs" / file.name)
-    *pictures, page_file = _write_report(docs)
-    names = ["", "-time", "-curriculum", "-goals-cube-0", "-goals-cube-1", "-coverage-cube-0", "-ablations"]
-    assert [path.name for path in pictures] == [f"pretraining{name}.png" for name in names]
-    assert all(path.read_bytes().startswith(b"\x89PNG") for path in pictures)
-    page = page_file.read_text()
-    assert all(f"]({path.name})" in page for path in pictures)
-    # evaluated every 20 of 700 iterations: (620 + 640 + 660) / 3 / 700 = 0.91, and 0.89 one evaluation before
-    rates = "**91 % [86, 96]** | **88 % [83, 93]** | 95 % [90, 100] | **70 % [65, 75]** | **66 % [61, 71]**"
-    assert f"| cube-0 | {rates} | 6.6 M |" in page  # asked are 95, 95, 95, 90 and 85 %
-    assert "| cube-1 (60 steps) |  | **0 % [-5, 5]** |  |  |  | 6.6 M |" in page
-    assert "| doing nothing | 6 % [1, 11] | 5 % [0, 10] |" in page
-    # iterations 1 to 69 (mean share 35 / 700) and, in the last tenth, 629 to 700 (mean share 664.5 / 700)
-    assert "| cube-0 | 0 | 4 | 160 | 7 M | 18 min | 95 % | 9 % | 50 % | 8.3 to 13.7 cm | 3.5 to 12.5 cm |" in page
-    assert "| cube-0 | 20 % | 15 % | 45 % | 75 % | 3.8 |" in page
-    recipe, ablated = (page.index(row) for row in ("| recipe, seed 0 | nothing |", "| no-abc, seed 1 | `learner.abc"))
-    assert recipe < ablated
-    assert "Not recorded yet." in page  # the throughput
-    page_file.write_text(f"Words before.\n{page}Words after.\n")
-    _write_report(docs)
-    assert page_file.read_text() == f"Words before.\n{page}Words after.\n"
-
-
-def test_the_page_shows_the_throughput(tmp_path):
-    side = {"env_steps_per_s": 2000.4}
-    result = {
-        "benchmark": "throughput",
-        "settings": {"trained_steps": 500_000, "num_pairs": 5},
-        "rows": {"10399f0": side, "abcdef0": {"env_steps_per_s": 5000.0}},
-        "ratio": {"median": 2.5, "least": 2.375, "greatest": 2.625, "cpu": 2.0},
-    }
-    words = throughput_words(result)
-    assert "5,000 env steps/s (abcdef0) instead of 2,000 env steps/s (10399f0)" in words
-    assert "2.50 times as many (2.38 to 2.62 in 5 pairs" in words
-    docs = _documents(tmp_path)
-    (docs / "results" / "throughput.json").write_text(json.dumps(result))
-    (page,) = _write_report(docs)
-    assert words in page.read_text()
-
-
-def test_a_bob_without_primitives_is_shown_without_coverage(tmp_path):
-    docs = _documents(tmp_path)
-    run = json.loads((ROOT / "docs" / "results" / "runs" / "cube-3.json").read_text())
-    run |= {"coverage": None, "evaluations": [row for row in run["evaluations"] if row["goals"] != "sphere"]}
-    (docs / "results" / "runs" / "cube-3.json").write_text(json.dumps(run))
-    files = _write_report(docs)
-    assert "pretraining-goals-cube-3.png" in {path.name for path in files}
-    assert not [path.name for path in files if "coverage" in path.name]
-    assert "| cube-3 | 98 % [96, 99] | 98 % [96, 99] | 97 % [95, 99] | 93 % [89, 95] |  |" in files[-1].read_text()
-
-
 def test_a_page_without_markers_is_left_alone(tmp_path):
     docs = _documents(tmp_path)
     page = docs / "results" / "pretraining.md"
@@ -645,92 +417,6 @@ def test_a_page_without_markers_is_left_alone(tmp_path):
     with pytest.raises(TandemError, match="no markers for coverage"):
         Report(docs).write()
     assert {path: path.read_bytes() for path in docs.rglob("*.*")} == before
-
-
-def test_words_of_the_pages_by_hand():
-    assert [duration(seconds) for seconds in (90, 5400, 7200, 37_800)] == ["2 min", "90 min", "2.0 h", "10.5 h"]
-    assert commit("f3c0f7898cd36eea") == "commit `f3c0f78`"
-    assert commit("f3c0f7898cd36eea-dirty") == "commit `f3c0f78` with local changes"
-
-
-# --- ablations --------------------------------------------------------------------------------------------------------
-
-
-EVERYTHING_ON = [
-    "seed=3", "learner.bob.mirror=both", "learner.alice.mirror=both",
-    "learner.abc={weight: 0.5, num_iterations: 8, hindsight: true}",
-    "game.num_goals=5", "game.bob_hold_steps=5", "generator.past_opponent_fraction=0.2",
-    "generator.replay_invalid=true", "generator.replay_from_reset=true", "game.alice_steps_min=5",
-    "learner.alice.decoupled=false",
-]  # fmt: skip
-
-
-@pytest.mark.parametrize("name", ablations.ABLATIONS)
-def test_an_ablation_changes_what_it_says_and_nothing_else(name):
-    recipe, ablated = (
-        _leaves(ablations.ablated_config(measuring.RECIPE_FILE, each, EVERYTHING_ON).model_dump(mode="json"))
-        for each in (ablations.RECIPE, name)
-    )
-    changed = {key for key in recipe.keys() | ablated.keys() if recipe.get(key) != ablated.get(key)}
-    expected = {override.partition("=")[0] for override in ablations.ABLATIONS[name]}
-    assert {key.removesuffix(".hidden_sizes") for key in changed} == expected
-
-
-def _leaves(tree, prefix=""):
-    if not isinstance(tree, dict):
-        return {prefix[:-1]: tree}
-    return {key: leaf for name, each in tree.items() for key, leaf in _leaves(each, f"{prefix}{name}.").items()}
-
-
-def test_what_is_off_already_is_no_ablation():
-    assert (
-        ablations.ablated_config(
-            measuring.RECIPE_FILE, "no-mirror", ["learner.bob.mirror=none", "learner.alice.mirror=none"]
-        )
-        is None
-    )
-    assert ablations.ablated_config(measuring.RECIPE_FILE, ablations.RECIPE, []) == load_config(measuring.RECIPE_FILE)
-    with pytest.raises(TandemError, match="no ablation 'no-such'; choose from recipe, no-abc"):
-        ablations.ablated_config(measuring.RECIPE_FILE, "no-such", [])
-
-
-def test_ablations_are_run_recorded_and_then_skipped(tmp_path, monkeypatch, capsys):
-    coverage = json.loads(json.dumps(COVERAGE))
-    monkeypatch.setattr(ablations, "measure_run", lambda directory: {"evaluations": [], "coverage": coverage})
-    (tmp_path / "tiny.yaml").write_text(dump_config(load_config(None, TINY)))
-    arguments = ["--steps", "100", "--seed", "2", "--config", tmp_path / "tiny.yaml", "--run-dir", tmp_path / "runs"]
-    command = ["ablations", *map(str, arguments), "--out", str(tmp_path), "no-abc", "no-mirror"]
-    monkeypatch.setattr(sys, "argv", command)
-    assert ablations.main() == 0
-    assert (
-        "no-mirror: learner.bob.mirror=none, learner.alice.mirror=none\n  skipped, the recipe does not have it on"
-        in capsys.readouterr().out
-    )
-    (file,) = tmp_path.glob("ablation-*")
-    run = run_files.read_run(file)
-    assert (file.name, run["name"]) == ("ablation-no-abc-2.json", "ablation-no-abc-2")
-    assert run["ablation"] == {"name": "no-abc", "overrides": ["learner.abc.weight=0"]}
-    assert (run["config"]["seed"], run["config"]["learner"]["abc"]["weight"]) == (2, 0.0)
-    assert run["series"]["env_steps"][-1] >= 100
-    assert not any(key.startswith("learner/") for key in run["series"])
-    assert [list(stage) for stage in run["coverage"]["stages"].values()] == [["shares"], *[["env_steps", "shares"]] * 3]
-    before = file.read_bytes()
-    assert ablations.main() == 0
-    assert "no-abc: learner.abc.weight=0\n  skipped" in capsys.readouterr().out
-    assert file.read_bytes() == before
-
-
-def test_a_stopped_ablation_goes_on_and_another_one_is_not_touched(config, tmp_path):
-    short = config.model_copy(update={"run": config.run.model_copy(update={"total_env_steps": 150})})
-    run = LocalRun(short, RunDirectory(tmp_path))
-    run.run(lambda metrics: run.request_stop())
-    run.directory.close()
-    stopped_at = run.num_env_steps
-    ablations.learn(short, RunDirectory(tmp_path))
-    steps = [json.loads(line)["env_steps"] for line in (tmp_path / "metrics.jsonl").read_text().splitlines()]
-    assert steps[0] == stopped_at < 150 <= steps[-1]
-    with pytest.raises(TandemError, match="a run of another configuration"):
-        ablations.learn(config, RunDirectory(tmp_path))
 
 
 # --- two commits ------------------------------------------------------------------------------------------------------

@@ -1,10 +1,8 @@
 """The configuration: defaults, YAML, overrides, what a run recorded before, and errors a user can act on."""
 
-from copy import deepcopy
 from pathlib import Path
 
 import pytest
-import yaml
 from pydantic import ValidationError
 
 from service.config import Config, WorkspaceConfig, dump_config, load_config, parse_config
@@ -108,8 +106,7 @@ def test_frozen():
         ("run.total_env_steps=2e5", "run.total_env_steps", 200_000),
         ("learner.bob.learning_rate=1e-3", "learner.bob.learning_rate", 0.001),
         ("learner.bob.learning_rate=0.001", "learner.bob.learning_rate", 0.001),
-        ("learner.bob.mirror=true", "learner.bob.mirror", "both"),
-        ("learner.alice.mirror=random", "learner.alice.mirror", "random"),
+        ("learner.bob.mirror=random", "learner.bob.mirror", "random"),
         ("generator.replay_invalid=false", "generator.replay_invalid", False),
         ("world.object=sphere", "world.object", "sphere"),
         ("world.workspace.center_y_m=-0.1", "world.workspace.center_y_m", -0.1),
@@ -256,64 +253,6 @@ def test_every_shipped_configuration_loads():
     assert robots
     for path in robots:  # their models are in packages that need not be installed
         assert RobotConfig.model_validate(parse_yaml(path.read_bytes(), path)).model.startswith("package:")
-
-
-RECORDED = {
-    "game": {
-        "alice_outside_reward": 0.0,
-        "alice_outside_from_valid_fraction": 0.0,
-        "alice_proximity_reward": 0.0,
-        "num_goals": 7,
-    },
-    "learner": {"alice_interval": 1, "bob_average_decay": 0.9, "mirror": True},
-}
-TODAY = {"game": {"num_goals": 7}, "learner": {"bob_ema_decay": 0.9, "bob": {"mirror": "both"}}}
-
-
-def test_what_version_0_1_0_recorded_is_read(tmp_path):
-    tree = deepcopy(RECORDED)
-    expected = parse_config(TODAY, where="today")
-    assert parse_config(tree, where="a manifest", recorded=True) == expected
-    assert tree == RECORDED  # a manifest carries a digest of it
-    path = tmp_path / "config.yaml"
-    path.write_text(yaml.safe_dump(RECORDED))
-    assert load_config(path, recorded=True) == expected
-    path.write_text(dump_config(expected))
-    assert load_config(path, recorded=True) == expected
-
-
-@pytest.mark.parametrize(
-    ("group", "key", "value"),
-    [
-        ("game", "alice_outside_reward", -3.0),
-        ("game", "alice_outside_from_valid_fraction", 0.3),
-        ("game", "alice_proximity_reward", 0.02),
-        ("learner", "alice_interval", 3),
-    ],
-)
-def test_a_removed_key_that_mattered_is_refused(group, key, value):
-    with pytest.raises(ConfigError) as raised:
-        parse_config({group: {key: value}}, where="the manifest of cube@3", recorded=True)
-    text = str(raised.value)
-    assert text.startswith(f"the manifest of cube@3: {group}.{key} = {value}")
-    assert "tandem 0.1.0" in text
-    assert "\n" not in text
-
-
-def test_a_recorded_group_that_is_none():
-    with pytest.raises(ConfigError, match="'game' is a value, not a group of keys"):
-        parse_config({"game": 3}, where="a manifest", recorded=True)
-
-
-def test_old_keys_in_a_configuration_of_today(tmp_path):
-    path = tmp_path / "run.yaml"
-    path.write_text("learner: {bob_average_decay: 0.9}\n")
-    assert "'learner.bob_average_decay' is now called 'learner.bob_ema_decay'" in message(path)
-    assert "now called 'learner.bob_ema_decay'" in message(overrides=["learner.bob_average_decay=0.9"])
-    assert "unknown key 'learner.alice_interval'" in message(overrides=["learner.alice_interval=1"])
-    path.write_text(yaml.safe_dump(RECORDED))
-    with pytest.raises(ConfigError, match=r"now called 'learner\.bob_ema_decay'"):  # an override is not recorded
-        load_config(path, ["learner.bob_average_decay=0.8"], recorded=True)
 
 
 def test_a_margin_as_wide_as_success_is_refused():

@@ -92,9 +92,9 @@ def test_every_key_is_in_the_reference():
 def test_the_public_functions_are_in_the_reference():
     text = docs_reference.api()
     assert [name for name in service.__all__ if f"### service.{name}\n" not in text] == []
-    assert "- `reference`: NAME, NAME@ALIAS or NAME@VERSION, a run directory" in text
-    assert "### TrainedBob.primitives\n" in text
-    assert "- `label: str`: Where he comes from, such as `panda-cube@3`." in text
+    assert "- `reference`: NAME, NAME@ALIAS or NAME@VERSION; or the path of a run" in text
+    assert "### Trained.primitives\n" in text
+    assert "- `label: str`: Where it comes from, such as `panda-cube@3 (bundled)`." in text
 
 
 def blocks(text, *languages):

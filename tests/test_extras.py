@@ -32,7 +32,12 @@ def without(monkeypatch):
 @pytest.mark.parametrize(
     ("package", "ours", "arguments", "said"),
     [
-        ("fastapi", ("server", "app"), ["serve"], "tandem serve needs the package fastapi, .*'tandem-skills[serve]'"),
+        (
+            "fastapi",
+            ("status.server", "status.app"),
+            ["serve"],
+            "tandem serve needs the package fastapi, .*'tandem-skills[serve]'",
+        ),
         (
             "minari",
             (),
@@ -54,7 +59,7 @@ def without(monkeypatch):
         ("ray", (), ["downstream", "table", "--runtime", "ray", "--methods", "idle"], "'tandem-skills[cluster]'"),
         (
             "httpx",
-            ("client",),
+            ("registry.client",),
             ["downstream", "train", "--task", "wall", "--registry", "http://127.0.0.1:9"],
             "fetching primitives needs the package httpx, .*'tandem-skills[serve]'",
         ),
@@ -62,7 +67,7 @@ def without(monkeypatch):
 )
 def test_a_command_says_which_one_to_install(tmp_path, monkeypatch, without, package, ours, arguments, said):
     monkeypatch.chdir(tmp_path)
-    without(package, ours=[f"service.status.{name}" for name in ours])
+    without(package, ours=[f"service.{name}" for name in ours])
     result = CliRunner().invoke(app, arguments)
     assert result.exit_code == 2, result.output
     assert_one_line(result.stderr, "which is not installed: pip install")

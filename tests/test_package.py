@@ -15,10 +15,11 @@ import numpy as np
 import pytest
 
 import service
-from service.config import load_config, parse_config
+from service.config import load_config
 from service.errors import TandemError
 from service.extras import MissingPackageError, needs_extra
 from service.policies.numpy_policy import NumpyMCPPolicy
+from service.primitives.acting import acting_config
 from service.primitives.bundled import BUNDLED
 from service.recipes import recipes, robots
 from service.registry.registry import Registry
@@ -113,7 +114,7 @@ def test_load_primitives(tmp_path, monkeypatch):
     bob = service.load_primitives()
     manifest, parameters = Registry(BUNDLED).load("panda-cube@champion")
     assert bob.manifest == manifest
-    assert bob.config == parse_config(manifest.config, where="the manifest", recorded=True)
+    assert bob.config == acting_config(manifest.config, where="the manifest")
     assert bob.config.policy.bob.num_primitives == bob.primitives.num_primitives == 8
     rows = 0.1 * np.random.default_rng(0).standard_normal((5, 14)).astype(np.float32)
     expected = NumpyMCPPolicy(parameters)

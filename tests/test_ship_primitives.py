@@ -13,7 +13,7 @@ from service.errors import TandemError
 from service.io.run_directory import RunDirectory
 from service.policies.numpy_policy import numpy_bob
 from service.primitives import publishing
-from service.primitives.loading import load_bob, read_parameters
+from service.primitives.loading import load
 from service.primitives.publishing import publish
 from service.registry.registry import Registry
 from tests.registry.helpers import assert_identical, files_in
@@ -34,7 +34,7 @@ def run(tmp_path_factory):
 def registry(run, tmp_path):
     """A registry with the run's Bob as version 1 and 2, and as the only version of another name."""
     registry = Registry(tmp_path / "registry")
-    bob = read_parameters(run, "bob")
+    bob = load(str(run.path)).parameters
     publish(registry, tiny_config(), bob, {"score": 0.25})
     changed = bob | {"gate.output.bias": bob["gate.output.bias"] + 1.0}
     publish(registry, tiny_config(), changed, {"score": 0.5}, parent="tiny@1")
@@ -54,7 +54,7 @@ def test_what_is_shipped_is_what_was_published(registry, target):
     original, expected = registry.load("tiny@2")
     assert_identical(parameters, expected)
     assert manifest == original.model_copy(update={"version": 1, "parent": None})
-    assert load_bob("tiny@latest", target).config == tiny_config()
+    assert load("tiny@latest", target).config.policy == tiny_config().policy
     assert Registry(target).verify() == []
     assert list(target.rglob(".*")) == []
 
@@ -85,13 +85,13 @@ def test_a_damaged_version_is_not_shipped(registry, target):
     ("changes", "part"),
     [
         ({"spaces": {"made": [{"in": "/somewhere/runs"}]}}, "'/somewhere/runs'"),
-        ({"config": TREE | {"worlds": {}}}, "'worlds'"),
+        ({"config": TREE | {"world": {"worlds": {}}}}, "'world.worlds'"),
         ({"parameters": {"a": np.zeros(1, np.float32)}}, "primitives"),
     ],
 )
 def test_what_nobody_else_could_use_is_not_shipped(run, registry, target, changes, part):
     fields = {"spaces": {}, "normalisation": {}, "config": TREE, "metrics": {}} | changes
-    parameters = fields.pop("parameters", None) or read_parameters(run, "bob")
+    parameters = fields.pop("parameters", None) or load(str(run.path)).parameters
     registry.publish("tiny", parameters, **fields)
     with pytest.raises(TandemError) as error:
         ship("tiny@3", registry, target)
@@ -107,7 +107,7 @@ def test_the_newest_bob_of_a_run_is_measured(run, tmp_path, monkeypatch):
     near.config_file.write_text(dump_config(parse_config(TREE | {"game": TREE["game"] | game}, where="a test")))
     assert str(publish_newest(near, registry)) == "tiny@1"
     manifest, parameters = registry.load("tiny")
-    assert_identical(parameters, read_parameters(run, "bob"))
+    assert_identical(parameters, load(str(run.path)).parameters)
     env_steps = json.loads(run.metrics_file.read_text().splitlines()[-1])["env_steps"]
     config = near.read_config()
     for kind in ("mixed", "air", "table"):

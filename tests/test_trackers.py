@@ -9,7 +9,7 @@ from typer.testing import CliRunner
 from service.cli.main import app
 from service.errors import TandemError
 from service.primitives import publishing
-from service.runtime import pretrain as module
+from service.runs import train as module
 from service.trackers import Trackers
 from tests.downstream.trials import SETS
 from tests.runtime.runs import TREE, assert_one_line, read_lines, write_yaml

@@ -24,10 +24,9 @@ from service.recipes import DEFAULT_RECIPE, recipes
 
 SECTIONS = ("Args", "Returns", "Raises", "Yields", "Attributes")
 RETURNED = (
-    ("service.primitives.loading", "TrainedBob"),
+    ("service.primitives.loading", "Trained"),
     ("service.policies.numpy_policy", "NumpyMCPPolicy"),
-    ("service.primitives.loading", "TrainedSkills"),
-    ("service.downstream.orchestrators", "Orchestrator"),
+    ("service.baselines.frozen", "FrozenSkills"),
     ("service.downstream.compose", "ComposePrimitives"),
 )
 """What the public functions return, and what is built from it."""

@@ -18,12 +18,12 @@ from pathlib import Path
 
 from pydantic import JsonValue
 
-from service.config import parse_config
 from service.errors import TandemError
 from service.io import tensors
 from service.io.files import os_errors, write_atomic
 from service.io.run_directory import RunDirectory
 from service.policies.numpy_policy import NumpyMCPPolicy
+from service.primitives.acting import acting_config
 from service.primitives.bundled import BUNDLED
 from service.primitives.loading import read_stages
 from service.primitives.publishing import measure_bob, publish
@@ -60,7 +60,7 @@ def ship(reference: str, source: Registry, target: Path) -> Version:
     """
     manifest, parameters = source.load(reference)
     NumpyMCPPolicy(parameters)
-    parse_config(manifest.config, where=f"the manifest of {reference}")
+    acting_config(manifest.config, where=f"the manifest of {reference}")
     for text in _texts(manifest.model_dump(mode="json")):
         if text.startswith(("/", "~")):
             raise TandemError(f"{reference}: its manifest names the path {text!r}, which only one machine has")

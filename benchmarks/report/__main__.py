@@ -4,7 +4,7 @@
 
 Every block between two markers of the ``PAGES`` is written anew, and all pictures; the words around the blocks stay.
 Whether a target was reached is computed. A block about something that was not recorded says so.
-``results/downstream.md`` is written whole, as by ``tandem downstream table``.
+``results/downstream.md`` is written whole.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from benchmarks import robot_bridge, time_to_skill
+from benchmarks import time_to_skill
 from benchmarks.report import (
     attacks,
     champion,
@@ -37,6 +37,7 @@ from benchmarks.report import (
     summary,
     transfer,
 )
+from benchmarks.report.downstream import draw_table, write_results
 from benchmarks.report.figures import (
     draw_ablations,
     draw_chaos,
@@ -50,9 +51,8 @@ from benchmarks.report.figures import (
 )
 from benchmarks.reproduce import Places, experiments
 from benchmarks.run_files import Run, read_run
-from service.downstream.page import draw_table
-from service.downstream.results import Result, ResultsDirectory
-from service.downstream.table import write_results
+from service.downstream.files import Result
+from service.downstream.results import ResultsDirectory
 from service.errors import TandemError
 from service.io.files import os_errors, write_atomic
 
@@ -60,23 +60,23 @@ PROGRAMS = {
     "env_throughput": "benchmarks.env_throughput",
     "selfplay_throughput": "benchmarks.selfplay_throughput",
     "throughput": "benchmarks.compare_commits",
-    "cluster_throughput": "benchmarks.cluster_throughput",
+    "cluster_throughput": "benchmarks.cluster_throughput of commit 82ca6fd",
     "chaos": "benchmarks.chaos of commit ddd0770",
     "rest_load": "benchmarks.rest_load of commit ddd0770",
     "soak": "benchmarks.soak of commit ddd0770",
-    "strikes": "tools.strikes",
+    "strikes": "tools.strikes of commit 82ca6fd",
     "deployed": "tools.deployed",
     "mutation": "tools.mutation",
-    "scaling": "benchmarks.scaling",
-    "ranks_on_nodes": "tools.ranks_on_nodes",
+    "scaling": "benchmarks.scaling of commit 82ca6fd",
+    "scaling_box": "benchmarks.scaling",
     "robots": "benchmarks.robots",
     "transfer": "benchmarks.transfer",
     "transfer_champion": "benchmarks.transfer --name transfer_champion",
-    "robot_bridge": "benchmarks.robot_bridge",
-    "world_speed": "benchmarks.world_speed",
+    "robot_bridge": "benchmarks.robot_bridge of commit 82ca6fd",
+    "world_speed": "benchmarks.compare_commits --worlds",
     "page_speed": "benchmarks.page_speed",
-    "robustness": "benchmarks.robustness",
-    "randomisation_ranges": "benchmarks.randomisation_ranges",
+    "robustness": "benchmarks.robustness of commit 82ca6fd",
+    "randomisation_ranges": "benchmarks.randomisation_ranges of commit 82ca6fd",
 }
 """Modules by the name of the recorded file that they make."""
 PAGES = {
@@ -94,7 +94,7 @@ PAGES = {
     "results/README.md": ("throughput", "mutation"),
     "results/robust.md": ("robustness", "randomisation_ranges"),
     "../README.md": ("headline",),
-    "scaling.md": ("bottleneck", "box", "nodes", "model", "batches", "skill", "constants"),
+    "scaling.md": ("bottleneck", "box", "model", "batches", "skill", "constants"),
 }
 """Blocks of every page."""
 RECIPE = "recipe"
@@ -164,12 +164,9 @@ def read_all(directory: Path) -> list[Run]:
 
 def read_runs(directory: Path) -> tuple[list[Run], list[Run]]:
     """Recorded runs in the order of their names, and recorded ablations in that of their list."""
-    from benchmarks.ablations import ABLATIONS
-
     runs = read_all(directory)
-    order = {name: place for place, name in enumerate(ABLATIONS)}
     ablations = [run for run in runs if "ablation" in run]
-    ablations.sort(key=lambda run: (order.get(run["ablation"]["name"], len(order)), run["config"]["seed"]))
+    ablations.sort(key=lambda run: (pretraining.ABLATIONS.index(run["ablation"]["name"]), run["config"]["seed"]))
     return [run for run in runs if "ablation" not in run], ablations
 
 
@@ -190,7 +187,7 @@ def transfer_blocks(found: Results) -> Blocks:
     }
     bridge = found.get("robot_bridge")
     if bridge is not None:
-        blocks["robot_bridge"] = [robot_bridge.report(bridge), transfer.bridge_words(bridge)]
+        blocks["robot_bridge"] = [transfer.bridge_table(bridge), transfer.bridge_words(bridge)]
     return blocks
 
 
@@ -360,8 +357,8 @@ def scaling_blocks(found: Results, studies: Results) -> Blocks:
         "constants": scaling.constants_block,
     }
     blocks = {name: [maker(found["scaling"])] for name, maker in makers.items() if "scaling" in found}
-    if "ranks_on_nodes" in found:
-        blocks["nodes"] = [scaling.nodes_block(found["ranks_on_nodes"])]
+    if "scaling_box" in found:  # newer than the box of the model
+        blocks["box"] = [scaling.box_block(found["scaling_box"])]
     if studies:
         blocks["batches"] = [scaling.batches_block(studies), recipe.recipe_words(studies[RECIPE])]
     if studies and "scaling" in found:

@@ -6,10 +6,9 @@ from collections.abc import Sequence
 
 from benchmarks.report.markdown import millions, percent
 from benchmarks.run_files import Run
-from service.config import parse_config
-from service.downstream.compose import parameters_digest
 from service.primitives.bundled import BUNDLED
-from service.primitives.loading import load_bob
+from service.primitives.digest import parameters_digest
+from service.primitives.loading import load
 from service.primitives.publishing import FINAL_EVALUATION_EPISODES
 
 CHAMPION = "panda-cube@champion"
@@ -19,21 +18,17 @@ DIGITS = 12
 
 def champion_words(runs: Sequence[Run]) -> str:
     """The bundled champion: its version, digest, run, and what its manifest says it solved when it was published."""
-    bob = load_bob(CHAMPION, BUNDLED)
-    alike = [
-        run["name"]
-        for run in runs
-        if parse_config(run["config"], where=f"the run {run['name']}", recorded=True) == bob.config
-    ]
+    bob = load(CHAMPION, BUNDLED)
+    assert bob.manifest is not None  # it is a published version
+    alike = [run["name"] for run in runs if run["config"] == bob.manifest.config]
     made_by = f"the run {alike[0]}" if alike else "made by no run that is recorded here"
     manifest, config = bob.manifest, bob.config
-    assert manifest is not None  # it is a published version
     rates = ", ".join(
         f"{percent(manifest.metrics[f'evaluation/{goals}_success_last'], 1)} of {goals}"
         for goals in ("mixed", "air", "table")
     )
     return (
-        f"`{CHAMPION}`, in the package, is version {manifest.version}, {made_by}: seed {config.seed}, "
+        f"`{CHAMPION}`, in the package, is version {manifest.version}, {made_by}: seed {manifest.config['seed']}, "
         f"{config.policy.bob.num_primitives} primitives, {millions(manifest.metrics['env_steps'])} env steps, "
         f"parameters `{parameters_digest(bob.primitives)[:DIGITS]}`. When it was published it had {rates} "
         f"goals, {FINAL_EVALUATION_EPISODES} of each."

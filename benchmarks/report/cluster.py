@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import Any
 
 from benchmarks.report.markdown import duration, measured_on, percent, table
@@ -19,31 +18,16 @@ NUM_ROUNDS = 50_000
 _NAMES = {"actor": "rollout actor", "generator": "task generator", "status": "status actor", "redis": "Redis"}
 
 
-@dataclass(frozen=True, slots=True)
-class Target:
-    """A number that was asked for, beside what was measured."""
-
-    what: str
-    asked: str
-    measured: str
-    reached: bool | None
-    """None: not measured."""
-
-
-def targets(found: Mapping[str, Result]) -> list[Target]:
-    """All targets.
-
-    Args:
-        found: recorded results by the name of their benchmark; those that are missing were not measured.
-    """
-    makers = {"cluster_throughput": _throughput_targets, "chaos": _chaos_targets, "rest_load": _rest_targets,
-              "soak": _soak_targets}  # fmt: skip
-    return [target for name, maker in makers.items() if name in found for target in maker(found[name])]
+Target = tuple[str, str, str, bool | None]
+"""What was asked for, how much, what was measured, and whether it was reached; None: not measured."""
 
 
 def targets_table(found: Mapping[str, Result]) -> str:
-    """All targets, and whether they were reached."""
-    rows = [(each.what, each.asked, each.measured, verdict(each.reached)) for each in targets(found)]
+    """All targets of the recorded results, by the name of their benchmark, and whether they were reached."""
+    makers = {"cluster_throughput": _throughput_targets, "chaos": _chaos_targets, "rest_load": _rest_targets,
+              "soak": _soak_targets}  # fmt: skip
+    targets = [target for name, maker in makers.items() if name in found for target in maker(found[name])]
+    rows = [(*words, verdict(reached)) for *words, reached in targets]
     return table(("", "asked", "measured", ""), rows) if rows else ""
 
 
@@ -53,81 +37,65 @@ def verdict(reached: bool | None) -> str:
 
 
 def _throughput_targets(result: Result) -> list[Target]:
-    ratio, ray, sent = result["ratio"], result["ray"], result["broadcast"]
+    ratio, ray, overlapped = result["ratio"], result["ray"], result["broadcast"]["overlapped_share"]
     lag, idle = ray["policy_lag"], ray["learner_idle_share"]
     return [
-        Target("env steps/s, Ray / local", f">= {percent(MIN_RATIO)}", _spread(ratio), ratio["median"] >= MIN_RATIO),
-        Target("learner idle", f"< {percent(MAX_IDLE)}", percent(idle), idle < MAX_IDLE),
-        Target("mean policy lag", f"<= {MAX_MEAN_LAG:g}", f"{lag['mean']:.2f}", lag["mean"] <= MAX_MEAN_LAG),
-        Target("greatest policy lag", f"<= {MAX_LAG:g}", f"{lag['max']:g}", lag["max"] <= MAX_LAG),
-        Target("updates and broadcasts overlapped with acting", f">= {percent(MIN_OVERLAPPED)}",
-               percent(sent["overlapped_share"]), sent["overlapped_share"] >= MIN_OVERLAPPED),
+        ("env steps/s, Ray / local", f">= {percent(MIN_RATIO)}", _spread(ratio), ratio["median"] >= MIN_RATIO),
+        ("learner idle", f"< {percent(MAX_IDLE)}", percent(idle), idle < MAX_IDLE),
+        ("mean policy lag", f"<= {MAX_MEAN_LAG:g}", f"{lag['mean']:.2f}", lag["mean"] <= MAX_MEAN_LAG),
+        ("greatest policy lag", f"<= {MAX_LAG:g}", f"{lag['max']:g}", lag["max"] <= MAX_LAG),
+        ("updates and broadcasts overlapped with acting", f">= {percent(MIN_OVERLAPPED)}", percent(overlapped),
+         overlapped >= MIN_OVERLAPPED),
     ]  # fmt: skip
 
 
 def _chaos_targets(result: Result) -> list[Target]:
     ended, account, redis = result["ended"], result["account"], result["redis"]
-    missed = account["num_handed_by_the_dead"] - account["num_counted_of_the_dead"]
-    twice = account["num_counted"] - account["num_in_ledger"]
-    went_on = redis["iterations_meanwhile"]
+    handed, left = account["num_handed_by_the_dead"], account["num_left_at_the_end"]
+    missed, twice = handed - account["num_counted_of_the_dead"], account["num_counted"] - account["num_in_ledger"]
+    whole, went_on = redis["history_complete"], redis["iterations_meanwhile"]
+    finished = ended["exit_code"] == 0 and ended["state"] == "finished"
+    compared = result["compared"]["bob/success_rate"]
+    away, most = compared["disturbed_from_undisturbed"], max(compared["undisturbed_from_each_other"])
+    mean = sum(away) / len(away)
+    curve = f"<= {WITHIN_NOISE:g} x {most:.3f}, as far as undisturbed ones are apart"
     return [
-        Target("the run that is shot at ends by itself", "finished", str(ended["state"]),
-               ended["exit_code"] == 0 and ended["state"] == "finished"),
-        Target("rollouts lost after hand-over", "0", f"{missed} of {account['num_handed_by_the_dead']} by actors that "
-               "were killed", missed == 0 and account["num_left_at_the_end"] >= 0),
-        Target("rollouts counted twice", "0", f"{twice} of {account['num_counted']}", twice == 0),
-        Target("records complete", "yes", "yes" if account["complete"] else "no", bool(account["complete"])),
-        _back("rollout actor back", result["recovery"].get("actor"), ACTOR_BACK_S),
-        _back("learner back", result["recovery"].get("learner"), LEARNER_BACK_S),
-        Target("iterations while Redis is away", "> 0", str(went_on), None if went_on is None else went_on > 0),
-        Target("Redis has the whole history again", "yes", "yes" if redis["history_complete"] else "no",
-               bool(redis["history_complete"])),
-        _curve(result["compared"]["bob/success_rate"]),
-    ]  # fmt: skip
+        ("the run that is shot at ends by itself", "finished", ended["state"], finished),
+        ("rollouts lost after hand-over", "0", f"{missed} of {handed} by actors that were killed", missed == 0 <= left),
+        ("rollouts counted twice", "0", f"{twice} of {account['num_counted']}", twice == 0),
+        ("records complete", "yes", "yes" if account["complete"] else "no", account["complete"]),
+        _back("rollout actor", result["recovery"]["actor"], ACTOR_BACK_S),
+        _back("learner", result["recovery"]["learner"], LEARNER_BACK_S),
+        ("iterations while Redis is away", "> 0", str(went_on), went_on > 0),
+        ("Redis has the whole history again", "yes", "yes" if whole else "no", whole),
+        ("success curve, distance from undisturbed", curve, f"{mean:.3f}", mean <= WITHIN_NOISE * most),
+    ]
 
 
-def _back(what: str, found: Mapping[str, Any] | None, seconds: float) -> Target:
-    asked = f"<= {seconds:g} s"
-    if found is None or found["up_s"]["worst"] is None:
-        return Target(what, asked, "never", None if found is None else False)
+def _back(what: str, found: Mapping[str, Any], seconds: float) -> Target:
     worst, median = found["up_s"]["worst"], found["up_s"]["median"]
     words = f"{worst:.1f} s at worst, {median:.1f} s as a rule ({found['back']} of {found['killed']})"
-    return Target(what, asked, words, worst <= seconds and found["back"] == found["killed"])
-
-
-def _curve(compared: Mapping[str, Any]) -> Target:
-    away, noise = compared["disturbed_from_undisturbed"], compared["undisturbed_from_each_other"]
-    mean = sum(away) / len(away)
-    if not noise:
-        return Target("success curve, distance from undisturbed", "within noise", f"{mean:.3f}", None)
-    asked = f"<= {WITHIN_NOISE:g} x {max(noise):.3f}, as far as undisturbed ones are apart"
-    return Target("success curve, distance from undisturbed", asked, f"{mean:.3f}", mean <= WITHIN_NOISE * max(noise))
+    return f"{what} back", f"<= {seconds:g} s", words, worst <= seconds and found["back"] == found["killed"]
 
 
 def _rest_targets(result: Result) -> list[Target]:
     p99, slow, rate = result["answered"]["all"]["p99_ms"], result["slow_down"], result["requests_per_s"]
-    asked = result["settings"]["rate"]
+    asked, failed = result["settings"]["rate"], result["num_failed"]
+    answered = rate >= 0.98 * asked and asked >= REQUESTS_PER_S and failed == 0
     return [
-        Target("requests a second, all answered", f"{REQUESTS_PER_S:.0f}", f"{rate:.0f}, {result['num_failed']} failed",
-               rate >= 0.98 * asked and asked >= REQUESTS_PER_S and result["num_failed"] == 0),
-        Target("p99 of all routes", f"< {MAX_P99_MS:g} ms", f"{p99:.1f} ms", p99 < MAX_P99_MS),
-        Target("the training slows by", f"< {percent(MAX_SLOW_DOWN)}", _spread(slow), slow["median"] < MAX_SLOW_DOWN),
-    ]  # fmt: skip
+        ("requests a second, all answered", f"{REQUESTS_PER_S:.0f}", f"{rate:.0f}, {failed} failed", answered),
+        ("p99 of all routes", f"< {MAX_P99_MS:g} ms", f"{p99:.1f} ms", p99 < MAX_P99_MS),
+        ("the training slows by", f"< {percent(MAX_SLOW_DOWN)}", _spread(slow), slow["median"] < MAX_SLOW_DOWN),
+    ]
 
 
 def _soak_targets(result: Result) -> list[Target]:
-    grown = [name for name, each in result["processes"].items() if not each["flat"]]
-    leaking = [name for name, each in result["processes"].items() if not each["descriptors_flat"]]
-    return [
-        Target("rounds of tiny games", f">= {NUM_ROUNDS:,}", f"{result['num_rounds']:,}",
-               result["num_rounds"] >= NUM_ROUNDS),
-        Target("memory flat", "every process", _but(grown), not grown),
-        Target("file descriptors and threads flat", "every process", _but(leaking), not leaking),
-    ]  # fmt: skip
-
-
-def _but(exceptions: list[str]) -> str:
-    return f"all but {', '.join(exceptions)}" if exceptions else "all"
+    num = result["num_rounds"]
+    rows: list[Target] = [("rounds of tiny games", f">= {NUM_ROUNDS:,}", f"{num:,}", num >= NUM_ROUNDS)]
+    for what, key in {"memory flat": "flat", "file descriptors and threads flat": "descriptors_flat"}.items():
+        grown = [name for name, each in result["processes"].items() if not each[key]]
+        rows.append((what, "every process", f"all but {', '.join(grown)}" if grown else "all", not grown))
+    return rows
 
 
 def _spread(each: Mapping[str, Any]) -> str:

@@ -7,14 +7,13 @@ from collections.abc import Iterable, Sequence
 
 import numpy as np
 
+from benchmarks.report.downstream import PAPER, Seeds
 from benchmarks.report.markdown import Row, table
 from benchmarks.reproduce import Experiment
 from service.actors.evaluation import wilson_interval
-from service.downstream.files import TRIAL
+from service.downstream.files import TRIAL, Result
 from service.downstream.methods import METHODS
-from service.downstream.page import PAPER
-from service.downstream.rates import seed_interval
-from service.downstream.results import Result
+from service.downstream.rates import by_method_and_task, rate_of
 from service.envs.tasks import TASKS
 
 PAPER_EPISODES = 48
@@ -28,9 +27,10 @@ def comparison_table(results: Sequence[Result]) -> str:
 
     Bold where it is no accident: the paper's interval, Wilson's of 48 episodes, and ours have nothing in common.
     """
+    of = by_method_and_task(results)
     rows: list[Row] = []
     for method, rates in PAPER.items():
-        found = [_rates(results, method, task) for task in TASKS]
+        found = [of.get((method, task), []) for task in TASKS]
         cells = [_cell(seeds, rates[task]) for seeds, task in zip(found, TASKS, strict=True)]
         counts = sorted({len(seeds) for seeds in found if seeds})
         rows.append((METHODS[method].title, *cells, " to ".join(map(str, counts)) or "0"))
@@ -40,9 +40,10 @@ def comparison_table(results: Sequence[Result]) -> str:
 def longer_table(results: Sequence[Result], longer: Sequence[Result]) -> str:
     """Success after the env steps of the table and after those of longer trials, where there are such."""
     tasks = [task for task in TASKS if any(each[TRIAL]["task"] == task for each in longer)]
+    of, of_longer = by_method_and_task(results), by_method_and_task(longer)
     rows: list[Row] = []
     for method in METHODS:
-        pairs = [(_rates(results, method, task), _rates(longer, method, task)) for task in tasks]
+        pairs = [(of.get((method, task), []), of_longer.get((method, task), [])) for task in tasks]
         if any(after for _, after in pairs):
             cells = [f"{_mean(before)} to {_mean(after)} ({len(after)})" if after else "" for before, after in pairs]
             rows.append((METHODS[method].title, *cells))
@@ -51,9 +52,10 @@ def longer_table(results: Sequence[Result], longer: Sequence[Result]) -> str:
 
 def distances_table(results: Sequence[Result]) -> str:
     """Mean distance between object and goal at the end of the final episodes, of what learns from nothing."""
+    of = by_method_and_task(results)
     rows: list[Row] = []
     for name in learning(None):
-        found = [trials_of(results, name, task) for task in TASKS]
+        found = [of.get((name, task), []) for task in TASKS]
         cells = [_mean_distance(trials) if trials else "" for trials in found]
         rows += [(METHODS[name].title, *cells)] if any(cells) else []
     words = "Distance of the object from the goal at the end of the final episodes, mean of episodes and seeds:"
@@ -62,10 +64,12 @@ def distances_table(results: Sequence[Result]) -> str:
 
 def harder_table(results: Sequence[Result]) -> str:
     """Success at the last step on *HardPush* and, of the same seeds, on *Push*: each seed."""
+    of = by_method_and_task(results)
     rows: list[Row] = []
     for method in METHODS:
-        hard = {each[TRIAL]["seed"]: each for each in trials_of(results, method, "hard-push")}
-        plain = {each[TRIAL]["seed"]: each for each in trials_of(results, method, "push")}
+        hard, plain = (
+            {each[TRIAL]["seed"]: each for each in of.get((method, task), [])} for task in ("hard-push", "push")
+        )
         if hard:
             rows.append((METHODS[method].title, _each(hard.values()), _each(plain[s] for s in hard if s in plain)))
     return table(("", "HardPush", "Push, the same seeds"), rows) if rows else ""
@@ -106,14 +110,8 @@ def _missing(group: Sequence[Experiment]) -> str:
     )
 
 
-def _mean(seeds: Sequence[tuple[float, int]]) -> str:
-    return f"{100 * np.mean([rate for rate, _ in seeds]):.1f}" if seeds else "not run"
-
-
-def _rates(results: Sequence[Result], method: str, task: str) -> list[tuple[float, int]]:
-    """Success at the last step and number of episodes of each seed."""
-    found = [each["evaluation"] for each in trials_of(results, method, task)]
-    return [(float(each["success_last"]), int(each["num_episodes"])) for each in found]
+def _mean(seeds: Seeds) -> str:
+    return f"{100 * rate_of(seeds).mean:.1f}" if seeds else "not run"
 
 
 def learning(takes: str | None) -> list[str]:
@@ -121,23 +119,14 @@ def learning(takes: str | None) -> list[str]:
     return [name for name, method in METHODS.items() if method.takes == takes and method.player is None]
 
 
-def trials_of(results: Sequence[Result], method: str, task: str) -> list[Result]:
-    """Results of a method on a task."""
-    return [each for each in results if (each[TRIAL]["method"], each[TRIAL]["task"]) == (method, task)]
-
-
 def _mean_distance(trials: Sequence[Result]) -> str:
     return f"{np.mean([each['evaluation']['mean_distance_m'] for each in trials]):.2f} m"
 
 
-def _cell(seeds: Sequence[tuple[float, int]], paper: float) -> str:
+def _cell(seeds: Seeds, paper: float) -> str:
     if not seeds:
         return f"not run ({100 * paper:.0f})"
-    ours = float(np.mean([rate for rate, _ in seeds]))
-    if len(seeds) == 1:
-        low, high = wilson_interval(round(ours * seeds[0][1]), seeds[0][1])
-    else:
-        low, high = seed_interval([rate for rate, _ in seeds])
-    paper_low, paper_high = wilson_interval(round(paper * PAPER_EPISODES), PAPER_EPISODES)
-    text = f"{100 * ours:.1f} ({100 * paper:.0f}, {100 * (ours - paper):+.0f})"
-    return f"**{text}**" if low > paper_high or high < paper_low else text
+    ours = rate_of(seeds)
+    low, high = wilson_interval(round(paper * PAPER_EPISODES), PAPER_EPISODES)
+    text = f"{100 * ours.mean:.1f} ({100 * paper:.0f}, {100 * (ours.mean - paper):+.0f})"
+    return f"**{text}**" if ours.low > high or ours.high < low else text

@@ -14,8 +14,17 @@ import numpy as np
 
 from benchmarks.record_run import BIN_M, NUM_BINS, NUM_SLICES
 from benchmarks.report.skills import METHODS, by_method
-from benchmarks.run_files import Records, Run, binned, unthin
-from benchmarks.stages import CELL_SIZE_M, RANDOM, STAGES, mean_share, paths_m
+from benchmarks.run_files import (
+    CELL_SIZE_M,
+    RANDOM,
+    STAGES,
+    Records,
+    Run,
+    binned,
+    mean_share,
+    paths_m,
+    unthin,
+)  # fmt: skip
 from benchmarks.tasks import ASKED
 from service.config import WorkspaceConfig
 from service.io.files import os_errors, write_atomic

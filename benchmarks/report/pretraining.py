@@ -6,10 +6,13 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 from benchmarks.report.markdown import Row, duration, millions, percent, table
-from benchmarks.run_files import Records, Run, binned, steps_until, unthin
-from benchmarks.stages import RANDOM, STAGES, mean_share
+from benchmarks.run_files import RANDOM, STAGES, Records, Run, binned, mean_share, steps_until, unthin
 from benchmarks.tasks import ASKED, ASKED_RATES, ASKED_STEPS, NUM_STEPS, TASKS
 
+ABLATIONS = (
+    "recipe", "no-abc", "one-goal", "no-past-opponents", "monolithic", "no-mirror", "no-replay-invalid",
+)  # fmt: skip
+"""Recorded ablations in the order of their rows."""
 NUM_BINS = 10
 """Equal parts of a run's env steps; rates are those of the last, distances and heights also those of the first."""
 

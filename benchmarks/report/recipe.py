@@ -8,7 +8,7 @@ from typing import Any
 
 from benchmarks.measuring import RECIPE_FILE
 from benchmarks.report.markdown import commit
-from service.config import load_config, parse_config
+from service.config import Config, load_config
 from service.errors import TandemError
 
 SHIPPED = "the shipped recipe"
@@ -57,7 +57,16 @@ def check_words(path: Path, page: str, study: Mapping[str, Any]) -> None:
 
 
 def _tree(recorded: Mapping[str, Any]) -> dict[str, Any]:
-    return parse_config(dict(recorded), where="a recorded recipe", recorded=True).model_dump(mode="json")
+    """The recorded values of today's keys; those that are gone did nothing in what is compared."""
+    return _filled(Config().model_dump(mode="json"), recorded)
+
+
+def _filled(defaults: Mapping[str, Any], recorded: Mapping[str, Any]) -> dict[str, Any]:
+    found = dict(defaults)
+    for key in defaults.keys() & recorded.keys():
+        both = isinstance(defaults[key], dict) and isinstance(recorded[key], dict)
+        found[key] = _filled(defaults[key], recorded[key]) if both else recorded[key]
+    return found
 
 
 def _leaves(tree: Mapping[str, Any], above: str = "") -> dict[str, Any]:

@@ -7,15 +7,19 @@ import statistics
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
-from benchmarks.report.markdown import commit, measured_on, millions, percent, table
-from benchmarks.scaling_model import ACTORS, Batch, Cost, Model, Ranks, fastest
-from service.config import MIN_ROWS
-from service.media.figures import counted
+from benchmarks.report.markdown import commit, millions, percent, table
+from benchmarks.scaling_model import ACTORS, Batch, Cost, Model, Prediction, fastest, limit, predict
 
 Result = Mapping[str, Any]
 CORES = (2, 4, 16, 64, 256)
+PREDICTED = (1, 2, 4, 16, 256, 4096)
+"""Numbers of actors."""
 NAMED = (16, 256, 4096)
-"""Numbers of actors for which the time of every part is shown."""
+"""Those for which the time of every part is shown."""
+WORLDS_EACH = 120
+"""Worlds of each actor where every actor brings as many."""
+SHARED_WORLDS = 240
+"""Worlds in all where actors share them out."""
 RECIPE = "recipe"
 """Name of the file of the recipe without any change, which other sizes of update are compared with."""
 MIN_SEEDS = 3
@@ -40,22 +44,6 @@ def box_block(result: Result) -> str:
     return f"{words}\n\n{table(head, rows)}"
 
 
-def nodes_block(result: Result) -> str:
-    """A run on many nodes that are processes, with ranks that are killed and hang."""
-    settings, strikes = result["settings"], result["strikes"]
-    words = {"kill": "killed", "stop": "stopped, so that it hangs"}
-    rows = [(each["name"], words[each["how"]], f"{each['back_s']:.0f} s") for each in strikes]
-    wrong = result["num_rollouts_handed_over"] - result["num_rollouts_counted"]
-    return (
-        f"{counted(settings['actors'], 'tiny actor')} and a learner of {counted(settings['ranks'], 'rank')} on "
-        f"{counted(settings['nodes'], 'node')} beside a head, {counted(result['num_iterations'], 'update')}:\n\n"
-        f"{table(('process', 'was', 'next update after'), rows)}\n\n"
-        f"Rollouts that actors handed over: {result['num_rollouts_handed_over']:,}; that the learner counted: "
-        f"{result['num_rollouts_counted']:,}; lost or counted twice: {abs(wrong):,}."
-        f"{measured_on(result['machine'])}"
-    )
-
-
 def constants_block(result: Result) -> str:
     """Costs of every part."""
     head = ("", "an update", "and each rollout", "and each world of it", "and each actor at each rollout")
@@ -63,12 +51,8 @@ def constants_block(result: Result) -> str:
         (name, *(_time(cost[key]) for key in ("update_s", "rollout_s", "world_s", "pair_s")))
         for name, cost in result["model"]["constants"].items()
     ]
-    assumed, messages = result["assumed"], result["alone"]["messages"]
-    model_s = Ranks(**(result["model"]["ranks"] | {"num_messages": 1})).seconds(4)
+    assumed = result["assumed"]
     words = (
-        f"Messages of an update between ranks: {messages['num_messages']}. Between two ranks one takes "
-        f"{_time(messages['message_s'])}, a small one {_time(messages['small_message_s'])}. Between four one takes "
-        f"{_time(messages['message_s_of_four'])} where they share two cores, and {_time(model_s)} in the model.\n\n"
         f"Assumed, not measured: a node receives {assumed['network_mb_per_s']:g} MB/s (two Ray nodes on one box do, so "
         f"a cluster does better), a node has {assumed['actors_per_node']} actors."
     )
@@ -77,14 +61,13 @@ def constants_block(result: Result) -> str:
 
 def model_block(result: Result) -> str:
     """Predictions: as many worlds for each actor, and the same worlds shared out."""
-    model = result["model"]
-    num, total = model["worlds_each"][0]["num_worlds"], model["shared_worlds"]
+    model = _model(result)
+    each = [predict(model, num, WORLDS_EACH) for num in PREDICTED]
+    shared = [predict(model, num, max(1, -(-SHARED_WORLDS // num))) for num in PREDICTED]
     return (
-        f"Every actor brings {num} worlds, so that more actors make larger updates, and the learner has as many ranks "
-        "as keep up with them:\n\n"
-        f"{_predictions(model['worlds_each'])}\n\n"
-        f"The same experiment shared out, {total} worlds in all and at least one for each actor:\n\n"
-        f"{_predictions(model['worlds_shared'])}"
+        f"Every actor brings {WORLDS_EACH} worlds, so that more actors make larger updates:\n\n{_predictions(each)}\n\n"
+        f"The same experiment shared out, {SHARED_WORLDS} worlds in all and at least one for each actor:\n\n"
+        f"{_predictions(shared)}"
     )
 
 
@@ -104,19 +87,18 @@ def batches_block(studies: Mapping[str, Result]) -> str:
 
 def skill_block(result: Result, studies: Mapping[str, Result]) -> str:
     """Time to a skill on many cores: the model's seconds of an update, and how many updates a study took."""
-    model = result["model"]
-    costs = {name: Cost(**cost) for name, cost in model["constants"].items()}
-    actor = costs.pop(ACTORS)
-    ranks, per_node = Ranks(**model["ranks"]), result["assumed"]["actors_per_node"]
-    made = Model(actor, costs, model["env_steps_per_world"], ranks, per_node)
-    found = [_batch(study) for study in studies.values() if len(study["runs"]) >= MIN_SEEDS]
-    head = ("cores", "worlds in all", "actors", "ranks", "an update every", "minutes", "core-hours of those used")
+    model = _model(result)
+    found = [
+        Batch(study["settings"]["num_worlds"], _median(study["runs"], "iteration"))
+        for study in studies.values()
+        if len(study["runs"]) >= MIN_SEEDS
+    ]
+    head = ("cores", "worlds in all", "actors", "an update every", "minutes", "core-hours of those used")
     rows = []
     for num_cores in CORES:
-        way = fastest(made, found, num_cores)
+        way = fastest(model, found, num_cores)
         rows.append(
-            (str(num_cores), str(way.batch.num_worlds), str(way.run.num_actors), str(way.run.num_ranks),
-             f"{way.run.update_s:.3f} s",
+            (str(num_cores), str(way.batch.num_worlds), str(way.run.num_actors), f"{way.run.update_s:.3f} s",
              f"{way.seconds / 60:.1f}", f"{way.seconds * way.run.num_cores / 3600:.2f}")
         )  # fmt: skip
     return f"{table(head, rows)}\n\n**A run gets shorter up to {way.run.num_cores} cores.**"
@@ -131,22 +113,20 @@ def _number(value: float, write: Callable[[float], str] = "{:,.0f}".format) -> s
     return write(value) if math.isfinite(value) else ""
 
 
-def _batch(study: Result) -> Batch:
-    settings = study["settings"]
-    rows = min(settings["recipe"]["learner"][player]["minibatch_size"] for player in ("alice", "bob"))
-    return Batch(settings["num_worlds"], _median(study["runs"], "iteration"), rows // MIN_ROWS)
+def _model(result: Result) -> Model:
+    costs = {name: Cost(**cost) for name, cost in result["model"]["constants"].items()}
+    return Model(costs.pop(ACTORS), costs, result["model"]["env_steps_per_world"])
 
 
-def _predictions(rows: list[Mapping[str, Any]]) -> str:
-    head = ("actors", "ranks", "worlds of each", "env steps/s", "of one actor's", "an update every", "actors busy",
+def _predictions(rows: Sequence[Prediction]) -> str:
+    head = ("actors", "worlds of each", "env steps/s", "of one actor's", "an update every", "actors busy",
             "learner idle", "bottleneck")  # fmt: skip
     return table(
         head,
         [
-            (f"{row['num_actors']:,}", f"{row['num_ranks']:,}", f"{row['num_worlds']:g}",
-             f"{row['env_steps_per_s']:,.0f}", f"{row['env_steps_per_s'] / rows[0]['env_steps_per_s']:.1f}",
-             f"{_seconds(row['update_s'])} s", percent(row["actors_busy"], 1), percent(row["learner_idle"]),
-             row["bottleneck"])
+            (f"{row.num_actors:,}", f"{row.num_worlds:g}", f"{row.env_steps_per_s:,.0f}",
+             f"{row.env_steps_per_s / rows[0].env_steps_per_s:.1f}", f"{_seconds(row.update_s)} s",
+             percent(row.busy(ACTORS), 1), percent(1.0 - row.busy("learner")), row.bottleneck)
             for row in rows
         ],
     )  # fmt: skip
@@ -154,23 +134,24 @@ def _predictions(rows: list[Mapping[str, Any]]) -> str:
 
 def limits_block(result: Result) -> str:
     """The first bottleneck, the next ones, and how busy each part is with many actors."""
-    model = result["model"]
-    limits = model["limits"]
+    model = _model(result)
+    found = {name: limit(model, name, WORLDS_EACH) for name in model.parts}
+    limits = dict(sorted(found.items(), key=lambda item: math.inf if item[1] is None else item[1]))
     first, most = next(iter(limits.items()))
-    rows = {row["num_actors"]: row for row in model["one_rank"]}
+    rows = {num: predict(model, num, WORLDS_EACH) for num in NAMED}
     head = ("part", "keeps up with", *(f"seconds an update, {num:,} actors" for num in NAMED))
     parts = table(
         head,
         [
-            (name, _actors(most_actors), *(_seconds(rows[num]["seconds"][name]) for num in NAMED))
+            (name, _actors(most_actors), *(_seconds(rows[num].seconds[name]) for num in NAMED))
             for name, most_actors in limits.items()
         ],
     )
-    playing = rows[NAMED[0]]["seconds"]["actors"]
+    playing = rows[NAMED[0]].seconds[ACTORS]
     words = f"**The first bottleneck is the {first}**: it keeps up with {_actors(most)}"
     sizes = result["alone"]["sizes"]
     world = sizes["rollout"] / sizes["num_worlds"]
-    held = ", ".join(f"{_mb(num * rows[num]['num_worlds'] * world)} with {num:,}" for num in NAMED)
+    held = ", ".join(f"{_mb(num * WORLDS_EACH * world)} with {num:,}" for num in NAMED)
     return (
         f"{words}, whose rounds take {playing:.2f} s. The rollouts of one update, which the learner holds in memory, "
         f"have {held}. In the order in which parts become one:\n\n{parts}"

@@ -10,8 +10,7 @@ import numpy as np
 from benchmarks.controls import CONTROLS, OURS, TASKS
 from benchmarks.report.markdown import Row, millions, percent, table
 from benchmarks.report.recipe import differences
-from benchmarks.run_files import Run, unthin
-from benchmarks.stages import RANDOM, STAGES, mean_share
+from benchmarks.run_files import RANDOM, STAGES, Run, mean_share, unthin
 from service.envs.tasks import TASKS as DOWNSTREAM
 
 METHODS = {"ours": "ours", "metra": "METRA", "lsd": "LSD", "dads": "DADS", "diayn": "DIAYN"}

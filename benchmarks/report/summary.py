@@ -4,14 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-import numpy as np
-
-from benchmarks.report.comparison import learning, trials_of
+from benchmarks.report.comparison import learning
+from benchmarks.report.downstream import BEST
 from benchmarks.report.markdown import Row, percent, table
-from service.downstream.files import TRIAL
+from service.downstream.files import Result
 from service.downstream.methods import METHODS
-from service.downstream.page import BEST
-from service.downstream.results import Result
+from service.downstream.rates import Rate, by_method_and_task, rate_of
 from service.envs.tasks import TASKS
 
 _OWN = "ours-her"
@@ -25,7 +23,8 @@ def headline_table(results: Sequence[Result]) -> str:
 
     Every cell has its number of seeds in brackets.
     """
-    known = {each[TRIAL]["method"] for each in results}
+    rates = {place: rate_of(seeds) for place, seeds in by_method_and_task(results).items()}
+    known = {method for method, _ in rates}
     groups = {
         "composing frozen primitives, with hindsight": [_OWN],
         "Bob alone, no downstream step": ["asp-only"],
@@ -38,18 +37,14 @@ def headline_table(results: Sequence[Result]) -> str:
             words = f"{title}, the best of up to {len(found)} on each task"
             if len(found) == 1:
                 words = title if len(names) == 1 else f"{title}: {METHODS[found[0]].title}"
-            rows.append((words, *(_best(results, found, task) for task in TASKS)))
+            rows.append(
+                (words, *(_best([rates[name, task] for name in found if (name, task) in rates]) for task in TASKS))
+            )
     rows.append(("*the best of the paper*", *(f"*{percent(rate)} ({_PAPER_SEEDS})*" for rate in BEST.values())))
     words = "Success at the last step, the mean of the seeds; in brackets how many seeds."
     return f"{table(('', *(task.title for task in TASKS.values())), rows)}\n\n{words}"
 
 
-def _best(results: Sequence[Result], methods: Sequence[str], task: str) -> str:
-    means = []
-    for method in methods:
-        rates = [each["evaluation"]["success_last"] for each in trials_of(results, method, task)]
-        means += [(float(np.mean(rates)), len(rates))] if rates else []
-    if not means:
-        return ""
-    best, num_seeds = max(means)
-    return f"{percent(best)} ({num_seeds})"
+def _best(rates: Sequence[Rate]) -> str:
+    best = max(rates, key=lambda rate: (rate.mean, rate.num_seeds), default=None)
+    return "" if best is None else f"{percent(best.mean)} ({best.num_seeds})"

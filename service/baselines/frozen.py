@@ -6,12 +6,13 @@ import math
 
 import numpy as np
 
-from service.envs.observations import POSITIONS
+from service.envs.observations import BOB, POSITIONS
 from service.errors import TandemError
 from service.off_policy_config import SkillMethod
-from service.policies.parameters import ParameterReader, Parameters, PolicyError
+from service.policies.forward import prepared, relu_layers
+from service.policies.parameters import Parameters, PolicyError, checked
 from service.sac.inputs import NUM_MOTION_INPUTS, motion_inputs
-from service.sac.numpy_actor import NumpyActor, NumpyLayers
+from service.sac.numpy_actor import NumpyActor, relu_shapes
 from service.types import FloatArray
 
 _OBJECT = POSITIONS["object"]
@@ -76,12 +77,11 @@ class FrozenSkills:
                     f"policy parameter {name!r}: not of skills; load what a skill-discovery run published"
                 )
             parts[part][rest] = array
-        self._actor, self.method = NumpyActor(parts["actor"]), method
-        self.size = self._actor.num_inputs - NUM_MOTION_INPUTS
+        self.actor, self.method = NumpyActor(parts["actor"]), method
+        self.size = self.actor.num_inputs - NUM_MOTION_INPUTS
         """Z."""
-        reader = ParameterReader({f"network.{name}": array for name, array in parts["network"].items()})
-        self._network = NumpyLayers(reader, "network", None)
-        reader.finish()
+        network = {f"network.{name}": array for name, array in parts["network"].items()}
+        self.network = prepared(np, checked(network, relu_shapes(network, "network")))["network"]
 
     def draw(self, num: int, rng: np.random.Generator) -> FloatArray:
         """(num, Z) skills of the prior."""
@@ -117,7 +117,7 @@ class FrozenSkills:
             raise TandemError(
                 f"skill: expected shape (N, {self.size}), got {skill.shape}; its size is that of training"
             )
-        return self._actor(skill_inputs(previous, positions, skill))
+        return self.actor(skill_inputs(previous, positions, skill))
 
     def towards(self, positions: FloatArray, goal: FloatArray) -> FloatArray:
         """(N, Z) skills that lead to (N, 3) goals, metres, without learning: zero-shot.
@@ -129,10 +129,11 @@ class FrozenSkills:
         """
         there = normalised_place(goal)
         if self.method == "diayn":
-            return self._network(there)
+            found: FloatArray = relu_layers(np, self.network, there)
+            return found
         if self.method == "dads":
             raise TandemError("skills of DADS lead to no given goal; learn an orchestrator")
-        step = self._network(there) - self._network(object_state(positions))
+        step = relu_layers(np, self.network, there) - relu_layers(np, self.network, object_state(positions))
         mean_length = math.sqrt(2.0) * math.gamma((self.size + 1) / 2) / math.gamma(self.size / 2)  # of N(0, I)
         length = np.float32(1.0 if self.method == "metra" else mean_length)
         skills: FloatArray = length * step / np.maximum(np.linalg.norm(step, axis=1, keepdims=True), np.float32(1e-6))
@@ -150,3 +151,22 @@ class SkillPlayer:
         """Act."""
         previous, self._previous = self._previous, positions.copy()
         return self._skills.actions(positions if previous is None else previous, positions, self._skill)
+
+
+class ZeroShotPolicy:
+    """Plays N episodes from their start by the skill that leads from where the object is to the goal."""
+
+    def __init__(self, skills: FrozenSkills) -> None:
+        self.skills = skills
+        self.begin()
+
+    def begin(self) -> None:
+        """Forget the last step: new episodes begin."""
+        self._previous: FloatArray | None = None
+
+    def act_deterministic(self, observation: FloatArray) -> FloatArray:
+        """(N, 14) Bob's input, positions and goal, to actions (N, 4)."""
+        positions = observation[:, : POSITIONS.size]
+        previous, self._previous = self._previous, positions.copy()
+        skill = self.skills.towards(positions, observation[:, BOB["goal"]])
+        return self.skills.actions(positions if previous is None else previous, positions, skill)

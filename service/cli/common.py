@@ -10,7 +10,7 @@ import sys
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich.console import Console
@@ -19,7 +19,11 @@ from typer.core import TyperGroup
 from service.cli.unexpected import UsageError, traceback_in
 from service.errors import TandemError, did_you_mean, one_line
 from service.progress import Display, Task, display, doing
-from service.runtime.signals import InterruptError
+from service.runs.signals import InterruptError
+
+if TYPE_CHECKING:
+    from service.config import Config
+    from service.primitives.loading import Trained
 
 CHAMPION = "panda-cube@champion"
 """The primitives that come with the package."""
@@ -28,6 +32,19 @@ EXIT_SIGNAL = 128
 
 RegistryOption = Annotated[
     Path, typer.Option("--registry", envvar="TANDEM_REGISTRY", metavar="DIR", help="Directory of the registry.")
+]
+SourceOption = Annotated[
+    str,
+    typer.Option(
+        "--registry", envvar="TANDEM_REGISTRY", metavar="DIR|URL", help="Where versions are: a registry or its service."
+    ),
+]
+SOURCE = "registry"
+REFERENCE = "NAME@ALIAS|PATH"
+"""What ``load`` takes, as help has it."""
+ActsWithOption = Annotated[
+    str | None,
+    typer.Option("--primitives", metavar=REFERENCE, help="What it acts with, where that has moved since training."),
 ]
 
 
@@ -130,6 +147,36 @@ def _one_line() -> Iterator[None]:
         command = f"; see {said.ctx.command_path} --help" if said.ctx is not None else ""
         typer.echo(f"error: {one_line(text).rstrip('.')}{command}", err=True)
         raise typer.Exit(said.exit_code) from None
+
+
+def load_start(reference: str, registry: Path | str, config: Config) -> Trained:
+    """What a run of that configuration begins from.
+
+    Raises:
+        TandemError: nothing there, no primitives, or a run of skills.
+    """
+    from service.primitives.loading import load
+
+    if config.skills is not None:
+        raise TandemError("--from is for self-play; skill discovery begins anew: leave it out")
+    return load(reference, registry).expect("primitives", by="--from")
+
+
+def directory_of(registry: str, *, publish: bool) -> Path:
+    """The directory of a registry in which a run publishes, if it does.
+
+    Raises:
+        TandemError: it does, and the registry is a service.
+    """
+    from service.registry.names import is_service
+
+    if not is_service(registry):
+        return Path(registry)
+    if publish:
+        raise TandemError(
+            f"{registry} is read only: publish in a directory (--registry DIR), and serve that; or give --no-publish"
+        )
+    return REGISTRY
 
 
 def how_to_go_on(run_dir: Path, registry: Path, *, runtime: str = "local", address: str | None = None) -> str:

@@ -7,16 +7,16 @@ from typing import Annotated
 
 import typer
 
-from service.cli.common import REGISTRY, QuietOption, RegistryOption, loading
+from service.cli.common import REFERENCE, SOURCE, QuietOption, SourceOption, loading
 from service.cli.film import CAMERA, SIZE, SPEED, GoalsOption, film_options, parse_goals
-from service.errors import TandemError
 
 _MAX_FILMED = 16
 
 
 def dataset(
     players: Annotated[
-        str, typer.Argument(metavar="RUN_DIR|NAME@ALIAS", help="A run's Alice and Bob, or published primitives.")
+        str,
+        typer.Argument(metavar=REFERENCE, help="A run's Alice and Bob, primitives, or a policy of a task."),
     ],
     out: Annotated[
         str, typer.Option(metavar="NAME", help="Of the data set, such as panda-cube; -v0 is added where no -vN is.")
@@ -27,31 +27,28 @@ def dataset(
     video: Annotated[
         Path | None, typer.Option(metavar="FILE", help=f"Film of the first {_MAX_FILMED}, too: .mp4 or .gif.")
     ] = None,
-    registry: RegistryOption = REGISTRY,
+    registry: SourceOption = SOURCE,
     quiet: QuietOption = False,
 ) -> None:
     """Write Bob's episodes, or of a run without --goals its self-play, as a Minari data set."""
     with loading():
-        from service.io.run_directory import RunDirectory
         from service.media import recording
         from service.media.dataset import check_name, played_episodes, played_turns, write_dataset
         from service.media.video import write_episode_video, write_video
-        from service.primitives.loading import TrainedSkills, load_either, load_players
+        from service.primitives.loading import load
 
         name = check_name(out)  # now, not after hours of playing
         options = film_options(SIZE, CAMERA, SPEED, video) if video is not None else None
-        trained = load_either(players, registry)
-    config = trained.config
-    if isinstance(trained, TrainedSkills):
-        raise TandemError(f"{trained.label} holds skills, which have no goals: name primitives, or a run of self-play")
-    if trained.manifest is None and goals is None and config.is_self_play:
-        alice_and_bob = load_players(RunDirectory(Path(players)))
-        rounds = recording.play_rounds(config, *alice_and_bob, num_rounds=episodes, seed=seed)
+        trained = load(players, registry).expect("primitives", "orchestrator", by="tandem dataset")
+    game = trained.config.game.model_copy(update={"success_distance_m": trained.success_distance_m})
+    config = trained.config.model_copy(update={"world": trained.world, "game": game})
+    if trained.alice is not None and goals is None:
+        rounds = recording.play_rounds(config, trained.alice, trained.policy, num_rounds=episodes, seed=seed)
         played = played_turns(rounds)
         if video is not None:
             write_video(rounds[:_MAX_FILMED], config.world, video, options)
     else:
-        asked = parse_goals(goals or "mixed", config.world)
+        asked = parse_goals(goals or ("mixed" if trained.task is None else trained.goals), config.world)
         points = None if isinstance(asked, str) else asked
         if points is not None:
             points = points[[index % len(points) for index in range(episodes)]]
@@ -60,8 +57,8 @@ def dataset(
             config.world,
             asked if isinstance(asked, str) else "mixed",
             num_episodes=episodes,
-            num_steps=config.run.evaluation_steps,
-            success_distance_m=config.game.success_distance_m,
+            num_steps=trained.num_steps,
+            success_distance_m=trained.success_distance_m,
             seed=seed,
             goal=points,
         )

@@ -14,12 +14,16 @@ import typer
 from service.cli.common import (
     CHAMPION,
     EXIT_SIGNAL,
+    REFERENCE,
+    SOURCE,
     CommandGroup,
     QuietOption,
+    SourceOption,
     TrackerOption,
     choose,
     loading,
     print_json,
+    print_table,
     shown,
 )
 from service.cli.orchestrators import evaluate, publish, render
@@ -32,7 +36,7 @@ from service.trackers import Trackers
 if TYPE_CHECKING:
     from service.downstream.table import Runner
     from service.downstream.worker import Callbacks
-    from service.runtime.signals import StopSignals
+    from service.runs.signals import StopSignals
 
 downstream_app = typer.Typer(
     name="downstream", help="New tasks with frozen primitives.", cls=CommandGroup, no_args_is_help=True
@@ -56,12 +60,7 @@ def _method_names() -> list[str]:
     return list(METHODS)
 
 
-_Primitives = Annotated[
-    str, typer.Option(metavar="NAME@ALIAS|RUN_DIR", help="What a method takes: primitives or skills.")
-]
-_Registry = Annotated[
-    str, typer.Option(envvar="TANDEM_REGISTRY", metavar="DIR|URL", help="Where primitives come from.")
-]
+_Primitives = Annotated[str, typer.Option(metavar=REFERENCE, help="What a method takes: primitives or skills.")]
 _Set = Annotated[
     list[str] | None, typer.Option("--set", metavar="A=B", help="How SAC learns, such as gamma=0.9; repeatable.")
 ]
@@ -92,7 +91,7 @@ def train(
     ] = None,
     resume: Annotated[bool, typer.Option("--resume", help="Continue exactly; where nothing is, begin.")] = False,
     overrides: _Set = None,
-    registry: _Registry = "registry",
+    registry: SourceOption = SOURCE,
     threads: _Threads = None,
     publish_as: Annotated[
         str | None, typer.Option("--publish", metavar="NAME", help="Publish what was learned by this name.")
@@ -163,12 +162,12 @@ def table(
     skill_steps: _SkillSteps = None,
     reward_margin_m: _RewardMargin = None,
     episodes: _Episodes = 300,
-    out: Annotated[
-        Path, typer.Option(metavar="DIR", help="Page and picture; in its downstream/ one file for each trial.")
-    ] = Path("docs/results"),
+    out: Annotated[Path, typer.Option(metavar="DIR", help="Has one file for each trial, in its downstream/.")] = Path(
+        "results"
+    ),
     runs: Annotated[Path, typer.Option(metavar="DIR", help="Trainings, to continue them.")] = Path("runs/downstream"),
     overrides: _Set = None,
-    registry: _Registry = "registry",
+    registry: SourceOption = SOURCE,
     runtime: Annotated[str, typer.Option(help="local: in this process; ray: many at once on a cluster.")] = "local",
     address: Annotated[
         str | None, typer.Option(metavar="auto|HOST:PORT", help="Ray cluster; default: a new one on this machine.")
@@ -177,10 +176,10 @@ def table(
     threads: _Threads = None,
     quiet: QuietOption = False,
 ) -> None:
-    """Run the trials that are missing, and write downstream.md."""
+    """Run the trials that are missing, and print the success of every method on every task."""
     from service.downstream.methods import METHODS
     from service.downstream.settings import make_trial
-    from service.downstream.table import Source, make_table
+    from service.downstream.table import Source, make_table, success_table
     from service.envs.tasks import TASKS
 
     learning = _learning(steps, skill_steps, reward_margin_m, overrides)
@@ -196,6 +195,8 @@ def table(
     if not complete:
         typer.echo("stopped; the same command continues", err=True)
         raise typer.Exit(EXIT_SIGNAL + (signals.first or 0))
+    head, *rows = success_table(out)
+    print_table(head, rows)
 
 
 @downstream_app.command("methods")
@@ -276,7 +277,7 @@ def _make_runner(name: str, address: str | None, num_workers: int | None, thread
 def _stop_on_signals() -> Iterator[tuple[Callbacks, StopSignals]]:
     """Let SIGINT and SIGTERM end the block where it can be continued."""
     from service.downstream.worker import Callbacks
-    from service.runtime.signals import InterruptError, StopSignals
+    from service.runs.signals import InterruptError, StopSignals
 
     stopping = functools.partial(answer, "stopping after this iteration; again to end now")
     with StopSignals() as signals, signals.asking(stopping):

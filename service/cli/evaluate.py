@@ -2,12 +2,23 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, cast
 
 import typer
 
-from service.cli.common import CHAMPION, REGISTRY, JsonOption, QuietOption, RegistryOption, choose, loading, print_json
+from service.cli.common import (
+    CHAMPION,
+    REFERENCE,
+    SOURCE,
+    JsonOption,
+    QuietOption,
+    SourceOption,
+    choose,
+    loading,
+    print_json,
+)
 from service.cli.film import (
     CAMERA,
     OUT,
@@ -27,7 +38,8 @@ if TYPE_CHECKING:
     from service.envs.sampling import GoalKind
 
 _Primitives = Annotated[
-    str, typer.Option(metavar="NAME@ALIAS|RUN_DIR", help="Whose Bob; or the directory of an exported version.")
+    str,
+    typer.Option(metavar=REFERENCE, help="A version; or a run, checkpoint, training or exported version."),
 ]
 _Seed = Annotated[int, typer.Option(help="Of the episodes.", min=0)]
 
@@ -35,8 +47,11 @@ _Seed = Annotated[int, typer.Option(help="Of the episodes.", min=0)]
 def evaluate(
     primitives: _Primitives,
     goals: Annotated[
-        str, typer.Option(help="table, air, volume or mixed (70 % anywhere in the volume, else table).")
-    ] = "mixed",
+        str | None,
+        typer.Option(
+            help="table, air, volume or mixed (70 % anywhere in the volume, else table). Default: its task's, or mixed."
+        ),
+    ] = None,
     episodes: Annotated[int, typer.Option(help="Number of random goals.", min=1)] = 300,
     steps: Annotated[int, typer.Option(help="Steps an episode, 25 a second.", min=1)] = 50,
     seed: _Seed = 0,
@@ -45,12 +60,12 @@ def evaluate(
         typer.Option("--set", metavar="world.A=B", help="In another world than that of training; repeatable."),
     ] = None,
     as_json: JsonOption = False,
-    registry: RegistryOption = REGISTRY,
+    registry: SourceOption = SOURCE,
     quiet: QuietOption = False,
 ) -> None:
     """Bob on random goals from fresh resets, without noise, beside a policy that does nothing.
 
-    Of skills (LSD, METRA, DIAYN) the one that leads to the goal acts, zero-shot.
+    Of skills (LSD, METRA, DIAYN) the one that leads to the goal acts, zero-shot. A policy of a task plays its task.
     """
     for override in overrides or ():
         if not override.startswith("world."):
@@ -59,16 +74,15 @@ def evaluate(
         from service.actors.evaluation import IdlePolicy
         from service.actors.evaluation import evaluate as run
         from service.config import changed_config
-        from service.downstream.skills import ZeroShotPolicy
         from service.envs.observations import layouts
         from service.envs.sampling import GOAL_KINDS
-        from service.primitives.loading import TrainedBob, load_either
+        from service.primitives.loading import load
 
-        kind = cast("GoalKind", choose("--goals", goals, GOAL_KINDS))
-        trained = load_either(primitives, registry)
-    player = trained.policy if isinstance(trained, TrainedBob) else ZeroShotPolicy(trained.skills)
+        asked = None if goals is None else choose("--goals", goals, GOAL_KINDS)
+        trained = load(primitives, registry).expect_goals("tandem evaluate")
     config = changed_config(trained.config, overrides or ())
-    world, distance_m = config.world, config.game.success_distance_m
+    world, distance_m = replace(trained, config=config).world, trained.success_distance_m
+    kind = cast("GoalKind", asked or ("mixed" if trained.task is None else trained.goals))
     seen, known = (list(layouts(each.world).positions.columns) for each in (config, trained.config))
     if seen != known:
         more = ", ".join(sorted(set(seen) ^ set(known)))
@@ -78,12 +92,12 @@ def evaluate(
         )
     rows = {
         name: run(policy, world, kind, num_episodes=episodes, num_steps=steps, seed=seed, success_distance_m=distance_m)
-        for name, policy in ((trained.label, player), ("idle", IdlePolicy()))
+        for name, policy in ((trained.label, trained), ("idle", IdlePolicy()))
     }
     if as_json:
         print_json({name: row.as_dict() for name, row in rows.items()})
         return
-    typer.echo(f"{episodes} random goals ({goals}), {steps} steps, within {100 * distance_m:g} cm")
+    typer.echo(f"{episodes} random goals ({kind}), {steps} steps, within {100 * distance_m:g} cm")
     for name, row in rows.items():
         typer.echo(
             f"  {name:<24} at the last step {row.success_last:6.1%}"
@@ -99,7 +113,7 @@ def coverage(
     seed: _Seed = 0,
     out: Annotated[Path, typer.Option(metavar="FILE", help="Picture to write.")] = Path("coverage.png"),
     as_json: JsonOption = False,
-    registry: RegistryOption = REGISTRY,
+    registry: SourceOption = SOURCE,
     quiet: QuietOption = False,
 ) -> None:
     """Plot where random compositions of the primitives, or random skills, move the object, beside a random policy."""
@@ -109,11 +123,11 @@ def coverage(
         from service.actors.coverage import RandomPolicy, skill_trajectories, visited_share
         from service.baselines.coverage import skill_paths
         from service.media.plots import plot_coverage
-        from service.primitives.loading import TrainedBob, load_either
+        from service.primitives.loading import load
 
-        trained = load_either(primitives, registry)
-    world = trained.config.world
-    if isinstance(trained, TrainedBob):
+        trained = load(primitives, registry).expect("primitives", "skills", by="tandem coverage")
+    world = trained.world
+    if trained.kind == "primitives":
         of, path = (
             "composition",
             skill_trajectories(trained.primitives, world, num_skills=skills, num_steps=steps, seed=seed),
@@ -141,19 +155,18 @@ def render(
     size: SizeOption = SIZE,
     camera: CameraOption = CAMERA,
     speed: SpeedOption = SPEED,
-    registry: RegistryOption = REGISTRY,
+    registry: SourceOption = SOURCE,
     quiet: QuietOption = False,
 ) -> None:
-    """Make a film of a run's Alice beside its Bob, of published primitives on goals, or of random skills."""
+    """Make a film of a run's Alice beside its Bob, of a policy on goals or on its task, or of random skills."""
     with loading():
-        from service.io.run_directory import RunDirectory
         from service.media import recording, video
-        from service.primitives.loading import TrainedSkills, load_either, load_players
+        from service.primitives.loading import load
 
         options = film_options(size, camera, speed, out)
-        trained = load_either(primitives, registry)
+        trained = load(primitives, registry)
     config = trained.config
-    if isinstance(trained, TrainedSkills):
+    if trained.kind == "skills":
         assert config.skills is not None
         if goals is not None:
             raise TandemError(f"--goals: {trained.label} holds skills, of which random ones are shown; leave it out")
@@ -161,22 +174,21 @@ def render(
             trained.skills, config.world, num_skills=episodes, num_steps=config.skills.episode_steps, seed=seed
         )
         video.write_episode_video(recorded, config.world, out, options)
-    elif trained.manifest is None and goals is None and config.is_self_play:
-        players = load_players(RunDirectory(Path(primitives)))
-        rounds = recording.record_rounds(config, *players, num_rounds=episodes, seed=seed)
+    elif trained.alice is not None and goals is None:
+        rounds = recording.record_rounds(config, trained.alice, trained.policy, num_rounds=episodes, seed=seed)
         video.write_video(rounds, config.world, out, options)
     else:
-        asked = parse_goals(goals or "mixed", config.world)
+        asked = parse_goals(goals or ("mixed" if trained.task is None else trained.goals), trained.world)
         points = None if isinstance(asked, str) else asked
         recorded = recording.record_episodes(
             trained.policy,
-            config.world,
+            trained.world,
             asked if isinstance(asked, str) else "mixed",
             num_episodes=episodes if points is None else len(points),
-            num_steps=config.run.evaluation_steps,
-            success_distance_m=config.game.success_distance_m,
+            num_steps=trained.num_steps,
+            success_distance_m=trained.success_distance_m,
             seed=seed,
             goal=points,
         )
-        video.write_episode_video(recorded, config.world, out, options)
+        video.write_episode_video(recorded, trained.world, out, options)
     typer.echo(f"video: {out}")

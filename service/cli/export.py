@@ -7,14 +7,14 @@ from typing import Annotated, cast
 
 import typer
 
-from service.cli.common import REGISTRY, JsonOption, QuietOption, RegistryOption, loading
+from service.cli.common import REFERENCE, SOURCE, ActsWithOption, JsonOption, QuietOption, SourceOption, loading
 
 
 def export(
     policy: Annotated[
         str,
         typer.Argument(
-            metavar="NAME@ALIAS|RUN_DIR",
+            metavar=REFERENCE,
             help="Whose Bob; or an orchestrator, published or in its training.",
         ),
     ],
@@ -23,16 +23,10 @@ def export(
     part: Annotated[
         str, typer.Option(help="policy, primitives (each by itself), or all that there is.", metavar="PART")
     ] = "all",
-    primitives: Annotated[
-        str | None,
-        typer.Option(
-            metavar="NAME@ALIAS|RUN_DIR",
-            help="Of an orchestrator; default: those that its training names, which are looked up in the registry.",
-        ),
-    ] = None,
+    primitives: ActsWithOption = None,
     episodes: Annotated[int, typer.Option(help="Played for each delay that is measured.", min=1)] = 100,
     as_json: JsonOption = False,
-    registry: RegistryOption = REGISTRY,
+    registry: SourceOption = SOURCE,
     quiet: QuietOption = False,
 ) -> None:
     """Write a policy for use elsewhere, such as on a robot: networks, what their numbers mean, a README.
@@ -41,11 +35,12 @@ def export(
     1e-5; with inputs far outside of what the policy meets, 1e-4.
     """
     with loading():
-        from service.export.exporting import Part, find_source
+        from service.export.exporting import Part
         from service.export.exporting import export as run
+        from service.primitives.loading import load
 
-        source = find_source(policy, registry, cast(Part, part), primitives)
-    about = run(source, format_name, out, num_episodes=episodes)
+        trained = load(policy, registry, primitives)
+    about = run(trained, format_name, out, part=cast(Part, part), num_episodes=episodes)
     if as_json:
         typer.echo(about.model_dump_json(indent=1))
         return

@@ -10,7 +10,6 @@ from typing import Annotated
 
 import typer
 
-from service import __version__
 from service.cli.common import CommandGroup, QuietOption, quieten
 from service.cli.configs import configs_app
 from service.cli.dataset import dataset
@@ -23,6 +22,7 @@ from service.cli.registry import registry_app
 from service.cli.robot import robot_app
 from service.cli.serve import serve
 from service.cli.unexpected import report_thread_error
+from service.version import __version__
 
 app = typer.Typer(name="tandem", help="Robot skills, pre-trained.", cls=CommandGroup, no_args_is_help=True)
 for command in (pretrain, demo, evaluate, coverage, render, play, dataset, export, serve):

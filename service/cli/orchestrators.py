@@ -3,11 +3,20 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from service.cli.common import JsonOption, QuietOption, loading, print_json
+from service.cli.common import (
+    REFERENCE,
+    SOURCE,
+    ActsWithOption,
+    JsonOption,
+    QuietOption,
+    SourceOption,
+    loading,
+    print_json,
+)
 from service.cli.film import (
     CAMERA,
     OUT,
@@ -20,20 +29,32 @@ from service.cli.film import (
     film_options,
 )
 
+if TYPE_CHECKING:
+    from service.primitives.loading import Trained
+
 ReferenceArgument = Annotated[
-    str, typer.Argument(metavar="RUN|NAME@ALIAS", help="Directory of a training, or a published orchestrator.")
+    str, typer.Argument(metavar=REFERENCE, help="Directory of a training, or a published orchestrator.")
 ]
-ActsWithOption = Annotated[
-    str | None,
-    typer.Option(
-        "--primitives", metavar="NAME@ALIAS|RUN_DIR", help="What it acts with, where that has moved since training."
-    ),
-]
-RegistryOption = Annotated[
-    str, typer.Option("--registry", envvar="TANDEM_REGISTRY", metavar="DIR|URL", help="Where both come from.")
-]
-_Task = Annotated[str | None, typer.Option(help="Another task than the one it was trained on.")]
+_Task = Annotated[str | None, typer.Option(help="Another task than the one it was trained on, if it was.")]
 _Seed = Annotated[int, typer.Option(help="Of the episodes.", min=0)]
+
+
+def load_on_task(
+    reference: str, registry: str, primitives: str | None, task: str | None, *, by: str
+) -> tuple[Trained, str]:
+    """A policy, and the task that it shall play: that of ``--task``, or its own.
+
+    Raises:
+        TandemError: see ``service.load``; or it has no task, or no goals.
+    """
+    from service.primitives.loading import load
+
+    found = load(reference, registry, primitives).expect_goals(by)
+    if task is None:
+        found.expect("orchestrator", by=f"{by} without --task")
+    on = task or found.task
+    assert on is not None
+    return found, on
 
 
 def evaluate(
@@ -42,29 +63,26 @@ def evaluate(
     episodes: Annotated[int, typer.Option(help="Number of random goals.", min=1)] = 300,
     seed: _Seed = 0,
     primitives: ActsWithOption = None,
-    registry: RegistryOption = "registry",
+    registry: SourceOption = SOURCE,
     as_json: JsonOption = False,
     quiet: QuietOption = False,
 ) -> None:
-    """Measure an orchestrator on its task, beside Bob as he is and a policy that does nothing.
+    """Measure a policy on its task, beside Bob as he is and a policy that does nothing.
 
     With the seed of its training, the goals are those of its result.
     """
     with loading():
-        import service
         from service.actors.evaluation import DeterministicPolicy, IdlePolicy
         from service.downstream.playing import FINAL_SEED, evaluate_on
         from service.envs.tasks import SUCCESS_DISTANCE_M, find_task
-        from service.primitives.loading import TrainedBob
 
-        found = service.load_policy(reference, registry, primitives)
-    on, trained = task or found.task, found.trained
-    title = find_task(on).title
+        found, on = load_on_task(reference, registry, primitives, task, by="tandem downstream evaluate")
+    title, trained = find_task(on).title, found.trained
     players: dict[str, DeterministicPolicy] = {found.label: found}
-    if isinstance(trained, TrainedBob) and found.method != "asp-only":
+    if trained is not None and trained.kind == "primitives" and found.policy is not trained.policy:
         players[f"{trained.label}, Bob alone"] = trained.policy
     rows = {
-        name: evaluate_on(on, trained.config.world, player, episodes, seed + FINAL_SEED)
+        name: evaluate_on(on, found.config.world, player, episodes, seed + FINAL_SEED)
         for name, player in (players | {"idle": IdlePolicy()}).items()
     }
     if as_json:
@@ -90,19 +108,18 @@ def render(
     camera: CameraOption = CAMERA,
     speed: SpeedOption = SPEED,
     primitives: ActsWithOption = None,
-    registry: RegistryOption = "registry",
+    registry: SourceOption = SOURCE,
     quiet: QuietOption = False,
 ) -> None:
-    """Make a film of an orchestrator on its task."""
+    """Make a film of a policy on its task."""
     with loading():
-        import service
         from service.downstream.playing import FINAL_SEED, record_on
         from service.envs.tasks import find_task
         from service.media.video import write_episode_video
 
         options = film_options(size, camera, speed, out)
-        found = service.load_policy(reference, registry, primitives)
-    on, world = task or found.task, found.trained.config.world
+        found, on = load_on_task(reference, registry, primitives, task, by="tandem downstream render")
+    world = found.config.world
     recorded = record_on(on, world, found, episodes, seed + FINAL_SEED)
     write_episode_video(recorded, find_task(on).world_from(world), out, options)
     typer.echo(f"video: {out}")
@@ -116,7 +133,7 @@ def publish(
         str | None,
         typer.Option(metavar="NAME@ALIAS", help="The published version that it acts with, if it has another name now."),
     ] = None,
-    registry: RegistryOption = "registry",
+    registry: SourceOption = SOURCE,
     quiet: QuietOption = False,
 ) -> None:
     """Publish an orchestrator in the registry, with a reference to the primitives that it belongs to."""
@@ -130,5 +147,6 @@ def publish(
     found, version = publish_orchestrator(run, name, registry, primitives)
     if alias is not None:
         Registry(Path(registry)).set_alias(version.name, alias, version.number)
+    assert found.trained is not None
     assert found.trained.manifest is not None
     typer.echo(f"{version} is in {registry}: {found.task}, acts with {found.trained.manifest.reference}")

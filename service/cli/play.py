@@ -3,17 +3,21 @@
 from __future__ import annotations
 
 import socket
-from collections.abc import Callable
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
-from service.cli.common import CHAMPION, EXIT_SIGNAL, REGISTRY, QuietOption, RegistryOption, loading
-from service.cli.orchestrators import ActsWithOption, ReferenceArgument
-from service.cli.orchestrators import RegistryOption as AnyRegistryOption
-
-if TYPE_CHECKING:
-    from service.play.cast import Cast
+from service.cli.common import (
+    CHAMPION,
+    EXIT_SIGNAL,
+    REFERENCE,
+    SOURCE,
+    ActsWithOption,
+    QuietOption,
+    SourceOption,
+    loading,
+)
+from service.cli.orchestrators import ReferenceArgument
 
 _Task = Annotated[str | None, typer.Option(help="Play in the world of a downstream task, such as wall.")]
 _Host = Annotated[
@@ -24,24 +28,16 @@ _Seed = Annotated[int, typer.Option(help="Of starts and goals.", min=0)]
 
 
 def play(
-    primitives: Annotated[
-        str, typer.Option(metavar="NAME@ALIAS|RUN_DIR", help="Who plays; a run has Alice.")
-    ] = CHAMPION,
+    primitives: Annotated[str, typer.Option(metavar=REFERENCE, help="Who plays; a run has Alice.")] = CHAMPION,
     task: _Task = None,
     host: _Host = "127.0.0.1",
     port: _Port = None,
     seed: _Seed = 0,
-    registry: RegistryOption = REGISTRY,
+    registry: SourceOption = SOURCE,
     quiet: QuietOption = False,
 ) -> None:
     """Watch a live world in the browser: drag the goal, drive the primitives, see Alice propose."""
-
-    def make_cast() -> Cast:
-        from service.play.cast import cast_primitives
-
-        return cast_primitives(primitives, registry, task)
-
-    _serve(make_cast, host, port, seed)
+    _serve(primitives, registry, None, task, host, port, seed)
 
 
 def play_downstream(
@@ -51,33 +47,29 @@ def play_downstream(
     port: _Port = None,
     seed: _Seed = 0,
     primitives: ActsWithOption = None,
-    registry: AnyRegistryOption = "registry",
+    registry: SourceOption = SOURCE,
     quiet: QuietOption = False,
 ) -> None:
     """Watch an orchestrator on its task, live in the browser."""
-
-    def make_cast() -> Cast:
-        import service
-        from service.play.cast import cast_orchestrator
-
-        return cast_orchestrator(service.load_policy(reference, registry, primitives), task)
-
-    _serve(make_cast, host, port, seed)
+    _serve(reference, registry, primitives, task, host, port, seed)
 
 
-def _serve(make_cast: Callable[[], Cast], host: str, port: int | None, seed: int) -> None:
-    """Load a cast, and show it until Ctrl-C."""
+def _serve(
+    reference: str, registry: str, primitives: str | None, task: str | None, host: str, port: int | None, seed: int
+) -> None:
+    """Load who plays, and show that until Ctrl-C."""
     with loading():
         from service.play.server import LiveWorld
-        from service.runtime.signals import InterruptError, StopSignals
+        from service.primitives.loading import load
+        from service.runs.signals import InterruptError, StopSignals
 
-        cast = make_cast()
+        players = load(reference, registry, primitives).expect_goals("tandem play").on(task)
     with StopSignals() as signals:
         try:
             with loading():
-                world = LiveWorld(cast, host, port, seed)
+                world = LiveWorld(players, host, port, seed)
             with world as live, signals.asking(lambda: None):
-                typer.echo(f"{cast.label}: {live.url}")
+                typer.echo(f"{players.title}: {live.url}")
                 typer.echo(
                     f"from another machine: ssh -L {live.port}:127.0.0.1:{live.port} {socket.gethostname()}, "
                     f"then http://127.0.0.1:{live.port} there; Ctrl-C ends"

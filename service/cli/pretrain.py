@@ -16,12 +16,15 @@ import typer
 from service.cli.common import (
     CHAMPION,
     EXIT_SIGNAL,
-    REGISTRY,
+    REFERENCE,
+    SOURCE,
     QuietOption,
-    RegistryOption,
+    SourceOption,
     TrackerOption,
     choose,
+    directory_of,
     how_to_go_on,
+    load_start,
     loading,
     shown,
     was_typed,
@@ -37,9 +40,9 @@ from service.trackers import Trackers, find_factory
 if TYPE_CHECKING:
     from service.config import Config
     from service.io.run_directory import RunDirectory
-    from service.runtime.pretrain import Pretrained
+    from service.primitives.loading import Trained
+    from service.runs.train import Finished, Runtime
     from service.runtime.ray_connection import ClusterOptions
-    from service.runtime.starting import Start
 
 _CLUSTER_ONLY = ("address", "num_actors", "actor_threads", "learner_cpus", "status", "token_file")
 """Options that mean nothing in one process."""
@@ -70,7 +73,7 @@ def pretrain(
     resume: Annotated[bool, typer.Option("--resume", help="Continue the run in --run-dir exactly.")] = False,
     start_from: Annotated[
         str | None,
-        typer.Option("--from", metavar="NAME@ALIAS|DIR", help="Begin with what that learned, as far as it fits."),
+        typer.Option("--from", metavar=REFERENCE, help="Begin with what that learned, as far as it fits."),
     ] = None,
     seeds: Annotated[
         str | None, typer.Option(metavar="0,1,2|0-4", help="A study: a run for each, in DIR/seed-N; names the best.")
@@ -82,7 +85,7 @@ def pretrain(
         list[str] | None,
         typer.Option("--set", metavar="A.B=C", help="Override a key of the configuration; repeatable."),
     ] = None,
-    registry: RegistryOption = REGISTRY,
+    source: SourceOption = SOURCE,
     publish: Annotated[bool, typer.Option("--publish/--no-publish", help="Publish at the end.")] = True,
     runtime: Annotated[str, typer.Option(help="local: in this process; ray: on a cluster.")] = "local",
     address: Annotated[
@@ -95,7 +98,7 @@ def pretrain(
     actor_threads: Annotated[int, typer.Option(help="Cores of each rollout actor.", min=1)] = 1,
     learner_cpus: Annotated[
         float,
-        typer.Option(help="Cores for each rank of the learner; 0: none for one rank, its threads for several.", min=0),
+        typer.Option(help="Cores for the learner alone; 0: it shares those of the actors.", min=0),
     ] = 0.0,
     status: Annotated[
         str | None,
@@ -117,13 +120,14 @@ def pretrain(
     """Pre-train primitives by self-play, in this process or on a Ray cluster, and publish them."""
     from service.config import load_config
     from service.io.run_directory import RunDirectory
-    from service.runtime.pretrain import prepare
-    from service.runtime.resuming import resumed_config
+    from service.registry.names import is_service
+    from service.runs.resuming import resumed_config
+    from service.runs.train import prepare
     from service.store.models import RUN_ID
 
     def cluster_options() -> ClusterOptions:
+        from service.registry.token import read_token
         from service.runtime.ray_connection import ClusterOptions, parse_status
-        from service.status.token import read_token
 
         where = parse_status(status, read_token(token_file))
         return ClusterOptions(num_actors, actor_threads, learner_cpus, where)
@@ -133,6 +137,7 @@ def pretrain(
         find_factory(each)  # now, not after Ray has started
     named = find_file(config, recipes()) if config is not None else None
     _check_used(context, choose("--runtime", runtime, ("local", "ray")), status)
+    registry = directory_of(source, publish=publish)
     if start_from is not None and resume:
         raise TandemError("--from is for a run that begins, and --resume goes on with one: leave out one of them")
     if run_id is not None:
@@ -150,6 +155,8 @@ def pretrain(
             raise TandemError(
                 "--method with --seeds: a study compares Bobs; start a run for each seed with --set seed=N"
             )
+        if start_from is not None and is_service(source):
+            raise TandemError(f"--from {start_from} with --seeds: runs of a study look in a directory, not at {source}")
         if accept_damaged_records:
             raise TandemError("--accept-damaged-records is for one run of a study: resume that one by its --run-dir")
         pretrain_study(
@@ -170,21 +177,20 @@ def pretrain(
         run_dir = run_dir or runs / resolved.name
     start = None
     if start_from is not None and not resume:
-        from service.runtime.starting import read_start
-
-        start = read_start(start_from, registry, resolved)
+        start = load_start(start_from, source, resolved)
     directory = RunDirectory(run_dir, accept_damaged_records=accept_damaged_records)
     if runtime == "local":
         _pretrain(resolved, directory, registry, resume=resume, publish=publish, start=start, trackers=trackers)
         return
     from service.runtime.ray_connection import connected
+    from service.runtime.ray_runtime import RayRuntime
 
-    options = cluster_options()
+    cluster = RayRuntime(cluster_options())
     with closing(directory), traceback_in(run_dir):
-        prepare(resolved, directory, registry, resume=resume, publish=publish, runtime=runtime)
+        prepare(resolved, directory, registry, resume=resume, publish=publish, runtime=cluster)
         _pretrain(
             resolved, directory, registry, resume=resume, publish=publish, start=start, trackers=trackers,
-            cluster=options, address=address, connection=connected(address),
+            runtime=cluster, address=address, connection=connected(address),
         )  # fmt: skip
 
 
@@ -244,7 +250,7 @@ def demo(
     done = _pretrain(config, RunDirectory(path), path / "registry", resume=False)
     typer.echo(f"\n{_in_words(done)}")
     typer.echo(f"\nThat was a beginning. Primitives that have learned for longer come with tandem; {CHAMPION}:")
-    evaluate(CHAMPION, registry=BUNDLED)  # prints what the first of the next commands prints
+    evaluate(CHAMPION, registry=str(BUNDLED))  # prints what the first of the next commands prints
     typer.echo("\nLook at them, or at the run on its page, in a browser:")
     typer.echo(f"  tandem evaluate --primitives {CHAMPION} --goals mixed --episodes 300")
     typer.echo(f"  tandem render   --primitives {CHAMPION} --out champion.mp4")
@@ -256,7 +262,7 @@ def demo(
         typer.echo(f"tandem {' and '.join(missing)} need: pip install 'tandem-skills[{','.join(missing)}]'")
 
 
-def _in_words(done: Pretrained) -> str:
+def _in_words(done: Finished) -> str:
     """What a short run has come to."""
     rates = {where: done.metrics.get(f"evaluation/{name}_success_last") for name, where in _WHERE.items()}
     told = [f"{rate:.0%} of random goals {where}" for where, rate in rates.items() if rate is not None]
@@ -274,22 +280,22 @@ def _pretrain(
     *,
     resume: bool,
     publish: bool = True,
-    cluster: ClusterOptions | None = None,
+    runtime: Runtime | None = None,
     address: str | None = None,
-    start: Start | None = None,
+    start: Trained | None = None,
     trackers: Sequence[str] = (),
     connection: AbstractContextManager[None] | None = None,
-) -> Pretrained:
+) -> Finished:
     with loading():
-        from service.runtime.pretrain import pretrain as run
+        from service.runs.train import train as run
+    from service.runs.signals import InterruptError
     from service.runtime.progress import Progress
-    from service.runtime.signals import InterruptError
     from service.store.disk_reader import run_id_of
 
     def say_stopped(what: str, number: int) -> NoReturn:
         """Say how to go on, and exit as a process that a signal ends."""
-        runtime = "local" if cluster is None else "ray"
-        how = how_to_go_on(directory.path, registry, runtime=runtime, address=address)
+        name = "local" if runtime is None else runtime.name
+        how = how_to_go_on(directory.path, registry, runtime=name, address=address)
         typer.echo(f"{what}; {how if directory.exists else 'nothing was saved yet'}")
         raise typer.Exit(EXIT_SIGNAL + number)
 
@@ -307,7 +313,7 @@ def _pretrain(
 
             done = run(
                 config, directory, registry,
-                resume=resume, publish=publish, on_iteration=tell, cluster=cluster, start=start,
+                resume=resume, publish=publish, on_iteration=tell, runtime=runtime, start=start,
             )  # fmt: skip
             if done.metrics:
                 final = {name.replace("evaluation/", "final/", 1): value for name, value in done.metrics.items()}

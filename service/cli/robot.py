@@ -10,21 +10,21 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from service.cli.common import CHAMPION, EXIT_SIGNAL, REGISTRY, CommandGroup, RegistryOption, print_json
+from service.cli.common import CHAMPION, EXIT_SIGNAL, REFERENCE, SOURCE, CommandGroup, SourceOption, print_json
 from service.errors import TandemError
 
 if TYPE_CHECKING:
+    from service.primitives.loading import Trained
     from service.robot.backends import Backend, BackendConfig
     from service.robot.limits import Box
     from service.robot.loop import BridgeConfig
-    from service.robot.policies import RobotPolicy
     from service.types import StateArray
 
 robot_app = typer.Typer(name="robot", help="Frozen policies on a robot.", cls=CommandGroup, no_args_is_help=True)
 
 _Policy = Annotated[
     str,
-    typer.Option(metavar="NAME@ALIAS|RUN_DIR", help="Whose Bob; or an orchestrator, published or in its training."),
+    typer.Option(metavar=REFERENCE, help="Whose Bob; or an orchestrator, published or in its training."),
 ]
 _Robot = Annotated[
     str, typer.Option(metavar="NAME|FILE", help="mujoco, pybullet, franka, module:function, or a YAML file.")
@@ -52,16 +52,15 @@ def run(
     overrides: _Set = None,
     dead_man: _DeadMan = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print the result as JSON.")] = False,
-    registry: RegistryOption = REGISTRY,
+    registry: SourceOption = SOURCE,
 ) -> None:
     """Bring the object to goals; Ctrl-C stops the robot first."""
     from service.robot.calibrate import read_calibration
     from service.robot.log import RobotLog
     from service.robot.loop import Bridge
-    from service.robot.policies import load_robot_policy
     from service.robot.running import parse_goal, play
 
-    config, described, player = _bridge_config(overrides), _backend_config(robot), load_robot_policy(policy, registry)
+    config, described, player = _bridge_config(overrides), _backend_config(robot), _load(policy, registry)
     goal_m = None if goal is None else parse_goal(goal, player.world)
     gain = (1.0, 1.0, 1.0)
     if calibration is not None:
@@ -109,13 +108,12 @@ def calibrate(
     policy: _Policy = CHAMPION,
     overrides: _Set = None,
     dead_man: _DeadMan = None,
-    registry: RegistryOption = REGISTRY,
+    registry: SourceOption = SOURCE,
 ) -> None:
     """Measure the response of an arm by motions of some 6 cm about the middle of its safety box, without an object."""
     from service.robot import calibrate as measuring
-    from service.robot.policies import load_robot_policy
 
-    config, described, player = _bridge_config(overrides), _backend_config(robot), load_robot_policy(policy, registry)
+    config, described, player = _bridge_config(overrides), _backend_config(robot), _load(policy, registry)
     with _connected(described, player, 0, dead_man) as (backend, held, wait):
         wait("take everything out of the arm's way")
         found = measuring.calibrate(described.label, backend.robot, player.world, config, held=held)
@@ -156,6 +154,13 @@ def _bridge_config(overrides: list[str] | None) -> BridgeConfig:
         raise TandemError(f"--set: {first_error(error)}") from None
 
 
+def _load(policy: str, registry: str) -> Trained:
+    from service.primitives.loading import load
+    from service.robot.policies import for_robot
+
+    return for_robot(load(policy, registry))
+
+
 def _backend_config(reference: str) -> BackendConfig:
     from service.robot.backends import read_backend
 
@@ -164,7 +169,7 @@ def _backend_config(reference: str) -> BackendConfig:
 
 @contextlib.contextmanager
 def _connected(
-    described: BackendConfig, player: RobotPolicy, seed: int, dead_man: str | None, dry_run: bool = False
+    described: BackendConfig, player: Trained, seed: int, dead_man: str | None, dry_run: bool = False
 ) -> Iterator[tuple[Backend, Callable[[], bool], Callable[[str], None]]]:
     """A robot with its dead-man's switch, and what asks people to get ready; signals come as exceptions.
 
@@ -173,7 +178,7 @@ def _connected(
     from service.robot.backends import connect
     from service.robot.dead_man import HeldKey
     from service.robot.safety import always_held
-    from service.runtime.signals import InterruptError, StopSignals
+    from service.runs.signals import InterruptError, StopSignals
 
     if dead_man not in (None, "key", "none"):
         raise TandemError(f"--dead-man {dead_man!r}: choose key or none")
@@ -199,7 +204,7 @@ def _connected(
 
 
 def _header(
-    player: RobotPolicy, described: BackendConfig, config: BridgeConfig, calibration: Path | None
+    player: Trained, described: BackendConfig, config: BridgeConfig, calibration: Path | None
 ) -> dict[str, Any]:
     return {
         "policy": player.label,

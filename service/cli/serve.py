@@ -27,11 +27,11 @@ def serve(
     quiet: QuietOption = False,
 ) -> None:
     """Show finished and running runs and the registry over REST, to Prometheus, and to a browser."""
+    from service.registry.errors import StatusError
     from service.registry.registry import Registry
-    from service.status.errors import StatusError
+    from service.registry.token import VARIABLE, read_token
     from service.status.ports import DEFAULT_PORT, free_port
     from service.status.run_reader import open_reader
-    from service.status.token import VARIABLE, read_token
 
     with needs_extra("serve", "tandem serve"):
         from service.status.server import StatusServer

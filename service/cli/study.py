@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import typer
 
-from service.cli.common import EXIT_SIGNAL, how_to_go_on, print_table, shown
+from service.cli.common import EXIT_SIGNAL, how_to_go_on, load_start, print_table, shown
 from service.cli.unexpected import traceback_in
 from service.errors import TandemError, one_line
 from service.recipes import DEFAULT_RECIPE, recipes
@@ -65,12 +65,11 @@ def pretrain_study(
     """
     from service.config import load_config
     from service.io.study_directory import StudyDirectory
+    from service.runs.resuming import resumed_config
+    from service.runs.signals import InterruptError
     from service.runtime.pretrain_study import StudyCluster
     from service.runtime.pretrain_study import pretrain_study as run
-    from service.runtime.progress import StudyProgress
-    from service.runtime.resuming import resumed_config
-    from service.runtime.signals import InterruptError
-    from service.runtime.starting import read_start
+    from service.runtime.progress import Progress
     from service.runtime.study_plan import check_same_seeds, parse_seeds
 
     given = parse_seeds(seeds) if seeds is not None else ()
@@ -94,7 +93,7 @@ def pretrain_study(
         resolved, chosen = load_config(config or recipes()[DEFAULT_RECIPE], overrides), given
         directory.check_free(chosen)
         if start_from is not None:
-            start_from = read_start(start_from, registry, resolved).reference
+            start_from = load_start(start_from, registry, resolved).reference
     options = cluster() if cluster is not None else None  # reads the status service's token
     connection: Any = nullcontext()
     if options is not None:
@@ -106,7 +105,7 @@ def pretrain_study(
     try:
         with closing(directory), traceback_in(path), connection:
             place = StudyCluster(*cluster_size(address), options) if options is not None else None
-            progress = StudyProgress(resolved.run.total_env_steps, shown())
+            progress = Progress(resolved.run.total_env_steps, shown())
             result = run(
                 resolved, directory, chosen, registry,
                 resume=resume, publish=publish, parallel=parallel, cluster=place, progress=progress,

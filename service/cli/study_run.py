@@ -20,7 +20,7 @@ def stop_with(parent: int) -> None:
     Args:
         parent: id of the process that started this one.
     """
-    from service.runtime.signals import PASSED_ON
+    from service.runs.signals import PASSED_ON
 
     if sys.platform == "linux":
         ctypes.CDLL(None, use_errno=True).prctl(PR_SET_PDEATHSIG, int(PASSED_ON))

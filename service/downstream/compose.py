@@ -2,7 +2,7 @@
 
 ``ComposePrimitives`` wraps an environment, ``ComposePrimitivesVector`` many at once. What a learner sees stays as it
 was; what it sets, K numbers in [-1, 1], are weights on a logarithmic scale, and the environment is handed the mean of
-the composition, which is deterministic and inside the range of the primitives' means (``policies.composition``). Only
+the composition, which is deterministic and inside the range of the primitives' means (``forward.compose``). Only
 ratios of weights bear on that mean. With a residual the learner sets four more numbers, a small action of its own that
 is added: what primitives never learned, such as pushing where they only carry, is then in reach. NumPy alone: acting
 needs no torch.
@@ -10,59 +10,27 @@ needs no torch.
 
 from __future__ import annotations
 
-import hashlib
-import math
 import operator
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import Any
 
 import gymnasium
 import numpy as np
-from numpy.typing import NDArray
 
 from service.envs.observations import layouts
 from service.errors import TandemError
 from service.policies.numpy_policy import NumpyMCPPolicy
-from service.primitives.loading import TrainedBob, TrainedSkills
+from service.primitives.learned import compose_actions
+from service.primitives.loading import Trained
 from service.types import FloatArray
 
 Info = dict[str, Any]
 Positions = Callable[[Any], FloatArray]
 
 _SEEN_BY_SKILLS = ("action", "positions", "layout")
-WEIGHT_RATIO = 100.0
-"""Greatest weight over least. Bob's own gate has the same range, [0.01, 1]."""
 
 
-def action_weights(actions: FloatArray) -> FloatArray:
-    """Weights ``100 ** ((a - 1) / 2)`` of (..., K) actions: 0.01 at -1, 1 at 1; equal actions, equal weights.
-
-    A linear scale would be its upper half nearly everywhere: a weight has to be 100 times another for its primitive to
-    decide alone.
-    """
-    exponent = 0.5 * (np.clip(np.asarray(actions, dtype=np.float32), -1.0, 1.0) - 1.0)
-    weights: FloatArray = np.exp(np.float32(math.log(WEIGHT_RATIO)) * exponent)
-    return weights
-
-
-def compose_actions(
-    primitives: NumpyMCPPolicy, positions: FloatArray, actions: FloatArray, residual: float
-) -> FloatArray:
-    """(..., 4) actions of the robot, not clipped.
-
-    Args:
-        primitives: K of them.
-        positions: (..., P), metres.
-        actions: (..., K) of a learner; with a residual (..., K + 4).
-        residual: size of the greatest action that is added (Silver et al. 2018; Johannink et al. 2019).
-    """
-    mean, _ = primitives.compose(positions, action_weights(actions[..., : primitives.num_primitives]))
-    if residual:
-        mean += np.float32(residual) * actions[..., primitives.num_primitives :]
-    return mean
-
-
-def check_primitives(primitives: NumpyMCPPolicy | TrainedBob) -> NumpyMCPPolicy:
+def check_primitives(primitives: NumpyMCPPolicy | Trained) -> NumpyMCPPolicy:
     """Return what can be composed, once its manifest says that it is for this robot and layout.
 
     Raises:
@@ -74,7 +42,7 @@ def check_primitives(primitives: NumpyMCPPolicy | TrainedBob) -> NumpyMCPPolicy:
     return primitives.primitives
 
 
-def check_robot(trained: TrainedBob | TrainedSkills) -> None:
+def check_robot(trained: Trained) -> None:
     """Assert that a policy, composable or not, or skills are for this robot and layout, as far as its manifest says.
 
     Raises:
@@ -84,22 +52,11 @@ def check_robot(trained: TrainedBob | TrainedSkills) -> None:
         return
     spaces = trained.manifest.spaces
     known = layouts(trained.config.world).spaces
-    wanted_spaces = known if isinstance(trained, TrainedBob) else {key: known[key] for key in _SEEN_BY_SKILLS}
+    wanted_spaces = {key: known[key] for key in _SEEN_BY_SKILLS} if trained.kind == "skills" else known
     wrong = {key: spaces.get(key) for key, value in wanted_spaces.items() if spaces.get(key) != value}
     if wrong:
         found, wanted = (", ".join(f"{key} {tree[key]}" for key in wrong) for tree in (wrong, known))
         raise TandemError(f"{trained.label} is for another robot or layout: {found}; this one has {wanted}")
-
-
-def parameters_digest(primitives: object) -> str:
-    """SHA-256 of every array of a policy, in their order: the same before and after it was used.
-
-    Recorded results hold it, and the names of the policy's attributes are part of it.
-    """
-    digest = hashlib.sha256()
-    for name, array in _arrays(primitives, ""):
-        digest.update(f"{name} {array.dtype} {array.shape} ".encode() + np.ascontiguousarray(array).tobytes())
-    return digest.hexdigest()
 
 
 class _ComposingWrapper:
@@ -110,7 +67,7 @@ class _ComposingWrapper:
 
     def _compose_with(
         self,
-        primitives: NumpyMCPPolicy | TrainedBob,
+        primitives: NumpyMCPPolicy | Trained,
         observation_space: gymnasium.Space[Any],
         action_space: gymnasium.Space[Any],
         positions: Positions | None,
@@ -185,7 +142,7 @@ class ComposePrimitives(
 
     Args:
         env: acts by the four numbers of ``TabletopEnv``, and shows the P positions that primitives see.
-        primitives: what ``service.load_primitives`` returns, or its ``.primitives``. Never changed.
+        primitives: what ``service.load`` returns, or its ``.primitives``. Never changed.
         positions: takes the (P,) positions (``service.envs.observations``) out of an observation. By default they are
             the observation itself, or its entry ``observation``.
         residual: above 0, the action has four more numbers, which are added to the composition, times this.
@@ -198,7 +155,7 @@ class ComposePrimitives(
     def __init__(
         self,
         env: gymnasium.Env[Any, FloatArray],
-        primitives: NumpyMCPPolicy | TrainedBob,
+        primitives: NumpyMCPPolicy | Trained,
         *,
         positions: Positions | None = None,
         residual: float = 0.0,
@@ -220,7 +177,7 @@ class ComposePrimitivesVector(_ComposingWrapper, gymnasium.vector.VectorWrapper[
     def __init__(
         self,
         env: gymnasium.vector.VectorEnv[Any, FloatArray, Any],
-        primitives: NumpyMCPPolicy | TrainedBob,
+        primitives: NumpyMCPPolicy | Trained,
         *,
         positions: Positions | None = None,
         residual: float = 0.0,
@@ -242,15 +199,3 @@ class ComposePrimitivesVector(_ComposingWrapper, gymnasium.vector.VectorWrapper[
     def restore(self, state: Any) -> Any:
         """Go back to a saved state; the observation there."""
         return self._observe(self.env.restore(state))
-
-
-def _arrays(owner: Any, prefix: str) -> Iterator[tuple[str, NDArray[Any]]]:
-    """Arrays below an object, by the paths to them."""
-    if isinstance(owner, np.ndarray | np.generic):
-        yield prefix, np.asarray(owner)
-    elif isinstance(owner, list | tuple):
-        for index, value in enumerate(owner):
-            yield from _arrays(value, f"{prefix}.{index}")
-    elif hasattr(owner, "__dict__"):
-        for name, value in sorted(vars(owner).items()):
-            yield from _arrays(value, f"{prefix}.{name}")

@@ -7,7 +7,7 @@
 | ``tensorboard/`` | the same metrics as TensorBoard events over env steps |
 | ``checkpoints/`` | the newest one: everything the training continues from exactly, replay buffer included |
 | ``result.json`` | how well it does in the end |
-| ``policy.safetensors`` | what was learned, averaged; ``policy.load_policy`` plays it without torch |
+| ``policy.safetensors`` | what was learned, averaged; ``service.load`` of the directory plays it without torch |
 | ``published.json`` | the version that it was published as last, and the sha256 of its parameters |
 | ``curves.png``, ``episodes.mp4`` | for people |
 | ``tandem-error-*.txt`` | traceback of an error that nobody expected |
@@ -34,6 +34,7 @@ from service.io.files import TEMPORARY_PREFIX, os_errors, remove_temporaries
 from service.io.jsonl import JsonlWriter
 from service.io.lock import LOCK_FILE, DirectoryLock
 from service.io.run_directory import TRIAL_FILE
+from service.primitives.learned import POLICY_FILE
 from service.types import Arrays
 
 _ELSEWHERE = "name another directory (--run-dir, of a table --runs)"
@@ -49,7 +50,7 @@ class TrainingDirectory:
         self.metrics_file = path / "metrics.jsonl"
         self._checkpoints = CheckpointStore(path / "checkpoints", keep=1)
         self.result_file = path / RESULT_FILE
-        self.policy_file = path / "policy.safetensors"
+        self.policy_file = path / POLICY_FILE
         self._metrics = JsonlWriter(self.metrics_file)
         self._lock: DirectoryLock | None = None
 
@@ -85,7 +86,7 @@ class TrainingDirectory:
         with os_errors("write", self.path):
             remove_temporaries(self.path)
         write_json(self.trial_file, {"format_version": FORMAT_VERSION, **identity})  # first: it says whose the rest is
-        self._metrics.truncate_after(saved.step if saved else 0)
+        self._metrics.cut_after(saved.step if saved else 0)
         with os_errors("write", self.path):
             self._events = EventFile(self.path / "tensorboard", after_step=saved.meta["env_steps"] if saved else None)
         return saved

@@ -18,6 +18,8 @@ FORMAT_VERSION = 1
 """Version of both, and of the table's files."""
 TRIAL = "cell"
 """Key of a trial's settings in these files, which call a trial a cell."""
+Result = dict[str, Any]
+"""What a result's file has."""
 MAX_BYTES = 64 * 1024 * 1024
 """Of each of them, whose curves grow with the length of a training."""
 

@@ -7,11 +7,12 @@ import functools
 import numpy as np
 import torch
 
-from service.downstream.inputs import learner_inputs, num_inputs
-from service.downstream.methods import Method, Trained
+from service.downstream.methods import Method
 from service.downstream.settings import TrialConfig
 from service.downstream.worlds import TaskWorlds, columns
 from service.envs.observations import POSITIONS
+from service.primitives.learned import learner_inputs, num_inputs
+from service.primitives.loading import Trained
 from service.sac.learner import Batch, SACLearner
 from service.sac.loop import OffPolicyLoop
 from service.sac.networks import GaussianActor, MCPActor

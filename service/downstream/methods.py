@@ -1,8 +1,8 @@
 """The methods of the paper's table, by name. The harness knows nothing of a method but what is here.
 
-A method that learns says in which worlds its learner acts (``enter``), how its actions become the robot's (``decode``),
-which actor it has and whether goals are relabelled; one with nothing to learn says which policy plays. What a method
-takes, ``primitives``, ``skills`` or nothing, comes from a registry and never changes.
+A method that learns says in which worlds its learner acts (``enter``), which actor it has and whether goals are
+relabelled; one with nothing to learn says which policy plays. What a method takes, ``primitives``, ``skills`` or
+nothing, comes from a registry and never changes.
 """
 
 from __future__ import annotations
@@ -11,57 +11,21 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import gymnasium
-import numpy as np
 
-import service
 from service.actors.evaluation import DeterministicPolicy, IdlePolicy
-from service.baselines.frozen import FrozenSkills
-from service.downstream.compose import (
-    ComposePrimitivesVector,
-    check_primitives,
-    check_robot,
-    compose_actions,
-    parameters_digest,
-)
-from service.downstream.skills import SkillTaskWorlds, ZeroShotPolicy
+from service.baselines.frozen import ZeroShotPolicy
+from service.downstream.compose import ComposePrimitivesVector, check_primitives, check_robot
+from service.downstream.skills import SkillTaskWorlds
 from service.downstream.worlds import TaskWorlds
 from service.envs.observations import layouts
 from service.errors import TandemError, did_you_mean
 from service.off_policy_config import SkillMethod
-from service.primitives.loading import TrainedBob, TrainedSkills
-from service.types import FloatArray
-
-Trained = TrainedBob | TrainedSkills
-Kind = Literal["primitives", "skills"]
-
-
-def frozen_bob(trained: Trained) -> TrainedBob:
-    """The same, a Bob.
-
-    Raises:
-        TandemError: skills.
-    """
-    if isinstance(trained, TrainedBob):
-        return trained
-    raise TandemError(
-        f"{trained.label} holds skills of {trained.skills.method}; this method takes primitives: name some"
-    )
-
-
-def frozen_skills(trained: Trained) -> FrozenSkills:
-    """The skills of ``trained``.
-
-    Raises:
-        TandemError: primitives.
-    """
-    if isinstance(trained, TrainedSkills):
-        return trained.skills
-    raise TandemError(
-        f"{trained.label} holds primitives; this method takes skills: name those of a skill-discovery run"
-    )
+from service.policies.parameters import Parameters
+from service.primitives.learned import RESIDUAL, Frozen, LearnedPolicy
+from service.primitives.loading import Kind, Trained, load
 
 
 def _enter(env: gymnasium.vector.VectorEnv[Any, Any, Any], seed: int, trained: Trained, hold_steps: int) -> TaskWorlds:
@@ -76,31 +40,13 @@ def _enter_composing(
     *,
     residual: float = 0.0,
 ) -> TaskWorlds:
-    return _enter(ComposePrimitivesVector(env, frozen_bob(trained), residual=residual), seed, trained, hold_steps)
+    return _enter(ComposePrimitivesVector(env, trained, residual=residual), seed, trained, hold_steps)
 
 
 def _enter_with_skills(
     env: gymnasium.vector.VectorEnv[Any, Any, Any], seed: int, trained: Trained, hold_steps: int
 ) -> TaskWorlds:
-    return SkillTaskWorlds(env, seed, frozen_skills(trained), hold_steps)
-
-
-Decode = Callable[[Trained, FloatArray, FloatArray, FloatArray], FloatArray]
-
-
-def _itself(trained: Trained, previous: FloatArray, positions: FloatArray, actions: FloatArray) -> FloatArray:
-    return actions
-
-
-def _compose(
-    trained: Trained, previous: FloatArray, positions: FloatArray, actions: FloatArray, *, residual: float = 0.0
-) -> FloatArray:
-    return np.clip(compose_actions(frozen_bob(trained).primitives, positions, actions, residual), -1.0, 1.0)
-
-
-def _act_by_skills(trained: Trained, previous: FloatArray, positions: FloatArray, actions: FloatArray) -> FloatArray:
-    skills = frozen_skills(trained)
-    return skills.actions(previous, positions, skills.from_action(actions))
+    return SkillTaskWorlds(env, seed, trained.skills, hold_steps)
 
 
 def _idle(trained: Trained) -> DeterministicPolicy:
@@ -108,11 +54,11 @@ def _idle(trained: Trained) -> DeterministicPolicy:
 
 
 def _bob(trained: Trained) -> DeterministicPolicy:
-    return frozen_bob(trained).policy
+    return trained.policy
 
 
 def _zero_shot(trained: Trained) -> DeterministicPolicy:
-    return ZeroShotPolicy(frozen_skills(trained))
+    return ZeroShotPolicy(trained.skills)
 
 
 @dataclass(frozen=True, slots=True)
@@ -127,8 +73,6 @@ class Method:
     """What its result depends on; None: nothing, what is loaded only says in which world it plays."""
     enter: Callable[[gymnasium.vector.VectorEnv[Any, Any, Any], int, Trained, int], TaskWorlds] = _enter
     """Makes the worlds its learner acts in, of the task's, a seed, what it takes, and the env steps a skill is held."""
-    decode: Decode = _itself
-    """Turns (N, P) positions one step ago, those of now and the learner's (N, A) actions into (N, 4) actions."""
     mcp_actor: bool = False
     """Whether the actor is a Multiplicative Compositional Policy, learned end to end; else SAC's own network."""
     her_ratio: tuple[float, float] | None = None
@@ -151,6 +95,16 @@ class Method:
         """Whether its learner's action lasts for several env steps."""
         return self.takes == "skills" and self.player is None
 
+    def frozen(self, trained: Trained) -> Frozen:
+        """What its policy acts with; None: it acts by itself."""
+        if self.takes is None:
+            return None
+        return trained.primitives if self.takes == "primitives" else trained.skills
+
+    def learned(self, parameters: Parameters, trained: Trained, hold_steps: int = 1) -> LearnedPolicy:
+        """The policy of what its learner has exported."""
+        return LearnedPolicy(parameters, self.frozen(trained), layouts(trained.config.world), hold_steps)
+
     def check(self, trained: Trained) -> None:
         """Assert that these primitives or skills are for this method.
 
@@ -158,12 +112,12 @@ class Method:
             TandemError: of another kind, robot or layout, skills of another method, or primitives that cannot be
                 composed.
         """
+        if self.takes is not None:
+            trained.expect(self.takes, by=f"the method {self.title}")
         check_robot(trained)
         if self.composes:
-            check_primitives(frozen_bob(trained))
-        elif self.takes == "primitives":
-            frozen_bob(trained)
-        elif self.takes == "skills" and (found := frozen_skills(trained).method) != self.skills:
+            check_primitives(trained)
+        if self.skills is not None and (found := trained.skills.method) != self.skills:
             raise TandemError(f"{trained.label} holds skills of {found}, this method takes those of {self.skills}")
 
 
@@ -179,7 +133,6 @@ def _composing_method(
         description,
         "primitives",
         partial(_enter_composing, residual=residual),
-        partial(_compose, residual=residual),
         her_ratio=her_ratio,
         residual=residual,
     )
@@ -187,7 +140,7 @@ def _composing_method(
 
 def _skill_method(name: SkillMethod) -> Method:
     title = f"{name.upper()} skills"
-    return Method(title, "SAC sets the skill vector", "skills", _enter_with_skills, _act_by_skills, skills=name)
+    return Method(title, "SAC sets the skill vector", "skills", _enter_with_skills, skills=name)
 
 
 def _zero_shot_method(name: SkillMethod) -> Method:
@@ -200,7 +153,7 @@ METHODS: Mapping[str, Method] = {
         "ours + HER", "the same, with relabelled goals, fewer and fewer", her_ratio=(_HER_SHARE, 0.0)
     ),
     "ours-residual-her": _composing_method(
-        "ours + residual + HER", "and adds a small action of its own", her_ratio=(_HER_SHARE, 0.0), residual=0.5
+        "ours + residual + HER", "and adds a small action of its own", her_ratio=(_HER_SHARE, 0.0), residual=RESIDUAL
     ),
     "asp-only": Method("ASP only", "Bob as he is", "primitives", player=_bob),
     "scratch-monolithic-her": Method(
@@ -237,24 +190,21 @@ def find_method(name: str) -> Method:
 
 
 def load_for(methods: Iterable[str], reference: str, registry: Path | str) -> Trained:
-    """Load what methods take: skills, or else primitives, which also say in which world a method plays that takes none.
+    """Load what methods take: skills, or primitives; a method that takes neither plays in their world.
 
     Raises:
         TandemError: no such method, methods that take different kinds, or nothing of that kind there by that reference.
     """
-    kinds = {takes: name for name in methods if (takes := find_method(name).takes)}
+    kinds: dict[Kind, str] = {takes: name for name in methods if (takes := find_method(name).takes)}
     if len(kinds) > 1:
         raise TandemError(
             f"{kinds['primitives']} takes primitives and {kinds['skills']} skills: run them by two commands, each with "
             "its own --primitives"
         )
-    load = service.load_skills if "skills" in kinds else service.load_primitives
-    return load(reference, registry)
-
-
-def digest_of(trained: Trained) -> str:
-    """SHA-256 of the parameters of primitives or skills, as ``parameters_digest`` has it."""
-    return parameters_digest(trained.policy if isinstance(trained, TrainedBob) else trained.skills)
+    trained = load(reference, registry)
+    for kind, name in kinds.items():
+        trained.expect(kind, by=f"the method {name}")
+    return trained
 
 
 def provenance(trained: Trained, method: str = "ours") -> dict[str, Any]:
@@ -267,6 +217,6 @@ def provenance(trained: Trained, method: str = "ours") -> dict[str, Any]:
     """
     name = trained.label if trained.manifest is None else trained.manifest.reference  # the same wherever it came from
     env_steps = None if trained.manifest is None else trained.manifest.metrics.get("env_steps")
-    primitives = {"name": name, "digest": digest_of(trained), "env_steps": env_steps}
+    primitives = {"name": name, "digest": trained.digest, "env_steps": env_steps}
     without = method in METHODS and METHODS[method].takes is None
     return {"primitives": None if without else primitives, "world": trained.config.world.model_dump(mode="json")}

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from service.actors.evaluation import DeterministicPolicy, Evaluation, evaluate
 from service.config import WorldConfig
-from service.envs.gym.registration import EPISODE_STEPS
-from service.envs.tasks import SUCCESS_DISTANCE_M, find_task
+from service.envs.tasks import EPISODE_STEPS, SUCCESS_DISTANCE_M, find_task
 from service.media.recording import RecordedEpisodes, record_episodes
 
 CURVE_SEED, FINAL_SEED = 1_000_000, 2_000_000

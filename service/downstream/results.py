@@ -7,13 +7,12 @@ from pathlib import Path
 from typing import Any
 
 from service.downstream.directory import read_trial
-from service.downstream.files import made_with, read_result, to_json
-from service.downstream.methods import METHODS, Trained, provenance
+from service.downstream.files import Result, made_with, read_result, to_json
+from service.downstream.methods import METHODS, provenance
 from service.downstream.settings import TrialConfig, differences
 from service.errors import TandemError
 from service.io.files import os_errors, write_exclusive
-
-Result = dict[str, Any]
+from service.primitives.loading import Trained
 
 
 class ResultsDirectory:

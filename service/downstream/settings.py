@@ -8,8 +8,7 @@ from pydantic import Field, ValidationError
 
 from service.config_tree import check_numbers
 from service.downstream.methods import find_method
-from service.envs.gym.registration import EPISODE_STEPS
-from service.envs.tasks import SUCCESS_DISTANCE_M, find_task
+from service.envs.tasks import EPISODE_STEPS, SUCCESS_DISTANCE_M, find_task
 from service.errors import TandemError
 from service.frozen import FrozenModel
 from service.off_policy_config import SACConfig

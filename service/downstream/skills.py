@@ -1,4 +1,4 @@
-"""Frozen skills downstream: a learner's action is a skill vector that is held for some steps, or none is learned."""
+"""Frozen skills downstream: a learner's action is a skill vector that is held for some steps."""
 
 from __future__ import annotations
 
@@ -9,7 +9,6 @@ import numpy as np
 
 from service.baselines.frozen import FrozenSkills
 from service.downstream.worlds import TaskWorlds
-from service.envs.observations import BOB, POSITIONS
 from service.sac.worlds import Step
 from service.types import FloatArray
 
@@ -55,18 +54,3 @@ class SkillTaskWorlds(TaskWorlds):
                 success=np.where(goes_on, step.success, total.success),
             )
         return total
-
-
-class ZeroShotPolicy:
-    """Plays N episodes from their start by the skill that leads from where the object is to the goal."""
-
-    def __init__(self, skills: FrozenSkills) -> None:
-        self._skills = skills
-        self._previous: FloatArray | None = None
-
-    def act_deterministic(self, observation: FloatArray) -> FloatArray:
-        """(N, 14) Bob's input, positions and goal, to actions (N, 4)."""
-        positions = observation[:, : POSITIONS.size]
-        previous, self._previous = self._previous, positions.copy()
-        skill = self._skills.towards(positions, observation[:, BOB["goal"]])
-        return self._skills.actions(positions if previous is None else previous, positions, skill)

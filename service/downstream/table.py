@@ -1,7 +1,7 @@
-"""The table: runs the trials that are missing, one after another here or many at once on Ray, and writes the page.
+"""The table: runs the trials that are missing, one after another here or many at once on Ray.
 
-Consumes the results directory; produces a file there for each trial as it ends, then page and picture. A trial that was
-cut off continues from its own training directory, which lies where it ran.
+Consumes the results directory; produces a file there for each trial as it ends. A trial that was cut off continues from
+its own training directory, which lies where it ran.
 """
 
 from __future__ import annotations
@@ -12,19 +12,18 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from service import is_service
-from service.downstream.files import MAX_BYTES, made_with
-from service.downstream.methods import Trained, find_method, load_for, provenance
-from service.downstream.page import MARK, draw_table, write_page
-from service.downstream.results import Result, ResultsDirectory
+from service.downstream.files import Result, made_with
+from service.downstream.methods import METHODS, find_method, load_for, provenance
+from service.downstream.rates import by_method_and_task, rate_of
+from service.downstream.results import ResultsDirectory
 from service.downstream.settings import TrialConfig
 from service.downstream.worker import Callbacks, RunOptions, check_trial, run_trial
+from service.envs.tasks import HARD_TASKS, TASKS
 from service.errors import TandemError
-from service.io.files import os_errors, write_atomic
-from service.progress import doing, tick
-from service.regular_files import read_regular
+from service.primitives.loading import Trained
+from service.progress import doing
+from service.registry.names import is_service
 
-PAGE_FILE, PICTURE_FILE = "downstream.md", "downstream.png"
 _POLL_S = 1.0
 
 
@@ -45,7 +44,7 @@ Runner = Callable[[Sequence[TrialConfig], Trained, Source, Callbacks], Results]
 
 
 def make_table(trials: Sequence[TrialConfig], source: Source, out: Path, runner: Runner, callbacks: Callbacks) -> bool:
-    """Run what is missing; write page and picture from every result in the directory.
+    """Run what is missing, each result into a file of its own in ``out/downstream``.
 
     Returns:
         Whether everything is there; False where it was stopped before.
@@ -54,10 +53,6 @@ def make_table(trials: Sequence[TrialConfig], source: Source, out: Path, runner:
         TandemError: results that are damaged, of another version or other settings, primitives that do not fit or
             cannot be fetched, or a trial that failed. What had ended is kept.
     """
-    page = out / PAGE_FILE
-    with os_errors("read", page):
-        if page.exists() and MARK.encode() not in read_regular(page, MAX_BYTES, follow=True):
-            raise TandemError(f"{page} was not written by this command; name another directory with --out")
     trained = load_for({trial.method for trial in trials}, source.primitives, source.registry)
     results = ResultsDirectory(out / "downstream")
     missing = results.missing(trials, trained)
@@ -72,21 +67,21 @@ def make_table(trials: Sequence[TrialConfig], source: Source, out: Path, runner:
             task.advance()
             rate = result["evaluation"]["success_last"]
             callbacks.say(f"{trial.name}: {rate:.1%} at the last step ({done} of {len(missing)})")
-    callbacks.say("\n".join(map(str, write_results(out))))
     return done == len(missing)
 
 
-def write_results(out: Path) -> list[Path]:
-    """Write page and picture from every result in the directory.
+def success_table(out: Path) -> list[Sequence[str]]:
+    """A head with the tasks, and for each method its success at the last step, of every result in the directory.
 
     Raises:
-        TandemError: a result is damaged or of another version, or something cannot be written.
+        TandemError: a result is damaged or of another version.
     """
-    found, page = ResultsDirectory(out / "downstream").read_all(), out / PAGE_FILE
-    picture = draw_table(found, out / PICTURE_FILE)
-    with os_errors("write", page):
-        write_atomic(page, write_page(found, PICTURE_FILE).encode())
-    return [page, picture]
+    of = by_method_and_task(ResultsDirectory(out / "downstream").read_all())
+    tasks = [task for task in (*TASKS, *HARD_TASKS) if any(task == other for _, other in of)]
+    methods = [method for method in METHODS if any(method == other for other, _ in of)]
+    seeds = [[of.get((method, task)) for task in tasks] for method in methods]
+    rows = [[str(rate_of(each)) if each else "" for each in row] for row in seeds]
+    return [("method", *tasks), *((method, *row) for method, row in zip(methods, rows, strict=True))]
 
 
 def run_here(
@@ -146,7 +141,6 @@ def run_on_ray(
             for reference in running:
                 ray.cancel(reference, force=False)
             return
-        tick()
         ended, _ = ray.wait(list(running), num_returns=1, timeout=_POLL_S)
         for reference in ended:
             trial = running.pop(reference)

@@ -21,22 +21,22 @@ import numpy as np
 import torch
 
 from service.actors.evaluation import DeterministicPolicy, wilson_interval
+from service.downstream.curves import draw_training
 from service.downstream.directory import TrainingDirectory
 from service.downstream.files import FORMAT_VERSION, TRIAL, read_result, write_json
 from service.downstream.learner import make_loop, set_progress, spread_seed
-from service.downstream.methods import Method, Trained, find_method, provenance
-from service.downstream.page import draw_training
+from service.downstream.methods import Method, find_method, provenance
 from service.downstream.playing import CURVE_SEED, FINAL_SEED, evaluate_on, record_on
-from service.downstream.policy import LearnedPolicy, save_policy
 from service.downstream.settings import TrialConfig
 from service.downstream.worlds import TaskWorlds
-from service.envs.gym.registration import EPISODE_STEPS
 from service.envs.gym.vector import TabletopVectorEnv
-from service.envs.tasks import SUCCESS_DISTANCE_M, find_task
+from service.envs.tasks import EPISODE_STEPS, SUCCESS_DISTANCE_M, find_task
 from service.errors import TandemError
 from service.io.checkpoints import Checkpoint
 from service.io.git import git_commit
 from service.io.jsonl import plain
+from service.primitives.learned import save_policy
+from service.primitives.loading import Trained
 from service.progress import Task, doing
 
 CHECKPOINT_EVERY_S = 120.0
@@ -145,9 +145,8 @@ class _Training:
 
     def new_player(self) -> DeterministicPolicy:
         """Make the policy learned so far, ready for a batch of episodes."""
-        return LearnedPolicy(
-            self._loop.learner.averaged_parameters(), self._method, self._trained, self.worlds.steps_per_action
-        )
+        parameters = self._loop.learner.averaged_parameters()
+        return self._method.learned(parameters, self._trained, self.worlds.steps_per_action)
 
     def run(self, saved: Checkpoint | None) -> dict[str, Any] | None:
         """Learn to the end; None where stopped before."""
@@ -168,7 +167,9 @@ class _Training:
             return None
         parameters = self._loop.learner.averaged_parameters()
         held = self.worlds.steps_per_action
-        save_policy(self._directory.policy_file, parameters, self._trial.method, self._trained, held)
+        method = self._trial.method
+        acts_with = provenance(self._trained, method)["primitives"]
+        save_policy(self._directory.policy_file, parameters, method, acts_with, held)
         return {"env_steps": self._loop.num_env_steps, "wall_s": self._wall_s, "curve": self._curve}
 
     def _iterate(self, task: Task) -> None:

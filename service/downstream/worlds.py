@@ -7,8 +7,8 @@ from typing import Any
 import gymnasium
 import numpy as np
 
-from service.downstream.inputs import learner_inputs
 from service.envs.observations import PAPER, POSITIONS, Layouts
+from service.primitives.learned import learner_inputs
 from service.sac.replay import Columns
 from service.sac.worlds import TabletopWorlds
 from service.types import Array, Arrays, BoolArray, FloatArray

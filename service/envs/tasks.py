@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from service.config import WorldConfig
-from service.envs.sampling import GoalKind
 from service.errors import TandemError, did_you_mean
+
+if TYPE_CHECKING:
+    from service.envs.sampling import GoalKind
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,6 +42,8 @@ class Task:
 
 SUCCESS_DISTANCE_M = 0.05
 """Greatest distance from object to goal that counts as success, in every task (paper)."""
+EPISODE_STEPS = 50
+"""Steps of an episode (paper: 50)."""
 
 TASKS: Mapping[str, Task] = {
     "larger": Task(

@@ -8,7 +8,6 @@ from datetime import UTC, datetime
 import mujoco
 import numpy as np
 
-import service
 from service.config import WorldConfig
 from service.envs.batch import DISPLACEMENT_M, MAX_TURN_RAD, WIDTH_CHANGE_M, WorldBatch
 from service.envs.observations import (
@@ -47,6 +46,7 @@ from service.export.networks import Network
 from service.export.parity import Differences
 from service.io.git import git_commit
 from service.robot_config import Numbers, RobotConfig
+from service.version import __version__
 
 _COMPONENTS: Mapping[Kind, tuple[str, ...]] = {
     VECTOR: ("x", "y", "z"),
@@ -104,7 +104,7 @@ def describe(
         task=task,
         format=format_name,
         made=Made(
-            tandem=service.__version__,
+            tandem=__version__,
             git_commit=git_commit(),
             created=datetime.now(UTC).isoformat(timespec="seconds"),
             sha256=dict(digests),

@@ -4,20 +4,22 @@ from __future__ import annotations
 
 import importlib.util
 import logging
+import runpy
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from service.errors import did_you_mean
-from service.export import standalone
 from service.export.errors import ExportError
 from service.export.networks import Network, Outputs
 from service.extras import needs_extra
+from service.policies import forward
 from service.types import FloatArray
 
 if TYPE_CHECKING:
@@ -63,7 +65,7 @@ def find_format(name: str) -> Format:
 
 
 def _write_numpy(network: Network, path: Path) -> None:
-    columns = {f"{standalone.COLUMNS}{name}": [part.start, part.stop] for name, part in network.columns.items()}
+    columns = {f"{forward.COLUMNS}{name}": [part.start, part.stop] for name, part in network.columns.items()}
     about = {"function": network.function, "input_sizes": list(network.inputs.values()), **columns}
     arrays: dict[str, Any] = {**network.parameters, **about}
     np.savez(path, allow_pickle=False, **arrays)
@@ -71,17 +73,12 @@ def _write_numpy(network: Network, path: Path) -> None:
 
 def _read_numpy(network: Network, path: Path) -> Run:
     """Run the folder's own copy of the program, not the package's module."""
-    spec = importlib.util.spec_from_file_location("exported_policy", path.parent / PROGRAM)
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    loaded: Run = module.load(path)
+    loaded: Run = runpy.run_path(str(path.parent / PROGRAM))["load"](path)
     return loaded
 
 
 def _write_program(folder: Path) -> None:
-    (folder / PROGRAM).write_text(Path(standalone.__file__).read_text(encoding="utf-8"), encoding="utf-8")
+    (folder / PROGRAM).write_text(Path(forward.__file__).read_text(encoding="utf-8"), encoding="utf-8")
 
 
 def torch_module(network: Network) -> nn.Module:
@@ -89,7 +86,22 @@ def torch_module(network: Network) -> nn.Module:
     import torch
     from torch import Tensor, nn
 
-    function = standalone.FUNCTIONS[network.function]
+    function = forward.FUNCTIONS[network.function]
+
+    def without_out(operation: Callable[..., Tensor]) -> Callable[..., Tensor]:
+        return lambda *values, out=None: operation(*values)
+
+    xp = SimpleNamespace(
+        ascontiguousarray=lambda array: array,  # a copy would be made at each call
+        clip=torch.clip,
+        concatenate=torch.concatenate,
+        exp=without_out(torch.exp),
+        maximum=without_out(lambda values, least: values.clip(min=least)),
+        minimum=without_out(lambda values, most: values.clip(max=most)),
+        repeat=torch.repeat_interleave,
+        stack=torch.stack,
+        tanh=without_out(torch.tanh),
+    )
 
     class _Module(nn.Module):
         def __init__(self) -> None:
@@ -98,8 +110,8 @@ def torch_module(network: Network) -> nn.Module:
                 self.register_buffer(name.replace(".", "__"), torch.from_numpy(np.array(array)))
 
         def forward(self, *inputs: Tensor) -> tuple[Tensor, ...]:
-            parameters = {name: getattr(self, name.replace(".", "__")) for name in network.parameters}
-            outputs = function(torch, parameters, network.columns, *inputs)
+            stored = {name: getattr(self, name.replace(".", "__")) for name in network.parameters}
+            outputs = function(xp, forward.prepared(xp, stored), network.columns, *inputs)
             return tuple(outputs[name] for name in network.outputs)
 
     return _Module().eval()

@@ -7,8 +7,6 @@ fails where the simulator does not. Everything here is played in the policy's ow
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable
-from dataclasses import dataclass
 
 import numpy as np
 from pydantic import Field
@@ -17,8 +15,8 @@ from service.actors.evaluation import REPORTED_SEED, DeterministicPolicy, evalua
 from service.config import WorldConfig
 from service.envs.batch import DISPLACEMENT_M, WIDTH_CHANGE_M, WorldBatch
 from service.envs.observations import COMMAND_PREFIX, DELAY, ObservationLayout, bob_observation, layouts
-from service.envs.sampling import GoalKind
 from service.frozen import FrozenModel
+from service.primitives.loading import Trained
 from service.types import FloatArray, StateArray
 
 _NUM_PLACES = 64
@@ -94,21 +92,8 @@ class Measured(FrozenModel):
         return good.index(False) - 1 if False in good else len(good) - 1
 
 
-@dataclass(frozen=True, slots=True)
-class Episodes:
-    """What is played to measure: a policy on random goals of a world."""
-
-    world: WorldConfig
-    goals: GoalKind
-    num: int
-    num_steps: int
-    success_distance_m: float
-    new_player: Callable[[], DeterministicPolicy]
-    """Makes the policy, ready for a batch of episodes."""
-
-
-def measure(episodes: Episodes) -> tuple[Measured, FloatArray]:
-    """Measure a policy and its arm; takes seconds.
+def measure(trained: Trained, num_episodes: int) -> tuple[Measured, FloatArray]:
+    """Measure a policy and its arm on random goals of its world; takes seconds.
 
     Returns:
         What was measured; and (T, E, O) observations of the episodes without delay, T steps and the start, E episodes.
@@ -120,16 +105,16 @@ def measure(episodes: Episodes) -> tuple[Measured, FloatArray]:
         observations.append(bob_observation(worlds.positions(), goal))
         tip.append(worlds.ee_position.copy())
 
-    layout = layouts(episodes.world).bob
+    layout = layouts(trained.world).bob
     late = []
     for steps in range(_MAX_LATE_STEPS + 1):
         found = evaluate(
-            _Late(episodes.new_player(), steps, layout),
-            episodes.world,
-            episodes.goals,
-            num_episodes=episodes.num,
-            num_steps=episodes.num_steps,
-            success_distance_m=episodes.success_distance_m,
+            _Late(trained.player(), steps, layout),
+            trained.world,
+            trained.goals,
+            num_episodes=num_episodes,
+            num_steps=trained.num_steps,
+            success_distance_m=trained.success_distance_m,
             seed=REPORTED_SEED,
             observe=record if steps == 0 else None,
         )
@@ -141,11 +126,11 @@ def measure(episodes: Episodes) -> tuple[Measured, FloatArray]:
                 success_last_high=found.success_last_high,
             )
         )
-    response, width_response = measure_response(episodes.world)
+    response, width_response = measure_response(trained.world)
     measured = Measured(
         response=response,
         width_response=width_response,
-        motion=_motion(np.stack(tip), episodes.world),
+        motion=_motion(np.stack(tip), trained.world),
         late_observations=tuple(late),
     )
     return measured, np.stack(observations)

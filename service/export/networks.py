@@ -3,33 +3,35 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property, partial
 
 import numpy as np
 
-from service.downstream.compose import action_weights
-from service.downstream.inputs import learner_inputs
 from service.downstream.methods import find_method
-from service.downstream.policy import LearnedPolicy
-from service.envs.observations import ACTION, GOAL_FROM_OBJECT, Layouts, layouts
-from service.policies.numpy_policy import NumpyMCPPolicy
+from service.envs.observations import Layouts, ObservationLayout, layouts
+from service.policies.forward import FUNCTIONS
+from service.policies.numpy_policy import NumpyMCPPolicy, NumpyPolicy
 from service.policies.parameters import Parameters
-from service.primitives.loading import TrainedBob
+from service.primitives.learned import RESIDUAL, LearnedPolicy, action_weights, learner_inputs
+from service.primitives.loading import Trained
 from service.sac.inputs import STEP_SCALE_M
 from service.sac.numpy_actor import numpy_actor
 from service.types import FloatArray
 
 Outputs = dict[str, FloatArray]
+_MOVED = ("effector", "object")
+"""What an orchestrator sees the movements of."""
 
 
 @dataclass(frozen=True)
 class Network:
-    """A network that is exported: a function of ``standalone`` with its parameters."""
+    """A network that is exported: a function of ``policies.forward`` with its parameters."""
 
     name: str
     """Of its file, without the ending."""
     function: str
-    """Name in ``standalone.FUNCTIONS``."""
+    """Name in ``forward.FUNCTIONS``."""
     title: str
     """A few words for people."""
     parameters: Parameters
@@ -37,34 +39,28 @@ class Network:
     """Places of what it looks for in its observation."""
     inputs: Mapping[str, int]
     """Sizes by name: N rows of each."""
-    outputs: Mapping[str, tuple[int, ...]]
-    """Shapes by name, without N."""
     reference: Callable[..., Outputs]
     """Its outputs as the evaluator's own policy computes them."""
 
+    @cached_property
+    def outputs(self) -> dict[str, tuple[int, ...]]:
+        """Shapes by name, without N."""
+        rows = (np.zeros((1, size), dtype=np.float32) for size in self.inputs.values())
+        return {name: array.shape[1:] for name, array in self.reference(*rows).items()}
 
-def networks_of_bob(trained: TrainedBob) -> list[Network]:
+
+def networks_of_bob(trained: Trained) -> list[Network]:
     """The network of a whole Bob, composed or monolithic."""
-    seen = layouts(trained.config.world)
-    policy, parameters = trained.policy, trained.parameters
-    if not isinstance(policy, NumpyMCPPolicy):
-
-        def act(observation: FloatArray) -> Outputs:
-            return {"action": np.clip(policy.act_deterministic(observation), -1.0, 1.0)}
-
-        shapes = {"action": (ACTION.size,)}
-        return [Network("policy", "monolithic", "Bob, who has no primitives", parameters, {}, _sees(seen), shapes, act)]
-
-    def compose(observation: FloatArray) -> Outputs:
-        means, variances = policy.primitives(observation[:, : seen.positions.size])
-        action = np.clip(policy.act_deterministic(observation), -1.0, 1.0)
-        return {"action": action, "weights": policy.gate(observation), "means": means, "variances": variances}
-
-    title = f"Bob: {policy.num_primitives} primitives, composed by his gate"
-    return [Network("policy", "bob", title, parameters, _columns(seen), _sees(seen), _composed_shapes(policy), compose)]
+    policy, function, title = trained.policy, "monolithic", "Bob, who has no primitives"
+    assert isinstance(policy, NumpyPolicy)
+    if isinstance(policy, NumpyMCPPolicy):
+        function, title = "bob", f"Bob: {policy.num_primitives} primitives, composed by his gate"
+    act = partial(FUNCTIONS[function], np, policy.network, policy.columns)
+    inputs = {"observation": layouts(trained.config.world).bob.size}
+    return [Network("policy", function, title, trained.parameters, policy.columns, inputs, act)]
 
 
-def networks_of_primitives(trained: TrainedBob) -> list[Network]:
+def networks_of_primitives(trained: Trained) -> list[Network]:
     """A network for each primitive.
 
     Raises:
@@ -74,23 +70,21 @@ def networks_of_primitives(trained: TrainedBob) -> list[Network]:
     return [_primitive(policy, trained.parameters, number, seen) for number in range(policy.num_primitives)]
 
 
-def network_of_orchestrator(trained: TrainedBob, method_name: str, actor_parameters: Parameters) -> Network:
-    """The network of an orchestrator, with the primitives that it composes.
-
-    Args:
-        trained: the primitives.
-        method_name: that it was learned by, one that composes.
-        actor_parameters: that were learned.
+def network_of_orchestrator(learned: Trained) -> Network:
+    """The network of a policy that composes primitives, with these.
 
     Raises:
         TandemError: the primitives are none.
     """
-    policy, seen, method = trained.primitives, layouts(trained.config.world), find_method(method_name)
+    policy, actor_parameters, trained = learned.primitives, learned.parameters, learned.trained
+    assert trained is not None
+    seen = layouts(trained.config.world)
     actor = numpy_actor(actor_parameters)
     num_positions, goal = seen.positions.size, seen.bob["goal"]
+    residual = RESIDUAL if actor.num_actions > policy.num_primitives else 0.0
 
     def act(previous_positions: FloatArray, observation: FloatArray) -> Outputs:
-        player, positions = LearnedPolicy(actor_parameters, method, trained), observation[:, :num_positions]
+        player, positions = LearnedPolicy(actor_parameters, policy, seen), observation[:, :num_positions]
         player.act_deterministic(np.concatenate((previous_positions, observation[:, goal]), axis=1))
         chosen = actor(learner_inputs(previous_positions, positions, observation[:, goal], seen))
         means, variances = policy.primitives(positions)
@@ -101,24 +95,21 @@ def network_of_orchestrator(trained: TrainedBob, method_name: str, actor_paramet
             "variances": variances,
         }
 
-    moved = ("effector", "object")
-    moved_size = sum(seen.positions[name].stop - seen.positions[name].start for name in moved)
-    layers = [name for name in actor_parameters if name.endswith(".weight")]
+    entries = {entry.name: entry for entry in seen.positions.entries}
+    moved = [replace(entries[name], name=f"{name}_moved", offset=0.0, scale=STEP_SCALE_M) for name in _MOVED]
+    told = seen.gate.entries[len(entries) :]
+    normalisation = ObservationLayout(*entries.values(), *moved, *told).normalisation
     shown = {
         **{name: array for name, array in trained.parameters.items() if name.startswith("primitives.")},
-        **{
-            f"actor.layers.{place}.{kind}": actor_parameters[f"layers.{2 * place}.{kind}"]  # ReLUs stand in between
-            for place in range(len(layers))
-            for kind in ("weight", "bias")
-        },
-        "actor.input.offset": _joined(seen, "offset", moved_size, 0.0),
-        "actor.input.scale": _joined(seen, "scale", moved_size, STEP_SCALE_M),
-        "actor.residual": np.array(method.residual, dtype=np.float32),
+        **{f"actor.{name}": array for name, array in actor_parameters.items()},
+        "actor.input.offset": normalisation.offset,
+        "actor.input.scale": normalisation.scale,
+        "actor.residual": np.array(residual, dtype=np.float32),
     }
-    columns = {**_columns(seen), "effector": seen.positions["effector"]}
-    inputs = {"previous_positions": num_positions, **_sees(seen)}
-    title = f"an orchestrator of {policy.num_primitives} primitives ({method.title})"
-    return Network("policy", "orchestrator", title, shown, columns, inputs, _composed_shapes(policy), act)
+    columns = {**policy.columns, "effector": seen.positions["effector"]}
+    inputs = {"previous_positions": num_positions, "observation": seen.bob.size}
+    title = f"an orchestrator of {policy.num_primitives} primitives ({find_method(str(learned.method)).title})"
+    return Network("policy", "orchestrator", title, shown, columns, inputs, act)
 
 
 def _primitive(policy: NumpyMCPPolicy, parameters: Parameters, number: int, seen: Layouts) -> Network:
@@ -133,26 +124,5 @@ def _primitive(policy: NumpyMCPPolicy, parameters: Parameters, number: int, seen
         mean, variance = (each[:, number] for each in policy.primitives(positions))
         return {"action": np.clip(mean, -1.0, 1.0), "mean": mean, "variance": variance}
 
-    inputs, outputs = {"positions": seen.positions.size}, dict.fromkeys(("action", "mean", "variance"), (ACTION.size,))
-    return Network(f"primitive_{number}", "primitive", f"primitive {number} alone", own, {}, inputs, outputs, act)
-
-
-def _sees(seen: Layouts) -> dict[str, int]:
-    return {"observation": seen.bob.size}
-
-
-def _columns(seen: Layouts) -> dict[str, slice]:
-    return {"positions": slice(0, seen.positions.size), "object": seen.bob["object"], "goal": seen.bob["goal"]}
-
-
-def _composed_shapes(policy: NumpyMCPPolicy) -> dict[str, tuple[int, ...]]:
-    num, size = policy.num_primitives, policy.action_size
-    return {"action": (size,), "weights": (num,), "means": (num, size), "variances": (num, size)}
-
-
-def _joined(seen: Layouts, which: str, moved_size: int, moved: float) -> FloatArray:
-    """Offsets or scales of an orchestrator's inputs: positions, movements, goal, the way to it."""
-    movements = np.full(moved_size, moved, dtype=np.float32)
-    own, way = getattr(seen.bob.normalisation, which), getattr(GOAL_FROM_OBJECT.normalisation, which)
-    goal = own[seen.bob["goal"]]
-    return np.concatenate((own[: seen.positions.size], movements, goal, way))
+    inputs = {"positions": seen.positions.size}
+    return Network(f"primitive_{number}", "primitive", f"primitive {number} alone", own, {}, inputs, act)

@@ -138,11 +138,11 @@ class DifficultyGrid:
         )
 
     def load_state(self, state: Mapping[str, Array]) -> None:
-        """Take over what ``state`` gave, of this or an older version, which counted other things, and no proposals.
+        """Take over what ``state`` gave.
 
         Raises:
             ConfigError: of a grid of another size.
         """
         self.seen = take(state, "seen", self.seen)
-        self.proposals = take({"proposals": np.zeros(len(self.cells)), **state}, "proposals", self.proposals)
+        self.proposals = take(state, "proposals", self.proposals)
         self.counts.load_state(split_parts(state).get("cells", {}))

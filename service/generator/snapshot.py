@@ -123,7 +123,7 @@ class GeneratorSnapshot:
     def with_state(self, state: Mapping[str, Array]) -> GeneratorSnapshot:
         """A snapshot with the arrays that ``state`` gave, and all else from this one."""
         parts = split_parts(state)
-        arrays: dict[str, Any] = {name: state[name] for name in _ARRAYS if name in state}  # older states lack some
+        arrays: dict[str, Any] = {name: state[name] for name in _ARRAYS}
         return replace(self, **arrays, buffer=parts["buffer"], starts=parts["starts"])
 
     def _choose_replayed(self, valid: BoolArray, bob_past: BoolArray, rng: np.random.Generator) -> BoolArray:

@@ -125,8 +125,9 @@ class Appender:
         self._flush()
 
     def take_new_file(self) -> None:
-        """Write to whichever file is there next."""
+        """Write to whichever file is there next; what waits was for the file before."""
         self._identity = None
+        self._waiting.clear()
 
     def sync(self) -> None:
         """Write what waits, and wait until the disk has it.

@@ -27,8 +27,9 @@ import json
 import logging
 import os
 import platform
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from importlib.metadata import version
 from pathlib import Path
@@ -40,13 +41,13 @@ from pydantic import JsonValue
 from service.config import Config, dump_config, load_config
 from service.errors import ConfigError, TandemError
 from service.io.checkpoints import CheckpointStore
-from service.io.epoch import Epoch
-from service.io.errors import StorageError
+from service.io.epoch import claim_epoch, give_back_epoch, newest_epoch
+from service.io.errors import CheckpointError, RunTakenError, StorageError
 from service.io.files import Appender, os_errors, remove_temporaries, write_atomic
 from service.io.git import git_commit
-from service.io.jsonl import JsonlWriter
+from service.io.jsonl import Extent, JsonlWriter
 from service.io.lock import LOCK_FILE, DirectoryLock
-from service.io.run_history import RunHistory, read_history
+from service.io.run_history import FIRST_VERSION, RunHistory, is_of_this_version, read_history, written_by
 from service.parsing import ParseError, parse_json
 from service.regular_files import read_regular
 from service.types import FloatArray, StateArray
@@ -72,8 +73,24 @@ class Published(NamedTuple):
     """Digest of its parameters: another registry may have another version of that number."""
 
 
+@dataclass(frozen=True, slots=True)
+class Resumption:
+    """The checkpoint that a run goes on from, as far as its directory has to know."""
+
+    iteration: int
+    num_env_steps: int
+    run: str
+    """Identity of the run that saved it."""
+    records: dict[str, Extent]
+    """What the files of records held then."""
+    changed: dict[str, tuple[JsonValue, JsonValue]]
+    """Settings that are not as they were then: what they were, and what they are."""
+
+
 class RunDirectory:
-    """Reads and writes the files of one run; nothing is written before `claim` or `start`.
+    """Reads and writes the files of one run.
+
+    A process that runs it calls ``claim``, then ``start``, and ``close`` at the end. Nothing is written before.
 
     Args:
         path: of the directory.
@@ -95,11 +112,10 @@ class RunDirectory:
         self._events: EventFile | None = None
         self._failing: dict[Path, str] = {}
         self._lock: DirectoryLock | None = None
-        self._history: RunHistory | None = None
-        self._changed: dict[str, tuple[JsonValue, JsonValue]] = {}
-        self._damage: list[str] = []
-        self.epoch: Epoch | None = None
-        """Number of this process among those that ever ran the run; None before ``claim``."""
+        self.history: RunHistory | None = None
+        """Identity of the run, and what was not as before when a process went on with it; None before ``claim``."""
+        self.epoch = 0
+        """Number of this process among those that ever ran the run; 0 before ``claim``."""
 
     @property
     def exists(self) -> bool:
@@ -110,7 +126,8 @@ class RunDirectory:
         """Read the run's resolved configuration, with ``overrides`` as in ``load_config``.
 
         Raises:
-            ConfigError: no run here, or its configuration cannot be read.
+            ConfigError: no run here, one of another version, or its configuration cannot be read.
+            StorageError: see ``version``.
         """
         if not self.exists and (self.path / TRIAL_FILE).exists():
             raise ConfigError(
@@ -119,35 +136,54 @@ class RunDirectory:
             )
         if not self.exists:
             raise ConfigError(f"no run in {self.path}: {self.config_file.name} is missing; name the directory of a run")
-        return load_config(self.config_file, overrides, recorded=True)
+        if not is_of_this_version(self.version):
+            raise ConfigError(written_by(self.path, self.version))
+        return load_config(self.config_file, overrides)
 
-    def start(self, config: Config, *, after_iteration: int | None = None, after_env_steps: int | None = None) -> None:
+    @property
+    def version(self) -> str:
+        """The version of tandem that began the run which is here.
+
+        Raises:
+            StorageError: the file that says so cannot be read, or is damaged.
+        """
+        history = read_history(self.path)
+        return history.tandem if history is not None else FIRST_VERSION
+
+    def start(self, config: Config, resumption: Resumption | None = None) -> None:
         """Begin a run here, or continue one: then records of later iterations, which will be made again, are dropped.
 
         Args:
             config: the run.
-            after_iteration: the last iteration that is not made again; None for a run that begins.
-            after_env_steps: how many there were by then.
+            resumption: where it goes on; None for a run that begins.
 
         Raises:
             TandemError: a new run where there is one already, or a directory that cannot be written.
         """
         from service.io.tensorboard import EventFile  # TensorBoard's packages, which only a run needs
 
-        if after_iteration is None:
+        if resumption is None:
             self.check_free()
-        else:
-            self._metrics.truncate_after(after_iteration)
-            self._goals.truncate_after(after_iteration)
         with os_errors("write", self.path):
             self.checkpoints.mkdir(parents=True, exist_ok=True)
             remove_temporaries(self.path)
-            self._events = EventFile(self.path / "tensorboard", after_step=after_env_steps)
-            if self._history is not None:
+        damaged = self._damaged(resumption) if resumption is not None else {}
+        for writer in (self._metrics, self._goals):
+            if resumption is None:
+                writer.cut(0)
+            elif writer.path.name in damaged:
+                writer.cut_after(resumption.iteration, accept_damage=True)
+            else:
+                writer.cut(resumption.records[writer.path.name].num_bytes)
+        with os_errors("write", self.path):
+            after_step = resumption.num_env_steps if resumption is not None else None
+            self._events = EventFile(self.path / "tensorboard", after_step=after_step)
+            self.history = self.history or RunHistory.new()
+            if resumption is not None:
+                said = [f"{name} {what}" for name, what in damaged.items()]
                 at = datetime.now(UTC)
-                self._history = self._history.with_event(at, after_iteration or 0, self._changed, self._damage)
-                self._history.write(self.path)
-                self._changed, self._damage = {}, []
+                self.history = self.history.with_event(at, resumption.iteration, resumption.changed, said)
+            self.history.write(self.path)
             write_atomic(self.path / "environment.json", json.dumps(_environment(), indent=1).encode())
             write_atomic(self.config_file, dump_config(config).encode())  # last: a start that failed can be tried again
 
@@ -199,8 +235,8 @@ class RunDirectory:
         self._lock = DirectoryLock(self.path, "stop that one first, or name another --run-dir")
         if not resume:
             self.check_free()  # of two that begin at once, the second sees here what the first has made
-        self._history = read_history(self.path) if resume else RunHistory.new()
-        self.epoch = Epoch(self.path)
+        self.history = read_history(self.path) if resume else RunHistory.new()
+        self.epoch = claim_epoch(self.path)
 
     def check_owner(self) -> None:
         """Assert that no other process has taken over the run since ``claim``.
@@ -208,45 +244,43 @@ class RunDirectory:
         Raises:
             RunTakenError: one has; this one must write nothing more.
         """
-        if self.epoch is not None:
-            self.epoch.check()
+        if newest_epoch(self.path) > self.epoch > 0:
+            raise RunTakenError(
+                f"{self.path} was taken over by another process; this one stops, and what it did since then is not kept"
+            )
 
-    @property
-    def history(self) -> RunHistory | None:
-        """The run's identity, and what was not as before when a process went on with it; None where nobody noted it."""
-        return self._history
-
-    def take_over(self, run: str | None, changed: dict[str, tuple[JsonValue, JsonValue]]) -> None:
-        """Go on as the run of that identity, or a new one if it has none, and note for ``start`` what has changed."""
-        if self._history is None:
-            self._history = RunHistory.new() if run is None else RunHistory(run=run)
-        self._changed = changed
-
-    def checksums(self) -> dict[str, str]:
-        """How far the records reach and what they are, for a checkpoint: see ``JsonlWriter.checksums``."""
-        return {writer.path.name: writer.checksums() for writer in (self._metrics, self._goals)}
-
-    def check_records(self, checksums: Mapping[str, str]) -> bool:
-        """Compare the records with what a checkpoint knows of them.
+    def check_resumable(self, resumption: Resumption) -> bool:
+        """Check that a checkpoint is of this run, and that the records still are what they were when it was saved.
 
         Returns:
-            Whether they are as they were; else the damage was accepted, and only sound records are there now.
+            Whether the records are; if not, that is accepted, and ``start`` keeps those that can be read.
 
         Raises:
-            StorageError: some are missing or changed, and that is not accepted; or they cannot be read.
+            CheckpointError: it is of another run.
+            StorageError: records are damaged and that is not accepted, or they cannot be read.
         """
-        writers = [writer for writer in (self._metrics, self._goals) if writer.path.name in checksums]
-        damaged = [(writer, damage) for writer in writers if (damage := writer.damage(checksums[writer.path.name]))]
+        if self.history is not None and self.history.run != resumption.run:
+            raise CheckpointError(
+                f"{self.path}: its newest checkpoint is of another run ({resumption.run[:8]}, not "
+                f"{self.history.run[:8]}); put that of this run back"
+            )
+        damaged = self._damaged(resumption)
+        said = "; ".join(f"{self.path / name} {what}" for name, what in damaged.items())
         if damaged and not self._accept_damaged_records:
             raise StorageError(
-                f"{'; '.join(str(damage) for _, damage in damaged)}: restore the file from a copy, or go on without "
-                "them by --accept-damaged-records"
+                f"{said}: restore it from a copy, or go on with those records that can be read by "
+                "--accept-damaged-records"
             )
-        for writer, damage in damaged:
-            _logger.warning("%s; going on without", damage)
-            writer.keep_only(checksums[writer.path.name])
-            self._damage.append(f"{damage.path.name}: {damage.text}")
+        if damaged:
+            _logger.warning("%s; going on with those records that can be read", said)
         return not damaged
+
+    def _damaged(self, resumption: Resumption) -> dict[str, str]:
+        """What is wrong with files of records, by their names."""
+        found = {
+            each.path.name: each.damage(resumption.records[each.path.name]) for each in (self._metrics, self._goals)
+        }
+        return {name: damage for name, damage in found.items() if damage is not None}
 
     def check_free(self) -> None:
         """Assert that no run has begun here.
@@ -291,11 +325,12 @@ class RunDirectory:
         with self._keep_running(self.diverged), os_errors("write", path):
             write_atomic(path, data.getvalue())
 
-    def sync(self) -> None:
-        """Wait until the disk has every record; a checkpoint must not know more than they do."""
+    def sync(self) -> dict[str, Extent]:
+        """Wait until the disk has every record, and say what there is: a checkpoint must not know more than they do."""
         for writer in self._writers():
             with self._keep_running(writer.path):
                 writer.sync()
+        return {writer.path.name: writer.extent for writer in (self._metrics, self._goals)}
 
     def close(self) -> None:
         """Write what still waits for room on the disk, and let other processes in.
@@ -307,21 +342,17 @@ class RunDirectory:
                 writer.sync()
             except StorageError as error:  # must not hide why the run ended
                 _logger.warning("the newest records are lost: %s", error)
-        self._events = None
         if self._lock is not None:
-            if not self.exists:
-                self._leave_nothing()
+            if self._events is None:  # it did not start
+                give_back_epoch(self.path, self.epoch)
+            if not self.exists:  # nor did any other; the directory goes if nothing else is in it
+                with suppress(OSError):
+                    (self.path / LOCK_FILE).unlink()
+                    self.path.rmdir()
             self._lock.release()
             self._lock = None
-            self.epoch = None
-
-    def _leave_nothing(self) -> None:
-        """Remove what a run that did not begin has claimed, and the directory if nothing else is in it."""
-        if self.epoch is not None:
-            self.epoch.give_back()
-        with suppress(OSError):
-            (self.path / LOCK_FILE).unlink()
-            self.path.rmdir()
+            self.epoch = 0
+        self._events = None
 
     def _writers(self) -> list[Appender]:
         return [self._metrics, self._goals, *([self._events] if self._events is not None else [])]

@@ -1,4 +1,4 @@
-"""The history of a run: its identity, and what was not as before when a process went on with it."""
+"""The history of a run: its identity and version, and what was not as before when a process went on with it."""
 
 from __future__ import annotations
 
@@ -13,8 +13,11 @@ from service.io.errors import StorageError
 from service.io.files import os_errors, write_atomic
 from service.parsing import ParseError, parse_with
 from service.regular_files import read_regular
+from service.version import __version__
 
 FILE = "run.json"
+FIRST_VERSION, SECOND_VERSION = "0.1.0", "0.2.0"
+"""Versions that wrote no ``run.json``, and one that does not say which version wrote it."""
 MAX_BYTES = 16 * 1024 * 1024
 
 
@@ -31,12 +34,13 @@ class RunHistory(FrozenModel):
     """Content of ``run.json``."""
 
     run: str = Field(pattern=r"^[0-9a-f]{32}$", description="identity, drawn at random when the run began")
+    tandem: str = Field(SECOND_VERSION, description="version that began the run")
     events: tuple[Event, ...] = ()
 
     @classmethod
     def new(cls) -> RunHistory:
         """The history of a run that begins."""
-        return cls(run=secrets.token_hex(16))
+        return cls(run=secrets.token_hex(16), tandem=__version__)
 
     def with_event(
         self, at: datetime, after_iteration: int, changed: dict[str, tuple[JsonValue, JsonValue]], damaged: list[str]
@@ -56,8 +60,19 @@ class RunHistory(FrozenModel):
         write_atomic(directory / FILE, self.model_dump_json(indent=1).encode() + b"\n")
 
 
+def written_by(path: Path, version: str) -> str:
+    """Say of what another version has written which version reads it."""
+    reader = "0.2" if version.startswith("0.1.") else version
+    return f"{path} was written by tandem {version}, which this version does not read: use tandem {reader}"
+
+
+def is_of_this_version(version: str) -> bool:
+    """Whether this version goes on with the runs of another one: until 1.0, those of its own minor version."""
+    return version.split(".")[:2] == __version__.split(".")[:2]
+
+
 def read_history(directory: Path) -> RunHistory | None:
-    """Read a run's history; None where there is none, as of a run of an earlier version.
+    """Read a run's history; None where there is none, as of a run of version 0.1.0.
 
     Raises:
         StorageError: it cannot be read, or is damaged.
@@ -71,4 +86,4 @@ def read_history(directory: Path) -> RunHistory | None:
     try:
         return parse_with(RunHistory.model_validate_json, data, path)
     except ParseError:
-        raise StorageError(f"{path} is damaged; restore it from a copy, or remove it to go on without it") from None
+        raise StorageError(f"{path} is damaged; restore it from a copy") from None

@@ -67,7 +67,7 @@ class StudyDirectory:
             ConfigError: no study here, or its configuration cannot be read.
         """
         self._check_begun()
-        return load_config(self.config_file, overrides, recorded=True)
+        return load_config(self.config_file, overrides)
 
     def read_seeds(self) -> tuple[int, ...]:
         """Read the seeds of the runs.

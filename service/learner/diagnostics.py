@@ -2,47 +2,38 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import torch
 from torch import Tensor
 
-from service.learner.group import ALONE, Group, mean_and_std
 from service.learner.player import Player
-from service.learner.samples import Cloning, Rows
+from service.learner.samples import Cloning
 from service.policies import gaussian
 from service.policies.networks import MCPPolicy
-from service.types import IntArray, Metrics
+from service.types import IntArray
 
 NUM_PROBES = 1024
 """Number of rows that are enough for what is measured once an update."""
 
 
-def probes(rows: Rows) -> Rows:
-    """The own ones of at most ``NUM_PROBES`` of the rows of all ranks, evenly spread."""
-    return rows.find(spread(np.arange(rows.num_total)))
+def probes(num: int) -> IntArray:
+    """At most ``NUM_PROBES`` of the places of ``num`` rows, evenly spread."""
+    return np.arange(0, num, max(1, -(-num // NUM_PROBES)))
 
 
-def spread(places: IntArray) -> IntArray:
-    """At most ``NUM_PROBES`` of the (N,) places, evenly spread."""
-    return places[:: max(1, -(-len(places) // NUM_PROBES))]
+def mean_and_std(values: Tensor) -> tuple[float, float]:
+    """Mean and standard deviation of (N,) values."""
+    mean = float(values.sum()) / len(values)
+    return mean, math.sqrt(float((values - mean).square().sum()) / len(values))
 
 
-def explained_variance(returns: Tensor, values: Tensor, num: int, group: Group = ALONE) -> float:
-    """Share of the variance of ``returns`` (N,) that ``values`` predict: 1 at best, 0 for a constant.
-
-    ``num`` rows are those of all ranks together.
-    """
-    _, std = mean_and_std(returns.double(), num, group)
-    _, error_std = mean_and_std((returns - values).double(), num, group)
+def explained_variance(returns: Tensor, values: Tensor) -> float:
+    """Share of the variance of ``returns`` (N,) that ``values`` predict: 1 at best, 0 for a constant."""
+    _, std = mean_and_std(returns.double())
+    _, error_std = mean_and_std((returns - values).double())
     return 1.0 - (error_std / std) ** 2 if std > 0.0 else 0.0
-
-
-def mean_over_ranks(metrics: Metrics, num_rows: int, num_total: int, group: Group) -> Metrics:
-    """Average a rank's means over its ``num_rows`` with those of the other ranks, ``num_total`` rows together."""
-    weighted = [value * (num_rows / num_total) if num_rows else 0.0 for value in metrics.values()]
-    sums = torch.tensor(weighted, dtype=torch.float64)
-    group.sum(sums)
-    return dict(zip(metrics, sums.tolist(), strict=True))
 
 
 @torch.no_grad()

@@ -13,7 +13,7 @@ from service.actors.distillation import Lesson
 from service.distillation_config import DistillationConfig
 from service.policies import networks
 from service.policies.adam import Adam
-from service.policies.composition import compose
+from service.policies.forward import compose
 from service.types import Array, Arrays, FloatArray, Metrics
 
 _ADAM_EPSILON = 1e-8

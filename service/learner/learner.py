@@ -3,38 +3,34 @@
 from __future__ import annotations
 
 import math
-import zlib
-from collections import deque
 from collections.abc import Mapping, Sequence
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from service.actors.rollout import Demonstrations, Rollout, Turns, part_to_arrays
+from service.actors.rollout import Demonstrations, Rollout, Turns
 from service.config import Config
-from service.envs.observations import ACTION, Layouts, ObservationLayout, layouts
+from service.envs.observations import Layouts, layouts
 from service.io.tensors import join_parts, split_parts
 from service.learner import ppo, transfer
-from service.learner.diagnostics import composition_metrics, mean_over_ranks, probes
-from service.learner.group import ALONE, Group
+from service.learner.diagnostics import composition_metrics, probes
 from service.learner.player import LearnerError, Player
 from service.learner.samples import (
     DemonstrationHistory,
     DemonstrationRows,
     Samples,
-    alices,
-    bobs,
-    mirror,
+    reflect_at_random,
 )
-from service.learner.shares import DEMONSTRATIONS, IMITATED, own_demonstrations, share_of, share_out
 from service.learner.weights import MAX_POLICY_LAG, Weights
 from service.policies import networks
 from service.types import Array, Arrays, Metrics
 
+DEMONSTRATIONS, IMITATED = "demonstrations", "imitated"
+"""Names of what is cloned in a learner's state, each a ``DemonstrationHistory``."""
 _LOW_WORD = (1 << 64) - 1
-_BOB_EMA = "steady_bob"
-"""The name of Bob's moving average in a checkpoint, which it has had since version 0.1.0."""
+_BOB_EMA = "bob_ema"
+"""Bob's moving average in a checkpoint."""
 
 
 class Learner:
@@ -44,18 +40,13 @@ class Learner:
     ``state`` holds all that ``load_state`` needs to continue as if nothing had happened, bit for bit.
     """
 
-    def __init__(self, config: Config, group: Group = ALONE) -> None:
+    def __init__(self, config: Config) -> None:
         """Make both players from ``config.seed``; this is version 0.
-
-        Args:
-            config: the run.
-            group: of the ranks that learn together. Each has a learner of its own and takes its share of the rollouts,
-                ``shares.share_out`` of their ids in order; ``update`` is called on all at once.
 
         Raises:
             LearnerError: CUDA is asked for and not there.
         """
-        self.config, self._group = config, group
+        self.config = config
         self.version = 0
         self._layouts = seen = layouts(config.world)
         self._device = torch_device(config.learner.device)
@@ -78,7 +69,6 @@ class Learner:
         self._counted: dict[tuple[int, int], int] = {}  # (actor, incarnation) to the last sequence learned from
         self._pending: dict[tuple[int, int, int], Rollout] = {}
         self._bob_ema = networks.export_parameters(bob[0])
-        self._window: deque[list[Turns]] = deque(maxlen=config.learner.bob_window)  # Bob's, of the last iterations
 
     def ingest(self, rollout: Rollout) -> bool:
         """Take a rollout for the next update.
@@ -99,22 +89,20 @@ class Learner:
         """Learn from all rollouts taken since the last update, in the order of their ids; makes the next version.
 
         Returns:
-            Metrics named ``learner/...``, equal on all ranks; one that could not be measured is left out.
+            Metrics named ``learner/...``; one that could not be measured is left out.
 
         Raises:
-            LearnerError: no rank has any, or the ranks are not at the same point of the same run.
-            GroupError: another rank does not answer; this learner cannot go on.
+            LearnerError: there are none.
         """
         rollouts = [self._pending[key] for key in sorted(self._pending)]
-        everyones = self._meet(rollouts)
-        if not len(everyones):
+        if not rollouts:
             raise LearnerError("learner update with 0 rollouts: ingest at least one first")
         metrics = self._update_alice(rollouts)
         for name, value in self._update_bob(rollouts).items():
             metrics[name] = metrics.get(name, 0.0) + value  # only counts of failures are both players'
-        self._counted |= {(actor, incarnation): sequence for actor, incarnation, sequence, _ in sorted(everyones)}
+        self._counted |= {(actor, incarnation): sequence for actor, incarnation, sequence in sorted(self._pending)}
         self._pending.clear()
-        lags = [self.version - version for *_, version in everyones]
+        lags = [self.version - rollout.policy_version for rollout in rollouts]
         metrics |= {"policy_lag": float(np.mean(lags)), "max_policy_lag": float(max(lags))}
         self.version += 1
         self._average_bob()
@@ -152,16 +140,8 @@ class Learner:
         return Weights(self.version, alice, bob, {name: array.copy() for name, array in self._bob_ema.items()})
 
     def state(self) -> Arrays:
-        """Everything a resumed run needs, as arrays by name; rollouts not yet learned from are not part of it.
-
-        Where there are several ranks, ``shares.join_states`` makes one state of theirs; all but rank 0 hand out only
-        what they alone have.
-        """
+        """Everything a resumed run needs, as arrays by name; rollouts not yet learned from are not part of it."""
         parts = {name: history.state() for name, history in self._histories.items()}
-        for index, iteration in enumerate(self._used_again()):
-            parts |= {f"window/{index:04}/{place:04}": part_to_arrays(each) for place, each in enumerate(iteration)}
-        if self._group.rank > 0:
-            return join_parts(parts)
         parts |= {"alice": self._alice.state(), "bob": self._bob.state()}
         parts |= {_BOB_EMA: {name: array.copy() for name, array in self._bob_ema.items()}}
         counted = [(*source, sequence) for source, sequence in sorted(self._counted.items())]
@@ -174,8 +154,6 @@ class Learner:
     def load_state(self, state: Mapping[str, Array]) -> None:
         """Continue exactly where ``state`` was taken, by a learner of the same configuration.
 
-        Of several ranks' joined state each takes its share; there may have been another number of ranks.
-
         Raises:
             LearnerError: an array is missing, left over or does not fit; the learner is as it was then.
         """
@@ -187,41 +165,14 @@ class Learner:
             histories = {key: {name: state.pop(f"{key}/{name}") for name in arrays} for key in self._histories}
         except KeyError as error:
             raise LearnerError(f"learner state: no array {error}; take an undamaged checkpoint") from None
-        parts = split_parts(state)
-        window = [_turns_of(iteration) for _, iteration in sorted(split_parts(parts.pop("window", {})).items())]
-        self._load_players(parts)
+        self._load_players(split_parts(state))
         self._bob_ema = bob_ema
-        self._window.clear()
-        self._window.extend(list(share_out(turns, self._group.rank, self._group.size)) for turns in window)
         self.version = int(own["version"])
         self._rng = _rng_from_array(own["rng"])
         self._counted = {(int(actor), int(incarnation)): int(last) for actor, incarnation, last in own["counted"]}
         for name, history in histories.items():
-            self._histories[name].load_state(own_demonstrations(history, self._group.rank, self._group.size))
+            self._histories[name].load_state(history)
         self._pending.clear()
-
-    def _meet(self, rollouts: Sequence[Rollout]) -> list[tuple[int, ...]]:
-        """Tell the other ranks what this one learns from, and go on from exactly the same parameters.
-
-        Ranks on processors of different kinds round differently; taking over what rank 0 has keeps them from drifting
-        apart, and costs no more than one gradient step.
-
-        Returns:
-            (actor, incarnation, sequence, policy version) of the rollouts of all ranks.
-        """
-        players = self._alice, self._bob
-        rates = np.array([player.optimizer.learning_rate for player in players])
-        random = zlib.crc32(_rng_to_array(self._rng).tobytes() + rates.tobytes())
-        ids = [number for each in rollouts for number in (*each.id, each.policy_version)]
-        told = self._group.gather(np.array([self.version, random, *ids], dtype=np.int64))
-        for rank, numbers in enumerate(told):
-            if (numbers[:2] != told[0][:2]).any():
-                raise LearnerError(
-                    f"learner rank {rank} is at version {numbers[0]} with random numbers and learning rates "
-                    f"{numbers[1]:08x}, rank 0 at {told[0][0]} with {told[0][1]:08x}: start all ranks from one state"
-                )
-        self._group.copy_first([tensor for player in players for tensor in player.tensors().values()])
-        return [tuple(each) for numbers in told for each in numbers[2:].reshape(-1, 4).tolist()]
 
     def _average_bob(self) -> None:
         """Move the average towards the new version.
@@ -234,11 +185,6 @@ class Learner:
         old = self._bob_ema if keep > 0.0 else new
         self._bob_ema = {name: np.asarray(each + np.float32(keep) * (old[name] - each)) for name, each in new.items()}
 
-    def _used_again(self) -> list[list[Turns]]:
-        """The iterations of Bob's window that the next update will use again: all but one that then falls out of it."""
-        window = list(self._window)
-        return window[1:] if len(window) == self.config.learner.bob_window else window
-
     def _load_players(self, states: Mapping[str, Arrays]) -> None:
         players = {"alice": self._alice, "bob": self._bob}
         if unknown := sorted(states.keys() - players.keys()):
@@ -249,12 +195,8 @@ class Learner:
             player.load_state(states[key])
 
     def _update_alice(self, rollouts: Sequence[Rollout]) -> Metrics:
-        seen = self._layouts
-        nothing = _no_turns(seen.full, seen.full)
-        samples = ppo.collect([[rollout.alice for rollout in rollouts]], nothing, self._alice, self._group)
+        samples = ppo.collect([rollout.alice for rollout in rollouts], self._alice)
         counted = {"num_alice_samples": float(_num(samples))}
-        if samples is not None:
-            samples = mirror(samples, alices(seen), self._alice, self._rng)
         how, imitated = self.config.learner.self_imitation, None
         if IMITATED in self._histories:
             imitated = self._to_clone(IMITATED, [paid_well(each.alice, how.min_reward) for each in rollouts])
@@ -263,47 +205,37 @@ class Learner:
             share = _num(imitated) / max(how.rows_per_sample * counted["num_alice_samples"], 1.0)
             how = how.model_copy(update={"weight": how.weight * min(1.0, share)})
         learns = self.version >= self.config.learner.alice.value_first_updates
-        metrics = ppo.update(self._alice, samples, imitated, how, self._rng, self._group, policy_learns=learns)
+        metrics = ppo.update(self._alice, samples, imitated, how, self._rng, policy_learns=learns)
         return _prefixed("alice", metrics) | counted
 
     def _update_bob(self, rollouts: Sequence[Rollout]) -> Metrics:
-        config, bob, group = self.config.learner, self._bob, self._group
-        self._window.append([rollout.bob for rollout in rollouts])
-        nothing = _no_turns(self._layouts.bob, self._layouts.bob_value)
-        samples = ppo.collect(self._window, nothing, bob, group)
+        config, bob = self.config.learner, self._bob
+        samples = ppo.collect([rollout.bob for rollout in rollouts], bob)
         metrics = {"num_bob_samples": float(_num(samples))}
-        if samples is not None:
-            samples = mirror(samples, bobs(self._layouts), bob, self._rng)
+        mirrors = config.bob.mirror == "random"
+        if samples is not None and mirrors:
+            samples = reflect_at_random(samples, self._layouts, bob, self._rng)
         demonstrations = self._to_clone(DEMONSTRATIONS, [each.demonstrations for each in rollouts])
-        metrics["num_demonstrations"] = float(_num(demonstrations) // (1 + config.bob.mirrors))
+        metrics["num_demonstrations"] = float(_num(demonstrations) // (1 + mirrors))
         learns = self.version >= config.bob.value_first_updates
-        updated = ppo.update(bob, samples, demonstrations, config.abc, self._rng, group, policy_learns=learns)
+        updated = ppo.update(bob, samples, demonstrations, config.abc, self._rng, policy_learns=learns)
         metrics |= _prefixed("bob", updated)
         rows = samples if samples is not None else demonstrations
         if rows is not None and isinstance(self._bob_policy, networks.MCPPolicy):
-            probed = probes(rows)
-            composed = composition_metrics(self._bob_policy, probed.observation)
-            metrics |= mean_over_ranks(composed, len(probed), probed.num_total, group)
+            probed = rows.take(probes(len(rows)))
+            metrics |= composition_metrics(self._bob_policy, probed.observation)
         return metrics
 
     def _to_clone(self, name: str, new: Sequence[Demonstrations]) -> DemonstrationRows | None:
-        """What a history keeps, this update's among it; None if no rank has any or it has no weight."""
+        """What a history keeps, this update's among it; None if there are none or they have no weight."""
         history, config = self._histories[name], self.config.learner
         how = config.abc if name == DEMONSTRATIONS else config.self_imitation
-        reflection = self._layouts.bob.mirror if name == DEMONSTRATIONS and config.bob.mirrors else None
+        mirrored = name == DEMONSTRATIONS and config.bob.mirror == "random"
+        reflection = self._layouts.bob.mirror if mirrored else None
         history.append(new)
         kept = history.joined()
         observation, action = (torch.from_numpy(each).to(self._device) for each in (kept.observation, kept.action))
-        rows = DemonstrationRows(observation, action, reflection, share_of(history.sizes(), self._group))
-        return rows if rows.num_total and how.weight else None
-
-
-def _turns_of(iteration: Mapping[str, Array]) -> list[Turns]:
-    """Bob's turns of one iteration of the window, by rollout."""
-    try:
-        return [Turns(**arrays) for _, arrays in sorted(split_parts(iteration).items())]
-    except TypeError as error:
-        raise LearnerError(f"learner state, window: {error}; take an undamaged checkpoint") from None
+        return DemonstrationRows(observation, action, reflection) if len(action) and how.weight else None
 
 
 def paid_well(turns: Turns, min_reward: float) -> Demonstrations:
@@ -312,25 +244,8 @@ def paid_well(turns: Turns, min_reward: float) -> Demonstrations:
     return Demonstrations(turns.observation[chosen], turns.action[chosen])
 
 
-def _no_turns(observation: ObservationLayout, value_observation: ObservationLayout) -> Turns:
-    """Turns of no world, for a rank without rollouts."""
-    numbers, flags = np.zeros((0, 0), dtype=np.float32), np.zeros((0, 0), dtype=np.bool_)
-    return Turns(
-        observation=numbers.reshape(0, 0, observation.size),
-        value_observation=numbers.reshape(0, 0, value_observation.size),
-        final_value_observation=numbers.reshape(0, value_observation.size),
-        action=numbers.reshape(0, 0, ACTION.size),
-        log_prob=numbers,
-        reward=numbers,
-        active=flags,
-        terminated=flags,
-        learn=flags.ravel(),
-    )
-
-
 def _num(rows: Samples | DemonstrationRows | None) -> int:
-    """Rows of all ranks."""
-    return 0 if rows is None else rows.num_total
+    return 0 if rows is None else len(rows)
 
 
 def _prefixed(player: str, metrics: Metrics) -> Metrics:

@@ -3,10 +3,6 @@
 Three policies meet in an update, with the names of decoupled PPO (Hilton et al. 2022). The behaviour policy acted. The
 proximal policy is the one at the start of the update, which may be a version or two ahead. The third is being learned.
 
-A ``group`` of several ranks computes what one rank would from all rows, up to the order of float sums: a mean is each
-rank's sum divided by the number of rows of all ranks, added up over the ranks, and all decisions are taken from such
-sums.
-
 Shapes: T steps of a turn (time first), N worlds, B samples, D steps of demonstrations.
 """
 
@@ -24,14 +20,12 @@ from torch.nn.utils import clip_grad_norm_
 
 from service.actors.rollout import Turns
 from service.config import CloningConfig
-from service.learner.diagnostics import cloning_metrics, explained_variance, mean_over_ranks, probes, spread
-from service.learner.group import ALONE, Group, mean_and_std
+from service.learner.diagnostics import cloning_metrics, explained_variance, mean_and_std, probes
 from service.learner.player import LEARNING_RATE_BOUNDS, Player
 from service.learner.samples import Cloning, DemonstrationRows, Samples, draw_epoch
-from service.learner.shares import share_of
 from service.liveness import count_work
 from service.policies import gaussian
-from service.types import Array, IntArray, Metrics
+from service.types import Array, Metrics
 
 Scalars = dict[str, Tensor]
 
@@ -47,34 +41,27 @@ LEARNING_RATE_STEP = 1.5
 """The KL-adaptive learning rate moves by this factor (rsl_rl)."""
 
 
-def collect(
-    iterations: Sequence[Sequence[Turns]], nobody: Turns, player: Player, group: Group = ALONE
-) -> Samples | None:
+def collect(played: Sequence[Turns], player: Player) -> Samples | None:
     """Turn what was played into samples: the active steps of all worlds that ``learn``.
 
     Args:
-        iterations: turns of one player, with equal T, by iteration; joined along worlds.
-        nobody: turns of no world, for a rank without any.
+        played: turns of one player, with equal T; joined along worlds.
         player: values the states, and is the proximal policy.
-        group: advantages are normalised over all its ranks.
 
     Returns:
-        The samples of this rank, None if no rank has any.
+        The samples, None if there are none.
     """
-    turns = [each for iteration in iterations for each in iteration] or [nobody]
-    active = _join(turns, "active")
-    share = share_of(_block_sizes(iterations, len(active)), group)
-    num_total = int(active.sum()) if share is None else share.total
-    if num_total == 0:
+    active = _join(played, "active")
+    if not active.any():
         return None
 
     def tensor(array: Array) -> Tensor:
         return torch.from_numpy(array).to(player.device)
 
     names = "observation", "value_observation", "action", "log_prob"
-    observation, value_observation, action, log_prob = (tensor(_join(turns, name)[active]) for name in names)
-    reward, terminated, acted = tensor(_join(turns, "reward")), tensor(_join(turns, "terminated")), tensor(active)
-    final = tensor(np.concatenate([each.final_value_observation[each.learn] for each in turns]))
+    observation, value_observation, action, log_prob = (tensor(_join(played, name)[active]) for name in names)
+    reward, terminated, acted = tensor(_join(played, "reward")), tensor(_join(played, "terminated")), tensor(active)
+    final = tensor(np.concatenate([each.final_value_observation[each.learn] for each in played]))
     with torch.no_grad():
         estimates = player.value(torch.cat((value_observation, final)))
         proximal_mean, proximal_std = player.policy(observation)
@@ -83,7 +70,7 @@ def collect(
     estimated = reward, values, final_value, acted, terminated
     advantage = advantages(*estimated, gamma=config.gamma, gae_lambda=config.gae_lambda)[acted]
     wide = advantage.double()
-    mean, std = mean_and_std(wide, num_total, group)
+    mean, std = mean_and_std(wide)
     return Samples(
         observation=observation,
         value_observation=value_observation,
@@ -94,7 +81,6 @@ def collect(
         advantage=((wide - mean) / (std + 1e-8)).float(),
         value_target=advantage + value,
         value=value,
-        share=share,
     )
 
 
@@ -143,7 +129,6 @@ def update(
     demonstrations: DemonstrationRows | None,
     how: CloningConfig,
     rng: np.random.Generator,
-    group: Group = ALONE,
     *,
     policy_learns: bool = True,
 ) -> Metrics:
@@ -163,25 +148,23 @@ def update(
     rows = samples if samples is not None else demonstrations
     if rows is None:
         return metrics
-    snapshot, probed = player.snapshot(), probes(rows)
+    snapshot, probed = player.snapshot(), rows.take(probes(len(rows)))
     with torch.no_grad():
         before = player.policy(probed.observation)
-    stats = train(player, samples, demonstrations, how, rng, group, policy_learns=policy_learns)
+    stats = train(player, samples, demonstrations, how, rng, policy_learns=policy_learns)
     with torch.no_grad():
-        moved = gaussian.kl(*before, *player.policy(probed.observation))
-    kl = mean_over_ranks({"kl": float(moved.mean())}, len(probed), probed.num_total, group)["kl"]
+        kl = float(gaussian.kl(*before, *player.policy(probed.observation)).mean())
     failed = stats.aborted or not kl <= KL_COLLAPSE * player.config.target_kl
     if failed:
         player.restore(snapshot)
     if policy_learns:
         player.optimizer.learning_rate = _adapted_learning_rate(player, math.inf if failed or stats.stopped else kl)
     if samples is not None:
-        estimated = samples.value_target, samples.value
-        metrics["explained_variance"] = explained_variance(*estimated, samples.num_total, group)
+        metrics["explained_variance"] = explained_variance(samples.value_target, samples.value)
     metrics |= {"non_finite_steps": float(stats.num_non_finite), "rollbacks": float(failed)}
     metrics["policy_steps"] = float(max(len(stats.scalars.get(name, ())) for name in ("policy_loss", "cloning_loss")))
-    if (cloned := stats.cloned) is not None:
-        metrics |= mean_over_ranks(cloning_metrics(player, cloned), len(cloned), cloned.num_total, group)
+    if stats.cloned is not None:
+        metrics |= cloning_metrics(player, stats.cloned)
     return metrics | stats.means() | {"kl": kl}
 
 
@@ -226,7 +209,6 @@ def train(
     demonstrations: DemonstrationRows | None,
     how: CloningConfig,
     rng: np.random.Generator,
-    group: Group = ALONE,
     *,
     policy_learns: bool = True,
 ) -> UpdateStats:
@@ -235,19 +217,19 @@ def train(
     All epochs are drawn first: only demonstrations that are drawn need a log-probability under the policy before.
     """
     stats, config = UpdateStats(stopped=not policy_learns), player.config
-    num_samples, num_demonstrations = (0 if rows is None else rows.num_total for rows in (samples, demonstrations))
+    num_samples, num_demonstrations = (0 if rows is None else len(rows) for rows in (samples, demonstrations))
     epochs = [draw_epoch(num_samples, num_demonstrations, config, how, rng) for _ in range(config.num_epochs)]
     cloning = None
     if demonstrations is not None:
         drawn = np.unique(np.concatenate([places for epoch in epochs for _, places in epoch]))
         cloning = demonstrations.to_clone(drawn, player)
-        stats.cloned = cloning.find(spread(drawn))
+        stats.cloned = cloning.take(probes(len(cloning)))
     for epoch in epochs:
         stats.kls.clear()
         for own, cloned in epoch:
-            drawn_samples = None if samples is None else samples.find(own)
-            drawn_cloning = None if cloning is None else cloning.find(cloned)
-            _step(player, drawn_samples, drawn_cloning, how, stats, group)
+            drawn_samples = None if samples is None else samples.take(own)
+            drawn_cloning = None if cloning is None else cloning.take(np.searchsorted(drawn, cloned))
+            _step(player, drawn_samples, drawn_cloning, how, stats)
             count_work()
             if stats.aborted:
                 return stats
@@ -255,41 +237,26 @@ def train(
 
 
 def _step(
-    player: Player,
-    samples: Samples | None,
-    cloning: Cloning | None,
-    how: CloningConfig,
-    stats: UpdateStats,
-    group: Group,
+    player: Player, samples: Samples | None, cloning: Cloning | None, how: CloningConfig, stats: UpdateStats
 ) -> None:
-    """Take one gradient step, or none if it would not be finite.
-
-    The gradients of all ranks and the numbers that decide about the step travel together. Policy and value network
-    share no parameter, so a policy that is to stop by now is left out of the step after its gradient was computed.
-    """
-    config, losses, scalars = player.config, Scalars(), Scalars()
+    """Take one gradient step, or none if it would not be finite; a policy that is to stop by now is left out of it."""
+    config, scalars, losses = player.config, Scalars(), []
     if not stats.stopped:
-        losses["policy"], scalars = _policy_loss(player, samples, cloning, how)
+        policy_loss, of_policy = _policy_loss(player, samples, cloning, how)
+        if samples is not None:
+            stats.stopped = stats.passes(float(of_policy["kl"]), KL_STOP * config.target_kl)
+        if not stats.stopped:
+            losses, scalars = [policy_loss], of_policy
     if samples is not None:
-        value = player.value(samples.value_observation)
-        scalars["value_loss"] = value_loss(value, samples.value_target, samples.num_total)
-        losses["value"] = config.value_weight * scalars["value_loss"]
+        scalars["value_loss"] = value_loss(player.value(samples.value_observation), samples.value_target)
+        losses.append(config.value_weight * scalars["value_loss"])
+    loss = torch.stack(losses).sum()
     player.policy.zero_grad()
     player.value.zero_grad()
-    torch.stack(list(losses.values())).sum().backward()
-    losses, scalars = ({name: each.detach() for name, each in part.items()} for part in (losses, scalars))
-    parameters = (*player.policy_parameters, *player.value_parameters)
-    gradients = [each.grad for each in parameters if each.grad is not None]
-    group.sum(*gradients, *losses.values(), *scalars.values())
-    if not stats.stopped and samples is not None:
-        stats.stopped = stats.passes(float(scalars["kl"]), KL_STOP * config.target_kl)
-        if stats.stopped:
-            player.policy.zero_grad()
-            del losses["policy"]
-            scalars = {"value_loss": scalars["value_loss"]}
+    loss.backward()
     norm = clip_grad_norm_(player.policy_parameters, config.max_grad_norm)
     value_norm = clip_grad_norm_(player.value_parameters, config.max_grad_norm)
-    if not math.isfinite(float(torch.stack(list(losses.values())).sum() + norm + value_norm)):
+    if not math.isfinite(float(loss.detach() + norm + value_norm)):
         stats.num_non_finite += 1
         return
     player.optimizer.step()
@@ -299,7 +266,7 @@ def _step(
 def _policy_loss(
     player: Player, samples: Samples | None, cloning: Cloning | None, how: CloningConfig
 ) -> tuple[Tensor, Scalars]:
-    """PPO's surrogate, entropy bonus and cloning, of one pass through the policy: this rank's part of each mean."""
+    """PPO's surrogate, entropy bonus and cloning, of one pass through the policy."""
     rows = [part for part in (samples, cloning) if part is not None]
     action = torch.cat([part.action for part in rows])
     mean, std = player.policy(torch.cat([part.observation for part in rows]))
@@ -316,24 +283,23 @@ def _policy_loss(
             # the whole clip range for this update.
             reference = samples.proximal_log_prob
             advantage = advantage * importance_weight(reference, samples.behaviour_log_prob)
-        pair, num = (log_prob[:num_samples], reference), samples.num_total
-        surrogate, clip_fraction = clipped_surrogate(*pair, advantage, config.clip, config.dual_clip, num)
-        entropy = gaussian.entropy(std[:num_samples]).sum() / num
+        pair = log_prob[:num_samples], reference
+        surrogate, clip_fraction = clipped_surrogate(*pair, advantage, config.clip, config.dual_clip)
+        entropy = gaussian.entropy(std[:num_samples]).mean()
         loss = surrogate - config.entropy_weight * entropy
         scalars = {"policy_loss": surrogate, "entropy": entropy, "clip_fraction": clip_fraction}
         # Exact: the usual estimate from sampled actions is ruled by the few that the policy would hardly have taken,
         # of which symmetry augmentation makes many.
         kl = gaussian.kl(samples.proximal_mean, samples.proximal_std, mean[:num_samples], std[:num_samples])
-        scalars["kl"] = kl.detach().sum() / num
+        scalars["kl"] = kl.detach().mean()
     if cloning is not None:
-        pair = log_prob[num_samples:], cloning.proximal_log_prob
-        scalars["cloning_loss"] = cloning_loss(*pair, how.clip, cloning.num_total)
+        scalars["cloning_loss"] = cloning_loss(log_prob[num_samples:], cloning.proximal_log_prob, how.clip)
         loss = loss + how.weight * scalars["cloning_loss"]
     return loss, scalars
 
 
 def clipped_surrogate(
-    log_prob: Tensor, reference_log_prob: Tensor, advantage: Tensor, clip: float, dual_clip: float, num: int
+    log_prob: Tensor, reference_log_prob: Tensor, advantage: Tensor, clip: float, dual_clip: float
 ) -> tuple[Tensor, Tensor]:
     """PPO's clipped surrogate (Schulman et al. 2017, eq. 7) with the dual clip of Ye et al. (2020, eq. 5).
 
@@ -346,7 +312,6 @@ def clipped_surrogate(
         advantage: (B,) normalised.
         clip: epsilon.
         dual_clip: greater than 1.
-        num: rows of the minibatch on all ranks, by which sums are divided.
 
     Returns:
         The loss, a mean, and the share of ratios outside ``1 +- clip`` (no gradient).
@@ -354,8 +319,8 @@ def clipped_surrogate(
     ratio = gaussian.log_ratio(log_prob, reference_log_prob).exp()
     objective = torch.minimum(ratio * advantage, ratio.clamp(1.0 - clip, 1.0 + clip) * advantage)
     bounded = torch.where(advantage < 0.0, torch.maximum(objective, dual_clip * advantage), objective)
-    clip_fraction = ((ratio.detach() - 1.0).abs() > clip).float().sum() / num
-    return -(bounded.sum() / num), clip_fraction
+    clip_fraction = ((ratio.detach() - 1.0).abs() > clip).float().mean()
+    return -bounded.mean(), clip_fraction
 
 
 def importance_weight(proximal_log_prob: Tensor, behaviour_log_prob: Tensor) -> Tensor:
@@ -363,18 +328,17 @@ def importance_weight(proximal_log_prob: Tensor, behaviour_log_prob: Tensor) -> 
     return gaussian.log_ratio(proximal_log_prob, behaviour_log_prob).exp().clamp(max=MAX_IMPORTANCE_WEIGHT)
 
 
-def cloning_loss(log_prob: Tensor, proximal_log_prob: Tensor, clip: float, num: int) -> Tensor:
+def cloning_loss(log_prob: Tensor, proximal_log_prob: Tensor, clip: float) -> Tensor:
     """Alice behavioural cloning (OpenAI 2021): the clipped surrogate with advantage 1, ``-mean(min(ratio, 1 + clip))``.
 
-    An action that is already ``1 + clip`` times likelier than at the start of the update has no gradient. ``num`` is
-    the number of demonstrations in the minibatch on all ranks.
+    An action that is already ``1 + clip`` times likelier than at the start of the update has no gradient.
     """
-    return -(gaussian.log_ratio(log_prob, proximal_log_prob).exp().clamp(max=1.0 + clip).sum() / num)
+    return -gaussian.log_ratio(log_prob, proximal_log_prob).exp().clamp(max=1.0 + clip).mean()
 
 
-def value_loss(value: Tensor, target: Tensor, num: int) -> Tensor:
-    """Half the mean squared error over ``num`` rows, those of all ranks."""
-    return 0.5 * ((value - target).square().sum() / num)
+def value_loss(value: Tensor, target: Tensor) -> Tensor:
+    """Half the mean squared error."""
+    return 0.5 * (value - target).square().mean()
 
 
 def _adapted_learning_rate(player: Player, kl: float) -> float:
@@ -389,15 +353,6 @@ def _adapted_learning_rate(player: Player, kl: float) -> float:
     if kl < 0.5 * player.config.target_kl:
         return min(player.optimizer.learning_rate * LEARNING_RATE_STEP, high)
     return player.optimizer.learning_rate
-
-
-def _block_sizes(iterations: Sequence[Sequence[Turns]], num_steps: int) -> IntArray:
-    """(T * iterations,) samples of each iteration at each step: the order of samples is by step, then by iteration."""
-    sizes = np.zeros((num_steps, len(iterations)), dtype=np.int64)
-    for index, iteration in enumerate(iterations):
-        for turns in iteration:
-            sizes[:, index] += turns.active[:, turns.learn].sum(1)
-    return sizes.ravel()
 
 
 def _join(turns: Sequence[Turns], name: str) -> Array:

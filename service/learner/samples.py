@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, fields, replace
-from typing import Self, TypeVar
+from typing import Self
 
 import numpy as np
 import torch
@@ -15,49 +15,24 @@ from service.actors.rollout import Demonstrations
 from service.config import CloningConfig, PPOConfig
 from service.envs.observations import ACTION, Layouts, Mirror
 from service.learner.player import Player
-from service.learner.shares import Share
 from service.policies import gaussian
 from service.types import Array, Arrays, IntArray
 
-Rows = TypeVar("Rows", bound="_Rows")
-
 
 class _Rows:
-    """A dataclass of tensors with equally many rows, and of ``share``: their places among the rows of all ranks."""
-
-    share: Share | None
+    """A dataclass of tensors with equally many rows."""
 
     def __len__(self) -> int:
-        return len(self.tensors()[0])
+        return len(self.columns()[0])
 
-    @property
-    def num_total(self) -> int:
-        """Rows of all ranks together."""
-        return len(self) if self.share is None else self.share.total
+    def columns(self) -> list[Tensor]:
+        """The tensors, in the order of the fields."""
+        return [getattr(self, field.name) for field in fields(self)]  # type: ignore[arg-type]
 
-    def take(self, rows: Tensor) -> Self:
-        """Take the rows of these indices, in their order."""
-        return type(self)(*(tensor.index_select(0, rows) for tensor in self.tensors()))
-
-    def tensors(self) -> list[Tensor]:
-        """The columns, in the order of the fields."""
-        return [getattr(self, name) for name in self.names()]
-
-    def names(self) -> list[str]:
-        """Names of the columns, in the order of the fields."""
-        return [field.name for field in fields(self) if field.name not in ("share", "mirror")]  # type: ignore[arg-type]
-
-    def having(self, columns: Iterable[Tensor], share: Share | None) -> Self:
-        """The same rows with other columns, in the order of the fields."""
-        return replace(self, **dict(zip(self.names(), columns, strict=True)), share=share)  # type: ignore[type-var]
-
-    def find(self, drawn: IntArray) -> Self:
-        """Take the own ones of the rows at these places of all ranks' rows, in their order."""
-        if self.share is None:
-            rows, share = drawn, None
-        else:
-            rows, share = self.share.find(drawn)
-        return replace(self.take(torch.from_numpy(rows).to(self.tensors()[0].device)), share=share)  # type: ignore[type-var]
+    def take(self, places: IntArray) -> Self:
+        """Take the rows at these places, in their order."""
+        rows = torch.from_numpy(places).to(self.columns()[0].device)
+        return type(self)(*(column.index_select(0, rows) for column in self.columns()))
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,8 +57,6 @@ class Samples(_Rows):
     """(B,) advantage, not normalised, plus ``value``."""
     value: Tensor
     """(B,) estimated at the start of the update."""
-    share: Share | None = None
-    """Places among the samples of all ranks; None without other ranks."""
 
     @property
     def proximal_log_prob(self) -> Tensor:
@@ -101,12 +74,10 @@ class Cloning(_Rows):
     """(D, A)."""
     proximal_log_prob: Tensor
     """(D,) of the action under the policy at the start of the update."""
-    share: Share | None = None
-    """Places among all that could be drawn, of all ranks; None where these are all."""
 
 
 @dataclass(frozen=True, slots=True)
-class DemonstrationRows(_Rows):
+class DemonstrationRows:
     """Demonstrations that minibatches are drawn from, far more than an update draws."""
 
     observation: Tensor
@@ -114,38 +85,28 @@ class DemonstrationRows(_Rows):
     action: Tensor
     """(D, A)."""
     mirror: Mirror | None = None
-    """Of observations; where there is one, as many reflections in y follow, which are made when they are drawn."""
-    share: Share | None = None
-    """Places among the demonstrations of all ranks; None without other ranks."""
+    """Of observations; where there is one, as many reflections in y follow, which are made when they are taken."""
 
-    @property
-    def num_total(self) -> int:
-        """Rows of all ranks together, with their reflections."""
-        return (len(self) if self.share is None else self.share.total) * self._num_copies
+    def __len__(self) -> int:
+        return len(self.action) * (1 if self.mirror is None else 2)
 
-    @property
-    def _num_copies(self) -> int:
-        return 1 if self.mirror is None else 2
+    def take(self, places: IntArray) -> DemonstrationRows:
+        """Take the rows at these places, in their order."""
+        num, device = len(self.action), self.action.device
+        rows = torch.from_numpy(places % num).to(device)
+        observation, action = (column.index_select(0, rows) for column in (self.observation, self.action))
+        if self.mirror is not None:
+            reflected = torch.from_numpy(places >= num).to(device)[:, None]
+            observation = torch.where(reflected, _reflect(observation, self.mirror), observation)
+            action = torch.where(reflected, _reflect(action, ACTION.mirror), action)
+        return DemonstrationRows(observation, action)
 
-    def find(self, drawn: IntArray) -> DemonstrationRows:
-        """Take the own ones of the rows at these places of all ranks' rows, in their order; reflections are made."""
-        num = self.num_total // self._num_copies
-        part = _Rows.find(self, drawn % num)
-        if self.mirror is None:
-            return part
-        own = drawn if part.share is None else drawn[part.share.places]
-        reflected = torch.from_numpy(own >= num).to(self.observation.device)[:, None]
-        pairs = zip(part.tensors(), (self.mirror, ACTION.mirror), strict=True)
-        columns = (torch.where(reflected, _reflect(column, mirror), column) for column, mirror in pairs)
-        return part.having(columns, part.share)
-
-    def to_clone(self, drawn: IntArray, player: Player) -> Cloning:
-        """Prepare the own ones of the rows at these places, ascending; ``player`` is at the start of the update."""
-        part = self.find(drawn)
-        places = drawn if part.share is None else drawn[part.share.places]
+    def to_clone(self, places: IntArray, player: Player) -> Cloning:
+        """Prepare the rows at these places; ``player`` is at the start of the update."""
+        part = self.take(places)
         with torch.no_grad():
             log_prob = player.log_prob(part.observation, part.action)
-        return Cloning(part.observation, part.action, log_prob, Share(places, self.num_total))
+        return Cloning(part.observation, part.action, log_prob)
 
 
 class DemonstrationHistory:
@@ -167,14 +128,11 @@ class DemonstrationHistory:
         """Join all that is kept, oldest first."""
         return self._join(self._iterations)
 
-    def sizes(self) -> IntArray:
-        """Steps of each iteration, oldest first."""
-        return np.array([len(each.action) for each in self._iterations], dtype=np.int64)
-
     def state(self) -> Arrays:
         """Everything that a resumed run needs, by name."""
         everything = self.joined()
-        return {"observation": everything.observation, "action": everything.action, "num_steps": self.sizes()}
+        num_steps = np.array([len(each.action) for each in self._iterations], dtype=np.int64)
+        return {"observation": everything.observation, "action": everything.action, "num_steps": num_steps}
 
     def load_state(self, state: Mapping[str, Array]) -> None:
         """Continue where ``state`` was taken; a shorter history keeps the newest."""
@@ -190,46 +148,13 @@ class DemonstrationHistory:
         return Demonstrations(observation, np.concatenate([part.action for part in all_parts]))
 
 
-@dataclass(frozen=True, slots=True)
-class Mirrors:
-    """Reflections in y of what a player sees."""
-
-    observation: Mirror
-    value_observation: Mirror
-
-
-def alices(layouts: Layouts) -> Mirrors:
-    """Reflections of what Alice sees."""
-    return Mirrors(layouts.full.mirror, layouts.full.mirror)
-
-
-def bobs(layouts: Layouts) -> Mirrors:
-    """Reflections of what Bob sees."""
-    return Mirrors(layouts.bob.mirror, layouts.bob_value.mirror)
-
-
-def mirror(samples: Samples, mirrors: Mirrors, player: Player, rng: np.random.Generator) -> Samples:
-    """Augment samples by symmetry, as ``PPOConfig.mirror`` of the player says."""
-    if player.config.mirror == "both":
-        return augment_by_symmetry(samples, mirrors, player)
-    return reflect_at_random(samples, mirrors, player, rng) if player.config.mirror == "random" else samples
-
-
-def augment_by_symmetry(samples: Samples, mirrors: Mirrors, player: Player) -> Samples:
-    """Append the reflections in y of samples, which have the originals' advantages and values."""
-    reflections = _reflections(samples, mirrors, player)
-    pairs = zip(samples.tensors(), reflections.tensors(), strict=True)
-    return samples.having(map(torch.cat, pairs), samples.share and samples.share.mirrored())
-
-
-def reflect_at_random(samples: Samples, mirrors: Mirrors, player: Player, rng: np.random.Generator) -> Samples:
-    """Replace half of the samples, chosen at random, by their reflections in y: half the work of learning both."""
-    chosen = rng.random(samples.num_total) < 0.5  # of all ranks, so that all draw alike
-    own = chosen if samples.share is None else chosen[samples.share.places]
-    rows = torch.from_numpy(np.flatnonzero(own)).to(samples.observation.device)
-    reflections = _reflections(samples.take(rows), mirrors, player)
-    pairs = zip(samples.tensors(), reflections.tensors(), strict=True)
-    return samples.having((column.index_copy(0, rows, reflected) for column, reflected in pairs), samples.share)
+def reflect_at_random(samples: Samples, seen: Layouts, bob: Player, rng: np.random.Generator) -> Samples:
+    """Replace half of Bob's samples, chosen at random, by their reflections in y."""
+    places = np.flatnonzero(rng.random(len(samples)) < 0.5)
+    reflections = _reflections(samples.take(places), seen, bob)
+    rows = torch.from_numpy(places).to(samples.observation.device)
+    pairs = zip(samples.columns(), reflections.columns(), strict=True)
+    return Samples(*(column.index_copy(0, rows, reflected) for column, reflected in pairs))
 
 
 def draw_epoch(
@@ -241,12 +166,10 @@ def draw_epoch(
     ``how.rows_per_sample`` times as many demonstrations, which are cycled through if they are too few. Demonstrations
     alone are gone through once.
 
-    The rows of all ranks are drawn together, so with equal random numbers all draw the same.
-
     Args:
-        num_samples: of all ranks; may be 0 where there are demonstrations.
-        num_demonstrations: of all ranks; may be 0 where there are samples.
-        config: size of a minibatch of samples, of all ranks together.
+        num_samples: may be 0 where there are demonstrations.
+        num_demonstrations: may be 0 where there are samples.
+        config: size of a minibatch of samples.
         how: demonstrations beside them.
         rng: shuffles.
 
@@ -269,22 +192,22 @@ def _draw(num_rows: int, num: int, rng: np.random.Generator) -> IntArray:
     return np.concatenate([np.zeros(0, dtype=np.int64), *rounds])[:num]
 
 
-def _reflections(samples: Samples, mirrors: Mirrors, player: Player) -> Samples:
-    """Reflect samples in y.
+def _reflections(samples: Samples, seen: Layouts, bob: Player) -> Samples:
+    """Reflect Bob's samples in y.
 
     A reflection was acted by the reflected behaviour policy, so it has the behaviour log-probability of its original.
-    The importance weight, or without ``decoupled`` PPO's ratio, then says how much it counts: little, where ``player``
+    The importance weight, or without ``decoupled`` PPO's ratio, then says how much it counts: little, where he
     would hardly act like that. With a full weight one reflection in ten, tens of standard deviations from the mean,
     ruled the gradient.
     """
-    observations = _reflect(samples.observation, mirrors.observation)
+    observations = _reflect(samples.observation, seen.bob.mirror)
     actions = _reflect(samples.action, ACTION.mirror)
     with torch.no_grad():
-        mean, std = player.policy(observations)
+        mean, std = bob.policy(observations)
     return replace(
         samples,
         observation=observations,
-        value_observation=_reflect(samples.value_observation, mirrors.value_observation),
+        value_observation=_reflect(samples.value_observation, seen.bob_value.mirror),
         action=actions,
         proximal_mean=mean,
         proximal_std=std,

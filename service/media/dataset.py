@@ -12,7 +12,6 @@ from pathlib import Path
 
 import numpy as np
 
-from service import __version__
 from service.config import Config
 from service.envs.batch import WorldBatch
 from service.envs.gym.tabletop import action_space, goal_space
@@ -22,6 +21,7 @@ from service.io.files import os_errors
 from service.media.recording import RecordedEpisodes, RecordedRound
 from service.progress import counted
 from service.types import FloatArray, StateArray
+from service.version import __version__
 
 _NAME = re.compile(r"(?![\w-]/[\w-]+$)(?:[\w-]+/)*[\w-]+-v[0-9]+")  # what Minari takes
 _FURTHEST_M = 10.0

@@ -9,15 +9,16 @@ from typing import Literal
 
 import numpy as np
 
-from service.downstream.orchestrators import Orchestrator
+from service.actors.self_play import StochasticPolicy
 from service.envs.batch import WorldBatch
 from service.envs.observations import bob_observation
 from service.envs.obstacles import inside_fixtures
 from service.envs.sampling import draw_goals
+from service.envs.tasks import EPISODE_STEPS
 from service.errors import TandemError
 from service.generator.validity import FALLEN_BELOW_M, Verdict, classify_goal
-from service.play.cast import Cast
 from service.policies.numpy_policy import NumpyMCPPolicy
+from service.primitives.loading import Trained
 from service.types import FloatArray, StateArray
 
 Mode = Literal["goals", "primitives", "alice"]
@@ -35,19 +36,32 @@ class Game:
     """One world and its players.
 
     Args:
-        cast: the players.
+        players: Bob, and Alice where a run has her.
         seed: of starts, random goals and Alice's noise.
     """
 
-    def __init__(self, cast: Cast, seed: int = 0) -> None:
-        self.cast = cast
+    def __init__(self, players: Trained, seed: int = 0) -> None:
+        rules, on_task = players.config.game, players.task is not None
+        self.players, self.title, self.world = players, players.title, players.world
+        self.bob = players.policy
+        acting = players.trained or players
+        self.primitives = acting.policy if isinstance(acting.policy, NumpyMCPPolicy) else None
+        """What sliders drive."""
+        self.alice: StochasticPolicy | None = players.alice if rules.alice_plays else None
+        self.alice_steps = rules.alice_steps
+        self.num_goals = rules.num_goals
+        """Rounds of a game."""
+        self.bob_steps = EPISODE_STEPS if on_task else rules.bob_steps
+        """Of a goal, after which another one comes."""
+        self.hold_steps = EPISODE_STEPS // 4 if on_task else max(rules.bob_hold_steps, 1)
+        """At the goal, after which it counts as solved."""
         self._rng = np.random.default_rng(seed)
-        self.worlds = WorldBatch(cast.world, 1, num_threads=1)
-        self.step_s = cast.world.physics_step_s * cast.world.num_substeps
+        self.worlds = WorldBatch(self.world, 1, num_threads=1)
+        self.step_s = self.world.physics_step_s * self.world.num_substeps
         self.mode: Mode = "goals"
         self.new_goals = True
         """Whether another goal comes when Bob is there, or his time is over."""
-        num = cast.primitives.num_primitives if cast.primitives is not None else 0
+        num = self.primitives.num_primitives if self.primitives is not None else 0
         self.weights: FloatArray = np.ones(num, dtype=np.float32)
         """(K,) of the primitives, where they are set."""
         self.caption = ""
@@ -76,10 +90,10 @@ class Game:
 
     @property
     def modes(self) -> tuple[Mode, ...]:
-        """What this cast can do."""
+        """What these players can do."""
         modes: list[Mode] = ["goals"]
-        modes += ["primitives"] if self.cast.primitives is not None else []
-        return (*modes, "alice") if self.cast.alice is not None else tuple(modes)
+        modes += ["primitives"] if self.primitives is not None else []
+        return (*modes, "alice") if self.alice is not None else tuple(modes)
 
     @property
     def shows_goal(self) -> bool:
@@ -95,7 +109,7 @@ class Game:
         """(K,) weights that act now: those that are set, or the gate's; None where neither is known."""
         if self.mode == "primitives":
             return self.weights
-        bob = self.cast.bob
+        bob = self.bob
         if self._turn == "bob" and isinstance(bob, NumpyMCPPolicy):
             gate: FloatArray = bob.gate(bob_observation(self.worlds.positions(), self.goal[None]))[0]
             return gate
@@ -117,7 +131,7 @@ class Game:
             TandemError: nobody here does that.
         """
         if mode not in self.modes:
-            raise TandemError(f"mode {mode!r}: {self.cast.label} can do {', '.join(self.modes)}")
+            raise TandemError(f"mode {mode!r}: {self.title} can do {', '.join(self.modes)}")
         if mode == "primitives" and (weights := self.weights_now()) is not None:
             self.weights = weights.copy()  # as the gate had them last: what follows is seen to come from the person
         changed, self.mode = mode != self.mode, mode
@@ -131,10 +145,10 @@ class Game:
 
         Where the object would be inside a fixture there is no goal: it stays where it was.
         """
-        workspace = self.cast.world.workspace
-        low = (*workspace.lower_m[:2], self.cast.world.rest_height_m)
+        workspace = self.world.workspace
+        low = (*workspace.lower_m[:2], self.world.rest_height_m)
         place = np.clip(np.asarray(goal, dtype=np.float64), low, workspace.upper_m)
-        if inside_fixtures(place[None], self.cast.world)[0]:
+        if inside_fixtures(place[None], self.world)[0]:
             return
         self.goal = place
         self.new_goals = False
@@ -157,7 +171,7 @@ class Game:
             self._pause("the object fell off the table" if not diverged else "the physics diverged", "reset")
         elif self._turn == "alice":
             self.caption = f"Alice proposes: {self._seconds()}"
-            if self._steps >= self.cast.alice_steps:
+            if self._steps >= self.alice_steps:
                 self._judge()
         elif self.mode == "primitives":
             self.caption = "Primitives by your weights"
@@ -165,30 +179,29 @@ class Game:
             self._follow_bob()
 
     def _action(self) -> FloatArray:
-        cast, worlds = self.cast, self.worlds
+        worlds = self.worlds
         if self._turn == "alice":
-            assert cast.alice is not None
-            return cast.alice.act(worlds.full(self._steps / max(cast.alice_steps, 1)), self._rng)[0]
+            assert self.alice is not None
+            return self.alice.act(worlds.full(self._steps / max(self.alice_steps, 1)), self._rng)[0]
         if self.mode == "primitives":
-            assert cast.primitives is not None
-            return cast.primitives.compose(worlds.positions(), self.weights[None])[0]
-        return cast.bob.act_deterministic(bob_observation(worlds.positions(), self.goal[None]))
+            assert self.primitives is not None
+            return self.primitives.compose(worlds.positions(), self.weights[None])[0]
+        return self.bob.act_deterministic(bob_observation(worlds.positions(), self.goal[None]))
 
     def _follow_bob(self) -> None:
-        cast = self.cast
-        there = self.distance_m <= cast.success_distance_m
+        there = self.distance_m <= self.players.success_distance_m
         self._held = self._held + 1 if there else 0
         self.caption = (
             f"At the goal, {100 * self.distance_m:.1f} cm away" if there else f"On the way: {self._seconds()}"
         )
-        solved, late = self._held >= cast.hold_steps, self._steps >= cast.bob_steps
+        solved, late = self._held >= self.hold_steps, self._steps >= self.bob_steps
         if self.mode == "alice":
             if solved or late:
                 self._pause(f"Bob: solved after {self._seconds()}" if solved else "Bob: not solved", "round")
         elif self.new_goals and late and not there:
             self._pause(f"Not there in {self._seconds()}", "reset")
         elif self.new_goals and solved and self._steps >= 1 / self.step_s:  # a goal beside the object is seen, too
-            if cast.world.fixture == "none":
+            if self.world.fixture == "none":
                 self._begin_turn("bob", forget=False)
                 self._draw_goal()
             else:
@@ -197,8 +210,8 @@ class Game:
     def _judge(self) -> None:
         """Take where Alice left the object for a goal, or say why it is none."""
         self._end_state, self.goal = self.worlds.states.copy(), self.worlds.object_position[0].copy()
-        before, workspace = self._start[:, self.worlds.layout["object"]], self.cast.world.workspace
-        verdict = Verdict(classify_goal(before, self.goal[None], workspace, self.cast.success_distance_m)[0])
+        before, workspace = self._start[:, self.worlds.layout["object"]], self.world.workspace
+        verdict = Verdict(classify_goal(before, self.goal[None], workspace, self.players.success_distance_m)[0])
         if verdict == Verdict.VALID:
             self._pause("Alice proposed this goal", "bob")
         else:
@@ -212,7 +225,7 @@ class Game:
         if self._after == "bob":
             self.worlds.restore(self._start)
             self._begin_turn("bob")
-        elif self._after == "round" and self._round + 1 < self.cast.num_goals:
+        elif self._after == "round" and self._round + 1 < self.num_goals:
             self._round += 1
             self.worlds.restore(self._end_state)  # as games do: the next round starts where Alice ended
             self._begin_turn("alice")
@@ -224,16 +237,16 @@ class Game:
         self._turn, self._steps, self._held, self._still_steps = turn, 0, 0, 0
         self._start = self.worlds.states.copy()
         self.caption = "Alice proposes" if turn == "alice" else "On the way"
-        if forget and isinstance(self.cast.bob, Orchestrator):
-            self.cast.bob.begin()
+        if forget:
+            self.players.begin()
 
     def _draw_goal(self) -> None:
-        cast, worlds = self.cast, self.worlds
+        worlds = self.worlds
         self.goal = draw_goals(
-            cast.goals,
+            self.players.goals,
             self._rng,
-            cast.world,
-            cast.success_distance_m,
+            self.world,
+            self.players.success_distance_m,
             start=worlds.object_position,
             box=worlds.box_place,
         )[0]

@@ -44,11 +44,11 @@ class Panel:
         self.new_goals = gui.add_checkbox("New goals", game.new_goals, hint="another goal when Bob is there")
         gui.add_markdown(_HELP)
         self.weights: list[Any] = []
-        if game.cast.primitives is not None:
+        if game.primitives is not None:
             with gui.add_folder("Weights of the primitives"):
                 self.weights = [
                     gui.add_slider(f"{number}", _LEAST_WEIGHT, 1.0, 0.01, 1.0)
-                    for number in range(1, game.cast.primitives.num_primitives + 1)
+                    for number in range(1, game.primitives.num_primitives + 1)
                 ]
         self._connect()
 
@@ -64,7 +64,7 @@ class Panel:
         """Tell what goes on now."""
         game = self._game
         paused = " (paused)" if self.paused else ""
-        self._tell(self.caption, "content", f"**{game.cast.label}**\n\n{game.caption}{paused}")
+        self._tell(self.caption, "content", f"**{game.title}**\n\n{game.caption}{paused}")
         self._tell(self.pause, "label", "Go on" if self.paused else "Pause")
         self._tell(self.new_goals, "value", game.new_goals)
         self._tell(self.mode, "value", _TITLES[game.mode])

@@ -18,10 +18,10 @@ import numpy as np
 
 from service.errors import TandemError
 from service.extras import needs_extra
-from service.play.cast import Cast
 from service.play.game import Game
 from service.play.panel import Panel
 from service.play.scene import LiveScene
+from service.primitives.loading import Trained
 
 PORT = 8322
 _NUM_PORTS = 50
@@ -35,7 +35,7 @@ class LiveWorld:
     """A game, and the server that shows it.
 
     Args:
-        cast: who plays.
+        players: see ``Game``.
         host: to listen on; others than this machine's own let everybody who reaches it play along.
         port: to listen on; None for 8322, or the next one that is free.
         seed: of the game.
@@ -44,14 +44,14 @@ class LiveWorld:
         TandemError: the packages of the extra ``play`` are missing, the port is taken, or the host is not here.
     """
 
-    def __init__(self, cast: Cast, host: str = "127.0.0.1", port: int | None = None, seed: int = 0) -> None:
+    def __init__(self, players: Trained, host: str = "127.0.0.1", port: int | None = None, seed: int = 0) -> None:
         viser = _import_viser()
         self.port = _free_port(host, port)
         self.host = host
-        self.game = Game(cast, seed)
+        self.game = Game(players, seed)
         self._server = _quiet_server(viser, host, self.port)
         try:
-            self.scene = LiveScene(self._server, cast.world)
+            self.scene = LiveScene(self._server, self.game.world)
             self.panel = Panel(self._server, self.game)
         except BaseException:
             self.close()

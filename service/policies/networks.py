@@ -18,8 +18,7 @@ from torch import Tensor, nn
 
 from service.config import MCPConfig, MLPConfig, PolicyConfig
 from service.envs.observations import ACTION, PAPER, POSITIONS, Layouts, Normalisation, ObservationLayout
-from service.policies.composition import compose
-from service.policies.parameters import INPUT_CLIP, MEAN_BOUND
+from service.policies.forward import INPUT_CLIP, MEAN_BOUND, compose
 from service.types import FloatArray
 
 INITIAL_LOG_STD = -0.1

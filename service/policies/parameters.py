@@ -1,88 +1,145 @@
-"""Exported parameters, as torch and NumPy share them: constants of the architecture, and a reader that checks."""
+"""Exported parameters: the shapes that networks need, declared once, and a check."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any
+from collections.abc import Iterator, Mapping, Sequence
+from itertools import pairwise
 
 import numpy as np
 
+from service.envs.observations import ACTION, GOAL_FROM_OBJECT, PAPER
 from service.errors import TandemError
 from service.types import FloatArray
 
 Parameters = Mapping[str, FloatArray]
-
-INPUT_CLIP = 5.0
-"""Normalised inputs are clipped to +- this."""
-MEAN_BOUND = 2.0
-"""Means are ``MEAN_BOUND * tanh(x / MEAN_BOUND)``: slope 1 at 0, and a little room past the action's [-1, 1]."""
+Shapes = dict[str, tuple[int, ...]]
+NUM_GOAL = PAPER.bob.size - PAPER.positions.size
 
 
 class PolicyError(TandemError):
     """Parameters or inputs that do not fit the policy; the message names them, with expected and actual shape."""
 
 
-class ParameterReader:
-    """Reader of an exported dict: parameters are taken one by one and checked; ``finish`` tells of any left over."""
+def bob_shapes(
+    num_positions: int,
+    trunk: Sequence[int],
+    heads: tuple[int, int],
+    gate: Sequence[int],
+    action_size: int = ACTION.size,
+) -> Shapes:
+    """Shape of every parameter of a composed Bob.
 
-    def __init__(self, parameters: Parameters) -> None:
-        """Read from ``parameters``, which stays as it is."""
-        self._left: dict[str, Any] = dict(parameters)
+    Args:
+        num_positions: P.
+        trunk: sizes of the layers that the primitives share.
+        heads: number of primitives, and hidden size of each.
+        gate: sizes of the gate's hidden layers.
+        action_size: A.
+    """
+    num_primitives, head_size = heads
+    num_seen = num_positions + NUM_GOAL + GOAL_FROM_OBJECT.size
+    last_of_trunk, last_of_gate = [num_positions, *trunk][-1], [num_seen, *gate][-1]
+    return {
+        **_input_shapes("primitives.input", num_positions),
+        **layer_shapes("primitives.trunk.{}", (num_positions, *trunk)),
+        **layer_shapes("primitives.hidden", (last_of_trunk, num_primitives * head_size)),
+        "primitives.output_weight": (num_primitives, head_size, 2 * action_size),
+        "primitives.output_bias": (num_primitives, 2 * action_size),
+        **_squash_shapes("primitives.squash"),
+        **_input_shapes("gate.input", num_seen),
+        **layer_shapes("gate.hidden.{}", (num_seen, *gate)),
+        **layer_shapes("gate.output", (last_of_gate, num_primitives)),
+        "gate.weight_floor": (),
+    }
 
-    def __contains__(self, name: str) -> bool:
-        """Whether ``name`` is there and not yet taken."""
-        return name in self._left
 
-    def take(self, name: str, shape: tuple[int | None, ...]) -> FloatArray:
-        """Take one parameter as a float32 copy.
+def gaussian_shapes(num_inputs: int, hidden: Sequence[int], action_size: int) -> Shapes:
+    """Shape of every parameter of Alice, or of a monolithic Bob."""
+    return {
+        **_input_shapes("input", num_inputs),
+        **layer_shapes("hidden.{}", (num_inputs, *hidden)),
+        **layer_shapes("output", ([num_inputs, *hidden][-1], 2 * action_size)),
+        **_squash_shapes("squash"),
+    }
 
-        Args:
-            name: key of the exported dict.
-            shape: expected shape; None stands for any size of at least 1.
 
-        Raises:
-            PolicyError: missing, of another shape, not floating point, or not finite.
-        """
-        expected = _describe(shape)
-        if name not in self._left:
-            raise PolicyError(f"policy parameter {name!r} is missing, expected shape {expected}; export it again")
-        value = np.asarray(self._left.pop(name))
-        fits = len(shape) == value.ndim and all(
-            actual == size or (size is None and actual > 0) for size, actual in zip(shape, value.shape, strict=True)
-        )
-        if not fits:
-            actual = _describe(value.shape)
-            raise PolicyError(f"policy parameter {name!r}: expected shape {expected}, got {actual}; export it again")
+def layer_shapes(name: str, sizes: Sequence[int], step: int = 1) -> Shapes:
+    """Weights (outputs, inputs) and biases between every two neighbours of ``sizes``.
+
+    Args:
+        name: with ``{}`` for the place of a layer.
+        sizes: inputs, then outputs of each layer.
+        step: from one place to the next.
+    """
+    shapes: Shapes = {}
+    for place, (inputs, outputs) in enumerate(pairwise(sizes)):
+        layer = name.format(step * place)
+        shapes |= {f"{layer}.weight": (outputs, inputs), f"{layer}.bias": (outputs,)}
+    return shapes
+
+
+def layer_sizes(parameters: Parameters, name: str, step: int = 1) -> tuple[int, ...]:
+    """Outputs of each layer that is there; see ``layer_shapes``.
+
+    Raises:
+        PolicyError: the first is missing, or a weight is no matrix.
+    """
+    sizes: list[int] = []
+    while not sizes or f"{name.format(step * len(sizes))}.weight" in parameters:
+        sizes.append(shape_of(parameters, f"{name.format(step * len(sizes))}.weight", 2)[0])
+    return tuple(sizes)
+
+
+def shape_of(parameters: Parameters, name: str, num_axes: int) -> tuple[int, ...]:
+    """Shape of a parameter that sizes are read from.
+
+    Raises:
+        PolicyError: it is missing, or has another number of axes.
+    """
+    if name not in parameters:
+        raise PolicyError(f"policy parameter {name!r} is missing; export it again")
+    shape = np.shape(parameters[name])
+    if len(shape) != num_axes or 0 in shape:
+        raise PolicyError(f"policy parameter {name!r}: expected {num_axes} axes, got {shape}; export it again")
+    return shape
+
+
+def misfits(parameters: Parameters, expected: Shapes) -> Iterator[str]:
+    """Tell of each parameter that is missing, of another shape, or not expected."""
+    for name in [*expected, *(name for name in parameters if name not in expected)]:
+        if name not in parameters:
+            yield f"policy parameter {name!r} is missing, expected shape {expected[name]}"
+        elif (shape := np.shape(parameters[name])) != expected.get(name):
+            wanted = f"shape {expected[name]}" if name in expected else "none of that name"
+            yield f"policy parameter {name!r}: expected {wanted}, got {shape}"
+
+
+def checked(parameters: Parameters, expected: Shapes) -> dict[str, FloatArray]:
+    """Float32 copies of parameters that have the expected shapes.
+
+    Raises:
+        PolicyError: a parameter is missing, left over, of another shape, not finite, or out of its range.
+    """
+    for misfit in misfits(parameters, expected):
+        raise PolicyError(f"{misfit}; export it again")
+    for name, value in parameters.items():
+        about = f"policy parameter {name!r}"
         if value.dtype.kind != "f":
-            raise PolicyError(f"policy parameter {name!r} of shape {expected}: expected float32, got {value.dtype}")
+            raise PolicyError(f"{about} of shape {value.shape}: expected float32, got {value.dtype}")
         if not np.isfinite(value).all():
-            raise PolicyError(f"policy parameter {name!r} of shape {expected} is not finite; use an earlier version")
-        return value.astype(np.float32)
-
-    def take_scalar(self, name: str, low: float, high: float) -> np.float32:
-        """Take a 0-d parameter strictly between ``low`` and ``high``.
-
-        Raises:
-            PolicyError: as ``take``, or the value is out of range.
-        """
-        value: np.float32 = self.take(name, ())[()]  # type: ignore[assignment]  # indexing by () gives the scalar
-        if not low < value < high:
-            raise PolicyError(f"policy parameter {name!r} = {value}: expected a value between {low:g} and {high:g}")
-        return value
-
-    def finish(self) -> None:
-        """Assert that every parameter was taken.
-
-        Raises:
-            PolicyError: some were not.
-        """
-        if self._left:
-            name, value = next(iter(self._left.items()))
-            more = f" (and {len(self._left) - 1} more)" if len(self._left) > 1 else ""
-            actual = _describe(np.shape(value))
-            raise PolicyError(f"policy parameter {name!r}: expected none of that name, got shape {actual}{more}")
+            raise PolicyError(f"{about} of shape {value.shape} is not finite; use an earlier version")
+        if name.endswith(".scale") and not (value > 0.0).all():
+            raise PolicyError(f"{about} = {value}: expected positive values")
+        if name.endswith("weight_floor") and not 0.0 < value < 1.0:
+            raise PolicyError(f"{about} = {value}: expected a value between 0 and 1")
+        if name.endswith("log_std_max") and not value > (low := parameters[f"{name.removesuffix('max')}min"]):
+            raise PolicyError(f"{about} = {value}: expected a value above the least, {low:g}")
+    return {name: value.astype(np.float32) for name, value in parameters.items()}
 
 
-def _describe(shape: tuple[int | None, ...]) -> str:
-    sizes = ", ".join("any" if size is None else str(size) for size in shape)
-    return f"({sizes},)" if len(shape) == 1 else f"({sizes})"
+def _input_shapes(name: str, size: int) -> Shapes:
+    return {f"{name}.offset": (size,), f"{name}.scale": (size,)}
+
+
+def _squash_shapes(name: str) -> Shapes:
+    return {f"{name}.log_std_min": (), f"{name}.log_std_max": ()}

@@ -7,14 +7,14 @@ from pathlib import Path
 from service.errors import did_you_mean
 from service.registry.errors import UnknownVersionError
 from service.registry.exported import ExportedVersion, is_exported
-from service.registry.names import Version, split_reference
+from service.registry.names import Version, is_service, split_reference
 from service.registry.registry import Registry
 
 BUNDLED = Path(__file__).parent / "data"
 """The registry that comes with the package; it is only read."""
 
 
-def find_version(reference: str, root: Path) -> tuple[Registry, Version]:
+def find_version(reference: str, root: Path | str) -> tuple[Registry, Version]:
     """Find a version in the registry at ``root`` or, where that does not have it, in the bundled one.
 
     What the user's registry has is always the user's. An alias of it that means a missing version is not looked up
@@ -22,16 +22,21 @@ def find_version(reference: str, root: Path) -> tuple[Registry, Version]:
 
     Args:
         reference: NAME, NAME@VERSION or NAME@ALIAS; or the directory of an exported version.
-        root: of the user's registry; need not exist.
+        root: of the user's registry; need not exist. Or the URL of a ``tandem serve``, which alone is asked.
 
     Raises:
         UnknownVersionError: in neither; the message says what there is.
         RegistryError: not a reference, or a damaged alias.
+        FetchError: the service cannot be reached, or wants a token.
     """
     if is_exported(Path(reference)):
         exported = ExportedVersion(Path(reference))
         return exported, exported.version
-    own, bundled = Registry(root), Registry(BUNDLED)
+    if is_service(root):
+        from service.registry.client import fetch_primitives  # its packages, which only a URL needs
+
+        return fetch_primitives(str(root), reference)
+    own, bundled = Registry(Path(root)), Registry(BUNDLED)
     try:
         return own, own.resolve(reference)
     except UnknownVersionError as error:

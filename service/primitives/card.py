@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Mapping, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Iterable, Mapping, Sequence
+from math import prod
+from typing import Any
 
 import yaml
 
@@ -13,64 +14,41 @@ from service.registry.manifest import Manifest
 
 LICENCE = "apache-2.0"
 """Tandem's own, as hubs write it."""
-_PRIMITIVES = "primitives"
-_LEARNED = {
-    False: "They were learned by self-play, in which Alice proposes goals and Bob reaches them.",
-    True: "They were learned from other ones, which saw more and had been learned by self-play (distillation).",
-}
-_SUCCESS = re.compile(r"evaluation/(?:(\w+)_)?success_(last|ever)")
-
-
-class Paper(NamedTuple):
-    """A paper as ``docs/bibliography.md`` has it, which does not come with the package."""
-
-    authors: str
-    title: str
-    year: int
-    arxiv: str
-
-
 PAPERS = {
-    "tandem": Paper(
-        "Paul Jansonnie, Bingbing Wu, Julien Perez, Jan Peters",
-        "Unsupervised Skill Discovery for Robotic Manipulation through Automatic Task Generation",
-        2024,
+    "tandem": (
         "2410.04855",
+        "Paul Jansonnie, Bingbing Wu, Julien Perez, Jan Peters: *Unsupervised Skill Discovery for Robotic "
+        "Manipulation through Automatic Task Generation*, 2024",
     ),
-    "self-play": Paper(
-        "OpenAI and others",
-        "Asymmetric self-play for automatic goal discovery in robotic manipulation",
-        2021,
+    "self-play": (
         "2101.04882",
+        "OpenAI and others: *Asymmetric self-play for automatic goal discovery in robotic manipulation*, 2021",
     ),
-    "mcp": Paper(
-        "Xue Bin Peng, Michael Chang, Grace Zhang, Pieter Abbeel, Sergey Levine",
-        "MCP: Learning Composable Hierarchical Control with Multiplicative Compositional Policies",
-        2019,
+    "mcp": (
         "1905.09808",
+        "Xue Bin Peng, Michael Chang, Grace Zhang, Pieter Abbeel, Sergey Levine: *MCP: Learning Composable "
+        "Hierarchical Control with Multiplicative Compositional Policies*, 2019",
     ),
-    "ppo": Paper("John Schulman and others", "Proximal Policy Optimization Algorithms", 2017, "1707.06347"),
-    "sac": Paper("Tuomas Haarnoja and others", "Soft Actor-Critic Algorithms and Applications", 2018, "1812.05905"),
-    "her": Paper("Marcin Andrychowicz and others", "Hindsight Experience Replay", 2017, "1707.01495"),
-    "diayn": Paper(
-        "Benjamin Eysenbach and others",
-        "Diversity is All You Need: Learning Skills without a Reward Function",
-        2018,
+    "ppo": ("1707.06347", "John Schulman and others: *Proximal Policy Optimization Algorithms*, 2017"),
+    "sac": ("1812.05905", "Tuomas Haarnoja and others: *Soft Actor-Critic Algorithms and Applications*, 2018"),
+    "her": ("1707.01495", "Marcin Andrychowicz and others: *Hindsight Experience Replay*, 2017"),
+    "diayn": (
         "1802.06070",
+        "Benjamin Eysenbach and others: *Diversity is All You Need: Learning Skills without a Reward Function*, 2018",
     ),
-    "dads": Paper(
-        "Archit Sharma and others", "Dynamics-Aware Unsupervised Discovery of Skills", 2019, "1907.01657"
-    ),
-    "lsd": Paper(
-        "Seohong Park and others", "Lipschitz-constrained Unsupervised Skill Discovery", 2022, "2202.00914"
-    ),
-    "metra": Paper(
-        "Seohong Park, Oleh Rybkin, Sergey Levine",
-        "METRA: Scalable Unsupervised RL with Metric-Aware Abstraction",
-        2023,
+    "dads": ("1907.01657", "Archit Sharma and others: *Dynamics-Aware Unsupervised Discovery of Skills*, 2019"),
+    "lsd": ("2202.00914", "Seohong Park and others: *Lipschitz-constrained Unsupervised Skill Discovery*, 2022"),
+    "metra": (
         "2310.08887",
+        "Seohong Park, Oleh Rybkin, Sergey Levine: *METRA: Scalable Unsupervised RL with Metric-Aware Abstraction*, "
+        "2023",
     ),
-}  # fmt: skip
+}
+"""Numbers at arXiv and citations, as in ``docs/bibliography.md``, which does not come with the package."""
+_RATE = re.compile(r"evaluation/(?:(\w+)_)?success_(last|ever)")
+_HISTORY = "Settings that changed on the way, and records that were lost:"
+_SUCCESS = "Share of episodes in which the object was at its goal, in simulation and without noise in the actions:"
+_WHEN = {"last": "success at the last step", "ever": "success at any step"}
 
 
 def model_card(manifest: Manifest, *, licence: str = LICENCE) -> str:
@@ -80,195 +58,136 @@ def model_card(manifest: Manifest, *, licence: str = LICENCE) -> str:
         manifest: of the version.
         licence: of its parameters, as hubs write it.
     """
-    sections = (_what, _how_trained, _results, _how_to_load, _papers)
-    body = "\n\n".join(text for section in sections for text in section(manifest))
-    head = yaml.safe_dump(_head(manifest, licence), sort_keys=False, allow_unicode=True)
-    return f"---\n{head}---\n\n{body}\n\n## Licence\n\n{licence}\n"
-
-
-def _head(manifest: Manifest, licence: str) -> dict[str, Any]:
-    """The YAML head; results are in the form of a hub's ``model-index``."""
-    kind = _kind(manifest)
-    papers = [f"arxiv:{PAPERS[key].arxiv}" for key in _paper_keys(manifest)]
-    results = [
-        {
-            "task": {"type": "robotics", "name": "Tabletop manipulation"},
-            "dataset": {"type": "tandem", "name": _goals(manifest, where)},
-            "metrics": [
-                {"type": "success_rate", "name": name, "value": round(rates[when], 4)}
-                for when, name in _WHEN.items()
-                if when in rates
-            ],
-        }
-        for where, rates in _rates(manifest).items()
-    ]
-    return {
+    spaces, config, metrics = manifest.spaces, manifest.config, manifest.metrics
+    what, code, after, papers = _kind(manifest)
+    rates = _rates(manifest)
+    tags = ("robotics", "reinforcement-learning", "mujoco", str(spaces.get("kind", "primitives")))
+    head = {
         "license": licence,
         "library_name": "tandem-skills",
         "pipeline_tag": "robotics",
-        "tags": ["robotics", "reinforcement-learning", "mujoco", kind, *papers],
-        **({"model-index": [{"name": manifest.name, "results": results}]} if results else {}),
+        "tags": [*tags, *(f"arxiv:{PAPERS[key][0]}" for key in papers)],
+        **({"model-index": [{"name": manifest.name, "results": _model_index(rates)}]} if rates else {}),
     }
-
-
-def _what(manifest: Manifest) -> Iterator[str]:
-    yield f"# {manifest.reference}"
-    spaces, kind = manifest.spaces, _kind(manifest)
-    config = manifest.config
-    if kind == ORCHESTRATOR:
-        yield (
-            f"An orchestrator of Tandem: a policy for the task *{spaces.get('task', '?')}* that acts with the frozen "
-            f"{_takes(manifest)} `{spaces.get('primitives', '?')}` (digest "
-            f"`{str(spaces.get('primitives_digest', '?'))[:12]}`), and with no others."
-        )
-    elif kind == SKILLS:
-        yield (
-            f"Frozen skills of Tandem, found by {str(_at(config, 'skills', 'method') or '?').upper()}: a policy that "
-            f"acts by a vector of {_text(spaces.get('skill'))} numbers. No task and no reward was written for them."
-        )
-    else:
-        num = _first(_at(config, "policy", "bob", "num_primitives"), "The")
-        yield (
-            f"{num} frozen primitives of Tandem, and the gate that composes them: a policy that brings an object to a "
-            f"goal. {_LEARNED[_at(config, 'distillation') is not None]} No task and no reward was written for them. "
-            "New tasks are learned by composing them."
-        )
-    thing = _at(config, "world", "object")
-    rows = [
-        ("robot", _at(config, "world", "robot", "name") or _at(config, "world", "robot") or "panda"),
-        ("object", thing if not isinstance(thing, Mapping) else thing.get("shape")),
-        ("simulator", "MuJoCo"),
-        ("observation", _numbers(spaces.get("observation"))),
-        ("action", _numbers(spaces.get("action"))),
-        ("parameters", f"{sum(_product(each.shape) for each in manifest.tensors.values()):,}"),
-        ("sha256 of the parameters", f"`{manifest.blob_sha256}`"),
+    thing, robot = _at(config, "world", "object"), _at(config, "world", "robot")
+    facts = {
+        "robot": _at(robot, "name") or robot or "panda",
+        "object": _at(thing, "shape") if isinstance(thing, Mapping) else thing,
+        "simulator": "MuJoCo",
+        **{name: f"{spaces[name]} numbers" for name in ("observation", "action") if isinstance(spaces.get(name), int)},
+        "parameters": f"{sum(prod(each.shape) for each in manifest.tensors.values()):,}",
+        "sha256 of the parameters": f"`{manifest.blob_sha256}`",
+    }
+    seed = config.get("seed")
+    training = {
+        "env steps": f"{metrics['env_steps']:,.0f}" if "env_steps" in metrics else None,
+        "method": spaces.get("method") or _at(config, "skills", "method"),
+        "seed": seed if seed is not None else _at(config, "trial", "seed"),
+        "trained on from": f"`{manifest.parent}`" if manifest.parent else None,
+        "published": manifest.created,
+        "code": f"commit `{manifest.git_commit}`" if manifest.git_commit else None,
+    }
+    success = [
+        (where, *(f"{found[when]:.1%}" if when in found else "-" for when in _WHEN)) for where, found in rates.items()
     ]
-    yield _table(("", ""), [(name, _text(value)) for name, value in rows if value is not None])
-
-
-def _how_trained(manifest: Manifest) -> Iterator[str]:
-    yield "## How it was trained"
-    steps = manifest.metrics.get("env_steps")
-    method = manifest.spaces.get("method") or _at(manifest.config, "skills", "method")
-    rows = [
-        ("env steps", f"{steps:,.0f}" if steps is not None else None),
-        ("method", method),
-        ("seed", _first(_at(manifest.config, "seed"), _at(manifest.config, "trial", "seed"))),
-        ("trained on from", f"`{manifest.parent}`" if manifest.parent else None),
-        ("published", manifest.created),
-        ("code", f"commit `{manifest.git_commit}`" if manifest.git_commit else None),
-    ]
-    yield _table(("", ""), [(name, _text(value)) for name, value in rows if value is not None])
-    if manifest.history:
-        yield "Settings that changed on the way, and records that were lost:"
-        yield _fenced("yaml", yaml.safe_dump(manifest.history, sort_keys=False))
-    yield "The whole configuration:"
-    yield _fenced("yaml", yaml.safe_dump(manifest.config, sort_keys=False))
-
-
-def _results(manifest: Manifest) -> Iterator[str]:
-    yield "## Results"
-    rates = _rates(manifest)
-    if rates:
-        yield "Share of episodes in which the object was at its goal, in simulation and without noise in the actions:"
-        cells = []
-        for where, found in rates.items():
-            low, high = (manifest.metrics.get(f"evaluation/success_last_{end}") for end in ("low", "high"))
-            interval = f"{low:.1%} to {high:.1%}" if low is not None and high is not None and not where else "-"
-            shown = [f"{found[when]:.1%}" if when in found else "-" for when in _WHEN]
-            cells.append((_goals(manifest, where), *shown, interval))
-        header = ("goals", *_WHEN.values(), "95 % interval of the first")
-        if all(row[-1] == "-" for row in cells):
-            header, cells = header[:-1], [row[:-1] for row in cells]
-        yield _table(header, cells)
-    counted = {*(name for name in manifest.metrics if name.startswith("evaluation/success_")), "env_steps"}
     others = [
         (f"`{name}`", f"{value:.6g}")
-        for name, value in manifest.metrics.items()
-        if name not in counted and not _SUCCESS.fullmatch(name)
+        for name, value in metrics.items()
+        if name != "env_steps" and not _RATE.fullmatch(name)
     ]
-    if others:
-        yield _table(("metric", "value"), others)
-    if not rates and not others:
-        yield "The version has none."
+    parts = [
+        f"---\n{yaml.safe_dump(head, sort_keys=False, allow_unicode=True)}---",
+        f"# {manifest.reference}",
+        what,
+        _table(("", ""), facts.items()),
+        "## How it was trained",
+        _table(("", ""), training.items()),
+        *([_HISTORY, _yaml(manifest.history)] if manifest.history else []),
+        "The whole configuration:",
+        _yaml(config),
+        "## Results",
+        *([_SUCCESS, _table(("goals", *_WHEN.values()), success)] if success else []),
+        *([_table(("metric", "value"), others)] if others else []),
+        *(["The version has none."] if not success and not others else []),
+        "## How to load it",
+        "No index of packages has Tandem yet. In a clone of its repository:",
+        "```sh\npip install .\n```",
+        f"```python\nimport service\n\n{code}\n```",
+        f"`registry` is a directory, or the `http://HOST:PORT` of a `tandem serve`. {after}",
+        "## Papers",
+        "\n".join(f"- {words}. [arXiv {number}](https://arxiv.org/abs/{number})."
+                  for number, words in (PAPERS[key] for key in papers)),
+        "## Licence",
+        licence,
+    ]  # fmt: skip
+    return "\n\n".join(parts) + "\n"
 
 
-def _how_to_load(manifest: Manifest) -> Iterator[str]:
-    kind, name = _kind(manifest), manifest.reference
-    size = manifest.spaces.get("observation", "O")
-    yield "## How to load it"
-    yield "No index of packages has Tandem yet. In a clone of its repository:"
-    yield _fenced("sh", "pip install .")
-    if kind == ORCHESTRATOR:
-        code = [
-            f'policy = service.load_policy("{name}", registry="registry")',
-            "policy.begin()  # before new episodes: it remembers the step before",
+def _kind(manifest: Manifest) -> tuple[str, str, str, list[str]]:
+    """What differs by kind: what it is, code that loads it, words about that, and keys of the papers it rests on."""
+    spaces, config, name = manifest.spaces, manifest.config, manifest.reference
+    after = "In place of the name, the folder that `tandem registry export` has written will do."
+    if spaces.get("kind") == ORCHESTRATOR:
+        method, frozen = str(spaces.get("method", "")), spaces.get("primitives", "?")
+        takes, how = (SKILLS, [method]) if method in PAPERS else ("primitives", ["self-play", "mcp"])
+        return (
+            f"An orchestrator of Tandem: a policy for the task *{spaces.get('task', '?')}* that acts with the frozen "
+            f"{takes} `{frozen}` (digest `{str(spaces.get('primitives_digest', '?'))[:12]}`), and with no others.",
+            f'policy = service.load("{name}", registry="registry")\n'
+            "policy.begin()  # before new episodes: it remembers the step before\n"
             "action = policy.act_deterministic(observation)  # (N, O) positions and goal -> (N, 4)",
-        ]
-        needed = manifest.spaces.get("primitives")
-        after = f"The registry, or the one that comes with the package, has to have `{needed}`, too."
-    elif kind == SKILLS:
-        code = [f'skills = service.load_skills("{name}", registry="registry").skills']
-        after = _EXPORTED
-    else:
-        code = [
-            f'bob = service.load_primitives("{name}", registry="registry")',
-            f"action = bob.policy.act_deterministic(observation)  # (N, {size}) positions and goal -> (N, 4)",
-        ]
-        after = _EXPORTED
-    yield _fenced("python", "\n".join(["import service", "", *code]))
-    yield f"`registry` is a directory, or the `http://HOST:PORT` of a `tandem serve`. {after}"
-
-
-def _papers(manifest: Manifest) -> Iterator[str]:
-    yield "## Papers"
-    lines = []
-    for key in _paper_keys(manifest):
-        paper = PAPERS[key]
-        link = f"[arXiv {paper.arxiv}](https://arxiv.org/abs/{paper.arxiv})"
-        lines.append(f"- {paper.authors}: *{paper.title}*, {paper.year}. {link}.")
-    yield "\n".join(lines)
-
-
-_EXPORTED = "In place of the name, the folder that `tandem registry export` has written will do."
-_WHEN = {"last": "success at the last step", "ever": "success at any step"}
-
-
-def _kind(manifest: Manifest) -> str:
-    return str(manifest.spaces.get("kind", _PRIMITIVES))
-
-
-def _takes(manifest: Manifest) -> str:
-    return SKILLS if str(manifest.spaces.get("method", "")) in PAPERS else _PRIMITIVES
-
-
-def _paper_keys(manifest: Manifest) -> list[str]:
-    """Keys in ``PAPERS`` of what a version rests on."""
-    kind, method = _kind(manifest), str(manifest.spaces.get("method", ""))
-    if kind == SKILLS:
-        found = str(_at(manifest.config, "skills", "method"))
-        return [*([found] if found in PAPERS else []), "sac", "tandem"]
-    if kind == ORCHESTRATOR:
-        how = [method] if method in PAPERS else ["self-play", "mcp"]
-        return ["tandem", *how, "sac", *(["her"] if method.endswith("-her") else [])]
-    return ["tandem", "self-play", "mcp", "ppo"]
+            f"The registry, or the one that comes with the package, has to have `{frozen}`, too.",
+            ["tandem", *how, "sac", *["her"] * method.endswith("-her")],
+        )
+    if spaces.get("kind") == SKILLS:
+        method = str(_at(config, "skills", "method") or "?")
+        return (
+            f"Frozen skills of Tandem, found by {method.upper()}: a policy that acts by a vector of "
+            f"{spaces.get('skill')} numbers. No task and no reward was written for them.",
+            f'skills = service.load("{name}", registry="registry").skills',
+            after,
+            [*[method] * (method in PAPERS), "sac", "tandem"],
+        )
+    learned = "by self-play, in which Alice proposes goals and Bob reaches them"
+    if _at(config, "distillation") is not None:
+        learned = "from other ones, which saw more and had been learned by self-play (distillation)"
+    return (
+        f"{_at(config, 'policy', 'bob', 'num_primitives') or 'The'} frozen primitives of Tandem, and the gate that "
+        f"composes them: a policy that brings an object to a goal. They were learned {learned}. No task and no reward "
+        "was written for them. New tasks are learned by composing them.",
+        f'bob = service.load("{name}", registry="registry")\n'
+        "action = bob.policy.act_deterministic(observation)  "
+        f"# (N, {spaces.get('observation', 'O')}) positions and goal -> (N, 4)",
+        after,
+        ["tandem", "self-play", "mcp", "ppo"],
+    )
 
 
 def _rates(manifest: Manifest) -> dict[str, dict[str, float]]:
-    """Success rates by where goals are, empty for those of a task, and by when success is asked for."""
+    """Success rates by words for where goals are, and by when success is asked for."""
     rates: dict[str, dict[str, float]] = {}
     for name, value in manifest.metrics.items():
-        if (match := _SUCCESS.fullmatch(name)) is not None:
-            rates.setdefault(match[1] or "", {})[match[2]] = value
+        if (match := _RATE.fullmatch(name)) is not None:
+            where = match[1] or f"of the task {manifest.spaces.get('task', '')}".rstrip()
+            if where.startswith("nominal_"):
+                where = f"{where.removeprefix('nominal_')}, in the world as it is in the middle of its ranges"
+            rates.setdefault(where, {})[match[2]] = value
     return rates
 
 
-def _goals(manifest: Manifest, where: str) -> str:
-    """Words for where goals are, such as ``mixed`` or ``nominal_table``."""
-    if not where:
-        return f"of the task {manifest.spaces.get('task', '')}".rstrip()
-    kind = where.removeprefix("nominal_")
-    return where if kind == where else f"{kind}, in the world as it is in the middle of its ranges"
+def _model_index(rates: Mapping[str, Mapping[str, float]]) -> list[dict[str, Any]]:
+    return [
+        {
+            "task": {"type": "robotics", "name": "Tabletop manipulation"},
+            "dataset": {"type": "tandem", "name": where},
+            "metrics": [
+                {"type": "success_rate", "name": name, "value": round(found[when], 4)}
+                for when, name in _WHEN.items()
+                if when in found
+            ],
+        }
+        for where, found in rates.items()
+    ]
 
 
 def _at(tree: Any, *keys: str) -> Any:
@@ -278,29 +197,11 @@ def _at(tree: Any, *keys: str) -> Any:
     return tree
 
 
-def _first(*values: Any) -> Any:
-    return next((value for value in values if value is not None), None)
+def _table(header: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
+    """A table of the rows whose values are all known."""
+    cells = [[str(cell).replace("|", "\\|").replace("\n", " ") for cell in row] for row in rows if None not in row]
+    return "\n".join(f"| {' | '.join(line)} |" for line in (header, ["---"] * len(header), *cells))
 
 
-def _numbers(size: Any) -> str | None:
-    return f"{size} numbers" if isinstance(size, int) else None
-
-
-def _product(shape: tuple[int, ...]) -> int:
-    product = 1
-    for size in shape:
-        product *= size
-    return product
-
-
-def _text(value: Any) -> str:
-    return str(value).replace("|", "\\|").replace("\n", " ")
-
-
-def _table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    lines = [header, ["---"] * len(header), *rows]
-    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
-
-
-def _fenced(language: str, text: str) -> str:
-    return f"```{language}\n{text.rstrip()}\n```"
+def _yaml(tree: Any) -> str:
+    return f"```yaml\n{yaml.safe_dump(tree, sort_keys=False).rstrip()}\n```"

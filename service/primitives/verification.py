@@ -2,24 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
-from itertools import pairwise
+from collections.abc import Iterator, Mapping
 
 import numpy as np
 
 from service.baselines.frozen import FrozenSkills
-from service.config import MCPConfig, parse_config
-from service.envs.observations import ACTION, PAPER, Layouts, layouts
+from service.config import Config
+from service.envs.observations import ACTION, POSITIONS, layouts
 from service.errors import TandemError
-from service.off_policy_config import SkillsConfig
 from service.policies.numpy_policy import NumpyMCPPolicy
+from service.policies.parameters import Shapes, bob_shapes, layer_shapes, misfits
+from service.primitives.acting import acting_config
 from service.primitives.loading import ORCHESTRATOR
 from service.registry.manifest import Manifest
 from service.sac.inputs import NUM_MOTION_INPUTS
 from service.sac.numpy_actor import numpy_actor
 
-Shapes = dict[str, tuple[int, ...]]
-_OBJECT_SIZE = 3
+_OBJECT_SIZE = POSITIONS["object"].stop - POSITIONS["object"].start
 """Of the object's position, which rewards of skill discovery see."""
 
 
@@ -29,82 +28,38 @@ def network_problems(manifest: Manifest, arrays: Mapping[str, np.ndarray]) -> It
     Where all are, a policy is made of them, which tells what else is wrong. A manifest without networks in its
     configuration describes none, and nothing is asked of it.
     """
-    if manifest.spaces.get("kind") == ORCHESTRATOR:
-        try:
-            numpy_actor(dict(arrays))
-        except TandemError as error:
-            yield str(error)
-        return
-    if "policy" not in manifest.config:
-        return
     try:
-        config = parse_config(manifest.config, where=f"the manifest of {manifest.reference}", recorded=True)
+        if manifest.spaces.get("kind") == ORCHESTRATOR:
+            numpy_actor(dict(arrays))
+        elif "policy" in manifest.config:
+            config = acting_config(manifest.config, where=f"the manifest of {manifest.reference}")
+            yield from _problems(config, arrays)
     except TandemError as error:
         yield str(error)
+
+
+def expected_shapes(config: Config) -> Shapes:
+    """Shape of every parameter that a run publishes, by name: of Bob, or of skills (``frozen.export_skills``)."""
+    if config.skills is None:
+        bob, seen = config.policy.bob, layouts(config.world)
+        heads = bob.num_primitives, bob.primitive_hidden_size
+        return bob_shapes(seen.positions.size, bob.trunk_hidden_sizes, heads, bob.gate_hidden_sizes)
+    skills = config.skills
+    if skills.method == "dads":
+        network = _OBJECT_SIZE + skills.size, *skills.hidden_sizes, _OBJECT_SIZE
+    else:
+        network = _OBJECT_SIZE, *skills.hidden_sizes, skills.size
+    actor = NUM_MOTION_INPUTS + skills.size, *skills.sac.hidden_sizes, 2 * ACTION.size
+    return layer_shapes("actor.layers.{}", actor, 2) | layer_shapes("network.{}", network, 2)
+
+
+def _problems(config: Config, arrays: Mapping[str, np.ndarray]) -> Iterator[str]:
+    found = list(misfits(arrays, expected_shapes(config)))
+    for misfit in found:
+        yield f"{misfit}, by the configuration of the manifest; publish it again"
+    if found:
         return
-    expected = (
-        mcp_shapes(config.policy.bob, layouts(config.world)) if config.skills is None else skill_shapes(config.skills)
-    )
-    wrong = [name for name in sorted(expected.keys() | arrays.keys()) if _shape(arrays, name) != expected.get(name)]
-    for name in wrong:
-        there, wanted = (_named(each) for each in (_shape(arrays, name), expected.get(name)))
-        yield f"parameter {name!r} is {there}, but by the configuration of the manifest {wanted}; publish it again"
-    if not wrong:
-        try:
-            if config.skills is None:
-                NumpyMCPPolicy(arrays)
-            else:
-                FrozenSkills(arrays, config.skills.method)
-        except TandemError as error:
-            yield str(error)
-
-
-def mcp_shapes(config: MCPConfig, seen: Layouts = PAPER) -> Shapes:
-    """Shape of every parameter of ``networks.MCPPolicy``, by name."""
-    heads, outputs = config.num_primitives * config.primitive_hidden_size, 2 * ACTION.size
-    trunk = (seen.positions.size, *config.trunk_hidden_sizes)
-    gate = (seen.gate.size, *config.gate_hidden_sizes)
-    return {
-        **_input("primitives.input", seen.positions.size),
-        **_layers("primitives.trunk.{}", trunk),
-        **_layers("primitives.hidden", (trunk[-1], heads)),
-        "primitives.output_weight": (config.num_primitives, config.primitive_hidden_size, outputs),
-        "primitives.output_bias": (config.num_primitives, outputs),
-        "primitives.squash.log_std_min": (),
-        "primitives.squash.log_std_max": (),
-        **_input("gate.input", seen.gate.size),
-        **_layers("gate.hidden.{}", gate),
-        **_layers("gate.output", (gate[-1], config.num_primitives)),
-        "gate.weight_floor": (),
-    }
-
-
-def skill_shapes(config: SkillsConfig) -> Shapes:
-    """Shape of every parameter of ``frozen.export_skills``, by name."""
-    skill, state = config.size, _OBJECT_SIZE
-    ends = (state + skill, state) if config.method == "dads" else (state, skill)
-    return {
-        **_layers("actor.layers.{}", (NUM_MOTION_INPUTS + skill, *config.sac.hidden_sizes, 2 * ACTION.size), step=2),
-        **_layers("network.{}", (ends[0], *config.hidden_sizes, ends[1]), step=2),
-    }
-
-
-def _input(name: str, size: int) -> Shapes:
-    return {f"{name}.offset": (size,), f"{name}.scale": (size,)}
-
-
-def _layers(name: str, sizes: Sequence[int], step: int = 1) -> Shapes:
-    """Weights (outputs, inputs) and biases between every two neighbours of ``sizes``."""
-    shapes: Shapes = {}
-    for place, (inputs, outputs) in enumerate(pairwise(sizes)):
-        layer = name.format(step * place)
-        shapes |= {f"{layer}.weight": (outputs, inputs), f"{layer}.bias": (outputs,)}
-    return shapes
-
-
-def _shape(arrays: Mapping[str, np.ndarray], name: str) -> tuple[int, ...] | None:
-    return arrays[name].shape if name in arrays else None
-
-
-def _named(shape: tuple[int, ...] | None) -> str:
-    return "missing" if shape is None else f"of shape {list(shape)}"
+    if config.skills is None:
+        NumpyMCPPolicy(arrays)
+    else:
+        FrozenSkills(arrays, config.skills.method)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from pathlib import Path
 from typing import NamedTuple
 
 from service.registry.errors import RegistryError
@@ -48,6 +49,11 @@ def check_alias(alias: str) -> str:
 def is_name(text: str) -> bool:
     """Whether ``text`` follows the rule for names."""
     return re.fullmatch(NAME_PATTERN.strip("^$"), text) is not None
+
+
+def is_service(registry: Path | str) -> bool:
+    """Whether a registry is the URL of a ``tandem serve``, not a directory."""
+    return str(registry).startswith(("http://", "https://"))
 
 
 def is_number(text: str) -> bool:

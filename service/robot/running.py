@@ -10,10 +10,10 @@ import numpy as np
 from service.envs.obstacles import inside_fixtures
 from service.envs.sampling import draw_goals, draw_starts
 from service.errors import TandemError
+from service.primitives.loading import Trained
 from service.robot.backends import Backend
 from service.robot.errors import RobotError
 from service.robot.loop import Bridge
-from service.robot.policies import RobotPolicy
 from service.types import StateArray
 from service.world_config import WorldConfig
 
@@ -55,7 +55,7 @@ def parse_goal(text: str, world: WorldConfig) -> StateArray:
 def play(
     bridge: Bridge,
     backend: Backend,
-    policy: RobotPolicy,
+    policy: Trained,
     *,
     goal_m: StateArray | None,
     num_episodes: int,
@@ -103,7 +103,7 @@ def _seen(backend: Backend) -> StateArray:
     return position
 
 
-def _goal_for(object_m: StateArray, rng: np.random.Generator, policy: RobotPolicy) -> StateArray:
+def _goal_for(object_m: StateArray, rng: np.random.Generator, policy: Trained) -> StateArray:
     """(3,) a goal for an object that lies somewhere; behind a wall it depends on that."""
     if policy.world.fixture == "box":
         raise RobotError(f"{policy.label} brings the object into a box, and nothing tells a bridge where it is: --goal")

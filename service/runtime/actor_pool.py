@@ -12,9 +12,9 @@ from typing import Any
 import ray
 
 from service.config import Config
+from service.methods.workers import RoundSummary
 from service.runtime.ray_actors import Location, RolloutActor, remote_actor
 from service.runtime.watch import Clock, Watch
-from service.runtime.workers import RoundSummary
 from service.store.models import ActorStatus
 
 START_GRACE_S = 30.0

@@ -1,20 +1,18 @@
-"""The cluster runner: the workers of the local runner as Ray actors, and a driver that loses none of them.
+"""Self-play on a Ray cluster: its workers are Ray actors, and a driver loses none of them.
 
 | process | consumes | produces | waits for | bounded by |
 |---|---|---|---|---|
-| driver, ``ClusterRun`` | results of the others | calls, records, checkpoints | next result, ``POLL_S`` at most | - |
+| driver, ``RaySelfPlay`` | results of the others | calls, iterations, states | next result, ``POLL_S`` at most | - |
 | rollout actors x N | weights, snapshot, opponents | a rollout, a goal summary | nothing | ``RolloutSlots`` |
-| learner, R ranks | shares of an iteration's rollouts | weights, states, metrics | each other | ``RANK_ANSWER_S`` |
+| learner | rollouts of one iteration | weights, its state, metrics | nothing | one update at a time |
 | task generator | goal summaries of one iteration | snapshot, opponents, its state | nothing | one record at a time |
 
 The weights of an iteration and the task generator's snapshot come out together, and a round is given the newest of
-both. No worker calls another, but for the learner's ranks among themselves: one that dies or freezes holds back
-iterations, and no round.
+both. No worker calls another: one that dies or freezes holds back iterations, and no round.
 
 The driver hands on references, not data. Learner and generator hand back their whole state with every iteration, of
 which the driver's node keeps a copy; so when one dies, alone or with its node, another goes on from there with the
-rollouts in hand: what an actor handed over is neither lost, but with its own node, nor counted twice. A rank of the
-learner that dies or hangs ends all of them, and as many others go on.
+rollouts in hand: what an actor handed over is neither lost, but with its own node, nor counted twice.
 
 A worker hangs when it makes no progress (``watch``): it is ended, and then it is like one that died. Before that, an
 actor that is late no longer holds back updates. Only time in which the driver looks after its workers counts.
@@ -25,6 +23,7 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -35,30 +34,27 @@ from ray.exceptions import ObjectLostError, RayError
 from service.actors.evaluation import EVALUATED_GOALS
 from service.actors.rollout import from_arrays
 from service.config import Config
-from service.errors import DivergedError, GroupError
-from service.io.run_directory import RunDirectory
-from service.learner.shares import join_states
+from service.errors import DivergedError
 from service.learner.weights import MAX_POLICY_LAG
+from service.methods.method import Health, Iteration, State, StateLostError, WorkersError
+from service.methods.self_play import IterationResult, LocalSelfPlay, SelfPlay
+from service.methods.workers import RoundSummary
 from service.policies.parameters import Parameters, PolicyError
+from service.primitives.loading import Trained
 from service.runtime.actor_pool import ActorPool, ActorSlot
 from service.runtime.copies import Copies
-from service.runtime.iteration import Iteration, PendingRollout
-from service.runtime.learner_group import LearnerGroup, Update, check_room, num_gpus
+from service.runtime.iteration import OpenIteration, PendingRollout
 from service.runtime.ray_actors import GeneratorActor, LearnerActor, remote_actor
 from service.runtime.ray_connection import ClusterOptions
 from service.runtime.raylet import RayletWatch
-from service.runtime.remote_worker import POLL_S, START_S, RemoteWorker, Worker, lost, one_line, pause, wait_for
-from service.runtime.runner import ClusterError, Health, IterationResult, OnBeat, Runner, StateLostError
+from service.runtime.remote_worker import POLL_S, START_S, RemoteWorker, lost, one_line, pause, wait_for
 from service.runtime.slots import RolloutSlots
-from service.runtime.watch import Clock
-from service.runtime.workers import GeneratorResult, RoundSummary, UpdateResult
+from service.runtime.watch import Clock, Watch
 from service.store.models import GoalGrid
-from service.types import Metrics
+from service.types import Arrays, Metrics
 
 _logger = logging.getLogger(__name__)
 
-BEAT_S = 1.0
-"""Time between two heartbeats of the run."""
 RESIZE_S = 5.0
 """Time between two looks at the size of the cluster."""
 MAX_ATTEMPTS = 3
@@ -69,72 +65,98 @@ MAX_FAILED_ROUNDS = 20
 """Rounds, or starts of actors, in a row that may fail."""
 
 
-class ClusterRun(Runner):
-    """A pre-training run on the Ray cluster that this process is connected to.
+class RaySelfPlay(SelfPlay):
+    """Self-play on the Ray cluster that this process is connected to.
 
-    One loop, ``run``: it consumes what actors, learner and generator finish, and starts what can start. It waits for
-    the next of them to finish, at most ``POLL_S``.
+    ``step`` consumes what actors, learner and generator have finished, and starts what can start. It waits for the
+    next of them to finish, at most ``POLL_S``.
 
     Args:
         config: the run. Its ``game.num_worlds`` are shared out among the actors there are at the start.
-        directory: where it keeps everything.
         options: of the cluster.
-        resume: continue from the newest checkpoint, whichever runner and however many actors wrote it.
+        start_from: what a new run begins from; None: from nothing.
         raylet: watch over that of this machine; None where there is none.
-
-    Raises:
-        CheckpointError: ``resume`` without a usable checkpoint.
-        ClusterError: learner or generator do not start.
     """
 
     def __init__(
         self,
         config: Config,
-        directory: RunDirectory,
         options: ClusterOptions,
-        *,
-        resume: bool = False,
+        start_from: Trained | None = None,
         raylet: RayletWatch | None = None,
     ) -> None:
-        super().__init__(config, directory)
-        self._options, self._raylet, self._clock = options, raylet, Clock()
+        super().__init__(config)
+        self._options, self._start_from, self._raylet, self._clock = options, start_from, raylet, Clock()
         self._waiting: dict[Any, Callable[[Any], None]] = {}
         self._copies = Copies()
         self._slots = RolloutSlots()
         self._pending: list[PendingRollout] = []
-        self._current: Iteration | None = None
+        self._carried: list[Any] = []
+        """References to rollouts of an earlier process, to be learned from with the first ones."""
+        self._current: OpenIteration | None = None
+        self._ended: Iteration | None = None
         self._evaluated: Metrics = {}
         self._grid: GoalGrid | None = None
         self._num_failed_rounds = self._num_counted = self._num_refused = 0
         self._last_error: str | None = None
-        self._last_iteration = self._last_beat = self._last_resize = time.monotonic()
-        self._on_beat: OnBeat = lambda: None
-        learner = config.learner
-        self._rank_cpus = options.rank_cpus(learner)
-        check_room(learner.num_learners, learner.device, self._rank_cpus, options.actor_threads)
-        learner_state = generator_state = pending = None
-        first_incarnation = 0
-        if resume:
-            parts, meta = self.bookkeeper.resume()
-            learner_state, generator_state = parts["learner"], parts["generator"]
-            pending = from_arrays(parts["pending"]) if "pending" in parts else None
-            first_incarnation = int(meta.get("next_incarnation", 1))
-        self._next_incarnation = first_incarnation + 1
-        self._learner = self._start_learner(learner_state, pending)
-        self._generator = self._start_generator(generator_state)
+        self._last_iteration = self._last_resize = time.monotonic()
+        self._first_incarnation = 0
+        self._next_incarnation = 1
+        self._states: dict[str, Arrays | None] = {"learner": None, "generator": None}
+        self._to_close: list[Callable[[], None]] = []
+
+    def start(self, state: State | None = None) -> None:
+        """Start the workers, from a state or what the run begins from.
+
+        Raises:
+            WorkersError: learner or generator do not start.
+        """
+        if state is None and self._start_from is not None:
+            on_cpu = self.config.learner.model_copy(update={"device": "cpu"})
+            begun = LocalSelfPlay(self.config.model_copy(update={"learner": on_cpu}), self._start_from)
+            state = begun.state()
+            begun.close()
+        if state is not None:
+            self.load_state(state)
+        options, device = self._options, self.config.learner.device
+        learner = remote_actor(LearnerActor, num_cpus=options.learner_cpus, num_gpus=num_gpus(device))
+        self._learner = self._worker("learner", learner)
+        self._generator = self._worker("generator", remote_actor(GeneratorActor, num_cpus=0))
+        self._states.clear()
         self._learner.start()
         self._generator.start()
-        self._weights, *states = self._begin(self._learner, self._learner.begin)
-        self._learner.states = states
-        begun = self._begin(self._generator, self._generator.handle.begin.options(num_returns=3).remote)
-        self._generator.state, self._snapshot, self._opponents = begun
+        self._weights, self._learner.state = self._begin(self._learner, 2)
+        self._generator.state, self._snapshot, self._opponents = self._begin(self._generator, 3)
         self._version: int = ray.get(self._weights).version
         self._keep_copies()
-        self._pool = self._start_actors(first_incarnation)
-        self._open_directory(resume=resume)
-        if not resume:
-            self._save_first()
+        self._pool = self._start_actors(self._first_incarnation)
+        self._to_close.append(self._pool.close)
         self._last_iteration = time.monotonic()
+
+    def step(self) -> Iteration | None:
+        """Wait for a worker for a moment; the iteration that has ended meanwhile, if any."""
+        self._ended = None
+        self._start_iteration()
+        self._start_rounds()
+        with self.timing("wait"):
+            ray.wait(list(self._waiting), timeout=POLL_S)
+            # All that is there, before anybody is called late or hung: after a pause that may be everything.
+            ready, _ = ray.wait(list(self._waiting), num_returns=len(self._waiting), timeout=0)
+        for reference in ready:
+            self._waiting.pop(reference)(reference)
+        if self._raylet is None or not self._raylet.silent:  # else they may all wait for it
+            self._clock.look()
+            self._check_workers()
+        return self._ended
+
+    def evaluate(self) -> Metrics:
+        """Ask actors for one kind of goals each; the success is in the metrics of a later iteration."""
+        alive = [slot for slot in self._pool if slot.alive]
+        for index, kind in enumerate(EVALUATED_GOALS if alive else ()):
+            slot = alive[index % len(alive)]
+            slot.start_evaluation()
+            self._waiting[slot.handle.evaluate.remote(self._weights, [kind])] = partial(self._on_evaluation, slot)
+        return {}
 
     def parameters(self) -> Parameters:
         """The newest Bob, as he is evaluated and published."""
@@ -149,41 +171,47 @@ class ClusterRun(Runner):
         )
         if late := ", ".join(f"rollout-{slot.index}" for slot in self._pool.late):
             lack += (f"{late}: late; updates go on without",)
-        actors = (*(slot.status() for slot in self._pool), *self._learner.statuses(), self._generator.status())
+        actors = (*(slot.status() for slot in self._pool), self._learner.status(), self._generator.status())
         return Health(actors, self._num_counted, self._num_refused, lack, self._last_error)
 
-    def grid(self) -> GoalGrid:
-        """The task generator's goal grid after the last iteration."""
-        assert self._grid is not None
+    def grid(self) -> GoalGrid | None:
+        """The task generator's goal grid after the last iteration; None before the first."""
         return self._grid
+
+    def state(self) -> State:
+        """Learner and generator after the last iteration; rounds being played and their actors are no part of it."""
+        weights, learner, generator = _fetch([self._weights, self._learner.state, self._generator.state])
+        rng = np.random.default_rng([self.config.seed, self.iteration])  # what a process of its own goes on with
+        return {
+            "learner": learner,
+            "generator": generator,
+            "alice": weights.alice,  # for readers without torch
+            "bob": weights.bob_ema,
+            "next_incarnation": self._next_incarnation,
+            "rng": rng.bit_generator.state,
+        }
+
+    def load_state(self, state: State) -> None:
+        """Let the workers, which have not started, begin with a state, whoever made it."""
+        self._states = {"learner": state["learner"], "generator": state["generator"]}
+        if "pending" in state:
+            self._carried = [ray.put(from_arrays(state["pending"]))]
+        self._first_incarnation = int(state["next_incarnation"])
+        self._next_incarnation = self._first_incarnation + 1
 
     def close(self) -> None:
         """End all workers."""
-        self._pool.close()
-        self._learner.close()
-        self._generator.close()
+        for close in reversed(self._to_close):
+            close()
+        self._to_close.clear()
 
-    def _advance(self, on_beat: OnBeat) -> None:
-        self._on_beat = on_beat
-        self._start_iteration()
-        self._start_rounds()
-        with self.timing("wait"):
-            ray.wait(list(self._waiting), timeout=POLL_S)
-            # All that is there, before anybody is called late or hung: after a pause that may be everything.
-            ready, _ = ray.wait(list(self._waiting), num_returns=len(self._waiting), timeout=0)
-        with self.bookkeeper.explaining_divergence():
-            for reference in ready:
-                self._waiting.pop(reference)(reference)
-        if self._raylet is None or not self._raylet.silent:  # else they may all wait for it
-            self._clock.look()
-            self._check_workers()
-        self._beat()
+    def _worker(self, name: str, actor: Any) -> RemoteWorker:
+        worker = RemoteWorker(name, actor, self.config, self._states[name], self._clock, self._wait)
+        self._to_close.append(worker.close)
+        return worker
 
-    def _beat(self) -> None:
-        """Say that the driver is alive, now and then; also while it waits for a worker."""
-        if time.monotonic() - self._last_beat >= BEAT_S:
-            self._last_beat = time.monotonic()
-            self._on_beat()
+    def _wait(self) -> None:
+        self.on_wait()
 
     # --- rounds ----------------------------------------------------------------------------------------------------
 
@@ -214,7 +242,6 @@ class ClusterRun(Runner):
         slot.finish_round(summary)
         self._slots.finish(ticket)
         self._pending.append(pending(summary, time.monotonic() - slot.round_started - summary.play_s))
-        self.directory.dump_diverged("-".join(map(str, summary.id)), summary.diverged)
 
     def _on_failed_round(self, slot: ActorSlot, ticket: int, error: Exception) -> None:
         """Replace the actor, unless the run as a whole cannot go on."""
@@ -228,7 +255,7 @@ class ClusterRun(Runner):
     def _on_failed_actor(self, slot: ActorSlot, reason: str) -> None:
         self._num_failed_rounds += 1
         if self._num_failed_rounds > MAX_FAILED_ROUNDS:
-            raise ClusterError(f"{MAX_FAILED_ROUNDS + 1} rollout actors in a row failed, at last with: {reason}")
+            raise WorkersError(f"{MAX_FAILED_ROUNDS + 1} rollout actors in a row failed, at last with: {reason}")
         self._replace(slot, reason)
 
     def _replace(self, slot: ActorSlot, reason: str) -> None:
@@ -261,7 +288,7 @@ class ClusterRun(Runner):
         if len(self._pending) < num:
             return
         batch, self._pending = self._pending, []  # all: one that were left over would only get older
-        self._current = Iteration(batch)
+        self._current = OpenIteration(batch)
         self._ask_generator(self._current)
         self._ask_learner(self._current)
 
@@ -273,13 +300,14 @@ class ClusterRun(Runner):
             self._slots.lose(each.ticket)
             self._num_refused += 1
 
-    def _ask_learner(self, iteration: Iteration) -> None:
-        in_order = sorted(iteration.batch, key=lambda each: each.summary.id)
-        update = iteration.update = self._learner.update([each.rollout for each in in_order])
-        for rank, answer in enumerate(update.answers):
-            self._waiting[answer] = partial(self._on_learned, iteration, update, rank)
+    def _ask_learner(self, iteration: OpenIteration) -> None:
+        rollouts = [*self._carried, *(each.rollout for each in iteration.batch)]
+        updated, *others = self._learner.handle.update_from.options(num_returns=3).remote(rollouts)
+        iteration.weights, iteration.learner_state = others
+        self._learner.watch.begin()
+        self._waiting[updated] = partial(self._on_learned, iteration, self._learner.watch)
 
-    def _ask_generator(self, iteration: Iteration) -> None:
+    def _ask_generator(self, iteration: OpenIteration) -> None:
         num_env_steps = self.num_env_steps + iteration.num_env_steps
         goals = [each.goals for each in iteration.batch]
         record = self._generator.handle.record_from.options(num_returns=4)
@@ -287,26 +315,21 @@ class ClusterRun(Runner):
         recorded, *others = record.remote(self.iteration, num_env_steps, weights, goals)
         iteration.generator_state, iteration.snapshot, iteration.opponents = others
         self._generator.watch.begin()
-        self._waiting[recorded] = partial(self._on_recorded, iteration)
+        self._waiting[recorded] = partial(self._on_recorded, iteration, self._generator.watch)
 
-    def _on_learned(self, iteration: Iteration, update: Update, rank: int, reference: Any) -> None:
-        if iteration is not self._current or iteration.update is not update:
-            return  # of ranks that were ended meanwhile, or of rollouts that were all lost
+    def _on_learned(self, iteration: OpenIteration, watch: Watch, reference: Any) -> None:
+        watch.end()
+        if iteration is not self._current:
+            return  # its rollouts were all lost
         try:
-            result = ray.get(reference)
+            iteration.updated = ray.get(reference)
         except RayError as error:
             self._on_failed_answer(iteration, self._learner, error)
             return
-        self._learner.note_answer(rank)
-        if isinstance(result, GroupError):
-            self._on_failed_answer(iteration, self._learner, result)
-            return
-        update.add(rank, result)
-        if update.done:
-            iteration.updated = update.joined()
-            self._finish_if_done(iteration)
+        self._finish_if_done(iteration)
 
-    def _on_recorded(self, iteration: Iteration, reference: Any) -> None:
+    def _on_recorded(self, iteration: OpenIteration, watch: Watch, reference: Any) -> None:
+        watch.end()
         if iteration is not self._current:
             return  # its rollouts were all lost
         try:
@@ -314,26 +337,23 @@ class ClusterRun(Runner):
         except RayError as error:
             self._on_failed_answer(iteration, self._generator, error)
             return
-        self._generator.watch.end()
         self._finish_if_done(iteration)
 
-    def _on_failed_answer(self, iteration: Iteration, worker: Worker, error: Exception) -> None:
+    def _on_failed_answer(self, iteration: OpenIteration, worker: RemoteWorker, error: Exception) -> None:
         """Start another learner or generator from the state before the iteration, and ask it what is left of that."""
         is_lost = lost(error)
         reason = one_line(error) if is_lost else worker.explain(error)
         if is_lost:
             self._drop_lost(iteration)
-            if worker is self._learner and self._learner.size > 1:
-                worker.restart(reason)  # the other ranks wait for the one that has nothing to learn from
-        elif isinstance(error, (DivergedError, PolicyError)) or (not isinstance(error, GroupError) and worker.alive):
+        elif isinstance(error, (DivergedError, PolicyError)) or worker.alive:
             raise error
         else:
-            pause(RETRY_S * 2 ** (attempt - 1) if (attempt := iteration.num_attempts[worker.name]) else 0.0, self._beat)
+            pause(RETRY_S * 2 ** (attempt - 1) if (attempt := iteration.num_attempts[worker.name]) else 0.0, self._wait)
             self._last_error = f"{worker.name}: {reason}"
             worker.restart(reason)
         iteration.num_attempts[worker.name] += 1
         if iteration.num_attempts[worker.name] >= MAX_ATTEMPTS:
-            raise ClusterError(
+            raise WorkersError(
                 f"{MAX_ATTEMPTS} times in a row the {worker.name} failed at the same rollouts, at last with: {reason}"
             ) from error
         if not iteration.batch:
@@ -343,7 +363,7 @@ class ClusterRun(Runner):
         else:
             self._ask_generator(iteration)
 
-    def _drop_lost(self, iteration: Iteration) -> None:
+    def _drop_lost(self, iteration: OpenIteration) -> None:
         """Forget rollouts that were lost with the node that held them."""
         for each in list(iteration.batch):
             try:
@@ -353,22 +373,19 @@ class ClusterRun(Runner):
                 iteration.batch.remove(each)
                 self._slots.lose(each.ticket)
 
-    def _finish_if_done(self, iteration: Iteration) -> None:
-        if iteration.update is not None and iteration.updated is not None and iteration.recorded is not None:
-            self._finish_iteration(iteration, iteration.update, iteration.updated, iteration.recorded)
-
-    def _finish_iteration(
-        self, iteration: Iteration, update: Update, updated: UpdateResult, recorded: GeneratorResult
-    ) -> None:
-        """Count and record an iteration whose version is out, and give its rollout slots back."""
+    def _finish_if_done(self, iteration: OpenIteration) -> None:
+        """Count and record an iteration once its version is out, and give its rollout slots back."""
+        updated, recorded = iteration.updated, iteration.recorded
+        if updated is None or recorded is None:
+            return
         now = time.monotonic()
         elapsed_s, self._last_iteration = now - self._last_iteration, now
-        self._weights, self._version = update.weights, updated.version
+        self._weights, self._version = iteration.weights, updated.version
         self._snapshot = iteration.snapshot
         if recorded.new_opponents:
             self._opponents = iteration.opponents
-        self._learner.keep(update)
-        self._generator.state = iteration.generator_state
+        self._learner.state, self._generator.state = iteration.learner_state, iteration.generator_state
+        self._carried = []
         self._keep_copies()
         self._slots.publish([each.ticket for each in iteration.batch])
         self._current, self._grid = None, iteration.grid
@@ -379,22 +396,12 @@ class ClusterRun(Runner):
             recorded,
             updated,
             num_actors_alive=self._pool.num_alive,
+            elapsed_s=elapsed_s,
             hand_over_s=float(np.mean([each.hand_over_s for each in iteration.batch])),
         )
-        self._count(result)
-        self.bookkeeper.wall_s += elapsed_s
         evaluated, self._evaluated = self._evaluated, {}
-        self._record(result, self._metrics(result, elapsed_s) | evaluated)
-        if self.bookkeeper.evaluation_due(self.iteration):
-            self._evaluate()
-
-    def _evaluate(self) -> None:
-        """Ask actors for one kind of goals each; the success is in the record of a later iteration."""
-        alive = [slot for slot in self._pool if slot.alive]
-        for index, kind in enumerate(EVALUATED_GOALS if alive else ()):
-            slot = alive[index % len(alive)]
-            slot.start_evaluation()
-            self._waiting[slot.handle.evaluate.remote(self._weights, [kind])] = partial(self._on_evaluation, slot)
+        ended = self._finish(result)
+        self._ended = replace(ended, metrics=ended.metrics | evaluated)
 
     def _on_evaluation(self, slot: ActorSlot, reference: Any) -> None:
         slot.finish_evaluation()
@@ -405,7 +412,7 @@ class ClusterRun(Runner):
 
     def _keep_copies(self) -> None:
         """Let the driver's node have what the next workers would begin with."""
-        needed = [self._weights, self._snapshot, self._opponents, self._generator.state, *self._learner.states]
+        needed = [self._weights, self._snapshot, self._opponents, self._generator.state, self._learner.state]
         self._waiting |= self._copies.keep(needed)
 
     # --- looking after workers -------------------------------------------------------------------------------------
@@ -431,7 +438,7 @@ class ClusterRun(Runner):
     def _num_actors(self) -> int:
         if self._options.num_actors is not None:
             return self._options.num_actors
-        cores = ray.cluster_resources().get("CPU", 0.0) - self._rank_cpus * self._learner.size
+        cores = ray.cluster_resources().get("CPU", 0.0) - self._options.learner_cpus
         return max(1, int(cores // self._options.actor_threads))
 
     def _start_actors(self, first_incarnation: int) -> ActorPool:
@@ -443,38 +450,23 @@ class ClusterRun(Runner):
             self._await_start(slot)
         return pool
 
-    # --- saving ----------------------------------------------------------------------------------------------------
-
-    def _save(self) -> None:
-        """Write a checkpoint of the last iteration; rounds being played and their actors are no part of it."""
-        with self.timing("checkpoint"):
-            weights, generator, *states = _fetch([self._weights, self._generator.state, *self._learner.states])
-            parts = {"learner": join_states(states), "generator": generator}
-            parts |= {"alice": weights.alice, "bob": weights.bob_ema}  # for readers without torch
-            rng = np.random.default_rng([self.config.seed, self.iteration])  # what a local runner goes on with
-            meta = {"next_incarnation": self._next_incarnation, "rng": rng.bit_generator.state}
-            self.bookkeeper.save(parts, meta)
-
-    def _begin(self, worker: Worker, begin: Callable[[], list[Any]]) -> list[Any]:
-        """References to what a worker has before the first iteration; they are there when this returns."""
+    def _begin(self, worker: RemoteWorker, num: int) -> list[Any]:
+        """The references, so many, to what a worker has before the first iteration; it is there when this returns."""
         for _ in range(MAX_ATTEMPTS):
             try:
-                begun = begin()
-                wait_for(begun, START_S, self._beat)
+                begun: list[Any] = worker.handle.begin.options(num_returns=num).remote()
+                wait_for(begun, START_S, self._wait)
                 return begun
             except RayError as error:
                 worker.restart(worker.explain(error))
-        raise ClusterError(f"the {worker.name} fails as it begins, {MAX_ATTEMPTS} times in a row")
+        raise WorkersError(f"the {worker.name} fails as it begins, {MAX_ATTEMPTS} times in a row")
 
-    def _start_learner(self, state: Any, pending: Any) -> LearnerGroup:
-        learner = self.config.learner
-        gpus = num_gpus(learner.device, learner.num_learners)
-        actor = remote_actor(LearnerActor, num_cpus=self._rank_cpus, num_gpus=gpus)
-        return LearnerGroup(actor, self.config, state, pending, self._clock, self._beat)
 
-    def _start_generator(self, state: Any) -> RemoteWorker:
-        actor = remote_actor(GeneratorActor, num_cpus=0)
-        return RemoteWorker("generator", actor, self.config, state, self._clock, self._beat)
+def num_gpus(device: str) -> int:
+    """GPUs that the learner asks Ray for; an actor that asks for none sees none."""
+    if device == "auto":
+        return int(ray.cluster_resources().get("GPU", 0.0) >= 1.0)
+    return int(device == "cuda")
 
 
 def _fetch(state: Any) -> Any:

@@ -1,4 +1,4 @@
-"""An iteration of the cluster runner on its way: references to what was played, learned and recorded."""
+"""An iteration on a cluster on its way: references to what was played, learned and recorded."""
 
 from __future__ import annotations
 
@@ -6,8 +6,7 @@ from collections import Counter
 from dataclasses import dataclass, field
 from typing import Any
 
-from service.runtime.learner_group import Update
-from service.runtime.workers import GeneratorResult, RoundSummary, UpdateResult
+from service.methods.workers import GeneratorResult, RoundSummary, UpdateResult
 from service.store.models import GoalGrid
 
 
@@ -30,14 +29,16 @@ class PendingRollout:
 
 
 @dataclass(slots=True)
-class Iteration:
+class OpenIteration:
     """One iteration on its way through the learner and the task generator, which work on it side by side."""
 
     batch: list[PendingRollout]
     num_attempts: Counter[str] = field(default_factory=Counter)
     """Failed attempts, by worker."""
-    update: Update | None = None
-    """The learner's part, as it was asked for last."""
+    weights: Any = None
+    """Reference to the version that comes out of it."""
+    learner_state: Any = None
+    """Reference to the learner's state after it."""
     snapshot: Any = None
     """Reference to what the generator knows after it."""
     opponents: Any = None

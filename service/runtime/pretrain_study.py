@@ -18,10 +18,9 @@ from service.media.plots import plot_study
 from service.progress import counted
 from service.registry.names import Version
 from service.registry.registry import Registry
-from service.runtime.local import check_one_learner
-from service.runtime.progress import StudyProgress
+from service.runs.signals import StopSignals
+from service.runtime.progress import Progress
 from service.runtime.ray_connection import ClusterOptions
-from service.runtime.signals import StopSignals
 from service.runtime.study import RunEnd, Study
 from service.runtime.study_plan import share_cluster, share_machine
 from service.runtime.study_results import Scores, best_seed, publish_best, score_run
@@ -66,7 +65,7 @@ def pretrain_study(
     publish: bool = True,
     parallel: int | None = None,
     cluster: StudyCluster | None = None,
-    progress: StudyProgress,
+    progress: Progress,
     trackers: Sequence[str] = (),
     start: str | None = None,
 ) -> StudyResult:
@@ -85,7 +84,7 @@ def pretrain_study(
         cluster: run on it; None: on this machine, by the local runner.
         progress: where the runs are shown.
         trackers: of every run; see ``service.trackers``.
-        start: reference of what the runs of a new study begin from (``Start.reference``); one that is resumed knows.
+        start: reference of what the runs of a new study begin from (``Trained.reference``); one that is resumed knows.
 
     Raises:
         TandemError: see ``StudyDirectory``; a registry that is only read; or the best run cannot be published.
@@ -95,7 +94,6 @@ def pretrain_study(
         Registry(registry).check_writable()  # now, not after hours of learning
     if cluster is None:
         torch_device(config.learner.device)
-        check_one_learner(config)
     with StopSignals() as signals, ExitStack() as stack:
         stack.callback(directory.close)
         if resume:
@@ -132,10 +130,9 @@ def _share(config: Config, num_runs: int, parallel: int | None, cluster: StudyCl
         chosen = config.run.num_threads or share.num_workers
         return share.num_parallel, ["--set", f"run.num_threads={chosen}"]
     options = cluster.options
-    learner_cpus = options.rank_cpus(config.learner) * config.learner.num_learners
     share = share_cluster(
         cluster.num_cores, num_runs, parallel,
-        num_actors=options.num_actors, actor_threads=options.actor_threads, learner_cpus=learner_cpus,
+        num_actors=options.num_actors, actor_threads=options.actor_threads, learner_cpus=options.learner_cpus,
     )  # fmt: skip
     place = ["--runtime", "ray", "--address", cluster.address, "--status", "off"]
     place += ["--num-actors", str(share.num_workers), "--actor-threads", str(options.actor_threads)]
@@ -162,12 +159,11 @@ def _resumable(config: Config) -> Iterator[str]:
     """All that may differ from what a run was begun with; see ``RESUMABLE``."""
     for key, value in config.run.model_dump(mode="json").items():
         yield f"run.{key}={json.dumps(value)}"
-    yield f"learner.num_learners={config.learner.num_learners}"
     for name, player in (("alice", config.learner.alice), ("bob", config.learner.bob)):
         yield f"learner.{name}.learning_rate={player.learning_rate!r}"
 
 
-def _finish(study: Study, directory: StudyDirectory, registry: Registry | None, progress: StudyProgress) -> StudyResult:
+def _finish(study: Study, directory: StudyDirectory, registry: Registry | None, progress: Progress) -> StudyResult:
     """Score the runs that have ended, and publish the best of them."""
     ended = [run for run in study.runs.values() if run.has_ended]
     if ended:

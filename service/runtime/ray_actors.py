@@ -19,12 +19,11 @@ from ray.util.metrics import Counter, Histogram
 import service.runtime.worker_variables  # noqa: F401  before NumPy and MuJoCo are imported  # isort: split
 from service.actors.rollout import Rollout
 from service.config import Config
-from service.errors import GroupError
 from service.generator.opponents import Opponents
 from service.generator.snapshot import GeneratorSnapshot
 from service.generator.summary import GoalSummary
 from service.liveness import count_work, work_done
-from service.runtime.workers import (
+from service.methods.workers import (
     GeneratorResult,
     GeneratorWorker,
     LearnerWorker,
@@ -36,7 +35,6 @@ from service.store.models import GoalGrid
 from service.types import Arrays
 
 if TYPE_CHECKING:
-    from service.learner.group import Group
     from service.learner.weights import Weights
 
 NICENESS = 10
@@ -80,6 +78,10 @@ def remote_actor(kind: type[Watched], **options: Any) -> Any:
 class Watched:
     """A worker that can be asked for its progress while it works."""
 
+    def ping(self) -> Location:
+        """The worker's location."""
+        return Location.here()
+
     @ray.method(concurrency_group="probe")
     def progress(self) -> int:
         """Work that the thread beside this one has done, see ``liveness``."""
@@ -94,10 +96,6 @@ class RolloutActor(RolloutWorker, Watched):
         super().__init__(config, actor, incarnation, num_threads=num_threads)
         self._count = _round_counters(actor)
 
-    def ping(self) -> Location:
-        """The worker's location."""
-        return Location.here()
-
     def play_round(
         self, weights: Weights, snapshot: GeneratorSnapshot, opponents: Opponents, num_rounds: int
     ) -> tuple[Rollout, GoalSummary, RoundSummary]:
@@ -110,9 +108,12 @@ class RolloutActor(RolloutWorker, Watched):
 class GeneratorActor(GeneratorWorker, Watched):
     """A task generator that hands its whole state back with every record."""
 
-    def ping(self) -> Location:
-        """The worker's location."""
-        return Location.here()
+    def start(self, references: Sequence[Any]) -> Location:
+        """Continue from a state, given as the only one of the object references; see ``RemoteWorker``."""
+        (state,) = _fetch(references)
+        if state is not None:
+            self.generator.load_state(state)
+        return self.ping()
 
     def begin(self) -> tuple[Arrays, GeneratorSnapshot, Opponents]:
         """State, snapshot and past players before the first iteration."""
@@ -134,83 +135,32 @@ class GeneratorActor(GeneratorWorker, Watched):
 
 
 class LearnerActor(Watched):
-    """One rank of the learner, which hands its whole state back with every update.
+    """The learner, which hands its whole state back with every update."""
 
-    Consumes its share of an iteration's rollouts, produces its state, and rank 0 weights; waits for the other ranks at
-    every gradient step, at most as long as ``start`` was told.
-
-    Args:
-        config: the run.
-        rank, size: of this process, and of the group.
-    """
-
-    def __init__(self, config: Config, rank: int, size: int) -> None:
+    def __init__(self, config: Config) -> None:
         lower_priority()
-        import torch  # noqa: F401  now, so that nobody waits for it once the ranks meet
+        self._config = config
 
-        self._config, self._rank, self._size = config, rank, size
-        self._host = ray.util.get_node_ip_address()
-        self._store: Any = None
-
-    def ping(self) -> Location:
-        """The worker's location."""
-        return Location.here()
-
-    def open_store(self, timeout_s: float) -> tuple[str, int]:
-        """Open the store in which the ranks of a new group find each other; its address. Of rank 0 only."""
-        from service.learner.group import open_store
-
-        self._store = open_store(self._host, timeout_s)
-        return self._host, self._store.port
-
-    def start(
-        self, states: Sequence[Any], pending: Rollout | None, address: tuple[str, int] | None, timeout_s: float
-    ) -> None:
-        """Join the group, and continue from a state.
-
-        Args:
-            states: references to the parts of the state, by the ranks that had them; empty at the start of a run.
-            pending: rollout to be learned from with the next ones, or None.
-            address: of the store; None where there is no other rank.
-            timeout_s: most time that a rank waits for another.
+    def start(self, references: Sequence[Any]) -> Location:
+        """Continue from a state, given as the only one of the object references; see ``RemoteWorker``.
 
         Raises:
-            GroupError: the ranks cannot reach each other.
-            LearnerError: the state does not fit.
+            LearnerError: the state does not fit, or a device is not there.
         """
-        from service.learner.shares import join_states
+        (state,) = _fetch(references)
+        self._worker = LearnerWorker(self._config, state)
+        return self.ping()
 
-        state = join_states(ray.get(list(states))) if states else None
-        group = self._join_group(address, timeout_s) if address is not None else None
-        self._worker = LearnerWorker(self._config, state, pending, group)
-
-    def begin(self) -> tuple[Weights | None, Arrays]:
+    def begin(self) -> tuple[Weights, Arrays]:
         """Weights and state before the first update."""
-        return self._weights(), self._worker.learner.state()
+        return self._worker.learner.weights(), self._worker.learner.state()
 
-    def update_from(self, references: Sequence[Any]) -> tuple[Weights | None, Arrays, UpdateResult | GroupError]:
-        """Learn from rollouts, given as object references; see ``LearnerWorker.update``.
-
-        Where another rank is gone, its error is the result: nobody asks for that of every rank, and Ray would print it.
-        """
+    def update_from(self, references: Sequence[Any]) -> tuple[UpdateResult, Weights, Arrays]:
+        """Learn from rollouts, given as object references; see ``LearnerWorker.update``."""
         start = time.perf_counter()
-        try:
-            result = self._worker.update(_fetch(references))
-        except GroupError as error:
-            return None, {}, error
-        weights, state = self._weights(), self._worker.learner.state()
-        return weights, state, replace(result, update_s=time.perf_counter() - start)  # all that an actor waits for
-
-    def _weights(self) -> Weights | None:
-        return self._worker.learner.weights() if self._rank == 0 else None
-
-    def _join_group(self, address: tuple[str, int], timeout_s: float) -> Group:
-        from service.learner.group import TorchGroup, find_store
-        from service.learner.learner import torch_device
-
-        store = self._store if self._store is not None else find_store(*address, timeout_s)
-        device = torch_device(self._config.learner.device)
-        return TorchGroup(store, self._rank, self._size, host=self._host, device=device, timeout_s=timeout_s)
+        result = self._worker.update(_fetch(references))
+        weights, state = self.begin()
+        return replace(result, update_s=time.perf_counter() - start), weights, state  # all that an actor waits for
 
 
 def _fetch(references: Sequence[Any]) -> list[Any]:

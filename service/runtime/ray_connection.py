@@ -13,12 +13,11 @@ from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
 
-from service.config import LearnerConfig
 from service.errors import TandemError, one_line
 from service.extras import needs_extra
+from service.methods.method import WorkersError
 from service.progress import answer, doing
-from service.runtime.runner import ClusterError
-from service.runtime.signals import InterruptError, StopSignals
+from service.runs.signals import InterruptError, StopSignals
 from service.status.ports import DEFAULT_PORT
 
 CONNECT_S = 5.0
@@ -53,24 +52,16 @@ class ClusterOptions:
     actor_threads: int = 1
     """Cores of each."""
     learner_cpus: float = 0.0
-    """Reserved for each rank of the learner; 0: see ``rank_cpus``."""
+    """Reserved for the learner; with 0 it shares the actors' cores, which is right where physics is the bottleneck."""
     status: StatusOptions | None = None
     """None: no status service of its own."""
-
-    def rank_cpus(self, learner: LearnerConfig) -> float:
-        """Cores reserved for each rank of a run's learner.
-
-        Without a wish the only one shares the actors' cores, which is right where physics is the bottleneck, and each
-        of several takes as many as it has threads.
-        """
-        return self.learner_cpus or float(learner.num_threads * (learner.num_learners > 1))
 
 
 def parse_status(text: str | None, token: str | None) -> StatusOptions | None:
     """Parse ``HOST:PORT`` or ``off``; None is this machine alone, at the usual port or the next free one.
 
     Raises:
-        ClusterError: neither.
+        WorkersError: neither.
     """
     if text is None:
         return StatusOptions(token=token, or_next=True)
@@ -78,7 +69,7 @@ def parse_status(text: str | None, token: str | None) -> StatusOptions | None:
         return None
     host, separator, port = text.rpartition(":")
     if not separator or not host or not port.isdecimal() or len(port) > 5:
-        raise ClusterError(f"--status {text!r}: expected HOST:PORT, such as 127.0.0.1:8321, or off")
+        raise WorkersError(f"--status {text!r}: expected HOST:PORT, such as 127.0.0.1:8321, or off")
     return StatusOptions(host.strip("[]"), int(port), token)
 
 
@@ -92,7 +83,7 @@ def connected(address: str | None, num_cpus: int | None = None) -> Iterator[None
         num_cpus: of a new one; None: all there are.
 
     Raises:
-        ClusterError: nobody there, another version of Ray or Python there, or it does not let us in; or Ray fails
+        WorkersError: nobody there, another version of Ray or Python there, or it does not let us in; or Ray fails
             while the block runs.
         InterruptError: a signal that nobody else has taken over.
     """
@@ -138,7 +129,7 @@ def _init(address: str | None, options: dict[str, Any]) -> None:
         except Exception as error:  # other versions, a refused token, a slow node: Ray has no common class for them
             ray.shutdown()
             if attempt == 1 or address is not None or "timed out during startup" not in str(error):
-                raise ClusterError(_explained(address, error)) from None
+                raise WorkersError(_explained(address, error)) from None
 
 
 @contextmanager
@@ -147,7 +138,7 @@ def explaining_ray_errors() -> Iterator[None]:
 
     Raises:
         TandemError: what the worker itself raised for people.
-        ClusterError: the worker, or what it made, is gone.
+        WorkersError: the worker, or what it made, is gone.
         RuntimeError: anything else that a worker raised; its traceback is in the cause.
     """
     from ray.exceptions import RayError, RayTaskError
@@ -161,7 +152,7 @@ def explaining_ray_errors() -> Iterator[None]:
     except (RayError, OSError) as error:
         if isinstance(error, OSError) and (type(error) is not OSError or error.errno is not None):  # none of Ray's
             raise
-        raise ClusterError(
+        raise WorkersError(
             f"Ray gave up: {_last_line(error)}; see ray status, and continue with --resume from what was saved"
         ) from error
 
@@ -184,11 +175,11 @@ def _check_reachable(address: str | None) -> None:
     if not separator:
         return
     if not port.isdecimal():
-        raise ClusterError(f"--address {address}: expected auto or HOST:PORT, as ray start prints it")
+        raise WorkersError(f"--address {address}: expected auto or HOST:PORT, as ray start prints it")
     try:
         socket.create_connection((host.strip("[]"), int(port)), timeout=CONNECT_S).close()
     except (OSError, OverflowError) as error:
-        raise ClusterError(_explained(address, error)) from None
+        raise WorkersError(_explained(address, error)) from None
 
 
 def _check_token(address: str | None) -> None:
@@ -214,12 +205,12 @@ def _check_token(address: str | None) -> None:
         sent = os.environ.get("RAY_AUTH_MODE") == "token"
         what = "it refuses the token that was sent" if sent else "it wants a token, and none was sent"
         mode = "" if sent else "RAY_AUTH_MODE=token, and "
-        raise ClusterError(
+        raise WorkersError(
             f"--address {address}: {what}: set {mode}RAY_AUTH_TOKEN or RAY_AUTH_TOKEN_PATH to the one that the cluster "
             f"was started with.{said}"
         )
     if code in (grpc.StatusCode.UNAVAILABLE, grpc.StatusCode.DEADLINE_EXCEEDED):
-        raise ClusterError(f"--address {address}: {_NOBODY}.{said}")
+        raise WorkersError(f"--address {address}: {_NOBODY}.{said}")
 
 
 def _last_line(error: Exception) -> str:

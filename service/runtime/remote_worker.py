@@ -1,28 +1,25 @@
-"""Workers in other processes whose state the driver keeps, and the one of a single process: the task generator."""
+"""Workers in other processes whose state the driver keeps: the learner and the task generator."""
 
 from __future__ import annotations
 
 import logging
 import time
-from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from typing import Any
 
 import ray
 from ray.exceptions import GetTimeoutError, ObjectLostError, RayActorError, RayError, RayTaskError
 
+from service.errors import TandemError
+from service.methods.method import StateLostError, WorkersError
 from service.runtime.ray_actors import Location
-from service.runtime.runner import ClusterError, StateLostError
 from service.runtime.watch import Clock, Watch
 from service.store.models import ActorStatus
 
 START_S = 120.0
 """A worker that has not started by then will not; torch is imported within it, and images are loaded on a new node."""
-ANSWER_S = 20.0
+ANSWER_S = 80.0
 """A worker that is alive and has nothing to do answers within it."""
-RANK_ANSWER_S = 60.0
-"""A rank gives up one that does not take part in a gradient step for so long: long after the driver would have ended
-it, and longer than a machine may sleep."""
 START_ATTEMPTS = 4
 """Times that a worker is started in place of one, before its state is given up."""
 BACK_OFF_S = 0.5
@@ -32,26 +29,36 @@ _logger = logging.getLogger(__name__)
 OnWait = Callable[[], None]
 
 
-class Worker(ABC):
+class RemoteWorker:
     """A worker, and all that is needed to start the next one in its place.
+
+    It gets its state by ``start``, not as it is made: Ray prints the errors of that with their tracebacks.
 
     Args:
         name: of the worker, for people.
+        actor: Ray's actor class, with its options.
+        config: what it is made with.
+        state: the state to start from, or None.
         clock: of the driver.
         on_wait: called again and again while the driver waits for it to start.
     """
 
-    def __init__(self, name: str, clock: Clock, on_wait: OnWait) -> None:
+    def __init__(self, name: str, actor: Any, config: Any, state: Any, clock: Clock, on_wait: OnWait) -> None:
         self.name, self._clock, self._on_wait = name, clock, on_wait
+        self.state = ray.put(state)
+        """Reference to its newest state."""
         self.incarnation = 0
+        self._actor, self._config = actor, config
         self._last_error: str | None = None
         self._hung: str | None = None
+        self._location: Location | None
+        self._spawn()
 
     def start(self) -> None:
         """Wait until it has started; one that dies meanwhile is started anew.
 
         Raises:
-            ClusterError: it does not start.
+            WorkersError: it does not start.
         """
         for pause_s in _pauses():
             try:
@@ -61,7 +68,7 @@ class Worker(ABC):
                 reason = one_line(error)
                 _logger.warning("the %s died while it started (%s); another takes its place", self.name, reason)
                 self._start_next(pause_s)
-        raise ClusterError(f"the {self.name} died {START_ATTEMPTS} times while it started, at last with: {reason}")
+        raise WorkersError(f"the {self.name} died {START_ATTEMPTS} times while it started, at last with: {reason}")
 
     def restart(self, reason: str) -> None:
         """Start another from the newest state; what the last one was doing has to be asked of it again.
@@ -79,7 +86,7 @@ class Worker(ABC):
                 self.wait_ready()
                 _logger.info("the %s is back, as its incarnation %d", self.name, self.incarnation)
                 return
-            except (RayError, ClusterError) as error:
+            except (RayError, WorkersError) as error:
                 reason = one_line(error)
                 _logger.warning("the %s did not start (%s)", self.name, reason)
                 if lost(error):
@@ -88,19 +95,50 @@ class Worker(ABC):
 
     def end_if_hung(self) -> None:
         """Kill it if it hangs; what it was asked then fails. To be asked often."""
-        if self._hung is None and (reason := self._look()) is not None:
+        if self._hung is None and (reason := self.watch.look()) is not None:
             _logger.warning("the %s hangs: %s", self.name, reason)
             self._hung = reason
             self.close()
 
     @property
     def alive(self) -> bool:
-        """Whether all its processes answer. Only to be asked while they have nothing to do, or soon will."""
+        """Whether it answers. Only to be asked while it has nothing to do, or soon will."""
         try:
-            wait_for(self._pings(), RANK_ANSWER_S + ANSWER_S, self._on_wait)
+            wait_for([self.handle.ping.remote()], ANSWER_S, self._on_wait)
         except RayError:
             return False
         return True
+
+    def wait_ready(self) -> None:
+        """Wait until it has started, and has its state.
+
+        Raises:
+            WorkersError: it has not in time, or cannot.
+            RayError: it died.
+        """
+        try:
+            (self._location,) = wait_for([self.handle.start.remote([self.state])], START_S, self._on_wait)
+        except GetTimeoutError:
+            raise WorkersError(
+                f"the {self.name} did not start within {START_S:.0f} s: does a node of the cluster answer, and has one "
+                "what it asks for (a GPU, with learner.device=cuda)? see ray status"
+            ) from None
+        except RayTaskError as error:
+            if isinstance(error.cause, TandemError):  # for people; where it was raised is not
+                raise WorkersError(str(error.cause)) from None
+            raise
+
+    def explain(self, error: BaseException) -> str:
+        """The reason in a line why it failed."""
+        return self._hung or one_line(error)
+
+    def close(self) -> None:
+        """Kill it."""
+        ray.kill(self.handle, no_restart=True)
+
+    def status(self) -> ActorStatus:
+        """Its state for the status service."""
+        return self.watch.status(self.name, self.incarnation, self._location, self._last_error)
 
     def _start_next(self, pause_s: float) -> None:
         self.close()
@@ -109,87 +147,9 @@ class Worker(ABC):
         self._hung = None
         self._spawn()
 
-    @abstractmethod
-    def wait_ready(self) -> None:
-        """Wait until it has started.
-
-        Raises:
-            ClusterError: it has not, or not in time.
-            RayError: it died.
-        """
-
-    @abstractmethod
-    def _look(self) -> str | None:
-        """The reason in a few words why it hangs, if it does."""
-
-    @abstractmethod
-    def _pings(self) -> list[Any]:
-        """Ask all its processes whether they live; references to their answers."""
-
-    @abstractmethod
-    def explain(self, error: BaseException) -> str:
-        """The reason in a line why it failed."""
-
-    @abstractmethod
-    def close(self) -> None:
-        """Kill it."""
-
-    @abstractmethod
     def _spawn(self) -> None:
-        """Make its processes, which need not be up."""
-
-
-class RemoteWorker(Worker):
-    """A worker of one process.
-
-    Args:
-        name: of the worker, for people.
-        actor: Ray's actor class, with its options.
-        config: first argument of the worker.
-        state: second one: the state to start from, or None.
-        clock: of the driver.
-        on_wait: called again and again while the driver waits for it to start.
-    """
-
-    def __init__(self, name: str, actor: Any, config: Any, state: Any, clock: Clock, on_wait: OnWait) -> None:
-        super().__init__(name, clock, on_wait)
-        self.state = ray.put(state)
-        """Reference to its newest state."""
-        self._actor, self._config = actor, config
-        self._location: Location | None
-        self._spawn()
-
-    def wait_ready(self) -> None:
-        """Wait until it has started."""
-        try:
-            (found,) = wait_for(self._pings(), START_S, self._on_wait)
-        except GetTimeoutError:
-            raise ClusterError(
-                f"the {self.name} did not start within {START_S:.0f} s: does a node of the cluster answer? see ray "
-                "status"
-            ) from None
-        self._location = found
-
-    def explain(self, error: BaseException) -> str:
-        """The reason in a line why it failed."""
-        return self._hung or one_line(error)
-
-    def close(self) -> None:
-        """Kill the worker."""
-        ray.kill(self.handle, no_restart=True)
-
-    def status(self) -> ActorStatus:
-        """The worker's state for the status service."""
-        return self.watch.status(self.name, self.incarnation, self._location, self._last_error)
-
-    def _look(self) -> str | None:
-        return self.watch.look()
-
-    def _pings(self) -> list[Any]:
-        return [self.handle.ping.remote()]
-
-    def _spawn(self) -> None:
-        self.handle = self._actor.remote(self._config, self.state)
+        """Make its process, which need not be up."""
+        self.handle = self._actor.remote(self._config)
         self.watch = Watch(self.handle.progress.remote, self._clock)
         self._location = None
 

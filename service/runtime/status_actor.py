@@ -14,10 +14,10 @@ import ray
 from ray.exceptions import RayError, RayTaskError
 from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
+from service.methods.method import WorkersError
+from service.registry.errors import StatusError
 from service.runtime.ray_connection import StatusOptions
 from service.runtime.remote_worker import one_line
-from service.runtime.runner import ClusterError
-from service.status.errors import StatusError
 from service.status.ports import free_port
 from service.store.address import RedisAddress
 
@@ -96,7 +96,7 @@ def serving(options: StatusOptions, runs_dir: Path, registry: Path, redis: Redis
 
     Raises:
         StatusError: the address cannot be had, or a public one without a token.
-        ClusterError: it does not start.
+        WorkersError: it does not start.
     """
     here = NodeAffinitySchedulingStrategy(ray.get_runtime_context().get_node_id(), soft=False)
     actor = ray.remote(StatusWorker).options(num_cpus=0, max_restarts=-1, scheduling_strategy=here)
@@ -115,5 +115,5 @@ def _started(handle: Any) -> str:
             raise error.cause from None
         raise
     except RayError as error:
-        raise ClusterError(f"the status service does not start: {one_line(error)}") from None
+        raise WorkersError(f"the status service does not start: {one_line(error)}") from None
     return url

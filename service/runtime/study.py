@@ -21,8 +21,8 @@ from service.io.files import os_errors
 from service.io.study_directory import StudyDirectory
 from service.progress import answer
 from service.regular_files import open_regular, open_to_append
-from service.runtime.progress import StudyProgress
-from service.runtime.signals import PASSED_ON, STOPPING, StopSignals
+from service.runs.signals import PASSED_ON, STOPPING, StopSignals
+from service.runtime.progress import Progress
 from service.store.disk_reader import DiskReader, run_id_of
 from service.store.errors import StoreError, UnknownRunError
 from service.store.models import RunState, RunStatus
@@ -91,7 +91,7 @@ class Study:
         """Seeds whose runs have not ended."""
         return [seed for seed, run in self.runs.items() if not run.has_ended]
 
-    def run(self, command: Command, num_parallel: int, signals: StopSignals, progress: StudyProgress) -> None:
+    def run(self, command: Command, num_parallel: int, signals: StopSignals, progress: Progress) -> None:
         """Run all runs that have not ended.
 
         The first signal ends them where they can be resumed; a second one raises, and ends them at once.
@@ -160,7 +160,7 @@ class Study:
             )
         self._save_if_possible()
 
-    def _end(self, seed: int, progress: StudyProgress) -> None:
+    def _end(self, seed: int, progress: Progress) -> None:
         code = self._processes.pop(seed).returncode
         run = self._found(seed)
         if code not in (0, *(128 + number for number in STOPPING)) and not (self._stopping and -code in STOPPING):
@@ -218,19 +218,14 @@ class Study:
         except UnknownRunError:
             return None
 
-    def _show(self, progress: StudyProgress) -> None:
-        states = {seed: run.state for seed, run in self.runs.items()}
+    def _show(self, progress: Progress) -> None:
         for seed in self.runs:
             status = self._status(seed)
             if status is None:
-                states[seed] = "starting" if seed in self._processes else None
                 continue
-            if seed in self._processes:
-                states[seed] = status.state
             for record in self._reader.metrics(status.run_id, after_iteration=self._shown[seed]):
                 self._shown[seed] = int(record["iteration"] or 0)
-                progress.take(seed, record)
-        progress.show(states)
+                progress.show(record, f"seed {seed}")
 
     def _stop(self) -> None:
         self._stopping = True

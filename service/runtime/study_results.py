@@ -18,7 +18,7 @@ from service.io.run_directory import RunDirectory
 from service.io.study_directory import StudyDirectory
 from service.policies.numpy_policy import numpy_bob
 from service.policies.parameters import Parameters
-from service.primitives.loading import read_parameters
+from service.primitives.loading import load
 from service.primitives.publishing import publish_run
 from service.registry.names import Version
 from service.registry.registry import Registry
@@ -26,7 +26,7 @@ from service.runtime.study import RunEnd
 from service.store.address import address_from_environment
 from service.store.disk_reader import DiskReader, run_id_of
 from service.store.errors import StoreError
-from service.store.run_writer import RunWriter
+from service.store.run_writer import reporting_to
 
 SELECTION_GOALS: GoalKind = "mixed"
 NUM_EPISODES = 1000
@@ -76,7 +76,8 @@ def score_run(directory: RunDirectory) -> Scores:
     Raises:
         TandemError: the run has no usable checkpoint.
     """
-    return score(directory.read_config(), read_parameters(directory, "bob"))
+    trained = load(str(directory.path))
+    return score(trained.config, trained.parameters)
 
 
 def best_seed(scores: Mapping[int, Scores]) -> int:
@@ -98,8 +99,12 @@ def publish_best(directory: StudyDirectory, registry: Registry, run: RunEnd, sco
     if config.policy.monolithic_bob is not None:
         return None
     metrics = scores.metrics() | {"env_steps": float(run.num_env_steps)}
-    version = publish_run(place, registry, config, read_parameters(place, "bob"), metrics)
+    version = publish_run(place, registry, config, load(str(place.path)).parameters, metrics)
     run_id = run_id_of(place.path)
-    with suppress(StoreError), closing(RunWriter(place, run_id, address_from_environment())) as writer:
-        writer.status(DiskReader(directory.path).run(run_id).model_copy(update={"published": str(version)}))
+    status = DiskReader(directory.path).run(run_id)
+    place.claim(resume=True)
+    with closing(place), suppress(StoreError):
+        told = status.model_copy(update={"published": str(version), "epoch": place.epoch})
+        with closing(reporting_to(place, run_id, address_from_environment())) as writer:
+            writer.status(told)
     return version

@@ -59,8 +59,6 @@ class Watch:
         self.heartbeat = datetime.now(UTC)
         """When it last answered a call, or had counted further."""
         self._began = self._moved = self._looked = clock.now
-        self.silent = False
-        """Whether it did not even answer the last question."""
         self._asked: Any = None
         self._count: int | None = None
 
@@ -82,7 +80,6 @@ class Watch:
         """Note that it has answered a call."""
         self._num_calls = max(0, self._num_calls - 1)
         self._bound_s = STALL_S
-        self.silent = False
         self._began = self._moved = self._clock.now
         self.heartbeat = datetime.now(UTC)
 
@@ -105,8 +102,7 @@ class Watch:
     def _take_answer(self) -> None:
         if self._asked is not None:
             ready, _ = ray.wait([self._asked], timeout=0)
-            self.silent = not ready
-            if self.silent:
+            if not ready:
                 return
             try:
                 count = ray.get(self._asked)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from service.envs.observations import POSITIONS, ObservationLayout
-from service.policies.parameters import INPUT_CLIP
+from service.policies.forward import INPUT_CLIP
 from service.types import FloatArray
 
 STEP_SCALE_M = 0.02

@@ -40,7 +40,7 @@ class SACLearner:
     """Learns an actor; the same batches give the same actor, whatever else draws random numbers.
 
     Args:
-        actor: gives mean and log-std before the tanh (``networks.Actor``).
+        actor: gives mean and log-std, (N, A) each, before the tanh.
         num_inputs: I.
         num_actions: A.
         config: how to learn.

@@ -5,24 +5,16 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from itertools import pairwise
-from typing import Protocol
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
 from service.config import MCPConfig
-from service.policies.composition import compose
-from service.sac.limits import LOG_STD_MAX, LOG_STD_MIN, MCP_LOG_STD_MIN
+from service.policies.forward import compose
+from service.sac.numpy_actor import LOG_STD_MAX, LOG_STD_MIN, MCP_LOG_STD_MIN
 
 _HALF_LOG_TWO_PI = 0.5 * math.log(2.0 * math.pi)
-
-
-class Actor(Protocol):
-    """A network that gives a Gaussian before the tanh."""
-
-    def __call__(self, inputs: Tensor) -> tuple[Tensor, Tensor]:
-        """Mean and log-std, (N, A) each, at (N, I) inputs."""
 
 
 def make_layers(*sizes: int, layer_norm: bool = False) -> nn.Sequential:

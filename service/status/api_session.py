@@ -6,10 +6,10 @@ import hmac
 
 from fastapi import APIRouter, Request, Response
 
+from service.registry.token import SESSION_COOKIE, session_secret
 from service.status.openapi import INVALID, problems
 from service.status.problems import ProblemError
 from service.status.schemas import Session, TokenEntry
-from service.status.token import SESSION_COOKIE, session_secret
 
 SESSION_S = 7 * 24 * 3600
 

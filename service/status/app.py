@@ -10,8 +10,9 @@ from fastapi import FastAPI, Request
 from starlette.responses import Response
 from starlette.staticfiles import StaticFiles
 
-import service
+from service.registry.errors import StatusError
 from service.registry.registry import Registry
+from service.registry.token import VARIABLE, check_token
 from service.status import openapi, problems
 from service.status.api_downstream import downstream_router
 from service.status.api_health import health_router
@@ -20,13 +21,12 @@ from service.status.api_runs import runs_router
 from service.status.api_series import series_router
 from service.status.api_session import session_router
 from service.status.auth import AuthMiddleware
-from service.status.errors import StatusError
 from service.status.files import RunDirectories, file_response
 from service.status.metrics import Telemetry
 from service.status.problems import ProblemError
 from service.status.stream import Streams
-from service.status.token import VARIABLE, check_token
 from service.store.models import RunReader
+from service.version import __version__
 
 PAGE = Path(__file__).parent / "page"
 """Directory of the web page: ``index.html`` is served at ``/``, all files under ``/page/``."""
@@ -74,7 +74,7 @@ def create_app(
         title="Tandem",
         summary="Robot skills, pre-trained: runs, metrics and primitives.",
         description=openapi.DESCRIPTION,
-        version=service.__version__,
+        version=__version__,
         docs_url=None,  # its scripts are loaded from another site
         redoc_url=None,
         redirect_slashes=False,

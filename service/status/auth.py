@@ -18,8 +18,8 @@ from starlette.datastructures import Headers, MutableHeaders
 from starlette.exceptions import HTTPException
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
+from service.registry.token import SESSION_COOKIE, VARIABLE, check_authorization, check_session
 from service.status.problems import ProblemError
-from service.status.token import SESSION_COOKIE, VARIABLE, check_authorization, check_session
 
 OPEN = frozenset({"/livez", "/"})
 OPEN_FOLDER = "/page/"

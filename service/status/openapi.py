@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from typing import Any
 
+from service.registry.token import SESSION_COOKIE
 from service.status.auth import OPEN, PROBES, SESSION
 from service.status.problems import MEDIA_TYPE, Problem
-from service.status.token import SESSION_COOKIE
 
 _CONTENT = {MEDIA_TYPE: {"schema": {"$ref": "#/components/schemas/Problem"}}}
 _COMMON = {

@@ -13,10 +13,10 @@ from pathlib import Path
 
 import uvicorn
 
+from service.registry.errors import StatusError
 from service.registry.registry import Registry
 from service.status.app import create_app
 from service.status.auth import is_loopback
-from service.status.errors import StatusError
 from service.status.ports import DEFAULT_PORT
 from service.store.models import RunReader
 

@@ -158,6 +158,6 @@ def _flat(tree: Mapping[str, Any], before: str = "") -> dict[str, Any]:
 
 
 def _place(name: str, known: Iterable[str]) -> tuple[int, str]:
-    """Sorts as in the table that ``tandem downstream table`` writes; unknown names come after, by themselves."""
+    """Sorts as in the table that ``tandem downstream table`` prints; unknown names come after, by themselves."""
     order = list(known)
     return (order.index(name), "") if name in order else (len(order), name)

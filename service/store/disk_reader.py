@@ -1,4 +1,4 @@
-"""Runs read from their directories: also downstream trainings, and runs of an older tandem, without ``status.json``."""
+"""Runs read from their directories: also downstream trainings."""
 
 from __future__ import annotations
 
@@ -6,10 +6,9 @@ import os
 import re
 import shutil
 import socket
-from collections.abc import Sequence
-from contextlib import suppress
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
 from datetime import UTC, datetime
-from functools import lru_cache
 from pathlib import Path
 from threading import Lock
 
@@ -17,20 +16,22 @@ from service.errors import one_line
 from service.io.epoch import newest_epoch
 from service.io.lock import holder, is_locked
 from service.io.run_directory import TRIAL_FILE
+from service.io.run_history import FILE as RUN_FILE
+from service.io.run_history import FIRST_VERSION, written_by
 from service.io.study_directory import is_study
-from service.parsing import MAX_YAML_CHARACTERS, ParseError, parse_with, parse_yaml
+from service.parsing import ParseError, parse_with
 from service.regular_files import read_regular
-from service.store.disk import GOALS_FILE, MAX_BYTES, STATUS_FILE, STOP_FILE, read_published
+from service.store.disk import GOALS_FILE, MAX_BYTES, STATUS_FILE, STOP_FILE
 from service.store.errors import DamagedStoreError, StoreError, StoreUnavailableError, UnknownRunError
-from service.store.models import ACTIVE, SILENT_AFTER, Columns, GoalGrid, Record, RunState, RunStatus
-from service.store.pulse import Pulse, ahead_s
+from service.store.models import ACTIVE, Columns, GoalGrid, Record, RunStatus
+from service.store.pulse import Pulse, with_clock
 from service.store.tail import RecordFile
-from service.store.trial_reader import is_trial, modified, read_trial_status
+from service.store.trial_reader import is_trial, read_trial_status
 
 QUIET_S = 10.0
 """A run writes its status every second; after so long something keeps it from that."""
-MAX_COLUMN_BYTES = 96 * 1024 * 1024
-"""Of metrics in memory: all 70 of 17 runs with 10,000 iterations each, or six of 200 runs."""
+MAX_COLUMN_BYTES = 256 * 1024 * 1024
+"""Of metrics in memory: all 70 of 45 runs with 10,000 iterations each."""
 FULL_BYTES = 1_000_000
 """A disk with less room than this is full: a status and a grid would not fit."""
 
@@ -108,18 +109,14 @@ class DiskReader:
     def metrics(self, run_id: str, *, after_iteration: int = 0) -> list[Record]:
         """The records of iterations above ``after_iteration``, in order."""
         path, records = self._find(run_id)
-        try:
+        with _using(path / "metrics.jsonl"):
             return records.after(after_iteration)
-        except OSError as error:
-            raise _unavailable(path / "metrics.jsonl", error) from error
 
     def columns(self, run_id: str, names: Sequence[str] | None) -> Columns:
         """These metrics of all iterations; what was read stays in memory, up to ``MAX_COLUMN_BYTES`` of all runs."""
         path, records = self._find(run_id)
-        try:
+        with _using(path / "metrics.jsonl"):
             found = records.columns(names)
-        except OSError as error:
-            raise _unavailable(path / "metrics.jsonl", error) from error
         with self._lock:
             self._in_columns.pop(records, None)
             self._in_columns[records] = None
@@ -128,28 +125,27 @@ class DiskReader:
                 oldest = kept.pop(0)
                 num_bytes -= oldest.num_bytes
                 del self._in_columns[oldest]
-                oldest.forget_columns()
+                oldest.forget()
         return found
 
     def sample(self, run_id: str, name: str, number: int) -> list[float | None]:
         """One metric of about ``number`` records, evenly over the file."""
         path, records = self._find(run_id)
-        try:
+        with _using(path / "metrics.jsonl"):
             return records.sample(name, number)
-        except OSError as error:
-            raise _unavailable(path / "metrics.jsonl", error) from error
 
     def goals(self, run_id: str) -> GoalGrid | None:
         """The newest grid; None before the first."""
         path = self._find(run_id)[0] / GOALS_FILE
-        try:
-            return parse_with(GoalGrid.model_validate_json, read_regular(path, MAX_BYTES), path)
-        except FileNotFoundError:
-            return None
-        except OSError as error:
-            raise _unavailable(path, error) from error
-        except ParseError:
-            raise DamagedStoreError(f"{path} is no goal grid; delete it, a run writes it anew every few s") from None
+        with _using(path):
+            try:
+                return parse_with(GoalGrid.model_validate_json, read_regular(path, MAX_BYTES), path)
+            except FileNotFoundError:
+                return None
+            except ParseError:
+                raise DamagedStoreError(
+                    f"{path} is no goal grid; delete it, a run writes it anew every few s"
+                ) from None
 
     def request_stop(self, run_id: str) -> None:
         """Ask a run to end after its current iteration; nothing happens if it has ended.
@@ -164,12 +160,8 @@ class DiskReader:
             raise StoreError(
                 f"run {run_id} is a downstream training: stop it with Ctrl-C there, or kill -INT its process"
             )
-        if not (path / STATUS_FILE).exists():
-            raise StoreError(f"run {run_id} has no {STATUS_FILE}: an older tandem runs it; stop it with Ctrl-C there")
-        try:
+        with _using(path / STOP_FILE):
             (path / STOP_FILE).touch()
-        except OSError as error:
-            raise _unavailable(path / STOP_FILE, error) from error
 
     def ready(self) -> None:
         """Return if the directory can be read."""
@@ -178,10 +170,10 @@ class DiskReader:
     def _status(self, run_id: str, path: Path, records: RecordFile) -> RunStatus:
         try:
             if (cause := _why_closed(path)) is not None:
-                return _damaged(run_id, path, cause)
+                return _unreadable(run_id, path, cause)
             status = self._read_status(run_id, path, records)
         except Exception as error:  # whatever a directory holds, it must not hide the other runs
-            return _damaged(run_id, path, f"{type(error).__name__}: {error}")
+            return _unreadable(run_id, path, f"{type(error).__name__}: {error}")
         if (number := records.num_passed_over) > 0:
             status = status.suffering("well", f"metrics.jsonl: lines that are no records and are passed over: {number}")
         return status
@@ -190,11 +182,9 @@ class DiskReader:
         if is_trial(path):
             trained = read_trial_status(run_id, path, records)
             return (trained.state in ACTIVE and _why_quiet(trained, path)) or trained
-        status = _read_status(run_id, path, records)
+        status = _read_status(run_id, path)
         age_s = self._pulse.age_s(run_id, status.heartbeat)
-        if (ahead := ahead_s(status.heartbeat)) is not None and status.state in ACTIVE:
-            text = f"its heartbeat is {ahead:.0f} s in the future: the clock of its machine, or the one here, is wrong"
-            status = status.suffering("clock", text)
+        status = with_clock(status)
         if status.state not in ACTIVE or age_s <= QUIET_S:
             return status
         silent = status.is_silent(age_s)
@@ -252,6 +242,10 @@ def _real(path: Path) -> Path:
     return Path(os.path.realpath(path))
 
 
+def _unreadable(run_id: str, path: Path, cause: str) -> RunStatus:
+    return _damaged(run_id, path, f"{path} cannot be read: {one_line(cause, 300)}; mend it, or remove it")
+
+
 def _damaged(run_id: str, path: Path, cause: str) -> RunStatus:
     """The status of a directory of which nothing can be said but why."""
     try:
@@ -266,26 +260,32 @@ def _damaged(run_id: str, path: Path, cause: str) -> RunStatus:
         started=changed,
         heartbeat=changed,
         total_env_steps=1,
-        last_error=f"{path} cannot be read: {one_line(cause, 300)}; mend it, or remove it",
+        last_error=cause,
     )
 
 
-def _unavailable(path: Path, error: OSError) -> StoreUnavailableError:
-    return StoreUnavailableError(f"cannot use {path}: {error.strerror}; check the disk and the permissions")
+@contextmanager
+def _using(path: Path) -> Iterator[None]:
+    try:
+        yield
+    except OSError as error:
+        raise StoreUnavailableError(
+            f"cannot use {path}: {error.strerror}; check the disk and the permissions"
+        ) from error
 
 
-def _read_status(run_id: str, path: Path, records: RecordFile) -> RunStatus:
+def _read_status(run_id: str, path: Path) -> RunStatus:
     try:
         status = parse_with(RunStatus.model_validate_json, read_regular(path / STATUS_FILE, MAX_BYTES), STATUS_FILE)
     except FileNotFoundError:
-        return _guess_status(run_id, path, records)
+        if not (path / RUN_FILE).exists():
+            return _damaged(run_id, path, written_by(path, FIRST_VERSION))
+        return _damaged(run_id, path, f"{path} has no {STATUS_FILE}: its run has only begun, or it is gone; resume it")
     except (OSError, ParseError) as error:
         reason = error.strerror if isinstance(error, OSError) else "it is no run's status"
-        note = f"{STATUS_FILE} cannot be read: {reason}; what is shown comes from metrics.jsonl"
-        return _guess_status(run_id, path, records).model_copy(update={"warnings": (note,)})
+        return _unreadable(run_id, path, f"{STATUS_FILE}: {reason}")
     if status.epoch < newest_epoch(path):
-        note = f"{STATUS_FILE} is of an earlier process; what is shown comes from metrics.jsonl"
-        return _guess_status(run_id, path, records).suffering("well", note)
+        status = status.suffering("well", f"{STATUS_FILE} is of an earlier process; a newer one has written none yet")
     stopping = status.state in ACTIVE and (status.stopping or (path / STOP_FILE).exists())
     # a copied directory has another id
     return status.model_copy(update={"run_id": run_id, "study": study_of(path), "stopping": stopping})
@@ -318,63 +318,3 @@ def _is_stopped(pid: int) -> bool:
         return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] in ("T", "t")
     except (OSError, IndexError):
         return False
-
-
-# --- without a status -------------------------------------------------------------------------------------------------
-
-
-def _guess_status(run_id: str, path: Path, records: RecordFile) -> RunStatus:
-    """The status as the configuration and the newest record show it."""
-    config, metrics = path / "config.yaml", path / "metrics.jsonl"
-    started = modified(config)
-    heartbeat = modified(metrics if metrics.exists() else config)
-    name, total = _read_config(config, started)
-    try:
-        record = records.last() or {}
-    except OSError:
-        record = {}
-    steps = _whole(record, "env_steps")
-    return RunStatus(
-        run_id=run_id,
-        name=name or run_id,
-        study=study_of(path),
-        runtime="local",
-        state=_guess_state(path, steps, total, heartbeat),
-        started=min(started, heartbeat),
-        heartbeat=heartbeat,
-        iteration=_whole(record, "iteration"),
-        num_env_steps=steps,
-        total_env_steps=total or max(1, steps),
-        env_steps_per_s=_positive(record, "time/env_steps_per_s"),
-        policy_version=_whole(record, "learner/version"),
-        policy_lag=_positive(record, "learner/policy_lag"),
-        num_rollouts_counted=max(0, _whole(record, "iteration") - 1),
-        published=read_published(path),
-    )
-
-
-def _guess_state(path: Path, steps: int, total: int | None, heartbeat: datetime) -> RunState:
-    if total is not None and steps >= total:
-        return "finished"
-    if datetime.now(UTC) - heartbeat < SILENT_AFTER:
-        return "running"
-    published = path / "published.json"
-    return "converged" if published.exists() and modified(published) >= heartbeat else "interrupted"
-
-
-@lru_cache(maxsize=1024)
-def _read_config(path: Path, modified: datetime) -> tuple[str | None, int | None]:
-    """Name and budget, from a configuration of any version; read once, as YAML takes its time."""
-    try:
-        tree = parse_yaml(read_regular(path, MAX_YAML_CHARACTERS, follow=True), path)
-        return str(tree["name"]), max(1, int(tree["run"]["total_env_steps"]))
-    except (OSError, KeyError, TypeError, ValueError, OverflowError):
-        return None, None
-
-
-def _whole(record: Record, name: str) -> int:
-    return int(_positive(record, name))
-
-
-def _positive(record: Record, name: str) -> float:
-    return max(0.0, record.get(name) or 0.0)

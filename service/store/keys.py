@@ -7,8 +7,8 @@
 | ``tandem:run:ID:metrics`` | sorted set | records as JSON by iteration, the newest ``MAX_RECORDS`` |
 | ``tandem:run:ID:goals`` | string | ``GoalGrid`` as JSON |
 | ``tandem:run:ID:stop`` | string | is there when somebody asked the run to stop |
-| ``tandem:run:ID:lease`` | string, expires | who runs it, as JSON; gone ``LEASE_S`` after its last sign of life |
-| ``tandem:run:ID:epoch`` | string | how many drivers have claimed it: only the last of them writes anything |
+| ``tandem:run:ID:heartbeat`` | string, expires | is there until ``HEARTBEAT_S`` after its process last reported |
+| ``tandem:run:ID:epoch`` | string | ``RUN:EPOCH``: identity of the run and number of the process that reports |
 
 Records are in a sorted set and no stream: written twice, as after an answer that got lost, a record is there once, and
 a resumed run's takes the place of the earlier one.
@@ -21,9 +21,9 @@ from typing import Literal
 RUNS = "tandem:runs"
 MAX_RECORDS = 20_000
 """Of one run, about 60 MB; ``metrics.jsonl`` has them all."""
-LEASE_S = 10.0
+HEARTBEAT_S = 10.0
 
 
-def run_key(run_id: str, content: Literal["status", "metrics", "goals", "stop", "lease", "epoch"]) -> str:
+def run_key(run_id: str, content: Literal["status", "metrics", "goals", "stop", "heartbeat", "epoch"]) -> str:
     """Key of one value of a run."""
     return f"tandem:run:{run_id}:{content}"

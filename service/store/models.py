@@ -190,7 +190,7 @@ class RunReader(Protocol):
     def request_stop(self, run_id: str) -> None:
         """Ask a run to end after its current iteration, saved; nothing happens if it has ended.
 
-        May raise ``StoreError``: an older tandem runs it, which takes no requests.
+        May raise ``StoreError``: it takes no requests, as a downstream training.
         """
 
     def ready(self) -> None:

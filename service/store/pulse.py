@@ -8,6 +8,8 @@ from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 from threading import Lock
 
+from service.store.models import ACTIVE, RunStatus
+
 MAX_AHEAD = timedelta(seconds=5)
 """A heartbeat from further in the future says that two clocks differ."""
 _MAX_RUNS = 10_000
@@ -52,7 +54,10 @@ class Pulse:
         return now_s - beat_s
 
 
-def ahead_s(heartbeat: datetime) -> float | None:
-    """Seconds by which a heartbeat comes from the future, where that is more than clocks differ by; else None."""
-    ahead = heartbeat - datetime.now(UTC)
-    return ahead.total_seconds() if ahead > MAX_AHEAD else None
+def with_clock(status: RunStatus) -> RunStatus:
+    """The status of a run, with a warning where its heartbeat comes from the future."""
+    ahead = status.heartbeat - datetime.now(UTC)
+    if status.state not in ACTIVE or ahead <= MAX_AHEAD:
+        return status
+    text = f"its heartbeat is {ahead.total_seconds():.0f} s in the future: the clock of its machine, or the one here"
+    return status.suffering("clock", f"{text}, is wrong")

@@ -13,7 +13,7 @@ from service.store import keys
 from service.store.address import RedisAddress
 from service.store.errors import DamagedStoreError, UnknownRunError
 from service.store.models import ACTIVE, Columns, GoalGrid, Record, RunStatus
-from service.store.pulse import Pulse, ahead_s
+from service.store.pulse import Pulse, with_clock
 from service.store.tail import columns_of, parse_record
 
 TIMEOUT_S = 0.5
@@ -107,30 +107,28 @@ class RedisReader:
         with self._errors():
             self._client.ping()
 
-    def _status(self, run_id: str, text: bytes | None, leased: bool, stop: bool) -> RunStatus:
+    def _status(self, run_id: str, text: bytes | None, beats: bool, stop: bool) -> RunStatus:
         status = _parse_status(run_id, text)
         status = status.model_copy(update={"stopping": status.state in ACTIVE and (status.stopping or stop)})
         age_s = self._pulse.age_s(run_id, status.heartbeat)
-        if (ahead := ahead_s(status.heartbeat)) is not None and status.state in ACTIVE:
-            said = f"its heartbeat is {ahead:.0f} s in the future: the clock of its machine, or the one here, is wrong"
-            status = status.suffering("clock", said)
+        status = with_clock(status)
         if not status.is_silent(age_s):
             return status
-        if leased:
-            said = f"its process renews its claim in Redis, and has said nothing else for {age_s:.0f} s: it hangs"
+        if beats:
+            said = f"its process reaches Redis, and its training has said nothing for {age_s:.0f} s: it hangs"
             return status.suffering("stuck", said)
         said = (
-            f"nothing was heard of it for {age_s:.0f} s, and its claim in Redis has expired: its process has ended, is "
-            "frozen, or does not reach Redis; --resume goes on from its last checkpoint, if nobody else does"
+            f"Redis has heard nothing of it for {age_s:.0f} s: its process has ended, is frozen, or does not reach "
+            "Redis; once it has ended, --resume goes on from its last checkpoint"
         )
         return status.suffering("silent", said)
 
     def _look_up(self, run_ids: list[str]) -> Iterator[tuple[bytes | None, bool, bool]]:
-        """Status of each run, whether a process runs it, and whether it was asked to stop."""
+        """Status of each run, whether its process reports, and whether it was asked to stop."""
         with self._client.pipeline(transaction=False) as pipe:
             for run_id in run_ids:
                 pipe.get(keys.run_key(run_id, "status"))
-                pipe.exists(keys.run_key(run_id, "lease"))
+                pipe.exists(keys.run_key(run_id, "heartbeat"))
                 pipe.exists(keys.run_key(run_id, "stop"))
             replies = iter(pipe.execute(raise_on_error=False) if run_ids else [])
         for text in replies:

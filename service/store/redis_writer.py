@@ -7,6 +7,7 @@ import logging
 import time
 from collections import deque
 from contextlib import suppress
+from functools import partial
 from threading import Event, Lock, Thread
 from typing import NamedTuple
 
@@ -16,7 +17,6 @@ from service.io.errors import RunTakenError
 from service.io.jsonl import plain
 from service.store import keys
 from service.store.address import RedisAddress, reason_of
-from service.store.lease import Lease
 from service.store.models import GoalGrid, Record, RunStatus, Trouble
 
 TICK_S = 0.5
@@ -38,8 +38,12 @@ class _Line(NamedTuple):
     text: str
 
 
+class _NewerProcessError(Exception):
+    """A newer process reports under this run id."""
+
+
 class RedisWriter:
-    """Reports of one run to Redis. While it lives, no other driver can write the same run id.
+    """Reports of one run to Redis. The run directory decides who runs a run; Redis keeps the newest process's reports.
 
     One thread consumes what the methods leave behind and produces transactions; it waits for ``TICK_S`` and is
     unblocked by ``close``. Status and grid that were not sent yet are replaced by newer ones, records wait in line.
@@ -47,21 +51,28 @@ class RedisWriter:
     Args:
         address: of a Redis that has to be there now; later it may go and come.
         run_id: id of the run.
-        lease_s: how long after this process died another may take the run over.
+        run: identity of the run, by which runs of the same id are told apart.
+        epoch: number of this process among those that ever ran it.
 
     Raises:
-        RunTakenError: another driver runs this run.
+        RunTakenError: another run with this id reports to this Redis.
         StoreUnavailableError: Redis is not there, or does not let us in.
     """
 
-    def __init__(self, address: RedisAddress, run_id: str, *, lease_s: float = keys.LEASE_S) -> None:
-        self._address, self._run_id = address, run_id
+    def __init__(self, address: RedisAddress, run_id: str, *, run: str, epoch: int) -> None:
+        self._address, self._run_id, self._run, self._epoch = address, run_id, run.encode(), epoch
+        self._mine, self._key = f"{run}:{epoch}".encode(), partial(keys.run_key, run_id)
         self._connected_anew = Event()
         self._client = address.client(TIMEOUT_S, self._connected_anew.set)
-        self._lease = Lease(self._client, run_id, lease_s)
         try:
-            self._lease.acquire()
-            self._client.delete(keys.run_key(run_id, "stop"))
+            theirs = self._client.get(self._key("epoch")) or self._mine
+            if theirs.partition(b":")[0] != self._run and self._client.exists(self._key("heartbeat")):
+                raise RunTakenError(
+                    f"another run with the id {run_id} reports to Redis at {address}; stop that one (if it has ended, "
+                    f"wait {keys.HEARTBEAT_S:.0f} s), or name another --run-dir"
+                )
+            self._client.set(self._key("epoch"), self._mine)
+            self._client.delete(self._key("stop"))
         except (RedisError, OSError) as error:
             raise address.unavailable(error) from None
         self._lock = Lock()
@@ -74,7 +85,7 @@ class RedisWriter:
         self._num_lost = 0
         self._stop = False
         self._away: tuple[float, str] | None = None
-        self._taken: str | None = None
+        self._replaced = False
         self._closing = Event()
         self._deadline_s = float("inf")
         self._thread = Thread(target=self._work, name="redis-writer", daemon=True)
@@ -101,15 +112,6 @@ class RedisWriter:
         """Whether somebody asked the run to stop since it was started, as of the last message to Redis."""
         return self._stop
 
-    def check(self) -> None:
-        """Assert that this is still the run's driver, as of the last message to Redis.
-
-        Raises:
-            RunTakenError: another one has taken it over.
-        """
-        if self._taken is not None:
-            raise RunTakenError(f"{self._taken}; this process stops, and what it did since then is not kept")
-
     def troubles(self) -> list[Trouble]:
         """Problems at the moment."""
         found, away = list[str](), self._away
@@ -119,30 +121,36 @@ class RedisWriter:
                 f"Redis at {self._address} has taken nothing for {since_s:.0f} s: {away[1]}; {len(self._waiting)} "
                 "records wait for it"
             )
+        if self._replaced:
+            found.append(
+                f"Redis at {self._address} gets nothing more: another process reports there as run {self._run_id}; "
+                "give one of the two runs another name"
+            )
         if self._num_lost:
             found.append(f"{self._num_lost} records did not reach Redis; metrics.jsonl has them")
         return [Trouble("redis", text) for text in found]
 
     def close(self, timeout_s: float = 2.0) -> None:
-        """Send what still waits, for at most about ``timeout_s``, and let others have the run."""
+        """Send what still waits, for at most about ``timeout_s``."""
         self._deadline_s = time.monotonic() + timeout_s
         self._closing.set()
         self._thread.join(timeout_s + 0.1)  # a call to a hanging Redis may last longer; the thread then dies alone
-        if self._pending() and self._taken is None:
+        if self._pending() and not self._replaced:
             _logger.warning("Redis at %s did not get the end of run %s; its files have it", self._address, self._run_id)
 
     # --- the thread ---------------------------------------------------------------------------------------------------
 
     def _work(self) -> None:
         pause_s = 0.0
-        while self._taken is None:
+        while True:
             self._closing.wait(pause_s)
             ending = self._closing.is_set()
             try:
                 more = self._send()
-            except RunTakenError as error:
-                self._taken = str(error)
-            except WatchError:  # the lease has expired or was taken in this very moment; the next try tells which
+            except _NewerProcessError:
+                self._replaced = True
+                break
+            except WatchError:  # another process began in this very moment; the next try tells
                 pause_s = 0.0
             except (RedisError, OSError) as error:
                 self._note_failure(reason_of(error))
@@ -156,8 +164,9 @@ class RedisWriter:
                     break
             if time.monotonic() > self._deadline_s:
                 break
-        with suppress(RedisError, OSError):  # the lease expires by itself
-            self._lease.release()
+        with suppress(RedisError, OSError):  # it expires by itself
+            if not self._replaced:
+                self._client.delete(self._key("heartbeat"))
             self._client.close()
 
     def _send(self) -> bool:
@@ -166,23 +175,33 @@ class RedisWriter:
         with self._lock:
             batch = list(self._waiting)[:BATCH]
         with self._client.pipeline() as pipe:
-            self._lease.renew(pipe)
+            pipe.watch(self._key("epoch"))
+            if self._is_newer(pipe.get(self._key("epoch"))):
+                raise _NewerProcessError
+            pipe.multi()
+            pipe.set(self._key("epoch"), self._mine)  # a Redis that lost its data has forgotten it
+            pipe.set(self._key("heartbeat"), 1, px=int(1000 * keys.HEARTBEAT_S))
             if status is not None and status is not self._sent_status:
                 pipe.zadd(keys.RUNS, {self._run_id: status.started.timestamp()})
-                pipe.set(keys.run_key(self._run_id, "status"), status.model_dump_json())
+                pipe.set(self._key("status"), status.model_dump_json())
             if grid is not None and grid is not self._sent_grid:
-                pipe.set(keys.run_key(self._run_id, "goals"), grid.model_dump_json())
-            key = keys.run_key(self._run_id, "metrics")
+                pipe.set(self._key("goals"), grid.model_dump_json())
+            key = self._key("metrics")
             for line in batch:
                 pipe.zremrangebyscore(key, line.iteration, "+inf")
                 pipe.zadd(key, {line.text: line.iteration})
             if batch:
                 pipe.zremrangebyrank(key, 0, -keys.MAX_RECORDS - 1)
-            pipe.exists(keys.run_key(self._run_id, "stop"))
+            pipe.exists(self._key("stop"))
             self._stop = bool(pipe.execute()[-1])
         self._sent_status, self._sent_grid = status, grid
         more = self._count(batch)
         return self._send_again() or more
+
+    def _is_newer(self, found: bytes | None) -> bool:
+        """Whether the process of an epoch in Redis began after this one; one from an older copy of its data did not."""
+        run, _, epoch = (found or self._mine).partition(b":")
+        return run != self._run or not epoch.isdigit() or int(epoch) > self._epoch
 
     def _count(self, batch: list[_Line]) -> bool:
         now_s = time.monotonic()

@@ -2,38 +2,73 @@
 
 from __future__ import annotations
 
+import logging
+import time
+from collections.abc import Callable
 from contextlib import ExitStack
+from pathlib import Path
 from typing import TYPE_CHECKING
 
+from pydantic import BaseModel
+
+from service.io.files import write_atomic
 from service.io.run_directory import RunDirectory
 from service.store.address import RedisAddress
-from service.store.disk import DiskWriter
-from service.store.models import GoalGrid, Record, RunStatus, Trouble
+from service.store.disk import GOALS_FILE, STATUS_FILE, STOP_FILE
+from service.store.models import Condition, GoalGrid, Record, RunState, RunStatus, Trouble
 
 if TYPE_CHECKING:
     from service.store.redis_writer import RedisWriter
+
+STATUS_INTERVAL_S = 1.0
+GOALS_INTERVAL_S = 5.0
+_logger = logging.getLogger(__name__)
+
+
+def reporting_to(directory: RunDirectory, run_id: str, address: RedisAddress | None) -> RunWriter:
+    """The writer of a run to its directory, which the caller has claimed, and to the Redis that is given.
+
+    Raises:
+        RunTakenError: see ``RedisWriter``; the directory is then as it was.
+        StoreUnavailableError: Redis is not there, or does not let us in.
+    """
+    if address is None:
+        return RunWriter(directory)
+    from service.store.redis_writer import RedisWriter  # where there is no Redis, its package is not needed
+
+    assert directory.history is not None
+    return RunWriter(directory, RedisWriter(address, run_id, run=directory.history.run, epoch=directory.epoch))
 
 
 class RunWriter:
     """The place a runner reports to. No method raises for a store that is away or full: training goes on.
 
+    A few small files a second are written without waiting for the disk, so the training thread does it by the way.
+    Metrics go to Redis alone: the run directory has its own ``metrics.jsonl``.
+
     Args:
         directory: the run's; the caller has claimed it.
-        run_id: id of the run.
-        redis: a Redis to report to as well.
-
-    Raises:
-        RunTakenError: another driver runs this run; the directory is then as it was.
-        StoreUnavailableError: Redis is not there, or does not let us in.
+        redis: a Redis to report to as well; ``close`` closes it.
+        clock: counts seconds.
     """
 
-    def __init__(self, directory: RunDirectory, run_id: str, redis: RedisAddress | None) -> None:
-        remote: list[RedisWriter] = []
-        if redis is not None:
-            from service.store.redis_writer import RedisWriter  # where there is no Redis, its package is not needed
-
-            remote.append(RedisWriter(redis, run_id))
-        self._writers: list[DiskWriter | RedisWriter] = [DiskWriter(directory), *remote]
+    def __init__(
+        self,
+        directory: RunDirectory,
+        redis: RedisWriter | None = None,
+        *,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        """Take back the stop request of an earlier process."""
+        self._directory, self._redis = directory, redis
+        self._stop_file = directory.path / STOP_FILE
+        self._status = _LatestFile(directory.path / STATUS_FILE, STATUS_INTERVAL_S, clock)
+        self._goals = _LatestFile(directory.path / GOALS_FILE, GOALS_INTERVAL_S, clock)
+        self._told: tuple[RunState, Condition] | None = None
+        try:
+            self._stop_file.unlink(missing_ok=True)
+        except OSError as error:
+            _logger.warning("cannot delete %s: %s; the run will stop at once", self._stop_file, error.strerror)
 
     def check(self) -> None:
         """Assert that this process is still the one that runs the run.
@@ -41,34 +76,70 @@ class RunWriter:
         Raises:
             RunTakenError: another one has taken it over; then nothing more may be written.
         """
-        for writer in self._writers:
-            writer.check()
+        self._directory.check_owner()
 
     def status(self, status: RunStatus) -> None:
         """Replace what is known about the run."""
-        for writer in self._writers:
-            writer.status(status)
+        told = status.state, status.condition
+        self._status.put(status, now=told != self._told)
+        self._told = told
+        if self._redis is not None:
+            self._redis.status(status)
 
     def metrics(self, record: Record) -> None:
         """Append one iteration's metrics."""
-        for writer in self._writers:
-            writer.metrics(record)
+        if self._redis is not None:
+            self._redis.metrics(record)
 
     def goals(self, grid: GoalGrid) -> None:
         """Replace the grid."""
-        for writer in self._writers:
-            writer.goals(grid)
+        self._goals.put(grid)
+        if self._redis is not None:
+            self._redis.goals(grid)
 
     def stop_requested(self) -> bool:
         """Whether somebody asked the run to stop anywhere since it was started."""
-        return any(writer.stop_requested() for writer in self._writers)
+        return self._stop_file.exists() or (self._redis is not None and self._redis.stop_requested())
 
     def troubles(self) -> list[Trouble]:
-        """Problems at the moment; empty when all is well."""
-        return [trouble for writer in self._writers for trouble in writer.troubles()]
+        """Problems at the moment, such as files that cannot be written; empty when all is well."""
+        problems = [self._status.problem, self._goals.problem, *self._directory.problems()]
+        found = [Trouble("disk", problem) for problem in problems if problem is not None]
+        return [*found, *(self._redis.troubles() if self._redis is not None else ())]
 
     def close(self) -> None:
         """Write what still waits, for a bounded time, to every store, also where another fails."""
         with ExitStack() as stack:
-            for writer in reversed(self._writers):
-                stack.callback(writer.close)
+            if self._redis is not None:
+                stack.callback(self._redis.close)
+            stack.callback(self._goals.flush)
+            stack.callback(self._status.flush)
+
+
+class _LatestFile:
+    """Holds the newest of what it is given, not older than ``interval_s`` when something newer comes."""
+
+    def __init__(self, path: Path, interval_s: float, clock: Callable[[], float]) -> None:
+        self._path, self._interval_s, self._clock = path, interval_s, clock
+        self._waiting: BaseModel | None = None
+        self._written_s = float("-inf")
+        self.problem: str | None = None
+
+    def put(self, content: BaseModel, *, now: bool = False) -> None:
+        self._waiting = content
+        if now or self._clock() - self._written_s >= self._interval_s:
+            self.flush()
+
+    def flush(self) -> None:
+        if self._waiting is None:
+            return
+        self._written_s = self._clock()
+        try:
+            write_atomic(self._path, self._waiting.model_dump_json().encode() + b"\n", flush=False)
+        except OSError as error:
+            problem = f"{self._path.name} cannot be written: {error.strerror}"
+            if self.problem is None:
+                _logger.warning("%s: %s; the run goes on", self._path.parent, problem)
+            self.problem = problem
+        else:
+            self._waiting, self.problem = None, None

@@ -1,13 +1,15 @@
-"""A growing file of records, read again and again: only new lines are parsed, and only their places are kept."""
+"""A growing file of records: its newest ones, a sample, and columns, for which only new lines are read."""
 
 from __future__ import annotations
 
 import logging
 import math
+import sys
 from array import array
-from bisect import bisect_left, bisect_right
+from bisect import bisect_left
 from collections.abc import Callable, Iterator, Sequence
-from functools import lru_cache
+from contextlib import suppress
+from functools import cache
 from io import BytesIO
 from pathlib import Path
 from threading import Lock
@@ -24,101 +26,88 @@ INDEX = ("iteration", "env_steps")
 """Keys of every record that are no metrics."""
 MAX_ITERATION = 2**53
 _SEAL_BYTES = 256
+"""Length of the end of what was read, by which a file is known again that was cut meanwhile."""
 _MAX_LINE_BYTES = 1024 * 1024
-_TAIL_BYTES = 64 * 1024
+_TAIL_BYTES = 32 * 1024
 _BATCH = 1000
 """Lines that are decoded before they become numbers of NumPy's, which need a tenth of the room."""
-_EVERY = 64
-"""Of so many lines with the same number of keys, one is asked which they are."""
 _logger = logging.getLogger(__name__)
-_Row = tuple[float | None, ...]
 
 
 class RecordFile:
     """The iterations of one ``metrics.jsonl``; any number of threads may read at once. A missing file is empty.
 
     A resumed run cuts the file and goes on: where an iteration comes again, it and all after it are made anew.
-    Metrics that were asked for in columns stay in memory until ``forget_columns``.
+    Columns stay in memory until ``forget``. Every method raises ``OSError`` where the file cannot be read.
     """
 
     def __init__(self, path: Path) -> None:
-        self._path = path
-        self._lock = Lock()
-        self._forget()
+        self._path, self._lock = path, Lock()
+        self.forget()
 
     def after(self, iteration: int) -> list[Record]:
-        """The records of iterations above ``iteration``, in order.
-
-        Raises:
-            OSError: the file cannot be read.
-        """
-        with self._lock, self._open() as file:
-            self._catch_up(file)
-            first = bisect_right(self._iterations, iteration)
-            found = [self._read(file, start) for start in self._starts[first:]]
-            return [record for record in found if record is not None]
+        """The records of iterations above ``iteration``, in order."""
+        with self._open() as file:
+            for whole, records in _newest_first(file):
+                if whole or (records and _iteration(records[0]) <= iteration):
+                    kept: list[Record] = []
+                    for record in records:
+                        while kept and _iteration(kept[-1]) >= _iteration(record):
+                            kept.pop()
+                        kept.append(record)
+                    return [record for record in kept if _iteration(record) > iteration]
+        return []
 
     def last(self) -> Record | None:
-        """The newest record; None before the first.
+        """The newest record; None before the first."""
+        with self._open() as file:
+            return next((records[-1] for _, records in _newest_first(file) if records), None)
 
-        Raises:
-            OSError: the file cannot be read.
-        """
-        with self._lock, self._open() as file:
-            self._catch_up(file)
-            return self._read(file, self._starts[-1]) if self._starts else None
+    def sample(self, name: str, number: int) -> list[float | None]:
+        """A metric of about ``number`` records, evenly over the file, without reading the others."""
+        found: dict[int, Record] = {}
+        with self._open() as file:
+            size = file.seek(0, 2)
+            for start in [size * index // number for index in range(number)]:
+                file.seek(max(0, start - 1))
+                if start:
+                    file.readline(_MAX_LINE_BYTES)  # the rest of a line
+                if (record := parse_record(file.readline(_MAX_LINE_BYTES))) is not None:
+                    found[_iteration(record)] = record
+        if (last := self.last()) is not None:
+            found[_iteration(last)] = last
+        return [record.get(name) for record in found.values()]
 
     def columns(self, names: Sequence[str] | None) -> Columns:
-        """Metrics over all iterations; None for all that there are. Names that no record has are left out.
-
-        Raises:
-            OSError: the file cannot be read.
-        """
+        """Metrics over all iterations; None for all that there are. Names that no record has are left out."""
         with self._lock, self._open() as file:
-            if not self._starts:  # nothing is known yet: one pass over the file finds everything
-                asked = [name for name in names or () if name not in INDEX]
-                self._columns.update({name: array("d") for name in ("env_steps", *asked)})
-            self._catch_up(file)
-            wanted = sorted(self._names) if names is None else [name for name in names if name in self._names]
-            for name in self._columns.keys() - self._names - {"env_steps"}:
-                del self._columns[name]
-            missing = [name for name in ("env_steps", *wanted) if name not in self._columns]
-            if missing:
-                self._load(file, missing)
+            try:
+                self._catch_up(file)
+            except OSError:  # in the middle of a batch
+                self.forget()
+                raise
+            there = sorted(self._columns.keys() - set(INDEX))
+            wanted = there if names is None else [name for name in names if name in self._columns and name not in INDEX]
             return Columns(
                 iteration=np.array(self._iterations, dtype=np.int64),
                 env_steps=np.nan_to_num(np.array(self._columns["env_steps"])).astype(np.int64),
                 metrics={name: np.array(self._columns[name]) for name in wanted},  # a view would keep it from growing
-                names=tuple(sorted(self._names)),
+                names=tuple(there),
             )
-
-    def sample(self, name: str, number: int) -> list[float | None]:
-        """A metric of about ``number`` records, evenly over the file, without reading the others.
-
-        Raises:
-            OSError: the file cannot be read.
-        """
-        with self._lock:
-            known = self._columns.get(name)
-            with self._open() as file:
-                size = file.seek(0, 2)
-                if known is not None and size == self._end and known:
-                    chosen = np.unique(np.linspace(0, len(known) - 1, number).astype(int))
-                    return [None if math.isnan(known[index]) else known[index] for index in chosen.tolist()]
-                lines = list(_lines_of(file, size, number))
-        decode = _decoder((name,))
-        rows = [_row(decode, (name,), line) for line in lines]
-        return [row[1] for row in rows if row is not None]
 
     @property
     def num_bytes(self) -> int:
         """Memory that the columns take."""
-        return 8 * sum(map(len, self._columns.values()))
+        return 8 * len(self._iterations) * len(self._columns)
 
-    def forget_columns(self) -> None:
+    def forget(self) -> None:
         """Free the memory of all columns."""
-        with self._lock:
-            self._columns.clear()
+        self._iterations = array("q")
+        self._columns: dict[str, array[float]] = {}
+        self._learn(["env_steps"])
+        self._end, self._seal = 0, b""
+        self.num_passed_over = 0
+        """Lines that are no records, of those in columns."""
 
     def _open(self) -> BinaryIO:
         try:
@@ -126,104 +115,87 @@ class RecordFile:
         except FileNotFoundError:
             return BytesIO()
 
-    def _forget(self) -> None:
-        self._iterations = array("q")
-        self._starts = array("q")
-        self._columns: dict[str, array[float]] = {}
-        self._keys: set[str] = set()
-        self._names: set[str] = set()
-        self._num_keys = self._num_same = 0
-        self._end, self._seal = 0, b""
-        self.num_passed_over = 0
-        """Lines that are no records, of those that were read."""
-
     def _catch_up(self, file: BinaryIO) -> None:
-        """Find the lines that are new; a torn last one waits for its end."""
+        """Add the lines that are new to the columns; a torn last one waits for its end."""
         file.seek(self._end - len(self._seal))
         if file.read(len(self._seal)) != self._seal:  # cut by a resume, or another file
-            columns = self._columns
-            self._forget()
-            self._columns = {name: array("d") for name in columns}
+            self.forget()
             file.seek(0)
-        names = tuple(self._columns)
-        decode, rows = _decoder(names), list[_Row]()
-        # a line that is longer is no record, nor is what follows it
-        while (line := file.readline(_MAX_LINE_BYTES)).endswith(b"\n"):
-            row = _row(decode, names, line)
-            if row is None:
+        rows: list[tuple[float | None, ...]] = []
+        for line in _lines(file):
+            try:
+                row = parse_with(self._decode, line, "record")
+            except ParseError:  # no record, or one with a metric that is new, or with something that is no number
+                record = parse_record(line)
+                if record is not None and (new := record.keys() - self._columns.keys() - {"iteration"}):
+                    self._extend(rows)
+                    self._learn(sorted(new))
+                row = (record["iteration"], *map(record.get, self._columns)) if record is not None else (None,)
+            if row[0] is None or abs(row[0]) > MAX_ITERATION:
                 self.num_passed_over += 1
                 _logger.warning("%s: passing over what is no record: %r", self._path, line[:60])
             else:
-                iteration = int(row[0] or 0)
-                again = bool(self._iterations) and iteration <= self._iterations[-1]
-                if again or len(rows) == _BATCH:
-                    self._extend(names, rows)
-                    rows = []
-                if again:
-                    self._cut(bisect_left(self._iterations, iteration))
-                self._iterations.append(iteration)
-                self._starts.append(self._end)
-                self._note_names(line)
+                if self._iterations and row[0] <= self._iterations[-1]:
+                    self._extend(rows)
+                    self._cut(bisect_left(self._iterations, row[0]))
+                elif len(rows) == _BATCH:
+                    self._extend(rows)
+                self._iterations.append(int(row[0]))
                 rows.append(row)
             self._end += len(line)
             self._seal = line[-_SEAL_BYTES:]
-        self._extend(names, rows)
+        self._extend(rows)
 
     def _cut(self, size: int) -> None:
-        del self._iterations[size:], self._starts[size:]
+        del self._iterations[size:]
         for column in self._columns.values():
             del column[size:]
 
-    def _note_names(self, line: bytes) -> None:
-        """Learn the names of metrics from lines with another number of keys than the last, and from some others."""
-        num_keys = line.count(b":")
-        self._num_same = self._num_same + 1 if num_keys == self._num_keys else 0
-        self._num_keys = num_keys
-        if self._num_same % _EVERY == 0 and (new := keys_of(line) - self._keys):
-            self._keys |= new
-            self._names.update(name for name in parse_record(line) or () if name not in INDEX)
+    def _extend(self, rows: list[tuple[float | None, ...]]) -> None:
+        """Put decoded rows into the columns, and empty the list."""
+        if rows:
+            numbers: NDArray[np.float64] = np.array(rows, dtype=np.float64).T[1:].copy()
+            for column, values in zip(self._columns.values(), numbers, strict=True):
+                column.frombytes(values.tobytes())
+            rows.clear()
 
-    def _load(self, file: BinaryIO, names: list[str]) -> None:
-        """Read columns of all known records."""
-        decode, rows = _decoder(tuple(names)), list[_Row]()
-        for name in names:
-            self._columns[name] = array("d")
-        nothing: _Row = (None,) * (1 + len(names))
-        at = 0
-        file.seek(0)
-        for start in self._starts:
-            if start != at:
-                file.seek(start)
-            line = file.readline(_MAX_LINE_BYTES)
-            at = start + len(line)
-            rows.append(_row(decode, tuple(names), line) or nothing)
-            if len(rows) == _BATCH:
-                self._extend(names, rows)
-                rows = []
-        self._extend(names, rows)
+    def _learn(self, names: Sequence[str]) -> None:
+        """Begin a column for each of these metrics, and make the decoder of all: ten times as fast as a parser."""
+        import msgspec
 
-    def _extend(self, names: Sequence[str], rows: list[_Row]) -> None:
-        if not rows or not names:
-            return
-        numbers: NDArray[np.float64] = np.array(rows, dtype=np.float64).T[1:].copy()
-        for name, values in zip(names, numbers, strict=True):
-            self._columns[name].frombytes(values.tobytes())
-
-    def _read(self, file: BinaryIO, start: int) -> Record | None:
-        file.seek(start)
-        return parse_record(file.readline(_MAX_LINE_BYTES))
+        self._columns.update({name: array("d", [math.nan]) * len(self._iterations) for name in names})
+        keys = {f"f{index}": name for index, name in enumerate(self._columns)}
+        fields: list[Any] = [("iteration", int), *((field, float | None, None) for field in keys)]
+        kind = msgspec.defstruct("Line", fields, rename=keys, gc=False, forbid_unknown_fields=True)
+        decode, values = msgspec.json.Decoder(kind).decode, msgspec.structs.astuple
+        self._decode: Callable[[bytes], tuple[float | None, ...]] = lambda line: values(decode(line))
 
 
 def parse_record(text: bytes) -> Record | None:
     """One record of JSON text; None where it is none."""
     try:
-        record = parse_json(text, "record", allow_nan=True)
-    except ParseError:
-        return None
-    if not isinstance(record, dict) or type(record.get("iteration")) is not int:
+        return _check_record(parse_with(_fast_parser(), text, "record"))
+    except ParseError:  # NaN, which is no JSON, or something that is no number
+        with suppress(ParseError):
+            return _check_record(parse_json(text, "record", allow_nan=True))
+    return None
+
+
+@cache
+def _fast_parser() -> Callable[[bytes], Any]:
+    import msgspec
+
+    return msgspec.json.Decoder(dict[str, int | float | None]).decode
+
+
+def _check_record(record: Any) -> Record | None:
+    iteration = record.get("iteration") if isinstance(record, dict) else None
+    if type(iteration) is not int or abs(iteration) > MAX_ITERATION:
         return None
     values = {name: value for name, value in record.items() if value is None or type(value) in (int, float)}
-    return {name: None if value is not None and not math.isfinite(value) else value for name, value in values.items()}
+    return {
+        name: value if value is None or abs(value) <= sys.float_info.max else None for name, value in values.items()
+    }
 
 
 def columns_of(records: Sequence[Record], names: Sequence[str] | None) -> Columns:
@@ -242,56 +214,22 @@ def columns_of(records: Sequence[Record], names: Sequence[str] | None) -> Column
     )
 
 
-@lru_cache(256)
-def _decoder(names: tuple[str, ...]) -> Callable[[bytes], _Row]:
-    """A parser of lines that keeps the iteration and these metrics, and passes over all others: 20 times as fast."""
-    import msgspec
-
-    fields = {f"f{index}": name for index, name in enumerate(names)}
-    kinds: list[tuple[str, Any, Any]] = [(field, float | None, None) for field in fields]
-    kind = msgspec.defstruct("Line", [("iteration", int), *kinds], rename=fields, gc=False)
-    decode, values = msgspec.json.Decoder(kind).decode, msgspec.structs.astuple
-    return lambda line: values(decode(line))
+def _iteration(record: Record) -> int:
+    return int(record["iteration"] or 0)
 
 
-def keys_of(line: bytes) -> set[str]:
-    """The keys of a line; empty where it is no object."""
-    import msgspec
-
-    try:
-        return set(parse_with(lambda text: msgspec.json.decode(text, type=dict[str, msgspec.Raw]), line, "record"))
-    except ParseError:
-        return set(parse_record(line) or ())
+def _lines(file: BinaryIO) -> Iterator[bytes]:
+    """Whole lines from here on. One that is too long is no record, nor is what follows it."""
+    while (line := file.readline(_MAX_LINE_BYTES)).endswith(b"\n"):
+        yield line
 
 
-def _row(decode: Callable[[bytes], _Row], names: Sequence[str], line: bytes) -> _Row | None:
-    """The iteration of a line and its metrics; None where it is no record."""
-    try:
-        row = parse_with(decode, line, "record")
-    except ParseError:  # NaN, or text where a number should be
-        record = parse_record(line)
-        if record is None:
-            return None
-        row = (record["iteration"], *(record.get(name) for name in names))
-    return row if abs(row[0] or 0) < MAX_ITERATION else None
-
-
-def _lines_of(file: BinaryIO, size: int, number: int) -> Iterator[bytes]:
-    """Whole lines of a file, about ``number`` of them, evenly over its bytes; the first and the last among them."""
-    last = -1
-    for index in range(number):
-        start = size * index // number
-        file.seek(max(0, start - 1))
-        if start > 0:
+def _newest_first(file: BinaryIO) -> Iterator[tuple[bool, list[Record]]]:
+    """The records at the end of a file, then those of the whole file; and which of both it is."""
+    start = max(0, file.seek(0, 2) - _TAIL_BYTES)
+    for begin in dict.fromkeys((start, 0)):
+        file.seek(begin)
+        if begin:
             file.readline(_MAX_LINE_BYTES)  # the rest of a line
-        at = file.tell()
-        if at > last and (line := file.readline(_MAX_LINE_BYTES)).endswith(b"\n"):
-            last = at
-            yield line
-    base = max(0, size - _TAIL_BYTES)
-    file.seek(base)
-    tail = file.read(size - base)
-    end = tail.rfind(b"\n")
-    begin = tail.rfind(b"\n", 0, max(0, end)) + 1
-    if end > begin and base + begin > last and (begin or not base):
-        yield tail[begin : end + 1]
+        found = map(parse_record, _lines(file))
+        yield begin == 0, [record for record in found if record is not None]

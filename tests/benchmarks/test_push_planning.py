@@ -5,10 +5,10 @@ import numpy as np
 import service
 from benchmarks.push_planning import Settings, measure
 from service.config import load_config
-from service.downstream.compose import parameters_digest
 from service.learner.learner import Learner
 from service.policies.numpy_policy import numpy_bob
-from service.primitives.loading import TrainedBob
+from service.primitives.digest import parameters_digest
+from service.primitives.loading import Trained
 
 SMALL = Settings(num_goals=4, goals_at_once=4, num_plans=24, num_elites=5, num_rounds=6, seed=1)
 
@@ -18,7 +18,7 @@ def still_bob():
     parameters = dict(Learner(load_config(None, ["policy.bob.num_primitives=2"])).weights().bob)
     for name in ("primitives.output_weight", "primitives.output_bias"):
         parameters[name] = np.zeros_like(parameters[name])
-    return TrainedBob("by hand", numpy_bob(parameters), parameters, load_config())
+    return Trained("by hand", "primitives", load_config(), numpy_bob(parameters), parameters)
 
 
 def test_plans_reach_goals_with_primitives_that_push_and_none_with_those_that_rest():

@@ -7,10 +7,10 @@ import pytest
 import service
 from benchmarks.push_range import DIRECTIONS, best_pushes, measure, positions_behind
 from service.config import load_config
-from service.downstream.compose import parameters_digest
 from service.learner.learner import Learner
 from service.policies.numpy_policy import numpy_bob
-from service.primitives.loading import TrainedBob
+from service.primitives.digest import parameters_digest
+from service.primitives.loading import Trained
 
 
 def test_the_fastest_of_those_that_go_straight():
@@ -49,7 +49,7 @@ def test_what_no_composition_does_is_impossible():
     bias = np.zeros_like(parameters["primitives.output_bias"])
     bias[0, 0] = bias[1, 1] = 3.0
     parameters["primitives.output_bias"] = bias
-    bob = TrainedBob("by hand", numpy_bob(parameters), parameters, load_config())
+    bob = Trained("by hand", "primitives", load_config(), numpy_bob(parameters), parameters)
     found = measure(bob, num_places=7, num_weights=40, seed=0)
     assert found == {"+x": 0.0, "-x": 1.0, "+y": 0.0, "-y": 1.0}
 

@@ -14,8 +14,8 @@ from benchmarks.measuring import RECIPE_FILE
 from benchmarks.report.__main__ import ABOUT_THE_RECIPE, PAGES, Report, begin, end
 from benchmarks.report.recipe import SHIPPED, check_words, differences, recipe_words
 from service.config import load_config
-from service.downstream.compose import parameters_digest
 from service.errors import TandemError
+from service.primitives.digest import parameters_digest
 
 DOCS = Path(__file__).parents[2] / "docs"
 

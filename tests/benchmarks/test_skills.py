@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 
-from benchmarks import measuring, record_skills, stages
+from benchmarks import measuring, record_run, run_files
 from benchmarks.report import figures, skills
 from service.actors.coverage import visited_share
 from service.baselines.coverage import skill_paths
@@ -21,13 +21,13 @@ from tests.runtime.test_skill_run import play, small_config
 
 @pytest.fixture(autouse=True)
 def short(monkeypatch):
-    monkeypatch.setattr(record_skills, "EPISODE_STEPS", 8)
+    monkeypatch.setattr(record_run, "EPISODE_STEPS", 8)
 
 
 def test_a_skill_run_is_recorded(tmp_path):
     config = small_config("dads", total_env_steps=400)
     play(tmp_path, config)
-    run = record_skills.record_skills(RunDirectory(tmp_path), "dads-0", "a test")
+    run = record_run.record_skills(RunDirectory(tmp_path), "dads-0", "a test")
     assert (run["name"], run["note"], run["method"], run["config"]["seed"]) == ("dads-0", "a test", "dads", 0)
     assert run["series"]["env_steps"][-1] == 400
     assert {name.partition("/")[0] for name in run["series"]} == {
@@ -40,13 +40,13 @@ def test_a_skill_run_is_recorded(tmp_path):
     newest = FrozenSkills(read_stages(RunDirectory(tmp_path))[400], "dads")
     paths = skill_paths(newest, config.world, num_skills=32, num_steps=8, seed=0)
     assert found["end"]["shares"][0] == round(visited_share(paths, config.world.workspace), 4)
-    np.testing.assert_allclose(stages.paths_m(found["end"]), paths[:, ::4], atol=0.0005)
+    np.testing.assert_allclose(run_files.paths_m(found["end"]), paths[:, ::4], atol=0.0005)
     json.loads(measuring.to_text(run))
 
 
 def test_self_play_is_recorded_as_skills(tmp_path):
     play_rounds(tmp_path)
-    run = record_skills.record_skills(RunDirectory(tmp_path), "ours-0")
+    run = record_run.record_skills(RunDirectory(tmp_path), "ours-0")
     assert run["method"] == "ours"
     assert "bob/env_steps_fraction" in run["series"]
     assert not any(name.startswith("alice/") for name in run["series"])
@@ -56,7 +56,7 @@ def test_a_monolithic_bob_is_refused(tmp_path):
     policy = {"monolithic_bob": {"hidden_sizes": [8]}}
     play_rounds(tmp_path, parse_config(TREE | {"policy": TREE.get("policy", {}) | policy}, where="a test"))
     with pytest.raises(TandemError, match="monolithic Bob, who has no skills"):
-        record_skills.record_skills(RunDirectory(tmp_path), "none")
+        record_run.record_skills(RunDirectory(tmp_path), "none")
 
 
 # --- the page ---------------------------------------------------------------------------------------------------------

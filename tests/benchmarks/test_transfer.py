@@ -1,17 +1,11 @@
 """The benchmark of a frozen policy in another engine: what it counts, a few real steps, its page, and wrong rows."""
 
-import json
-from dataclasses import asdict
-
 import numpy as np
 import pytest
 
-from benchmarks import robot_bridge
 from benchmarks.report import transfer as page
-from benchmarks.report.__main__ import transfer_blocks
 from benchmarks.transfer import (
     ROWS,
-    Job,
     Played,
     Settings,
     benchmark,
@@ -75,11 +69,11 @@ def test_goals_are_drawn_for_the_cube_of_the_engine():
 
 def test_a_chunk_is_played_alike_again_in_the_real_engine():
     pytest.importorskip("pybullet", reason="needs PyBullet: pip install 'tandem-skills[pybullet]'")
-    job = Job("together", 0, Settings(num_goals=2, num_steps=8), CALIBRATION)
-    first = play_chunk(job)
+    asked = ROWS["together"], 0, Settings(num_goals=2, num_steps=8), CALIBRATION.gain
+    first = play_chunk(*asked)
     assert [each.stopped for each in first] == ["", ""]
     assert [each.num_steps for each in first] == [8, 8]
-    assert play_chunk(job) == first
+    assert play_chunk(*asked) == first
     assert all(0 < each.free[0] <= 8 for each in first)  # it comes from above
 
 
@@ -114,25 +108,3 @@ def test_the_page_has_a_row_for_each_and_says_what_was_not_measured():
     assert "some-policy@1, 50 goals a row" in words
     assert "the tip itself in 90.0 %: in 95.00 % of those in which the arm touches nothing (40 % of all)" in words
     assert "| nominal | 100.0 % |" in report(result)
-
-
-def test_the_bridge_in_our_own_engine_has_a_block_and_keeps_rows_of_the_same_settings_only(tmp_path):
-    settings = robot_bridge.Settings(num_episodes=40)
-    motion = {"max_set_point_speed_m_s": 1.5, "max_set_point_acceleration_m_s2": 11.0}
-    row = {"success_last": 0.95, "stops": ["stopped: late"], **motion}
-    rows = {"bounds of a Franka, the arm of training": row}
-    result = {
-        "settings": asdict(settings),
-        "machine": MACHINE,
-        "evaluator": {"success_last": 0.98},
-        "rows": rows,
-    }
-    table, words = transfer_blocks({"robot_bridge": result})["robot_bridge"]
-    assert "| the evaluator, without the bridge | 98.0 % |  |  |" in table
-    assert "| bounds of a Franka, the arm of training | 95.0 % | 1 | 1.50 m/s, 11.0 m/s2 |" in table
-    assert words.startswith("panda-cube@champion, 40 mixed goals a row, 50 steps. On 2 cores of a processor, ")
-    path = tmp_path / "robot_bridge.json"
-    assert robot_bridge._measured_before(settings, path) == {}
-    path.write_text(json.dumps(result))
-    assert robot_bridge._measured_before(settings, path) == rows
-    assert robot_bridge._measured_before(robot_bridge.Settings(num_episodes=300), path) == {}

@@ -161,7 +161,7 @@ def good(tmp_path_factory):
     run, _ = play(home / "run", config)
     write_yaml(home / "tiny.yaml", config.model_dump(mode="json"))
     registry = Registry(home / "registry")
-    publish(registry, config, run.parameters(), {"env_steps": 600.0})
+    publish(registry, config, run.method.parameters(), {"env_steps": 600.0})
     (home / "study").mkdir()
     shutil.copy(home / "run" / "config.yaml", home / "study" / "study.yaml")
     (home / "study" / "study.json").write_text('{"seeds": [0, 1]}')

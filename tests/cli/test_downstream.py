@@ -85,7 +85,7 @@ def test_what_was_learned_is_published_evaluated_and_rendered(tmp_path, monkeypa
     assert (episodes.states.shape[:2], world.gripper, path.name) == ((51, 2), "blocked", "push.gif")
     for words, refused in (
         ("panda-cube is the name of primitives already", invoke("train", "--task", "wall", "--publish", "panda-cube")),
-        ("load them by service.load_primitives", invoke("evaluate", "panda-cube@champion")),
+        ("without --task needs a policy of a task", invoke("evaluate", "panda-cube@champion")),
         ("unknown task 'lift'", invoke("evaluate", run, "--task", "lift")),
     ):
         assert refused.exit_code == 2
@@ -100,8 +100,10 @@ def test_a_table_from_the_command_line(tmp_path):
     assert made.exit_code == 0, made.output
     assert "0 of 4 trials are there, 4 to run" in made.stderr
     assert len(list((tmp_path / "o" / "downstream").iterdir())) == 4
+    assert made.stdout.splitlines() == ["method\tpush\tbox", "idle\t0.0 % [0, 0] (2)\t0.0 % [0, 0] (2)"]
     again = invoke("table", "--methods", "idle", "--tasks", "push,box", "--seeds", "0,1", "--episodes", 4, "--out", "o")
     assert "4 of 4 trials are there, 0 to run" in again.stderr
+    assert again.stdout == made.stdout
 
 
 def test_methods_are_listed():

@@ -25,7 +25,7 @@ from service.primitives.bundled import BUNDLED
 from service.recipes import recipes
 from service.registry.names import Version
 from service.registry.registry import Registry
-from service.runtime.signals import InterruptError
+from service.runs.signals import InterruptError
 from tests.runtime.runs import TREE, assert_one_line, no_room_above, tiny_config, write_yaml
 
 ROOT = Path(__file__).parents[2]
@@ -117,7 +117,7 @@ def test_the_examples_of_pretraining(monkeypatch, tmp_path):
     What they do with ``--runtime ray`` is shown in tests/runtime.
     """
     monkeypatch.setattr("service.primitives.publishing.FINAL_EVALUATION_EPISODES", 4)
-    monkeypatch.setattr("service.runtime.pretrain.make_artifacts", lambda directory: {})
+    monkeypatch.setattr("service.runs.train.make_artifacts", lambda directory: {})
     monkeypatch.chdir(tmp_path)
     commands = [
         shlex.split(line, comments=True) for line in re.findall(r"^\$ tandem (pretrain .*)$", EXAMPLES, re.MULTILINE)
@@ -148,7 +148,7 @@ def test_a_resumed_run_takes_the_file_it_was_begun_with(trained, monkeypatch):
         asked.append((config.run, kwargs["resume"]))
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("service.runtime.pretrain.pretrain", pretrain)
+    monkeypatch.setattr("service.runs.train.train", pretrain)
     config = trained.home / "tiny.yaml"
     common = ("pretrain", "--resume", "--run-dir", trained.run, "--config", config)
     tandem(*common, "--set", "run.total_env_steps=950")
@@ -163,7 +163,7 @@ def test_pretrain_goes_to_runs_by_its_name(monkeypatch, tmp_path):
         raise KeyboardInterrupt
 
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("service.runtime.pretrain.pretrain", pretrain)
+    monkeypatch.setattr("service.runs.train.train", pretrain)
     tandem("pretrain", "--set", "name=blue")
     tandem("pretrain", "--set", "name=blue", "--run-dir", "here", TANDEM_REGISTRY="/there")
     assert asked == [
@@ -182,7 +182,7 @@ def test_demo_is_a_short_pretraining_with_a_registry_of_its_own(monkeypatch, tmp
         raise KeyboardInterrupt
 
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("service.runtime.pretrain.pretrain", pretrain)
+    monkeypatch.setattr("service.runs.train.train", pretrain)
     tandem("demo", "--env-steps", "7")
     tandem("demo", "--env-steps", "8")
     one, two = Path("runs/demo-1"), Path("runs/demo-2")
@@ -197,18 +197,18 @@ def test_demo_is_a_short_pretraining_with_a_registry_of_its_own(monkeypatch, tmp
 
 def test_demo_ends_with_what_comes_with_tandem_and_what_to_type(monkeypatch, tmp_path):
     from service.actors import evaluation
-    from service.runtime.pretrain import Pretrained
-    from service.runtime.runner import RunResult
+    from service.runs.run import RunResult
+    from service.runs.train import Finished
 
     metrics = {"evaluation/table_success_last": 0.12, "evaluation/air_success_last": 0.03}
 
     def pretrain(*args, **kwargs):
-        return Pretrained(RunResult("finished", 1, 7), {}, Version("panda-cube-demo", 1), metrics, "total 1 s")
+        return Finished(RunResult("finished", 1, 7), {}, Version("panda-cube-demo", 1), metrics, "total 1 s")
 
     real = evaluation.evaluate
     few = {"num_episodes": 4, "num_steps": 2}
     monkeypatch.setattr(evaluation, "evaluate", lambda *args, **kwargs: real(*args, **kwargs | few))
-    monkeypatch.setattr("service.runtime.pretrain.pretrain", pretrain)
+    monkeypatch.setattr("service.runs.train.train", pretrain)
     monkeypatch.chdir(tmp_path)
     result = tandem("demo", "--env-steps", "7")
     assert result.exit_code == 0, result.output
@@ -270,7 +270,7 @@ def test_how_to_go_on_is_where_the_run_was_begun(tmp_path, monkeypatch, options,
 
     monkeypatch.setattr("service.runtime.ray_connection.connected", lambda address: nullcontext())
     monkeypatch.setattr("service.runtime.ray_connection.cluster_size", lambda address: ("head:6379", 4.0))
-    monkeypatch.setattr("service.runtime.pretrain.pretrain", stop)
+    monkeypatch.setattr("service.runs.train.train", stop)
     monkeypatch.setattr("service.runtime.pretrain_study.pretrain_study", stop)
     result = tandem("pretrain", "--run-dir", tmp_path / "a run", "--registry", "registry", *seeds, *options)
     assert result.exit_code == 128 + signal.SIGTERM, result.exception
@@ -541,13 +541,13 @@ def test_a_run_directory_that_is_a_file(tmp_path):
         (["evaluate", "--primitives", "tiny@best"], ["no alias 'best'", "latest -> 1"]),
         (["evaluate", "--primitives", "tiny@2"], ["no version 2"]),
         (["evaluate", "--primitives", "nobody"], ["no 'nobody'", "it holds: tiny", "with tandem comes: panda-cube"]),
-        (["evaluate", "--primitives", "no/where"], ["no/where", "no such run directory"]),
+        (["evaluate", "--primitives", "no/where"], ["no/where", "no such directory of a run"]),
         (["evaluate", "--primitives", "."], ["no run in ."]),
         (["evaluate", "--primitives", "tiny", "--goals", "sky"], ["'sky'", "table, air, mixed"]),
         (["coverage", "--primitives", "tiny@best"], ["no alias 'best'"]),
         (["coverage", "--primitives", "tiny", "--skills", "2", "--steps", "1", "--out", "file/x.png"], ["file/x.png"]),
         (["coverage", "--primitives", "tiny", "--out", "x.txt"], ["--out x.txt", "ends in .png"]),
-        (["render", "--primitives", "no/where"], ["no/where", "no such run directory"]),
+        (["render", "--primitives", "no/where"], ["no/where", "no such directory of a run"]),
         (["registry", "show", "tiny@best"], ["no alias 'best'"]),
     ],
 )
@@ -603,7 +603,7 @@ def test_a_method_makes_a_run_of_skills_under_its_own_name(monkeypatch, tmp_path
         raise TandemError("not today")
 
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("service.runtime.pretrain.pretrain", pretrain)
+    monkeypatch.setattr("service.runs.train.train", pretrain)
     tandem("pretrain", "--method", "dads", "--set", "seed=3")
     assert seen == [("dads", "panda-cube-dads", 3, "panda-cube-dads")]
     tandem("pretrain", "--method", "lsd")

@@ -12,11 +12,11 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
-from service import __version__
 from service.cli.main import app
 from service.config import load_config
 from service.errors import TandemError, did_you_mean
 from service.recipes import CONFIGS, recipes, robots
+from service.version import __version__
 
 RECIPE = CONFIGS / "pretrain" / "panda_cube.yaml"
 
@@ -35,7 +35,7 @@ def begun(monkeypatch, tmp_path):
         raise TandemError("not today")
 
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("service.runtime.pretrain.pretrain", pretrain)
+    monkeypatch.setattr("service.runs.train.train", pretrain)
     return seen
 
 
@@ -144,8 +144,7 @@ def test_what_takes_long_can_be_quiet():
 
 def test_quiet_before_and_after_the_command(monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
-    for limit in ("SHOWN_AFTER_S", "PLAIN_INTERVAL_S"):
-        monkeypatch.setattr(f"service.progress.{limit}", 0.0)
+    monkeypatch.setattr("service.progress.PLAIN_INTERVAL_S", 0.0)
     typed = ["evaluate", "--primitives", "panda-cube@champion", "--episodes", "1", "--steps", "1"]
     assert "evaluating on mixed goals" in tandem(*typed).stderr
     level = logging.getLogger().level

@@ -42,7 +42,7 @@ def test_skills_are_evaluated_by_the_one_towards_the_goal(registry):
     assert rows["lsd@1"]["mean_distance_m"] != rows["idle"]["mean_distance_m"]
     refused = tandem(*common, "dads@1")
     assert refused.exit_code == 2
-    assert refused.stderr.startswith("error: skills of DADS lead to no given goal")
+    assert refused.stderr.startswith("error: dads@1 is a set of skills of dads, which no goal leads; tandem evaluate")
 
 
 def test_render_shows_random_skills(registry, tmp_path, monkeypatch):

@@ -12,6 +12,7 @@ from typer.testing import CliRunner
 from service.cli.main import app
 from service.config import dump_config
 from service.io.checkpoints import CheckpointStore
+from service.io.run_history import RunHistory
 from service.recipes import recipes
 from service.runtime.pretrain_study import StudyResult
 from tests.deploy.files import DEPLOY, DOCUMENTS, commands, compose, container, manifest, manifests, pod_templates
@@ -76,6 +77,7 @@ def test_pretrain_begins_with_it_and_goes_on_with_it(arguments, monkeypatch, tmp
         begun.append((directory.path, resume))
         CheckpointStore(directory.checkpoints, keep=1).save(0, {}, {})
         directory.config_file.write_text(dump_config(config))
+        RunHistory.new().write(directory.path)
 
     def pretrain_study(config, directory, seeds, registry, *, resume, **kwargs):
         begun.append((directory.path, resume))

@@ -2,10 +2,10 @@
 
 import torch
 
-from service.baselines.frozen import FrozenSkills, export_skills
+from service.baselines.frozen import FrozenSkills, ZeroShotPolicy, export_skills
 from service.config import Config, SkillsConfig, WorldConfig
 from service.policies.networks import export_parameters
-from service.primitives.loading import TrainedSkills
+from service.primitives.loading import Trained
 from service.sac.inputs import NUM_MOTION_INPUTS
 from service.sac.networks import GaussianActor, make_layers
 
@@ -23,4 +23,5 @@ def parameters(seed=5):
 
 def made(method="lsd", seed=5):
     config = CONFIG.model_copy(update={"skills": SkillsConfig(method=method, size=SIZE)})
-    return TrainedSkills("made@1", FrozenSkills(parameters(seed), method), config)
+    arrays = parameters(seed)
+    return Trained("made@1", "skills", config, ZeroShotPolicy(FrozenSkills(arrays, method)), arrays)

@@ -1,6 +1,7 @@
 """Composing frozen primitives: the weights, what the environment is handed, both checkers, learners, bad input."""
 
 import dataclasses
+import math
 import re
 import warnings
 from pathlib import Path
@@ -14,17 +15,20 @@ from stable_baselines3.common.env_checker import check_env as check_stable_basel
 
 import service
 import service.envs.gym.registration
+from service.baselines.frozen import FrozenSkills
 from service.config import WorldConfig
 from service.downstream.compose import (
     ComposePrimitives,
     ComposePrimitivesVector,
-    action_weights,
     check_primitives,
-    parameters_digest,
 )
 from service.envs.gym.tabletop import TabletopEnv
 from service.envs.gym.vector import TabletopVectorEnv
 from service.errors import TandemError
+from service.policies.numpy_policy import NumpyGaussianPolicy
+from service.policies.parameters import gaussian_shapes, layer_shapes
+from service.primitives.digest import parameters_digest
+from service.primitives.learned import action_weights
 
 DOCUMENT = Path(__file__).parents[2] / "docs" / "downstream.md"
 CONFIG = WorldConfig(physics_step_s=0.005, num_substeps=8)
@@ -167,9 +171,22 @@ def test_a_learner_that_knows_nothing_of_it_learns_and_the_primitives_stay_froze
 def test_the_digest_sees_a_single_bit(trained):
     primitives = service.load_primitives("panda-cube@champion", registry="no registry here").primitives
     assert parameters_digest(primitives) == parameters_digest(trained.primitives)
-    bias = primitives._primitives._bias
+    bias = primitives.network["primitives.output_bias"]
     bias.flat[0] = np.nextafter(bias.flat[0], np.float32(9.0))
     assert parameters_digest(primitives) != parameters_digest(trained.primitives)
+
+
+def test_digests_stay_what_they_were_when_the_first_were_recorded():
+    """Of Bob, ``tests/benchmarks`` has recorded ones."""
+    alone = gaussian_shapes(5, (3, 2), 4)
+    skills = layer_shapes("actor.layers.{}", (20, 3, 8), 2) | layer_shapes("network.{}", (3, 2, 3), 2)
+    alone, skills = (
+        {name: np.arange(1, 1 + math.prod(shape), dtype=np.float32).reshape(shape) for name, shape in shapes.items()}
+        for shapes in (alone, skills)
+    )
+    alone["squash.log_std_max"] *= 2
+    assert parameters_digest(NumpyGaussianPolicy(alone))[:12] == "f7f5cc35f7b4"
+    assert parameters_digest(FrozenSkills(skills, "lsd"))[:12] == "490bcd275666"
 
 
 class TestBadInput:

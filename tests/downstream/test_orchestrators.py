@@ -12,11 +12,10 @@ from service.downstream.orchestrators import publish_orchestrator
 from service.downstream.worker import RunOptions, run_trial
 from service.envs.observations import layouts
 from service.errors import TandemError
-from service.export.exporting import find_source
 from service.primitives.bundled import BUNDLED
 from service.primitives.verification import network_problems
 from service.registry.registry import Registry
-from service.robot.policies import load_robot_policy
+from service.robot.policies import for_robot
 from tests.downstream.trials import small_trial
 from tests.registry.helpers import files_in
 from tests.status.conftest import serve
@@ -71,10 +70,10 @@ def test_it_acts_alike_from_its_directory_a_registry_and_a_service(finished, cha
     published = service.load_policy("push-orchestrator@latest", registry)
     np.testing.assert_array_equal(acted(published, observation), expected)
     for reference, name in ((str(finished / "ours"), "push-ours-0"), ("push-orchestrator@latest", str(version))):
-        on_robot, source = load_robot_policy(reference, registry), find_source(reference, registry, "policy")
-        assert (on_robot.label, source.name) == (name, f"{name} with {champion.manifest.reference}")
-        assert on_robot.world == source.world == local.world
-        np.testing.assert_array_equal(source.players().act_deterministic(observation), expected[0])
+        found = service.load(reference, registry)
+        assert found.name == name
+        assert for_robot(found).world == found.nominal.world == local.world
+        np.testing.assert_array_equal(found.player().act_deterministic(observation), expected[0])
     Registry(registry).export("push-orchestrator", tmp_path / "exported")
     exported = service.load_policy(str(tmp_path / "exported"), tmp_path / "no-registry")
     np.testing.assert_array_equal(acted(exported, observation), expected)
@@ -113,11 +112,9 @@ def test_orchestrators_and_primitives_are_not_taken_for_each_other(finished, cha
     publish_orchestrator(finished / "ours", "push-orchestrator", registry)
     before = files_in(registry)
     for load in (service.load_primitives, service.load_skills):
-        with pytest.raises(TandemError, match="push-orchestrator@1 is an orchestrator for the task push, not primi"):
+        with pytest.raises(TandemError, match=f"@1 is a policy of the task push; {load.__name__} needs "):
             load("push-orchestrator@latest", registry)
-    assert "holds primitives, not an orchestrator: load them by service.load_primitives" in refused(
-        "panda-cube@champion", registry
-    )
+    assert "is a set of primitives; load_policy needs a policy of a task" in refused("panda-cube@champion", registry)
     for name in (champion.manifest.name, "Push"):
         with pytest.raises(TandemError, match=r"panda-cube is the name of primitives already|bad name 'Push'"):
             publish_orchestrator(finished / "ours", name, registry)
@@ -143,16 +140,31 @@ def test_a_policy_from_nothing_needs_the_world_alone(finished, champion, observa
     recorded = json.loads((copy / "cell.json").read_text())
     recorded["world"]["object_mass_kg"] = 0.3
     (copy / "cell.json").write_text(json.dumps(recorded))
-    assert "was trained in another world than that of panda-cube" in refused(copy, tmp_path)
+    assert service.load(str(copy), tmp_path).world.object_mass_kg == 0.3
+    assert "acts with no others" in refused(copy, tmp_path, primitives="panda-cube@champion")
 
 
-def test_what_holds_no_training(finished, tmp_path):
-    assert "holds no downstream training" in refused(tmp_path, tmp_path)
-    assert "no such directory of a training" in refused("no/where", tmp_path)
-    (tmp_path / "config.yaml").write_text("name: x\n")
-    assert "is a run of tandem pretrain, not a downstream training" in refused(tmp_path, tmp_path)
+def test_a_training_that_has_not_ended_or_is_damaged(finished, tmp_path):
     copy = shutil.copytree(finished / "ours", tmp_path / "copy")
+    kept = (copy / "cell.json").read_text()
+    for text, said in (("{", "is no JSON object"), ("{}", "lacks 'cell'")):
+        (copy / "cell.json").write_text(text)
+        assert said in refused(copy, tmp_path)
+    changed = json.loads(kept)
+    changed["primitives"]["env_steps"] = 1.0
+    (copy / "cell.json").write_text(json.dumps(changed))
+    assert "policy.safetensors is of another training than" in refused(copy, tmp_path)
+    (copy / "cell.json").write_text(kept)
     (copy / "policy.safetensors").unlink()
     assert f"{copy} has ended, but its policy.safetensors is gone" in refused(copy, tmp_path)
     (copy / "result.json").unlink()
     assert f"{copy} has not ended: continue it with tandem downstream train --resume" in refused(copy, tmp_path)
+
+
+def test_a_training_that_learned_nothing_plays_what_it_was_given(champion, tmp_path):
+    for method, acts_with in (("asp-only", champion.label), ("idle", None)):
+        run_trial(small_trial(method), champion, tmp_path / method, RunOptions(num_threads=1))
+        found = service.load_policy(str(tmp_path / method), tmp_path)
+        assert (found.trained.label if found.trained else None) == acts_with
+        action = found.act_deterministic(np.zeros((1, layouts(found.world).bob.size), dtype=np.float32))
+        assert (action == 0.0).all() == (method == "idle")

@@ -1,13 +1,12 @@
-import dataclasses
-
 import numpy as np
 import pytest
 
 from service.downstream.learner import make_loop
 from service.downstream.methods import METHODS
-from service.downstream.policy import LearnedPolicy, load_policy, save_policy
 from service.downstream.worker import make_worlds
+from service.envs.observations import layouts
 from service.errors import TandemError
+from service.primitives.learned import LearnedPolicy, read_policy, save_policy
 from tests.downstream.trials import small_trial
 
 
@@ -23,11 +22,10 @@ def learned(method, champion):
 def test_a_learned_policy_acts_as_in_its_worlds(champion, method, tmp_path):
     """Evaluation goes another way than learning, from Bob's input to actions; a loaded policy does the same."""
     loop, parameters = learned(method, champion)
-    save_policy(tmp_path / "policy.safetensors", parameters, method, champion)
-    players = (
-        LearnedPolicy(parameters, METHODS[method], champion),
-        load_policy(tmp_path / "policy.safetensors", champion),
-    )
+    save_policy(tmp_path / "policy.safetensors", parameters, method, None)
+    saved, frozen = read_policy(tmp_path / "policy.safetensors"), METHODS[method].frozen(champion)
+    seen = layouts(champion.config.world)
+    players = [LearnedPolicy(each, frozen, seen) for each in (parameters, saved.parameters)]
     inner = loop.worlds.env.env if METHODS[method].composes else loop.worlds.env
     handed, step = [], inner.step
     inner.step = lambda actions: handed.append(actions) or step(actions)
@@ -43,23 +41,15 @@ def test_a_learned_policy_acts_as_in_its_worlds(champion, method, tmp_path):
         for player in players:
             np.testing.assert_allclose(player.act_deterministic(rows), handed[-1], rtol=0, atol=1e-5)
     players[0].begin()
-    fresh = LearnedPolicy(parameters, METHODS[method], champion)
+    fresh = METHODS[method].learned(parameters, champion)
     np.testing.assert_array_equal(players[0].act_deterministic(rows), fresh.act_deterministic(rows))
     loop.worlds.close()
 
 
-def test_what_cannot_be_loaded(champion, tmp_path):
+def test_what_is_no_policy(tmp_path):
     path = tmp_path / "policy.safetensors"
     with pytest.raises(TandemError, match=r"policy\.safetensors"):
-        load_policy(path, champion)
+        read_policy(path)
     path.write_bytes(b"nothing of the kind")
     with pytest.raises(TandemError, match="is no policy of a downstream training"):
-        load_policy(path, champion)
-    loop, parameters = learned("ours", champion)
-    loop.worlds.close()
-    save_policy(path, parameters, "ours", champion)
-    changed = {name: array + 1e-3 for name, array in vars(champion.policy._gate._output).items() if name == "_bias"}
-    other = dataclasses.replace(champion, policy=type(champion.policy).__new__(type(champion.policy)))
-    vars(other.policy).update(vars(champion.policy), _extra=changed["_bias"])
-    with pytest.raises(TandemError, match=r"acts with panda-cube@\d+, not panda-cube@\d+; load that"):
-        load_policy(path, other)
+        read_policy(path)

@@ -1,25 +1,24 @@
 """Frozen skills downstream: a skill held for some steps, the same in learning and in evaluation, and bad input."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 import torch
 
 import service
+from service.baselines.frozen import ZeroShotPolicy
 from service.downstream.learner import make_loop
 from service.downstream.methods import METHODS, load_for
-from service.downstream.policy import LearnedPolicy, load_policy, save_policy
-from service.downstream.skills import SkillTaskWorlds, ZeroShotPolicy
+from service.downstream.skills import SkillTaskWorlds
 from service.downstream.worker import RunOptions, make_worlds, run_trial
 from service.downstream.worlds import TaskWorlds
 from service.envs.gym.vector import TabletopVectorEnv
 from service.envs.observations import POSITIONS
 from service.errors import TandemError
 from service.io.checkpoints import CheckpointStore
-from service.policies.networks import export_parameters
-from service.primitives.loading import TrainedSkills
 from service.primitives.publishing import publish
 from service.registry.registry import Registry
-from service.sac.networks import GaussianActor
 from tests.downstream.skill_sets import CONFIG, SIZE, WORLD, made, parameters
 from tests.downstream.trials import small_trial
 
@@ -77,14 +76,12 @@ def test_updates_and_horizon_are_counted_in_env_steps(skills):
     worlds.close()
 
 
-def test_a_learned_policy_holds_its_skills(skills, tmp_path):
+def test_a_learned_policy_holds_its_skills(skills):
     trial = small_trial("lsd", skill_steps=5)
     worlds = make_worlds(trial, METHODS["lsd"], skills, 1)
     loop = make_loop(trial, METHODS["lsd"], skills, worlds)
     loop.play(200)  # learned nothing yet: the average is the actor
-    path, exported = tmp_path / "policy.safetensors", loop.learner.averaged_parameters()
-    save_policy(path, exported, "lsd", skills, 5)
-    players = LearnedPolicy(exported, METHODS["lsd"], skills, 5), load_policy(path, skills)
+    player = METHODS["lsd"].learned(loop.learner.averaged_parameters(), skills, 5)
     worlds = SkillTaskWorlds(worlds.env, 3, skills.skills, 5)
     handed, step = [], worlds.env.step
 
@@ -99,9 +96,8 @@ def test_a_learned_policy_holds_its_skills(skills, tmp_path):
         worlds.step(actions)
     assert len(handed) == 15
     for positions, goal, expected in handed:
-        for player in players:
-            acted = player.act_deterministic(np.concatenate((positions, goal), axis=1))
-            np.testing.assert_allclose(acted, expected, rtol=0, atol=1e-5)
+        acted = player.act_deterministic(np.concatenate((positions, goal), axis=1))
+        np.testing.assert_allclose(acted, expected, rtol=0, atol=1e-5)
     worlds.close()
 
 
@@ -157,18 +153,18 @@ class TestBadInput:
         assert trained.skills.size == SIZE
 
     def test_skills_where_primitives_are_expected(self, registry, champion):
-        with pytest.raises(TandemError, match=r"made@1 holds skills of lsd, not primitives"):
+        with pytest.raises(TandemError, match=r"made@1 is a set of skills of lsd; the method ours needs primitives"):
             load_for(["ours"], "made", registry)
         for method in ("ours", "asp-only"):
-            with pytest.raises(TandemError, match=r"made@1 holds skills of lsd; this method takes primitives"):
+            with pytest.raises(TandemError, match=r"made@1 is a set of skills of lsd; the method .* needs primitives"):
                 METHODS[method].check(made())
         with pytest.raises(TandemError, match="ours takes primitives and lsd skills: run them by two commands"):
             load_for(["ours", "lsd"], "made", registry)
 
     def test_primitives_where_skills_are_expected(self, champion):
-        with pytest.raises(TandemError, match=r"panda-cube@\d+ \(bundled\) holds primitives, not skills"):
+        with pytest.raises(TandemError, match=r"panda-cube@.* is a set of primitives; the method lsd needs"):
             load_for(["lsd"], "panda-cube@champion", "no registry here")
-        with pytest.raises(TandemError, match=r"panda-cube@\d+ .*holds primitives; this method takes skills"):
+        with pytest.raises(TandemError, match=r"panda-cube@.* is a set of primitives; the method LSD skills needs"):
             METHODS["lsd"].check(champion)
 
     def test_skills_of_another_method(self):
@@ -178,19 +174,11 @@ class TestBadInput:
     def test_skills_of_another_robot(self, registry):
         trained = service.load_skills("made", registry)
         spaces = {**trained.manifest.spaces, "action": 7}
-        other = TrainedSkills(
-            "made@1", trained.skills, trained.config, trained.manifest.model_copy(update={"spaces": spaces})
-        )
+        other = dataclasses.replace(trained, manifest=trained.manifest.model_copy(update={"spaces": spaces}))
         with pytest.raises(
             TandemError, match=r"made@1 is for another robot or layout: action 7; this one has action 4"
         ):
             METHODS["lsd"].check(other)
-
-    def test_a_policy_of_other_skills(self, skills, tmp_path):
-        exported = GaussianActor(23, SIZE, (8,))
-        save_policy(tmp_path / "policy.safetensors", export_parameters(exported), "lsd", skills)
-        with pytest.raises(TandemError, match=r"acts with made@1, not made@1; load that"):
-            load_policy(tmp_path / "policy.safetensors", made(seed=6))
 
     def test_another_size_of_z(self, skills):
         rows = np.zeros((NUM, POSITIONS.size), dtype=np.float32)

@@ -1,20 +1,16 @@
 import dataclasses
 import functools
 import json
-from pathlib import Path
 
 import pytest
-from PIL import Image
 
-from service.downstream.page import BEST, PAPER, draw_table, steps_until, write_page
-from service.downstream.rates import seed_interval
+from service.downstream.rates import by_method_and_task, rate_of, seed_interval
 from service.downstream.results import ResultsDirectory
-from service.downstream.table import Source, make_table, run_here, run_on_ray
+from service.downstream.table import Source, make_table, run_here, run_on_ray, success_table
 from service.downstream.worker import Callbacks
 from service.errors import TandemError
 from tests.downstream.trials import small_trial
 
-DOCS = Path(__file__).parents[2] / "docs" / "results"
 HERE, ON_RAY = functools.partial(run_here, num_threads=1), functools.partial(run_on_ray, num_workers=2)
 TRIALS = [small_trial(method, task) for task in ("push", "box") for method in ("idle", "asp-only")]
 
@@ -59,10 +55,9 @@ def test_a_table_runs_what_is_missing_and_nothing_else(source, tmp_path):
     assert table(TRIALS, source, tmp_path, counted(ran))
     assert ran == [trial.name for trial in TRIALS]
     assert all(path.stat().st_mtime_ns == stamp for path, stamp in stamps.items())
-    page = (tmp_path / "out" / "downstream.md").read_text()
-    assert "| ASP only |" in page
-    assert "| idle |" in page
-    assert (tmp_path / "out" / "downstream.png").stat().st_size > 10_000
+    head, played, idle = success_table(tmp_path / "out")
+    assert (head, played[0], idle[0]) == (("method", "push", "box"), "asp-only", "idle")
+    assert idle[1] == "16.7 % [3, 56]* (1)"  # 1 of 6, Wilson (z = 1.96)
 
 
 def test_a_stopped_table_says_so_and_continues_its_training(source, tmp_path):
@@ -171,11 +166,6 @@ class TestBadInput:
         played.write_text(json.dumps(tree))
         self.refused(r"push-asp-only-0\.json is of primitives\.digest '000", TRIALS, source, tmp_path)
 
-    def test_a_page_that_a_person_wrote(self, source, tmp_path):
-        (tmp_path / "out").mkdir()
-        (tmp_path / "out" / "downstream.md").write_text("# How to learn downstream\n")
-        self.refused(r"downstream\.md was not written by this command", TRIALS, source, tmp_path)
-
     def test_seeds_of_other_settings(self, file, source, tmp_path):
         trials = [small_trial("idle", seed=1, num_episodes=9)]
         words = r"push-idle-0\.json and push-idle-1, asked for, are seeds of one method, but of num_episodes 6, not 9"
@@ -213,62 +203,20 @@ class TestBadInput:
         self.refused(r"push-idle-0\.json is no JSON", TRIALS, source, tmp_path)
 
 
-def result(method, task, seed, last, ever, curve=(), num=100):
-    evaluation = {"num_episodes": num, "success_last": last, "success_ever": ever}
-    return {
-        "cell": {"method": method, "task": task, "seed": seed},
-        "evaluation": evaluation,
-        "primitives": {"name": "panda-cube@4", "digest": "ab" * 32, "env_steps": 1e7 + seed * 1e6},
-        "made": {"git_commit": "c" * 40},
-        "env_steps": 2000,
-        "wall_s": 60.0,
-        "curve": list(curve),
-    }
+def result(method, task, seed, last, num=100):
+    evaluation = {"num_episodes": num, "success_last": last}
+    return {"cell": {"method": method, "task": task, "seed": seed}, "evaluation": evaluation}
 
 
-def test_the_page_by_hand():
-    curve = [{"env_steps": 1000 * step, "success_last": rate} for step, rate in enumerate((0.0, 0.9, 0.4, 0.8, 0.9))]
-    page = write_page(
-        [result("ours", "wall", 1, 0.97, 1.0, curve), result("ours", "wall", 0, 0.95, 0.97, curve)], "picture.png"
-    )
-    lines = page.splitlines()
-    # std 0.01414 of two seeds: 0.96 - 12.706 * 0.01414 / sqrt(2) is 0.833
-    assert "| ours |  |  |  |  | 96.0 % [83, 100] (2) |  |" in lines
-    assert "| *the paper's* | *83 %* | *100 %* | *52 %* | *100 %* | *98 %* | *98 %* |" in lines
-    assert "| ours |  |  |  |  | 98.5 % [79, 100] (2) |  |" in lines
-    assert "| ours |  |  |  |  | 95.0, 97.0 |  |" in lines
-    assert "| ours |  |  |  |  | 10.5 M + 2, 1 min |  |" in lines
-    assert "scratch" not in page
-
-
-def test_harder_tasks_have_a_section_of_their_own():
-    page = write_page([result("ours", "wall", 0, 0.96, 0.96)], "picture.png")
-    assert "A harder start" not in page
-    results = [
-        result("ours", "wall", 0, 0.96, 0.96),
-        result("ours", "hard-push", 0, 0.50, 0.75),
-        result("asp-only", "hard-push", 0, 0.10, 0.10),
-    ]
-    for each in results:
-        each["cell"]["task_version"] = 1
-    page = write_page(results, "picture.png")
-    plain, _, harder = page.partition("## A harder start and cube")
-    assert "HardPush" not in plain
-    assert r"| ours |  |  |  |  | 96.0 % [90, 98]\* (1) |  |" in plain.splitlines()
-    # 50 of 100, Wilson (z = 1.96) is 0.404 to 0.596
-    assert {"|  | HardPush |", r"| ours | 50.0 % [40, 60]\* (1) |", "| ours | 50.0 |"} <= set(harder.splitlines())
-    assert "paper" not in harder
-
-
-def test_pictures_of_learning_have_a_panel_for_each_task(tmp_path):
-    tasks, sizes = ("larger", "inair", "push", "hard-push", "hard-box"), []
-    for num in (0, 3, 4):
-        picture = draw_table([result("ours", name, 0, 0.5, 0.5) for name in tasks[:num]], tmp_path / f"{num}.png")
-        with Image.open(picture) as image:
-            sizes.append(image.size)
-    assert sizes[0] == sizes[1]
-    assert sizes[1][0] == sizes[2][0]
-    assert sizes[2][1] > 1.5 * sizes[1][1]  # two rows of panels, not one
+def test_seeds_of_a_method_on_a_task_by_hand():
+    results = [result("ours", "wall", seed, rate) for seed, rate in ((2, 0.84), (0, 0.80), (1, 0.82))]
+    found = by_method_and_task([*results, result("ours", "box", 0, 0.96), result("idle", "wall", 0, 0.0)])
+    assert [each["cell"]["seed"] for each in found["ours", "wall"]] == [0, 1, 2]
+    # 0.82 +- 4.303 * 0.02 / sqrt(3)
+    assert str(rate_of(found["ours", "wall"])) == "82.0 % [77, 87] (3)"
+    # a single seed: 96 of 100, Wilson (z = 1.96) is 0.902 to 0.984
+    assert str(rate_of(found["ours", "box"])) == "96.0 % [90, 98]* (1)"
+    assert len(found) == 3
 
 
 def test_intervals_by_hand():
@@ -280,69 +228,3 @@ def test_intervals_by_hand():
     # four: Student's t of three degrees of freedom is 3.182, the standard error 0.11547 / 2
     assert seed_interval([0.4, 0.6] * 2) == pytest.approx((0.5 - 3.182 * 0.057735, 0.5 + 3.182 * 0.057735), abs=1e-5)
     assert seed_interval([0.0, 1.0] * 8) == pytest.approx((0.5 - 1.96 * 0.516398 / 4, 0.5 + 1.96 * 0.516398 / 4))
-    # a single seed: 96 of 100, Wilson (z = 1.96) is 0.902 to 0.984
-    page = write_page([result("ours", "wall", 0, 0.96, 0.96)], "picture.png")
-    assert r"| ours |  |  |  |  | 96.0 % [90, 98]\* (1) |  |" in page.splitlines()
-
-
-def test_what_a_page_says_of_its_origin_by_hand():
-    first, second = result("ours", "box", 0, 0.5, 0.5), result("idle", "box", 0, 0.0, 0.0)
-    first["made"]["git_commit"] = "d" * 40 + "-dirty"
-    second["primitives"] = None
-    lines = write_page([first, second], "picture.png").splitlines()
-    assert lines[-1] == f"Primitives: panda-cube@4 (abababababab). Commits: {'c' * 12}, {'d' * 12}-dirty."
-    (old,) = [line for line in lines if "Recorded before" in line]
-    assert old.startswith("Recorded before `tandem/Box-v1` (all methods), with other contacts")
-    second["cell"]["task_version"] = 1
-    assert "Recorded before `tandem/Box-v1` (ours)" in write_page([first, second], "picture.png")
-    first["cell"]["task_version"] = 1
-    assert "Recorded before" not in write_page([first, second], "picture.png")
-    lines = write_page([first, second, result("ours", "wall", 0, 0.5, 0.5)], "picture.png").splitlines()
-    (old,) = [line for line in lines if "Recorded before" in line]
-    assert old.startswith("Recorded before `tandem/Wall-v1` (all methods), ")
-
-
-def test_the_recorded_page_is_what_its_files_give():
-    results = ResultsDirectory(DOCS / "downstream").read_all()
-    assert (DOCS / "downstream.md").read_text() == write_page(results, "downstream.png")
-
-
-def test_how_soon_beside_what_learns_from_nothing_by_hand():
-    def learned(method, task, seed, last, *rates):
-        points = [{"env_steps": 1000 * step, "success_last": rate} for step, rate in enumerate(rates, 1)]
-        return result(method, task, seed, last, last, points)
-
-    page = write_page(
-        [
-            learned("ours", "wall", 0, 0.9, 0.0, 0.9, 0.9),  # 0.9 x 0.8, the mean of the seeds: 3,000 env steps
-            learned("ours", "wall", 1, 0.7, 0.1, 0.2, 0.3, 0.9, 0.7),  # 5,000
-            learned("scratch-monolithic", "wall", 0, 0.3, 0.1, 0.3, 0.3),
-            learned("scratch-monolithic-her", "wall", 0, 0.8, 0.1, 0.3, 0.5, 0.8, 0.8),  # 5,000
-            learned("ours", "box", 0, 0.9, 0.0, 0.9, 0.9),
-            learned("scratch-monolithic", "box", 0, 0.3, 0.1, 0.3, 0.3),  # never
-            learned("ours", "push", 0, 0.9, 0.0, 0.9, 0.9),  # nothing to compare with
-            learned("ours", "inair", 0, 0.9, 0.0, 0.8, 0.8),  # 0.81 is not held
-            learned("scratch-monolithic", "larger", 0, 0.3, 0.1, 0.3, 0.3),
-        ],
-        "picture.png",
-    )
-    lines = page.splitlines()
-    assert "| ours |  |  | 3 |  | 4 | 3 |" in lines
-    assert "| *best from scratch* |  |  |  |  | *5, scratch monolithic + HER (2)* | *> 2 (1)* |" in lines
-
-
-def test_how_soon_by_hand():
-    curve = [{"env_steps": step, "success_last": rate} for step, rate in [(1, 0.9), (2, 0.1), (3, 0.8), (4, 0.9)]]
-    assert steps_until(curve, 0.5) == 2  # of the two that are good enough on average, the last
-    assert steps_until(curve, 0.6) == 4
-    assert steps_until(curve, 0.9) is None
-    assert steps_until(curve, 0.0) is None
-
-
-def test_the_papers_rates():
-    """Shares of 16 episodes of three seeds, to two digits: all but one."""
-    of_48 = {round(num / 48, 2) for num in range(49)}
-    rates = [rate for row in PAPER.values() for rate in row.values()]
-    assert [rate for rate in rates if rate not in of_48] == [0.36]
-    assert [len(row) for row in PAPER.values()] == [6] * 9
-    assert dict(BEST) == {"larger": 0.94, "inair": 1.00, "push": 0.92, "sphere": 1.00, "wall": 0.98, "box": 0.98}

@@ -7,7 +7,6 @@ import torch
 
 from service.actors.evaluation import IdlePolicy, evaluate
 from service.downstream import playing
-from service.downstream.compose import parameters_digest
 from service.downstream.methods import find_method
 from service.downstream.playing import evaluate_on
 from service.downstream.worker import Callbacks, RunOptions, make_worlds, run_trial
@@ -16,6 +15,7 @@ from service.errors import TandemError
 from service.io.checkpoints import CheckpointStore
 from service.io.jsonl import read_jsonl
 from service.io.lock import is_locked
+from service.primitives.digest import parameters_digest
 from tests.downstream.trials import small_trial
 
 

@@ -4,11 +4,12 @@ import gymnasium
 import numpy as np
 import pytest
 
+import service.envs.gym.registration  # noqa: F401 - names the environments
 from service.config import WorldConfig
 from service.downstream.compose import ComposePrimitivesVector
-from service.downstream.inputs import learner_inputs
 from service.downstream.worlds import TaskWorlds
 from service.envs.gym.vector import TabletopVectorEnv
+from service.primitives.learned import learner_inputs
 
 CONFIG = WorldConfig(physics_step_s=0.005, num_substeps=8)
 NUM, LENGTH, SEED = 3, 6, 8

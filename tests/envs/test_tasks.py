@@ -12,15 +12,15 @@ from gymnasium.utils.env_checker import data_equivalence
 from gymnasium.vector import AutoresetMode
 from stable_baselines3.common.env_checker import check_env as check_stable_baselines
 
+import service.envs.gym.registration  # noqa: F401 - names the environments
 from service.config import WorldConfig
 from service.envs import scene
 from service.envs.batch import DISPLACEMENT_M, WorldBatch
-from service.envs.gym.registration import EPISODE_STEPS
 from service.envs.gym.tabletop import TabletopEnv
 from service.envs.gym.vector import TabletopVectorEnv
 from service.envs.rendering.renderer import RenderError, SceneRenderer
 from service.envs.sampling import draw_goals
-from service.envs.tasks import HARD_TASKS, TASKS, find_task
+from service.envs.tasks import EPISODE_STEPS, HARD_TASKS, TASKS, find_task
 from service.errors import TandemError
 from tests.envs.scripted_tasks import play_task
 

@@ -5,15 +5,14 @@ import torch
 from service.config import Config, MCPConfig, MLPConfig, PolicyConfig, RunConfig, WorldConfig
 from service.downstream.directory import TrainingDirectory
 from service.downstream.files import write_json
-from service.downstream.inputs import num_inputs
 from service.downstream.methods import provenance
-from service.downstream.policy import save_policy
 from service.downstream.settings import make_trial
 from service.envs.observations import layouts
 from service.io.checkpoints import CheckpointStore
 from service.io.run_directory import RunDirectory
 from service.policies.networks import export_parameters, make_bob
-from service.primitives.loading import load_bob
+from service.primitives.learned import num_inputs, save_policy
+from service.primitives.loading import load
 from service.primitives.publishing import publish
 from service.sac.networks import GaussianActor
 
@@ -52,7 +51,7 @@ def actor_of(residual):
 def publish_bob(registry, parameters=None):
     """Publish a Bob as made@1, and load him."""
     publish(registry, CONFIG, parameters or parameters_of(CONFIG), {})
-    return load_bob("made@1", registry.root)
+    return load("made@1", registry.root)
 
 
 def write_training(path, trained, method="ours-residual-her", task="push"):
@@ -60,7 +59,7 @@ def write_training(path, trained, method="ours-residual-her", task="push"):
     training, trial = TrainingDirectory(path), make_trial(task=task, method=method)
     tree = {"format_version": 1, "cell": trial.model_dump(mode="json"), **provenance(trained, method)}
     write_json(training.trial_file, tree)
-    save_policy(training.policy_file, actor_of("residual" in method), method, trained)
+    save_policy(training.policy_file, actor_of("residual" in method), method, tree["primitives"])
     return training
 
 

@@ -13,14 +13,14 @@ import pytest
 from typer.testing import CliRunner
 
 from service.cli.main import app
-from service.downstream.policy import LearnedPolicy
 from service.export.description import read_description
 from service.export.errors import ExportError, ParityError
-from service.export.exporting import export, find_source
+from service.export.exporting import export
 from service.export.measurements import measure
 from service.export.readme import example
 from service.primitives.bundled import BUNDLED
-from tests.downstream.skill_sets import CONFIG as SKILLS_CONFIG
+from service.primitives.loading import load
+from tests.downstream import skill_sets
 from tests.export.policies import (
     CONFIG,
     MONOLITHIC,
@@ -132,20 +132,17 @@ def test_an_orchestrator_with_its_primitives(run, registry, tmp_path, monkeypatc
     monkeypatch.chdir(tmp_path / "out")
     scope = {}
     exec(program, scope)
-    source = find_source(str(training.path), registry.root, "policy")
-    player = source.players()
-    assert isinstance(player, LearnedPolicy)
+    player = load(str(training.path), registry.root).player()
     np.testing.assert_allclose(scope["action"], player.act_deterministic(scope["observation"])[0], atol=1e-5)
 
 
 def test_what_does_not_compute_the_same_is_not_left_behind(registry, tmp_path):
     publish_bob(registry)
-    source = find_source("made@1", registry.root, "policy")
-    (network,) = source.networks
-    wrong = {**network.parameters, "gate.output.bias": network.parameters["gate.output.bias"] + 0.01}
-    other = dataclasses.replace(source, networks=(dataclasses.replace(network, parameters=wrong),))
+    trained = load("made@1", registry.root)
+    wrong = {**trained.parameters, "gate.output.bias": trained.parameters["gate.output.bias"] + 0.01}
+    other = dataclasses.replace(trained, parameters=wrong)
     with pytest.raises(ParityError) as error:
-        export(other, "numpy", tmp_path / "here" / "out", num_episodes=2)
+        export(other, "numpy", tmp_path / "here" / "out", part="policy", num_episodes=2)
     assert_one_line(error.value, "policy: its", "differs from the policy's by", "nothing was written")
     assert list((tmp_path / "here").iterdir()) == []
 
@@ -184,15 +181,21 @@ def test_a_monolithic_bob(run, tmp_path):
 
 def test_what_is_no_bob(run, registry, tmp_path):
     fields = {"spaces": {"kind": "skills"}, "normalisation": {}, "metrics": {}}
-    registry.publish("skills", parameters_of(CONFIG), config=SKILLS_CONFIG.model_dump(mode="json"), **fields)
-    fails(run("skills", "--format", "numpy", "--out", "out"), "skills@1 holds skills of lsd, not primitives")
+    registry.publish("skills", skill_sets.parameters(), config=skill_sets.CONFIG.model_dump(mode="json"), **fields)
+    fails(
+        run("skills", "--format", "numpy", "--out", "out"),
+        "a set of skills of lsd; tandem export needs",
+    )
     broken = parameters_of(CONFIG)
     broken["gate.output.bias"][0] = np.nan
     publish_bob_of = {"spaces": SEEN.spaces, "normalisation": {}, "metrics": {}}
     registry.publish("made", broken, config=CONFIG.model_dump(mode="json"), **publish_bob_of)
     fails(run("made@2", "--format", "numpy", "--out", "out"), "made@2", "'gate.output.bias'", "is not finite")
     fails(run("nobody", "--format", "numpy", "--out", "out"), "no 'nobody'")
-    fails(run("made", "--format", "numpy", "--primitives", "made", "--out", "out"), "made is no orchestrator")
+    fails(
+        run("made@1", "--format", "numpy", "--primitives", "made@1", "--out", "out"),
+        "made@1 acts with no others",
+    )
     assert not (tmp_path / "out").exists()
 
 
@@ -220,7 +223,7 @@ def test_a_description_that_is_none(tmp_path):
 
 def test_the_champion_tolerates_no_late_observation():
     """As was found with a throw-away bridge: 98 % fall to 64 when positions are 40 ms late."""
-    measured, _ = measure(find_source("panda-cube@champion", BUNDLED, "policy").episodes(40))
+    measured, _ = measure(load("panda-cube@champion", BUNDLED), 40)
     on_time, one, two = (late.success_last for late in measured.late_observations)
     assert on_time > 0.9
     assert one < on_time - 0.1

@@ -4,10 +4,12 @@ import numpy as np
 import pytest
 
 from service.actors.evaluation import IdlePolicy
+from service.config import RunConfig
 from service.envs.observations import ACTION, layouts
-from service.export.measurements import Episodes, LateObservations, Measured, measure, measure_response
+from service.export.measurements import LateObservations, Measured, measure, measure_response
+from service.primitives.loading import Trained
 from service.world_config import ObservedConfig
-from tests.export.policies import SEEN, WORLD
+from tests.export.policies import CONFIG, SEEN, WORLD
 
 
 class Upwards:
@@ -15,7 +17,9 @@ class Upwards:
 
     def __init__(self, seen):
         self._seen = seen
-        seen.append([])
+
+    def begin(self):
+        self._seen.append([])
 
     def act_deterministic(self, observation):
         self._seen[-1].append(observation.copy())
@@ -24,13 +28,14 @@ class Upwards:
         return action
 
 
-def episodes(new_player):
-    return Episodes(WORLD, "table", 3, 5, 0.05, new_player)
+def trained(policy, world=WORLD, num_steps=5):
+    config = CONFIG.model_copy(update={"world": world, "run": RunConfig(evaluation_steps=num_steps)})
+    return Trained("made", "primitives", config, policy, {})
 
 
 def test_late_positions_and_the_speed_of_the_tip():
     seen = []
-    measured, observations = measure(episodes(lambda: Upwards(seen)))
+    measured, observations = measure(trained(Upwards(seen)), 3)
     assert observations.shape == (6, 3, SEEN.bob.size)
     on_time = np.array(seen[0])
     np.testing.assert_array_equal(on_time, observations[:-1])
@@ -53,13 +58,13 @@ def test_late_positions_and_the_speed_of_the_tip():
 
 def test_a_policy_that_observes_its_delay_is_told_it():
     world, seen = WORLD.model_copy(update={"observed": ObservedConfig(num_commands=1, delay=True)}), []
-    measure(Episodes(world, "table", 2, 3, 0.05, lambda: Upwards(seen)))
+    measure(trained(Upwards(seen), world, 3), 2)
     delay = layouts(world).bob["delay"]
     assert [np.unique(np.array(each)[:, :, delay]).tolist() for each in seen] == [[0.0], [1.0], [2.0]]
 
 
 def test_who_stands_still():
-    measured, _ = measure(episodes(IdlePolicy))
+    measured, _ = measure(trained(IdlePolicy()), 3)
     assert measured.motion.tip_speed_m_s.max < 0.01
     assert measured.motion.outside_workspace == 0.0
     assert measured.tolerated_late_steps == 2

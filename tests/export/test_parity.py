@@ -1,5 +1,7 @@
 """What is written computes what the evaluator's policy does, in every format."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -9,20 +11,27 @@ from service.export.formats import FORMATS, find_format
 from service.export.networks import network_of_orchestrator, networks_of_bob, networks_of_primitives
 from service.export.parity import check_parity, make_inputs
 from service.policies.numpy_policy import numpy_bob
-from service.primitives.loading import TrainedBob
+from service.primitives.learned import LearnedPolicy
+from service.primitives.loading import Trained
 from tests.export.policies import CONFIG, MONOLITHIC, SEEN, actor_of, parameters_of
+
+
+def learned(bob, method):
+    actor = actor_of(residual="residual" in method)
+    policy = LearnedPolicy(actor, bob.primitives, SEEN)
+    return Trained("made", "orchestrator", CONFIG, policy, actor, task="push", method=method, trained=bob)
 
 
 def networks():
     parameters = parameters_of(CONFIG)
-    bob = TrainedBob("made", numpy_bob(parameters), parameters, CONFIG)
+    bob = Trained("made", "primitives", CONFIG, numpy_bob(parameters), parameters)
     other = parameters_of(MONOLITHIC)
-    alone = TrainedBob("made", numpy_bob(other), other, MONOLITHIC)
+    alone = Trained("made", "primitives", MONOLITHIC, numpy_bob(other), other)
     return {
         "bob": networks_of_bob(bob)[0],
         "primitive": networks_of_primitives(bob)[1],
-        "orchestrator": network_of_orchestrator(bob, "ours-residual-her", actor_of(residual=True)),
-        "orchestrator of weights alone": network_of_orchestrator(bob, "ours", actor_of(residual=False)),
+        "orchestrator": network_of_orchestrator(learned(bob, "ours-residual-her")),
+        "orchestrator of weights alone": network_of_orchestrator(learned(bob, "ours")),
         "monolithic": networks_of_bob(alone)[0],
     }
 
@@ -85,6 +94,18 @@ def test_what_differs_is_found(inputs, tmp_path):
             check_parity(network, changed(name, change), inputs)
     with pytest.raises(ParityError, match="its action differs"):  # one row alone is tried, too
         check_parity(network, changed("action", lambda values: values + (len(values) == 1)), inputs)
+
+
+def test_orchestrators_exported_before_0_3_load(inputs, tmp_path):
+    """Their layers have the numbers 0, 1, 2: those of the ReLUs in between were left out."""
+    network = networks()["orchestrator"]
+    numbers = {f"actor.layers.{2 * place}.": f"actor.layers.{place}." for place in (1, 2)}
+    parameters = {
+        next((new + name.removeprefix(old) for old, new in numbers.items() if name.startswith(old)), name): array
+        for name, array in network.parameters.items()
+    }
+    assert parameters.keys() - network.parameters.keys() == {"actor.layers.1.weight", "actor.layers.1.bias"}
+    check_parity(network, written(replace(network, parameters=parameters), "numpy", tmp_path), inputs)
 
 
 def test_arrays_of_other_sizes(tmp_path):

@@ -147,18 +147,6 @@ def test_bins_of_distance_and_height_by_hand() -> None:
     assert (NUM_DISTANCE_BINS, NUM_TASK_BINS) == (5, 20)
 
 
-def test_state_of_an_older_version_loads() -> None:
-    old = make()
-    record(old, [(0.1, 0.06, 0.025)], [True])
-    counted = {f"heights/{name}": np.ones(4) for name in ("tries", "successes", "num_tries")}
-    grid = make()
-    state = old.state() | counted
-    del state["proposals"]  # not counted by then
-    grid.load_state(state)
-    assert grid.num_cells_seen == 1
-    np.testing.assert_array_equal(grid.counts.tries, old.counts.tries)
-
-
 def test_state_of_another_grid_is_refused() -> None:
     state = make().state()
     with pytest.raises(ConfigError, match=r"'seen' is bool \(343,\), this configuration needs bool \(64,\)"):

@@ -254,13 +254,6 @@ def test_no_drawn_goal_in_the_air_where_the_gripper_is_blocked() -> None:
     assert (choice.goal[blocked, 2] <= 0.025 + 0.05).all()
 
 
-def test_a_state_of_before_goals_had_sources(make_records: MakeRecords) -> None:
-    state = filled(make_records).snapshot().state()
-    del state["cell_learnability"]
-    fresh = TaskGenerator(config(), FREE).snapshot()
-    np.testing.assert_array_equal(fresh.with_state(state).cell_learnability, 0.25)
-
-
 def test_choice_does_not_alias_its_inputs(make_records: MakeRecords) -> None:
     generator = filled(make_records, replay_fraction=1.0)
     start_state, position = np.ones((1, STATE_SIZE)), np.zeros((1, 3))

@@ -1,48 +1,55 @@
 """The number of each process that ever ran a run: claimed once, and only the highest counts."""
 
-from concurrent.futures import ThreadPoolExecutor
-
 import pytest
 
+from service.io import epoch
 from service.io.checkpoints import CheckpointStore
-from service.io.epoch import Epoch, newest_epoch
+from service.io.epoch import claim_epoch, newest_epoch
 from service.io.errors import RunTakenError, StorageError
 from service.io.jsonl import JsonlWriter, read_jsonl
-from tests.runtime.runs import assert_one_line
+from service.io.run_directory import RunDirectory
+from tests.runtime.runs import assert_one_line, play, tiny_config
 
 
-def test_each_number_is_claimed_once(tmp_path):
-    with ThreadPoolExecutor(8) as pool:
-        numbers = list(pool.map(lambda _: Epoch(tmp_path).number, range(40)))
-    assert len(set(numbers)) == 40
-    assert newest_epoch(tmp_path) == max(numbers)
-    assert Epoch(tmp_path).number == max(numbers) + 1
-    assert len(list((tmp_path / "epochs").iterdir())) == 10
+def test_each_number_is_claimed_once(tmp_path, monkeypatch):
+    """Another process takes the number that this one has just seen to be free."""
+
+    def look(directory):
+        monkeypatch.undo()
+        seen = newest_epoch(directory)
+        assert claim_epoch(directory) == 1
+        return seen
+
+    monkeypatch.setattr(epoch, "newest_epoch", look)
+    assert claim_epoch(tmp_path) == 2
+    assert (newest_epoch(tmp_path), claim_epoch(tmp_path)) == (2, 3)
 
 
 def test_a_number_beyond_eight_digits(tmp_path):
     """It once made a run that was resumed hang for ever."""
     (tmp_path / "epochs").mkdir()
     (tmp_path / "epochs" / "99999999").touch()
-    epoch = Epoch(tmp_path)
-    assert (epoch.number, Epoch(tmp_path).number) == (10**8, 10**8 + 1)
-    CheckpointStore(tmp_path, keep=1, epoch=epoch.number).save(20, {}, {})
+    number = claim_epoch(tmp_path)
+    assert (number, claim_epoch(tmp_path)) == (10**8, 10**8 + 1)
+    CheckpointStore(tmp_path, keep=1, epoch=number).save(20, {}, {})
     CheckpointStore(tmp_path, keep=1).save(30, {}, {})
     assert CheckpointStore(tmp_path, keep=1).load_latest().step == 20
     (tmp_path / "epochs" / ("9" * 255)).touch()
     with pytest.raises(StorageError) as error:
-        Epoch(tmp_path)
+        claim_epoch(tmp_path)
     assert_one_line(error.value, tmp_path, "File name too long")
 
 
 def test_only_the_highest_may_write(tmp_path):
-    first = Epoch(tmp_path)
-    first.check()
-    second = Epoch(tmp_path)
-    second.check()
+    play(tmp_path / "cube", tiny_config(total_env_steps=200))
+    first = RunDirectory(tmp_path / "cube")
+    first.claim(resume=True)
+    first.check_owner()
+    claim_epoch(tmp_path / "cube")  # as another machine may where its file system has no locks
     with pytest.raises(RunTakenError) as error:
-        first.check()
+        first.check_owner()
     assert_one_line(error.value, tmp_path, "taken over by another process", "stops")
+    first.close()
 
 
 def test_what_a_stale_process_saves_is_not_read_and_deletes_nothing(tmp_path):
@@ -68,7 +75,7 @@ def test_what_a_stale_process_records_is_not_read(tmp_path):
     stale.append({"iteration": 1})
     stale.append({"iteration": 2})
     fresh = JsonlWriter(path)
-    fresh.truncate_after(1)
+    fresh.cut_after(1)
     fresh.append({"iteration": 2, "by": "fresh"})
     with pytest.raises(StorageError, match="another process has put a file of its own in its place"):
         stale.append({"iteration": 3})

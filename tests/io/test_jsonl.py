@@ -1,10 +1,10 @@
-import json
+import zlib
 
 import numpy as np
 import pytest
 
 from service.errors import TandemError
-from service.io.jsonl import JsonlWriter, read_jsonl
+from service.io.jsonl import Extent, JsonlWriter, read_jsonl
 
 
 @pytest.fixture
@@ -60,38 +60,52 @@ def test_a_missing_file_is_one_line_for_the_user(path):
     assert "\n" not in str(caught.value)
 
 
-def test_truncate_keeps_the_bytes_up_to_the_iteration_and_drops_the_rest(path):
-    _write(path, b'{"iteration": 0}\n{"iteration":   1, "x": 1e0}\n{"iteration": 2}\n{"iterat')
+def test_the_extent_is_of_what_was_appended_or_kept(path):
     writer = JsonlWriter(path)
-    writer.truncate_after(1)
-    assert path.read_bytes() == b'{"iteration": 0}\n{"iteration":   1, "x": 1e0}\n'
-    writer.append({"iteration": 2})
-    assert [record["iteration"] for record in read_jsonl(path)] == [0, 1, 2]
+    assert writer.extent == (0, 0)
+    for iteration in range(3):
+        writer.append({"iteration": iteration})
+    assert writer.extent == (len(path.read_bytes()), zlib.crc32(path.read_bytes()))
+    writer.cut(34)
+    writer.append({"iteration": 2, "x": 1})
+    assert path.read_bytes() == b'{"iteration": 0}\n{"iteration": 1}\n{"iteration": 2, "x": 1}\n'
+    assert writer.extent == Extent.of(path.read_bytes())
     assert list(path.parent.iterdir()) == [path]
 
 
-def test_truncate_ends_a_kept_line_that_lost_its_line_end(path):
-    _write(path, b'{"iteration": 0}\n{"iteration": 1}')
-    JsonlWriter(path).truncate_after(5)
-    assert path.read_bytes() == b'{"iteration": 0}\n{"iteration": 1}\n'
-
-
-def test_truncate_before_the_first_empties_and_a_missing_file_stays_missing(path):
+def test_damage_is_found_in_what_the_extent_knows_alone(path):
+    _write(path, b'{"iteration": 0}\n{"iteration": 1}\n')
     writer = JsonlWriter(path)
-    writer.truncate_after(0)
+    for known in (0, 17, 34):
+        assert writer.damage(Extent.of(path.read_bytes()[:known])) is None
+    assert writer.damage(Extent(34, 7)) == "has other first 34 bytes than were written"
+    assert writer.damage(Extent(1234, 7)) == "has 34 bytes, and had 1,234 when the checkpoint was saved"
+    path.unlink()
+    assert "has 0 bytes" in writer.damage(Extent(34, 7))
+    assert writer.damage(Extent()) is None
+
+
+def test_a_cut_of_a_missing_file_leaves_it_missing(path):
+    writer = JsonlWriter(path)
+    writer.cut(0)
+    writer.cut_after(5)
     assert not path.exists()
-    writer.append({"iteration": 0})
-    writer.truncate_after(-1)
-    assert path.read_bytes() == b""
 
 
-@pytest.mark.parametrize("record", [{}, {"iteration": None}, {"iteration": "1"}])
-def test_truncate_leaves_a_file_it_cannot_judge_as_it_was(path, record):
-    _write(path, b'{"iteration": 0}\n' + json.dumps(record).encode() + b"\n")
+def test_a_cut_by_iterations_keeps_the_bytes_of_records_in_their_order(path, caplog):
+    _write(path, b'{"iteration":   1, "x": 1e0}\n{"iteration": 2}\n{"iterat')
+    JsonlWriter(path).cut_after(1)
+    assert path.read_bytes() == b'{"iteration":   1, "x": 1e0}\n'
+    assert caplog.messages == []
+    strange = b'[1]\n\xff\n{}\n{"iteration": "1"}\n{"iteration": null}\n{"iteration": 0}\n'
+    _write(path, b'{"iteration": 1}\n' + strange + b'{"iteration": 3}\n{"iteration": 4}\n')
     before = path.read_bytes()
-    with pytest.raises(TandemError, match="iteration"):
-        JsonlWriter(path).truncate_after(0)
+    with pytest.raises(TandemError, match=r"metrics\.jsonl line 2: b'\[1\]' is no record"):
+        JsonlWriter(path).cut_after(3)
     assert path.read_bytes() == before
+    JsonlWriter(path).cut_after(3, accept_damage=True)
+    assert path.read_bytes() == b'{"iteration": 1}\n{"iteration": 3}\n'
+    assert caplog.messages == [f"{path}: left out 6 lines that are no records in their order"]
 
 
 def test_a_file_that_cannot_be_written_is_one_line_for_the_user(tmp_path):

@@ -5,7 +5,8 @@ import pytest
 
 from service.config import load_config
 from service.errors import ConfigError, TandemError
-from service.io.run_directory import MAX_DIVERGED_FILES, RunDirectory
+from service.io.jsonl import Extent
+from service.io.run_directory import MAX_DIVERGED_FILES, Resumption, RunDirectory
 from tests.runtime.runs import assert_one_line, no_room_above, read_lines, tiny_config
 
 
@@ -21,6 +22,14 @@ def directory(tmp_path):
 def record(directory, *iterations):
     for iteration in iterations:
         directory.record({"iteration": iteration, "env_steps": 100 * iteration, "bob/success_rate": iteration / 8})
+
+
+def resumption(directory, iteration):
+    """After so many lines of each file."""
+    files = directory.metrics_file, directory.goals_file
+    lines = {path.name: path.read_bytes().splitlines(True) if path.exists() else [] for path in files}
+    extents = {name: Extent.of(b"".join(each[:iteration])) for name, each in lines.items()}
+    return Resumption(iteration, 100 * iteration, "0" * 32, extents, {})
 
 
 def read_events(path):
@@ -104,7 +113,7 @@ def test_a_resume_cuts_both_files_and_goes_on(directory):
         directory.record_goals(iteration, 100 * iteration, np.zeros((1, 7)))
     directory.close()
     resumed = RunDirectory(directory.path)
-    resumed.start(tiny_config(total_env_steps=900), after_iteration=1)
+    resumed.start(tiny_config(total_env_steps=900), resumption(directory, 1))
     record(resumed, 2)
     resumed.close()
     assert [row["iteration"] for row in read_lines(resumed.metrics_file)] == [1, 2]
@@ -190,7 +199,7 @@ def test_closing_on_a_full_disk_does_not_hide_why_the_run_ended(directory, caplo
         directory.close()
     assert_one_line(caplog.messages[0], "lost", directory.metrics_file)
     resumed = RunDirectory(directory.path)
-    resumed.start(tiny_config(), after_iteration=1, after_env_steps=100)
+    resumed.start(tiny_config(), resumption(directory, 0))
     record(resumed, 2)
     resumed.close()
     assert [row["iteration"] for row in read_lines(directory.metrics_file)] == [2]
@@ -199,4 +208,4 @@ def test_closing_on_a_full_disk_does_not_hide_why_the_run_ended(directory, caplo
 def test_a_resume_that_cuts_nothing_needs_no_room_for_the_records(directory):
     record(directory, 1)
     with no_room_above(0):
-        directory._metrics.truncate_after(1)
+        directory._metrics.cut(directory.metrics_file.stat().st_size)

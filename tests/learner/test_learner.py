@@ -12,7 +12,7 @@ from service.learner.player import LearnerError
 from tests.learner.rollouts import make_config, make_rollout, nobody_learns
 
 IMITATION = {"weight": 0.5, "num_iterations": 2, "min_reward": 0.5}
-HISTORY = {"abc": {"num_iterations": 2}, "bob": {"mirror": "both"}, "self_imitation": IMITATION}
+HISTORY = {"abc": {"num_iterations": 2}, "bob": {"mirror": "random"}, "self_imitation": IMITATION}
 
 BOTH_PLAYERS = ("policy_loss", "value_loss", "entropy", "kl", "clip_fraction", "learning_rate")
 BOTH_PLAYERS += ("explained_variance", "grad_norm", "policy_steps")
@@ -195,32 +195,15 @@ def test_a_loaded_generator_continues(num_halves):
 
 
 def test_names_in_a_state_are_those_of_checkpoints_that_are_out_there():
-    """A run directory of version 0.1.0 must still load, so none of these may be renamed."""
-    learner = Learner(make_config(bob_window=2))
+    """Runs of this version go on, so none of these may be renamed before its next one."""
+    learner = Learner(make_config())
     updated(learner, 0)
     parts = {"/".join(name.split("/")[:2]) for name in learner.state()}
     of_player = "adam", "learning_rate", "policy", "value"
     players = {f"{player}/{part}" for player in ("alice", "bob") for part in of_player}
-    kept = {f"demonstrations/{name}" for name in ("action", "num_steps", "observation")} | {"window/0000"}
-    average = {f"steady_bob/{name}" for name in learner.weights().bob}
+    kept = {f"demonstrations/{name}" for name in ("action", "num_steps", "observation")}
+    average = {f"bob_ema/{name}" for name in learner.weights().bob}
     assert parts == players | kept | average | {"version", "rng", "counted"}
-
-
-def test_bob_learns_from_a_window_of_iterations():
-    config = make_config(bob_window=2)
-    learner, resumed = Learner(config), Learner(config)
-    played = []
-    for sequence in range(3):
-        rollout = make_rollout(learner, sequence)
-        played.append(int((rollout.bob.active & rollout.bob.learn).sum()))
-        for each in (learner, resumed) if sequence == 2 else (learner,):
-            assert each.ingest(rollout)
-            assert each.update()["learner/num_bob_samples"] == sum(played[-2:])
-        if sequence == 1:
-            state = learner.state()
-            assert sum(name.startswith("window/") and name.endswith("/action") for name in state) == 1
-            resumed.load_state(state)
-    assert_same_state(learner, resumed)
 
 
 def test_a_state_is_a_copy():
@@ -250,16 +233,6 @@ def test_a_state_with_a_missing_array_is_refused(name):
     damaged = {key: array for key, array in state.items() if key != name}
     with pytest.raises(LearnerError, match=name):
         learner.load_state(damaged)
-    assert save(learner.state()) == before
-
-
-def test_a_window_with_a_missing_array_is_refused():
-    learner = Learner(make_config(bob_window=2))
-    updated(learner, 0)
-    state = learner.state()
-    before = save(state)
-    with pytest.raises(LearnerError, match=r"window: .*'action'; take an undamaged checkpoint"):
-        learner.load_state({key: array for key, array in state.items() if not key.endswith("0000/action")})
     assert save(learner.state()) == before
 
 
@@ -375,30 +348,6 @@ def test_the_weight_of_cloning_is_that_of_the_configuration():
     assert log_ratios[1] > 1.5 * log_ratios[0] > 0.0
 
 
-def test_each_player_is_mirrored_by_itself():
-    plain = Learner(make_config())
-    updated(plain, 0)
-    for player, other in (("alice", "bob"), ("bob", "alice")):
-        learner = Learner(make_config(**{player: {"mirror": "both"}}))
-        updated(learner, 0)
-        weights, expected = ({"alice": each.alice, "bob": each.bob} for each in (learner.weights(), plain.weights()))
-        assert any(not np.array_equal(each, expected[player][name]) for name, each in weights[player].items())
-        if player == "bob":  # Bob comes second, with random numbers that her minibatches have moved
-            assert all(np.array_equal(each, expected[other][name]) for name, each in weights[other].items())
-
-
-def test_mirroring_doubles_what_bob_learns_from():
-    learner = Learner(make_config(bob={"mirror": "both"}))
-    rollout = make_rollout(learner, 0)
-    rows = learner._to_clone("demonstrations", [rollout.demonstrations]).find(np.arange(24))
-    np.testing.assert_array_equal(rows.observation[12:], BOB.mirror(rollout.demonstrations.observation))
-    np.testing.assert_array_equal(rows.action[12:], ACTION.mirror(rollout.demonstrations.action))
-    metrics, plain = updated(learner, 0), updated(Learner(make_config()), 0)
-    assert metrics["learner/bob_policy_steps"] == 2 * plain["learner/bob_policy_steps"]
-    for name in ("num_bob_samples", "num_demonstrations", "num_alice_samples"):
-        assert metrics[f"learner/{name}"] == plain[f"learner/{name}"]
-
-
 def test_a_broken_turn_leaves_the_player_as_it_was():
     learner = Learner(make_config(bob={"num_epochs": 3}))
     rollout = make_rollout(learner, 0)
@@ -424,3 +373,17 @@ def test_cuda_that_is_not_there_is_the_users_mistake():
 def test_the_device_is_what_there_is(monkeypatch, found, expected):
     monkeypatch.setattr("torch.cuda.is_available", lambda: found)
     assert torch_device("auto") == torch.device(expected)
+
+
+def test_bob_is_mirrored_alone():
+    plain, learner = Learner(make_config()), Learner(make_config(bob={"mirror": "random"}))
+    rollout = make_rollout(learner, 0)
+    rows = learner._to_clone("demonstrations", [rollout.demonstrations]).take(np.arange(24))
+    np.testing.assert_array_equal(rows.observation[12:], BOB.mirror(rollout.demonstrations.observation))
+    np.testing.assert_array_equal(rows.action[12:], ACTION.mirror(rollout.demonstrations.action))
+    metrics, expected = updated(learner, 0), updated(plain, 0)
+    for name in ("num_bob_samples", "num_demonstrations", "num_alice_samples"):
+        assert metrics[f"learner/{name}"] == expected[f"learner/{name}"]
+    found, before = learner.weights(), plain.weights()
+    assert all(np.array_equal(each, before.alice[name]) for name, each in found.alice.items())
+    assert any(not np.array_equal(each, before.bob[name]) for name, each in found.bob.items())

@@ -11,7 +11,7 @@ LN2 = math.log(2.0)
 def surrogate(log_ratios, advantages, clip=0.2, dual_clip=3.0):
     log_prob = torch.tensor(log_ratios, requires_grad=True)
     loss, clip_fraction = ppo.clipped_surrogate(
-        log_prob, torch.zeros(len(log_ratios)), torch.tensor(advantages), clip, dual_clip, len(log_ratios)
+        log_prob, torch.zeros(len(log_ratios)), torch.tensor(advantages), clip, dual_clip
     )
     loss.backward()
     return loss.item(), clip_fraction.item(), log_prob.grad.tolist()
@@ -49,7 +49,7 @@ def test_extreme_log_ratios_stay_finite(log_ratio, advantage):
     assert math.isfinite(loss)
     assert all(math.isfinite(gradient) for gradient in gradients)
     log_prob = torch.tensor([log_ratio], requires_grad=True)
-    cloning = ppo.cloning_loss(log_prob, torch.zeros(1), 0.2, 1)
+    cloning = ppo.cloning_loss(log_prob, torch.zeros(1), 0.2)
     cloning.backward()
     assert torch.isfinite(cloning)
     assert torch.isfinite(log_prob.grad).all()
@@ -57,7 +57,7 @@ def test_extreme_log_ratios_stay_finite(log_ratio, advantage):
 
 def test_cloning_clips_only_what_became_likelier():
     log_prob = torch.tensor([math.log(1.1), math.log(1.3)], requires_grad=True)
-    loss = ppo.cloning_loss(log_prob, torch.zeros(2), clip=0.2, num=2)
+    loss = ppo.cloning_loss(log_prob, torch.zeros(2), clip=0.2)
     loss.backward()
     assert loss.item() == pytest.approx(-(1.1 + 1.2) / 2)
     assert log_prob.grad.tolist() == pytest.approx([-1.1 / 2, 0.0])
@@ -65,9 +65,9 @@ def test_cloning_clips_only_what_became_likelier():
 
 def test_cloning_pulls_unlikely_actions():
     log_prob = torch.tensor([-LN2], requires_grad=True)
-    ppo.cloning_loss(log_prob, torch.zeros(1), clip=0.2, num=1).backward()
+    ppo.cloning_loss(log_prob, torch.zeros(1), clip=0.2).backward()
     assert log_prob.grad.tolist() == pytest.approx([-0.5])
 
 
 def test_value_loss_is_half_the_mean_squared_error():
-    assert ppo.value_loss(torch.tensor([1.0, 2.0]), torch.tensor([0.0, 4.0]), 2).item() == pytest.approx(1.25)
+    assert ppo.value_loss(torch.tensor([1.0, 2.0]), torch.tensor([0.0, 4.0])).item() == pytest.approx(1.25)

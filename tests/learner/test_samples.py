@@ -7,16 +7,12 @@ import torch
 from torch import nn
 
 from service.config import ABCConfig, PPOConfig
-from service.envs.observations import ACTION, BOB, BOB_VALUE, FULL, PAPER
+from service.envs.observations import ACTION, BOB, BOB_VALUE, PAPER
 from service.learner.player import Player
 from service.learner.ppo import advantages, collect
 from service.learner.samples import (
     DemonstrationRows,
-    alices,
-    augment_by_symmetry,
-    bobs,
     draw_epoch,
-    mirror,
     reflect_at_random,
 )
 from tests.learner.rollouts import make_turns, nobody_learns
@@ -51,7 +47,7 @@ PLAYER = Player(Policy(), Estimate(), CONFIG, CPU)
 def test_only_active_steps_of_learnable_worlds_become_samples():
     learn = np.array([True, False] * 4)
     turns = make_bob_turns(learn=learn)
-    samples = collect([[turns]], turns, PLAYER)
+    samples = collect([turns], PLAYER)
     kept = turns.active & learn
     assert len(samples) == kept.sum() > 0
     order = np.argwhere(kept)
@@ -65,7 +61,7 @@ def test_only_active_steps_of_learnable_worlds_become_samples():
 
 def test_targets_are_advantages_plus_values():
     turns = make_bob_turns()
-    samples = collect([[turns]], turns, PLAYER)
+    samples = collect([turns], PLAYER)
     names = "reward", "active", "terminated", "value_observation", "final_value_observation"
     reward, active, terminated, *observed = (torch.from_numpy(getattr(turns, name)) for name in names)
     values, final = (PLAYER.value(each.flatten(0, -2)) for each in observed)
@@ -79,70 +75,38 @@ def test_targets_are_advantages_plus_values():
 
 def test_several_rollouts_are_joined_along_worlds():
     first, second = make_bob_turns(0), make_bob_turns(1)
-    joined = collect([[first], [second]], first, PLAYER)
+    joined = collect([first, second], PLAYER)
     assert len(joined) == first.active.sum() + second.active.sum()
-    apart = [collect([[turns]], turns, PLAYER).value_target for turns in (first, second)]
+    apart = [collect([turns], PLAYER).value_target for turns in (first, second)]
     np.testing.assert_allclose(np.sort(joined.value_target), np.sort(np.concatenate(apart)), atol=1e-6)
 
 
 def test_no_samples_at_all():
     idle = make_bob_turns(active=np.zeros_like(make_bob_turns().active))
-    assert collect([[idle, nobody_learns(make_bob_turns())]], idle, PLAYER) is None
+    assert collect([idle, nobody_learns(make_bob_turns())], PLAYER) is None
 
 
 def test_equal_advantages_become_zero():
     turns = make_bob_turns()
     constant = replace(turns, reward=np.full_like(turns.reward, 0.1), terminated=turns.active)
-    samples = collect([[constant]], constant, Player(Policy(), Zero(), CONFIG, CPU))
+    samples = collect([constant], Player(Policy(), Zero(), CONFIG, CPU))
     np.testing.assert_array_equal(samples.advantage, np.zeros(len(samples)))
 
 
-def test_samples_are_augmented_by_their_reflections():
-    samples = collect([[make_bob_turns()]], make_bob_turns(), PLAYER)
-    mirrors = BOB.mirror, BOB_VALUE.mirror, ACTION.mirror
-    doubled = augment_by_symmetry(samples, bobs(PAPER), PLAYER)
-    num = len(samples)
-    assert len(doubled) == 2 * num
-    for before, after in zip(samples.tensors(), doubled.tensors(), strict=True):
-        assert torch.equal(after[:num], before)
-    names = "observation", "value_observation", "action"
-    for name, each in zip(names, mirrors, strict=True):
-        np.testing.assert_array_equal(getattr(doubled, name)[num:], each(getattr(samples, name).numpy()))
-    for name in ("advantage", "value_target", "value", "behaviour_log_prob"):
-        assert torch.equal(getattr(doubled, name)[num:], getattr(samples, name))
-    # The policy is asked at the reflected observation, whose y changes its sign.
-    np.testing.assert_array_equal(doubled.proximal_mean[num:, 0], -samples.observation[:, 1])
-
-
 def test_half_of_the_samples_are_reflected_at_random():
-    samples = collect([[make_bob_turns()]], make_bob_turns(), PLAYER)
-    mixed = reflect_at_random(samples, bobs(PAPER), PLAYER, np.random.default_rng(0))
-    reflected = np.random.default_rng(0).random(len(samples)) < 0.5
-    assert 0.3 < reflected.mean() < 0.7
-    doubled = augment_by_symmetry(samples, bobs(PAPER), PLAYER)
-    for column, both in zip(mixed.tensors(), doubled.tensors(), strict=True):
-        original, reflection = both.numpy().reshape(2, len(samples), -1)
-        expected = np.where(reflected[:, None], reflection, original)
-        np.testing.assert_array_equal(column.numpy().reshape(expected.shape), expected)
-
-
-@pytest.mark.parametrize("how", ["none", "both", "random"])
-def test_a_player_is_mirrored_as_configured(how):
-    turns = make_turns(np.random.default_rng(0), FULL.size, FULL.size)
-    alice = Player(Policy(), Estimate(), PPOConfig(mirror=how), CPU)
-    samples = collect([[turns]], turns, alice)
-    found = mirror(samples, alices(PAPER), alice, np.random.default_rng(0))
-    num = len(samples)
-    reflected = FULL.mirror(samples.observation.numpy())
-    if how == "none":
-        assert found is samples
-    elif how == "both":
-        np.testing.assert_array_equal(found.observation[num:], reflected)
-        np.testing.assert_array_equal(found.value_observation[num:], FULL.mirror(samples.value_observation.numpy()))
-    else:
-        chosen = np.random.default_rng(0).random(num) < 0.5
-        np.testing.assert_array_equal(found.observation[chosen], reflected[chosen])
-        assert torch.equal(found.observation[~chosen], samples.observation[~chosen])
+    samples = collect([make_bob_turns()], PLAYER)
+    mixed = reflect_at_random(samples, PAPER, PLAYER, np.random.default_rng(0))
+    chosen = np.random.default_rng(0).random(len(samples)) < 0.5
+    assert 0.3 < chosen.mean() < 0.7
+    for before, after in zip(samples.columns(), mixed.columns(), strict=True):
+        assert torch.equal(after[~chosen], before[~chosen])
+    mirrors = {"observation": BOB.mirror, "value_observation": BOB_VALUE.mirror, "action": ACTION.mirror}
+    for name, each in mirrors.items():
+        np.testing.assert_array_equal(getattr(mixed, name)[chosen], each(getattr(samples, name)[chosen].numpy()))
+    for name in ("advantage", "value_target", "value", "behaviour_log_prob"):
+        assert torch.equal(getattr(mixed, name), getattr(samples, name))
+    # The policy is asked at the reflected observation, whose y changes its sign.
+    np.testing.assert_array_equal(mixed.proximal_mean[chosen, 0], -samples.observation[chosen, 1])
 
 
 def places(epoch, part):
@@ -190,7 +154,7 @@ def test_only_demonstrations_that_are_drawn_are_reflected_and_asked_for():
     rng = np.random.default_rng(0)
     observation, action = (rng.standard_normal((5, size)).astype(np.float32) for size in (BOB.size, ACTION.size))
     rows = DemonstrationRows(torch.from_numpy(observation), torch.from_numpy(action), mirror=PAPER.bob.mirror)
-    assert rows.num_total == 10
+    assert len(rows) == 10
     cloning = rows.to_clone(np.array([1, 4, 6]), PLAYER)  # 6 is the reflection of row 1
     assert len(cloning) == 3
     np.testing.assert_array_equal(cloning.observation[:2], observation[[1, 4]])
@@ -198,6 +162,5 @@ def test_only_demonstrations_that_are_drawn_are_reflected_and_asked_for():
     np.testing.assert_array_equal(cloning.action[2], ACTION.mirror(action[1]))
     expected = PLAYER.log_prob(cloning.observation, cloning.action)
     np.testing.assert_array_equal(cloning.proximal_log_prob, expected)
-    minibatch = cloning.find(np.array([6, 1, 6]))
+    minibatch = cloning.take(np.array([2, 0, 2]))
     assert torch.equal(minibatch.action, cloning.action[[2, 0, 2]])
-    assert minibatch.num_total == 3

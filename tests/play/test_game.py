@@ -4,22 +4,20 @@ import dataclasses
 
 import numpy as np
 import pytest
+import torch
 
-from service.downstream.compose import action_weights
-from service.downstream.orchestrators import Orchestrator
+from service.envs.observations import layouts
 from service.errors import TandemError
-from service.play.cast import cast_orchestrator, cast_primitives
 from service.play.game import Game
-
-
-@pytest.fixture(scope="module")
-def cast(tmp_path_factory):
-    return cast_primitives("panda-cube@champion", tmp_path_factory.mktemp("no-registry"))
+from service.policies.networks import export_parameters
+from service.primitives.learned import LearnedPolicy, action_weights, num_inputs
+from service.primitives.loading import Trained
+from service.sac.networks import GaussianActor
 
 
 @pytest.fixture
-def game(cast):
-    game = Game(cast, seed=1)
+def game(champion):
+    game = Game(champion, seed=1)
     yield game
     game.close()
 
@@ -37,8 +35,8 @@ def test_bob_goes_where_the_goal_is_put_and_stays(game):
         assert np.linalg.norm(game.worlds.object_position[0] - goal) < 0.05
         assert game.caption.startswith("At the goal")
     game.set_goal(np.array([9.0, 0.0, -1.0]))
-    workspace = game.cast.world.workspace
-    assert game.goal.tolist() == [workspace.upper_m[0], 0.0, game.cast.world.rest_height_m]
+    workspace = game.world.workspace
+    assert game.goal.tolist() == [workspace.upper_m[0], 0.0, game.world.rest_height_m]
 
 
 def test_another_goal_comes_when_he_is_there(game):
@@ -49,17 +47,17 @@ def test_another_goal_comes_when_he_is_there(game):
     assert len(goals) > 2
 
 
-def test_weights_that_are_set_drive_the_primitives(game, cast):
+def test_weights_that_are_set_drive_the_primitives(game, champion):
     go(game, 3)
-    gate = cast.primitives.gate(np.concatenate((game.worlds.positions()[0], game.goal)).astype(np.float32))
+    gate = champion.primitives.gate(np.concatenate((game.worlds.positions()[0], game.goal)).astype(np.float32))
     game.set_mode("primitives")
     np.testing.assert_allclose(game.weights, gate, rtol=1e-5)  # nothing changes until somebody sets one
     start = game.state.copy()
     ends = []
-    for action in np.eye(cast.primitives.num_primitives, dtype=np.float32)[:2] * 2 - 1:
+    for action in np.eye(champion.primitives.num_primitives, dtype=np.float32)[:2] * 2 - 1:
         game.worlds.restore(start[None])
         game.weights = action_weights(action)
-        means, _ = cast.primitives.compose(game.worlds.positions(), game.weights[None])
+        means, _ = champion.primitives.compose(game.worlds.positions(), game.weights[None])
         before = game.worlds.ee_position[0].copy()
         game.step()
         moved = game.worlds.ee_position[0] - before
@@ -82,9 +80,11 @@ class Carrying:
         return self._bob.act_deterministic(np.concatenate((observation[:, : self._num], goal), axis=1)), np.zeros(1)
 
 
-def test_alice_proposes_and_bob_follows_from_her_start(cast):
-    alice = Carrying(cast.bob, cast.primitives.num_positions)
-    game = Game(dataclasses.replace(cast, alice=alice, alice_steps=40, num_goals=2, bob_steps=60), seed=0)
+def test_alice_proposes_and_bob_follows_from_her_start(champion):
+    rules = {"alice_steps": 40, "num_goals": 2, "bob_steps": 60, "bob_hold_steps": 5}
+    config = champion.config.model_copy(update={"game": champion.config.game.model_copy(update=rules)})
+    alice = Carrying(champion.policy, champion.primitives.num_positions)
+    game = Game(dataclasses.replace(champion, config=config, alice=alice), seed=0)
     assert game.modes == ("goals", "primitives", "alice")
     game.set_mode("alice")
     start = game.state.copy()
@@ -122,14 +122,22 @@ def test_a_task_and_its_orchestrator(champion):
     """An orchestrator acts in the world of its task, and forgets where episodes begin."""
     begun = []
 
-    class Counting(Orchestrator):
+    class Counting(LearnedPolicy):
         def begin(self):
             begun.append(1)
+            super().begin()
 
-    bob = Counting("mine@1", "mine@1", "wall", "ours", champion.policy, champion)
-    game = Game(cast_orchestrator(bob), seed=0)
-    assert game.cast.label == "mine@1 on Wall"
-    assert game.cast.world.fixture == "wall"
+    seen, num = layouts(champion.config.world), champion.primitives.num_primitives
+    with torch.random.fork_rng():
+        torch.manual_seed(4)
+        actor = export_parameters(GaussianActor(num_inputs(seen)[1], num, (8,)))
+    policy = Counting(actor, champion.primitives, seen)
+    common = {"task": "wall", "method": "ours", "trained": champion}
+    game = Game(Trained("mine@1", "orchestrator", champion.config, policy, actor, **common), seed=0)
+    begun.clear()
+    game.reset()
+    assert game.title == "mine@1 on Wall"
+    assert game.world.fixture == "wall"
     assert game.modes == ("goals", "primitives")
     assert begun
     assert game.weights_now() is None  # an orchestrator's are not known here

@@ -14,7 +14,6 @@ import numpy as np
 import pytest
 
 from service.errors import TandemError
-from service.play.cast import cast_primitives
 from service.play.server import PORT, LiveWorld
 from tests.status.browser import CHROMIUM, Visit, chromium
 
@@ -22,9 +21,8 @@ ROOT = Path(__file__).parents[2]
 
 
 @pytest.fixture(scope="module")
-def shared(tmp_path_factory):
-    cast = cast_primitives("panda-cube@champion", tmp_path_factory.mktemp("no-registry"))
-    with LiveWorld(cast, port=0, seed=1) as live:
+def shared(champion):
+    with LiveWorld(champion, port=0, seed=1) as live:
         yield live
 
 
@@ -53,7 +51,7 @@ def test_a_dragged_goal_is_where_bob_goes(live):
     assert np.linalg.norm(object_of(live) - (0.12, 0.1, 0.2)) < 0.05
     live.scene.goal.position = (3.0, 0.0, 0.2)
     live.tick(0.0)
-    assert live.scene.goal.position[0] == pytest.approx(live.game.cast.world.workspace.upper_m[0])
+    assert live.scene.goal.position[0] == pytest.approx(live.game.world.workspace.upper_m[0])
 
 
 def test_time_goes_as_fast_as_is_asked(live):
@@ -116,7 +114,7 @@ def test_a_browser_shows_and_drives_it(live):
             visit = Visit(browser, live.url, viewport={"width": 420, "height": 420}, device_scale_factor=0.25)
             page = visit.page
             page.goto(live.url)
-            page.get_by_text(live.game.cast.label).wait_for()
+            page.get_by_text(live.game.title).wait_for()
             assert live.game.num_steps == before
             # Not by its place: the panel still moves while it loads, and the click may meet the next button.
             page.get_by_role("button", name="Go on").dispatch_event("click")
@@ -131,25 +129,24 @@ def test_a_browser_shows_and_drives_it(live):
         thread.join()
 
 
-def test_a_port_that_is_taken(tmp_path, monkeypatch):
-    cast = cast_primitives("panda-cube@champion", tmp_path)
+def test_a_port_that_is_taken(champion, monkeypatch):
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
         with pytest.raises(TandemError, match=f"cannot listen on 127.0.0.1:{port}: Address already in use; take anoth"):
-            LiveWorld(cast, port=port)
+            LiveWorld(champion, port=port)
         monkeypatch.setattr("service.play.server.PORT", port)
-        with LiveWorld(cast) as live:
+        with LiveWorld(champion) as live:
             assert port < live.port < port + 50
     with pytest.raises(TandemError, match=r"cannot listen on 203\.0\.113\.7:0: .*; check --host"):
-        LiveWorld(cast, host="203.0.113.7", port=0)
+        LiveWorld(champion, host="203.0.113.7", port=0)
     assert PORT == 8322
 
 
-def test_without_its_packages(tmp_path, monkeypatch):
+def test_without_its_packages(champion, monkeypatch):
     monkeypatch.setitem(sys.modules, "mjviser", None)
     said = r"tandem play needs the package mjviser, .*pip install 'tandem-skills\[play\]'"
     with pytest.raises(TandemError, match=said):
-        LiveWorld(cast_primitives("panda-cube@champion", tmp_path))
+        LiveWorld(champion)
 
 
 def test_the_command_ends_cleanly(default_signals, tmp_path):

@@ -7,7 +7,7 @@ import pytest
 import torch
 from numpy.typing import NDArray
 
-from service.policies.composition import compose
+from service.policies.forward import compose
 
 FloatArray = NDArray[np.float64]
 

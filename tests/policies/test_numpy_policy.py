@@ -12,7 +12,7 @@ import torch
 
 from service.config import PolicyConfig
 from service.envs.observations import BOB, FULL, POSITIONS
-from service.policies import gaussian
+from service.policies import forward, gaussian
 from service.policies.networks import GaussianPolicy, MCPPolicy, export_parameters, make_alice, make_bob
 from service.policies.numpy_policy import NumpyGaussianPolicy, NumpyMCPPolicy
 from service.policies.parameters import FloatArray, Parameters, PolicyError
@@ -30,9 +30,9 @@ def players(alice: GaussianPolicy, bob: MCPPolicy) -> Players:
     ]
 
 
-def _close(actual: FloatArray, expected: torch.Tensor) -> None:
+def _close(actual: FloatArray, expected: torch.Tensor | FloatArray) -> None:
     assert actual.dtype == np.float32
-    np.testing.assert_allclose(actual, expected.detach().numpy(), atol=1e-5, rtol=1e-5)
+    np.testing.assert_allclose(actual, torch.as_tensor(expected).detach(), atol=1e-5, rtol=1e-5)
 
 
 def test_distribution_equals_torch(players: Players, observe: Observe) -> None:
@@ -59,6 +59,8 @@ def test_primitives_gate_and_compose_equal_torch(bob: MCPPolicy, config: PolicyC
     _close(weights, bob.gate(torch.tensor(rows)))
     for actual, expected in zip(numpy_policy.compose(positions, weights), numpy_policy.distribution(rows), strict=True):
         np.testing.assert_array_equal(actual, expected)
+    exported = forward.bob(np, numpy_policy.network, numpy_policy.columns, rows[0])
+    _close(exported["action"], numpy_policy.act_deterministic(rows[0]).clip(-1.0, 1.0))
 
 
 def test_act_samples_the_distribution_and_its_log_prob(players: Players, observe: Observe) -> None:
@@ -125,9 +127,9 @@ def _with(name: str, *shape: int, value: float = 0.5) -> Break:
 
 
 BROKEN_BOB: list[tuple[Break, str]] = [
-    (_without("primitives.trunk.0.weight"), r"'primitives\.trunk\.0\.weight' is missing, expected shape \(any, 11\)"),
+    (_without("primitives.trunk.0.weight"), r"'primitives\.trunk\.0\.weight' is missing; export it again"),
     (_without("gate.weight_floor"), r"'gate\.weight_floor' is missing, expected shape \(\)"),
-    (_without("primitives.output_weight"), r"'primitives\.output_weight' is missing, expected shape \(any, any, any\)"),
+    (_without("primitives.output_weight"), r"'primitives\.output_weight' is missing; export it again"),
     (_with("primitives.trunk.0.bias", 3), r"'primitives\.trunk\.0\.bias': expected shape \(256,\), got \(3,\)"),
     (_with("primitives.output_bias", 4, 6), r"'primitives\.output_bias': expected shape \(4, 8\), got \(4, 6\)"),
     (_with("primitives.hidden.weight", 500, 256), r"'primitives\.hidden\.weight': expected shape \(512, 256\)"),
@@ -136,9 +138,12 @@ BROKEN_BOB: list[tuple[Break, str]] = [
     (_with("gate.input.scale", 17, value=0.0), r"'gate\.input\.scale' = .*expected positive"),
     (_with("gate.output.bias", 4, value=np.nan), r"'gate\.output\.bias' of shape \(4,\) is not finite"),
     (_with("gate.weight_floor", value=0.0), r"'gate\.weight_floor' = 0\.0: expected a value between 0 and 1"),
-    (_with("primitives.squash.log_std_max", value=-3.0), r"'primitives\.squash\.log_std_max' = -3\.0: expected .* -2 "),
+    (
+        _with("primitives.squash.log_std_max", value=-3.0),
+        r"'primitives\.squash\.log_std_max' = -3\.0: expected .* the least, -2",
+    ),
     (_with("gate.hidden.2.weight", 256, 256), r"'gate\.hidden\.2\.bias' is missing, expected shape \(256,\)"),
-    (_with("primitives.more", 2, 3), r"'primitives\.more': expected none of that name, got shape \(2, 3\)"),
+    (_with("primitives.more", 2, 3), r"'primitives\.more': expected none of that name, got \(2, 3\)"),
 ]
 
 
@@ -154,7 +159,7 @@ def test_broken_parameters_of_bob_are_named(damage: Break, message: str) -> None
 def test_broken_parameters_of_alice_are_named() -> None:
     parameters = export_parameters(make_alice(PolicyConfig()))
     odd = {**parameters, "output.weight": parameters["output.weight"][:7], "output.bias": parameters["output.bias"][:7]}
-    with pytest.raises(PolicyError, match="'squash': expected an even number of outputs, got 7"):
+    with pytest.raises(PolicyError, match=r"'output\.weight': expected shape \(6, 256\), got \(7, 256\)"):
         NumpyGaussianPolicy(odd)
     integers: Parameters = {**parameters, "output.bias": np.zeros(8, dtype=np.int64)}
     with pytest.raises(PolicyError, match=r"'output\.bias' of shape \(8,\): expected float32, got int64"):

@@ -1,3 +1,4 @@
+import dataclasses
 import json
 
 import numpy as np
@@ -5,11 +6,13 @@ import pytest
 
 from service.downstream.learner import make_loop
 from service.downstream.methods import METHODS, provenance
-from service.downstream.policy import save_policy
 from service.downstream.worker import make_worlds
 from service.errors import TandemError
 from service.primitives.bundled import BUNDLED
-from service.robot.policies import load_robot_policy
+from service.primitives.learned import save_policy
+from service.primitives.loading import load
+from service.robot.policies import for_robot
+from tests.downstream.skill_sets import made
 from tests.downstream.trials import small_trial
 
 
@@ -22,37 +25,31 @@ def write_training(path, champion, method="ours"):
     path.mkdir()
     about = {"format_version": 1, "cell": trial.model_dump(mode="json"), **provenance(champion, method)}
     (path / "cell.json").write_text(json.dumps(about))
-    save_policy(path / "policy.safetensors", parameters, method, champion)
+    save_policy(path / "policy.safetensors", parameters, method, about["primitives"])
 
 
 def test_a_bob_and_an_orchestrator_with_its_world(champion, tmp_path):
-    bob = load_robot_policy("panda-cube@champion", tmp_path)
+    bob = for_robot(load("panda-cube@champion", tmp_path))
     assert (bob.goals, bob.world.fixture) == ("mixed", "none")
-    robust = load_robot_policy("panda-cube-robust@champion", tmp_path).world
+    robust = for_robot(load("panda-cube-robust@champion", tmp_path)).world
     assert (robust.nominal, robust.observed.delay) == (robust, True)  # a robot is one, not drawn from many
     write_training(tmp_path / "wall", champion)
-    found = load_robot_policy(str(tmp_path / "wall"), BUNDLED)
-    assert (found.label, found.goals, found.world.fixture) == ("wall-ours-0", "table", "wall")
+    found = for_robot(load(str(tmp_path / "wall"), BUNDLED))
+    assert (found.name, found.goals, found.world.fixture) == ("wall-ours-0", "table", "wall")
     action = found.policy.act_deterministic(np.zeros((1, 14), dtype=np.float32))
     assert action.shape == (1, 4)
 
 
-def test_what_is_no_policy_for_a_robot(champion, tmp_path, monkeypatch):
+def test_what_is_no_policy_for_a_robot(champion, tmp_path):
     write_training(tmp_path / "alone", champion, "scratch-mcp-her")
     with pytest.raises(TandemError, match="acts without primitives"):
-        load_robot_policy(str(tmp_path / "alone"), BUNDLED)
-    with pytest.raises(TandemError, match="no such run directory"):
-        load_robot_policy("runs/nothing", BUNDLED)
+        for_robot(load(str(tmp_path / "alone"), BUNDLED))
 
     class Narrow:
         def act_deterministic(self, observation):
             return observation @ np.zeros((12, 4), dtype=np.float32)
 
-    monkeypatch.setattr(
-        "service.robot.policies.load_bob",
-        lambda *given: type(
-            "Bob", (), {"label": "narrow", "policy": Narrow(), "config": champion.config, "manifest": None}
-        )(),
-    )
-    with pytest.raises(TandemError, match="narrow does not take 14 numbers"):
-        load_robot_policy("panda-cube", BUNDLED)
+    with pytest.raises(TandemError, match="does not take 14 numbers"):
+        for_robot(dataclasses.replace(champion, policy=Narrow()))
+    with pytest.raises(TandemError, match="made@1 is a set of skills of lsd; tandem robot needs primitives"):
+        for_robot(made())

@@ -18,8 +18,8 @@ import yaml
 from service.config import parse_config
 from service.io.checkpoints import CheckpointStore
 from service.io.run_directory import RunDirectory
-from service.runtime.local import LocalRun
-from service.runtime.reporting import Report
+from service.runs.report import Report
+from service.runs.train import open_run
 from service.store.disk_reader import DiskReader
 from service.store.run_writer import RunWriter
 
@@ -51,8 +51,8 @@ TREE = {
         },
     },
     "learner": {
-        "alice": {"minibatch_size": 64, "mirror": "both"},
-        "bob": {"minibatch_size": 64, "num_epochs": 2, "mirror": "both"},
+        "alice": {"minibatch_size": 64},
+        "bob": {"minibatch_size": 64, "num_epochs": 2, "mirror": "random"},
         "abc": {"num_iterations": 2},
         "self_imitation": {"weight": 0.2, "num_iterations": 2, "min_reward": 1.0},
     },
@@ -85,7 +85,7 @@ def write_yaml(path, tree=TREE):
 def play(path, config=None, *, resume=False, kill_after=None, on_iteration=None):
     """Run to the end, or be killed after so many iterations in all; returns the run and how it ended."""
     directory = RunDirectory(path)
-    run = LocalRun(config or tiny_config(), directory, resume=resume)
+    run = open_run(config or tiny_config(), directory, resume=resume)
 
     def each(metrics):
         if on_iteration is not None:
@@ -126,7 +126,7 @@ class FullForAWhile:
     def __call__(self, run, metrics):
         path, iteration = run.directory.path, run.iteration
         if self.report is None:
-            writer, epoch = RunWriter(run.directory, path.name, None), run.directory.epoch.number
+            writer, epoch = RunWriter(run.directory), run.directory.epoch
             self.report = Report(run.config, path.name, self.runtime, writer, epoch=epoch)
             self.report.begin(run)
         self.report.iteration(run, metrics)

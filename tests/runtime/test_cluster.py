@@ -12,21 +12,24 @@ import numpy as np
 import pytest
 import ray
 from ray.exceptions import ObjectLostError
+from torch import cuda
 
 from benchmarks.processes import descendants
 from service.errors import DivergedError
 from service.io.checkpoints import CheckpointStore
 from service.io.run_directory import RunDirectory
+from service.methods.method import StateLostError, WorkersError
+from service.runs.run import Run
+from service.runs.train import open_run
 from service.runtime import watch
-from service.runtime.cluster import MAX_FAILED_ROUNDS, ClusterRun
-from service.runtime.learner_group import LearnerGroup
+from service.runtime.cluster import MAX_FAILED_ROUNDS, RaySelfPlay, num_gpus
 from service.runtime.ray_actors import NICENESS
 from service.runtime.ray_connection import ClusterOptions, connected
+from service.runtime.ray_runtime import RayRuntime
 from service.runtime.raylet import RayletWatch
 from service.runtime.remote_worker import RemoteWorker
-from service.runtime.runner import ClusterError, StateLostError
 from service.runtime.worker_variables import WORKER_VARIABLES
-from tests.runtime.runs import FullForAWhile, is_alive, newest, play, read_lines, tiny_config
+from tests.runtime.runs import FullForAWhile, assert_one_line, is_alive, newest, play, read_lines, tiny_config
 
 TOGETHER = ("learner/", "alice/", "bob/", "generator/")
 
@@ -41,8 +44,8 @@ def cluster():
 def run_cluster(path, config=None, *, num_actors=2, resume=False, on_iteration=None, on_beat=None):
     """To the end; returns the run, closed, and how it ended."""
     directory = RunDirectory(path)
-    directory.claim(resume=resume)
-    run = ClusterRun(config or tiny_config(), directory, ClusterOptions(num_actors=num_actors), resume=resume)
+    runtime = RayRuntime(ClusterOptions(num_actors=num_actors))
+    run = open_run(config or tiny_config(), directory, resume=resume, runtime=runtime)
     try:
         result = run.run(
             lambda metrics: on_iteration(run, metrics) if on_iteration else None,
@@ -55,7 +58,7 @@ def run_cluster(path, config=None, *, num_actors=2, resume=False, on_iteration=N
 
 
 def pid_of(run, name):
-    return next(actor.pid for actor in run.health().actors if actor.name == name)
+    return next(actor.pid for actor in run.method.health().actors if actor.name == name)
 
 
 def kill(run, name):
@@ -96,8 +99,8 @@ def test_worlds_are_shared_out_and_every_rollout_counts_once(tmp_path):
     run, result = run_cluster(tmp_path, tiny_config(total_env_steps=1500), num_actors=3, on_iteration=look)
     told.check()
     assert result.reason == "finished"
-    assert run._pool.num_worlds == 8
-    health = run.health()
+    assert run.method._pool.num_worlds == 8
+    health = run.method.health()
     assert health.num_rollouts_refused == 0
     counted = sum(highest + 1 for _, _, highest in ids(tmp_path))
     assert counted == health.num_rollouts_counted
@@ -136,7 +139,7 @@ def test_whoever_is_killed_is_replaced_and_nobody_else(tmp_path, monkeypatch):
 
         return slow
 
-    for kind, name in ((ClusterRun, "_save"), (LearnerGroup, "wait_ready"), (RemoteWorker, "wait_ready")):
+    for kind, name in ((Run, "_save"), (RemoteWorker, "wait_ready")):
         monkeypatch.setattr(kind, name, lose_a_minute(getattr(kind, name)))
 
     def strike(run, metrics):
@@ -149,7 +152,7 @@ def test_whoever_is_killed_is_replaced_and_nobody_else(tmp_path, monkeypatch):
             return
         since.clear()
         if not strikes:
-            incarnations.update({actor.name: actor.incarnation for actor in run.health().actors})
+            incarnations.update({actor.name: actor.incarnation for actor in run.method.health().actors})
             run.request_stop()
             return
         for name in strikes.pop(0):
@@ -167,7 +170,7 @@ def test_whoever_is_killed_is_replaced_and_nobody_else(tmp_path, monkeypatch):
     counted = ids(tmp_path)
     assert {(actor, incarnation) for actor, incarnation, _ in counted} == {(0, 0), (1, 0), (1, 1), (1, 2)}
     # Not one of the rollouts that the actors handed over is missing.
-    assert sum(highest + 1 for _, _, highest in counted) == run.health().num_rollouts_counted
+    assert sum(highest + 1 for _, _, highest in counted) == run.method.health().num_rollouts_counted
     assert run.iteration == result.iteration == rows[-1]["iteration"]
 
 
@@ -176,14 +179,14 @@ def test_updates_go_on_without_an_actor_that_is_late_and_one_that_hangs_is_repla
     late, frozen, said = [], [], []
 
     def freeze(run, metrics):
-        pid, slot = pid_of(run, "rollout-0"), run._pool._slots[0]
+        pid, slot = pid_of(run, "rollout-0"), run.method._pool._slots[0]
         if metrics["iteration"] < 4 or pid is None or pid_of(run, "rollout-1") is None:
             return
         if not late:
             late.append((pid, slot.incarnation, metrics["iteration"]))
             os.kill(pid, signal.SIGSTOP)
         elif slot.late and not frozen:  # iterations have gone on without it
-            said.append(run.health().warnings)
+            said.append(run.method.health().warnings)
             if metrics["iteration"] >= late[0][2] + 6:  # what it plays is too old by then
                 os.kill(pid, signal.SIGCONT)
                 frozen.append(None)
@@ -197,10 +200,10 @@ def test_updates_go_on_without_an_actor_that_is_late_and_one_that_hangs_is_repla
     assert result.reason == "interrupted"
     assert said
     assert "rollout-0: late; updates go on without" in said[-1]
-    assert re.match(r"rollout-0: no progress for 1\d s", str(run.health().last_error))
+    assert re.match(r"rollout-0: no progress for 1\d s", str(run.method.health().last_error))
     assert not is_alive(frozen[0])
     assert late[0][:2] == (frozen[0], 0)  # late it was not replaced, but when it was frozen for good
-    health = run.health()
+    health = run.method.health()
     assert health.num_rollouts_refused >= 1  # it came too late
     counted = sum(highest + 1 for _, _, highest in ids(tmp_path))
     assert counted - health.num_rollouts_counted in (0, 1)  # the refused one is left out, unless a later one covers it
@@ -213,18 +216,18 @@ def test_no_round_notices_workers_that_are_frozen(tmp_path, monkeypatch):
     names = list(played)
 
     def worker(run, name):
-        return run._generator if name == "generator" else run._learner
+        return run.method._generator if name == "generator" else run.method._learner
 
     def freeze(run, metrics):
         """One after the other, each when all have been there for some iterations."""
         since.append(metrics["iteration"])
         waited_for = [name for name in frozen if worker(run, name).incarnation == 0]
-        if waited_for or any(actor.pid is None for actor in run.health().actors):
+        if waited_for or any(actor.pid is None for actor in run.method.health().actors):
             since.clear()
         if len(since) < 4:
             return
         since.clear()
-        errors.append({actor.name: actor.last_error for actor in run.health().actors})
+        errors.append({actor.name: actor.last_error for actor in run.method.health().actors})
         if not names:
             run.request_stop()
             return
@@ -235,7 +238,7 @@ def test_no_round_notices_workers_that_are_frozen(tmp_path, monkeypatch):
     def look(run):
         for name in frozen:
             if worker(run, name).incarnation == 0:
-                played[name].append((run.iteration, run._slots.num_taken, len(run._slots._began)))
+                played[name].append((run.iteration, run.method._slots.num_taken, len(run.method._slots._began)))
 
     run, result = run_cluster(tmp_path, tiny_config(total_env_steps=10**9), on_iteration=freeze, on_beat=look)
     assert result.reason == "interrupted"
@@ -249,7 +252,7 @@ def test_no_round_notices_workers_that_are_frozen(tmp_path, monkeypatch):
         assert len({iteration for iteration, _, _ in played[name]}) <= 2
         assert not is_alive(pid)
         assert re.match(r"no progress for 1\d s", after_both[name])
-    health = run.health()
+    health = run.method.health()
     assert health.num_rollouts_refused == 0
     counted = ids(tmp_path)
     assert {incarnation for _, incarnation, _ in counted} == {0}
@@ -260,50 +263,42 @@ def test_no_round_notices_workers_that_are_frozen(tmp_path, monkeypatch):
 
 
 def test_learners_that_die_before_the_run_has_begun_and_while_they_start_lose_nothing(tmp_path, monkeypatch):
-    ready, early, struck = LearnerGroup.wait_ready, [], []
+    ready, doomed, struck = RemoteWorker.wait_ready, ["learner"], []
 
-    def kill_first(group):
-        if not early:
-            early.append(ray.get(group._ranks[0].ping.remote()).pid)
-            os.kill(early[0], signal.SIGKILL)
-        ready(group)
+    def kill_some(worker):
+        """Once its process is up, and before it has its state."""
+        if worker.name in doomed:
+            doomed.remove(worker.name)
+            struck.append(ray.get(worker.handle.ping.remote()).pid)
+            os.kill(struck[-1], signal.SIGKILL)
+        ready(worker)
 
-    monkeypatch.setattr(LearnerGroup, "wait_ready", kill_first)
+    monkeypatch.setattr(RemoteWorker, "wait_ready", kill_some)
 
     def strike(run, metrics):
         if metrics["iteration"] == 1:
             assert newest(tmp_path).step == 0  # of the learner that came after the first one
         elif metrics["iteration"] == 4:
-            assert pid_of(run, "learner") not in early
-            ask = run._learner._ask
-
-            def ask_and_strike(timeout_s, answers, what):
-                found = ask(timeout_s, answers, what)
-                if what == "start" and len(struck) < 2:  # its process is up, and has not got its state yet
-                    struck.append(found[0].pid)
-                    os.kill(struck[-1], signal.SIGKILL)
-                return found
-
-            run._learner._ask = ask_and_strike
+            assert pid_of(run, "learner") not in struck
+            doomed.extend(["learner", "learner"])
             kill(run, "learner")
         elif metrics["iteration"] >= 8:
             run.request_stop()
 
     run, result = run_cluster(tmp_path, tiny_config(total_env_steps=10**9), num_actors=1, on_iteration=strike)
     assert result.reason == "interrupted"
-    assert len(early) == 1
-    assert len(struck) == 2
-    assert run._learner.incarnation == 4
+    assert len(struck) == 3
+    assert run.method._learner.incarnation == 4
     rows = read_lines(tmp_path / "metrics.jsonl")
     assert [row["learner/version"] for row in rows] == list(range(1, len(rows) + 1))
-    assert sum(highest + 1 for _, _, highest in ids(tmp_path)) == run.health().num_rollouts_counted
+    assert sum(highest + 1 for _, _, highest in ids(tmp_path)) == run.method.health().num_rollouts_counted
 
 
 def test_a_stop_ends_it_at_once_and_saved(tmp_path):
     torch, nice, asked = {}, {}, []
 
     def look_and_ask(run, metrics):
-        actors = run.health().actors
+        actors = run.method.health().actors
         if metrics["iteration"] >= 5 and not any(actor.pid is None for actor in actors):  # all have unpickled weights
             for actor in actors:
                 torch[actor.name] = "libtorch" in Path(f"/proc/{actor.pid}/maps").read_text()
@@ -343,16 +338,16 @@ def test_a_learner_that_dies_of_every_batch_ends_the_run_with_one_line(tmp_path,
 
     def strike(run, metrics):
         if metrics["iteration"] >= 3:
-            real = run._learner.restart
+            real = run.method._learner.restart
 
             def restart_and_strike(why):
                 real(why)
-                os.kill(run._learner.locations[0].pid, signal.SIGKILL)
+                os.kill(pid_of(run, "learner"), signal.SIGKILL)
 
-            run._learner.restart = restart_and_strike
+            run.method._learner.restart = restart_and_strike
             kill(run, "learner")
 
-    with pytest.raises(ClusterError, match=r"2 times in a row the learner failed") as error:
+    with pytest.raises(WorkersError, match=r"2 times in a row the learner failed") as error:
         run_cluster(tmp_path, tiny_config(total_env_steps=10**9), num_actors=1, on_iteration=strike)
     assert "\n" not in str(error.value)
 
@@ -362,9 +357,9 @@ def test_a_policy_that_diverges_ends_the_run_with_how_to_go_on(tmp_path):
 
     def spoil(run, metrics):
         if metrics["iteration"] == 3:
-            weights = ray.get(run._weights)
+            weights = ray.get(run.method._weights)
             nans = {name: np.full_like(array, np.nan) for name, array in weights.bob.items()}
-            run._weights = ray.put(replace(weights, bob=nans))
+            run.method._weights = ray.put(replace(weights, bob=nans))
 
     with pytest.raises(DivergedError, match=r"resume with lower learning rates") as error:
         run_cluster(tmp_path, tiny_config(total_env_steps=10**9), num_actors=1, on_iteration=spoil)
@@ -385,11 +380,61 @@ def test_a_snapshot_lost_with_its_machine_sends_the_run_back(tmp_path):
 
     def lose(run, metrics):
         if metrics["iteration"] == 3:
-            run._snapshot = lost_object()
+            run.method._snapshot = lost_object()
 
     with pytest.raises(StateLostError, match=r"goes back to its newest checkpoint") as error:
         run_cluster(tmp_path, tiny_config(total_env_steps=10**9), num_actors=1, on_iteration=lose)
     assert "\n" not in str(error.value)
+
+
+def test_rollouts_that_are_all_lost_with_their_machine_are_not_learned_from(tmp_path, monkeypatch):
+    """As when the machine of all actors loses power before the learner has got what it held."""
+    ask_learner, losing, lost = RaySelfPlay._ask_learner, [], []
+
+    def lose_some(run, iteration):
+        if losing:
+            losing.clear()
+            lost.extend(iteration.batch)
+            iteration.batch[:] = [replace(each, rollout=lost_object()) for each in iteration.batch]
+        ask_learner(run, iteration)
+
+    monkeypatch.setattr(RaySelfPlay, "_ask_learner", lose_some)
+
+    def look(run, metrics):
+        if metrics["iteration"] == 3:
+            losing.append(True)
+        elif metrics["iteration"] == 6:
+            run.request_stop()
+
+    run, result = run_cluster(tmp_path, tiny_config(total_env_steps=10**9), on_iteration=look)
+    assert result.reason == "interrupted"
+    assert len(lost) >= 2
+    assert run.method._learner.incarnation == run.method._generator.incarnation == 0
+    rows = read_lines(tmp_path / "metrics.jsonl")
+    assert [row["learner/version"] for row in rows] == [1, 2, 3, 4, 5, 6]
+    num_played = sum(highest + 1 for _, _, highest in ids(tmp_path))
+    assert run.method.health().num_rollouts_counted == num_played - len(lost)
+    method = run.method
+    for _ in range(2):  # the first look takes the answer to a question of before
+        method._clock.now += 1000.0
+        assert method._learner.watch.look() is method._generator.watch.look() is None  # neither is still waited for
+
+
+@pytest.mark.parametrize(
+    ("device", "there", "asked"), [("cpu", 2.0, 0), ("cuda", 0.0, 1), ("auto", 0.0, 0), ("auto", 2.0, 1)]
+)
+def test_the_learner_asks_for_a_gpu(monkeypatch, device, there, asked):
+    monkeypatch.setattr("ray.cluster_resources", lambda: {"CPU": 8.0} | ({"GPU": there} if there else {}))
+    assert num_gpus(device) == asked
+
+
+@pytest.mark.skipif(cuda.is_available(), reason="asking for CUDA is no mistake on a machine that has it")
+def test_a_learner_that_cannot_start_is_one_line(tmp_path, monkeypatch):
+    monkeypatch.setattr("service.runtime.cluster.num_gpus", lambda device: 0)  # Ray would wait for one
+    learner = tiny_config().learner.model_copy(update={"device": "cuda"})
+    with pytest.raises(WorkersError) as error:
+        run_cluster(tmp_path, tiny_config().model_copy(update={"learner": learner}))
+    assert_one_line(error.value, "learner.device", "no CUDA device", "learner.device=cpu")
 
 
 def test_actors_that_wait_for_a_core_do_not_end_the_run(tmp_path):
@@ -397,8 +442,8 @@ def test_actors_that_wait_for_a_core_do_not_end_the_run(tmp_path):
     num_replaced = []
 
     def hurry(run, metrics):
-        num_replaced.append(sum(slot.incarnation for slot in run._pool))
-        for slot in run._pool:
+        num_replaced.append(sum(slot.incarnation for slot in run.method._pool))
+        for slot in run.method._pool:
             if not slot.alive:
                 slot.may_start_s = 0.01
 
@@ -438,7 +483,7 @@ def test_a_raylet_that_is_frozen_is_silent_and_one_that_stays_so_is_given_up(mon
 def test_a_state_lost_before_it_was_saved_sends_the_run_back(tmp_path):
     def lose(run, metrics):
         if metrics["iteration"] == 3:
-            run._generator.state = lost_object()
+            run.method._generator.state = lost_object()
 
     config = tiny_config(total_env_steps=10**9, checkpoint_interval=3)
     with pytest.raises(StateLostError, match=r"newest state is lost .* goes back to its newest checkpoint") as error:

@@ -16,14 +16,12 @@ from service.errors import ConfigError, TandemError
 from service.io.run_directory import RunDirectory
 from service.learner.distillation import Distiller
 from service.learner.transfer import take_over
-from service.play.cast import cast_primitives
 from service.policies import networks
-from service.policies.numpy_policy import NumpyMCPPolicy
-from service.primitives.loading import load_bob
+from service.policies.numpy_policy import NumpyMCPPolicy, numpy_bob
+from service.primitives.loading import Trained, load
 from service.primitives.publishing import publish_run
 from service.registry.registry import Registry
-from service.runtime.distillation_run import DistillationRun
-from service.runtime.starting import Start, read_start
+from service.runs.train import open_run
 from tests.runtime.runs import TREE, assert_one_line, assert_same_run, play
 
 HOW = {"num_worlds": 8, "episode_steps": 6, "gradient_steps": 3, "batch_size": 16}
@@ -178,11 +176,11 @@ def taught(tmp_path_factory):
     root = tmp_path_factory.mktemp("taught")
     run, _ = play(root / "run", parse_config(TREE | {"run": TREE["run"] | {"total_env_steps": 200}}, where="a test"))
     run.close()
-    return root, publish_run(run.directory, Registry(root / "registry"), run.config, run.parameters(), {})
+    return root, publish_run(run.directory, Registry(root / "registry"), run.config, run.method.parameters(), {})
 
 
 def run_to_end(path, config, start=None, *, resume=False, stop_after=None):
-    run = DistillationRun(config, RunDirectory(path), resume=resume, start=start)
+    run = open_run(config, RunDirectory(path), resume=resume, start=start)
 
     def each(metrics):
         if metrics["iteration"] == stop_after:
@@ -200,29 +198,29 @@ def test_a_run_is_published_with_its_teacher_as_parent_and_is_exact_when_resumed
     root, version = taught
     drawn = {"delay_steps": [0, 1], "object_noise_m": [0.0, 0.01], "friction": [0.5, 1.0], "num_models": 2}
     config = config_of(drawn, total_env_steps=220, evaluation_interval=2)
-    start = read_start(str(version), root / "registry", config)
+    start = load(str(version), root / "registry")
     whole = run_to_end(tmp_path / "whole", config, start)
-    assert cast_primitives(str(tmp_path / "whole"), tmp_path).alice is None
+    assert load(str(tmp_path / "whole")).alice is None
     filmed = CliRunner().invoke(app, ["render", "--primitives", str(tmp_path / "whole"), "--episodes", "1"])
     assert filmed.exit_code == 0, filmed.output
     run_to_end(tmp_path / "part", config, start, stop_after=2)
     run_to_end(tmp_path / "part", config, resume=True)
     assert_same_run(tmp_path / "part", tmp_path / "whole")
-    assert whole.grid().cells
+    assert whole.method.grid().cells
     registry = Registry(root / "registry")
-    published = publish_run(whole.directory, registry, config, whole.parameters(), {})
+    published = publish_run(whole.directory, registry, config, whole.method.parameters(), {})
     assert registry.manifest(str(published)).parent == str(version)
-    assert load_bob(str(published), root / "registry").primitives.num_positions == 11 + 8 + 1
+    assert load(str(published), root / "registry").primitives.num_positions == 11 + 8 + 1
 
 
 def test_a_run_of_distillation_can_be_begun_from_as_well(taught, tmp_path):
     """By self-play, or by distillation again: it has Bob's policy alone."""
     root, version = taught
     config = config_of({"delay_steps": [0, 1]}, total_env_steps=60)
-    first = run_to_end(tmp_path / "first", config, read_start(str(version), root / "registry", config))
-    start = read_start(str(tmp_path / "first"), tmp_path, config)
+    first = run_to_end(tmp_path / "first", config, load(str(version), root / "registry"))
+    start = load(str(tmp_path / "first"))
     assert start.networks.keys() == {"bob/policy"}
-    for name, array in first.parameters().items():
+    for name, array in first.method.parameters().items():
         np.testing.assert_array_equal(start.networks["bob/policy"][name], array)
     run_to_end(tmp_path / "again", config, start)
 
@@ -237,15 +235,16 @@ def test_a_run_of_distillation_can_be_begun_from_as_well(taught, tmp_path):
 def test_a_teacher_that_does_not_fit_is_refused(tmp_path, changed, said):
     teacher = config_of({})
     parameters = networks.export_parameters(networks.make_bob(teacher.policy, layouts(teacher.world)))
-    start = Start("a test", {"bob/policy": parameters}, teacher.world, None)
+    learned = {"bob/policy": parameters}
+    start = Trained("a test", "primitives", teacher, numpy_bob(parameters), parameters, networks=learned)
     config = parse_config(teacher.model_dump(mode="json") | changed, where="a test")
     with pytest.raises(TandemError, match=said) as error:
-        DistillationRun(config, RunDirectory(tmp_path / "run"), start=start)
+        open_run(config, RunDirectory(tmp_path / "run"), start=start)
     assert_one_line(error.value)
 
 
 def test_without_a_teacher_and_what_goes_together(tmp_path):
     with pytest.raises(TandemError, match="name him, --from"):
-        DistillationRun(config_of({}), RunDirectory(tmp_path / "run"))
+        open_run(config_of({}), RunDirectory(tmp_path / "run"))
     with pytest.raises(ConfigError, match="distillation teaches primitives"):
         parse_config(TREE | {"distillation": {}, "skills": {"method": "lsd"}}, where="a test")

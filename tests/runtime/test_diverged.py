@@ -10,10 +10,10 @@ from typer.testing import CliRunner
 from service.cli.main import app
 from service.errors import DivergedError
 from service.io.run_directory import RunDirectory
+from service.methods.workers import RolloutWorker
 from service.policies.numpy_policy import NumpyGaussianPolicy
-from service.runtime.local import LocalRun
-from service.runtime.resuming import resumed_config
-from service.runtime.workers import RolloutWorker
+from service.runs.resuming import resumed_config
+from service.runs.train import open_run
 from tests.runtime.runs import assert_one_line, assert_same_run, newest, play, read_lines, write_yaml
 
 
@@ -39,7 +39,7 @@ def diverge_after(patch, iteration):
 
     def spoiled(self, *given):
         if next(rounds) >= iteration:
-            patch.setattr("service.runtime.workers.NumpyGaussianPolicy", NotANumber)
+            patch.setattr("service.methods.workers.NumpyGaussianPolicy", NotANumber)
         return players(self, *given)
 
     patch.setattr(RolloutWorker, "_players", spoiled)
@@ -73,7 +73,7 @@ def test_parameters_that_are_not_numbers_are_the_same_error(tmp_path):
     def spoil(run, metrics):
         if run.iteration == 3:
             with torch.no_grad():
-                run.learner._bob.policy_parameters[0].view(-1)[0] = torch.nan
+                run.method.learner._bob.policy_parameters[0].view(-1)[0] = torch.nan
 
     with pytest.raises(DivergedError) as error:
         play(tmp_path, on_iteration=spoil)
@@ -92,10 +92,10 @@ def test_a_resumed_run_takes_a_lower_learning_rate(tmp_path):
     play(tmp_path, kill_after=3)
     before = newest(tmp_path).arrays["learner/bob/learning_rate"]
     config = resumed_config(RunDirectory(tmp_path), ["learner.bob.learning_rate=1e-6"])
-    run = LocalRun(config, RunDirectory(tmp_path), resume=True)
+    run = open_run(config, RunDirectory(tmp_path), resume=True)
     assert before > 1e-5
-    assert run.learner._bob.optimizer.learning_rate == pytest.approx(2e-6)  # the highest that adapts from 1e-6
-    assert run.learner._alice.optimizer.learning_rate == newest(tmp_path).arrays["learner/alice/learning_rate"]
+    assert run.method.learner._bob.optimizer.learning_rate == pytest.approx(2e-6)  # the highest that adapts from 1e-6
+    assert run.method.learner._alice.optimizer.learning_rate == newest(tmp_path).arrays["learner/alice/learning_rate"]
     assert RunDirectory(tmp_path).read_config().learner.bob.learning_rate == 1e-6
     assert run.run().reason == "finished"
     assert newest(tmp_path).arrays["learner/bob/learning_rate"] <= 2e-6
@@ -106,18 +106,18 @@ def test_a_world_that_breaks_is_said_recorded_and_starts_anew(tmp_path, caplog):
 
     def spin(run, metrics):
         if run.iteration == 2:
-            states = run.game.worlds.states.copy()
+            states = run.method.game.worlds.states.copy()
             states[5, 29] = 1e200
-            run.game.worlds.restore(states)
+            run.method.game.worlds.restore(states)
 
     run, result = play(tmp_path, on_iteration=spin)
     assert result.reason == "finished"
-    assert np.isfinite(run.game.worlds.states).all()
-    assert np.abs(run.game.worlds.states).max() < 1e3
+    assert np.isfinite(run.method.game.worlds.states).all()
+    assert np.abs(run.method.game.worlds.states).max() < 1e3
     diverged = [row["world/num_broken"] for row in read_lines(tmp_path / "metrics.jsonl")]
     assert diverged[:2] == [0.0, 0.0]
     assert set(diverged[2:]) == {1.0}
     (file,) = (tmp_path / "broken").iterdir()
     assert_one_line(caplog.messages[0], "physics diverged", file)
-    state = run.learner.state()
+    state = run.method.learner.state()
     assert all(np.isfinite(array).all() for array in state.values() if array.dtype.kind == "f")

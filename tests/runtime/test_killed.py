@@ -14,7 +14,7 @@ from service.io import files, tensors
 from service.io.checkpoints import CheckpointStore
 from service.io.jsonl import JsonlWriter
 from service.io.run_directory import RunDirectory
-from service.runtime.resuming import resumed_config
+from service.runs.resuming import resumed_config
 from tests.runtime.runs import ROOT, assert_same_run, newest, play, start_endless_run, tiny_config
 
 STEP = 4
@@ -147,15 +147,15 @@ def test_a_resume_that_is_killed_while_it_cuts_the_records(uninterrupted, tmp_pa
     """One file is cut and the other is not."""
     path = tmp_path / "run"
     play(path, kill_after=3)
-    cut = JsonlWriter.truncate_after
+    cut = JsonlWriter.cut
 
-    def cut_one(self, iteration):
+    def cut_one(self, num_bytes):
         if self.path.name == "goals.jsonl":
             die()
-        cut(self, iteration)
+        cut(self, num_bytes)
 
     with monkeypatch.context() as patch:
-        patch.setattr(JsonlWriter, "truncate_after", cut_one)
+        patch.setattr(JsonlWriter, "cut", cut_one)
         killed(lambda: play(path, resume=True))
     play(path, resume=True)
     assert_same_run(path, uninterrupted)

@@ -11,12 +11,12 @@ from service.io.checkpoints import CheckpointStore
 from service.io.errors import CheckpointError
 from service.io.run_directory import RunDirectory
 from service.learner.learner import Learner
+from service.methods import workers
 from service.policies.numpy_policy import numpy_bob
-from service.primitives.loading import read_parameters, read_stages
-from service.runtime import workers
-from service.runtime.bookkeeping import UnsavedError
-from service.runtime.local import LocalRun
-from service.runtime.resuming import resumed_config
+from service.primitives.loading import load, read_stages
+from service.runs.resuming import resumed_config
+from service.runs.run import Run, UnsavedError
+from service.runs.train import open_run
 from tests.runtime.runs import (
     FullForAWhile,
     KilledError,
@@ -125,9 +125,9 @@ def test_every_metric_is_recorded_under_its_name(tmp_path):
     """Objects are held up and let go, so that there are goals in the air: Alice's turn ends while they fall."""
 
     def lift(run, metrics):
-        states = run.game.worlds.states.copy()
+        states = run.method.game.worlds.states.copy()
         states[::2, 12] = 0.25
-        run.game.worlds.restore(states)
+        run.method.game.worlds.restore(states)
 
     play(tmp_path, tiny_config(**LONG, evaluation_interval=4), on_iteration=lift)
     assert names_in(tmp_path) == METRICS
@@ -161,7 +161,7 @@ def test_a_snapshot_joins_the_pool_every_interval(tmp_path):
     seen = {}
 
     def look(run, metrics):
-        seen[run.iteration] = (run.learner.weights().bob, list(run.generator.opponents.bob))
+        seen[run.iteration] = (run.method.learner.weights().bob, list(run.method.generator.opponents.bob))
 
     play(tmp_path, tiny_config(total_env_steps=900), on_iteration=look)
     assert [len(pool) for _, pool in list(seen.values())[:6]] == [0, 0, 1, 1, 2, 2]
@@ -186,7 +186,7 @@ def test_bob_is_kept_untrained_and_after_each_tenth(uninterrupted):
     stages = read_stages(RunDirectory(uninterrupted))
     assert list(stages) == expected
     assert len(stages) > 4
-    untrained, last = Learner(tiny_config(**LONG)).weights().bob, read_parameters(RunDirectory(uninterrupted), "bob")
+    untrained, last = Learner(tiny_config(**LONG)).weights().bob, load(str(uninterrupted)).parameters
     for bob, same in ((stages[0], untrained), (stages[steps[-1]], last)):
         assert bob.keys() == same.keys()
         assert all(np.array_equal(bob[name], array) for name, array in same.items())
@@ -225,8 +225,8 @@ def test_a_world_whose_physics_breaks_is_counted_and_its_state_kept(tmp_path):
             self._pool.close()
 
     directory = RunDirectory(tmp_path)
-    run = LocalRun(tiny_config(), directory)
-    run.game.worlds._pool = Diverging(run.game.worlds._pool)
+    run = open_run(tiny_config(), directory)
+    run.method.game.worlds._pool = Diverging(run.method.game.worlds._pool)
     assert run.run().reason == "finished"
     directory.close()
     rows = read_lines(tmp_path / "metrics.jsonl")
@@ -234,7 +234,7 @@ def test_a_world_whose_physics_breaks_is_counted_and_its_state_kept(tmp_path):
     assert rows[0]["alice/fallen_fraction"] == pytest.approx(1 / 24)
     (file,) = (tmp_path / "broken").iterdir()
     with np.load(file) as dump:
-        assert dump["states"].shape == (1, run.game.worlds.layout.size)
+        assert dump["states"].shape == (1, run.method.game.worlds.layout.size)
         assert dump["actions"].shape == (1, 4)
         assert np.isfinite(dump["states"]).all()
 
@@ -254,7 +254,7 @@ def test_a_run_killed_between_two_iterations(uninterrupted, tmp_path, iteration)
     run, result = play(tmp_path, config, resume=True)
     assert result.reason == "finished"
     assert_same_run(tmp_path, uninterrupted)
-    assert run.bookkeeper.wall_s > 0.0
+    assert run.wall_s > 0.0
     snapshots = [
         {file.name: file.read_bytes() for file in (path / "snapshots").iterdir()} for path in (tmp_path, uninterrupted)
     ]
@@ -340,7 +340,7 @@ def test_a_damaged_newest_checkpoint_is_passed_over(uninterrupted, tmp_path, cap
 
 def test_resume_where_there_is_no_run(tmp_path):
     with pytest.raises(CheckpointError) as error:
-        LocalRun(tiny_config(), RunDirectory(tmp_path), resume=True)
+        open_run(tiny_config(), RunDirectory(tmp_path), resume=True)
     assert_one_line(error.value, tmp_path, "no checkpoint", "--resume")
     assert list(tmp_path.iterdir()) == []
 
@@ -350,7 +350,7 @@ def test_a_new_run_does_not_touch_an_old_one(uninterrupted, tmp_path):
     shutil.copytree(uninterrupted, path)
     before = {file: file.read_bytes() for file in path.rglob("*") if file.is_file()}
     with pytest.raises(TandemError) as error:
-        LocalRun(tiny_config(seed=5), RunDirectory(path))
+        open_run(tiny_config(seed=5), RunDirectory(path))
     assert_one_line(error.value, path, "--resume", "--run-dir")
     assert {file: file.read_bytes() for file in path.rglob("*") if file.is_file()} == before
 
@@ -412,14 +412,14 @@ def test_records_that_do_not_fit_are_said_until_they_do(tmp_path):
 def test_the_last_checkpoint_is_not_written_twice(tmp_path, monkeypatch):
     """The second writing could fail on a disk that is full by now, although all is saved."""
     with ExitStack() as stack:
-        save = LocalRun._save
+        save = Run._save
 
         def save_and_fill(self):
             save(self)
             if self.iteration == 2:
                 stack.enter_context(no_room_above(0))
 
-        monkeypatch.setattr(LocalRun, "_save", save_and_fill)
+        monkeypatch.setattr(Run, "_save", save_and_fill)
         _, result = play(tmp_path, tiny_config(total_env_steps=200))
     assert (result.reason, result.iteration) == ("finished", 2)
     assert newest(tmp_path).step == 2

@@ -7,7 +7,6 @@ import time
 
 import numpy as np
 import pytest
-import yaml
 
 from service.actors import evaluation
 from service.config import parse_config
@@ -17,10 +16,10 @@ from service.io.run_directory import RunDirectory
 from service.primitives import publishing
 from service.primitives.bundled import BUNDLED
 from service.registry.registry import Registry
-from service.runtime import pretrain as module
-from service.runtime.pretrain import UnfinishedError, pretrain
-from service.runtime.resuming import resumed_config
-from service.runtime.signals import InterruptError
+from service.runs import train as module
+from service.runs.resuming import resumed_config
+from service.runs.signals import InterruptError
+from service.runs.train import UnfinishedError, train
 from tests.runtime.runs import (
     TREE,
     assert_one_line,
@@ -46,7 +45,7 @@ def quick(monkeypatch):
 
 def run_pretrain(tmp_path, config=None, *, on_iteration=lambda metrics: None, **kwargs):
     directory = RunDirectory(tmp_path / "run")
-    return pretrain(
+    return train(
         config or tiny_config(total_env_steps=400),
         directory,
         tmp_path / "registry",
@@ -81,7 +80,7 @@ def test_the_final_evaluation_is_played_on_goals_of_its_own(tmp_path, quick, mon
     curve, final = [], []
     for name in ("one", "another"):
         config = tiny_config(total_env_steps=400, evaluation_interval=1)
-        done = pretrain(config, RunDirectory(tmp_path / name), tmp_path / "registry", on_iteration=lambda metrics: None)
+        done = train(config, RunDirectory(tmp_path / name), tmp_path / "registry", on_iteration=lambda metrics: None)
         assert done.result.iteration == (len(drawn) - 3) / 3 >= 2
         curve += [drawn[start : start + 3] for start in range(0, len(drawn) - 3, 3)]
         final.append(drawn[-3:])
@@ -163,13 +162,13 @@ def test_a_version_of_the_same_number_in_another_registry_is_no_parent(tmp_path,
     other = Registry(tmp_path / "other")
     other.publish("tiny", {"a": np.zeros(1)}, spaces={}, normalisation={}, config={}, metrics={})
     config = resumed_config(RunDirectory(tmp_path / "run"), ["run.total_env_steps=600"])
-    pretrain(config, RunDirectory(tmp_path / "run"), other.root, resume=True, on_iteration=lambda metrics: None)
+    train(config, RunDirectory(tmp_path / "run"), other.root, resume=True, on_iteration=lambda metrics: None)
     assert other.manifest("tiny@2").parent is None
 
 
 def test_a_registry_that_is_only_read_is_refused_before_anything_is_learned(tmp_path):
     with pytest.raises(TandemError) as error:
-        pretrain(tiny_config(), RunDirectory(tmp_path / "run"), BUNDLED, on_iteration=lambda metrics: None)
+        train(tiny_config(), RunDirectory(tmp_path / "run"), BUNDLED, on_iteration=lambda metrics: None)
     assert_one_line(error.value, "cannot write", BUNDLED, "only read")
     assert not (tmp_path / "run").exists()
 
@@ -262,22 +261,6 @@ def test_a_resumed_run_keeps_its_configuration(begun):
     assert resumed_config(begun, []) == tiny_config(seed=3)
     changed = resumed_config(begun, ["run.total_env_steps=9e5", "run.keep_checkpoints=7"])
     assert changed == tiny_config(seed=3, total_env_steps=900_000, keep_checkpoints=7)
-
-
-def test_a_run_of_version_0_1_0_is_resumed(begun):
-    tree = yaml.safe_load(begun.config_file.read_text())
-    tree["learner"]["bob_ema_decay"] = tree["learner"].pop("bob_ema_decay")
-    tree["learner"]["alice_interval"] = 1
-    begun.config_file.write_text(yaml.safe_dump(tree))
-    assert begun.read_config() == tiny_config(seed=3)
-    changed = resumed_config(begun, ["run.keep_checkpoints=7", "seed=3"])
-    assert changed == tiny_config(seed=3, keep_checkpoints=7)
-    assert resumed_config(begun, [], begun.config_file) == tiny_config(seed=3)  # the same command as before
-    tree["learner"]["alice_interval"] = 2
-    begun.config_file.write_text(yaml.safe_dump(tree))
-    with pytest.raises(ConfigError) as error:
-        resumed_config(begun, [])
-    assert_one_line(error.value, begun.config_file, "learner.alice_interval = 2", "tandem 0.1.0")
 
 
 @pytest.mark.parametrize("override", ["seed=4", "game.num_worlds=3", "runs.total_env_steps=3", "name=run.x"])

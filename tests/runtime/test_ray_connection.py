@@ -11,8 +11,8 @@ import ray
 from ray.exceptions import ActorDiedError, RayTaskError
 
 from service.errors import DivergedError
+from service.methods.method import WorkersError
 from service.runtime.ray_connection import START_ATTEMPTS, connected, explaining_ray_errors
-from service.runtime.runner import ClusterError
 from tests.runtime.runs import ROOT, assert_one_line
 
 SLOW = "The current node timed out during startup. This could happen because some of the raylet failed to startup"
@@ -45,7 +45,7 @@ def test_a_start_that_took_too_long_is_tried_again(starts):
 def test_a_ray_that_never_starts_is_one_line(starts):
     tried, failing = starts
     failing[0] = START_ATTEMPTS
-    with pytest.raises(ClusterError) as error, connected(None):
+    with pytest.raises(WorkersError) as error, connected(None):
         pass
     assert len(tried) == START_ATTEMPTS
     assert_one_line(error.value, "Ray does not start here", "timed out during startup")
@@ -54,7 +54,7 @@ def test_a_ray_that_never_starts_is_one_line(starts):
 def test_another_cluster_is_asked_once(starts):
     tried, failing = starts
     failing[0] = 1
-    with pytest.raises(ClusterError), connected("auto"):
+    with pytest.raises(WorkersError), connected("auto"):
         pass
     assert tried == [("auto",)]
 
@@ -131,13 +131,13 @@ def serve(monkeypatch):
 def test_a_wrong_token_is_named_before_ray_is_asked(serve, monkeypatch):
     monkeypatch.setattr(ray, "init", lambda *arguments, **options: pytest.fail("Ray tries for 20 s"))
     address = serve(Head("a" * 64))
-    with pytest.raises(ClusterError) as error, connected(address):
+    with pytest.raises(WorkersError) as error, connected(address):
         pass
     assert_one_line(
         error.value, address, "it refuses the token that was sent: set RAY_AUTH_TOKEN", "InvalidAuthToken: "
     )
     monkeypatch.setenv("RAY_AUTH_MODE", "disabled")
-    with pytest.raises(ClusterError) as error, connected(address):
+    with pytest.raises(WorkersError) as error, connected(address):
         pass
     assert_one_line(error.value, "it wants a token, and none was sent: set RAY_AUTH_MODE=token, and RAY_AUTH_TOKEN")
 
@@ -153,7 +153,7 @@ def test_the_right_token_goes_on_to_ray(serve, monkeypatch):
 
 def test_somebody_else_at_that_port(serve, monkeypatch):
     monkeypatch.setattr(ray, "init", lambda *arguments, **options: pytest.fail("Ray tries for 20 s"))
-    with pytest.raises(ClusterError) as error, connected(serve(Head("", grpc.StatusCode.UNAVAILABLE))):
+    with pytest.raises(WorkersError) as error, connected(serve(Head("", grpc.StatusCode.UNAVAILABLE))):
         pass
     assert_one_line(error.value, "no Ray cluster answers there")
 
@@ -186,7 +186,7 @@ def test_any_other_error_of_a_worker_is_its_last_line():
 
 
 def test_an_error_of_rays_own_is_one_line():
-    with pytest.raises(ClusterError) as error, explaining_ray_errors():
+    with pytest.raises(WorkersError) as error, explaining_ray_errors():
         dies()
     assert_one_line(error.value, "Ray gave up: ActorDiedError: The actor died unexpectedly", "--resume")
 
@@ -195,7 +195,7 @@ def test_an_error_of_rays_own_is_one_line():
     ("address", "said"), [("127.0.0.1:1", "no Ray cluster answers there"), ("head:x", "HOST:PORT")]
 )
 def test_no_cluster_at_an_address_is_one_line(address, said):
-    with pytest.raises(ClusterError, match=said) as error, connected(address):
+    with pytest.raises(WorkersError, match=said) as error, connected(address):
         pass
     assert "\n" not in str(error.value)
     assert address in str(error.value)

@@ -73,7 +73,7 @@ def test_a_raylet_that_is_frozen_for_ever_ends_the_run(tmp_path):
     said = (tmp_path / "err").read_text().strip().splitlines()[-1]
     assert_one_line(said, "the raylet, has not answered for 1", "--resume goes on from iteration 0")
     status = read_status(directory.path)
-    assert (status.state, status.last_error) == ("failed", said.replace("error", "ClusterError", 1))
+    assert (status.state, status.last_error) == ("failed", said.replace("error", "WorkersError", 1))
     assert {actor.incarnation for actor in status.actors} == {0}
     ours = ("actor", "learner", "generator", "raylet", "gcs")  # Ray's two agents notice it within a minute
     assert [role for pid, role in below.items() if role in ours and is_alive(pid)] == []

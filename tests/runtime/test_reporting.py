@@ -7,19 +7,23 @@ import sys
 import threading
 import time
 
+import httpx
 import pytest
 
 from service.errors import DivergedError, TandemError
 from service.io import lock
+from service.io.epoch import claim_epoch
 from service.io.errors import RunTakenError
 from service.io.run_directory import RunDirectory
 from service.primitives import publishing
 from service.registry.registry import Registry
-from service.runtime import pretrain as module
-from service.runtime.pretrain import UnfinishedError, pretrain
-from service.runtime.resuming import resumed_config
-from service.runtime.signals import InterruptError
-from service.store import disk, redis_writer
+from service.runs import train as module
+from service.runs.resuming import resumed_config
+from service.runs.signals import InterruptError
+from service.runs.train import UnfinishedError, train
+from service.status.run_reader import open_reader
+from service.status.server import StatusServer
+from service.store import redis_writer, run_writer
 from service.store.disk_reader import DiskReader
 from service.store.errors import StoreUnavailableError
 from service.store.redis_reader import RedisReader
@@ -32,7 +36,8 @@ from tests.runtime.runs import (
     start_endless_run,
     tiny_config,
 )
-from tests.store.stores import Killable, wait_until
+from tests.status.runs import BEARER, CLIENT, TOKEN
+from tests.store.stores import Killable, a_writer, wait_until
 
 pytestmark = pytest.mark.usefixtures("default_signals")
 
@@ -56,7 +61,7 @@ def redis(tmp_path, monkeypatch):
 def run(tmp_path, config=None, *, resume=False, on_iteration=lambda metrics: None):
     directory = RunDirectory(tmp_path / "runs" / "cube")
     config = config or tiny_config(total_env_steps=400)
-    return pretrain(config, directory, tmp_path / "registry", resume=resume, on_iteration=on_iteration)
+    return train(config, directory, tmp_path / "registry", resume=resume, on_iteration=on_iteration)
 
 
 def status(tmp_path):
@@ -146,7 +151,7 @@ def test_a_second_signal_is_an_interruption(tmp_path):
 
 def test_totals_count_what_is_done_again_and_never_fall(tmp_path, monkeypatch):
     """A process that dies after its checkpoint: the next one makes some iterations a second time."""
-    monkeypatch.setattr(disk, "STATUS_INTERVAL_S", 0.0)
+    monkeypatch.setattr(run_writer, "STATUS_INTERVAL_S", 0.0)
     seen, config = [], tiny_config(total_env_steps=1500, checkpoint_interval=3)
 
     def die(metrics):
@@ -172,19 +177,18 @@ def test_totals_count_what_is_done_again_and_never_fall(tmp_path, monkeypatch):
 
 
 def test_a_run_that_another_took_over_stops_at_once_and_leaves_its_status_alone(tmp_path, redis):
-    theirs = b'{"token": "x", "host": "elsewhere", "pid": 7, "since": "today"}'
-    seen, client = [], redis.address.client(1.0)
+    """On another machine, whose file system gave the lock away: the epoch in the directory tells."""
+    seen, path = [], tmp_path / "runs" / "cube"
 
     def take_over(metrics):
         seen.append(metrics["iteration"])
         if len(seen) == 3:
-            client.set("tandem:run:cube:lease", theirs)
-        time.sleep(0.1 * (len(seen) > 3))
+            claim_epoch(path)
 
-    with pytest.raises(RunTakenError, match="run cube was taken over by process 7 on elsewhere"):
+    with pytest.raises(RunTakenError, match="was taken over by another process"):
         run(tmp_path, tiny_config(total_env_steps=10**9), on_iteration=take_over)
-    assert client.get("tandem:run:cube:lease") == theirs
-    assert RedisReader(redis.address).run("cube").state == "running"
+    assert len(seen) == 3
+    assert (status(tmp_path).state, RedisReader(redis.address).run("cube").state) == ("running", "running")
     assert not (tmp_path / "registry").exists()
 
 
@@ -243,7 +247,7 @@ def test_a_run_in_use_is_not_touched(tmp_path):
     first.claim(resume=True)
     before = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
     with pytest.raises(RunTakenError):
-        pretrain(
+        train(
             tiny_config(), RunDirectory(tmp_path), tmp_path / "registry", resume=True, on_iteration=lambda metrics: None
         )
     assert {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()} == before
@@ -264,7 +268,7 @@ def test_a_run_tells_redis_too(tmp_path, redis):
 
 def test_a_run_whose_redis_is_killed_and_comes_back(tmp_path, redis, monkeypatch):
     """Everything is as if nothing had happened, and in between the status said what was wrong."""
-    monkeypatch.setattr(disk, "STATUS_INTERVAL_S", 0.0)
+    monkeypatch.setattr(run_writer, "STATUS_INTERVAL_S", 0.0)
     warned = []
 
     def each(metrics):
@@ -286,6 +290,32 @@ def test_a_run_whose_redis_is_killed_and_comes_back(tmp_path, redis, monkeypatch
     assert_same_run(tmp_path / "runs" / "cube", tmp_path / "whole")
 
 
+def test_a_status_service_without_the_shared_disk_serves_a_run_and_stops_it(tmp_path, redis):
+    (tmp_path / "empty").mkdir()
+    seen = {}
+
+    def look(metrics):
+        if metrics["iteration"] != 4:
+            return
+        with httpx.Client(base_url=server.url, headers=BEARER, **CLIENT) as client:
+            # at iteration 4, what was told of iteration 3 is on its way to Redis
+            wait_until(lambda: client.get("/v1/runs/cube").json().get("iteration", 0) >= 3)
+            wait_until(lambda: client.get("/v1/runs/cube/metrics").json()["last_iteration"] >= 3)
+            seen["runs"] = [each["run_id"] for each in client.get("/v1/runs").json()["runs"]]
+            seen["grid"] = client.get("/v1/runs/cube/goals").json()["shape"]
+            seen["gauge"] = 'tandem_run_iterations_total{run="cube"}' in client.get("/metrics").text
+            assert client.post("/v1/runs/cube/stop").status_code == 202
+        time.sleep(0.5)  # a message to Redis says that there is a request
+
+    with StatusServer(open_reader(tmp_path / "empty"), Registry(tmp_path / "registry"), token=TOKEN, port=0) as server:
+        done = run(tmp_path, tiny_config(total_env_steps=10**9), on_iteration=look)
+        last = httpx.get(f"{server.url}/v1/runs/cube", headers=BEARER, **CLIENT).json()
+    assert done.result.reason == "interrupted"
+    assert (last["state"], last["epoch"], last["iteration"]) == ("interrupted", 1, done.result.iteration)
+    assert seen == {"runs": ["cube"], "grid": list(seen["grid"]), "gauge": True}
+    assert list((tmp_path / "empty").iterdir()) == []
+
+
 def test_a_redis_that_is_not_there_is_said_before_anything_is_learned(tmp_path, redis):
     redis.kill()
     with pytest.raises(StoreUnavailableError) as error:
@@ -296,10 +326,11 @@ def test_a_redis_that_is_not_there_is_said_before_anything_is_learned(tmp_path, 
 
 
 def test_the_same_run_id_elsewhere(tmp_path, redis):
-    other = redis_writer.RedisWriter(redis.address, "cube")
+    other = a_writer(redis.address)
+    wait_until(lambda: redis.address.client(1.0).exists("tandem:run:cube:heartbeat"))
     with pytest.raises(RunTakenError) as error:
         run(tmp_path)
-    assert_one_line(error.value, "run cube is being run by process")
+    assert_one_line(error.value, "another run with the id cube reports to Redis")
     assert not (tmp_path / "runs" / "cube" / "config.yaml").exists()
     other.close()
     assert str(run(tmp_path).version) == "tiny@1"

@@ -6,14 +6,14 @@ import shutil
 import pytest
 import yaml
 
-from service.io.checkpoints import CheckpointStore
+from service.errors import ConfigError
+from service.io.epoch import claim_epoch
 from service.io.errors import CheckpointError, StorageError
 from service.io.run_directory import RunDirectory
 from service.io.run_history import read_history
 from service.registry.registry import Registry
-from service.runtime.local import LocalRun
-from service.runtime.pretrain import pretrain
-from service.runtime.resuming import resumed_config
+from service.runs.resuming import resumed_config
+from service.runs.train import open_run, train
 from tests.runtime.runs import assert_one_line, newest, play, read_lines, tiny_config
 
 
@@ -34,7 +34,7 @@ def run(begun, tmp_path):
 def go_on(path, *, accept=False, steps=800):
     directory = RunDirectory(path, accept_damaged_records=accept)
     config = resumed_config(directory, [f"run.total_env_steps={steps}"])
-    local = LocalRun(config, directory, resume=True)
+    local = open_run(config, directory, resume=True)
     try:
         return local.run()
     finally:
@@ -59,47 +59,39 @@ def change_a_byte(path):
     path.write_bytes(bytes(data))
 
 
-def add_a_line(path):
-    path.write_bytes(b'{"iteration": 1, "env_steps": 5}\n' + path.read_bytes())
-
-
-def swap_lines(path):
-    first, second, *rest = path.read_bytes().splitlines(keepends=True)
-    path.write_bytes(b"".join([second, first, *rest]))
-
-
 @pytest.mark.parametrize("name", ["metrics.jsonl", "goals.jsonl"])
 @pytest.mark.parametrize(
     ("damage", "said"),
     [
-        (lambda path: path.unlink(), "the records of iterations 1-{last} are missing or changed"),
-        (cut, "the record of iteration {last} is missing or changed"),
-        (leave_out_a_line, "the record of iteration 2 is missing or changed"),
-        (change_a_byte, "the record of iteration 2 is missing or changed"),
-        (add_a_line, "1 lines are not the run's"),
-        (swap_lines, "its lines are in another order"),
+        (lambda path: path.unlink(), "has 0 bytes, and had {size:,} when the checkpoint was saved"),
+        (cut, "has {short:,} bytes, and had {size:,} when the checkpoint was saved"),
+        (leave_out_a_line, "and had {size:,} when the checkpoint was saved"),
+        (change_a_byte, "has other first {size:,} bytes than were written"),
     ],
 )
 def test_damaged_records_are_refused_in_one_line(run, name, damage, said):
+    size = (run / name).stat().st_size
     damage(run / name)
     there = (run / name).read_bytes() if (run / name).exists() else None
     with pytest.raises(StorageError) as error:
         go_on(run)
-    assert_one_line(error.value, run / name, said.format(last=newest(run).step), "--accept-damaged-records")
+    assert_one_line(error.value, run / name, said.format(size=size, short=size - 20), "--accept-damaged-records")
     assert ((run / name).read_bytes() if (run / name).exists() else None) == there
 
 
 def test_a_hole_that_is_accepted_is_named_and_asked_about_once(run, tmp_path):
     last = newest(run).step
-    change_a_byte(run / "metrics.jsonl")
+    size = (run / "metrics.jsonl").stat().st_size
+    leave_out_a_line(run / "metrics.jsonl")
+    short = (run / "metrics.jsonl").stat().st_size
     go_on(run, accept=True, steps=600)  # nothing is left to do, and it is saved all the same
-    said = ("metrics.jsonl: the record of iteration 2 is missing or changed",)
+    said = (f"metrics.jsonl has {short:,} bytes, and had {size:,} when the checkpoint was saved",)
     (event,) = read_history(run).events
     assert (event.after_iteration, event.damaged_records) == (last, said)
     assert [row["iteration"] for row in read_lines(run / "metrics.jsonl")] == [1, *range(3, last + 1)]
     directory, registry = RunDirectory(run), tmp_path / "registry"
     config = resumed_config(directory, ["run.total_env_steps=700"])
-    pretrain(config, directory, registry, resume=True, on_iteration=lambda metrics: None)
+    train(config, directory, registry, resume=True, on_iteration=lambda metrics: None)
     manifest = Registry(registry).manifest("tiny@1")
     first, second = manifest.history["events"]
     assert first["damaged_records"] == list(said)
@@ -121,7 +113,7 @@ def test_a_checkpoint_of_another_run_is_refused(run, tmp_path):
     with pytest.raises(CheckpointError) as error:
         go_on(run)
     ours, theirs = read_history(run).run, read_history(tmp_path / "other").run
-    assert_one_line(error.value, run, "of another run", f"({theirs[:8]}, not {ours[:8]})", "run.json")
+    assert_one_line(error.value, run, "of another run", f"({theirs[:8]}, not {ours[:8]})", "put that of this run back")
 
 
 def test_a_checkpoint_of_another_seed_is_refused(run):
@@ -149,34 +141,35 @@ def test_a_run_may_be_moved(run, tmp_path):
     assert go_on(run.rename(tmp_path / "elsewhere")).reason == "finished"
 
 
-def test_a_run_of_an_earlier_version_goes_on(run, caplog, monkeypatch):
-    """Its checkpoint says nothing about records or identity, and its name has no epoch."""
-    (checkpoint,) = [newest(run)]
-    meta = {key: value for key, value in checkpoint.meta.items() if key not in ("run", "records")}
-    shutil.rmtree(run / "checkpoints")
-    CheckpointStore(run / "checkpoints", keep=1).save(checkpoint.step, checkpoint.arrays, meta)
-    (run / "run.json").unlink()
-    shutil.rmtree(run / "epochs")
-    assert go_on(run).reason == "finished"
-    assert "nobody knows its records" in caplog.text
-    change_a_byte(run / "metrics.jsonl")
-    with pytest.raises(StorageError):  # from now on they are known
-        go_on(run)
+@pytest.mark.parametrize("version", ["0.1.0", "0.2.0", "0.4.1"])
+def test_a_run_of_another_version_is_left_alone(run, version):
+    identity = json.loads((run / "run.json").read_text()) | {"tandem": version}
+    if version == "0.2.0":
+        del identity["tandem"]
+    (run / "run.json").write_text(json.dumps(identity))
+    if version == "0.1.0":
+        (run / "run.json").unlink()
+    before = {path: path.read_bytes() for path in run.rglob("*") if path.is_file()}
+    with pytest.raises(ConfigError) as error:
+        resumed_config(RunDirectory(run), [])
+    reader = "0.2" if version == "0.1.0" else version
+    assert_one_line(error.value, run, f"by tandem {version}, which this version does not read: use tandem {reader}")
+    assert {path: path.read_bytes() for path in run.rglob("*") if path.is_file()} == before
 
 
 def test_a_damaged_history_is_one_line(run):
     (run / "run.json").write_text(json.dumps({"run": "x"}))
     with pytest.raises(StorageError) as error:
         go_on(run)
-    assert_one_line(error.value, run / "run.json", "damaged", "remove it")
+    assert_one_line(error.value, run / "run.json", "damaged", "restore it from a copy")
 
 
 def test_a_process_that_was_overtaken_saves_nothing(run):
     """Another one has claimed the run, on a file system without locks."""
     directory = RunDirectory(run)
-    local = LocalRun(resumed_config(directory, ["run.total_env_steps=900"]), directory, resume=True)
+    local = open_run(resumed_config(directory, ["run.total_env_steps=900"]), directory, resume=True)
     before = sorted(path.name for path in (run / "checkpoints").iterdir())
-    directory.epoch.__class__(run)
+    claim_epoch(run)
     with pytest.raises(StorageError, match="taken over by another process"):
         local.run()
     local.close()

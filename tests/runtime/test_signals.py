@@ -10,8 +10,8 @@ from typer.testing import CliRunner
 
 from service.cli.main import app
 from service.registry.registry import Registry
-from service.runtime.local import LocalRun
-from service.runtime.signals import PASSED_ON, STOPPING, InterruptError, StopSignals
+from service.runs.run import Run
+from service.runs.signals import PASSED_ON, STOPPING, InterruptError, StopSignals
 from tests.runtime.runs import assert_same_run, newest, play, tiny_config, write_yaml
 
 pytestmark = pytest.mark.usefixtures("default_signals")
@@ -130,7 +130,7 @@ def uninterrupted(tmp_path_factory):
     ("where", "number"),
     [
         ("service.primitives.publishing.success_metrics", signal.SIGINT),
-        ("service.runtime.pretrain.publish_run", signal.SIGTERM),
+        ("service.runs.train.publish_run", signal.SIGTERM),
         ("service.media.artifacts.plot_curves", signal.SIGTERM),
         ("service.media.artifacts.skill_trajectories", signal.SIGINT),
         ("service.media.recording.record_rounds", signal.SIGTERM),
@@ -158,7 +158,7 @@ def test_a_resume_does_what_the_signal_kept_from_being_done(home, uninterrupted,
 
 
 @BOTH
-@pytest.mark.parametrize("where", ["service.runtime.workers.SelfPlay", "service.io.checkpoints.write_atomic"])
+@pytest.mark.parametrize("where", ["service.methods.workers.SelfPlay", "service.io.checkpoints.write_atomic"])
 def test_a_signal_while_a_run_is_being_begun(home, monkeypatch, where, number):
     with monkeypatch.context() as patch:
         send_when_called(patch, where, number)
@@ -172,7 +172,7 @@ def test_a_signal_while_a_run_is_being_begun(home, monkeypatch, where, number):
 def test_a_signal_while_a_run_is_being_loaded(home, uninterrupted, monkeypatch, number):
     play(home.path, kill_after=3)
     with monkeypatch.context() as patch:
-        send_when_called(patch, "service.runtime.workers.TaskGenerator.load_state", number)
+        send_when_called(patch, "service.methods.workers.TaskGenerator.load_state", number)
         result = home.run("--resume")
     assert result.exit_code == 128 + number
     assert result.stdout == f"stopped at once; {home.hint}"
@@ -182,7 +182,7 @@ def test_a_signal_while_a_run_is_being_loaded(home, uninterrupted, monkeypatch, 
 
 @BOTH
 def test_a_signal_during_an_iteration(home, uninterrupted, monkeypatch, number):
-    record = LocalRun._take_snapshot
+    record = Run._take_snapshot
 
     def signalled(self, **kwargs):
         record(self, **kwargs)
@@ -190,7 +190,7 @@ def test_a_signal_during_an_iteration(home, uninterrupted, monkeypatch, number):
             send(number)
 
     with monkeypatch.context() as patch:
-        patch.setattr(LocalRun, "_take_snapshot", signalled)
+        patch.setattr(Run, "_take_snapshot", signalled)
         result = home.run()
     assert result.exit_code == 128 + number
     assert "stopping after this iteration; again to end now\n" in result.stderr
@@ -207,7 +207,7 @@ def test_two_signals_during_an_iteration(home, uninterrupted, monkeypatch):
         send(signal.SIGINT)
 
     with monkeypatch.context() as patch:
-        patch.setattr(LocalRun, "_metrics", signalled)
+        patch.setattr(Run, "_record", signalled)
         result = home.run()
     assert result.exit_code == 130
     assert result.stdout == f"stopped at once; {home.hint}"
@@ -218,13 +218,13 @@ def test_two_signals_during_an_iteration(home, uninterrupted, monkeypatch):
 
 def test_a_signal_while_the_last_checkpoint_is_written(home, uninterrupted, monkeypatch):
     """It came too late to end the learning, but in time to leave out what follows."""
-    save = LocalRun._save_last
+    save = Run._save_last
 
     def signalled(self):
         send(signal.SIGTERM)
         save(self)
 
-    monkeypatch.setattr(LocalRun, "_save_last", signalled)
+    monkeypatch.setattr(Run, "_save_last", signalled)
     result = home.run()
     assert result.exit_code == 143
     assert "finished after" in result.stdout

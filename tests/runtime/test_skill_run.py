@@ -14,8 +14,9 @@ from service.io.checkpoints import CheckpointStore
 from service.io.jsonl import read_jsonl
 from service.io.run_directory import RunDirectory
 from service.registry.registry import Registry
-from service.runtime.pretrain import pretrain
-from service.runtime.skill_run import SkillRun
+from service.runs.train import open_run, train
+from service.runtime.ray_connection import ClusterOptions
+from service.runtime.ray_runtime import RayRuntime
 
 
 def small_config(method="lsd", **run):
@@ -36,7 +37,7 @@ def timeless(path):
 
 
 def play(path, config, *, resume=False, stop_after=None):
-    run = SkillRun(config, directory := RunDirectory(path), resume=resume)
+    run = open_run(config, directory := RunDirectory(path), resume=resume)
 
     def stop(metrics):
         if metrics["iteration"] == stop_after:
@@ -59,7 +60,7 @@ def test_a_resumed_run_is_the_uninterrupted_one(tmp_path, method):
     one, other = (CheckpointStore(tmp_path / name / "checkpoints", 1).load_latest() for name in ("whole", "cut"))
     assert one.arrays.keys() == other.arrays.keys()
     assert all(np.array_equal(array, other.arrays[name]) for name, array in one.arrays.items())
-    assert one.meta["loop"] == other.meta["loop"]
+    assert one.meta["state"] == other.meta["state"]
 
 
 def test_its_records(tmp_path):
@@ -79,19 +80,19 @@ def test_its_records(tmp_path):
 
 
 def test_what_the_object_did_is_counted(tmp_path):
-    run = SkillRun(small_config(), RunDirectory(tmp_path))
+    run = open_run(small_config(), RunDirectory(tmp_path))
     ends = [((0, 0, 0.025), place) for place in ((0.0, 0.04, 0.025), (0.0, 0.06, 0.1), (0.0, 0.06, 0.025), (1, 0, -3))]
-    run._worlds.finished += [np.float32(pair) for pair in ends]
-    found = run._episodes()
+    run.method._worlds.finished += [np.float32(pair) for pair in ends]
+    found = run.method._episodes()
     assert found["skills/moved_fraction"] == 0.5  # and is still there
     assert found["skills/lifted_fraction"] == 0.25
     assert found["skills/outside_fraction"] == 0.25
     assert found["skills/num_cells_seen"] == 2.0
     distance = [0.04, np.hypot(0.06, 0.075), 0.06]
     assert found["skills/distance_m"] == pytest.approx(np.mean(distance), rel=1e-5)
-    grid = run.grid()
+    grid = run.method.grid()
     assert sorted(cell.num_tries for cell in grid.cells) == [1, 1]
-    assert run._worlds.finished == []
+    assert run.method._worlds.finished == []
     run.close()
 
 
@@ -105,7 +106,7 @@ def published(tmp_path_factory):
         patch.setattr(
             "service.media.video.write_episode_video", lambda episodes, world, path: drawn.append(episodes) or path
         )
-        done = pretrain(small_config(), run, path / "registry", on_iteration=lambda metrics: None)
+        done = train(small_config(), run, path / "registry", on_iteration=lambda metrics: None)
     assert str(done.version) == "cube-lsd@1"
     assert done.files == {
         "curves": run.path / "curves.png", "coverage": run.path / "coverage.png", "video": run.path / "skills.mp4"
@@ -152,12 +153,12 @@ class TestBadInput:
         assert "\n" not in str(caught.value)
 
     def test_skills_where_primitives_are_expected(self, published):
-        words = r"holds skills of lsd, not primitives: load them by service\.load_skills"
+        words = r"is a set of skills of lsd; load_primitives needs primitives$"
         for reference in ("cube-lsd@1", str(published / "run")):
             self.refused(words, service.load_primitives, reference, published / "registry")
 
     def test_primitives_where_skills_are_expected(self, tmp_path):
-        words = r"holds primitives, not skills: load them by service\.load_primitives"
+        words = r"is a set of primitives; load_skills needs skills$"
         self.refused(words, service.load_skills, "panda-cube@champion", tmp_path)
 
     def test_a_skill_of_another_size(self, published):
@@ -177,12 +178,13 @@ class TestBadInput:
     def test_a_directory_that_has_a_run(self, published, tmp_path):
         shutil.copytree(published / "run", tmp_path / "run")
         before = (tmp_path / "run" / "metrics.jsonl").read_bytes()
-        self.refused("holds a run already", SkillRun, small_config(), RunDirectory(tmp_path / "run"))
+        self.refused("holds a run already", open_run, small_config(), RunDirectory(tmp_path / "run"))
         assert (tmp_path / "run" / "metrics.jsonl").read_bytes() == before
 
     def test_on_a_cluster(self, tmp_path):
         self.refused(
-            "skill discovery runs in one process; use --runtime local", pretrain, small_config(),
-            RunDirectory(tmp_path / "run"), tmp_path, on_iteration=lambda metrics: None, cluster=object(),
+            "skill discovery runs in one process; use --runtime local", train, small_config(),
+            RunDirectory(tmp_path / "run"), tmp_path, on_iteration=lambda metrics: None,
+            runtime=RayRuntime(ClusterOptions()),
         )  # fmt: skip
         assert not (tmp_path / "run").exists()

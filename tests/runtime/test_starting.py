@@ -5,15 +5,15 @@ import logging
 import numpy as np
 import pytest
 
+from service.cli.common import load_start
 from service.config import parse_config
 from service.errors import TandemError
 from service.io.run_directory import RunDirectory
 from service.policies.numpy_policy import numpy_bob
-from service.primitives.loading import load_bob, read_parameters
+from service.primitives.loading import load
 from service.primitives.publishing import publish, publish_run
 from service.registry.registry import Registry
-from service.runtime.local import LocalRun
-from service.runtime.starting import read_start
+from service.runs.train import open_run
 from tests.runtime.runs import TREE, assert_same_run, play, tiny_config
 
 DRAWN = {"num_models": 3, "friction": [0.5, 1.0], "delay_steps": [0, 1], "object_noise_m": [0.0, 0.005]}
@@ -30,7 +30,7 @@ def trained(tmp_path_factory):
     root = tmp_path_factory.mktemp("trained")
     run, _ = play(root / "run")
     run.close()
-    version = publish_run(run.directory, Registry(root / "registry"), run.config, run.parameters(), {})
+    version = publish_run(run.directory, Registry(root / "registry"), run.config, run.method.parameters(), {})
     return root, run.directory, version
 
 
@@ -44,45 +44,46 @@ def test_a_run_with_more_to_see_is_exact_when_resumed(tmp_path):
 
 def test_from_a_version_bob_is_taken_and_it_is_the_parent(trained, tmp_path, caplog):
     root, _, version = trained
-    start = read_start(str(version), root / "registry", wider_config())
+    start = load(str(version), root / "registry")
     with caplog.at_level(logging.INFO):
-        run = LocalRun(wider_config(), RunDirectory(tmp_path / "run"), start=start)
+        run = open_run(wider_config(), RunDirectory(tmp_path / "run"), start=start)
     run.close()
     assert "bob/policy: taken: new command_1, command_2" in caplog.text
     assert "alice/policy: nothing there, begins anew" in caplog.text
     registry = Registry(root / "registry")
-    published = publish_run(run.directory, registry, run.config, run.parameters(), {})
+    published = publish_run(run.directory, registry, run.config, run.method.parameters(), {})
     assert registry.manifest(str(published)).parent == str(version)
-    bob = load_bob(str(published), root / "registry")
+    bob = load(str(published), root / "registry")
     assert bob.primitives.num_positions == 19
     assert bob.manifest.spaces["observation"] == 22
 
 
 def test_from_a_run_directory_all_four_networks_are_taken(trained, tmp_path):
     _, directory, _ = trained
-    start = read_start(str(directory.path), tmp_path, tiny_config())
-    new = LocalRun(tiny_config(seed=5), RunDirectory(tmp_path / "new"), start=start)
+    start = load(str(directory.path))
+    new = open_run(tiny_config(seed=5), RunDirectory(tmp_path / "new"), start=start)
     new.close()
-    old = LocalRun(tiny_config(), directory, resume=True)
+    old = open_run(tiny_config(), directory, resume=True)
     old.close()
-    ours, theirs = new.learner.state(), old.learner.state()
+    ours, theirs = new.method.learner.state(), old.method.learner.state()
     networks = [name for name in theirs if "adam" not in name and ("/policy/" in name or "/value/" in name)]
     assert len(networks) > 20
     for name in networks:
         np.testing.assert_array_equal(ours[name], theirs[name], err_msg=name)
     observation = np.random.default_rng(0).normal(size=(4, 14)).astype(np.float32)
-    published = numpy_bob(read_parameters(RunDirectory(tmp_path / "new"), "bob"))
+    published = load(str(tmp_path / "new"))
     np.testing.assert_allclose(
-        published.act_deterministic(observation), numpy_bob(new.learner.weights().bob).act_deterministic(observation)
+        published.act_deterministic(observation),
+        numpy_bob(new.method.learner.weights().bob).act_deterministic(observation),
     )
 
 
 def test_only_the_value_network_learns_at_first(tmp_path):
     tree = TREE | {"learner": {**TREE["learner"], "bob": {**TREE["learner"]["bob"], "value_first_updates": 100}}}
-    run = LocalRun(parse_config(tree, where="a test"), RunDirectory(tmp_path / "run"))
-    before = {name: array.copy() for name, array in run.learner.state().items()}
+    run = open_run(parse_config(tree, where="a test"), RunDirectory(tmp_path / "run"))
+    before = {name: array.copy() for name, array in run.method.learner.state().items()}
     run.run()
-    after = run.learner.state()
+    after = run.method.learner.state()
     run.close()
     changed = {name for name in before if name in after and not np.array_equal(before[name], after[name])}
     assert not {name for name in changed if name.startswith("bob/policy/")}
@@ -92,31 +93,31 @@ def test_only_the_value_network_learns_at_first(tmp_path):
 
 @pytest.mark.parametrize(
     ("reference", "expected"),
-    [("nobody@1", "nobody"), ("some/where", "no such run directory")],
+    [("nobody@1", "nobody"), ("some/where", "no such directory of a run")],
 )
 def test_what_cannot_be_begun_from(tmp_path, reference, expected):
     with pytest.raises(TandemError, match=expected):
-        read_start(reference, tmp_path, tiny_config())
+        load_start(reference, tmp_path, tiny_config())
 
 
 def test_nothing_that_fits_is_refused_and_another_try_can_begin(trained, tmp_path):
     root, _, version = trained
-    start = read_start(str(version), root / "registry", tiny_config())
+    start = load(str(version), root / "registry")
     larger = tiny_config(seed=5)
     bob = larger.policy.bob.model_copy(update={"primitive_hidden_size": larger.policy.bob.primitive_hidden_size + 1})
     larger = larger.model_copy(update={"policy": larger.policy.model_copy(update={"bob": bob})})
     directory = RunDirectory(tmp_path / "run")
     with pytest.raises(TandemError, match=r"^--from tiny@1: nothing of it fits: bob/policy: not taken, .* is of shape"):
-        LocalRun(larger, directory, start=start)
+        open_run(larger, directory, start=start)
     directory.close()
-    LocalRun(tiny_config(seed=5), RunDirectory(tmp_path / "run"), start=start).close()
+    open_run(tiny_config(seed=5), RunDirectory(tmp_path / "run"), start=start).close()
 
 
 def test_from_an_exported_version(trained, tmp_path, monkeypatch):
     root, _, version = trained
     Registry(root / "registry").export(str(version), tmp_path / "exported")
     monkeypatch.chdir(tmp_path)
-    start = read_start("exported", tmp_path / "empty", tiny_config())
+    start = load("exported", tmp_path / "empty")
     assert start.reference == str(tmp_path / "exported")
     assert start.published.version == str(version)
     assert start.networks.keys() == {"bob/policy"}
@@ -126,16 +127,16 @@ def test_a_version_that_came_with_tandem_is_the_parent_in_any_registry(trained, 
     """But not where that registry has another version of that name and number."""
     root, _, version = trained
     monkeypatch.setattr("service.primitives.bundled.BUNDLED", root / "registry")
-    start = read_start("tiny", tmp_path / "empty", wider_config())
+    start = load("tiny", tmp_path / "empty")
     assert start.reference == str(version) == "tiny@1"
-    run = LocalRun(wider_config(), RunDirectory(tmp_path / "run"), start=start)
+    run = open_run(wider_config(), RunDirectory(tmp_path / "run"), start=start)
     run.close()
     parents = []
     for name in ("other", "taken"):
         registry = Registry(tmp_path / name)
         if name == "taken":
-            publish(registry, tiny_config(), run.parameters(), {})
+            publish(registry, tiny_config(), run.method.parameters(), {})
         run.directory.write_published(start.published)
-        published = publish_run(run.directory, registry, run.config, run.parameters(), {})
+        published = publish_run(run.directory, registry, run.config, run.method.parameters(), {})
         parents.append(registry.manifest(str(published)).parent)
     assert parents == ["tiny@1", None]

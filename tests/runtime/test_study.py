@@ -16,14 +16,13 @@ from typer.testing import CliRunner
 from service.actors.evaluation import EVALUATION_SEED, REPORTED_SEED, SELECTION_SEED, Evaluation
 from service.cli.main import app
 from service.errors import ConfigError, TandemError
-from service.io.run_directory import RunDirectory
 from service.io.study_directory import StudyDirectory
-from service.primitives.loading import read_parameters
+from service.primitives.loading import load
 from service.registry.registry import Registry
+from service.runs.resuming import resumed_config
 from service.runtime import study_results
 from service.runtime.pretrain_study import StudyCluster, _arguments, _share
 from service.runtime.ray_connection import ClusterOptions
-from service.runtime.resuming import resumed_config
 from service.runtime.study import RunEnd, Study
 from service.runtime.study_plan import Share, check_same_seeds, parse_seeds, share_cluster, share_machine
 from service.runtime.study_results import Scores, best_seed, publish_best, score
@@ -188,7 +187,7 @@ def test_goals_that_choose_are_not_those_that_are_reported(monkeypatch, tmp_path
 
     play(tmp_path, tiny_config(total_env_steps=120))
     monkeypatch.setattr("service.actors.evaluation.evaluate", evaluate)
-    scores = score(tiny_config(), read_parameters(RunDirectory(tmp_path), "bob"))
+    scores = score(tiny_config(), load(str(tmp_path)).parameters)
     reported = [(kind, 1000, 2, REPORTED_SEED) for kind in ("table", "air", "mixed")]
     assert sorted(asked) == sorted([*reported, ("mixed", 1000, 2, SELECTION_SEED)])
     # recorded figures are of these goals, and what chose is not what is reported
@@ -257,7 +256,7 @@ def test_a_study_is_killed_stopped_resumed_and_names_its_best(tmp_path, monkeypa
     assert result.exit_code == 130, result.output
     assert f"saved; continue with: tandem pretrain --resume --run-dir {path} --registry {registry}\n" in result.stdout
     assert_one_line(result.stderr.splitlines()[-1], "seed 8 failed: ended by SIGKILL", path / "seed-8" / "log.txt")
-    assert re.search(r"^seed [38]: +[0-9,]+ env steps \| ", result.stderr, re.MULTILINE)
+    assert re.search(r"^seed [38]: [0-9,]+ of [0-9,]+ env steps, .* \| ", result.stderr, re.MULTILINE)
     assert {seed: run["state"] for seed, run in told().items()} == {"3": "interrupted", "8": "failed"}
     statuses = {run.run_id: run for run in DiskReader(tmp_path).runs()}  # as the status service lists them
     assert set(statuses) == {"study-seed-3", "study-seed-8"}
@@ -285,7 +284,7 @@ def test_a_study_is_killed_stopped_resumed_and_names_its_best(tmp_path, monkeypa
     manifest, parameters = Registry(registry).load("tiny@latest")
     assert manifest.config["seed"] == best
     assert manifest.metrics["env_steps"] == results["runs"][str(best)]["env_steps"]
-    bob = read_parameters(study.run(best), "bob")
+    bob = load(str(study.run(best).path)).parameters
     assert all(np.array_equal(parameters[name], array) for name, array in bob.items())
     assert DiskReader(path).run(f"study-seed-{best}").published == "tiny@1"
 

@@ -62,7 +62,6 @@ def test_one_that_counts_no_further_hangs_whether_it_answers_or_not(worker, answ
     worker.answers = answers
     assert worker.looks(STALL_S - 0.5) is None
     assert worker.looks(4.0) in {f"no progress for {seconds} s" for seconds in (30, 31, 32)}
-    assert worker.watch.silent is not answers
 
 
 @pytest.mark.parametrize("per_s", [0.1, 5.0])

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from service.generator.ring import join_rows
-from service.runtime.workers import GeneratorWorker, LearnerWorker, RolloutWorker
+from service.methods.workers import GeneratorWorker, LearnerWorker, RolloutWorker
 from tests.actors.players import assert_same_rollout
 from tests.runtime.runs import tiny_config
 

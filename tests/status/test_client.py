@@ -20,11 +20,17 @@ import service
 from service.errors import TandemError
 from service.io.errors import StorageError
 from service.primitives.bundled import BUNDLED
-from service.registry.errors import DamagedBlobError, RegistryError, UnknownVersionError
+from service.registry import client
+from service.registry.client import fetch_primitives
+from service.registry.errors import (
+    DamagedBlobError,
+    FetchError,
+    RegistryError,
+    StatusError,
+    UnknownVersionError,
+    WrongTokenError,
+)
 from service.registry.registry import Registry
-from service.status import client
-from service.status.client import fetch_primitives
-from service.status.errors import FetchError, StatusError, WrongTokenError
 from service.status.server import StatusServer
 from service.store.disk_reader import DiskReader
 from tests.registry.helpers import files_in

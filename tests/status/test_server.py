@@ -14,10 +14,10 @@ import pytest
 from typer.testing import CliRunner
 
 from service.cli.main import app
+from service.registry.errors import StatusError
 from service.registry.registry import Registry
-from service.status.errors import StatusError
+from service.registry.token import read_token
 from service.status.server import StatusServer
-from service.status.token import read_token
 from service.store.disk_reader import DiskReader
 from tests.status.conftest import serve
 from tests.status.runs import BEARER, CLIENT, TOKEN, publish, write_runs

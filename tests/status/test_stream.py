@@ -18,10 +18,9 @@ from service.status.server import StatusServer
 from service.status.stream import RunFollower, Streams
 from service.store.disk_reader import DiskReader
 from service.store.redis_reader import RedisReader
-from service.store.redis_writer import RedisWriter
 from tests.status.conftest import serve
 from tests.status.runs import BEARER, CLIENT, append, record, status, write_status
-from tests.store.stores import Killable
+from tests.store.stores import Killable, a_writer
 
 
 @pytest.fixture
@@ -126,7 +125,7 @@ def test_a_browser_that_reconnects_after_a_resume(root, service):
 def test_a_run_that_is_only_in_redis(tmp_path):
     redis = Killable(tmp_path)
     try:
-        writer = RedisWriter(redis.address, "far")
+        writer = a_writer(redis.address, "far")
         writer.status(status("far", state="finished", iteration=5))
         for iteration in range(1, 6):
             writer.metrics(record(iteration))

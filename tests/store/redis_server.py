@@ -39,6 +39,7 @@ class RedisServer:
 
     def __init__(self, directory: Path, *, port: int | None = None, password: str | None = None) -> None:
         password = password or secrets.token_urlsafe(24)
+        self.directory = directory
         directory.mkdir(parents=True, exist_ok=True)
         for _ in range(_ATTEMPTS):  # a free port may be taken by others before the server has it
             chosen = port or _free_port()

@@ -4,6 +4,7 @@ import time
 from datetime import UTC, datetime, timedelta
 
 from service.store.models import GoalCell, GoalGrid, RunStatus
+from service.store.redis_writer import RedisWriter
 from tests.store.redis_server import RedisServer
 
 
@@ -15,6 +16,11 @@ def a_status(run_id="cube", **changes):
 
 def a_silent_status(**changes):
     return a_status(heartbeat=datetime.now(UTC) - timedelta(seconds=61), **changes)
+
+
+def a_writer(address, run_id="cube", *, run="a", epoch=1):
+    """A process that reports to Redis."""
+    return RedisWriter(address, run_id, run=run, epoch=epoch)
 
 
 def a_grid(iteration=1):

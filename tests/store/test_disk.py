@@ -6,7 +6,6 @@ import re
 import shutil
 import signal
 import subprocess
-import time
 import tracemalloc
 from contextlib import suppress
 from datetime import UTC, datetime, timedelta
@@ -18,10 +17,10 @@ from service.io.jsonl import JsonlWriter
 from service.io.lock import DirectoryLock
 from service.io.run_directory import RunDirectory
 from service.store import disk_reader
-from service.store.disk import DiskWriter
 from service.store.disk_reader import DiskReader, run_id_of
 from service.store.errors import StoreError
 from service.store.pulse import Pulse
+from service.store.run_writer import RunWriter
 from service.store.tail import RecordFile
 from tests.runtime.runs import assert_one_line, no_room_above
 from tests.store.stores import a_grid, a_record, a_silent_status, a_status, wait_until
@@ -46,7 +45,7 @@ def read_status(directory):
 
 def test_status_is_written_once_a_second_and_at_changes_of_state_or_condition(tmp_path):
     clock = Clock()
-    writer = DiskWriter(RunDirectory(tmp_path), clock=clock)
+    writer = RunWriter(RunDirectory(tmp_path), clock=clock)
     seen, told = [], [(0.0, 1, "running"), (0.9, 2, "running"), (1.0, 3, "running"), (1.1, 4, "failed")]
     for now_s, iteration, state in told:
         clock.now_s = now_s
@@ -61,7 +60,7 @@ def test_status_is_written_once_a_second_and_at_changes_of_state_or_condition(tm
 
 def test_the_grid_is_written_every_five_seconds_and_at_the_end(tmp_path):
     clock, seen = Clock(), []
-    writer = DiskWriter(RunDirectory(tmp_path), clock=clock)
+    writer = RunWriter(RunDirectory(tmp_path), clock=clock)
     for number in range(1, 8):
         writer.goals(a_grid(number))
         seen.append(json.loads((tmp_path / "goals.json").read_text())["iteration"])
@@ -74,7 +73,7 @@ def test_the_grid_is_written_every_five_seconds_and_at_the_end(tmp_path):
 
 def test_a_full_disk_is_a_warning_and_passes(tmp_path, caplog):
     clock = Clock()
-    writer = DiskWriter(RunDirectory(tmp_path), clock=clock)
+    writer = RunWriter(RunDirectory(tmp_path), clock=clock)
     writer.status(a_status(iteration=1))
     with no_room_above(10):
         for _ in range(3):
@@ -95,76 +94,46 @@ def test_a_full_disk_is_a_warning_and_passes(tmp_path, caplog):
 
 
 @pytest.fixture
-def old_run(tmp_path):
-    """A run directory without a status, as an older tandem leaves it; not heard of for an hour."""
+def ended(tmp_path):
+    """The directory of a run that has ended."""
     directory = tmp_path / "old one"
     directory.mkdir()
-    (directory / "config.yaml").write_text("name: panda-cube\nrun: {total_env_steps: 1000}\nno_longer_there: 1\n")
+    RunWriter(RunDirectory(directory)).status(a_status("old-one", state="finished", iteration=4))
+    (directory / "config.yaml").write_text("name: panda-cube\n")
+    (directory / "run.json").write_text('{"run": "00000000000000000000000000000000"}')
     records = JsonlWriter(directory / "metrics.jsonl")
-    speed = {"time/env_steps_per_s": 12.5, "learner/version": 3.0, "learner/policy_lag": 1.0}
     for number in range(1, 5):
-        records.append(a_record(number, **speed))
-    age(directory, 3600)
+        records.append(a_record(number))
     return directory
 
 
-def age(directory, seconds):
-    for path in directory.iterdir():
-        os.utime(path, (time.time() - seconds, time.time() - seconds))
+def test_a_directory_of_version_0_1_0_names_the_version_that_reads_it(ended):
+    for name in ("status.json", "run.json"):
+        (ended / name).unlink()
+    run = DiskReader(ended.parent).run("old-one")
+    assert run.state == "interrupted"
+    assert_one_line(run.last_error, ended, "written by tandem 0.1.0, which this version does not read: use tandem 0.2")
 
 
-def test_an_older_run_shows_what_its_files_tell(old_run):
-    (run,) = DiskReader(old_run.parent).runs()
-    assert (run.run_id, run.name, run.state) == ("old-one", "panda-cube", "interrupted")
-    assert (run.iteration, run.num_env_steps, run.total_env_steps) == (4, 400, 1000)
-    assert (run.env_steps_per_s, run.policy_version, run.policy_lag, run.num_rollouts_counted) == (12.5, 3, 1.0, 3)
-    assert run.heartbeat.timestamp() == pytest.approx(time.time() - 3600, abs=60)
-    assert [each["iteration"] for each in DiskReader(old_run.parent).metrics("old-one", after_iteration=2)] == [3, 4]
+def test_a_run_without_a_status_has_only_begun(ended):
+    (ended / "status.json").unlink()
+    assert_one_line(DiskReader(ended.parent).run("old-one").last_error, ended, "has no status.json")
 
 
-def test_how_an_older_run_ended(old_run):
-    def state():
-        return DiskReader(old_run.parent).run("old-one").state
-
-    (old_run / "published.json").write_text('{"version": "panda-cube@2"}')
-    assert state() == "converged"
-    assert DiskReader(old_run.parent).run("old-one").published == "panda-cube@2"
-    age(old_run, 5)
-    assert state() == "running"  # by a process of an older tandem
-    with pytest.raises(StoreError) as error:
-        DiskReader(old_run.parent).request_stop("old-one")
-    assert_one_line(error.value, "old-one", "older tandem")
-    JsonlWriter(old_run / "metrics.jsonl").append(a_record(10))
-    assert state() == "finished"
-    DiskReader(old_run.parent).request_stop("old-one")
-    assert not (old_run / "stop").exists()
+WITHOUT_A_ZONE = a_status().model_dump_json().replace("Z", "").encode()  # which no clock compares with
 
 
-def test_an_older_run_before_its_first_record(old_run):
-    (old_run / "metrics.jsonl").unlink()
-    (old_run / "config.yaml").write_text("{: damaged")
-    run = DiskReader(old_run.parent).run("old-one")
-    assert (run.name, run.iteration, run.total_env_steps) == ("old-one", 0, 1)
-
-
-@pytest.mark.parametrize("content", [b"", b"{", b'{"run_id": "x"}', b"\xff\xfe", b"[]"])
-def test_a_damaged_status_falls_back_on_the_records(old_run, content):
-    (old_run / "status.json").write_bytes(content)
-    (run,) = DiskReader(old_run.parent).runs()
-    assert (run.iteration, run.name) == (4, "panda-cube")
-    assert_one_line(run.warnings[0], "status.json cannot be read")
-
-
-def test_a_date_without_a_time_zone_is_damage(old_run):
-    """It could not be compared with the clock."""
-    text = a_status().model_dump_json().replace("Z", "")
-    (old_run / "status.json").write_text(text)
-    assert DiskReader(old_run.parent).run("old-one").warnings != ()
+@pytest.mark.parametrize("content", [b"", b"{", b'{"run_id": "x"}', b"\xff\xfe", b"[]", WITHOUT_A_ZONE])
+def test_a_damaged_status_is_damage_of_its_run(ended, content):
+    (ended / "status.json").write_bytes(content)
+    (run,) = DiskReader(ended.parent).runs()
+    assert_one_line(run.last_error, ended, "cannot be read: status.json")
+    assert [each["iteration"] for each in DiskReader(ended.parent).metrics("old-one", after_iteration=2)] == [3, 4]
 
 
 def test_a_copied_directory_is_another_run(tmp_path):
     (tmp_path / "a").mkdir()
-    writer = DiskWriter(RunDirectory(tmp_path / "a"))
+    writer = RunWriter(RunDirectory(tmp_path / "a"))
     writer.status(a_status("a", state="finished"))
     shutil.copytree(tmp_path / "a", tmp_path / "b")
     assert {run.run_id for run in DiskReader(tmp_path).runs()} == {"a", "b"}
@@ -182,7 +151,7 @@ def test_the_runs_of_a_study_are_listed_with_the_others_under_its_name(tmp_path)
     study = tmp_path / "night 1"
     for path in (tmp_path / "cube", study / "seed-0", study / "seed-12"):
         path.mkdir(parents=True)
-        DiskWriter(RunDirectory(path)).status(a_status(run_id_of(path), state="finished", iteration=len(path.name)))
+        RunWriter(RunDirectory(path)).status(a_status(run_id_of(path), state="finished", iteration=len(path.name)))
     assert {run.run_id for run in DiskReader(tmp_path).runs()} == {"cube"}
     (study / "study.yaml").touch()
     (study / "seed-99").mkdir()  # not begun
@@ -210,7 +179,7 @@ def test_run_ids_of_directories(tmp_path, name, run_id):
 
 def test_a_silent_run_that_nobody_locks_has_vanished_and_is_not_asked_to_stop(tmp_path):
     (tmp_path / "cube").mkdir()
-    writer = DiskWriter(RunDirectory(tmp_path / "cube"))
+    writer = RunWriter(RunDirectory(tmp_path / "cube"))
     writer.status(a_silent_status())
     reader = DiskReader(tmp_path)
     reader.request_stop("cube")
@@ -224,7 +193,7 @@ def test_a_silent_run_that_nobody_locks_has_vanished_and_is_not_asked_to_stop(tm
 def held(tmp_path):
     """A run directory that a process has, which has said nothing for a minute."""
     lock = DirectoryLock(tmp_path / "cube", "")
-    DiskWriter(RunDirectory(tmp_path / "cube")).status(a_silent_status())
+    RunWriter(RunDirectory(tmp_path / "cube")).status(a_silent_status())
     yield DiskReader(tmp_path)
     lock.release()
 
@@ -240,7 +209,7 @@ def test_a_frozen_process_is_stuck_and_named(held, monkeypatch):
 def test_a_frozen_process_is_seen_long_before_it_is_silent(tmp_path, monkeypatch):
     lock = DirectoryLock(tmp_path / "cube", "")
     heartbeat = datetime.now(UTC) - timedelta(seconds=disk_reader.QUIET_S + 2)
-    DiskWriter(RunDirectory(tmp_path / "cube")).status(a_status(heartbeat=heartbeat))
+    RunWriter(RunDirectory(tmp_path / "cube")).status(a_status(heartbeat=heartbeat))
     reader = DiskReader(tmp_path)
     assert reader.run("cube").condition == "well"
     monkeypatch.setattr(disk_reader, "_is_stopped", lambda pid: pid == os.getpid())
@@ -250,7 +219,7 @@ def test_a_frozen_process_is_seen_long_before_it_is_silent(tmp_path, monkeypatch
 
 def test_a_run_that_vanished_while_its_disk_was_full_has_vanished(tmp_path):
     (tmp_path / "cube").mkdir()
-    DiskWriter(RunDirectory(tmp_path / "cube")).status(a_silent_status().suffering("disk", "no room"))
+    RunWriter(RunDirectory(tmp_path / "cube")).status(a_silent_status().suffering("disk", "no room"))
     seen = DiskReader(tmp_path).run("cube")
     assert (seen.state, seen.condition) == ("interrupted", "well")
     assert "vanished" in seen.last_error
@@ -276,7 +245,7 @@ def test_a_full_disk_is_what_it_is(held, monkeypatch):
 def test_a_heartbeat_from_the_future_is_no_sign_of_life(tmp_path, monkeypatch, locked):
     clock = Clock()
     lock = DirectoryLock(tmp_path / "cube", "")
-    DiskWriter(RunDirectory(tmp_path / "cube")).status(a_status(heartbeat=datetime.now(UTC) + timedelta(hours=1)))
+    RunWriter(RunDirectory(tmp_path / "cube")).status(a_status(heartbeat=datetime.now(UTC) + timedelta(hours=1)))
     if not locked:
         lock.release()
     reader = DiskReader(tmp_path)
@@ -290,27 +259,15 @@ def test_a_heartbeat_from_the_future_is_no_sign_of_life(tmp_path, monkeypatch, l
     lock.release()
 
 
-def test_yaml_is_parsed_once(old_run, monkeypatch):
-    calls, load = [], disk_reader.parse_yaml
-    monkeypatch.setattr(disk_reader, "parse_yaml", lambda *given: calls.append(1) or load(*given))
-    reader = DiskReader(old_run.parent)
-    for _ in range(3):
-        reader.run("old-one")
-    assert len(calls) == 1
-    os.utime(old_run / "config.yaml")  # as a resume does
-    reader.run("old-one")
-    assert len(calls) == 2
-
-
 @pytest.mark.parametrize(
     "name", ["status.json", "goals.json", "metrics.jsonl", "config.yaml", "published.json", ".lock"]
 )
-def test_nobody_waits_for_a_fifo(old_run, name):
-    (old_run / name).unlink(missing_ok=True)
+def test_nobody_waits_for_a_fifo(ended, name):
+    (ended / name).unlink(missing_ok=True)
     if name == "config.yaml":  # so that it is a run
-        (old_run / "status.json").write_text("no status")
-    os.mkfifo(old_run / name)
-    reader = DiskReader(old_run.parent)
+        (ended / "status.json").write_text("no status")
+    os.mkfifo(ended / name)
+    reader = DiskReader(ended.parent)
     (status,) = reader.runs()
     assert status.run_id == "old-one"
     for read in (reader.metrics, reader.goals, reader.request_stop):
@@ -360,13 +317,17 @@ def growing(tmp_path):
 
 def test_only_what_is_new_is_read(growing):
     path, writer, records = growing
-    for number in range(1, 400):
+    for number in range(1, 2000):
         writer.append(a_record(number))
-    assert len(records.after(0)) == 399
-    writer.append(a_record(400))
-    # a limit on what may be read: the whole file is some 25 KB
+    assert len(records.columns(None).iteration) == 1999
+    writer.append(a_record(2000))
+    assert [each["iteration"] for each in records.after(100)] == list(range(101, 2001))
+    for ask in (lambda: records.after(1999), lambda: [records.last()]):
+        before = bytes_read()
+        assert ask() == [a_record(2000)]
+        assert bytes_read() - before < path.stat().st_size // 2
     before = bytes_read()
-    assert records.after(399) == [a_record(400)]
+    assert len(records.columns(None).iteration) == 2000
     assert bytes_read() - before < path.stat().st_size // 2
 
 
@@ -396,9 +357,9 @@ def test_a_file_that_a_resume_has_cut(growing):
     for number in range(1, 8):
         writer.append(a_record(number, past=0))
     assert len(records.after(0)) == 7
-    writer.truncate_after(4)
+    writer.cut_after(4)
     assert len(records.after(0)) == 4
-    writer.truncate_after(3)
+    writer.cut_after(3)
     for number in range(4, 12):  # longer than before when it is looked at next
         writer.append(a_record(number, past=1))
     found = records.after(0)
@@ -413,21 +374,22 @@ DEEP = {
 
 
 @pytest.mark.parametrize("line", DEEP)
-def test_a_deep_line_is_damage_of_its_run_alone(old_run, line):
+def test_a_deep_line_is_damage_of_its_run_alone(ended, line):
     """Parsers that call themselves end with a RecursionError, which is no ValueError."""
-    with (old_run / "metrics.jsonl").open("a") as file:
+    with (ended / "metrics.jsonl").open("a") as file:
         file.write(DEEP[line] + "\n" + json.dumps(a_record(5)) + "\n")
-    reader = DiskReader(old_run.parent)
-    (run,) = reader.runs()
-    assert run.iteration == 5
-    assert_one_line(run.warnings[-1], "metrics.jsonl", "no records", "1")
+    reader = DiskReader(ended.parent)
     assert [record["iteration"] for record in reader.metrics("old-one")][-1] == 5
     assert reader.columns("old-one", None).iteration[-1] == 5
+    (run,) = reader.runs()
+    assert_one_line(run.warnings[-1], "metrics.jsonl", "no records", "1")
     assert reader.sample("old-one", "env_steps", 5)
+    (run,) = reader.runs()
+    assert_one_line(run.warnings[-1], "metrics.jsonl", "no records", "1")
 
 
-def test_a_directory_that_cannot_be_read_is_a_damaged_run_beside_the_others(old_run, monkeypatch):
-    root = old_run.parent
+def test_a_directory_that_cannot_be_read_is_a_damaged_run_beside_the_others(ended, monkeypatch):
+    root = ended.parent
     (root / "loop-1").symlink_to("loop-2")
     (root / "loop-2").symlink_to("loop-1")
     (root / "trainings").mkdir()
@@ -443,25 +405,23 @@ def test_a_directory_that_cannot_be_read_is_a_damaged_run_beside_the_others(old_
         assert DiskReader(root).run(name) == runs[name]
 
     def no_permission(path, *args, **kwargs):  # which root always has
-        if str(path).startswith(str(old_run)):
+        if str(path).startswith(str(ended)):
             raise PermissionError(13, "Permission denied", str(path))
         return stat(path, *args, **kwargs)
 
     stat = os.stat
     monkeypatch.setattr(os, "stat", no_permission)
     runs = {run.run_id: run for run in DiskReader(root).runs()}
-    assert_one_line(runs["old-one"].last_error, old_run, "Permission denied")
+    assert_one_line(runs["old-one"].last_error, ended, "Permission denied")
     assert "trainings-push" in runs
 
 
-def test_whatever_is_wrong_with_a_run_it_hides_no_other(old_run, monkeypatch):
-    """A record that nobody thought of, say."""
-    shutil.copytree(old_run, old_run.parent / "other")
-    guess = disk_reader._guess_status
-    monkeypatch.setattr(
-        disk_reader, "_guess_status", lambda run_id, *rest: 1 / 0 if run_id == "other" else guess(run_id, *rest)
-    )
-    runs = {run.run_id: run for run in DiskReader(old_run.parent).runs()}
+def test_whatever_is_wrong_with_a_run_it_hides_no_other(ended, monkeypatch):
+    """An error that nobody thought of, say."""
+    shutil.copytree(ended, ended.parent / "other")
+    newest = disk_reader.newest_epoch
+    monkeypatch.setattr(disk_reader, "newest_epoch", lambda path: 1 / 0 if path.name == "other" else newest(path))
+    runs = {run.run_id: run for run in DiskReader(ended.parent).runs()}
     assert runs["old-one"].last_error is None
     assert_one_line(runs["other"].last_error, "other", "ZeroDivisionError: division by zero")
 

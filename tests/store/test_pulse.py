@@ -4,7 +4,8 @@ from datetime import UTC, datetime, timedelta
 
 import pytest
 
-from service.store.pulse import Pulse, ahead_s
+from service.store.pulse import Pulse, with_clock
+from tests.store.stores import a_status
 
 
 @pytest.fixture
@@ -44,7 +45,7 @@ def test_a_new_one_is_not_older_than_our_last_look(pulse, clock):
     assert pulse.age_s("cube", ago(1000)) == pytest.approx(1000.0, abs=1.0)  # it beat while nobody looked
 
 
-def test_how_far_ahead():
-    assert ahead_s(ago(60)) is None
-    assert ahead_s(ago(-3)) is None
-    assert ahead_s(ago(-60)) == pytest.approx(60.0, abs=1.0)
+def test_a_heartbeat_from_the_future_says_that_a_clock_is_wrong():
+    assert [with_clock(a_status(heartbeat=ago(age))).condition for age in (60, -3, -60)] == ["well", "well", "clock"]
+    assert "is 60 s in the future" in with_clock(a_status(heartbeat=ago(-60.4))).warnings[0]
+    assert with_clock(a_status(heartbeat=ago(-60), state="finished")).condition == "well"

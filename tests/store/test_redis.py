@@ -2,8 +2,6 @@
 
 import os
 import signal
-import subprocess
-import sys
 import threading
 import time
 
@@ -14,23 +12,13 @@ from service.store import keys, redis_writer
 from service.store.address import RedisAddress
 from service.store.errors import DamagedStoreError, StoreUnavailableError
 from service.store.redis_reader import RedisReader
-from service.store.redis_writer import RedisWriter
 from tests.runtime.runs import assert_one_line
-from tests.store.stores import a_grid, a_record, a_status, wait_until
-
-DRIVE = """
-import sys, time
-from service.store.address import RedisAddress
-from service.store.redis_writer import RedisWriter
-writer = RedisWriter(RedisAddress(sys.stdin.readline().strip()), "cube", lease_s=1.0)
-print("has it", flush=True)
-time.sleep(60)
-"""
+from tests.store.stores import a_grid, a_record, a_status, a_writer, wait_until
 
 
 @pytest.fixture
 def writer(redis):
-    writer = RedisWriter(redis.address, "cube")
+    writer = a_writer(redis.address, "cube")
     yield writer
     writer.close()
 
@@ -84,7 +72,7 @@ def test_killed_and_back_at_the_same_place(redis, writer, reader):
 def test_stopped_for_a_while(redis, reader, monkeypatch, timeout_s):
     """It answers nobody, and its connections stay open: worse than being dead."""
     monkeypatch.setattr(redis_writer, "TIMEOUT_S", timeout_s)
-    writer = RedisWriter(redis.address, "cube")
+    writer = a_writer(redis.address, "cube")
     train(writer, range(1, 6))
     wait_until(lambda: reader.runs() != [])
     os.kill(redis.server.pid, signal.SIGSTOP)
@@ -117,7 +105,7 @@ def test_what_redis_forgot_that_it_had_is_sent_again(redis, writer, reader):
 
 def test_a_restart_between_two_messages_is_noticed(redis, reader, monkeypatch):
     """No call has failed: the client has made a new connection without a word."""
-    writer = RedisWriter(redis.address, "cube")
+    writer = a_writer(redis.address, "cube")
     train(writer, range(1, 11))
     wait_until(lambda: reader.runs() and iterations(reader)[-1:] == [10])
     monkeypatch.setattr(redis_writer, "TICK_S", 3600.0)
@@ -173,7 +161,7 @@ def test_history_in_redis_is_bounded(writer, reader, monkeypatch):
 
 def test_closing_waits_for_a_bounded_time(redis, caplog, monkeypatch):
     monkeypatch.setattr(redis_writer, "TIMEOUT_S", 3600.0)
-    writer = RedisWriter(redis.address, "cube")
+    writer = a_writer(redis.address, "cube")
     os.kill(redis.server.pid, signal.SIGSTOP)
     try:
         writer.metrics(a_record(1))
@@ -184,7 +172,7 @@ def test_closing_waits_for_a_bounded_time(redis, caplog, monkeypatch):
 
 
 def test_closing_sends_what_waits(redis, reader):
-    writer = RedisWriter(redis.address, "cube")
+    writer = a_writer(redis.address, "cube")
     for number in range(1, 1201):
         writer.metrics(a_record(number))
     writer.status(a_status(state="finished"))
@@ -205,123 +193,68 @@ def test_a_reader_goes_on_when_redis_is_back(redis, writer, reader):
     assert reader.run("cube").run_id == "cube"
 
 
-def test_no_thread_and_no_lease_is_left(redis):
-    writer = RedisWriter(redis.address, "cube")
+def test_no_thread_and_no_heartbeat_is_left(redis, writer):
+    client = redis.address.client(1.0)
+    assert wait_until(lambda: 0 < client.pttl(keys.run_key("cube", "heartbeat")) <= 10_000)
     writer.close()
     assert not writer._thread.is_alive()
-    assert redis.address.client(1.0).exists(keys.run_key("cube", "lease")) == 0
+    assert client.exists(keys.run_key("cube", "heartbeat")) == 0
 
 
-# --- who runs it -----------------------------------------------------------------------------------------------------
+# --- who reports -----------------------------------------------------------------------------------------------------
 
 
-def test_two_drivers_of_one_run_refuse_each_other(redis):
-    """At once: a lease that is renewed is not waited for."""
-    writer, errors = RedisWriter(redis.address, "cube", lease_s=3600.0), []
-
-    def second():
-        with pytest.raises(RunTakenError) as error:
-            RedisWriter(redis.address, "cube", lease_s=3600.0)
-        errors.append(error.value)
-
-    assert returns(second)
-    host = os.uname().nodename
-    assert_one_line(errors[0], "run cube is being run by", f"process {os.getpid()} on {host}", "another id")
-    RedisWriter(redis.address, "cube-2").close()
-    writer.close()
-
-
-def test_the_next_driver_may_begin_at_once(redis, writer):
-    writer.close()
-    assert returns(lambda: RedisWriter(redis.address, "cube", lease_s=3600.0).close())
-
-
-def test_a_driver_that_was_killed_leaves_the_run_to_the_next(redis):
-    with subprocess.Popen(
-        [sys.executable, "-c", DRIVE], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
-    ) as driver:
-        driver.stdin.write(redis.address.url + "\n")
-        driver.stdin.flush()
-        assert driver.stdout.readline() == "has it\n"
-        with pytest.raises(RunTakenError, match=f"process {driver.pid} on"):
-            RedisWriter(redis.address, "cube")
-        driver.kill()
-    RedisWriter(redis.address, "cube", lease_s=10.0).close()
-
-
-def test_a_lease_outlives_an_outage(redis, reader):
-    """It has expired by the time Redis is back, and nobody else has come."""
-    writer = RedisWriter(redis.address, "cube", lease_s=1.0)
-    redis.kill()
-    wait_until(writer.troubles)
-    time.sleep(1.1)
-    redis.revive()
-    writer.status(a_status())
+def test_the_next_process_of_a_run_reports_and_the_one_before_falls_silent(redis, reader):
+    """As after a freeze: its directory has a newer epoch. What it still says comes to nothing."""
+    first = a_writer(redis.address, epoch=1)
+    first.status(a_status(iteration=1))
     wait_until(lambda: reader.runs() != [])
-    with pytest.raises(RunTakenError):
-        RedisWriter(redis.address, "cube", lease_s=5.0)
-    writer.close()
-
-
-def test_a_driver_that_was_taken_over_is_silent(redis, reader, caplog):
-    writer = RedisWriter(redis.address, "cube")
-    writer.status(a_status(iteration=1))
-    wait_until(lambda: reader.runs() != [])
-    theirs = b'{"token": "x", "host": "elsewhere", "pid": 7, "since": "today"}'
-    redis.address.client(1.0).set(keys.run_key("cube", "lease"), theirs)
-    wait_until(lambda: not writer._thread.is_alive())
-    with pytest.raises(RunTakenError) as error:
-        writer.check()
-    assert_one_line(error.value, "run cube was taken over by process 7 on elsewhere", "stops")
-    writer.status(a_status(iteration=2))
-    writer.close()
-    assert reader.run("cube").iteration == 1
-    assert redis.address.client(1.0).get(keys.run_key("cube", "lease")) == theirs
-
-
-def test_a_driver_that_was_frozen_while_another_began_and_ended_writes_nothing(redis, reader):
-    """The lease is free again; the number of the claim tells."""
-    first = RedisWriter(redis.address, "cube", lease_s=0.5)
-    client = redis.address.client(1.0)
     with first._client.connection_pool._lock:  # nothing of it gets through, as of a process that is frozen
-        wait_until(lambda: not client.exists(keys.run_key("cube", "lease")))
-        second = RedisWriter(redis.address, "cube")
+        second = a_writer(redis.address, epoch=2)
         second.status(a_status(iteration=2))
-        wait_until(lambda: reader.runs() != [])
+        wait_until(lambda: reader.run("cube").iteration == 2)
         second.close()
     first.status(a_status(iteration=1))
+    first.metrics(a_record(1))
     wait_until(lambda: not first._thread.is_alive())
-    with pytest.raises(RunTakenError, match="another process, which has ended since"):
-        first.check()
+    ((condition, warning),) = first.troubles()
+    assert condition == "redis"
+    assert_one_line(warning, f"Redis at {redis.address} gets nothing more", "another process reports there as run cube")
     first.close()
-    assert reader.run("cube").iteration == 2
-    assert client.get(keys.run_key("cube", "epoch")) == b"2"
+    assert (reader.run("cube").iteration, iterations(reader)) == (2, [])
+    assert redis.address.client(1.0).get(keys.run_key("cube", "epoch")) == b"a:2"
 
 
-@pytest.mark.parametrize(("number", "goes_on"), [(b"3", True), (b"2", True), (b"4", False), (b"many", False)])
-def test_only_a_higher_number_is_a_takeover(redis, reader, number, goes_on):
+def test_another_run_of_the_same_id_is_refused_while_the_first_reports(redis, writer, reader):
+    writer.status(a_status(iteration=1))
+    wait_until(lambda: reader.runs() != [])
+    with pytest.raises(RunTakenError) as error:
+        a_writer(redis.address, run="b")
+    assert_one_line(error.value, "another run with the id cube reports to Redis at", "wait 10 s", "--run-dir")
+    a_writer(redis.address, "cube-2", run="b").close()
+    writer.close()
+    other = a_writer(redis.address, run="b")
+    other.status(a_status(iteration=2))
+    wait_until(lambda: reader.run("cube").iteration == 2)
+    other.close()
+
+
+@pytest.mark.parametrize(
+    ("found", "goes_on"), [(b"a:3", True), (b"a:2", True), (b"a:4", False), (b"b:1", False), (b"7", False)]
+)
+def test_only_a_higher_epoch_or_another_run_is_newer(redis, reader, found, goes_on):
     """A Redis that begins again from an older copy has an older number."""
     client, key = redis.address.client(1.0), keys.run_key("cube", "epoch")
-    client.set(key, 2)
-    writer = RedisWriter(redis.address, "cube")
-    client.set(key, number)
+    writer = a_writer(redis.address, epoch=3)
+    client.set(key, found)
+    writer.status(a_status(iteration=7))
     if goes_on:
-        wait_until(lambda: client.get(key) == b"3")
-        client.set(key, number)
-        writer.status(a_status(iteration=7))
         wait_until(lambda: [run.iteration for run in reader.runs()] == [7])
-        writer.check()
+        assert (client.get(key), writer.troubles()) == (b"a:3", [])
     else:
         wait_until(lambda: not writer._thread.is_alive())
-        with pytest.raises(RunTakenError):
-            writer.check()
+        assert client.get(key) == found
     writer.close()
-
-
-def test_a_lease_that_never_expires_is_no_endless_wait(redis):
-    redis.address.client(1.0).set(keys.run_key("cube", "lease"), b"\xff nobody")
-    with pytest.raises(RunTakenError, match="another process"):
-        RedisWriter(redis.address, "cube", lease_s=0.2)
 
 
 # --- what is wrong ---------------------------------------------------------------------------------------------------
@@ -330,19 +263,19 @@ def test_a_lease_that_never_expires_is_no_endless_wait(redis):
 def test_a_run_does_not_begin_without_the_redis_it_was_given(redis):
     wrong = RedisAddress(redis.address.url.replace("redis://:", "redis://:not-"))
     with pytest.raises(StoreUnavailableError, match="wrong or missing password"):
-        RedisWriter(wrong, "cube")
+        a_writer(wrong)
     with pytest.raises(StoreUnavailableError, match="wrong or missing password"):
         RedisReader(wrong).runs()
     redis.kill()
     with pytest.raises(StoreUnavailableError) as error:
-        RedisWriter(redis.address, "cube")
+        a_writer(redis.address, "cube")
     assert_one_line(error.value, f"Redis at {redis.address}", "refused")
 
 
 @pytest.mark.parametrize("content", [b"", b"{}", b"\xff", b"[1]", b'{"run_id": "cube", "heartbeat": "now"}'])
 def test_a_damaged_status_hides_only_its_own_run(redis, reader, caplog, content):
     for run_id in ("cube", "sound"):
-        writer = RedisWriter(redis.address, run_id)
+        writer = a_writer(redis.address, run_id)
         writer.status(a_status(run_id))
         writer.close()
     redis.address.client(1.0).set(keys.run_key("cube", "status"), content)

@@ -1,4 +1,4 @@
-"""Several writers at once."""
+"""A run's reports to its directory and to Redis at once."""
 
 import json
 
@@ -6,16 +6,16 @@ import pytest
 
 from service.io.errors import RunTakenError
 from service.io.run_directory import RunDirectory
-from service.store.disk import DiskWriter
 from service.store.keys import run_key
 from service.store.redis_reader import RedisReader
 from service.store.redis_writer import RedisWriter
-from service.store.run_writer import RunWriter
-from tests.store.stores import a_grid, a_record, a_status, wait_until
+from service.store.run_writer import RunWriter, reporting_to
+from tests.runtime.runs import play, tiny_config
+from tests.store.stores import a_grid, a_record, a_status, a_writer, wait_until
 
 
 def test_a_writer_to_disk_and_redis(redis, tmp_path):
-    writer = RunWriter(RunDirectory(tmp_path / "run"), "cube", redis.address)
+    writer = RunWriter(RunDirectory(tmp_path / "run"), a_writer(redis.address))
     reader = RedisReader(redis.address)
     writer.status(a_status(iteration=1))
     writer.metrics(a_record(1))
@@ -34,25 +34,31 @@ def test_a_writer_to_disk_and_redis(redis, tmp_path):
 
 
 def test_a_stop_file_stops_a_run_that_tells_redis_too(redis, tmp_path):
-    writer = RunWriter(RunDirectory(tmp_path), "cube", redis.address)
+    writer = RunWriter(RunDirectory(tmp_path), a_writer(redis.address))
     (tmp_path / "stop").touch()
     assert writer.stop_requested()
     writer.close()
 
 
-def test_a_run_that_another_driver_has_leaves_the_directory_alone(redis, tmp_path):
-    other = RedisWriter(redis.address, "cube")
-    directory = tmp_path / "run"
-    directory.mkdir()
-    (directory / "stop").touch()
+def test_a_run_whose_id_another_one_has_in_redis_leaves_the_directory_alone(redis, tmp_path):
+    play(tmp_path, tiny_config(total_env_steps=200))
+    directory = RunDirectory(tmp_path)
+    directory.claim(resume=True)
+    (tmp_path / "stop").touch()
+    other = a_writer(redis.address)
+    wait_until(lambda: redis.address.client(1.0).exists(run_key("cube", "heartbeat")))
     with pytest.raises(RunTakenError):
-        RunWriter(RunDirectory(directory), "cube", redis.address)
-    assert [path.name for path in directory.iterdir()] == ["stop"]
+        reporting_to(directory, "cube", redis.address)
+    assert (tmp_path / "stop").exists()
     other.close()
+    reporting_to(directory, "cube", redis.address).close()
+    mine = f"{directory.history.run}:{directory.epoch}".encode()
+    assert redis.address.client(1.0).get(run_key("cube", "epoch")) == mine
+    directory.close()
 
 
 def test_all_are_closed_though_one_fails(redis, tmp_path, monkeypatch):
-    writer = RunWriter(RunDirectory(tmp_path), "cube", redis.address)
+    writer = RunWriter(RunDirectory(tmp_path), a_writer(redis.address))
     writer.goals(a_grid(1))
     writer.goals(a_grid(2))
     close = RedisWriter.close
@@ -66,8 +72,8 @@ def test_all_are_closed_though_one_fails(redis, tmp_path, monkeypatch):
         writer.close()
     assert json.loads((tmp_path / "goals.json").read_text())["iteration"] == 2
     monkeypatch.undo()
-    other, close_on_disk = RunWriter(RunDirectory(tmp_path), "cube", redis.address), DiskWriter.close
-    monkeypatch.setattr(DiskWriter, "close", lambda self: [close_on_disk(self), 1 / 0])
+    other = RunWriter(RunDirectory(tmp_path), a_writer(redis.address))
+    monkeypatch.setattr(other._status, "flush", lambda: 1 / 0)
     with pytest.raises(ZeroDivisionError):
         other.close()
-    assert redis.address.client(1.0).exists(run_key("cube", "lease")) == 0
+    assert redis.address.client(1.0).exists(run_key("cube", "heartbeat")) == 0

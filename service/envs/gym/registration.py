@@ -9,11 +9,9 @@ from __future__ import annotations
 
 import gymnasium
 
-from service.envs.tasks import HARD_TASKS, TASKS
+from service.envs.tasks import EPISODE_STEPS, HARD_TASKS, TASKS
 
 TABLETOP_ID = "tandem/Tabletop-v1"
-EPISODE_STEPS = 50
-"""Steps of an episode (paper: 50)."""
 
 
 def register_all() -> None:

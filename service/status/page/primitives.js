@@ -9,7 +9,6 @@ import { age, Table } from "./widgets.js";
 const EVERY_MS = 10_000;
 const RATES = [["Mixed", "evaluation/mixed_success_last"], ["Table", "evaluation/table_success_last"], ["Air", "evaluation/air_success_last"]];
 const TASK_RATES = [["Last step", "evaluation/success_last"], ["Any step", "evaluation/success_ever"]];
-const LOADERS = { primitives: "load_primitives", skills: "load_skills", orchestrator: "load_policy" };
 
 /** Every name in the registry, each with its versions. */
 export function primitivesView(root, signal) {
@@ -54,7 +53,7 @@ export class Versions {
       const found = await get(["v1", "primitives", this.name], [], signal);
       this.found = found;
       const more = found.num_versions > found.versions.length ? `, the newest ${found.versions.length} here` : "";
-      setText(this.summary, `${counted(found.num_versions, "version")}${more}. In Python: service.${LOADERS[found.versions[0]?.kind] ?? LOADERS.primitives}("${this.name}@latest").`);
+      setText(this.summary, `${counted(found.num_versions, "version")}${more}. In Python: service.load("${this.name}@latest").`);
       if (!runs) this.show(await publishers(signal), new Map());
     } catch (error) {
       if (!(error instanceof ApiError) || error.status === 0) throw error;

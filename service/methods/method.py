@@ -1,0 +1,167 @@
+"""The interface of what a run trains: it learns in steps, and knows nothing of the run around it."""
+
+from __future__ import annotations
+
+import os
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from typing import Any
+
+import numpy as np
+
+from service.actors.rollout import Diverged
+from service.errors import TandemError
+from service.generator.bins import GoalCells
+from service.methods.timing import Timing
+from service.policies.parameters import Parameters
+from service.store.models import ActorStatus, GoalCell, GoalGrid
+from service.types import IntArray, Metrics, StateArray
+
+State = Mapping[str, Any]
+"""By the name of a component its arrays, which have names of their own, or plain values as JSON has them."""
+
+
+class WorkersError(TandemError):
+    """A method's workers, such as those on a cluster, do not let the run go on; what it had learned is saved."""
+
+    exit_code = 1
+
+
+class StateLostError(WorkersError):
+    """A state was lost with the machine that kept it; the newest checkpoint has one."""
+
+    def __init__(self, lost: str) -> None:
+        """Say what was lost, and how the run goes on."""
+        super().__init__(f"{lost}; the run goes back to its newest checkpoint")
+
+
+@dataclass(frozen=True, slots=True)
+class Iteration:
+    """What an iteration that has ended leaves behind."""
+
+    metrics: Metrics
+    goals: StateArray | None = None
+    """(M, 7) a sample of its goals: start x y z, goal x y z (metres), solved 0/1; None for a method without goals."""
+    diverged: Mapping[str, Diverged] = field(default_factory=dict)
+    """By the name of a round: states and actions of worlds whose physics diverged in it."""
+
+
+@dataclass(frozen=True, slots=True)
+class Health:
+    """The state of a method's workers."""
+
+    actors: tuple[ActorStatus, ...]
+    num_rollouts_counted: int
+    """Learned from, by the processes that run now."""
+    num_rollouts_refused: int = 0
+    warnings: tuple[str, ...] = ()
+    last_error: str | None = None
+
+
+class Method(ABC):
+    """What a run trains.
+
+    Call order: ``start`` once; then ``step`` again and again, with ``evaluate``, ``state`` and the others in between;
+    ``close`` at the end. A method that continues from what ``state`` gave learns what it would have learned without
+    the interruption, bit for bit.
+    """
+
+    def __init__(self) -> None:
+        self.iteration = 0
+        """Finished iterations."""
+        self.num_env_steps = 0
+        """Env steps of all finished iterations."""
+        self.timing = Timing()
+        self.on_wait: Callable[[], None] = lambda: None
+        """Called about every second while ``step`` or ``start`` wait for another process."""
+
+    @property
+    def converged(self) -> bool:
+        """Whether there is nothing more to learn; the run then ends before its budget is spent."""
+        return False
+
+    def start(self, state: State | None = None) -> None:
+        """Begin, or continue from a state; ``iteration`` and ``num_env_steps`` have been set."""
+        if state is not None:
+            self.load_state(state)
+
+    @abstractmethod
+    def step(self) -> Iteration | None:
+        """Go on by an iteration, or by as much of one as is done within a moment.
+
+        Returns:
+            The iteration that has ended; None where it goes on.
+
+        Raises:
+            DivergedError: a policy is no longer finite.
+            StateLostError: the newest state is lost.
+        """
+
+    def evaluate(self) -> Metrics:
+        """Measure what has been learned; a method may also start to, and give the metrics with a later iteration."""
+        return {}
+
+    @abstractmethod
+    def parameters(self) -> Parameters:
+        """What is evaluated, kept in snapshots and published."""
+
+    def health(self) -> Health:
+        """The state of its workers, right now; of a method in one process that of this process."""
+        actor = ActorStatus(
+            name="rollout-0",
+            incarnation=0,
+            state="alive",
+            pid=os.getpid(),
+            heartbeat=datetime.now(UTC),
+            num_rollouts=self.iteration,
+            num_env_steps=self.num_env_steps,
+        )
+        return Health((actor,), num_rollouts_counted=self.iteration)
+
+    def grid(self) -> GoalGrid | None:
+        """What is known of goals by cells of the workspace; None for a method without goals."""
+        return None
+
+    @abstractmethod
+    def state(self) -> State:
+        """Everything that ``load_state`` continues from."""
+
+    @abstractmethod
+    def load_state(self, state: State) -> None:
+        """Go back to a state."""
+
+    @abstractmethod
+    def close(self) -> None:
+        """End what it started; a second call does nothing."""
+
+    def count(self, num_env_steps: int) -> dict[str, float]:
+        """Count an iteration and its env steps; the first of its metrics."""
+        self.iteration += 1
+        self.num_env_steps += num_env_steps
+        return {"iteration": self.iteration, "env_steps": self.num_env_steps}
+
+    def grid_of(self, cells: GoalCells, num_tries: IntArray, success_rate: StateArray) -> GoalGrid:
+        """The grid of (cells,) tries and success rates; untried cells are left out."""
+        centers = cells.centers().reshape(-1, 3)
+        tried = tuple(
+            GoalCell(
+                center_m=tuple(np.round(centers[cell], 4).tolist()),
+                num_tries=int(num_tries[cell]),
+                success_rate=float(success_rate[cell]),
+                learnability=float(success_rate[cell] * (1.0 - success_rate[cell])),
+            )
+            for cell in np.flatnonzero(num_tries)
+        )
+        lower, upper = cells.bounds_m
+        return GoalGrid(
+            iteration=self.iteration,
+            num_env_steps=self.num_env_steps,
+            cell_size_m=cells.cell_size_m,
+            shape=cells.shape,
+            num_cells=len(cells),
+            lower_m=lower,
+            upper_m=upper,
+            cells=tried,
+        )

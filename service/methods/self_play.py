@@ -1,0 +1,212 @@
+"""Self-play: Alice proposes goals, Bob learns to reach them.
+
+What is learned is the same wherever its three workers are: in this process, ``LocalSelfPlay``, or on a Ray cluster.
+
+``LocalSelfPlay``: while one thread plays round i with the newest weights, another learns from round i-1. Policy lag is
+exactly 1, both cores of a laptop are busy, and the order of everything is fixed, so a run is reproducible bit for bit.
+"""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+
+import numpy as np
+
+from service.actors.evaluation import EVALUATED_GOALS
+from service.actors.rollout import Rollout, from_arrays, to_arrays
+from service.config import Config
+from service.envs.observations import layouts
+from service.errors import TandemError
+from service.generator.opponents import Opponents
+from service.methods.method import Health, Iteration, Method, State
+from service.methods.workers import (
+    GeneratorResult,
+    GeneratorWorker,
+    LearnerWorker,
+    RolloutWorker,
+    RoundSummary,
+    UpdateResult,
+)
+from service.policies.parameters import Parameters
+from service.primitives.loading import Trained
+from service.store.models import GoalGrid
+from service.types import Metrics
+
+_logger = logging.getLogger(__name__)
+OLDER_OPPONENTS = -1
+"""Version of past players that a checkpoint has beside the task generator's, which have joined meanwhile."""
+
+
+@dataclass(frozen=True, slots=True)
+class IterationResult:
+    """Results of all workers for one iteration."""
+
+    rounds: Sequence[RoundSummary]
+    recorded: GeneratorResult
+    updated: UpdateResult | None
+    """None where there was nothing to learn from yet."""
+    num_actors_alive: int
+    elapsed_s: float
+    hand_over_s: float = 0.0
+    """Mean time a round's result was on its way or in line, seconds."""
+
+
+class SelfPlay(Method):
+    """What self-play has in common wherever its workers are."""
+
+    def __init__(self, config: Config) -> None:
+        super().__init__()
+        self.config = config
+        self._converged = False
+
+    @property
+    def converged(self) -> bool:
+        """Whether the paper's stop criterion holds: no new goals, and Bob solves what is proposed."""
+        return self._converged
+
+    def _finish(self, result: IterationResult) -> Iteration:
+        """Count an iteration, and make its metrics."""
+        counted = self.count(sum(each.num_env_steps for each in result.rounds))
+        self._converged = result.recorded.should_stop
+        learned: Metrics = {}
+        if result.updated is not None:
+            learned = result.updated.metrics | {"time/learn_s": result.updated.update_s}
+        metrics = {
+            **counted,
+            **_round_metrics(result.rounds),
+            **result.recorded.metrics,
+            **learned,
+            "actor/num_rollouts": float(len(result.rounds)),
+            "actor/num_alive": float(result.num_actors_alive),
+            "time/hand_over_s": result.hand_over_s,
+            "time/learner_idle_fraction": max(0.0, 1.0 - learned.get("time/learn_s", 0.0) / result.elapsed_s),
+        }
+        diverged = {"-".join(map(str, each.id)): each.diverged for each in result.rounds if each.diverged}
+        return Iteration(metrics, result.recorded.goals, diverged)
+
+
+class LocalSelfPlay(SelfPlay):
+    """Self-play in this process.
+
+    Args:
+        config: the run.
+        start_from: what a new run begins from; None: from nothing.
+    """
+
+    def __init__(self, config: Config, start_from: Trained | None = None) -> None:
+        super().__init__(config)
+        self._incarnation = 0
+        self._pending: Rollout | None = None
+        self._learner = LearnerWorker(config)
+        self._actor = RolloutWorker(config, num_threads=config.run.num_threads)
+        self._generator = GeneratorWorker(config)
+        self.learner, self.game, self.generator = self._learner.learner, self._actor.game, self._generator.generator
+        self._snapshot, self._opponents = self.generator.snapshot(), self._generator.opponents()
+        self._played = self.learner.weights()
+        self._executor = ThreadPoolExecutor(max_workers=1, thread_name_prefix="learner")
+        if start_from is not None:
+            self._take_over(start_from)
+
+    def step(self) -> Iteration:
+        """Consume the pending rollout and produce the next one; waits for play and learning both."""
+        begun = time.perf_counter()
+        with self.timing("weights"):
+            weights, snapshot, opponents = self.learner.weights(), self._snapshot, self._opponents
+            # For the next round, and as old as its weights will be.
+            self._snapshot, self._opponents = self.generator.snapshot(), self._generator.opponents()
+        learning = self._executor.submit(self._learner.update, [self._pending]) if self._pending is not None else None
+        with self.timing("play"):
+            rollout, goals, summary = self._actor.play(weights, snapshot, opponents)
+        with self.timing("generator"):
+            recorded = self._generator.record(self.iteration, weights, [goals])
+        with self.timing("wait for learner"):
+            updated = learning.result() if learning is not None else None
+        self._pending, self._played = rollout, weights
+        elapsed_s = time.perf_counter() - begun
+        return self._finish(IterationResult([summary], recorded, updated, 1, elapsed_s))
+
+    def evaluate(self) -> Metrics:
+        """Success of the Bob who played the last round on the run's goals, without noise."""
+        return self._actor.evaluate(self._played, EVALUATED_GOALS)
+
+    def parameters(self) -> Parameters:
+        """The newest Bob, as he is evaluated and published."""
+        return self.learner.weights().bob_ema
+
+    def health(self) -> Health:
+        """The state of the one actor there is, this process."""
+        actors = super().health().actors
+        return Health(actors, num_rollouts_counted=max(0, self.iteration - 1))  # the newest is learned from next
+
+    def grid(self) -> GoalGrid:
+        """The task generator's goal grid."""
+        return self._generator.grid(self.iteration, self.num_env_steps)
+
+    def close(self) -> None:
+        """End the threads; a second call does nothing."""
+        self._executor.shutdown()
+        self.game.close()
+
+    def state(self) -> State:
+        """Networks, optimisers, goals, worlds, random numbers and the rollout that is learned from next."""
+        weights = self.learner.weights()
+        parts = {
+            "learner": self.learner.state(),
+            "generator": self.generator.state(),
+            "snapshot": self._snapshot.state(),
+            "game": self.game.state(),
+            "alice": weights.alice,  # for readers without torch: evaluate, render, coverage
+            "bob": weights.bob_ema,
+        }
+        if self._opponents.version != self._generator.opponents().version:
+            parts["opponents"] = self._opponents.state()
+        if self._pending is not None:
+            parts["pending"] = to_arrays(self._pending)
+        return {
+            **parts,
+            "rng": self._actor.rng.bit_generator.state,
+            "next_incarnation": self._incarnation + 1,
+        }
+
+    def load_state(self, state: State) -> None:
+        """Continue from a state of this process or of a cluster."""
+        self.learner.load_state(state["learner"])
+        self.generator.load_state(state["generator"])
+        self._snapshot, self._opponents = self.generator.snapshot(), self._generator.opponents()
+        if "snapshot" in state:  # a cluster's has none
+            self._snapshot = self._snapshot.with_state(state["snapshot"])
+        if "opponents" in state:
+            self._opponents = Opponents.from_state(OLDER_OPPONENTS, state["opponents"])
+        next_incarnation = int(state["next_incarnation"])
+        # The same actor goes on. A cluster's are no part of a checkpoint: after them another begins.
+        self._incarnation = next_incarnation - 1 if "game" in state else next_incarnation
+        if "game" in state:
+            self.game.load_state(state["game"])
+        self.game.incarnation = self._incarnation
+        self._pending = from_arrays(state["pending"]) if "pending" in state else None
+        self._actor.rng.bit_generator.state = state["rng"]
+
+    def _take_over(self, start: Trained) -> None:
+        lines = self.learner.take_over(start.networks, layouts(start.world))
+        if not any(": taken" in line for line in lines):  # or a run from nothing would have it as its parent
+            raise TandemError(
+                f"--from {start.reference}: nothing of it fits: {lines[0]}; give this run the sizes of that one's "
+                "networks (policy), or leave out --from"
+            )
+        for line in lines:
+            _logger.info("from %s: %s", start.reference, line)
+
+
+def _round_metrics(rounds: Sequence[RoundSummary]) -> Metrics:
+    """Means of the rounds' own metrics, weighted by their worlds, and how many worlds broke."""
+    num_worlds = np.array([each.num_worlds for each in rounds], dtype=np.float64)
+    shares = num_worlds / num_worlds.sum()
+    means = {name: float(shares @ [each.metrics[name] for each in rounds]) for name in rounds[0].metrics}
+    return means | {
+        "world/num_broken": float(sum(each.num_diverged for each in rounds)),
+        "time/play_s": float(np.mean([each.play_s for each in rounds])),
+    }

@@ -1,0 +1,115 @@
+"""Skill discovery: an intrinsic reward teaches a policy that a skill vector steers.
+
+An iteration is an episode of every world.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from service.actors.coverage import NUM_SKILLS, visited_share
+from service.actors.evaluation import EVALUATION_SEED
+from service.baselines.coverage import skill_paths
+from service.baselines.frozen import FrozenSkills, export_skills
+from service.baselines.skills import IntrinsicBatches, SkillWorlds, make_skill_loop
+from service.config import Config
+from service.generator.bins import GoalCells, in_air
+from service.io.tensors import join_parts, split_parts
+from service.methods.method import Iteration, Method, State
+from service.policies.parameters import Parameters
+from service.store.models import GoalGrid
+from service.types import Metrics
+
+
+class SkillDiscovery(Method):
+    """LSD, METRA, DADS or DIAYN.
+
+    Args:
+        config: the run, with ``skills``.
+    """
+
+    def __init__(self, config: Config) -> None:
+        super().__init__()
+        assert config.skills is not None
+        self._config, self._skills = config, config.skills
+        self._loop = make_skill_loop(config)
+        assert isinstance(self._loop.worlds, SkillWorlds)
+        assert isinstance(self._loop.make_batch, IntrinsicBatches)
+        self._worlds, self._batches = self._loop.worlds, self._loop.make_batch
+        self._cells = GoalCells(config.world, config.generator.cell_size_m)
+        self._visits = np.zeros(len(self._cells), dtype=np.int64)  # ends of episodes that moved the object
+
+    def step(self) -> Iteration:
+        """Play an episode in every world, with its updates."""
+        before = self._loop.num_env_steps
+        with self.timing("play and learn"):
+            learned = self._loop.play(self._worlds.num_worlds * self._skills.episode_steps)
+        metrics = self.count(self._loop.num_env_steps - before)
+        metrics |= {f"learner/{name}": value for name, value in learned.items()} | self._episodes()
+        if self._batches.losses:
+            metrics["learner/representation_loss"] = float(np.mean(self._batches.losses))
+            self._batches.losses.clear()
+        return Iteration(metrics)
+
+    def evaluate(self) -> Metrics:
+        """Coverage of random skills without noise."""
+        skills = FrozenSkills(self.parameters(), self._skills.method)
+        paths = skill_paths(
+            skills,
+            self._config.world,
+            num_skills=NUM_SKILLS,
+            num_steps=self._skills.episode_steps,
+            seed=EVALUATION_SEED,
+            num_threads=self._config.run.num_threads,
+        )
+        return {"evaluation/coverage": visited_share(paths, self._config.world.workspace)}
+
+    def parameters(self) -> Parameters:
+        """The newest skills: the averaged actor, and the network that rewards come from."""
+        return export_skills(self._loop.learner.averaged_parameters(), self._batches.reward.exported())
+
+    def grid(self) -> GoalGrid:
+        """The cells into which episodes brought the object; nobody tries goals, so success says nothing."""
+        return self.grid_of(self._cells, self._visits, np.full(len(self._cells), 0.5))
+
+    def close(self) -> None:
+        """Stop the worlds' threads; a second call does nothing."""
+        self._worlds.close()
+
+    def state(self) -> State:
+        """The off-policy loop with its replay buffer, the reward's network, and the visits."""
+        arrays, values = self._loop.state()
+        reward = {f"reward/{name}": array for name, array in self._batches.reward.state().items()}
+        return {
+            "loop": {**arrays, **reward},
+            "skills": dict(self.parameters()),  # for readers without torch
+            "visits": {"cells": self._visits},
+            "random": values,
+        }
+
+    def load_state(self, state: State) -> None:
+        """Continue, bit for bit, where ``state`` gave these."""
+        loop = split_parts(state["loop"])
+        self._batches.reward.load_state(loop.pop("reward"))
+        self._loop.load_state(join_parts(loop), state["random"])
+        self._visits = np.array(state["visits"]["cells"])
+
+    def _episodes(self) -> Metrics:
+        """What the episodes that ended did to the object."""
+        if not self._worlds.finished:
+            return {}
+        start, end = np.stack(self._worlds.finished).astype(np.float64).swapaxes(0, 1)
+        self._worlds.finished.clear()
+        distance = np.linalg.norm(end - start, axis=1)
+        lower, upper = self._cells.bounds_m
+        inside = ((end >= lower) & (end <= upper)).all(axis=1)
+        moved = inside & (distance > self._config.game.success_distance_m)
+        self._visits += self._cells.count(end[moved])
+        lifted = inside & in_air(end, self._config.world.rest_height_m)
+        return {
+            "skills/moved_fraction": float(moved.mean()),
+            "skills/outside_fraction": float((~inside).mean()),
+            "skills/lifted_fraction": float(lifted.mean()),
+            "skills/distance_m": float(distance[inside].mean()) if inside.any() else 0.0,
+            "skills/num_cells_seen": float(np.count_nonzero(self._visits)),
+        }

@@ -1,0 +1,256 @@
+"""The three workers of a run: the rollout worker, the learner and the task generator.
+
+Both runners use them: ``local`` calls them in its own process, ``ray_actors`` puts each into a process of a Ray
+cluster. Arrays that come through Ray's object store are read-only and are never written to.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from service.actors.evaluation import EVALUATION_SEED, success_metrics
+from service.actors.rollout import Diverged, Rollout
+from service.actors.self_play import Players, SelfPlay, StochasticPolicy
+from service.config import Config
+from service.envs.sampling import GoalKind
+from service.envs.scene import build_layout
+from service.generator.bins import GoalCells, TaskBins
+from service.generator.generator import NUM_STARTS, TaskGenerator
+from service.generator.opponents import Opponents
+from service.generator.snapshot import GeneratorSnapshot
+from service.generator.summary import GoalSummary, join_summaries, summarize
+from service.policies.numpy_policy import NumpyGaussianPolicy, numpy_bob
+from service.store.models import GoalCell, GoalGrid
+from service.types import Arrays, Metrics
+
+if TYPE_CHECKING:
+    from service.learner.weights import Weights
+
+RolloutId = tuple[int, int, int]
+
+
+@dataclass(frozen=True, slots=True)
+class RoundSummary:
+    """A played round in a few numbers; its rollout travels on its own."""
+
+    id: RolloutId
+    num_env_steps: int
+    num_worlds: int
+    num_diverged: int
+    """Worlds whose physics diverged, in this incarnation."""
+    diverged: Diverged
+    """Those of this round."""
+    play_s: float
+    metrics: Metrics
+
+
+@dataclass(frozen=True, slots=True)
+class GeneratorResult:
+    """The task generator's result for an iteration."""
+
+    metrics: Metrics
+    should_stop: bool
+    goals: NDArray[np.float64]
+    """(M, 7) some of them for the run directory: start x y z, goal x y z (metres), solved 0/1."""
+    new_opponents: bool
+    """This iteration's players joined the past ones."""
+
+
+@dataclass(frozen=True, slots=True)
+class UpdateResult:
+    """The learner's result for an iteration."""
+
+    version: int
+    metrics: Metrics
+    counted: tuple[RolloutId, ...]
+    """Ids of the rollouts learned from."""
+    refused: tuple[RolloutId, ...]
+    """Seen before, too old, or of a version this learner has not made."""
+    update_s: float
+
+
+class RolloutWorker:
+    """Plays rounds on its own worlds.
+
+    Consumes weights, a snapshot of the task generator and past opponents, produces a rollout and a summary of its
+    goals; waits for nothing.
+
+    Args:
+        config: the run; ``game.num_worlds`` are this worker's.
+        actor, incarnation: first parts of its rollouts' ids. The very first worker of a run draws from the random
+            numbers of the run's seed.
+        num_threads: native threads for physics; 0 for one per core.
+    """
+
+    def __init__(self, config: Config, actor: int = 0, incarnation: int = 0, *, num_threads: int = 0) -> None:
+        self._config, self._num_threads = config, num_threads
+        source = config.seed if (actor, incarnation) == (0, 0) else [config.seed, actor, incarnation]
+        self.rng = np.random.default_rng(source)
+        self.game = SelfPlay(config, self.rng, actor=actor, incarnation=incarnation, num_threads=num_threads)
+        self._cells = GoalCells(config.world, config.generator.cell_size_m)
+        self._tasks = TaskBins.from_config(config, self.game.worlds.layout)
+        self._opponents_version: int | None = None
+        self._past: list[tuple[StochasticPolicy, StochasticPolicy]] = []
+
+    def play(
+        self, weights: Weights, snapshot: GeneratorSnapshot, opponents: Opponents, num_rounds: int = 1
+    ) -> tuple[Rollout, GoalSummary, RoundSummary]:
+        """Play a round in every world.
+
+        Args:
+            weights: the policy version to act with.
+            snapshot: what Bob's goals are chosen from.
+            opponents: past players.
+            num_rounds: rounds that make an iteration, which share the places for new goals and starts.
+
+        Raises:
+            DivergedError: a policy no longer acts in finite numbers.
+        """
+        start = time.perf_counter()
+        config = self._config.generator
+        self.game.block_grippers(float(snapshot.success_rate))
+        starts = self.game.game_starts()
+        plan = opponents.plan(self.game.worlds.num_worlds, config.past_opponent_fraction, self.rng)
+        choose_goals = partial(snapshot.choose_goals, plan, rng=self.rng)
+        rollout = self.game.play_round(self._players(weights, opponents), plan, choose_goals)
+        goals = summarize(
+            rollout.records,
+            starts,
+            self._cells,
+            self._tasks,
+            max_goals=-(-config.replay_buffer_size // num_rounds),
+            max_starts=-(-NUM_STARTS // num_rounds),
+            rng=self.rng,
+        )
+        summary = RoundSummary(
+            id=rollout.id,
+            num_env_steps=rollout.num_env_steps,
+            num_worlds=self._config.game.num_worlds,
+            num_diverged=self.game.worlds.num_diverged,
+            diverged=rollout.diverged,
+            play_s=time.perf_counter() - start,
+            metrics=rollout.metrics,
+        )
+        return rollout, goals, summary
+
+    def evaluate(self, weights: Weights, kinds: Sequence[GoalKind]) -> Metrics:
+        """Bob's success without noise on the run's goals of some kinds, as metrics."""
+        bob, episodes = numpy_bob(weights.bob_ema), self._config.run.evaluation_episodes
+        return success_metrics(bob, self._config, kinds, episodes, seed=EVALUATION_SEED, num_threads=self._num_threads)
+
+    def _players(self, weights: Weights, opponents: Opponents) -> Players:
+        if opponents.version != self._opponents_version:
+            pairs = zip(opponents.alice, opponents.bob, strict=True)
+            self._past = [(NumpyGaussianPolicy(alice), numpy_bob(bob)) for alice, bob in pairs]
+            self._opponents_version = opponents.version
+        return Players(
+            version=weights.version,
+            alice=NumpyGaussianPolicy(weights.alice),
+            bob=numpy_bob(weights.bob),
+            past_alice=[alice for alice, _ in self._past],
+            past_bob=[bob for _, bob in self._past],
+        )
+
+
+class GeneratorWorker:
+    """The task generator, behind one call for an iteration.
+
+    Consumes summaries of goals, produces snapshots to choose goals from, and past opponents; waits for nothing.
+
+    Args:
+        config: the run.
+        state: to continue from; None to start.
+    """
+
+    def __init__(self, config: Config, state: Mapping[str, NDArray[Any]] | None = None) -> None:
+        layout = build_layout(config.world, blocked_fraction=config.game.blocked_gripper_fraction)
+        self.generator = TaskGenerator(config, layout)
+        self._opponents_version = 0
+        if state is not None:
+            self.generator.load_state(state)
+
+    def opponents(self) -> Opponents:
+        """Past players for the next rounds."""
+        return self.generator.opponents.freeze(self._opponents_version)
+
+    def record(self, iteration: int, weights: Weights, goals: Sequence[GoalSummary]) -> GeneratorResult:
+        """Learn from what became of an iteration's goals.
+
+        Args:
+            iteration: finished ones before it.
+            weights: of the players of this iteration, who may become past opponents.
+            goals: of all its rounds.
+        """
+        joined = join_summaries(goals)
+        metrics = self.generator.record(joined)
+        new_opponents = self.generator.opponents_due(iteration)
+        if new_opponents:
+            self.generator.add_opponents(weights.alice, weights.bob)
+            self._opponents_version = iteration  # the same whichever process records it
+        return GeneratorResult(metrics, self.generator.should_stop(), joined.shown, new_opponents)
+
+    def grid(self, iteration: int, num_env_steps: int) -> GoalGrid:
+        """The cells in which a valid goal was ever proposed, as they are after ``iteration`` iterations."""
+        grid = self.generator.grid
+        maps = grid.maps()
+        cells = tuple(
+            GoalCell(
+                center_m=tuple(np.round(maps["center"][tuple(at)], 4).tolist()),
+                num_tries=int(maps["num_tries"][tuple(at)]),
+                success_rate=round(float(maps["success_rate"][tuple(at)]), 4),
+                learnability=round(float(maps["learnability"][tuple(at)]), 4),
+            )
+            for at in np.argwhere(maps["seen"])
+        )
+        lower, upper = grid.cells.bounds_m
+        return GoalGrid(
+            iteration=iteration,
+            num_env_steps=num_env_steps,
+            cell_size_m=grid.cells.cell_size_m,
+            shape=grid.cells.shape,
+            num_cells=len(grid.cells),
+            lower_m=lower,
+            upper_m=upper,
+            cells=cells,
+        )
+
+
+class LearnerWorker:
+    """The learner, behind one call for an update.
+
+    Consumes rollouts, produces weights and metrics; waits for nothing.
+
+    Args:
+        config: the run.
+        state: to continue from; None to start.
+    """
+
+    def __init__(self, config: Config, state: Arrays | None = None) -> None:
+        import torch  # here, not where runs are only read
+
+        from service.learner.learner import Learner
+
+        torch.set_num_threads(config.learner.num_threads)
+        self.learner = Learner(config)
+        if state is not None:
+            self.learner.load_state(state)
+
+    def update(self, rollouts: Sequence[Rollout]) -> UpdateResult:
+        """Learn from rollouts; makes the next version.
+
+        Raises:
+            LearnerError: none of them could be learned from.
+        """
+        start = time.perf_counter()
+        taken = [rollout for rollout in rollouts if self.learner.ingest(rollout)]
+        metrics = self.learner.update()
+        counted = tuple(rollout.id for rollout in taken)
+        refused = tuple(rollout.id for rollout in rollouts if rollout.id not in counted)
+        return UpdateResult(self.learner.version, metrics, counted, refused, time.perf_counter() - start)

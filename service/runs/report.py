@@ -1,0 +1,190 @@
+"""Reporting of a run while it goes on: its status, its metrics, its goal grid."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from datetime import UTC, datetime
+from threading import Event, Thread
+from types import TracebackType
+from typing import Any, Literal, Self
+
+from service.config import Config
+from service.io.errors import RunTakenError
+from service.liveness import work_done
+from service.runs.run import Run
+from service.store.models import CONDITIONS, RunState, RunStatus, RunTotals
+from service.store.run_writer import GOALS_INTERVAL_S, RunWriter
+
+BEAT_S = 2.0
+"""Time between two heartbeats of what follows learning."""
+
+
+class Report:
+    """Consumes the metrics of every iteration and produces statuses and goal grids; waits for nothing.
+
+    A context manager: where its block ends with an exception, the run has failed or was interrupted, and in any case
+    the writer is closed.
+
+    Args:
+        config: the run.
+        run_id: of the run.
+        runtime: which runner runs it.
+        writer: to whom it is told.
+        published: what the run published before.
+        previous: the last status of an earlier process, whose totals go on.
+        epoch: number of this process among those that ever ran the run.
+    """
+
+    def __init__(
+        self,
+        config: Config,
+        run_id: str,
+        runtime: Literal["local", "ray"],
+        writer: RunWriter,
+        *,
+        published: str | None = None,
+        previous: RunStatus | None = None,
+        epoch: int = 0,
+    ) -> None:
+        self._writer = writer
+        self._totals = previous.totals.model_dump() if previous is not None else {}
+        self._counted: dict[str, int] = {}
+        self._gridded_s = float("-inf")
+        now = datetime.now(UTC)
+        self._status = RunStatus(
+            run_id=run_id,
+            name=config.name,
+            runtime=runtime,
+            state="starting",
+            started=now,
+            heartbeat=now,
+            epoch=epoch,
+            total_env_steps=config.run.total_env_steps,
+            published=published,
+            totals=previous.totals if previous is not None else RunTotals(),
+        )
+
+    def __enter__(self) -> Self:
+        self._tell()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        try:
+            if isinstance(error, RunTakenError):
+                pass  # the status is another's now
+            elif isinstance(error, Exception):
+                self.end("failed", error=" ".join(f"{type(error).__name__}: {error}".split()))
+            elif error is not None:  # a signal's
+                self.end("interrupted", error=f"ended at once by {error}" if str(error) else None)
+        finally:
+            self._writer.close()
+
+    def check(self) -> None:
+        """Assert that this process is still the one that runs the run.
+
+        Raises:
+            RunTakenError: another one has taken it over.
+        """
+        self._writer.check()
+
+    @contextmanager
+    def beating(self) -> Iterator[None]:
+        """Tell in a block that takes long that the run is alive, for as long as its work goes on (``liveness``)."""
+        over = Event()
+
+        def beat() -> None:
+            done = work_done()
+            while not over.wait(BEAT_S):
+                if (now := work_done()) != done:
+                    done = now
+                    self._tell()
+
+        thread = Thread(target=beat, name="heartbeat", daemon=True)
+        thread.start()
+        try:
+            yield
+        finally:
+            over.set()
+            thread.join()
+
+    def begin(self, run: Run) -> None:
+        """Say that the run begins, or goes on where it was."""
+        self._status = self._status.model_copy(update={"state": "running"})
+        self._counted = self._counters(run)  # where it goes on is no work of this process
+        if not self._totals:  # of earlier ones nothing is known but how far they came
+            self._totals = {name: self._counted[name] for name in ("iterations", "env_steps")}
+        self.beat(run)
+
+    def iteration(self, run: Run, metrics: Mapping[str, float]) -> None:
+        """Tell an iteration's metrics, where the run is, and now and then what the generator knows; see ``beat``."""
+        self.check()
+        self._writer.metrics(dict(metrics))
+        if time.monotonic() - self._gridded_s >= GOALS_INTERVAL_S:
+            self._gridded_s = time.monotonic()
+            if (grid := run.method.grid()) is not None:
+                self._writer.goals(grid)
+        self._status = self._status.model_copy(
+            update={
+                "env_steps_per_s": metrics["time/env_steps_per_s"],
+                "policy_version": int(metrics.get("learner/version", self._status.policy_version)),
+                "policy_lag": metrics.get("learner/policy_lag", 0.0),
+            }
+        )
+        self.beat(run)
+
+    def beat(self, run: Run) -> None:
+        """Tell that the run is alive, how far it is, and how its parts are.
+
+        Raises:
+            RunTakenError: another process has taken it over.
+        """
+        self.check()
+        health = run.method.health()
+        counters = self._counters(run)
+        for name, value in counters.items():
+            self._totals[name] = self._totals.get(name, 0) + max(0, value - self._counted.get(name, 0))
+        self._counted = counters
+        self._tell(
+            totals=RunTotals(**self._totals),
+            iteration=run.iteration,
+            num_env_steps=run.num_env_steps,
+            num_rollouts_counted=health.num_rollouts_counted,
+            num_rollouts_refused=health.num_rollouts_refused,
+            stopping=self.stop_requested(),
+            actors=health.actors,
+            last_error=health.last_error,
+            warnings=health.warnings,
+        )
+
+    def stop_requested(self) -> bool:
+        """Whether somebody asked the run to stop."""
+        return self._writer.stop_requested()
+
+    def end(self, state: RunState, *, published: str | None = None, error: str | None = None) -> None:
+        """Say how the run ended."""
+        published = published or self._status.published
+        self._tell(state=state, stopping=False, published=published, last_error=error or self._status.last_error)
+
+    @staticmethod
+    def _counters(run: Run) -> dict[str, int]:
+        """What this process counts now; it falls where the run goes back to a checkpoint."""
+        health = run.method.health()
+        return {
+            "iterations": run.iteration,
+            "env_steps": run.num_env_steps,
+            "rollouts_counted": health.num_rollouts_counted,
+            "rollouts_refused": health.num_rollouts_refused,
+            "replacements": sum(actor.incarnation for actor in health.actors),
+        }
+
+    def _tell(self, **changes: Any) -> None:
+        troubles = self._writer.troubles()
+        condition = max((each.condition for each in troubles), key=CONDITIONS.index, default="well")
+        warnings = (*(each.text for each in troubles), *changes.pop("warnings", ()))
+        changes |= {"heartbeat": datetime.now(UTC), "condition": condition, "warnings": warnings}
+        self._status = self._status.model_copy(update=changes)
+        self._writer.status(self._status)

@@ -1,0 +1,92 @@
+"""Settings with which a run may go on: those that it was begun with, but for a few."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from service.config import Config, load_config
+from service.errors import ConfigError
+from service.io.errors import CheckpointError
+from service.io.run_directory import RunDirectory
+from service.io.study_directory import StudyDirectory
+
+RESUMABLE = ("run.", "learner.alice.learning_rate=", "learner.bob.learning_rate=")
+"""What an override of a resumed run may begin with: nothing that its past would have to be made again for."""
+
+
+def resumed_config(directory: RunDirectory | StudyDirectory, overrides: list[str], file: Path | None = None) -> Config:
+    """The configuration to resume a run with: the saved one, where only ``RESUMABLE`` may be changed.
+
+    Args:
+        directory: of the run, or of a study.
+        overrides: ``run.a=b`` strings, or learning rates; others may only say what the run has.
+        file: YAML that, with ``overrides``, says the same as the saved one outside ``run``; what it says there comes
+            before ``overrides``.
+
+    Raises:
+        ConfigError: no run there, an override of anything else, or a file that says otherwise.
+    """
+    saved = directory.read_config()
+    fixed = [override for override in overrides if not override.startswith(RESUMABLE)]
+    for override in fixed:
+        if not _says(saved, directory, override):
+            raise ConfigError(
+                f"override {override!r}: a resumed run keeps its configuration; only run.* and the learning rates may "
+                "change, for example run.total_env_steps"
+            )
+    if file is not None:
+        given = load_config(file, fixed)
+        _check_same_outside_run(saved, given, file)
+        named = given.run.model_dump(mode="json", exclude_unset=True)
+        overrides = [f"run.{key}={json.dumps(value)}" for key, value in named.items()] + overrides
+    return directory.read_config(overrides)
+
+
+def _says(saved: Config, directory: RunDirectory | StudyDirectory, override: str) -> bool:
+    try:
+        return directory.read_config([override]) == saved
+    except ConfigError:
+        return False
+
+
+def _check_same_outside_run(saved: Config, given: Config, file: Path) -> None:
+    left, right = (dict(_leaves(config.model_dump(mode="json", exclude={"run"}))) for config in (saved, given))
+    for key in sorted(left.keys() | right.keys()):
+        if left.get(key) != right.get(key):
+            raise ConfigError(
+                f"{file}: {key} = {right.get(key)!r}, but the run has {left.get(key)!r}; a resumed run keeps its "
+                "configuration: leave out --config, or start another run without --resume"
+            )
+
+
+def _leaves(tree: dict[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    for key, value in tree.items():
+        if isinstance(value, dict):
+            yield from _leaves(value, f"{prefix}{key}.")
+        else:
+            yield prefix + key, value
+
+
+def changed_settings(saved: dict[str, Any], config: Config, directory: Path) -> dict[str, tuple[Any, Any]]:
+    """Settings in which a run differs from what its checkpoint was made with: what they were, and what they are.
+
+    Args:
+        saved: configuration in the checkpoint.
+        config: to go on with.
+        directory: of the run, named in errors.
+
+    Raises:
+        CheckpointError: a setting that may not change.
+    """
+    was, now = dict(_leaves(saved)), dict(_leaves(config.model_dump(mode="json")))
+    changed = {key: (was.get(key), now.get(key)) for key in {**was, **now} if was.get(key) != now.get(key)}
+    for key, (old, new) in changed.items():
+        if not f"{key}=".startswith(RESUMABLE):
+            raise CheckpointError(
+                f"{directory}: {key} is {new!r} in config.yaml, but its newest checkpoint was made with {old!r}; put "
+                "that back, or start another run without --resume"
+            )
+    return changed

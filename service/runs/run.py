@@ -1,0 +1,237 @@
+"""A run: it drives a method until its budget is spent, records what happens, and can be stopped and resumed.
+
+Consumes the iterations of one ``Method``; produces records, checkpoints and snapshots in one directory. It waits for
+the method alone, which also says whether an iteration has ended.
+"""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+
+from service.config import Config
+from service.errors import DivergedError
+from service.io.errors import CheckpointError
+from service.io.run_directory import Published, RunDirectory
+from service.methods.method import Iteration, Method
+from service.policies.parameters import PolicyError
+from service.runs.saving import Saves
+from service.types import Metrics
+
+OnIteration = Callable[[Metrics], None]
+OnBeat = Callable[[], None]
+BEAT_S = 1.0
+"""Time between two heartbeats of a run whose iterations take longer."""
+_logger = logging.getLogger(__name__)
+
+
+class UnsavedError(CheckpointError):
+    """A run has ended, and its last checkpoint could not be written."""
+
+    exit_code = 1
+
+
+@dataclass(frozen=True, slots=True)
+class RunResult:
+    """Reason and length of a run that has ended."""
+
+    reason: str
+    """``finished`` (budget), ``converged`` (nothing more to learn) or ``interrupted``."""
+    iteration: int
+    num_env_steps: int
+
+
+class Run:
+    """A run of a method in a directory.
+
+    Args:
+        config: the run.
+        directory: where it keeps everything; it is claimed here.
+        make: makes the method, once the directory is this process's.
+        resume: continue from the newest checkpoint instead of starting anew.
+        parent: version that a new run begins from.
+
+    Raises:
+        TandemError: see ``RunDirectory.claim``; or the method cannot be made.
+        CheckpointError: ``resume`` without a usable checkpoint.
+    """
+
+    def __init__(
+        self,
+        config: Config,
+        directory: RunDirectory,
+        make: Callable[[], Method],
+        *,
+        resume: bool = False,
+        parent: Published | None = None,
+    ) -> None:
+        directory.claim(resume=resume)
+        self.config, self.directory = config, directory
+        self.saves = Saves(config, directory)
+        self.wall_s = 0.0
+        """Seconds spent on iterations, by all processes that ran this run."""
+        self._iteration_s = 0.0
+        self._last_beat = time.monotonic()
+        self._stop_requested = False
+        self._on_iteration: OnIteration = lambda metrics: None
+        self._on_beat: OnBeat = lambda: None
+        saved = self.saves.load() if resume else None
+        self.method = method = make()
+        method.on_wait = self._beat
+        try:
+            if saved is not None:
+                resumption, state, self.wall_s = saved
+                method.iteration, method.num_env_steps = resumption.iteration, resumption.num_env_steps
+                method.start(state)
+                _logger.info("resumed at iteration %d, %d env steps", self.iteration, self.num_env_steps)
+                directory.start(config, resumption)
+                if not self._is_saved:  # records are not as the checkpoint says, and that was accepted
+                    self._save()
+            else:
+                method.start()
+                # An untrained run is saved, so that one that is killed before its first interval can be resumed, too.
+                self._save()
+                self._take_snapshot(before=-1)
+                directory.start(config)
+                if parent is not None:
+                    directory.write_published(parent)
+        except BaseException:
+            method.close()
+            raise
+
+    @property
+    def iteration(self) -> int:
+        """Finished iterations."""
+        return self.method.iteration
+
+    @property
+    def num_env_steps(self) -> int:
+        """Env steps of all finished iterations."""
+        return self.method.num_env_steps
+
+    def request_stop(self) -> None:
+        """End soon, with a checkpoint. Safe to call from a signal handler."""
+        self._stop_requested = True
+
+    def run(self, on_iteration: OnIteration = lambda metrics: None, on_beat: OnBeat = lambda: None) -> RunResult:
+        """Learn and record until the budget is spent, the method has converged, or a stop is requested.
+
+        Args:
+            on_iteration: called with the metrics of every iteration.
+            on_beat: called about every second where iterations take longer.
+
+        Raises:
+            DivergedError: a policy has.
+            StateLostError: the method's state is lost; a new ``Run`` can go on from the newest checkpoint.
+            UnsavedError: the last checkpoint could not be written; earlier ones that could not are only warned of.
+        """
+        self._on_iteration, self._on_beat = on_iteration, on_beat
+        while (reason := self._stop_reason()) is None:
+            self._advance()
+        self._save_last()
+        return RunResult(reason, self.iteration, self.num_env_steps)
+
+    def close(self) -> None:
+        """End what the method has started; a second call does nothing."""
+        self.method.close()
+
+    def _stop_reason(self) -> str | None:
+        if self._stop_requested:
+            return "interrupted"
+        if self.num_env_steps >= self.config.run.total_env_steps:
+            return "finished"
+        return "converged" if self.method.converged else None
+
+    def _advance(self) -> None:
+        method, before, begun = self.method, self.num_env_steps, time.perf_counter()
+        with self._explaining_divergence():
+            ended = method.step()
+            interval = self.config.run.evaluation_interval
+            evaluated: Metrics = {}
+            if ended is not None and interval and self.iteration % interval == 0:
+                with method.timing("evaluate"):
+                    evaluated = method.evaluate()
+        self._iteration_s += time.perf_counter() - begun
+        if ended is None:
+            self._beat()
+            return
+        self.wall_s += self._iteration_s
+        speed = (self.num_env_steps - before) / self._iteration_s
+        self._iteration_s = 0.0
+        times = {"time/wall_s": self.wall_s, "time/env_steps_per_s": speed}
+        with method.timing("record"):
+            self._record(ended, ended.metrics | evaluated | times)
+        with self._tolerating("without this snapshot"):
+            self._take_snapshot(before=before)
+        if self.iteration % self.config.run.checkpoint_interval == 0:
+            with self._tolerating(f"and saves again after {self.config.run.checkpoint_interval} iterations"):
+                self._save()
+
+    def _record(self, ended: Iteration, metrics: Metrics) -> None:
+        for name, diverged in ended.diverged.items():
+            self.directory.dump_diverged(name, diverged)
+        self.directory.record(metrics)
+        if ended.goals is not None:
+            self.directory.record_goals(self.iteration, self.num_env_steps, ended.goals)
+        self._on_iteration(metrics)
+
+    def _beat(self) -> None:
+        if time.monotonic() - self._last_beat >= BEAT_S:
+            self._last_beat = time.monotonic()
+            self._on_beat()
+
+    # --- saving ----------------------------------------------------------------------------------------------------
+
+    @property
+    def _is_saved(self) -> bool:
+        return self.saves.saved == self.iteration
+
+    def _save(self) -> None:
+        with self.method.timing("checkpoint"):
+            counters = {"env_steps": self.num_env_steps, "wall_s": self.wall_s}
+            self.saves.save(self.iteration, self.method.state(), counters)
+
+    def _take_snapshot(self, *, before: int) -> None:
+        if self.saves.snapshot_due(before, self.num_env_steps):
+            with self.method.timing("checkpoint"):
+                self.saves.take_snapshot(self.iteration, self.num_env_steps, self.method.parameters())
+
+    @contextmanager
+    def _tolerating(self, consequence: str) -> Iterator[None]:
+        """Warn of a full disk and go on: what was saved before is intact, and what comes may fit."""
+        try:
+            yield
+        except CheckpointError as error:
+            _logger.warning("%s; the run goes on, %s", error, consequence)
+
+    @contextmanager
+    def _explaining_divergence(self) -> Iterator[None]:
+        """Add to the error of a policy that has diverged when that was, and how to go on from before it."""
+        played = self.iteration
+        try:
+            yield
+        except (DivergedError, PolicyError) as error:
+            checkpoints, learner = self.saves.checkpoints, self.config.learner
+            newest = checkpoints.newest()
+            is_played = newest is not None and checkpoints.steps()[-1] == played
+            has_it = f"delete {newest.name}, which has this policy; " if newest is not None and is_played else ""
+            rates = f"alice.learning_rate={learner.alice.learning_rate / 2:g} --set learner.bob.learning_rate="
+            said = str(error).strip().splitlines()[-1]  # from another process it comes with its traceback
+            raise DivergedError(
+                f"{self.directory.path}, iteration {played + 1}: {said}: {has_it}resume with lower learning rates, "
+                f"for example --resume --set learner.{rates}{learner.bob.learning_rate / 2:g}"
+            ) from error
+
+    def _save_last(self) -> None:
+        """Save the last iteration, if it is not, and say what is lost where that fails."""
+        try:
+            if not self._is_saved:
+                self._save()
+        except CheckpointError as error:
+            saved = next(reversed(self.saves.checkpoints.steps()), None)
+            raise UnsavedError(
+                f"{error}; the run is at iteration {self.iteration}, saved is iteration {saved}: --resume goes on there"
+            ) from error

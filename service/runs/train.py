@@ -1,0 +1,267 @@
+"""A training from the first signal handler to what it publishes."""
+
+from __future__ import annotations
+
+import logging
+import os
+import socket
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, closing, contextmanager, suppress
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from threading import Thread
+from typing import TYPE_CHECKING, Literal, cast
+
+from service.config import Config
+from service.errors import TandemError
+from service.io.checkpoints import CheckpointStore
+from service.io.run_directory import Published, RunDirectory
+from service.io.run_log import RunLog
+from service.media.artifacts import make_artifacts
+from service.methods.method import Method, StateLostError, WorkersError
+from service.primitives.loading import Trained
+from service.primitives.publishing import measure_bob, measure_skills, publish_run
+from service.progress import answer, doing
+from service.registry.names import Version
+from service.registry.registry import Registry
+from service.runs.report import Report
+from service.runs.run import OnIteration, Run, RunResult
+from service.runs.signals import InterruptError, StopSignals
+from service.store.address import address_from_environment
+from service.store.disk import read_status
+from service.store.disk_reader import run_id_of
+from service.store.run_writer import reporting_to
+
+if TYPE_CHECKING:
+    from service.store.models import RunState
+
+MAX_STATES_LOST = 5
+"""Times in a row that a run goes back to a checkpoint without getting beyond it."""
+BACK_OFF_S = 2.0
+"""Pause before the second time; it doubles."""
+END_S = 5.0
+"""Most time to tell how a run ended whose process is ended at once."""
+_logger = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, slots=True)
+class Finished:
+    """Results of a training."""
+
+    result: RunResult
+    files: dict[str, Path]
+    """Pictures and video by what they show."""
+    version: Version | None
+    """What it published; None when interrupted, or when nothing was to be published."""
+    metrics: dict[str, float]
+    """Metrics of the final evaluation."""
+    timing: str
+    """Where the time went, as a text tree."""
+    signal: int | None = None
+    """The signal that ended it before its time."""
+
+
+class UnfinishedError(TandemError):
+    """What was learned is saved, but could not be published."""
+
+    exit_code = 1
+
+
+class Runtime:
+    """Where a method's workers are: in this process. See ``service.runtime.ray_runtime`` for a cluster."""
+
+    name: Literal["local", "ray"] = "local"
+
+    def check(self, config: Config) -> None:
+        """Check what can be checked before anything is started.
+
+        Raises:
+            TandemError: this run cannot be here.
+        """
+        from service.learner.learner import torch_device
+
+        torch_device(config.learner.device)
+
+    def make(self, config: Config, start_from: Trained | None) -> Method:
+        """Make the method of a run, which begins from ``start_from`` where there is one."""
+        if config.skills is not None:
+            from service.methods.skills import SkillDiscovery
+
+            return SkillDiscovery(config)
+        if config.distillation is not None:
+            from service.methods.distillation import Distillation
+
+            return Distillation(config, start_from)
+        from service.methods.self_play import LocalSelfPlay
+
+        return LocalSelfPlay(config, start_from)
+
+    @contextmanager
+    def around(self, directory: Path, registry: Path, end_now: Callable[[str], None]) -> Iterator[None]:
+        """Surround a run with what it needs, such as a watch that may call ``end_now`` with a reason."""
+        yield
+
+
+def train(
+    config: Config,
+    directory: RunDirectory,
+    registry: Path,
+    *,
+    resume: bool = False,
+    publish: bool = True,
+    on_iteration: OnIteration,
+    runtime: Runtime | None = None,
+    start: Trained | None = None,
+) -> Finished:
+    """Train to the end, then evaluate, publish, draw and record a video.
+
+    SIGINT and SIGTERM end the run after the current iteration, saved, and what follows it at once: a resumed run does
+    that again. A second signal ends an iteration, too. A stop request ends it as a signal does.
+
+    Args:
+        config: the run.
+        directory: where it keeps everything.
+        registry: where it publishes.
+        resume: continue the run that the directory holds.
+        publish: or else leave that to a later resume, or to ``publish_run``.
+        on_iteration: called with the metrics of every iteration.
+        runtime: where its workers are; None: in this process.
+        start: what a new run begins from (``service.load``); a resumed one has begun already.
+
+    Raises:
+        TandemError: see ``Run`` and ``RunDirectory.start``; or a registry that is only read; or a Redis that is
+            configured and cannot be used; or a method that the runtime does not have.
+        UnfinishedError: everything is saved, and not published.
+        InterruptError: a signal while the run was being loaded, or a second one.
+    """
+    runtime = runtime or Runtime()
+    with StopSignals() as signals, ExitStack() as stack:
+        stack.callback(directory.close)
+        last = prepare(config, directory, registry, resume=resume, publish=publish, runtime=runtime)
+        run_id = run_id_of(directory.path)
+        previous = read_status(directory.path) if resume else None
+        writer = reporting_to(directory, run_id, address_from_environment())
+        published, epoch = last.version if last is not None else None, directory.epoch
+        report = Report(config, run_id, runtime.name, writer, published=published, previous=previous, epoch=epoch)
+        log = stack.enter_context(RunLog(directory.path))
+        begins = "goes on with" if resume else "begins"
+        log.note(f"process {os.getpid()} on {socket.gethostname()} {begins} the run ({runtime.name} runtime)")
+        stack.enter_context(report)
+        stack.enter_context(runtime.around(directory.path, registry, partial(_end_now, report, directory)))
+        num_lost, furthest = 0, -1
+        while True:
+            with doing("starting", aloud=False):
+                begun = open_run(config, directory, resume=resume, start=start, runtime=runtime)
+            with closing(begun) as run:
+                try:
+                    done = _run(run, Registry(registry) if publish else None, signals, report, on_iteration)
+                except StateLostError as error:  # with a machine of the cluster
+                    num_lost = num_lost + 1 if run.iteration <= furthest else 1
+                    furthest = max(furthest, run.iteration)
+                    if num_lost >= MAX_STATES_LOST:
+                        raise
+                    _logger.warning("%s", error)
+                    resume = True
+                else:
+                    said = f", published {done.version}" if done.version is not None else ""
+                    at = f"iteration {done.result.iteration}, {done.result.num_env_steps} env steps"
+                    log.note(f"the run is {done.result.reason} at {at}{said}")
+                    return replace(done, signal=signals.first)
+            time.sleep(BACK_OFF_S * (2 ** (num_lost - 1) - 1))
+
+
+def open_run(
+    config: Config,
+    directory: RunDirectory,
+    *,
+    resume: bool = False,
+    start: Trained | None = None,
+    runtime: Runtime | None = None,
+) -> Run:
+    """Begin or continue a run, of which nothing is reported; see ``train``."""
+    make = partial((runtime or Runtime()).make, config, start)
+    return Run(config, directory, make, resume=resume, parent=start.published if start is not None else None)
+
+
+def prepare(
+    config: Config, directory: RunDirectory, registry: Path, *, resume: bool, publish: bool, runtime: Runtime
+) -> Published | None:
+    """Check what can be checked before Ray is started, which may take a minute, and keep other processes out.
+
+    The caller closes the directory. A second call does nothing new.
+
+    Returns:
+        What the run published last.
+
+    Raises:
+        TandemError: see ``train``.
+    """
+    if publish:
+        Registry(registry).check_writable()  # now, not after hours of learning
+    runtime.check(config)
+    directory.claim(resume=resume)
+    return directory.read_published()
+
+
+def _end_now(report: Report, directory: RunDirectory, what: str) -> None:
+    """End this process from a thread while Ray is frozen: no call of the main thread may ever come back."""
+    try:
+        saved = next(reversed(CheckpointStore(directory.checkpoints, keep=1).steps()), None)
+        text = f"{what}; " + ("nothing is saved yet" if saved is None else f"--resume goes on from iteration {saved}")
+        print(f"error: {text}", file=sys.stderr, flush=True)
+        ending = Thread(target=report.__exit__, args=(WorkersError, WorkersError(text), None), daemon=True)
+        ending.start()
+        ending.join(END_S)  # a disk or a Redis may stand still, too
+    finally:
+        os._exit(WorkersError.exit_code)
+
+
+def _run(
+    run: Run, registry: Registry | None, signals: StopSignals, report: Report, on_iteration: OnIteration
+) -> Finished:
+    def beat() -> None:
+        report.beat(run)
+        if report.stop_requested():
+            run.request_stop()
+
+    def tell(metrics: dict[str, float]) -> None:
+        on_iteration(metrics)
+        report.iteration(run, metrics)
+        if report.stop_requested():
+            run.request_stop()
+
+    report.begin(run)
+
+    def stop() -> None:
+        run.request_stop()
+        answer("stopping after this iteration; again to end now")
+
+    with signals.asking(stop):
+        result = run.run(tell, beat)
+    done = Finished(result, {}, None, {}, run.method.timing.tree(), signals.first)
+    if result.reason != "interrupted" and signals.first is None:
+        with suppress(InterruptError), report.beating():
+            done = _finish(done, run, registry, report)
+    complete = result.reason if signals.first is None else "interrupted"  # --resume does what is left
+    report.end(cast("RunState", complete), published=str(done.version) if done.version is not None else None)
+    return done
+
+
+def _finish(done: Finished, run: Run, registry: Registry | None, report: Report) -> Finished:
+    _logger.info("learning is over; now evaluating, publishing, drawing and recording a video")
+    config, directory, parameters = run.config, run.directory, run.method.parameters()
+    run.close()
+    metrics, version = (measure_bob if config.skills is None else measure_skills)(config, parameters), None
+    report.check()
+    try:
+        if registry is not None and (config.policy.monolithic_bob is None or config.skills is not None):
+            known = metrics | {"env_steps": done.result.num_env_steps}
+            version = publish_run(directory, registry, config, parameters, known)
+    except TandemError as error:
+        raise UnfinishedError(f"learning is over and saved, but not published: {error}; --resume does it") from error
+    report.check()
+    files, timing = make_artifacts(directory), run.method.timing.tree()
+    return replace(done, files=files, version=version, metrics=metrics, timing=timing)

@@ -1,0 +1,97 @@
+"""Every command takes every reference, or says in a line why it means nothing there."""
+
+import json
+
+import pytest
+from typer.testing import CliRunner
+
+from service.cli.main import app
+from service.primitives.publishing import publish
+from service.registry.registry import Registry
+from tests.downstream import skill_sets
+from tests.export.policies import publish_bob, write_training
+from tests.status.conftest import serve
+
+SMALL = ("--episodes", "2", "--json")
+
+
+@pytest.fixture
+def home(tmp_path, monkeypatch):
+    """A directory with a registry of primitives and skills, and a training."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.delenv("TANDEM_REGISTRY", raising=False)
+    registry = Registry(tmp_path / "registry")
+    write_training(tmp_path / "training", publish_bob(registry), "ours", "wall")
+    publish(registry, skill_sets.CONFIG.model_copy(update={"name": "skills"}), skill_sets.parameters(), {})
+    (tmp_path / "runs").mkdir()
+    return tmp_path
+
+
+def tandem(*arguments):
+    return CliRunner().invoke(app, list(map(str, arguments)))
+
+
+def test_a_policy_of_a_task_is_evaluated_on_its_task(home):
+    found = tandem("evaluate", "--primitives", "training", "--steps", 2, *SMALL)
+    assert found.exit_code == 0, found.output
+    rows = json.loads(found.stdout)
+    assert list(rows) == ["training", "idle"]
+    assert rows["training"]["goals"] == "table"
+    same = tandem("downstream", "evaluate", "training", *SMALL)
+    assert list(json.loads(same.stdout)) == ["task", "training", "made@1, Bob alone", "idle"]
+
+
+def test_primitives_are_tried_on_a_task(home):
+    found = tandem("downstream", "evaluate", "made", "--task", "wall", *SMALL)
+    assert found.exit_code == 0, found.output
+    assert list(json.loads(found.stdout)) == ["task", "made@1", "idle"]
+
+
+def test_a_registry_may_be_a_url(home, monkeypatch):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(home / "cache"))
+    with serve(home) as server:
+        monkeypatch.chdir(home / "runs")  # where no registry is
+        monkeypatch.setenv("TANDEM_REGISTRY", server.url)
+        for arguments in (
+            ("evaluate", "--primitives", "made", "--steps", 2, *SMALL),
+            ("coverage", "--primitives", "skills", "--steps", 2, "--skills", 2, "--json"),
+            ("downstream", "evaluate", home / "training", *SMALL),
+        ):
+            done = tandem(*arguments)
+            assert done.exit_code == 0, done.output
+        refused = tandem("pretrain", "--from", "made", "--config", "panda-cube")
+        assert f"{server.url} is read only: publish in a directory" in refused.stderr
+        refused = tandem("pretrain", "--from", "skills", "--no-publish", "--config", "panda-cube")
+        assert "skills@1 is a set of skills of lsd; --from needs primitives" in refused.stderr
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (("coverage", "--primitives", "training"), "tandem coverage needs primitives or skills: name made@1, which it"),
+        (
+            ("dataset", "skills", "--out", "d"),
+            "skills@1 is a set of skills of lsd; tandem dataset needs primitives or a",
+        ),
+        (
+            ("robot", "run", "--robot", "mujoco", "--policy", "skills"),
+            "skills@1 is a set of skills of lsd; tandem robot",
+        ),
+        (
+            ("pretrain", "--from", "training"),
+            "training is a policy of the task wall; --from needs primitives: name made",
+        ),
+        (
+            ("downstream", "train", "--task", "wall", "--primitives", "training"),
+            "the method ours needs primitives: name",
+        ),
+        (("downstream", "publish", "made@1", "--name", "x"), "made@1 is no directory of a downstream training"),
+        (("export", "runs", "--format", "numpy", "--out", "o"), "no run in runs"),
+    ],
+)
+def test_a_kind_that_means_nothing_there(home, arguments, said):
+    refused = tandem(*arguments)
+    assert refused.exit_code == 2
+    assert refused.stderr.startswith("error: ")
+    assert refused.stderr.count("\n") == 1
+    assert said in refused.stderr
