@@ -1,7 +1,8 @@
-"""Env steps a second at two commits, of the whole learning loop or of bare worlds, in turn on the same cores.
+"""Env steps a second at two commits, of self-play, bare worlds or learning a task, in turn on the same cores.
 
     python -m benchmarks.compare_commits 10399f0 HEAD --json docs/results/throughput.json
     python -m benchmarks.compare_commits 2b220b3^ HEAD --worlds --json docs/results/world_speed.json
+    python -m benchmarks.compare_commits 4dacdca HEAD --task wall --seconds 20
 
 Each commit is checked out into a worktree of its own and trains with its own shipped configuration for the same number
 of env steps, since policies that touch the object make its physics dearer. From there a number of iterations is
@@ -10,7 +11,9 @@ for bit, so what differs between them is the machine. Learning is part of it, an
 and records that fall into 20 iterations. Only the command line is used, which all commits have.
 
 Bare worlds play episodes of random actions in the world of their commit's recipe, with one thread: what an actor does
-but for its policies. With few worlds NumPy's calls weigh most, with many its arithmetic.
+but for its policies. With few worlds NumPy's calls weigh most, with many its arithmetic. A task is learned with the
+champion's primitives, without evaluations and on one thread, for at most 300,000 env steps; its settings are its own:
+64 worlds, several large updates after a step of all.
 """
 
 from __future__ import annotations
@@ -20,7 +23,7 @@ import shutil
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -62,6 +65,36 @@ play()
 print(json.dumps(asdict(measure(play, float(sys.argv[2])))))
 """
 """What runs with the code of a commit."""
+_LEARN_TASK = """
+import json, sys
+from dataclasses import asdict
+import torch
+import service
+from benchmarks.measuring import measure
+torch.set_num_threads(1)
+task, method, trained = sys.argv[1], "ours", service.load_primitives("panda-cube@champion", "no registry")
+try:
+    from service.config.task import TaskConfig
+    from service.methods.task import TaskLearning
+    config = TaskConfig(task=task, method=method, world=trained.config.world, run={"num_threads": 1})
+    learning = TaskLearning(config, trained)
+    step = learning.step
+except ImportError:  # 0.2 and before
+    from service.downstream.learner import make_loop
+    from service.downstream.methods import METHODS
+    from service.downstream.settings import make_trial
+    from service.downstream.worker import make_worlds
+    trial = make_trial(task=task, method=method)
+    learning = make_loop(trial, METHODS[method], trained, make_worlds(trial, METHODS[method], trained, 1))
+    step = lambda: learning.play(50 * trial.sac.num_worlds)
+def play():
+    before = learning.num_env_steps
+    step()
+    return learning.num_env_steps - before
+for _ in range(3):  # by then it learns
+    play()
+print(json.dumps(asdict(measure(play, float(sys.argv[2])))))
+"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,7 +107,7 @@ class Settings:
     num_iterations: int = 20
     """Iterations of each measurement, with the evaluations and checkpoints that fall into them."""
     seconds: float = 2.0
-    """Length of each measurement of bare worlds."""
+    """Length of each measurement of bare worlds, or of a task."""
 
 
 @contextmanager
@@ -136,11 +169,7 @@ def compare(trees: Mapping[str, Path], home: Path, settings: Settings) -> dict[s
 
 
 def sample_of(program: str, tree: Path, home: Path, *arguments: object) -> Sample:
-    """Run a program with the code of a checkout; the sample that it prints.
-
-    Raises:
-        TandemError: it fails.
-    """
+    """Run a program with the code of a checkout; the sample that it prints."""
     command = [sys.executable, "-c", program, *map(str, arguments)]
     done = subprocess.run(command, cwd=tree, env=environment(home, tree), capture_output=True, text=True, check=False)
     if done.returncode:
@@ -148,25 +177,28 @@ def sample_of(program: str, tree: Path, home: Path, *arguments: object) -> Sampl
     return Sample(**json.loads(done.stdout.splitlines()[-1]))
 
 
-def compare_worlds(trees: Mapping[str, Path], home: Path, settings: Settings) -> dict[str, dict[str, list[Sample]]]:
-    """Samples of the bare worlds of every tree in turn, by the number of worlds and by the name of the tree."""
-    found: dict[str, dict[str, list[Sample]]] = {str(num): {name: [] for name in trees} for num in NUM_WORLDS}
-    for num, samples in found.items():
+def compare_programs(
+    program: str, arguments: Sequence[str], trees: Mapping[str, Path], home: Path, settings: Settings
+) -> dict[str, dict[str, list[Sample]]]:
+    """Samples of a program in every tree in turn, by each of its arguments and by the name of the tree."""
+    found: dict[str, dict[str, list[Sample]]] = {each: {name: [] for name in trees} for each in arguments}
+    for each, samples in found.items():
         for _ in range(settings.num_pairs):
             for name, tree in trees.items():
-                samples[name].append(sample_of(_PLAY_WORLDS, tree, home, num, settings.seconds))
+                samples[name].append(sample_of(program, tree, home, each, settings.seconds))
     return found
 
 
-def benchmark(old: str, new: str, settings: Settings, *, worlds: bool = False) -> dict[str, Any]:
+def benchmark(old: str, new: str, settings: Settings, *, worlds: bool = False, task: str = "") -> dict[str, Any]:
     """Compare two commits in directories that are deleted at the end; a ratio is the new one's speed by the old's."""
     commits = {"old": full_name(old), "new": full_name(new)}
     if commits["old"] == commits["new"]:
         raise TandemError(f"{old} and {new} are the same commit; name two")
     first, last = names = [commit[:7] for commit in commits.values()]
     with worktree(commits["old"]) as before, worktree(commits["new"]) as after, scratch() as home:
-        if worlds:
-            found = compare_worlds({"old": before, "new": after}, home, settings)
+        if worlds or task:
+            program, asked = (_LEARN_TASK, [task]) if task else (_PLAY_WORLDS, [str(num) for num in NUM_WORLDS])
+            found = compare_programs(program, asked, {"old": before, "new": after}, home, settings)
             rows = {num: {name: rates(each) for name, each in samples.items()} for num, samples in found.items()}
             ratios = {num: ratio(samples["new"], samples["old"]) for num, samples in found.items()}
             return {"commits": commits, "rows": rows, "ratios": ratios}
@@ -178,7 +210,7 @@ def benchmark(old: str, new: str, settings: Settings, *, worlds: bool = False) -
 def report(result: dict[str, Any]) -> str:
     """A result for people."""
     if "ratios" in result:
-        return "\n".join(describe_ratio(f"new / old, {num} worlds", each) for num, each in result["ratios"].items())
+        return "\n".join(describe_ratio(f"new / old, {name}", each) for name, each in result["ratios"].items())
     return f"{rates_table(result['rows'])}\n{describe_ratio('new / old', result['ratio'])}"
 
 
@@ -187,13 +219,15 @@ def main() -> int:
     parser = parser_of(__doc__, Settings())
     parser.add_argument("old", metavar="OLD", help="a commit")
     parser.add_argument("new", metavar="NEW", nargs="?", default="HEAD", help="a later one (default: %(default)s)")
-    parser.add_argument("--worlds", action="store_true", help="bare worlds, not the whole loop")
+    parser.add_argument("--worlds", action="store_true", help="bare worlds, 8 and 240, not self-play")
+    parser.add_argument("--task", default="", help="learning a task, not self-play")
     given = parser.parse_args()
 
     def run(settings: Settings) -> dict[str, Any]:
-        return benchmark(given.old, given.new, settings, worlds=given.worlds)
+        return benchmark(given.old, given.new, settings, worlds=given.worlds, task=given.task)
 
-    return run_benchmark("world_speed" if given.worlds else "throughput", PACKAGES, given, Settings, run, report)
+    name = "task_speed" if given.task else "world_speed" if given.worlds else "throughput"
+    return run_benchmark(name, PACKAGES, given, Settings, run, report)
 
 
 if __name__ == "__main__":

@@ -19,9 +19,8 @@ from benchmarks.measuring import RECIPE_FILE, ROOT, machine, write_json
 from benchmarks.record_run import PACKAGES
 from benchmarks.run_files import COUNTERS, FORMAT_VERSION, Run, thin
 from benchmarks.tasks import measure_tasks
+from benchmarks.trials import NUM_EPISODES, run_trial, trial_config
 from service.config import Config, load_config
-from service.downstream.settings import make_trial
-from service.downstream.worker import RunOptions, run_trial
 from service.errors import TandemError
 from service.io.run_directory import RunDirectory
 from service.media.figures import read_records
@@ -45,7 +44,6 @@ BOB_STEPS = 6_000_000
 BOB_SHARE = 0.6
 """Share of all env steps that are Bob's where Alice plays, by the recorded runs of the recipe; it hardly changes."""
 TASKS, METHOD = ("wall", "box", "push"), "ours-her"
-NUM_EPISODES = 1_000
 MAX_POINTS = 100
 _KEPT = (*COUNTERS, "evaluation/", "bob/", "alice/valid_fraction", "alice/lifted_fraction")
 
@@ -104,17 +102,13 @@ def run_control(config: Config, name: str, given: argparse.Namespace) -> Run:
     done = train(config, directory, directory.path, resume=resume, publish=False, on_iteration=_show)
     if done.result.reason == "interrupted":  # what it learned so far is no result
         raise TandemError(f"stopped at {done.result.num_env_steps:,} env steps; the same command goes on from there")
-    bob = load(str(directory.path))
     found = {}
     for task in TASKS:
-        trial = make_trial(
-            task=task, method=METHOD, seed=config.seed, num_env_steps=given.steps, num_episodes=NUM_EPISODES
-        )
-        path = given.run_dir / f"{name}-{config.seed}-{task}"
-        result = run_trial(trial, bob, path, RunOptions(resume=path.exists(), num_threads=config.run.num_threads))
-        assert result is not None
-        found[task] = result
-        print(f"  {task}: {result['evaluation']['success_last']:.1%}", flush=True)
+        settings = [f"run.total_env_steps={given.steps}", f"run.final_episodes={NUM_EPISODES}"]
+        settings.append(f"run.num_threads={config.run.num_threads}")
+        trial = trial_config(task, METHOD, config.seed, str(directory.path.absolute()), settings)
+        found[task] = run_trial(trial, directory.path, given.run_dir / f"{name}-{config.seed}-{task}")
+        print(f"  {task}: {found[task]['evaluation']['success_last']:.1%}", flush=True)
     return record_control(directory, name, found)
 
 

@@ -18,6 +18,7 @@ from service.actors.coverage import NUM_SKILLS, RandomPolicy, skill_trajectories
 from service.baselines.coverage import skill_paths
 from service.baselines.frozen import FrozenSkills
 from service.config import Config
+from service.config.skills import SkillDiscoveryConfig
 from service.media.artifacts import COVERAGE_STEPS
 from service.policies.numpy_policy import NumpyMCPPolicy, numpy_bob
 from service.policies.parameters import Parameters
@@ -43,7 +44,7 @@ def measure_coverage(
     """The share of the workspace's table cells of 5 cm that each stage's random skills move the object into.
 
     Args:
-        stages: parameters of Bob, or of skills where the run has ``config.skills``, by env steps of training.
+        stages: parameters of Bob, or of skills, by env steps of training.
         config: of the run.
         num_sets: sets of 32 skills, each from a seed of its own, the same for all stages.
         num_steps: of each skill.
@@ -54,7 +55,7 @@ def measure_coverage(
     common: dict[str, Any] = {"num_skills": NUM_SKILLS, "num_steps": num_steps, "num_threads": config.run.num_threads}
 
     def player(parameters: Parameters) -> _Player | None:
-        if config.skills is not None:
+        if isinstance(config, SkillDiscoveryConfig):
             return partial(skill_paths, FrozenSkills(parameters, config.skills.method), config.world, **common)
         bob = numpy_bob(parameters)
         return partial(skill_trajectories, bob, config.world, **common) if isinstance(bob, NumpyMCPPolicy) else None

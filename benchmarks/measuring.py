@@ -26,6 +26,7 @@ from benchmarks.report.markdown import table
 from service.errors import TandemError
 from service.io.files import os_errors, write_atomic
 from service.io.git import git_commit
+from service.primitives.loading import load
 
 ROOT = Path(__file__).parents[1]
 RECIPE_FILE = ROOT / "configs" / "pretrain" / "panda_cube.yaml"
@@ -53,28 +54,13 @@ class Sample:
         return self.num_steps / self.cpu_s
 
 
-class Stopwatch:
-    """Wall-clock and CPU time of this process since the stopwatch was made."""
-
-    def __init__(self) -> None:
-        self._wall, self._cpu = time.perf_counter(), time.process_time()
-
-    def wall_s(self) -> float:
-        """Seconds so far."""
-        return time.perf_counter() - self._wall
-
-    def sample(self, num_steps: int) -> Sample:
-        """``num_steps`` env steps in the time so far."""
-        return Sample(num_steps, self.wall_s(), time.process_time() - self._cpu)
-
-
 def measure(play: Callable[[], int], seconds: float) -> Sample:
     """Call ``play``, which returns its number of env steps, at least once and until ``seconds`` have passed."""
-    watch = Stopwatch()
+    wall_s, cpu_s = time.perf_counter(), time.process_time()
     num_steps = play()
-    while watch.wall_s() < seconds:
+    while time.perf_counter() - wall_s < seconds:
         num_steps += play()
-    return watch.sample(num_steps)
+    return Sample(num_steps, time.perf_counter() - wall_s, time.process_time() - cpu_s)
 
 
 def measure_in_turn(plays: Mapping[str, Callable[[], int]], num_pairs: int, seconds: float) -> dict[str, list[Sample]]:
@@ -84,11 +70,6 @@ def measure_in_turn(plays: Mapping[str, Callable[[], int]], num_pairs: int, seco
         for name, play in plays.items():
             samples[name].append(measure(play, seconds))
     return samples
-
-
-def total(samples: Sequence[Sample]) -> Sample:
-    """Sum of several stretches of time."""
-    return Sample(sum(s.num_steps for s in samples), sum(s.wall_s for s in samples), sum(s.cpu_s for s in samples))
 
 
 def rates(samples: Sequence[Sample]) -> dict[str, Any]:
@@ -114,11 +95,7 @@ def ratio(ours: Sequence[Sample], theirs: Sequence[Sample]) -> dict[str, float]:
 
 
 def machine(*packages: str) -> dict[str, Any]:
-    """The commit, the processor, how busy it is with everything that runs on it, and versions of ``packages``.
-
-    Raises:
-        TandemError: one of them is not installed.
-    """
+    """The commit, the processor, how busy it is with everything that runs on it, and versions of ``packages``."""
     try:
         versions = {name: importlib.metadata.version(name) for name in packages}
     except importlib.metadata.PackageNotFoundError as error:
@@ -154,11 +131,7 @@ def describe_ratio(name: str, each: dict[str, float]) -> str:
 
 
 def write_json(path: Path, result: dict[str, Any]) -> None:
-    """Write a result, its innermost lists on one line each.
-
-    Raises:
-        TandemError: the file cannot be written.
-    """
+    """Write a result, its innermost lists on one line each."""
     with os_errors("write", path):
         write_atomic(path, to_text(result).encode())
 
@@ -209,6 +182,26 @@ def run_benchmark(
         return 2
     print(report(result))
     return int(failed(result))
+
+
+def primitives_benchmark(
+    name: str, packages: Sequence[str], doc: str | None, defaults: _Settings, measure: Callable[..., dict[str, Any]],
+    report: Callable[[dict[str, Any]], str],
+) -> int:  # fmt: skip
+    """The command line of a benchmark that calls ``measure`` with each of the primitives that it is given."""
+    parser = parser_of(doc, defaults)
+    parser.add_argument("primitives", nargs="+", metavar="NAME@ALIAS|RUN_DIR")
+    parser.add_argument("--registry", default="registry")
+    given = parser.parse_args()
+
+    def benchmark(settings: _Settings) -> dict[str, Any]:
+        rows = {}
+        for reference in given.primitives:
+            trained = load(reference, given.registry)
+            rows[reference] = {"name": trained.name, "digest": trained.digest, **measure(trained, settings)}
+        return {"rows": rows}
+
+    return run_benchmark(name, packages, given, type(defaults), benchmark, report)
 
 
 def _cpu_model() -> str:

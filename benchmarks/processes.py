@@ -52,12 +52,6 @@ def cpu_s(pid: int) -> float:
     return sum(map(int, fields[11:15])) / _TICKS if fields else 0.0
 
 
-def resident_bytes(pid: int) -> int:
-    """Memory of a process that is not swapped out; 0 if it has ended."""
-    fields = _stat(pid)
-    return int(fields[21]) * os.sysconf("SC_PAGE_SIZE") if fields else 0
-
-
 def cpu_s_by_role(root: int) -> dict[str, float]:
     """CPU seconds of ``root`` and all below it, summed by role."""
     seconds = defaultdict[str, float](float)

@@ -15,11 +15,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-import service
-from benchmarks.measuring import parser_of, run_benchmark
+from benchmarks.measuring import primitives_benchmark
 from service.actors.evaluation import wilson_interval
 from service.downstream.compose import check_primitives
-from service.downstream.methods import provenance
 from service.envs.batch import WorldBatch
 from service.envs.sampling import draw_goals
 from service.envs.tasks import EPISODE_STEPS, SUCCESS_DISTANCE_M, find_task
@@ -45,6 +43,7 @@ _LEAST_STD = 0.1
 class Settings:
     """Amount of what is measured."""
 
+    task: str = "push"
     num_goals: int = 300
     num_plans: int = 48
     """Plans of one goal in each round of the search."""
@@ -114,36 +113,26 @@ def measure(trained: Trained, task_name: str, settings: Settings) -> dict[str, A
     return {"reached": reached / settings.num_goals, "low": low, "high": high}
 
 
-def benchmark(references: list[str], registry: str, task: str, settings: Settings) -> dict[str, Any]:
-    """Measure primitives of a registry or of run directories; a row for each."""
-    rows = {}
-    for name in references:
-        trained = service.load_primitives(name, registry)
-        rows[name] = {**provenance(trained)["primitives"], **measure(trained, task, settings)}
-    return {"task": task, "num_goals": settings.num_goals, "rows": rows}
-
-
 def report(result: dict[str, Any]) -> str:
     """A result for people."""
+    settings = result["settings"]
     return "\n".join(
-        f"{name}: plans reach {row['reached']:.1%} [{row['low']:.1%}, {row['high']:.1%}] of {result['num_goals']} "
-        f"goals of {result['task']}"
+        f"{name}: plans reach {row['reached']:.1%} [{row['low']:.1%}, {row['high']:.1%}] of {settings['num_goals']} "
+        f"goals of {settings['task']}"
         for name, row in result["rows"].items()
     )
 
 
 def main() -> int:
     """Parse the command line, measure, print, write."""
-    parser = parser_of(__doc__, Settings())
-    parser.add_argument("primitives", nargs="+", metavar="NAME@ALIAS|RUN_DIR")
-    parser.add_argument("--registry", default="registry")
-    parser.add_argument("--task", default="push")
-    given = parser.parse_args()
-
-    def run(settings: Settings) -> dict[str, Any]:
-        return benchmark(given.primitives, given.registry, given.task, settings)
-
-    return run_benchmark("push_planning", PACKAGES, given, Settings, run, report)
+    return primitives_benchmark(
+        "push_planning",
+        PACKAGES,
+        __doc__,
+        Settings(),
+        lambda trained, settings: measure(trained, settings.task, settings),
+        report,
+    )
 
 
 if __name__ == "__main__":

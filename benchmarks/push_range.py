@@ -13,10 +13,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-import service
-from benchmarks.measuring import parser_of, run_benchmark
+from benchmarks.measuring import primitives_benchmark
 from service.downstream.compose import check_primitives
-from service.downstream.methods import provenance
 from service.primitives.learned import action_weights
 
 if TYPE_CHECKING:
@@ -87,15 +85,6 @@ def measure(trained: Trained, *, num_places: int, num_weights: int, seed: int) -
     return shares
 
 
-def benchmark(references: list[str], registry: str, settings: Settings) -> dict[str, Any]:
-    """Measure primitives of a registry or of run directories; a row for each."""
-    rows = {}
-    for name in references:
-        trained = service.load_primitives(name, registry)
-        rows[name] = {**provenance(trained)["primitives"], "impossible": measure(trained, **asdict(settings))}
-    return {"rows": rows}
-
-
 def report(result: dict[str, Any]) -> str:
     """A result for people."""
     return "\n".join(
@@ -106,12 +95,13 @@ def report(result: dict[str, Any]) -> str:
 
 def main() -> int:
     """Parse the command line, measure, print, write."""
-    parser = parser_of(__doc__, Settings())
-    parser.add_argument("primitives", nargs="+", metavar="NAME@ALIAS|RUN_DIR")
-    parser.add_argument("--registry", default="registry")
-    given = parser.parse_args()
-    return run_benchmark(
-        "push_range", PACKAGES, given, Settings, lambda each: benchmark(given.primitives, given.registry, each), report
+    return primitives_benchmark(
+        "push_range",
+        PACKAGES,
+        __doc__,
+        Settings(),
+        lambda trained, settings: {"impossible": measure(trained, **asdict(settings))},
+        report,
     )
 
 

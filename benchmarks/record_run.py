@@ -26,6 +26,7 @@ from benchmarks.coverage import measure_coverage
 from benchmarks.measuring import machine, write_json
 from benchmarks.run_files import COUNTERS, FORMAT_VERSION, Records, Run, blocks, thin
 from benchmarks.tasks import measure_tasks
+from service.config.skills import SkillDiscoveryConfig
 from service.envs.tasks import EPISODE_STEPS
 from service.errors import TandemError
 from service.io.run_directory import RunDirectory
@@ -74,11 +75,7 @@ def measure_run(directory: RunDirectory) -> dict[str, Any]:
 
 
 def record_skills(directory: RunDirectory, name: str, note: str = "") -> Run:
-    """Everything that is kept of a run of skills, or of self-play as skills.
-
-    Raises:
-        TandemError: no run, or one of a monolithic Bob, who has no skills.
-    """
+    """Everything that is kept of a run of skills, or of self-play as skills."""
     config = directory.read_config()
     coverage = measure_coverage(read_stages(directory), config, num_steps=EPISODE_STEPS)
     if coverage is None:
@@ -91,7 +88,7 @@ def record_skills(directory: RunDirectory, name: str, note: str = "") -> Run:
         "format_version": FORMAT_VERSION,
         "name": name,
         "note": note,
-        "method": OURS if config.skills is None else config.skills.method,
+        "method": config.skills.method if isinstance(config, SkillDiscoveryConfig) else OURS,
         "recorded": machine(*PACKAGES),
         "config": config.model_dump(mode="json"),
         "series": thin(kept, SKILL_POINTS),

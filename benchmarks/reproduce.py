@@ -21,7 +21,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from benchmarks.controls import CONTROLS
-from benchmarks.measuring import RECIPE_FILE, ROOT
+from benchmarks.measuring import ROOT
 from service.downstream.methods import METHODS
 from service.envs.tasks import TASKS, find_task
 
@@ -33,7 +33,6 @@ SKILL_HOLD_STEPS = 1
 """Env steps that an orchestrator holds a skill; 1, 5 and 25 were compared (log, T20)."""
 CONTROL_SEEDS = (0, 2)
 LONGER_ENV_STEPS = 1_000_000
-NUM_EPISODES = 1_000
 Command = tuple[str, ...]
 
 
@@ -92,30 +91,28 @@ def experiments(places: Places) -> Iterator[Experiment]:
 
 
 def _trial(places: Places, task: str, method: str, seed: int) -> Experiment:
-    return _table(places, places.out, task, method, seed, PRIMITIVES[seed])
+    return _table(places, "downstream", task, method, seed, PRIMITIVES[seed])
 
 
 def _longer(places: Places, task: str, method: str) -> Experiment:
-    extra = ("--steps", str(LONGER_ENV_STEPS))
-    found = _table(places, places.out / "downstream_longer", task, method, 0, PRIMITIVES[0], extra)
+    extra = ("--set", f"run.total_env_steps={LONGER_ENV_STEPS}")
+    found = _table(places, "downstream_longer", task, method, 0, PRIMITIVES[0], extra)
     return replace(found, group="a million env steps", part=f"{task}-{method}")
 
 
 def _table(
-    places: Places, out: Path, task: str, method: str, seed: int, reference: str, extra: Command = ()
+    places: Places, directory: str, task: str, method: str, seed: int, reference: str, extra: Command = ()
 ) -> Experiment:
-    """A trial by ``tandem downstream table``, which gives it its name."""
-    name = f"{task}-{method}-{seed}"
-    command = _tandem(
-        *("downstream", "table", "--tasks", task, "--methods", method, "--seeds", str(seed)),
-        *("--primitives", reference, "--registry", str(places.out / "primitives")),
-        *("--episodes", str(NUM_EPISODES), "--threads", "1", "--out", str(out), "--runs", str(places.runs / out.name)),
-        *extra,
+    """A trial with primitives or skills of the recorded registry."""
+    name, file = f"{directory}/{task}-{method}-{seed}", places.out / directory / f"{task}-{method}-{seed}.json"
+    command = _python(
+        *("-m", "benchmarks.trials", task, method, str(seed), "--primitives", reference, "--out", str(file)),
+        *("--registry", str(places.out / "primitives"), "--runs", str(places.runs / directory)),
+        *("--set", "run.num_threads=1", *extra),
     )
     versions = places.out / "primitives" / "models" / reference.partition("@")[0]
     group, part = (METHODS[method].title, task) if task in TASKS else (find_task(task).title, method)
-    file = out / "downstream" / f"{name}.json"
-    return Experiment(f"{out.name}/{name}", file, group, part, seed, lambda: [command], versions)
+    return Experiment(name, file, group, part, seed, lambda: [command], versions)
 
 
 def _control(places: Places, name: str, seed: int) -> Experiment:
@@ -134,10 +131,11 @@ def _skills(places: Places, seed: int) -> Iterator[Experiment]:
         yield _discover(places, method, seed)
     for method in SKILL_METHODS:
         rows = (method, f"{method}-zero-shot") if method in ("lsd", "metra") else (method,)
-        hold = ("--skill-steps", str(SKILL_HOLD_STEPS))
+        hold = ("--set", f"skill_steps={SKILL_HOLD_STEPS}")
         for row in rows:
             for task in TASKS:
-                yield _table(places, places.out, task, row, seed, f"{_skills_name(method, seed)}@1", hold)
+                settings = hold if row == method else ()
+                yield _table(places, "downstream", task, row, seed, f"{_skills_name(method, seed)}@1", settings)
 
 
 def _skills_name(method: str, seed: int) -> str:
@@ -147,7 +145,7 @@ def _skills_name(method: str, seed: int) -> str:
 def _discover(places: Places, method: str, seed: int) -> Experiment:
     run, file = places.runs / f"{method}-{seed}", places.out / "skills" / f"{method}-{seed}.json"
     train = _tandem(
-        *("pretrain", "--method", method, "--config", str(RECIPE_FILE), "--run-dir", str(run)),
+        *("train", f"panda-cube-{method}", "--run-dir", str(run)),
         *("--registry", str(places.out / "primitives"), "--set", f"name={_skills_name(method, seed)}"),
         *("--set", f"seed={seed}", "--set", f"run.total_env_steps={SKILL_ENV_STEPS}", "--set", "run.num_threads=1"),
     )
@@ -193,7 +191,7 @@ def _run_one(experiment: Experiment, logs: Path) -> None:
 
 
 def _run(commands: Sequence[Command], log: int) -> int:
-    environment = os.environ | {"OMP_NUM_THREADS": "1"}
+    environment = os.environ | {"OMP_NUM_THREADS": "1", "MUJOCO_GL": "disable"}  # without videos
     for command in commands:
         code = subprocess.run(command, cwd=ROOT, env=environment, stdout=log, stderr=log, check=False).returncode
         if code:

@@ -35,11 +35,7 @@ Records = Sequence[dict[str, Any]]
 
 
 def read_run(path: Path) -> Run:
-    """A file that ``record_run.py`` made.
-
-    Raises:
-        TandemError: it cannot be read, or is of another format.
-    """
+    """A file that ``record_run.py`` made."""
     try:
         run = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:

@@ -24,7 +24,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import zip_longest
 from pathlib import Path
 from typing import Any
@@ -71,6 +71,10 @@ class Row:
     """Iteration of the checkpoint from which it is resumed after a kill -9; 0: it is not killed."""
     checkpoints: tuple[str, str] = ("checkpoints", "checkpoints")
     """Where the run directory has them, in the old tree and in the new one."""
+    renamed: Mapping[str, str | None] = field(default_factory=dict)
+    """As ``RENAMED``, of this row alone."""
+    added: tuple[str, ...] = ()
+    """Beginnings of names that only the new tree has, on purpose."""
     late: tuple[str, ...] = ()
     """Beginnings of metrics that come with the next record there is: their values count, not where they are."""
 
@@ -96,6 +100,14 @@ _WALL = (
     "downstream train --task wall --primitives panda-cube@champion --run-dir {run} --registry {registry}"
     " --steps 12800 --episodes 20 --threads 1 --quiet"
 )
+_TASK = (
+    "train wall --primitives panda-cube@champion --run-dir {run} --registry {registry} --quiet"
+    " --set run.total_env_steps=12800 --set run.final_episodes=20 --set run.num_threads=1"
+)
+_TASK_RENAMED: Mapping[str, str | None] = {
+    **{f"checkpoint/{part}/": f"checkpoint/loop/{part}/" for part in ("learner", "replay", "worlds")},
+    "header/meta/curve": None,  # it is in the metrics
+}
 _LEARNERS = ("ours", "ours-her", "ours-residual-her", *(f"scratch-{net}" for net in ("monolithic", "mcp")))
 _LEARNERS += tuple(f"scratch-{net}-her" for net in ("monolithic", "mcp"))
 ROWS = (
@@ -103,7 +115,16 @@ ROWS = (
     Row("self-play-ray", _RAY, killed_after=12, late=("evaluation/",)),  # its actor evaluates beside the updates
     Row("distillation", _ROBUST),
     *(Row(method, f"{_SKILLS} --method {method}") for method in ("lsd", "metra", "dads", "diayn")),
-    *(Row(f"wall-{method}", f"{_WALL} --method {method}") for method in _LEARNERS),
+    *(
+        Row(
+            f"wall-{method}",
+            f"{_WALL} --method {method}",
+            f"{_TASK} --method {method}",
+            renamed=_TASK_RENAMED,
+            added=("checkpoint/policy/",),
+        )
+        for method in _LEARNERS
+    ),
 )
 
 
@@ -123,13 +144,11 @@ class Settings:
 
 
 def compare_runs(old: Path, new: Path, row: Row) -> dict[str, Any]:
-    """Compare what two run directories of a row hold: how much that was, and the names of what differs.
-
-    Raises:
-        TandemError: one of them has no checkpoint.
-        OSError: or no metrics.
-    """
-    before, after = _renamed(read_run(old, row, 0)), read_run(new, row, 1)
+    """Compare what two run directories of a row hold: how much that was, and the names of what differs."""
+    before, after = _renamed(read_run(old, row, 0), {**RENAMED, **row.renamed}), read_run(new, row, 1)
+    after = {
+        name: values for name, values in after.items() if name in before or not name.startswith(row.added or ("\0",))
+    }
     names = before.keys() & after.keys()
     differing = [
         (_first_difference(before.get(name, []), after.get(name, [])), name)
@@ -150,11 +169,7 @@ def _first_difference(one: Values, other: Values) -> int:
 
 
 def newest_checkpoint(directory: Path) -> Path:
-    """The last file of the last process.
-
-    Raises:
-        TandemError: there is none.
-    """
+    """The last file of the last process."""
     if not (files := sorted(directory.glob("*.safetensors"))):
         raise TandemError(f"no checkpoint in {directory}; name in the row where its tree has them")
     return files[-1]
@@ -190,12 +205,12 @@ def _leaves(name: str, value: Any) -> Iterator[tuple[str, str]]:
             yield from _leaves(f"{name}/{key}", each)
 
 
-def _renamed(things: Mapping[str, Values]) -> dict[str, Values]:
+def _renamed(things: Mapping[str, Values], renamed: Mapping[str, str | None]) -> dict[str, Values]:
     """What the old tree has, by the names of the new one."""
     found = {}
     for name, thing in things.items():
-        begin = next((begin for begin in RENAMED if name.startswith(begin)), "")
-        if (instead := RENAMED.get(begin, "")) is not None:
+        begin = max((begin for begin in renamed if name.startswith(begin)), key=len, default="")
+        if (instead := renamed.get(begin, "")) is not None:
             found[instead + name.removeprefix(begin)] = thing
     return found
 
@@ -204,11 +219,7 @@ def _renamed(things: Mapping[str, Values]) -> dict[str, Values]:
 
 
 def train(row: Row, side: int, tree: Path, home: Path) -> Path:
-    """Run a row with the code of a checkout, 0 the old and 1 the new one; its run directory.
-
-    Raises:
-        TandemError: it fails, or has saved again before it was killed.
-    """
+    """Run a row with the code of a checkout, 0 the old and 1 the new one; its run directory."""
     run = home / "runs" / row.name
     command = shlex.split((row.old, row.new or row.old)[side].format(run=run, registry=home / "registry"))
     if row.killed_after:

@@ -43,7 +43,7 @@ def measure_tasks(
                 task.goals,
                 num_episodes=num_episodes,
                 num_steps=num_steps,
-                success_distance_m=config.game.success_distance_m,
+                success_distance_m=config.success_distance_m,
                 seed=SEED,
                 num_threads=config.run.num_threads,
             )

@@ -23,8 +23,9 @@ from benchmarks.measuring import RECIPE_FILE, machine, write_json
 from benchmarks.processes import cpu_s_by_role
 from benchmarks.training_process import Training, overrides, scratch
 from service.config import load_config
+from service.config.self_play import SelfPlayConfig
 from service.errors import TandemError
-from service.runtime.study_plan import parse_seeds
+from service.runs.grid import parse_seeds
 
 SHARE = 0.9
 NUM_IN_A_ROW = 3
@@ -41,11 +42,7 @@ def first_in_a_row(rates: Sequence[float], share: float = SHARE, num: int = NUM_
 
 
 def run_seed(config: Path, settings: Sequence[str], seed: int, max_env_steps: int, share: float) -> dict[str, Any]:
-    """Run one seed until it is there, or to ``max_env_steps``; for JSON.
-
-    Raises:
-        TandemError: the run ended by itself, by an error.
-    """
+    """Run one seed until it is there, or to ``max_env_steps``; for JSON."""
     budget = overrides({"seed": seed, "run.total_env_steps": max_env_steps})
     given = [word for each in settings for word in ("--set", each)]
     points: list[dict[str, float]] = []
@@ -100,6 +97,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     given = parser.parse_args(arguments)
     try:
         config = load_config(given.config, given.set)
+        assert isinstance(config, SelfPlayConfig)
         settings = {
             "config": given.config.name,
             "set": given.set,

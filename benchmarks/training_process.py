@@ -25,6 +25,7 @@ from tempfile import mkdtemp
 from types import MappingProxyType
 from typing import Any, Literal, Self, TypeVar
 
+import yaml
 from pydantic import ValidationError
 
 from benchmarks.measuring import ROOT, Sample
@@ -130,11 +131,7 @@ class Training:
             return None
 
     def wait_for(self, what: Callable[[], _Answer | None], seconds: float = START_S) -> _Answer:
-        """The first answer of ``what`` that is true.
-
-        Raises:
-            TandemError: the run ended, or there was none in time.
-        """
+        """The first answer of ``what`` that is true."""
         deadline_s = time.monotonic() + seconds
         while self.ended is None and time.monotonic() < deadline_s:
             if answer := what():
@@ -144,11 +141,7 @@ class Training:
         raise TandemError(f"the run does not do what is waited for: {why}; its last words: {self.last_words()}")
 
     def wait_until(self, key: str, value: float) -> None:
-        """Wait, a day at most, until a record has at least ``value`` under ``key``.
-
-        Raises:
-            TandemError: see ``wait_for``.
-        """
+        """Wait, a day at most, until a record has at least ``value`` under ``key``."""
         self.wait_for(lambda: any(row[key] >= value for row in self.records.new()), 86_400.0)
 
     def stop(self) -> None:
@@ -199,8 +192,6 @@ class Measured:
 
     num_steps: int
     wall_s: float
-    cpu_s: float
-    """CPU seconds of all processes of the run, Ray's and the status service's included."""
     num_iterations: int
     num_rollouts: int
     num_actors: int
@@ -210,15 +201,13 @@ class Measured:
     """Mean duration of a round; 0 where play and learning share a process."""
     learn_s: float
     """Mean duration of an update."""
-    mean_policy_lag: float
-    max_policy_lag: float
     role_cpu_s: dict[str, float]
     """CPU seconds by role of process, several of one role together."""
 
     @property
     def sample(self) -> Sample:
         """Its env steps and times."""
-        return Sample(self.num_steps, self.wall_s, self.cpu_s)
+        return Sample(self.num_steps, self.wall_s, sum(self.role_cpu_s.values()))
 
     @property
     def learner_idle_share(self) -> float:
@@ -237,9 +226,6 @@ def measure_training(
     """Measure about ``num_iterations`` iterations of a run that has just been started, then end it.
 
     It is measured from when ``num_actors`` are alive and ``num_warmup`` iterations, at least 1, are over.
-
-    Raises:
-        TandemError: the run ended before.
     """
     rows: list[dict[str, Any]] = []
     marks = []
@@ -253,8 +239,13 @@ def measure_training(
     training.stop()
     (num_before, first_s, before), (_, last_s, after) = marks
     role_cpu_s = {role: seconds - before.get(role, 0.0) for role, seconds in after.items()}
-    num_worlds = training.directory.read_config().game.num_worlds
+    num_worlds = _num_worlds(training.directory)
     return summarise_rows(rows, num_before, last_s - first_s, role_cpu_s, num_actors, -(-num_worlds // num_actors))
+
+
+def _num_worlds(directory: RunDirectory) -> int:
+    """Worlds of a run, which may be one of another version."""
+    return int(yaml.safe_load(directory.config_file.read_text(encoding="utf-8"))["game"]["num_worlds"])
 
 
 def summarise_rows(
@@ -264,7 +255,6 @@ def summarise_rows(
     """Costs of the records after the first ``num_before``, at least 1, which took ``wall_s`` and ``role_cpu_s``."""
     measured = rows[num_before:]
     rollouts = [row.get("actor/num_rollouts", 1.0) for row in measured]
-    lags = [row["learner/policy_lag"] for row in measured if "learner/policy_lag" in row]
 
     def mean_of_rounds(key: str) -> float:
         return sum(row.get(key, 0.0) * num for row, num in zip(measured, rollouts, strict=True)) / sum(rollouts)
@@ -272,17 +262,12 @@ def summarise_rows(
     return Measured(
         num_steps=int(measured[-1]["env_steps"] - rows[num_before - 1]["env_steps"]),
         wall_s=wall_s,
-        cpu_s=sum(role_cpu_s.values()),
         num_iterations=len(measured),
         num_rollouts=int(sum(rollouts)),
         num_actors=num_actors,
         num_worlds=num_worlds,
         play_s=mean_of_rounds("time/play_s"),
         learn_s=statistics.fmean(row.get("time/learn_s", 0.0) for row in measured),
-        mean_policy_lag=statistics.fmean(lags),
-        max_policy_lag=max(
-            lags + [row["learner/max_policy_lag"] for row in measured if "learner/max_policy_lag" in row]
-        ),
         role_cpu_s=dict(role_cpu_s),
     )
 
@@ -306,15 +291,10 @@ def scratch() -> Iterator[Path]:
 
 
 def copy_run(source: RunDirectory, home: Path, name: str = "run") -> RunDirectory:
-    """Copy what a ``Training`` in ``home`` needs to go on from the newest checkpoint of ``source``.
-
-    Raises:
-        TandemError: no run there, or one without a checkpoint.
-    """
-    source.read_config()
+    """Copy what a ``Training`` in ``home`` needs to go on from the newest checkpoint of ``source``."""
     store, target = CheckpointStore(source.checkpoints, keep=1), RunDirectory(home / "runs" / name)
     if (newest := store.newest()) is None:
-        raise TandemError(f"no checkpoint in {source.checkpoints}; name a run that has one")
+        raise TandemError(f"no run with a checkpoint in {source.path}; name one that has one")
     target.checkpoints.mkdir(parents=True)
     shutil.copy(newest, target.checkpoints)
     for file in (source.config_file, source.metrics_file, source.goals_file, source.path / RUN_FILE):

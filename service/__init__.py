@@ -22,8 +22,8 @@ def load(
     """Load what was trained, ready to act, without torch; ``panda-cube@champion`` comes with the package.
 
     Args:
-        reference: NAME, NAME@ALIAS or NAME@VERSION; or the path of a run, of a checkpoint of a run, of a downstream
-            training, or of an exported version.
+        reference: NAME, NAME@ALIAS or NAME@VERSION; or the path of a run, of a checkpoint of a run, or of an
+            exported version.
         registry: directory to look in first; a version or alias it does not have is looked up among what comes with
             the package. Or the ``http://HOST:PORT`` of a ``tandem serve``, which alone is asked, with the token in
             TANDEM_TOKEN. What a policy of a task acts with is looked up there, too, by the version that it was trained

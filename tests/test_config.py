@@ -5,10 +5,11 @@ from pathlib import Path
 import pytest
 from pydantic import ValidationError
 
-from service.config import Config, WorkspaceConfig, dump_config, load_config, parse_config
+from service.config import WorkspaceConfig, dump_config, load_config, parse_config
+from service.config.robot import RobotConfig
+from service.config.self_play import SelfPlayConfig
 from service.errors import ConfigError
 from service.parsing import parse_yaml
-from service.robot_config import RobotConfig
 from tests.runtime.runs import assert_one_line
 
 CONFIGS = Path(__file__).parents[1] / "configs"
@@ -25,7 +26,7 @@ def message(path=None, overrides=()) -> str:
 
 def test_defaults_are_valid_and_the_papers():
     config = load_config()
-    assert config == Config()
+    assert config == SelfPlayConfig()
     assert config.policy.bob.num_primitives == 4
     assert (config.game.alice_valid_reward, config.game.alice_difficult_reward) == (1.0, 5.0)
     assert config.game.success_distance_m == 0.05
@@ -39,14 +40,14 @@ def test_corners_of_the_workspace_by_hand():
 
 def test_every_default_lies_within_its_own_range():
     # Pydantic does not validate defaults; a tree without any is validated in full.
-    assert Config.model_validate(Config().model_dump()) == Config()
+    assert SelfPlayConfig.model_validate(SelfPlayConfig().model_dump()) == SelfPlayConfig()
 
 
 def test_yaml_round_trip(tmp_path):
     config = load_config(
         overrides=["name=sphere.v2", "world.object=sphere", "policy.alice.hidden_sizes=[64, 32]", "seed=7"]
     )
-    assert config != Config()
+    assert config != SelfPlayConfig()
     path = tmp_path / "run.yaml"
     path.write_text(dump_config(config))
     assert load_config(path) == config
@@ -57,8 +58,8 @@ def test_a_file_may_name_only_what_differs(tmp_path):
     path.write_text("learner:\n  alice: {learning_rate: 1e-4}\n")
     config = load_config(path)
     assert config.learner.alice.learning_rate == 1e-4
-    assert config.learner.bob == Config().learner.bob
-    assert config.game == Config().game
+    assert config.learner.bob == SelfPlayConfig().learner.bob
+    assert config.game == SelfPlayConfig().game
 
 
 @pytest.mark.parametrize("text", ["", "# nothing here\n", "null", "---\n"])
@@ -70,7 +71,7 @@ def test_an_empty_file_is_refused(tmp_path, text):
         load_config(path)
     assert_one_line(error.value, path, "holds no key", "write {}")
     path.write_text("{}")
-    assert load_config(path) == Config()
+    assert load_config(path) == SelfPlayConfig()
 
 
 @pytest.mark.parametrize(
@@ -81,7 +82,6 @@ def test_an_empty_file_is_refused(tmp_path, text):
         "generator.replay_fraction=false",
         "policy.alice.hidden_sizes=[true, 64]",
         "world.randomisation.delay_steps=[false, true]",
-        "skills.size=true",
     ],
 )
 def test_true_and_false_are_no_numbers(override):
@@ -91,7 +91,7 @@ def test_true_and_false_are_no_numbers(override):
 
 
 def test_frozen():
-    config = Config()
+    config = SelfPlayConfig()
     with pytest.raises(ValidationError, match="frozen"):
         config.seed = 1
     with pytest.raises(ValidationError, match="frozen"):
@@ -149,7 +149,7 @@ def test_override_through_a_value():
 @pytest.mark.parametrize(
     ("override", "key", "known"),
     [
-        ("sed=1", "'sed'", "game, generator, learner, name, policy, run, seed, skills, world"),
+        ("sed=1", "'sed'", "game, generator, learner, method, name, policy, run, seed, world"),
         ("game.bob_step=1", "'game.bob_step'", "bob_steps"),
         ("learner.bob.lr=1", "'learner.bob.lr'", "learning_rate"),
         ("world.workspace.width_m=1", "'world.workspace.width_m'", "length_x_m, length_y_m"),

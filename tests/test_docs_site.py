@@ -11,7 +11,6 @@ from typer.testing import CliRunner
 
 import service
 from service.cli.main import app
-from service.config import Config
 from tests.downstream.trials import SETS
 from tools import docs_reference
 from tools.docs_site import SiteError, build
@@ -77,14 +76,19 @@ def test_every_command_and_option_is_in_the_reference():
     text = docs_reference.commands()
     for name, command in docs_reference.walk_commands(typer.main.get_command(app), "tandem"):
         section = text[text.index(f"# {name}\n") :].partition("\n#")[0]
-        options = [option for each in command.params for option in each.opts if option.startswith("-")]
+        options = [
+            option
+            for each in command.params
+            for option in each.opts
+            if option.startswith("-") and not getattr(each, "hidden", False)
+        ]
         assert [option for option in options if option not in section] == [], name
 
 
 def test_every_key_is_in_the_reference():
     text = docs_reference.configuration()
-    keys = list(docs_reference.keys(Config))
-    assert "learner.bob.learning_rate" in keys
+    keys = [key for kind in docs_reference.method_classes() for key in docs_reference.keys(kind)]
+    assert {"learner.bob.learning_rate", "skills.sac.tau", "skill_steps", "distillation.num_worlds"} <= set(keys)
     assert [key for key in keys if f"| `{key}` |" not in text] == []
     assert "| `world.num_substeps` | `20` | `8` | `>= 1`, `<= 200` | physics steps per action;" in text
 
@@ -129,7 +133,7 @@ def test_commands_in_pages_can_be_typed(page):
 
 def test_there_are_commands_to_type():
     verbs = {words[0] for words in commands(START)}
-    assert verbs == {"--version", "demo", "evaluate", "play", "render", "downstream", "pretrain", "serve"}
+    assert verbs == {"--version", "demo", "evaluate", "play", "render", "train", "serve"}
 
 
 def test_start_here_measures_what_comes_with_tandem(tmp_path, monkeypatch):
@@ -142,14 +146,14 @@ def test_start_here_measures_what_comes_with_tandem(tmp_path, monkeypatch):
 
 
 def test_start_heres_task_is_learned_measured_and_loaded(tmp_path, monkeypatch):
-    """Its commands, in order, with a tiny training; then what downstream.md does with the result."""
+    """Its commands, in order, with a tiny run; then what downstream.md does with the result."""
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("service.downstream.worker._record_video", lambda *arguments: None)
-    small = {"train": [*SETS, "--steps", "600", "--threads", "1"], "evaluate": []}
-    typed = [words for words in commands(START) if words[0] == "downstream" and words[1] in small]
-    assert [words[1] for words in typed] == ["train", "evaluate"]
+    monkeypatch.setattr("service.runs.train.make_artifacts", lambda directory, registry: {})
+    small = {"train": SETS, "evaluate": ["--episodes", "2"]}
+    typed = [words for words in commands(START) if "wall" in words[1:2] or "runs/wall-ours-her-0" in words][:2]
+    assert [words[0] for words in typed] == ["train", "evaluate"]
     for words in typed:
-        result = CliRunner().invoke(app, [*words, *small[words[1]], "--episodes", "2"])
+        result = CliRunner().invoke(app, [*words, *small[words[0]]])
         assert result.exit_code == 0, result.output
     *_, load = blocks((ROOT / "docs" / "downstream.md").read_text(), "python")
     assert '"wall-orchestrator@best"' in load

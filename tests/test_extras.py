@@ -56,11 +56,11 @@ def without(monkeypatch):
             ["pretrain", "--runtime", "ray"],
             "--runtime ray needs the package ray, .*'tandem-skills[cluster]'",
         ),
-        ("ray", (), ["downstream", "table", "--runtime", "ray", "--methods", "idle"], "'tandem-skills[cluster]'"),
+        ("ray", (), ["train", "push,wall", "--runtime", "ray"], "'tandem-skills[cluster]'"),
         (
             "httpx",
             ("registry.client",),
-            ["downstream", "train", "--task", "wall", "--registry", "http://127.0.0.1:9"],
+            ["train", "wall", "--registry", "http://127.0.0.1:9"],
             "fetching primitives needs the package httpx, .*'tandem-skills[serve]'",
         ),
     ],

@@ -16,12 +16,12 @@ import pytest
 
 import service
 from service.config import load_config
+from service.config.recipes import recipes, robots
 from service.errors import TandemError
 from service.extras import MissingPackageError, needs_extra
 from service.policies.numpy_policy import NumpyMCPPolicy
 from service.primitives.acting import acting_config
 from service.primitives.bundled import BUNDLED
-from service.recipes import recipes, robots
 from service.registry.registry import Registry
 from tests.registry.helpers import files_in
 
@@ -104,7 +104,7 @@ def test_what_a_missing_package_asks_for_needs_no_index(installed, tmp_path):
 def test_an_installed_tandem_evaluates_them_in_any_directory(installed, tmp_path):
     label, site = run(installed, tmp_path, "-c", LOAD).splitlines()
     assert (label, site) == (f"{Registry(BUNDLED).resolve('panda-cube@champion')} (bundled)", str(installed))
-    command = ("evaluate", "--primitives", "panda-cube@champion", "--episodes", "4", "--steps", "2", "--json")
+    command = ("evaluate", "panda-cube@champion", "--episodes", "4", "--steps", "2", "--json")
     assert list(json.loads(run(installed, tmp_path, "-m", "service", *command))) == [label, "idle"]
     assert list(tmp_path.iterdir()) == []
 
@@ -126,7 +126,6 @@ def test_load_primitives(tmp_path, monkeypatch):
 def test_the_champion_has_what_its_manifest_says():
     """Its rate, which pages repeat, on other goals: not lower than chance explains."""
     from service.actors.evaluation import evaluate, wilson_interval
-    from service.primitives.publishing import FINAL_EVALUATION_EPISODES
 
     bob, num = service.load_primitives(), 60
     said = bob.manifest.metrics["evaluation/mixed_success_last"]
@@ -135,7 +134,7 @@ def test_the_champion_has_what_its_manifest_says():
     found = evaluate(
         bob.policy, bob.config.world, "mixed", num_episodes=num, num_steps=50, success_distance_m=reach_m, seed=3
     )
-    least, _ = wilson_interval(round(said * FINAL_EVALUATION_EPISODES), FINAL_EVALUATION_EPISODES)
+    least, _ = wilson_interval(round(said * bob.config.run.final_episodes), bob.config.run.final_episodes)
     _, most = wilson_interval(round(found.success_last * num), num)
     assert most >= least, found.success_last  # of 98 % said, 54 of 60 fail
 
@@ -151,8 +150,7 @@ SHORT_DEMO = """
 import functools, sys
 from service.actors import evaluation
 from service.media import artifacts
-from service.primitives import publishing
-publishing.FINAL_EVALUATION_EPISODES, artifacts.COVERAGE_STEPS = 2, 2
+artifacts.COVERAGE_STEPS = 2
 artifacts.video.write_video = lambda rounds, world, path: path
 real = evaluation.evaluate
 evaluation.evaluate = lambda *all, **more: real(*all, **more | {"num_episodes": 2, "num_steps": 2})

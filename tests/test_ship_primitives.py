@@ -12,7 +12,6 @@ from service.config import dump_config, parse_config
 from service.errors import TandemError
 from service.io.run_directory import RunDirectory
 from service.policies.numpy_policy import numpy_bob
-from service.primitives import publishing
 from service.primitives.loading import load
 from service.primitives.publishing import publish
 from service.registry.registry import Registry
@@ -100,11 +99,12 @@ def test_what_nobody_else_could_use_is_not_shipped(run, registry, target, change
 
 
 def test_the_newest_bob_of_a_run_is_measured(run, tmp_path, monkeypatch):
-    monkeypatch.setattr(publishing, "FINAL_EVALUATION_EPISODES", 40)
     registry, near = Registry(tmp_path / "registry"), RunDirectory(tmp_path / "run")
     shutil.copytree(run.path, near.path)
+    more = {"final_episodes": 40}
     game = {"success_distance_m": 0.05}  # this Bob solves nothing by less
-    near.config_file.write_text(dump_config(parse_config(TREE | {"game": TREE["game"] | game}, where="a test")))
+    tree = TREE | {"game": TREE["game"] | game, "run": TREE["run"] | more}
+    near.config_file.write_text(dump_config(parse_config(tree, where="a test")))
     assert str(publish_newest(near, registry)) == "tiny@1"
     manifest, parameters = registry.load("tiny")
     assert_identical(parameters, load(str(run.path)).parameters)
@@ -131,7 +131,6 @@ def test_one_command(run, registry, target, monkeypatch, capsys):
         monkeypatch.setattr(sys, "argv", ["ship_primitives", *map(str, arguments)])
         return ship_primitives.main()
 
-    monkeypatch.setattr(publishing, "FINAL_EVALUATION_EPISODES", 4)
     monkeypatch.setattr(ship_primitives, "BUNDLED", target)
     assert tandem_ships(run.path) == 0
     assert f"tiny@1 is in {target}" in capsys.readouterr().out

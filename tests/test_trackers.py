@@ -8,7 +8,6 @@ from typer.testing import CliRunner
 
 from service.cli.main import app
 from service.errors import TandemError
-from service.primitives import publishing
 from service.runs import train as module
 from service.trackers import Trackers
 from tests.downstream.trials import SETS
@@ -58,9 +57,7 @@ def refuses(name, config):
 def written(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.delenv("TANDEM_REDIS_URL", raising=False)
-    monkeypatch.setattr(publishing, "FINAL_EVALUATION_EPISODES", 4)
-    monkeypatch.setattr(module, "make_artifacts", lambda directory: {})
-    monkeypatch.setattr("service.downstream.worker._record_video", lambda *arguments: None)
+    monkeypatch.setattr(module, "make_artifacts", lambda directory, registry: {})
     (tmp_path / "trackers_of_a_test.py").write_text(CODE)
     yield
     sys.modules.pop("trackers_of_a_test", None)
@@ -95,14 +92,16 @@ def test_a_run_gives_them_every_record_and_goes_on_without_one_that_throws(tmp_p
     ]
 
 
-def test_a_training_downstream_has_them_too(tmp_path):
-    done = tandem(
-        "downstream", "train", "--task", "wall", "--steps", 600, "--episodes", 4, "--threads", 1, *SETS,
-        "--tracker", "trackers_of_a_test:File",
-    )  # fmt: skip
+def test_learning_a_task_has_them_too(tmp_path, champion):
+    done = tandem("train", "wall", *SETS, "--tracker", "trackers_of_a_test:File")
     assert done.exit_code == 0, done.output
     (name, told), *records, last, closed = read(tmp_path / "wall-ours-0.txt")
-    assert (name, told["task"], told["primitives"], closed) == ("wall-ours-0", "wall", "panda-cube@champion", "closed")
+    assert (name, told["task"], told["primitives"], closed) == (
+        "wall-ours-0",
+        "wall",
+        champion.manifest.reference,
+        "closed",
+    )
     assert records[-1][0] == last[0] == 600
     assert "learner/num_updates" in records[-1][1]
     assert 0.0 <= last[1]["final/success_last"] <= 1.0

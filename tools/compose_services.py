@@ -9,7 +9,7 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import yaml
 
@@ -25,18 +25,15 @@ _VARIABLE = re.compile(r"\$(?:(?P<escaped>\$)|\{(?P<name>\w+)(?::(?P<how>[-?])(?
 _SIZES = {"kb": 2**10, "mb": 2**20, "gb": 2**30, "k": 2**10, "m": 2**20, "g": 2**30}
 
 
-@dataclass(frozen=True, slots=True)
-class Mount:
-    """A file or directory of the machine, or a volume, in a container."""
+class Mount(NamedTuple):
+    """A file or directory of the machine, or a volume by its name, in a container."""
 
     source: Path | str
-    """A path of the machine, or the name of a volume."""
     target: str
     read_only: bool
 
 
-@dataclass(frozen=True, slots=True)
-class Port:
+class Port(NamedTuple):
     """A port of a container that the machine has, too."""
 
     address: str
@@ -44,9 +41,8 @@ class Port:
     inside: int
 
 
-@dataclass(frozen=True, slots=True)
-class Dependency:
-    """What a service waits for."""
+class Dependency(NamedTuple):
+    """A service that another waits for, until it is there or healthy."""
 
     service: str
     healthy: bool
@@ -88,9 +84,6 @@ def read_services(path: Path, variables: Mapping[str, str]) -> dict[str, Service
     Args:
         path: the compose file; its relative paths begin at its directory.
         variables: those of ``.env``.
-
-    Raises:
-        TandemError: something that Compose would refuse, or that is not known here.
     """
     tree = _with_variables(yaml.safe_load(path.read_text(encoding="utf-8")), variables)
     values = {name: variables[each["environment"]] for name, each in tree["secrets"].items()}
@@ -101,13 +94,10 @@ def read_services(path: Path, variables: Mapping[str, str]) -> dict[str, Service
                 raise TandemError(f"{path}: {service.name} mounts the volume {mount.source}, which is not listed")
     ordered: dict[str, Service] = {}
     while len(ordered) < len(found):
-        ready = [
-            each
-            for each in found.values()
-            if each.name not in ordered and all(other.service in ordered for other in each.depends_on)
-        ]
+        left = [each for name, each in found.items() if name not in ordered]
+        ready = [each for each in left if all(other.service in ordered for other in each.depends_on)]
         if not ready:
-            raise TandemError(f"{path}: services wait for each other: {', '.join(found.keys() - ordered.keys())}")
+            raise TandemError(f"{path}: services wait for each other: {', '.join(each.name for each in left)}")
         ordered |= {each.name: each for each in ready}
     return ordered
 
@@ -127,6 +117,7 @@ def _service(name: str, tree: Mapping[str, Any], directory: Path, secrets: Mappi
     depends_on = tree.get("depends_on", {})
     if isinstance(depends_on, list):
         depends_on = {each: {} for each in depends_on}
+    how, *words = tree.get("healthcheck", {}).get("test", [""])
     return Service(
         name=name,
         image=tree["image"],
@@ -138,10 +129,8 @@ def _service(name: str, tree: Mapping[str, Any], directory: Path, secrets: Mappi
         tmpfs=tree.get("tmpfs", []),
         secrets={each: secrets[each] for each in tree.get("secrets", [])},
         ports=[_port(text) for text in tree.get("ports", [])],
-        depends_on=[
-            Dependency(other, each.get("condition") == "service_healthy") for other, each in depends_on.items()
-        ],
-        health=_health(tree["healthcheck"]["test"]) if "healthcheck" in tree else None,
+        depends_on=[Dependency(name, each.get("condition") == "service_healthy") for name, each in depends_on.items()],
+        health=["/bin/sh", "-c", *words] if how == "CMD-SHELL" else words or None,
         num_containers=int(deploy.get("replicas", 1)),
         memory_bytes=_bytes(limits["memory"]) if "memory" in limits else None,
         shm_bytes=_bytes(tree.get("shm_size", "64mb")),
@@ -180,11 +169,6 @@ def _mount(text: str, directory: Path) -> Mount:
 def _port(text: str) -> Port:
     address, outside, inside = text.split(":")
     return Port(address, int(outside), int(inside))
-
-
-def _health(test: Sequence[str]) -> list[str]:
-    how, *words = test
-    return ["/bin/sh", "-c", *words] if how == "CMD-SHELL" else list(words)
 
 
 def _bytes(text: str) -> int:

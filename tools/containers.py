@@ -85,11 +85,7 @@ class Container:
 
     @property
     def pid(self) -> int:
-        """The first process inside.
-
-        Raises:
-            TandemError: it does not run.
-        """
+        """The first process inside."""
         if self._process is not None:
             children = Path(f"/proc/{self._process.pid}/task/{self._process.pid}/children")
             with suppress(OSError):
@@ -186,11 +182,7 @@ class Container:
     def run(
         self, command: Sequence[str], *, timeout_s: float = 600.0, check: bool = True
     ) -> subprocess.CompletedProcess[str]:
-        """Run a command in it as ``docker compose exec`` does.
-
-        Raises:
-            TandemError: it failed, and ``check`` is set.
-        """
+        """Run a command in it as ``docker compose exec`` does."""
         spaces = ["nsenter", f"--target={self.pid}", "--mount", "--uts", "--ipc", "--net", "--pid", "--root"]
         return run([*spaces, *self._inside(), *command], timeout_s=timeout_s, check=check)
 
@@ -354,11 +346,7 @@ class Containers:
 
 
 def run(command: Sequence[str], *, timeout_s: float = 600.0, check: bool = True) -> subprocess.CompletedProcess[str]:
-    """Run a command and return what it said.
-
-    Raises:
-        TandemError: it failed, and ``check`` is set.
-    """
+    """Run a command and return what it said."""
     result = subprocess.run(
         command, stdin=subprocess.DEVNULL, capture_output=True, text=True, timeout=timeout_s, check=False
     )
@@ -406,11 +394,7 @@ def _account(user: str, root: Path) -> tuple[str, str, str]:
 
 
 def need_programs(names: Sequence[str]) -> None:
-    """Stop where a program is missing.
-
-    Raises:
-        TandemError: it is.
-    """
+    """Stop where a program is missing."""
     if missing := [name for name in names if shutil.which(name) is None]:
         where = "apt-get install buildah debootstrap dnsmasq-base iproute2 socat tini"
         raise TandemError(f"needs {', '.join(missing)}; on Debian: {where}")

@@ -20,7 +20,9 @@ from pydantic_core import PydanticUndefined
 import service
 from service.cli.main import app
 from service.config import Config, load_config
-from service.recipes import DEFAULT_RECIPE, recipes
+from service.config.find import METHODS, find_class
+from service.config.recipes import DEFAULT_RECIPE, recipes
+from service.config.self_play import SelfPlayConfig
 
 SECTIONS = ("Args", "Returns", "Raises", "Yields", "Attributes")
 RETURNED = (
@@ -55,20 +57,30 @@ def walk_commands(command: Any, name: str) -> Iterator[tuple[str, Any]]:
     """Every command below one, itself first, with its whole name."""
     yield name, command
     for each, below in getattr(command, "commands", {}).items():
-        yield from walk_commands(below, f"{name} {each}")
+        if not below.hidden:
+            yield from walk_commands(below, f"{name} {each}")
 
 
 def configuration() -> str:
-    """Every key of a run's configuration."""
+    """Every key of a run's configuration: all of self-play, then what other methods have beside them or otherwise."""
     recipe = load_config(recipes()[DEFAULT_RECIPE])
     parts = [
         "# Configuration",
-        "Every key of a run, made from the code. `--set a.b=c` changes one, a YAML file given to `--config` many. "
-        f"The column *recipe* says what `{DEFAULT_RECIPE}`, the recipe of a run without `--config`, has instead of the "
-        "default. Unknown keys are errors.",
+        "Every key of a run, made from the code. `--set a.b=c` changes one, a YAML file many. "
+        f"The column *recipe* says what `{DEFAULT_RECIPE}`, the recipe of a run for which none is named, has instead "
+        "of the default. The key `method` says which keys there are: first come those of self-play, and then what "
+        "other methods have besides, or with another default. Unknown keys are errors.",
+        *_models(SelfPlayConfig, "", recipe),
     ]
-    parts += _models(Config, "", recipe)
+    for kind in method_classes()[1:]:
+        names = ", ".join(name for name in METHODS if find_class(name) is kind)
+        parts += [f"## method: {names}", *list(_models(kind, "", None, SelfPlayConfig))[1:]]
     return "\n\n".join(parts) + "\n"
+
+
+def method_classes() -> list[type[Config]]:
+    """The classes of the configurations of all methods, that of self-play first."""
+    return list(dict.fromkeys(find_class(name) for name in METHODS))
 
 
 def keys(model: type[BaseModel], prefix: str = "") -> Iterator[str]:
@@ -79,12 +91,16 @@ def keys(model: type[BaseModel], prefix: str = "") -> Iterator[str]:
             yield from keys(inner, f"{prefix}{name}.")
 
 
-def _models(model: type[BaseModel], prefix: str, recipe: BaseModel | None) -> Iterator[str]:
-    """A heading and a table of a model's own keys, then those of the models inside it."""
+def _models(
+    model: type[BaseModel], prefix: str, recipe: BaseModel | None, known: type[BaseModel] | None = None
+) -> Iterator[str]:
+    """A heading and a table of a model's own keys, then those of the models inside it; not those that ``known`` has."""
+    others = known.model_fields if known is not None else {}
+    fields = {name: each for name, each in model.model_fields.items() if not _same(each, others.get(name))}
     yield f"{'##' if prefix.count('.') < 2 else '###'} {prefix.removesuffix('.') or 'The run'}"
     yield first_line(model)
     rows: list[tuple[str, ...]] = []
-    for name, field in model.model_fields.items():
+    for name, field in fields.items():
         default = _default(field)
         chosen = getattr(recipe, name, field.default)
         differs = recipe is not None and not _inner(field) and chosen != field.get_default(call_default_factory=True)
@@ -95,10 +111,14 @@ def _models(model: type[BaseModel], prefix: str, recipe: BaseModel | None) -> It
         yield table(("key", "default", "range", "meaning"), rows)
     else:
         yield table(("key", "default", "recipe", "range", "meaning"), rows)
-    for name, field in model.model_fields.items():
+    for name, field in fields.items():
         for inner in _inner(field):
             below = getattr(recipe, name, None) if recipe is not None else None
             yield from _models(inner, f"{prefix}{name}.", below if isinstance(below, inner) else None)
+
+
+def _same(field: FieldInfo, other: FieldInfo | None) -> bool:
+    return other is not None and (field.annotation, field.default) == (other.annotation, other.default)
 
 
 def _inner(field: FieldInfo) -> list[type[BaseModel]]:

@@ -41,9 +41,6 @@ def build(out: Path, root: Path = ROOT) -> Path:
 
     Returns:
         Directory with ``index.html``.
-
-    Raises:
-        SiteError: a link to nothing, a page that is missing or not in the navigation, a generator that complains.
     """
     shutil.rmtree(out, ignore_errors=True)
     stage(out, root)

@@ -77,11 +77,7 @@ class Watcher:
             os.kill(pid, kind)
 
     def look(self) -> RunStatus:
-        """The status now.
-
-        Raises:
-            TandemError: there is none.
-        """
+        """The status now."""
         if (status := self.training.status()) is None:
             raise TandemError("the run has no status")
         if not self.seen or self.seen[-1].heartbeat != status.heartbeat:

@@ -35,11 +35,7 @@ CHAMPION = "champion"
 
 
 def publish_newest(directory: RunDirectory, registry: Registry) -> Version:
-    """Measure and publish the newest Bob of a run, ended or not.
-
-    Raises:
-        TandemError: no run there, or no usable checkpoint.
-    """
+    """Measure and publish the newest Bob of a run, ended or not."""
     config, stages = directory.read_config(), read_stages(directory)
     env_steps = max(stages)
     metrics = measure_bob(config, stages[env_steps]) | {"env_steps": env_steps}
@@ -53,10 +49,6 @@ def ship(reference: str, source: Registry, target: Path) -> Version:
         reference: of the version.
         source: where it is.
         target: root of the bundled registry.
-
-    Raises:
-        TandemError: no such version, damaged, not primitives that this tandem can use, or a path in its manifest; then
-            nothing is changed.
     """
     manifest, parameters = source.load(reference)
     NumpyMCPPolicy(parameters)

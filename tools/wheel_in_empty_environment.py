@@ -31,8 +31,8 @@ STEPS = (
     ("--version",),
     ("configs",),
     ("demo", "--env-steps", "3000"),
-    ("evaluate", "--primitives", "panda-cube@champion", "--episodes", "50"),
-    ("downstream", "methods"),
+    ("evaluate", "panda-cube@champion", "--episodes", "50"),
+    ("methods",),
     ("serve", "--runs", "runs"),
     ("play",),
 )
@@ -43,7 +43,7 @@ WALK = (
     ("--version",),
     ("demo", "--env-steps", "3000"),
     ("demo", "--env-steps", "3000"),  # another one, to compare
-    ("evaluate", "--primitives", "panda-cube@champion", "--goals", "mixed", "--episodes", "100"),
+    ("evaluate", "panda-cube@champion", "--goals", "mixed", "--episodes", "100"),
     ("render", "--goals", "0.1,0.1,0.25; -0.1,0,0.025", "--out", "mine.mp4"),
 )
 """What docs/start.md has one type, the demo shorter; then come its snippets and its two servers."""

@@ -2,9 +2,9 @@
 
     python -m benchmarks.report --docs docs
 
-Every block between two markers of the ``PAGES`` is written anew, and all pictures; the words around the blocks stay.
-Whether a target was reached is computed. A block about something that was not recorded says so.
-``results/downstream.md`` is written whole.
+Every block between two markers of the ``PAGES`` is written anew, and all pictures; the words around the blocks stay,
+and so do blocks that were said once, by programs that are gone. Whether a target was reached is computed. A block about
+something that was not recorded says so. ``results/downstream.md`` is written whole.
 """
 
 from __future__ import annotations
@@ -20,51 +20,29 @@ from typing import Any
 
 from benchmarks import time_to_skill
 from benchmarks.report import (
-    attacks,
     champion,
-    cluster,
     comparison,
-    deployed,
+    figures,
+    measured,
     mutation,
-    page_speed,
     pretraining,
     recipe,
-    robots,
-    robustness,
     scaling,
     skills,
-    speed,
     summary,
     transfer,
 )
 from benchmarks.report.downstream import draw_table, write_results
-from benchmarks.report.figures import (
-    draw_ablations,
-    draw_chaos,
-    draw_coverage,
-    draw_curriculum,
-    draw_curves,
-    draw_goals,
-    draw_skill_curves,
-    draw_skills,
-    draw_soak,
-)
+from benchmarks.report.results import Result, read_trials
 from benchmarks.reproduce import Places, experiments
 from benchmarks.run_files import Run, read_run
-from service.downstream.files import Result
-from service.downstream.results import ResultsDirectory
 from service.errors import TandemError
 from service.io.files import os_errors, write_atomic
 
 PROGRAMS = {
     "env_throughput": "benchmarks.env_throughput",
-    "selfplay_throughput": "benchmarks.selfplay_throughput",
     "throughput": "benchmarks.compare_commits",
-    "cluster_throughput": "benchmarks.cluster_throughput of commit 82ca6fd",
-    "chaos": "benchmarks.chaos of commit ddd0770",
-    "rest_load": "benchmarks.rest_load of commit ddd0770",
-    "soak": "benchmarks.soak of commit ddd0770",
-    "strikes": "tools.strikes of commit 82ca6fd",
+    "world_speed": "benchmarks.compare_commits --worlds",
     "deployed": "tools.deployed",
     "mutation": "tools.mutation",
     "scaling": "benchmarks.scaling of commit 82ca6fd",
@@ -72,39 +50,46 @@ PROGRAMS = {
     "robots": "benchmarks.robots",
     "transfer": "benchmarks.transfer",
     "transfer_champion": "benchmarks.transfer --name transfer_champion",
-    "robot_bridge": "benchmarks.robot_bridge of commit 82ca6fd",
-    "world_speed": "benchmarks.compare_commits --worlds",
-    "page_speed": "benchmarks.page_speed",
-    "robustness": "benchmarks.robustness of commit 82ca6fd",
-    "randomisation_ranges": "benchmarks.randomisation_ranges of commit 82ca6fd",
 }
 """Modules by the name of the recorded file that they make."""
+RECIPE = "recipe"
+"""Name of the recorded time to a skill with the recipe, without any change."""
 PAGES = {
-    "results/pretraining.md": (
-        *("skill", "champion", "tasks", "curves", "curriculum", "coverage", "ablations", "throughput"),
-    ),
-    "results/cluster.md": ("targets", "throughput", "chaos", "strikes", "rest", "soak"),
+    "results/pretraining.md": ("skill", "champion", "tasks", "curves", "curriculum", "coverage", "throughput"),
     "results/deployed.md": ("checks",),
     "results/skills.md": ("coverage", "curves", "controls"),
     "results/comparison.md": ("rows", "longer", "below", "harder", "missing"),
     "downstream.md": ("headline",),
     "robots.md": ("robots",),
-    "results/transfer.md": ("transfer", "transfer_champion", "robot_bridge"),
-    "api.md": ("page",),
+    "results/transfer.md": ("transfer", "transfer_champion"),
     "results/README.md": ("throughput", "mutation"),
-    "results/robust.md": ("robustness", "randomisation_ranges"),
     "../README.md": ("headline",),
-    "scaling.md": ("bottleneck", "box", "model", "batches", "skill", "constants"),
+    "scaling.md": ("box", "batches"),
 }
-"""Blocks of every page."""
-RECIPE = "recipe"
-"""Name of the recorded time to a skill with the recipe, without any change."""
+"""Blocks of every page that are made anew."""
 ABOUT_THE_RECIPE = ("results/pretraining.md", "scaling.md")
 """Pages that show it, and so may call it the shipped recipe only while it is."""
 Results = Mapping[str, Mapping[str, Any]]
 """Recorded files by the name of their benchmark."""
-Blocks = Mapping[str, Sequence[str]]
+Blocks = dict[str, list[str]]
 """Parts of the text of each block."""
+MEASURED: Mapping[str, Mapping[str, Sequence[tuple[str, Callable[[Mapping[str, Any]], str]]]]] = {
+    "results/deployed.md": {"checks": [("deployed", measured.checks_words), ("deployed", measured.checks_table)]},
+    "robots.md": {
+        "robots": [
+            ("robots", measured.robots_table), ("robots", measured.robots_words), ("world_speed", measured.speed_words)
+        ]
+    },
+    "results/transfer.md": {
+        name: [(name, transfer.transfer_table), (name, transfer.transfer_words)]
+        for name in ("transfer", "transfer_champion")
+    },
+    "results/README.md": {
+        "throughput": [("env_throughput", measured.ratios_block)],
+        "mutation": [("mutation", mutation.mutation_words), ("mutation", mutation.mutation_table)],
+    },
+}  # fmt: skip
+"""What says a block of a page, each from the recorded file of that name."""
 _NOTHING = "Not recorded yet."
 
 
@@ -162,60 +147,6 @@ def read_all(directory: Path) -> list[Run]:
     return [read_run(path) for path in sorted(directory.glob("*.json"))]
 
 
-def read_runs(directory: Path) -> tuple[list[Run], list[Run]]:
-    """Recorded runs in the order of their names, and recorded ablations in that of their list."""
-    runs = read_all(directory)
-    ablations = [run for run in runs if "ablation" in run]
-    ablations.sort(key=lambda run: (pretraining.ABLATIONS.index(run["ablation"]["name"]), run["config"]["seed"]))
-    return [run for run in runs if "ablation" not in run], ablations
-
-
-def robots_blocks(found: Results) -> Blocks:
-    """Parts of the block about robots by description."""
-    recorded, worlds = found.get("robots"), found.get("world_speed")
-    parts = [robots.robots_table(recorded), robots.robots_words(recorded)] if recorded is not None else []
-    parts += [robots.speed_words(worlds)] if worlds is not None else []
-    return {"robots": parts} if parts else {}
-
-
-def transfer_blocks(found: Results) -> Blocks:
-    """Parts of the blocks about frozen policies in another engine, and through the bridge in ours."""
-    blocks = {
-        name: [transfer.transfer_table(found[name]), transfer.transfer_words(found[name])]
-        for name in ("transfer", "transfer_champion")
-        if name in found
-    }
-    bridge = found.get("robot_bridge")
-    if bridge is not None:
-        blocks["robot_bridge"] = [transfer.bridge_table(bridge), transfer.bridge_words(bridge)]
-    return blocks
-
-
-def page_blocks(found: Results) -> Blocks:
-    """Parts of the block about the speed of the page."""
-    recorded = found.get("page_speed")
-    return {"page": [page_speed.page_table(recorded), page_speed.page_words(recorded)]} if recorded is not None else {}
-
-
-def index_blocks(found: Results) -> Blocks:
-    """Parts of the blocks of the index of results: speed, and mutation testing."""
-    blocks = {}
-    if speeds := [found[name] for name in ("env_throughput", "selfplay_throughput") if name in found]:
-        blocks["throughput"] = [speed.ratios_block(speeds)]
-    if (recorded := found.get("mutation")) is not None:
-        blocks["mutation"] = [mutation.mutation_words(recorded), mutation.mutation_table(recorded)]
-    return blocks
-
-
-def robustness_blocks(found: Results) -> Blocks:
-    """Parts of the blocks about policies in worlds that differ from those of training."""
-    parts = {
-        "robustness": (robustness.robustness_table, robustness.robustness_words),
-        "randomisation_ranges": (robustness.ranges_table, robustness.ranges_words),
-    }
-    return {name: [part(found[name]) for part in both] for name, both in parts.items() if name in found}
-
-
 class Report:
     """Draws pictures into ``docs/results``, and writes the pages.
 
@@ -230,32 +161,32 @@ class Report:
 
     def write(self) -> None:
         """Write all pages and pictures."""
-        found, (runs, ablations) = read_results(self._results), read_runs(self._results / "runs")
+        found = read_results(self._results)
+        runs = [run for run in read_all(self._results / "runs") if "ablation" not in run]
         studies = read_studies(self._results / "time_to_skill")
-        trials, longer = (
-            ResultsDirectory(self._results / name).read_all() for name in ("downstream", "downstream_longer")
-        )
+        trials, longer = (read_trials(self._results / name) for name in ("downstream", "downstream_longer"))
         recorded_skills, controls = (read_all(self._results / name) for name in ("skills", "controls"))
         for page, names in PAGES.items():  # what is wrong with a page is found before anything is drawn
             words = replace_blocks(self._docs / page, dict.fromkeys(names, ""))
             if page in ABOUT_THE_RECIPE and RECIPE in studies:
                 recipe.check_words(self._docs / page, words, studies[RECIPE])
-        made = (
-            self.pretraining_blocks(runs, ablations, found, studies),
-            self.cluster_blocks(found),
-            deployed.deployed_blocks(found),
-            self.skills_blocks(recorded_skills, controls, runs),
-            self.comparison_blocks(trials, longer),
-            summary_blocks(trials),
-            robots_blocks(found),
-            transfer_blocks(found),
-            page_blocks(found),
-            index_blocks(found),
-            robustness_blocks(found),
-            summary_blocks(trials),
-            scaling_blocks(found, studies),
-        )
-        for (page, names), blocks in zip(PAGES.items(), made, strict=True):
+        made = {
+            page: {
+                block: [part(found[name]) for name, part in parts if name in found] for block, parts in blocks.items()
+            }
+            for page, blocks in MEASURED.items()
+        }
+        headline = {"headline": [summary.headline_table(trials)] if trials else []}
+        made |= {
+            "results/pretraining.md": self.pretraining_blocks(runs, found, studies),
+            "results/skills.md": self.skills_blocks(recorded_skills, controls, runs),
+            "results/comparison.md": self.comparison_blocks(trials, longer),
+            "downstream.md": headline,
+            "../README.md": headline,
+            "scaling.md": scaling_blocks(found, studies),
+        }
+        for page, names in PAGES.items():
+            blocks = made[page]
             path = self._docs / page
             text = replace_blocks(path, {name: "\n\n".join(blocks.get(name, ())) for name in names})
             with os_errors("write", path):
@@ -263,9 +194,7 @@ class Report:
             self.files.append(path)
         self.files += write_results(self._results)
 
-    def pretraining_blocks(
-        self, runs: Sequence[Run], ablations: Sequence[Run], found: Results, studies: Results
-    ) -> Blocks:
+    def pretraining_blocks(self, runs: Sequence[Run], found: Results, studies: Results) -> Blocks:
         """Parts of the blocks about pre-training."""
         show, blocks = self._show, defaultdict[str, list[str]](list)
         if RECIPE in studies:
@@ -274,52 +203,33 @@ class Report:
             blocks["champion"] = [champion.champion_words(runs)]
             blocks["tasks"] = [pretraining.tasks_table(runs)]
             blocks["curves"] = [
-                show("Over env steps", "pretraining", draw_curves, runs),
-                show("Over wall-clock time", "pretraining-time", partial(draw_curves, over_time=True), runs),
+                show("Over env steps", "pretraining", figures.draw_curves, runs),
+                show("Over wall-clock time", "pretraining-time", partial(figures.draw_curves, over_time=True), runs),
                 pretraining.training_table(runs),
             ]
         if counted := [run for run in runs if "curriculum" in run]:  # older files have only a sample of the goals
-            blocks["curriculum"].append(show("The curriculum", "pretraining-curriculum", draw_curriculum, counted))
+            picture = show("The curriculum", "pretraining-curriculum", figures.draw_curriculum, counted)
+            blocks["curriculum"].append(picture)
         for run in runs:
             words, picture = f"Where the goals of {run['name']} were", f"pretraining-goals-{run['name']}"
-            blocks["curriculum"].append(show(words, picture, draw_goals, run))
+            blocks["curriculum"].append(show(words, picture, figures.draw_goals, run))
         if covered := [run for run in runs if run.get("coverage")]:
             blocks["coverage"].append(pretraining.coverage_table(covered))
         for run in covered:
             words, picture = f"Random compositions of {run['name']}", f"pretraining-coverage-{run['name']}"
-            blocks["coverage"].append(show(words, picture, draw_coverage, run))
-        if ablations:
-            picture = show("Ablations", "pretraining-ablations", draw_ablations, ablations)
-            blocks["ablations"] = [picture, pretraining.ablations_table(ablations)]
+            blocks["coverage"].append(show(words, picture, figures.draw_coverage, run))
         if "throughput" in found:
             blocks["throughput"] = [pretraining.throughput_words(found["throughput"])]
-        return blocks
-
-    def cluster_blocks(self, found: Results) -> Blocks:
-        """Parts of the blocks about running on a cluster."""
-        blocks = {"targets": [cluster.targets_table(found)]}
-        if (throughput := found.get("cluster_throughput")) is not None:
-            blocks["throughput"] = [cluster.throughput_block(throughput)]
-        if (chaos := found.get("chaos")) is not None:
-            picture = self._show("Success, shot at and not", "cluster-chaos", draw_chaos, chaos)
-            blocks["chaos"] = [cluster.chaos_words(chaos), picture, cluster.faults_table(chaos)]
-        if (strikes := found.get("strikes")) is not None:
-            blocks["strikes"] = [attacks.strikes_words(strikes), attacks.strikes_table(strikes)]
-        if (rest := found.get("rest_load")) is not None:
-            blocks["rest"] = [cluster.latency_table(rest), cluster.rest_words(rest)]
-        if (soak := found.get("soak")) is not None:
-            picture = self._show("Memory of every process", "cluster-soak", draw_soak, soak)
-            blocks["soak"] = [cluster.soak_words(soak), picture, cluster.soak_table(soak)]
         return blocks
 
     def skills_blocks(self, runs: Sequence[Run], controls: Sequence[Run], pretrained: Sequence[Run]) -> Blocks:
         """Parts of the blocks about skills, and about controls of self-play."""
         blocks = {}
         if runs:
-            picture = self._show("Random skills at three stages of training", "skills", draw_skills, runs)
+            picture = self._show("Random skills at three stages of training", "skills", figures.draw_skills, runs)
             blocks["coverage"] = [skills.coverage_table(runs), picture]
         if learned := [run for run in runs if run["method"] != "ours"]:
-            picture = self._show("Skill discovery over env steps", "skills-curves", draw_skill_curves, learned)
+            picture = self._show("Skill discovery over env steps", "skills-curves", figures.draw_skill_curves, learned)
             blocks["curves"] = [picture]
         if controls:
             blocks["controls"] = [skills.controls_table(controls), skills.alike_table([*pretrained, *controls])]
@@ -343,26 +253,13 @@ class Report:
         return f"![{words}]({name}.png)"
 
 
-def summary_blocks(trials: Sequence[Result]) -> Blocks:
-    """Parts of the block that says the whole in one table."""
-    return {"headline": [summary.headline_table(trials)]} if trials else {}
-
-
 def scaling_blocks(found: Results, studies: Results) -> Blocks:
     """Parts of the blocks about scaling."""
-    makers = {
-        "bottleneck": scaling.limits_block,
-        "box": scaling.box_block,
-        "model": scaling.model_block,
-        "constants": scaling.constants_block,
-    }
-    blocks = {name: [maker(found["scaling"])] for name, maker in makers.items() if "scaling" in found}
-    if "scaling_box" in found:  # newer than the box of the model
-        blocks["box"] = [scaling.box_block(found["scaling_box"])]
+    blocks = {}
+    if (box := found.get("scaling_box", found.get("scaling"))) is not None:  # the newer one, where there is one
+        blocks["box"] = [scaling.box_block(box)]
     if studies:
         blocks["batches"] = [scaling.batches_block(studies), recipe.recipe_words(studies[RECIPE])]
-    if studies and "scaling" in found:
-        blocks["skill"] = [scaling.skill_block(found["scaling"], studies)]
     return blocks
 
 

@@ -9,11 +9,11 @@ import numpy as np
 
 from benchmarks.report.downstream import PAPER, Seeds
 from benchmarks.report.markdown import Row, table
+from benchmarks.report.results import TRIAL, Result, by_method_and_task
 from benchmarks.reproduce import Experiment
 from service.actors.evaluation import wilson_interval
-from service.downstream.files import TRIAL, Result
 from service.downstream.methods import METHODS
-from service.downstream.rates import by_method_and_task, rate_of
+from service.downstream.rates import rate_of
 from service.envs.tasks import TASKS
 
 PAPER_EPISODES = 48
@@ -116,7 +116,7 @@ def _mean(seeds: Seeds) -> str:
 
 def learning(takes: str | None) -> list[str]:
     """Names of the methods that learn downstream with what they take, ``"skills"`` for one; None: from nothing."""
-    return [name for name, method in METHODS.items() if method.takes == takes and method.player is None]
+    return [name for name, method in METHODS.items() if method.takes == takes and method.learns]
 
 
 def _mean_distance(trials: Sequence[Result]) -> str:

@@ -11,10 +11,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from benchmarks.report.markdown import Row, table
-from service.downstream.files import TRIAL, Result
+from benchmarks.report.results import TRIAL, Result, by_method_and_task, read_trials
 from service.downstream.methods import METHODS
-from service.downstream.rates import by_method_and_task, rate_of
-from service.downstream.results import ResultsDirectory
+from service.downstream.rates import rate_of
 from service.envs.tasks import HARD_TASKS, TASKS, find_task
 from service.io.files import os_errors, write_atomic
 from service.media.figures import BLUE, FAINT, GREEN, ORANGE, new_figure, save, style_axes
@@ -53,12 +52,8 @@ BEST: Mapping[str, float] = {task: max(rates[task] for rates in PAPER.values()) 
 
 
 def write_results(out: Path) -> list[Path]:
-    """Write page and picture from every result in the directory.
-
-    Raises:
-        TandemError: a result is damaged or of another version, or something cannot be written.
-    """
-    found, page = ResultsDirectory(out / "downstream").read_all(), out / PAGE_FILE
+    """Write page and picture from every result in the directory."""
+    found, page = read_trials(out / "downstream"), out / PAGE_FILE
     picture = draw_table(found, out / PICTURE_FILE)
     with os_errors("write", page):
         write_atomic(page, write_page(found, PICTURE_FILE).encode())
@@ -196,7 +191,7 @@ def _efficiency(of: Mapping[tuple[str, str], Seeds]) -> Sequence[str]:
     """The section on how soon methods that compose are good, and the first that learns from nothing is as good."""
     known = {name: method for name, method in METHODS.items() if any(found == name for found, _ in of)}
     composing = [name for name, method in known.items() if method.composes]
-    scratch = [name for name, method in known.items() if method.player is None and method.takes is None]
+    scratch = [name for name, method in known.items() if method.learns and method.takes is None]
     if not composing or not scratch:
         return ()
     rows = []
@@ -260,9 +255,6 @@ def draw_table(results: Sequence[Result], path: Path) -> Path:
     """Draw success at the last step over env steps: a panel per task that was run, a line per method.
 
     Several seeds have a band from the least to the greatest.
-
-    Raises:
-        TandemError: the picture cannot be written.
     """
     of, lines = by_method_and_task(results), dict[str, "Line2D"]()
     run = {task for _, task in of}

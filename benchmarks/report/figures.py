@@ -1,4 +1,4 @@
-"""All pictures of recorded results: learning curves, ablations, goals, coverage, the curriculum, faults, memory.
+"""All pictures of recorded results: learning curves, goals, coverage, the curriculum.
 
 A drawing takes what was recorded and the path of the PNG to write, which it returns.
 """
@@ -97,7 +97,7 @@ def _end(records: Records, clock: Clock) -> float:
 NUM_SPANS = 60
 """Equal parts of a run's length; a curve shows the mean in each."""
 IDLE_STYLE, ASKED_STYLE = (0, (4, 3)), (0, (1, 2))
-MILLIONS, THOUSANDS = Clock("env_steps", "million env steps", 1e6), Clock("env_steps", "thousand env steps", 1e3)
+MILLIONS = Clock("env_steps", "million env steps", 1e6)
 
 
 class _CurvePanel(NamedTuple):
@@ -155,49 +155,6 @@ def draw_curve(axes: Axes, records: Records, key: str, clock: Clock, color: str,
 def _wall_clock(records: Sequence[Records]) -> Clock:
     hours = Clock("time/wall_s", "hours", 3600.0)
     return hours if max(_end(each, hours) for each in records) >= 2.0 else Clock("time/wall_s", "minutes", 60.0)
-
-
-# --- ablations --------------------------------------------------------------------------------------------------------
-
-NUM_COLUMNS = 4
-RECIPE_LINE = {"linestyle": (0, (2, 1.5)), "linewidth": 1.3}
-_ABLATION_CURVES = (
-    ("evaluation/mixed_success_last", "mixed goals", BLUE),
-    ("evaluation/table_success_last", "goals on the table", GREEN),
-)
-
-
-def draw_ablations(runs: Sequence[Run], path: Path, recipe: str = "recipe") -> Path:
-    """Draw a panel for each ablation: Bob's success on random goals, and dashed that of the whole recipe."""
-    names = list(dict.fromkeys(run["ablation"]["name"] for run in runs if run["ablation"]["name"] != recipe))
-    num_rows = max(-(-len(names) // NUM_COLUMNS), 1)
-    height = 1.6 + 2.9 * num_rows
-    figure = _tall_figure(height, "Ablations: Bob on random goals, solved at the last step")
-    panels = list(figure.subplots(num_rows, NUM_COLUMNS, squeeze=False).flat)
-    for axes in panels[len(names) :]:
-        axes.set_visible(False)
-    end = max(run["series"]["env_steps"][-1] for run in runs) / 1e6
-    for axes, name in zip(panels, names, strict=False):
-        _panel(axes, name, "", "", size=12)
-        for shown, line in ((recipe, RECIPE_LINE), (name, {"linewidth": 2.2})):  # the recipe below
-            for run in (run for run in runs if run["ablation"]["name"] == shown):
-                for key, _, color in _ABLATION_CURVES:
-                    draw_curve(axes, unthin(run["series"]), key, MILLIONS, color, **line)
-        axes.set_xlim(0.0, end)
-        axes.set_ylim(0.0, _top(runs))
-    figure.supxlabel(MILLIONS.unit, y=0.12 / height, color=FAINT, fontsize=10)
-    figure.subplots_adjust(
-        left=0.04, right=0.985, top=1.0 - 1.25 / height, bottom=0.7 / height, wspace=0.16, hspace=0.34
-    )
-    lines = [(label, {"color": color, "linewidth": 2.2}) for _, label, color in _ABLATION_CURVES]
-    _legend(figure, [*lines, ("the whole recipe", {"color": INK, **RECIPE_LINE})], 1.0 - 0.5 / height, 3)
-    return save(figure, path)
-
-
-def _top(runs: Sequence[Run]) -> float:
-    """Upper end of a common scale, a little over the highest success."""
-    values = [column(unthin(run["series"]), key) for run in runs for key, _, _ in _ABLATION_CURVES]
-    return min(1.0, 1.15 * float(np.nanmax(np.concatenate(values), initial=0.1)))
 
 
 # --- goals ------------------------------------------------------------------------------------------------------------
@@ -385,53 +342,4 @@ def draw_skill_curves(runs: Sequence[Run], path: Path) -> Path:
         axes.set_xlim(left=0.0)
     _legend(figure, [(METHODS[method], {"color": colours[method]}) for method in learned], 0.95, len(learned))
     figure.subplots_adjust(left=0.05, right=0.98, top=0.87, bottom=0.08, hspace=0.35, wspace=0.12)
-    return save(figure, path)
-
-
-# --- a cluster --------------------------------------------------------------------------------------------------------
-
-FAULT_COLORS = {"actor": FAINT, "learner": ORANGE, "generator": GREEN, "status": "#CC79A7", "redis": "#E69F00"}
-UNDISTURBED_COLOR = "#9ecae1"
-_PLAYER_CURVES = (
-    ("bob/success_rate", "Bob on Alice's valid goals", "solved, share"),
-    ("alice/valid_fraction", "Alice", "valid, share"),
-)
-_OUR_ROLES = ("driver", "actor", "learner", "generator", "status", "redis")
-
-
-def draw_chaos(result: Mapping[str, Any], path: Path) -> Path:
-    """Draw both players' success over env steps, and every fault."""
-    figure = new_figure(WIDTH, 5.2, "A run that is shot at, beside undisturbed ones")
-    curves = result["curves"]
-    for axes, (key, title, label) in zip(figure.subplots(1, 2), _PLAYER_CURVES, strict=True):
-        _panel(axes, title, THOUSANDS.unit, label)
-        for each in curves["undisturbed"]:
-            draw_curve(axes, unthin(each["series"]), key, THOUSANDS, UNDISTURBED_COLOR)
-        draw_curve(axes, unthin(curves["disturbed"]["series"]), key, THOUSANDS, BLUE)
-        for fault in result["strikes"]:
-            axes.axvline(fault["num_env_steps"] / 1e3, color=FAULT_COLORS[fault["target"]], linewidth=0.9, alpha=0.7)
-        axes.set_ylim(0.0, 1.0)
-        axes.set_xlim(0.0, curves["disturbed"]["env_steps"] / 1e3)
-    lines: list[_LegendLine] = [("shot at", {"color": BLUE}), ("undisturbed", {"color": UNDISTURBED_COLOR})]
-    lines += [(f"{name} killed", {"color": color, "linewidth": 0.9}) for name, color in FAULT_COLORS.items()]
-    _legend(figure, lines, 0.92, 7)
-    figure.subplots_adjust(left=0.055, right=0.985, top=0.76, bottom=0.11, wspace=0.18)
-    return save(figure, path)
-
-
-def draw_soak(result: Mapping[str, Any], path: Path) -> Path:
-    """Draw the own memory of the run's processes, and of Ray's."""
-    figure = new_figure(WIDTH, 5.6, "Memory of every process, without files, shared memory and history")
-    found = result["processes"]
-    for axes, title, ours in zip(figure.subplots(1, 2), ("The run", "Ray's own"), (True, False), strict=True):
-        _panel(axes, title, "thousand updates", "MB")
-        shown = {name: each["series"] for name, each in found.items() if (each["role"] in _OUR_ROLES) == ours}
-        for index, (name, series) in enumerate(shown.items()):
-            x, color = [iteration / 1e3 for iteration in series["iteration"]], COLORS[index % len(COLORS)]
-            style = "-" if index < len(COLORS) else "--"
-            axes.plot(x, series["own_mb"], style, color=color, linewidth=1.6, label=name)
-        axes.set_ylim(bottom=0.0)
-        axes.set_xlim(0.0, result["num_iterations"] / 1e3)
-        axes.legend(loc="upper left", bbox_to_anchor=(0.0, -0.14), ncols=4, frameon=False, fontsize=9)
-    figure.subplots_adjust(left=0.05, right=0.985, top=0.85, bottom=0.26, wspace=0.14)
     return save(figure, path)

@@ -9,10 +9,6 @@ from benchmarks.report.markdown import Row, duration, millions, percent, table
 from benchmarks.run_files import RANDOM, STAGES, Records, Run, binned, mean_share, steps_until, unthin
 from benchmarks.tasks import ASKED, ASKED_RATES, ASKED_STEPS, NUM_STEPS, TASKS
 
-ABLATIONS = (
-    "recipe", "no-abc", "one-goal", "no-past-opponents", "monolithic", "no-mirror", "no-replay-invalid",
-)  # fmt: skip
-"""Recorded ablations in the order of their rows."""
 NUM_BINS = 10
 """Equal parts of a run's env steps; rates are those of the last, distances and heights also those of the first."""
 
@@ -78,26 +74,6 @@ def _coverage_row(run: Run) -> Row:
     shares = {name: mean_share(stage) for name, stage in stages.items()}
     cells = [percent(shares[name]) if name in shares else "" for name in (RANDOM, *STAGES)]
     return (str(run["name"]), *cells, f"{shares['end'] / shares[RANDOM]:.1f}")
-
-
-def ablations_table(runs: Sequence[Run]) -> str:
-    """A row for each ablation that was run, the whole recipe first."""
-    tasks = ("mixed", "air", "table")
-    head = ("run", "changed", "env steps", *tasks, "valid goals", "of those, lifted", "Bob on valid goals", "coverage")
-    return table(head, [_ablation_row(run, tasks) for run in runs])
-
-
-def _ablation_row(run: Run, tasks: Iterable[str]) -> Row:
-    records = unthin(run["series"])
-    changed = ", ".join(f"`{override}`" for override in run["ablation"]["overrides"])
-    return (
-        f"{run['ablation']['name']}, seed {run['config']['seed']}",
-        changed or "nothing",
-        millions(records[-1]["env_steps"]),
-        *tasks_cells(run["evaluations"], tasks),
-        *(_at_end(records, key) for key in ("alice/valid_fraction", "alice/lifted_fraction", "bob/success_rate")),
-        percent(mean_share(run["coverage"]["stages"]["end"])) if run.get("coverage") else "",
-    )
 
 
 def throughput_words(result: Mapping[str, Any]) -> str:

@@ -8,7 +8,8 @@ from typing import Any
 
 from benchmarks.measuring import RECIPE_FILE
 from benchmarks.report.markdown import commit
-from service.config import Config, load_config
+from service.config import load_config
+from service.config.self_play import SelfPlayConfig
 from service.errors import TandemError
 
 SHIPPED = "the shipped recipe"
@@ -44,11 +45,7 @@ def recipe_words(study: Mapping[str, Any]) -> str:
 
 
 def check_words(path: Path, page: str, study: Mapping[str, Any]) -> None:
-    """Refuse a page that calls the recipe of a study the shipped one, where it is another.
-
-    Raises:
-        TandemError: it does; the message names the keys that differ.
-    """
+    """Refuse a page that calls the recipe of a study the shipped one, where it is another."""
     if SHIPPED in " ".join(page.lower().split()) and (differing := differences(study["settings"]["recipe"])):
         raise TandemError(
             f"{path}: it says {SHIPPED!r}, but what it shows was recorded with another {', '.join(differing)}; "
@@ -58,7 +55,7 @@ def check_words(path: Path, page: str, study: Mapping[str, Any]) -> None:
 
 def _tree(recorded: Mapping[str, Any]) -> dict[str, Any]:
     """The recorded values of today's keys; those that are gone did nothing in what is compared."""
-    return _filled(Config().model_dump(mode="json"), recorded)
+    return _filled(SelfPlayConfig().model_dump(mode="json"), recorded)
 
 
 def _filled(defaults: Mapping[str, Any], recorded: Mapping[str, Any]) -> dict[str, Any]:

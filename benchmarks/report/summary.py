@@ -7,9 +7,9 @@ from collections.abc import Sequence
 from benchmarks.report.comparison import learning
 from benchmarks.report.downstream import BEST
 from benchmarks.report.markdown import Row, percent, table
-from service.downstream.files import Result
+from benchmarks.report.results import Result, by_method_and_task
 from service.downstream.methods import METHODS
-from service.downstream.rates import Rate, by_method_and_task, rate_of
+from service.downstream.rates import Rate, rate_of
 from service.envs.tasks import TASKS
 
 _OWN = "ours-her"

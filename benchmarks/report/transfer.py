@@ -54,23 +54,5 @@ def transfer_words(result: Result) -> str:
     return " ".join(words)
 
 
-def bridge_table(result: Result) -> str:
-    """Success, stops and motion of every way from the champion to an arm in our own engine."""
-    rows = [("the evaluator, without the bridge", percent(result["evaluator"]["success_last"], 1), "", "")]
-    for name, row in result["rows"].items():
-        motion = f"{row['max_set_point_speed_m_s']:.2f} m/s, {row['max_set_point_acceleration_m_s2']:.1f} m/s2"
-        rows.append((name, percent(row["success_last"], 1), str(len(row["stops"])), motion))
-    return table(("between policy and arm", "success at the last step", "stops", "most of its set-points"), rows)
-
-
-def bridge_words(result: Result) -> str:
-    """What was played through the bridge, and where."""
-    settings = result["settings"]
-    return (
-        f"{settings['policy']}, {settings['num_episodes']} mixed goals a row, {settings['num_steps']} steps."
-        f"{measured_on(result['machine'])}"
-    )
-
-
 def _interval(each: Result, name: str) -> str:
     return f"({percent(each[f'success_{name}_low'])} to {percent(each[f'success_{name}_high'])})"

@@ -10,7 +10,7 @@ from dataclasses import dataclass, fields
 
 import numpy as np
 
-from service.config import Config
+from service.config.distillation import DistillingConfig
 from service.envs.batch import WorldBatch
 from service.envs.observations import Layouts, bob_observation
 from service.envs.obstacles import draw_goals
@@ -63,15 +63,16 @@ class DistillationWorlds:
         num_threads: native threads for physics; 0 for one per core.
     """
 
-    def __init__(self, config: Config, teacher: NumpyMCPPolicy, seen: Layouts, *, num_threads: int = 0) -> None:
-        assert config.distillation is not None
+    def __init__(
+        self, config: DistillingConfig, teacher: NumpyMCPPolicy, seen: Layouts, *, num_threads: int = 0
+    ) -> None:
         self._config, self._how = config, config.distillation
         self._teacher, self._seen = teacher, seen
         self._worlds = WorldBatch(
             config.world,
             self._how.num_worlds,
             num_threads=num_threads,
-            blocked_fraction=config.game.blocked_gripper_fraction,
+            blocked_fraction=self._how.blocked_gripper_fraction,
         )
         self._most_late = (config.world.randomisation.delay_steps or (0, 0))[1]
 
@@ -82,7 +83,7 @@ class DistillationWorlds:
     def play(self, student: NumpyMCPPolicy, rng: np.random.Generator) -> Round:
         """Play an episode in every world, and some steps more, so that each step of it has its label."""
         worlds, how = self._worlds, self._how
-        num, distance_m = worlds.num_worlds, self._config.game.success_distance_m
+        num, distance_m = worlds.num_worlds, self._config.success_distance_m
         worlds.reset(rng)
         start = worlds.object_position.copy()
         goal = draw_goals("mixed", rng, self._config.world, distance_m, worlds.places)

@@ -134,7 +134,7 @@ def evaluate_run(
         kind,
         num_episodes=num_episodes,
         num_steps=config.run.evaluation_steps,
-        success_distance_m=config.game.success_distance_m,
+        success_distance_m=config.success_distance_m,
         seed=seed,
         num_threads=num_threads,
     )

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.actors.rollout import Demonstrations, Rollout, Turns
-from service.config import Config
+from service.config.self_play import SelfPlayConfig
 from service.envs.batch import WorldBatch
 from service.envs.observations import ACTION, bob_observation
 from service.generator.opponents import CURRENT, RoundPlan
@@ -71,7 +71,13 @@ class SelfPlay:
     """
 
     def __init__(
-        self, config: Config, rng: np.random.Generator, *, actor: int = 0, incarnation: int = 0, num_threads: int = 0
+        self,
+        config: SelfPlayConfig,
+        rng: np.random.Generator,
+        *,
+        actor: int = 0,
+        incarnation: int = 0,
+        num_threads: int = 0,
     ) -> None:
         self.config = config
         self.worlds = WorldBatch(

@@ -6,9 +6,9 @@ import math
 
 import numpy as np
 
+from service.config.skills import SkillMethod
 from service.envs.observations import BOB, POSITIONS
 from service.errors import TandemError
-from service.off_policy_config import SkillMethod
 from service.policies.forward import prepared, relu_layers
 from service.policies.parameters import Parameters, PolicyError, checked
 from service.sac.inputs import NUM_MOTION_INPUTS, motion_inputs

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn.utils.parametrizations import spectral_norm
 
-from service.off_policy_config import SkillMethod, SkillsConfig
+from service.config.skills import SkillMethod, SkillsConfig
 from service.policies.adam import Adam
 from service.sac.learner import ADAM_EPSILON
 from service.sac.networks import make_layers

@@ -12,10 +12,10 @@ import torch
 
 from service.baselines.frozen import draw_skills, normalised_place, skill_inputs
 from service.baselines.rewards import IntrinsicReward, make_reward
-from service.config import Config, WorkspaceConfig
+from service.config import WorkspaceConfig
+from service.config.skills import SkillDiscoveryConfig, SkillsConfig
 from service.envs.gym.vector import TabletopVectorEnv
 from service.envs.observations import POSITIONS
-from service.off_policy_config import SkillsConfig
 from service.sac.inputs import NUM_MOTION_INPUTS
 from service.sac.learner import Batch, SACLearner
 from service.sac.loop import OffPolicyLoop
@@ -123,13 +123,12 @@ class IntrinsicBatches:
         return Batch(seen.inputs, rows["action"], np.float32(self._config.reward_scale) * paid, seen.next_inputs)
 
 
-def make_skill_loop(config: Config) -> OffPolicyLoop:
+def make_skill_loop(config: SkillDiscoveryConfig) -> OffPolicyLoop:
     """Make the worlds, the networks and the loop of a skill-discovery run; ``loop.worlds`` has to be closed.
 
     ``loop.make_batch`` is its ``IntrinsicBatches``.
     """
     skills = config.skills
-    assert skills is not None, "a run of self-play"
     seeds = [int(seed) for seed in np.random.SeedSequence(config.seed).generate_state(5) >> 1]
     reward = make_reward(skills, STATE_SIZE, seeds[0])
     env = TabletopVectorEnv(

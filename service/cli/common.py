@@ -22,7 +22,6 @@ from service.progress import Display, Task, display, doing
 from service.runs.signals import InterruptError
 
 if TYPE_CHECKING:
-    from service.config import Config
     from service.primitives.loading import Trained
 
 CHAMPION = "panda-cube@champion"
@@ -42,9 +41,21 @@ SourceOption = Annotated[
 SOURCE = "registry"
 REFERENCE = "NAME@ALIAS|PATH"
 """What ``load`` takes, as help has it."""
+ReferenceArgument = Annotated[
+    str | None,
+    typer.Argument(
+        metavar=REFERENCE,
+        help=f"A version, or the path of a run, a checkpoint or an exported version. Default: {CHAMPION}.",
+    ),
+]
 ActsWithOption = Annotated[
     str | None,
-    typer.Option("--primitives", metavar=REFERENCE, help="What it acts with, where that has moved since training."),
+    typer.Option(
+        "--primitives", metavar=REFERENCE, help="What a policy of a task acts with, where that has moved since then."
+    ),
+]
+TaskOption = Annotated[
+    str | None, typer.Option(autocompletion=lambda: task_names(), help="On a task of tandem tasks, such as wall.")
 ]
 
 
@@ -92,6 +103,21 @@ def choose(option: str, name: str, known: Iterable[str]) -> str:
     if name not in names:
         raise TandemError(f"{option} {name!r}: choose one of {', '.join(names)}{did_you_mean(name, names)}")
     return name
+
+
+def task_names() -> list[str]:
+    """What the shell completes."""
+    from service.envs.tasks import HARD_TASKS, TASKS
+
+    return [*TASKS, *HARD_TASKS]
+
+
+def what_is_meant(reference: str | None, primitives: str | None) -> tuple[str, str | None]:
+    """The reference of a command, and what that acts with, if that was typed.
+
+    Until version 0.2 the reference itself was typed as ``--primitives``.
+    """
+    return (reference, primitives) if reference is not None else (primitives or CHAMPION, None)
 
 
 def was_typed(context: typer.Context, name: str) -> bool:
@@ -149,7 +175,7 @@ def _one_line() -> Iterator[None]:
         raise typer.Exit(said.exit_code) from None
 
 
-def load_start(reference: str, registry: Path | str, config: Config) -> Trained:
+def load_start(reference: str, registry: Path | str) -> Trained:
     """What a run of that configuration begins from.
 
     Raises:
@@ -157,8 +183,6 @@ def load_start(reference: str, registry: Path | str, config: Config) -> Trained:
     """
     from service.primitives.loading import load
 
-    if config.skills is not None:
-        raise TandemError("--from is for self-play; skill discovery begins anew: leave it out")
     return load(reference, registry).expect("primitives", by="--from")
 
 
@@ -179,10 +203,10 @@ def directory_of(registry: str, *, publish: bool) -> Path:
     return REGISTRY
 
 
-def how_to_go_on(run_dir: Path, registry: Path, *, runtime: str = "local", address: str | None = None) -> str:
+def how_to_go_on(run_dir: Path, registry: Path | str, *, runtime: str = "local", address: str | None = None) -> str:
     """The command that continues a run or a study, where it was begun."""
     place = ["--runtime", runtime] * (runtime != "local") + (["--address", address] if address is not None else [])
-    command = ["tandem", "pretrain", "--resume", "--run-dir", str(run_dir), "--registry", str(registry), *place]
+    command = ["tandem", "train", "--resume", "--run-dir", str(run_dir), "--registry", str(registry), *place]
     return f"continue with: {shlex.join(command)}"
 
 

@@ -1,4 +1,4 @@
-"""``tandem configs``: the configurations that come with tandem."""
+"""``tandem configs``, ``tandem methods`` and ``tandem tasks``: what can be named, with a line each."""
 
 from __future__ import annotations
 
@@ -7,8 +7,8 @@ from typing import Annotated
 import typer
 
 from service.cli.common import CommandGroup, JsonOption, print_json, print_table
+from service.config.recipes import first_comment, recipes, robots
 from service.errors import TandemError, did_you_mean
-from service.recipes import first_comment, recipes, robots
 
 configs_app = typer.Typer(name="configs", help="Recipes and robots that come with tandem.", cls=CommandGroup)
 
@@ -20,7 +20,7 @@ def config_names() -> list[str]:
 
 @configs_app.callback(invoke_without_command=True)
 def list_configs(context: typer.Context, as_json: JsonOption = False) -> None:
-    """List recipes, for tandem pretrain --config NAME, and robots, for --set world.robot=NAME."""
+    """List recipes, for tandem train NAME, and robots, for --set world.robot=NAME."""
     if context.invoked_subcommand is not None:
         return
     rows = [
@@ -28,6 +28,34 @@ def list_configs(context: typer.Context, as_json: JsonOption = False) -> None:
         for kind, known in (("recipe", recipes()), ("robot", robots()))
         for name, path in known.items()
     ]
+    _show(rows, as_json)
+
+
+def methods(as_json: JsonOption = False) -> None:
+    """List the methods by which a run learns, and those of tandem evaluate, which learn nothing."""
+    from service.config.find import METHODS, find_class
+    from service.downstream.methods import METHODS as OF_TASKS
+
+    rows = []
+    for name in [*METHODS, *(each for each in OF_TASKS if each not in METHODS)]:
+        if name in OF_TASKS:
+            what = "a task" if name in METHODS else "nothing"
+            rows.append({"name": name, "learns": what, "about": OF_TASKS[name].description})
+        else:
+            about = (find_class(name).__doc__ or "").partition("\n")[0]
+            rows.append({"name": name, "learns": "pre-training", "about": about.rstrip(".")})
+    _show(rows, as_json)
+
+
+def tasks(as_json: JsonOption = False) -> None:
+    """List the tasks, for tandem train TASK, and for --task of the commands that know tasks."""
+    from service.envs.tasks import HARD_TASKS, TASKS
+
+    known = {**TASKS, **HARD_TASKS}
+    _show([{"name": name, "title": task.title, "about": task.description} for name, task in known.items()], as_json)
+
+
+def _show(rows: list[dict[str, str]], as_json: bool) -> None:
     if as_json:
         print_json(rows)
     else:

@@ -32,6 +32,7 @@ def dataset(
 ) -> None:
     """Write Bob's episodes, or of a run without --goals its self-play, as a Minari data set."""
     with loading():
+        from service.config.self_play import SelfPlayConfig
         from service.media import recording
         from service.media.dataset import check_name, played_episodes, played_turns, write_dataset
         from service.media.video import write_episode_video, write_video
@@ -40,9 +41,8 @@ def dataset(
         name = check_name(out)  # now, not after hours of playing
         options = film_options(SIZE, CAMERA, SPEED, video) if video is not None else None
         trained = load(players, registry).expect("primitives", "orchestrator", by="tandem dataset")
-    game = trained.config.game.model_copy(update={"success_distance_m": trained.success_distance_m})
-    config = trained.config.model_copy(update={"world": trained.world, "game": game})
-    if trained.alice is not None and goals is None:
+    config = trained.config.model_copy(update={"world": trained.world})
+    if trained.alice is not None and isinstance(config, SelfPlayConfig) and goals is None:
         rounds = recording.play_rounds(config, trained.alice, trained.policy, num_rounds=episodes, seed=seed)
         played = played_turns(rounds)
         if video is not None:

@@ -9,15 +9,17 @@ from typing import TYPE_CHECKING, Annotated, cast
 import typer
 
 from service.cli.common import (
-    CHAMPION,
-    REFERENCE,
     SOURCE,
+    ActsWithOption,
     JsonOption,
     QuietOption,
+    ReferenceArgument,
     SourceOption,
+    TaskOption,
     choose,
     loading,
     print_json,
+    what_is_meant,
 )
 from service.cli.film import (
     CAMERA,
@@ -35,17 +37,25 @@ from service.cli.film import (
 from service.errors import TandemError, one_line
 
 if TYPE_CHECKING:
-    from service.envs.sampling import GoalKind
+    from pydantic import JsonValue
 
-_Primitives = Annotated[
-    str,
-    typer.Option(metavar=REFERENCE, help="A version; or a run, checkpoint, training or exported version."),
-]
+    from service.actors.evaluation import DeterministicPolicy
+    from service.envs.sampling import GoalKind
+    from service.primitives.loading import Trained
+    from service.types import Metrics
+
 _Seed = Annotated[int, typer.Option(help="Of the episodes.", min=0)]
 
 
 def evaluate(
-    primitives: _Primitives,
+    reference: ReferenceArgument = None,
+    task: TaskOption = None,
+    method: Annotated[
+        str | None,
+        typer.Option(
+            metavar="NAME", help="Of a task, one that learns nothing: asp-only, idle, lsd-zero-shot or metra-zero-shot."
+        ),
+    ] = None,
     goals: Annotated[
         str | None,
         typer.Option(
@@ -59,30 +69,41 @@ def evaluate(
         list[str] | None,
         typer.Option("--set", metavar="world.A=B", help="In another world than that of training; repeatable."),
     ] = None,
+    out: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="Of a task: write what learns nothing as a run writes its result.json."),
+    ] = None,
+    primitives: ActsWithOption = None,
     as_json: JsonOption = False,
     registry: SourceOption = SOURCE,
     quiet: QuietOption = False,
 ) -> None:
-    """Bob on random goals from fresh resets, without noise, beside a policy that does nothing.
+    """Measure on random goals, from fresh resets and without noise, beside a policy that does nothing.
 
-    Of skills (LSD, METRA, DIAYN) the one that leads to the goal acts, zero-shot. A policy of a task plays its task.
+    Of skills (LSD, METRA, DIAYN) the one that leads to the goal acts. A policy of a task plays its task, beside its Bob
+    alone; with the seed of its run, the goals are those of its result.
     """
     for override in overrides or ():
         if not override.startswith("world."):
             raise TandemError(f"--set {one_line(override, 200)}: of an evaluation only the world can be set, world.A=B")
+    reference, primitives = what_is_meant(reference, primitives)
     with loading():
-        from service.actors.evaluation import IdlePolicy
         from service.actors.evaluation import evaluate as run
         from service.config import changed_config
+        from service.downstream.playing import FINAL_SEED, numbers_of
         from service.envs.observations import layouts
         from service.envs.sampling import GOAL_KINDS
+        from service.envs.tasks import find_task
         from service.primitives.loading import load
 
         asked = None if goals is None else choose("--goals", goals, GOAL_KINDS)
-        trained = load(primitives, registry).expect_goals("tandem evaluate")
+        trained = load(reference, registry, primitives).on(task)
+    players, on = _players(trained, method), trained.task
+    _check_used(trained, method, out)
     config = changed_config(trained.config, overrides or ())
     world, distance_m = replace(trained, config=config).world, trained.success_distance_m
-    kind = cast("GoalKind", asked or ("mixed" if trained.task is None else trained.goals))
+    kind = cast("GoalKind", asked or ("mixed" if on is None else trained.goals))
+    of, first_seed = ("", seed) if on is None else (f" of {find_task(on).title}", seed + FINAL_SEED)
     seen, known = (list(layouts(each.world).positions.columns) for each in (config, trained.config))
     if seen != known:
         more = ", ".join(sorted(set(seen) ^ set(known)))
@@ -91,27 +112,91 @@ def evaluate(
             "world.observed as it is"
         )
     rows = {
-        name: run(policy, world, kind, num_episodes=episodes, num_steps=steps, seed=seed, success_distance_m=distance_m)
-        for name, policy in ((trained.label, trained), ("idle", IdlePolicy()))
-    }
+        name: run(
+            player, world, kind,
+            num_episodes=episodes, num_steps=steps, seed=first_seed, success_distance_m=distance_m,
+        )
+        for name, player in players.items()
+    }  # fmt: skip
+    if out is not None:
+        _write_result(out, trained, method, seed, numbers_of(next(iter(rows.values()))))
     if as_json:
-        print_json({name: row.as_dict() for name, row in rows.items()})
+        found = {name: row.as_dict() for name, row in rows.items()}
+        print_json(found if on is None else {"task": on, **found})
         return
-    typer.echo(f"{episodes} random goals ({kind}), {steps} steps, within {100 * distance_m:g} cm")
+    typer.echo(f"{episodes} random goals{of} ({kind}), {steps} steps, within {100 * distance_m:g} cm")
+    width = max(24, *map(len, rows))
     for name, row in rows.items():
         typer.echo(
-            f"  {name:<24} at the last step {row.success_last:6.1%}"
+            f"  {name:<{width}} at the last step {row.success_last:6.1%}"
             f"  [{row.success_last_low:.1%}, {row.success_last_high:.1%}]"
             f"   ever {row.success_ever:6.1%}   mean distance {row.mean_distance_m:.3f} m"
         )
 
 
+def _players(trained: Trained, method: str | None) -> dict[str, DeterministicPolicy]:
+    """The policies that are measured, by name."""
+    from service.actors.evaluation import IdlePolicy
+    from service.config.find import METHODS
+    from service.downstream.methods import find_method
+
+    players: dict[str, DeterministicPolicy] = {}
+    if method in METHODS:
+        raise TandemError(f"--method {method} learns: tandem train TASK --method {method}, then evaluate that run")
+    if method is not None:
+        find_method(method).check(trained)
+    if method != "idle":
+        players[trained.label] = trained.expect_goals("tandem evaluate").player()
+    bob = trained.trained
+    if bob is not None and bob.kind == "primitives" and method is None:
+        players[f"{bob.label}, Bob alone"] = bob.policy
+    return players | {"idle": IdlePolicy()}
+
+
+def _check_used(trained: Trained, method: str | None, out: Path | None) -> None:
+    """Refuse options that mean nothing without a task, and a file that is there or would have no result."""
+    for option, value in (("--method", method), ("--out", out)):
+        if value is not None and trained.task is None:
+            raise TandemError(f"{option} is for a task: name one by --task, such as --task push")
+    if out is None:
+        return
+    if method is None and trained.kind == "orchestrator":
+        raise TandemError(f"--out {out}: {trained.label} has learned, and its run has the result.json; leave out --out")
+    if out.exists():
+        raise TandemError(f"--out {out} is there already: name another file, or move it away")
+
+
+def _write_result(path: Path, trained: Trained, method: str | None, seed: int, numbers: Metrics) -> None:
+    """Write a file that says what a run's configuration and result say."""
+    from service.downstream.methods import METHODS
+    from service.io.files import os_errors, write_exclusive
+    from service.io.run_directory import encode_result
+
+    method = method or ("asp-only" if trained.kind == "primitives" else f"{trained.skills.method}-zero-shot")
+    takes = method not in METHODS or METHODS[method].takes is not None
+    result: dict[str, JsonValue] = {
+        "task": trained.task,
+        "method": method,
+        "seed": seed,
+        "primitives": trained.name if takes else None,
+        "primitives_digest": trained.digest if takes else None,
+        "evaluation": dict(numbers),
+        "env_steps": 0,
+        "wall_s": 0.0,
+    }
+    with os_errors("write", path):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        if not write_exclusive(path, encode_result(result)):
+            raise TandemError(f"--out {path} is there already: name another file, or move it away")
+
+
 def coverage(
-    primitives: _Primitives,
+    reference: ReferenceArgument = None,
     skills: Annotated[int, typer.Option(help="Number of random compositions, or skills.", min=1)] = 32,
     steps: Annotated[int, typer.Option(help="Steps each.", min=1)] = 100,
     seed: _Seed = 0,
     out: Annotated[Path, typer.Option(metavar="FILE", help="Picture to write.")] = Path("coverage.png"),
+    primitives: Annotated[str | None, typer.Option("--primitives", hidden=True)] = None,
     as_json: JsonOption = False,
     registry: SourceOption = SOURCE,
     quiet: QuietOption = False,
@@ -119,13 +204,14 @@ def coverage(
     """Plot where random compositions of the primitives, or random skills, move the object, beside a random policy."""
     if out.suffix.lower() != ".png":
         raise TandemError(f"--out {out}: the picture is a PNG; name a file that ends in .png")
+    reference, _ = what_is_meant(reference, primitives)
     with loading():
         from service.actors.coverage import RandomPolicy, skill_trajectories, visited_share
         from service.baselines.coverage import skill_paths
         from service.media.plots import plot_coverage
         from service.primitives.loading import load
 
-        trained = load(primitives, registry).expect("primitives", "skills", by="tandem coverage")
+        trained = load(reference, registry).expect("primitives", "skills", by="tandem coverage")
     world = trained.world
     if trained.kind == "primitives":
         of, path = (
@@ -147,7 +233,8 @@ def coverage(
 
 
 def render(
-    primitives: _Primitives = CHAMPION,
+    reference: ReferenceArgument = None,
+    task: TaskOption = None,
     episodes: Annotated[int, typer.Option(help="Rounds, episodes or skills to record.", min=1, max=64)] = 4,
     goals: GoalsOption = None,
     seed: _Seed = 0,
@@ -155,29 +242,35 @@ def render(
     size: SizeOption = SIZE,
     camera: CameraOption = CAMERA,
     speed: SpeedOption = SPEED,
+    primitives: ActsWithOption = None,
     registry: SourceOption = SOURCE,
     quiet: QuietOption = False,
 ) -> None:
     """Make a film of a run's Alice beside its Bob, of a policy on goals or on its task, or of random skills."""
+    reference, primitives = what_is_meant(reference, primitives)
     with loading():
+        from service.config.self_play import SelfPlayConfig
+        from service.config.skills import SkillDiscoveryConfig
+        from service.downstream.playing import FINAL_SEED
         from service.media import recording, video
         from service.primitives.loading import load
 
         options = film_options(size, camera, speed, out)
-        trained = load(primitives, registry)
+        trained = load(reference, registry, primitives).on(task)
     config = trained.config
-    if trained.kind == "skills":
-        assert config.skills is not None
+    if trained.kind == "skills" and trained.task is None:
+        assert isinstance(config, SkillDiscoveryConfig)
         if goals is not None:
             raise TandemError(f"--goals: {trained.label} holds skills, of which random ones are shown; leave it out")
         recorded = recording.record_skills(
             trained.skills, config.world, num_skills=episodes, num_steps=config.skills.episode_steps, seed=seed
         )
         video.write_episode_video(recorded, config.world, out, options)
-    elif trained.alice is not None and goals is None:
+    elif trained.alice is not None and isinstance(config, SelfPlayConfig) and goals is None:
         rounds = recording.record_rounds(config, trained.alice, trained.policy, num_rounds=episodes, seed=seed)
         video.write_video(rounds, config.world, out, options)
     else:
+        trained.expect_goals("tandem render")
         asked = parse_goals(goals or ("mixed" if trained.task is None else trained.goals), trained.world)
         points = None if isinstance(asked, str) else asked
         recorded = recording.record_episodes(
@@ -187,7 +280,7 @@ def render(
             num_episodes=episodes if points is None else len(points),
             num_steps=trained.num_steps,
             success_distance_m=trained.success_distance_m,
-            seed=seed,
+            seed=seed if trained.task is None else seed + FINAL_SEED,
             goal=points,
         )
         video.write_episode_video(recorded, trained.world, out, options)

@@ -15,7 +15,7 @@ def export(
         str,
         typer.Argument(
             metavar=REFERENCE,
-            help="Whose Bob; or an orchestrator, published or in its training.",
+            help="Primitives, or a policy of a task: a version, or the path of a run or checkpoint.",
         ),
     ],
     format_name: Annotated[str, typer.Option("--format", help="onnx, numpy or torchscript.")],

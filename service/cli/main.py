@@ -11,24 +11,28 @@ from typing import Annotated
 import typer
 
 from service.cli.common import CommandGroup, QuietOption, quieten
-from service.cli.configs import configs_app
+from service.cli.configs import configs_app, methods, tasks
 from service.cli.dataset import dataset
-from service.cli.downstream import downstream_app
 from service.cli.evaluate import coverage, evaluate, render
 from service.cli.export import export
+from service.cli.moved import downstream
 from service.cli.play import play
-from service.cli.pretrain import demo, pretrain
+from service.cli.publish import publish
 from service.cli.registry import registry_app
 from service.cli.robot import robot_app
 from service.cli.serve import serve
+from service.cli.train import TrainCommand, demo, train
 from service.cli.unexpected import report_thread_error
 from service.version import __version__
 
 app = typer.Typer(name="tandem", help="Robot skills, pre-trained.", cls=CommandGroup, no_args_is_help=True)
-for command in (pretrain, demo, evaluate, coverage, render, play, dataset, export, serve):
+app.command(cls=TrainCommand)(train)
+app.command("pretrain", cls=TrainCommand, help="The same as tandem train, by its name for self-play.")(train)
+for command in (demo, evaluate, coverage, render, play, dataset, export, publish, serve, methods, tasks):
     app.command()(command)
+_anything = {"ignore_unknown_options": True, "help_option_names": []}
+app.command(hidden=True, context_settings=_anything)(downstream)
 app.add_typer(registry_app)
-app.add_typer(downstream_app)
 app.add_typer(robot_app)
 app.add_typer(configs_app)
 

@@ -1,4 +1,4 @@
-"""``tandem play`` and ``tandem downstream play``: a live world in the browser."""
+"""``tandem play``: a live world in the browser."""
 
 from __future__ import annotations
 
@@ -8,18 +8,17 @@ from typing import Annotated
 import typer
 
 from service.cli.common import (
-    CHAMPION,
     EXIT_SIGNAL,
-    REFERENCE,
     SOURCE,
     ActsWithOption,
     QuietOption,
+    ReferenceArgument,
     SourceOption,
+    TaskOption,
     loading,
+    what_is_meant,
 )
-from service.cli.orchestrators import ReferenceArgument
 
-_Task = Annotated[str | None, typer.Option(help="Play in the world of a downstream task, such as wall.")]
 _Host = Annotated[
     str, typer.Option(help="Where to listen; on others than this machine's, all who reach it play along.")
 ]
@@ -28,21 +27,8 @@ _Seed = Annotated[int, typer.Option(help="Of starts and goals.", min=0)]
 
 
 def play(
-    primitives: Annotated[str, typer.Option(metavar=REFERENCE, help="Who plays; a run has Alice.")] = CHAMPION,
-    task: _Task = None,
-    host: _Host = "127.0.0.1",
-    port: _Port = None,
-    seed: _Seed = 0,
-    registry: SourceOption = SOURCE,
-    quiet: QuietOption = False,
-) -> None:
-    """Watch a live world in the browser: drag the goal, drive the primitives, see Alice propose."""
-    _serve(primitives, registry, None, task, host, port, seed)
-
-
-def play_downstream(
-    reference: ReferenceArgument,
-    task: _Task = None,
+    reference: ReferenceArgument = None,
+    task: TaskOption = None,
     host: _Host = "127.0.0.1",
     port: _Port = None,
     seed: _Seed = 0,
@@ -50,14 +36,8 @@ def play_downstream(
     registry: SourceOption = SOURCE,
     quiet: QuietOption = False,
 ) -> None:
-    """Watch an orchestrator on its task, live in the browser."""
-    _serve(reference, registry, primitives, task, host, port, seed)
-
-
-def _serve(
-    reference: str, registry: str, primitives: str | None, task: str | None, host: str, port: int | None, seed: int
-) -> None:
-    """Load who plays, and show that until Ctrl-C."""
+    """Watch a live world in the browser: drag the goal, drive the primitives, see a run's Alice propose."""
+    reference, primitives = what_is_meant(reference, primitives)
     with loading():
         from service.play.server import LiveWorld
         from service.primitives.loading import load

@@ -141,7 +141,7 @@ def replay(
 def _bridge_config(overrides: list[str] | None) -> BridgeConfig:
     from pydantic import ValidationError
 
-    from service.config_tree import apply_override
+    from service.config.tree import apply_override
     from service.robot.backends import first_error
     from service.robot.loop import BridgeConfig
 

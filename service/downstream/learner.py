@@ -1,4 +1,4 @@
-"""The learner of a trial: soft actor-critic on its task's worlds, with hindsight where its method has it."""
+"""The learner of a task: soft actor-critic on its task's worlds, with hindsight where its method has it."""
 
 from __future__ import annotations
 
@@ -7,10 +7,13 @@ import functools
 import numpy as np
 import torch
 
-from service.downstream.methods import Method
-from service.downstream.settings import TrialConfig
+from service.config.distillation import DistillingConfig
+from service.config.self_play import MCPConfig, SelfPlayConfig
+from service.config.task import TaskConfig
+from service.downstream.methods import TaskMethod
 from service.downstream.worlds import TaskWorlds, columns
 from service.envs.observations import POSITIONS
+from service.errors import TandemError
 from service.primitives.learned import learner_inputs, num_inputs
 from service.primitives.loading import Trained
 from service.sac.learner import Batch, SACLearner
@@ -47,31 +50,38 @@ class Hindsight:
         )
 
 
-def make_loop(trial: TrialConfig, method: Method, trained: Trained, worlds: TaskWorlds) -> OffPolicyLoop:
+def make_loop(config: TaskConfig, method: TaskMethod, trained: Trained, worlds: TaskWorlds) -> OffPolicyLoop:
     """Make a new learner in worlds that have begun; ``loop.make_batch`` is its ``Hindsight``.
 
     Where an action lasts for H env steps, updates an env step and the horizon in env steps stay: H times the updates
     after each action, and a discount of ``gamma ** H``.
     """
     size, hold = worlds.num_actions, worlds.steps_per_action
-    longer = {"gradient_steps": hold * trial.sac.gradient_steps, "gamma": trial.sac.gamma**hold}
-    sac = trial.sac.model_copy(update=longer)
+    longer = {"gradient_steps": hold * config.sac.gradient_steps, "gamma": config.sac.gamma**hold}
+    sac = config.sac.model_copy(update=longer)
     num_without_goal, num_seen = num_inputs(worlds.seen)
     with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(spread_seed(trial.seed, 0))
+        torch.manual_seed(spread_seed(config.seed, 0))
         actor = (
-            MCPActor(num_without_goal, num_seen, size, trained.config.policy.bob)
+            MCPActor(num_without_goal, num_seen, size, _sizes_of(trained))
             if method.mcp_actor
             else GaussianActor(num_seen, size, sac.hidden_sizes)
         )
-    learner = SACLearner(actor, num_seen, size, sac, spread_seed(trial.seed, 1))
-    num_steps = -(-trial.num_env_steps // (sac.num_worlds * hold))  # everything is kept
+    learner = SACLearner(actor, num_seen, size, sac, spread_seed(config.seed, 1))
+    num_steps = -(-config.run.total_env_steps // (sac.num_worlds * hold))  # everything is kept
     replay = ReplayBuffer(num_steps, sac.num_worlds, {**columns(worlds.seen), "action": size})
     share = method.her_ratio[0] if method.her_ratio else 0.0
-    return OffPolicyLoop(worlds, replay, learner, Hindsight(worlds, share), spread_seed(trial.seed, 2))
+    return OffPolicyLoop(worlds, replay, learner, Hindsight(worlds, share), spread_seed(config.seed, 2))
 
 
-def set_progress(loop: OffPolicyLoop, method: Method, progress: float) -> None:
+def _sizes_of(trained: Trained) -> MCPConfig:
+    """Sizes of primitives and gate that are learned from nothing: those of the primitives that were named."""
+    if not isinstance(trained.config, SelfPlayConfig | DistillingConfig):
+        raise TandemError(f"{trained.label} has no primitives, whose sizes scratch-mcp takes: name some")
+    return trained.config.policy.bob
+
+
+def set_progress(loop: OffPolicyLoop, method: TaskMethod, progress: float) -> None:
     """Set the share of relabelled goals for a progress from 0, when learning begins, to 1, when it ends."""
     if method.her_ratio is not None:
         first, last = method.her_ratio

@@ -1,14 +1,14 @@
-"""Episodes of a downstream task, played by any policy: evaluated, or recorded for a film."""
+"""Episodes of a task, played by any policy."""
 
 from __future__ import annotations
 
-from service.actors.evaluation import DeterministicPolicy, Evaluation, evaluate
+from service.actors.evaluation import DeterministicPolicy, Evaluation, evaluate, wilson_interval
 from service.config import WorldConfig
 from service.envs.tasks import EPISODE_STEPS, SUCCESS_DISTANCE_M, find_task
-from service.media.recording import RecordedEpisodes, record_episodes
+from service.types import Metrics
 
 CURVE_SEED, FINAL_SEED = 1_000_000, 2_000_000
-"""Added to a trial's seed: goals of evaluations are none that were learned on, and the same for every method."""
+"""Added to a run's seed: goals of evaluations are none that were learned on, and the same for every method."""
 
 
 def evaluate_on(
@@ -40,21 +40,8 @@ def evaluate_on(
     )
 
 
-def record_on(
-    task: str, world: WorldConfig, player: DeterministicPolicy, num_episodes: int, seed: int
-) -> RecordedEpisodes:
-    """Record the episodes that ``evaluate_on`` plays with these arguments.
-
-    Raises:
-        TandemError: no such task.
-    """
-    found = find_task(task)
-    return record_episodes(
-        player,
-        found.world_from(world),
-        found.goals,
-        num_episodes=num_episodes,
-        num_steps=EPISODE_STEPS,
-        success_distance_m=SUCCESS_DISTANCE_M,
-        seed=seed,
-    )
+def numbers_of(found: Evaluation) -> Metrics:
+    """The numbers of an evaluation as a run's result has them, with 95 % intervals."""
+    low, high = wilson_interval(round(found.success_ever * found.num_episodes), found.num_episodes)
+    measured = {**found.as_dict(), "success_ever_low": low, "success_ever_high": high}
+    return {name: value for name, value in measured.items() if not isinstance(value, str)}

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from typing import NamedTuple
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from service.actors.evaluation import wilson_interval
-from service.downstream.files import TRIAL, Result
 
 _STUDENT = (12.706, 4.303, 3.182, 2.776, 2.571, 2.447, 2.365, 2.306, 2.262)
 """97.5th percentiles of Student's t for 1 to 9 degrees of freedom; 1.96 is near enough for more."""
@@ -29,15 +28,7 @@ class Rate(NamedTuple):
         return f"{100 * self.mean:.1f} % [{100 * self.low:.0f}, {100 * self.high:.0f}]{star} ({self.num_seeds})"
 
 
-def by_method_and_task(results: Sequence[Result]) -> dict[tuple[str, str], list[Result]]:
-    """Results of the seeds of each method on each task, in the order of the seeds."""
-    found: dict[tuple[str, str], list[Result]] = {}
-    for result in sorted(results, key=lambda each: int(each[TRIAL]["seed"])):
-        found.setdefault((result[TRIAL]["method"], result[TRIAL]["task"]), []).append(result)
-    return found
-
-
-def rate_of(results: Sequence[Result], key: str = "success_last") -> Rate:
+def rate_of(results: Sequence[Mapping[str, Any]], key: str = "success_last") -> Rate:
     """The mean over one or more seeds.
 
     The interval of several is for the mean over seeds (Student's t). That of one is Wilson's over its episodes: it

@@ -6,9 +6,9 @@ from typing import Any
 
 import mujoco
 
-from service.mesh_files import Vector
-from service.model_files import model_file
-from service.object_config import MeshConfig
+from service.config.mesh_files import Vector
+from service.config.model_files import model_file
+from service.config.objects import MeshConfig
 
 
 def add_mesh(spec: mujoco.MjSpec, mesh: MeshConfig, name: str, mass_kg: float) -> list[dict[str, Any]]:

@@ -10,10 +10,10 @@ import mujoco
 import numpy as np
 
 from service.config import WorldConfig
+from service.config.objects import ObjectConfig
 from service.envs.robot import described
 from service.envs.scene import FIXTURE_PREFIX, build_model
 from service.errors import ConfigError
-from service.object_config import ObjectConfig
 from service.types import Array, StateArray
 
 _SEED = 0

@@ -7,9 +7,9 @@ from typing import Any
 import mujoco
 
 from service.config import WorldConfig
+from service.config.objects import ROUND, ObjectConfig, ObstacleConfig
 from service.envs.contacts import FLOOR_BIT, GRIPPER_BIT, OBJECT_BIT, OBSTACLE_PRIORITY, STIFF
 from service.envs.meshes import add_mesh, center_of_mass
-from service.object_config import ROUND, ObjectConfig, ObstacleConfig
 
 GRAVITY_MS2 = 9.81
 FLOOR_Z_M = -0.74

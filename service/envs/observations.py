@@ -22,7 +22,7 @@ from service.envs.state_layout import columns
 from service.types import FloatArray
 
 if TYPE_CHECKING:
-    from service.world_config import WorldConfig  # acting needs no pydantic
+    from service.config.world import WorldConfig  # acting needs no pydantic
 
 
 @dataclass(frozen=True)

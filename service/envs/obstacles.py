@@ -12,13 +12,13 @@ import mujoco
 import numpy as np
 
 from service.config import WorldConfig
+from service.config.objects import ObjectConfig
 from service.envs import sampling, scene
 from service.envs.contacts import GRIPPER_BIT
 from service.envs.observations import OBSTACLE_PREFIX
 from service.envs.sampling import GoalKind
 from service.envs.state_layout import StateLayout
 from service.errors import ConfigError
-from service.object_config import ObjectConfig
 from service.types import BoolArray, StateArray
 
 SEEN_WITHIN_M = 1.0

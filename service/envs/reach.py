@@ -12,9 +12,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from service.config import WorkspaceConfig
+from service.config.robot import RobotConfig
 from service.envs.kinematics import Chain
 from service.errors import ConfigError
-from service.robot_config import RobotConfig
 from service.types import BoolArray, StateArray
 
 _STEP_M = 0.0025

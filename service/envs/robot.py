@@ -10,12 +10,12 @@ import mujoco
 import numpy as np
 
 from service.config import WorldConfig
+from service.config.model_files import model_file
+from service.config.robot import Numbers, PadConfig, RobotConfig
 from service.envs import panda
 from service.envs.contacts import BODY_FRICTION, GRIPPER_BIT, add_finger_sensors, grip
 from service.envs.kinematics import Chain
 from service.errors import ConfigError
-from service.model_files import model_file
-from service.robot_config import Numbers, PadConfig, RobotConfig
 from service.types import BoolArray, StateArray
 
 _PREFIX, _HAND_PREFIX = "robot/", "hand/"

@@ -7,6 +7,8 @@ from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 from service.config import WorldConfig
+from service.config.run import SUCCESS_DISTANCE_M as SUCCESS_DISTANCE_M
+from service.config.task import EPISODE_STEPS as EPISODE_STEPS
 from service.errors import TandemError, did_you_mean
 
 if TYPE_CHECKING:
@@ -39,11 +41,6 @@ class Task:
             tree[key] = {**tree[key], **value} if isinstance(value, Mapping) else value
         return WorldConfig.model_validate(tree)
 
-
-SUCCESS_DISTANCE_M = 0.05
-"""Greatest distance from object to goal that counts as success, in every task (paper)."""
-EPISODE_STEPS = 50
-"""Steps of an episode (paper: 50)."""
 
 TASKS: Mapping[str, Task] = {
     "larger": Task(

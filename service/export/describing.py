@@ -9,6 +9,7 @@ import mujoco
 import numpy as np
 
 from service.config import WorldConfig
+from service.config.robot import Numbers, RobotConfig
 from service.envs.batch import DISPLACEMENT_M, MAX_TURN_RAD, WIDTH_CHANGE_M, WorldBatch
 from service.envs.observations import (
     COMMAND,
@@ -45,7 +46,6 @@ from service.export.measurements import Measured
 from service.export.networks import Network
 from service.export.parity import Differences
 from service.io.git import git_commit
-from service.robot_config import Numbers, RobotConfig
 from service.version import __version__
 
 _COMPONENTS: Mapping[Kind, tuple[str, ...]] = {

@@ -7,13 +7,13 @@ from typing import Literal
 
 from pydantic import Field, ValidationError
 
+from service.config.frozen import FrozenModel
+from service.config.robot import EffectorConfig, Vector
 from service.export.errors import ExportError
 from service.export.measurements import Measured
-from service.frozen import FrozenModel
 from service.io.files import os_errors
 from service.parsing import ParseError, parse_json
 from service.regular_files import read_regular
-from service.robot_config import EffectorConfig, Vector
 
 FILE = "policy.json"
 _MAX_BYTES = 4 * 1024 * 1024

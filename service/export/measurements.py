@@ -13,9 +13,9 @@ from pydantic import Field
 
 from service.actors.evaluation import REPORTED_SEED, DeterministicPolicy, evaluate
 from service.config import WorldConfig
+from service.config.frozen import FrozenModel
 from service.envs.batch import DISPLACEMENT_M, WIDTH_CHANGE_M, WorldBatch
 from service.envs.observations import COMMAND_PREFIX, DELAY, ObservationLayout, bob_observation, layouts
-from service.frozen import FrozenModel
 from service.primitives.loading import Trained
 from service.types import FloatArray, StateArray
 

@@ -6,11 +6,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from service.config import Config, WorldConfig
+from service.config import WorldConfig
+from service.config.self_play import SelfPlayConfig
+from service.config.world import Point
 from service.envs.obstacles import obstacle_columns
 from service.envs.state_layout import StateLayout
 from service.types import Array, BoolArray, IntArray, StateArray
-from service.world_config import Point
 
 AIR_ABOVE_REST_M = 0.05
 """A goal is in the air when the object's centre is higher than it rests on the table by more than this."""
@@ -40,6 +41,10 @@ def distance_bins(goals: StateArray, start_positions: StateArray) -> IntArray:
     distance = np.linalg.norm(goals - start_positions, axis=-1)
     bins: IntArray = np.digitize(distance, DISTANCE_EDGES_M).astype(np.int64)
     return bins
+
+
+CELL_SIZE_M = 0.05
+"""Usual edge of a goal cell."""
 
 
 class GoalCells:
@@ -97,7 +102,7 @@ class TaskBins:
     """Columns of a state that hold poses of obstacles."""
 
     @classmethod
-    def from_config(cls, config: Config, layout: StateLayout) -> TaskBins:
+    def from_config(cls, config: SelfPlayConfig, layout: StateLayout) -> TaskBins:
         """The bins of a run whose worlds' states have this layout."""
         return cls(
             rest_height_m=config.world.rest_height_m,

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from service.config import Config
+from service.config.self_play import SelfPlayConfig
 from service.envs.state_layout import StateLayout
 from service.generator.bins import GoalCells, TaskBins, in_air
 from service.generator.difficulty import DifficultyGrid, SuccessCounts
@@ -47,7 +47,7 @@ class TaskGenerator:
     opponents: OpponentPool
     """Past versions of both players."""
 
-    def __init__(self, config: Config, layout: StateLayout) -> None:
+    def __init__(self, config: SelfPlayConfig, layout: StateLayout) -> None:
         self._config = config.generator
         self._success_distance_m, self._world = config.game.success_distance_m, config.world
         self.cells = GoalCells(config.world, config.generator.cell_size_m)

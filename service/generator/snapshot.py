@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from service.config import GeneratorConfig, WorldConfig
+from service.config import WorldConfig
+from service.config.self_play import GeneratorConfig
 from service.envs.obstacles import inside_obstacles, obstacle_places
 from service.envs.sampling import GoalKind, sample_goals
 from service.generator.bins import GoalCells, TaskBins, in_air

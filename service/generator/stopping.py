@@ -6,7 +6,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from service.config import GeneratorConfig
+from service.config.self_play import GeneratorConfig
 from service.generator.state import take
 from service.types import Array, Arrays
 

@@ -11,6 +11,7 @@
 | ``tensorboard/`` | the same metrics as TensorBoard events over env steps |
 | ``checkpoints/`` | the newest checkpoints; ``--resume`` continues from them exactly |
 | ``snapshots/`` | Bob's parameters untrained and after each tenth of the run, kept for good |
+| ``result.json`` | what was measured when learning was over |
 | ``published.json`` | the version this run published last, and the sha256 of its parameters |
 | ``recordings/`` | earlier videos, with the time at which a newer one took their place |
 | ``log.jsonl`` | what happened: who died, who came back, how it ended; see ``service.io.run_log`` |
@@ -27,16 +28,16 @@ import json
 import logging
 import os
 import platform
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from importlib.metadata import version
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
-from pydantic import JsonValue
+from pydantic import BaseModel, JsonValue
 
 from service.config import Config, dump_config, load_config
 from service.errors import ConfigError, TandemError
@@ -58,10 +59,19 @@ if TYPE_CHECKING:
 _logger = logging.getLogger(__name__)
 MAX_DIVERGED_FILES = 100
 MAX_NOTE_BYTES = 10_000
+MAX_RESULT_BYTES = 1_000_000
 RECORDINGS = "recordings"
-TRIAL_FILE = "cell.json"
-"""Settings of a downstream training: its directory is another kind than that of a run."""
+RESULT_FILE = "result.json"
+"""What was measured at the end of a run."""
 MAX_RECORDINGS = 20
+
+
+class _Result(BaseModel):
+    """What ``result.json`` has to have."""
+
+    evaluation: dict[str, float]
+    env_steps: int
+    wall_s: float
 
 
 class Published(NamedTuple):
@@ -129,11 +139,6 @@ class RunDirectory:
             ConfigError: no run here, one of another version, or its configuration cannot be read.
             StorageError: see ``version``.
         """
-        if not self.exists and (self.path / TRIAL_FILE).exists():
-            raise ConfigError(
-                f"{self.path} is a downstream training, not a run of tandem pretrain: name it to tandem downstream "
-                "evaluate, render, play or publish"
-            )
         if not self.exists:
             raise ConfigError(f"no run in {self.path}: {self.config_file.name} is missing; name the directory of a run")
         if not is_of_this_version(self.version):
@@ -209,6 +214,35 @@ class RunDirectory:
                 f"{path} names no version and digest; remove it: what the run publishes next then has no parent"
             )
         return Published(version, digest)
+
+    def read_result(self) -> dict[str, Any] | None:
+        """What was measured at the end; None before it.
+
+        Raises:
+            StorageError: the file that says so cannot be read, or is damaged.
+        """
+        path = self.path / RESULT_FILE
+        with os_errors("read", path):
+            try:
+                data = read_regular(path, MAX_RESULT_BYTES, follow=True)
+            except FileNotFoundError:
+                return None
+        try:
+            result: dict[str, Any] = dict(parse_json(data, path))
+            _Result.model_validate(result)
+        except (ParseError, ValueError, TypeError):
+            raise StorageError(f"{path} is no result; remove it, and --resume makes it again") from None
+        return result
+
+    def write_result(self, result: Mapping[str, JsonValue]) -> None:
+        """Keep what was measured at the end, in ``result.json``.
+
+        Raises:
+            StorageError: it cannot be written.
+        """
+        path = self.path / RESULT_FILE
+        with os_errors("write", path):
+            write_atomic(path, encode_result(result))
 
     def write_published(self, published: Published) -> None:
         """Note what this run published.
@@ -382,6 +416,12 @@ class RunDirectory:
         except StorageError as error:
             if not known:
                 _logger.warning("%s; the run goes on", error)
+
+
+def encode_result(result: Mapping[str, JsonValue]) -> bytes:
+    """A result as JSON, with what it was made by."""
+    made = {"git_commit": git_commit(), "num_cores": os.cpu_count()}
+    return (json.dumps({**result, "made": made}, indent=1) + "\n").encode()
 
 
 def _environment() -> dict[str, object]:

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from pydantic import AwareDatetime, Field, JsonValue
 
-from service.frozen import FrozenModel
+from service.config.frozen import FrozenModel
 from service.io.errors import StorageError
 from service.io.files import os_errors, write_atomic
 from service.parsing import ParseError, parse_with

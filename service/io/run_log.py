@@ -16,7 +16,7 @@ from typing import Literal, Self
 
 from pydantic import AwareDatetime
 
-from service.frozen import FrozenModel
+from service.config.frozen import FrozenModel
 from service.parsing import ParseError, parse_with
 from service.regular_files import open_to_append, read_regular
 

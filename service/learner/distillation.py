@@ -10,7 +10,7 @@ from torch import Tensor
 from torch.nn.utils import clip_grad_norm_
 
 from service.actors.distillation import Lesson
-from service.distillation_config import DistillationConfig
+from service.config.distillation import DistillationConfig
 from service.policies import networks
 from service.policies.adam import Adam
 from service.policies.forward import compose

@@ -10,7 +10,7 @@ import torch
 from numpy.typing import NDArray
 
 from service.actors.rollout import Demonstrations, Rollout, Turns
-from service.config import Config
+from service.config.self_play import SelfPlayConfig
 from service.envs.observations import Layouts, layouts
 from service.io.tensors import join_parts, split_parts
 from service.learner import ppo, transfer
@@ -40,7 +40,7 @@ class Learner:
     ``state`` holds all that ``load_state`` needs to continue as if nothing had happened, bit for bit.
     """
 
-    def __init__(self, config: Config) -> None:
+    def __init__(self, config: SelfPlayConfig) -> None:
         """Make both players from ``config.seed``; this is version 0.
 
         Raises:

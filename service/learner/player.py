@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from service.config import PPOConfig
+from service.config.self_play import PPOConfig
 from service.errors import TandemError
 from service.policies import gaussian
 from service.policies.adam import Adam

@@ -19,7 +19,7 @@ from torch import Tensor
 from torch.nn.utils import clip_grad_norm_
 
 from service.actors.rollout import Turns
-from service.config import CloningConfig
+from service.config.self_play import CloningConfig
 from service.learner.diagnostics import cloning_metrics, explained_variance, mean_and_std, probes
 from service.learner.player import LEARNING_RATE_BOUNDS, Player
 from service.learner.samples import Cloning, DemonstrationRows, Samples, draw_epoch

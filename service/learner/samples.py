@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from service.actors.rollout import Demonstrations
-from service.config import CloningConfig, PPOConfig
+from service.config.self_play import CloningConfig, PPOConfig
 from service.envs.observations import ACTION, Layouts, Mirror
 from service.learner.player import Player
 from service.policies import gaussian

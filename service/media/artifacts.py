@@ -9,10 +9,13 @@ from pathlib import Path
 
 from service.actors.coverage import NUM_SKILLS, skill_trajectories
 from service.baselines.coverage import skill_paths
+from service.config.self_play import SelfPlayConfig
+from service.config.skills import SkillDiscoveryConfig
 from service.errors import TandemError
 from service.io.run_directory import RunDirectory
 from service.media import recording, video
 from service.media.plots import plot_coverage, plot_curves, plot_goals
+from service.media.task_curves import draw_training
 from service.policies.numpy_policy import NumpyMCPPolicy
 from service.primitives.loading import Trained, load
 from service.progress import counted
@@ -24,17 +27,26 @@ _SEED = 7
 _logger = logging.getLogger(__name__)
 
 
-def make_artifacts(directory: RunDirectory) -> dict[str, Path]:
+def make_artifacts(directory: RunDirectory, registry: Path | str = "registry") -> dict[str, Path]:
     """Draw the curves, the goals, the coverage and a video of a few rounds.
 
     Returns:
         Files by what they show. What cannot be made, for want of an OpenGL library or of room on the disk, is left
         out, and a warning says why.
     """
-    trained = load(str(directory.path))
-    config, world = trained.config, trained.config.world
     makers: dict[str, Callable[[], Path]]
-    if config.skills is not None:
+    if directory.read_config().makes is None:
+        return {}
+    trained = load(str(directory.path), registry)
+    world = trained.config.world
+    if trained.kind == "orchestrator":
+        return _make(
+            {
+                "curves": partial(draw_training, directory.path),
+                "video": partial(_draw_episodes, directory, trained),
+            }
+        )
+    if trained.kind == "skills":
         makers = {
             "curves": partial(plot_curves, directory.path, "skills"),
             "coverage": partial(_draw_skills, directory, trained),
@@ -62,6 +74,7 @@ def _make(makers: dict[str, Callable[[], Path]]) -> dict[str, Path]:
 
 def _draw_rounds(directory: RunDirectory, trained: Trained) -> Path:
     assert trained.alice is not None
+    assert isinstance(trained.config, SelfPlayConfig)
     rounds = recording.record_rounds(
         trained.config, trained.alice, trained.policy, num_rounds=NUM_RECORDED_ROUNDS, seed=_SEED
     )
@@ -72,7 +85,7 @@ def _draw_rounds(directory: RunDirectory, trained: Trained) -> Path:
 
 def _draw_skills(directory: RunDirectory, trained: Trained) -> Path:
     config = trained.config
-    assert config.skills is not None
+    assert isinstance(config, SkillDiscoveryConfig)
     steps = config.skills.episode_steps
     paths = skill_paths(trained.skills, config.world, num_skills=NUM_SKILLS, num_steps=steps, seed=_SEED)
     return plot_coverage(paths, config.world.workspace, directory.path / "coverage.png", config.name, of="skill")
@@ -80,7 +93,7 @@ def _draw_skills(directory: RunDirectory, trained: Trained) -> Path:
 
 def _draw_skill_video(directory: RunDirectory, trained: Trained) -> Path:
     config = trained.config
-    assert config.skills is not None
+    assert isinstance(config, SkillDiscoveryConfig)
     steps = config.skills.episode_steps
     episodes = recording.record_skills(
         trained.skills, config.world, num_skills=NUM_RECORDED_SKILLS, num_steps=steps, seed=_SEED
@@ -92,9 +105,9 @@ def _draw_skill_video(directory: RunDirectory, trained: Trained) -> Path:
 
 def _draw_episodes(directory: RunDirectory, trained: Trained) -> Path:
     episodes = recording.record_episodes(
-        trained.policy,
+        trained.player(),
         trained.world,
-        "mixed",
+        trained.goals,
         num_episodes=NUM_RECORDED_SKILLS,
         num_steps=trained.num_steps,
         success_distance_m=trained.success_distance_m,

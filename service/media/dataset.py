@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from service.config import Config
+from service.config.self_play import SelfPlayConfig
 from service.envs.batch import WorldBatch
 from service.envs.gym.tabletop import action_space, goal_space
 from service.errors import TandemError
@@ -104,7 +105,7 @@ def write_dataset(name: str, played: Sequence[Played], config: Config, label: st
     with needs_extra("data", "tandem dataset"):
         import minari
 
-    description = {"players": label, "success_distance_m": config.game.success_distance_m}
+    description = {"players": label, "success_distance_m": config.success_distance_m}
     about = {**description, "world": config.world.model_dump(mode="json")}
     try:
         with os_errors("write", place), warnings.catch_warnings():
@@ -132,11 +133,12 @@ def _buffers(played: Sequence[Played], config: Config) -> Iterator[object]:
     worlds = WorldBatch(config.world, longest, num_threads=1)
     if worlds.states.shape[1] != columns:  # those of self-play have a column more
         worlds.close()
+        assert isinstance(config, SelfPlayConfig)
         blocked = config.game.blocked_gripper_fraction
         worlds = WorldBatch(config.world, longest, num_threads=1, blocked_fraction=blocked)
     with worlds:
         for each in counted(played, "writing the data set", len(played), "episodes"):
-            yield EpisodeBuffer(**_arrays(each, worlds, config.game.success_distance_m))
+            yield EpisodeBuffer(**_arrays(each, worlds, config.success_distance_m))
 
 
 def _arrays(played: Played, worlds: WorldBatch, success_distance_m: float) -> dict[str, object]:

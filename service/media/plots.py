@@ -152,8 +152,16 @@ def plot_curves(run_dir: Path, kind: Literal["self-play", "skills", "distillatio
     return save(figure, run_dir / "curves.png")
 
 
+_SELF_PLAY = (
+    (_PANELS["random"].title, "evaluation/mixed_success_last"),
+    (_PANELS["bob"].title, "bob/success_rate"),
+)
+_TASKS = (("Evaluated", "evaluation/success_last"), ("While learning, with noise", "rollout/success_last"))
+"""Curves of a study, with their titles."""
+
+
 def plot_study(run_dirs: Mapping[str, Path], path: Path) -> Path:
-    """Draw the success of several runs side by side: on random goals, and on Alice's.
+    """Draw the success of several runs side by side: on random goals and on Alice's, or on their tasks.
 
     Args:
         run_dirs: run directories by label; one without metrics is left out.
@@ -169,15 +177,15 @@ def plot_study(run_dirs: Mapping[str, Path], path: Path) -> Path:
     if not found:
         raise TandemError(f"no run in {path.parent} has metrics yet; wait for a first iteration")
     figure = new_figure(14.0, 5.2, f"{path.parent.resolve().name}: {counted(len(found), 'run')}")
-    shown = (("random", "evaluation/mixed_success_last"), ("bob", "bob/success_rate"))
-    for axes, (name, key) in zip(figure.subplots(1, 2), shown, strict=True):
+    tasks = any("rollout/success_last" in record for records in found.values() for record in records[-1:])
+    for axes, (title, key) in zip(figure.subplots(1, 2), _TASKS if tasks else _SELF_PLAY, strict=True):
         style_axes(axes)
-        axes.set_title(f"{_PANELS[name].title}: {key.split('/')[1]}", loc="left", fontsize=12, weight="bold", color=INK)
+        axes.set_title(f"{title}: {key.split('/')[1]}", loc="left", fontsize=12, weight="bold", color=INK)
         axes.set_xlabel("million env steps", color=FAINT)
         axes.set_ylim(0.0, 1.0)
         ends = []
         for (label, records), color in zip(found.items(), cycle(_COLORS), strict=False):
-            curve = _Curve(name, key, label, color)
+            curve = _Curve(title, key, label, color)
             end = _draw_curve(axes, curve, column(records, "env_steps") / 1e6, column(records, key))
             ends += [(end, curve)] if end is not None else []
         axes.set_xlim(left=0.0)

@@ -17,7 +17,8 @@ from service.actors.evaluation import DeterministicPolicy, evaluate
 from service.actors.self_play import Players, SelfPlay, StochasticPolicy
 from service.baselines.coverage import skill_paths
 from service.baselines.frozen import FrozenSkills
-from service.config import Config, WorldConfig
+from service.config import WorldConfig
+from service.config.self_play import SelfPlayConfig
 from service.envs.batch import WorldBatch
 from service.envs.sampling import GoalKind
 from service.generator.bins import in_air
@@ -73,7 +74,7 @@ class RecordedEpisodes:
 
 
 def play_rounds(
-    config: Config, alice: StochasticPolicy, bob: DeterministicPolicy, *, num_rounds: int, seed: int
+    config: SelfPlayConfig, alice: StochasticPolicy, bob: DeterministicPolicy, *, num_rounds: int, seed: int
 ) -> list[RecordedRound]:
     """Play rounds from fresh resets and keep them as they come, whatever became of their goals.
 
@@ -90,7 +91,7 @@ def play_rounds(
 
 
 def record_rounds(
-    config: Config, alice: StochasticPolicy, bob: DeterministicPolicy, *, num_rounds: int, seed: int
+    config: SelfPlayConfig, alice: StochasticPolicy, bob: DeterministicPolicy, *, num_rounds: int, seed: int
 ) -> list[RecordedRound]:
     """Play rounds from fresh resets and keep the most interesting: valid goals, lifted ones first, far ones first.
 
@@ -162,7 +163,7 @@ def record_skills(
 
 
 def _play(
-    config: Config, alice: StochasticPolicy, bob: DeterministicPolicy, *, num_worlds: int, seed: int
+    config: SelfPlayConfig, alice: StochasticPolicy, bob: DeterministicPolicy, *, num_worlds: int, seed: int
 ) -> Iterator[tuple[GoalRecords, list[RecordedRound]]]:
     """Rounds of that many worlds at once, each from a fresh reset, without end."""
     rng = np.random.default_rng(seed)

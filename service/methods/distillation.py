@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 import logging
+from pathlib import Path
 
 import numpy as np
 import torch
 
 from service.actors.distillation import DistillationWorlds
 from service.actors.evaluation import EVALUATED_GOALS, EVALUATION_SEED, success_metrics
-from service.config import Config
+from service.config.distillation import DistillingConfig
+from service.config.world import ObservedConfig
 from service.envs.observations import layouts
 from service.errors import TandemError
-from service.generator.bins import GoalCells
+from service.generator.bins import CELL_SIZE_M, GoalCells
 from service.learner import transfer
 from service.learner.distillation import Distiller
 from service.methods.method import Iteration, Method, State
@@ -20,9 +22,9 @@ from service.policies import networks
 from service.policies.numpy_policy import NumpyMCPPolicy, numpy_bob
 from service.policies.parameters import Parameters
 from service.primitives.loading import Trained
+from service.primitives.publishing import measure_bob
 from service.store.models import GoalGrid
 from service.types import Arrays, Metrics, StateArray
-from service.world_config import ObservedConfig
 
 NUM_RECORDED_GOALS = 32
 """Goals of each iteration that the run directory keeps."""
@@ -33,7 +35,7 @@ class Distillation(Method):
     """DAgger with a teacher who sees the world as it will be when a command counts.
 
     Args:
-        config: the run, with ``distillation``.
+        config: the run.
         start_from: the teacher, from whom the student begins as well; None for a run that is resumed, which has him
             in its checkpoint.
 
@@ -41,9 +43,8 @@ class Distillation(Method):
         TandemError: a teacher without primitives, or who does not fit.
     """
 
-    def __init__(self, config: Config, start_from: Trained | None = None) -> None:
+    def __init__(self, config: DistillingConfig, start_from: Trained | None = None) -> None:
         super().__init__()
-        assert config.distillation is not None
         self._config, self._start_from = config, start_from
         with torch.random.fork_rng(devices=[]):
             torch.default_generator.manual_seed(config.seed)
@@ -51,7 +52,7 @@ class Distillation(Method):
                 networks.MCPPolicy(config.policy.bob, layouts=layouts(config.world)), config.distillation
             )
         self._rng = np.random.default_rng(config.seed)
-        self._cells = GoalCells(config.world, config.generator.cell_size_m)
+        self._cells = GoalCells(config.world, CELL_SIZE_M)
         self._tries, self._solved = (np.zeros(len(self._cells), dtype=np.int64) for _ in range(2))
         self._num_broken = 0
         self._teacher: Arrays = {}
@@ -98,6 +99,10 @@ class Distillation(Method):
             seed=EVALUATION_SEED,
             num_threads=run.num_threads,
         )
+
+    def measure(self) -> Metrics:
+        """Success of the newest Bob on every kind of goals."""
+        return measure_bob(self._config, self.parameters())
 
     def parameters(self) -> Parameters:
         """The newest Bob, as he is evaluated and published."""
@@ -173,3 +178,8 @@ class Distillation(Method):
         said = transfer.take_over(self._distiller.student, dict(start.networks["bob/policy"]), before, seen)
         self._distiller.begin()
         _logger.info("from %s: bob/policy: %s", start.reference, said)
+
+
+def make(config: DistillingConfig, registry: Path | str, start_from: Trained | None) -> Distillation:
+    """Make distillation; ``start_from`` is the teacher."""
+    return Distillation(config, start_from)

@@ -82,6 +82,15 @@ class Method(ABC):
         """Whether there is nothing more to learn; the run then ends before its budget is spent."""
         return False
 
+    @property
+    def remedy(self) -> str:
+        """What a user may do about a policy that has diverged."""
+        return "begin another run with a lower learning rate"
+
+    def measure(self) -> Metrics:
+        """Measure at the end what has been learned, on goals that chose nothing."""
+        return {}
+
     def start(self, state: State | None = None) -> None:
         """Begin, or continue from a state; ``iteration`` and ``num_env_steps`` have been set."""
         if state is not None:

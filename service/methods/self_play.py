@@ -13,15 +13,17 @@ import time
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
 from service.actors.evaluation import EVALUATED_GOALS
 from service.actors.rollout import Rollout, from_arrays, to_arrays
-from service.config import Config
+from service.config.self_play import SelfPlayConfig
 from service.envs.observations import layouts
 from service.errors import TandemError
 from service.generator.opponents import Opponents
+from service.learner.learner import torch_device
 from service.methods.method import Health, Iteration, Method, State
 from service.methods.workers import (
     GeneratorResult,
@@ -33,6 +35,7 @@ from service.methods.workers import (
 )
 from service.policies.parameters import Parameters
 from service.primitives.loading import Trained
+from service.primitives.publishing import measure_bob
 from service.store.models import GoalGrid
 from service.types import Metrics
 
@@ -58,7 +61,7 @@ class IterationResult:
 class SelfPlay(Method):
     """What self-play has in common wherever its workers are."""
 
-    def __init__(self, config: Config) -> None:
+    def __init__(self, config: SelfPlayConfig) -> None:
         super().__init__()
         self.config = config
         self._converged = False
@@ -67,6 +70,20 @@ class SelfPlay(Method):
     def converged(self) -> bool:
         """Whether the paper's stop criterion holds: no new goals, and Bob solves what is proposed."""
         return self._converged
+
+    @property
+    def remedy(self) -> str:
+        """Lower learning rates, with which the run may go on."""
+        learner = self.config.learner
+        rates = f"alice.learning_rate={learner.alice.learning_rate / 2:g} --set learner.bob.learning_rate="
+        return (
+            "resume with lower learning rates, for example --resume --set learner."
+            f"{rates}{learner.bob.learning_rate / 2:g}"
+        )
+
+    def measure(self) -> Metrics:
+        """Success of the newest Bob on every kind of goals."""
+        return measure_bob(self.config, self.parameters())
 
     def _finish(self, result: IterationResult) -> Iteration:
         """Count an iteration, and make its metrics."""
@@ -97,7 +114,7 @@ class LocalSelfPlay(SelfPlay):
         start_from: what a new run begins from; None: from nothing.
     """
 
-    def __init__(self, config: Config, start_from: Trained | None = None) -> None:
+    def __init__(self, config: SelfPlayConfig, start_from: Trained | None = None) -> None:
         super().__init__(config)
         self._incarnation = 0
         self._pending: Rollout | None = None
@@ -210,3 +227,13 @@ def _round_metrics(rounds: Sequence[RoundSummary]) -> Metrics:
         "world/num_broken": float(sum(each.num_diverged for each in rounds)),
         "time/play_s": float(np.mean([each.play_s for each in rounds])),
     }
+
+
+def check_here(config: SelfPlayConfig) -> None:
+    """Check that the learner's device is on this machine."""
+    torch_device(config.learner.device)
+
+
+def make(config: SelfPlayConfig, registry: Path | str, start_from: Trained | None) -> LocalSelfPlay:
+    """Make self-play in this process."""
+    return LocalSelfPlay(config, start_from)

@@ -5,6 +5,8 @@ An iteration is an episode of every world.
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 
 from service.actors.coverage import NUM_SKILLS, visited_share
@@ -12,11 +14,14 @@ from service.actors.evaluation import EVALUATION_SEED
 from service.baselines.coverage import skill_paths
 from service.baselines.frozen import FrozenSkills, export_skills
 from service.baselines.skills import IntrinsicBatches, SkillWorlds, make_skill_loop
-from service.config import Config
-from service.generator.bins import GoalCells, in_air
+from service.config.skills import SkillDiscoveryConfig
+from service.errors import ConfigError
+from service.generator.bins import CELL_SIZE_M, GoalCells, in_air
 from service.io.tensors import join_parts, split_parts
 from service.methods.method import Iteration, Method, State
 from service.policies.parameters import Parameters
+from service.primitives.loading import Trained
+from service.primitives.publishing import measure_skills
 from service.store.models import GoalGrid
 from service.types import Metrics
 
@@ -25,18 +30,17 @@ class SkillDiscovery(Method):
     """LSD, METRA, DADS or DIAYN.
 
     Args:
-        config: the run, with ``skills``.
+        config: the run.
     """
 
-    def __init__(self, config: Config) -> None:
+    def __init__(self, config: SkillDiscoveryConfig) -> None:
         super().__init__()
-        assert config.skills is not None
         self._config, self._skills = config, config.skills
         self._loop = make_skill_loop(config)
         assert isinstance(self._loop.worlds, SkillWorlds)
         assert isinstance(self._loop.make_batch, IntrinsicBatches)
         self._worlds, self._batches = self._loop.worlds, self._loop.make_batch
-        self._cells = GoalCells(config.world, config.generator.cell_size_m)
+        self._cells = GoalCells(config.world, CELL_SIZE_M)
         self._visits = np.zeros(len(self._cells), dtype=np.int64)  # ends of episodes that moved the object
 
     def step(self) -> Iteration:
@@ -63,6 +67,10 @@ class SkillDiscovery(Method):
             num_threads=self._config.run.num_threads,
         )
         return {"evaluation/coverage": visited_share(paths, self._config.world.workspace)}
+
+    def measure(self) -> Metrics:
+        """Coverage of random skills that chose nothing, without noise."""
+        return measure_skills(self._config, self.parameters())
 
     def parameters(self) -> Parameters:
         """The newest skills: the averaged actor, and the network that rewards come from."""
@@ -103,7 +111,7 @@ class SkillDiscovery(Method):
         distance = np.linalg.norm(end - start, axis=1)
         lower, upper = self._cells.bounds_m
         inside = ((end >= lower) & (end <= upper)).all(axis=1)
-        moved = inside & (distance > self._config.game.success_distance_m)
+        moved = inside & (distance > self._config.success_distance_m)
         self._visits += self._cells.count(end[moved])
         lifted = inside & in_air(end, self._config.world.rest_height_m)
         return {
@@ -113,3 +121,19 @@ class SkillDiscovery(Method):
             "skills/distance_m": float(distance[inside].mean()) if inside.any() else 0.0,
             "skills/num_cells_seen": float(np.count_nonzero(self._visits)),
         }
+
+
+def begin(config: SkillDiscoveryConfig, registry: Path | str, start_from: Trained | None) -> SkillDiscoveryConfig:
+    """The configuration as it is.
+
+    Raises:
+        ConfigError: it cannot begin from what another run has learned.
+    """
+    if start_from is not None:
+        raise ConfigError("--from is for self-play; skill discovery begins anew: leave it out")
+    return config
+
+
+def make(config: SkillDiscoveryConfig, registry: Path | str, start_from: Trained | None) -> SkillDiscovery:
+    """Make skill discovery."""
+    return SkillDiscovery(config)

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from service.actors.evaluation import EVALUATION_SEED, success_metrics
 from service.actors.rollout import Diverged, Rollout
 from service.actors.self_play import Players, SelfPlay, StochasticPolicy
-from service.config import Config
+from service.config.self_play import SelfPlayConfig
 from service.envs.sampling import GoalKind
 from service.envs.scene import build_layout
 from service.generator.bins import GoalCells, TaskBins
@@ -89,7 +89,7 @@ class RolloutWorker:
         num_threads: native threads for physics; 0 for one per core.
     """
 
-    def __init__(self, config: Config, actor: int = 0, incarnation: int = 0, *, num_threads: int = 0) -> None:
+    def __init__(self, config: SelfPlayConfig, actor: int = 0, incarnation: int = 0, *, num_threads: int = 0) -> None:
         self._config, self._num_threads = config, num_threads
         source = config.seed if (actor, incarnation) == (0, 0) else [config.seed, actor, incarnation]
         self.rng = np.random.default_rng(source)
@@ -169,7 +169,7 @@ class GeneratorWorker:
         state: to continue from; None to start.
     """
 
-    def __init__(self, config: Config, state: Mapping[str, NDArray[Any]] | None = None) -> None:
+    def __init__(self, config: SelfPlayConfig, state: Mapping[str, NDArray[Any]] | None = None) -> None:
         layout = build_layout(config.world, blocked_fraction=config.game.blocked_gripper_fraction)
         self.generator = TaskGenerator(config, layout)
         self._opponents_version = 0
@@ -232,7 +232,7 @@ class LearnerWorker:
         state: to continue from; None to start.
     """
 
-    def __init__(self, config: Config, state: Arrays | None = None) -> None:
+    def __init__(self, config: SelfPlayConfig, state: Arrays | None = None) -> None:
         import torch  # here, not where runs are only read
 
         from service.learner.learner import Learner

@@ -10,6 +10,7 @@ from typing import Literal
 import numpy as np
 
 from service.actors.self_play import StochasticPolicy
+from service.config.self_play import GameConfig, SelfPlayConfig
 from service.envs.batch import WorldBatch
 from service.envs.observations import bob_observation
 from service.envs.obstacles import inside_fixtures
@@ -41,7 +42,8 @@ class Game:
     """
 
     def __init__(self, players: Trained, seed: int = 0) -> None:
-        rules, on_task = players.config.game, players.task is not None
+        config, on_task = players.config, players.task is not None
+        rules = config.game if isinstance(config, SelfPlayConfig) else GameConfig()
         self.players, self.title, self.world = players, players.title, players.world
         self.bob = players.policy
         acting = players.trained or players

@@ -16,7 +16,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from service.config import MCPConfig, MLPConfig, PolicyConfig
+from service.config.self_play import MCPConfig, MLPConfig, PolicyConfig
 from service.envs.observations import ACTION, PAPER, POSITIONS, Layouts, Normalisation, ObservationLayout
 from service.policies.forward import INPUT_CLIP, MEAN_BOUND, compose
 from service.types import FloatArray

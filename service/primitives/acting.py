@@ -8,7 +8,7 @@ from __future__ import annotations
 from typing import Any
 
 from service.config import Config, parse_config
-from service.config_tree import group_of
+from service.config.tree import group_of
 
 ACTING = (
     "name",
@@ -44,4 +44,8 @@ def acting_config(tree: dict[str, Any], *, where: str) -> Config:
         if isinstance(found, dict) and last in found:
             group, name = group_of(acting, key, where=where)
             group[name] = found[last]
+    if "skills" in acting:
+        acting["method"] = "skills"
+        acting.pop("policy", None)
+        acting.pop("game", None)
     return parse_config(acting, where=where)

@@ -1,4 +1,4 @@
-"""Policies that were learned for a task, in NumPy: what their networks see, what they set, and their file.
+"""Policies that were learned for a task, in NumPy: what their networks see, and what they set.
 
 Such a policy sets the weights of frozen primitives, sets the skill of frozen skills, or acts by itself. Torch and
 Gymnasium are not needed to act.
@@ -6,33 +6,20 @@ Gymnasium are not needed to act.
 
 from __future__ import annotations
 
-import json
-from pathlib import Path
-from typing import Any, NamedTuple
-
 import numpy as np
 
 from service.baselines.frozen import FrozenSkills
 from service.envs.observations import GOAL_FROM_OBJECT, PAPER, POSITIONS, Layouts
-from service.errors import TandemError
-from service.io.files import os_errors, write_atomic
-from service.io.tensors import decode, encode, read_metadata
-from service.parsing import parse_json
 from service.policies import forward
 from service.policies.forward import INPUT_CLIP
 from service.policies.numpy_policy import NumpyMCPPolicy
 from service.policies.parameters import Parameters, PolicyError
-from service.regular_files import read_regular
 from service.sac.inputs import NUM_MOTION_INPUTS, motion_inputs
 from service.sac.numpy_actor import numpy_actor
 from service.types import FloatArray
 
-POLICY_FILE = "policy.safetensors"
-MAX_BYTES = 1024**3
-"""Of a policy's file; usual are some hundred thousand."""
 RESIDUAL = 0.5
 """Size of the greatest action that a policy with a residual adds to the composition."""
-_KEY = "downstream_policy"
 _GOAL = PAPER.bob["goal"]
 _GOAL_OFFSET, _GOAL_SCALE = PAPER.bob.normalisation.offset[_GOAL], PAPER.bob.normalisation.scale[_GOAL]
 Frozen = NumpyMCPPolicy | FrozenSkills | None
@@ -145,40 +132,3 @@ class LearnedPolicy:
             self._held = self._actor(learner_inputs(previous, positions, goal, self._seen))
         self._num_steps, self._previous = self._num_steps + 1, positions.copy()
         return robot_actions(self._acts_with, previous, positions, self._held)
-
-
-class SavedPolicy(NamedTuple):
-    """Content of a policy's file."""
-
-    parameters: Parameters
-    primitives: dict[str, Any] | None
-    """Name and digest of what it acts with; None: it acts by itself."""
-    hold_steps: int
-
-
-def save_policy(
-    path: Path, parameters: Parameters, method: str, primitives: dict[str, Any] | None, hold_steps: int = 1
-) -> None:
-    """Write an actor's parameters, its method, and which primitives or skills it acts with.
-
-    Raises:
-        TandemError: the file cannot be written.
-    """
-    about = {"method": method, "primitives": primitives, "hold_steps": hold_steps}
-    with os_errors("write", path):
-        write_atomic(path, encode(parameters, {_KEY: json.dumps(about)}))
-
-
-def read_policy(path: Path) -> SavedPolicy:
-    """Read what ``save_policy`` wrote.
-
-    Raises:
-        TandemError: no such file, or damaged.
-    """
-    with os_errors("read", path):
-        data = read_regular(path, MAX_BYTES, follow=True)
-    try:
-        about: dict[str, Any] = dict(parse_json(read_metadata(data)[_KEY], path))
-        return SavedPolicy(decode(data), about["primitives"], about.get("hold_steps", 1))
-    except (KeyError, TypeError, ValueError) as error:
-        raise TandemError(f"{path} is no policy of a downstream training ({error}); take {POLICY_FILE}") from None

@@ -13,23 +13,22 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from service.baselines.frozen import FrozenSkills, ZeroShotPolicy
 from service.config import Config, WorldConfig
+from service.config.skills import SkillDiscoveryConfig
+from service.config.task import TaskConfig
 from service.envs.observations import layouts
 from service.envs.tasks import EPISODE_STEPS, SUCCESS_DISTANCE_M, find_task
 from service.errors import ConfigError, TandemError
 from service.io.checkpoints import Checkpoint, CheckpointStore, read_checkpoint
-from service.io.files import os_errors
-from service.io.run_directory import TRIAL_FILE, Published, RunDirectory
+from service.io.run_directory import Published, RunDirectory
 from service.io.tensors import digest_of, split_parts
-from service.parsing import ParseError, parse_json
 from service.policies.numpy_policy import NumpyGaussianPolicy, NumpyMCPPolicy, NumpyPolicy, numpy_bob
 from service.policies.parameters import Parameters, PolicyError
 from service.primitives.acting import acting_config
 from service.primitives.bundled import BUNDLED, find_version, is_bundled
 from service.primitives.digest import parameters_digest
-from service.primitives.learned import POLICY_FILE, LearnedPolicy, read_policy
+from service.primitives.learned import LearnedPolicy
 from service.registry.exported import is_exported
 from service.registry.manifest import Manifest
-from service.regular_files import read_regular
 from service.types import FloatArray
 
 if TYPE_CHECKING:
@@ -42,9 +41,10 @@ PRIMITIVES: Kind = "primitives"
 SKILLS: Kind = "skills"
 """Part of a run's checkpoint that holds frozen skills, and kind in the spaces of their manifest."""
 ORCHESTRATOR: Kind = "orchestrator"
+_TRIAL_FILE = "cell.json"
+"""Is in the directories of downstream trainings of version 0.2."""
 _DESCRIPTION = "policy.json"
 """Is in the folders that ``tandem export`` writes."""
-_MAX_JSON_BYTES = 64 * 1024 * 1024
 _SHOWN = 12
 """Characters of a digest in messages."""
 
@@ -87,7 +87,7 @@ class Trained:
         if self.manifest is not None:
             return self.manifest.reference
         if self.kind == ORCHESTRATOR or self.path is None:
-            return self.config.name
+            return self.config.directory_name
         return f"{self.config.name} of the run {self.path.resolve().name}"
 
     @property
@@ -132,7 +132,7 @@ class Trained:
     @property
     def success_distance_m(self) -> float:
         """Greatest distance from object to goal that counts as success."""
-        return self.config.game.success_distance_m if self.task is None else SUCCESS_DISTANCE_M
+        return self.config.success_distance_m if self.task is None else SUCCESS_DISTANCE_M
 
     @property
     def primitives(self) -> NumpyMCPPolicy:
@@ -232,17 +232,17 @@ def load(reference: str, registry: Path | str = "registry", primitives: str | No
     is_place = path.is_dir() or "/" in reference or (path.suffix == ".safetensors" and path.is_file())
     if is_exported(path) or not is_place:
         found = _load_version(reference, registry, primitives)
-    elif (path / TRIAL_FILE).exists():
-        found = _load_training(path, registry, primitives)
+    elif (path / _TRIAL_FILE).exists():
+        raise TandemError(f"{reference} is a downstream training of tandem 0.2: use tandem 0.2, or train it again")
     elif (path / _DESCRIPTION).exists():
         raise TandemError(
             f"{reference} is a folder of tandem export, made for use without tandem: name what it was made of, as its "
             "README.md says"
         )
     elif path.is_dir():
-        found = _load_run(reference, RunDirectory(path), None)
+        found = _load_run(reference, RunDirectory(path), None, (registry, primitives))
     elif path.is_file():
-        found = _load_run(reference, RunDirectory(path.absolute().parent.parent), path)
+        found = _load_run(reference, RunDirectory(path.absolute().parent.parent), path, (registry, primitives))
     else:
         raise TandemError(
             f"{reference}: no such directory of a run, training or exported version; for published versions write "
@@ -259,7 +259,7 @@ def read_stages(directory: RunDirectory) -> dict[int, Parameters]:
     Raises:
         TandemError: a snapshot is damaged, or there is no usable checkpoint.
     """
-    part = "bob" if directory.read_config().skills is None else SKILLS
+    part = directory.read_config().part
     store = CheckpointStore(directory.snapshots, keep=1)
     saved = [read_checkpoint(store.path(step)) for step in store.steps()]
     saved.append(CheckpointStore(directory.checkpoints, keep=1).load_latest())
@@ -288,7 +288,7 @@ def _load_version(reference: str, registry: Path | str, primitives: str | None) 
         )
     config = acting_config(manifest.config, where=f"the manifest of {reference}")
     try:
-        if kind == SKILLS and config.skills is not None:
+        if isinstance(config, SkillDiscoveryConfig):
             player = ZeroShotPolicy(FrozenSkills(parameters, config.skills.method))
             return Trained(label, SKILLS, config, player, parameters, manifest, path)
         if kind == PRIMITIVES:
@@ -299,7 +299,7 @@ def _load_version(reference: str, registry: Path | str, primitives: str | None) 
     raise TandemError(f"{label} is of the kind {kind!r}, which this tandem cannot load; load it with a newer one")
 
 
-def _load_run(label: str, directory: RunDirectory, file: Path | None) -> Trained:
+def _load_run(label: str, directory: RunDirectory, file: Path | None, place: tuple[Path | str, str | None]) -> Trained:
     """What a run has learned: in a checkpoint or snapshot of it, or in the newest checkpoint."""
     if file is not None and not directory.exists:
         raise ConfigError(f"{label} is a file, and no checkpoint of a run: name a run, or a version as NAME@ALIAS")
@@ -308,52 +308,31 @@ def _load_run(label: str, directory: RunDirectory, file: Path | None) -> Trained
         CheckpointStore(directory.checkpoints, keep=1).load_latest() if file is None else read_checkpoint(file)
     )
     parts, path = split_parts(saved.arrays), file or directory.path
-    if config.skills is not None:
-        parameters = parts[SKILLS]
+    if config.makes is None or config.part not in parts:
+        raise TandemError(f"{label} is a run of the method {config.method}, which makes nothing that can be loaded")
+    parameters = parts[config.part]
+    if isinstance(config, SkillDiscoveryConfig):
         skills = ZeroShotPolicy(FrozenSkills(parameters, config.skills.method))
         return Trained(label, SKILLS, config, skills, parameters, path=path)
-    networks: dict[str, Parameters] = {"bob/policy": parts["bob"]}
-    if "learner" in parts and config.is_self_play:
+    if isinstance(config, TaskConfig):
+        trained = None
+        if config.primitives_digest is not None:
+            wanted = {"name": config.primitives, "digest": config.primitives_digest}
+            trained = _find_frozen(label, wanted, *place)
+        policy = _learned(parameters, trained, config, config.hold_steps)
+        about: dict[str, Any] = {"task": config.task, "method": config.method, "trained": trained}
+        return Trained(label, ORCHESTRATOR, config, policy, parameters, path=path, **about)
+    networks: dict[str, Parameters] = {"bob/policy": parameters}
+    alice = None
+    if "learner" in parts and "alice" in parts:
         learner = {player: split_parts(own) for player, own in split_parts(parts["learner"]).items()}
         networks = {
             f"{player}/{part}": learner[player][part] for player in ("bob", "alice") for part in ("policy", "value")
         }
-    alice = NumpyGaussianPolicy(parts["alice"]) if "alice" in parts and config.is_self_play else None
-    bob = numpy_bob(parts["bob"])
-    return Trained(label, PRIMITIVES, config, bob, parts["bob"], path=path, networks=networks, alice=alice)
-
-
-def _load_training(path: Path, registry: Path | str, primitives: str | None) -> Trained:
-    """What a downstream training has learned; one that learns nothing has the policy of what it was given."""
-    file = path / TRIAL_FILE
-    about = _read_json(file)
-    try:
-        task, method, seed = (about["cell"][key] for key in ("task", "method", "seed"))
-        wanted, world = about["primitives"], about["world"]
-    except (KeyError, TypeError) as error:
-        raise TandemError(f"{file} lacks {error}: it is no file of a downstream training") from None
-    name = f"{task}-{method}-{seed}"
-    config = acting_config({"name": name, "world": world}, where=str(file))
-    trained = None if wanted is None else _find_frozen(str(path), wanted, registry, primitives)
-    if trained is not None:
-        config = trained.config.model_copy(update={"name": name})
-    common: dict[str, Any] = {"path": path, "task": task, "method": method, "trained": trained}
-    if not (path / POLICY_FILE).exists():
-        result = path / "result.json"
-        if not result.exists():
-            how = f"tandem downstream train --resume --run-dir {path}"
-            raise TandemError(f"{path} has not ended: continue it with {how}")
-        if _read_json(result).get("env_steps") != 0:
-            raise TandemError(f"{path} has ended, but its {POLICY_FILE} is gone: train it again")
-        from service.actors.evaluation import IdlePolicy  # with the physics, which nothing else here needs
-
-        policy = IdlePolicy() if trained is None else trained.policy
-        return Trained(str(path), ORCHESTRATOR, config, policy, {}, **common)
-    saved = read_policy(path / POLICY_FILE)
-    if saved.primitives != wanted:
-        raise TandemError(f"{path / POLICY_FILE} is of another training than {file}: it acts with other primitives")
-    learned = _learned(saved.parameters, trained, config, saved.hold_steps)
-    return Trained(str(path), ORCHESTRATOR, config, learned, saved.parameters, **common)
+        alice = NumpyGaussianPolicy(parts["alice"])
+    return Trained(
+        label, PRIMITIVES, config, numpy_bob(parameters), parameters, path=path, networks=networks, alice=alice
+    )
 
 
 def _learned(parameters: Parameters, trained: Trained | None, config: Config, hold_steps: int) -> LearnedPolicy:
@@ -382,12 +361,3 @@ def _find_frozen(label: str, wanted: dict[str, Any], registry: Path | str, named
         f"{label} acts with {name} of digest {digest[:_SHOWN]}, which is not here: {problems[0]}; "
         "name it with --primitives, or the registry that has it with --registry"
     )
-
-
-def _read_json(path: Path) -> dict[str, Any]:
-    with os_errors("read", path):
-        data = read_regular(path, _MAX_JSON_BYTES, follow=True)
-    try:
-        return dict(parse_json(data, path))
-    except (ParseError, TypeError, ValueError) as error:
-        raise TandemError(f"{path} is no JSON object: {error}") from None

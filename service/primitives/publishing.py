@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 from service.actors.coverage import NUM_SKILLS, visited_share
@@ -11,20 +12,21 @@ from service.actors.evaluation import EVALUATED_GOALS, REPORTED_SEED, success_me
 from service.baselines.coverage import skill_paths
 from service.baselines.frozen import FrozenSkills
 from service.config import Config
+from service.config.skills import SkillDiscoveryConfig, SkillsConfig
+from service.config.task import TaskConfig
 from service.envs.observations import POSITIONS, SPACES, layouts
+from service.errors import TandemError
 from service.io import tensors
 from service.io.errors import StorageError
 from service.io.run_directory import Published, RunDirectory
-from service.off_policy_config import SkillsConfig
 from service.policies.numpy_policy import numpy_bob
 from service.policies.parameters import Parameters
-from service.primitives.bundled import find_version
-from service.primitives.loading import SKILLS
+from service.primitives.bundled import BUNDLED, find_version
+from service.primitives.learned import num_inputs
+from service.primitives.loading import ORCHESTRATOR, PRIMITIVES, SKILLS
 from service.registry.blobs import sha256_of
-from service.registry.names import Version
+from service.registry.names import Version, is_service
 from service.registry.registry import Registry
-
-FINAL_EVALUATION_EPISODES = 300
 
 
 def measure_bob(config: Config, parameters: Parameters) -> dict[str, float]:
@@ -41,7 +43,7 @@ def measure_bob(config: Config, parameters: Parameters) -> dict[str, float]:
             numpy_bob(parameters),
             world,
             EVALUATED_GOALS,
-            FINAL_EVALUATION_EPISODES,
+            config.run.final_episodes,
             seed=REPORTED_SEED,
             num_threads=config.run.num_threads,
         )
@@ -49,9 +51,8 @@ def measure_bob(config: Config, parameters: Parameters) -> dict[str, float]:
     return metrics
 
 
-def measure_skills(config: Config, parameters: Parameters) -> dict[str, float]:
+def measure_skills(config: SkillDiscoveryConfig, parameters: Parameters) -> dict[str, float]:
     """Share of the workspace's table that random skills move the object over, without noise."""
-    assert config.skills is not None
     paths = skill_paths(
         FrozenSkills(parameters, config.skills.method),
         config.world,
@@ -93,25 +94,75 @@ def publish(
     parent: str | Version | None = None,
     history: Mapping[str, Any] | None = None,
 ) -> Version:
-    """Publish Bob, or the skills of a run that has ``config.skills``, with everything a user needs.
-
-    The spaces in the manifest say which of the two they are.
+    """Publish what a run has learned, with everything a user needs; the spaces in the manifest say what it is.
 
     Raises:
         StorageError: see ``Registry.publish``.
     """
-    seen = layouts(config.world)
-    normalisation = seen.bob.normalisation if config.skills is None else POSITIONS.normalisation
     return registry.publish(
         config.name,
         parameters,
-        spaces=seen.spaces if config.skills is None else skill_spaces(config.skills),
-        normalisation={"offset": normalisation.offset.tolist(), "scale": normalisation.scale.tolist()},
+        **_described(config),
         config=config.model_dump(mode="json"),
         metrics=metrics,
         parent=parent,
         history=history,
     )
+
+
+def check_publishable(config: Config, registry: Path | str) -> None:
+    """Check that what a run makes can be published in a registry.
+
+    Raises:
+        TandemError: a registry that is only read; or a name that is that of something else; or, of a policy of a task,
+            primitives that are not published.
+    """
+    if is_service(registry):
+        raise TandemError(f"{registry} is read only: publish in a directory (--registry DIR), and serve that")
+    target = Registry(Path(registry))
+    target.check_writable()
+    for place in (target, Registry(BUNDLED)):  # of either, NAME@latest would come to mean something else
+        for version in place.versions(config.name)[-1:]:
+            with contextlib.suppress(StorageError):  # a damaged version is mended by publishing again
+                kind = place.manifest(str(version)).spaces.get("kind", PRIMITIVES)
+                if config.makes not in (None, kind):
+                    what = f"an {kind}" if kind == ORCHESTRATOR else kind
+                    raise TandemError(f"{config.name} is the name of {what} already: choose another name")
+    if not isinstance(config, TaskConfig):
+        return
+    if config.primitives_digest is None:
+        raise TandemError(f"the method {config.method} acts with no primitives: there is nothing to publish")
+    if Path(config.primitives).is_absolute():
+        raise TandemError(
+            f"an orchestrator for {config.primitives}, which is no published version, cannot be published: publish "
+            "that first, and name it by --primitives NAME@VERSION"
+        )
+
+
+def _described(config: Config) -> dict[str, Any]:
+    """Spaces and normalisation in the manifest of what a run makes."""
+    seen = layouts(config.world)
+    if isinstance(config, TaskConfig):
+        spaces = {
+            **seen.spaces,
+            "kind": ORCHESTRATOR,
+            "task": config.task,
+            "task_version": config.task_version,
+            "method": config.method,
+            "hold_steps": config.hold_steps,
+            "primitives": config.primitives,
+            "primitives_digest": config.primitives_digest,
+        }
+        return {
+            "spaces": spaces,
+            "normalisation": {"made_by": num_inputs.__module__, "num_inputs": num_inputs(seen)[1]},
+        }
+    if isinstance(config, SkillDiscoveryConfig):
+        normalisation, spaces = POSITIONS.normalisation, skill_spaces(config.skills)
+    else:
+        normalisation, spaces = seen.bob.normalisation, seen.spaces
+    constants = {"offset": normalisation.offset.tolist(), "scale": normalisation.scale.tolist()}
+    return {"spaces": spaces, "normalisation": constants}
 
 
 def skill_spaces(skills: SkillsConfig) -> dict[str, object]:

@@ -8,6 +8,8 @@ import numpy as np
 
 from service.baselines.frozen import FrozenSkills
 from service.config import Config
+from service.config.self_play import SelfPlayConfig
+from service.config.skills import SkillDiscoveryConfig
 from service.envs.observations import ACTION, POSITIONS, layouts
 from service.errors import TandemError
 from service.policies.numpy_policy import NumpyMCPPolicy
@@ -31,7 +33,7 @@ def network_problems(manifest: Manifest, arrays: Mapping[str, np.ndarray]) -> It
     try:
         if manifest.spaces.get("kind") == ORCHESTRATOR:
             numpy_actor(dict(arrays))
-        elif "policy" in manifest.config:
+        elif manifest.config.keys() & {"policy", "skills"}:
             config = acting_config(manifest.config, where=f"the manifest of {manifest.reference}")
             yield from _problems(config, arrays)
     except TandemError as error:
@@ -40,10 +42,11 @@ def network_problems(manifest: Manifest, arrays: Mapping[str, np.ndarray]) -> It
 
 def expected_shapes(config: Config) -> Shapes:
     """Shape of every parameter that a run publishes, by name: of Bob, or of skills (``frozen.export_skills``)."""
-    if config.skills is None:
+    if isinstance(config, SelfPlayConfig):
         bob, seen = config.policy.bob, layouts(config.world)
         heads = bob.num_primitives, bob.primitive_hidden_size
         return bob_shapes(seen.positions.size, bob.trunk_hidden_sizes, heads, bob.gate_hidden_sizes)
+    assert isinstance(config, SkillDiscoveryConfig)
     skills = config.skills
     if skills.method == "dads":
         network = _OBJECT_SIZE + skills.size, *skills.hidden_sizes, _OBJECT_SIZE
@@ -59,7 +62,7 @@ def _problems(config: Config, arrays: Mapping[str, np.ndarray]) -> Iterator[str]
         yield f"{misfit}, by the configuration of the manifest; publish it again"
     if found:
         return
-    if config.skills is None:
-        NumpyMCPPolicy(arrays)
-    else:
+    if isinstance(config, SkillDiscoveryConfig):
         FrozenSkills(arrays, config.skills.method)
+    else:
+        NumpyMCPPolicy(arrays)

@@ -10,7 +10,7 @@ from typing import Any
 
 from pydantic import Field, JsonValue, StrictInt, ValidationError
 
-from service.frozen import FrozenModel
+from service.config.frozen import FrozenModel
 from service.io.errors import FormatVersionError
 from service.parsing import ParseError, parse_json
 from service.registry.errors import DamagedBlobError, RegistryError

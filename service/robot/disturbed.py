@@ -10,7 +10,7 @@ from typing import Generic, Protocol, TypeVar
 import numpy as np
 from pydantic import Field
 
-from service.frozen import FrozenModel
+from service.config.frozen import FrozenModel
 from service.robot.interface import Command, ObjectPose, PoseSource, RobotInterface, RobotState
 
 _SAME_TIME_S = 1e-9

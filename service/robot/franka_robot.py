@@ -19,13 +19,13 @@ from typing import Any
 import numpy as np
 from pydantic import Field, ValidationError
 
+from service.config.frozen import FrozenModel
+from service.config.world import Point, WorldConfig
 from service.errors import TandemError, one_line
 from service.extras import needs_extra
-from service.frozen import FrozenModel
 from service.robot.backends import Backend, first_error
 from service.robot.errors import RobotError
 from service.robot.interface import Command, ObjectPose, PoseSource, RobotState
-from service.world_config import Point, WorldConfig
 
 _DOWN = (1.0, 0.0, 0.0, 0.0)  # x y z w
 _MOST_TILT_RAD = 0.2

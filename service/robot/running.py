@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from service.config.world import WorldConfig
 from service.envs.obstacles import inside_fixtures
 from service.envs.sampling import draw_goals, draw_starts
 from service.errors import TandemError
@@ -15,7 +16,6 @@ from service.robot.backends import Backend
 from service.robot.errors import RobotError
 from service.robot.loop import Bridge
 from service.types import StateArray
-from service.world_config import WorldConfig
 
 _ROUNDING_M = 1e-6
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from pydantic import Field
 
-from service.frozen import FrozenModel
+from service.config.frozen import FrozenModel
 from service.robot.interface import ObjectPose, RobotState
 from service.types import StateArray
 

@@ -11,10 +11,11 @@ from types import TracebackType
 from typing import Any, Literal, Self
 
 from service.config import Config
+from service.config.task import TaskConfig
 from service.io.errors import RunTakenError
 from service.liveness import work_done
 from service.runs.run import Run
-from service.store.models import CONDITIONS, RunState, RunStatus, RunTotals
+from service.store.models import CONDITIONS, RunState, RunStatus, RunTotals, Trial
 from service.store.run_writer import GOALS_INTERVAL_S, RunWriter
 
 BEAT_S = 2.0
@@ -62,6 +63,7 @@ class Report:
             heartbeat=now,
             epoch=epoch,
             total_env_steps=config.run.total_env_steps,
+            trial=_trial_of(config),
             published=published,
             totals=previous.totals if previous is not None else RunTotals(),
         )
@@ -160,6 +162,25 @@ class Report:
             warnings=health.warnings,
         )
 
+    def measured(self, metrics: Mapping[str, float]) -> None:
+        """Tell how well the run does in the end; of a task that is shown beside its name."""
+        trial = self._status.trial
+        if trial is None:
+            return
+        found = {name: metrics.get(f"evaluation/{name}") for name in ("success_last", "success_ever")}
+        low, high = (metrics.get(f"evaluation/success_last_{end}") for end in ("low", "high"))
+        self._tell(
+            trial=trial.model_copy(
+                update={
+                    "success": found["success_last"],
+                    "success_low": low,
+                    "success_high": high,
+                    "success_ever": found["success_ever"],
+                    "num_episodes": int(metrics.get("evaluation/num_episodes", 0)) or None,
+                }
+            )
+        )
+
     def stop_requested(self) -> bool:
         """Whether somebody asked the run to stop."""
         return self._writer.stop_requested()
@@ -188,3 +209,17 @@ class Report:
         changes |= {"heartbeat": datetime.now(UTC), "condition": condition, "warnings": warnings}
         self._status = self._status.model_copy(update=changes)
         self._writer.status(self._status)
+
+
+def _trial_of(config: Config) -> Trial | None:
+    """What a run that learns a task is about; None for others."""
+    if not isinstance(config, TaskConfig):
+        return None
+    has = config.primitives_digest is not None
+    return Trial(
+        task=config.task,
+        method=config.method,
+        seed=config.seed,
+        primitives=config.primitives if has else None,
+        primitives_digest=config.primitives_digest,
+    )

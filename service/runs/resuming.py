@@ -3,25 +3,22 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 from service.config import Config, load_config
+from service.config.tree import leaves
 from service.errors import ConfigError
 from service.io.errors import CheckpointError
 from service.io.run_directory import RunDirectory
-from service.io.study_directory import StudyDirectory
-
-RESUMABLE = ("run.", "learner.alice.learning_rate=", "learner.bob.learning_rate=")
-"""What an override of a resumed run may begin with: nothing that its past would have to be made again for."""
+from service.runs.study_file import SavedConfig
 
 
-def resumed_config(directory: RunDirectory | StudyDirectory, overrides: list[str], file: Path | None = None) -> Config:
-    """The configuration to resume a run with: the saved one, where only ``RESUMABLE`` may be changed.
+def resumed_config(directory: RunDirectory | SavedConfig, overrides: list[str], file: Path | None = None) -> Config:
+    """The configuration to resume a run with: the saved one, changed only where its class says it is ``resumable``.
 
     Args:
-        directory: of the run, or of a study.
+        directory: of the run; or what a run of a study begins with.
         overrides: ``run.a=b`` strings, or learning rates; others may only say what the run has.
         file: YAML that, with ``overrides``, says the same as the saved one outside ``run``; what it says there comes
             before ``overrides``.
@@ -30,30 +27,38 @@ def resumed_config(directory: RunDirectory | StudyDirectory, overrides: list[str
         ConfigError: no run there, an override of anything else, or a file that says otherwise.
     """
     saved = directory.read_config()
-    fixed = [override for override in overrides if not override.startswith(RESUMABLE)]
+    fixed = [override for override in overrides if not override.startswith(saved.resumable)]
     for override in fixed:
         if not _says(saved, directory, override):
             raise ConfigError(
-                f"override {override!r}: a resumed run keeps its configuration; only run.* and the learning rates may "
-                "change, for example run.total_env_steps"
+                f"override {override!r}: a resumed run keeps its configuration; only {_resumable(saved)} may change, "
+                "for example run.total_env_steps"
             )
     if file is not None:
         given = load_config(file, fixed)
-        _check_same_outside_run(saved, given, file)
+        _check_same_outside_run(saved, _as_in(saved, given), file)
         named = given.run.model_dump(mode="json", exclude_unset=True)
         overrides = [f"run.{key}={json.dumps(value)}" for key, value in named.items()] + overrides
-    return directory.read_config(overrides)
+    return directory.read_config([override for override in overrides if override not in fixed])
 
 
-def _says(saved: Config, directory: RunDirectory | StudyDirectory, override: str) -> bool:
+def _resumable(config: Config) -> str:
+    return " and ".join(key.rstrip("=") if key.endswith("=") else f"{key}*" for key in config.resumable)
+
+
+def _says(saved: Config, directory: RunDirectory | SavedConfig, override: str) -> bool:
     try:
-        return directory.read_config([override]) == saved
+        return _as_in(saved, directory.read_config([override])) == saved
     except ConfigError:
         return False
 
 
+def _as_in(saved: Config, given: Config) -> Config:
+    return given.as_in(saved) if type(given) is type(saved) else given
+
+
 def _check_same_outside_run(saved: Config, given: Config, file: Path) -> None:
-    left, right = (dict(_leaves(config.model_dump(mode="json", exclude={"run"}))) for config in (saved, given))
+    left, right = (dict(leaves(config.model_dump(mode="json", exclude={"run"}))) for config in (saved, given))
     for key in sorted(left.keys() | right.keys()):
         if left.get(key) != right.get(key):
             raise ConfigError(
@@ -62,12 +67,10 @@ def _check_same_outside_run(saved: Config, given: Config, file: Path) -> None:
             )
 
 
-def _leaves(tree: dict[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
-    for key, value in tree.items():
-        if isinstance(value, dict):
-            yield from _leaves(value, f"{prefix}{key}.")
-        else:
-            yield prefix + key, value
+def resumable_settings(config: Config) -> list[str]:
+    """All that may differ from what a run was begun with, as overrides."""
+    settings = leaves(config.model_dump(mode="json"))
+    return [f"{key}={json.dumps(value)}" for key, value in settings if f"{key}=".startswith(config.resumable)]
 
 
 def changed_settings(saved: dict[str, Any], config: Config, directory: Path) -> dict[str, tuple[Any, Any]]:
@@ -81,10 +84,10 @@ def changed_settings(saved: dict[str, Any], config: Config, directory: Path) -> 
     Raises:
         CheckpointError: a setting that may not change.
     """
-    was, now = dict(_leaves(saved)), dict(_leaves(config.model_dump(mode="json")))
+    was, now = dict(leaves(saved)), dict(leaves(config.model_dump(mode="json")))
     changed = {key: (was.get(key), now.get(key)) for key in {**was, **now} if was.get(key) != now.get(key)}
     for key, (old, new) in changed.items():
-        if not f"{key}=".startswith(RESUMABLE):
+        if not f"{key}=".startswith(config.resumable):
             raise CheckpointError(
                 f"{directory}: {key} is {new!r} in config.yaml, but its newest checkpoint was made with {old!r}; put "
                 "that back, or start another run without --resume"

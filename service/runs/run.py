@@ -214,15 +214,13 @@ class Run:
         try:
             yield
         except (DivergedError, PolicyError) as error:
-            checkpoints, learner = self.saves.checkpoints, self.config.learner
+            checkpoints = self.saves.checkpoints
             newest = checkpoints.newest()
             is_played = newest is not None and checkpoints.steps()[-1] == played
             has_it = f"delete {newest.name}, which has this policy; " if newest is not None and is_played else ""
-            rates = f"alice.learning_rate={learner.alice.learning_rate / 2:g} --set learner.bob.learning_rate="
             said = str(error).strip().splitlines()[-1]  # from another process it comes with its traceback
             raise DivergedError(
-                f"{self.directory.path}, iteration {played + 1}: {said}: {has_it}resume with lower learning rates, "
-                f"for example --resume --set learner.{rates}{learner.bob.learning_rate / 2:g}"
+                f"{self.directory.path}, iteration {played + 1}: {said}: {has_it}{self.method.remedy}"
             ) from error
 
     def _save_last(self) -> None:

@@ -95,8 +95,7 @@ class Saves:
         Raises:
             CheckpointError: a full disk.
         """
-        part = "bob" if self._config.skills is None else "skills"
-        arrays = {f"{part}/{name}": array for name, array in parameters.items()}
+        arrays = {f"{self._config.part}/{name}": array for name, array in parameters.items()}
         self._snapshots.save(iteration, arrays, {"env_steps": num_env_steps})
 
 

@@ -15,6 +15,8 @@ from pathlib import Path
 from threading import Thread
 from typing import TYPE_CHECKING, Literal, cast
 
+from pydantic import JsonValue
+
 from service.config import Config
 from service.errors import TandemError
 from service.io.checkpoints import CheckpointStore
@@ -23,7 +25,7 @@ from service.io.run_log import RunLog
 from service.media.artifacts import make_artifacts
 from service.methods.method import Method, StateLostError, WorkersError
 from service.primitives.loading import Trained
-from service.primitives.publishing import measure_bob, measure_skills, publish_run
+from service.primitives.publishing import check_publishable, publish_run
 from service.progress import answer, doing
 from service.registry.names import Version
 from service.registry.registry import Registry
@@ -76,28 +78,17 @@ class Runtime:
     name: Literal["local", "ray"] = "local"
 
     def check(self, config: Config) -> None:
-        """Check what can be checked before anything is started.
+        """Check that the method can be here.
 
         Raises:
-            TandemError: this run cannot be here.
+            TandemError: it cannot.
         """
-        from service.learner.learner import torch_device
+        config.check_here()
 
-        torch_device(config.learner.device)
-
-    def make(self, config: Config, start_from: Trained | None) -> Method:
+    def make(self, config: Config, registry: Path | str, start_from: Trained | None) -> Method:
         """Make the method of a run, which begins from ``start_from`` where there is one."""
-        if config.skills is not None:
-            from service.methods.skills import SkillDiscovery
-
-            return SkillDiscovery(config)
-        if config.distillation is not None:
-            from service.methods.distillation import Distillation
-
-            return Distillation(config, start_from)
-        from service.methods.self_play import LocalSelfPlay
-
-        return LocalSelfPlay(config, start_from)
+        method: Method = config.build(registry, start_from)
+        return method
 
     @contextmanager
     def around(self, directory: Path, registry: Path, end_now: Callable[[str], None]) -> Iterator[None]:
@@ -108,7 +99,7 @@ class Runtime:
 def train(
     config: Config,
     directory: RunDirectory,
-    registry: Path,
+    registry: Path | str,
     *,
     resume: bool = False,
     publish: bool = True,
@@ -124,7 +115,7 @@ def train(
     Args:
         config: the run.
         directory: where it keeps everything.
-        registry: where it publishes.
+        registry: directory where it publishes; what the method takes is looked up there, too.
         resume: continue the run that the directory holds.
         publish: or else leave that to a later resume, or to ``publish_run``.
         on_iteration: called with the metrics of every iteration.
@@ -150,14 +141,14 @@ def train(
         begins = "goes on with" if resume else "begins"
         log.note(f"process {os.getpid()} on {socket.gethostname()} {begins} the run ({runtime.name} runtime)")
         stack.enter_context(report)
-        stack.enter_context(runtime.around(directory.path, registry, partial(_end_now, report, directory)))
+        stack.enter_context(runtime.around(directory.path, Path(registry), partial(_end_now, report, directory)))
         num_lost, furthest = 0, -1
         while True:
             with doing("starting", aloud=False):
-                begun = open_run(config, directory, resume=resume, start=start, runtime=runtime)
+                begun = open_run(config, directory, registry, resume=resume, start=start, runtime=runtime)
             with closing(begun) as run:
                 try:
-                    done = _run(run, Registry(registry) if publish else None, signals, report, on_iteration)
+                    done = _run(run, registry, publish, signals, report, on_iteration)
                 except StateLostError as error:  # with a machine of the cluster
                     num_lost = num_lost + 1 if run.iteration <= furthest else 1
                     furthest = max(furthest, run.iteration)
@@ -176,18 +167,19 @@ def train(
 def open_run(
     config: Config,
     directory: RunDirectory,
+    registry: Path | str = "registry",
     *,
     resume: bool = False,
     start: Trained | None = None,
     runtime: Runtime | None = None,
 ) -> Run:
     """Begin or continue a run, of which nothing is reported; see ``train``."""
-    make = partial((runtime or Runtime()).make, config, start)
+    make = partial((runtime or Runtime()).make, config, registry, start)
     return Run(config, directory, make, resume=resume, parent=start.published if start is not None else None)
 
 
 def prepare(
-    config: Config, directory: RunDirectory, registry: Path, *, resume: bool, publish: bool, runtime: Runtime
+    config: Config, directory: RunDirectory, registry: Path | str, *, resume: bool, publish: bool, runtime: Runtime
 ) -> Published | None:
     """Check what can be checked before Ray is started, which may take a minute, and keep other processes out.
 
@@ -200,7 +192,7 @@ def prepare(
         TandemError: see ``train``.
     """
     if publish:
-        Registry(registry).check_writable()  # now, not after hours of learning
+        check_publishable(config, registry)  # now, not after hours of learning
     runtime.check(config)
     directory.claim(resume=resume)
     return directory.read_published()
@@ -220,7 +212,7 @@ def _end_now(report: Report, directory: RunDirectory, what: str) -> None:
 
 
 def _run(
-    run: Run, registry: Registry | None, signals: StopSignals, report: Report, on_iteration: OnIteration
+    run: Run, registry: Path | str, publish: bool, signals: StopSignals, report: Report, on_iteration: OnIteration
 ) -> Finished:
     def beat() -> None:
         report.beat(run)
@@ -244,24 +236,27 @@ def _run(
     done = Finished(result, {}, None, {}, run.method.timing.tree(), signals.first)
     if result.reason != "interrupted" and signals.first is None:
         with suppress(InterruptError), report.beating():
-            done = _finish(done, run, registry, report)
+            done = _finish(done, run, registry, publish, report)
     complete = result.reason if signals.first is None else "interrupted"  # --resume does what is left
     report.end(cast("RunState", complete), published=str(done.version) if done.version is not None else None)
     return done
 
 
-def _finish(done: Finished, run: Run, registry: Registry | None, report: Report) -> Finished:
+def _finish(done: Finished, run: Run, registry: Path | str, publish: bool, report: Report) -> Finished:
     _logger.info("learning is over; now evaluating, publishing, drawing and recording a video")
     config, directory, parameters = run.config, run.directory, run.method.parameters()
+    metrics, version = run.method.measure(), None
     run.close()
-    metrics, version = (measure_bob if config.skills is None else measure_skills)(config, parameters), None
     report.check()
+    found: dict[str, JsonValue] = {name.removeprefix("evaluation/"): value for name, value in metrics.items()}
+    directory.write_result({"evaluation": found, "env_steps": run.num_env_steps, "wall_s": run.wall_s})
+    report.measured(metrics)
     try:
-        if registry is not None and (config.policy.monolithic_bob is None or config.skills is not None):
+        if publish and config.publishable:
             known = metrics | {"env_steps": done.result.num_env_steps}
-            version = publish_run(directory, registry, config, parameters, known)
+            version = publish_run(directory, Registry(Path(registry)), config, parameters, known)
     except TandemError as error:
         raise UnfinishedError(f"learning is over and saved, but not published: {error}; --resume does it") from error
     report.check()
-    files, timing = make_artifacts(directory), run.method.timing.tree()
+    files, timing = make_artifacts(directory, registry), run.method.timing.tree()
     return replace(done, files=files, version=version, metrics=metrics, timing=timing)

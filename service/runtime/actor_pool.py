@@ -11,7 +11,7 @@ from typing import Any
 
 import ray
 
-from service.config import Config
+from service.config.self_play import SelfPlayConfig
 from service.methods.workers import RoundSummary
 from service.runtime.ray_actors import Location, RolloutActor, remote_actor
 from service.runtime.watch import Clock, Watch
@@ -111,7 +111,7 @@ class ActorPool:
         clock: of the driver.
     """
 
-    def __init__(self, config: Config, num_threads: int, first_incarnation: int, clock: Clock) -> None:
+    def __init__(self, config: SelfPlayConfig, num_threads: int, first_incarnation: int, clock: Clock) -> None:
         self.num_worlds = config.game.num_worlds
         """Worlds of each actor."""
         self._config, self._num_threads, self._clock = config, num_threads, clock

@@ -33,7 +33,7 @@ from ray.exceptions import ObjectLostError, RayError
 
 from service.actors.evaluation import EVALUATED_GOALS
 from service.actors.rollout import from_arrays
-from service.config import Config
+from service.config.self_play import SelfPlayConfig
 from service.errors import DivergedError
 from service.learner.weights import MAX_POLICY_LAG
 from service.methods.method import Health, Iteration, State, StateLostError, WorkersError
@@ -80,7 +80,7 @@ class RaySelfPlay(SelfPlay):
 
     def __init__(
         self,
-        config: Config,
+        config: SelfPlayConfig,
         options: ClusterOptions,
         start_from: Trained | None = None,
         raylet: RayletWatch | None = None,

@@ -18,7 +18,7 @@ from ray.util.metrics import Counter, Histogram
 
 import service.runtime.worker_variables  # noqa: F401  before NumPy and MuJoCo are imported  # isort: split
 from service.actors.rollout import Rollout
-from service.config import Config
+from service.config.self_play import SelfPlayConfig
 from service.generator.opponents import Opponents
 from service.generator.snapshot import GeneratorSnapshot
 from service.generator.summary import GoalSummary
@@ -91,7 +91,7 @@ class Watched:
 class RolloutActor(RolloutWorker, Watched):
     """A rollout worker in a process of its own."""
 
-    def __init__(self, config: Config, actor: int, incarnation: int, num_threads: int) -> None:
+    def __init__(self, config: SelfPlayConfig, actor: int, incarnation: int, num_threads: int) -> None:
         lower_priority()
         super().__init__(config, actor, incarnation, num_threads=num_threads)
         self._count = _round_counters(actor)
@@ -137,7 +137,7 @@ class GeneratorActor(GeneratorWorker, Watched):
 class LearnerActor(Watched):
     """The learner, which hands its whole state back with every update."""
 
-    def __init__(self, config: Config) -> None:
+    def __init__(self, config: SelfPlayConfig) -> None:
         lower_priority()
         self._config = config
 

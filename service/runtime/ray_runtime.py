@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from service.config import Config
+from service.config.self_play import SelfPlayConfig
 from service.errors import ConfigError
 from service.methods.method import Method
 from service.primitives.loading import Trained
@@ -42,17 +43,14 @@ class RayRuntime(Runtime):
         Raises:
             ConfigError: it has not.
         """
-        if config.skills is not None:
-            raise ConfigError(
-                f"skills.method = {config.skills.method}: skill discovery runs in one process; use --runtime local"
-            )
-        if config.distillation is not None:
-            raise ConfigError("distillation runs in one process: use --runtime local, or leave out distillation")
+        if not config.runs_on_ray:
+            raise ConfigError(f"method = {config.method}: it runs in one process; use --runtime local")
 
-    def make(self, config: Config, start_from: Trained | None) -> Method:
+    def make(self, config: Config, registry: Path | str, start_from: Trained | None) -> Method:
         """Make self-play, whose workers start with it."""
         from service.runtime.cluster import RaySelfPlay
 
+        assert isinstance(config, SelfPlayConfig), "checked"
         return RaySelfPlay(config, self._options, start_from, self._raylet)
 
     @contextmanager

@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from service.off_policy_config import SACConfig
+from service.config.sac import SACConfig
 from service.policies.adam import Adam
 from service.policies.networks import export_parameters
 from service.sac.networks import Critics, sample_actions

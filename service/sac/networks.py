@@ -10,7 +10,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from service.config import MCPConfig
+from service.config.self_play import MCPConfig
 from service.policies.forward import compose
 from service.sac.numpy_actor import LOG_STD_MAX, LOG_STD_MIN, MCP_LOG_STD_MIN
 

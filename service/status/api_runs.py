@@ -61,7 +61,7 @@ def runs_router(runs: RunReader, streams: Streams, directories: RunDirectories, 
                 description="a metric to give in a few points for each run; of several, the first that it has",
             ),
         ] = None,
-        downstream: Annotated[bool | None, Query(description="only downstream trainings, or only pre-training")] = None,
+        downstream: Annotated[bool | None, Query(description="only runs that learn a task, or only others")] = None,
     ) -> RunList:
         """Newest start first."""
         found = [
@@ -141,7 +141,7 @@ def runs_router(runs: RunReader, streams: Streams, directories: RunDirectories, 
 
     @router.get("/{run_id}/setup", summary="A run's configuration and commands", responses=errors)
     def get_setup(run_id: _Run) -> RunSetup:
-        """The resolved configuration, where the run is, and the commands that stop it or go on with it."""
+        """The resolved configuration, the directory, and the commands that stop the run, resume it or use it."""
         return run_details.setup(runs.run(run_id), directories.directory(run_id), registry)
 
     @router.get("/{run_id}/log", summary="What happened to a run", responses=errors)
@@ -154,7 +154,7 @@ def runs_router(runs: RunReader, streams: Streams, directories: RunDirectories, 
         "/{run_id}/stop",
         summary="Ask a run to end",
         status_code=202,
-        responses={**errors, **problems(READ_ONLY, (409, "The run takes no requests."))},
+        responses={**errors, **problems(READ_ONLY)},
     )
     def stop_run(run_id: _Run) -> RunStatus:
         """The run ends after its current iteration, saved, and can be resumed. No effect on one that has ended."""

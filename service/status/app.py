@@ -84,7 +84,7 @@ def create_app(
     app.include_router(health_router(runs, registry, telemetry))
     directories = RunDirectories(runs_dir)
     app.include_router(runs_router(runs, streams, directories, registry.root))
-    app.include_router(downstream_router(directories))
+    app.include_router(downstream_router(runs, directories))
     app.include_router(series_router(runs))
     app.include_router(session_router(token))
     app.include_router(primitives_router(registry))

@@ -20,7 +20,6 @@ from service.status.openapi import problems
 from service.status.problems import ProblemError
 from service.status.schemas import RunFile
 from service.store.disk_reader import run_directories
-from service.store.trial_reader import is_trial
 
 RUN_FILES = {
     "rounds.mp4": ("Alice beside Bob", "video/mp4"),
@@ -92,19 +91,15 @@ class RunDirectories:
 
     def directory(self, run_id: str) -> Path | None:
         """Find the directory of a run; None if it is not on this machine."""
-        try:
-            # looked up instead of built from the id, so that no id leads outside the root
-            return run_directories(self._root).get(run_id) if self._root is not None else None
-        except OSError:
-            return None
+        # looked up instead of built from the id, so that no id leads outside the root
+        return self.directories().get(run_id)
 
-    def trials(self) -> dict[str, Path]:
-        """The directories of downstream trainings, by the ids of their runs; those that are on this machine."""
+    def directories(self) -> dict[str, Path]:
+        """The directories of runs that are on this machine, by their ids."""
         try:
-            found = run_directories(self._root) if self._root is not None else {}
+            return run_directories(self._root) if self._root is not None else {}
         except OSError:
             return {}
-        return {run_id: path for run_id, path in found.items() if is_trial(path)}
 
     def _paths(self, run_id: str) -> dict[str, Path]:
         directory = self.directory(run_id)

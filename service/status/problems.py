@@ -15,7 +15,7 @@ from starlette.responses import JSONResponse
 from service.errors import TandemError
 from service.io.errors import FormatVersionError
 from service.registry.errors import DamagedBlobError, UnknownVersionError
-from service.store.errors import DamagedStoreError, StoreError, StoreUnavailableError, UnknownRunError
+from service.store.errors import DamagedStoreError, StoreUnavailableError, UnknownRunError
 
 MEDIA_TYPE = "application/problem+json"
 _BLANK = "about:blank"
@@ -79,7 +79,6 @@ _KINDS: tuple[tuple[type[TandemError], int, str], ...] = (
     (DamagedStoreError, 500, "damaged"),
     (DamagedBlobError, 500, "damaged"),
     (FormatVersionError, 500, "other-format"),
-    (StoreError, 409, "not-possible"),
     (TandemError, 500, "failed"),
 )
 """Status and kind by error; the first match counts."""

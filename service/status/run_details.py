@@ -8,15 +8,16 @@ from typing import Any
 
 import numpy as np
 
+from service.config.tree import read_yaml
+from service.errors import ConfigError
 from service.io.run_history import read_history
 from service.io.run_log import read_log
-from service.io.study_directory import LOG_FILE, is_study
-from service.parsing import MAX_YAML_CHARACTERS, ParseError, parse_json, parse_yaml
-from service.regular_files import open_regular, read_regular
-from service.status import trial_details
-from service.status.schemas import GoalFrame, GoalFrames, LogEntry, RunLog, RunSetup
-from service.store.models import GoalGrid, RunStatus
-from service.store.trial_reader import is_trial
+from service.parsing import ParseError, parse_json
+from service.regular_files import open_regular
+from service.status.schemas import GoalFrame, GoalFrames, LogEntry, RunCommand, RunLog, RunSetup
+from service.store.disk import OUTPUT_FILE
+from service.store.disk_reader import is_study
+from service.store.models import ACTIVE, GoalGrid, RunStatus
 
 DEFAULT_CELL_M = 0.05
 FRAME_BYTES = 256 * 1024
@@ -28,29 +29,35 @@ def setup(run: RunStatus, directory: Path | None, registry: Path) -> RunSetup:
     """Read a run's configuration, and write the commands for it."""
     if directory is None:
         return RunSetup(run_id=run.run_id, directory=None, config=None, stop_command=None, resume_command=None)
-    if is_trial(directory):
-        return trial_details.setup(run, directory, registry)
     config, problem = None, None
     try:
-        tree = parse_yaml(read_regular(directory / "config.yaml", MAX_YAML_CHARACTERS, follow=True), "config.yaml")
-        config = tree if isinstance(tree, dict) else None
-        problem = None if config is not None else "config.yaml is no configuration"
-    except OSError as error:
-        problem = f"config.yaml cannot be read: {error.strerror}"
-    except ParseError as error:
-        problem = str(error)
+        config = read_yaml(file := directory / "config.yaml")
+    except ConfigError as error:
+        problem = str(error) if file.exists() else f"{file} is not there: the run has only begun, or it was removed"
     path = directory.absolute()
+    place = ["--registry", str(registry.absolute())]
     begun = path.parent if is_study(path.parent) else path
     runtime = ["--runtime", "ray"] * (run.runtime == "ray")
-    place = ["--run-dir", str(begun), "--registry", str(registry.absolute())]
     return RunSetup(
         run_id=run.run_id,
         directory=str(path),
         config=config,
         problem=problem,
         stop_command=shlex.join(["touch", str(path / "stop")]),
-        resume_command=shlex.join(["tandem", "pretrain", "--resume", *place, *runtime]),
+        resume_command=shlex.join(["tandem", "train", "--resume", "--run-dir", str(begun), *place, *runtime]),
+        commands=_uses(run, path, place) if config is not None and run.state not in ACTIVE else (),
     )
+
+
+def _uses(run: RunStatus, path: Path, place: list[str]) -> tuple[RunCommand, ...]:
+    """The commands that use what a run has learned."""
+    words = {
+        "Measure what it learned": ["evaluate", str(path)],
+        "Watch it live in the browser": ["play", str(path)],
+        "Make a film of it": ["render", str(path), "--out", f"{run.name}.mp4"],
+        "Publish it in the registry": ["publish", str(path), "--name", run.name],
+    }
+    return tuple(RunCommand(what=what, command=shlex.join(["tandem", *each, *place])) for what, each in words.items())
 
 
 def log(directory: Path | None, limit: int) -> RunLog:
@@ -67,7 +74,7 @@ def log(directory: Path | None, limit: int) -> RunLog:
         )
     entries.sort(key=lambda entry: entry.at)
     return RunLog(
-        entries=tuple(entries[-limit:]), num_entries=len(entries), output=tuple(_output(directory / LOG_FILE))
+        entries=tuple(entries[-limit:]), num_entries=len(entries), output=tuple(_output(directory / OUTPUT_FILE))
     )
 
 

@@ -3,8 +3,7 @@
 | information | source |
 |---|---|
 | status | the newer one; Redis if both are about equally old, because it knows which machines are alive |
-| metrics | the run's directory, which has all of them; Redis if there is no directory on this machine |
-| goals | the newer grid |
+| metrics, goals | the run's directory; Redis if there is no directory on this machine |
 | a request to stop | sent to both |
 
 If Redis is unavailable, everything in the directories can still be read, and each active run has a warning.
@@ -84,9 +83,7 @@ class CombinedReader:
 
     def goals(self, run_id: str) -> GoalGrid | None:
         """The newest grid; None before the first."""
-        self.run(run_id)  # or raise UnknownRunError
-        grids = (_if_known(lambda: self._disk.goals(run_id)), self._ask_redis(lambda: self._redis.goals(run_id)))
-        return max((grid for grid in grids if grid is not None), key=lambda grid: grid.iteration, default=None)
+        return self._disk_first(lambda reader: reader.goals(run_id))
 
     def request_stop(self, run_id: str) -> None:
         """Ask a run to end after its current iteration; nothing happens if it has ended."""

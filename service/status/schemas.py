@@ -6,7 +6,7 @@ from typing import Literal
 
 from pydantic import AwareDatetime, Field, JsonValue
 
-from service.frozen import FrozenModel
+from service.config.frozen import FrozenModel
 from service.registry.manifest import Manifest
 from service.store.models import RunStatus
 
@@ -97,7 +97,7 @@ class RunSetup(FrozenModel):
     problem: str | None = Field(None, description="why there is no configuration")
     stop_command: str | None = Field(description="for a shell on that machine")
     resume_command: str | None = Field(description="for a shell on that machine, once the run has ended")
-    commands: tuple[RunCommand, ...] = Field((), description="what can be done with what a downstream training learned")
+    commands: tuple[RunCommand, ...] = Field((), description="what can be done with what it learned")
 
 
 class TaskColumn(FrozenModel):
@@ -133,7 +133,7 @@ class TaskRow(FrozenModel):
 
 
 class TaskTable(FrozenModel):
-    """Success of methods on tasks, from the downstream trainings of this service."""
+    """Success of methods on tasks, from the runs of this service that learn one."""
 
     tasks: tuple[TaskColumn, ...]
     rows: tuple[TaskRow, ...]

@@ -47,19 +47,24 @@ class Shelf:
             for origin, version in found
         )
 
+    def _last_first(self) -> list[tuple[Origin, Registry]]:
+        """The registries, so that in a dictionary the first one's entry is put last and counts."""
+        return list(reversed(self.registries.items()))
+
     def _versions(self, name: str) -> list[tuple[Origin, Version]]:
-        found: dict[int, tuple[Origin, Version]] = {}
-        for origin, registry in self.registries.items():
-            for version in registry.versions(name):
-                found.setdefault(version.number, (origin, version))
+        found = {
+            version.number: (origin, version)
+            for origin, registry in self._last_first()
+            for version in registry.versions(name)
+        }
         return list(found.values())
 
     def _aliases(self, name: str) -> dict[str, tuple[Origin, Version]]:
-        found: dict[str, tuple[Origin, Version]] = {}
-        for origin, registry in self.registries.items():
-            for alias, number in registry.aliases(name).items():
-                found.setdefault(alias, (origin, Version(name, number)))
-        return found
+        return {
+            alias: (origin, Version(name, number))
+            for origin, registry in self._last_first()
+            for alias, number in registry.aliases(name).items()
+        }
 
     def _describe(self, origin: Origin, version: Version, aliases: list[str]) -> VersionSummary:
         registry = self.registries[origin]

@@ -10,57 +10,66 @@ from __future__ import annotations
 import json
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
-from service.downstream.files import RESULT_FILE
+from service.config.tree import leaves, read_yaml
 from service.errors import TandemError
+from service.io.run_directory import RESULT_FILE, RunDirectory
+from service.parsing import parse_json
 from service.status.schemas import TaskCell, TaskColumn, TaskRow, TaskTable
-from service.status.trial_details import resolved
-from service.store.trial_reader import read_trial_result
+from service.store.models import RunStatus, Trial
 
 Column = tuple[str, int]
 """A task and its version."""
-_PLACE = ("task", "task_version", "method", "seed")
-"""Settings that say where in the table a run belongs."""
+_ELSEWHERE = {"name", "primitives", "primitives_digest", "task", "task_version", "method", "seed"}
+"""Keys of a configuration that say where in the table a run belongs."""
 
 
 @dataclass(frozen=True, slots=True)
 class _Run:
     run_id: str
-    method: str
+    trial: Trial
     column: Column
-    seed: int
     settings: dict[str, Any]
-    """All that its result depends on but primitives, method, task and seed; flat, the world's too."""
-    primitives: Mapping[str, Any]
+    """Whatever its result depends on but primitives, method, task and seed; flat, the world's too."""
     ended: float
     """Time of its result."""
     result: dict[str, Any] | None
 
     @property
-    def made(self) -> tuple[str, str]:
+    def made(self) -> tuple[str, str | None]:
         """Method and digest of the primitives."""
-        return self.method, str(self.primitives.get("digest"))
+        return self.trial.method, self.trial.primitives_digest
 
 
-def task_table(trials: Mapping[str, Path]) -> TaskTable:
-    """Make the table of the downstream trainings in these directories, by the ids of their runs."""
+def task_table(statuses: Iterable[RunStatus], directories: Mapping[str, Path]) -> TaskTable:
+    """Make the table of those runs that learn a task and are on this machine.
+
+    Args:
+        statuses: of all runs.
+        directories: of the runs that are on this machine, by their ids.
+    """
     from service.downstream.methods import METHODS  # with MuJoCo and Gymnasium, which few views need
     from service.envs.tasks import HARD_TASKS, TASKS
 
     runs, problems = list[_Run](), list[str]()
-    for run_id, path in trials.items():
+    for status in statuses:
+        path = directories.get(status.run_id)
         try:
-            runs.append(_read(run_id, path))
+            if path is not None and status.trial is not None:
+                runs.append(_read(status.run_id, status.trial, path))
+        except FileNotFoundError:  # it has only begun, or is deleted just now
+            continue
+        except OSError as error:
+            problems.append(f"{path} cannot be read: {error.strerror}")
         except TandemError as error:
             problems.append(str(error))
-        except OSError as error:  # it may be deleted just now
-            problems.append(f"{path} cannot be read: {error.strerror}")
     tasks = {**TASKS, **HARD_TASKS}
     columns = sorted({run.column for run in runs}, key=lambda column: (*_place(column[0], tasks), column[1]))
-    rows = sorted(_rows(runs), key=lambda row: (*_place(_first(row).method, METHODS), str(_first(row).primitives)))
-    differing = _differing(runs)
+    rows = [(_first(row).trial, row) for row in _rows(runs)]
+    rows.sort(key=lambda row: (*_place(row[0].method, METHODS), str(row[0].primitives)))
     return TaskTable(
         tasks=tuple(
             TaskColumn(task=task, version=version, title=tasks[task].title if task in tasks else task)
@@ -68,33 +77,39 @@ def task_table(trials: Mapping[str, Path]) -> TaskTable:
         ),
         rows=tuple(
             TaskRow(
-                method=_first(row).method,
-                title=METHODS[_first(row).method].title if _first(row).method in METHODS else _first(row).method,
-                primitives=_first(row).primitives.get("name"),
-                primitives_digest=_first(row).primitives.get("digest"),
-                cells=tuple(_cell(row[column], differing) for column in columns if column in row),
+                method=trial.method,
+                title=METHODS[trial.method].title if trial.method in METHODS else trial.method,
+                primitives=trial.primitives,
+                primitives_digest=trial.primitives_digest,
+                cells=tuple(_cell(row[column], runs) for column in columns if column in row),
             )
-            for row in rows
+            for trial, row in rows
         ),
         problems=tuple(problems),
     )
 
 
-def _read(run_id: str, path: Path) -> _Run:
-    from service.downstream.results import settings_of
+def _read(run_id: str, trial: Trial, path: Path) -> _Run:
+    """A run that learns a task. Its configuration is taken as data: no method of somebody's own is imported."""
+    config = path / "config.yaml"
+    settings = _settings(config, config.stat().st_mtime_ns)
+    result = RunDirectory(path).read_result()
+    ended = (path / RESULT_FILE).stat().st_mtime if result is not None else 0.0
+    version = settings.get("task_version")
+    column = (trial.task, version if isinstance(version, int) else 0)
+    return _Run(run_id, trial, column, {key: settings[key] for key in settings if _counts(key)}, ended, result)
 
-    (trial, primitives, world), result = resolved(path), read_trial_result(path)
-    settings = {key: value for key, value in settings_of(trial).items() if key not in _PLACE}
-    return _Run(
-        run_id,
-        trial.method,
-        (trial.task, trial.task_version),
-        trial.seed,
-        _flat({**settings, "world": world}),
-        primitives or {},
-        (path / RESULT_FILE).stat().st_mtime if result is not None else 0.0,
-        result,
-    )
+
+def _counts(key: str) -> bool:
+    """Whether a result depends on a key of the configuration, and the place in the table does not say it."""
+    return key == "run.total_env_steps" or not (key in _ELSEWHERE or key.startswith("run."))
+
+
+@lru_cache(1000)
+def _settings(config: Path, _stamp: int) -> dict[str, Any]:
+    """A run's configuration, flat; the page asks every few seconds, and YAML is slow."""
+    text = json.dumps(read_yaml(config), default=str, skipkeys=True)  # YAML has dates, and keys that are no text
+    return dict(leaves(parse_json(text, config)))
 
 
 def _rows(runs: Sequence[_Run]) -> list[dict[Column, list[_Run]]]:
@@ -115,49 +130,39 @@ def _rows(runs: Sequence[_Run]) -> list[dict[Column, list[_Run]]]:
     return [row for same in rows.values() for row in same]
 
 
-def _cell(runs: Sequence[_Run], differing: Mapping[tuple[str, str], set[str]]) -> TaskCell:
+def _cell(runs: Sequence[_Run], all_runs: Sequence[_Run]) -> TaskCell:
     from service.downstream.rates import rate_of
 
     ended = sorted((run for run in runs if run.result is not None), key=lambda run: run.ended)
-    counted = sorted({run.seed: run for run in ended}.values(), key=lambda run: run.seed)
+    by_seed = {run.trial.seed: run for run in ended}
+    counted = [by_seed[seed] for seed in sorted(by_seed)]
     rate = rate_of([run.result for run in counted if run.result is not None]) if counted else None
-    settings, keys = runs[0].settings, differing[runs[0].made]
+    task, version = runs[0].column
     return TaskCell(
-        task=runs[0].column[0],
-        version=runs[0].column[1],
+        task=task,
+        version=version,
         success=rate.mean if rate else None,
         low=rate.low if rate else None,
         high=rate.high if rate else None,
         num_seeds=len(counted),
         run_ids=tuple(run.run_id for run in counted),
         unfinished=tuple(run.run_id for run in runs if run.result is None),
-        differs={key: settings[key] for key in sorted(keys) if key in settings},
+        differs=_differs(runs[0], all_runs),
     )
 
 
-def _differing(runs: Sequence[_Run]) -> dict[tuple[str, str], set[str]]:
-    """Settings in which runs of one method with the same primitives differ."""
-    found: dict[tuple[str, str], set[str]] = {}
-    first: dict[tuple[str, str], dict[str, Any]] = {}
-    for run in runs:
-        one = first.setdefault(run.made, run.settings)
-        keys = {key for key in one.keys() | run.settings.keys() if one.get(key) != run.settings.get(key)}
-        found.setdefault(run.made, set()).update(keys)
-    return found
+def _differs(run: _Run, runs: Sequence[_Run]) -> dict[str, Any]:
+    """Those settings of a run that others of its method with the same primitives have otherwise."""
+    others = [other.settings for other in runs if other.made == run.made]
+    return {
+        key: value for key, value in sorted(run.settings.items()) if any(other.get(key) != value for other in others)
+    }
 
 
 def _first(row: Mapping[Column, Sequence[_Run]]) -> _Run:
     return next(iter(row.values()))[0]
 
 
-def _flat(tree: Mapping[str, Any], before: str = "") -> dict[str, Any]:
-    found: dict[str, Any] = {}
-    for key, value in tree.items():
-        found |= _flat(value, f"{before}{key}.") if isinstance(value, dict) else {before + key: value}
-    return found
-
-
 def _place(name: str, known: Iterable[str]) -> tuple[int, str]:
-    """Sorts as in the table that ``tandem downstream table`` prints; unknown names come after, by themselves."""
-    order = list(known)
-    return (order.index(name), "") if name in order else (len(order), name)
+    """Key that sorts names as they are listed; unknown names come after them, alphabetically."""
+    return [*known, name].index(name), name

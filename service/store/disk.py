@@ -13,15 +13,19 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from service.parsing import ParseError, parse_json, parse_with
+from service.parsing import ParseError, parse_with
 from service.regular_files import read_regular
 from service.store.models import RunStatus
 
 MAX_BYTES = 64 * 1024 * 1024
-"""Of a run's status, its grid of goals and its note of what it published."""
+"""Greatest size of a run's status, and of its grid of goals."""
 STATUS_FILE = "status.json"
 GOALS_FILE = "goals.json"
 STOP_FILE = "stop"
+STUDY_FILE = "study.json"
+"""In the directory of a study, which has a run directory for each of its runs."""
+OUTPUT_FILE = "log.txt"
+"""All that the processes of a study's run said."""
 
 
 def read_status(directory: Path) -> RunStatus | None:
@@ -30,12 +34,4 @@ def read_status(directory: Path) -> RunStatus | None:
         data = read_regular(directory / STATUS_FILE, MAX_BYTES)
         return parse_with(RunStatus.model_validate_json, data, STATUS_FILE)
     except (OSError, ParseError):
-        return None
-
-
-def read_published(directory: Path) -> str | None:
-    """``NAME@VERSION`` of what a run published last; None where there is none, or where that cannot be read."""
-    try:
-        return str(parse_json(read_regular(directory / "published.json", MAX_BYTES), directory)["version"])
-    except (OSError, KeyError, TypeError, ValueError):
         return None

@@ -1,4 +1,4 @@
-"""Runs read from their directories: also downstream trainings."""
+"""Runs read from their directories."""
 
 from __future__ import annotations
 
@@ -15,18 +15,15 @@ from threading import Lock
 from service.errors import one_line
 from service.io.epoch import newest_epoch
 from service.io.lock import holder, is_locked
-from service.io.run_directory import TRIAL_FILE
 from service.io.run_history import FILE as RUN_FILE
 from service.io.run_history import FIRST_VERSION, written_by
-from service.io.study_directory import is_study
 from service.parsing import ParseError, parse_with
 from service.regular_files import read_regular
-from service.store.disk import GOALS_FILE, MAX_BYTES, STATUS_FILE, STOP_FILE
-from service.store.errors import DamagedStoreError, StoreError, StoreUnavailableError, UnknownRunError
+from service.store.disk import GOALS_FILE, MAX_BYTES, STATUS_FILE, STOP_FILE, STUDY_FILE
+from service.store.errors import DamagedStoreError, StoreUnavailableError, UnknownRunError
 from service.store.models import ACTIVE, Columns, GoalGrid, Record, RunStatus
 from service.store.pulse import Pulse, with_clock
 from service.store.tail import RecordFile
-from service.store.trial_reader import is_trial, read_trial_status
 
 QUIET_S = 10.0
 """A run writes its status every second; after so long something keeps it from that."""
@@ -36,13 +33,18 @@ FULL_BYTES = 1_000_000
 """A disk with less room than this is full: a status and a grid would not fit."""
 
 
+def is_study(path: Path) -> bool:
+    """Whether a study has begun in this directory."""
+    return os.path.isfile(path / STUDY_FILE)
+
+
 def run_id_of(directory: Path) -> str:
     """A run's id on one machine: the name of its directory, with a dash for what an id may not hold.
 
     That of a study's run begins with the name of the study.
     """
     path = _real(directory)
-    name = f"{path.parent.name[:100]}-{path.name}" if is_study(path.parent) else path.name
+    name = f"{path.parent.name[: 127 - len(path.name[:100])]}-{path.name}" if is_study(path.parent) else path.name
     return re.sub(r"[^A-Za-z0-9._-]", "-", name).lstrip("._-")[:128] or "run"
 
 
@@ -53,35 +55,21 @@ def study_of(directory: Path) -> str | None:
 
 
 def run_directories(root: Path) -> dict[str, Path]:
-    """The run directories in ``root`` by the ids of their runs, those of studies, and downstream trainings.
+    """The run directories in ``root`` by the ids of their runs, and those of studies.
 
-    Downstream trainings may lie one directory further down, as in ``runs/downstream``, the name of which then begins
-    their ids. Of two directories with the same id, the first is found.
+    Of two directories with the same id, the first is found.
 
     Raises:
         OSError: ``root`` cannot be read.
     """
     found, inner = sorted(root.iterdir()), list[Path]()
-    seen = {_real(path) for path in found}  # a link leads to what is there by its own name
     for path in found:
         if path.name.startswith(".") or _is_run(path):
             continue
         with suppress(OSError):
             if is_study(path):
                 inner += filter(_is_run, sorted(path.iterdir()))
-            else:
-                there = sorted(Path(each.path) for each in os.scandir(path) if not each.is_file(follow_symlinks=False))
-                new = [each for each in there if is_trial(each) and _real(each) not in seen]
-                seen.update(map(_real, new))
-                inner += new
-    directories = [*filter(_is_run, found), *inner]
-    return {_id_in(root, path): path for path in reversed(directories)}
-
-
-def _id_in(root: Path, path: Path) -> str:
-    if path.parent == root or is_study(path.parent):
-        return run_id_of(path)
-    return run_id_of(Path(f"{path.parent.name[:60]}-{path.name}"))
+    return {run_id_of(path): path for path in reversed([*filter(_is_run, found), *inner])}
 
 
 class DiskReader:
@@ -148,18 +136,10 @@ class DiskReader:
                 ) from None
 
     def request_stop(self, run_id: str) -> None:
-        """Ask a run to end after its current iteration; nothing happens if it has ended.
-
-        Raises:
-            StoreError: a tandem runs it that takes no requests.
-        """
+        """Ask a run to end after its current iteration; nothing happens if it has ended."""
         path, records = self._find(run_id)
         if self._status(run_id, path, records).state not in ACTIVE:
             return
-        if is_trial(path):
-            raise StoreError(
-                f"run {run_id} is a downstream training: stop it with Ctrl-C there, or kill -INT its process"
-            )
         with _using(path / STOP_FILE):
             (path / STOP_FILE).touch()
 
@@ -179,9 +159,6 @@ class DiskReader:
         return status
 
     def _read_status(self, run_id: str, path: Path, records: RecordFile) -> RunStatus:
-        if is_trial(path):
-            trained = read_trial_status(run_id, path, records)
-            return (trained.state in ACTIVE and _why_quiet(trained, path)) or trained
         status = _read_status(run_id, path)
         age_s = self._pulse.age_s(run_id, status.heartbeat)
         status = with_clock(status)
@@ -222,7 +199,7 @@ def _is_run(path: Path) -> bool:
     """Whether it is a run's directory, or one that cannot be looked into, which may be a run's."""
     if path.name.startswith(".") or path.name == "lost+found":  # the latter is of the file system
         return False
-    files = (path / STATUS_FILE, path / "config.yaml", path / TRIAL_FILE)
+    files = (path / STATUS_FILE, path / "config.yaml")
     return any(map(os.path.isfile, files)) or _why_closed(path) is not None
 
 

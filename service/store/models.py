@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import AwareDatetime, Field
 
-from service.frozen import FrozenModel
+from service.config.frozen import FrozenModel
 
 RunState = Literal["starting", "running", "finished", "converged", "interrupted", "failed"]
 ACTIVE: frozenset[RunState] = frozenset({"starting", "running"})
@@ -78,7 +78,7 @@ class ActorStatus(FrozenModel):
 
 
 class Trial(FrozenModel):
-    """What a downstream training learns, and how well it does in the end."""
+    """The task that a run learns, and how well it does in the end."""
 
     task: str = Field(examples=["push"])
     method: str = Field(examples=["ours-her"])
@@ -96,9 +96,9 @@ class RunStatus(FrozenModel):
     """The state of a run right now."""
 
     run_id: str = Field(pattern=RUN_ID)
-    name: str = Field(description="registry name of the primitives it makes; of a downstream training TASK-METHOD-SEED")
+    name: str = Field(description="registry name of what it makes")
     study: str | None = Field(None, description="whose run of one seed it is, as far as its directory tells")
-    trial: Trial | None = Field(None, description="of a downstream training; null for pre-training")
+    trial: Trial | None = Field(None, description="of a run that learns a task; null for others")
     runtime: Literal["local", "ray"]
     state: RunState
     started: AwareDatetime = Field(description="UTC, of the process that runs it now or ran it last")
@@ -188,10 +188,7 @@ class RunReader(Protocol):
         """The newest grid; None before the first."""
 
     def request_stop(self, run_id: str) -> None:
-        """Ask a run to end after its current iteration, saved; nothing happens if it has ended.
-
-        May raise ``StoreError``: it takes no requests, as a downstream training.
-        """
+        """Ask a run to end after its current iteration, saved; nothing happens if it has ended."""
 
     def ready(self) -> None:
         """Return if reads work right now."""

@@ -1,4 +1,4 @@
-"""Runs read from Redis: every call is one round trip, and one that Redis does not answer at once has failed."""
+"""Runs read from Redis: a call that Redis does not answer at once has failed."""
 
 from __future__ import annotations
 
@@ -47,16 +47,16 @@ class RedisReader:
         """One run."""
         with self._errors():
             ((text, *flags),) = self._look_up([run_id])
-            self._check_known(run_id, text is not None)
+            if text is None:
+                run_ids = [name.decode(errors="replace") for name in self._client.zrange(keys.RUNS, 0, -1)]
+                raise UnknownRunError.of(run_id, self._address, sorted(run_ids))
             return self._status(run_id, text, *flags)
 
     def metrics(self, run_id: str, *, after_iteration: int = 0) -> list[Record]:
         """The records of iterations above ``after_iteration``, in order."""
-        with self._errors(), self._client.pipeline(transaction=False) as pipe:
-            pipe.exists(keys.run_key(run_id, "status"))
-            pipe.zrangebyscore(keys.run_key(run_id, "metrics"), f"({after_iteration}", "+inf")
-            known, lines = pipe.execute()
-            self._check_known(run_id, bool(known))
+        self.run(run_id)  # or raise UnknownRunError
+        with self._errors():
+            lines = self._client.zrangebyscore(keys.run_key(run_id, "metrics"), f"({after_iteration}", "+inf")
         by_iteration: dict[int, Record] = {}
         for line in lines:
             record = parse_record(line)
@@ -72,25 +72,20 @@ class RedisReader:
 
     def sample(self, run_id: str, name: str, number: int) -> list[float | None]:
         """One metric of about ``number`` records, evenly over those that Redis keeps."""
+        self.run(run_id)  # or raise UnknownRunError
         key = keys.run_key(run_id, "metrics")
-        with self._errors():
+        with self._errors(), self._client.pipeline(transaction=False) as pipe:
             size = self._client.zcard(key)
-            with self._client.pipeline(transaction=False) as pipe:
-                pipe.exists(keys.run_key(run_id, "status"))
-                for index in sorted({size * place // max(1, number - 1) for place in range(number)} if size else ()):
-                    pipe.zrange(key, min(index, size - 1), min(index, size - 1))
-                known, *lines = pipe.execute()
-            self._check_known(run_id, bool(known))
-        records = [parse_record(line[0]) for line in lines if line]
+            for index in sorted({(size - 1) * place // max(1, number - 1) for place in range(number)} if size else ()):
+                pipe.zrange(key, index, index)
+            records = [parse_record(line[0]) for line in pipe.execute() if line]
         return [record.get(name) for record in records if record is not None]
 
     def goals(self, run_id: str) -> GoalGrid | None:
         """The newest grid; None before the first."""
-        with self._errors(), self._client.pipeline(transaction=False) as pipe:
-            pipe.exists(keys.run_key(run_id, "status"))
-            pipe.get(keys.run_key(run_id, "goals"))
-            known, text = pipe.execute()
-            self._check_known(run_id, bool(known))
+        self.run(run_id)  # or raise UnknownRunError
+        with self._errors():
+            text = self._client.get(keys.run_key(run_id, "goals"))
         try:
             return parse_with(GoalGrid.model_validate_json, text, "grid") if text is not None else None
         except ParseError:
@@ -137,11 +132,6 @@ class RedisReader:
             elif isinstance(text, Exception):
                 raise text
             yield text, bool(next(replies)), bool(next(replies))
-
-    def _check_known(self, run_id: str, known: bool) -> None:
-        if not known:
-            run_ids = [name.decode(errors="replace") for name in self._client.zrange(keys.RUNS, 0, -1)]
-            raise UnknownRunError.of(run_id, self._address, sorted(run_ids))
 
     @contextmanager
     def _errors(self) -> Iterator[None]:

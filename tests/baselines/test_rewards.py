@@ -8,7 +8,7 @@ import torch
 
 from service.baselines.frozen import draw_skills
 from service.baselines.rewards import METHODS, make_reward
-from service.off_policy_config import SkillsConfig
+from service.config.skills import SkillsConfig
 
 BEFORE = torch.tensor([[0.1, 0.2, 0.0], [1.0, -1.0, 0.5], [0.0, 0.0, 0.0]])
 AFTER = torch.tensor([[0.1, 0.3, 0.0], [1.0, -1.0, 0.5], [-0.2, 0.0, 0.4]])

@@ -7,7 +7,7 @@ from service.baselines.frozen import draw_skills
 from service.baselines.rewards import METHODS, make_reward
 from service.baselines.skills import IntrinsicBatches, Seen, make_skill_loop, see_object
 from service.config import parse_config
-from service.off_policy_config import SkillsConfig, SkillsSACConfig
+from service.config.skills import SkillsConfig, SkillsSACConfig
 from service.sac.learner import SACLearner
 from service.sac.loop import OffPolicyLoop
 from service.sac.networks import GaussianActor
@@ -134,7 +134,8 @@ def small_config(**skills):
     sac = {"num_worlds": 4, "gradient_steps": 2, "batch_size": 16, "learning_starts": 100, "hidden_sizes": [8]}
     tree = {"method": "lsd", "episode_steps": 10, "hidden_sizes": [8], "batch_size": 8, "sac": sac, **skills}
     world = {"physics_step_s": 0.005, "num_substeps": 8}
-    return parse_config({"skills": tree, "world": world, "run": {"total_env_steps": 400}}, where="a test")
+    run = {"total_env_steps": 400}
+    return parse_config({"method": "skills", "skills": tree, "world": world, "run": run}, where="a test")
 
 
 @pytest.mark.parametrize("method", METHODS)
@@ -191,7 +192,7 @@ def test_rewards_are_scaled_and_see_the_object_alone():
 
 
 def test_a_setting_of_the_learner_leaves_the_others_as_skill_discovery_has_them():
-    sac = parse_config({"skills": {"sac": {"num_worlds": 4}}}, where="a test").skills.sac
+    sac = SkillsConfig(sac={"num_worlds": 4}).sac
     assert sac == SkillsConfig().sac.model_copy(update={"num_worlds": 4})
     assert sac.gamma == 0.98
     assert not sac.critic_layer_norm

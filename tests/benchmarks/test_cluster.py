@@ -3,7 +3,6 @@
 import json
 import os
 import subprocess
-from dataclasses import asdict
 from datetime import UTC, datetime
 
 import pytest
@@ -11,7 +10,6 @@ import pytest
 from benchmarks import processes, scaling, training_process
 from benchmarks.report import __main__ as report
 from benchmarks.report import scaling as scaling_blocks
-from benchmarks.scaling_model import ACTORS, Batch, Cost, Model, fastest, limit, predict
 from benchmarks.training_process import Measured, Records, Training, copy_run, measure_training, summarise_rows
 from service.config import dump_config, load_config
 from service.errors import TandemError
@@ -108,23 +106,22 @@ def test_a_fault_with_rollouts_lost_is_missed():
 
 def measured(**changed):
     given = {
-        "num_steps": 1000, "wall_s": 10.0, "cpu_s": 15.0, "num_iterations": 4, "num_rollouts": 8, "num_actors": 2,
+        "num_steps": 1000, "wall_s": 10.0, "num_iterations": 4, "num_rollouts": 8, "num_actors": 2,
         "num_worlds": 10, "play_s": 2.0, "learn_s": 1.5,
-        "mean_policy_lag": 1.0, "max_policy_lag": 2.0, "role_cpu_s": {},
+        "role_cpu_s": {},
     }  # fmt: skip
     return Measured(**(given | changed))
 
 
 def test_costs_of_some_iterations_by_hand():
     rows = [
-        {"env_steps": 10.0 * index, "learner/policy_lag": float(index), "actor/num_rollouts": float(num),
+        {"env_steps": 10.0 * index, "actor/num_rollouts": float(num),
          "time/learn_s": 0.5, "time/play_s": float(index)}
         for index, num in enumerate((2, 2, 2, 1, 3))
     ]  # fmt: skip
     found = summarise_rows(rows, 3, 5.0, {"driver": 1.5, "actor": 2.0}, num_actors=2, num_worlds=7)
     assert (found.num_steps, found.num_iterations, found.num_rollouts) == (20, 2, 4)
-    assert (found.wall_s, found.cpu_s, found.num_worlds) == (5.0, 3.5, 7)
-    assert (found.mean_policy_lag, found.max_policy_lag, found.learn_s) == (3.5, 4.0, 0.5)
+    assert (found.wall_s, found.sample.cpu_s, found.num_worlds, found.learn_s) == (5.0, 3.5, 7, 0.5)
     assert found.play_s == pytest.approx((3.0 + 3 * 4.0) / 4)  # weighted by rounds
 
 
@@ -148,7 +145,7 @@ class Scripted:
 
 def test_it_is_measured_from_when_all_actors_are_up(tiny):
     def row(index, num_alive):
-        return {"env_steps": 10.0 * index, "learner/policy_lag": 1.0, "actor/num_alive": num_alive}
+        return {"env_steps": 10.0 * index, "actor/num_alive": num_alive}
 
     portions = [[row(0, 0)], [row(1, 1), row(2, 2)], [row(3, 2), row(4, 1)]]  # one that dies later is measured, too
     run = Scripted(tiny, portions)
@@ -206,56 +203,8 @@ def test_a_box_by_hand():
 
 # --- scaling ----------------------------------------------------------------------------------------------------------
 
-MODEL = Model(
-    actor=Cost(rollout_s=1.0, world_s=0.1),
-    parts={"learner": Cost(update_s=0.5, rollout_s=0.25, world_s=0.025), "driver": Cost(rollout_s=0.01, pair_s=0.001)},
-    env_steps=40.0,
-)
 
-
-def test_a_cost_by_hand():
-    assert Cost(1.0, 0.5, 0.25, 0.125).seconds(4, 2) == 1.0 + 4 * (0.5 + 2 * 0.25) + 16 * 0.125
-
-
-def test_predictions_by_hand():
-    # 10 worlds: an actor takes 2 s, the learner 0.5 + 0.5 N, the driver 0.01 N + 0.001 N^2
-    two, four = predict(MODEL, 2, 10), predict(MODEL, 4, 10)
-    assert (two.update_s, two.bottleneck, two.env_steps_per_s) == (2.0, ACTORS, 400.0)
-    assert two.busy("learner") == 0.75
-    assert (four.update_s, four.bottleneck, four.env_steps_per_s) == (2.5, "learner", 640.0)
-    assert four.busy(ACTORS) == 0.8
-    many = predict(MODEL, 1000, 10)
-    assert (many.bottleneck, many.update_s) == ("driver", pytest.approx(1010.0))
-
-
-def test_limits_by_hand():
-    assert limit(MODEL, "learner", 10) == 3  # 0.5 + 0.5 N <= 2
-    assert limit(MODEL, "driver", 10) == 40  # 0.4 + 1.6 = 2
-    assert limit(Model(MODEL.actor, {"idle": Cost(1e-12)}, 1.0), "idle", 10) is None
-    assert limit(Model(MODEL.actor, {"slow": Cost(3.0)}, 1.0), "slow", 10) == 0
-
-
-def test_the_fastest_way_to_a_skill_by_hand():
-    model = Model(Cost(world_s=0.1), {"learner": Cost(world_s=0.05)}, 40.0)
-    # three cores: two actors of 10 worlds take 1 s, and so does the learner of 20
-    way = fastest(model, [Batch(20, 100.0)], 3)
-    assert (way.run.num_actors, way.run.num_cores, way.seconds) == (2, 3, pytest.approx(100.0))
-    # updates twice as large take twice as long: they have to save half of all updates
-    assert fastest(model, [Batch(20, 100.0), Batch(40, 60.0)], 3).batch.num_worlds == 20
-    assert fastest(model, [Batch(20, 100.0), Batch(40, 40.0)], 3).batch.num_worlds == 40
-    assert fastest(model, [Batch(20, 100.0)], 256).run.num_cores == 3  # the learner takes 1 s, however many play
-
-
-def test_what_is_on_paper_goes_onto_the_page():
-    costs = {ACTORS: Cost(rollout_s=1.5, world_s=0.2), "learner": Cost(0.3, 0.1, 0.1)}
-    model = {"constants": {name: asdict(cost) for name, cost in costs.items()}, "env_steps_per_world": 40.0}
-    result = {"model": model, "alone": {"sizes": {"rollout": 20e6, "num_worlds": 20}}}
-    # 120 worlds: an actor takes 1.5 + 24 s, the learner 0.3 + 12.1 N, so 48.7 s with four
-    assert "**The first bottleneck is the learner**: it keeps up with 2 actors" in scaling_blocks.limits_block(result)
-    blocks = scaling_blocks.model_block(result)
-    assert "| 4 | 120 | 394 | 2.1 | 48.7 s | 52.4 % | 0 % | learner |" in blocks
-    # 240 worlds on 16 actors, 15 each: the learner takes 0.3 + 1.6 N, an actor 4.5 s
-    assert "| 16 | 15 | 371 | 1.9 | 25.9 s | 17.4 % | 0 % | learner |" in blocks
+def test_sizes_of_updates_by_hand():
     there = [
         {"seed": seed, "reached": True, "at": {"iteration": num, "env_steps": 1e4 * num}}
         for seed, num in enumerate((300, 500, 400))
@@ -269,13 +218,11 @@ def test_what_is_on_paper_goes_onto_the_page():
         "large": {"settings": settings | {"num_worlds": 40}, "runs": [{"seed": 1, "reached": False}]},
         "recipe": {"settings": settings | {"num_worlds": 20}, "runs": [*there, {"seed": 3, "reached": False}]},
     }
-    batches = scaling_blocks.batches_block(studies).splitlines()
-    assert batches[2:] == [
+    assert scaling_blocks.batches_block(studies).splitlines()[2:] == [
         "| 10 | `few.json` | 1 of 1 | 1 M | 1 | 300 |",
         "| 20 | `recipe.json` | 3 of 4 | 4.5 M | 450 | 450 |",
         "| 40 | `large.json` | 0 of 1 |  |  | 500 |",
     ]
-    assert "| 16 | 20 |" in scaling_blocks.skill_block(result, studies)  # one seed of a few worlds shows nothing
 
 
 # --- the pages --------------------------------------------------------------------------------------------------------
@@ -287,8 +234,8 @@ def test_a_page_without_markers_and_a_wrong_file_are_left_alone(tmp_path):
     with pytest.raises(TandemError, match="no markers for chaos"):
         report.replace_blocks(page, {"chaos": "text"})
     assert page.read_text() == "words"
-    (tmp_path / "scaling.json").write_text('{"benchmark": "chaos"}')
-    with pytest.raises(TandemError, match=r"not what python -m benchmarks\.scaling of commit 82ca6fd writes"):
+    (tmp_path / "scaling_box.json").write_text('{"benchmark": "chaos"}')
+    with pytest.raises(TandemError, match=r"not what python -m benchmarks\.scaling writes"):
         report.read_results(tmp_path)
 
 

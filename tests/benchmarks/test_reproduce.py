@@ -1,10 +1,16 @@
 """One command for every learning experiment: what it would run, in which order, and what becomes of failures."""
 
 import sys
+from itertools import pairwise
 
 import pytest
+import typer
 
-from benchmarks.reproduce import Experiment, Places, experiments, run_all
+from benchmarks.reproduce import SKILL_ENV_STEPS, Experiment, Places, experiments, run_all
+from benchmarks.trials import trial_config
+from service.cli.main import app
+from service.config import load_config
+from service.config.recipes import recipes
 from service.downstream.methods import METHODS
 from service.envs.tasks import TASKS
 
@@ -18,8 +24,26 @@ def test_every_method_is_run_on_every_task_with_three_seeds(places):
     everything = list(experiments(places))
     names = [each.name for each in everything]
     assert len(set(names)) == len(names) == len({each.file for each in everything})
-    table = {name.removeprefix("out/") for name in names if name.startswith("out/")}
-    assert {f"{task}-{method}-{seed}" for task in TASKS for method in METHODS for seed in range(3)} <= table
+    assert {f"downstream/{task}-{method}-{seed}" for task in TASKS for method in METHODS for seed in range(3)} <= set(
+        names
+    )
+
+
+def test_every_command_is_accepted_by_its_program(places):
+    """Commands are parsed, and the configurations that they stand for are made."""
+    main = typer.main.get_command(app)
+    for each in experiments(places):
+        for _, _, module, *words in each.commands():
+            if module == "benchmarks.trials":
+                task, method, seed = words[:3]
+                settings = [value for option, value in pairwise(words) if option == "--set"]
+                config = trial_config(task, method, int(seed), "panda-cube@1", settings)
+                assert (config.run.num_threads, config.run.final_episodes) == (1, 1000)
+            elif module == "service":
+                command = main.commands[words[0]]
+                given = command.make_context("tandem", words[1:]).params
+                config = load_config(recipes()[given["what"]], given["overrides"])
+                assert config.run.total_env_steps == SKILL_ENV_STEPS
 
 
 def making(tmp_path, name, *, needs=None, code=0):

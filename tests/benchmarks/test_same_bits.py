@@ -20,7 +20,12 @@ def same_names(monkeypatch):
 
 
 def header(env_steps=20, words=(1, 2**100), wall_s=3.5):
-    meta = {"env_steps": env_steps, "wall_s": wall_s, "rng": {"state": list(words)}, "config": {"seed": wall_s}}
+    meta = {
+        "env_steps": env_steps,
+        "wall_s": wall_s,
+        "state": {"rng": {"state": list(words)}},
+        "config": {"seed": wall_s},
+    }
     return {"tandem_checkpoint": json.dumps({"format_version": 1, "step": 2, "meta": meta, "sha256": str(wall_s)})}
 
 
@@ -62,7 +67,7 @@ def test_equal_runs_at_other_times(tmp_path):
         ({"weights": ((0.0, 1.0),)}, ["checkpoint/bob/weight"]),
         ({"weights": (0, 0x3F800000), "dtype": np.int32}, ["checkpoint/bob/weight"]),
         ({"name": "bob/weights"}, ["checkpoint/bob/weight", "checkpoint/bob/weights"]),
-        ({"words": (1, 2**100 + 1)}, ["header/meta/rng/state/1"]),
+        ({"words": (1, 2**100 + 1)}, ["header/meta/state/rng/state/1"]),
         ({"env_steps": 21}, ["header/meta/env_steps"]),
         ({"metrics": records(-0.0, 0.25)}, ["metrics.jsonl/loss from record 1 on"]),
         ({"metrics": records(0.0, 0.25000000000000006)}, ["metrics.jsonl/loss from record 2 on"]),

@@ -11,7 +11,7 @@ import shutil
 import signal
 import socket
 import zipfile
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from itertools import pairwise
 
 import numpy as np
@@ -21,6 +21,7 @@ from typer.testing import CliRunner
 from service.cli.main import app
 from service.primitives.publishing import publish
 from service.registry.registry import Registry
+from service.runs.study_file import StudyDirectory
 from tests.runtime.runs import play, tiny_config, write_yaml
 
 LIMIT_S = 60
@@ -95,8 +96,7 @@ NO_CONTENT = {
 }
 EVALUATE = ("evaluate", "--episodes", "2", "--steps", "2", "--registry", "registry", "--primitives")
 RESUME = ("pretrain", "--resume", "--registry", "registry", "--run-dir")
-IDLE = ("--method", "idle", "--task", "push", "--episodes", "4")
-CHECKPOINT, TRAINING = "run/checkpoints/*", "trainings/push-idle-0"
+CHECKPOINT = "run/checkpoints/*"
 VERSION, ALIAS, BLOB = "registry/models/tiny/versions/1", "registry/models/tiny/aliases/latest", "registry/blobs/*/*"
 PLACES = {
     "--config": ("tiny.yaml", ("pretrain", "--config", "tiny.yaml", "--run-dir", "new")),
@@ -107,7 +107,7 @@ PLACES = {
     "checkpoint to evaluate": (CHECKPOINT, (*EVALUATE, "run")),
     "published.json": ("run/published.json", (*RESUME, "run")),
     "run.json": ("run/run.json", (*RESUME, "run")),
-    "study.yaml": ("study/study.yaml", (*RESUME, "study", "--seeds", "0,1")),
+    "study's config": ("study/seed-1.yaml", (*RESUME, "study", "--seeds", "0,1")),
     "study.json": ("study/study.json", (*RESUME, "study", "--seeds", "0,1")),
     "manifest": (VERSION, (*EVALUATE, "tiny")),
     "manifest to list": (VERSION, ("registry", "list", "--registry", "registry")),
@@ -116,13 +116,11 @@ PLACES = {
     "blob": (BLOB, (*EVALUATE, "tiny")),
     "blob to verify": (BLOB, ("registry", "verify", "--registry", "registry")),
     "blob to export": (BLOB, ("registry", "export", "tiny", "out", "--registry", "registry")),
-    "cell.json": (f"{TRAINING}/cell.json", ("downstream", "train", *IDLE, "--resume", "--run-dir", TRAINING)),
-    "result.json": (f"{TRAINING}/result.json", ("downstream", "train", *IDLE, "--resume", "--run-dir", TRAINING)),
+    "checkpoint to publish": (CHECKPOINT, ("publish", "run", "--registry", "registry")),
 }
 RECORDS = {
     "metrics.jsonl": ("run/metrics.jsonl", (*RESUME, "run")),
     "goals.jsonl": ("run/goals.jsonl", (*RESUME, "run")),
-    "records of a training": (f"{TRAINING}/metrics.jsonl", PLACES["cell.json"][1]),
 }
 """Places of files with a line for each iteration."""
 
@@ -155,19 +153,17 @@ def refuse(arguments):
 
 @pytest.fixture(scope="module")
 def good(tmp_path_factory):
-    """A run, what it published, a study and a training that has ended, all of them small."""
+    """A run, what it published and a study, all of them small."""
     home = tmp_path_factory.mktemp("good")
     config = tiny_config(keep_checkpoints=1)
     run, _ = play(home / "run", config)
     write_yaml(home / "tiny.yaml", config.model_dump(mode="json"))
     registry = Registry(home / "registry")
     publish(registry, config, run.method.parameters(), {"env_steps": 600.0})
-    (home / "study").mkdir()
-    shutil.copy(home / "run" / "config.yaml", home / "study" / "study.yaml")
-    (home / "study" / "study.json").write_text('{"seeds": [0, 1]}')
-    trained = CliRunner().invoke(app, ["downstream", "table", "--methods", "idle", "--tasks", "push", *IDLE[4:],
-        "--out", str(home / "out"), "--runs", str(home / "trainings")])  # fmt: skip
-    assert trained.exit_code == 0, trained.output
+    with closing(StudyDirectory(home / "study")) as study:
+        study.begin(
+            {f"seed-{seed}": ({"seed": str(seed)}, config.model_copy(update={"seed": seed})) for seed in (0, 1)}, None
+        )
     return home
 
 
@@ -222,8 +218,8 @@ TYPED = {
     "an absolute id": ((*PRETRAIN, "--run-id", "/tmp/x"), "--run-id '/tmp/x'"),
     "an id with a line end": ((*PRETRAIN, "--run-id", "x\n"), "--run-id 'x\\n'"),
     "true as a number": ((*PRETRAIN, "--run-dir", "new", "--set", "game.num_worlds=true"), "expected a number"),
-    "true as a number of a task": (("downstream", "train", "--task", "push", "--method", "scratch-monolithic",
-        "--run-dir", "new", "--set", "num_worlds=true"), "expected a number"),
+    "true as a number of a task": (("train", "push", "--run-dir", "new", "--set", "sac.num_worlds=true"),
+        "expected a number"),
     "a lock that is a link": ((*PRETRAIN, "--run-dir", "locked"), "locked/.lock: a symbolic link"),
     "a host that is no text": (("serve", "--runs", ".", "--host", NOT_UTF8), "--host is a name or address"),
     "a host that is no text, to play": (("play", "--primitives", "tiny", "--registry", "registry", "--host", NOT_UTF8),

@@ -17,15 +17,17 @@ from typer.testing import CliRunner
 from service.cli.film import parse_goals
 from service.cli.main import app
 from service.config import WorldConfig, load_config
+from service.config.recipes import recipes
+from service.downstream import playing  # noqa: F401  before the function that it calls is replaced
 from service.errors import TandemError
 from service.io import checkpoints
 from service.io.lock import DirectoryLock
 from service.io.run_directory import RunDirectory
 from service.primitives.bundled import BUNDLED
-from service.recipes import recipes
 from service.registry.names import Version
 from service.registry.registry import Registry
 from service.runs.signals import InterruptError
+from service.runs.study import Place, Study
 from tests.runtime.runs import TREE, assert_one_line, no_room_above, tiny_config, write_yaml
 
 ROOT = Path(__file__).parents[2]
@@ -116,13 +118,12 @@ def test_the_examples_of_pretraining(monkeypatch, tmp_path):
 
     What they do with ``--runtime ray`` is shown in tests/runtime.
     """
-    monkeypatch.setattr("service.primitives.publishing.FINAL_EVALUATION_EPISODES", 4)
-    monkeypatch.setattr("service.runs.train.make_artifacts", lambda directory: {})
+    monkeypatch.setattr("service.runs.train.make_artifacts", lambda directory, registry: {})
     monkeypatch.chdir(tmp_path)
     commands = [
-        shlex.split(line, comments=True) for line in re.findall(r"^\$ tandem (pretrain .*)$", EXAMPLES, re.MULTILINE)
+        shlex.split(line, comments=True) for line in re.findall(r"^\$ tandem (train .*)$", EXAMPLES, re.MULTILINE)
     ]
-    commands = [command for command in commands if "--runtime" not in command]
+    commands = [command for command in commands if "--runtime" not in command and command[1] != "wall"]
     write_yaml(tmp_path / "tiny.yaml", TREE | {"name": "panda-cube"})
     monkeypatch.setitem(recipes(), "panda-cube", tmp_path / "tiny.yaml")
     for command in commands:
@@ -135,9 +136,9 @@ def test_the_examples_of_pretraining(monkeypatch, tmp_path):
     own = [(row["name"], row["version"], row["parent"]) for row in rows if row["where"] == "yours"]
     assert own == [("panda-cube", 1, None), ("panda-sphere", 1, None)]  # resuming what was finished made no version
     few = ("--episodes", 2, "--steps", 2, "--json")  # after which the bundled primitives are still there
-    evaluated = json.loads(tandem("evaluate", "--primitives", "panda-cube@champion", *few).stdout)
+    evaluated = json.loads(tandem("evaluate", "panda-cube@champion", *few).stdout)
     assert list(evaluated) == [f"{Registry(BUNDLED).resolve('panda-cube@champion')} (bundled)", "idle"]
-    evaluated = json.loads(tandem("evaluate", "--primitives", "panda-cube", *few).stdout)
+    evaluated = json.loads(tandem("evaluate", "panda-cube", *few).stdout)
     assert list(evaluated) == ["panda-cube@1", "idle"]
 
 
@@ -166,10 +167,7 @@ def test_pretrain_goes_to_runs_by_its_name(monkeypatch, tmp_path):
     monkeypatch.setattr("service.runs.train.train", pretrain)
     tandem("pretrain", "--set", "name=blue")
     tandem("pretrain", "--set", "name=blue", "--run-dir", "here", TANDEM_REGISTRY="/there")
-    assert asked == [
-        ("blue", Path("runs/blue"), Path("registry"), False),
-        ("blue", Path("here"), Path("/there"), False),
-    ]
+    assert asked == [("blue", Path("runs/blue"), "registry", False), ("blue", Path("here"), "/there", False)]
 
 
 def test_demo_is_a_short_pretraining_with_a_registry_of_its_own(monkeypatch, tmp_path):
@@ -191,7 +189,7 @@ def test_demo_is_a_short_pretraining_with_a_registry_of_its_own(monkeypatch, tmp
     (one / "config.yaml").touch()
     refused = tandem("demo", "--run-dir", one)
     assert refused.exit_code == 2
-    hint = "leave --run-dir out, or name another; or continue with: tandem pretrain --resume --run-dir runs/demo-1"
+    hint = "leave --run-dir out, or name another; or continue with: tandem train --resume --run-dir runs/demo-1"
     assert_one_line(refused.stderr, hint, "runs/demo-1/registry")
 
 
@@ -266,15 +264,18 @@ def test_how_to_go_on_is_where_the_run_was_begun(tmp_path, monkeypatch, options,
     def stop(config, directory, *arguments, **keywords):
         directory.config_file.parent.mkdir(exist_ok=True)
         directory.config_file.touch()  # so it has begun
+        interrupt()
+
+    def interrupt(*_):
         raise InterruptError(signal.SIGTERM)
 
     monkeypatch.setattr("service.runtime.ray_connection.connected", lambda address: nullcontext())
-    monkeypatch.setattr("service.runtime.ray_connection.cluster_size", lambda address: ("head:6379", 4.0))
     monkeypatch.setattr("service.runs.train.train", stop)
-    monkeypatch.setattr("service.runtime.pretrain_study.pretrain_study", stop)
+    monkeypatch.setattr("service.cli.study._on_ray", lambda *_: Place())
+    monkeypatch.setattr(Study, "train", interrupt)
     result = tandem("pretrain", "--run-dir", tmp_path / "a run", "--registry", "registry", *seeds, *options)
     assert result.exit_code == 128 + signal.SIGTERM, result.exception
-    how = f"continue with: tandem pretrain --resume --run-dir '{tmp_path}/a run' --registry registry{hint}\n"
+    how = f"continue with: tandem train --resume --run-dir '{tmp_path}/a run' --registry registry{hint}\n"
     assert result.stdout == f"stopped at once; {how}"
 
 
@@ -284,7 +285,6 @@ def test_how_to_go_on_is_where_the_run_was_begun(tmp_path, monkeypatch, options,
 def evaluate(trained, primitives, *arguments):
     return tandem(
         "evaluate",
-        "--primitives",
         primitives,
         "--registry",
         trained.registry,
@@ -340,7 +340,7 @@ def test_evaluate_for_people(trained):
 
 def test_coverage(trained, tmp_path):
     picture = tmp_path / "sub" / "a-picture-with-quite-a-long-name-so-that-it-does-not-fit-a-line.png"
-    common = ("coverage", "--primitives", "tiny", "--registry", trained.registry, "--skills", 3, "--steps", 4)
+    common = ("coverage", "tiny", "--registry", trained.registry, "--skills", 3, "--steps", 4)
     result = tandem(*common, "--out", picture, "--json")
     assert result.exit_code == 0, result.output
     tree = json.loads(result.stdout)
@@ -355,7 +355,7 @@ def test_coverage(trained, tmp_path):
 
 def test_what_comes_with_tandem_needs_no_registry_and_no_directory_of_its_own(filmed, monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
-    champion = ("--primitives", "panda-cube@champion")
+    champion = ("panda-cube@champion",)
     label = f"{Registry(BUNDLED).resolve('panda-cube@champion')} (bundled)"
     result = tandem("evaluate", *champion, "--goals", "mixed", "--episodes", 4, "--steps", 2, "--json")
     assert result.exit_code == 0, result.output
@@ -385,7 +385,7 @@ def filmed(monkeypatch):
 
 def test_render_films_rounds_of_a_run(trained, filmed, tmp_path):
     out = tmp_path / "a-video-[b]-with-quite-a-long-name-so-that-it-does-not-fit-a-line.mp4"
-    result = tandem("render", "--primitives", trained.run, "--episodes", 2, "--out", out)
+    result = tandem("render", trained.run, "--episodes", 2, "--out", out)
     assert result.exit_code == 0, result.output
     assert filmed == [(2, out)]
     assert result.stdout == f"video: {out}\n"  # on one line, to be copied
@@ -394,7 +394,7 @@ def test_render_films_rounds_of_a_run(trained, filmed, tmp_path):
 def test_render_films_episodes_of_published_primitives(trained, filmed, tmp_path):
     out = tmp_path / "x.mp4"
     common = ("--registry", trained.registry, "--out", out)
-    result = tandem("render", "--primitives", "tiny@latest", "--episodes", 3, *common)
+    result = tandem("render", "tiny@latest", "--episodes", 3, *common)
     assert result.exit_code == 0, result.output
     assert filmed == [((3, 3), out)]
 
@@ -404,7 +404,6 @@ def test_render_films_goals_that_are_typed(trained, monkeypatch, tmp_path):
     monkeypatch.setattr("service.media.video.write_episode_video", lambda *arguments: shown.append(arguments))
     common = (
         "render",
-        "--primitives",
         trained.run,
         "--goals",
         "0.02,0,0.2; 0,-0.05,0.025",
@@ -538,16 +537,16 @@ def test_a_run_directory_that_is_a_file(tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "parts"),
     [
-        (["evaluate", "--primitives", "tiny@best"], ["no alias 'best'", "latest -> 1"]),
-        (["evaluate", "--primitives", "tiny@2"], ["no version 2"]),
-        (["evaluate", "--primitives", "nobody"], ["no 'nobody'", "it holds: tiny", "with tandem comes: panda-cube"]),
-        (["evaluate", "--primitives", "no/where"], ["no/where", "no such directory of a run"]),
-        (["evaluate", "--primitives", "."], ["no run in ."]),
-        (["evaluate", "--primitives", "tiny", "--goals", "sky"], ["'sky'", "table, air, mixed"]),
-        (["coverage", "--primitives", "tiny@best"], ["no alias 'best'"]),
-        (["coverage", "--primitives", "tiny", "--skills", "2", "--steps", "1", "--out", "file/x.png"], ["file/x.png"]),
-        (["coverage", "--primitives", "tiny", "--out", "x.txt"], ["--out x.txt", "ends in .png"]),
-        (["render", "--primitives", "no/where"], ["no/where", "no such directory of a run"]),
+        (["evaluate", "tiny@best"], ["no alias 'best'", "latest -> 1"]),
+        (["evaluate", "tiny@2"], ["no version 2"]),
+        (["evaluate", "nobody"], ["no 'nobody'", "it holds: tiny", "with tandem comes: panda-cube"]),
+        (["evaluate", "no/where"], ["no/where", "no such directory of a run"]),
+        (["evaluate", "."], ["no run in ."]),
+        (["evaluate", "tiny", "--goals", "sky"], ["'sky'", "table, air, mixed"]),
+        (["coverage", "tiny@best"], ["no alias 'best'"]),
+        (["coverage", "tiny", "--skills", "2", "--steps", "1", "--out", "file/x.png"], ["file/x.png"]),
+        (["coverage", "tiny", "--out", "x.txt"], ["--out x.txt", "ends in .png"]),
+        (["render", "no/where"], ["no/where", "no such directory of a run"]),
         (["registry", "show", "tiny@best"], ["no alias 'best'"]),
     ],
 )
@@ -609,5 +608,4 @@ def test_a_method_makes_a_run_of_skills_under_its_own_name(monkeypatch, tmp_path
     tandem("pretrain", "--method", "lsd")
     tandem("pretrain", "--method", "dads", "--set", "skills.hidden_sizes=[32]")
     assert sizes == [(64, 64), (256, 256), (32,)]
-    assert_user_error(tandem("pretrain", "--method", "ppo"), "--method 'ppo'", "lsd, diayn, dads, metra")
-    assert_user_error(tandem("pretrain", "--method", "lsd", "--seeds", "0,1"), "--method with --seeds")
+    assert_user_error(tandem("pretrain", "--method", "ppo"), "method = 'ppo'", "lsd, dads, diayn, metra")

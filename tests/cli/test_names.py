@@ -14,8 +14,8 @@ from typer.testing import CliRunner
 
 from service.cli.main import app
 from service.config import load_config
+from service.config.recipes import CONFIGS, recipes, robots
 from service.errors import TandemError, did_you_mean
-from service.recipes import CONFIGS, recipes, robots
 from service.version import __version__
 
 RECIPE = CONFIGS / "pretrain" / "panda_cube.yaml"
@@ -45,7 +45,9 @@ def test_without_a_name_it_is_the_shipped_recipe(begun):
     assert begun == 3 * [load_config(RECIPE, ["seed=3"])]
     assert begun[0].game.num_worlds == 120  # the default is another
     tandem("pretrain", "--method", "lsd")
-    assert begun[3] == load_config(RECIPE, ["skills.method=lsd", "name=panda-cube-lsd"])
+    tandem("train", "panda-cube-lsd")
+    assert begun[3:] == 2 * [load_config(recipes()["panda-cube-lsd"])]
+    assert (begun[3].method, begun[3].skills.method) == ("skills", "lsd")
 
 
 def test_a_file_stands_alone_and_a_name_comes_first(begun):
@@ -73,13 +75,13 @@ def test_configs_are_listed_and_shown():
         (["configs", "show", "panda_cube"], "did you mean 'panda-cube'?"),
         (
             ["pretrain", "--config", "panda-cub"],
-            "tandem configs lists those that come with tandem; did you mean 'panda-cube'?",
+            "no recipe, task or file of that name; there are panda-cube, ",
         ),
         (["pretrain", "--set", "world.robot=ur5"], "did you mean 'ur5e'?"),
         (["pretrain", "--set", "learner.bob.num_epoch=3"], "did you mean 'num_epochs'?"),
         (
             ["pretrain", "--set", "num_worlds=3"],
-            "did you mean distillation.num_worlds or game.num_worlds or skills.sac.num_worlds?",
+            "did you mean game.num_worlds?",
         ),
         (
             ["pretrain", "--set", "learner.gae_lambda=0.9"],
@@ -87,12 +89,12 @@ def test_configs_are_listed_and_shown():
         ),
         (["pretrain", "--method", "LSDD"], "did you mean 'lsd'?"),
         (["pretrain", "--runtime", "rai"], "did you mean 'ray'?"),
-        (["evaluate", "--primitives", "panda-cube", "--goals", "tabel"], "did you mean 'table'?"),
-        (["evaluate", "--primitives", "panda-cub"], "did you mean 'panda-cube'?"),
-        (["evaluate", "--primitives", "panda-cube@champoin"], "did you mean 'champion'?"),
-        (["downstream", "train", "--task", "walls"], "did you mean 'wall'?"),
-        (["downstream", "train", "--task", "wall", "--method", "ours_her"], "did you mean 'ours-her'?"),
-        (["downstream", "train", "--task", "wall", "--set", "gama=0.9"], "did you mean 'gamma'?"),
+        (["evaluate", "panda-cube", "--goals", "tabel"], "did you mean 'table'?"),
+        (["evaluate", "panda-cub"], "did you mean 'panda-cube'?"),
+        (["evaluate", "panda-cube@champoin"], "did you mean 'champion'?"),
+        (["train", "walls"], "did you mean 'wall'?"),
+        (["train", "wall", "--method", "ours_her"], "did you mean 'ours-her'?"),
+        (["train", "wall", "--set", "sac.gama=0.9"], "did you mean 'gamma'?"),
         (["evalute"], "Did you mean 'evaluate'?"),
     ],
 )
@@ -116,10 +118,7 @@ def test_what_is_like_nothing_gets_no_guess():
         (["pretrain", "--runs", "a", "--run-dir", "b"], "drop one of them"),
         (["pretrain", "--runtime", "ray", "--status", "off", "--token-file", "x"], "drop one of them"),
         (["pretrain", "--seeds", "0,1", "--accept-damaged-records"], "resume that one by its --run-dir"),
-        (["downstream", "train", "--task", "wall", "--skill-steps", "5"], "and ours takes none: leave it out"),
-        (["downstream", "train", "--task", "wall", "--method", "idle", "--steps", "900"], "idle learns nothing"),
-        (["downstream", "train", "--task", "wall", "--method", "asp-only", "--set", "gamma=0.9"], "--set is about"),
-        (["evaluate", "--primitives", "panda-cube@champion", "--set", "seed=3"], "only the world can be set"),
+        (["evaluate", "panda-cube@champion", "--set", "seed=3"], "only the world can be set"),
     ],
 )
 def test_options_that_would_do_nothing_are_refused(monkeypatch, tmp_path, arguments, said):
@@ -133,8 +132,7 @@ def test_options_that_would_do_nothing_are_refused(monkeypatch, tmp_path, argume
 def test_what_takes_long_can_be_quiet():
     root = typer.main.get_command(app)
     for line in (
-        "pretrain", "demo", "evaluate", "coverage", "render", "play", "dataset", "export", "serve", "downstream train",
-        "downstream table", "downstream evaluate", "downstream render", "downstream play", "downstream publish",
+        "train", "pretrain", "demo", "evaluate", "coverage", "render", "play", "dataset", "export", "publish", "serve",
     ):  # fmt: skip
         command = root
         for word in line.split():
@@ -145,7 +143,7 @@ def test_what_takes_long_can_be_quiet():
 def test_quiet_before_and_after_the_command(monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("service.progress.PLAIN_INTERVAL_S", 0.0)
-    typed = ["evaluate", "--primitives", "panda-cube@champion", "--episodes", "1", "--steps", "1"]
+    typed = ["evaluate", "panda-cube@champion", "--episodes", "1", "--steps", "1"]
     assert "evaluating on mixed goals" in tandem(*typed).stderr
     level = logging.getLogger().level
     for arguments in (["-q", *typed], [*typed, "-q"]):

@@ -32,17 +32,18 @@ def tandem(*arguments):
 
 
 def test_a_policy_of_a_task_is_evaluated_on_its_task(home):
-    found = tandem("evaluate", "--primitives", "training", "--steps", 2, *SMALL)
+    found = tandem("evaluate", "training", "--steps", 2, *SMALL)
     assert found.exit_code == 0, found.output
     rows = json.loads(found.stdout)
-    assert list(rows) == ["training", "idle"]
-    assert rows["training"]["goals"] == "table"
-    same = tandem("downstream", "evaluate", "training", *SMALL)
-    assert list(json.loads(same.stdout)) == ["task", "training", "made@1, Bob alone", "idle"]
+    assert list(rows) == ["task", "training", "made@1, Bob alone", "idle"]
+    assert (rows["task"], rows["training"]["goals"]) == ("wall", "table")
+    assert tandem("evaluate", "--primitives", "training", "--steps", 2, *SMALL).stdout == found.stdout  # as in 0.2
+    moved = tandem("evaluate", "training", "--primitives", "made@1", "--steps", 2, *SMALL)
+    assert moved.stdout == found.stdout
 
 
 def test_primitives_are_tried_on_a_task(home):
-    found = tandem("downstream", "evaluate", "made", "--task", "wall", *SMALL)
+    found = tandem("evaluate", "made", "--task", "wall", *SMALL)
     assert found.exit_code == 0, found.output
     assert list(json.loads(found.stdout)) == ["task", "made@1", "idle"]
 
@@ -53,9 +54,9 @@ def test_a_registry_may_be_a_url(home, monkeypatch):
         monkeypatch.chdir(home / "runs")  # where no registry is
         monkeypatch.setenv("TANDEM_REGISTRY", server.url)
         for arguments in (
-            ("evaluate", "--primitives", "made", "--steps", 2, *SMALL),
-            ("coverage", "--primitives", "skills", "--steps", 2, "--skills", 2, "--json"),
-            ("downstream", "evaluate", home / "training", *SMALL),
+            ("evaluate", "made", "--steps", 2, *SMALL),
+            ("coverage", "skills", "--steps", 2, "--skills", 2, "--json"),
+            ("evaluate", home / "training", *SMALL),
         ):
             done = tandem(*arguments)
             assert done.exit_code == 0, done.output
@@ -68,7 +69,7 @@ def test_a_registry_may_be_a_url(home, monkeypatch):
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        (("coverage", "--primitives", "training"), "tandem coverage needs primitives or skills: name made@1, which it"),
+        (("coverage", "training"), "tandem coverage needs primitives or skills: name made@1, which it"),
         (
             ("dataset", "skills", "--out", "d"),
             "skills@1 is a set of skills of lsd; tandem dataset needs primitives or a",
@@ -82,10 +83,10 @@ def test_a_registry_may_be_a_url(home, monkeypatch):
             "training is a policy of the task wall; --from needs primitives: name made",
         ),
         (
-            ("downstream", "train", "--task", "wall", "--primitives", "training"),
+            ("train", "wall", "--primitives", "training"),
             "the method ours needs primitives: name",
         ),
-        (("downstream", "publish", "made@1", "--name", "x"), "made@1 is no directory of a downstream training"),
+        (("publish", "made@1", "--name", "x"), "no run in made@1"),
         (("export", "runs", "--format", "numpy", "--out", "o"), "no run in runs"),
     ],
 )

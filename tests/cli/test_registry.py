@@ -141,7 +141,7 @@ def test_what_is_exported_is_a_version_for_every_command(tmp_path: Path, monkeyp
     assert tandem("registry", "export", "given", "again").exit_code == 0
     assert files_in(tmp_path / "again") == files_in(tmp_path / "given")
     played = [
-        json.loads(tandem("evaluate", "--primitives", each, "--episodes", 3, "--steps", 5, "--json").stdout)
+        json.loads(tandem("evaluate", each, "--episodes", 3, "--steps", 5, "--json").stdout)
         for each in ("given", "./again", "panda-cube@champion")
     ]
     assert played[0] == played[1]
@@ -155,12 +155,12 @@ def test_what_is_exported_is_a_version_for_every_command(tmp_path: Path, monkeyp
     parameters.write_bytes(parameters.read_bytes()[:-1] + b"x")
     result = tandem("registry", "verify", "given")
     assert (result.exit_code, result.stderr.count("\n")) == (1, 1)
-    result = tandem("evaluate", "--primitives", "given")
+    result = tandem("evaluate", "given")
     assert result.stderr.startswith("error: given/primitives.safetensors is damaged: expected sha256")
     parameters.unlink()
-    assert "given/primitives.safetensors is missing" in tandem("evaluate", "--primitives", "given").stderr
+    assert "given/primitives.safetensors is missing" in tandem("evaluate", "given").stderr
     (tmp_path / "given" / "manifest.json").write_text("{}")
-    assert tandem("evaluate", "--primitives", "given").stderr.startswith("error: given/manifest.json")
+    assert tandem("evaluate", "given").stderr.startswith("error: given/manifest.json")
 
 
 def test_verify(run: Run, registry: Registry) -> None:

@@ -10,7 +10,8 @@ import yaml
 from typer.testing import CliRunner
 
 from service.cli.main import app
-from service.config import Config, WorldConfig
+from service.config import WorldConfig
+from service.config.self_play import SelfPlayConfig
 from service.errors import TandemError
 from service.primitives.loading import Trained
 from service.robot import backends
@@ -124,7 +125,7 @@ def test_a_goal_inside_the_wall_is_refused_and_one_behind_it_is_not():
 
 def test_a_robot_that_cannot_know_where_the_box_is_wants_a_goal():
     robot, world = FakeRobot(), WorldConfig(fixture="box")
-    policy = Trained("into-it", "primitives", Config(world=world), Steady([0.1, 0.0, 0.0, 0.0]), {})
+    policy = Trained("into-it", "primitives", SelfPlayConfig(world=world), Steady([0.1, 0.0, 0.0, 0.0]), {})
     bridge = Bridge(policy.policy, robot, robot.poses, world, BridgeConfig())
     given = {"num_episodes": 1, "num_steps": 2, "seed": 0, "ready": lambda episode, goal_m: None}
     with pytest.raises(RobotError, match=r"into-it brings the object into a box, .*: --goal"):

@@ -6,7 +6,7 @@ import pytest
 from typer.testing import CliRunner
 
 from service.cli.main import app
-from service.config import SkillsConfig
+from service.config.skills import SkillsConfig
 from service.primitives.publishing import publish
 from service.registry.registry import Registry
 from tests.downstream.skill_sets import CONFIG, SIZE, parameters
@@ -27,7 +27,7 @@ def tandem(*arguments):
 
 def test_coverage_of_skills(registry, tmp_path):
     picture = tmp_path / "skills.png"
-    common = ("coverage", "--primitives", "dads@1", "--registry", registry, "--skills", 3, "--steps", 4)
+    common = ("coverage", "dads@1", "--registry", registry, "--skills", 3, "--steps", 4)
     found = tandem(*common, "--out", picture, "--json")
     assert found.exit_code == 0, found.output
     assert json.loads(found.stdout)["share_of_table_cells_visited"].keys() == {"dads@1", "random policy"}
@@ -50,7 +50,7 @@ def test_render_shows_random_skills(registry, tmp_path, monkeypatch):
     monkeypatch.setattr(
         "service.media.video.write_episode_video", lambda episodes, world, path, options: shown.append((episodes, path))
     )
-    common = ("render", "--primitives", "dads@1", "--registry", registry, "--episodes", 2)
+    common = ("render", "dads@1", "--registry", registry, "--episodes", 2)
     found = tandem(*common, "--out", tmp_path / "skills.mp4")
     assert found.exit_code == 0, found.output
     ((episodes, path),) = shown

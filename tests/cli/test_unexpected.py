@@ -147,18 +147,16 @@ def test_a_thread_that_fails_is_one_line_in_the_log(monkeypatch, caplog, tempora
         (["pretend"], "No such command 'pretend'"),
         (["pretrain", "--nope"], "No such option: --nope; see "),
         (["pretrain", "--parallel", "0"], "'--parallel'"),
-        (["evaluate"], "Missing option '--primitives'; see "),
+        (["publish"], "Missing argument 'RUN'; see "),
         (["registry", "show"], "Missing argument"),
         (["registry", "shove"], "No such command 'shove'"),
-        (["downstream", "train", "--task", "push", "--seed", "x"], "'--seed'"),
         (["pretrain", "--set", "seed=" + "[" * 100_000], "the value is not YAML (nested more than 64 deep)"),
         (["pretrain", "--set", "a=&a [*a]"], "the value is not YAML (an alias within what it stands for)"),
         (["pretrain", "--set", "game.num_worlds=" + "9" * 30], "the value is a whole number beyond 9.22e+18"),
         (["pretrain", "--set", "learner.bob.learning_rate=.nan"], "learning_rate"),
         (["pretrain", "--set", "name=x\nTraceback"], "name = 'x Traceback'"),
         (["pretrain", "--set", f"name={'x' * 100_000}"], "name = 'xxx"),
-        (["downstream", "train", "--task", "push", "--set", "gamma=" + "[" * 1000], "the value is not YAML (nested"),
-        (["evaluate", "--primitives", "x" * 5000], "File name too long"),
+        (["evaluate", "x" * 5000], "File name too long"),
     ],
 )
 def test_what_is_typed_wrong_is_one_line(monkeypatch, tmp_path, arguments, said):
@@ -171,7 +169,7 @@ def test_what_is_typed_wrong_is_one_line(monkeypatch, tmp_path, arguments, said)
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize("arguments", [[], ["registry"], ["downstream"]])
+@pytest.mark.parametrize("arguments", [[], ["registry"]])
 def test_a_group_of_commands_alone_shows_its_help(arguments):
     result = CliRunner().invoke(app, arguments)
     assert result.exit_code == 2

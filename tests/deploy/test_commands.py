@@ -11,11 +11,14 @@ from typer.testing import CliRunner
 
 from service.cli.main import app
 from service.config import dump_config
+from service.config.recipes import recipes
 from service.io.checkpoints import CheckpointStore
 from service.io.run_history import RunHistory
-from service.recipes import recipes
-from service.runtime.pretrain_study import StudyResult
+from service.runs.study import Place, Study
 from tests.deploy.files import DEPLOY, DOCUMENTS, commands, compose, container, manifest, manifests, pod_templates
+
+BEGIN = ("train", "pretrain")
+"""The second is what version 0.2 documented."""
 
 
 def tandem_commands():
@@ -28,6 +31,10 @@ def tandem_commands():
     ]
     texts = [*DOCUMENTS, DEPLOY / "compose" / "compose.yaml"]
     found += [(path.name, arguments) for path in texts for arguments in commands(path.read_text(), "tandem")]
+    found += [
+        ("0.2", shlex.split("pretrain --runtime ray --address auto --status off --run-id cube")),
+        ("0.2", shlex.split("pretrain --runtime ray --address auto --run-id study --seeds 0-4")),
+    ]
     return [pytest.param(arguments, id=f"{where}: {' '.join(arguments)[:60]}") for where, arguments in found]
 
 
@@ -68,30 +75,26 @@ def test_ray_takes_it(arguments):
     parse(cli, arguments)
 
 
-@pytest.mark.parametrize("arguments", [each for each in tandem_commands() if each.values[0][0] == "pretrain"])
-def test_pretrain_begins_with_it_and_goes_on_with_it(arguments, monkeypatch, tmp_path):
+@pytest.mark.parametrize("arguments", [each for each in tandem_commands() if each.values[0][0] in BEGIN])
+def test_a_run_begins_with_it_and_goes_on_with_it(arguments, monkeypatch, tmp_path):
     """Up to where a run would begin: options that exclude each other are found out only then."""
     begun = []
 
-    def pretrain(config, directory, registry, *, resume, **kwargs):
+    def train(config, directory, registry, *, resume, **kwargs):
         begun.append((directory.path, resume))
         CheckpointStore(directory.checkpoints, keep=1).save(0, {}, {})
-        directory.config_file.write_text(dump_config(config))
         RunHistory.new().write(directory.path)
+        directory.config_file.write_text(dump_config(config))
 
-    def pretrain_study(config, directory, seeds, registry, *, resume, **kwargs):
-        begun.append((directory.path, resume))
-        if not resume:
-            directory.begin(config, seeds)
-            directory.close()
-        return StudyResult(())
+    def begin(study, *arguments):
+        begun.append((study.directory.path, resumed))
 
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("service.cli.pretrain._pretrain", pretrain)
-    monkeypatch.setattr("service.runtime.pretrain_study.pretrain_study", pretrain_study)
-    monkeypatch.setattr("service.runtime.ray_connection.cluster_size", lambda *_: ("here", 8.0))
+    monkeypatch.setattr("service.cli.train._train", train)
+    monkeypatch.setattr(Study, "train", begin)
+    monkeypatch.setattr("service.cli.study._on_ray", lambda *_: Place())
     monkeypatch.setattr("service.runtime.ray_connection.connected", lambda *_: nullcontext())
-    here = list(arguments)
+    here, resumed = list(arguments), False
     for resumed in (False, True):
         result = CliRunner().invoke(app, here)
         assert result.exit_code == 0, result.output

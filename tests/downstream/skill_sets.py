@@ -3,7 +3,8 @@
 import torch
 
 from service.baselines.frozen import FrozenSkills, ZeroShotPolicy, export_skills
-from service.config import Config, SkillsConfig, WorldConfig
+from service.config import WorldConfig
+from service.config.skills import SkillDiscoveryConfig, SkillsConfig
 from service.policies.networks import export_parameters
 from service.primitives.loading import Trained
 from service.sac.inputs import NUM_MOTION_INPUTS
@@ -11,7 +12,7 @@ from service.sac.networks import GaussianActor, make_layers
 
 WORLD = WorldConfig(physics_step_s=0.005, num_substeps=8)
 SIZE = 4
-CONFIG = Config(name="made", world=WORLD, skills=SkillsConfig(method="lsd", size=SIZE))
+CONFIG = SkillDiscoveryConfig(name="made", world=WORLD, skills=SkillsConfig(method="lsd", size=SIZE))
 
 
 def parameters(seed=5):

@@ -1,18 +1,15 @@
 import numpy as np
 import pytest
 
-from service.downstream.learner import Hindsight, make_loop, set_progress
+from service.config.sac import SACConfig
+from service.downstream.learner import Hindsight, set_progress
 from service.downstream.methods import METHODS
-from service.downstream.settings import make_trial
-from service.downstream.worker import make_worlds
-from service.off_policy_config import SACConfig
+from service.methods.task import TaskLearning
 from tests.downstream.trials import SMALL, small_trial
 
 
-def loop_of(method, champion, trial=None):
-    trial = trial or small_trial(method)
-    worlds = make_worlds(trial, METHODS[method], champion, 1)
-    return make_loop(trial, METHODS[method], champion, worlds)
+def loop_of(method, champion, **changes):
+    return TaskLearning(small_trial(method, **changes).begin("no registry here", None), champion).loop
 
 
 def test_every_setting_reaches_the_learner(champion):
@@ -31,7 +28,7 @@ def test_every_setting_reaches_the_learner(champion):
         "learning_starts": 160,
     }
     assert all(settings[name] != field.default for name, field in SACConfig.model_fields.items())
-    loop = loop_of("ours", champion, make_trial(task="push", method="ours", num_env_steps=500, sac=settings))
+    loop = loop_of("ours", champion, sac=settings, run={"total_env_steps": 500})
     assert loop.worlds.num_worlds == loop.replay.num_worlds == 3
     assert loop.replay.num_steps == 167  # all 500, in whole steps of 3 worlds
     num_outputs = 2 * champion.primitives.num_primitives
@@ -127,7 +124,7 @@ def test_the_entropy_coefficient_goes_where_the_target_entropy_is(champion, sett
     sac = {"num_worlds": 4, "gradient_steps": 8, "batch_size": 16, "learning_starts": 40, "learning_rate": 1e-2}
     found = []
     for changed in (settings, {**settings, "learn_entropy_coefficient": False}):
-        loop = loop_of("ours", champion, make_trial(task="push", method="ours", num_env_steps=500, sac=sac | changed))
+        loop = loop_of("ours", champion, sac=sac | changed, run={"total_env_steps": 500})
         loop.play(60)
         found.append(loop.play(40)["entropy_coefficient"])
         loop.worlds.close()

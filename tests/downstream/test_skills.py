@@ -8,15 +8,13 @@ import torch
 
 import service
 from service.baselines.frozen import ZeroShotPolicy
-from service.downstream.learner import make_loop
-from service.downstream.methods import METHODS, load_for
+from service.downstream.methods import METHODS
 from service.downstream.skills import SkillTaskWorlds
-from service.downstream.worker import RunOptions, make_worlds, run_trial
 from service.downstream.worlds import TaskWorlds
 from service.envs.gym.vector import TabletopVectorEnv
 from service.envs.observations import POSITIONS
 from service.errors import TandemError
-from service.io.checkpoints import CheckpointStore
+from service.methods.task import TaskLearning
 from service.primitives.publishing import publish
 from service.registry.registry import Registry
 from tests.downstream.skill_sets import CONFIG, SIZE, WORLD, made, parameters
@@ -65,24 +63,21 @@ def test_a_held_skill_is_so_many_steps_of_the_frozen_policy(skills, hold):
 
 def test_updates_and_horizon_are_counted_in_env_steps(skills):
     trial = small_trial("lsd", skill_steps=5)
-    worlds = make_worlds(trial, METHODS["lsd"], skills, 1)
-    loop = make_loop(trial, METHODS["lsd"], skills, worlds)
+    loop = TaskLearning(trial, skills).loop
     assert loop.learner.config.gradient_steps == 5 * trial.sac.gradient_steps
     assert loop.learner.config.gamma == trial.sac.gamma**5
-    loop.play(trial.num_env_steps)
-    assert loop.num_env_steps == trial.num_env_steps == 5 * loop.replay.num_added * trial.sac.num_worlds
-    learned = trial.num_env_steps - trial.sac.learning_starts
+    loop.play(trial.run.total_env_steps)
+    assert loop.num_env_steps == trial.run.total_env_steps == 5 * loop.replay.num_added * trial.sac.num_worlds
+    learned = trial.run.total_env_steps - trial.sac.learning_starts
     assert loop.num_updates == learned // trial.sac.num_worlds * trial.sac.gradient_steps
-    worlds.close()
+    loop.worlds.close()
 
 
 def test_a_learned_policy_holds_its_skills(skills):
-    trial = small_trial("lsd", skill_steps=5)
-    worlds = make_worlds(trial, METHODS["lsd"], skills, 1)
-    loop = make_loop(trial, METHODS["lsd"], skills, worlds)
+    loop = TaskLearning(small_trial("lsd", skill_steps=5), skills).loop
     loop.play(200)  # learned nothing yet: the average is the actor
     player = METHODS["lsd"].learned(loop.learner.averaged_parameters(), skills, 5)
-    worlds = SkillTaskWorlds(worlds.env, 3, skills.skills, 5)
+    worlds = SkillTaskWorlds(loop.worlds.env, 3, skills.skills, 5)
     handed, step = [], worlds.env.step
 
     def handing(actions):
@@ -119,27 +114,6 @@ def test_zero_shot_acts_by_the_skill_towards_the_goal(skills):
         before = positions
 
 
-@pytest.mark.parametrize("method", ["lsd", "lsd-zero-shot"])
-def test_a_trial_continues_where_it_was_cut_off(skills, tmp_path, method):
-    trial = small_trial(method)
-
-    def run(name, left, *, resume=False):
-        from service.downstream.worker import Callbacks
-
-        asked = iter(range(99))
-        options = RunOptions(resume, num_threads=1, callbacks=Callbacks(stop=lambda: next(asked) >= left))
-        return run_trial(trial, skills, tmp_path / name, options)
-
-    whole = run("whole", 99)
-    assert whole["primitives"]["name"] == "made@1"
-    assert whole["env_steps"] == (trial.num_env_steps if method == "lsd" else 0)
-    if method == "lsd":
-        assert run("cut", 2) is None
-        assert run("cut", 99, resume=True)["evaluation"] == whole["evaluation"]
-        first, second = (CheckpointStore(tmp_path / name / "checkpoints", 1).load_latest() for name in ("whole", "cut"))
-        assert all(np.array_equal(array, second.arrays[name]) for name, array in first.arrays.items())
-
-
 class TestBadInput:
     @pytest.fixture
     def registry(self, tmp_path):
@@ -147,29 +121,15 @@ class TestBadInput:
         publish(registry, CONFIG, parameters(), {"env_steps": 100.0})
         return registry.root
 
-    def test_skills_from_a_registry(self, registry):
-        trained = load_for(["lsd", "lsd-zero-shot", "idle"], "made", registry)
-        METHODS["lsd"].check(trained)
-        assert trained.skills.size == SIZE
-
-    def test_skills_where_primitives_are_expected(self, registry, champion):
+    def test_skills_and_primitives_where_the_other_is_expected(self, champion):
         with pytest.raises(TandemError, match=r"made@1 is a set of skills of lsd; the method ours needs primitives"):
-            load_for(["ours"], "made", registry)
-        for method in ("ours", "asp-only"):
-            with pytest.raises(TandemError, match=r"made@1 is a set of skills of lsd; the method .* needs primitives"):
-                METHODS[method].check(made())
-        with pytest.raises(TandemError, match="ours takes primitives and lsd skills: run them by two commands"):
-            load_for(["ours", "lsd"], "made", registry)
-
-    def test_primitives_where_skills_are_expected(self, champion):
-        with pytest.raises(TandemError, match=r"panda-cube@.* is a set of primitives; the method lsd needs"):
-            load_for(["lsd"], "panda-cube@champion", "no registry here")
+            METHODS["ours"].check(made())
         with pytest.raises(TandemError, match=r"panda-cube@.* is a set of primitives; the method LSD skills needs"):
             METHODS["lsd"].check(champion)
 
     def test_skills_of_another_method(self):
         with pytest.raises(TandemError, match=r"made@1 holds skills of dads, this method takes those of lsd"):
-            METHODS["lsd-zero-shot"].check(made("dads"))
+            METHODS["lsd"].check(made("dads"))
 
     def test_skills_of_another_robot(self, registry):
         trained = service.load_skills("made", registry)

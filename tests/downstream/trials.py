@@ -1,12 +1,24 @@
-"""Trials small enough for tests."""
+"""Learning of tasks that is small enough for tests."""
 
-from service.downstream.settings import make_trial
+from service.config import parse_config
 
 SMALL = {"num_worlds": 4, "gradient_steps": 2, "batch_size": 16, "learning_starts": 200, "hidden_sizes": (8,)}
-SETS = [f"--set={key}={list(value) if isinstance(value, tuple) else value}" for key, value in SMALL.items()]
+RUN = {
+    "total_env_steps": 600,
+    "checkpoint_interval": 1,
+    "evaluation_interval": 2,
+    "evaluation_episodes": 4,
+    "final_episodes": 6,
+    "num_threads": 1,
+}
+SETS = [
+    f"--set={group}.{key}={list(value) if isinstance(value, tuple) else value}"
+    for group, keys in (("sac", SMALL), ("run", RUN))
+    for key, value in keys.items()
+]
 
 
-def small_trial(method="ours", task="push", **changes):
+def small_trial(method="ours", task="push", *, sac=None, run=None, **changes):
     """Three iterations of 200 env steps; the second and third learn."""
-    values = {"num_env_steps": 600, "num_episodes": 6, "curve_every": 2, "curve_episodes": 4, **changes}
-    return make_trial(task=task, method=method, sac=SMALL, **values)
+    tree = {"method": method, "task": task, "sac": SMALL | (sac or {}), "run": RUN | (run or {}), **changes}
+    return parse_config(tree, where="a test")

@@ -5,10 +5,10 @@ import numpy as np
 import pytest
 
 from service.config import WorldConfig, load_config
+from service.config.objects import FixtureConfig
 from service.envs.batch import WorldBatch
 from service.envs.sampling import draw_starts, sample_goals
 from service.errors import ConfigError
-from service.object_config import FixtureConfig
 from tests.envs.scripted import CLOSE, drive
 from tests.envs.test_meshes import write_box
 from tests.runtime.runs import assert_one_line

@@ -121,7 +121,7 @@ def test_it_is_read_once(tmp_path, monkeypatch):
     (tmp_path / "saved.yaml").write_text(dump_config(config))
     monkeypatch.chdir("/")
     WorldBatch(config.world, 1).close()
-    monkeypatch.setattr("service.object_config.measure", None)
+    monkeypatch.setattr("service.config.objects.measure", None)
     assert load_config(tmp_path / "saved.yaml") == config
     write_box(file, (0.05, 0.04, 0.03))
     with pytest.raises(ConfigError) as error:

@@ -1,17 +1,16 @@
-"""Policies with random parameters, published, and trainings by hand."""
+"""Policies with random parameters, published, and runs by hand."""
 
 import torch
 
-from service.config import Config, MCPConfig, MLPConfig, PolicyConfig, RunConfig, WorldConfig
-from service.downstream.directory import TrainingDirectory
-from service.downstream.files import write_json
-from service.downstream.methods import provenance
-from service.downstream.settings import make_trial
+from service.config import RunConfig, WorldConfig
+from service.config.self_play import MCPConfig, MLPConfig, PolicyConfig, SelfPlayConfig
+from service.config.task import TaskConfig
+from service.downstream.methods import METHODS
 from service.envs.observations import layouts
 from service.io.checkpoints import CheckpointStore
 from service.io.run_directory import RunDirectory
 from service.policies.networks import export_parameters, make_bob
-from service.primitives.learned import num_inputs, save_policy
+from service.primitives.learned import num_inputs
 from service.primitives.loading import load
 from service.primitives.publishing import publish
 from service.sac.networks import GaussianActor
@@ -20,7 +19,7 @@ WORLD = WorldConfig(physics_step_s=0.005, num_substeps=8, observed={"num_command
 """A world in which policies see more than in the paper."""
 SEEN = layouts(WORLD)
 BOB = MCPConfig(num_primitives=2, trunk_hidden_sizes=(24, 12), primitive_hidden_size=9, gate_hidden_sizes=(16,))
-CONFIG = Config(name="made", world=WORLD, policy=PolicyConfig(bob=BOB), run=RunConfig(evaluation_steps=4))
+CONFIG = SelfPlayConfig(name="made", world=WORLD, policy=PolicyConfig(bob=BOB), run=RunConfig(evaluation_steps=4))
 MONOLITHIC = CONFIG.model_copy(
     update={"policy": PolicyConfig(bob=BOB, monolithic_bob=MLPConfig(hidden_sizes=(20, 10)))}
 )
@@ -41,10 +40,12 @@ def parameters_of(config):
         return scattered(make_bob(config.policy, SEEN))
 
 
-def actor_of(residual):
+def actor_of(method):
+    """Of a policy of a task; it sets the weights of Bob's primitives, or acts by itself."""
+    composed = BOB.num_primitives if METHODS[method].composes else 4
     with torch.random.fork_rng():
         torch.manual_seed(4)
-        actor = GaussianActor(num_inputs(SEEN)[1], BOB.num_primitives + (4 if residual else 0), (16, 12))
+        actor = GaussianActor(num_inputs(SEEN)[1], composed + (4 if METHODS[method].residual else 0), (16, 12))
         return scattered(actor)
 
 
@@ -55,19 +56,23 @@ def publish_bob(registry, parameters=None):
 
 
 def write_training(path, trained, method="ours-residual-her", task="push"):
-    """The directory of a training at its end, as far as an export reads it."""
-    training, trial = TrainingDirectory(path), make_trial(task=task, method=method)
-    tree = {"format_version": 1, "cell": trial.model_dump(mode="json"), **provenance(trained, method)}
-    write_json(training.trial_file, tree)
-    save_policy(training.policy_file, actor_of("residual" in method), method, tree["primitives"])
-    return training
+    """The run of a task at its end, as far as an export reads it."""
+    config = TaskConfig(
+        method=method,
+        task=task,
+        world=trained.config.world,
+        primitives=trained.reference,
+        primitives_digest=trained.digest if METHODS[method].takes else None,
+    )
+    return write_run(path, config, actor_of(method))
 
 
-def write_run(path, config):
+def write_run(path, config, parameters=None):
     """A run directory with one checkpoint."""
     directory = RunDirectory(path)
     directory.start(config)
-    arrays = {f"bob/{name}": array for name, array in parameters_of(config).items()}
+    parameters = parameters or parameters_of(config)
+    arrays = {f"{config.part}/{name}": array for name, array in parameters.items()}
     CheckpointStore(directory.checkpoints, keep=1).save(1, arrays, {"env_steps": 1})
     directory.close()
     return path

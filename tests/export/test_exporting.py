@@ -132,7 +132,7 @@ def test_an_orchestrator_with_its_primitives(run, registry, tmp_path, monkeypatc
     monkeypatch.chdir(tmp_path / "out")
     scope = {}
     exec(program, scope)
-    player = load(str(training.path), registry.root).player()
+    player = load(str(training), registry.root).player()
     np.testing.assert_allclose(scope["action"], player.act_deterministic(scope["observation"])[0], atol=1e-5)
 
 
@@ -193,7 +193,7 @@ def test_what_is_no_bob(run, registry, tmp_path):
     fails(run("made@2", "--format", "numpy", "--out", "out"), "made@2", "'gate.output.bias'", "is not finite")
     fails(run("nobody", "--format", "numpy", "--out", "out"), "no 'nobody'")
     fails(
-        run("made@1", "--format", "numpy", "--primitives", "made@1", "--out", "out"),
+        run("made@1", "--format", "numpy", "--primitives", "made", "--out", "out"),
         "made@1 acts with no others",
     )
     assert not (tmp_path / "out").exists()
@@ -203,11 +203,9 @@ def test_trainings_that_cannot_be_exported(run, registry, tmp_path):
     trained = publish_bob(registry)
     write_training(tmp_path / "scratch", trained, "scratch-monolithic")
     fails(run("scratch", "--format", "numpy", "--out", "out"), "scratch was trained with", "composes no primitives")
-    training = write_training(tmp_path / "begun", trained, "ours")
+    write_training(tmp_path / "begun", trained, "ours")
     champion = ("--primitives", "panda-cube@champion")
     fails(run("begun", "--format", "numpy", "--out", "out", *champion), "acts with made@1 of digest")
-    training.policy_file.unlink()
-    fails(run("begun", "--format", "numpy", "--out", "out"), "begun has not ended: continue it")
     assert not (tmp_path / "out").exists()
 
 

@@ -5,10 +5,10 @@ import pytest
 
 from service.actors.evaluation import IdlePolicy
 from service.config import RunConfig
+from service.config.world import ObservedConfig
 from service.envs.observations import ACTION, layouts
 from service.export.measurements import LateObservations, Measured, measure, measure_response
 from service.primitives.loading import Trained
-from service.world_config import ObservedConfig
 from tests.export.policies import CONFIG, SEEN, WORLD
 
 

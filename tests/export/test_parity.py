@@ -17,7 +17,7 @@ from tests.export.policies import CONFIG, MONOLITHIC, SEEN, actor_of, parameters
 
 
 def learned(bob, method):
-    actor = actor_of(residual="residual" in method)
+    actor = actor_of(method)
     policy = LearnedPolicy(actor, bob.primitives, SEEN)
     return Trained("made", "orchestrator", CONFIG, policy, actor, task="push", method=method, trained=bob)
 

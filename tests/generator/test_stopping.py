@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from service.config import GeneratorConfig
+from service.config.self_play import GeneratorConfig
 from service.generator.stopping import StopCriterion
 
 CONFIG = GeneratorConfig(novelty_window=4, stop_success_rate=0.95)

@@ -1,7 +1,7 @@
 import pytest
 import torch
 
-from service.config import MCPConfig
+from service.config.self_play import MCPConfig
 from service.learner.diagnostics import composition_metrics
 from service.policies.networks import MCPPolicy
 

@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch import nn
 
-from service.config import ABCConfig, PPOConfig
+from service.config.self_play import ABCConfig, PPOConfig
 from service.learner import ppo
 from service.learner.diagnostics import probes
 from service.learner.player import Player

@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch import nn
 
-from service.config import ABCConfig, PPOConfig
+from service.config.self_play import ABCConfig, PPOConfig
 from service.envs.observations import ACTION, BOB, BOB_VALUE, PAPER
 from service.learner.player import Player
 from service.learner.ppo import advantages, collect

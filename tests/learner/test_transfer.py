@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from service.config import MCPConfig, MLPConfig, PolicyConfig
+from service.config.self_play import MCPConfig, MLPConfig, PolicyConfig
 from service.envs.observations import PAPER, Layouts
 from service.learner.transfer import take_over
 from service.policies import networks

@@ -8,13 +8,14 @@ import pytest
 from typer.testing import CliRunner
 
 from service.cli.main import app
-from service.config import Config, WorldConfig
+from service.config import WorldConfig
+from service.config.self_play import SelfPlayConfig
 from service.envs.gym.tabletop import TabletopEnv
 from service.media.dataset import Played, check_name, played_episodes, played_turns, write_dataset
 from service.media.recording import play_rounds, record_episodes
 from tests.media.test_recording import NOTHING, PUSH, Constant
 
-CONFIG = Config(
+CONFIG = SelfPlayConfig(
     world=WorldConfig(physics_step_s=0.005, num_substeps=8),
     game={"alice_steps": 12, "bob_steps": 12, "blocked_gripper_fraction": 0.5},
 )

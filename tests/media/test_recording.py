@@ -8,7 +8,8 @@ import pytest
 from service.actors.evaluation import evaluate
 from service.baselines.coverage import skill_paths
 from service.baselines.frozen import FrozenSkills
-from service.config import Config, GameConfig, WorldConfig
+from service.config import WorldConfig
+from service.config.self_play import GameConfig, SelfPlayConfig
 from service.envs.batch import WorldBatch
 from service.generator.validity import Verdict
 from service.media import recording, video
@@ -37,7 +38,7 @@ class Constant:
 
 
 def record(alice=PUSH, bob=PUSH, *, num_rounds=3, seed=0, **game):
-    config = Config(game=GameConfig(**{"alice_steps": 12, "bob_steps": 12} | game))
+    config = SelfPlayConfig(game=GameConfig(**{"alice_steps": 12, "bob_steps": 12} | game))
     return record_rounds(config, Constant(alice), Constant(bob), num_rounds=num_rounds, seed=seed)
 
 
@@ -101,7 +102,7 @@ class Sweep(Constant):
 
 def test_a_bob_who_passes_the_goal_has_not_solved_it():
     # He does what Alice did, but for 20 steps, not 5: where she left the object he does not stop.
-    config = Config(game=GameConfig(alice_steps=5, bob_steps=20, bob_hold_steps=20))
+    config = SelfPlayConfig(game=GameConfig(alice_steps=5, bob_steps=20, bob_hold_steps=20))
     rounds = record_rounds(config, Sweep(), Sweep(), num_rounds=30, seed=0)
     tried = [played for played in rounds if played.verdict == Verdict.VALID]
     assert {len(played.bob_actions) for played in tried} == {20}
@@ -113,7 +114,9 @@ def test_a_bob_who_passes_the_goal_has_not_solved_it():
 
 @pytest.mark.parametrize("distance_m", [0.03, 0.06])
 def test_the_caption_says_solved_where_the_runs_own_rule_does(monkeypatch, distance_m):
-    config = Config(game=GameConfig(alice_steps=5, bob_steps=11, bob_hold_steps=11, success_distance_m=distance_m))
+    config = SelfPlayConfig(
+        game=GameConfig(alice_steps=5, bob_steps=11, bob_hold_steps=11, success_distance_m=distance_m)
+    )
     rounds = record_rounds(config, Sweep(), Sweep(), num_rounds=30, seed=1)
     blank = SimpleNamespace(render=lambda state, goal=None: np.zeros((8, 8, 3), dtype=np.uint8))
     words, bar = [], video._bar

@@ -10,7 +10,7 @@ import pytest
 import torch
 from torch import nn
 
-from service.config import MCPConfig, MLPConfig, PolicyConfig
+from service.config.self_play import MCPConfig, MLPConfig, PolicyConfig
 from service.policies.networks import GaussianPolicy, MCPPolicy, make_alice, make_bob
 from service.policies.parameters import FloatArray
 

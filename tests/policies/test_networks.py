@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from service.config import MCPConfig, PolicyConfig
+from service.config.self_play import MCPConfig, PolicyConfig
 from service.envs.observations import ACTION, BOB, BOB_VALUE, FULL, POSITIONS
 from service.policies.gaussian import log_prob
 from service.policies.networks import (

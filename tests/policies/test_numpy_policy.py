@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 
-from service.config import PolicyConfig
+from service.config.self_play import PolicyConfig
 from service.envs.observations import BOB, FULL, POSITIONS
 from service.policies import forward, gaussian
 from service.policies.networks import GaussianPolicy, MCPPolicy, export_parameters, make_alice, make_bob

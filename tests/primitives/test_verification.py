@@ -12,11 +12,12 @@ from typer.testing import CliRunner
 from service.baselines.frozen import export_skills
 from service.baselines.rewards import METHODS, make_reward
 from service.cli.main import app
-from service.config import Config, MCPConfig, PolicyConfig, SkillsConfig, WorldConfig
+from service.config import WorldConfig
+from service.config.self_play import MCPConfig, PolicyConfig, SelfPlayConfig
+from service.config.skills import SkillDiscoveryConfig, SkillsConfig, SkillsSACConfig
 from service.envs.observations import layouts
 from service.errors import TandemError
 from service.io import tensors
-from service.off_policy_config import SkillsSACConfig
 from service.policies.networks import export_parameters, make_bob
 from service.primitives.loading import load
 from service.primitives.publishing import publish
@@ -47,14 +48,14 @@ def skills(config):
 
 def test_shapes_are_those_of_the_networks():
     bobs = MCPConfig(num_primitives=3, trunk_hidden_sizes=(6, 7), primitive_hidden_size=5, gate_hidden_sizes=(8, 9))
-    config = Config(policy=PolicyConfig(bob=bobs), world=WorldConfig(observed={"num_commands": 2}))
+    config = SelfPlayConfig(policy=PolicyConfig(bob=bobs), world=WorldConfig(observed={"num_commands": 2}))
     assert expected_shapes(config) == shapes(bob(config))
 
 
 @pytest.mark.parametrize("method", METHODS)
 def test_shapes_are_those_of_skills(method):
     config = SKILLS.model_copy(update={"method": method})
-    assert expected_shapes(Config(skills=config)) == shapes(skills(config))
+    assert expected_shapes(SkillDiscoveryConfig(skills=config)) == shapes(skills(config))
 
 
 @pytest.fixture
@@ -72,7 +73,7 @@ def verify(registry):
 
 def test_what_was_published_is_well(registry):
     publish(registry, tiny_config(), bob(tiny_config()), {})
-    config = Config(name="skills", skills=SKILLS)
+    config = SkillDiscoveryConfig(name="skills", skills=SKILLS)
     publish(registry, config, skills(SKILLS), {})
     assert verify(registry) == []
 
@@ -123,7 +124,7 @@ def test_sizes_of_another_configuration_are_named(registry):
 
 
 def test_skills_of_another_size_are_named(registry):
-    publish(registry, Config(name="skills", skills=SkillsConfig(size=4)), skills(SKILLS), {})
+    publish(registry, SkillDiscoveryConfig(name="skills", skills=SkillsConfig(size=4)), skills(SKILLS), {})
     assert_one_line(verify(registry)[0], "skills@1: policy parameter 'actor.layers.0.weight'", "(256, 21), got (8, 22)")
 
 
@@ -162,7 +163,7 @@ def test_a_blob_of_something_else(registry, tmp_path, data, command):
     forge(registry, data)
     arguments = {
         "verify": ["registry", "verify"],
-        "evaluate": ["evaluate", "--primitives", "tiny"],
+        "evaluate": ["evaluate", "tiny"],
         "export": ["registry", "export", "tiny", str(tmp_path / "out")],
     }[command]
     result = CliRunner().invoke(app, [*arguments, "--registry", str(registry.root)])

@@ -1,11 +1,11 @@
 import numpy as np
 import pytest
 
+from service.config.world import WorldConfig
 from service.errors import TandemError
 from service.robot.backends import BackendConfig, connect, read_backend
 from service.robot.disturbed import DisturbanceConfig, DisturbedPoses, DisturbedRobot
 from service.robot.interface import Command
-from service.world_config import WorldConfig
 from tests.robot.fakes import OBJECT_M, FakeRobot
 
 

@@ -8,13 +8,13 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from service.config.world import WorldConfig
 from service.envs import panda
 from service.errors import TandemError
 from service.robot.backends import BackendConfig, connect
 from service.robot.errors import RobotError
 from service.robot.franka_robot import FrankaParameters, FrankaRobot, _Hand
 from service.robot.interface import Command, ObjectPose
-from service.world_config import WorldConfig
 
 PARAMETERS = FrankaParameters(host="robot.local")
 TIP_IN_BASE = np.array([0.55, 0.02, 0.10])

@@ -1,42 +1,25 @@
 import dataclasses
-import json
 
 import numpy as np
 import pytest
 
-from service.downstream.learner import make_loop
-from service.downstream.methods import METHODS, provenance
-from service.downstream.worker import make_worlds
 from service.errors import TandemError
 from service.primitives.bundled import BUNDLED
-from service.primitives.learned import save_policy
 from service.primitives.loading import load
 from service.robot.policies import for_robot
 from tests.downstream.skill_sets import made
-from tests.downstream.trials import small_trial
+from tests.export.policies import publish_bob, write_training
 
 
-def write_training(path, champion, method="ours"):
-    """What a bridge reads of a downstream training's directory."""
-    trial = small_trial(method, task="wall")
-    worlds = make_worlds(trial, METHODS[method], champion, 1)
-    parameters = make_loop(trial, METHODS[method], champion, worlds).learner.averaged_parameters()
-    worlds.close()
-    path.mkdir()
-    about = {"format_version": 1, "cell": trial.model_dump(mode="json"), **provenance(champion, method)}
-    (path / "cell.json").write_text(json.dumps(about))
-    save_policy(path / "policy.safetensors", parameters, method, about["primitives"])
-
-
-def test_a_bob_and_an_orchestrator_with_its_world(champion, tmp_path):
+def test_a_bob_and_an_orchestrator_with_its_world(registry, tmp_path):
     bob = for_robot(load("panda-cube@champion", tmp_path))
     assert (bob.goals, bob.world.fixture) == ("mixed", "none")
     robust = for_robot(load("panda-cube-robust@champion", tmp_path)).world
     assert (robust.nominal, robust.observed.delay) == (robust, True)  # a robot is one, not drawn from many
-    write_training(tmp_path / "wall", champion)
-    found = for_robot(load(str(tmp_path / "wall"), BUNDLED))
+    write_training(tmp_path / "wall", publish_bob(registry), "ours", "wall")
+    found = for_robot(load(str(tmp_path / "wall"), registry.root))
     assert (found.name, found.goals, found.world.fixture) == ("wall-ours-0", "table", "wall")
-    action = found.policy.act_deterministic(np.zeros((1, 14), dtype=np.float32))
+    action = found.policy.act_deterministic(np.zeros((1, 22), dtype=np.float32))
     assert action.shape == (1, 4)
 
 

@@ -5,12 +5,12 @@ import sys
 import numpy as np
 import pytest
 
+from service.config.world import WorldConfig
 from service.errors import ConfigError, TandemError
 from service.robot.backends import BackendConfig, connect
 from service.robot.errors import RobotError
 from service.robot.interface import Command
 from service.robot.pybullet_robot import CONTROL_STEP_S, PyBulletParameters, PyBulletRobot, lag_s, world_of
-from service.world_config import WorldConfig
 
 _NEEDS = "needs PyBullet: pip install 'tandem-skills[pybullet]'"
 PLACE = np.array([0.05, 0.08, 0.02])

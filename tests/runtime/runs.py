@@ -62,9 +62,17 @@ TREE = {
         "evaluation_interval": 0,
         "evaluation_steps": 2,
         "evaluation_episodes": 4,
+        "final_episodes": 4,
         "num_threads": 1,
     },
 }
+
+TINY_TASK = [
+    *("--set", "sac.num_worlds=4", "--set", "sac.learning_starts=200", "--set", "sac.hidden_sizes=[8]"),
+    *("--set", "sac.batch_size=8", "--set", "sac.gradient_steps=1", "--set", "run.final_episodes=4"),
+    *("--set", "run.checkpoint_interval=1", "--set", "run.evaluation_interval=0"),
+]
+"""Options of a task in iterations of 200 env steps, 0.2 s each; without rendering it is over in seconds."""
 
 
 class KilledError(Exception):
@@ -189,8 +197,9 @@ def assert_same_run(one, other):
     timeless = [{key: value for key, value in side.meta.items() if key not in own} for side in (left, right)]
     assert timeless[0] == timeless[1]
     assert timeless_metrics(one) == timeless_metrics(other)
-    for name in ("goals.jsonl", "config.yaml"):
-        assert (one / name).read_bytes() == (other / name).read_bytes(), name
+    for name in ("goals.jsonl", "config.yaml"):  # not every method has goals
+        assert (one / name).exists() == (other / name).exists(), name
+        assert not (one / name).exists() or (one / name).read_bytes() == (other / name).read_bytes(), name
 
 
 def assert_one_line(text, *parts):

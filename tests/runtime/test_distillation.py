@@ -8,7 +8,7 @@ from typer.testing import CliRunner
 from service.actors.distillation import _LEAST_LOG_WEIGHT, _NOISY_SHARE, DistillationWorlds
 from service.cli.main import app
 from service.config import parse_config
-from service.distillation_config import DistillationConfig
+from service.config.distillation import DistillationConfig
 from service.envs.batch import WorldBatch
 from service.envs.observations import PAPER, POSITIONS, layouts
 from service.envs.obstacles import inside_obstacles
@@ -29,7 +29,8 @@ HOW = {"num_worlds": 8, "episode_steps": 6, "gradient_steps": 3, "batch_size": 1
 
 def config_of(randomisation, how=None, **run):
     world = TREE["world"] | {"observed": {"num_commands": 2, "delay": True}, "randomisation": randomisation}
-    tree = TREE | {"name": "robust", "world": world, "distillation": HOW | (how or {}), "run": TREE["run"] | run}
+    tree = {"name": "robust", "method": "distillation", "world": world, "policy": TREE["policy"]}
+    tree |= {"distillation": HOW | (how or {}), "run": TREE["run"] | run}
     return parse_config(tree, where="a test")
 
 
@@ -201,7 +202,7 @@ def test_a_run_is_published_with_its_teacher_as_parent_and_is_exact_when_resumed
     start = load(str(version), root / "registry")
     whole = run_to_end(tmp_path / "whole", config, start)
     assert load(str(tmp_path / "whole")).alice is None
-    filmed = CliRunner().invoke(app, ["render", "--primitives", str(tmp_path / "whole"), "--episodes", "1"])
+    filmed = CliRunner().invoke(app, ["render", str(tmp_path / "whole"), "--episodes", "1"])
     assert filmed.exit_code == 0, filmed.output
     run_to_end(tmp_path / "part", config, start, stop_after=2)
     run_to_end(tmp_path / "part", config, resume=True)
@@ -247,4 +248,4 @@ def test_without_a_teacher_and_what_goes_together(tmp_path):
     with pytest.raises(TandemError, match="name him, --from"):
         open_run(config_of({}), RunDirectory(tmp_path / "run"))
     with pytest.raises(ConfigError, match="distillation teaches primitives"):
-        parse_config(TREE | {"distillation": {}, "skills": {"method": "lsd"}}, where="a test")
+        parse_config({"method": "distillation", "policy": {"monolithic_bob": {}}}, where="a test")

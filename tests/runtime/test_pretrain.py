@@ -13,7 +13,6 @@ from service.config import parse_config
 from service.envs.obstacles import draw_goals
 from service.errors import ConfigError, TandemError
 from service.io.run_directory import RunDirectory
-from service.primitives import publishing
 from service.primitives.bundled import BUNDLED
 from service.registry.registry import Registry
 from service.runs import train as module
@@ -39,8 +38,7 @@ pytestmark = pytest.mark.usefixtures("default_signals")
 @pytest.fixture
 def quick(monkeypatch):
     """The final evaluation of a few episodes, and no pictures."""
-    monkeypatch.setattr(publishing, "FINAL_EVALUATION_EPISODES", 4)
-    monkeypatch.setattr(module, "make_artifacts", lambda directory: {"curves": directory.path / "curves.png"})
+    monkeypatch.setattr(module, "make_artifacts", lambda directory, registry: {"curves": directory.path / "curves.png"})
 
 
 def run_pretrain(tmp_path, config=None, *, on_iteration=lambda metrics: None, **kwargs):
@@ -236,7 +234,7 @@ def test_a_signal_saves_and_says_how_to_resume(tmp_path, number, exit_code):
         process.kill()
     assert process.returncode == exit_code, err
     assert re.search(r"^interrupted after [\d,]+ env steps, \d+ iterations$", out, re.MULTILINE)
-    assert f"tandem pretrain --resume --run-dir {path}" in out
+    assert f"tandem train --resume --run-dir {path}" in out
     assert "Traceback" not in err
     saved = newest(path)
     assert saved.step == read_lines(path / "metrics.jsonl")[-1]["iteration"]

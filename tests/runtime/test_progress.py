@@ -8,7 +8,7 @@ from rich.console import Console
 
 from service.methods.timing import Timing
 from service.progress import PLAIN_INTERVAL_S, Display
-from service.runtime.progress import Progress
+from service.runs.progress import Progress
 
 
 class Clock:

@@ -15,7 +15,6 @@ from service.io import lock
 from service.io.epoch import claim_epoch
 from service.io.errors import RunTakenError
 from service.io.run_directory import RunDirectory
-from service.primitives import publishing
 from service.registry.registry import Registry
 from service.runs import train as module
 from service.runs.resuming import resumed_config
@@ -45,8 +44,7 @@ pytestmark = pytest.mark.usefixtures("default_signals")
 @pytest.fixture(autouse=True)
 def quick(monkeypatch):
     monkeypatch.delenv("TANDEM_REDIS_URL", raising=False)
-    monkeypatch.setattr(publishing, "FINAL_EVALUATION_EPISODES", 4)
-    monkeypatch.setattr(module, "make_artifacts", lambda directory: {})
+    monkeypatch.setattr(module, "make_artifacts", lambda directory, registry: {})
     monkeypatch.setattr(redis_writer, "TICK_S", 0.02)
 
 

@@ -102,7 +102,6 @@ def test_a_stop_that_is_passed_on_raises_where_nothing_else_was_asked_for():
 @pytest.fixture
 def home(tmp_path, monkeypatch):
     """A quick end of a run, and ``run(*more)``: a pre-training there from the command line."""
-    monkeypatch.setattr("service.primitives.publishing.FINAL_EVALUATION_EPISODES", 4)
     monkeypatch.setattr("service.media.artifacts.NUM_SKILLS", 2)
     monkeypatch.setattr("service.media.artifacts.COVERAGE_STEPS", 2)
     monkeypatch.setattr("service.media.video.write_video", lambda takes, world, path: path)
@@ -115,7 +114,7 @@ def home(tmp_path, monkeypatch):
         return CliRunner().invoke(app, [str(part) for part in arguments], env={"COLUMNS": "80"})
 
     home.run = run
-    home.hint = f"continue with: tandem pretrain --resume --run-dir {home.path} --registry {home.registry}\n"
+    home.hint = f"continue with: tandem train --resume --run-dir {home.path} --registry {home.registry}\n"
     return home
 
 

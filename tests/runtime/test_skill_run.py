@@ -24,6 +24,7 @@ def small_config(method="lsd", **run):
     skills = {"method": method, "episode_steps": 10, "hidden_sizes": [8], "batch_size": 8, "sac": sac}
     tree = {
         "name": f"cube-{method}",
+        "method": "skills",
         "skills": skills,
         "world": {"physics_step_s": 0.005, "num_substeps": 8},
         "run": {"total_env_steps": 400, "checkpoint_interval": 4, "evaluation_interval": 5, "num_threads": 1, **run},
@@ -183,7 +184,7 @@ class TestBadInput:
 
     def test_on_a_cluster(self, tmp_path):
         self.refused(
-            "skill discovery runs in one process; use --runtime local", train, small_config(),
+            "method = skills: it runs in one process; use --runtime local", train, small_config(),
             RunDirectory(tmp_path / "run"), tmp_path, on_iteration=lambda metrics: None,
             runtime=RayRuntime(ClusterOptions()),
         )  # fmt: skip

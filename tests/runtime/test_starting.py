@@ -97,7 +97,7 @@ def test_only_the_value_network_learns_at_first(tmp_path):
 )
 def test_what_cannot_be_begun_from(tmp_path, reference, expected):
     with pytest.raises(TandemError, match=expected):
-        load_start(reference, tmp_path, tiny_config())
+        load_start(reference, tmp_path)
 
 
 def test_nothing_that_fits_is_refused_and_another_try_can_begin(trained, tmp_path):

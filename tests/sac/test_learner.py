@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from service.off_policy_config import SACConfig
+from service.config.sac import SACConfig
 from service.sac.learner import Batch, SACLearner, actions_at_random
 from service.sac.networks import GaussianActor, sample_actions
 

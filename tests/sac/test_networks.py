@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from service.config import MCPConfig
+from service.config.self_play import MCPConfig
 from service.policies.networks import export_parameters
 from service.policies.parameters import PolicyError
 from service.sac.networks import Critics, GaussianActor, MCPActor, sample_actions

@@ -116,22 +116,38 @@ def write_runs(root: Path) -> None:
 def write_trial(
     root: Path, run_id: str, task: str, method: str, seed: int, success: float | None, **changes: Any
 ) -> Path:
-    """Write a downstream training of two iterations; it has ended where ``success``, over 300 episodes, is a number."""
-    path = root / run_id
-    path.mkdir(parents=True)
-    primitives = {"name": "tiny@1", "digest": "0" * 64, "env_steps": 1000.0}
-    made = {"primitives": primitives, "world": {"robot": "panda"}} | changes.pop("made", {})
-    trial = {"task": task, "method": method, "seed": seed, "num_env_steps": 2000, "task_version": 1} | changes
-    tree = {"format_version": 1, "cell": trial, **made}
-    (path / "cell.json").write_text(json.dumps(tree))
+    """Write a run of two iterations that learns a task; it has ended where ``success``, over 300 episodes, is a number.
+
+    Args:
+        root: directory of runs.
+        run_id: name of its directory.
+        task: what it learns.
+        method: how.
+        seed: of the run.
+        success: at the last step, in the final evaluation.
+        changes: other keys of its configuration; ``total_env_steps`` is that of ``run``.
+    """
+    path, total = root / run_id, changes.pop("total_env_steps", 2000)
+    scratch = method.startswith("scratch")
+    tree = {"name": f"{task}-{method}", "seed": seed, "method": method, "task": task, "task_version": 1}
+    tree |= {"primitives": "tiny@1", "primitives_digest": None if scratch else "0" * 64, "reward_margin_m": 0.01}
+    tree |= {"world": {"object": "cube", "object_mass_kg": 0.1}, "run": {"total_env_steps": total, "num_threads": 0}}
+    tree |= changes
+    low, high = wilson_interval(round(300 * (success or 0.0)), 300)
+    ended = {"success_last": success, "success_ever": 1.0, "num_episodes": 300}
+    evaluation = {**ended, "success_last_low": low, "success_last_high": high} if success is not None else {}
+    trial = {"task": task, "method": method, "seed": seed, "primitives_digest": tree["primitives_digest"]}
+    trial |= {"primitives": None if scratch else tree["primitives"], "success": success, "success_ever": 1.0}
+    trial |= {"success_low": low, "success_high": high, "num_episodes": 300} if evaluation else {}
+    done: dict[str, Any] = {"iteration": 2, "num_env_steps": 2000, "total_env_steps": total, "actors": ()}
+    state = "running" if success is None else "finished"
+    write_status(root, run_id, name=f"{task}-{method}", runtime="local", state=state, trial=trial, **done)
+    (path / "config.yaml").write_text(json.dumps(tree))  # JSON is YAML
     names = {"rollout/success_last": 0.25, "evaluation/success_last": success, "time/env_steps_per_s": 50.0}
     append(root, run_id, *({"iteration": i, "env_steps": 1000 * i, **names} for i in (1, 2)))
-    if success is not None:
-        low, high = wilson_interval(round(300 * success), 300)
-        ever = {"success_ever": 1.0, "num_episodes": 300}
-        evaluation = {"success_last": success, "success_last_low": low, "success_last_high": high, **ever}
-        result = {"evaluation": evaluation, "made": {"git_commit": None}, "env_steps": 2000, "wall_s": 9.0, "curve": []}
-        (path / "result.json").write_text(json.dumps(tree | result))
+    if evaluation:
+        result = {"evaluation": evaluation, "made": {"git_commit": None}, "env_steps": 2000, "wall_s": 9.0}
+        (path / "result.json").write_text(json.dumps(result))
     return path
 
 

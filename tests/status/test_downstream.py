@@ -1,20 +1,22 @@
-"""Downstream trainings beside runs of pre-training: the list, one of them, and the table of tasks."""
+"""Runs that learn a task: the table of tasks, the list, the page of one, and stopping and resuming one."""
 
 import os
 import shlex
+import subprocess
+import sys
 
 import httpx
 import pytest
 
-from service.io.lock import DirectoryLock
 from service.registry.registry import Registry
 from service.status.files import RunDirectories
 from service.status.task_table import task_table
 from service.store.disk_reader import DiskReader
 from tests.status.conftest import serve
 from tests.status.runs import BEARER, CLIENT, VIDEO, publish, write_runs, write_trial
+from tests.store.stores import wait_until
 
-OTHERS = {"primitives": {"name": "other@2", "digest": "1" * 64, "env_steps": None}}
+OTHERS = {"primitives": "other@2", "primitives_digest": "1" * 64}
 
 
 @pytest.fixture
@@ -31,7 +33,7 @@ def ask(root):
 
 
 def table(root):
-    return task_table(RunDirectories(root).trials())
+    return task_table(DiskReader(root).runs(), RunDirectories(root).directories())
 
 
 def shown(found):
@@ -62,10 +64,10 @@ def test_means_and_intervals(root):
 
 def test_only_seeds_of_the_same_are_averaged(root):
     write_trial(root, "a", "push", "ours", 0, 0.2)
-    write_trial(root, "b", "push", "ours", 1, 0.4, num_env_steps=4000)
-    write_trial(root, "c", "wall", "ours", 0, 0.6, num_env_steps=4000)
-    write_trial(root, "d", "push", "ours", 0, 0.8, made=OTHERS)
-    write_trial(root, "e", "push", "ours", 0, 0.9, made={"world": {"object_mass_kg": 0.3}})
+    write_trial(root, "b", "push", "ours", 1, 0.4, total_env_steps=4000)
+    write_trial(root, "c", "wall", "ours", 0, 0.6, total_env_steps=4000)
+    write_trial(root, "d", "push", "ours", 0, 0.8, **OTHERS)
+    write_trial(root, "e", "push", "ours", 0, 0.9, world={"object": "cube", "object_mass_kg": 0.3})
     found = table(root)
     assert shown(found) == [
         ("ours", "other@2", {"push": 0.8}),
@@ -73,105 +75,128 @@ def test_only_seeds_of_the_same_are_averaged(root):
         ("ours", "tiny@1", {"push": 0.2}),
         ("ours", "tiny@1", {"push": 0.9}),
     ]
-    assert [cell.differs for cell in found.rows[1].cells] == [{"num_env_steps": 4000, "world.object_mass_kg": 0.1}] * 2
-    assert found.rows[3].cells[0].differs == {"num_env_steps": 2000, "world.object_mass_kg": 0.3}
+    longer = {"run.total_env_steps": 4000, "world.object_mass_kg": 0.1}
+    assert [cell.differs for cell in found.rows[1].cells] == [longer] * 2
+    assert found.rows[3].cells[0].differs == {"run.total_env_steps": 2000, "world.object_mass_kg": 0.3}
     assert found.rows[0].cells[0].differs == {}
 
 
-def test_tasks_with_different_budgets_share_a_row(root):
-    write_trial(root, "a", "push", "ours", 0, 0.2, num_env_steps=3000)
+def test_what_no_result_depends_on_makes_no_row(root):
+    """Tasks may have had different budgets; seeds may have had different names, threads and registries."""
+    write_trial(root, "a", "push", "ours", 0, 0.2, total_env_steps=3000)
     write_trial(root, "b", "wall", "ours", 0, 0.4)
-    write_trial(root, "idle", "wall", "idle", 0, 0.0, made={"primitives": None})
-    assert shown(table(root)) == [("ours", "tiny@1", {"push": 0.2, "wall": 0.4}), ("idle", None, {"wall": 0.0})]
+    run = {"total_env_steps": 2000, "num_threads": 4}
+    write_trial(root, "c", "wall", "ours", 1, 0.6, run=run, name="mine", primitives="/srv/tiny@1")
+    write_trial(root, "d", "wall", "scratch-mcp", 0, 0.0)
+    rows = [("ours", "tiny@1", {"push": 0.2, "wall": 0.5}), ("scratch-mcp", None, {"wall": 0.0})]
+    assert shown(table(root)) == rows
 
 
 def test_of_a_seed_that_was_run_twice_the_newer_counts(root):
     older = write_trial(root, "z", "push", "ours", 0, 0.2)
     write_trial(root, "b", "push", "ours", 0, 0.4)
-    write_trial(root / "table", "c", "push", "ours", 1, None)
+    write_trial(root / "night", "c", "push", "ours", 1, None)
+    (root / "night" / "study.json").touch()
     os.utime(older / "result.json", (1, 1))
     (cell,) = table(root).rows[0].cells
-    assert (cell.success, cell.run_ids, cell.unfinished) == (0.4, ("b",), ("table-c",))
+    assert (cell.success, cell.run_ids, cell.unfinished) == (0.4, ("b",), ("night-c",))
 
 
 def test_what_is_damaged_or_unknown_hides_nothing_else(root):
     write_trial(root, "good", "push", "ours", 0, 0.4)
     write_trial(root, "future", "juggle", "telepathy", 0, 0.6, task_version=7)
+    (write_trial(root, "begins", "push", "ours", 5, None) / "config.yaml").unlink()
+    own = f"{root}/own.py:Own"
+    config = write_trial(root, "own", "push", own, 0, 0.9) / "config.yaml"
+    config.write_text(config.read_text()[:-1] + ', "day": 2026-01-01}')  # a date, which JSON has not
+    (root / "own.py").write_text("raise SystemExit('a status service runs no method')")
     for name, file, text in (
-        ("no-json", "cell.json", "{"),
-        ("no-trial", "cell.json", '{"format_version": 1, "cell": 7}'),
-        ("no-result", "result.json", '{"format_version": 1, "evaluation": {}}'),
-        ("no-number", "result.json", '{"format_version": 1, "evaluation": NaN}'),
+        ("no-yaml", "config.yaml", "{"),
+        ("no-keys", "config.yaml", "7"),
+        ("no-result", "result.json", '{"evaluation": {}}'),
+        ("no-number", "result.json", '{"evaluation": NaN}'),
     ):
         (write_trial(root, name, "push", "ours", 9, 0.1) / file).write_text(text)
     found = table(root)
-    assert shown(found) == [("ours", "tiny@1", {"push": 0.4}), ("telepathy", "tiny@1", {"juggle": 0.6})]
+    assert shown(found) == [
+        ("ours", "tiny@1", {"push": 0.4}),
+        (own, "tiny@1", {"push": 0.9}),
+        ("telepathy", "tiny@1", {"juggle": 0.6}),
+    ]
     assert [task.version for task in found.tasks] == [1, 7]
-    damaged = ("no-json/cell.json", "no-number/result.json", "no-result/result.json", "no-trial/cell.json")
+    damaged = ("no-keys/config.yaml", "no-number/result.json", "no-result/result.json", "no-yaml/config.yaml")
     assert sorted(text.split(":")[0].split(" ")[0] for text in found.problems) == [f"{root}/{name}" for name in damaged]
-    runs = {run.run_id: run for run in DiskReader(root).runs()}
-    assert runs["no-json"].trial is None
-    assert all(len(runs[name].warnings) == 1 for name in ("no-json", "no-trial", "no-result", "no-number"))
 
 
 # --- runs, over HTTP ------------------------------------------------------------------------------------------------
 
 
-def test_trainings_are_runs(root, ask):
-    write_trial(root / "downstream", "push-ours-3", "push", "ours", 3, 0.75)
-    (root / "downstream" / "push-ours-3" / "episodes.mp4").write_bytes(VIDEO)
-    (root / "downstream" / "notes").mkdir()
-    (root / "here").symlink_to(root)
-    (root / "linked").symlink_to(root / "downstream")
+def test_a_run_that_learns_a_task_is_a_run(root, ask):
+    path = write_trial(root, "push-ours-3", "push", "ours", 3, 0.75)
+    (path / "episodes.mp4").write_bytes(VIDEO)
+    (root / "older").mkdir()
+    (root / "older" / "cell.json").write_text('{"format_version": 1}')  # of version 0.2, which kept no run directory
     assert ask("runs")["num_runs"] == 3
     assert {run["run_id"] for run in ask("runs", downstream=False)["runs"]} == {"cube", "old"}
     found = ask("runs", downstream=True, sparkline=["bob/success_rate", "rollout/success_last"])
     (run,) = found["runs"]
-    assert (run["run_id"], run["name"], run["state"]) == ("downstream-push-ours-3", "push-ours-3", "finished")
-    assert (run["num_env_steps"], run["total_env_steps"], run["iteration"]) == (2000, 2000, 2)
+    assert (run["run_id"], run["name"], run["state"]) == ("push-ours-3", "push-ours", "finished")
     trial = run["trial"]
     assert [trial[key] for key in ("task", "method", "seed", "primitives")] == ["push", "ours", 3, "tiny@1"]
     assert trial["success_low"] < trial["success"] == 0.75 < trial["success_high"]
-    assert found["sparklines"] == {"downstream-push-ours-3": [0.25, 0.25]}
-    curves = ask("series", runs=["downstream-push-ours-3", "cube"], names=["evaluation/success_last"])["runs"]
+    assert found["sparklines"] == {"push-ours-3": [0.25, 0.25]}
+    curves = ask("series", runs=["push-ours-3", "cube"], names=["evaluation/success_last"])["runs"]
     assert curves[0]["curves"]["evaluation/success_last"]["mean"] == [0.75, 0.75]
-    (film,) = ask("runs/downstream-push-ours-3/files")["files"]
+    (film,) = ask("runs/push-ours-3/files")["files"]
     assert (film["name"], film["num_bytes"]) == ("episodes.mp4", len(VIDEO))
-    assert ask("downstream")["rows"][0]["cells"][0]["run_ids"] == ["downstream-push-ours-3"]
-    setup = ask("runs/downstream-push-ours-3/setup")
-    assert setup["config"]["trial"]["reward_margin_m"] == 0.01  # a default that the file does not have
-    assert setup["config"]["world"]["object"] == "cube"
-    assert (setup["stop_command"], setup["resume_command"]) == (None, None)
-    place = ["--registry", str(root.parent / "registry")]
-    directory = str(root / "downstream" / "push-ours-3")
-    assert [shlex.split(each["command"]) for each in setup["commands"]] == [
-        ["tandem", "downstream", *words, *place]
-        for words in (
-            ["evaluate", directory],
-            ["play", directory],
-            ["render", directory, "--out", "push-ours-3.mp4"],
-            ["publish", directory, "--name", "push-orchestrator"],
-        )
-    ]
-
-
-def test_a_training_in_progress(root, ask):
-    path = write_trial(root, "now", "push", "scratch-monolithic", 0, None, made={"primitives": None})
-    (path / "tandem-error-1.txt").write_text("Traceback")
-    assert ask("runs/now")["state"] == "failed"
-    lock = DirectoryLock(path, "")
-    run, setup = DiskReader(root).run("now"), ask("runs/now/setup", wait=1)
-    lock.release()
-    assert (run.state, run.last_error, run.num_env_steps, run.trial.success) == ("running", None, 2000, None)
-    assert setup["stop_command"] == f"kill -INT {os.getpid()}"
+    assert ask("downstream")["rows"][0]["cells"][0]["run_ids"] == ["push-ours-3"]
     with pytest.raises(httpx.HTTPStatusError, match="404"):
-        ask("runs/now/goals")
+        ask("runs/push-ours-3/goals")
 
 
-def test_a_training_takes_no_requests(root):
-    lock = DirectoryLock(write_trial(root, "now", "push", "ours", 0, None), "")
-    with serve(root.parent) as server, httpx.Client(base_url=server.url, headers=BEARER, **CLIENT) as client:
-        answer = client.post("/v1/runs/now/stop")
-    lock.release()
-    assert (answer.status_code, answer.json()["type"]) == (409, "urn:tandem:not-possible")
-    assert "Ctrl-C" in answer.json()["detail"]
+TINY = ("sac.num_worlds=4", "sac.gradient_steps=1", "sac.batch_size=16", "sac.learning_starts=200")
+TINY += ("sac.hidden_sizes=[8]", "run.evaluation_interval=0", "run.num_threads=1", "run.total_env_steps=100000000")
+
+
+@pytest.fixture
+def train(tmp_path, default_signals):
+    """Start ``tandem train`` in a process of its own, which makes no film."""
+    processes = []
+
+    def _train(*words):
+        command = [sys.executable, "-m", "service", "train", *words, "--run-dir", tmp_path / "runs" / "wall"]
+        processes.append(subprocess.Popen(command, env={**os.environ, "MUJOCO_GL": "off"}))
+        return processes[-1]
+
+    yield _train
+    for process in processes:
+        process.kill()
+        process.wait()
+
+
+def test_one_is_stopped_over_rest_and_resumed_by_its_directory_alone(tmp_path, train):
+    """A real training and a real service: what happened to the run is in its log."""
+    (tmp_path / "runs").mkdir()
+    with serve(tmp_path) as server, httpx.Client(base_url=server.url, headers=BEARER, **CLIENT) as client:
+
+        def ask(path=""):
+            return client.get(f"/v1/runs/wall{path}").raise_for_status().json()
+
+        def stop_after(process, iteration):
+            """Stop it once it is so far, and give its status then."""
+            wait_until(lambda: client.get("/v1/runs/wall").is_success and ask()["iteration"] >= iteration)
+            assert client.post("/v1/runs/wall/stop").json()["stopping"]
+            assert process.wait(300) == 0
+            return ask()
+
+        stopped = stop_after(train("wall", "--method", "scratch-monolithic", *(f"--set={each}" for each in TINY)), 3)
+        assert (stopped["state"], stopped["trial"]["method"]) == ("interrupted", "scratch-monolithic")
+        resume = shlex.split(ask("/setup")["resume_command"])
+        assert resume[:5] == ["tandem", "train", "--resume", "--run-dir", str(tmp_path / "runs" / "wall")]
+        again = stop_after(train("--resume"), stopped["iteration"] + 2)
+        assert (again["state"], again["epoch"]) == ("interrupted", 2)
+        assert ask("/metrics")["iteration"] == list(range(1, again["iteration"] + 1))
+        said = [entry["text"] for entry in ask("/log")["entries"]]
+        assert f"resumed at iteration {stopped['iteration']}, {stopped['num_env_steps']} env steps" in said
+        (row,) = client.get("/v1/downstream").json()["rows"]
+        assert (row["primitives"], row["cells"][0]["unfinished"]) == (None, ["wall"])

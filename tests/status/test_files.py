@@ -47,7 +47,7 @@ def test_a_malformed_range_gives_the_whole_file(client, asked):
 def test_pictures_of_a_studys_run(tmp_path):
     run = tmp_path / "night" / "seed-3"
     run.mkdir(parents=True)
-    for path in (run.parent / "study.yaml", run / "config.yaml", run / "curves.png"):
+    for path in (run.parent / "study.json", run / "config.yaml", run / "curves.png"):
         path.write_bytes(b"-")
     (found,) = RunDirectories(tmp_path).files("night-seed-3")
     assert (found.name, found.num_bytes) == ("curves.png", 1)

@@ -101,26 +101,26 @@ def test_a_run(visit):
 def test_downstream_trainings(own):
     visit, home, _ = own
     for seed, success in enumerate((0.80, 0.82, 0.84)):
-        write_trial(home / "runs" / "downstream", f"push-ours-{seed}", "push", "ours", seed, success)
-    (write_trial(home / "runs", "wall", "wall", "idle", 0, 0.5) / "episodes.mp4").write_bytes(VIDEO)
+        write_trial(home / "runs", f"push-ours-{seed}", "push", "ours", seed, success)
+    (write_trial(home / "runs", "wall", "wall", "scratch-mcp", 0, 0.5) / "episodes.mp4").write_bytes(VIDEO)
     publish(Registry(home / "registry"), "push-orchestrator", kind="orchestrator", task="push", primitives="tiny@1")
     page = visit.go("#/tasks").page
     page.get_by_role("table", name="Tasks").wait_for()
-    ours, idle = (text.split() for text in page.locator("tbody tr").all_inner_texts())
+    ours, scratch = (text.split() for text in page.locator("tbody tr").all_inner_texts())
     assert ours == f"ours tiny@1 3 runs 82.0{NBSP}% 77 to 87, 3 seeds \u2013".split()
-    assert idle == f"idle tiny@1 wall \u2013 50.0{NBSP}% 44 to 56, 1 seed".split()
+    assert scratch == f"scratch MCP no primitives wall \u2013 50.0{NBSP}% 44 to 56, 1 seed".split()
     page.get_by_role("link", name=f"82.0{NBSP}%").click()
     page.get_by_role("heading", name="3 runs compared").wait_for()
-    name = "downstream-push-ours-2"
+    name = "push-ours-2"
     assert visit.points("evaluation/success_last", 2, name)[-1] == (2000, 0.84)
     page.get_by_label("seeds as a band").check()
     visit.wait(
         "document.querySelectorAll('.canvas')[0].data.some(({name}) => name === 'push, ours, with tiny@1 highest')"
     )
-    visit.go("#/runs/wall").page.get_by_text("tandem downstream evaluate").wait_for()
+    visit.go("#/runs/wall").page.get_by_text(f"tandem evaluate {home}/runs/wall").wait_for()
     assert f"50.0{NBSP}%" in page.locator(".tile").nth(1).inner_text()
     assert f"last step, 44 to 56{NBSP}%" in page.locator(".tile").nth(1).inner_text()
-    parts = ["Curves", "Recordings", "Commands", "Configuration", "Primitives tiny"]  # no goals, no actors
+    parts = ["Curves", "Recordings", "Log", "Commands", "Configuration"]  # no goals, no actors
     assert page.locator("h2").all_inner_texts() == parts
     versions = visit.go("#/primitives").page.get_by_role("table", name="Versions of push-orchestrator")
     assert versions.locator("tbody td").nth(2).inner_text() == "push"
@@ -192,7 +192,7 @@ def test_log_commands_and_configuration(own):
     page.get_by_label("Find a setting").fill("target_kl")
     assert page.locator(".settings dt").all_inner_texts() == ["learner.bob.target_kl"]
     write_status(home / "runs", "cube", state="interrupted")
-    page.locator(".command").get_by_text(f"tandem pretrain --resume --run-dir {run} --registry").wait_for()
+    page.locator(".command").get_by_text(f"tandem train --resume --run-dir {run} --registry").wait_for()
 
 
 def test_versions(visit):
@@ -392,7 +392,7 @@ def test_nothing_yet(browser, tmp_path):
     with serve(tmp_path) as server:
         visit = Visit(browser, server.url)
         page = visit.go().page
-        page.get_by_text("tandem pretrain --run-dir runs/cube").wait_for()
+        page.get_by_text("tandem train --run-dir runs/cube").wait_for()
         write_status(tmp_path / "runs", "first")
         page.get_by_role("link", name="first").wait_for()
         visit.go("#/primitives").page.get_by_text("comes with tandem").first.wait_for()
@@ -438,7 +438,7 @@ def test_a_phone_need_not_scroll_sideways(own, browser):
     visit = Visit(browser, server.url, **PHONE)
     settings = "".join(f"setting_{number}: {number}\n" for number in range(100))
     (home / "runs" / "cube" / "config.yaml").write_text(settings)
-    write_trial(home / "runs", "x" * 100, HOSTILE, "ours", 0, 0.5, made={"primitives": {"name": f"{HOSTILE}@1"}})
+    write_trial(home / "runs", "x" * 100, HOSTILE, "ours", 0, 0.5, primitives=f"{HOSTILE}@1")
     for place, table in (
         ("#/", "Runs"),
         ("#/runs/cube", "Actors"),

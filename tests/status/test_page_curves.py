@@ -32,7 +32,7 @@ def home(tmp_path_factory):
     values = {"bob/success_rate": 0.5}
     append(runs, "long", *(record(i, **values, **{"learner/kl": 9.0 if i == 1234 else 0.01}) for i in range(1, LONG)))
     (runs / "night").mkdir()
-    (runs / "night" / "study.yaml").write_text("name: night\n")
+    (runs / "night" / "study.json").write_text("name: night\n")
     for seed in (0, 1):
         write_status(runs / "night", f"seed-{seed}", state="finished")
         append(

@@ -2,6 +2,8 @@
 
 import shlex
 
+import pytest
+
 from service.status import run_details
 from tests.status.runs import append, grid, status, write_status
 
@@ -26,22 +28,44 @@ def test_goals_over_a_run(tmp_path):
     assert run_details.goal_frames(tmp_path / "gone", None, 2).frames == ()
 
 
-def test_commands_of_a_run_of_a_study_go_on_with_the_study(tmp_path):
+@pytest.fixture
+def directory(tmp_path):
     directory = tmp_path / "a night" / "seed-3"
     directory.mkdir(parents=True)
-    (directory.parent / "study.yaml").write_text("x: 1\n")
     (directory / "config.yaml").write_text("seed: 3\n")
-    found = run_details.setup(status("night-seed-3"), directory, tmp_path / "registry")
+    return directory
+
+
+def test_commands(directory, tmp_path):
+    found = run_details.setup(status("night", state="finished", runtime="local"), directory, tmp_path / "registry")
     assert found.config == {"seed": 3}
     assert shlex.split(found.stop_command) == ["touch", str(directory / "stop")]
+    place = ["--registry", str(tmp_path / "registry")]
+    assert shlex.split(found.resume_command) == ["tandem", "train", "--resume", "--run-dir", str(directory), *place]
+    assert [shlex.split(each.command) for each in found.commands] == [
+        ["tandem", *words, *place]
+        for words in (
+            ["evaluate", str(directory)],
+            ["play", str(directory)],
+            ["render", str(directory), "--out", "panda-cube.mp4"],
+            ["publish", str(directory), "--name", "panda-cube"],
+        )
+    ]
+    assert run_details.setup(status("night"), directory, tmp_path).commands == ()
+
+
+def test_commands_of_a_run_of_a_study_go_on_with_the_study(directory, tmp_path):
+    (directory.parent / "study.json").write_text("x: 1\n")
+    found = run_details.setup(status("night-seed-3"), directory, tmp_path / "registry")
     words = shlex.split(found.resume_command)
     assert words[words.index("--run-dir") + 1] == str(directory.parent)
     assert words[-2:] == ["--runtime", "ray"]
 
 
 def test_a_configuration_that_cannot_be_read(tmp_path):
-    found = run_details.setup(status("cube"), tmp_path, tmp_path)
-    assert (found.config, found.problem) == (None, "config.yaml cannot be read: No such file or directory")
+    found = run_details.setup(status("cube", state="failed"), tmp_path, tmp_path)
+    assert (found.config, found.commands) == (None, ())
+    assert found.problem.startswith(f"{tmp_path}/config.yaml is not there")
     (tmp_path / "config.yaml").write_text("[" * 5000)
     assert "nested" in run_details.setup(status("cube"), tmp_path, tmp_path).problem
     assert run_details.setup(status("cube"), None, tmp_path).directory is None

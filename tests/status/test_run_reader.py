@@ -54,14 +54,11 @@ def test_a_directory_that_was_written_later(reader, root):
     assert reader.run("cube").iteration == 9
 
 
-def test_metrics_come_from_the_directory(reader, root):
+def test_metrics_and_goals_come_from_the_directory_where_there_is_one(reader, root):
     append(root, "cube", record(4))
     assert [each["iteration"] for each in reader.metrics("cube", after_iteration=1)] == [2, 3, 4]
     assert [each["iteration"] for each in reader.metrics("far")] == [1]
-
-
-def test_the_newer_grid(reader):
-    assert [reader.goals(run_id).iteration for run_id in ("cube", "far")] == [7, 7]
+    assert [reader.goals(run_id).iteration for run_id in ("cube", "far")] == [3, 7]
     assert reader.goals("old") is None
 
 

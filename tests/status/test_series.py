@@ -92,16 +92,6 @@ def test_a_history_that_was_cut_and_grew_again_unseen(root):
     assert ask(reader).metrics == {"x": (1, 2, 30, 40, 50)}
 
 
-def test_only_what_is_new_is_read(root):
-    reader = DiskReader(root)
-    append(root, "cube", *(record(i, x=i) for i in range(1, 401)))
-    ask(reader)
-    append(root, "cube", record(401, x=401))
-    before = bytes_read()
-    assert ask(reader, after=399).metrics == {"x": (400, 401)}
-    assert bytes_read() - before < (root / "cube" / "metrics.jsonl").stat().st_size // 2
-
-
 def bytes_read():
     """Of files, by this process; /proc's own text is small."""
     with open("/proc/self/io") as file:

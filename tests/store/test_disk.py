@@ -153,7 +153,7 @@ def test_the_runs_of_a_study_are_listed_with_the_others_under_its_name(tmp_path)
         path.mkdir(parents=True)
         RunWriter(RunDirectory(path)).status(a_status(run_id_of(path), state="finished", iteration=len(path.name)))
     assert {run.run_id for run in DiskReader(tmp_path).runs()} == {"cube"}
-    (study / "study.yaml").touch()
+    (study / "study.json").touch()
     (study / "seed-99").mkdir()  # not begun
     iterations = {run.run_id: run.iteration for run in DiskReader(tmp_path).runs()}
     assert iterations == {"cube": 4, "night-1-seed-0": 6, "night-1-seed-12": 7}
@@ -164,7 +164,7 @@ def test_the_runs_of_a_study_are_listed_with_the_others_under_its_name(tmp_path)
 def test_seeds_of_a_study_with_a_long_name_are_told_apart(tmp_path):
     study = tmp_path / ("x" * 200)
     study.mkdir()
-    (study / "study.yaml").touch()
+    (study / "study.json").touch()
     assert run_id_of(study / "seed-10") != run_id_of(study / "seed-11")
     assert a_status(run_id_of(study / "seed-10"))
 
@@ -392,12 +392,12 @@ def test_a_directory_that_cannot_be_read_is_a_damaged_run_beside_the_others(ende
     root = ended.parent
     (root / "loop-1").symlink_to("loop-2")
     (root / "loop-2").symlink_to("loop-1")
-    (root / "trainings").mkdir()
-    (root / "trainings" / "push").mkdir()
-    (root / "trainings" / "push" / "cell.json").write_text("{}")
-    (root / "trainings" / "loop").symlink_to("loop")
+    (root / "night" / "seed-0").mkdir(parents=True)
+    for name in ("study.json", "seed-0/config.yaml"):
+        (root / "night" / name).touch()
+    (root / "night" / "loop").symlink_to("loop")
     runs = {run.run_id: run for run in DiskReader(root).runs()}
-    assert runs.keys() == {"old-one", "loop-1", "loop-2", "trainings-push"}
+    assert runs.keys() == {"old-one", "loop-1", "loop-2", "night-seed-0", "night-loop"}
     assert runs["old-one"].last_error is None
     for name in ("loop-1", "loop-2"):
         assert runs[name].state == "interrupted"
@@ -413,7 +413,7 @@ def test_a_directory_that_cannot_be_read_is_a_damaged_run_beside_the_others(ende
     monkeypatch.setattr(os, "stat", no_permission)
     runs = {run.run_id: run for run in DiskReader(root).runs()}
     assert_one_line(runs["old-one"].last_error, ended, "Permission denied")
-    assert "trainings-push" in runs
+    assert "night-seed-0" in runs
 
 
 def test_whatever_is_wrong_with_a_run_it_hides_no_other(ended, monkeypatch):

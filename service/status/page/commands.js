@@ -23,15 +23,14 @@ export class Commands {
     const remote = `curl -X POST -H "Authorization: Bearer $TANDEM_TOKEN" ${url}`;
     return [
       ...(setup.stop_command ? [command("Stop it after this iteration, saved, on its machine", setup.stop_command)] : []),
-      ...(run.trial ? [] : [command("The same from anywhere, if this service has a token", remote)]),
+      command("The same from anywhere, if this service has a token", remote),
     ];
   }
 
   resume(run, setup) {
     if (!setup.directory) return [note("Its directory is on another machine; go on with it there.")];
-    const uses = setup.commands.map((each) => command(each.what, each.command));
-    if (setup.resume_command) return [command("Go on with it, from its last checkpoint", setup.resume_command), ...uses];
-    return uses.length ? uses : [note("It was begun with settings that no option has: go on with it by the program that began it.")];
+    const goOn = command("Go on with it, from its last checkpoint", setup.resume_command);
+    return [goOn, ...setup.commands.map((each) => command(each.what, each.command))];
   }
 }
 

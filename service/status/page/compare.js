@@ -35,7 +35,7 @@ export async function compareView(root, ids, signal) {
   });
 }
 
-/** What runs that differ in their seed alone have in common: their study, or what they learn downstream. */
+/** What runs that differ in their seed alone have in common: their study, or their task. */
 function studyOf(run) {
   return run?.study ?? (run?.trial ? trialText({ ...run.trial, seed: null }) : null);
 }

@@ -53,7 +53,7 @@ export function counted(number, noun) {
 
 /** A setting that is not usual, such as "300 k env steps". */
 export function setting(key, value) {
-  if (key === "num_env_steps") return `${count(value)} env steps`;
+  if (key === "run.total_env_steps") return `${count(value)} env steps`;
   return `${key} ${typeof value === "string" ? value : JSON.stringify(value)}`;
 }
 

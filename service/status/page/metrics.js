@@ -20,7 +20,7 @@ export const OVERVIEW = [
   { title: "Policy lag", hint: "versions between acting and learning", curves: [["learner/policy_lag", "versions"]] },
 ];
 
-/** The panels of a downstream training. */
+/** The panels of a run that learns a task. */
 export const TRIAL = [
   {
     title: "Success",
@@ -42,7 +42,7 @@ const COMPARED = [
   ["time/env_steps_per_s", "Throughput"],
 ];
 
-/** The metrics of several downstream trainings that are always there: one a panel. */
+/** The metrics of several runs that learn tasks that are always there: one a panel. */
 const COMPARED_TRIALS = [
   ["evaluation/success_last", "Success at the last step"],
   ["evaluation/success_ever", "Success at any step"],
@@ -50,7 +50,7 @@ const COMPARED_TRIALS = [
   ["time/env_steps_per_s", "Throughput"],
 ];
 
-/** Panels for runs that are compared: of pre-training, of downstream trainings, or of both. */
+/** Panels for runs that are compared: runs that learn tasks, others, or both. */
 export function comparedPanels(statuses) {
   const [trials, others] = [statuses.some((run) => run.trial), statuses.some((run) => !run.trial)];
   const metrics = [...(others || !trials ? COMPARED : []), ...(trials ? COMPARED_TRIALS : [])];

@@ -50,7 +50,7 @@ class RunPage {
       curves: section("Curves", "wide"), space: section("Goals over the run", "wide"), map: section("Goal map", "wide"),
       media: section("Recordings"), actors: section("Actors"), log: section("Log"), commands: section("Commands"), config: section("Configuration"),
     };
-    for (const name of run.trial ? ["space", "map", "actors", "log"] : []) delete parts[name]; // which pre-training has
+    for (const name of run.trial ? ["space", "map", "actors"] : []) delete parts[name]; // which self-play has
     const [name, published] = run.trial ? (run.trial.primitives ?? "").split("@") : [run.name, true];
     this.primitives = published ? new Versions(name, `Primitives ${name}`) : null;
     parts.curves.body.append(this.board.root);
@@ -190,7 +190,7 @@ class Summary {
     this.troubles.replaceChildren(...boxes.map(([kind, title, text]) => el("p", { class: kind }, el("strong", {}, `${title}: `), text)));
   }
 
-  /** Show how well a downstream training does in the end. */
+  /** Show how well a run does its task in the end. */
   finally({ success, success_low: low, success_high: high, success_ever: ever, num_episodes: episodes }) {
     const known = Number.isFinite(success);
     this.final.last.set(percent(success), known ? `last step, ${(100 * low).toFixed(0)} to ${(100 * high).toFixed(0)}${NBSP}%` : "once it has ended");

@@ -127,7 +127,7 @@ function title(run, page) {
   return el("span", { class: "chooser" }, box, el("span", { class: "two" }, runLink(run.run_id), el("small", {}, run.trial ? trialText(run.trial) : `${run.name}, ${run.runtime}`)));
 }
 
-/** Bob's on Alice's goals; of a downstream training that of its final evaluation, until then with noise. */
+/** Bob's on Alice's goals; of a run that learns a task that of its final evaluation, until then with noise. */
 function success(run) {
   return run.trial?.success ?? run.values.findLast((value) => value !== null);
 }
@@ -143,7 +143,7 @@ function state(run) {
 }
 
 function nothing() {
-  const command = el("code", {}, "tandem pretrain --run-dir runs/cube");
+  const command = el("code", {}, "tandem train --run-dir runs/cube");
   return note("No runs yet. Start one with ", command, ": it appears here when it has started. Runs that are somewhere else are shown by ", el("code", {}, "tandem serve --runs DIR"), ".");
 }
 

@@ -75,6 +75,6 @@ function cell(found) {
 }
 
 function nothing() {
-  const command = el("code", {}, "tandem downstream train --task push --method ours");
-  return note("No downstream trainings yet. Start one with ", command, ": it appears here, and under Runs, when it has started.");
+  const command = el("code", {}, "tandem train push --method ours");
+  return note("No run has learned a task yet. Start one with ", command, ": it appears here, and under Runs, when it has started.");
 }

@@ -1,0 +1,161 @@
+"""Learn a task with a method and a seed, or play it where nothing is learned, and record what ``docs/results`` keeps.
+
+    python -m benchmarks.trials wall ours-her 0 --primitives panda-cube@champion --out wall-ours-her-0.json
+
+A method that learns has a run directory, ``RUNS/NAME``; what was stopped goes on from there. What has its file is not
+run again. The file says what was measured and with which settings, and keeps the learning curve.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+from benchmarks.measuring import write_json
+from benchmarks.report.results import FORMAT_VERSION, TRIAL, Result
+from service.actors.evaluation import DeterministicPolicy, IdlePolicy, evaluate, wilson_interval
+from service.config.load import parse_config
+from service.config.task import TaskConfig
+from service.config.tree import apply_override
+from service.downstream.methods import find_method
+from service.downstream.playing import FINAL_SEED
+from service.envs.tasks import EPISODE_STEPS, SUCCESS_DISTANCE_M, find_task
+from service.errors import TandemError
+from service.io.git import git_commit
+from service.io.jsonl import read_jsonl
+from service.io.run_directory import RunDirectory
+from service.primitives.loading import Trained, load
+from service.runs.train import train
+from service.types import Metrics
+
+NUM_EPISODES = 1_000
+"""Of the last evaluation."""
+
+
+def trial_config(task: str, method: str, seed: int, primitives: str, settings: Sequence[str] = ()) -> TaskConfig:
+    """Configuration of a trial; ``settings`` are overrides."""
+    find_task(task)
+    learns = find_method(method).learns  # what learns nothing is no method of a run
+    tree: dict[str, Any] = {"name": f"{task}-{method}", "task": task, "method": method if learns else "ours"}
+    tree |= {"seed": seed, "primitives": primitives, "run": {"final_episodes": NUM_EPISODES}}
+    for setting in settings:
+        apply_override(tree, setting)
+    config = parse_config(tree, where=f"{method} on {task}")
+    assert isinstance(config, TaskConfig)
+    return config.model_copy(update={"method": method})
+
+
+def run_trial(
+    config: TaskConfig, registry: Path, path: Path, on_iteration: Callable[[Metrics], None] = lambda metrics: None
+) -> Result:
+    """Learn in a run directory, or go on there, or play where nothing is learned; what is recorded."""
+    begun = config.begin(registry, None)
+    if not find_method(config.method).learns:
+        return _recorded(begun, registry, _play(begun, registry), [])
+    directory = RunDirectory(path)
+    if directory.exists and directory.read_config() != begun:
+        raise TandemError(f"{path} holds a run of another configuration; remove it, or name another directory")
+    if (result := directory.read_result() if directory.exists else None) is None:
+        train(begun, directory, registry, resume=directory.exists, publish=False, on_iteration=on_iteration)
+        if (result := directory.read_result()) is None:
+            raise TandemError(f"{path}: stopped before its end; the same command goes on from there")
+    return _recorded(begun, registry, result, read_jsonl(directory.metrics_file))
+
+
+def _play(config: TaskConfig, registry: Path) -> dict[str, Any]:
+    """What ``result.json`` has of a method that learns nothing."""
+    trained, task = load(config.primitives, registry), find_task(config.task)
+    player: DeterministicPolicy = IdlePolicy() if config.method == "idle" else trained.player()
+    found = evaluate(
+        player,
+        task.world_from(config.world),
+        task.goals,
+        num_episodes=config.run.final_episodes,
+        num_steps=EPISODE_STEPS,
+        success_distance_m=SUCCESS_DISTANCE_M,
+        seed=config.seed + FINAL_SEED,
+        num_threads=config.run.num_threads,
+    )
+    low, high = wilson_interval(round(found.success_ever * found.num_episodes), found.num_episodes)
+    evaluation = {**found.as_dict(), "success_ever_low": low, "success_ever_high": high}
+    made = {"git_commit": git_commit(), "num_cores": os.cpu_count()}
+    return {"evaluation": evaluation, "env_steps": 0, "wall_s": 0.0, "made": made}
+
+
+def provenance(trained: Trained, method: str | None = None) -> dict[str, Any]:
+    """Primitives or skills and the world that a result is of, as the recorded files have them."""
+    env_steps = None if trained.manifest is None else trained.manifest.metrics.get("env_steps")
+    primitives = {"name": trained.name, "digest": trained.digest, "env_steps": env_steps}
+    takes = method is None or find_method(method).takes is not None
+    return {"primitives": primitives if takes else None, "world": trained.config.world.model_dump(mode="json")}
+
+
+def _recorded(config: TaskConfig, registry: Path, result: dict[str, Any], records: Sequence[dict[str, Any]]) -> Result:
+    """The file of a trial from its configuration, its ``result.json`` and its metrics."""
+    run = config.run
+    settings = {
+        "task": config.task,
+        "method": config.method,
+        "seed": config.seed,
+        "num_env_steps": run.total_env_steps,
+        "sac": config.sac.model_dump(mode="json"),
+        "curve_every": run.evaluation_interval,
+        "curve_episodes": run.evaluation_episodes,
+        "skill_steps": config.skill_steps,
+        "reward_margin_m": config.reward_margin_m,
+        "num_episodes": run.final_episodes,
+        "task_version": config.task_version,
+    }
+    curve = [
+        {
+            "env_steps": each["env_steps"],
+            "wall_s": each["time/wall_s"],
+            **{key: each[f"evaluation/{key}"] for key in ("success_last", "success_ever")},
+        }
+        for each in records
+        if "evaluation/success_last" in each
+    ]
+    return {
+        "format_version": FORMAT_VERSION,
+        TRIAL: settings,
+        **provenance(load(config.primitives, registry), config.method),
+        "evaluation": {"goals": find_task(config.task).goals, **result["evaluation"]},
+        "made": {**result["made"], "num_threads": run.num_threads},
+        **{key: result[key] for key in ("env_steps", "wall_s")},
+        "curve": curve,
+    }
+
+
+def main() -> int:
+    """Parse the command line, run and record what is not there yet."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    add = parser.add_argument
+    add("task")
+    add("method")
+    add("seed", type=int)
+    add("--primitives", default="panda-cube@champion", help="default: %(default)s")
+    add("--registry", type=Path, metavar="DIR", default=Path("registry"), help="of the primitives or skills")
+    add("--set", dest="settings", metavar="A.B=C", action="append", default=[], help="of the run; repeatable")
+    add("--runs", type=Path, metavar="DIR", default=Path("runs"), help="of run directories (default: %(default)s)")
+    add("--out", type=Path, metavar="FILE", required=True)
+    given = parser.parse_args()
+    try:
+        if given.out.exists():
+            print(f"skipped, {given.out} is there")
+            return 0
+        config = trial_config(given.task, given.method, given.seed, given.primitives, given.settings)
+        result = run_trial(config, given.registry, given.runs / config.directory_name)
+        write_json(given.out, result)
+    except TandemError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+    print(f"{given.out}: {result['evaluation']['success_last']:.1%} at the last step")
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

@@ -1,0 +1,398 @@
+"""``tandem train``, which ``tandem pretrain`` is, too, and ``tandem demo``."""
+
+from __future__ import annotations
+
+import re
+import shlex
+from collections.abc import Sequence
+from contextlib import AbstractContextManager, closing, nullcontext
+from functools import partial
+from importlib.util import find_spec
+from itertools import count
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, NoReturn
+
+import typer
+from typer.core import TyperCommand
+
+from service.cli.common import (
+    CHAMPION,
+    EXIT_SIGNAL,
+    REFERENCE,
+    SOURCE,
+    QuietOption,
+    SourceOption,
+    TrackerOption,
+    choose,
+    how_to_go_on,
+    load_start,
+    loading,
+    shown,
+    task_names,
+    was_typed,
+)
+from service.cli.configs import config_names
+from service.cli.evaluate import evaluate
+from service.cli.study import is_study, train_study
+from service.cli.unexpected import traceback_in
+from service.config.recipes import DEFAULT_RECIPE, find_file, recipes
+from service.errors import TandemError, did_you_mean
+from service.trackers import Trackers, find_factory
+
+if TYPE_CHECKING:
+    from service.config import Config
+    from service.io.run_directory import RunDirectory
+    from service.primitives.loading import Trained
+    from service.runs.train import Finished, Runtime
+    from service.runtime.ray_connection import ClusterOptions
+
+AUTO, EXACTLY = "auto", "exactly"
+"""Values of ``--resume``; the second where it is typed alone."""
+_CLUSTER_ONLY = ("address", "num_actors", "actor_threads", "learner_cpus", "status", "token_file")
+"""Options that mean nothing in one process."""
+
+
+def _targets() -> list[str]:
+    """What the shell completes."""
+    return [*recipes(), *task_names()]
+
+
+class TrainCommand(TyperCommand):
+    """``tandem train``: the value of ``--resume`` can be left out, which typer does not have."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        """Read what was typed after the command."""
+        pairs = zip(args, [*args[1:], ""], strict=False)
+        return super().parse_args(
+            ctx, [f"--resume={EXACTLY}" if each == "--resume" and after != AUTO else each for each, after in pairs]
+        )
+
+
+def train(
+    context: typer.Context,
+    what: Annotated[
+        str | None,
+        typer.Argument(
+            metavar="RECIPE|TASK|FILE|all",
+            autocompletion=_targets,
+            help="A name of tandem configs, a task such as push, or a YAML file; what that leaves out has its default. "
+            f"Without: {DEFAULT_RECIPE}, or what a resumed run has. Several, such as push,wall, or all: a study.",
+        ),
+    ] = None,
+    config: Annotated[
+        str | None, typer.Option(metavar="NAME|FILE", autocompletion=config_names, help="The same as an option.")
+    ] = None,
+    method: Annotated[
+        str | None,
+        typer.Option(
+            metavar="NAME|FILE.py:CLASS",
+            help="Of a task: see tandem methods; several, or all: a study. Else lsd, dads, diayn, metra.",
+        ),
+    ] = None,
+    primitives: Annotated[
+        str | None, typer.Option(metavar=REFERENCE, help="Of a task: the primitives or skills that its method takes.")
+    ] = None,
+    run_dir: Annotated[Path | None, typer.Option(metavar="DIR", help="Default: RUNS/NAME.")] = None,
+    run_id: Annotated[
+        str | None, typer.Option(metavar="ID", help="Run in RUNS/ID, and continue it if it has begun: for jobs.")
+    ] = None,
+    runs: Annotated[
+        Path, typer.Option(envvar="TANDEM_RUNS", metavar="DIR", help="Directory of run directories.")
+    ] = Path("runs"),
+    resume: Annotated[
+        str | None,
+        typer.Option(metavar="[auto]", help="Continue the run in --run-dir exactly; auto: or begin it, for Slurm."),
+    ] = None,
+    start_from: Annotated[
+        str | None,
+        typer.Option("--from", metavar=REFERENCE, help="Begin with what that learned, as far as it fits."),
+    ] = None,
+    seeds: Annotated[
+        str | None, typer.Option(metavar="0,1,2|0-4", help="A study: a run for each, in DIR/seed-N; names the best.")
+    ] = None,
+    grid: Annotated[
+        list[str] | None,
+        typer.Option(metavar="A.B=C,D", help="A study: a run for each value of a key; repeatable, for each with each."),
+    ] = None,
+    parallel: Annotated[
+        int | None, typer.Option(help="Runs of a study at once; default: as many as there are cores for.", min=1)
+    ] = None,
+    overrides: Annotated[
+        list[str] | None,
+        typer.Option("--set", metavar="A.B=C", help="Override a key of the configuration; repeatable."),
+    ] = None,
+    source: SourceOption = SOURCE,
+    publish: Annotated[
+        bool | None,
+        typer.Option("--publish/--no-publish", help="Publish at the end. Default: all but policies of tasks."),
+    ] = None,
+    runtime: Annotated[str, typer.Option(help="local: in this process; ray: on a cluster.")] = "local",
+    address: Annotated[
+        str | None,
+        typer.Option(metavar="auto|HOST:PORT", help="Ray cluster; default: the job's, or a new one on this machine."),
+    ] = None,
+    num_actors: Annotated[
+        int | None, typer.Option(help="Rollout actors; default: as many as the cluster has cores for.", min=1)
+    ] = None,
+    actor_threads: Annotated[int, typer.Option(help="Cores of each rollout actor.", min=1)] = 1,
+    learner_cpus: Annotated[
+        float,
+        typer.Option(help="Cores for the learner alone; 0: it shares those of the actors.", min=0),
+    ] = 0.0,
+    status: Annotated[
+        str | None,
+        typer.Option(
+            metavar="HOST:PORT|off",
+            help="Where the status service of a run on a cluster listens. "
+            "Default: 127.0.0.1, at port 8321 or the next free one.",
+        ),
+    ] = None,
+    token_file: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Its token; default: TANDEM_TOKEN. See tandem serve.")
+    ] = None,
+    tracker: TrackerOption = None,
+    accept_damaged_records: Annotated[
+        bool, typer.Option("--accept-damaged-records", help="Resume without the records that are missing or changed.")
+    ] = False,
+    quiet: QuietOption = False,
+) -> None:
+    """Train what a recipe, a task or a file says, in this process or on a Ray cluster, and publish it."""
+    from service.config import load_config
+    from service.io.run_directory import RunDirectory
+    from service.runs.resuming import resumed_config
+    from service.runs.train import prepare
+    from service.store.models import RUN_ID
+
+    def cluster_options() -> ClusterOptions:
+        from service.registry.token import read_token
+        from service.runtime.ray_connection import ClusterOptions, parse_status
+
+        where = parse_status(status, read_token(token_file))
+        return ClusterOptions(num_actors, actor_threads, learner_cpus, where)
+
+    if what is not None and config is not None:
+        raise TandemError(f"{what} and --config {config}: name one of them")
+    what, trackers = what or config, tracker or []
+    for each in trackers:
+        find_factory(each)  # now, not after Ray has started
+    _check_used(context, choose("--runtime", runtime, ("local", "ray")), status)
+    again = resume is not None and choose("--resume", resume, (AUTO, EXACTLY)) == EXACTLY
+    if start_from is not None and again:
+        raise TandemError("--from is for a run that begins, and --resume goes on with one: leave out one of them")
+    if run_id is not None:
+        if resume is not None or run_dir is not None:
+            raise TandemError("--run-id names the run directory, and continues what is there: leave out the other two")
+        if re.fullmatch(RUN_ID, run_id) is None:
+            raise TandemError(
+                f"--run-id {run_id!r}: use 1 to 128 letters, digits, '.', '_' and '-', the first a letter or digit; "
+                "for another place there is --run-dir"
+            )
+        run_dir, resume = runs / run_id, AUTO
+    if is_study(run_dir, seeds, grid or (), what, method):
+        if accept_damaged_records:
+            raise TandemError("--accept-damaged-records is for one run of a study: resume that one by its --run-dir")
+        for name in ("num_actors", "actor_threads", "learner_cpus"):
+            if was_typed(context, name):
+                raise TandemError(
+                    f"--{name.replace('_', '-')} is for one run: each run of a study on Ray is a task, whose cores "
+                    "--set run.num_threads=N says"
+                )
+        train_study(
+            run_dir, what, method, seeds, grid or (),
+            name_one=partial(_named, primitives=primitives), overrides=overrides or [], runs=runs, source=source,
+            resume=None if resume == AUTO else again, publish=publish, parallel=parallel,
+            cluster=cluster_options if runtime == "ray" else None, address=address, trackers=trackers,
+            start_from=start_from,
+        )  # fmt: skip
+        return
+    named, first = _named(what, method, primitives)
+    overrides = [*first, *(overrides or [])]
+    if parallel is not None:
+        raise TandemError("--parallel is for the runs of a study: give --seeds or --grid, too, or leave it out")
+    if again and run_dir is None:
+        raise TandemError("--resume needs --run-dir, the directory of the run to continue")
+    begun = named if named is not None or first else recipes()[DEFAULT_RECIPE]
+    run_dir = run_dir or runs / load_config(begun, overrides).directory_name
+    if resume == AUTO:
+        again = RunDirectory(run_dir).exists
+    start = None
+    if again:
+        resolved = resumed_config(RunDirectory(run_dir), overrides, named)
+    else:
+        start = load_start(start_from, source) if start_from is not None else None
+        with loading():
+            resolved = load_config(begun, overrides).begin(source, start)
+    if publish is None:
+        publish = resolved.makes != "orchestrator"
+    directory = RunDirectory(run_dir, accept_damaged_records=accept_damaged_records)
+    if runtime == "local":
+        _train(resolved, directory, source, resume=again, publish=publish, start=start, trackers=trackers)
+        return
+    from service.runtime.ray_connection import connected
+    from service.runtime.ray_runtime import RayRuntime
+
+    cluster = RayRuntime(cluster_options())
+    with closing(directory), traceback_in(run_dir):
+        prepare(resolved, directory, source, resume=again, publish=publish, runtime=cluster)
+        _train(
+            resolved, directory, source, resume=again, publish=publish, start=start, trackers=trackers,
+            runtime=cluster, address=address, connection=connected(address),
+        )  # fmt: skip
+
+
+def _check_used(context: typer.Context, runtime: str, status: str | None) -> None:
+    """Refuse options that were typed and would do nothing."""
+    if runtime == "local":
+        for name in _CLUSTER_ONLY:
+            if was_typed(context, name):
+                raise TandemError(
+                    f"--{name.replace('_', '-')} is for a run on Ray: give --runtime ray, or leave it out"
+                )
+    if status == "off" and was_typed(context, "token_file"):
+        raise TandemError("--token-file is for the status service, and --status off leaves that out: drop one of them")
+    if was_typed(context, "runs") and was_typed(context, "run_dir"):
+        raise TandemError("--run-dir names the run's directory, and --runs the one it would be in: drop one of them")
+
+
+def _named(what: str | None, method: str | None, primitives: str | None) -> tuple[Path | None, list[str]]:
+    """The file of a recipe or configuration, if any, and the overrides that a task or method stands for.
+
+    Raises:
+        TandemError: no such recipe, task or file; or options that mean nothing there.
+    """
+    from service.config.find import METHODS
+    from service.downstream.methods import METHODS as OF_TASKS
+
+    known = _targets()
+    if what in task_names():
+        if method in OF_TASKS and method not in METHODS:
+            raise TandemError(f"{method} learns nothing: measure it by tandem evaluate --task {what} --method {method}")
+        chosen = [f"task={what}", f"method={method or 'ours'}"]
+        return None, chosen + [f"primitives={primitives}"] * (primitives is not None)
+    if primitives is not None:
+        raise TandemError("--primitives is for learning a task: name one, such as push; a run begins from --from")
+    if what is None:
+        recipe = recipes().get(f"{DEFAULT_RECIPE}-{method}")
+        if recipe is None and method in OF_TASKS:
+            raise TandemError(f"--method {method} is for a task: name one, such as tandem train push")
+        return recipe, [f"method={method}"] if method is not None and recipe is None else []
+    if what not in known and not Path(what).suffix and not Path(what).exists():
+        raise TandemError(
+            f"{what!r}: no recipe, task or file of that name; there are {', '.join(known)}{did_you_mean(what, known)}"
+        )
+    if method is not None:
+        raise TandemError(f"{what} says its method itself: leave out --method, or change it by --set method={method}")
+    return find_file(what, recipes()), []
+
+
+def demo(
+    run_dir: Annotated[Path | None, typer.Option(metavar="DIR", help="Default: runs/demo-N.")] = None,
+    env_steps: Annotated[
+        int, typer.Option(help="Budget; the default takes about three minutes on 2 cores.", min=1)
+    ] = 1_000_000,
+    quiet: QuietOption = False,
+) -> None:
+    """Watch a robot arm teach itself: a small pre-training from scratch, with pictures and a video."""
+    from service.config import load_config
+    from service.io.run_directory import RunDirectory
+    from service.primitives.bundled import BUNDLED
+
+    paths = (Path("runs") / f"demo-{number}" for number in count(1))
+    path = run_dir or next(path for path in paths if not path.exists())
+    if RunDirectory(path).exists:
+        raise TandemError(
+            f"{path} holds a run already, and a demo begins a new one: leave --run-dir out, or name another; or "
+            f"{how_to_go_on(path, path / 'registry')}"
+        )
+    typer.echo("A robot arm is about to teach itself: Alice proposes goals, Bob learns to reach them.")
+    # Evaluated often: about 200 iterations are to give a curve of Bob on random goals, not a point.
+    overrides = [f"run.total_env_steps={env_steps}", "name=panda-cube-demo", "run.evaluation_interval=25"]
+    config = load_config(recipes()[DEFAULT_RECIPE], overrides)
+    done = _train(config, RunDirectory(path), path / "registry", resume=False)
+    typer.echo(f"\n{_in_words(done)}")
+    typer.echo(f"\nThat was a beginning. Primitives that have learned for longer come with tandem; {CHAMPION}:")
+    evaluate(CHAMPION, registry=str(BUNDLED))  # prints what the first of the next commands prints
+    typer.echo("\nLook at them, or at the run on its page, in a browser:")
+    typer.echo(f"  tandem evaluate {CHAMPION} --goals mixed --episodes 300")
+    typer.echo(f"  tandem render   {CHAMPION} --out champion.mp4")
+    typer.echo(f"  tandem coverage {CHAMPION} --out champion.png")
+    typer.echo(f"  tandem play     {CHAMPION}")
+    typer.echo(f"  {shlex.join(['tandem', 'serve', '--runs', str(path.parent)])}")
+    missing = [extra for extra, package in (("play", "viser"), ("serve", "fastapi")) if find_spec(package) is None]
+    if missing:
+        typer.echo(f"tandem {' and '.join(missing)} need: pip install 'tandem-skills[{','.join(missing)}]'")
+
+
+def _in_words(done: Finished) -> str:
+    """What a short run has come to."""
+    rates = {where: done.metrics.get(f"evaluation/{name}_success_last") for name, where in _WHERE.items()}
+    told = [f"{rate:.0%} of random goals {where}" for where, rate in rates.items() if rate is not None]
+    said = f"Bob has practised for {done.result.num_env_steps:,} steps"
+    return f"{said}, and now reaches {' and '.join(told)}." if told else f"{said}."
+
+
+_WHERE = {"table": "on the table", "air": "in the air"}
+
+
+def _train(
+    config: Config,
+    directory: RunDirectory,
+    registry: Path | str,
+    *,
+    resume: bool,
+    publish: bool = True,
+    runtime: Runtime | None = None,
+    address: str | None = None,
+    start: Trained | None = None,
+    trackers: Sequence[str] = (),
+    connection: AbstractContextManager[None] | None = None,
+) -> Finished:
+    with loading():
+        from service.runs.train import train as run
+    from service.runs.progress import Progress
+    from service.runs.signals import InterruptError
+    from service.store.disk_reader import run_id_of
+
+    def say_stopped(what: str, number: int) -> NoReturn:
+        """Say how to go on, and exit as a process that a signal ends."""
+        name = "local" if runtime is None else runtime.name
+        how = how_to_go_on(directory.path, registry, runtime=name, address=address)
+        typer.echo(f"{what}; {how if directory.exists else 'nothing was saved yet'}")
+        raise typer.Exit(EXIT_SIGNAL + number)
+
+    try:
+        with (
+            connection or nullcontext(),
+            traceback_in(directory.path),
+            Trackers(trackers, run_id_of(directory.path), config.model_dump(mode="json")) as tracked,
+            Progress(config.run.total_env_steps, shown()) as progress,
+        ):
+
+            def tell(metrics: dict[str, float]) -> None:
+                progress.show(metrics)
+                tracked.log(metrics)
+
+            done = run(
+                config, directory, registry,
+                resume=resume, publish=publish, on_iteration=tell, runtime=runtime, start=start,
+            )  # fmt: skip
+            if done.metrics:
+                final = {name.replace("evaluation/", "final/", 1): value for name, value in done.metrics.items()}
+                tracked.log({"env_steps": done.result.num_env_steps, **final})
+    except InterruptError as interrupt:
+        say_stopped("stopped at once", interrupt.number)
+    result = done.result
+    typer.echo(f"\n{result.reason} after {result.num_env_steps:,} env steps, {result.iteration} iterations")
+    typer.echo(done.timing)
+    if done.signal is not None:
+        rest = "" if result.reason == "interrupted" else ", but not evaluated, published and drawn to the end"
+        say_stopped(f"saved{rest}", done.signal)
+    for name, value in done.metrics.items():
+        is_share = "success" in name or name == "coverage"
+        typer.echo(f"{name:<36} {value:.1%}" if is_share else f"{name:<36} {value:g}")
+    for name, file in done.files.items():
+        typer.echo(f"{name:<12} {file}")
+    typer.echo(f"{'checkpoint':<12} {directory.checkpoints}")
+    if done.version is not None:
+        typer.echo(f"{config.makes:<12} {done.version} in {registry}")
+    return done

@@ -1,0 +1,152 @@
+"""Descriptions of objects: their shape and size, as they lie on the table."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Annotated, Any, Literal, Self
+
+from pydantic import BeforeValidator, Discriminator, Field, Tag, ValidationError, model_validator
+
+from service.config.frozen import FrozenModel
+from service.config.mesh_files import LEAST_M, measure
+from service.config.model_files import absolute
+
+Shape = Literal["box", "sphere", "cylinder", "capsule", "ellipsoid", "mesh"]
+_NUM_SIZES: dict[Shape, tuple[int, str]] = {
+    "box": (3, "its extent along x, y and z"),
+    "sphere": (1, "its diameter"),
+    "cylinder": (2, "its diameter and height"),
+    "capsule": (2, "its diameter and whole length"),
+    "ellipsoid": (3, "its extent along x, y and z"),
+    "mesh": (3, "its extent along x, y and z, which is read from its files"),
+}
+ROUND: frozenset[Shape] = frozenset({"sphere", "cylinder", "capsule", "ellipsoid", "mesh"})
+"""Shapes that may roll."""
+Color = tuple[float, float, float]
+
+
+class MeshConfig(FrozenModel):
+    """A mesh of convex pieces, each in a file; what is read from them is kept, so that they need not be read again."""
+
+    pieces: tuple[str, ...] = Field(
+        min_length=1, description="STL or OBJ files, each of one convex piece; package:NAME/FILE for one in a package"
+    )
+    scale: float = Field(1.0, gt=0.0, description="metres in a unit of the files: 0.001 where they are in millimetres")
+    sha256: tuple[str, ...] = Field((), description="of each file, when it was read first")
+    center_m: tuple[float, float, float] = Field((0.0, 0.0, 0.0), description="middle of its extent, from its origin")
+    volume_m3: float = Field(0.0, ge=0.0)
+
+    @model_validator(mode="after")
+    def _was_read(self) -> Self:
+        if self.sha256 and (len(self.sha256) != len(self.pieces) or not self.volume_m3):
+            raise ValueError("sha256, center_m and volume_m3 are read from its files: leave them out")
+        return self
+
+
+class ObjectConfig(FrozenModel):
+    """A rigid object of one shape, as it starts: a cylinder stands, a capsule lies along x.
+
+    The fingers close along y.
+    """
+
+    shape: Shape
+    size_m: tuple[Annotated[float, Field(ge=0.005, le=0.5)], ...] = Field(
+        description="box, ellipsoid: extent along x, y, z; sphere: diameter; cylinder: diameter, height; capsule: "
+        "diameter, whole length"
+    )
+    mesh: MeshConfig | None = Field(None, description="files of a mesh; size_m is read from them")
+    color: Color = Field((0.86, 0.13, 0.11), description="red, green, blue in pictures, 0 to 1")
+
+    @model_validator(mode="after")
+    def _fits_shape(self) -> Self:
+        expected, what = _NUM_SIZES[self.shape]
+        if len(self.size_m) != expected:
+            raise ValueError(f"size_m of a {self.shape} has {expected} numbers, {what}; got {len(self.size_m)}")
+        if (self.shape == "mesh") != (self.mesh is not None):
+            raise ValueError("mesh, which names files as pieces, belongs to shape: mesh and to no other")
+        if self.shape == "capsule" and self.size_m[1] <= self.size_m[0]:
+            raise ValueError(f"size_m of a capsule: its length {self.size_m[1]:g} must exceed its diameter")
+        if not all(0.0 <= each <= 1.0 for each in self.color):
+            raise ValueError(f"color {self.color}: red, green and blue are from 0 to 1")
+        return self
+
+    @property
+    def extent_m(self) -> tuple[float, float, float]:
+        """Extent along x, y and z as it starts, metres."""
+        first, *others = self.size_m
+        if self.shape == "sphere":
+            return first, first, first
+        if self.shape == "cylinder":
+            return first, first, others[0]
+        if self.shape == "capsule":
+            return others[0], first, first
+        return first, others[0], others[1]
+
+
+class FixtureConfig(ObjectConfig):
+    """A thing that stands on the table and cannot be moved."""
+
+    position_m: tuple[float, float] = Field(description="middle of its bottom, x and y")
+    bottom_m: float = Field(0.0, ge=0.0, le=1.0, description="height of its bottom above the table: a shelf's")
+    turn_rad: float = Field(0.0, description="about the vertical")
+    color: Color = (0.42, 0.47, 0.54)
+
+    @property
+    def lower_m(self) -> tuple[float, float, float]:
+        """Corner with the least coordinates of the upright box around it, metres."""
+        half_x, half_y = self._half_m
+        return self.position_m[0] - half_x, self.position_m[1] - half_y, self.bottom_m
+
+    @property
+    def upper_m(self) -> tuple[float, float, float]:
+        """Corner with the greatest coordinates, metres."""
+        half_x, half_y = self._half_m
+        return self.position_m[0] + half_x, self.position_m[1] + half_y, self.bottom_m + self.extent_m[2]
+
+    @property
+    def _half_m(self) -> tuple[float, float]:
+        x, y, _ = self.extent_m
+        cosine, sine = abs(math.cos(self.turn_rad)), abs(math.sin(self.turn_rad))
+        return (cosine * x + sine * y) / 2, (sine * x + cosine * y) / 2
+
+
+class ObstacleConfig(ObjectConfig):
+    """A further thing that lies about on the table, elsewhere at every start, and can be pushed."""
+
+    mass_kg: float = Field(0.1, gt=0.0, le=5.0)
+    friction: float = Field(1.0, gt=0.0, le=3.0, description="sliding friction of it on the table and on other things")
+    color: Color = (0.90, 0.66, 0.20)
+
+
+def simple_object(name: Literal["cube", "sphere"], size_m: float) -> ObjectConfig:
+    """The description of a cube, by its edge, or of a sphere, by its diameter."""
+    size = (size_m, size_m, size_m) if name == "cube" else (size_m,)
+    return ObjectConfig.model_construct(shape="box" if name == "cube" else "sphere", size_m=size)
+
+
+def _read_mesh(value: Any) -> Any:
+    """A description of a mesh with what is read from its files, where that has not been done."""
+    if not isinstance(value, dict) or value.get("shape") != "mesh":
+        return value
+    try:
+        mesh = MeshConfig.model_validate(value.get("mesh"))
+    except ValidationError:
+        return {"size_m": (LEAST_M,) * 3, **value}  # what is wrong with it is said with its place
+    if mesh.sha256:
+        return value
+    pieces = tuple(absolute(piece, Path()) for piece in mesh.pieces)
+    found = measure(pieces, mesh.scale)
+    read = {"pieces": pieces, "sha256": found.sha256, "center_m": found.center_m, "volume_m3": found.volume_m3}
+    return {**value, "mesh": mesh.model_copy(update=read), "size_m": found.extent_m}
+
+
+_NAMED, _DESCRIBED = "named", "described"
+Object = Annotated[
+    Annotated[Literal["cube", "sphere"], Tag(_NAMED)] | Annotated[ObjectConfig, Tag(_DESCRIBED)],
+    Discriminator(lambda value: _NAMED if isinstance(value, str) else _DESCRIBED),
+    BeforeValidator(_read_mesh),
+]
+"""A name, or a description."""
+Fixture = Annotated[FixtureConfig, BeforeValidator(_read_mesh)]
+Obstacle = Annotated[ObstacleConfig, BeforeValidator(_read_mesh)]

@@ -1,0 +1,75 @@
+"""Configuration of the skill-discovery baselines: LSD, DIAYN, DADS and METRA."""
+
+from __future__ import annotations
+
+from typing import ClassVar, Literal, Self
+
+from pydantic import Field, PositiveInt, model_validator
+
+from service.config.frozen import FrozenModel
+from service.config.run import Config
+from service.config.sac import SACConfig
+from service.config.world import ObservedConfig
+
+SkillMethod = Literal["lsd", "diayn", "dads", "metra"]
+
+
+class SkillsSACConfig(SACConfig):
+    """Soft actor-critic of skill discovery. A class of its own, so that what is not given is as here, not as above."""
+
+    gradient_steps: int = Field(
+        4, ge=1, description="updates after a step of every world: 1 for 16 env steps; METRA: 1 for 4 to 32"
+    )
+    learning_rate: float = Field(3e-4, gt=0.0)
+    gamma: float = Field(0.98, gt=0.0, lt=1.0)
+    tau: float = Field(0.005, gt=0.0, le=1.0)
+    initial_entropy_coefficient: float = Field(0.01, gt=0.0, description="LSD's and METRA's code")
+    target_entropy: float = Field(-0.5, description="for each action; METRA's code")
+    critic_layer_norm: bool = Field(False, description="none has it")
+
+
+class SkillsConfig(FrozenModel):
+    """Skill discovery: a policy that a skill vector z steers, learned from an intrinsic reward alone."""
+
+    method: SkillMethod = Field("lsd", description="LSD, DIAYN, DADS or METRA, on the object's position alone")
+    size: int = Field(4, ge=1, description="of z; paper: 4, continuous")
+    episode_steps: int = Field(50, ge=2, description="as downstream; CSD's Fetch tasks have as many")
+    hidden_sizes: tuple[PositiveInt, ...] = Field(
+        (256, 256), min_length=1, description="of the network that rewards come from; METRA's code has 1024 twice"
+    )
+    learning_rate: float = Field(3e-4, gt=0.0, description="of that network; LSD's code 3e-5, METRA's 1e-4, DADS' 3e-4")
+    gradient_steps: int = Field(2, ge=1, description="of that network after a step of every world")
+    batch_size: int = Field(256, ge=2)
+    reward_scale: float = Field(1.0, gt=0.0)
+    newest_steps: int = Field(
+        1_000_000,
+        ge=1,
+        description="env steps that the network learns from: the newest of those kept; DADS' code has 10,000",
+    )
+    variance_floor: float = Field(
+        1e-3,
+        gt=0.0,
+        description="DADS: added to the variances by which it normalises, as its code's batch normalisation does",
+    )
+    num_alternatives: int = Field(100, ge=1, description="DADS: skills that each one is compared with")
+    dual_initial: float = Field(30.0, gt=0.0, description="METRA: first value of the dual variable")
+    dual_slack: float = Field(1e-3, gt=0.0, description="METRA: of its constraint")
+    replay_steps: int = Field(1_000_000, ge=1, description="env steps that are kept to learn from")
+    sac: SkillsSACConfig = SkillsSACConfig()
+
+
+class SkillDiscoveryConfig(Config):
+    """Skill discovery: a policy that a skill vector steers, learned from an intrinsic reward alone."""
+
+    made_in: ClassVar[str] = "service.methods.skills"
+    makes: ClassVar[Literal["skills"]] = "skills"
+    part: ClassVar[str] = "skills"
+
+    method: Literal["skills"] = "skills"
+    skills: SkillsConfig = SkillsConfig()
+
+    @model_validator(mode="after")
+    def _they_see_the_papers_positions(self) -> Self:
+        if self.world.observed != ObservedConfig():
+            raise ValueError("skill discovery sees the positions of the paper only: leave out world.observed")
+        return self

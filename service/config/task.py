@@ -1,0 +1,108 @@
+"""Configuration of learning a task with frozen primitives or skills, or from nothing."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, ClassVar, Literal, Self, get_args
+
+from pydantic import Field, model_validator
+
+from service.config.run import SUCCESS_DISTANCE_M, Config, RunConfig
+from service.config.sac import SACConfig
+from service.config.skills import SkillMethod
+
+EPISODE_STEPS = 50
+"""Env steps of an episode of every task (paper: 50)."""
+
+
+class TaskRunConfig(RunConfig):
+    """Length and bookkeeping of learning a task. A class of its own, so that what is not given is as here."""
+
+    total_env_steps: int = Field(300_000, ge=1)
+    checkpoint_interval: int = Field(40, ge=1, description="iterations, each an episode of every world")
+    keep_checkpoints: int = Field(1, ge=1, description="each has the whole replay buffer")
+    evaluation_interval: int = Field(4, ge=0, description="iterations between two evaluations; 0: never")
+
+
+class TaskConfig(Config):
+    """Learning one task by one method of the table."""
+
+    made_in: ClassVar[str] = "service.methods.task"
+    makes: ClassVar[Literal["orchestrator"]] = "orchestrator"
+
+    method: str
+    task: str = Field(description="a name of ``tandem tasks``")
+    primitives: str = Field(
+        "panda-cube@champion",
+        description="version, run or export whose primitives or skills the method takes, and in whose world it plays",
+    )
+    primitives_digest: str | None = Field(None, description="of their parameters; a new run records it")
+    sac: SACConfig = SACConfig()
+    skill_steps: int = Field(
+        5,
+        ge=1,
+        le=EPISODE_STEPS,
+        description="env steps that a skill is held; methods with primitives act anew in each",
+    )
+    reward_margin_m: float = Field(
+        0.01,
+        ge=0.0,
+        lt=SUCCESS_DISTANCE_M,
+        description="while learning the object has to be this much nearer than what counts: it seldom leaves again",
+    )
+    task_version: int = Field(0, ge=0, description="of the task's Gymnasium name; a new run records it")
+    run: TaskRunConfig = TaskRunConfig()
+
+    @property
+    def directory_name(self) -> str:
+        """Usual name of the run's directory: seeds of a method lie side by side."""
+        return f"{self.name}-{self.seed}"
+
+    @property
+    def hold_steps(self) -> int:
+        """Env steps that an action of the learner lasts."""
+        return self.skill_steps if self.method in get_args(SkillMethod) else 1
+
+    def as_in(self, saved: Self) -> Self:
+        """The same, with the exact version of the primitives and their world, where these may be those of ``saved``."""
+        exact = {"primitives_digest": saved.primitives_digest, "task_version": saved.task_version}
+        update: dict[str, Any] = {key: value for key, value in exact.items() if key not in self.model_fields_set}
+        if "world" not in self.model_fields_set:
+            update["world"] = saved.world
+        if _may_be(self.primitives, saved.primitives):
+            update["primitives"] = saved.primitives
+        return self.model_copy(update=update)
+
+    @model_validator(mode="before")
+    @classmethod
+    def _has_a_name(cls, values: Any) -> Any:
+        if not isinstance(values, Mapping) or "name" in values:
+            return values
+        return {**values, "name": f"{values.get('task')}-{values.get('method')}"}
+
+    @model_validator(mode="after")
+    def _learns_something(self) -> Self:
+        starts, episodes = self.sac.learning_starts, EPISODE_STEPS * self.sac.num_worlds
+        if self.run.total_env_steps <= starts:
+            raise ValueError(
+                f"{self.run.total_env_steps} env steps are all uniform actions: give more than sac.learning_starts, "
+                f"{starts}"
+            )
+        if self.skill_steps != type(self).model_fields["skill_steps"].default and self.method not in get_args(
+            SkillMethod
+        ):
+            raise ValueError(f"skill_steps is for methods that take skills, and {self.method} takes none: leave it out")
+        if self.method.endswith("-her") and starts < episodes:
+            raise ValueError(
+                f"sac.learning_starts = {starts}: goals are relabelled from whole episodes, so give at least "
+                f"{episodes}, one of each of {self.sac.num_worlds} worlds"
+            )
+        return self
+
+
+def _may_be(reference: str, exact: str) -> bool:
+    """Whether a reference may have named this version or path when it was made exact; an alias may have moved on."""
+    name, _, version = reference.partition("@")
+    is_alias = name == exact.partition("@")[0] and not version.isdecimal()
+    return is_alias or exact in (reference, str(Path(reference).absolute()))

@@ -1,0 +1,91 @@
+"""Configurations as plain trees: read from YAML, changed by overrides."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+from service.config.recipes import recipes
+from service.errors import ConfigError, did_you_mean, one_line
+from service.parsing import MAX_YAML_CHARACTERS, ParseError, parse_yaml
+from service.regular_files import read_regular
+
+
+def read_yaml(path: Path) -> dict[str, Any]:
+    """Read the tree of a YAML file; see ``config.load_config`` for its errors."""
+    try:
+        tree = parse_yaml(read_regular(path, MAX_YAML_CHARACTERS, follow=True), path)
+    except FileNotFoundError:
+        raise ConfigError(
+            f"no configuration file {path}; tandem configs lists those that come with tandem"
+            f"{did_you_mean(str(path), recipes())}"
+        ) from None
+    except OSError as error:
+        raise ConfigError(f"{path}: cannot be read: {error.strerror}; name a YAML file") from None
+    except ParseError as error:
+        raise ConfigError(f"{path}: cannot be read as YAML: {error.reason}") from None
+    if tree is None:
+        raise ConfigError(f"{path}: holds no key; write {{}} into it for the defaults")
+    if not isinstance(tree, dict):
+        raise ConfigError(f"{path}: expected keys and values at the top level, got {type(tree).__name__}")
+    return tree
+
+
+def leaves(tree: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """The keys of a tree as in ``--set``, such as ``learner.bob.gae_lambda``, with their values."""
+    for key, value in tree.items():
+        if isinstance(value, dict):
+            yield from leaves(value, f"{prefix}{key}.")
+        else:
+            yield f"{prefix}{key}", value
+
+
+def apply_override(tree: dict[str, Any], override: str) -> None:
+    """Apply one ``a.b=c`` string; see ``config.load_config`` for its errors."""
+    key, separator, text = override.partition("=")
+    if not separator or not key.strip():
+        raise ConfigError(f"override {override!r}: expected KEY=VALUE, for example learner.bob.num_epochs=3")
+    try:
+        value = parse_yaml(text, "its value")
+    except ParseError as error:
+        raise ConfigError(f"override {one_line(override, 200)!r}: the value is {error.reason}") from None
+    if isinstance(value, str):
+        with suppress(ValueError):
+            value = float(value)  # YAML 1.1 reads 1e-3 as text
+    group, name = group_of(tree, key.strip(), where=f"override {override!r}")
+    group[name] = value
+
+
+def check_numbers(tree: Any, read: Any, *, where: str, key: str = "") -> None:
+    """Refuse true and false where a number is expected, of which pydantic makes 1 and 0.
+
+    Args:
+        tree: as it was written.
+        read: the same as a model understood it, as plain values.
+        where: its origin, named in errors.
+        key: of the two in a greater tree.
+
+    Raises:
+        ConfigError: one was taken for a number.
+    """
+    if isinstance(tree, bool) and type(read) in (int, float):
+        raise ConfigError(f"{where}: {key} = {tree!r}: expected a number, not true or false")
+    inner: list[tuple[Any, Any, Any]] = []
+    if isinstance(tree, dict) and isinstance(read, dict):
+        inner = [(name, value, read.get(name)) for name, value in tree.items()]
+    elif isinstance(tree, (list, tuple)) and isinstance(read, list):
+        inner = [(index, *pair) for index, pair in enumerate(zip(tree, read, strict=False))]
+    for name, value, found in inner:
+        check_numbers(value, found, where=where, key=f"{key}.{name}" if key else str(name))
+
+
+def group_of(tree: dict[str, Any], key: str, *, where: str) -> tuple[dict[str, Any], str]:
+    """The group of a dotted key, made if it is not there, and the key's name in it."""
+    *parents, name = key.split(".")
+    for parent in parents:
+        tree = tree.setdefault(parent, {})
+        if not isinstance(tree, dict):
+            raise ConfigError(f"{where}: {parent!r} is a value, not a group of keys")
+    return tree, name

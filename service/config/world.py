@@ -1,0 +1,153 @@
+"""The configuration of a world: robot, table, object, workspace."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, Literal, Self
+
+from pydantic import BeforeValidator, Discriminator, Field, Tag, model_validator
+
+from service.config.frozen import FrozenModel
+from service.config.objects import Fixture, Object, ObjectConfig, Obstacle, simple_object
+from service.config.randomisation import RandomisationConfig
+from service.config.recipes import find_file, robots
+from service.config.robot import RobotConfig, read_robot
+
+Point = tuple[float, float, float]
+"""x, y, z in the world frame."""
+
+
+class WorkspaceConfig(FrozenModel):
+    """The box in which goals are valid. Origin of the world: the table top, 0.6 m in front of the robot's base."""
+
+    center_x_m: float = Field(-0.05, ge=-0.3, le=0.2, description="-0.05 keeps the downstream Larger task reachable")
+    center_y_m: float = Field(0.0, ge=-0.3, le=0.3)
+    length_x_m: float = Field(0.35, gt=0.0, le=0.8, description="paper: 35 cm")
+    length_y_m: float = Field(0.35, gt=0.0, le=0.8, description="paper: 35 cm")
+    height_m: float = Field(0.35, gt=0.0, le=0.8, description="paper: 35 cm")
+
+    @property
+    def lower_m(self) -> Point:
+        """Corner with the least coordinates, metres; the box stands on the table top."""
+        return self.center_x_m - self.length_x_m / 2, self.center_y_m - self.length_y_m / 2, 0.0
+
+    @property
+    def upper_m(self) -> Point:
+        """Corner with the greatest coordinates, metres."""
+        return self.center_x_m + self.length_x_m / 2, self.center_y_m + self.length_y_m / 2, self.height_m
+
+
+class ObservedConfig(FrozenModel):
+    """Entries of observations beyond the paper's: inputs of every policy, so they belong to what is published."""
+
+    num_commands: int = Field(
+        0,
+        ge=0,
+        le=8,
+        description="last commands of its own that a policy sees, the newest first; 0 in the paper. With late "
+        "observations or a slow arm, positions alone do not say what is still under way",
+    )
+    delay: bool = Field(
+        False,
+        description="policies see by how many control steps their commands are late; tandem robot run tells them by "
+        "how many what is seen is late",
+    )
+    obstacles: bool = Field(False, description="whether policies see where the middle of each of world.obstacles is")
+
+
+def _read_robot(value: Any) -> Any:
+    return read_robot(find_file(value, robots())) if isinstance(value, str) and value != "panda" else value
+
+
+_BUILT_IN, _DESCRIBED = "built-in", "described"
+NO_KEYS = (_BUILT_IN, _DESCRIBED, "named")
+"""Parts of pydantic's locations that are no keys."""
+Robot = Annotated[
+    Annotated[Literal["panda"], Tag(_BUILT_IN)] | Annotated[RobotConfig, Tag(_DESCRIBED)],
+    Discriminator(lambda value: _BUILT_IN if isinstance(value, str) else _DESCRIBED),
+    BeforeValidator(_read_robot),
+]
+
+
+class WorldConfig(FrozenModel):
+    """The MuJoCo world: robot, table, one rigid object."""
+
+    robot: Robot = Field(
+        "panda",
+        description="panda, a name of tandem configs, or a YAML file with a description of yours (docs/robots.md)",
+    )
+    object: Object = Field("cube", description="cube, sphere, or a description: shape, size_m, color (docs/objects.md)")
+    object_size_m: float = Field(
+        0.05, ge=0.02, le=0.07, description="cube edge or sphere diameter; paper: 5 cm. A description has its own"
+    )
+    object_mass_kg: float = Field(0.1, gt=0.0, le=2.0)
+    friction: float = Field(1.0, gt=0.0, le=3.0, description="sliding friction of the object, also on the table")
+    pad_friction: float = Field(1.0, gt=0.0, le=3.0, description="sliding friction of the fingertips on the object")
+    gripper: Literal["free", "blocked"] = Field("free", description="blocked: held closed, whatever the action says")
+    fixture: Literal["none", "wall", "box"] = Field(
+        "none", description="what stands on the table besides the object; docs/decisions/0007 has its geometry"
+    )
+    fixtures: tuple[Fixture, ...] = Field(
+        (), max_length=20, description="further things on the table that cannot be moved (docs/objects.md)"
+    )
+    obstacles: tuple[Obstacle, ...] = Field(
+        (),
+        max_length=8,
+        description="further objects that lie about on the table and can be pushed (docs/objects.md)",
+    )
+    workspace: WorkspaceConfig = WorkspaceConfig()
+    observed: ObservedConfig = ObservedConfig()
+    randomisation: RandomisationConfig = RandomisationConfig()
+    start_height_m: float = Field(
+        0.08,
+        ge=0.08,
+        le=0.4,
+        description="end effector at reset, above the workspace's centre; low, so that chance finds the object",
+    )
+    physics_step_s: float = Field(0.002, gt=0.0, le=0.01)
+    num_substeps: int = Field(20, ge=1, le=200, description="physics steps per action; 20 x 2 ms = 25 Hz as panda-gym")
+
+    @model_validator(mode="after")
+    def _one_kind_of_fixtures(self) -> Self:
+        if self.fixtures and self.fixture != "none":
+            raise ValueError(f"fixture = {self.fixture!r} and fixtures: a world has the one or the other")
+        return self
+
+    @model_validator(mode="after")
+    def _observes_what_is_there(self) -> Self:
+        if self.observed.obstacles and not self.obstacles:
+            raise ValueError("observed.obstacles, and no obstacles: describe some, or leave it out")
+        return self
+
+    @model_validator(mode="after")
+    def _object_is_lower_than_the_workspace(self) -> Self:
+        if self.rest_height_m >= self.workspace.height_m:
+            raise ValueError(
+                f"the object's centre lies {self.rest_height_m:g} m high, and the workspace ends at "
+                f"{self.workspace.height_m:g} m, so no goal is in it: raise workspace.height_m, or lower the object"
+            )
+        return self
+
+    @property
+    def num_observed_obstacles(self) -> int:
+        """Number of obstacles whose positions policies see."""
+        return len(self.obstacles) if self.observed.obstacles else 0
+
+    @property
+    def nominal(self) -> WorldConfig:
+        """The same world as it says, nothing drawn; policies see what they saw."""
+        return self.model_copy(update={"randomisation": RandomisationConfig()})
+
+    @property
+    def num_kept_commands(self) -> int:
+        """Last commands that a world remembers: those that are seen, and those that do not count yet."""
+        return max(self.observed.num_commands, (self.randomisation.delay_steps or (0, 0))[1])
+
+    @property
+    def shape(self) -> ObjectConfig:
+        """The object's shape and size."""
+        return simple_object(self.object, self.object_size_m) if isinstance(self.object, str) else self.object
+
+    @property
+    def rest_height_m(self) -> float:
+        """Height of the object's centre as it lies on the table."""
+        return self.shape.extent_m[2] / 2

@@ -1,0 +1,150 @@
+"""Learning a task: soft actor-critic composes frozen primitives, sets skills, or learns from nothing.
+
+An iteration is an episode of every world.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from service.actors.evaluation import DeterministicPolicy, Evaluation
+from service.config.task import TaskConfig
+from service.config.world import WorldConfig
+from service.downstream.learner import make_loop, set_progress, spread_seed
+from service.downstream.methods import find_method
+from service.downstream.playing import CURVE_SEED, FINAL_SEED, evaluate_on, numbers_of
+from service.downstream.worlds import TaskWorlds
+from service.envs.gym.vector import TabletopVectorEnv
+from service.envs.tasks import EPISODE_STEPS, SUCCESS_DISTANCE_M, find_task
+from service.errors import ConfigError, TandemError
+from service.methods.method import Iteration, Method, State
+from service.policies.parameters import Parameters
+from service.primitives.loading import Trained, load
+from service.types import Metrics
+
+
+class TaskLearning(Method):
+    """A learner in the worlds of one task.
+
+    Args:
+        config: the run.
+        acts_with: primitives or skills of which the method makes use, and whose world it plays in.
+
+    Raises:
+        TandemError: these do not fit the method, or are not those that the run began with.
+    """
+
+    def __init__(self, config: TaskConfig, acts_with: Trained) -> None:
+        super().__init__()
+        self._how = find_method(config.method)
+        self._how.check(acts_with)
+        if config.primitives_digest not in (None, acts_with.digest):
+            raise TandemError(
+                f"{acts_with.label} has other parameters than the {config.primitives} that this run began with: name "
+                "the registry that has those with --registry"
+            )
+        self.config, self._acts_with = config, acts_with
+        torch.set_num_threads(config.run.num_threads or 1)
+        self._worlds = self._make_worlds()
+        self.loop = make_loop(config, self._how, acts_with, self._worlds)
+        """Collects transitions and learns from them."""
+
+    def step(self) -> Iteration:
+        """Play an episode in every world, with its updates."""
+        before, total = self.num_env_steps, self.config.run.total_env_steps
+        set_progress(self.loop, self._how, before / total)
+        with self.timing("play and learn"):
+            learned = self.loop.play(min(EPISODE_STEPS * self._worlds.num_worlds, total - before))
+        metrics = self.count(self.loop.num_env_steps - before) | self._episodes()
+        metrics |= {f"learner/{name}": value for name, value in learned.items()}
+        metrics["learner/num_updates"] = self.loop.num_updates
+        return Iteration(metrics)
+
+    def evaluate(self) -> Metrics:
+        """Success without noise on goals that are not learned on."""
+        found = self._evaluate(self.config.run.evaluation_episodes, CURVE_SEED)
+        return {"evaluation/success_last": found.success_last, "evaluation/success_ever": found.success_ever}
+
+    def measure(self) -> Metrics:
+        """Success without noise on the goals that all methods are compared on, with 95 % intervals."""
+        found = self._evaluate(self.config.run.final_episodes, FINAL_SEED)
+        return {f"evaluation/{name}": value for name, value in numbers_of(found).items()}
+
+    def parameters(self) -> Parameters:
+        """The learner's actor, averaged."""
+        return self.loop.learner.averaged_parameters()
+
+    def player(self) -> DeterministicPolicy:
+        """The policy learned so far, at the start of new episodes."""
+        return self._how.learned(self.parameters(), self._acts_with, self._worlds.steps_per_action)
+
+    def close(self) -> None:
+        """Stop the worlds' threads; a second call does nothing."""
+        self._worlds.close()
+
+    def state(self) -> State:
+        """The off-policy loop with its replay buffer, and the actor for readers without torch."""
+        arrays, values = self.loop.state()
+        return {"loop": arrays, "policy": dict(self.parameters()), "random": values}
+
+    def load_state(self, state: State) -> None:
+        """Continue, bit for bit, where ``state`` gave these."""
+        self.loop.load_state(state["loop"], state["random"])
+
+    def _evaluate(self, num_episodes: int, seed: int) -> Evaluation:
+        config = self.config
+        return evaluate_on(
+            config.task, config.world, self.player(), num_episodes, config.seed + seed, config.run.num_threads
+        )
+
+    def _episodes(self) -> Metrics:
+        """Means over the episodes that ended in this iteration, which were played with noise."""
+        finished = np.array(self._worlds.finished, dtype=float).reshape(-1, 2)
+        self._worlds.finished.clear()
+        if not len(finished):
+            return {}
+        total, last = finished.T
+        means = {"return": total.mean(), "success_last": last.mean(), "success_ever": (total > 0.0).mean()}
+        return {f"rollout/{name}": float(value) for name, value in means.items()}
+
+    def _make_worlds(self) -> TaskWorlds:
+        config = self.config
+        env = TabletopVectorEnv(
+            config.sac.num_worlds,
+            config.world,
+            task=config.task,
+            success_distance_m=SUCCESS_DISTANCE_M - config.reward_margin_m,
+            max_episode_steps=EPISODE_STEPS,
+            num_threads=config.run.num_threads,
+        )
+        return self._how.enter(env, spread_seed(config.seed, 3), self._acts_with, config.skill_steps)
+
+
+def begin(config: TaskConfig, registry: Path | str, start_from: Trained | None) -> TaskConfig:
+    """The configuration with the exact version of the primitives, and their world.
+
+    Raises:
+        TandemError: no such task or primitives; or they are not for this method.
+    """
+    if start_from is not None:
+        raise ConfigError("--from is for self-play and distillation; name primitives by --set primitives=NAME")
+    found, how = load(config.primitives, registry), find_method(config.method)
+    if config.world not in (WorldConfig(), found.config.world):
+        raise ConfigError("world: a task is learned in the world of its primitives; leave out world")
+    how.check(found)
+    return config.model_copy(
+        update={
+            "world": found.config.world,
+            "primitives": found.reference,
+            "primitives_digest": config.primitives_digest or (None if how.takes is None else found.digest),
+            "task_version": find_task(config.task).version,
+        }
+    )
+
+
+def make(config: TaskConfig, registry: Path | str, start_from: Trained | None) -> TaskLearning:
+    """Make the learner, with the primitives that the run began with."""
+    return TaskLearning(config, load(config.primitives, registry))

@@ -1,0 +1,81 @@
+"""Progress of a run, or of the runs of a study: a bar for each, with its newest rates."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from math import inf
+from types import TracebackType
+from typing import Self
+
+from service.progress import Display, Task, line
+
+_PATTERNS = {
+    "alice/valid_fraction": "{:.0%}",
+    "alice/lifted_fraction": "{:.0%}",
+    "alice/goal_distance_m": "{:.3f} m",
+    "bob/success_rate": "{:.0%}",
+    "rollout/success_last": "{:.0%}",
+    "skills/moved_fraction": "{:.0%}",
+    "skills/lifted_fraction": "{:.0%}",
+    "skills/distance_m": "{:.3f} m",
+    "evaluation/table_success_last": "{:.0%}",
+    "evaluation/air_success_last": "{:.0%}",
+    "evaluation/coverage": "{:.0%}",
+}
+"""Metrics that are shown, where a run has them."""
+_SMOOTHING = 0.8
+
+
+class Progress:
+    """Shows every iteration's metrics of a run, or of several side by side; a context manager. The last lines stay.
+
+    Args:
+        total_env_steps: of each run.
+        display: where they are shown.
+    """
+
+    def __init__(self, total_env_steps: int, display: Display) -> None:
+        self._total, self._display = total_env_steps, display
+        self._runs: dict[str, tuple[Task, dict[str, float]]] = {}
+        """Bars and rates by title."""
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        for task, _ in self._runs.values():
+            self._end(task)
+
+    def say(self, text: str) -> None:
+        """Print a plain line."""
+        self._display.say(text)
+
+    def show(self, metrics: Mapping[str, float | None], title: str = "learning", total: int | None = None) -> None:
+        """Take in one iteration of the run with this title, of so many env steps where runs differ in that.
+
+        Rates are smoothed over about five iterations; evaluations are shown as they are.
+        """
+        env_steps, total = int(metrics["env_steps"] or 0), total or self._total
+        if title not in self._runs:
+            self._runs[title] = Task(title, total, "env steps"), {}
+            self._display.begin(self._runs[title][0])
+        task, rates = self._runs[title]
+        for key in _PATTERNS:
+            new = metrics.get(key)
+            if new is not None:
+                old = new if key.startswith("evaluation/") else rates.get(key, new)
+                rates[key] = _SMOOTHING * old + (1 - _SMOOTHING) * new
+        shown = [key for key in _PATTERNS if key in rates]
+        task.note = " | ".join(f"{key.split('/')[1]} {_PATTERNS[key].format(rates[key])}" for key in shown)
+        if env_steps >= total:
+            task.told_s = inf  # its last line follows anyway
+        task.advance(env_steps - task.done)
+        if env_steps >= total:
+            self._end(task)
+
+    def _end(self, task: Task) -> None:
+        if task.display is not None:
+            self._display.end(task)
+            self.say(line(task))

@@ -1,0 +1,171 @@
+"""What came out of a study: the best run, a table with intervals over seeds, and all numbers as CSV.
+
+The best run is named by its success on goals that are used for nothing else. What is reported of it comes from other
+goals, so that having been chosen does not make it look better than it is.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import closing, suppress
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from service.actors.evaluation import SELECTION_SEED, evaluate_run
+from service.envs.sampling import GoalKind
+from service.io.run_directory import RunDirectory
+from service.policies.numpy_policy import numpy_bob
+from service.primitives.loading import load
+from service.primitives.publishing import publish_run
+from service.registry.names import Version
+from service.registry.registry import Registry
+from service.runs.grid import SEED, Settings
+from service.runs.study_file import StudyRun
+from service.store.address import address_from_environment
+from service.store.disk import read_status
+from service.store.disk_reader import run_id_of
+from service.store.errors import StoreError
+from service.store.run_writer import reporting_to
+from service.types import StateArray
+
+SELECTION_GOALS: GoalKind = "mixed"
+SELECTION_EPISODES = 1000
+"""A success of 95 % is then known to 1.4 points either way."""
+SELECTED, DISTANCE = "selection_success_last", "selection_mean_distance_m"
+"""Results on the goals that choose."""
+MEASURES = ("success_last", "mixed_success_last", "coverage")
+"""Results that a table is of: the first that its runs have. Of tasks, of primitives, of skills."""
+NUM_RESAMPLES = 10_000
+
+
+class Summary(NamedTuple):
+    """Runs that differ in nothing but their seed, or some of several tasks, in a few numbers."""
+
+    num: int
+    mean: float
+    iqm: float
+    """Interquartile mean: of the middle half, so that a run that failed or excelled counts for little."""
+    low: float
+    """Lower end of the 95 % interval of the interquartile mean."""
+    high: float
+    """Upper end of that interval."""
+
+
+def interquartile_mean(values: StateArray) -> StateArray:
+    """Mean without the lowest and the highest quarter, rounded down, as ``scipy.stats.trim_mean(values, 0.25)``.
+
+    Args:
+        values: (..., N).
+
+    Returns:
+        (...).
+    """
+    cut = values.shape[-1] // 4
+    middle: StateArray = np.sort(values, axis=-1)[..., cut : values.shape[-1] - cut].mean(axis=-1)
+    return middle
+
+
+def bootstrap_interval(
+    groups: Sequence[Sequence[float]], estimate: Callable[[StateArray], StateArray] = interquartile_mean
+) -> tuple[float, float]:
+    """Both ends of the 95 % percentile bootstrap interval (Efron 1979; of several tasks Agarwal et al. 2021).
+
+    Args:
+        groups: values of one task each; each group is resampled by itself.
+        estimate: (R, N) resampled values of all groups to (R,).
+    """
+    rng = np.random.default_rng(0)  # the same runs have the same interval
+    arrays = [np.asarray(values, dtype=np.float64) for values in groups]
+    drawn = [values[rng.integers(len(values), size=(NUM_RESAMPLES, len(values)))] for values in arrays]
+    low, high = np.percentile(estimate(np.concatenate(drawn, axis=1)), (2.5, 97.5))
+    return float(low), float(high)
+
+
+def summarise(groups: Sequence[Sequence[float]]) -> Summary:
+    """A row of the table; see ``bootstrap_interval`` for the groups."""
+    values = np.concatenate([np.asarray(each, dtype=np.float64) for each in groups])
+    low, high = bootstrap_interval(groups)
+    return Summary(len(values), float(values.mean()), float(interquartile_mean(values)), low, high)
+
+
+def measure_of(runs: Iterable[StudyRun]) -> str | None:
+    """The result that a table is of; None where no run has one."""
+    there = {name for run in runs for name in run.result}
+    return next((name for name in MEASURES if name in there), None)
+
+
+def summaries(runs: Iterable[StudyRun]) -> list[tuple[Settings, Summary]]:
+    """A row for all settings but the seed; where there are several tasks, also one for all tasks together."""
+    runs = list(runs)
+    measure = measure_of(runs)
+    groups: dict[tuple[tuple[str, str], ...], list[float]] = {}
+    for run in runs:
+        if measure in run.result:
+            key = tuple((name, value) for name, value in run.settings.items() if name != SEED)
+            groups.setdefault(key, []).append(run.result[measure])
+    rows = [(dict(key), summarise([values])) for key, values in groups.items()]
+    over: dict[tuple[tuple[str, str], ...], list[list[float]]] = {}
+    for key, values in groups.items():
+        over.setdefault(tuple((name, "all" if name == "task" else value) for name, value in key), []).append(values)
+    return rows + [(dict(key), summarise(tasks)) for key, tasks in over.items() if len(tasks) > 1]
+
+
+def as_csv(runs: Mapping[str, StudyRun]) -> str:
+    """A line for each run, with its settings and results; empty where it has none."""
+    settings = list(dict.fromkeys(key for run in runs.values() for key in run.settings))
+    results = list(dict.fromkeys(key for run in runs.values() for key in run.result))
+    file = io.StringIO()
+    writer = csv.writer(file, lineterminator="\n")
+    writer.writerow(["run", *settings, "state", "env_steps", "wall_s", *results])
+    for name, run in runs.items():
+        told = [run.settings.get(key, "") for key in settings] + [run.state, run.env_steps, round(run.wall_s, 1)]
+        writer.writerow([name, *told, *(run.result.get(key, "") for key in results)])
+    return file.getvalue()
+
+
+def select(directory: Path) -> dict[str, float]:
+    """Evaluate the Bob of a run's newest checkpoint on the goals that choose.
+
+    Raises:
+        TandemError: the run has no usable checkpoint.
+    """
+    trained = load(str(directory))
+    bob = numpy_bob(trained.parameters)
+    found = evaluate_run(bob, trained.config, SELECTION_GOALS, SELECTION_EPISODES, seed=SELECTION_SEED)
+    return {SELECTED: found.success_last, DISTANCE: found.mean_distance_m}
+
+
+def best_of(runs: Mapping[str, StudyRun]) -> str | None:
+    """The run with the highest success on the goals that choose; of equals, whose object ends nearer to the goals."""
+    scores = {name: run.result for name, run in runs.items() if run.has_ended and SELECTED in run.result}
+    return max(scores, key=lambda name: (scores[name][SELECTED], -scores[name][DISTANCE]), default=None)
+
+
+def publish_best(directory: Path, registry: Registry, run: StudyRun) -> Version | None:
+    """Publish the Bob of one run of a study, whose manifest then has its settings in its configuration.
+
+    Returns:
+        The version, as ``publish_run`` does; None for a Bob without primitives.
+
+    Raises:
+        StorageError: see ``publish_run``.
+    """
+    place = RunDirectory(directory)
+    config = place.read_config()
+    if not config.publishable:
+        return None
+    metrics = {f"evaluation/{name}": value for name, value in run.result.items() if not name.startswith("selection_")}
+    metrics |= {f"selection/{SELECTION_GOALS}_success_last": run.result[SELECTED], "env_steps": float(run.env_steps)}
+    version = publish_run(place, registry, config, load(str(directory)).parameters, metrics)
+    status, run_id = read_status(directory), run_id_of(directory)
+    place.claim(resume=True)
+    with closing(place), suppress(StoreError):
+        if status is not None:
+            told = status.model_copy(update={"run_id": run_id, "published": str(version), "epoch": place.epoch})
+            with closing(reporting_to(place, run_id, address_from_environment())) as writer:
+                writer.status(told)
+    return version

@@ -1,0 +1,135 @@
+"""A method from a user's file is trained, recorded, killed and resumed like those that come with the package."""
+
+import pytest
+
+from service.config import load_config, parse_config
+from service.errors import ConfigError
+from service.io.run_directory import RunDirectory
+from service.runs.resuming import resumed_config
+from service.runs.train import train
+from service.store.disk import read_status
+from tests.runtime.runs import KilledError, assert_one_line, assert_same_run, newest, read_lines
+
+CODE = """
+import numpy as np
+from pydantic import Field
+from service.config import Config
+from service.methods.method import Iteration, Method
+
+
+class Climb(Method):
+    def __init__(self, config):
+        super().__init__()
+        self.rng, self.size, self.height = np.random.default_rng(config.seed), config.step_size, 0.0
+
+    def step(self):
+        self.height += self.size * self.rng.random()
+        return Iteration(self.count(10) | {"climb/height": self.height})
+
+    def measure(self):
+        return {"evaluation/height": self.height}
+
+    def parameters(self):
+        return {"height": np.array([self.height])}
+
+    def state(self):
+        return {"policy": self.parameters(), "rng": self.rng.bit_generator.state}
+
+    def load_state(self, state):
+        self.height, self.rng.bit_generator.state = float(state["policy"]["height"][0]), state["rng"]
+
+    def close(self):
+        pass
+
+
+class Mine(Config):
+    step_size: float = Field(1.0, gt=0.0)
+
+    def build(self, registry, start_from):
+        return Climb(self)
+"""
+
+
+@pytest.fixture
+def file(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "mine.py").write_text(CODE)
+    return tmp_path / "mine.py"
+
+
+def config_of(*overrides):
+    run = ["run.total_env_steps=60", "run.checkpoint_interval=2", "name=hill", "seed=4"]
+    return load_config(None, ["method=mine.py:Mine", *run, *overrides])
+
+
+def ignore(metrics):
+    pass
+
+
+@pytest.mark.usefixtures("default_signals")
+def test_it_is_trained_killed_and_resumed(file, tmp_path, monkeypatch):
+    def kill(metrics):
+        if metrics["iteration"] == 5:
+            raise KilledError
+
+    config = config_of("step_size=0.5")
+    done = train(config, RunDirectory(tmp_path / "whole"), tmp_path / "registry", on_iteration=ignore)
+    with pytest.raises(KilledError):
+        train(config, RunDirectory(tmp_path / "cut"), tmp_path / "registry", on_iteration=kill)
+    assert newest(tmp_path / "cut").step == 4
+    monkeypatch.chdir(tmp_path / "cut")  # config.yaml has the file's whole path
+    directory = RunDirectory(tmp_path / "cut")
+    resumed = resumed_config(directory, [])
+    assert (resumed.method, resumed.step_size) == (f"{file}:Mine", 0.5)
+    train(resumed, directory, tmp_path / "registry", resume=True, on_iteration=ignore)
+    assert_same_run(tmp_path / "whole", tmp_path / "cut")
+    rows = read_lines(tmp_path / "cut" / "metrics.jsonl")
+    assert [row["env_steps"] for row in rows] == [10, 20, 30, 40, 50, 60]
+    assert rows[-1]["climb/height"] == done.metrics["evaluation/height"] == newest(tmp_path / "cut").arrays[
+        "policy/height"
+    ]  # fmt: skip
+    assert directory.read_result()["evaluation"] == {"height": done.metrics["evaluation/height"]}
+    assert (read_status(tmp_path / "cut").state, done.version, done.files) == ("finished", None, {})
+    assert not (tmp_path / "registry").exists()
+
+
+@pytest.mark.parametrize(
+    ("method", "key", "said"),
+    [
+        (
+            "mine.py:Mine",
+            "game.num_goals",
+            "'game'; known there: method, name, run, seed, step_size, world",
+        ),
+        ("mine.py:Mine", "sac.gamma", "it is a key of method=ours"),
+        ("self-play", "skill_steps", "it is a key of method=ours"),
+        ("self-play", "distillation.batch_size", "it is a key of method=distillation"),
+        ("skills", "game.num_goals", "it is a key of method=self-play"),
+        ("skills", "policy.bob", "it is a key of method=self-play and distillation"),
+        ("self-play", "step_size", "unknown key 'step_size'; known there: "),
+        ("mine.py:Mine", "steps_size", "did you mean 'step_size'?"),
+    ],
+)
+def test_a_key_of_one_method_is_unknown_to_another(file, method, key, said):
+    with pytest.raises(ConfigError) as error:
+        load_config(None, [f"method={method}", f"{key}=1"])
+    assert_one_line(error.value, "unknown key", said)
+
+
+@pytest.mark.parametrize(
+    ("method", "said"),
+    [
+        ("mine.py:Climb", "Climb is no class that derives from service.config.Config"),
+        ("mine.py:Yours", "Yours is no class"),
+        ("gone.py:Mine", "no file gone.py; write FILE.py:CLASS"),
+        ("bad.py:Mine", "bad.py: ZeroDivisionError: division by zero"),
+        ("notes.txt:Mine", "notes.txt is no Python file"),
+        ("self_play", "did you mean 'self-play'?"),
+    ],
+)
+def test_what_is_no_method(file, tmp_path, method, said):
+    (tmp_path / "bad.py").write_text("1 / 0")
+    (tmp_path / "notes.txt").write_text("class Mine: ...")
+    with pytest.raises(ConfigError) as error:
+        parse_config({"method": method}, where="a test")
+    assert_one_line(error.value, f"a test: method = '{method}': ", said)
