@@ -49,8 +49,8 @@ from benchmarks.training_process import (
     overrides,
     scratch,
 )
-from service.errors import TandemError
-from service.io.run_directory import RunDirectory
+from service.base.errors import TandemError
+from service.store.run_directory import RunDirectory
 
 PACKAGES = ("mujoco", "numpy", "torch")
 NUM_WORLDS = (8, 240)
@@ -80,10 +80,10 @@ try:
     learning = TaskLearning(config, trained)
     step = learning.step
 except ImportError:  # 0.2 and before
-    from service.downstream.learner import make_loop
-    from service.downstream.methods import METHODS
-    from service.downstream.settings import make_trial
-    from service.downstream.worker import make_worlds
+    from service.methods.task_learner import make_loop
+    from service.methods.task_methods import METHODS
+    from service.methods.settings import make_trial
+    from service.methods.worker import make_worlds
     trial = make_trial(task=task, method=method)
     learning = make_loop(trial, METHODS[method], trained, make_worlds(trial, METHODS[method], trained, 1))
     step = lambda: learning.play(50 * trial.sac.num_worlds)

@@ -20,13 +20,13 @@ from benchmarks.record_run import PACKAGES
 from benchmarks.run_files import COUNTERS, FORMAT_VERSION, Run, thin
 from benchmarks.tasks import measure_tasks
 from benchmarks.trials import NUM_EPISODES, run_trial, trial_config
+from service.base.errors import TandemError
 from service.config import Config, load_config
-from service.errors import TandemError
-from service.io.run_directory import RunDirectory
 from service.media.figures import read_records
-from service.primitives.loading import load
+from service.registry.loading import load
 from service.runs.resuming import resumed_config
 from service.runs.train import train
+from service.store.run_directory import RunDirectory
 
 OURS = "ours"
 _WITHOUT_ALICE = ("game.alice_plays=false", "generator.past_opponent_fraction=0")

@@ -15,14 +15,14 @@ import numpy as np
 
 from benchmarks.run_files import CELL_SIZE_M, RANDOM, STAGES
 from service.actors.coverage import NUM_SKILLS, RandomPolicy, skill_trajectories, visited_share
-from service.baselines.coverage import skill_paths
-from service.baselines.frozen import FrozenSkills
+from service.actors.skill_coverage import skill_paths
+from service.base.types import StateArray
 from service.config import Config
 from service.config.skills import SkillDiscoveryConfig
 from service.media.artifacts import COVERAGE_STEPS
+from service.policies.frozen_skills import FrozenSkills
 from service.policies.numpy_policy import NumpyMCPPolicy, numpy_bob
 from service.policies.parameters import Parameters
-from service.types import StateArray
 
 NUM_SETS = 10
 KEPT_EVERY = 4

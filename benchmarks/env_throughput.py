@@ -23,12 +23,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.measuring import describe_ratio, measure_in_turn, parser_of, rates, rates_table, ratio, run_benchmark
+from service.base.errors import TandemError
 from service.config import WorldConfig
 from service.envs.batch import DISPLACEMENT_M, WorldBatch
 from service.envs.gym.registration import TABLETOP_ID
 from service.envs.observations import ACTION
 from service.envs.sampling import sample_goals
-from service.errors import TandemError
 
 EPISODE_STEPS = 50
 """Length of an episode in panda-gym's registration, and in ours."""

@@ -23,10 +23,10 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from benchmarks.report.markdown import table
-from service.errors import TandemError
-from service.io.files import os_errors, write_atomic
-from service.io.git import git_commit
-from service.primitives.loading import load
+from service.base.errors import TandemError
+from service.base.files import os_errors, write_atomic
+from service.base.git import git_commit
+from service.registry.loading import load
 
 ROOT = Path(__file__).parents[1]
 RECIPE_FILE = ROOT / "configs" / "pretrain" / "panda_cube.yaml"

@@ -17,17 +17,17 @@ import numpy as np
 
 from benchmarks.measuring import primitives_benchmark
 from service.actors.evaluation import wilson_interval
-from service.downstream.compose import check_primitives
 from service.envs.batch import WorldBatch
 from service.envs.sampling import draw_goals
 from service.envs.tasks import EPISODE_STEPS, SUCCESS_DISTANCE_M, find_task
-from service.primitives.learned import compose_actions
+from service.methods.compose import check_primitives
+from service.registry.learned import compose_actions
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from service.policies.numpy_policy import NumpyMCPPolicy
-    from service.primitives.loading import Trained
+    from service.registry.loading import Trained
 
 PACKAGES = ("mujoco", "numpy")
 _HELD_STEPS = 5

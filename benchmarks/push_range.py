@@ -14,13 +14,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from benchmarks.measuring import primitives_benchmark
-from service.downstream.compose import check_primitives
-from service.primitives.learned import action_weights
+from service.methods.compose import check_primitives
+from service.registry.learned import action_weights
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from service.primitives.loading import Trained
+    from service.registry.loading import Trained
 
 PACKAGES = ("numpy",)
 DIRECTIONS = {"+x": (1.0, 0.0), "-x": (-1.0, 0.0), "+y": (0.0, 1.0), "-y": (0.0, -1.0)}

@@ -26,14 +26,14 @@ from benchmarks.coverage import measure_coverage
 from benchmarks.measuring import machine, write_json
 from benchmarks.run_files import COUNTERS, FORMAT_VERSION, Records, Run, blocks, thin
 from benchmarks.tasks import measure_tasks
+from service.base.errors import TandemError
+from service.base.types import StateArray
 from service.config.skills import SkillDiscoveryConfig
 from service.envs.tasks import EPISODE_STEPS
-from service.errors import TandemError
-from service.io.run_directory import RunDirectory
 from service.media.figures import read_records
 from service.policies.numpy_policy import numpy_bob
-from service.primitives.loading import read_stages
-from service.types import StateArray
+from service.registry.loading import read_stages
+from service.store.run_directory import RunDirectory
 
 GOAL_RECORDS, GOALS_EACH = 60, 10
 """Stages of the run of which goals are kept, and the number of goals of each."""

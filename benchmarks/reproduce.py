@@ -22,8 +22,8 @@ from pathlib import Path
 
 from benchmarks.controls import CONTROLS
 from benchmarks.measuring import ROOT
-from service.downstream.methods import METHODS
 from service.envs.tasks import TASKS, find_task
+from service.methods.task_methods import METHODS
 
 PRIMITIVES = {0: "panda-cube@seed-0", 1: "panda-cube@seed-2", 2: "panda-cube@seed-3"}
 """Versions in ``docs/results/primitives`` by the seed of the trials that take them: each has its own pre-training."""

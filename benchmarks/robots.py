@@ -22,11 +22,11 @@ import numpy as np
 
 from benchmarks.env_throughput import BatchContender
 from benchmarks.measuring import RECIPE_FILE, ROOT, measure_in_turn, parser_of, ratio, run_benchmark
+from service.base.errors import ConfigError
+from service.base.jsonl import read_jsonl
 from service.config import Config, WorldConfig, load_config
 from service.envs.batch import WorldBatch
-from service.errors import ConfigError
-from service.io.jsonl import read_jsonl
-from service.io.run_directory import RunDirectory
+from service.store.run_directory import RunDirectory
 
 ROBOTS = ROOT / "configs" / "robots"
 OVERRIDES = {"viperx": ("world.workspace.height_m=0.25",), "jaco": ("world.workspace.height_m=0.25",)}

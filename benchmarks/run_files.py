@@ -15,9 +15,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from service.errors import TandemError
+from service.base.errors import TandemError
+from service.base.types import StateArray
 from service.media.figures import column
-from service.types import StateArray
 
 FORMAT_VERSION = 1
 MAX_POINTS = 300

@@ -36,7 +36,7 @@ from benchmarks.measuring import ROOT, parser_of, run_benchmark
 from benchmarks.processes import descendants
 from benchmarks.report.markdown import table
 from benchmarks.training_process import Records, environment, scratch
-from service.errors import TandemError
+from service.base.errors import TandemError
 
 PACKAGES = ("mujoco", "numpy", "torch")
 WORKTREE = "worktree"

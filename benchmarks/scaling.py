@@ -26,7 +26,7 @@ from benchmarks.training_process import (
     overrides,
     scratch,
 )  # fmt: skip
-from service.io.run_directory import RunDirectory
+from service.store.run_directory import RunDirectory
 
 PACKAGES = ("ray", "redis", "mujoco", "numpy", "torch")
 

@@ -22,9 +22,9 @@ from typing import Any
 from benchmarks.measuring import RECIPE_FILE, machine, write_json
 from benchmarks.processes import cpu_s_by_role
 from benchmarks.training_process import Training, overrides, scratch
+from service.base.errors import TandemError
 from service.config import load_config
 from service.config.self_play import SelfPlayConfig
-from service.errors import TandemError
 from service.runs.grid import parse_seeds
 
 SHARE = 0.9

@@ -30,13 +30,12 @@ from pydantic import ValidationError
 
 from benchmarks.measuring import ROOT, Sample
 from benchmarks.processes import cpu_s_by_role, descendants, is_running
-from service.errors import TandemError
-from service.io.checkpoints import CheckpointStore
-from service.io.run_directory import RunDirectory
-from service.io.run_history import FILE as RUN_FILE
+from service.base.errors import StoreError, TandemError
+from service.store.checkpoints import CheckpointStore
 from service.store.disk_reader import DiskReader
-from service.store.errors import StoreError
 from service.store.models import RunStatus
+from service.store.run_directory import RunDirectory
+from service.store.run_history import FILE as RUN_FILE
 
 ENDLESS = {"run.total_env_steps": 1_000_000_000_000}
 PLAIN = {"run.checkpoint_interval": 1_000_000_000, "run.evaluation_interval": 0}

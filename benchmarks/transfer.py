@@ -18,19 +18,18 @@ import numpy as np
 from benchmarks.measuring import parser_of, run_benchmark
 from benchmarks.report.markdown import percent, table
 from service.actors.evaluation import evaluate, wilson_interval
+from service.base.errors import RobotError, TandemError
+from service.base.types import BoolArray, StateArray
 from service.envs.sampling import draw_goals, draw_starts
-from service.errors import TandemError
-from service.primitives.loading import Trained, load
+from service.registry.loading import Trained, load
 from service.robot.backends import Backend, BackendConfig, Simulator, connect
 from service.robot.calibrate import Calibration, calibrate
 from service.robot.disturbed import DisturbanceConfig
-from service.robot.errors import RobotError
 from service.robot.loop import Bridge, BridgeConfig
 from service.robot.policies import for_robot
 from service.robot.pybullet_robot import CONTROL_STEP_S, PyBulletParameters, PyBulletRobot, world_of
 from service.robot.safety import SafetyConfig
 from service.robot.watchdogs import WatchConfig
-from service.types import BoolArray, StateArray
 
 PACKAGES = ("pybullet", "mujoco", "numpy")
 Gain = tuple[float, float, float]

@@ -18,19 +18,19 @@ from typing import Any
 from benchmarks.measuring import write_json
 from benchmarks.report.results import FORMAT_VERSION, TRIAL, Result
 from service.actors.evaluation import DeterministicPolicy, IdlePolicy, evaluate, wilson_interval
+from service.base.errors import TandemError
+from service.base.git import git_commit
+from service.base.jsonl import read_jsonl
+from service.base.types import Metrics
 from service.config.load import parse_config
 from service.config.task import TaskConfig
 from service.config.tree import apply_override
-from service.downstream.methods import find_method
-from service.downstream.playing import FINAL_SEED
 from service.envs.tasks import EPISODE_STEPS, SUCCESS_DISTANCE_M, find_task
-from service.errors import TandemError
-from service.io.git import git_commit
-from service.io.jsonl import read_jsonl
-from service.io.run_directory import RunDirectory
-from service.primitives.loading import Trained, load
+from service.methods.task_evaluation import FINAL_SEED
+from service.methods.task_methods import find_method
+from service.registry.loading import Trained, load
 from service.runs.train import train
-from service.types import Metrics
+from service.store.run_directory import RunDirectory
 
 NUM_EPISODES = 1_000
 """Of the last evaluation."""

@@ -8,10 +8,10 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from service.version import __version__ as __version__
+from service.base.version import __version__ as __version__
 
 if TYPE_CHECKING:
-    from service.primitives.loading import Trained
+    from service.registry.loading import Trained
 
 __all__ = ["load", "load_policy", "load_primitives", "load_skills"]
 
@@ -39,7 +39,7 @@ def load(
         TandemError: nothing there by that reference, damaged, or not finished; or what it acts with is not here; or the
             service cannot be reached or wants a token.
     """
-    from service.primitives import loading
+    from service.registry import loading
 
     return loading.load(reference, registry, primitives)
 

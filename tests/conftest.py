@@ -20,7 +20,7 @@ import pytest
 import typer.testing
 
 if TYPE_CHECKING:
-    from service.primitives.loading import Trained
+    from service.registry.loading import Trained
     from service.registry.names import Version
     from service.registry.registry import Registry
     from tests.registry.helpers import Publish

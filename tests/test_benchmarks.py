@@ -21,19 +21,19 @@ from benchmarks.measuring import Sample
 from benchmarks.report.__main__ import PAGES, Report, begin, end
 from benchmarks.report.figures import quantiles
 from service.actors.coverage import RandomPolicy, skill_trajectories, visited_share
+from service.base.errors import TandemError
+from service.base.jsonl import JsonlWriter
 from service.config import WorldConfig, dump_config, load_config
 from service.envs.gym.registration import TABLETOP_ID
-from service.errors import TandemError
-from service.io.jsonl import JsonlWriter
-from service.io.run_directory import RunDirectory
-from service.io.run_history import RunHistory
 from service.learner.learner import Learner
 from service.policies.numpy_policy import numpy_bob
-from service.primitives.bundled import BUNDLED
-from service.primitives.loading import load, read_stages
+from service.registry.bundled import BUNDLED
+from service.registry.loading import load, read_stages
 from service.registry.registry import Registry
 from service.runs.train import open_run
-from tests.runtime.runs import tiny_config
+from service.store.run_directory import RunDirectory
+from service.store.run_history import RunHistory
+from tests.runs.runs import tiny_config
 
 ROOT = Path(__file__).parents[1]
 

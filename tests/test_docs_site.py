@@ -11,7 +11,7 @@ from typer.testing import CliRunner
 
 import service
 from service.cli.main import app
-from tests.downstream.trials import SETS
+from tests.methods.trials import SETS
 from tools import docs_reference
 from tools.docs_site import SiteError, build
 

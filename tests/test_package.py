@@ -15,13 +15,13 @@ import numpy as np
 import pytest
 
 import service
+from service.base.errors import TandemError
+from service.base.extras import MissingPackageError, needs_extra
 from service.config import load_config
 from service.config.recipes import recipes, robots
-from service.errors import TandemError
-from service.extras import MissingPackageError, needs_extra
 from service.policies.numpy_policy import NumpyMCPPolicy
-from service.primitives.acting import acting_config
-from service.primitives.bundled import BUNDLED
+from service.registry.acting import acting_config
+from service.registry.bundled import BUNDLED
 from service.registry.registry import Registry
 from tests.registry.helpers import files_in
 
@@ -77,7 +77,7 @@ def run(installed, directory, *arguments, program="python"):
 
 
 def test_the_wheel_has_the_primitives_byte_for_byte(installed):
-    assert files_in(installed / "service" / "primitives" / "data") == files_in(BUNDLED)
+    assert files_in(installed / "service" / "registry" / "data") == files_in(BUNDLED)
     assert (installed / "service" / "py.typed").exists()
 
 

@@ -33,7 +33,7 @@ HEAVY = (
 )
 CLUSTER_MODULES = (
     "actor_pool",
-    "cluster",
+    "self_play",
     "copies",
     "ray_actors",
     "ray_task",
@@ -44,12 +44,10 @@ CLUSTER_MODULES = (
     "watch",
     "worker_variables",
 )
-ROOMS_WITHOUT_TORCH = ("actors", "envs", "generator", "play", "registry", "status")
+ROOMS_WITHOUT_TORCH = ("actors", "base", "config", "envs", "generator", "registry", "robot/play", "status", "store")
 ROOMS = (
-    *("version", "errors", "extras", "liveness", "progress", "trackers", "types", "parsing", "regular_files"),
-    *("config", "io", "envs", "policies", "generator", "actors", "learner", "sac", "baselines", "registry"),
-    *("primitives", "media", "downstream", "play", "export", "robot"),
-    *("store", "status", "methods", "runs", "runtime", "cli", "__main__", "service"),
+    *("base", "config", "store", "envs", "policies", "generator", "actors", "learner", "registry", "media"),
+    *("methods", "export", "robot", "status", "runs", "cluster", "cli", "__main__", "service"),
 )
 """Each room may import itself and those before it."""
 VERBS = (
@@ -125,7 +123,7 @@ def project_table():
     return tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 
 
-@pytest.mark.parametrize("module", ["service", "service.config", "service.errors", "service.cli"])
+@pytest.mark.parametrize("module", ["service", "service.config", "service.base.errors", "service.cli"])
 def test_import_is_light(module):
     run_python(IMPORT_ALL, ",".join(HEAVY), module)
 
@@ -144,7 +142,7 @@ def test_python_dash_m_is_the_command():
 
 
 def test_the_numpy_policies_need_no_torch():
-    run_python(IMPORT_ALL, "torch", "service.policies.numpy_policy,service.primitives.loading,service.runs.publishing")
+    run_python(IMPORT_ALL, "torch", "service.policies.numpy_policy,service.registry.loading,service.runs.publishing")
 
 
 @pytest.mark.parametrize("room", ROOMS_WITHOUT_TORCH)
@@ -191,7 +189,7 @@ def test_no_import_circle():
 
 def test_only_the_cluster_knows_ray_and_only_the_store_knows_redis():
     users = {(other.split(".")[0], one) for one, other in imports_of_modules()}
-    with_ray = {f"service.runtime.{name}" for name in CLUSTER_MODULES}
+    with_ray = {f"service.cluster.{name}" for name in CLUSTER_MODULES}
     assert {one for package, one in users if package == "ray"} == with_ray
     assert {room_of(one) for package, one in users if package == "redis"} == {"store"}
 
@@ -201,8 +199,8 @@ OPENS_OR_PARSES = re.compile(
     r"|json\.loads?|msgspec\.json\.(decode|Decoder)"
 )
 ALLOWED = {
-    "service/regular_files.py": {"open", "os.open", "FileIO"},
-    "service/parsing.py": {"yaml.load"},
+    "service/base/regular_files.py": {"open", "os.open", "FileIO"},
+    "service/base/parsing.py": {"yaml.load"},
     "service/store/tail.py": {"msgspec.json.Decoder"},  # which parse_with calls
     # what comes with the package, or is the kernel's
     "service/config/recipes.py": {"path.read_text"},
@@ -212,7 +210,7 @@ ALLOWED = {
     "service/policies/forward.py": {"np.load"},  # runs where this package is not
     # makes a file that must not be there yet, or opens a directory
     "service/cli/unexpected.py": {"open", "os.open"},
-    "service/io/files.py": {"os.open"},
+    "service/base/files.py": {"os.open"},
 }
 """Where files are opened and texts are parsed, and why it is not by the functions that all others use."""
 

@@ -8,15 +8,15 @@ import numpy as np
 import pytest
 
 from service.actors.evaluation import EVALUATION_SEED, evaluate
+from service.base.errors import TandemError
 from service.config import dump_config, parse_config
-from service.errors import TandemError
-from service.io.run_directory import RunDirectory
 from service.policies.numpy_policy import numpy_bob
-from service.primitives.loading import load
-from service.primitives.publishing import publish
+from service.registry.loading import load
+from service.registry.publishing import publish
 from service.registry.registry import Registry
+from service.store.run_directory import RunDirectory
 from tests.registry.helpers import assert_identical, files_in
-from tests.runtime.runs import TREE, assert_one_line, play, tiny_config
+from tests.runs.runs import TREE, assert_one_line, play, tiny_config
 from tools import ship_primitives
 from tools.ship_primitives import publish_newest, ship
 

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 
 import yaml
 
-from service.errors import TandemError
+from service.base.errors import TandemError
 
 KEYS = {
     "build", "cap_drop", "command", "depends_on", "deploy", "entrypoint", "environment", "healthcheck", "image", "init",

@@ -25,7 +25,7 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.measuring import machine, write_json
-from service.errors import TandemError
+from service.base.errors import TandemError
 from tools.compose_services import read_services, read_variables
 from tools.containers import Containers, need_programs, remove_memory_groups, run
 from tools.deployed_checks import CHECKS, Deployment

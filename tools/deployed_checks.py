@@ -17,7 +17,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
-from service.errors import TandemError
+from service.base.errors import TandemError
 from tools.compose_services import Service
 from tools.containers import Container, Containers
 

@@ -26,10 +26,10 @@ from service.config.self_play import SelfPlayConfig
 
 SECTIONS = ("Args", "Returns", "Raises", "Yields", "Attributes")
 RETURNED = (
-    ("service.primitives.loading", "Trained"),
+    ("service.registry.loading", "Trained"),
     ("service.policies.numpy_policy", "NumpyMCPPolicy"),
-    ("service.baselines.frozen", "FrozenSkills"),
-    ("service.downstream.compose", "ComposePrimitives"),
+    ("service.policies.frozen_skills", "FrozenSkills"),
+    ("service.methods.compose", "ComposePrimitives"),
 )
 """What the public functions return, and what is built from it."""
 

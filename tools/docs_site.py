@@ -16,7 +16,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from service.errors import TandemError
+from service.base.errors import TandemError
 from tools import docs_reference
 
 ROOT = Path(__file__).parents[1]

@@ -25,8 +25,8 @@ from benchmarks.measuring import RECIPE_FILE, parser_of, run_benchmark
 from benchmarks.processes import descendants
 from benchmarks.report.markdown import table
 from benchmarks.training_process import ENDLESS, Training, overrides, scratch
-from service.errors import TandemError
-from service.io.jsonl import read_jsonl
+from service.base.errors import TandemError
+from service.base.jsonl import read_jsonl
 from service.store.models import RunStatus
 from tests.store.redis_server import RedisServer
 from tools.rollout_audit import audit_run

@@ -16,7 +16,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from service.errors import TandemError
+from service.base.errors import TandemError
 from tools.containers import PATH, Image, read_image, run
 
 ROOT = Path(__file__).parents[1]

@@ -5,7 +5,7 @@
 
 It draws places in the code, all alike, and for each one of the operators of Cosmic Ray that change something there. A
 mutant whose syntax tree is the same without its annotations is drawn again: nothing of it would ever run. The tests of
-the mutant's own package come first, then those of the others and the short runs of ``tests/runtime``. What no test
+the mutant's own package come first, then those of the others. What no test
 notices survives: either it behaves as before, or a test is missing. That takes about half a minute a mutant.
 """
 
@@ -29,11 +29,8 @@ import numpy as np
 
 from benchmarks.measuring import ROOT, machine, write_json
 
-PACKAGES = ("actors", "baselines", "config", "downstream", "generator", "learner", "methods", "policies",
-            "primitives", "runs", "sac")  # fmt: skip
+PACKAGES = ("actors", "config", "generator", "learner", "methods", "policies", "registry", "runs")
 """Rooms of ``service`` that decide what is learned."""
-RUNS = ("tests/runtime", "tests/test_config.py")
-"""Asked, with the tests of the other packages, where a package's own tests have noticed nothing."""
 TIMEOUT_S = 400.0
 
 
@@ -79,7 +76,7 @@ def judge(mutant: Mutant, copy: Path, python: Path) -> str:
     target.write_text(mutant.code, encoding="utf-8")
     try:
         own = f"tests/{Path(mutant.file).parts[1]}"
-        known = [*(f"tests/{package}" for package in PACKAGES), *RUNS]
+        known = [f"tests/{package}" for package in PACKAGES]
         there = [tests for tests in known if (copy / tests).exists()]
         for tests in ([own] * (own in there), [each for each in there if each != own]):
             if tests and not _pass(tests, copy, python):
@@ -156,7 +153,7 @@ def run(num: int, seed: int, python: Path, parallel: int) -> list[dict[str, Any]
         for number in range(parallel):
             copies.put(copy := Path(place) / str(number))
             shutil.copytree(ROOT, copy, ignore=_left_out)
-        known = [*(f"tests/{package}" for package in PACKAGES), *RUNS]
+        known = [f"tests/{package}" for package in PACKAGES]
         for tests in (each for each in known if (copy / each).exists()):
             if not _pass((tests,), copy, python):  # else every mutant would seem to be killed
                 raise SystemExit(f"{tests} fails without any change: mend that first")

@@ -15,10 +15,10 @@ from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any
 
-from service.io.checkpoints import CheckpointStore
-from service.io.jsonl import read_jsonl
-from service.io.run_directory import RunDirectory
+from service.base.jsonl import read_jsonl
+from service.store.checkpoints import CheckpointStore
 from service.store.models import RunStatus
+from service.store.run_directory import RunDirectory
 
 Ledger = Mapping[tuple[int, int], int]
 """Highest sequence by (actor, incarnation)."""

@@ -3,7 +3,7 @@
     python -m tools.ship_primitives runs/cube                           # the newest Bob of a run, measured here
     python -m tools.ship_primitives panda-cube@7 --registry registry    # a published version
 
-``service/primitives`` is a registry like any other, except that only this script writes there. What it ships gets the
+``service/registry`` is a registry like any other, except that only this script writes there. What it ships gets the
 next number and the aliases champion and latest; older versions of its name are removed: the package stays small.
 """
 
@@ -18,18 +18,18 @@ from pathlib import Path
 
 from pydantic import JsonValue
 
-from service.errors import TandemError
-from service.io import tensors
-from service.io.files import os_errors, write_atomic
-from service.io.run_directory import RunDirectory
+from service.base import tensors
+from service.base.errors import TandemError
+from service.base.files import os_errors, write_atomic
 from service.policies.numpy_policy import NumpyMCPPolicy
-from service.primitives.acting import acting_config
-from service.primitives.bundled import BUNDLED
-from service.primitives.loading import read_stages
-from service.primitives.publishing import measure_bob, publish
+from service.registry.acting import acting_config
 from service.registry.blobs import BlobStore
+from service.registry.bundled import BUNDLED
+from service.registry.loading import read_stages
 from service.registry.names import LATEST, Version
+from service.registry.publishing import measure_bob, publish
 from service.registry.registry import Registry
+from service.store.run_directory import RunDirectory
 
 CHAMPION = "champion"
 

@@ -36,8 +36,8 @@ from benchmarks.report.downstream import draw_table, write_results
 from benchmarks.report.results import Result, read_trials
 from benchmarks.reproduce import Places, experiments
 from benchmarks.run_files import Run, read_run
-from service.errors import TandemError
-from service.io.files import os_errors, write_atomic
+from service.base.errors import TandemError
+from service.base.files import os_errors, write_atomic
 
 PROGRAMS = {
     "env_throughput": "benchmarks.env_throughput",

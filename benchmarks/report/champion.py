@@ -7,9 +7,9 @@ from collections.abc import Sequence
 from benchmarks.report.markdown import millions, percent
 from benchmarks.run_files import Run
 from service.config.self_play import SelfPlayConfig
-from service.primitives.bundled import BUNDLED
-from service.primitives.digest import parameters_digest
-from service.primitives.loading import load
+from service.registry.bundled import BUNDLED
+from service.registry.digest import parameters_digest
+from service.registry.loading import load
 
 CHAMPION = "panda-cube@champion"
 DIGITS = 12

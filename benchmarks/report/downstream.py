@@ -12,11 +12,11 @@ import numpy as np
 
 from benchmarks.report.markdown import Row, table
 from benchmarks.report.results import TRIAL, Result, by_method_and_task, read_trials
-from service.downstream.methods import METHODS
-from service.downstream.rates import rate_of
+from service.base.files import os_errors, write_atomic
 from service.envs.tasks import HARD_TASKS, TASKS, find_task
-from service.io.files import os_errors, write_atomic
 from service.media.figures import BLUE, FAINT, GREEN, ORANGE, new_figure, save, style_axes
+from service.methods.task_methods import METHODS
+from service.methods.task_rates import rate_of
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -26,10 +26,10 @@ from benchmarks.run_files import (
     unthin,
 )  # fmt: skip
 from benchmarks.tasks import ASKED
+from service.base.files import os_errors, write_atomic
+from service.base.jsonl import JsonlWriter
+from service.base.types import StateArray
 from service.config import WorkspaceConfig
-from service.io.files import os_errors, write_atomic
-from service.io.jsonl import JsonlWriter
-from service.io.run_directory import RunDirectory
 from service.media.figures import (
     BLUE,
     FAINT,
@@ -43,7 +43,7 @@ from service.media.figures import (
     style_axes,
 )
 from service.media.plots import draw_paths, draw_paths_above, plot_goals
-from service.types import StateArray
+from service.store.run_directory import RunDirectory
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -8,9 +8,9 @@ from typing import Any
 
 from benchmarks.measuring import RECIPE_FILE
 from benchmarks.report.markdown import commit
+from service.base.errors import TandemError
 from service.config import load_config
 from service.config.self_play import SelfPlayConfig
-from service.errors import TandemError
 
 SHIPPED = "the shipped recipe"
 _OF_ONE_RUN = ("name", "seed", "run.")

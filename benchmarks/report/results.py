@@ -9,7 +9,7 @@ from typing import Any
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 
-from service.errors import TandemError
+from service.base.errors import TandemError
 
 TRIAL = "cell"
 """Key of a trial's settings in these files, which call a trial a cell."""

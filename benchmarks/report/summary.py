@@ -8,9 +8,9 @@ from benchmarks.report.comparison import learning
 from benchmarks.report.downstream import BEST
 from benchmarks.report.markdown import Row, percent, table
 from benchmarks.report.results import Result, by_method_and_task
-from service.downstream.methods import METHODS
-from service.downstream.rates import Rate, rate_of
 from service.envs.tasks import TASKS
+from service.methods.task_methods import METHODS
+from service.methods.task_rates import Rate, rate_of
 
 _OWN = "ours-her"
 """The composing method of the summary."""

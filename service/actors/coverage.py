@@ -10,11 +10,11 @@ from typing import Protocol
 
 import numpy as np
 
+from service.base.progress import counted
+from service.base.types import FloatArray, StateArray
 from service.config import WorkspaceConfig, WorldConfig
 from service.envs.batch import WorldBatch
 from service.envs.observations import ACTION
-from service.progress import counted
-from service.types import FloatArray, StateArray
 
 NUM_SKILLS = 32
 """Random skills of which coverage is measured, unless told otherwise (paper: 32)."""

@@ -10,13 +10,13 @@ from dataclasses import dataclass, fields
 
 import numpy as np
 
+from service.base.liveness import count_work
+from service.base.types import BoolArray, FloatArray, IntArray, StateArray
 from service.config.distillation import DistillingConfig
 from service.envs.batch import WorldBatch
 from service.envs.observations import Layouts, bob_observation
 from service.envs.obstacles import draw_goals
-from service.liveness import count_work
 from service.policies.numpy_policy import NumpyMCPPolicy
-from service.types import BoolArray, FloatArray, IntArray, StateArray
 
 _LEAST_LOG_WEIGHT = np.log(0.01)
 """Random weights are from here to 0 on a logarithmic scale, as those of an orchestrator."""

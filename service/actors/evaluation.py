@@ -8,14 +8,14 @@ from typing import Protocol
 
 import numpy as np
 
+from service.base.liveness import count_work
+from service.base.progress import doing
+from service.base.types import FloatArray, Metrics, StateArray
 from service.config import Config, WorldConfig
 from service.envs.batch import WorldBatch
 from service.envs.observations import ACTION, bob_observation
 from service.envs.obstacles import draw_goals
 from service.envs.sampling import GoalKind
-from service.liveness import count_work
-from service.progress import doing
-from service.types import FloatArray, Metrics, StateArray
 
 Observer = Callable[[WorldBatch, StateArray], None]
 """Called with the worlds and their (N, 3) goals, metres, at the start and after each step."""

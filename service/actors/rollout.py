@@ -11,8 +11,8 @@ from typing import Any
 
 import numpy as np
 
+from service.base.types import Arrays, BoolArray, FloatArray, Metrics, StateArray
 from service.generator.records import GoalRecords
-from service.types import Arrays, BoolArray, FloatArray, Metrics, StateArray
 
 Diverged = tuple[tuple[StateArray, FloatArray], ...]
 """(last finite state (S,), action (4,)) of each world whose physics diverged."""

@@ -16,6 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.actors.rollout import Demonstrations, Rollout, Turns
+from service.base.liveness import count_work
+from service.base.types import Arrays, BoolArray, FloatArray, IntArray, Metrics, StateArray
 from service.config.self_play import SelfPlayConfig
 from service.envs.batch import WorldBatch
 from service.envs.observations import ACTION, bob_observation
@@ -24,8 +26,6 @@ from service.generator.records import GoalRecords
 from service.generator.ring import Rows
 from service.generator.snapshot import GoalChoice
 from service.generator.validity import Verdict, classify_goal, in_workspace
-from service.liveness import count_work
-from service.types import Arrays, BoolArray, FloatArray, IntArray, Metrics, StateArray
 
 VerdictArray = NDArray[np.int8]
 _HINDSIGHT_STRIDE = 4

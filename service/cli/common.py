@@ -16,13 +16,13 @@ import typer
 from rich.console import Console
 from typer.core import TyperGroup
 
+from service.base.errors import TandemError, did_you_mean, one_line
+from service.base.progress import Display, Task, display, doing
 from service.cli.unexpected import UsageError, traceback_in
-from service.errors import TandemError, did_you_mean, one_line
-from service.progress import Display, Task, display, doing
 from service.runs.signals import InterruptError
 
 if TYPE_CHECKING:
-    from service.primitives.loading import Trained
+    from service.registry.loading import Trained
 
 CHAMPION = "panda-cube@champion"
 """The primitives that come with the package."""
@@ -181,7 +181,7 @@ def load_start(reference: str, registry: Path | str) -> Trained:
     Raises:
         TandemError: nothing there, no primitives, or a run of skills.
     """
-    from service.primitives.loading import load
+    from service.registry.loading import load
 
     return load(reference, registry).expect("primitives", by="--from")
 

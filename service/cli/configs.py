@@ -6,9 +6,9 @@ from typing import Annotated
 
 import typer
 
+from service.base.errors import TandemError, did_you_mean
 from service.cli.common import CommandGroup, JsonOption, print_json, print_table
 from service.config.recipes import first_comment, recipes, robots
-from service.errors import TandemError, did_you_mean
 
 configs_app = typer.Typer(name="configs", help="Recipes and robots that come with tandem.", cls=CommandGroup)
 
@@ -34,7 +34,7 @@ def list_configs(context: typer.Context, as_json: JsonOption = False) -> None:
 def methods(as_json: JsonOption = False) -> None:
     """List the methods by which a run learns, and those of tandem evaluate, which learn nothing."""
     from service.config.find import METHODS, find_class
-    from service.downstream.methods import METHODS as OF_TASKS
+    from service.methods.task_methods import METHODS as OF_TASKS
 
     rows = []
     for name in [*METHODS, *(each for each in OF_TASKS if each not in METHODS)]:

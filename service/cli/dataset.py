@@ -36,7 +36,7 @@ def dataset(
         from service.media import recording
         from service.media.dataset import check_name, played_episodes, played_turns, write_dataset
         from service.media.video import write_episode_video, write_video
-        from service.primitives.loading import load
+        from service.registry.loading import load
 
         name = check_name(out)  # now, not after hours of playing
         options = film_options(SIZE, CAMERA, SPEED, video) if video is not None else None

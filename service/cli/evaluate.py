@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, cast
 
 import typer
 
+from service.base.errors import TandemError, one_line
 from service.cli.common import (
     SOURCE,
     ActsWithOption,
@@ -34,15 +35,14 @@ from service.cli.film import (
     film_options,
     parse_goals,
 )
-from service.errors import TandemError, one_line
 
 if TYPE_CHECKING:
     from pydantic import JsonValue
 
     from service.actors.evaluation import DeterministicPolicy
+    from service.base.types import Metrics
     from service.envs.sampling import GoalKind
-    from service.primitives.loading import Trained
-    from service.types import Metrics
+    from service.registry.loading import Trained
 
 _Seed = Annotated[int, typer.Option(help="Of the episodes.", min=0)]
 
@@ -90,11 +90,11 @@ def evaluate(
     with loading():
         from service.actors.evaluation import evaluate as run
         from service.config import changed_config
-        from service.downstream.playing import FINAL_SEED, numbers_of
         from service.envs.observations import layouts
         from service.envs.sampling import GOAL_KINDS
         from service.envs.tasks import find_task
-        from service.primitives.loading import load
+        from service.methods.task_evaluation import FINAL_SEED, numbers_of
+        from service.registry.loading import load
 
         asked = None if goals is None else choose("--goals", goals, GOAL_KINDS)
         trained = load(reference, registry, primitives).on(task)
@@ -138,7 +138,7 @@ def _players(trained: Trained, method: str | None) -> dict[str, DeterministicPol
     """The policies that are measured, by name."""
     from service.actors.evaluation import IdlePolicy
     from service.config.find import METHODS
-    from service.downstream.methods import find_method
+    from service.methods.task_methods import find_method
 
     players: dict[str, DeterministicPolicy] = {}
     if method in METHODS:
@@ -168,9 +168,9 @@ def _check_used(trained: Trained, method: str | None, out: Path | None) -> None:
 
 def _write_result(path: Path, trained: Trained, method: str | None, seed: int, numbers: Metrics) -> None:
     """Write a file that says what a run's configuration and result say."""
-    from service.downstream.methods import METHODS
-    from service.io.files import os_errors, write_exclusive
-    from service.io.run_directory import encode_result
+    from service.base.files import os_errors, write_exclusive
+    from service.methods.task_methods import METHODS
+    from service.store.run_directory import encode_result
 
     method = method or ("asp-only" if trained.kind == "primitives" else f"{trained.skills.method}-zero-shot")
     takes = method not in METHODS or METHODS[method].takes is not None
@@ -207,9 +207,9 @@ def coverage(
     reference, _ = what_is_meant(reference, primitives)
     with loading():
         from service.actors.coverage import RandomPolicy, skill_trajectories, visited_share
-        from service.baselines.coverage import skill_paths
+        from service.actors.skill_coverage import skill_paths
         from service.media.plots import plot_coverage
-        from service.primitives.loading import load
+        from service.registry.loading import load
 
         trained = load(reference, registry).expect("primitives", "skills", by="tandem coverage")
     world = trained.world
@@ -251,9 +251,9 @@ def render(
     with loading():
         from service.config.self_play import SelfPlayConfig
         from service.config.skills import SkillDiscoveryConfig
-        from service.downstream.playing import FINAL_SEED
         from service.media import recording, video
-        from service.primitives.loading import load
+        from service.methods.task_evaluation import FINAL_SEED
+        from service.registry.loading import load
 
         options = film_options(size, camera, speed, out)
         trained = load(reference, registry, primitives).on(task)

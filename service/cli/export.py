@@ -37,7 +37,7 @@ def export(
     with loading():
         from service.export.exporting import Part
         from service.export.exporting import export as run
-        from service.primitives.loading import load
+        from service.registry.loading import load
 
         trained = load(policy, registry, primitives)
     about = run(trained, format_name, out, part=cast(Part, part), num_episodes=episodes)

@@ -9,13 +9,13 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from service.errors import TandemError
+from service.base.errors import TandemError
 
 if TYPE_CHECKING:
+    from service.base.types import StateArray
     from service.config import WorldConfig
     from service.envs.sampling import GoalKind
     from service.media.video import FilmOptions
-    from service.types import StateArray
 
 SizeOption = Annotated[str, typer.Option("--size", metavar="WxH", help="Of the whole film, pixels.")]
 CameraOption = Annotated[

@@ -10,6 +10,7 @@ from typing import Annotated
 
 import typer
 
+from service.base.version import __version__
 from service.cli.common import CommandGroup, QuietOption, quieten
 from service.cli.configs import configs_app, methods, tasks
 from service.cli.dataset import dataset
@@ -23,7 +24,6 @@ from service.cli.robot import robot_app
 from service.cli.serve import serve
 from service.cli.train import TrainCommand, demo, train
 from service.cli.unexpected import report_thread_error
-from service.version import __version__
 
 app = typer.Typer(name="tandem", help="Robot skills, pre-trained.", cls=CommandGroup, no_args_is_help=True)
 app.command(cls=TrainCommand)(train)

@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from service.errors import TandemError
+from service.base.errors import TandemError
 
 _NOW = {
     "train": "tandem train TASK --method NAME --primitives X --set seed=N --set run.total_env_steps=N",

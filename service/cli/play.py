@@ -39,8 +39,8 @@ def play(
     """Watch a live world in the browser: drag the goal, drive the primitives, see a run's Alice propose."""
     reference, primitives = what_is_meant(reference, primitives)
     with loading():
-        from service.play.server import LiveWorld
-        from service.primitives.loading import load
+        from service.registry.loading import load
+        from service.robot.play.server import LiveWorld
         from service.runs.signals import InterruptError, StopSignals
 
         players = load(reference, registry, primitives).expect_goals("tandem play").on(task)

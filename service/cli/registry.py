@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from service.base.errors import one_line
 from service.cli.common import REGISTRY, CommandGroup, JsonOption, RegistryOption, print_json, print_table
-from service.errors import one_line
 
 if TYPE_CHECKING:
     from service.registry.manifest import Manifest
@@ -30,7 +30,7 @@ _Reference = Annotated[
 @registry_app.command("list")
 def list_versions(directory: RegistryOption = REGISTRY, as_json: JsonOption = False) -> None:
     """List every version: yours, and those that come with tandem (bundled)."""
-    from service.primitives.bundled import BUNDLED, is_bundled
+    from service.registry.bundled import BUNDLED, is_bundled
     from service.registry.registry import Registry
 
     own, bundled = Registry(directory), Registry(BUNDLED)
@@ -51,7 +51,7 @@ def list_versions(directory: RegistryOption = REGISTRY, as_json: JsonOption = Fa
 @registry_app.command()
 def show(reference: _Reference, directory: RegistryOption = REGISTRY, as_json: JsonOption = False) -> None:
     """Show what a version says about itself."""
-    from service.primitives.bundled import find_version
+    from service.registry.bundled import find_version
 
     registry, version = find_version(reference, directory)
     manifest = registry.manifest(str(version))
@@ -76,10 +76,10 @@ def verify(
     directory: RegistryOption = REGISTRY,
 ) -> None:
     """Check every byte against its digest, and every parameter; exit code 1 when something is damaged."""
-    from service.primitives.bundled import find_version
-    from service.primitives.verification import network_problems
-    from service.registry.errors import RegistryError
+    from service.base.errors import RegistryError
+    from service.registry.bundled import find_version
     from service.registry.registry import Registry
+    from service.registry.verification import network_problems
 
     if reference is not None:
         registry, version = find_version(reference, directory)
@@ -102,7 +102,7 @@ def alias(
     directory: RegistryOption = REGISTRY,
 ) -> None:
     """Make or move an alias to a version."""
-    from service.primitives.bundled import find_version
+    from service.registry.bundled import find_version
 
     registry, version = find_version(reference, directory)
     registry.set_alias(version.name, alias, version.number)
@@ -116,7 +116,7 @@ def export(
     directory: RegistryOption = REGISTRY,
 ) -> None:
     """Write a version as two files that need no registry; every command takes their directory as a version."""
-    from service.primitives.bundled import find_version
+    from service.registry.bundled import find_version
 
     registry, version = find_version(reference, directory)
     manifest = registry.export(str(version), target)
@@ -133,9 +133,9 @@ def card(
     directory: RegistryOption = REGISTRY,
 ) -> None:
     """Write a model card for a hub: what a version is, how it was trained, how good it is, how to load it."""
-    from service.io.files import os_errors, write_atomic
-    from service.primitives.bundled import find_version
-    from service.primitives.card import model_card
+    from service.base.files import os_errors, write_atomic
+    from service.registry.bundled import find_version
+    from service.registry.card import model_card
 
     registry, version = find_version(reference, directory)
     text = model_card(registry.manifest(str(version)), licence=licence)
@@ -149,7 +149,7 @@ def card(
 
 def _summary(registry: Registry, manifest: Manifest) -> dict[str, Any]:
     """A version's row in the list; two registries may both have a version 1, so it says where this one is."""
-    from service.primitives.bundled import is_bundled
+    from service.registry.bundled import is_bundled
     from service.registry.exported import ExportedVersion
 
     exported = isinstance(registry, ExportedVersion)

@@ -10,15 +10,15 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from service.base.errors import TandemError
 from service.cli.common import CHAMPION, EXIT_SIGNAL, REFERENCE, SOURCE, CommandGroup, SourceOption, print_json
-from service.errors import TandemError
 
 if TYPE_CHECKING:
-    from service.primitives.loading import Trained
+    from service.base.types import StateArray
+    from service.registry.loading import Trained
     from service.robot.backends import Backend, BackendConfig
     from service.robot.limits import Box
     from service.robot.loop import BridgeConfig
-    from service.types import StateArray
 
 robot_app = typer.Typer(name="robot", help="Frozen policies on a robot.", cls=CommandGroup, no_args_is_help=True)
 
@@ -155,7 +155,7 @@ def _bridge_config(overrides: list[str] | None) -> BridgeConfig:
 
 
 def _load(policy: str, registry: str) -> Trained:
-    from service.primitives.loading import load
+    from service.registry.loading import load
     from service.robot.policies import for_robot
 
     return for_robot(load(policy, registry))

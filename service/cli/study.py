@@ -9,18 +9,18 @@ from typing import TYPE_CHECKING
 
 import typer
 
+from service.base.errors import ConfigError, TandemError, one_line
 from service.cli.common import EXIT_SIGNAL, directory_of, how_to_go_on, load_start, loading, print_table, shown
 from service.cli.unexpected import traceback_in
 from service.config.recipes import DEFAULT_RECIPE, recipes
-from service.errors import ConfigError, TandemError, one_line
 from service.runs.grid import SEED, Settings, check_once, name_runs, parse_grid
 
 if TYPE_CHECKING:
+    from service.cluster.ray_connection import ClusterOptions
     from service.config import Config
     from service.runs.signals import StopSignals
     from service.runs.study import Place
     from service.runs.study_file import StudyDirectory, StudyFile, StudyRun
-    from service.runtime.ray_connection import ClusterOptions
 
 NameOne = Callable[[str | None, str | None], tuple[Path | None, list[str]]]
 """The file and the overrides that a recipe, task or file and a method stand for."""
@@ -71,7 +71,7 @@ def train_study(
         parallel: how many runs at once.
         cluster: makes the options of a Ray cluster; None: on this machine.
         address: of the cluster.
-        trackers: of every run; see ``service.trackers``.
+        trackers: of every run; see ``service.runs.trackers``.
         start_from: as typed; what the runs of a new study begin from.
     """
     from service.registry.names import is_service
@@ -175,7 +175,7 @@ def _plan(
 def _all_methods() -> list[str]:
     """The methods of tasks that learn and take no skills: those are other commands, each with its own --primitives."""
     from service.config.find import METHODS as KNOWN
-    from service.downstream.methods import METHODS
+    from service.methods.task_methods import METHODS
 
     return [name for name, how in METHODS.items() if name in KNOWN and how.takes != "skills"]
 
@@ -237,13 +237,13 @@ def _registry(source: str, configs: dict[str, Config], publish: bool | None) -> 
 
 def _on_ray(stack: ExitStack, options: ClusterOptions, address: str | None, path: Path, source: str) -> Place:
     from service.cli.common import REGISTRY
+    from service.cluster.ray_connection import connected
     from service.registry.names import is_service
-    from service.runtime.ray_connection import connected
     from service.store.address import address_from_environment
 
     stack.enter_context(connected(address))
-    from service.runtime.ray_task import cluster_place
-    from service.runtime.status_actor import serving
+    from service.cluster.ray_task import cluster_place
+    from service.cluster.status_actor import serving
 
     if options.status is not None:
         registry = REGISTRY if is_service(source) else Path(source)

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Annotated, Any, NoReturn
 import typer
 from typer.core import TyperCommand
 
+from service.base.errors import TandemError, did_you_mean
 from service.cli.common import (
     CHAMPION,
     EXIT_SIGNAL,
@@ -36,15 +37,14 @@ from service.cli.evaluate import evaluate
 from service.cli.study import is_study, train_study
 from service.cli.unexpected import traceback_in
 from service.config.recipes import DEFAULT_RECIPE, find_file, recipes
-from service.errors import TandemError, did_you_mean
-from service.trackers import Trackers, find_factory
+from service.runs.trackers import Trackers, find_factory
 
 if TYPE_CHECKING:
+    from service.cluster.ray_connection import ClusterOptions
     from service.config import Config
-    from service.io.run_directory import RunDirectory
-    from service.primitives.loading import Trained
+    from service.registry.loading import Trained
     from service.runs.train import Finished, Runtime
-    from service.runtime.ray_connection import ClusterOptions
+    from service.store.run_directory import RunDirectory
 
 AUTO, EXACTLY = "auto", "exactly"
 """Values of ``--resume``; the second where it is typed alone."""
@@ -158,14 +158,14 @@ def train(
 ) -> None:
     """Train what a recipe, a task or a file says, in this process or on a Ray cluster, and publish it."""
     from service.config import load_config
-    from service.io.run_directory import RunDirectory
     from service.runs.resuming import resumed_config
     from service.runs.train import prepare
     from service.store.models import RUN_ID
+    from service.store.run_directory import RunDirectory
 
     def cluster_options() -> ClusterOptions:
+        from service.cluster.ray_connection import ClusterOptions, parse_status
         from service.registry.token import read_token
-        from service.runtime.ray_connection import ClusterOptions, parse_status
 
         where = parse_status(status, read_token(token_file))
         return ClusterOptions(num_actors, actor_threads, learner_cpus, where)
@@ -228,8 +228,8 @@ def train(
     if runtime == "local":
         _train(resolved, directory, source, resume=again, publish=publish, start=start, trackers=trackers)
         return
-    from service.runtime.ray_connection import connected
-    from service.runtime.ray_runtime import RayRuntime
+    from service.cluster.ray_connection import connected
+    from service.cluster.ray_runtime import RayRuntime
 
     cluster = RayRuntime(cluster_options())
     with closing(directory), traceback_in(run_dir):
@@ -261,7 +261,7 @@ def _named(what: str | None, method: str | None, primitives: str | None) -> tupl
         TandemError: no such recipe, task or file; or options that mean nothing there.
     """
     from service.config.find import METHODS
-    from service.downstream.methods import METHODS as OF_TASKS
+    from service.methods.task_methods import METHODS as OF_TASKS
 
     known = _targets()
     if what in task_names():
@@ -294,8 +294,8 @@ def demo(
 ) -> None:
     """Watch a robot arm teach itself: a small pre-training from scratch, with pictures and a video."""
     from service.config import load_config
-    from service.io.run_directory import RunDirectory
-    from service.primitives.bundled import BUNDLED
+    from service.registry.bundled import BUNDLED
+    from service.store.run_directory import RunDirectory
 
     paths = (Path("runs") / f"demo-{number}" for number in count(1))
     path = run_dir or next(path for path in paths if not path.exists())

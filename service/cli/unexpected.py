@@ -19,8 +19,8 @@ from pathlib import Path
 
 import typer
 
-from service.errors import TRACEBACK_PREFIX, NoRoomError, TandemError, UnexpectedError, one_line
-from service.version import __version__
+from service.base.errors import TRACEBACK_PREFIX, NoRoomError, TandemError, UnexpectedError, one_line
+from service.base.version import __version__
 
 UsageError: type[Exception] = typer.BadParameter.__bases__[0]
 """The error of arguments that typer cannot read; it has no public name in all versions of typer."""

@@ -10,8 +10,8 @@ from hashlib import sha256
 from pathlib import Path
 from types import ModuleType
 
+from service.base.errors import ConfigError, did_you_mean
 from service.config.run import Config
-from service.errors import ConfigError, did_you_mean
 
 _TASK = "service.config.task:TaskConfig"
 METHODS: Mapping[str, str] = {

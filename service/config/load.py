@@ -10,12 +10,12 @@ from typing import Any, get_args
 import yaml
 from pydantic import BaseModel, ValidationError
 
+from service.base.errors import ConfigError, did_you_mean
 from service.config.find import METHODS, exact_name, find_class
 from service.config.frozen import reason
 from service.config.run import Config
 from service.config.tree import apply_override, check_numbers, read_yaml
 from service.config.world import NO_KEYS
-from service.errors import ConfigError, did_you_mean
 
 DEFAULT_METHOD = "self-play"
 """The method of a configuration that names none."""

@@ -7,9 +7,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from service.base.errors import ConfigError
+from service.base.types import StateArray
 from service.config.model_files import digest_of, model_file
-from service.errors import ConfigError
-from service.types import StateArray
 
 LEAST_M, MOST_M = 0.005, 0.5
 """Extents that an object may have."""

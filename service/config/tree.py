@@ -7,10 +7,10 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
+from service.base.errors import ConfigError, did_you_mean, one_line
+from service.base.parsing import MAX_YAML_CHARACTERS, ParseError, parse_yaml
+from service.base.regular_files import read_regular
 from service.config.recipes import recipes
-from service.errors import ConfigError, did_you_mean, one_line
-from service.parsing import MAX_YAML_CHARACTERS, ParseError, parse_yaml
-from service.regular_files import read_regular
 
 
 def read_yaml(path: Path) -> dict[str, Any]:

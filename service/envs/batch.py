@@ -9,6 +9,8 @@ import mujoco
 import numpy as np
 from mujoco import rollout
 
+from service.base.errors import ConfigError, DivergedError
+from service.base.types import BoolArray, FloatArray, IntArray, StateArray
 from service.config import WorldConfig
 from service.envs.model_bank import ModelBank
 from service.envs.noise import KEYS, normal
@@ -17,8 +19,6 @@ from service.envs.obstacles import SEEN_WITHIN_M, Places, draw_starts, gripper_b
 from service.envs.reach import reach_of
 from service.envs.robot import Robot, described
 from service.envs.scene import FIXTURE_PREFIX, build_layout
-from service.errors import ConfigError, DivergedError
-from service.types import BoolArray, FloatArray, IntArray, StateArray
 
 DISPLACEMENT_M = 0.05
 """Way from the end effector to its set-point that a full action asks for (paper); in a step the arm covers a part of

@@ -14,7 +14,7 @@ from typing import Any, Literal, NamedTuple
 import mujoco
 import numpy as np
 
-from service.types import BoolArray, IntArray, StateArray
+from service.base.types import BoolArray, IntArray, StateArray
 
 Orientation = Literal["down", "down_any_turn", "free"]
 """What a gripper may do with its direction: it points down and does not turn, it points down, or nothing is asked."""

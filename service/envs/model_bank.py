@@ -9,12 +9,12 @@ from __future__ import annotations
 import mujoco
 import numpy as np
 
+from service.base.errors import ConfigError
+from service.base.types import Array, StateArray
 from service.config import WorldConfig
 from service.config.objects import ObjectConfig
 from service.envs.robot import described
 from service.envs.scene import FIXTURE_PREFIX, build_model
-from service.errors import ConfigError
-from service.types import Array, StateArray
 
 _SEED = 0
 

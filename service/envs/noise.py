@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from service.types import StateArray
+from service.base.types import StateArray
 
 KEYS = 1 << 52
 """Keys are whole numbers below this, which a float64 holds exactly."""

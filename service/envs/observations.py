@@ -18,8 +18,8 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from service.base.types import FloatArray
 from service.envs.state_layout import columns
-from service.types import FloatArray
 
 if TYPE_CHECKING:
     from service.config.world import WorldConfig  # acting needs no pydantic

@@ -11,6 +11,8 @@ from typing import NamedTuple
 import mujoco
 import numpy as np
 
+from service.base.errors import ConfigError
+from service.base.types import BoolArray, StateArray
 from service.config import WorldConfig
 from service.config.objects import ObjectConfig
 from service.envs import sampling, scene
@@ -18,8 +20,6 @@ from service.envs.contacts import GRIPPER_BIT
 from service.envs.observations import OBSTACLE_PREFIX
 from service.envs.sampling import GoalKind
 from service.envs.state_layout import StateLayout
-from service.errors import ConfigError
-from service.types import BoolArray, StateArray
 
 SEEN_WITHIN_M = 1.0
 """An obstacle further from the origin along an axis, such as one on the floor, is seen at this bound."""

@@ -11,11 +11,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from service.base.errors import ConfigError
+from service.base.types import BoolArray, StateArray
 from service.config import WorkspaceConfig
 from service.config.robot import RobotConfig
 from service.envs.kinematics import Chain
-from service.errors import ConfigError
-from service.types import BoolArray, StateArray
 
 _STEP_M = 0.0025
 _HEIGHT_M = 1.2

@@ -9,14 +9,14 @@ from pathlib import Path
 import mujoco
 import numpy as np
 
+from service.base.errors import ConfigError
+from service.base.types import BoolArray, StateArray
 from service.config import WorldConfig
 from service.config.model_files import model_file
 from service.config.robot import Numbers, PadConfig, RobotConfig
 from service.envs import panda
 from service.envs.contacts import BODY_FRICTION, GRIPPER_BIT, add_finger_sensors, grip
 from service.envs.kinematics import Chain
-from service.errors import ConfigError
-from service.types import BoolArray, StateArray
 
 _PREFIX, _HAND_PREFIX = "robot/", "hand/"
 """Begin the names of all that comes from a file, so that none is that of something in the scene; a hand's has both."""

@@ -7,10 +7,10 @@ from typing import Literal
 
 import numpy as np
 
+from service.base.errors import ConfigError, TandemError
+from service.base.types import StateArray
 from service.config import WorkspaceConfig, WorldConfig
 from service.envs import scene
-from service.errors import ConfigError, TandemError
-from service.types import StateArray
 
 GoalKind = Literal["table", "air", "mixed", "volume"]
 GOAL_KINDS: tuple[GoalKind, ...] = ("table", "air", "mixed", "volume")

@@ -6,10 +6,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
+from service.base.errors import TandemError, did_you_mean
 from service.config import WorldConfig
 from service.config.run import SUCCESS_DISTANCE_M as SUCCESS_DISTANCE_M
 from service.config.task import EPISODE_STEPS as EPISODE_STEPS
-from service.errors import TandemError, did_you_mean
 
 if TYPE_CHECKING:
     from service.envs.sampling import GoalKind

@@ -8,6 +8,8 @@ from datetime import UTC, datetime
 import mujoco
 import numpy as np
 
+from service.base.git import git_commit
+from service.base.version import __version__
 from service.config import WorldConfig
 from service.config.robot import Numbers, RobotConfig
 from service.envs.batch import DISPLACEMENT_M, MAX_TURN_RAD, WIDTH_CHANGE_M, WorldBatch
@@ -45,8 +47,6 @@ from service.export.description import (
 from service.export.measurements import Measured
 from service.export.networks import Network
 from service.export.parity import Differences
-from service.io.git import git_commit
-from service.version import __version__
 
 _COMPONENTS: Mapping[Kind, tuple[str, ...]] = {
     VECTOR: ("x", "y", "z"),

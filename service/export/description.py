@@ -7,13 +7,13 @@ from typing import Literal
 
 from pydantic import Field, ValidationError
 
+from service.base.errors import ExportError
+from service.base.files import os_errors
+from service.base.parsing import ParseError, parse_json
+from service.base.regular_files import read_regular
 from service.config.frozen import FrozenModel
 from service.config.robot import EffectorConfig, Vector
-from service.export.errors import ExportError
 from service.export.measurements import Measured
-from service.io.files import os_errors
-from service.parsing import ParseError, parse_json
-from service.regular_files import read_regular
 
 FILE = "policy.json"
 _MAX_BYTES = 4 * 1024 * 1024

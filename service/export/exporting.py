@@ -5,19 +5,19 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Literal
 
+from service.base.errors import ExportError
+from service.base.files import new_directory, os_errors
+from service.base.tensors import digest_of
 from service.envs.observations import layouts
 from service.export.describing import describe
 from service.export.description import FILE, Description
-from service.export.errors import ExportError
 from service.export.formats import find_format
 from service.export.measurements import measure
 from service.export.networks import Network, network_of_orchestrator, networks_of_bob, networks_of_primitives
 from service.export.parity import check_parity, make_inputs
 from service.export.readme import make_readme
-from service.io.files import new_directory, os_errors
-from service.io.tensors import digest_of
-from service.primitives.learned import LearnedPolicy
-from service.primitives.loading import Trained
+from service.registry.learned import LearnedPolicy
+from service.registry.loading import Trained
 
 Part = Literal["all", "policy", "primitives"]
 PARTS: tuple[Part, ...] = ("all", "policy", "primitives")

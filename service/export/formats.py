@@ -15,12 +15,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from service.errors import did_you_mean
-from service.export.errors import ExportError
+from service.base.errors import ExportError, did_you_mean
+from service.base.extras import needs_extra
+from service.base.types import FloatArray
 from service.export.networks import Network, Outputs
-from service.extras import needs_extra
 from service.policies import forward
-from service.types import FloatArray
 
 if TYPE_CHECKING:
     from torch import nn

@@ -12,12 +12,12 @@ import numpy as np
 from pydantic import Field
 
 from service.actors.evaluation import REPORTED_SEED, DeterministicPolicy, evaluate
+from service.base.types import FloatArray, StateArray
 from service.config import WorldConfig
 from service.config.frozen import FrozenModel
 from service.envs.batch import DISPLACEMENT_M, WIDTH_CHANGE_M, WorldBatch
 from service.envs.observations import COMMAND_PREFIX, DELAY, ObservationLayout, bob_observation, layouts
-from service.primitives.loading import Trained
-from service.types import FloatArray, StateArray
+from service.registry.loading import Trained
 
 _NUM_PLACES = 64
 _FROM_EDGE_M = 0.05

@@ -8,16 +8,16 @@ from functools import cached_property, partial
 
 import numpy as np
 
-from service.downstream.methods import find_method
+from service.base.types import FloatArray
 from service.envs.observations import Layouts, ObservationLayout, layouts
+from service.methods.task_methods import find_method
 from service.policies.forward import FUNCTIONS
+from service.policies.inputs import STEP_SCALE_M
+from service.policies.numpy_actor import numpy_actor
 from service.policies.numpy_policy import NumpyMCPPolicy, NumpyPolicy
 from service.policies.parameters import Parameters
-from service.primitives.learned import RESIDUAL, LearnedPolicy, action_weights, learner_inputs
-from service.primitives.loading import Trained
-from service.sac.inputs import STEP_SCALE_M
-from service.sac.numpy_actor import numpy_actor
-from service.types import FloatArray
+from service.registry.learned import RESIDUAL, LearnedPolicy, action_weights, learner_inputs
+from service.registry.loading import Trained
 
 Outputs = dict[str, FloatArray]
 _MOVED = ("effector", "object")

@@ -12,11 +12,11 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from service.base.errors import ParityError
+from service.base.types import FloatArray
 from service.envs.observations import Layouts
-from service.export.errors import ParityError
 from service.export.formats import Run
 from service.export.networks import Network
-from service.types import FloatArray
 
 TOLERANCE, EXTREME_TOLERANCE = 1e-5, 1e-4
 """Greatest absolute difference of an output: at recorded inputs and around them, and at extreme ones."""

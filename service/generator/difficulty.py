@@ -6,10 +6,10 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from service.base.tensors import join_parts, split_parts
+from service.base.types import Array, Arrays, BoolArray, IntArray, StateArray
 from service.generator.bins import GoalCells
 from service.generator.state import take
-from service.io.tensors import join_parts, split_parts
-from service.types import Array, Arrays, BoolArray, IntArray, StateArray
 
 DECAY = 0.95
 """Weight that a try keeps from one record to the next: half after 13.5 iterations, so the rates follow Bob."""

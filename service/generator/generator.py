@@ -6,6 +6,8 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from service.base.tensors import join_parts, split_parts
+from service.base.types import Array, Arrays, Metrics, StateArray
 from service.config.self_play import SelfPlayConfig
 from service.envs.state_layout import StateLayout
 from service.generator.bins import GoalCells, TaskBins, in_air
@@ -16,8 +18,6 @@ from service.generator.ring import Ring
 from service.generator.snapshot import GeneratorSnapshot
 from service.generator.stopping import StopCriterion
 from service.generator.summary import GoalSummary
-from service.io.tensors import join_parts, split_parts
-from service.types import Array, Arrays, Metrics, StateArray
 
 NUM_STARTS = 1024
 """Starts of games kept for ``replay_from_reset``."""

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from service.io.tensors import split_parts
-from service.types import Array, Arrays, BoolArray, IntArray
+from service.base.tensors import split_parts
+from service.base.types import Array, Arrays, BoolArray, IntArray
 
 CURRENT = -1
 """Opponent index of the current policy version."""

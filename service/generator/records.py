@@ -8,9 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from service.base.types import Array, BoolArray, IntArray, Metrics, StateArray
 from service.generator.bins import HEIGHT_NAMES, height_bins, in_air
 from service.generator.validity import Verdict
-from service.types import Array, BoolArray, IntArray, Metrics, StateArray
 
 GOALS_PER_ITERATION = 32
 """Number of valid proposals kept for the run directory per iteration, at most."""

@@ -6,9 +6,9 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from service.errors import ConfigError
+from service.base.errors import ConfigError
+from service.base.types import Array, Arrays, IntArray, StateArray
 from service.generator.state import take
-from service.types import Array, Arrays, IntArray, StateArray
 
 Rows = dict[str, StateArray]
 """Named columns of equally many rows."""

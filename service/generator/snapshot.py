@@ -9,6 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from service.base.tensors import join_parts, split_parts
+from service.base.types import Array, Arrays, BoolArray, IntArray, StateArray
 from service.config import WorldConfig
 from service.config.self_play import GeneratorConfig
 from service.envs.obstacles import inside_obstacles, obstacle_places
@@ -17,8 +19,6 @@ from service.generator.bins import GoalCells, TaskBins, in_air
 from service.generator.opponents import RoundPlan
 from service.generator.ring import Rows, join_rows
 from service.generator.validity import Verdict
-from service.io.tensors import join_parts, split_parts
-from service.types import Array, Arrays, BoolArray, IntArray, StateArray
 
 LEARNABILITY_FLOOR = 0.01
 """Added to p (1 - p), which is at most 1/4, so goals of a solved or hopeless cell stay drawable and measured."""

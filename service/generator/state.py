@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from service.errors import ConfigError
-from service.types import Array
+from service.base.errors import ConfigError
+from service.base.types import Array
 
 
 def take(state: Mapping[str, Array], name: str, like: Array, *, any_rows: bool = False) -> Array:

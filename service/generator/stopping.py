@@ -6,9 +6,9 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from service.base.types import Array, Arrays
 from service.config.self_play import GeneratorConfig
 from service.generator.state import take
-from service.types import Array, Arrays
 
 MIN_NUM_GOALS = 100
 """Goals the window must hold before Bob's success rate says anything: its 95 % interval is then below +-10 points."""

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from service.base.types import BoolArray, IntArray, StateArray
 from service.generator.bins import GoalCells, TaskBins
 from service.generator.records import (
     GOALS_PER_ITERATION,
@@ -21,7 +22,6 @@ from service.generator.records import (
 )
 from service.generator.ring import Rows, join_rows
 from service.generator.validity import Verdict
-from service.types import BoolArray, IntArray, StateArray
 
 _COUNTS = ("proposed", "tries", "successes", "reset_tries", "reset_successes", "heights")
 

@@ -7,8 +7,8 @@ import enum
 import numpy as np
 from numpy.typing import NDArray
 
+from service.base.types import BoolArray, StateArray
 from service.config import WorkspaceConfig
-from service.types import BoolArray, StateArray
 
 FALLEN_BELOW_M = -0.02
 """Height of the object's centre under which it has left the table; the table top is at 0."""

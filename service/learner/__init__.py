@@ -1,1 +1,1 @@
-"""The central learner: PPO for both players, Alice behavioural cloning for Bob."""
+"""The learners: PPO for both players with Alice behavioural cloning for Bob, and soft actor-critic on many worlds."""

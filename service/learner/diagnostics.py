@@ -8,11 +8,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from service.base.types import IntArray
 from service.learner.player import Player
 from service.learner.samples import Cloning
 from service.policies import gaussian
 from service.policies.networks import MCPPolicy
-from service.types import IntArray
 
 NUM_PROBES = 1024
 """Number of rows that are enough for what is measured once an update."""

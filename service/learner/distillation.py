@@ -10,11 +10,11 @@ from torch import Tensor
 from torch.nn.utils import clip_grad_norm_
 
 from service.actors.distillation import Lesson
+from service.base.types import Array, Arrays, FloatArray, Metrics
 from service.config.distillation import DistillationConfig
 from service.policies import networks
 from service.policies.adam import Adam
 from service.policies.forward import compose
-from service.types import Array, Arrays, FloatArray, Metrics
 
 _ADAM_EPSILON = 1e-8
 _MAX_GRAD_NORM = 1.0

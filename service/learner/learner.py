@@ -10,9 +10,10 @@ import torch
 from numpy.typing import NDArray
 
 from service.actors.rollout import Demonstrations, Rollout, Turns
+from service.base.tensors import join_parts, split_parts
+from service.base.types import Array, Arrays, Metrics
 from service.config.self_play import SelfPlayConfig
 from service.envs.observations import Layouts, layouts
-from service.io.tensors import join_parts, split_parts
 from service.learner import ppo, transfer
 from service.learner.diagnostics import composition_metrics, probes
 from service.learner.player import LearnerError, Player
@@ -24,7 +25,6 @@ from service.learner.samples import (
 )
 from service.learner.weights import MAX_POLICY_LAG, Weights
 from service.policies import networks
-from service.types import Array, Arrays, Metrics
 
 DEMONSTRATIONS, IMITATED = "demonstrations", "imitated"
 """Names of what is cloned in a learner's state, each a ``DemonstrationHistory``."""

@@ -8,11 +8,11 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from service.base.errors import TandemError
+from service.base.types import Array, Arrays
 from service.config.self_play import PPOConfig
-from service.errors import TandemError
 from service.policies import gaussian
 from service.policies.adam import Adam
-from service.types import Array, Arrays
 
 ADAM_EPSILON = 1e-5
 LEARNING_RATE_BOUNDS = 0.03, 2.0

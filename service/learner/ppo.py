@@ -19,13 +19,13 @@ from torch import Tensor
 from torch.nn.utils import clip_grad_norm_
 
 from service.actors.rollout import Turns
+from service.base.liveness import count_work
+from service.base.types import Array, Metrics
 from service.config.self_play import CloningConfig
 from service.learner.diagnostics import cloning_metrics, explained_variance, mean_and_std, probes
 from service.learner.player import LEARNING_RATE_BOUNDS, Player
 from service.learner.samples import Cloning, DemonstrationRows, Samples, draw_epoch
-from service.liveness import count_work
 from service.policies import gaussian
-from service.types import Array, Metrics
 
 Scalars = dict[str, Tensor]
 

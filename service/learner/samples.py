@@ -12,11 +12,11 @@ import torch
 from torch import Tensor
 
 from service.actors.rollout import Demonstrations
+from service.base.types import Array, Arrays, IntArray
 from service.config.self_play import CloningConfig, PPOConfig
 from service.envs.observations import ACTION, Layouts, Mirror
 from service.learner.player import Player
 from service.policies import gaussian
-from service.types import Array, Arrays, IntArray
 
 
 class _Rows:

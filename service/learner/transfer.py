@@ -8,8 +8,8 @@ import numpy as np
 import torch
 from torch import nn
 
+from service.base.types import Array
 from service.envs.observations import GOAL_FROM_OBJECT, ObservationLayout
-from service.types import Array
 
 
 @torch.no_grad()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from service.types import FloatArray
+from service.base.types import FloatArray
 
 MAX_POLICY_LAG = 2
 """Policy versions between the one that acted and the one that learns from it, at most; 1 where all are equally fast."""

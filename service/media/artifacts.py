@@ -8,17 +8,17 @@ from functools import partial
 from pathlib import Path
 
 from service.actors.coverage import NUM_SKILLS, skill_trajectories
-from service.baselines.coverage import skill_paths
+from service.actors.skill_coverage import skill_paths
+from service.base.errors import TandemError
+from service.base.progress import counted
 from service.config.self_play import SelfPlayConfig
 from service.config.skills import SkillDiscoveryConfig
-from service.errors import TandemError
-from service.io.run_directory import RunDirectory
 from service.media import recording, video
 from service.media.plots import plot_coverage, plot_curves, plot_goals
 from service.media.task_curves import draw_training
 from service.policies.numpy_policy import NumpyMCPPolicy
-from service.primitives.loading import Trained, load
-from service.progress import counted
+from service.registry.loading import Trained, load
+from service.store.run_directory import RunDirectory
 
 COVERAGE_STEPS = 100
 NUM_RECORDED_ROUNDS = 4

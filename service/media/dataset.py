@@ -12,17 +12,17 @@ from pathlib import Path
 
 import numpy as np
 
+from service.base.errors import TandemError
+from service.base.extras import needs_extra
+from service.base.files import os_errors
+from service.base.progress import counted
+from service.base.types import FloatArray, StateArray
+from service.base.version import __version__
 from service.config import Config
 from service.config.self_play import SelfPlayConfig
 from service.envs.batch import WorldBatch
 from service.envs.gym.tabletop import action_space, goal_space
-from service.errors import TandemError
-from service.extras import needs_extra
-from service.io.files import os_errors
 from service.media.recording import RecordedEpisodes, RecordedRound
-from service.progress import counted
-from service.types import FloatArray, StateArray
-from service.version import __version__
 
 _NAME = re.compile(r"(?![\w-]/[\w-]+$)(?:[\w-]+/)*[\w-]+-v[0-9]+")  # what Minari takes
 _FURTHEST_M = 10.0

@@ -10,10 +10,10 @@ import subprocess
 from collections.abc import Iterator
 from pathlib import Path
 
+from service.base.errors import TandemError
+from service.base.files import TEMPORARY_PREFIX, os_errors
+from service.base.liveness import count_work
 from service.envs.rendering.renderer import Image, RenderError
-from service.errors import TandemError
-from service.io.files import TEMPORARY_PREFIX, os_errors
-from service.liveness import count_work
 
 _H264 = ("-c:v", "libx264", "-pix_fmt", "yuv420p", "-crf", "21", "-preset", "veryfast", "-movflags", "+faststart")
 # One palette for all frames, and a regular pattern where a colour is not in it: frames that hardly change stay small.

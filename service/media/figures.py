@@ -14,10 +14,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from service.errors import TandemError
-from service.io.files import os_errors, write_atomic
-from service.io.jsonl import read_jsonl
-from service.types import StateArray
+from service.base.errors import TandemError
+from service.base.files import os_errors, write_atomic
+from service.base.jsonl import read_jsonl
+from service.base.types import StateArray
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -14,8 +14,9 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 import numpy as np
 
 from service.actors.coverage import visited_share
+from service.base.errors import TandemError
+from service.base.types import StateArray
 from service.config import WorkspaceConfig
-from service.errors import TandemError
 from service.media.figures import (
     BLUE,
     FAINT,
@@ -29,7 +30,6 @@ from service.media.figures import (
     save,
     style_axes,
 )
-from service.types import StateArray
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

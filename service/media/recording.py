@@ -15,8 +15,9 @@ import numpy as np
 
 from service.actors.evaluation import DeterministicPolicy, evaluate
 from service.actors.self_play import Players, SelfPlay, StochasticPolicy
-from service.baselines.coverage import skill_paths
-from service.baselines.frozen import FrozenSkills
+from service.actors.skill_coverage import skill_paths
+from service.base.progress import counted, doing
+from service.base.types import BoolArray, FloatArray, StateArray
 from service.config import WorldConfig
 from service.config.self_play import SelfPlayConfig
 from service.envs.batch import WorldBatch
@@ -27,8 +28,7 @@ from service.generator.opponents import Opponents
 from service.generator.records import GoalRecords
 from service.generator.snapshot import GeneratorSnapshot
 from service.generator.validity import Verdict
-from service.progress import counted, doing
-from service.types import BoolArray, FloatArray, StateArray
+from service.policies.frozen_skills import FrozenSkills
 
 _NUM_WORLDS = 64
 _MAX_ROLLOUTS = 3

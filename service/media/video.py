@@ -15,14 +15,14 @@ from pathlib import Path
 
 import numpy as np
 
+from service.base.progress import counted
+from service.base.types import StateArray
 from service.config import WorldConfig
 from service.envs.rendering.camera import DEFAULT_VIEW, View
 from service.envs.rendering.renderer import Image, SceneRenderer
 from service.generator.validity import Verdict
 from service.media.encoding import check_format, encode
 from service.media.recording import RecordedEpisodes, RecordedRound
-from service.progress import counted
-from service.types import StateArray
 
 Colour = tuple[int, int, int]
 

@@ -1,1 +1,1 @@
-"""What a run can train: self-play, skill discovery, distillation; each is a ``Method``."""
+"""What a run can train: self-play, skill discovery, distillation and tasks; each is a ``Method``."""

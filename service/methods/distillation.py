@@ -10,10 +10,11 @@ import torch
 
 from service.actors.distillation import DistillationWorlds
 from service.actors.evaluation import EVALUATED_GOALS, EVALUATION_SEED, success_metrics
+from service.base.errors import TandemError
+from service.base.types import Arrays, Metrics, StateArray
 from service.config.distillation import DistillingConfig
 from service.config.world import ObservedConfig
 from service.envs.observations import layouts
-from service.errors import TandemError
 from service.generator.bins import CELL_SIZE_M, GoalCells
 from service.learner import transfer
 from service.learner.distillation import Distiller
@@ -21,10 +22,9 @@ from service.methods.method import Iteration, Method, State
 from service.policies import networks
 from service.policies.numpy_policy import NumpyMCPPolicy, numpy_bob
 from service.policies.parameters import Parameters
-from service.primitives.loading import Trained
-from service.primitives.publishing import measure_bob
+from service.registry.loading import Trained
+from service.registry.publishing import measure_bob
 from service.store.models import GoalGrid
-from service.types import Arrays, Metrics, StateArray
 
 NUM_RECORDED_GOALS = 32
 """Goals of each iteration that the run directory keeps."""

@@ -12,12 +12,12 @@ from typing import Any
 import numpy as np
 
 from service.actors.rollout import Diverged
-from service.errors import TandemError
+from service.base.errors import TandemError
+from service.base.types import IntArray, Metrics, StateArray
 from service.generator.bins import GoalCells
 from service.methods.timing import Timing
 from service.policies.parameters import Parameters
 from service.store.models import ActorStatus, GoalCell, GoalGrid
-from service.types import IntArray, Metrics, StateArray
 
 State = Mapping[str, Any]
 """By the name of a component its arrays, which have names of their own, or plain values as JSON has them."""

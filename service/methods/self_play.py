@@ -19,9 +19,10 @@ import numpy as np
 
 from service.actors.evaluation import EVALUATED_GOALS
 from service.actors.rollout import Rollout, from_arrays, to_arrays
+from service.base.errors import TandemError
+from service.base.types import Metrics
 from service.config.self_play import SelfPlayConfig
 from service.envs.observations import layouts
-from service.errors import TandemError
 from service.generator.opponents import Opponents
 from service.learner.learner import torch_device
 from service.methods.method import Health, Iteration, Method, State
@@ -34,10 +35,9 @@ from service.methods.workers import (
     UpdateResult,
 )
 from service.policies.parameters import Parameters
-from service.primitives.loading import Trained
-from service.primitives.publishing import measure_bob
+from service.registry.loading import Trained
+from service.registry.publishing import measure_bob
 from service.store.models import GoalGrid
-from service.types import Metrics
 
 _logger = logging.getLogger(__name__)
 OLDER_OPPONENTS = -1

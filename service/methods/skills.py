@@ -11,19 +11,19 @@ import numpy as np
 
 from service.actors.coverage import NUM_SKILLS, visited_share
 from service.actors.evaluation import EVALUATION_SEED
-from service.baselines.coverage import skill_paths
-from service.baselines.frozen import FrozenSkills, export_skills
-from service.baselines.skills import IntrinsicBatches, SkillWorlds, make_skill_loop
+from service.actors.skill_coverage import skill_paths
+from service.base.errors import ConfigError
+from service.base.tensors import join_parts, split_parts
+from service.base.types import Metrics
 from service.config.skills import SkillDiscoveryConfig
-from service.errors import ConfigError
 from service.generator.bins import CELL_SIZE_M, GoalCells, in_air
-from service.io.tensors import join_parts, split_parts
 from service.methods.method import Iteration, Method, State
+from service.methods.skill_learning import IntrinsicBatches, SkillWorlds, make_skill_loop
+from service.policies.frozen_skills import FrozenSkills, export_skills
 from service.policies.parameters import Parameters
-from service.primitives.loading import Trained
-from service.primitives.publishing import measure_skills
+from service.registry.loading import Trained
+from service.registry.publishing import measure_skills
 from service.store.models import GoalGrid
-from service.types import Metrics
 
 
 class SkillDiscovery(Method):

@@ -11,19 +11,19 @@ import numpy as np
 import torch
 
 from service.actors.evaluation import DeterministicPolicy, Evaluation
+from service.base.errors import ConfigError, TandemError
+from service.base.types import Metrics
 from service.config.task import TaskConfig
 from service.config.world import WorldConfig
-from service.downstream.learner import make_loop, set_progress, spread_seed
-from service.downstream.methods import find_method
-from service.downstream.playing import CURVE_SEED, FINAL_SEED, evaluate_on, numbers_of
-from service.downstream.worlds import TaskWorlds
 from service.envs.gym.vector import TabletopVectorEnv
 from service.envs.tasks import EPISODE_STEPS, SUCCESS_DISTANCE_M, find_task
-from service.errors import ConfigError, TandemError
 from service.methods.method import Iteration, Method, State
+from service.methods.task_evaluation import CURVE_SEED, FINAL_SEED, evaluate_on, numbers_of
+from service.methods.task_learner import make_loop, set_progress, spread_seed
+from service.methods.task_methods import find_method
+from service.methods.task_worlds import TaskWorlds
 from service.policies.parameters import Parameters
-from service.primitives.loading import Trained, load
-from service.types import Metrics
+from service.registry.loading import Trained, load
 
 
 class TaskLearning(Method):

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from service.actors.evaluation import EVALUATION_SEED, success_metrics
 from service.actors.rollout import Diverged, Rollout
 from service.actors.self_play import Players, SelfPlay, StochasticPolicy
+from service.base.types import Arrays, Metrics
 from service.config.self_play import SelfPlayConfig
 from service.envs.sampling import GoalKind
 from service.envs.scene import build_layout
@@ -28,7 +29,6 @@ from service.generator.snapshot import GeneratorSnapshot
 from service.generator.summary import GoalSummary, join_summaries, summarize
 from service.policies.numpy_policy import NumpyGaussianPolicy, numpy_bob
 from service.store.models import GoalCell, GoalGrid
-from service.types import Arrays, Metrics
 
 if TYPE_CHECKING:
     from service.learner.weights import Weights

@@ -16,10 +16,10 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from service.base.types import FloatArray
 from service.config.self_play import MCPConfig, MLPConfig, PolicyConfig
 from service.envs.observations import ACTION, PAPER, POSITIONS, Layouts, Normalisation, ObservationLayout
 from service.policies.forward import INPUT_CLIP, MEAN_BOUND, compose
-from service.types import FloatArray
 
 INITIAL_LOG_STD = -0.1
 """Log-std of a new policy's actions. The std is 0.9: chance has to find the object."""

@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from service.base.types import FloatArray
 from service.envs.observations import POSITIONS
 from service.policies import forward
 from service.policies.parameters import (
@@ -26,7 +27,6 @@ from service.policies.parameters import (
     layer_sizes,
     shape_of,
 )
-from service.types import FloatArray
 
 _HALF_LOG_TWO_PI = np.float32(0.5 * math.log(2.0 * math.pi))
 

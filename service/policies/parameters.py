@@ -7,9 +7,9 @@ from itertools import pairwise
 
 import numpy as np
 
+from service.base.errors import TandemError
+from service.base.types import FloatArray
 from service.envs.observations import ACTION, GOAL_FROM_OBJECT, PAPER
-from service.errors import TandemError
-from service.types import FloatArray
 
 Parameters = Mapping[str, FloatArray]
 Shapes = dict[str, tuple[int, ...]]

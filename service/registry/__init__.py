@@ -1,1 +1,1 @@
-"""The registry of frozen primitives: blobs, versions, aliases."""
+"""The registry of frozen primitives: versions, aliases, loading, publishing, and what comes with the package."""

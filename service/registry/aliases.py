@@ -5,10 +5,10 @@ from __future__ import annotations
 import fcntl
 from pathlib import Path
 
-from service.io.files import os_errors, write_atomic
-from service.registry.errors import RegistryError
+from service.base.errors import RegistryError
+from service.base.files import os_errors, write_atomic
+from service.base.regular_files import open_to_append, read_regular
 from service.registry.names import check_alias, is_name, is_number
-from service.regular_files import open_to_append, read_regular
 
 MAX_BYTES = 100
 """Of an alias' file, which holds a number."""

@@ -6,9 +6,9 @@ import errno
 import hashlib
 from pathlib import Path
 
-from service.io.files import os_errors, write_atomic
-from service.registry.errors import DamagedBlobError
-from service.regular_files import read_regular
+from service.base.errors import DamagedBlobError
+from service.base.files import os_errors, write_atomic
+from service.base.regular_files import read_regular
 
 MAX_BYTES = 1024**3
 """Of a blob; the largest primitives there are have about a megabyte."""

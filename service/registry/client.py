@@ -10,12 +10,19 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from service.errors import TandemError, one_line
-from service.extras import needs_extra
-from service.io.files import os_errors, write_atomic
-from service.parsing import ParseError, parse_json
+from service.base.errors import (
+    DamagedBlobError,
+    FetchError,
+    StatusError,
+    TandemError,
+    UnknownVersionError,
+    WrongTokenError,
+    one_line,
+)
+from service.base.extras import needs_extra
+from service.base.files import os_errors, write_atomic
+from service.base.parsing import ParseError, parse_json
 from service.registry.blobs import BlobStore, check_digest
-from service.registry.errors import DamagedBlobError, FetchError, StatusError, UnknownVersionError, WrongTokenError
 from service.registry.manifest import Manifest, parse_manifest
 from service.registry.names import Version, split_reference
 from service.registry.registry import Registry

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from service.io.files import os_errors
+from service.base.files import os_errors
+from service.base.regular_files import read_regular
 from service.registry.blobs import BlobStore
 from service.registry.manifest import MAX_BYTES, parse_manifest
 from service.registry.names import Version
 from service.registry.registry import EXPORTED_MANIFEST, EXPORTED_PARAMETERS, Registry
-from service.regular_files import read_regular
 
 
 def is_exported(path: Path) -> bool:

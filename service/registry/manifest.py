@@ -10,10 +10,9 @@ from typing import Any
 
 from pydantic import Field, JsonValue, StrictInt, ValidationError
 
+from service.base.errors import DamagedBlobError, FormatVersionError, RegistryError
+from service.base.parsing import ParseError, parse_json
 from service.config.frozen import FrozenModel
-from service.io.errors import FormatVersionError
-from service.parsing import ParseError, parse_json
-from service.registry.errors import DamagedBlobError, RegistryError
 
 FORMAT_VERSION = 1
 MAX_BYTES = 4 * 1024 * 1024

@@ -6,7 +6,7 @@ import re
 from pathlib import Path
 from typing import NamedTuple
 
-from service.registry.errors import RegistryError
+from service.base.errors import RegistryError
 
 LATEST = "latest"
 NAME_PATTERN = r"^[a-z0-9][a-z0-9._-]{0,63}$"  # the same as Config.name; no slash and no leading dot: no path leaves

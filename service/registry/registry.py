@@ -20,18 +20,16 @@ from typing import Any
 
 import numpy as np
 
-from service.errors import did_you_mean
-from service.io import tensors
-from service.io.errors import StorageError
-from service.io.files import os_errors, write_atomic, write_exclusive
-from service.io.git import git_commit
+from service.base import tensors
+from service.base.errors import DamagedBlobError, RegistryError, StorageError, UnknownVersionError, did_you_mean
+from service.base.files import os_errors, write_atomic, write_exclusive
+from service.base.git import git_commit
+from service.base.regular_files import read_regular
 from service.registry import names
 from service.registry.aliases import move_alias, read_alias, read_aliases
 from service.registry.blobs import BlobStore, sha256_of
-from service.registry.errors import DamagedBlobError, RegistryError, UnknownVersionError
 from service.registry.manifest import MAX_BYTES, Manifest, TensorDescription, make_manifest, parse_manifest
 from service.registry.names import LATEST, Version
-from service.regular_files import read_regular
 
 READ_ONLY_FILE = "READ_ONLY"
 EXPORTED_MANIFEST, EXPORTED_PARAMETERS = "manifest.json", "primitives.safetensors"

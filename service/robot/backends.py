@@ -10,13 +10,13 @@ from typing import Any, Protocol
 
 from pydantic import Field, ValidationError
 
+from service.base.errors import TandemError, one_line
+from service.base.types import StateArray
 from service.config.frozen import FrozenModel
 from service.config.tree import read_yaml
 from service.config.world import WorldConfig
-from service.errors import TandemError, one_line
 from service.robot.disturbed import DisturbanceConfig, DisturbedPoses, DisturbedRobot
 from service.robot.interface import PoseSource, RobotInterface
-from service.types import StateArray
 
 BACKENDS = {
     "mujoco": "service.robot.mujoco_robot:connect",

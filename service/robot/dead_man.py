@@ -10,7 +10,7 @@ import time
 import tty
 from typing import Self
 
-from service.errors import TandemError
+from service.base.errors import TandemError
 
 _RELEASED_S = 0.1
 """A key that is held repeats some 30 times a second; without one for so long it was let go."""

@@ -19,12 +19,11 @@ from typing import Any
 import numpy as np
 from pydantic import Field, ValidationError
 
+from service.base.errors import RobotError, TandemError, one_line
+from service.base.extras import needs_extra
 from service.config.frozen import FrozenModel
 from service.config.world import Point, WorldConfig
-from service.errors import TandemError, one_line
-from service.extras import needs_extra
 from service.robot.backends import Backend, first_error
-from service.robot.errors import RobotError
 from service.robot.interface import Command, ObjectPose, PoseSource, RobotState
 
 _DOWN = (1.0, 0.0, 0.0, 0.0)  # x y z w

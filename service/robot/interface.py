@@ -9,7 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Protocol
 
-from service.types import StateArray
+from service.base.types import StateArray
 
 
 @dataclass(frozen=True, slots=True)

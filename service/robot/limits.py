@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from service.types import StateArray
+from service.base.types import StateArray
 
 _NUM_HALVINGS = 6
 _STILL_M_S = 1e-9

@@ -10,12 +10,12 @@ from typing import Any
 import numpy as np
 from pydantic import ValidationError
 
+from service.base.errors import TandemError
+from service.base.jsonl import JsonlWriter, read_jsonl
+from service.base.types import StateArray
 from service.config import WorldConfig
 from service.envs.batch import WorldBatch
-from service.errors import TandemError
-from service.io.jsonl import JsonlWriter, read_jsonl
 from service.media.recording import RecordedEpisodes
-from service.types import StateArray
 
 FORMAT_VERSION = 1
 _SIZES = {"effector_m": 3, "fingers_m": 2, "object_m": 3, "goal_m": 3}

@@ -19,13 +19,13 @@ import numpy as np
 from pydantic import Field
 
 from service.actors.evaluation import DeterministicPolicy
+from service.base.types import FloatArray, StateArray
 from service.config.frozen import FrozenModel
 from service.config.world import WorldConfig
 from service.envs.batch import DISPLACEMENT_M, WIDTH_CHANGE_M
 from service.envs.observations import ACTION, COMMAND_PREFIX, ObservationLayout, bob_observation, layouts
 from service.robot.interface import PoseSource, RobotInterface, RobotState
 from service.robot.safety import SafeRobot, SafetyConfig, always_held
-from service.types import FloatArray, StateArray
 
 Record = Callable[[dict[str, Any]], None]
 """Takes what happened in a step: see ``Bridge.run``."""

@@ -9,15 +9,14 @@ import mujoco
 import numpy as np
 from pydantic import Field, ValidationError
 
+from service.base.errors import RobotError, TandemError
+from service.base.types import StateArray
 from service.config.frozen import FrozenModel
 from service.config.world import WorldConfig
 from service.envs.batch import MAX_SPEED, MAX_TURN_RAD, WorldBatch
 from service.envs.kinematics import Kinematics
-from service.errors import TandemError
 from service.robot.backends import Backend, first_error
-from service.robot.errors import RobotError
 from service.robot.interface import Command, ObjectPose, RobotState
-from service.types import StateArray
 
 _EARLY_S = 1e-9
 

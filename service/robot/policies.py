@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from service.downstream.compose import check_robot
+from service.base.errors import TandemError
 from service.envs.observations import ACTION, layouts
-from service.errors import TandemError
-from service.primitives.loading import Trained
+from service.methods.compose import check_robot
+from service.registry.loading import Trained
 
 
 def for_robot(trained: Trained) -> Trained:

@@ -15,14 +15,13 @@ from typing import Any, Literal
 import numpy as np
 from pydantic import Field, ValidationError
 
+from service.base.errors import ConfigError, RobotError, TandemError
+from service.base.extras import needs_extra
+from service.base.types import StateArray
 from service.config.frozen import FrozenModel
 from service.config.world import WorldConfig
-from service.errors import ConfigError, TandemError
-from service.extras import needs_extra
 from service.robot.backends import Backend, first_error
-from service.robot.errors import RobotError
 from service.robot.interface import Command, ObjectPose, RobotState
-from service.types import StateArray
 
 CONTROL_STEP_S = 0.04
 """Time of one action of a policy, for which ``PyBulletParameters.response`` is given."""

@@ -7,15 +7,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from service.base.errors import RobotError, TandemError
+from service.base.types import StateArray
 from service.config.world import WorldConfig
 from service.envs.obstacles import inside_fixtures
 from service.envs.sampling import draw_goals, draw_starts
-from service.errors import TandemError
-from service.primitives.loading import Trained
+from service.registry.loading import Trained
 from service.robot.backends import Backend
-from service.robot.errors import RobotError
 from service.robot.loop import Bridge
-from service.types import StateArray
 
 _ROUNDING_M = 1e-6
 

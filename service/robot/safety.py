@@ -10,14 +10,13 @@ from typing import Self
 import numpy as np
 from pydantic import Field, model_validator
 
+from service.base.errors import ConfigError, RobotError, SafetyStopError
+from service.base.types import StateArray
 from service.config.frozen import FrozenModel
 from service.config.world import Point, WorkspaceConfig
-from service.errors import ConfigError
-from service.robot.errors import RobotError, SafetyStopError
 from service.robot.interface import Command, PoseSource, RobotInterface, RobotState
 from service.robot.limits import Box, SetPointLimiter
 from service.robot.watchdogs import PoseWatch, StateWatch, WatchConfig
-from service.types import StateArray
 
 _NUM_TRIED = 5
 _POLL_S = 0.01

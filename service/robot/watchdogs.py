@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 from pydantic import Field
 
+from service.base.types import StateArray
 from service.config.frozen import FrozenModel
 from service.robot.interface import ObjectPose, RobotState
-from service.types import StateArray
 
 _CLOCKS_AGREE_S = 0.02
 _ROUNDING_S = 1e-6

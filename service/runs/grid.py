@@ -8,7 +8,7 @@ from itertools import product
 
 import yaml
 
-from service.errors import ConfigError
+from service.base.errors import ConfigError
 
 MAX_RUNS = 1000
 MAX_NAME = 100

@@ -7,7 +7,7 @@ from math import inf
 from types import TracebackType
 from typing import Self
 
-from service.progress import Display, Task, line
+from service.base.progress import Display, Task, line
 
 _PATTERNS = {
     "alice/valid_fraction": "{:.0%}",

@@ -5,17 +5,17 @@ from __future__ import annotations
 from contextlib import closing
 from pathlib import Path
 
+from service.base.types import Metrics
 from service.config import Config
 from service.config.skills import SkillDiscoveryConfig
 from service.config.task import TaskConfig
-from service.downstream.playing import FINAL_SEED, evaluate_on, numbers_of
-from service.io.checkpoints import CheckpointStore
-from service.io.run_directory import RunDirectory
-from service.primitives.loading import Trained, load
-from service.primitives.publishing import check_publishable, measure_bob, measure_skills, publish_run
+from service.methods.task_evaluation import FINAL_SEED, evaluate_on, numbers_of
+from service.registry.loading import Trained, load
 from service.registry.names import Version, check_name
+from service.registry.publishing import check_publishable, measure_bob, measure_skills, publish_run
 from service.registry.registry import Registry
-from service.types import Metrics
+from service.store.checkpoints import CheckpointStore
+from service.store.run_directory import RunDirectory
 
 
 def publish_learned(

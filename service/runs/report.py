@@ -10,10 +10,10 @@ from threading import Event, Thread
 from types import TracebackType
 from typing import Any, Literal, Self
 
+from service.base.errors import RunTakenError
+from service.base.liveness import work_done
 from service.config import Config
 from service.config.task import TaskConfig
-from service.io.errors import RunTakenError
-from service.liveness import work_done
 from service.runs.run import Run
 from service.store.models import CONDITIONS, RunState, RunStatus, RunTotals, Trial
 from service.store.run_writer import GOALS_INTERVAL_S, RunWriter

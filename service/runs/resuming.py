@@ -6,12 +6,11 @@ import json
 from pathlib import Path
 from typing import Any
 
+from service.base.errors import CheckpointError, ConfigError
 from service.config import Config, load_config
 from service.config.tree import leaves
-from service.errors import ConfigError
-from service.io.errors import CheckpointError
-from service.io.run_directory import RunDirectory
 from service.runs.study_file import SavedConfig
+from service.store.run_directory import RunDirectory
 
 
 def resumed_config(directory: RunDirectory | SavedConfig, overrides: list[str], file: Path | None = None) -> Config:

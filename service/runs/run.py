@@ -12,14 +12,13 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 
+from service.base.errors import CheckpointError, DivergedError
+from service.base.types import Metrics
 from service.config import Config
-from service.errors import DivergedError
-from service.io.errors import CheckpointError
-from service.io.run_directory import Published, RunDirectory
 from service.methods.method import Iteration, Method
 from service.policies.parameters import PolicyError
 from service.runs.saving import Saves
-from service.types import Metrics
+from service.store.run_directory import Published, RunDirectory
 
 OnIteration = Callable[[Metrics], None]
 OnBeat = Callable[[], None]

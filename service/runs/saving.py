@@ -9,15 +9,15 @@ from typing import Any
 
 import numpy as np
 
+from service.base.jsonl import Extent
+from service.base.tensors import split_parts
+from service.base.types import Arrays
 from service.config import Config
-from service.io.checkpoints import CheckpointStore
-from service.io.jsonl import Extent
-from service.io.run_directory import Resumption, RunDirectory
-from service.io.tensors import split_parts
 from service.methods.method import State
 from service.policies.parameters import Parameters
 from service.runs.resuming import changed_settings
-from service.types import Arrays
+from service.store.checkpoints import CheckpointStore
+from service.store.run_directory import Resumption, RunDirectory
 
 NUM_SNAPSHOTS = 10
 """Snapshots of what was learned, evenly over a run's env steps; one of it untrained comes before them."""

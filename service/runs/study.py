@@ -20,17 +20,15 @@ from pathlib import Path
 from signal import SIGKILL, SIGTERM, Signals
 from typing import Protocol
 
+from service.base.errors import StorageError, StoreError, TandemError
+from service.base.files import os_errors, write_atomic
+from service.base.lock import is_locked
+from service.base.progress import answer, counted
+from service.base.regular_files import open_regular, open_to_append
 from service.config import Config, dump_config, load_config
 from service.config.self_play import SelfPlayConfig
-from service.errors import TandemError
-from service.io.errors import StorageError
-from service.io.files import os_errors, write_atomic
-from service.io.lock import is_locked
-from service.io.run_directory import RunDirectory
 from service.media.plots import plot_study
-from service.progress import answer, counted
 from service.registry.registry import Registry
-from service.regular_files import open_regular, open_to_append
 from service.runs.progress import Progress
 from service.runs.resuming import resumable_settings
 from service.runs.signals import PASSED_ON, STOPPING, StopSignals
@@ -38,7 +36,7 @@ from service.runs.study_file import ENDED, StudyDirectory, StudyRun
 from service.runs.study_results import SELECTED, as_csv, best_of, publish_best, select
 from service.store.disk import OUTPUT_FILE, read_status
 from service.store.disk_reader import DiskReader, run_id_of
-from service.store.errors import StoreError
+from service.store.run_directory import RunDirectory
 
 POLL_S = 0.2
 SHOW_S = 1.0

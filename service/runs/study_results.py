@@ -16,21 +16,21 @@ from typing import NamedTuple
 import numpy as np
 
 from service.actors.evaluation import SELECTION_SEED, evaluate_run
+from service.base.errors import StoreError
+from service.base.types import StateArray
 from service.envs.sampling import GoalKind
-from service.io.run_directory import RunDirectory
 from service.policies.numpy_policy import numpy_bob
-from service.primitives.loading import load
-from service.primitives.publishing import publish_run
+from service.registry.loading import load
 from service.registry.names import Version
+from service.registry.publishing import publish_run
 from service.registry.registry import Registry
 from service.runs.grid import SEED, Settings
 from service.runs.study_file import StudyRun
 from service.store.address import address_from_environment
 from service.store.disk import read_status
 from service.store.disk_reader import run_id_of
-from service.store.errors import StoreError
+from service.store.run_directory import RunDirectory
 from service.store.run_writer import reporting_to
-from service.types import StateArray
 
 SELECTION_GOALS: GoalKind = "mixed"
 SELECTION_EPISODES = 1000

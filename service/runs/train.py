@@ -17,24 +17,24 @@ from typing import TYPE_CHECKING, Literal, cast
 
 from pydantic import JsonValue
 
+from service.base.errors import TandemError
+from service.base.progress import answer, doing
 from service.config import Config
-from service.errors import TandemError
-from service.io.checkpoints import CheckpointStore
-from service.io.run_directory import Published, RunDirectory
-from service.io.run_log import RunLog
 from service.media.artifacts import make_artifacts
 from service.methods.method import Method, StateLostError, WorkersError
-from service.primitives.loading import Trained
-from service.primitives.publishing import check_publishable, publish_run
-from service.progress import answer, doing
+from service.registry.loading import Trained
 from service.registry.names import Version
+from service.registry.publishing import check_publishable, publish_run
 from service.registry.registry import Registry
 from service.runs.report import Report
 from service.runs.run import OnIteration, Run, RunResult
 from service.runs.signals import InterruptError, StopSignals
 from service.store.address import address_from_environment
+from service.store.checkpoints import CheckpointStore
 from service.store.disk import read_status
 from service.store.disk_reader import run_id_of
+from service.store.run_directory import Published, RunDirectory
+from service.store.run_log import RunLog
 from service.store.run_writer import reporting_to
 
 if TYPE_CHECKING:
@@ -73,7 +73,7 @@ class UnfinishedError(TandemError):
 
 
 class Runtime:
-    """Where a method's workers are: in this process. See ``service.runtime.ray_runtime`` for a cluster."""
+    """Where a method's workers are: in this process. See ``service.cluster.ray_runtime`` for a cluster."""
 
     name: Literal["local", "ray"] = "local"
 

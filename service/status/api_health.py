@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from fastapi import APIRouter, Request, Response
 
-from service.errors import TandemError
+from service.base.errors import TandemError
 from service.registry.registry import Registry
 from service.status.auth import TRUSTED
 from service.status.metrics import CONTENT_TYPE, Telemetry

@@ -10,9 +10,9 @@ from typing import Annotated
 from fastapi import APIRouter, Query, Request, Response
 from fastapi import Path as InPath
 
-from service.primitives.bundled import find_version
+from service.base.errors import RegistryError
 from service.registry.blobs import BlobStore
-from service.registry.errors import RegistryError
+from service.registry.bundled import find_version
 from service.registry.names import NAME_PATTERN
 from service.registry.registry import Registry
 from service.status.files import BYTES, PARTS, file_response

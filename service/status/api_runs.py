@@ -11,13 +11,13 @@ from fastapi import APIRouter, Depends, Header, Query, Request, Response
 from fastapi import Path as InPath
 from fastapi.sse import EventSourceResponse, ServerSentEvent
 
+from service.base.errors import StoreError
 from service.status import run_details, series
 from service.status.files import BYTES, PARTS, RUN_FILES, RunDirectories, file_response, kind_of
 from service.status.openapi import INVALID, READ_ONLY, UNAVAILABLE, UNKNOWN_RUN, problems
 from service.status.problems import ProblemError
 from service.status.schemas import GoalFrames, MetricHistory, RunFiles, RunList, RunLog, RunSetup
 from service.status.stream import EVENT_SCHEMA, RunFollower, Streams
-from service.store.errors import StoreError
 from service.store.models import ACTIVE, GoalGrid, RunReader, RunStatus
 
 MAX_ITERATION = 2**53 - 1

@@ -10,7 +10,8 @@ from fastapi import FastAPI, Request
 from starlette.responses import Response
 from starlette.staticfiles import StaticFiles
 
-from service.registry.errors import StatusError
+from service.base.errors import StatusError
+from service.base.version import __version__
 from service.registry.registry import Registry
 from service.registry.token import VARIABLE, check_token
 from service.status import openapi, problems
@@ -26,7 +27,6 @@ from service.status.metrics import Telemetry
 from service.status.problems import ProblemError
 from service.status.stream import Streams
 from service.store.models import RunReader
-from service.version import __version__
 
 PAGE = Path(__file__).parent / "page"
 """Directory of the web page: ``index.html`` is served at ``/``, all files under ``/page/``."""

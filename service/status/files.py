@@ -14,12 +14,12 @@ from fastapi import Request
 from starlette.responses import FileResponse, Response
 from starlette.staticfiles import NotModifiedResponse, StaticFiles
 
-from service.io.run_directory import RECORDINGS
-from service.regular_files import open_regular
+from service.base.regular_files import open_regular
 from service.status.openapi import problems
 from service.status.problems import ProblemError
 from service.status.schemas import RunFile
 from service.store.disk_reader import run_directories
+from service.store.run_directory import RECORDINGS
 
 RUN_FILES = {
     "rounds.mp4": ("Alice beside Bob", "video/mp4"),

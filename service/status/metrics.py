@@ -17,9 +17,8 @@ from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram, Proc
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily
 from prometheus_client.registry import Collector
 
-from service.io.errors import StorageError
+from service.base.errors import StorageError, StoreError
 from service.registry.registry import Registry
-from service.store.errors import StoreError
 from service.store.models import ACTIVE, CONDITIONS, ActorStatus, Record, RunReader, RunState, RunStatus
 
 CONTENT_TYPE = "text/plain; version=0.0.4; charset=utf-8"

@@ -12,10 +12,15 @@ from pydantic import BaseModel, Field
 from starlette.exceptions import HTTPException
 from starlette.responses import JSONResponse
 
-from service.errors import TandemError
-from service.io.errors import FormatVersionError
-from service.registry.errors import DamagedBlobError, UnknownVersionError
-from service.store.errors import DamagedStoreError, StoreUnavailableError, UnknownRunError
+from service.base.errors import (
+    DamagedBlobError,
+    DamagedStoreError,
+    FormatVersionError,
+    StoreUnavailableError,
+    TandemError,
+    UnknownRunError,
+    UnknownVersionError,
+)
 
 MEDIA_TYPE = "application/problem+json"
 _BLANK = "about:blank"

@@ -8,16 +8,16 @@ from typing import Any
 
 import numpy as np
 
+from service.base.errors import ConfigError
+from service.base.parsing import ParseError, parse_json
+from service.base.regular_files import open_regular
 from service.config.tree import read_yaml
-from service.errors import ConfigError
-from service.io.run_history import read_history
-from service.io.run_log import read_log
-from service.parsing import ParseError, parse_json
-from service.regular_files import open_regular
 from service.status.schemas import GoalFrame, GoalFrames, LogEntry, RunCommand, RunLog, RunSetup
 from service.store.disk import OUTPUT_FILE
 from service.store.disk_reader import is_study
 from service.store.models import ACTIVE, GoalGrid, RunStatus
+from service.store.run_history import read_history
+from service.store.run_log import read_log
 
 DEFAULT_CELL_M = 0.05
 FRAME_BYTES = 256 * 1024

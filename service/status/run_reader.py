@@ -18,9 +18,9 @@ from datetime import timedelta
 from pathlib import Path
 from typing import TypeVar
 
+from service.base.errors import StoreUnavailableError, UnknownRunError
 from service.store.address import RedisAddress, address_from_environment
 from service.store.disk_reader import DiskReader
-from service.store.errors import StoreUnavailableError, UnknownRunError
 from service.store.models import ACTIVE, Columns, GoalGrid, Record, RunReader, RunStatus
 
 RETRY_AFTER_S = 5.0

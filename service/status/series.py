@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from service.base.errors import StoreError
 from service.status.schemas import Axis, MetricHistory
-from service.store.errors import StoreError
 from service.store.models import Columns, RunReader
 
 MAX_NUMBERS = 1_000_000

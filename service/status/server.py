@@ -13,7 +13,7 @@ from pathlib import Path
 
 import uvicorn
 
-from service.registry.errors import StatusError
+from service.base.errors import StatusError
 from service.registry.registry import Registry
 from service.status.app import create_app
 from service.status.auth import is_loopback

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from service.io.errors import FormatVersionError
-from service.primitives.bundled import BUNDLED, is_bundled
-from service.registry.errors import DamagedBlobError
+from service.base.errors import DamagedBlobError, FormatVersionError
+from service.registry.bundled import BUNDLED, is_bundled
 from service.registry.manifest import Manifest
 from service.registry.names import Version
 from service.registry.registry import Registry

@@ -14,8 +14,8 @@ from collections.abc import AsyncIterator, Callable, Collection
 from anyio import to_thread
 from fastapi.sse import ServerSentEvent
 
+from service.base.errors import StoreError, StoreUnavailableError
 from service.status.problems import ProblemError
-from service.store.errors import StoreError, StoreUnavailableError
 from service.store.models import ACTIVE, RunReader, RunStatus
 
 POLL_S = 0.5

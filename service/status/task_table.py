@@ -14,12 +14,12 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
+from service.base.errors import TandemError
+from service.base.parsing import parse_json
 from service.config.tree import leaves, read_yaml
-from service.errors import TandemError
-from service.io.run_directory import RESULT_FILE, RunDirectory
-from service.parsing import parse_json
 from service.status.schemas import TaskCell, TaskColumn, TaskRow, TaskTable
 from service.store.models import RunStatus, Trial
+from service.store.run_directory import RESULT_FILE, RunDirectory
 
 Column = tuple[str, int]
 """A task and its version."""
@@ -51,8 +51,8 @@ def task_table(statuses: Iterable[RunStatus], directories: Mapping[str, Path]) -
         statuses: of all runs.
         directories: of the runs that are on this machine, by their ids.
     """
-    from service.downstream.methods import METHODS  # with MuJoCo and Gymnasium, which few views need
     from service.envs.tasks import HARD_TASKS, TASKS
+    from service.methods.task_methods import METHODS  # with MuJoCo and Gymnasium, which few views need
 
     runs, problems = list[_Run](), list[str]()
     for status in statuses:
@@ -131,7 +131,7 @@ def _rows(runs: Sequence[_Run]) -> list[dict[Column, list[_Run]]]:
 
 
 def _cell(runs: Sequence[_Run], all_runs: Sequence[_Run]) -> TaskCell:
-    from service.downstream.rates import rate_of
+    from service.methods.task_rates import rate_of
 
     ended = sorted((run for run in runs if run.result is not None), key=lambda run: run.ended)
     by_seed = {run.trial.seed: run for run in ended}

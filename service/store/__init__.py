@@ -1,1 +1,1 @@
-"""Live reports of runs: written by runners to disk and to Redis, read by the status service."""
+"""What a run leaves: its directory, checkpoints, records and status; on disk, and in Redis where one is configured."""

@@ -8,8 +8,8 @@ from dataclasses import dataclass, field
 from typing import Any
 from urllib.parse import urlsplit
 
-from service.extras import needs_extra
-from service.store.errors import StoreError, StoreUnavailableError
+from service.base.errors import StoreError, StoreUnavailableError
+from service.base.extras import needs_extra
 
 VARIABLE = "TANDEM_REDIS_URL"
 _FORM = "redis://[[USER]:PASSWORD@]HOST[:PORT][/DB], with %-escapes for other characters than letters and digits"

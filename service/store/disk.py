@@ -13,8 +13,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from service.parsing import ParseError, parse_with
-from service.regular_files import read_regular
+from service.base.parsing import ParseError, parse_with
+from service.base.regular_files import read_regular
 from service.store.models import RunStatus
 
 MAX_BYTES = 64 * 1024 * 1024

@@ -12,17 +12,16 @@ from datetime import UTC, datetime
 from pathlib import Path
 from threading import Lock
 
-from service.errors import one_line
-from service.io.epoch import newest_epoch
-from service.io.lock import holder, is_locked
-from service.io.run_history import FILE as RUN_FILE
-from service.io.run_history import FIRST_VERSION, written_by
-from service.parsing import ParseError, parse_with
-from service.regular_files import read_regular
+from service.base.epoch import newest_epoch
+from service.base.errors import DamagedStoreError, StoreUnavailableError, UnknownRunError, one_line
+from service.base.lock import holder, is_locked
+from service.base.parsing import ParseError, parse_with
+from service.base.regular_files import read_regular
 from service.store.disk import GOALS_FILE, MAX_BYTES, STATUS_FILE, STOP_FILE, STUDY_FILE
-from service.store.errors import DamagedStoreError, StoreUnavailableError, UnknownRunError
 from service.store.models import ACTIVE, Columns, GoalGrid, Record, RunStatus
 from service.store.pulse import Pulse, with_clock
+from service.store.run_history import FILE as RUN_FILE
+from service.store.run_history import FIRST_VERSION, written_by
 from service.store.tail import RecordFile
 
 QUIET_S = 10.0

@@ -8,10 +8,10 @@ from contextlib import contextmanager
 
 from redis.exceptions import RedisError, ResponseError
 
-from service.parsing import ParseError, parse_with
+from service.base.errors import DamagedStoreError, UnknownRunError
+from service.base.parsing import ParseError, parse_with
 from service.store import keys
 from service.store.address import RedisAddress
-from service.store.errors import DamagedStoreError, UnknownRunError
 from service.store.models import ACTIVE, Columns, GoalGrid, Record, RunStatus
 from service.store.pulse import Pulse, with_clock
 from service.store.tail import columns_of, parse_record

@@ -13,8 +13,8 @@ from typing import NamedTuple
 
 from redis.exceptions import RedisError, WatchError
 
-from service.io.errors import RunTakenError
-from service.io.jsonl import plain
+from service.base.errors import RunTakenError
+from service.base.jsonl import plain
 from service.store import keys
 from service.store.address import RedisAddress, reason_of
 from service.store.models import GoalGrid, Record, RunStatus, Trouble

@@ -11,11 +11,11 @@ from typing import TYPE_CHECKING
 
 from pydantic import BaseModel
 
-from service.io.files import write_atomic
-from service.io.run_directory import RunDirectory
+from service.base.files import write_atomic
 from service.store.address import RedisAddress
 from service.store.disk import GOALS_FILE, STATUS_FILE, STOP_FILE
 from service.store.models import Condition, GoalGrid, Record, RunState, RunStatus, Trouble
+from service.store.run_directory import RunDirectory
 
 if TYPE_CHECKING:
     from service.store.redis_writer import RedisWriter

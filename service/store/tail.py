@@ -18,8 +18,8 @@ from typing import Any, BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
-from service.parsing import ParseError, parse_json, parse_with
-from service.regular_files import open_regular
+from service.base.parsing import ParseError, parse_json, parse_with
+from service.base.regular_files import open_regular
 from service.store.models import Columns, Record
 
 INDEX = ("iteration", "env_steps")

@@ -3,8 +3,8 @@
 from dataclasses import fields, replace
 
 from service.actors.rollout import Demonstrations, Rollout, Turns, from_arrays, to_arrays
+from service.base import tensors
 from service.generator.records import GoalRecords
-from service.io import tensors
 from tests.actors.players import AT_REST, IN_FRONT, SLIDES, Pusher, assert_same_rollout, make_config, make_game, play
 
 PARTS = {"alice": Turns, "bob": Turns, "demonstrations": Demonstrations, "records": GoalRecords}

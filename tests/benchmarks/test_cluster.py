@@ -11,10 +11,10 @@ from benchmarks import processes, scaling, training_process
 from benchmarks.report import __main__ as report
 from benchmarks.report import scaling as scaling_blocks
 from benchmarks.training_process import Measured, Records, Training, copy_run, measure_training, summarise_rows
+from service.base.errors import TandemError
 from service.config import dump_config, load_config
-from service.errors import TandemError
 from service.store.models import ActorStatus, RunStatus
-from tests.runtime.runs import tiny_config
+from tests.runs.runs import tiny_config
 from tools import faults
 from tools.rollout_audit import Stretch, audit_rollouts, ledger_of, stretches_of
 

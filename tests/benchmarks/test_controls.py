@@ -6,9 +6,9 @@ import pytest
 
 from benchmarks import controls
 from benchmarks.measuring import RECIPE_FILE
+from service.base.errors import TandemError
 from service.config import load_config
-from service.errors import TandemError
-from tests.runtime.runs import TREE, write_yaml
+from tests.runs.runs import TREE, write_yaml
 
 
 def leaves(tree, prefix=""):

@@ -7,8 +7,8 @@ from benchmarks.push_planning import Settings, measure
 from service.config import load_config
 from service.learner.learner import Learner
 from service.policies.numpy_policy import numpy_bob
-from service.primitives.digest import parameters_digest
-from service.primitives.loading import Trained
+from service.registry.digest import parameters_digest
+from service.registry.loading import Trained
 
 SMALL = Settings(num_goals=4, goals_at_once=4, num_plans=24, num_elites=5, num_rounds=6, seed=1)
 

@@ -9,8 +9,8 @@ from benchmarks.push_range import DIRECTIONS, best_pushes, measure, positions_be
 from service.config import load_config
 from service.learner.learner import Learner
 from service.policies.numpy_policy import numpy_bob
-from service.primitives.digest import parameters_digest
-from service.primitives.loading import Trained
+from service.registry.digest import parameters_digest
+from service.registry.loading import Trained
 
 
 def test_the_fastest_of_those_that_go_straight():

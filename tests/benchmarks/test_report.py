@@ -14,9 +14,9 @@ import service
 from benchmarks.measuring import RECIPE_FILE
 from benchmarks.report.__main__ import ABOUT_THE_RECIPE, PAGES, Report
 from benchmarks.report.recipe import SHIPPED, check_words, differences, recipe_words
+from service.base.errors import TandemError
 from service.config import load_config
-from service.errors import TandemError
-from service.primitives.digest import parameters_digest
+from service.registry.digest import parameters_digest
 
 DOCS = Path(__file__).parents[2] / "docs"
 

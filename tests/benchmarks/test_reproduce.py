@@ -11,8 +11,8 @@ from benchmarks.trials import trial_config
 from service.cli.main import app
 from service.config import load_config
 from service.config.recipes import recipes
-from service.downstream.methods import METHODS
 from service.envs.tasks import TASKS
+from service.methods.task_methods import METHODS
 
 
 @pytest.fixture

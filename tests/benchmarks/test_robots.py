@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from benchmarks.robots import ROBOTS, summarise_run
-from service.io.jsonl import read_jsonl
-from tests.runtime.runs import play, tiny_config
+from service.base.jsonl import read_jsonl
+from tests.runs.runs import play, tiny_config
 
 
 def test_a_run_is_summarised_by_its_end(tmp_path, monkeypatch):

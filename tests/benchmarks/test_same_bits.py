@@ -8,7 +8,7 @@ from safetensors.numpy import save_file
 
 from benchmarks import same_bits
 from benchmarks.same_bits import Row, compare_runs
-from service.errors import TandemError
+from service.base.errors import TandemError
 
 ROW = Row("a row", "")
 

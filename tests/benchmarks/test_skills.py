@@ -8,15 +8,15 @@ import pytest
 from benchmarks import measuring, record_run, run_files
 from benchmarks.report import figures, skills
 from service.actors.coverage import visited_share
-from service.baselines.coverage import skill_paths
-from service.baselines.frozen import FrozenSkills
+from service.actors.skill_coverage import skill_paths
+from service.base.errors import TandemError
 from service.config import WorldConfig, parse_config
-from service.errors import TandemError
-from service.io.run_directory import RunDirectory
-from service.primitives.loading import read_stages
-from tests.runtime.runs import TREE
-from tests.runtime.runs import play as play_rounds
-from tests.runtime.test_skill_run import play, small_config
+from service.policies.frozen_skills import FrozenSkills
+from service.registry.loading import read_stages
+from service.store.run_directory import RunDirectory
+from tests.methods.test_skill_run import play, small_config
+from tests.runs.runs import TREE
+from tests.runs.runs import play as play_rounds
 
 
 @pytest.fixture(autouse=True)

@@ -16,7 +16,7 @@ from benchmarks.transfer import (
     summarise,
 )
 from benchmarks.transfer import policy_of as policy_of_row
-from service.errors import TandemError
+from service.base.errors import TandemError
 from service.robot.calibrate import Calibration
 
 MACHINE = {"num_cpus": 2, "cpu": "a processor", "git_commit": "a" * 40, "time": "2026-11-24T10:00:00+00:00"}

@@ -8,7 +8,7 @@ import pytest
 from benchmarks import trials
 from benchmarks.report.results import by_method_and_task, read_trials
 from benchmarks.trials import run_trial, trial_config
-from service.errors import TandemError
+from service.base.errors import TandemError
 
 RECORDED = Path(__file__).parents[2] / "docs" / "results"
 REGISTRY = RECORDED / "primitives"

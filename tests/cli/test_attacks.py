@@ -19,10 +19,10 @@ import pytest
 from typer.testing import CliRunner
 
 from service.cli.main import app
-from service.primitives.publishing import publish
+from service.registry.publishing import publish
 from service.registry.registry import Registry
 from service.runs.study_file import StudyDirectory
-from tests.runtime.runs import play, tiny_config, write_yaml
+from tests.runs.runs import play, tiny_config, write_yaml
 
 LIMIT_S = 60
 """Far more than any refusal takes, and far less than forever."""

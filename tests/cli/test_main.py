@@ -14,21 +14,21 @@ from types import SimpleNamespace
 import pytest
 from typer.testing import CliRunner
 
+from service.base.errors import TandemError
+from service.base.lock import DirectoryLock
 from service.cli.film import parse_goals
 from service.cli.main import app
 from service.config import WorldConfig, load_config
 from service.config.recipes import recipes
-from service.downstream import playing  # noqa: F401  before the function that it calls is replaced
-from service.errors import TandemError
-from service.io import checkpoints
-from service.io.lock import DirectoryLock
-from service.io.run_directory import RunDirectory
-from service.primitives.bundled import BUNDLED
+from service.methods import task_evaluation  # noqa: F401  before the function that it calls is replaced
+from service.registry.bundled import BUNDLED
 from service.registry.names import Version
 from service.registry.registry import Registry
 from service.runs.signals import InterruptError
 from service.runs.study import Place, Study
-from tests.runtime.runs import TREE, assert_one_line, no_room_above, tiny_config, write_yaml
+from service.store import checkpoints
+from service.store.run_directory import RunDirectory
+from tests.runs.runs import TREE, assert_one_line, no_room_above, tiny_config, write_yaml
 
 ROOT = Path(__file__).parents[2]
 EXAMPLES = (ROOT / "docs" / "cli.md").read_text()
@@ -116,7 +116,7 @@ def test_pretrain_refuses_a_directory_with_a_run(trained):
 def test_the_examples_of_pretraining(monkeypatch, tmp_path):
     """As they stand there, one after the other, with a tiny configuration where the shipped one would be.
 
-    What they do with ``--runtime ray`` is shown in tests/runtime.
+    What they do with ``--runtime ray`` is shown in tests/runs and tests/cluster.
     """
     monkeypatch.setattr("service.runs.train.make_artifacts", lambda directory, registry: {})
     monkeypatch.chdir(tmp_path)
@@ -235,7 +235,7 @@ def test_options_of_a_cluster_are_refused_without_one(tmp_path, option):
 
 @pytest.mark.parametrize("seeds", [(), ("--seeds", "0,1")])
 def test_whoever_else_has_the_directory_is_named_before_ray_is_started(tmp_path, monkeypatch, seeds):
-    monkeypatch.setattr("service.runtime.ray_connection.connected", lambda address: pytest.fail("it takes a minute"))
+    monkeypatch.setattr("service.cluster.ray_connection.connected", lambda address: pytest.fail("it takes a minute"))
     arguments = ("pretrain", "--run-dir", tmp_path / "run", *seeds, "--runtime", "ray", "--status", "off")
     lock = DirectoryLock(tmp_path / "run", "")
     assert_user_error(tandem(*arguments), tmp_path / "run", f"is in use by process {os.getpid()} on ")
@@ -269,7 +269,7 @@ def test_how_to_go_on_is_where_the_run_was_begun(tmp_path, monkeypatch, options,
     def interrupt(*_):
         raise InterruptError(signal.SIGTERM)
 
-    monkeypatch.setattr("service.runtime.ray_connection.connected", lambda address: nullcontext())
+    monkeypatch.setattr("service.cluster.ray_connection.connected", lambda address: nullcontext())
     monkeypatch.setattr("service.runs.train.train", stop)
     monkeypatch.setattr("service.cli.study._on_ray", lambda *_: Place())
     monkeypatch.setattr(Study, "train", interrupt)
@@ -561,7 +561,7 @@ def test_a_full_disk_during_a_checkpoint(tmp_path, monkeypatch):
         raise OSError(28, os.strerror(28))
 
     config = write_yaml(tmp_path / "tiny.yaml")
-    monkeypatch.setattr("service.io.checkpoints.write_atomic", no_space)
+    monkeypatch.setattr("service.store.checkpoints.write_atomic", no_space)
     result = tandem("pretrain", "--config", config, "--run-dir", tmp_path / "run", "--registry", tmp_path / "registry")
     assert result.exit_code == 2
     assert result.stderr.count("\n") == 1

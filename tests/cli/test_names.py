@@ -12,11 +12,11 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
+from service.base.errors import TandemError, did_you_mean
+from service.base.version import __version__
 from service.cli.main import app
 from service.config import load_config
 from service.config.recipes import CONFIGS, recipes, robots
-from service.errors import TandemError, did_you_mean
-from service.version import __version__
 
 RECIPE = CONFIGS / "pretrain" / "panda_cube.yaml"
 
@@ -142,7 +142,7 @@ def test_what_takes_long_can_be_quiet():
 
 def test_quiet_before_and_after_the_command(monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("service.progress.PLAIN_INTERVAL_S", 0.0)
+    monkeypatch.setattr("service.base.progress.PLAIN_INTERVAL_S", 0.0)
     typed = ["evaluate", "panda-cube@champion", "--episodes", "1", "--steps", "1"]
     assert "evaluating on mixed goals" in tandem(*typed).stderr
     level = logging.getLogger().level

@@ -6,10 +6,10 @@ import pytest
 from typer.testing import CliRunner
 
 from service.cli.main import app
-from service.primitives.publishing import publish
+from service.registry.publishing import publish
 from service.registry.registry import Registry
-from tests.downstream import skill_sets
 from tests.export.policies import publish_bob, write_training
+from tests.methods import skill_sets
 from tests.status.conftest import serve
 
 SMALL = ("--episodes", "2", "--json")

@@ -12,8 +12,8 @@ from typer.testing import CliRunner
 import service
 from service.cli.main import app
 from service.cli.registry import registry_app
-from service.primitives.bundled import BUNDLED
-from service.primitives.digest import parameters_digest
+from service.registry.bundled import BUNDLED
+from service.registry.digest import parameters_digest
 from service.registry.manifest import parse_manifest
 from service.registry.registry import Registry
 from tests.registry.helpers import Publish, files_in

@@ -9,14 +9,13 @@ import pytest
 import yaml
 from typer.testing import CliRunner
 
+from service.base.errors import RobotError, TandemError
 from service.cli.main import app
 from service.config import WorldConfig
 from service.config.self_play import SelfPlayConfig
-from service.errors import TandemError
-from service.primitives.loading import Trained
+from service.registry.loading import Trained
 from service.robot import backends
 from service.robot.backends import Backend
-from service.robot.errors import RobotError
 from service.robot.log import read_log, states_of
 from service.robot.loop import Bridge, BridgeConfig
 from service.robot.running import parse_goal, play

@@ -7,9 +7,9 @@ from typer.testing import CliRunner
 
 from service.cli.main import app
 from service.config.skills import SkillsConfig
-from service.primitives.publishing import publish
+from service.registry.publishing import publish
 from service.registry.registry import Registry
-from tests.downstream.skill_sets import CONFIG, SIZE, parameters
+from tests.methods.skill_sets import CONFIG, SIZE, parameters
 
 
 @pytest.fixture

@@ -12,13 +12,13 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
+from service.base.lock import DirectoryLock
 from service.cli.main import app
 from service.config.find import METHODS
-from service.io.lock import DirectoryLock
-from service.io.run_directory import RunDirectory
-from service.primitives.bundled import BUNDLED
+from service.registry.bundled import BUNDLED
 from service.registry.registry import Registry
-from tests.runtime.runs import play
+from service.store.run_directory import RunDirectory
+from tests.runs.runs import play
 from tests.status.conftest import serve
 
 CHAMPION = str(Registry(BUNDLED).resolve("panda-cube@champion"))

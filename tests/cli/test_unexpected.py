@@ -15,7 +15,7 @@ from typer.testing import CliRunner
 
 from service.cli.main import app
 from service.cli.unexpected import report_thread_error
-from tests.runtime.runs import assert_one_line, write_yaml
+from tests.runs.runs import assert_one_line, write_yaml
 
 ROOT = Path(__file__).parents[2]
 SAID = re.compile(r"error: unexpected KeyError: 'x\\ny\\x1b'; its traceback is in (\S+), please report it\n")
@@ -55,13 +55,13 @@ def check(result, directory):
 
 
 def test_of_a_run_it_is_in_the_run_directory(tmp_path, monkeypatch, temporary):
-    monkeypatch.setattr("service.io.run_directory.RunDirectory.record", fail)
+    monkeypatch.setattr("service.store.run_directory.RunDirectory.record", fail)
     check(pretrain(tmp_path), tmp_path / "run")
     assert list(temporary.iterdir()) == []
 
 
 def test_of_a_run_without_a_directory_it_is_a_temporary_file(tmp_path, monkeypatch, temporary):
-    monkeypatch.setattr("service.io.run_directory.RunDirectory.claim", fail)
+    monkeypatch.setattr("service.store.run_directory.RunDirectory.claim", fail)
     check(pretrain(tmp_path), temporary)
     assert not (tmp_path / "run").exists()
 

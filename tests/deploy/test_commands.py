@@ -12,9 +12,9 @@ from typer.testing import CliRunner
 from service.cli.main import app
 from service.config import dump_config
 from service.config.recipes import recipes
-from service.io.checkpoints import CheckpointStore
-from service.io.run_history import RunHistory
 from service.runs.study import Place, Study
+from service.store.checkpoints import CheckpointStore
+from service.store.run_history import RunHistory
 from tests.deploy.files import DEPLOY, DOCUMENTS, commands, compose, container, manifest, manifests, pod_templates
 
 BEGIN = ("train", "pretrain")
@@ -93,7 +93,7 @@ def test_a_run_begins_with_it_and_goes_on_with_it(arguments, monkeypatch, tmp_pa
     monkeypatch.setattr("service.cli.train._train", train)
     monkeypatch.setattr(Study, "train", begin)
     monkeypatch.setattr("service.cli.study._on_ray", lambda *_: Place())
-    monkeypatch.setattr("service.runtime.ray_connection.connected", lambda *_: nullcontext())
+    monkeypatch.setattr("service.cluster.ray_connection.connected", lambda *_: nullcontext())
     here, resumed = list(arguments), False
     for resumed in (False, True):
         result = CliRunner().invoke(app, here)

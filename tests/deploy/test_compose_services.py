@@ -3,7 +3,7 @@
 import pytest
 import yaml
 
-from service.errors import TandemError
+from service.base.errors import TandemError
 from tests.deploy.files import COMPOSE, DEPLOY, load
 from tools.compose_services import Port, read_services, read_variables
 

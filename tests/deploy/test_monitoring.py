@@ -52,7 +52,7 @@ def exported():
 
 def actor_metrics():
     """Kind, name and labels of each of the actors' own metrics, as the source makes them."""
-    tree = ast.parse((ROOT / "service" / "runtime" / "ray_actors.py").read_text())
+    tree = ast.parse((ROOT / "service" / "cluster" / "ray_actors.py").read_text())
     for node in ast.walk(tree):
         if isinstance(node, ast.Call) and getattr(node.func, "id", "") in ("Counter", "Gauge", "Histogram"):
             (keys,) = [keyword.value for keyword in node.keywords if keyword.arg == "tag_keys"]

@@ -22,6 +22,6 @@ def test_it_is_left_out(is_left_out, path):
 
 
 def test_the_code_is_sent_along(is_left_out):
-    kept = ("service/registry/registry.py", "service/primitives/data", "configs/pretrain/panda_cube.yaml")
+    kept = ("service/registry/registry.py", "service/registry/data", "configs/pretrain/panda_cube.yaml")
     assert not any(map(is_left_out, kept))
     assert not any(is_left_out(path) for path in (ROOT / "service").rglob("*.py"))

@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
+from service.base.errors import DivergedError
 from service.config import WorkspaceConfig, WorldConfig
 from service.envs.batch import WorldBatch
 from service.envs.panda import FINGER_STROKE_M
 from service.envs.sampling import sample_in_volume, sample_on_table
-from service.errors import DivergedError
 
 CONFIG = WorldConfig(physics_step_s=0.004, num_substeps=10)
 NUM_WORLDS = 9

@@ -4,14 +4,14 @@ import mujoco
 import numpy as np
 import pytest
 
+from service.base.errors import ConfigError
 from service.config import WorldConfig, load_config
 from service.config.objects import FixtureConfig
 from service.envs.batch import WorldBatch
 from service.envs.sampling import draw_starts, sample_goals
-from service.errors import ConfigError
 from tests.envs.scripted import CLOSE, drive
 from tests.envs.test_meshes import write_box
-from tests.runtime.runs import assert_one_line
+from tests.runs.runs import assert_one_line
 
 BLOCK = {"shape": "box", "size_m": (0.10, 0.06, 0.04), "position_m": (-0.05, 0.1)}
 POST = {"shape": "cylinder", "size_m": (0.04, 0.2), "position_m": (0.08, -0.1)}

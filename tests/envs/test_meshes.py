@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
+from service.base.errors import ConfigError
 from service.config import dump_config, load_config
 from service.envs.batch import WorldBatch
-from service.errors import ConfigError
 from tests.envs.scripted import place_in_air
-from tests.runtime.runs import assert_one_line
+from tests.runs.runs import assert_one_line
 
 CORNERS = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], dtype=float)
 QUADS = ((0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3))

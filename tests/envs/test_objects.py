@@ -4,13 +4,13 @@ import mujoco
 import numpy as np
 import pytest
 
+from service.base.errors import ConfigError
 from service.config import WorldConfig, load_config
 from service.envs.batch import WorldBatch
 from service.envs.sampling import draw_starts
-from service.errors import ConfigError
 from service.generator.bins import TaskBins
 from tests.envs.scripted import place_in_air
-from tests.runtime.runs import assert_one_line
+from tests.runs.runs import assert_one_line
 
 COARSE = {"physics_step_s": 0.005, "num_substeps": 8}
 """By shape: sizes, extent as it starts, and volume, by hand."""

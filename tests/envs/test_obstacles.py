@@ -4,6 +4,7 @@ import mujoco
 import numpy as np
 import pytest
 
+from service.base.errors import ConfigError
 from service.config import WorldConfig, load_config
 from service.envs.batch import WorldBatch
 from service.envs.gym.tabletop import TabletopEnv
@@ -11,11 +12,10 @@ from service.envs.gym.vector import TabletopVectorEnv
 from service.envs.objects import FLOOR_Z_M
 from service.envs.observations import POSITIONS, layouts
 from service.envs.obstacles import SEEN_WITHIN_M, draw_goals
-from service.errors import ConfigError
 from service.generator.generator import TaskGenerator
 from tests.envs.scripted import CLOSE, drive
 from tests.envs.test_meshes import write_box
-from tests.runtime.runs import assert_one_line, play, tiny_config
+from tests.runs.runs import assert_one_line, play, tiny_config
 
 BLOCK = {"shape": "box", "size_m": (0.06, 0.04, 0.05), "mass_kg": 0.2}
 BALL = {"shape": "sphere", "size_m": (0.05,)}

@@ -4,13 +4,13 @@ import mujoco
 import numpy as np
 import pytest
 
+from service.base.errors import ConfigError
 from service.config import WorldConfig, parse_config
 from service.envs.batch import WorldBatch
 from service.envs.model_bank import ModelBank
 from service.envs.noise import KEYS, normal
 from service.envs.observations import POSITIONS
-from service.errors import ConfigError
-from tests.runtime.runs import assert_one_line
+from tests.runs.runs import assert_one_line
 
 COARSE = {"physics_step_s": 0.005, "num_substeps": 8}
 EVERYTHING = {

@@ -8,14 +8,14 @@ import mujoco
 import numpy as np
 import pytest
 
+from service.base.errors import ConfigError
 from service.config import dump_config, load_config
 from service.envs.batch import DISPLACEMENT_M, WorldBatch
 from service.envs.contacts import GRIPPER_BIT
-from service.errors import ConfigError
 from tests.envs.robots import GANTRY, GANTRY_DESCRIPTION, PINCHER, URDF, URDF_DESCRIPTION, write_robot
 from tests.envs.scripted import CLOSE, OPEN, drive, grasp, place_in_air
 from tests.envs.test_meshes import write_box
-from tests.runtime.runs import assert_one_line, play, tiny_config
+from tests.runs.runs import assert_one_line, play, tiny_config
 
 ROBOTS = Path(__file__).parents[2] / "configs" / "robots"
 RECIPE = ROBOTS.parent / "pretrain" / "panda_cube.yaml"

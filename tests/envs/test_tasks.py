@@ -13,6 +13,7 @@ from gymnasium.vector import AutoresetMode
 from stable_baselines3.common.env_checker import check_env as check_stable_baselines
 
 import service.envs.gym.registration  # noqa: F401 - names the environments
+from service.base.errors import TandemError
 from service.config import WorldConfig
 from service.envs import scene
 from service.envs.batch import DISPLACEMENT_M, WorldBatch
@@ -21,7 +22,6 @@ from service.envs.gym.vector import TabletopVectorEnv
 from service.envs.rendering.renderer import RenderError, SceneRenderer
 from service.envs.sampling import draw_goals
 from service.envs.tasks import EPISODE_STEPS, HARD_TASKS, TASKS, find_task
-from service.errors import TandemError
 from tests.envs.scripted_tasks import play_task
 
 CONFIG = WorldConfig(physics_step_s=0.005, num_substeps=8)

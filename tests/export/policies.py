@@ -5,15 +5,15 @@ import torch
 from service.config import RunConfig, WorldConfig
 from service.config.self_play import MCPConfig, MLPConfig, PolicyConfig, SelfPlayConfig
 from service.config.task import TaskConfig
-from service.downstream.methods import METHODS
 from service.envs.observations import layouts
-from service.io.checkpoints import CheckpointStore
-from service.io.run_directory import RunDirectory
+from service.learner.sac_networks import GaussianActor
+from service.methods.task_methods import METHODS
 from service.policies.networks import export_parameters, make_bob
-from service.primitives.learned import num_inputs
-from service.primitives.loading import load
-from service.primitives.publishing import publish
-from service.sac.networks import GaussianActor
+from service.registry.learned import num_inputs
+from service.registry.loading import load
+from service.registry.publishing import publish
+from service.store.checkpoints import CheckpointStore
+from service.store.run_directory import RunDirectory
 
 WORLD = WorldConfig(physics_step_s=0.005, num_substeps=8, observed={"num_commands": 2})
 """A world in which policies see more than in the paper."""

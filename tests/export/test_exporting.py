@@ -12,15 +12,14 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+from service.base.errors import ExportError, ParityError
 from service.cli.main import app
 from service.export.description import read_description
-from service.export.errors import ExportError, ParityError
 from service.export.exporting import export
 from service.export.measurements import measure
 from service.export.readme import example
-from service.primitives.bundled import BUNDLED
-from service.primitives.loading import load
-from tests.downstream import skill_sets
+from service.registry.bundled import BUNDLED
+from service.registry.loading import load
 from tests.export.policies import (
     CONFIG,
     MONOLITHIC,
@@ -31,7 +30,8 @@ from tests.export.policies import (
     write_run,
     write_training,
 )
-from tests.runtime.runs import assert_one_line
+from tests.methods import skill_sets
+from tests.runs.runs import assert_one_line
 
 
 @pytest.fixture

@@ -8,7 +8,7 @@ from service.config import RunConfig
 from service.config.world import ObservedConfig
 from service.envs.observations import ACTION, layouts
 from service.export.measurements import LateObservations, Measured, measure, measure_response
-from service.primitives.loading import Trained
+from service.registry.loading import Trained
 from tests.export.policies import CONFIG, SEEN, WORLD
 
 

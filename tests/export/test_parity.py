@@ -5,14 +5,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from service.base.errors import ParityError
 from service.export import parity
-from service.export.errors import ParityError
 from service.export.formats import FORMATS, find_format
 from service.export.networks import network_of_orchestrator, networks_of_bob, networks_of_primitives
 from service.export.parity import check_parity, make_inputs
 from service.policies.numpy_policy import numpy_bob
-from service.primitives.learned import LearnedPolicy
-from service.primitives.loading import Trained
+from service.registry.learned import LearnedPolicy
+from service.registry.loading import Trained
 from tests.export.policies import CONFIG, MONOLITHIC, SEEN, actor_of, parameters_of
 
 

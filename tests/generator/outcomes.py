@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
+from service.base.types import Metrics
 from service.generator.bins import GoalCells, TaskBins
 from service.generator.generator import TaskGenerator
 from service.generator.records import GoalRecords
 from service.generator.ring import Rows
 from service.generator.summary import GoalSummary, summarize
-from service.types import Metrics
 
 
 def starts_of(*states: list[float]) -> Rows:

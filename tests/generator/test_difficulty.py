@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from service.base.errors import ConfigError
 from service.config import WorkspaceConfig, WorldConfig
-from service.errors import ConfigError
 from service.generator.bins import NUM_DISTANCE_BINS, NUM_TASK_BINS, GoalCells, distance_bins, height_bins, in_air
 from service.generator.difficulty import DECAY, PROPOSAL_DECAY, DifficultyGrid, SuccessCounts
 

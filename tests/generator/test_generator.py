@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 import pytest
 
+from service.base.errors import ConfigError
 from service.config import Config, parse_config
 from service.envs.state_layout import StateLayout
-from service.errors import ConfigError
 from service.generator.generator import TaskGenerator
 from service.generator.opponents import CURRENT, RoundPlan
 from service.generator.records import GoalRecords

@@ -7,6 +7,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
+from service.base.types import Metrics
 from service.generator.records import (
     GoalRecords,
     alice_sums,
@@ -16,7 +17,6 @@ from service.generator.records import (
     means,
 )
 from service.generator.validity import Verdict
-from service.types import Metrics
 
 REST = 0.025
 

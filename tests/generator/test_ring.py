@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from service.errors import ConfigError
+from service.base.errors import ConfigError
 from service.generator.ring import Ring, join_rows
 
 

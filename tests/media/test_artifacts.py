@@ -1,9 +1,9 @@
 import pytest
 
-from service.io.run_directory import RunDirectory
 from service.media import artifacts
 from service.media.artifacts import make_artifacts
-from tests.runtime.runs import assert_one_line, no_room_above, play
+from service.store.run_directory import RunDirectory
+from tests.runs.runs import assert_one_line, no_room_above, play
 
 
 @pytest.fixture(scope="module")

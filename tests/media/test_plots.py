@@ -7,9 +7,9 @@ from functools import partial
 import numpy as np
 import pytest
 
+from service.base.errors import TandemError
+from service.base.jsonl import JsonlWriter
 from service.config import WorkspaceConfig
-from service.errors import TandemError
-from service.io.jsonl import JsonlWriter
 from service.media.figures import column, new_figure
 from service.media.plots import (
     _goals,

@@ -6,15 +6,15 @@ import numpy as np
 import pytest
 
 from service.actors.evaluation import evaluate
-from service.baselines.coverage import skill_paths
-from service.baselines.frozen import FrozenSkills
+from service.actors.skill_coverage import skill_paths
 from service.config import WorldConfig
 from service.config.self_play import GameConfig, SelfPlayConfig
 from service.envs.batch import WorldBatch
 from service.generator.validity import Verdict
 from service.media import recording, video
 from service.media.recording import record_episodes, record_rounds, record_skills
-from tests.downstream.skill_sets import parameters
+from service.policies.frozen_skills import FrozenSkills
+from tests.methods.skill_sets import parameters
 
 PUSH = (-1.0, 0.0, -1.0, -1.0)
 OPEN_AND_PUSH = (-1.0, 0.0, -1.0, 1.0)

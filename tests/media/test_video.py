@@ -6,11 +6,11 @@ import imageio_ffmpeg
 import numpy as np
 import pytest
 
+from service.base.errors import TandemError
 from service.config import WorldConfig
 from service.envs.batch import WorldBatch
 from service.envs.rendering.camera import parse_view
 from service.envs.rendering.renderer import RenderError, SceneRenderer
-from service.errors import TandemError
 from service.generator.validity import Verdict
 from service.media import encoding, video
 from service.media.recording import RecordedEpisodes, RecordedRound

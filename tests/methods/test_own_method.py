@@ -2,13 +2,13 @@
 
 import pytest
 
+from service.base.errors import ConfigError
 from service.config import load_config, parse_config
-from service.errors import ConfigError
-from service.io.run_directory import RunDirectory
 from service.runs.resuming import resumed_config
 from service.runs.train import train
 from service.store.disk import read_status
-from tests.runtime.runs import KilledError, assert_one_line, assert_same_run, newest, read_lines
+from service.store.run_directory import RunDirectory
+from tests.runs.runs import KilledError, assert_one_line, assert_same_run, newest, read_lines
 
 CODE = """
 import numpy as np

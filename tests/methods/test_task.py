@@ -11,28 +11,28 @@ import pytest
 
 import service
 from service.actors.evaluation import IdlePolicy, evaluate
+from service.base.errors import TandemError
 from service.config.find import METHODS as KNOWN
 from service.config.task import TaskConfig
-from service.downstream import playing as task_evaluation
-from service.downstream.methods import METHODS
 from service.envs.observations import layouts
 from service.envs.tasks import TASKS
-from service.errors import TandemError
-from service.io.run_directory import RunDirectory
+from service.methods import task_evaluation
 from service.methods.task import TaskLearning
-from service.primitives.bundled import BUNDLED
-from service.primitives.publishing import publish
-from service.primitives.verification import network_problems
+from service.methods.task_methods import METHODS
+from service.registry.bundled import BUNDLED
+from service.registry.publishing import publish
 from service.registry.registry import Registry
+from service.registry.verification import network_problems
 from service.robot.policies import for_robot
 from service.runs.resuming import resumed_config
 from service.runs.train import train
 from service.store.disk import read_status
 from service.store.disk_reader import DiskReader
-from tests.downstream import skill_sets
-from tests.downstream.trials import small_trial
+from service.store.run_directory import RunDirectory
+from tests.methods import skill_sets
+from tests.methods.trials import small_trial
 from tests.registry.helpers import files_in
-from tests.runtime.runs import KilledError, assert_one_line, assert_same_run, newest, read_lines
+from tests.runs.runs import KilledError, assert_one_line, assert_same_run, newest, read_lines
 from tests.status.conftest import serve
 
 pytestmark = pytest.mark.usefixtures("default_signals", "no_video")

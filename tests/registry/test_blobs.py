@@ -6,9 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from service.io.errors import StorageError
+from service.base.errors import DamagedBlobError, StorageError
 from service.registry.blobs import BlobStore
-from service.registry.errors import DamagedBlobError
 
 
 def test_put_and_get(tmp_path: Path) -> None:

@@ -4,7 +4,7 @@ import threading
 
 import numpy as np
 
-from service.robot.errors import RobotError
+from service.base.errors import RobotError
 from service.robot.interface import Command, ObjectPose, RobotState
 
 HOME_M = np.array([-0.05, 0.0, 0.1])

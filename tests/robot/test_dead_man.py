@@ -2,7 +2,7 @@ import os
 
 import pytest
 
-from service.errors import TandemError
+from service.base.errors import TandemError
 from service.robot import dead_man
 
 

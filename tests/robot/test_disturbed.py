@@ -1,8 +1,8 @@
 import numpy as np
 import pytest
 
+from service.base.errors import TandemError
 from service.config.world import WorldConfig
-from service.errors import TandemError
 from service.robot.backends import BackendConfig, connect, read_backend
 from service.robot.disturbed import DisturbanceConfig, DisturbedPoses, DisturbedRobot
 from service.robot.interface import Command

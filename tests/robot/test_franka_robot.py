@@ -8,11 +8,10 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from service.base.errors import RobotError, TandemError
 from service.config.world import WorldConfig
 from service.envs import panda
-from service.errors import TandemError
 from service.robot.backends import BackendConfig, connect
-from service.robot.errors import RobotError
 from service.robot.franka_robot import FrankaParameters, FrankaRobot, _Hand
 from service.robot.interface import Command, ObjectPose
 

@@ -1,11 +1,10 @@
 import numpy as np
 import pytest
 
+from service.base.errors import RobotError, TandemError
 from service.config import WorldConfig
 from service.envs.batch import WorldBatch
-from service.errors import TandemError
 from service.robot.calibrate import Calibration, read_calibration, write_calibration
-from service.robot.errors import RobotError
 from service.robot.interface import Command
 from service.robot.loop import Bridge, BridgeConfig
 from service.robot.mujoco_robot import MujocoParameters, MujocoRobot, connect

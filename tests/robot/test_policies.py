@@ -3,12 +3,12 @@ import dataclasses
 import numpy as np
 import pytest
 
-from service.errors import TandemError
-from service.primitives.bundled import BUNDLED
-from service.primitives.loading import load
+from service.base.errors import TandemError
+from service.registry.bundled import BUNDLED
+from service.registry.loading import load
 from service.robot.policies import for_robot
-from tests.downstream.skill_sets import made
 from tests.export.policies import publish_bob, write_training
+from tests.methods.skill_sets import made
 
 
 def test_a_bob_and_an_orchestrator_with_its_world(registry, tmp_path):

@@ -5,10 +5,9 @@ import sys
 import numpy as np
 import pytest
 
+from service.base.errors import ConfigError, RobotError, TandemError
 from service.config.world import WorldConfig
-from service.errors import ConfigError, TandemError
 from service.robot.backends import BackendConfig, connect
-from service.robot.errors import RobotError
 from service.robot.interface import Command
 from service.robot.pybullet_robot import CONTROL_STEP_S, PyBulletParameters, PyBulletRobot, lag_s, world_of
 

@@ -3,10 +3,9 @@
 import numpy as np
 import pytest
 
+from service.base.errors import ConfigError, RobotError
 from service.config import WorldConfig
-from service.errors import ConfigError
 from service.robot.disturbed import DisturbanceConfig, DisturbedPoses, DisturbedRobot
-from service.robot.errors import RobotError
 from service.robot.loop import Bridge, BridgeConfig
 from service.robot.safety import SafeRobot, SafetyConfig
 from tests.robot.fakes import HOME_M, OBJECT_M, FakeRobot, Steady

@@ -6,7 +6,7 @@ import httpx
 import numpy as np
 import pytest
 
-from service.primitives.bundled import BUNDLED
+from service.registry.bundled import BUNDLED
 from service.registry.manifest import parse_manifest
 from service.registry.registry import Registry
 from service.status.server import StatusServer

@@ -4,7 +4,7 @@ import httpx
 import pytest
 from starlette.routing import Mount, Route
 
-from service.registry.errors import StatusError
+from service.base.errors import StatusError
 from tests.status.conftest import serve
 from tests.status.runs import CLIENT, TOKEN, WRONG
 

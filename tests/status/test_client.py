@@ -17,19 +17,19 @@ import numpy as np
 import pytest
 
 import service
-from service.errors import TandemError
-from service.io.errors import StorageError
-from service.primitives.bundled import BUNDLED
-from service.registry import client
-from service.registry.client import fetch_primitives
-from service.registry.errors import (
+from service.base.errors import (
     DamagedBlobError,
     FetchError,
     RegistryError,
     StatusError,
+    StorageError,
+    TandemError,
     UnknownVersionError,
     WrongTokenError,
 )
+from service.registry import client
+from service.registry.bundled import BUNDLED
+from service.registry.client import fetch_primitives
 from service.registry.registry import Registry
 from service.status.server import StatusServer
 from service.store.disk_reader import DiskReader

@@ -8,11 +8,11 @@ import imageio_ffmpeg
 import numpy as np
 import pytest
 
-from service.io.run_log import RunLog
 from service.registry.registry import Registry
 from service.status.server import StatusServer
 from service.store.disk_reader import DiskReader
 from service.store.models import ActorStatus
+from service.store.run_log import RunLog
 from tests.status.browser import CHROMIUM, Visit, chromium
 from tests.status.conftest import serve
 from tests.status.runs import TOKEN, VIDEO, WRONG, append, grid, publish, record, write_runs, write_status, write_trial
@@ -184,7 +184,7 @@ def test_log_commands_and_configuration(own):
     run = home / "runs" / "cube"
     (run / "config.yaml").write_text("name: panda-cube\nlearner: {bob: {target_kl: 0.03}}\n")
     with RunLog(run):
-        logging.getLogger("service.runtime").warning("rollout actor 3 is gone (killed); another takes its place")
+        logging.getLogger("service.cluster").warning("rollout actor 3 is gone (killed); another takes its place")
     page = visit.go("#/runs/cube").page
     page.locator(".log .warning").get_by_text("rollout actor 3 is gone (killed)").wait_for()
     page.locator(".command").get_by_text(f"touch {run}/stop", exact=True).wait_for()

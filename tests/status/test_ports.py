@@ -7,8 +7,8 @@ import pytest
 from typer.testing import CliRunner
 
 from service.cli.main import app
-from service.runtime.ray_connection import StatusOptions, parse_status
-from service.runtime.status_actor import place
+from service.cluster.ray_connection import StatusOptions, parse_status
+from service.cluster.status_actor import place
 from service.status.ports import DEFAULT_PORT, free_port
 
 

@@ -4,9 +4,9 @@ from datetime import UTC, datetime, timedelta
 
 import pytest
 
+from service.base.errors import UnknownRunError
 from service.status.run_reader import RETRY_AFTER_S, CombinedReader, open_reader
 from service.store.disk_reader import DiskReader
-from service.store.errors import UnknownRunError
 from service.store.redis_reader import RedisReader
 from tests.status.runs import append, grid, record, status, write_runs, write_status
 from tests.store.stores import Killable, a_writer, wait_until

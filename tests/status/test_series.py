@@ -7,7 +7,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from service.io.files import write_atomic
+from service.base.files import write_atomic
 from service.status.schemas import SeriesSet
 from service.status.series import history, series, table
 from service.store import disk_reader

@@ -13,8 +13,8 @@ import httpx
 import pytest
 from typer.testing import CliRunner
 
+from service.base.errors import StatusError
 from service.cli.main import app
-from service.registry.errors import StatusError
 from service.registry.registry import Registry
 from service.registry.token import read_token
 from service.status.server import StatusServer

@@ -11,7 +11,7 @@ import httpx
 import pytest
 from fastapi import routing
 
-from service.io.files import write_atomic
+from service.base.files import write_atomic
 from service.registry.registry import Registry
 from service.status import stream
 from service.status.server import StatusServer

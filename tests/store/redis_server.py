@@ -10,8 +10,8 @@ import time
 from pathlib import Path
 from typing import Self
 
+from service.base.errors import StoreUnavailableError
 from service.store.address import RedisAddress
-from service.store.errors import StoreUnavailableError
 from service.store.redis_reader import RedisReader
 
 START_S = 30.0

@@ -6,11 +6,11 @@ import traceback
 
 import pytest
 
-from service.extras import MissingPackageError
+from service.base.errors import StoreError, StoreUnavailableError
+from service.base.extras import MissingPackageError
 from service.store.address import RedisAddress, address_from_environment
-from service.store.errors import StoreError, StoreUnavailableError
 from service.store.redis_reader import RedisReader
-from tests.runtime.runs import assert_one_line
+from tests.runs.runs import assert_one_line
 
 SECRET = "s3cret-word"
 

@@ -13,16 +13,16 @@ from types import SimpleNamespace
 
 import pytest
 
-from service.io.jsonl import JsonlWriter
-from service.io.lock import DirectoryLock
-from service.io.run_directory import RunDirectory
+from service.base.errors import StoreError
+from service.base.jsonl import JsonlWriter
+from service.base.lock import DirectoryLock
 from service.store import disk_reader
 from service.store.disk_reader import DiskReader, run_id_of
-from service.store.errors import StoreError
 from service.store.pulse import Pulse
+from service.store.run_directory import RunDirectory
 from service.store.run_writer import RunWriter
 from service.store.tail import RecordFile
-from tests.runtime.runs import assert_one_line, no_room_above
+from tests.runs.runs import assert_one_line, no_room_above
 from tests.store.stores import a_grid, a_record, a_silent_status, a_status, wait_until
 
 

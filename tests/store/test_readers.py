@@ -5,16 +5,16 @@ import threading
 
 import pytest
 
-from service.io.jsonl import JsonlWriter
-from service.io.lock import DirectoryLock
-from service.io.run_directory import RunDirectory
+from service.base.errors import DamagedStoreError, StoreUnavailableError, UnknownRunError
+from service.base.jsonl import JsonlWriter
+from service.base.lock import DirectoryLock
 from service.store.disk_reader import DiskReader
-from service.store.errors import DamagedStoreError, StoreUnavailableError, UnknownRunError
 from service.store.keys import run_key
 from service.store.models import SILENT_AFTER
 from service.store.redis_reader import RedisReader
+from service.store.run_directory import RunDirectory
 from service.store.run_writer import RunWriter
-from tests.runtime.runs import assert_one_line
+from tests.runs.runs import assert_one_line
 from tests.store.stores import a_grid, a_record, a_silent_status, a_status, a_writer, wait_until
 
 

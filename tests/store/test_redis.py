@@ -7,12 +7,11 @@ import time
 
 import pytest
 
-from service.io.errors import RunTakenError
+from service.base.errors import DamagedStoreError, RunTakenError, StoreUnavailableError
 from service.store import keys, redis_writer
 from service.store.address import RedisAddress
-from service.store.errors import DamagedStoreError, StoreUnavailableError
 from service.store.redis_reader import RedisReader
-from tests.runtime.runs import assert_one_line
+from tests.runs.runs import assert_one_line
 from tests.store.stores import a_grid, a_record, a_status, a_writer, wait_until
 
 

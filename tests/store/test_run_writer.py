@@ -4,13 +4,13 @@ import json
 
 import pytest
 
-from service.io.errors import RunTakenError
-from service.io.run_directory import RunDirectory
+from service.base.errors import RunTakenError
 from service.store.keys import run_key
 from service.store.redis_reader import RedisReader
 from service.store.redis_writer import RedisWriter
+from service.store.run_directory import RunDirectory
 from service.store.run_writer import RunWriter, reporting_to
-from tests.runtime.runs import play, tiny_config
+from tests.runs.runs import play, tiny_config
 from tests.store.stores import a_grid, a_record, a_status, a_writer, wait_until
 
 

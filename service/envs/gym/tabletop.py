@@ -10,13 +10,13 @@ import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
+from service.base.errors import TandemError
+from service.base.types import BoolArray, FloatArray, StateArray
 from service.config import WorldConfig
 from service.envs.batch import WorldBatch
 from service.envs.gym.goals import Goals, GoalSource, Success, succeeded
 from service.envs.observations import ACTION, layouts
 from service.envs.tasks import find_task
-from service.errors import TandemError
-from service.types import BoolArray, FloatArray, StateArray
 
 if TYPE_CHECKING:
     from service.envs.rendering.renderer import SceneRenderer

@@ -14,11 +14,11 @@ from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
+from service.base.errors import TandemError
+from service.base.types import BoolArray, FloatArray, StateArray
 from service.config import WorldConfig
 from service.envs.gym.goals import Goals, Success
 from service.envs.gym.tabletop import GoalWorlds, Observation, action_space, goal_space
-from service.errors import TandemError
-from service.types import BoolArray, FloatArray, StateArray
 
 Info = dict[str, Any]
 

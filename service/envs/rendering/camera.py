@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import mujoco
 
-from service.errors import TandemError
+from service.base.errors import TandemError
 
 _HOW = "write a view, such as close, or numbers, such as azimuth=120,elevation=-30,distance=1.5, or both"
 

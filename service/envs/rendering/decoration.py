@@ -14,11 +14,11 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from service.base.types import StateArray
 from service.config import WorkspaceConfig, WorldConfig
 from service.envs.objects import FLOOR_Z_M
 from service.envs.rendering.panda_visuals import add_panda_visuals, make_visual
 from service.envs.scene import FIXTURE_PREFIX, TABLE_CENTER_X_M, TABLE_HALF_SIZE_M
-from service.types import StateArray
 
 _TABLE_THICKNESS_M = 0.035
 _TEXTURE_SIZE = 512

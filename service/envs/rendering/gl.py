@@ -14,7 +14,7 @@ import platform
 import warnings
 from typing import TYPE_CHECKING, Any
 
-from service.errors import TandemError
+from service.base.errors import TandemError
 
 if TYPE_CHECKING:
     import mujoco

@@ -11,7 +11,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from service.types import StateArray
+from service.base.types import StateArray
 
 Vector = tuple[float, float, float]
 

@@ -14,13 +14,13 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from service.base.types import StateArray
 from service.config import WorldConfig
 from service.envs.objects import geometry
 from service.envs.rendering.camera import DEFAULT_VIEW, View
 from service.envs.rendering.decoration import decorate
 from service.envs.rendering.gl import RenderError, open_drawing
 from service.envs.scene import build_layout, build_spec
-from service.types import StateArray
 
 __all__ = ["RenderError", "SceneRenderer"]
 

@@ -7,11 +7,11 @@ import gymnasium
 import numpy as np
 import pytest
 
+from service.base.errors import TandemError
 from service.config import WorldConfig
 from service.envs.gym.registration import TABLETOP_ID
 from service.envs.gym.tabletop import TabletopEnv
 from service.envs.gym.vector import TabletopVectorEnv
-from service.errors import TandemError
 
 CONFIG = WorldConfig(physics_step_s=0.005, num_substeps=8)
 GOAL = (0.02, -0.1, 0.2)

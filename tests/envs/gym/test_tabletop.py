@@ -10,11 +10,11 @@ import pytest
 from gymnasium.utils.env_checker import check_env as check_gymnasium
 from stable_baselines3.common.env_checker import check_env as check_stable_baselines
 
+from service.base.errors import TandemError
 from service.config import WorldConfig
 from service.envs.gym.registration import TABLETOP_ID, register_all
 from service.envs.gym.tabletop import TabletopEnv
 from service.envs.tasks import EPISODE_STEPS
-from service.errors import TandemError
 
 CONFIG = WorldConfig(physics_step_s=0.004, num_substeps=10)
 

@@ -4,9 +4,9 @@ import mujoco
 import numpy as np
 import pytest
 
+from service.base.errors import TandemError
 from service.envs.rendering.camera import VIEWS, parse_view
 from service.envs.rendering.renderer import goal_color
-from service.errors import TandemError
 
 
 def test_what_is_typed():

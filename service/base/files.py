@@ -1,0 +1,214 @@
+"""Files that are wholly there or not at all, and files that grow by whole pieces.
+
+A whole file is written to a temporary file beside its target, flushed to the disk, and then takes its name in one step,
+so a kill or a power cut leaves the old one or the new one. A temporary file's name starts with ``.tmp-``, which no name
+or alias can, so readers never meet one. A full disk leaves no torn piece at the end of a growing file.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import os
+import secrets
+import shutil
+from collections import deque
+from collections.abc import Iterator
+from io import FileIO
+from pathlib import Path
+from typing import Literal
+
+from service.base.errors import StorageError
+from service.base.regular_files import open_regular, open_to_append
+
+TEMPORARY_PREFIX = ".tmp-"
+
+
+def write_atomic(path: Path, data: bytes, *, flush: bool = True) -> None:
+    """Put ``data`` at ``path``, replacing what was there in one step; the directory is made when missing.
+
+    Without ``flush``, it does not wait for the disk, and a power cut may leave an older content or none.
+
+    Raises:
+        OSError: the disk is full, or the directory cannot be written; ``path`` is then as it was.
+    """
+    with _temporary(path, data, flush=flush) as temporary:
+        temporary.replace(path)
+        if flush:
+            _flush_directory(path.parent)
+
+
+def write_exclusive(path: Path, data: bytes) -> bool:
+    """Put ``data`` at ``path`` unless something is there; True when it was put. One of many racing writers wins.
+
+    Raises:
+        OSError: as for `write_atomic`, or the file system has no hard links.
+    """
+    with _temporary(path, data) as temporary:
+        try:
+            os.link(temporary, path)
+        except FileExistsError:
+            return False
+        _flush_directory(path.parent)
+        return True
+
+
+@contextlib.contextmanager
+def new_directory(path: Path) -> Iterator[Path]:
+    """Give an empty directory beside ``path``, which takes that name when the block ends well, and else is removed.
+
+    Raises:
+        StorageError: something is at ``path`` already, or it cannot be written.
+    """
+    if path.exists() or path.is_symlink():
+        raise StorageError(f"cannot write {path}: it exists; name another folder, or remove it first")
+    temporary = path.absolute().parent / _temporary_name()
+    with os_errors("write", path):
+        temporary.mkdir(parents=True)
+    try:
+        yield temporary
+        with os_errors("write", path):
+            temporary.rename(path)
+            _flush_directory(temporary.parent)
+    except BaseException:
+        shutil.rmtree(temporary, ignore_errors=True)
+        raise
+
+
+@contextlib.contextmanager
+def os_errors(
+    action: Literal["read", "write"], path: Path, error_type: type[StorageError] = StorageError
+) -> Iterator[None]:
+    """Turn an operating-system error of the block into ``error_type`` with one line for the user."""
+    try:
+        yield
+    except OSError as error:
+        reason = error.strerror or type(error).__name__
+        if action == "read":
+            raise error_type(f"cannot read {path}: {reason}; check the path, its permissions and the disk") from error
+        raise error_type(
+            f"cannot write {path}: {reason} ({_free_bytes(path)} bytes free there); "
+            "free some space or check the permissions and try again; what was saved before is intact"
+        ) from error
+
+
+def remove_temporaries(directory: Path) -> None:
+    """Delete what killed writers left in ``directory``; only where no other writer can be at work."""
+    for path in directory.glob(f"{TEMPORARY_PREFIX}*"):
+        path.unlink(missing_ok=True)
+
+
+class Appender:
+    """Appends pieces to one file; a piece that does not fit waits, and comes before the next one.
+
+    Once it has written to the file, it writes to no other: a process that goes on with a run puts new files in the
+    places of those it continues, so one that was overtaken without noticing writes to nothing that anybody reads.
+
+    Args:
+        path: the file; what is there already stays, and nothing is made before the first piece.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self._waiting: deque[bytes] = deque()
+        self._identity: tuple[int, int] | None = None
+        """Device and inode of the file that it writes to."""
+
+    def append_bytes(self, piece: bytes) -> None:
+        """Put ``piece`` at the file's end and hand it to the operating system.
+
+        Raises:
+            StorageError: the disk is full or the file cannot be written; the file ends with a whole piece, and
+                ``piece`` waits for the next call or `sync`.
+        """
+        self._waiting.append(piece)
+        self._flush()
+
+    def take_new_file(self) -> None:
+        """Write to whichever file is there next; what waits was for the file before."""
+        self._identity = None
+        self._waiting.clear()
+
+    def sync(self) -> None:
+        """Write what waits, and wait until the disk has it.
+
+        Raises:
+            StorageError: as for `append_bytes`.
+        """
+        self._flush()
+        if self.path.is_file():
+            with os_errors("write", self.path), open_regular(self.path) as file:
+                os.fsync(file.fileno())
+
+    def _flush(self) -> None:
+        if not self._waiting:
+            return
+        with os_errors("write", self.path):
+            self.path.parent.mkdir(parents=True, exist_ok=True)
+            with open_to_append(self.path) as file:
+                self._check_same(file)
+                while self._waiting:
+                    _write_whole(file, self._waiting[0])
+                    self._waiting.popleft()
+
+    def _check_same(self, file: FileIO) -> None:
+        there = os.fstat(file.fileno())
+        identity = there.st_dev, there.st_ino
+        if self._identity not in (None, identity) and there.st_size:  # an empty one takes the place of one removed
+            raise OSError(errno.ESTALE, "another process has put a file of its own in its place", str(self.path))
+        self._identity = identity
+
+
+@contextlib.contextmanager
+def _temporary(path: Path, data: bytes, *, flush: bool = True) -> Iterator[Path]:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = path.parent / _temporary_name()
+    try:
+        if flush:
+            _write_flushed(temporary, data)
+        else:
+            temporary.write_bytes(data)
+        yield temporary
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def _temporary_name() -> str:
+    return f"{TEMPORARY_PREFIX}{os.getpid()}-{secrets.token_hex(8)}"
+
+
+def _write_flushed(path: Path, data: bytes) -> None:
+    # 0o666 before the umask: tempfile's 0o600 would lock colleagues out of a shared registry
+    descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o666)
+    try:
+        view = memoryview(data)
+        while view:
+            view = view[os.write(descriptor, view) :]
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def _flush_directory(directory: Path) -> None:
+    descriptor = os.open(directory, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def _free_bytes(path: Path) -> int:
+    existing = next(parent for parent in path.absolute().parents if parent.exists())
+    return shutil.disk_usage(existing).free
+
+
+def _write_whole(file: FileIO, piece: bytes) -> None:
+    end = file.seek(0, os.SEEK_END)
+    try:
+        view = memoryview(piece)
+        while view:
+            view = view[file.write(view) :]
+    except BaseException:  # a signal's, too
+        with contextlib.suppress(OSError):  # the first error is the one the user has to know
+            file.truncate(end)
+        raise

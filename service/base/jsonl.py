@@ -1,0 +1,165 @@
+"""The records of a run: files of one JSON object per line, appended as the run goes and cut back when it resumes.
+
+A killed run leaves at most one torn line, at the end: readers pass over it. A full disk leaves none.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import math
+import zlib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from service.base.errors import StorageError
+from service.base.files import Appender, os_errors, write_atomic
+from service.base.parsing import ParseError, parse_json
+from service.base.regular_files import read_regular
+
+MAX_BYTES = 8 * 1024**3
+"""Of a run's records; a million iterations have some two gigabytes."""
+_logger = logging.getLogger(__name__)
+
+
+class Extent(NamedTuple):
+    """The first bytes of a file: how many they are, and their CRC-32."""
+
+    num_bytes: int = 0
+    crc32: int = 0
+
+    @classmethod
+    def of(cls, data: bytes) -> Extent:
+        """The extent of these bytes."""
+        return cls(len(data), zlib.crc32(data))
+
+
+def plain(value: Any) -> Any:
+    """``value`` in JSON's own types: NumPy's become plain ones; NaN and infinity, which JSON lacks, become null."""
+    if isinstance(value, Mapping):
+        return {str(key): plain(item) for key, item in value.items()}
+    if hasattr(value, "tolist"):
+        value = value.tolist()
+    if isinstance(value, (list, tuple)):
+        return [plain(item) for item in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def read_jsonl(path: Path) -> list[dict[str, Any]]:
+    """The records of ``path`` in their order; a torn last line (no line end, not JSON) is passed over.
+
+    Raises:
+        StorageError: the file is missing or unreadable, or a line other than a torn last one is no JSON object.
+    """
+    *lines, tail = _read(path).split(b"\n")
+    records = []
+    for number, line in enumerate(lines, start=1):
+        record = _parse(line)
+        if record is None:
+            raise StorageError(
+                f"{path} line {number}: {line[:40]!r} is not a JSON object; remove that line and try again"
+            )
+        records.append(record)
+    last = _parse(tail)
+    return [*records, last] if last is not None else records
+
+
+class JsonlWriter(Appender):
+    """Appends records to one file, a line each, so that a kill loses no record already written."""
+
+    def __init__(self, path: Path) -> None:
+        super().__init__(path)
+        self.extent = Extent()
+        """Of what was appended, or kept by a cut."""
+
+    def append(self, record: Mapping[str, Any]) -> None:
+        """Write ``record``, made `plain`, as the file's last line and hand it to the operating system.
+
+        Raises:
+            StorageError: the disk is full or the file cannot be written; the record waits, see `append_bytes`.
+        """
+        line = json.dumps(plain(record), allow_nan=False).encode() + b"\n"
+        self.extent = Extent(self.extent.num_bytes + len(line), zlib.crc32(line, self.extent.crc32))
+        self.append_bytes(line)
+
+    def damage(self, extent: Extent) -> str | None:
+        """Compare the beginning of the file with what it once was: what is wrong with it, or None.
+
+        Raises:
+            StorageError: the file cannot be read.
+        """
+        begin = _read(self.path, missing_ok=True)[: extent.num_bytes]
+        if len(begin) < extent.num_bytes:
+            return f"has {len(begin):,} bytes, and had {extent.num_bytes:,} when the checkpoint was saved"
+        if Extent.of(begin) != extent:
+            return f"has other first {extent.num_bytes:,} bytes than were written"
+        return None
+
+    def cut(self, num_bytes: int) -> None:
+        """Keep so many bytes, in one atomic step. A missing file is empty.
+
+        Raises:
+            StorageError: the file cannot be read or written; it is then as it was.
+        """
+        self._replace(_read(self.path, missing_ok=True)[:num_bytes])
+
+    def cut_after(self, iteration: int, *, accept_damage: bool = False) -> None:
+        """Keep the records up to an iteration, in one atomic step.
+
+        Args:
+            iteration: the last one whose record stays.
+            accept_damage: leave out lines that are no records in their order.
+
+        Raises:
+            StorageError: there are such lines, and that is not accepted; or the file cannot be read or written. It is
+                then as it was.
+        """
+        *lines, _ = _read(self.path, missing_ok=True).split(b"\n")
+        kept, newest, num_strange = list[bytes](), -1, 0
+        for place, line in enumerate(lines, start=1):
+            number = (_parse(line) or {}).get("iteration")
+            if not isinstance(number, int) or not newest < number < 2**63:
+                if not accept_damage:
+                    raise StorageError(
+                        f"{self.path} line {place}: {line[:40]!r} is no record, or has not its iteration; remove that "
+                        "line and try again"
+                    )
+                num_strange += 1
+            elif number <= iteration:
+                kept.append(line)
+                newest = number
+        if num_strange:
+            _logger.warning("%s: left out %d lines that are no records in their order", self.path, num_strange)
+        self._replace(b"".join(line + b"\n" for line in kept))
+
+    def _replace(self, kept: bytes) -> None:
+        self.extent = Extent.of(kept)
+        if not self.path.exists():
+            return
+        same = kept == _read(self.path)
+        self.take_new_file()
+        try:
+            with os_errors("write", self.path):
+                write_atomic(self.path, kept)  # also the same bytes: see Appender
+        except StorageError:
+            if not same:  # else a disk that is full need not be written to
+                raise
+
+
+def _read(path: Path, *, missing_ok: bool = False) -> bytes:
+    with os_errors("read", path):
+        try:
+            return read_regular(path, MAX_BYTES)
+        except FileNotFoundError:
+            if not missing_ok:
+                raise
+            return b""
+
+
+def _parse(line: bytes) -> dict[str, Any] | None:
+    try:
+        record = parse_json(line, "a line", allow_nan=True)
+    except ParseError:
+        return None
+    return record if isinstance(record, dict) else None

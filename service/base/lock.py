@@ -1,0 +1,99 @@
+"""A lock on a directory: one process at a time, and the kernel frees it when its holder dies, however that happens."""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import json
+import logging
+import os
+import socket
+import time
+from io import FileIO
+from pathlib import Path
+from typing import BinaryIO
+
+from service.base.errors import RunTakenError, TandemError
+from service.base.files import os_errors
+from service.base.parsing import parse_json
+from service.base.regular_files import open_regular, open_to_append, read_regular
+
+LOCK_FILE = ".lock"
+WITHOUT_LOCKS = "TANDEM_WITHOUT_LOCKS"
+"""Variable of the environment that says, with 1, that somebody sees to it that one process uses a directory."""
+WAIT_S = 0.5
+"""Longer than ``is_locked`` of another process keeps the lock to itself."""
+_logger = logging.getLogger(__name__)
+
+
+class DirectoryLock:
+    """An exclusive hold on a directory, from construction until `release` or until this process dies.
+
+    Args:
+        directory: made when missing.
+        what_to_do: the end of the error's message.
+
+    Raises:
+        RunTakenError: another process, or another object in this one, has the lock; or the file system has no locks,
+            and ``TANDEM_WITHOUT_LOCKS`` does not say that this is known.
+        StorageError: the directory cannot be written.
+    """
+
+    def __init__(self, directory: Path, what_to_do: str) -> None:
+        path = directory / LOCK_FILE
+        with os_errors("write", path):
+            directory.mkdir(parents=True, exist_ok=True)
+            self._file = open_to_append(path)
+        try:
+            taken = _take(self._file, fcntl.LOCK_EX, WAIT_S)
+        except OSError as error:
+            self._file.close()
+            if os.environ.get(WITHOUT_LOCKS) == "1":
+                _logger.warning("%s: no locks there (%s), as %s says", path, error.strerror, WITHOUT_LOCKS)
+                return
+            raise RunTakenError(
+                f"{path}: its file system has no locks ({error.strerror}), so nothing keeps a second process out; use "
+                f"another directory, or see to it that there is only one and set {WITHOUT_LOCKS}=1"
+            ) from None
+        if not taken:
+            self._file.close()
+            found = holder(directory)
+            who = "another process" if found is None else f"process {found[1]} on {found[0]}"
+            raise RunTakenError(f"{directory} is in use by {who}; {what_to_do}")
+        note = {"pid": os.getpid(), "host": socket.gethostname()}
+        with contextlib.suppress(OSError):  # a full disk: who has it is only told to people
+            self._file.truncate(0)
+            self._file.write(json.dumps(note).encode())
+
+    def release(self) -> None:
+        """Let others in; a second call does nothing."""
+        self._file.close()
+
+
+def is_locked(directory: Path) -> bool:
+    """Whether some process holds the directory's lock now."""
+    try:
+        with open_regular(directory / LOCK_FILE) as file:
+            return not _take(file, fcntl.LOCK_SH, 0.0)
+    except OSError:  # nobody ever locked it, or nobody can
+        return False
+
+
+def holder(directory: Path) -> tuple[str, int] | None:
+    """Host and process that last took the directory's lock, as it noted them; None where that cannot be read."""
+    with contextlib.suppress(OSError, TandemError, ValueError, KeyError, TypeError):
+        note = parse_json(read_regular(directory / LOCK_FILE, 1000), "the lock")
+        return str(note["host"])[:100], int(note["pid"])
+    return None
+
+
+def _take(file: FileIO | BinaryIO, kind: int, wait_s: float) -> bool:
+    deadline_s = time.monotonic() + wait_s
+    while True:
+        try:
+            fcntl.flock(file, kind | fcntl.LOCK_NB)
+            return True
+        except BlockingIOError:
+            if time.monotonic() >= deadline_s:
+                return False
+            time.sleep(0.02)

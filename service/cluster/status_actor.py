@@ -1,0 +1,119 @@
+"""The status service as a Ray actor: it costs the driver nothing, and Ray restarts it when it dies."""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import ray
+from ray.exceptions import RayError, RayTaskError
+from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
+
+from service.base.errors import StatusError
+from service.cluster.ray_connection import StatusOptions
+from service.cluster.remote_worker import one_line
+from service.methods.method import WorkersError
+from service.status.ports import free_port
+from service.store.address import RedisAddress
+
+_logger = logging.getLogger(__name__)
+START_S = 60.0
+REBIND_S = 10.0
+"""A restarted service waits so long for its port, which the one that died had a moment ago."""
+
+
+class StatusWorker:
+    """Serves run directories, Redis and the registry, which it only reads but for stop requests and aliases.
+
+    Args:
+        options: where it listens.
+        runs_dir: directory of run directories.
+        registry: root of the registry.
+        redis: None where none is configured; run directories then tell everything.
+    """
+
+    def __init__(self, options: StatusOptions, runs_dir: Path, registry: Path, redis: RedisAddress | None) -> None:
+        self._options, self._runs_dir, self._registry, self._redis = options, runs_dir, registry, redis
+        if ray.get_runtime_context().was_current_actor_reconstructed:  # nobody asks a second time
+            self.start(patience_s=REBIND_S)
+
+    def start(self, patience_s: float = 0.0) -> str:
+        """Serve from now on.
+
+        Args:
+            patience_s: how long a port may be taken.
+
+        Returns:
+            Where the driver's machine reaches the service.
+
+        Raises:
+            StatusError: the address cannot be had, or a public one without a token.
+        """
+        from service.registry.registry import Registry
+        from service.status.run_reader import open_reader
+        from service.status.server import StatusServer
+
+        reader, options = open_reader(self._runs_dir, self._redis), self._options
+        registry = Registry(self._registry)
+        place: dict[str, Any] = {"host": options.host, "port": options.port, "runs_dir": self._runs_dir}
+        deadline_s = time.monotonic() + patience_s
+        while True:
+            try:
+                self._server = StatusServer(reader, registry, token=options.token, **place)
+                break
+            except StatusError:
+                if time.monotonic() >= deadline_s:
+                    raise
+                time.sleep(0.1)
+        self._server.start()
+        return self._server.url
+
+
+def place(options: StatusOptions) -> StatusOptions:
+    """The options with the port that is taken in the end: a service that is restarted must be where it was."""
+    if options.port != 0 and not options.or_next:
+        return options
+    try:
+        port = free_port(options.host, options.port)
+    except OSError:  # what is wrong with the host is said where the service begins
+        return options
+    if options.port not in (0, port):
+        _logger.info("port %d is taken, so the status service is at port %d", options.port, port)
+    return replace(options, port=port)
+
+
+@contextmanager
+def serving(options: StatusOptions, runs_dir: Path, registry: Path, redis: RedisAddress | None) -> Iterator[str]:
+    """Serve for as long as the block runs, on the driver's machine, where the run directories are.
+
+    Yields:
+        The service's URL.
+
+    Raises:
+        StatusError: the address cannot be had, or a public one without a token.
+        WorkersError: it does not start.
+    """
+    here = NodeAffinitySchedulingStrategy(ray.get_runtime_context().get_node_id(), soft=False)
+    actor = ray.remote(StatusWorker).options(num_cpus=0, max_restarts=-1, scheduling_strategy=here)
+    handle: Any = actor.remote(place(options), runs_dir.absolute(), registry.absolute(), redis)
+    try:
+        yield _started(handle)
+    finally:
+        ray.kill(handle, no_restart=True)
+
+
+def _started(handle: Any) -> str:
+    try:
+        url: str = ray.get(handle.start.remote(), timeout=START_S)
+    except RayTaskError as error:
+        if isinstance(error.cause, StatusError):
+            raise error.cause from None
+        raise
+    except RayError as error:
+        raise WorkersError(f"the status service does not start: {one_line(error)}") from None
+    return url

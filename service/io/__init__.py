@@ -1,1 +1,0 @@
-"""Files: atomic writes, locks, json lines, tensors, checkpoints, run directories."""

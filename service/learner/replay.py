@@ -1,0 +1,105 @@
+"""Replay buffer of many worlds that step together, with hindsight: goals of which the object came there later.
+
+A row is one step of every world. Columns are float32 arrays by name, whatever the learner wants to see again.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from service.base.types import Array, Arrays, BoolArray, FloatArray
+
+Columns = dict[str, FloatArray]
+_LAST_STEP = "last_step"
+_GOES_ON = np.iinfo(np.int32).max
+
+
+class Places(NamedTuple):
+    """Transitions in a buffer."""
+
+    step: NDArray[np.int64]
+    """(B,) numbers of their steps, counted from the first that was ever added."""
+    world: NDArray[np.int64]
+    """(B,)"""
+
+
+class ReplayBuffer:
+    """The newest transitions of N worlds, at most ``num_steps`` of each.
+
+    Args:
+        num_steps: that are kept; older ones are overwritten.
+        num_worlds: N.
+        columns: sizes by name.
+    """
+
+    def __init__(self, num_steps: int, num_worlds: int, columns: Mapping[str, int]) -> None:
+        self.num_steps, self.num_worlds = num_steps, num_worlds
+        self.num_added = 0
+        """Steps added so far, overwritten ones among them."""
+        self._columns = {name: np.zeros((num_steps, num_worlds, size), np.float32) for name, size in columns.items()}
+        self._last_step = np.full((num_steps, num_worlds), _GOES_ON, dtype=np.int32)  # of each transition's episode
+        self._began = np.zeros(num_worlds, dtype=np.int64)
+
+    @property
+    def oldest(self) -> int:
+        """Number of the oldest step that is kept."""
+        return max(0, self.num_added - self.num_steps)
+
+    def add(self, columns: Mapping[str, FloatArray], ended: BoolArray) -> None:
+        """Add a step of every world.
+
+        Args:
+            columns: (N, size) each.
+            ended: (N,) whether it was the last step of the world's episode.
+        """
+        assert columns.keys() == self._columns.keys()
+        row = self.num_added % self.num_steps
+        for name, values in columns.items():
+            self._columns[name][row] = values
+        self._last_step[row] = _GOES_ON
+        for world in np.flatnonzero(ended):
+            steps = np.arange(max(self._began[world], self.num_added + 1 - self.num_steps), self.num_added + 1)
+            self._last_step[steps % self.num_steps, world] = self.num_added
+            self._began[world] = self.num_added + 1
+        self.num_added += 1
+
+    def draw(self, size: int, rng: np.random.Generator, *, newest: int | None = None) -> Places:
+        """Draw ``size`` transitions, all alike, with replacement; of the newest steps of every world, or of all."""
+        oldest = self.oldest if newest is None else max(self.oldest, self.num_added - newest)
+        flat = rng.integers(oldest * self.num_worlds, self.num_added * self.num_worlds, size)
+        return Places(*np.divmod(flat, self.num_worlds))
+
+    def draw_later(self, places: Places, rng: np.random.Generator) -> Places:
+        """Draw for each place one of the same episode, not before it, all alike ("future", Andrychowicz et al. 2017).
+
+        Of an episode that goes on, what there is so far.
+        """
+        last = np.minimum(self._last_step[places.step % self.num_steps, places.world], self.num_added - 1)
+        return Places(rng.integers(places.step, last + 1), places.world)
+
+    def read(self, places: Places) -> Columns:
+        """Copies of all columns there, (B, size) each."""
+        rows = (places.step % self.num_steps, places.world)
+        return {name: values[rows] for name, values in self._columns.items()}
+
+    def column(self, name: str, places: Places) -> FloatArray:
+        """A copy of one column there, (B, size)."""
+        values: FloatArray = self._columns[name][places.step % self.num_steps, places.world]
+        return values
+
+    def state(self) -> Arrays:
+        """Everything a new buffer continues from, as arrays by name; rows that are not in use are left out."""
+        used = min(self.num_added, self.num_steps)
+        rows = {name: values[:used].copy() for name, values in self._columns.items()}
+        counted = {"num_added": np.array(self.num_added), "began": self._began.copy()}
+        return {**rows, _LAST_STEP: self._last_step[:used].copy(), **counted}
+
+    def load_state(self, state: Mapping[str, Array]) -> None:
+        """Continue from a buffer of the same sizes."""
+        for name, values in {**self._columns, _LAST_STEP: self._last_step}.items():
+            values[: len(state[name])] = state[name]
+        self.num_added, self._began = int(state["num_added"]), np.array(state["began"], dtype=np.int64)

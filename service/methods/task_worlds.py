@@ -1,0 +1,69 @@
+"""The worlds of a task, in which a downstream learner acts: they count its success."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import gymnasium
+import numpy as np
+
+from service.base.types import Array, Arrays, BoolArray, FloatArray
+from service.envs.observations import PAPER, POSITIONS, Layouts
+from service.learner.off_policy_worlds import TabletopWorlds
+from service.learner.replay import Columns
+from service.registry.learned import learner_inputs
+
+_POSITIONS = ("previous", "positions", "before", "following")
+
+
+def columns(seen: Layouts) -> dict[str, int]:
+    """Sizes of a transition's columns, by name, but for ``action``.
+
+    They are positions one env step ago, now, one env step before it ended and when it ended, goal and reward.
+    """
+    return {**dict.fromkeys(_POSITIONS, seen.positions.size), "goal": 3, "reward": 1}
+
+
+class TaskWorlds(TabletopWorlds):
+    """See ``TabletopWorlds``; where the environment is composed, actions are weights of its primitives."""
+
+    def __init__(self, env: gymnasium.vector.VectorEnv[Any, Any, Any], seed: int, seen: Layouts = PAPER) -> None:
+        super().__init__(env, seed)
+        self.seen = seen
+        """Layouts of the worlds."""
+        self.finished: list[tuple[float, bool]] = []
+        """Return and success at the last step of the episodes that ended since this list was last cleared."""
+        self._returns = np.zeros(self.num_worlds)
+
+    def inputs(self) -> FloatArray:
+        """(N, I) what the actor sees now."""
+        return learner_inputs(self.previous, self.positions, self.goal, self.seen)
+
+    def step(self, actions: FloatArray) -> tuple[Columns, BoolArray]:
+        """Act by (N, A) actions.
+
+        Returns:
+            The transitions, ``columns`` and ``action``, and (N,) whose episodes ended.
+        """
+        step = self.advance(actions)
+        self._returns += step.reward
+        self.finished += zip(self._returns[step.ended].tolist(), step.success[step.ended].tolist(), strict=True)
+        self._returns[step.ended] = 0.0
+        columns = {name: getattr(step, name) for name in (*_POSITIONS, "goal")}
+        return {**columns, "reward": step.reward[:, None], "action": actions}, step.ended
+
+    def rewards(self, following: FloatArray, goal: FloatArray) -> FloatArray:
+        """(B,) rewards for (B, P) positions come to, had the goals (B, 3) been others."""
+        paid: FloatArray = self.env.compute_reward(following[:, POSITIONS["object"]], goal, {})
+        return paid
+
+    def state(self) -> tuple[Arrays, Any]:
+        """Copy everything that ``load_state`` needs."""
+        arrays, random = super().state()
+        return {**arrays, "returns": self._returns.copy()}, random
+
+    def load_state(self, arrays: dict[str, Array], random: Any) -> None:
+        """Go back to a saved state; continues bit-identically."""
+        worlds = dict(arrays)
+        self._returns = np.array(worlds.pop("returns"))
+        super().load_state(worlds, random)

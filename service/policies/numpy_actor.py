@@ -1,0 +1,86 @@
+"""The actors of ``networks`` in NumPy, from exported parameters: acting without torch and without noise."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from service.base.types import FloatArray
+from service.policies.forward import compose, prepared, relu_layers
+from service.policies.parameters import Parameters, Shapes, checked, layer_shapes, layer_sizes, shape_of
+
+LOG_STD_MIN, LOG_STD_MAX = -20.0, 2.0
+"""Bounds of an actor's log-std before the tanh (Haarnoja et al. 2018)."""
+MCP_LOG_STD_MIN = -5.0
+"""Of a primitive's: with less, one that is sure decides alone and the others get no gradient."""
+
+
+class NumpyActor:
+    """Actions ``tanh(mean)`` of a ``GaussianActor``.
+
+    Args:
+        parameters: as exported.
+
+    Raises:
+        PolicyError: a parameter is missing, left over, of a wrong shape or not finite.
+    """
+
+    def __init__(self, parameters: Parameters) -> None:
+        expected = relu_shapes(parameters, "layers")
+        self.network = prepared(np, checked(parameters, expected))
+        *_, (num_outputs,) = expected.values()
+        self.num_inputs, self.num_actions = expected["layers.0.weight"][1], num_outputs // 2
+
+    def __call__(self, inputs: FloatArray) -> FloatArray:
+        """(N, A) actions at (N, I) inputs."""
+        actions: FloatArray = np.tanh(relu_layers(np, self.network["layers"], inputs)[:, : self.num_actions])
+        return actions
+
+
+class NumpyMCPActor(NumpyActor):
+    """Actions ``tanh(mean)`` of an ``MCPActor``."""
+
+    def __init__(self, parameters: Parameters) -> None:
+        num_primitives, hidden_size, num_outputs = shape_of(parameters, "output_weight", 3)
+        expected = {
+            "output_weight": (num_primitives, hidden_size, num_outputs),
+            "output_bias": (num_primitives, num_outputs),
+            "weight_floor": (),
+            **relu_shapes(parameters, "primitives", num_primitives * hidden_size),
+            **relu_shapes(parameters, "gate", num_primitives),
+        }
+        self.network = prepared(np, checked(parameters, expected))
+        self.num_inputs, self.num_actions = expected["gate.0.weight"][1], num_outputs // 2
+        self._heads = num_primitives, hidden_size
+        self._num_without_goal = expected["primitives.0.weight"][1]
+
+    def __call__(self, inputs: FloatArray) -> FloatArray:
+        """(N, A) actions at (N, I) inputs."""
+        network = self.network
+        hidden = np.maximum(relu_layers(np, network["primitives"], inputs[:, : self._num_without_goal]), 0.0)
+        heads = hidden.reshape(len(inputs), *self._heads)
+        outputs = np.einsum("nkh,kho->nko", heads, network["output_weight"]) + network["output_bias"]
+        means, log_stds = outputs[..., : self.num_actions], outputs[..., self.num_actions :]
+        floor, opened = network["weight_floor"], relu_layers(np, network["gate"], inputs)
+        weights = floor + (1.0 - floor) / (1.0 + np.exp(-opened))
+        mean, _ = compose(weights, means, np.exp(2.0 * np.clip(log_stds, MCP_LOG_STD_MIN, LOG_STD_MAX)))
+        actions: FloatArray = np.tanh(mean)
+        return actions
+
+
+def numpy_actor(parameters: Parameters) -> NumpyActor:
+    """The actor of exported parameters, of whichever kind.
+
+    Raises:
+        PolicyError: they are of neither.
+    """
+    return NumpyMCPActor(parameters) if "output_weight" in parameters else NumpyActor(parameters)
+
+
+def relu_shapes(parameters: Parameters, name: str, num_outputs: int | None = None) -> Shapes:
+    """Shapes that layers of ``networks.make_layers`` below a name need to fit together.
+
+    Raises:
+        PolicyError: the first is missing, or a weight is no matrix.
+    """
+    (*hidden, last), inputs = layer_sizes(parameters, f"{name}.{{}}", 2), shape_of(parameters, f"{name}.0.weight", 2)[1]
+    return layer_shapes(f"{name}.{{}}", (inputs, *hidden, num_outputs or last), 2)

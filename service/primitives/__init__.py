@@ -1,1 +1,0 @@
-"""Primitives: loading, publishing, and those that come with the package."""

@@ -1,0 +1,207 @@
+"""Model cards: what a version says about itself, in Markdown with the YAML head that hubs of models read."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from math import prod
+from typing import Any
+
+import yaml
+
+from service.registry.loading import ORCHESTRATOR, SKILLS
+from service.registry.manifest import Manifest
+
+LICENCE = "apache-2.0"
+"""Tandem's own, as hubs write it."""
+PAPERS = {
+    "tandem": (
+        "2410.04855",
+        "Paul Jansonnie, Bingbing Wu, Julien Perez, Jan Peters: *Unsupervised Skill Discovery for Robotic "
+        "Manipulation through Automatic Task Generation*, 2024",
+    ),
+    "self-play": (
+        "2101.04882",
+        "OpenAI and others: *Asymmetric self-play for automatic goal discovery in robotic manipulation*, 2021",
+    ),
+    "mcp": (
+        "1905.09808",
+        "Xue Bin Peng, Michael Chang, Grace Zhang, Pieter Abbeel, Sergey Levine: *MCP: Learning Composable "
+        "Hierarchical Control with Multiplicative Compositional Policies*, 2019",
+    ),
+    "ppo": ("1707.06347", "John Schulman and others: *Proximal Policy Optimization Algorithms*, 2017"),
+    "sac": ("1812.05905", "Tuomas Haarnoja and others: *Soft Actor-Critic Algorithms and Applications*, 2018"),
+    "her": ("1707.01495", "Marcin Andrychowicz and others: *Hindsight Experience Replay*, 2017"),
+    "diayn": (
+        "1802.06070",
+        "Benjamin Eysenbach and others: *Diversity is All You Need: Learning Skills without a Reward Function*, 2018",
+    ),
+    "dads": ("1907.01657", "Archit Sharma and others: *Dynamics-Aware Unsupervised Discovery of Skills*, 2019"),
+    "lsd": ("2202.00914", "Seohong Park and others: *Lipschitz-constrained Unsupervised Skill Discovery*, 2022"),
+    "metra": (
+        "2310.08887",
+        "Seohong Park, Oleh Rybkin, Sergey Levine: *METRA: Scalable Unsupervised RL with Metric-Aware Abstraction*, "
+        "2023",
+    ),
+}
+"""Numbers at arXiv and citations, as in ``docs/bibliography.md``, which does not come with the package."""
+_RATE = re.compile(r"evaluation/(?:(\w+)_)?success_(last|ever)")
+_HISTORY = "Settings that changed on the way, and records that were lost:"
+_SUCCESS = "Share of episodes in which the object was at its goal, in simulation and without noise in the actions:"
+_WHEN = {"last": "success at the last step", "ever": "success at any step"}
+
+
+def model_card(manifest: Manifest, *, licence: str = LICENCE) -> str:
+    """The card of a version of any kind.
+
+    Args:
+        manifest: of the version.
+        licence: of its parameters, as hubs write it.
+    """
+    spaces, config, metrics = manifest.spaces, manifest.config, manifest.metrics
+    what, code, after, papers = _kind(manifest)
+    rates = _rates(manifest)
+    tags = ("robotics", "reinforcement-learning", "mujoco", str(spaces.get("kind", "primitives")))
+    head = {
+        "license": licence,
+        "library_name": "tandem-skills",
+        "pipeline_tag": "robotics",
+        "tags": [*tags, *(f"arxiv:{PAPERS[key][0]}" for key in papers)],
+        **({"model-index": [{"name": manifest.name, "results": _model_index(rates)}]} if rates else {}),
+    }
+    thing, robot = _at(config, "world", "object"), _at(config, "world", "robot")
+    facts = {
+        "robot": _at(robot, "name") or robot or "panda",
+        "object": _at(thing, "shape") if isinstance(thing, Mapping) else thing,
+        "simulator": "MuJoCo",
+        **{name: f"{spaces[name]} numbers" for name in ("observation", "action") if isinstance(spaces.get(name), int)},
+        "parameters": f"{sum(prod(each.shape) for each in manifest.tensors.values()):,}",
+        "sha256 of the parameters": f"`{manifest.blob_sha256}`",
+    }
+    seed = config.get("seed")
+    training = {
+        "env steps": f"{metrics['env_steps']:,.0f}" if "env_steps" in metrics else None,
+        "method": spaces.get("method") or _at(config, "skills", "method"),
+        "seed": seed if seed is not None else _at(config, "trial", "seed"),
+        "trained on from": f"`{manifest.parent}`" if manifest.parent else None,
+        "published": manifest.created,
+        "code": f"commit `{manifest.git_commit}`" if manifest.git_commit else None,
+    }
+    success = [
+        (where, *(f"{found[when]:.1%}" if when in found else "-" for when in _WHEN)) for where, found in rates.items()
+    ]
+    others = [
+        (f"`{name}`", f"{value:.6g}")
+        for name, value in metrics.items()
+        if name != "env_steps" and not _RATE.fullmatch(name)
+    ]
+    parts = [
+        f"---\n{yaml.safe_dump(head, sort_keys=False, allow_unicode=True)}---",
+        f"# {manifest.reference}",
+        what,
+        _table(("", ""), facts.items()),
+        "## How it was trained",
+        _table(("", ""), training.items()),
+        *([_HISTORY, _yaml(manifest.history)] if manifest.history else []),
+        "The whole configuration:",
+        _yaml(config),
+        "## Results",
+        *([_SUCCESS, _table(("goals", *_WHEN.values()), success)] if success else []),
+        *([_table(("metric", "value"), others)] if others else []),
+        *(["The version has none."] if not success and not others else []),
+        "## How to load it",
+        "No index of packages has Tandem yet. In a clone of its repository:",
+        "```sh\npip install .\n```",
+        f"```python\nimport service\n\n{code}\n```",
+        f"`registry` is a directory, or the `http://HOST:PORT` of a `tandem serve`. {after}",
+        "## Papers",
+        "\n".join(f"- {words}. [arXiv {number}](https://arxiv.org/abs/{number})."
+                  for number, words in (PAPERS[key] for key in papers)),
+        "## Licence",
+        licence,
+    ]  # fmt: skip
+    return "\n\n".join(parts) + "\n"
+
+
+def _kind(manifest: Manifest) -> tuple[str, str, str, list[str]]:
+    """What differs by kind: what it is, code that loads it, words about that, and keys of the papers it rests on."""
+    spaces, config, name = manifest.spaces, manifest.config, manifest.reference
+    after = "In place of the name, the folder that `tandem registry export` has written will do."
+    if spaces.get("kind") == ORCHESTRATOR:
+        method, frozen = str(spaces.get("method", "")), spaces.get("primitives", "?")
+        takes, how = (SKILLS, [method]) if method in PAPERS else ("primitives", ["self-play", "mcp"])
+        return (
+            f"An orchestrator of Tandem: a policy for the task *{spaces.get('task', '?')}* that acts with the frozen "
+            f"{takes} `{frozen}` (digest `{str(spaces.get('primitives_digest', '?'))[:12]}`), and with no others.",
+            f'policy = service.load("{name}", registry="registry")\n'
+            "policy.begin()  # before new episodes: it remembers the step before\n"
+            "action = policy.act_deterministic(observation)  # (N, O) positions and goal -> (N, 4)",
+            f"The registry, or the one that comes with the package, has to have `{frozen}`, too.",
+            ["tandem", *how, "sac", *["her"] * method.endswith("-her")],
+        )
+    if spaces.get("kind") == SKILLS:
+        method = str(_at(config, "skills", "method") or "?")
+        return (
+            f"Frozen skills of Tandem, found by {method.upper()}: a policy that acts by a vector of "
+            f"{spaces.get('skill')} numbers. No task and no reward was written for them.",
+            f'skills = service.load("{name}", registry="registry").skills',
+            after,
+            [*[method] * (method in PAPERS), "sac", "tandem"],
+        )
+    learned = "by self-play, in which Alice proposes goals and Bob reaches them"
+    if _at(config, "distillation") is not None:
+        learned = "from other ones, which saw more and had been learned by self-play (distillation)"
+    return (
+        f"{_at(config, 'policy', 'bob', 'num_primitives') or 'The'} frozen primitives of Tandem, and the gate that "
+        f"composes them: a policy that brings an object to a goal. They were learned {learned}. No task and no reward "
+        "was written for them. New tasks are learned by composing them.",
+        f'bob = service.load("{name}", registry="registry")\n'
+        "action = bob.policy.act_deterministic(observation)  "
+        f"# (N, {spaces.get('observation', 'O')}) positions and goal -> (N, 4)",
+        after,
+        ["tandem", "self-play", "mcp", "ppo"],
+    )
+
+
+def _rates(manifest: Manifest) -> dict[str, dict[str, float]]:
+    """Success rates by words for where goals are, and by when success is asked for."""
+    rates: dict[str, dict[str, float]] = {}
+    for name, value in manifest.metrics.items():
+        if (match := _RATE.fullmatch(name)) is not None:
+            where = match[1] or f"of the task {manifest.spaces.get('task', '')}".rstrip()
+            if where.startswith("nominal_"):
+                where = f"{where.removeprefix('nominal_')}, in the world as it is in the middle of its ranges"
+            rates.setdefault(where, {})[match[2]] = value
+    return rates
+
+
+def _model_index(rates: Mapping[str, Mapping[str, float]]) -> list[dict[str, Any]]:
+    return [
+        {
+            "task": {"type": "robotics", "name": "Tabletop manipulation"},
+            "dataset": {"type": "tandem", "name": where},
+            "metrics": [
+                {"type": "success_rate", "name": name, "value": round(found[when], 4)}
+                for when, name in _WHEN.items()
+                if when in found
+            ],
+        }
+        for where, found in rates.items()
+    ]
+
+
+def _at(tree: Any, *keys: str) -> Any:
+    """What a tree of plain values has there; None where it has nothing."""
+    for key in keys:
+        tree = tree.get(key) if isinstance(tree, Mapping) else None
+    return tree
+
+
+def _table(header: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
+    """A table of the rows whose values are all known."""
+    cells = [[str(cell).replace("|", "\\|").replace("\n", " ") for cell in row] for row in rows if None not in row]
+    return "\n".join(f"| {' | '.join(line)} |" for line in (header, ["---"] * len(header), *cells))
+
+
+def _yaml(tree: Any) -> str:
+    return f"```yaml\n{yaml.safe_dump(tree, sort_keys=False).rstrip()}\n```"

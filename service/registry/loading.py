@@ -1,0 +1,363 @@
+"""The one way to load what was trained: ``load`` gives a ``Trained`` for every kind of reference.
+
+A reference names a version of a registry, a run, a checkpoint of a run, a downstream training, or an exported version.
+Acting is NumPy: nothing here needs torch.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+from service.base.errors import ConfigError, TandemError
+from service.base.tensors import digest_of, split_parts
+from service.base.types import FloatArray
+from service.config import Config, WorldConfig
+from service.config.skills import SkillDiscoveryConfig
+from service.config.task import TaskConfig
+from service.envs.observations import layouts
+from service.envs.tasks import EPISODE_STEPS, SUCCESS_DISTANCE_M, find_task
+from service.policies.frozen_skills import FrozenSkills, ZeroShotPolicy
+from service.policies.numpy_policy import NumpyGaussianPolicy, NumpyMCPPolicy, NumpyPolicy, numpy_bob
+from service.policies.parameters import Parameters, PolicyError
+from service.registry.acting import acting_config
+from service.registry.bundled import BUNDLED, find_version, is_bundled
+from service.registry.digest import parameters_digest
+from service.registry.exported import is_exported
+from service.registry.learned import LearnedPolicy
+from service.registry.manifest import Manifest
+from service.store.checkpoints import Checkpoint, CheckpointStore, read_checkpoint
+from service.store.run_directory import Published, RunDirectory
+
+if TYPE_CHECKING:
+    from service.actors.evaluation import DeterministicPolicy
+    from service.envs.sampling import GoalKind
+
+Kind = Literal["primitives", "skills", "orchestrator"]
+"""Bob, who has primitives unless he is monolithic; skills of a baseline; or a policy of a downstream task."""
+PRIMITIVES: Kind = "primitives"
+SKILLS: Kind = "skills"
+"""Part of a run's checkpoint that holds frozen skills, and kind in the spaces of their manifest."""
+ORCHESTRATOR: Kind = "orchestrator"
+_TRIAL_FILE = "cell.json"
+"""Is in the directories of downstream trainings of version 0.2."""
+_DESCRIPTION = "policy.json"
+"""Is in the folders that ``tandem export`` writes."""
+_SHOWN = 12
+"""Characters of a digest in messages."""
+
+
+@dataclass(frozen=True, slots=True)
+class Trained:
+    """What was trained, ready to act, with what it was trained with.
+
+    Policies of tasks and skills keep the step before: call ``begin`` before new episodes.
+    """
+
+    label: str
+    """Where it comes from, such as ``panda-cube@3 (bundled)``."""
+    kind: Kind
+    config: Config
+    """Of the run; of a policy of a task, that of what it acts with."""
+    policy: DeterministicPolicy
+    """Goes to goals: Bob, the skill that leads there, or what was learned for a task."""
+    parameters: Parameters = field(compare=False, repr=False)
+    """That the policy was made of."""
+    manifest: Manifest | None = None
+    """Of a version; None of a directory of a run or training."""
+    path: Path | None = None
+    """The directory or file it was read from; None for a version in a registry."""
+    networks: Mapping[str, Parameters] = field(default_factory=dict, compare=False, repr=False)
+    """What another run can begin from, by ``bob/policy``, ``bob/value``, ``alice/policy`` and ``alice/value``; of a
+    version, and of distillation, only the first."""
+    alice: NumpyGaussianPolicy | None = None
+    """Of a run of self-play."""
+    task: str | None = None
+    """Name of the task that it plays, such as ``push``."""
+    method: str | None = None
+    """Name of the method that learned a policy of a task, such as ``ours-her``."""
+    trained: Trained | None = None
+    """The primitives or skills that a policy of a task acts with, if any."""
+
+    @property
+    def name(self) -> str:
+        """What it is called elsewhere, where paths of this machine mean nothing."""
+        if self.manifest is not None:
+            return self.manifest.reference
+        if self.kind == ORCHESTRATOR or self.path is None:
+            return self.config.directory_name
+        return f"{self.config.name} of the run {self.path.resolve().name}"
+
+    @property
+    def title(self) -> str:
+        """Its label, and the task that it plays."""
+        return self.label if self.task is None else f"{self.label} on {find_task(self.task).title}"
+
+    @property
+    def reference(self) -> str:
+        """A reference that finds the same again from any directory: without an alias, or an absolute path."""
+        if self.path is not None:
+            return str(self.path.absolute())
+        return self.label if self.manifest is None else self.manifest.reference
+
+    @property
+    def published(self) -> Published | None:
+        """The version and its digest; None of a run or training."""
+        return None if self.manifest is None else Published(self.manifest.reference, self.manifest.blob_sha256)
+
+    @property
+    def world(self) -> WorldConfig:
+        """The world of its task, or of its training."""
+        return self.config.world if self.task is None else find_task(self.task).world_from(self.config.world)
+
+    @property
+    def nominal(self) -> Trained:
+        """The same in one world, where it was trained in worlds that are drawn."""
+        return replace(self, config=self.config.model_copy(update={"world": self.config.world.nominal}))
+
+    @property
+    def goals(self) -> GoalKind:
+        """Random goals that it is tried on."""
+        if self.task is not None:
+            return find_task(self.task).goals
+        return "mixed" if self.config.world.fixture == "none" else "table"
+
+    @property
+    def num_steps(self) -> int:
+        """Steps of an episode in which it is tried."""
+        return self.config.run.evaluation_steps if self.task is None else EPISODE_STEPS
+
+    @property
+    def success_distance_m(self) -> float:
+        """Greatest distance from object to goal that counts as success."""
+        return self.config.success_distance_m if self.task is None else SUCCESS_DISTANCE_M
+
+    @property
+    def primitives(self) -> NumpyMCPPolicy:
+        """The primitives, which can be composed; of a policy of a task, those that it acts with.
+
+        Raises:
+            TandemError: it has none.
+        """
+        if self.trained is not None:
+            return self.trained.primitives
+        if not isinstance(self.policy, NumpyMCPPolicy):
+            why = "trained with policy.monolithic_bob" if self.kind == PRIMITIVES else self._what
+            raise TandemError(f"{self.label} has no primitives: it is {why}")
+        return self.policy
+
+    @property
+    def skills(self) -> FrozenSkills:
+        """The skills, which act by a vector z; of a policy of a task, those that it acts with.
+
+        Raises:
+            TandemError: it has none.
+        """
+        if self.trained is not None:
+            return self.trained.skills
+        if not isinstance(self.policy, ZeroShotPolicy):
+            raise TandemError(f"{self.label} has no skills: it is {self._what}")
+        return self.policy.skills
+
+    @property
+    def digest(self) -> str:
+        """SHA-256 of the parameters; of primitives and skills as ``parameters_digest`` has it."""
+        policy = self.skills if self.kind == SKILLS else self.policy
+        if isinstance(policy, NumpyPolicy | FrozenSkills):
+            return parameters_digest(policy)
+        return digest_of(self.trained.digest if self.trained is not None else "", self.parameters)
+
+    def begin(self) -> None:
+        """Forget the last step: new episodes begin."""
+        begin = getattr(self.policy, "begin", None)
+        if begin is not None:
+            begin()
+
+    def act_deterministic(self, observation: FloatArray) -> FloatArray:
+        """(N, O) positions and goal, such as (N, 14), to actions (N, 4).
+
+        Raises:
+            PolicyError: another shape, or another N than in the step before.
+        """
+        return self.policy.act_deterministic(observation)
+
+    def player(self) -> DeterministicPolicy:
+        """The policy, at the start of new episodes."""
+        self.begin()
+        return self.policy
+
+    def on(self, task: str | None) -> Trained:
+        """The same on a task, without Alice; None: as it is."""
+        return self if task is None else replace(self, task=task, alice=None)
+
+    def expect(self, *kinds: Kind, by: str) -> Trained:
+        """Itself, if it is of one of these kinds.
+
+        Args:
+            kinds: that mean something there.
+            by: what needs them, such as ``tandem coverage``.
+
+        Raises:
+            TandemError: it is of another kind.
+        """
+        if self.kind in kinds:
+            return self
+        words = {PRIMITIVES: "primitives", SKILLS: "skills", ORCHESTRATOR: "a policy of a task"}
+        wanted = " or ".join(words[kind] for kind in kinds)
+        hint = f": name {self.trained.name}, which it acts with" if self.trained and self.trained.kind in kinds else ""
+        raise TandemError(f"{self.label} is {self._what}; {by} needs {wanted}{hint}")
+
+    def expect_goals(self, by: str) -> Trained:
+        """Itself, if it can be sent to goals.
+
+        Raises:
+            TandemError: it cannot; see ``expect``.
+        """
+        if self.kind == SKILLS and self.skills.method == "dads":
+            raise TandemError(f"{self.label} is {self._what}, which no goal leads; {by} needs a policy with goals")
+        return self
+
+    @property
+    def _what(self) -> str:
+        if self.kind == SKILLS:
+            return f"a set of skills of {self.skills.method}"
+        return "a set of primitives" if self.kind == PRIMITIVES else f"a policy of the task {self.task}"
+
+
+def load(reference: str, registry: Path | str = "registry", primitives: str | None = None) -> Trained:
+    """Load what was trained; see ``service.load``."""
+    path = Path(reference)
+    is_place = path.is_dir() or "/" in reference or (path.suffix == ".safetensors" and path.is_file())
+    if is_exported(path) or not is_place:
+        found = _load_version(reference, registry, primitives)
+    elif (path / _TRIAL_FILE).exists():
+        raise TandemError(f"{reference} is a downstream training of tandem 0.2: use tandem 0.2, or train it again")
+    elif (path / _DESCRIPTION).exists():
+        raise TandemError(
+            f"{reference} is a folder of tandem export, made for use without tandem: name what it was made of, as its "
+            "README.md says"
+        )
+    elif path.is_dir():
+        found = _load_run(reference, RunDirectory(path), None, (registry, primitives))
+    elif path.is_file():
+        found = _load_run(reference, RunDirectory(path.absolute().parent.parent), path, (registry, primitives))
+    else:
+        raise TandemError(
+            f"{reference}: no such directory of a run, training or exported version; for published versions write "
+            "NAME@ALIAS"
+        )
+    if primitives is not None and found.trained is None:
+        raise TandemError(f"{found.label} acts with no others: leave out primitives {primitives}")
+    return found
+
+
+def read_stages(directory: RunDirectory) -> dict[int, Parameters]:
+    """Parameters of Bob, or of skills, in a run's snapshots and its newest checkpoint, by env steps, in their order.
+
+    Raises:
+        TandemError: a snapshot is damaged, or there is no usable checkpoint.
+    """
+    part = directory.read_config().part
+    store = CheckpointStore(directory.snapshots, keep=1)
+    saved = [read_checkpoint(store.path(step)) for step in store.steps()]
+    saved.append(CheckpointStore(directory.checkpoints, keep=1).load_latest())
+    stages = {int(each.meta["env_steps"]): split_parts(each.arrays)[part] for each in saved}
+    return dict(sorted(stages.items()))  # a killed run may have a snapshot that is newer than its checkpoint
+
+
+def _load_version(reference: str, registry: Path | str, primitives: str | None) -> Trained:
+    place, version = find_version(reference, registry)
+    manifest, parameters = place.load(str(version))
+    # two registries may both have a version 1: which one was meant must be seen
+    label = f"{version} (bundled)" if is_bundled(place) else str(version)
+    path = Path(reference) if is_exported(Path(reference)) else None
+    kind = manifest.spaces.get("kind", PRIMITIVES)
+    if kind == ORCHESTRATOR:
+        spaces: dict[str, Any] = dict(manifest.spaces)
+        try:
+            wanted = {"name": spaces["primitives"], "digest": spaces["primitives_digest"]}
+            task, method, hold_steps = spaces["task"], spaces["method"], int(spaces["hold_steps"])
+        except (KeyError, TypeError, ValueError) as error:
+            raise TandemError(f"{label}: its manifest lacks {error}; publish it again") from None
+        trained = _find_frozen(label, wanted, registry, primitives)
+        config, policy = trained.config, _learned(parameters, trained, trained.config, hold_steps)
+        return Trained(
+            label, ORCHESTRATOR, config, policy, parameters, manifest, path, task=task, method=method, trained=trained
+        )
+    config = acting_config(manifest.config, where=f"the manifest of {reference}")
+    try:
+        if isinstance(config, SkillDiscoveryConfig):
+            player = ZeroShotPolicy(FrozenSkills(parameters, config.skills.method))
+            return Trained(label, SKILLS, config, player, parameters, manifest, path)
+        if kind == PRIMITIVES:
+            bob, networks = NumpyMCPPolicy(parameters), {"bob/policy": parameters}
+            return Trained(label, PRIMITIVES, config, bob, parameters, manifest, path, networks)
+    except PolicyError as error:
+        raise TandemError(f"{label} holds no {kind}: {error}") from None
+    raise TandemError(f"{label} is of the kind {kind!r}, which this tandem cannot load; load it with a newer one")
+
+
+def _load_run(label: str, directory: RunDirectory, file: Path | None, place: tuple[Path | str, str | None]) -> Trained:
+    """What a run has learned: in a checkpoint or snapshot of it, or in the newest checkpoint."""
+    if file is not None and not directory.exists:
+        raise ConfigError(f"{label} is a file, and no checkpoint of a run: name a run, or a version as NAME@ALIAS")
+    config = directory.read_config()
+    saved: Checkpoint = (
+        CheckpointStore(directory.checkpoints, keep=1).load_latest() if file is None else read_checkpoint(file)
+    )
+    parts, path = split_parts(saved.arrays), file or directory.path
+    if config.makes is None or config.part not in parts:
+        raise TandemError(f"{label} is a run of the method {config.method}, which makes nothing that can be loaded")
+    parameters = parts[config.part]
+    if isinstance(config, SkillDiscoveryConfig):
+        skills = ZeroShotPolicy(FrozenSkills(parameters, config.skills.method))
+        return Trained(label, SKILLS, config, skills, parameters, path=path)
+    if isinstance(config, TaskConfig):
+        trained = None
+        if config.primitives_digest is not None:
+            wanted = {"name": config.primitives, "digest": config.primitives_digest}
+            trained = _find_frozen(label, wanted, *place)
+        policy = _learned(parameters, trained, config, config.hold_steps)
+        about: dict[str, Any] = {"task": config.task, "method": config.method, "trained": trained}
+        return Trained(label, ORCHESTRATOR, config, policy, parameters, path=path, **about)
+    networks: dict[str, Parameters] = {"bob/policy": parameters}
+    alice = None
+    if "learner" in parts and "alice" in parts:
+        learner = {player: split_parts(own) for player, own in split_parts(parts["learner"]).items()}
+        networks = {
+            f"{player}/{part}": learner[player][part] for player in ("bob", "alice") for part in ("policy", "value")
+        }
+        alice = NumpyGaussianPolicy(parts["alice"])
+    return Trained(
+        label, PRIMITIVES, config, numpy_bob(parameters), parameters, path=path, networks=networks, alice=alice
+    )
+
+
+def _learned(parameters: Parameters, trained: Trained | None, config: Config, hold_steps: int) -> LearnedPolicy:
+    frozen = None if trained is None else trained.skills if trained.kind == SKILLS else trained.primitives
+    return LearnedPolicy(parameters, frozen, layouts(config.world), hold_steps)
+
+
+def _find_frozen(label: str, wanted: dict[str, Any], registry: Path | str, named: str | None) -> Trained:
+    """The primitives or skills of that digest: where they are said to be, in the registry, or what is bundled."""
+    try:
+        name, digest = str(wanted["name"]), str(wanted["digest"])
+    except (KeyError, TypeError):
+        raise TandemError(f"{label} does not say by name and digest what it acts with; train it again") from None
+    places: list[tuple[str, Path | str]] = [(named, registry)] if named else [(name, registry), (name, BUNDLED)]
+    problems = []
+    for reference, place in places:
+        try:
+            trained = load(reference, place).expect(PRIMITIVES, SKILLS, by=label)
+        except TandemError as error:
+            problems.append(str(error))
+            continue
+        if trained.digest == digest:
+            return trained
+        problems.append(f"{trained.label} has other parameters, digest {trained.digest[:_SHOWN]}")
+    raise TandemError(
+        f"{label} acts with {name} of digest {digest[:_SHOWN]}, which is not here: {problems[0]}; "
+        "name it with --primitives, or the registry that has it with --registry"
+    )

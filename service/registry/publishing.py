@@ -1,0 +1,191 @@
+"""Publishing a trained Bob, or skills: measured, published once, with the version training began from as parent."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from service.actors.coverage import NUM_SKILLS, visited_share
+from service.actors.evaluation import EVALUATED_GOALS, REPORTED_SEED, success_metrics
+from service.actors.skill_coverage import skill_paths
+from service.base import tensors
+from service.base.errors import StorageError, TandemError
+from service.config import Config
+from service.config.skills import SkillDiscoveryConfig, SkillsConfig
+from service.config.task import TaskConfig
+from service.envs.observations import POSITIONS, SPACES, layouts
+from service.policies.frozen_skills import FrozenSkills
+from service.policies.numpy_policy import numpy_bob
+from service.policies.parameters import Parameters
+from service.registry.blobs import sha256_of
+from service.registry.bundled import BUNDLED, find_version
+from service.registry.learned import num_inputs
+from service.registry.loading import ORCHESTRATOR, PRIMITIVES, SKILLS
+from service.registry.names import Version, is_service
+from service.registry.registry import Registry
+from service.store.run_directory import Published, RunDirectory
+
+
+def measure_bob(config: Config, parameters: Parameters) -> dict[str, float]:
+    """Bob's success rates without noise on every kind of goals, by metric; the goals are not those of the run.
+
+    Where his worlds are drawn from ranges, also in the nominal one.
+    """
+    nominal = config.model_copy(update={"world": config.world.nominal})
+    metrics: dict[str, float] = {}
+    for world, prefix in ((config, ""), (nominal, "nominal_")):
+        if prefix and world == config:
+            break
+        found = success_metrics(
+            numpy_bob(parameters),
+            world,
+            EVALUATED_GOALS,
+            config.run.final_episodes,
+            seed=REPORTED_SEED,
+            num_threads=config.run.num_threads,
+        )
+        metrics |= {name.replace("/", f"/{prefix}"): value for name, value in found.items()}
+    return metrics
+
+
+def measure_skills(config: SkillDiscoveryConfig, parameters: Parameters) -> dict[str, float]:
+    """Share of the workspace's table that random skills move the object over, without noise."""
+    paths = skill_paths(
+        FrozenSkills(parameters, config.skills.method),
+        config.world,
+        num_skills=NUM_SKILLS,
+        num_steps=config.skills.episode_steps,
+        seed=REPORTED_SEED,
+        num_threads=config.run.num_threads,
+    )
+    return {"coverage": visited_share(paths, config.world.workspace)}
+
+
+def publish_run(
+    directory: RunDirectory, registry: Registry, config: Config, parameters: Parameters, metrics: dict[str, float]
+) -> Version:
+    """Publish what a run has learned, and note it in the run directory: of what it publishes next, this is the parent.
+
+    Returns:
+        The new version, or the newest one of that name where it has the same parameters already.
+
+    Raises:
+        StorageError: see ``Registry.publish``; or the run directory cannot be written.
+    """
+    version = newest_if_same(registry, config.name, parameters)
+    if version is None:
+        parent = _published_before(directory, registry)
+        known = directory.history
+        history = known.model_dump(mode="json") if known is not None and known.events else None
+        version = publish(registry, config, parameters, metrics, parent=parent, history=history)
+    directory.write_published(Published(str(version), registry.manifest(str(version)).blob_sha256))
+    return version
+
+
+def publish(
+    registry: Registry,
+    config: Config,
+    parameters: Parameters,
+    metrics: dict[str, float],
+    *,
+    parent: str | Version | None = None,
+    history: Mapping[str, Any] | None = None,
+) -> Version:
+    """Publish what a run has learned, with everything a user needs; the spaces in the manifest say what it is.
+
+    Raises:
+        StorageError: see ``Registry.publish``.
+    """
+    return registry.publish(
+        config.name,
+        parameters,
+        **_described(config),
+        config=config.model_dump(mode="json"),
+        metrics=metrics,
+        parent=parent,
+        history=history,
+    )
+
+
+def check_publishable(config: Config, registry: Path | str) -> None:
+    """Check that what a run makes can be published in a registry.
+
+    Raises:
+        TandemError: a registry that is only read; or a name that is that of something else; or, of a policy of a task,
+            primitives that are not published.
+    """
+    if is_service(registry):
+        raise TandemError(f"{registry} is read only: publish in a directory (--registry DIR), and serve that")
+    target = Registry(Path(registry))
+    target.check_writable()
+    for place in (target, Registry(BUNDLED)):  # of either, NAME@latest would come to mean something else
+        for version in place.versions(config.name)[-1:]:
+            with contextlib.suppress(StorageError):  # a damaged version is mended by publishing again
+                kind = place.manifest(str(version)).spaces.get("kind", PRIMITIVES)
+                if config.makes not in (None, kind):
+                    what = f"an {kind}" if kind == ORCHESTRATOR else kind
+                    raise TandemError(f"{config.name} is the name of {what} already: choose another name")
+    if not isinstance(config, TaskConfig):
+        return
+    if config.primitives_digest is None:
+        raise TandemError(f"the method {config.method} acts with no primitives: there is nothing to publish")
+    if Path(config.primitives).is_absolute():
+        raise TandemError(
+            f"an orchestrator for {config.primitives}, which is no published version, cannot be published: publish "
+            "that first, and name it by --primitives NAME@VERSION"
+        )
+
+
+def _described(config: Config) -> dict[str, Any]:
+    """Spaces and normalisation in the manifest of what a run makes."""
+    seen = layouts(config.world)
+    if isinstance(config, TaskConfig):
+        spaces = {
+            **seen.spaces,
+            "kind": ORCHESTRATOR,
+            "task": config.task,
+            "task_version": config.task_version,
+            "method": config.method,
+            "hold_steps": config.hold_steps,
+            "primitives": config.primitives,
+            "primitives_digest": config.primitives_digest,
+        }
+        return {
+            "spaces": spaces,
+            "normalisation": {"made_by": num_inputs.__module__, "num_inputs": num_inputs(seen)[1]},
+        }
+    if isinstance(config, SkillDiscoveryConfig):
+        normalisation, spaces = POSITIONS.normalisation, skill_spaces(config.skills)
+    else:
+        normalisation, spaces = seen.bob.normalisation, seen.spaces
+    constants = {"offset": normalisation.offset.tolist(), "scale": normalisation.scale.tolist()}
+    return {"spaces": spaces, "normalisation": constants}
+
+
+def skill_spaces(skills: SkillsConfig) -> dict[str, object]:
+    """Sizes and layout in the manifest of frozen skills."""
+    shared = {name: size for name, size in SPACES.items() if name != "observation"}
+    return {**shared, "kind": SKILLS, "skill": skills.size}
+
+
+def newest_if_same(registry: Registry, name: str, parameters: Parameters) -> Version | None:
+    """The newest version, if it has these parameters: what is published again must not become another version."""
+    for version in registry.versions(name)[-1:]:
+        with contextlib.suppress(StorageError):  # a damaged version is mended by publishing again
+            manifest, _ = registry.load(str(version))
+            if manifest.blob_sha256 == sha256_of(tensors.encode(parameters)):
+                return version
+    return None
+
+
+def _published_before(directory: RunDirectory, registry: Registry) -> Version | None:
+    """The version this run published last, or began from, if readers of this registry find that one by its name."""
+    last = directory.read_published()
+    with contextlib.suppress(StorageError):
+        if last is not None:
+            found, version = find_version(last.version, registry.root)
+            if found.manifest(str(version)).blob_sha256 == last.blob_sha256:
+                return version
+    return None

@@ -1,0 +1,257 @@
+"""What goes on in a live world: one world, stepped by Bob, by weights that somebody sets, or by Alice and then Bob.
+
+Nothing is drawn here, and nothing knows of a browser. All of a game is used by one thread.
+"""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import numpy as np
+
+from service.actors.self_play import StochasticPolicy
+from service.base.errors import TandemError
+from service.base.types import FloatArray, StateArray
+from service.config.self_play import GameConfig, SelfPlayConfig
+from service.envs.batch import WorldBatch
+from service.envs.observations import bob_observation
+from service.envs.obstacles import inside_fixtures
+from service.envs.sampling import draw_goals
+from service.envs.tasks import EPISODE_STEPS
+from service.generator.validity import FALLEN_BELOW_M, Verdict, classify_goal
+from service.policies.numpy_policy import NumpyMCPPolicy
+from service.registry.loading import Trained
+
+Mode = Literal["goals", "primitives", "alice"]
+"""Bob goes to the goal; primitives act by weights that are set; Alice proposes a goal, and Bob goes there."""
+_PAUSE_S = 0.6
+"""Stillness after Alice's turn and after a round, so that one sees what came out."""
+_WORDS = {
+    Verdict.NOT_MOVED: "no goal: the object hardly moved",
+    Verdict.OUTSIDE: "no goal: the object left the workspace",
+    Verdict.FALLEN: "no goal: the object fell off the table",
+}
+
+
+class Game:
+    """One world and its players.
+
+    Args:
+        players: Bob, and Alice where a run has her.
+        seed: of starts, random goals and Alice's noise.
+    """
+
+    def __init__(self, players: Trained, seed: int = 0) -> None:
+        config, on_task = players.config, players.task is not None
+        rules = config.game if isinstance(config, SelfPlayConfig) else GameConfig()
+        self.players, self.title, self.world = players, players.title, players.world
+        self.bob = players.policy
+        acting = players.trained or players
+        self.primitives = acting.policy if isinstance(acting.policy, NumpyMCPPolicy) else None
+        """What sliders drive."""
+        self.alice: StochasticPolicy | None = players.alice if rules.alice_plays else None
+        self.alice_steps = rules.alice_steps
+        self.num_goals = rules.num_goals
+        """Rounds of a game."""
+        self.bob_steps = EPISODE_STEPS if on_task else rules.bob_steps
+        """Of a goal, after which another one comes."""
+        self.hold_steps = EPISODE_STEPS // 4 if on_task else max(rules.bob_hold_steps, 1)
+        """At the goal, after which it counts as solved."""
+        self._rng = np.random.default_rng(seed)
+        self.worlds = WorldBatch(self.world, 1, num_threads=1)
+        self.step_s = self.world.physics_step_s * self.world.num_substeps
+        self.mode: Mode = "goals"
+        self.new_goals = True
+        """Whether another goal comes when Bob is there, or his time is over."""
+        num = self.primitives.num_primitives if self.primitives is not None else 0
+        self.weights: FloatArray = np.ones(num, dtype=np.float32)
+        """(K,) of the primitives, where they are set."""
+        self.caption = ""
+        """What goes on, in a few words."""
+        self.goal: StateArray = np.zeros(3)
+        """(3,) metres."""
+        self.num_steps = 0
+        """Since the game was made."""
+        self._turn: Literal["alice", "bob"] = "bob"
+        self._steps = self._held = self._still_steps = self._round = 0
+        self._start = self._end_state = self.worlds.states.copy()
+        self._after: Literal["reset", "round", "bob"] = "reset"
+        self.reset()
+
+    def close(self) -> None:
+        """Stop the world's threads."""
+        self.worlds.close()
+
+    # --- what is seen ------------------------------------------------------------------------------------------------
+
+    @property
+    def state(self) -> StateArray:
+        """(S,) state of the world."""
+        state: StateArray = self.worlds.states[0]
+        return state
+
+    @property
+    def modes(self) -> tuple[Mode, ...]:
+        """What these players can do."""
+        modes: list[Mode] = ["goals"]
+        modes += ["primitives"] if self.primitives is not None else []
+        return (*modes, "alice") if self.alice is not None else tuple(modes)
+
+    @property
+    def shows_goal(self) -> bool:
+        """Whether there is a goal now."""
+        return self.mode == "goals" or (self.mode == "alice" and self._turn == "bob")
+
+    @property
+    def distance_m(self) -> float:
+        """From the object to the goal, metres."""
+        return float(np.linalg.norm(self.worlds.object_position[0] - self.goal))
+
+    def weights_now(self) -> FloatArray | None:
+        """(K,) weights that act now: those that are set, or the gate's; None where neither is known."""
+        if self.mode == "primitives":
+            return self.weights
+        bob = self.bob
+        if self._turn == "bob" and isinstance(bob, NumpyMCPPolicy):
+            gate: FloatArray = bob.gate(bob_observation(self.worlds.positions(), self.goal[None]))[0]
+            return gate
+        return None
+
+    # --- what people do ----------------------------------------------------------------------------------------------
+
+    def reset(self) -> None:
+        """Begin anew: the arm at home, the object and the goal elsewhere."""
+        self.worlds.reset(self._rng)
+        self._begin_turn("alice" if self.mode == "alice" else "bob")
+        self._round = 0
+        self._draw_goal()
+
+    def set_mode(self, mode: Mode) -> None:
+        """Let somebody else act.
+
+        Raises:
+            TandemError: nobody here does that.
+        """
+        if mode not in self.modes:
+            raise TandemError(f"mode {mode!r}: {self.title} can do {', '.join(self.modes)}")
+        if mode == "primitives" and (weights := self.weights_now()) is not None:
+            self.weights = weights.copy()  # as the gate had them last: what follows is seen to come from the person
+        changed, self.mode = mode != self.mode, mode
+        if changed and mode == "alice":
+            self.reset()
+        elif changed:
+            self._begin_turn("bob")
+
+    def set_goal(self, goal: StateArray) -> None:
+        """Put the goal at (3,) metres, or the nearest place in the workspace; Bob goes there and stays.
+
+        Where the object would be inside a fixture there is no goal: it stays where it was.
+        """
+        workspace = self.world.workspace
+        low = (*workspace.lower_m[:2], self.world.rest_height_m)
+        place = np.clip(np.asarray(goal, dtype=np.float64), low, workspace.upper_m)
+        if inside_fixtures(place[None], self.world)[0]:
+            return
+        self.goal = place
+        self.new_goals = False
+        if self.mode == "goals":
+            self._begin_turn("bob", forget=False)
+
+    # --- what happens ------------------------------------------------------------------------------------------------
+
+    def step(self) -> None:
+        """Let 40 ms go by in the world, or as long as its control step is."""
+        self.num_steps += 1
+        if self._still_steps:
+            self._still_steps -= 1
+            if not self._still_steps:
+                self._go_on()
+            return
+        diverged = bool(self.worlds.step(self._action())[0])
+        self._steps += 1
+        if diverged or self.worlds.object_position[0, 2] < FALLEN_BELOW_M:
+            self._pause("the object fell off the table" if not diverged else "the physics diverged", "reset")
+        elif self._turn == "alice":
+            self.caption = f"Alice proposes: {self._seconds()}"
+            if self._steps >= self.alice_steps:
+                self._judge()
+        elif self.mode == "primitives":
+            self.caption = "Primitives by your weights"
+        else:
+            self._follow_bob()
+
+    def _action(self) -> FloatArray:
+        worlds = self.worlds
+        if self._turn == "alice":
+            assert self.alice is not None
+            return self.alice.act(worlds.full(self._steps / max(self.alice_steps, 1)), self._rng)[0]
+        if self.mode == "primitives":
+            assert self.primitives is not None
+            return self.primitives.compose(worlds.positions(), self.weights[None])[0]
+        return self.bob.act_deterministic(bob_observation(worlds.positions(), self.goal[None]))
+
+    def _follow_bob(self) -> None:
+        there = self.distance_m <= self.players.success_distance_m
+        self._held = self._held + 1 if there else 0
+        self.caption = (
+            f"At the goal, {100 * self.distance_m:.1f} cm away" if there else f"On the way: {self._seconds()}"
+        )
+        solved, late = self._held >= self.hold_steps, self._steps >= self.bob_steps
+        if self.mode == "alice":
+            if solved or late:
+                self._pause(f"Bob: solved after {self._seconds()}" if solved else "Bob: not solved", "round")
+        elif self.new_goals and late and not there:
+            self._pause(f"Not there in {self._seconds()}", "reset")
+        elif self.new_goals and solved and self._steps >= 1 / self.step_s:  # a goal beside the object is seen, too
+            if self.world.fixture == "none":
+                self._begin_turn("bob", forget=False)
+                self._draw_goal()
+            else:
+                self._pause(f"There after {self._seconds()}", "reset")
+
+    def _judge(self) -> None:
+        """Take where Alice left the object for a goal, or say why it is none."""
+        self._end_state, self.goal = self.worlds.states.copy(), self.worlds.object_position[0].copy()
+        before, workspace = self._start[:, self.worlds.layout["object"]], self.world.workspace
+        verdict = Verdict(classify_goal(before, self.goal[None], workspace, self.players.success_distance_m)[0])
+        if verdict == Verdict.VALID:
+            self._pause("Alice proposed this goal", "bob")
+        else:
+            self._pause(f"Alice: {_WORDS[verdict]}", "reset")
+
+    def _pause(self, caption: str, after: Literal["reset", "round", "bob"]) -> None:
+        self.caption, self._after, self._still_steps = caption, after, max(round(_PAUSE_S / self.step_s), 1)
+
+    def _go_on(self) -> None:
+        """Do what comes after stillness."""
+        if self._after == "bob":
+            self.worlds.restore(self._start)
+            self._begin_turn("bob")
+        elif self._after == "round" and self._round + 1 < self.num_goals:
+            self._round += 1
+            self.worlds.restore(self._end_state)  # as games do: the next round starts where Alice ended
+            self._begin_turn("alice")
+        else:
+            self.reset()
+
+    def _begin_turn(self, turn: Literal["alice", "bob"], *, forget: bool = True) -> None:
+        """Begin a turn; ``forget`` where the world has jumped, or another policy acted."""
+        self._turn, self._steps, self._held, self._still_steps = turn, 0, 0, 0
+        self._start = self.worlds.states.copy()
+        self.caption = "Alice proposes" if turn == "alice" else "On the way"
+        if forget:
+            self.players.begin()
+
+    def _draw_goal(self) -> None:
+        worlds = self.worlds
+        self.goal = draw_goals(
+            self.players.goals,
+            self._rng,
+            self.world,
+            self.players.success_distance_m,
+            start=worlds.object_position,
+            box=worlds.box_place,
+        )[0]
+
+    def _seconds(self) -> str:
+        return f"{self._steps * self.step_s:.1f} s"

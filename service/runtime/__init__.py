@@ -1,1 +1,0 @@
-"""Runs: the two runners, and the signals, bookkeeping and reporting around them."""

@@ -1,0 +1,432 @@
+"""A run directory: everything a run leaves behind, and nothing else.
+
+| file | content |
+|---|---|
+| ``config.yaml`` | the resolved configuration |
+| ``environment.json`` | git commit, package versions and cores of the last start |
+| ``run.json`` | the run's identity, and of each start what had changed and which records were damaged |
+| ``epochs/`` | a file for each process that ever ran it; the highest number is who runs it now |
+| ``metrics.jsonl`` | an object per iteration, keyed by metric; only ``time/...`` differs between equal runs |
+| ``goals.jsonl`` | per iteration a sample of valid proposals: start x y z, goal x y z (metres), solved 0/1 |
+| ``tensorboard/`` | the same metrics as TensorBoard events over env steps |
+| ``checkpoints/`` | the newest checkpoints; ``--resume`` continues from them exactly |
+| ``snapshots/`` | Bob's parameters untrained and after each tenth of the run, kept for good |
+| ``result.json`` | what was measured when learning was over |
+| ``published.json`` | the version this run published last, and the sha256 of its parameters |
+| ``recordings/`` | earlier videos, with the time at which a newer one took their place |
+| ``log.jsonl`` | what happened: who died, who came back, how it ended; see ``service.store.run_log`` |
+| ``broken/`` | states of worlds whose physics diverged |
+| ``status.json``, ``goals.json``, ``stop`` | the run's state while it goes on; see ``service.store.disk`` |
+| ``tandem-error-*.txt`` | traceback of an error that nobody expected |
+| ``.lock`` | held by the process that runs it |
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import logging
+import os
+import platform
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from importlib.metadata import version
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+from pydantic import BaseModel, JsonValue
+
+from service.base.epoch import claim_epoch, give_back_epoch, newest_epoch
+from service.base.errors import CheckpointError, ConfigError, RunTakenError, StorageError, TandemError
+from service.base.files import Appender, os_errors, remove_temporaries, write_atomic
+from service.base.git import git_commit
+from service.base.jsonl import Extent, JsonlWriter
+from service.base.lock import LOCK_FILE, DirectoryLock
+from service.base.parsing import ParseError, parse_json
+from service.base.regular_files import read_regular
+from service.base.types import FloatArray, StateArray
+from service.config import Config, dump_config, load_config
+from service.store.checkpoints import CheckpointStore
+from service.store.run_history import FIRST_VERSION, RunHistory, is_of_this_version, read_history, written_by
+
+if TYPE_CHECKING:
+    from service.base.tensorboard import EventFile
+
+_logger = logging.getLogger(__name__)
+MAX_DIVERGED_FILES = 100
+MAX_NOTE_BYTES = 10_000
+MAX_RESULT_BYTES = 1_000_000
+RECORDINGS = "recordings"
+RESULT_FILE = "result.json"
+"""What was measured at the end of a run."""
+MAX_RECORDINGS = 20
+
+
+class _Result(BaseModel):
+    """What ``result.json`` has to have."""
+
+    evaluation: dict[str, float]
+    env_steps: int
+    wall_s: float
+
+
+class Published(NamedTuple):
+    """A version that a run published."""
+
+    version: str
+    """``NAME@VERSION``."""
+    blob_sha256: str
+    """Digest of its parameters: another registry may have another version of that number."""
+
+
+@dataclass(frozen=True, slots=True)
+class Resumption:
+    """The checkpoint that a run goes on from, as far as its directory has to know."""
+
+    iteration: int
+    num_env_steps: int
+    run: str
+    """Identity of the run that saved it."""
+    records: dict[str, Extent]
+    """What the files of records held then."""
+    changed: dict[str, tuple[JsonValue, JsonValue]]
+    """Settings that are not as they were then: what they were, and what they are."""
+
+
+class RunDirectory:
+    """Reads and writes the files of one run.
+
+    A process that runs it calls ``claim``, then ``start``, and ``close`` at the end. Nothing is written before.
+
+    Args:
+        path: of the directory.
+        accept_damaged_records: go on with a run whose records are not as they were written, without those.
+    """
+
+    def __init__(self, path: Path, *, accept_damaged_records: bool = False) -> None:
+        self.path = path
+        self._accept_damaged_records = accept_damaged_records
+        self.config_file = path / "config.yaml"
+        self.metrics_file = path / "metrics.jsonl"
+        self.goals_file = path / "goals.jsonl"
+        self.checkpoints = path / "checkpoints"
+        self.snapshots = path / "snapshots"
+        self.published_file = path / "published.json"
+        self.diverged = path / "broken"
+        self._metrics = JsonlWriter(self.metrics_file)
+        self._goals = JsonlWriter(self.goals_file)
+        self._events: EventFile | None = None
+        self._failing: dict[Path, str] = {}
+        self._lock: DirectoryLock | None = None
+        self.history: RunHistory | None = None
+        """Identity of the run, and what was not as before when a process went on with it; None before ``claim``."""
+        self.epoch = 0
+        """Number of this process among those that ever ran the run; 0 before ``claim``."""
+
+    @property
+    def exists(self) -> bool:
+        """Whether a run has begun here."""
+        return self.config_file.exists()
+
+    def read_config(self, overrides: list[str] | tuple[str, ...] = ()) -> Config:
+        """Read the run's resolved configuration, with ``overrides`` as in ``load_config``.
+
+        Raises:
+            ConfigError: no run here, one of another version, or its configuration cannot be read.
+            StorageError: see ``version``.
+        """
+        if not self.exists:
+            raise ConfigError(f"no run in {self.path}: {self.config_file.name} is missing; name the directory of a run")
+        if not is_of_this_version(self.version):
+            raise ConfigError(written_by(self.path, self.version))
+        return load_config(self.config_file, overrides)
+
+    @property
+    def version(self) -> str:
+        """The version of tandem that began the run which is here.
+
+        Raises:
+            StorageError: the file that says so cannot be read, or is damaged.
+        """
+        history = read_history(self.path)
+        return history.tandem if history is not None else FIRST_VERSION
+
+    def start(self, config: Config, resumption: Resumption | None = None) -> None:
+        """Begin a run here, or continue one: then records of later iterations, which will be made again, are dropped.
+
+        Args:
+            config: the run.
+            resumption: where it goes on; None for a run that begins.
+
+        Raises:
+            TandemError: a new run where there is one already, or a directory that cannot be written.
+        """
+        from service.base.tensorboard import EventFile  # TensorBoard's packages, which only a run needs
+
+        if resumption is None:
+            self.check_free()
+        with os_errors("write", self.path):
+            self.checkpoints.mkdir(parents=True, exist_ok=True)
+            remove_temporaries(self.path)
+        damaged = self._damaged(resumption) if resumption is not None else {}
+        for writer in (self._metrics, self._goals):
+            if resumption is None:
+                writer.cut(0)
+            elif writer.path.name in damaged:
+                writer.cut_after(resumption.iteration, accept_damage=True)
+            else:
+                writer.cut(resumption.records[writer.path.name].num_bytes)
+        with os_errors("write", self.path):
+            after_step = resumption.num_env_steps if resumption is not None else None
+            self._events = EventFile(self.path / "tensorboard", after_step=after_step)
+            self.history = self.history or RunHistory.new()
+            if resumption is not None:
+                said = [f"{name} {what}" for name, what in damaged.items()]
+                at = datetime.now(UTC)
+                self.history = self.history.with_event(at, resumption.iteration, resumption.changed, said)
+            self.history.write(self.path)
+            write_atomic(self.path / "environment.json", json.dumps(_environment(), indent=1).encode())
+            write_atomic(self.config_file, dump_config(config).encode())  # last: a start that failed can be tried again
+
+    def read_published(self) -> Published | None:
+        """What this run published last; None before the first.
+
+        Raises:
+            StorageError: the file that says so cannot be read, or is damaged.
+        """
+        path = self.published_file
+        with os_errors("read", path):
+            try:
+                data = read_regular(path, MAX_NOTE_BYTES, follow=True)
+            except FileNotFoundError:
+                return None
+        try:
+            note = parse_json(data, path)
+            version, digest = note["version"], note["blob_sha256"]
+        except (ParseError, KeyError, TypeError):
+            version = digest = None
+        if not (isinstance(version, str) and isinstance(digest, str)):
+            raise StorageError(
+                f"{path} names no version and digest; remove it: what the run publishes next then has no parent"
+            )
+        return Published(version, digest)
+
+    def read_result(self) -> dict[str, Any] | None:
+        """What was measured at the end; None before it.
+
+        Raises:
+            StorageError: the file that says so cannot be read, or is damaged.
+        """
+        path = self.path / RESULT_FILE
+        with os_errors("read", path):
+            try:
+                data = read_regular(path, MAX_RESULT_BYTES, follow=True)
+            except FileNotFoundError:
+                return None
+        try:
+            result: dict[str, Any] = dict(parse_json(data, path))
+            _Result.model_validate(result)
+        except (ParseError, ValueError, TypeError):
+            raise StorageError(f"{path} is no result; remove it, and --resume makes it again") from None
+        return result
+
+    def write_result(self, result: Mapping[str, JsonValue]) -> None:
+        """Keep what was measured at the end, in ``result.json``.
+
+        Raises:
+            StorageError: it cannot be written.
+        """
+        path = self.path / RESULT_FILE
+        with os_errors("write", path):
+            write_atomic(path, encode_result(result))
+
+    def write_published(self, published: Published) -> None:
+        """Note what this run published.
+
+        Raises:
+            StorageError: it cannot be written.
+        """
+        with os_errors("write", self.published_file):
+            write_atomic(self.published_file, json.dumps(published._asdict()).encode())
+
+    def claim(self, *, resume: bool) -> None:
+        """Keep every other process from running this run until ``close``; a second call does nothing.
+
+        Raises:
+            TandemError: another process runs it; or a new run where there is one already.
+            CheckpointError: ``resume`` where there is no checkpoint. Then, as always, nothing was written.
+        """
+        if self._lock is not None:
+            return
+        if resume:
+            CheckpointStore(self.checkpoints, keep=1).check_any()
+        else:
+            self.check_free()
+        self._lock = DirectoryLock(self.path, "stop that one first, or name another --run-dir")
+        if not resume:
+            self.check_free()  # of two that begin at once, the second sees here what the first has made
+        self.history = read_history(self.path) if resume else RunHistory.new()
+        self.epoch = claim_epoch(self.path)
+
+    def check_owner(self) -> None:
+        """Assert that no other process has taken over the run since ``claim``.
+
+        Raises:
+            RunTakenError: one has; this one must write nothing more.
+        """
+        if newest_epoch(self.path) > self.epoch > 0:
+            raise RunTakenError(
+                f"{self.path} was taken over by another process; this one stops, and what it did since then is not kept"
+            )
+
+    def check_resumable(self, resumption: Resumption) -> bool:
+        """Check that a checkpoint is of this run, and that the records still are what they were when it was saved.
+
+        Returns:
+            Whether the records are; if not, that is accepted, and ``start`` keeps those that can be read.
+
+        Raises:
+            CheckpointError: it is of another run.
+            StorageError: records are damaged and that is not accepted, or they cannot be read.
+        """
+        if self.history is not None and self.history.run != resumption.run:
+            raise CheckpointError(
+                f"{self.path}: its newest checkpoint is of another run ({resumption.run[:8]}, not "
+                f"{self.history.run[:8]}); put that of this run back"
+            )
+        damaged = self._damaged(resumption)
+        said = "; ".join(f"{self.path / name} {what}" for name, what in damaged.items())
+        if damaged and not self._accept_damaged_records:
+            raise StorageError(
+                f"{said}: restore it from a copy, or go on with those records that can be read by "
+                "--accept-damaged-records"
+            )
+        if damaged:
+            _logger.warning("%s; going on with those records that can be read", said)
+        return not damaged
+
+    def _damaged(self, resumption: Resumption) -> dict[str, str]:
+        """What is wrong with files of records, by their names."""
+        found = {
+            each.path.name: each.damage(resumption.records[each.path.name]) for each in (self._metrics, self._goals)
+        }
+        return {name: damage for name, damage in found.items() if damage is not None}
+
+    def check_free(self) -> None:
+        """Assert that no run has begun here.
+
+        Raises:
+            TandemError: one has.
+        """
+        if self.exists:
+            raise TandemError(f"{self.path} holds a run already; continue it with --resume, or name another --run-dir")
+
+    def record(self, metrics: dict[str, float]) -> None:
+        """Append one iteration's metrics to metrics.jsonl and TensorBoard; where a disk is full they wait in memory."""
+        with self._keep_running(self.metrics_file):
+            self._metrics.append(metrics)
+        if self._events is not None:
+            with self._keep_running(self._events.path):
+                self._events.add(metrics)
+
+    def record_goals(self, iteration: int, num_env_steps: int, goals: StateArray) -> None:
+        """Append a sample of an iteration's valid proposals: (M, 7) start x y z, goal x y z (metres), solved 0/1."""
+        with self._keep_running(self.goals_file):
+            self._goals.append({"iteration": iteration, "env_steps": num_env_steps, "goals": np.round(goals, 4)})
+
+    def keep_recording(self, path: Path) -> None:
+        """Put a video aside that is about to be replaced; of more than twenty, the oldest go."""
+        with self._keep_running(path), os_errors("write", self.path / RECORDINGS), suppress(FileNotFoundError):
+            when = datetime.fromtimestamp(path.stat().st_mtime, UTC).strftime("%Y%m%dT%H%M%S")
+            (self.path / RECORDINGS).mkdir(exist_ok=True)
+            path.replace(self.path / RECORDINGS / f"{path.stem}-{when}{path.suffix}")
+            kept = sorted((self.path / RECORDINGS).glob(f"{path.stem}-*{path.suffix}"))
+            for old in kept[:-MAX_RECORDINGS]:
+                old.unlink(missing_ok=True)
+
+    def dump_diverged(self, name: str, diverged: Sequence[tuple[StateArray, FloatArray]]) -> None:
+        """Save the (state, action) pairs of a round whose physics diverged, under the round's name, for 100 rounds."""
+        if not diverged or (self.diverged.is_dir() and len(list(self.diverged.iterdir())) >= MAX_DIVERGED_FILES):
+            return
+        states, actions = zip(*diverged, strict=True)
+        path, data = self.diverged / f"round-{name}.npz", io.BytesIO()
+        np.savez(data, states=np.stack(states), actions=np.stack(actions))
+        _logger.warning("physics diverged in %d worlds, which go on from sound states; see %s", len(states), path)
+        with self._keep_running(self.diverged), os_errors("write", path):
+            write_atomic(path, data.getvalue())
+
+    def sync(self) -> dict[str, Extent]:
+        """Wait until the disk has every record, and say what there is: a checkpoint must not know more than they do."""
+        for writer in self._writers():
+            with self._keep_running(writer.path):
+                writer.sync()
+        return {writer.path.name: writer.extent for writer in (self._metrics, self._goals)}
+
+    def close(self) -> None:
+        """Write what still waits for room on the disk, and let other processes in.
+
+        What does not fit is lost, and a warning says so.
+        """
+        for writer in self._writers():
+            try:
+                writer.sync()
+            except StorageError as error:  # must not hide why the run ended
+                _logger.warning("the newest records are lost: %s", error)
+        if self._lock is not None:
+            if self._events is None:  # it did not start
+                give_back_epoch(self.path, self.epoch)
+            if not self.exists:  # nor did any other; the directory goes if nothing else is in it
+                with suppress(OSError):
+                    (self.path / LOCK_FILE).unlink()
+                    self.path.rmdir()
+            self._lock.release()
+            self._lock = None
+            self.epoch = 0
+        self._events = None
+
+    def _writers(self) -> list[Appender]:
+        return [self._metrics, self._goals, *([self._events] if self._events is not None else [])]
+
+    def problems(self) -> list[str]:
+        """Why records or checkpoints cannot be written at the moment; empty when all is well."""
+        kept = (*(writer.path for writer in self._writers()), self.checkpoints)
+        return [self._failing[path] for path in kept if path in self._failing]
+
+    @contextmanager
+    def noting(self, path: Path) -> Iterator[None]:
+        """Keep among the `problems` why ``path`` cannot be written, until it can be again."""
+        try:
+            yield
+        except StorageError as error:
+            self._failing[path] = str(error)
+            raise
+        self._failing.pop(path, None)
+
+    @contextmanager
+    def _keep_running(self, path: Path) -> Iterator[None]:
+        """Turn a full disk into one warning for ``path`` until a write succeeds again: the run does not end for it."""
+        known = path in self._failing
+        try:
+            with self.noting(path):
+                yield
+        except StorageError as error:
+            if not known:
+                _logger.warning("%s; the run goes on", error)
+
+
+def encode_result(result: Mapping[str, JsonValue]) -> bytes:
+    """A result as JSON, with what it was made by."""
+    made = {"git_commit": git_commit(), "num_cores": os.cpu_count()}
+    return (json.dumps({**result, "made": made}, indent=1) + "\n").encode()
+
+
+def _environment() -> dict[str, object]:
+    return {
+        "git_commit": git_commit(),
+        "python": platform.python_version(),
+        "packages": {name: version(name) for name in ("mujoco", "numpy", "torch")},
+        "num_cores": os.cpu_count(),
+    }

@@ -1,0 +1,89 @@
+"""The history of a run: its identity and version, and what was not as before when a process went on with it."""
+
+from __future__ import annotations
+
+import secrets
+from datetime import datetime
+from pathlib import Path
+
+from pydantic import AwareDatetime, Field, JsonValue
+
+from service.base.errors import StorageError
+from service.base.files import os_errors, write_atomic
+from service.base.parsing import ParseError, parse_with
+from service.base.regular_files import read_regular
+from service.base.version import __version__
+from service.config.frozen import FrozenModel
+
+FILE = "run.json"
+FIRST_VERSION, SECOND_VERSION = "0.1.0", "0.2.0"
+"""Versions that wrote no ``run.json``, and one that does not say which version wrote it."""
+MAX_BYTES = 16 * 1024 * 1024
+
+
+class Event(FrozenModel):
+    """What was not as before when a process went on."""
+
+    at: AwareDatetime
+    after_iteration: int = Field(ge=0)
+    changed: dict[str, tuple[JsonValue, JsonValue]] = Field({}, description="settings: what they were, what they are")
+    damaged_records: tuple[str, ...] = Field((), description="records that are lost, and were accepted as lost")
+
+
+class RunHistory(FrozenModel):
+    """Content of ``run.json``."""
+
+    run: str = Field(pattern=r"^[0-9a-f]{32}$", description="identity, drawn at random when the run began")
+    tandem: str = Field(SECOND_VERSION, description="version that began the run")
+    events: tuple[Event, ...] = ()
+
+    @classmethod
+    def new(cls) -> RunHistory:
+        """The history of a run that begins."""
+        return cls(run=secrets.token_hex(16), tandem=__version__)
+
+    def with_event(
+        self, at: datetime, after_iteration: int, changed: dict[str, tuple[JsonValue, JsonValue]], damaged: list[str]
+    ) -> RunHistory:
+        """The history after a process has gone on; the same where everything was as before."""
+        if not changed and not damaged:
+            return self
+        event = Event(at=at, after_iteration=after_iteration, changed=changed, damaged_records=tuple(damaged))
+        return self.model_copy(update={"events": (*self.events, event)})
+
+    def write(self, directory: Path) -> None:
+        """Put it into a run directory.
+
+        Raises:
+            OSError: it cannot be written.
+        """
+        write_atomic(directory / FILE, self.model_dump_json(indent=1).encode() + b"\n")
+
+
+def written_by(path: Path, version: str) -> str:
+    """Say of what another version has written which version reads it."""
+    reader = "0.2" if version.startswith("0.1.") else version
+    return f"{path} was written by tandem {version}, which this version does not read: use tandem {reader}"
+
+
+def is_of_this_version(version: str) -> bool:
+    """Whether this version goes on with the runs of another one: until 1.0, those of its own minor version."""
+    return version.split(".")[:2] == __version__.split(".")[:2]
+
+
+def read_history(directory: Path) -> RunHistory | None:
+    """Read a run's history; None where there is none, as of a run of version 0.1.0.
+
+    Raises:
+        StorageError: it cannot be read, or is damaged.
+    """
+    path = directory / FILE
+    with os_errors("read", path):
+        try:
+            data = read_regular(path, MAX_BYTES)
+        except FileNotFoundError:
+            return None
+    try:
+        return parse_with(RunHistory.model_validate_json, data, path)
+    except ParseError:
+        raise StorageError(f"{path} is damaged; restore it from a copy") from None

@@ -1,0 +1,233 @@
+"""``ray job submit``, for real: a head, a job that is stopped and submitted again, its status over REST, primitives."""
+
+import json
+import os
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import tempfile
+import time
+import urllib.request
+from http.client import HTTPException
+from pathlib import Path
+
+import pytest
+from ray.job_submission import JobSubmissionClient
+
+from service.registry.publishing import publish
+from service.registry.registry import Registry
+from service.runs.study_file import StudyDirectory
+from service.store.checkpoints import CheckpointStore
+from service.store.run_directory import RunDirectory
+from tests.runs.runs import ROOT, TINY_TASK, newest, play, read_lines, tiny_config, write_yaml
+
+RAY = Path(sys.executable).with_name("ray")
+PATIENCE_S = 480.0
+"""On a busy machine a dashboard answers late, or with an error: it is asked again for so long."""
+
+
+def free_ports(num):
+    """Ports nobody has, above those that Ray gives to its workers."""
+    probes, ports = [], []
+    while len(ports) < num:
+        probe = socket.socket()
+        probes.append(probe)
+        probe.bind(("127.0.0.1", 0))
+        if (port := probe.getsockname()[1]) > 20_000:
+            ports.append(port)
+    for probe in probes:
+        probe.close()
+    return ports
+
+
+def wait_for(what, because=lambda: ""):
+    """The first true answer of ``what``; an error of it is no answer. ``because`` says why there is none."""
+    deadline, error = time.monotonic() + PATIENCE_S, None
+    while time.monotonic() < deadline:
+        try:
+            if answer := what():
+                return answer
+        except (OSError, HTTPException, RuntimeError) as caught:  # what Ray's client raises when it gets no answer
+            error = caught
+        time.sleep(0.25)
+    raise AssertionError(f"not within {PATIENCE_S} s; last error: {error!r}; {because()}")
+
+
+def run_ray(*arguments, known=None):
+    """Run a ``ray`` command until it succeeds, or fails because an earlier try was carried out: it says ``known``."""
+    said = []
+
+    def run():
+        done = subprocess.run([RAY, *arguments], capture_output=True, text=True, timeout=PATIENCE_S)
+        said.append(done.stdout + done.stderr)
+        return done.returncode == 0 or (known is not None and known in said[-1])
+
+    wait_for(run, because=lambda: said[-1])
+
+
+@pytest.fixture(scope="module")
+def head():
+    """The addresses of the jobs' server and of a fresh head itself, with three logical cores."""
+    scratch = Path(tempfile.mkdtemp(prefix="ray", dir="/tmp"))  # short: the paths of its sockets have 107 bytes
+    gcs, dashboard, client, agent = free_ports(4)
+    ports = [f"--port={gcs}", f"--dashboard-port={dashboard}", f"--ray-client-server-port={client}"]
+    ports.append(f"--dashboard-agent-listen-port={agent}")
+    command = [RAY, "start", "--head", "--block", "--num-cpus=3", f"--temp-dir={scratch}", *ports]
+    # Else Ray kills a job that still saves; it wants whole seconds.
+    settings = {"RAY_JOB_STOP_WAIT_TIME_S": f"{PATIENCE_S:.0f}"}
+    with (scratch / "head.log").open("wb") as log:
+        process = subprocess.Popen(command, stdout=log, stderr=log, env=os.environ | settings)
+        try:
+            address = f"http://127.0.0.1:{dashboard}"
+            wait_for(lambda: answers(f"{address}/api/gcs_healthz"))
+            yield address, f"127.0.0.1:{gcs}"
+        finally:
+            process.send_signal(signal.SIGTERM)  # ends what it started, and nothing else
+            try:
+                process.wait(PATIENCE_S)
+            except subprocess.TimeoutExpired:
+                process.kill()
+            shutil.rmtree(scratch, ignore_errors=True)
+
+
+def answers(url):
+    with urllib.request.urlopen(url, timeout=60) as response:
+        return response.read()
+
+
+def test_a_study_of_tasks_is_killed_with_its_driver_and_stopped_and_goes_on(head, tmp_path):
+    """Two seeds of two tasks, as tasks of Ray that fetch their primitives over HTTP."""
+    _, address = head
+    run, _ = play(tmp_path / "run", tiny_config(total_env_steps=120))
+    registry, (port,), path = Registry(tmp_path / "registry"), free_ports(1), tmp_path / "night"
+    publish(registry, run.config, run.method.parameters(), {})
+    serve = [sys.executable, "-m", "service", "serve", "--runs", str(tmp_path), "--port", str(port)]
+    place = ["--runtime", "ray", "--address", address, "--status", "off", "--registry", f"http://127.0.0.1:{port}"]
+    command = [sys.executable, "-m", "service", "train", "--run-dir", str(path), *place]
+    begin = [*command, *TINY_TASK, "push,wall", "--seeds", "0,1", "--primitives", "tiny@latest", "--parallel", "2"]
+
+    def steps_saved():
+        """The iterations of the newest checkpoints of the first two runs."""
+        stores = [CheckpointStore(path / f"push-seed-{seed}" / "checkpoints", keep=1) for seed in (0, 1)]
+        return [max(store.steps(), default=0) for store in stores]
+
+    def start(*arguments):
+        return subprocess.Popen(arguments, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+
+    def statuses():
+        files = [path / f"push-seed-{seed}" / "status.json" for seed in (0, 1)]
+        return [json.loads(file.read_text()) for file in files if file.exists()]
+
+    def wait_until_each_goes_on(process, epoch):
+        def goes_on():
+            known = statuses()
+            return len(known) == 2 and all(each["epoch"] == epoch and each["iteration"] >= 2 for each in known)
+
+        wait_for(lambda: process.poll() is not None or (goes_on() and min(steps_saved()) >= 2))
+        assert process.poll() is None, process.stdout.read()
+
+    with start(*serve, "--registry", str(registry.root)) as server:
+        try:
+            wait_for(lambda: answers(f"http://127.0.0.1:{port}/v1/runs"))
+            with start(*begin, "--set", "run.total_env_steps=1_000_000") as driver:
+                try:
+                    wait_until_each_goes_on(driver, 1)
+                finally:
+                    driver.kill()
+            with start(*command, "--resume", "--parallel", "2") as driver:
+                wait_until_each_goes_on(driver, 2)  # Ray ends the tasks of the first one, and with them their processes
+                driver.send_signal(signal.SIGTERM)
+                said = driver.communicate(timeout=PATIENCE_S)[0]
+            assert driver.returncode == 128 + signal.SIGTERM, said
+            left = statuses()
+            assert [status["state"] for status in left] == ["interrupted", "interrupted"], said
+            assert [status["iteration"] for status in left] == steps_saved()  # nothing is lost
+            assert {status["study"] for status in json.loads(answers(f"http://127.0.0.1:{port}/v1/runs"))["runs"]} == {
+                None,
+                "night",
+            }
+            steps = max(status["num_env_steps"] for status in left) + 200
+            last = subprocess.run(
+                [*command, "--resume", "--set", f"run.total_env_steps={steps}"],
+                cwd=ROOT, capture_output=True, text=True, timeout=PATIENCE_S,
+            )  # fmt: skip
+            assert last.returncode == 0, last.stderr
+        finally:
+            server.terminate()
+    found = StudyDirectory(path).read()
+    assert {(run.state, run.env_steps) for run in found.runs.values()} == {("finished", steps)}
+    for name, each in found.runs.items():
+        rows = read_lines(path / name / "metrics.jsonl")
+        assert [row["iteration"] for row in rows] == list(range(1, len(rows) + 1))
+        config = RunDirectory(path / name).read_config()
+        assert (config.primitives, config.task) == ("tiny@1", each.settings["task"])
+        assert each.result == RunDirectory(path / name).read_result()["evaluation"]
+    assert len((path / "results.csv").read_text().splitlines()) == 5
+
+
+def test_a_job_is_stopped_and_continued_and_publishes(head, tmp_path):
+    jobs, _ = head
+    work, home = tmp_path / "work", tmp_path / "home"
+    work.mkdir()
+    write_yaml(work / "tiny.yaml")
+    (port,) = free_ports(1)
+    variables = {"TANDEM_RUNS": str(home / "runs"), "TANDEM_REGISTRY": str(home / "registry")}
+
+    def submit(job, total_env_steps):
+        run_ray(
+            *("job", "submit", "--address", jobs, "--submission-id", job, "--no-wait", "--working-dir", work),
+            *("--runtime-env-json", json.dumps({"env_vars": variables}), "--"),
+            *(sys.executable, "-m", "service", "pretrain", "--runtime", "ray", "--run-id", "night"),
+            *("--config", "tiny.yaml", "--num-actors", "1", "--status", f"127.0.0.1:{port}"),
+            *("--set", f"run.total_env_steps={total_env_steps}"),
+            known="already exists",
+        )
+
+    client = wait_for(lambda: JobSubmissionClient(jobs))
+
+    def end_of(job):
+        state = client.get_job_status(job)
+        return state.value if state.is_terminal() else None
+
+    def read_status():
+        return json.loads(answers(f"http://127.0.0.1:{port}/v1/runs/night"))
+
+    submit("first", 10**9)
+    status = wait_for(lambda: (found := read_status())["iteration"] >= 5 and found)
+    assert (status["state"], status["runtime"]) == ("running", "ray")
+    assert {actor["name"] for actor in status["actors"]} == {"rollout-0", "learner", "generator"}
+    assert status["policy_lag"] <= 2
+
+    wait_for(lambda: client.stop_job("first"))
+    assert wait_for(lambda: end_of("first")) == "STOPPED"
+    saved = newest(home / "runs" / "night").step
+    told = json.loads((home / "runs" / "night" / "status.json").read_text())
+    assert saved == told["iteration"]  # nothing of the last interval is lost
+    assert told["state"] == "interrupted"
+
+    submit("second", newest(home / "runs" / "night").meta["env_steps"] + 1500)
+    assert wait_for(lambda: end_of("second")) == "SUCCEEDED", wait_for(lambda: client.get_job_logs("second"))
+    rows = read_lines(home / "runs" / "night" / "metrics.jsonl")
+    assert [row["iteration"] for row in rows] == list(range(1, len(rows) + 1))
+    assert len(rows) > saved
+    registry = Registry(home / "registry")
+    assert [version.number for version in registry.versions("tiny")] == [1]
+    assert registry.manifest("tiny@1").metrics["env_steps"] == rows[-1]["env_steps"]
+    assert not (work / "runs").exists()
+    assert os.environ["RAY_AUTH_TOKEN"] not in json.dumps(told)
+
+
+def test_a_cluster_of_another_version_of_ray(head, tmp_path):
+    """This process is the one with another version: a second one of Ray is not here."""
+    _, address = head
+    program = "import ray; ray.__version__ = '2.0.0'; from service.cli.main import main; main()"
+    command = [sys.executable, "-c", program, "pretrain", "--runtime", "ray", "--address", address, "--run-id", "night"]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=PATIENCE_S)
+    assert done.returncode == 1, done.stderr
+    (line,) = [line for line in done.stderr.splitlines() if "error" in line]
+    assert address in line
+    assert "use the same image or environment everywhere" in line
+    assert "2.0.0" in line
+    assert not (tmp_path / "runs" / "night").exists()

@@ -1,0 +1,79 @@
+"""A ``tandem pretrain --runtime ray`` that is struck from outside: its exit code, its last line, its status."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from contextlib import contextmanager
+
+import pytest
+
+from benchmarks.processes import descendants
+from service.base.jsonl import read_jsonl
+from service.store.disk import read_status
+from service.store.run_directory import RunDirectory
+from tests.runs.runs import ROOT, assert_one_line, is_alive, write_yaml
+
+PATIENCE_S = 300.0
+
+
+@contextmanager
+def run_on_ray(home, before="pass"):
+    """A run that ends only by what is done to it; its process has done ``before`` first."""
+    paths = {"--config": write_yaml(home / "tiny.yaml"), "--run-dir": home / "run", "--registry": home / "registry"}
+    arguments = [part for pair in paths.items() for part in map(str, pair)]
+    endless = ("--set", "run.total_env_steps=1_000_000_000", "--set", "run.checkpoint_interval=1_000_000")
+    code = f"{before}; from service.cli.main import main; main()"
+    command = [sys.executable, "-c", code, "pretrain", "--runtime", "ray", "--status", "off", "--num-actors", "1"]
+    with (home / "out").open("w") as out, (home / "err").open("w") as err:
+        process = subprocess.Popen([*command, *arguments, *endless], cwd=ROOT, stdout=out, stderr=err)
+    try:
+        yield process
+    finally:
+        process.kill()
+        process.wait()
+
+
+def wait_until(process, holds):
+    """Wait until it is so; the process must not have ended before."""
+    deadline_s = time.monotonic() + PATIENCE_S
+    while not holds():
+        assert process.poll() is None
+        assert time.monotonic() < deadline_s
+        time.sleep(0.02)
+
+
+@pytest.mark.parametrize(
+    ("number", "when"), [(signal.SIGTERM, "starting Ray"), (signal.SIGINT, "learner")], ids=lambda each: str(each)
+)
+def test_a_signal_while_it_starts(tmp_path, number, when):
+    with run_on_ray(tmp_path) as process:
+        wait_until(
+            process,
+            lambda: when in (tmp_path / "err").read_text() or when in descendants(process.pid).values(),
+        )
+        below = descendants(process.pid)
+        process.send_signal(number)
+        assert process.wait(PATIENCE_S) == 128 + number
+    assert (tmp_path / "out").read_text() == "stopped at once; nothing was saved yet\n"
+    assert "Traceback" not in (tmp_path / "err").read_text()
+    assert [role for pid, role in below.items() if is_alive(pid)] == []
+
+
+def test_a_raylet_that_is_frozen_for_ever_ends_the_run(tmp_path):
+    """No call of the driver needs to come back for that, and nobody is blamed for it, or replaced in vain."""
+    sooner = "from service.cluster import raylet; raylet.SILENT_S, raylet.LOST_S = 1.0, 10.0"
+    directory = RunDirectory(tmp_path / "run")
+    with run_on_ray(tmp_path, sooner) as process:
+        wait_until(process, lambda: directory.metrics_file.exists() and len(read_jsonl(directory.metrics_file)) >= 2)
+        below = descendants(process.pid)
+        os.kill(next(pid for pid, role in below.items() if role == "raylet"), signal.SIGSTOP)
+        assert process.wait(PATIENCE_S) == 1
+    said = (tmp_path / "err").read_text().strip().splitlines()[-1]
+    assert_one_line(said, "the raylet, has not answered for 1", "--resume goes on from iteration 0")
+    status = read_status(directory.path)
+    assert (status.state, status.last_error) == ("failed", said.replace("error", "WorkersError", 1))
+    assert {actor.incarnation for actor in status.actors} == {0}
+    ours = ("actor", "learner", "generator", "raylet", "gcs")  # Ray's two agents notice it within a minute
+    assert [role for pid, role in below.items() if role in ours and is_alive(pid)] == []

@@ -1,0 +1,269 @@
+"""The configuration: defaults, YAML, overrides, what a run recorded before, and errors a user can act on."""
+
+from pathlib import Path
+
+import pytest
+from pydantic import ValidationError
+
+from service.base.errors import ConfigError
+from service.base.parsing import parse_yaml
+from service.config import WorkspaceConfig, dump_config, load_config, parse_config
+from service.config.robot import RobotConfig
+from service.config.self_play import SelfPlayConfig
+from tests.runs.runs import assert_one_line
+
+CONFIGS = Path(__file__).parents[2] / "configs"
+
+
+def message(path=None, overrides=()) -> str:
+    """The one line a user reads when this configuration is refused."""
+    with pytest.raises(ConfigError) as raised:
+        load_config(path, overrides)
+    text = str(raised.value)
+    assert "\n" not in text
+    return text
+
+
+def test_defaults_are_valid_and_the_papers():
+    config = load_config()
+    assert config == SelfPlayConfig()
+    assert config.policy.bob.num_primitives == 4
+    assert (config.game.alice_valid_reward, config.game.alice_difficult_reward) == (1.0, 5.0)
+    assert config.game.success_distance_m == 0.05
+
+
+def test_corners_of_the_workspace_by_hand():
+    workspace = WorkspaceConfig(center_x_m=-0.05, center_y_m=0.1, length_x_m=0.3, length_y_m=0.2, height_m=0.4)
+    assert workspace.lower_m == pytest.approx((-0.2, 0.0, 0.0))
+    assert workspace.upper_m == pytest.approx((0.1, 0.2, 0.4))
+
+
+def test_every_default_lies_within_its_own_range():
+    # Pydantic does not validate defaults; a tree without any is validated in full.
+    assert SelfPlayConfig.model_validate(SelfPlayConfig().model_dump()) == SelfPlayConfig()
+
+
+def test_yaml_round_trip(tmp_path):
+    config = load_config(
+        overrides=["name=sphere.v2", "world.object=sphere", "policy.alice.hidden_sizes=[64, 32]", "seed=7"]
+    )
+    assert config != SelfPlayConfig()
+    path = tmp_path / "run.yaml"
+    path.write_text(dump_config(config))
+    assert load_config(path) == config
+
+
+def test_a_file_may_name_only_what_differs(tmp_path):
+    path = tmp_path / "run.yaml"
+    path.write_text("learner:\n  alice: {learning_rate: 1e-4}\n")
+    config = load_config(path)
+    assert config.learner.alice.learning_rate == 1e-4
+    assert config.learner.bob == SelfPlayConfig().learner.bob
+    assert config.game == SelfPlayConfig().game
+
+
+@pytest.mark.parametrize("text", ["", "# nothing here\n", "null", "---\n"])
+def test_an_empty_file_is_refused(tmp_path, text):
+    """It is what a full disk leaves of a file."""
+    path = tmp_path / "empty.yaml"
+    path.write_text(text)
+    with pytest.raises(ConfigError) as error:
+        load_config(path)
+    assert_one_line(error.value, path, "holds no key", "write {}")
+    path.write_text("{}")
+    assert load_config(path) == SelfPlayConfig()
+
+
+@pytest.mark.parametrize(
+    "override",
+    [
+        "game.num_worlds=true",
+        "game.alice_steps_min=true",
+        "generator.replay_fraction=false",
+        "policy.alice.hidden_sizes=[true, 64]",
+        "world.randomisation.delay_steps=[false, true]",
+    ],
+)
+def test_true_and_false_are_no_numbers(override):
+    with pytest.raises(ConfigError) as error:
+        load_config(None, [override])
+    assert_one_line(error.value, override.partition("=")[0], "expected a number, not true or false")
+
+
+def test_frozen():
+    config = SelfPlayConfig()
+    with pytest.raises(ValidationError, match="frozen"):
+        config.seed = 1
+    with pytest.raises(ValidationError, match="frozen"):
+        config.world.workspace.height_m = 0.2
+
+
+@pytest.mark.parametrize(
+    ("override", "path", "value"),
+    [
+        ("seed=3", "seed", 3),
+        ("run.total_env_steps=200_000", "run.total_env_steps", 200_000),
+        ("run.total_env_steps=2e5", "run.total_env_steps", 200_000),
+        ("learner.bob.learning_rate=1e-3", "learner.bob.learning_rate", 0.001),
+        ("learner.bob.learning_rate=0.001", "learner.bob.learning_rate", 0.001),
+        ("learner.bob.mirror=random", "learner.bob.mirror", "random"),
+        ("generator.replay_invalid=false", "generator.replay_invalid", False),
+        ("world.object=sphere", "world.object", "sphere"),
+        ("world.workspace.center_y_m=-0.1", "world.workspace.center_y_m", -0.1),
+        ("policy.alice.hidden_sizes=[64,32]", "policy.alice.hidden_sizes", (64, 32)),
+        (" seed =3", "seed", 3),
+    ],
+)
+def test_override(override, path, value):
+    node = load_config(overrides=[override])
+    for part in path.split("."):
+        node = getattr(node, part)
+    assert node == value
+    assert type(node) is type(value)
+
+
+def test_overrides_beat_the_file_and_the_last_one_wins(tmp_path):
+    path = tmp_path / "run.yaml"
+    path.write_text("seed: 1\ngame:\n  bob_steps: 50\n  alice_steps: 30\n")
+    config = load_config(path, ["seed=2", "game.bob_steps=60", "seed=3"])
+    assert (config.seed, config.game.bob_steps, config.game.alice_steps) == (3, 60, 30)
+
+
+@pytest.mark.parametrize("override", ["seed", "=3", "", "  =3"])
+def test_override_without_key_or_value_says_the_form(override):
+    text = message(overrides=[override])
+    assert repr(override) in text
+    assert "KEY=VALUE" in text
+
+
+def test_override_that_is_not_yaml():
+    assert "'policy.alice.hidden_sizes=[64'" in message(overrides=["policy.alice.hidden_sizes=[64"])
+
+
+def test_override_through_a_value():
+    text = message(overrides=["seed=1", "seed.x=2"])
+    assert "'seed.x=2'" in text
+    assert "not a group" in text
+
+
+@pytest.mark.parametrize(
+    ("override", "key", "known"),
+    [
+        ("sed=1", "'sed'", "game, generator, learner, method, name, policy, run, seed, world"),
+        ("game.bob_step=1", "'game.bob_step'", "bob_steps"),
+        ("learner.bob.lr=1", "'learner.bob.lr'", "learning_rate"),
+        ("world.workspace.width_m=1", "'world.workspace.width_m'", "length_x_m, length_y_m"),
+        (
+            "world.object={shape: sphere, size_m: [0.05], width_m: 1}",
+            "'world.object.width_m'",
+            "known there: color, mesh, shape, size_m",
+        ),
+        (
+            "world.obstacles=[{shape: sphere, size_m: [0.05], width_m: 1}]",
+            "'world.obstacles.0.width_m'",
+            "mass_kg, mesh, shape, size_m",
+        ),
+    ],
+)
+def test_unknown_key_lists_the_known_ones(override, key, known):
+    text = message(overrides=[override])
+    assert f"unknown key {key}" in text
+    assert known in text
+
+
+@pytest.mark.parametrize(
+    ("override", "key", "value"),
+    [
+        ("game.num_worlds=0", "game.num_worlds", "0"),
+        ("world.object_size_m=0.5", "world.object_size_m", "0.5"),
+        ("world.object=teapot", "world.object", "teapot"),
+        ("seed=half", "seed", "half"),
+        ("seed=0.5", "seed", "0.5"),
+        ("learner.bob.learning_rate=nan", "learner.bob.learning_rate", "nan"),
+        ("learner.bob.learning_rate=.inf", "learner.bob.learning_rate", "inf"),
+        ("learner.device=tpu", "learner.device", "tpu"),
+        ("name=Panda Cube", "name", "Panda Cube"),
+        ("name=../escape", "name", "../escape"),
+        ("policy.alice.hidden_sizes=[64,0]", "policy.alice.hidden_sizes.1", "0"),
+        ("policy.bob.log_std_min=0.5", "policy.bob", "0.5"),
+        ("policy.alice_log_std_min=0.5", "policy", "0.5"),
+        ("world.workspace.height_m=0.02", "world", "lies 0.025 m high, and the workspace ends at 0.02 m"),
+        ("world.object={shape: mesh, mesh: {pieces: a.stl}}", "world.object.mesh.pieces", "a.stl"),
+        ("world.object={shape: mesh, mesh: {pieces: [a.stl], scale: 0}}", "world.object.mesh.scale", "0"),
+        ("game=3", "game", "3"),
+    ],
+)
+def test_a_bad_value_is_named_with_its_key(override, key, value):
+    text = message(overrides=[override])
+    is_group = key in (
+        "policy",
+        "policy.bob",
+        "world",
+    )  # where two of its values do not fit together, it is not shown whole
+    assert f"{key}: " in text if is_group else f"{key} = " in text
+    assert value in text
+
+
+def test_several_mistakes_are_counted():
+    assert "(and 1 more)" in message(overrides=["seed=-1", "game.num_goals=0"])
+
+
+def test_the_file_is_named_in_its_errors(tmp_path):
+    path = tmp_path / "run.yaml"
+    path.write_text("game: {num_goals: -2}\n")
+    text = message(path)
+    assert str(path) in text
+    assert "game.num_goals = -2" in text
+
+
+def test_missing_file(tmp_path):
+    path = tmp_path / "none.yaml"
+    text = message(path)
+    assert str(path) in text
+    assert "tandem configs lists" in text
+
+
+@pytest.mark.parametrize(
+    ("content", "said"),
+    [(b"a: [1", "YAML"), (b"\xff\xfe\x00", "YAML"), (b"- 1\n- 2\n", "list"), (b"just words", "str")],
+)
+def test_a_file_that_is_no_configuration(tmp_path, content, said):
+    path = tmp_path / "bad.yaml"
+    path.write_bytes(content)
+    text = message(path)
+    assert str(path) in text
+    assert said in text
+
+
+def test_a_directory_is_no_file(tmp_path):
+    assert str(tmp_path) in message(tmp_path)
+
+
+def test_parse_config_names_where_the_tree_came_from():
+    with pytest.raises(ConfigError, match=r"^the manifest: unknown key 'colour'"):
+        parse_config({"colour": "red"}, where="the manifest")
+
+
+def test_every_shipped_configuration_loads():
+    robots = set(CONFIGS.glob("robots/*.yaml"))
+    paths = sorted(set(CONFIGS.rglob("*.yaml")) - robots)
+    assert paths, "no configuration ships in configs/"
+    for path in paths:
+        load_config(path)
+    assert robots
+    for path in robots:  # their models are in packages that need not be installed
+        assert RobotConfig.model_validate(parse_yaml(path.read_bytes(), path)).model.startswith("package:")
+
+
+def test_a_margin_as_wide_as_success_is_refused():
+    text = message(overrides=["game.bob_margin_m=0.05"])
+    assert "bob_margin_m 0.05 must be less than success_distance_m 0.05" in text
+    assert load_config(overrides=["game.bob_margin_m=0.04"]).game.bob_margin_m == 0.04
+
+
+def test_self_imitation_of_turns_that_no_reward_reaches_is_refused():
+    how = ["learner.self_imitation.weight=0.2", "learner.self_imitation.min_reward=11"]
+    with pytest.raises(ConfigError, match=r"min_reward = 11, but no turn of Alice's pays more than 6, ") as error:
+        load_config(None, how)
+    assert len(str(error.value)) < 500  # not the whole configuration
+    load_config(None, [*how, "game.alice_novelty_reward=5"])

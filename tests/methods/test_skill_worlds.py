@@ -1,0 +1,146 @@
+"""Frozen skills downstream: a skill held for some steps, the same in learning and in evaluation, and bad input."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+
+import service
+from service.base.errors import TandemError
+from service.envs.gym.vector import TabletopVectorEnv
+from service.envs.observations import POSITIONS
+from service.methods.skill_worlds import SkillTaskWorlds
+from service.methods.task import TaskLearning
+from service.methods.task_methods import METHODS
+from service.methods.task_worlds import TaskWorlds
+from service.policies.frozen_skills import ZeroShotPolicy
+from service.registry.publishing import publish
+from service.registry.registry import Registry
+from tests.methods.skill_sets import CONFIG, SIZE, WORLD, made, parameters
+from tests.methods.trials import small_trial
+
+NUM, LENGTH = 3, 8
+
+
+@pytest.fixture
+def skills():
+    return made()
+
+
+def env(length=LENGTH):
+    return TabletopVectorEnv(NUM, WORLD, task="push", max_episode_steps=length, num_threads=1)
+
+
+@pytest.mark.parametrize("hold", [1, 4, 3])
+def test_a_held_skill_is_so_many_steps_of_the_frozen_policy(skills, hold):
+    """Where 3 does not divide an episode of 8, its last skill is cut short; the next episode is seen later."""
+    held, plain = SkillTaskWorlds(env(), 3, skills.skills, hold), TaskWorlds(env(), 3)
+    rng = np.random.default_rng(0)
+    for _ in range(12 // hold):
+        actions = rng.uniform(-1.0, 1.0, (NUM, SIZE)).astype(np.float32)
+        start = plain.previous, plain.positions, plain.goal
+        columns, ended = held.step(actions)
+        reward, over, last = np.zeros(NUM), np.zeros(NUM, dtype=bool), None
+        for _ in range(hold):
+            step, _ = plain.step(skills.skills.actions(plain.previous, plain.positions, np.float32(1.5) * actions))
+            if not over.any():
+                last = step
+                reward += step["reward"][:, 0]
+            over |= plain.env._elapsed == 0
+        for name, expected in zip(("previous", "positions", "goal"), start, strict=True):
+            np.testing.assert_array_equal(columns[name], expected)
+        np.testing.assert_array_equal(columns["before"], last["positions"])
+        np.testing.assert_array_equal(columns["following"], last["following"])
+        np.testing.assert_array_equal(columns["reward"][:, 0], reward)
+        np.testing.assert_array_equal(columns["action"], actions)
+        np.testing.assert_array_equal(ended, over)
+        np.testing.assert_array_equal(held.inputs(), plain.inputs())
+    assert held.finished == plain.finished
+    held.close()
+    plain.close()
+
+
+def test_updates_and_horizon_are_counted_in_env_steps(skills):
+    trial = small_trial("lsd", skill_steps=5)
+    loop = TaskLearning(trial, skills).loop
+    assert loop.learner.config.gradient_steps == 5 * trial.sac.gradient_steps
+    assert loop.learner.config.gamma == trial.sac.gamma**5
+    loop.play(trial.run.total_env_steps)
+    assert loop.num_env_steps == trial.run.total_env_steps == 5 * loop.replay.num_added * trial.sac.num_worlds
+    learned = trial.run.total_env_steps - trial.sac.learning_starts
+    assert loop.num_updates == learned // trial.sac.num_worlds * trial.sac.gradient_steps
+    loop.worlds.close()
+
+
+def test_a_learned_policy_holds_its_skills(skills):
+    loop = TaskLearning(small_trial("lsd", skill_steps=5), skills).loop
+    loop.play(200)  # learned nothing yet: the average is the actor
+    player = METHODS["lsd"].learned(loop.learner.averaged_parameters(), skills, 5)
+    worlds = SkillTaskWorlds(loop.worlds.env, 3, skills.skills, 5)
+    handed, step = [], worlds.env.step
+
+    def handing(actions):
+        handed.append((worlds.positions, worlds.goal, actions))
+        return step(actions)
+
+    worlds.env.step = handing
+    for _ in range(3):
+        with torch.no_grad():
+            actions = torch.tanh(loop.learner.actor(torch.from_numpy(worlds.inputs()))[0]).numpy()
+        worlds.step(actions)
+    assert len(handed) == 15
+    for positions, goal, expected in handed:
+        acted = player.act_deterministic(np.concatenate((positions, goal), axis=1))
+        np.testing.assert_allclose(acted, expected, rtol=0, atol=1e-5)
+    worlds.close()
+
+
+def test_skills_of_actions_by_hand():
+    action = np.array([[0.6, 0.0, -0.8, 0.0], [0.3, 0.0, 0.4, 0.0]], dtype=np.float32)
+    expected = {"lsd": 1.5 * action, "diayn": 1.5 * action, "dads": action, "metra": action / [[1.0], [0.5]]}
+    for method, skill in expected.items():
+        np.testing.assert_allclose(made(method).skills.from_action(action), skill, rtol=1e-6)
+
+
+def test_zero_shot_acts_by_the_skill_towards_the_goal(skills):
+    player, rng = ZeroShotPolicy(skills.skills), np.random.default_rng(0)
+    rows = rng.uniform(-0.1, 0.1, (2, NUM, 14)).astype(np.float32)
+    before = rows[0][:, : POSITIONS.size]
+    for seen in rows:
+        positions, goal = seen[:, : POSITIONS.size], seen[:, POSITIONS.size :]
+        expected = skills.skills.actions(before, positions, skills.skills.towards(positions, goal))
+        np.testing.assert_array_equal(player.act_deterministic(seen), expected)
+        before = positions
+
+
+class TestBadInput:
+    @pytest.fixture
+    def registry(self, tmp_path):
+        registry = Registry(tmp_path / "registry")
+        publish(registry, CONFIG, parameters(), {"env_steps": 100.0})
+        return registry.root
+
+    def test_skills_and_primitives_where_the_other_is_expected(self, champion):
+        with pytest.raises(TandemError, match=r"made@1 is a set of skills of lsd; the method ours needs primitives"):
+            METHODS["ours"].check(made())
+        with pytest.raises(TandemError, match=r"panda-cube@.* is a set of primitives; the method LSD skills needs"):
+            METHODS["lsd"].check(champion)
+
+    def test_skills_of_another_method(self):
+        with pytest.raises(TandemError, match=r"made@1 holds skills of dads, this method takes those of lsd"):
+            METHODS["lsd"].check(made("dads"))
+
+    def test_skills_of_another_robot(self, registry):
+        trained = service.load_skills("made", registry)
+        spaces = {**trained.manifest.spaces, "action": 7}
+        other = dataclasses.replace(trained, manifest=trained.manifest.model_copy(update={"spaces": spaces}))
+        with pytest.raises(
+            TandemError, match=r"made@1 is for another robot or layout: action 7; this one has action 4"
+        ):
+            METHODS["lsd"].check(other)
+
+    def test_another_size_of_z(self, skills):
+        rows = np.zeros((NUM, POSITIONS.size), dtype=np.float32)
+        with pytest.raises(TandemError, match=r"skill: expected shape \(N, 4\), got \(3, 2\)"):
+            skills.skills.actions(rows, rows, np.zeros((NUM, 2), dtype=np.float32))

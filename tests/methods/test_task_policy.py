@@ -1,0 +1,33 @@
+import numpy as np
+import pytest
+import torch
+
+from service.envs.observations import layouts
+from service.methods.task import TaskLearning
+from service.methods.task_methods import METHODS
+from service.registry.learned import LearnedPolicy
+from tests.methods.trials import small_trial
+
+
+@pytest.mark.parametrize("method", ["ours", "ours-residual-her", "scratch-monolithic", "scratch-mcp-her"])
+def test_a_learned_policy_acts_as_in_its_worlds(champion, method):
+    """Evaluation goes another way than learning, from Bob's input to actions; a loaded policy does the same."""
+    loop = TaskLearning(small_trial(method).begin("no registry here", None), champion).loop
+    loop.play(400)
+    parameters, seen = loop.learner.averaged_parameters(), layouts(champion.config.world)
+    player = LearnedPolicy(parameters, METHODS[method].frozen(champion), seen)
+    inner = loop.worlds.env.env if METHODS[method].composes else loop.worlds.env
+    handed, step = [], inner.step
+    inner.step = lambda actions: handed.append(actions) or step(actions)
+    loop.worlds.env.reset(seed=3)
+    worlds = type(loop.worlds)(loop.worlds.env, 3)
+    for _ in range(3):
+        with torch.no_grad():  # this learner has been averaged once: the average is the actor
+            actions = torch.tanh(loop.learner.actor(torch.from_numpy(worlds.inputs()))[0]).numpy()
+        columns, _ = worlds.step(actions)
+        rows = np.concatenate((columns["positions"], columns["goal"]), axis=1)
+        np.testing.assert_allclose(player.act_deterministic(rows), handed[-1], rtol=0, atol=1e-5)
+    player.begin()
+    fresh = METHODS[method].learned(parameters, champion)
+    np.testing.assert_array_equal(player.act_deterministic(rows), fresh.act_deterministic(rows))
+    loop.worlds.close()

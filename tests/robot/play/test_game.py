@@ -1,0 +1,151 @@
+"""What goes on in a live world, without a browser."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+
+from service.base.errors import TandemError
+from service.envs.observations import layouts
+from service.learner.sac_networks import GaussianActor
+from service.policies.networks import export_parameters
+from service.registry.learned import LearnedPolicy, action_weights, num_inputs
+from service.registry.loading import Trained
+from service.robot.play.game import Game
+
+
+@pytest.fixture
+def game(champion):
+    game = Game(champion, seed=1)
+    yield game
+    game.close()
+
+
+def go(game, num):
+    for _ in range(num):
+        game.step()
+
+
+def test_bob_goes_where_the_goal_is_put_and_stays(game):
+    """From wherever he is: no reset comes between."""
+    for goal in ([0.1, 0.1, 0.2], [-0.1, -0.05, 0.1]):
+        game.set_goal(np.array(goal))
+        go(game, 75)
+        assert np.linalg.norm(game.worlds.object_position[0] - goal) < 0.05
+        assert game.caption.startswith("At the goal")
+    game.set_goal(np.array([9.0, 0.0, -1.0]))
+    workspace = game.world.workspace
+    assert game.goal.tolist() == [workspace.upper_m[0], 0.0, game.world.rest_height_m]
+
+
+def test_another_goal_comes_when_he_is_there(game):
+    goals = set()
+    for _ in range(150):
+        goals.add(tuple(game.goal))
+        game.step()
+    assert len(goals) > 2
+
+
+def test_weights_that_are_set_drive_the_primitives(game, champion):
+    go(game, 3)
+    gate = champion.primitives.gate(np.concatenate((game.worlds.positions()[0], game.goal)).astype(np.float32))
+    game.set_mode("primitives")
+    np.testing.assert_allclose(game.weights, gate, rtol=1e-5)  # nothing changes until somebody sets one
+    start = game.state.copy()
+    ends = []
+    for action in np.eye(champion.primitives.num_primitives, dtype=np.float32)[:2] * 2 - 1:
+        game.worlds.restore(start[None])
+        game.weights = action_weights(action)
+        means, _ = champion.primitives.compose(game.worlds.positions(), game.weights[None])
+        before = game.worlds.ee_position[0].copy()
+        game.step()
+        moved = game.worlds.ee_position[0] - before
+        assert moved @ means[0, :3] > 0.0  # towards what the composition says
+        ends.append(game.state.copy())
+    assert (ends[0] != ends[1]).any()
+    assert not game.shows_goal
+    with pytest.raises(TandemError, match=r"mode 'alice': panda-cube@\d+ .* can do goals, primitives"):
+        game.set_mode("alice")
+
+
+class Carrying:
+    """An Alice who carries the object to one place: Bob, who is told of it."""
+
+    def __init__(self, bob, num_positions):
+        self._bob, self._num = bob, num_positions
+
+    def act(self, observation, rng):
+        goal = np.array([[0.12, 0.12, 0.22]], dtype=np.float32)
+        return self._bob.act_deterministic(np.concatenate((observation[:, : self._num], goal), axis=1)), np.zeros(1)
+
+
+def test_alice_proposes_and_bob_follows_from_her_start(champion):
+    rules = {"alice_steps": 40, "num_goals": 2, "bob_steps": 60, "bob_hold_steps": 5}
+    config = champion.config.model_copy(update={"game": champion.config.game.model_copy(update=rules)})
+    alice = Carrying(champion.policy, champion.primitives.num_positions)
+    game = Game(dataclasses.replace(champion, config=config, alice=alice), seed=0)
+    assert game.modes == ("goals", "primitives", "alice")
+    game.set_mode("alice")
+    start = game.state.copy()
+    go(game, 39)
+    assert game.caption.startswith("Alice proposes: 1.")
+    assert not game.shows_goal
+    game.step()
+    assert game.caption == "Alice proposed this goal"
+    proposed, goal = game.worlds.object_position[0].copy(), game.goal.copy()
+    np.testing.assert_array_equal(proposed, goal)
+    assert np.linalg.norm(proposed - (0.12, 0.12, 0.22)) < 0.05
+    go(game, 15)  # stillness
+    np.testing.assert_array_equal(game.state, start)
+    assert game.shows_goal
+    for _ in range(61):
+        if game.caption.startswith("Bob: "):
+            break
+        game.step()
+    assert game.caption.startswith("Bob: solved after")
+    go(game, 15)
+    np.testing.assert_array_equal(game.worlds.object_position[0], proposed)  # the next round goes on from there
+    assert not game.shows_goal
+    game.close()
+
+
+def test_a_fallen_object_comes_back(game):
+    game.worlds.object_position[0] = (0.9, 0.0, -0.1)
+    game.step()
+    assert game.caption == "the object fell off the table"
+    go(game, 20)
+    assert game.worlds.object_position[0, 2] > 0.0
+
+
+def test_a_task_and_its_orchestrator(champion):
+    """An orchestrator acts in the world of its task, and forgets where episodes begin."""
+    begun = []
+
+    class Counting(LearnedPolicy):
+        def begin(self):
+            begun.append(1)
+            super().begin()
+
+    seen, num = layouts(champion.config.world), champion.primitives.num_primitives
+    with torch.random.fork_rng():
+        torch.manual_seed(4)
+        actor = export_parameters(GaussianActor(num_inputs(seen)[1], num, (8,)))
+    policy = Counting(actor, champion.primitives, seen)
+    common = {"task": "wall", "method": "ours", "trained": champion}
+    game = Game(Trained("mine@1", "orchestrator", champion.config, policy, actor, **common), seed=0)
+    begun.clear()
+    game.reset()
+    assert game.title == "mine@1 on Wall"
+    assert game.world.fixture == "wall"
+    assert game.modes == ("goals", "primitives")
+    assert begun
+    assert game.weights_now() is None  # an orchestrator's are not known here
+    game.set_goal(np.array([0.05, 0.0, 0.1]))
+    for goal in ([-0.05, 0.0, 0.03], [-0.05, 0.0, 0.2]):  # in the wall, and above it
+        game.set_goal(np.array(goal))
+        assert game.goal.tolist() == ([0.05, 0.0, 0.1] if goal[2] < 0.1 else goal)
+    go(game, 2)
+    game.reset()
+    assert len(begun) == 2
+    game.close()

@@ -1,0 +1,176 @@
+"""What a resume checks before it goes on: the records, the run, the configuration."""
+
+import json
+import shutil
+
+import pytest
+import yaml
+
+from service.base.epoch import claim_epoch
+from service.base.errors import CheckpointError, ConfigError, StorageError
+from service.registry.registry import Registry
+from service.runs.resuming import resumed_config
+from service.runs.train import open_run, train
+from service.store.run_directory import RunDirectory
+from service.store.run_history import read_history
+from tests.runs.runs import assert_one_line, newest, play, read_lines, tiny_config
+
+
+@pytest.fixture(scope="module")
+def begun(tmp_path_factory):
+    """A run that ended at its budget, with the records of some iterations."""
+    path = tmp_path_factory.mktemp("runs") / "begun"
+    _, result = play(path, tiny_config(total_env_steps=600))
+    assert result.iteration >= 3
+    return path
+
+
+@pytest.fixture
+def run(begun, tmp_path):
+    return shutil.copytree(begun, tmp_path / "cube")
+
+
+def go_on(path, *, accept=False, steps=800):
+    directory = RunDirectory(path, accept_damaged_records=accept)
+    config = resumed_config(directory, [f"run.total_env_steps={steps}"])
+    local = open_run(config, directory, resume=True)
+    try:
+        return local.run()
+    finally:
+        local.close()
+        directory.close()
+
+
+def cut(path):
+    path.write_bytes(path.read_bytes()[:-20])
+
+
+def leave_out_a_line(path):
+    lines = path.read_bytes().splitlines(keepends=True)
+    path.write_bytes(b"".join(lines[:1] + lines[2:]))
+
+
+def change_a_byte(path):
+    data = bytearray(path.read_bytes())
+    second = data.index(b"\n") + 1
+    at = data.index(b".", second) + 1  # a digit of a number: the line stays JSON
+    data[at] = ord("1") if data[at] != ord("1") else ord("2")
+    path.write_bytes(bytes(data))
+
+
+@pytest.mark.parametrize("name", ["metrics.jsonl", "goals.jsonl"])
+@pytest.mark.parametrize(
+    ("damage", "said"),
+    [
+        (lambda path: path.unlink(), "has 0 bytes, and had {size:,} when the checkpoint was saved"),
+        (cut, "has {short:,} bytes, and had {size:,} when the checkpoint was saved"),
+        (leave_out_a_line, "and had {size:,} when the checkpoint was saved"),
+        (change_a_byte, "has other first {size:,} bytes than were written"),
+    ],
+)
+def test_damaged_records_are_refused_in_one_line(run, name, damage, said):
+    size = (run / name).stat().st_size
+    damage(run / name)
+    there = (run / name).read_bytes() if (run / name).exists() else None
+    with pytest.raises(StorageError) as error:
+        go_on(run)
+    assert_one_line(error.value, run / name, said.format(size=size, short=size - 20), "--accept-damaged-records")
+    assert ((run / name).read_bytes() if (run / name).exists() else None) == there
+
+
+def test_a_hole_that_is_accepted_is_named_and_asked_about_once(run, tmp_path):
+    last = newest(run).step
+    size = (run / "metrics.jsonl").stat().st_size
+    leave_out_a_line(run / "metrics.jsonl")
+    short = (run / "metrics.jsonl").stat().st_size
+    go_on(run, accept=True, steps=600)  # nothing is left to do, and it is saved all the same
+    said = (f"metrics.jsonl has {short:,} bytes, and had {size:,} when the checkpoint was saved",)
+    (event,) = read_history(run).events
+    assert (event.after_iteration, event.damaged_records) == (last, said)
+    assert [row["iteration"] for row in read_lines(run / "metrics.jsonl")] == [1, *range(3, last + 1)]
+    directory, registry = RunDirectory(run), tmp_path / "registry"
+    config = resumed_config(directory, ["run.total_env_steps=700"])
+    train(config, directory, registry, resume=True, on_iteration=lambda metrics: None)
+    manifest = Registry(registry).manifest("tiny@1")
+    first, second = manifest.history["events"]
+    assert first["damaged_records"] == list(said)
+    assert second["changed"] == {"run.total_env_steps": [600, 700]}
+    assert (second["damaged_records"], manifest.history["run"]) == ([], read_history(run).run)
+
+
+def test_records_after_the_checkpoint_may_be_anything(run):
+    """They are made again."""
+    with (run / "metrics.jsonl").open("ab") as file:
+        file.write(b'{"iteration": 99, "env_steps": 5}\n{"iteration": 100, "env_st')
+    assert go_on(run).reason == "finished"
+
+
+def test_a_checkpoint_of_another_run_is_refused(run, tmp_path):
+    play(tmp_path / "other", tiny_config(total_env_steps=600))
+    shutil.rmtree(run / "checkpoints")
+    shutil.copytree(tmp_path / "other" / "checkpoints", run / "checkpoints")
+    with pytest.raises(CheckpointError) as error:
+        go_on(run)
+    ours, theirs = read_history(run).run, read_history(tmp_path / "other").run
+    assert_one_line(error.value, run, "of another run", f"({theirs[:8]}, not {ours[:8]})", "put that of this run back")
+
+
+def test_a_checkpoint_of_another_seed_is_refused(run):
+    tree = yaml.safe_load((run / "config.yaml").read_text())
+    (run / "config.yaml").write_text(yaml.safe_dump(tree | {"seed": 3}))
+    with pytest.raises(CheckpointError) as error:
+        go_on(run)
+    assert_one_line(error.value, run, "seed is 3 in config.yaml", "was made with 0", "put that back")
+
+
+def test_a_configuration_that_may_change_is_said_and_noted(run, caplog):
+    caplog.set_level("INFO")
+    tree = yaml.safe_load((run / "config.yaml").read_text())
+    tree["learner"]["bob"]["learning_rate"] = 1e-5
+    (run / "config.yaml").write_text(yaml.safe_dump(tree))
+    go_on(run)
+    (said,) = [each for each in caplog.messages if "changed since iteration" in each]
+    assert "learner.bob.learning_rate from 0.0003 to 1e-05" in said
+    (event,) = read_history(run).events
+    assert event.changed["learner.bob.learning_rate"] == (0.0003, 1e-5)
+    assert event.changed["run.total_env_steps"] == (600, 800)
+
+
+def test_a_run_may_be_moved(run, tmp_path):
+    assert go_on(run.rename(tmp_path / "elsewhere")).reason == "finished"
+
+
+@pytest.mark.parametrize("version", ["0.1.0", "0.2.0", "0.4.1"])
+def test_a_run_of_another_version_is_left_alone(run, version):
+    identity = json.loads((run / "run.json").read_text()) | {"tandem": version}
+    if version == "0.2.0":
+        del identity["tandem"]
+    (run / "run.json").write_text(json.dumps(identity))
+    if version == "0.1.0":
+        (run / "run.json").unlink()
+    before = {path: path.read_bytes() for path in run.rglob("*") if path.is_file()}
+    with pytest.raises(ConfigError) as error:
+        resumed_config(RunDirectory(run), [])
+    reader = "0.2" if version == "0.1.0" else version
+    assert_one_line(error.value, run, f"by tandem {version}, which this version does not read: use tandem {reader}")
+    assert {path: path.read_bytes() for path in run.rglob("*") if path.is_file()} == before
+
+
+def test_a_damaged_history_is_one_line(run):
+    (run / "run.json").write_text(json.dumps({"run": "x"}))
+    with pytest.raises(StorageError) as error:
+        go_on(run)
+    assert_one_line(error.value, run / "run.json", "damaged", "restore it from a copy")
+
+
+def test_a_process_that_was_overtaken_saves_nothing(run):
+    """Another one has claimed the run, on a file system without locks."""
+    directory = RunDirectory(run)
+    local = open_run(resumed_config(directory, ["run.total_env_steps=900"]), directory, resume=True)
+    before = sorted(path.name for path in (run / "checkpoints").iterdir())
+    claim_epoch(run)
+    with pytest.raises(StorageError, match="taken over by another process"):
+        local.run()
+    local.close()
+    directory.close()
+    assert sorted(path.name for path in (run / "checkpoints").iterdir()) == before

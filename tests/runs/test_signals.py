@@ -1,0 +1,237 @@
+"""SIGINT and SIGTERM at any moment of a run: what is on the disk then, what is said, and the exit code."""
+
+import os
+import signal
+from contextlib import suppress
+from types import SimpleNamespace
+
+import pytest
+from typer.testing import CliRunner
+
+from service.cli.main import app
+from service.registry.registry import Registry
+from service.runs.run import Run
+from service.runs.signals import PASSED_ON, STOPPING, InterruptError, StopSignals
+from tests.runs.runs import assert_same_run, newest, play, tiny_config, write_yaml
+
+pytestmark = pytest.mark.usefixtures("default_signals")
+BOTH = pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM], ids=lambda number: number.name)
+
+
+def send(number):
+    os.kill(os.getpid(), number)
+
+
+def send_when_called(patch, name, number):
+    """The first thing that this function does from now on is to get a signal."""
+
+    def interrupted(*args, **kwargs):
+        send(number)
+        raise AssertionError("nobody minded the signal")
+
+    patch.setattr(name, interrupted)
+
+
+# --- the handlers ----------------------------------------------------------------------------------------------------
+
+
+@BOTH
+def test_a_signal_raises_where_nothing_else_was_asked_for(number):
+    with pytest.raises(InterruptError, match=number.name) as caught, StopSignals() as signals:
+        send(number)
+    assert caught.value.number == signals.first == number
+    assert not isinstance(caught.value, Exception)  # or a broad ``except`` would swallow it
+
+
+@BOTH
+def test_the_first_signal_asks_and_the_second_raises(number):
+    asked = []
+    with StopSignals() as signals, signals.asking(lambda: asked.append("stop")):
+        send(number)
+        assert asked == ["stop"]
+        with pytest.raises(InterruptError, match="SIGTERM"):
+            send(signal.SIGTERM)
+    assert signals.first == number
+    assert asked == ["stop"]
+
+
+def test_after_the_question_a_signal_raises_again():
+    with StopSignals() as signals:
+        with signals.asking(lambda: pytest.fail("asked too late")):
+            pass
+        with pytest.raises(InterruptError):
+            send(signal.SIGINT)
+
+
+def test_a_signal_that_somebody_swallowed_is_not_forgotten():
+    asked = []
+    with StopSignals() as signals:
+        with suppress(BaseException):
+            send(signal.SIGTERM)
+        with signals.asking(lambda: asked.append("stop")):
+            assert asked == ["stop"]
+
+
+def test_the_handlers_from_before_are_put_back():
+    before = [signal.getsignal(number) for number in STOPPING]
+    with pytest.raises(InterruptError), StopSignals():
+        send(signal.SIGTERM)
+    assert [signal.getsignal(number) for number in STOPPING] == before
+
+
+@pytest.mark.parametrize("order", [(PASSED_ON, signal.SIGTERM), (signal.SIGTERM, PASSED_ON)])
+def test_a_stop_that_comes_directly_and_is_passed_on_is_one(order):
+    asked = []
+    with StopSignals() as signals, signals.asking(lambda: asked.append("stop")):
+        for number in order:
+            send(number)
+        assert asked
+        with pytest.raises(InterruptError, match="SIGINT"):
+            send(signal.SIGINT)
+    assert signals.first == order[0]
+
+
+def test_a_stop_that_is_passed_on_raises_where_nothing_else_was_asked_for():
+    with pytest.raises(InterruptError, match="SIGUSR1"), StopSignals():
+        send(PASSED_ON)
+
+
+# --- the command -----------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def home(tmp_path, monkeypatch):
+    """A quick end of a run, and ``run(*more)``: a pre-training there from the command line."""
+    monkeypatch.setattr("service.media.artifacts.NUM_SKILLS", 2)
+    monkeypatch.setattr("service.media.artifacts.COVERAGE_STEPS", 2)
+    monkeypatch.setattr("service.media.video.write_video", lambda takes, world, path: path)
+    home = SimpleNamespace(path=tmp_path / "run", registry=tmp_path / "registry")
+    config = write_yaml(tmp_path / "tiny.yaml")
+
+    def run(*more):
+        arguments = ("pretrain", "--run-dir", home.path, "--registry", home.registry, *more)
+        arguments += () if "--resume" in more else ("--config", config)
+        return CliRunner().invoke(app, [str(part) for part in arguments], env={"COLUMNS": "80"})
+
+    home.run = run
+    home.hint = f"continue with: tandem train --resume --run-dir {home.path} --registry {home.registry}\n"
+    return home
+
+
+@pytest.fixture(scope="module")
+def uninterrupted(tmp_path_factory):
+    path = tmp_path_factory.mktemp("uninterrupted")
+    play(path)
+    return path
+
+
+@pytest.mark.parametrize(
+    ("where", "number"),
+    [
+        ("service.registry.publishing.success_metrics", signal.SIGINT),
+        ("service.runs.train.publish_run", signal.SIGTERM),
+        ("service.media.artifacts.plot_curves", signal.SIGTERM),
+        ("service.media.artifacts.skill_trajectories", signal.SIGINT),
+        ("service.media.recording.record_rounds", signal.SIGTERM),
+    ],
+)
+def test_a_signal_behind_the_learning(home, uninterrupted, where, number):
+    with pytest.MonkeyPatch.context() as patch:
+        send_when_called(patch, where, number)
+        result = home.run()
+    assert result.exit_code == 128 + number, result.output
+    assert "finished after" in result.stdout
+    assert result.stdout.endswith(f"saved, but not evaluated, published and drawn to the end; {home.hint}")
+    assert_same_run(home.path, uninterrupted)
+
+
+def test_a_resume_does_what_the_signal_kept_from_being_done(home, uninterrupted, monkeypatch):
+    with monkeypatch.context() as patch:
+        send_when_called(patch, "service.media.artifacts.plot_goals", signal.SIGTERM)
+        assert home.run().exit_code == 143
+    result = home.run("--resume")
+    assert result.exit_code == 0, result.output
+    assert (home.path / "goals.png").exists()
+    assert [str(version) for version in Registry(home.registry).versions("tiny")] == ["tiny@1"]
+    assert_same_run(home.path, uninterrupted)
+
+
+@BOTH
+@pytest.mark.parametrize("where", ["service.methods.workers.SelfPlay", "service.store.checkpoints.write_atomic"])
+def test_a_signal_while_a_run_is_being_begun(home, monkeypatch, where, number):
+    with monkeypatch.context() as patch:
+        send_when_called(patch, where, number)
+        result = home.run()
+    assert result.exit_code == 128 + number
+    assert result.stdout == "stopped at once; nothing was saved yet\n"
+    assert home.run().exit_code == 0  # the same command works
+
+
+@BOTH
+def test_a_signal_while_a_run_is_being_loaded(home, uninterrupted, monkeypatch, number):
+    play(home.path, kill_after=3)
+    with monkeypatch.context() as patch:
+        send_when_called(patch, "service.methods.workers.TaskGenerator.load_state", number)
+        result = home.run("--resume")
+    assert result.exit_code == 128 + number
+    assert result.stdout == f"stopped at once; {home.hint}"
+    home.run("--resume")
+    assert_same_run(home.path, uninterrupted)
+
+
+@BOTH
+def test_a_signal_during_an_iteration(home, uninterrupted, monkeypatch, number):
+    record = Run._take_snapshot
+
+    def signalled(self, **kwargs):
+        record(self, **kwargs)
+        if self.iteration == 3:
+            send(number)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Run, "_take_snapshot", signalled)
+        result = home.run()
+    assert result.exit_code == 128 + number
+    assert "stopping after this iteration; again to end now\n" in result.stderr
+    assert "interrupted after" in result.stdout
+    assert result.stdout.endswith(f"\nsaved; {home.hint}")
+    assert newest(home.path).step == 3
+    home.run("--resume")
+    assert_same_run(home.path, uninterrupted)
+
+
+def test_two_signals_during_an_iteration(home, uninterrupted, monkeypatch):
+    def signalled(self, *args):
+        send(signal.SIGTERM)
+        send(signal.SIGINT)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Run, "_record", signalled)
+        result = home.run()
+    assert result.exit_code == 130
+    assert result.stdout == f"stopped at once; {home.hint}"
+    assert newest(home.path).step == 0
+    home.run("--resume")
+    assert_same_run(home.path, uninterrupted)
+
+
+def test_a_signal_while_the_last_checkpoint_is_written(home, uninterrupted, monkeypatch):
+    """It came too late to end the learning, but in time to leave out what follows."""
+    save = Run._save_last
+
+    def signalled(self):
+        send(signal.SIGTERM)
+        save(self)
+
+    monkeypatch.setattr(Run, "_save_last", signalled)
+    result = home.run()
+    assert result.exit_code == 143
+    assert "finished after" in result.stdout
+    assert not (home.path / "curves.png").exists()
+    assert not home.registry.exists()
+    assert_same_run(home.path, uninterrupted)
+
+
+def test_the_tiny_run_is_long_enough_for_these(uninterrupted):
+    assert newest(uninterrupted).step >= 4
+    assert tiny_config().run.checkpoint_interval == 2

@@ -1,0 +1,554 @@
+"""Studies: seeds, grids, cores, intervals, which run is the best, and real ones through kills, signals and resumes."""
+
+import csv
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+import threading
+import time
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from service.actors.evaluation import EVALUATION_SEED, REPORTED_SEED, SELECTION_SEED, Evaluation
+from service.base.errors import ConfigError, TandemError
+from service.base.lock import is_locked
+from service.cli.main import app
+from service.config import dump_config, load_config
+from service.registry.loading import load
+from service.registry.registry import Registry
+from service.runs import study_results
+from service.runs.grid import name_runs, parse_grid, parse_seeds
+from service.runs.resuming import resumed_config
+from service.runs.study import Job, Place, share
+from service.runs.study_file import StudyDirectory, StudyRun
+from service.runs.study_results import (
+    as_csv,
+    best_of,
+    bootstrap_interval,
+    interquartile_mean,
+    publish_best,
+    select,
+    summaries,
+)
+from service.store.checkpoints import CheckpointStore
+from service.store.disk_reader import DiskReader
+from service.store.run_directory import RunDirectory
+from service.store.run_log import read_log
+from tests.runs.runs import ROOT, TINY_TASK, assert_one_line, newest, play, read_lines, tiny_config, write_yaml
+
+PATIENCE_S = 300.0
+
+
+def tandem(*arguments, **environment):
+    """Run a command in this process."""
+    variables = {"COLUMNS": "80", "PYTHONPATH": str(ROOT), "MUJOCO_GL": "off", **environment}
+    return CliRunner().invoke(app, [str(argument) for argument in arguments], env=variables)
+
+
+def wait_for(what):
+    deadline_s = time.monotonic() + PATIENCE_S
+    while not what():
+        assert time.monotonic() < deadline_s, "not within 300 s"
+        time.sleep(0.02)
+
+
+# --- seeds and cores -------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("text", "seeds"),
+    [("0,1,2", (0, 1, 2)), ("5", (5,)), ("0-4", (0, 1, 2, 3, 4)), ("7, 0-1", (7, 0, 1)), ("3-3", (3,))],
+)
+def test_seeds_are_numbers_and_ranges(text, seeds):
+    assert parse_seeds(text) == seeds
+
+
+@pytest.mark.parametrize(
+    ("text", "parts"),
+    [
+        ("0,0", ["0 given twice", "name each once"]),
+        ("0-3,2,1", ["1, 2 given twice"]),
+        ("0,a", ["'a'", "0,1,2 or 0-4"]),
+        ("1.5", ["'1.5'"]),
+        ("-1", ["'-1'"]),
+        ("", ["''"]),
+        ("0,", ["''"]),
+        ("4-0", ["4-0", "goes down", "0-4"]),
+        ("0-999999999", ["more than 1000"]),
+        ("0-998,1000-1001", ["more than 1000"]),
+        ("\u0663", ["\u0663"]),  # a digit, in another script
+    ],
+)
+def test_seeds_that_are_none_are_refused_with_one_line(text, parts):
+    with pytest.raises(ConfigError) as error:
+        parse_seeds(text)
+    assert_one_line(error.value, "--seeds", *parts)
+
+
+def test_as_many_seeds_as_there_may_be():
+    assert len(parse_seeds("0-998,1000")) == 1000
+
+
+@pytest.mark.parametrize(
+    ("texts", "grid"),
+    [
+        (["a.b=1e-4,3e-4"], {"a.b": ["1e-4", "3e-4"]}),
+        (["a=1, 2", "b=x"], {"a": ["1", "2"], "b": ["x"]}),
+        (["a=[1, 2],[[3],4]"], {"a": ["[1, 2]", "[[3],4]"]}),
+        (["a='x,y',z"], {"a": ["'x,y'", "z"]}),
+        (["primitives=panda-cube@6,runs/x"], {"primitives": ["panda-cube@6", "runs/x"]}),
+        (["a={b: 1, c: 2},null"], {"a": ["{b: 1, c: 2}", "null"]}),
+    ],
+)
+def test_a_grid_has_values_as_they_are_typed(texts, grid):
+    assert parse_grid(texts) == grid
+
+
+@pytest.mark.parametrize(
+    ("texts", "seeds", "parts"),
+    [
+        (["a"], None, ["--grid 'a'", "KEY=VALUE,VALUE"]),
+        (["=1"], None, ["KEY=VALUE,VALUE"]),
+        (["a="], None, ["KEY=VALUE,VALUE"]),
+        (["a=1,"], None, ["KEY=VALUE,VALUE"]),
+        (["a=,1"], None, ["KEY=VALUE,VALUE"]),
+        (["a=[1,2"], None, ["KEY=VALUE,VALUE"]),
+        (["a=1],[2"], None, ["KEY=VALUE,VALUE"]),
+        (["a=" + "[" * 5000], None, ["KEY=VALUE,VALUE"]),
+        (["a=1,2,1"], None, ["1 given twice"]),
+        (["a=1", "a=2"], None, ["a is given by another --grid"]),
+        (["seed=1,2"], "0", ["--seeds 0", "--grid seed", "one of them"]),
+    ],
+)
+def test_a_grid_that_is_none_is_refused_with_one_line(texts, seeds, parts):
+    with pytest.raises(ConfigError) as error:
+        parse_grid(texts, seeds)
+    assert_one_line(error.value, *parts)
+
+
+def test_names_of_runs_say_what_they_differ_in():
+    grid = {"task": ["push"], "method": ["ours", "ours-her"], "learner.bob.learning_rate": ["1e-4"], "seed": ["0"]}
+    names = ["push-ours-learning_rate-1e-4-seed-0", "push-ours-her-learning_rate-1e-4-seed-0"]
+    assert list(name_runs(grid)) == names
+    assert name_runs(grid)[names[1]] == {"task": "push", "method": "ours-her", "seed": "0"} | {
+        "learner.bob.learning_rate": "1e-4"
+    }
+    assert list(name_runs({"seed": ["3", "8"]})) == ["seed-3", "seed-8"]
+    assert list(name_runs({"a.x": ["1"], "b.x": ["../2"]})) == ["a.x-1-b.x-..-2"]
+    for wrong, parts in (
+        ({"a": ["x/y", "x y"]}, ["a-x-y", "name of two runs"]),
+        ({"a": ["x" * 100]}, ["longer than 100 characters"]),
+        ({"a": list(map(str, range(40))), "b": list(map(str, range(26)))}, ["1040 runs", "at most 1000"]),
+    ):
+        with pytest.raises(ConfigError) as error:
+            name_runs(wrong)
+        assert_one_line(error.value, *parts)
+
+
+@pytest.mark.parametrize(
+    ("num_cores", "num_runs", "parallel", "found"),
+    [
+        (2, 3, None, (1, 2)),
+        (1, 3, None, (1, 1)),
+        (8, 3, None, (3, 2)),
+        (16, 3, None, (3, 5)),
+        (16, 20, None, (8, 2)),
+        (2, 3, 2, (2, 1)),
+        (2, 3, 9, (3, 1)),
+    ],
+)
+def test_cores_are_shared_out(num_cores, num_runs, parallel, found):
+    assert share([tiny_config(num_threads=0)] * num_runs, Place(num_cores), parallel) == (
+        found[0],
+        [found[1]] * num_runs,
+    )
+
+
+def test_a_task_has_one_core_and_no_run_more_than_its_machine_or_than_it_was_given():
+    task = tiny_task(num_threads=0)
+    assert share([task] * 9, Place(4), None) == (4, [1] * 9)
+    assert share([task] * 9, Place(4), 2) == (2, [1] * 9)
+    assert share([tiny_config(num_threads=0)] * 2, Place(64, 16), None) == (2, [16, 16])
+    assert share([tiny_config(num_threads=0)], Place(64, 16), None) == (1, [16])
+    assert share([tiny_config(num_threads=4), task], Place(8), None) == (2, [4, 1])
+
+
+def tiny_task(**run):
+    return load_config(None, ["task=push", "method=ours", *(f"run.{key}={value}" for key, value in run.items())])
+
+
+def test_what_a_run_is_told(tmp_path):
+    """It begins with its file and with what it begins from; once it has begun, it goes on with the study's budget."""
+    config, path = tiny_config(seed=3, total_env_steps=999), tmp_path / "seed-3"
+    run = StudyRun(settings={"seed": "3"})
+    job = Job(path, dump_config(config), run, ("--registry", "r"), ("--from", "panda-cube@6"))
+    place = ["--run-dir", str(path), "--no-publish"]
+    assert job.arguments() == ["train", f"{path}.yaml", *place, "--registry", "r", "--from", "panda-cube@6"]
+    play(path, tiny_config(seed=3, total_env_steps=120))
+    job.write_config()
+    arguments = job.arguments()
+    assert arguments[:5] == ["train", "--resume", *place]
+    assert arguments[-2:] == ["--registry", "r"]
+    overrides = [arguments[place + 1] for place, each in enumerate(arguments) if each == "--set"]
+    assert resumed_config(RunDirectory(path), overrides) == config
+
+
+# --- numbers ---------------------------------------------------------------------------------------------------------
+
+
+def test_the_interquartile_mean_is_of_the_middle_half():
+    assert interquartile_mean(np.array([9.0, 2.0, 0.0, 1.0])) == 1.5
+    assert interquartile_mean(np.array([0.0, 1.0, 2.0, 3.0, 99.0])) == 2.0  # a quarter of 5, rounded down, is 1
+    assert interquartile_mean(np.array([1.0, 2.0, 6.0])) == 3.0  # of three values, the mean of all
+    rows = np.array([[4.0, 0.0, 1.0, 2.0, 3.0, 5.0, 6.0, 99.0], [1.0] * 8])
+    assert interquartile_mean(rows).tolist() == [3.5, 1.0]
+
+
+def test_bootstrap_intervals_by_hand():
+    # Two values: their resampled mean is each of them with 1/4, and half the sum with 1/2.
+    assert bootstrap_interval([[0.2, 0.6]]) == (0.2, 0.6)
+    # Three: 1/27 = 3.7 % of the samples are the lowest alone, which is more than 2.5 %.
+    assert bootstrap_interval([[0.0, 0.5, 1.0]]) == (0.0, 1.0)
+    # Six values of which one is 1: it is in the middle half of six, the sorted places 2 to 5, as often as it is drawn
+    # twice or more. Binomial(6, 1/6): P(>= 4) = .87 %, P(>= 3) = 6.2 %, so the upper end is that of 3: 2 of 4.
+    low, high = bootstrap_interval([[0.0, 0.0, 0.0, 0.0, 0.0, 1.0]])
+    assert (low, high) == (0.0, 0.5)
+    # A task is resampled by itself: what differs between tasks adds nothing to the interval.
+    assert bootstrap_interval([[0.0, 0.0], [1.0, 1.0]]) == (0.5, 0.5)
+    assert bootstrap_interval([[0.7]]) == (0.7, 0.7)
+
+
+def test_a_mean_of_many_has_the_interval_of_the_normal_distribution():
+    values = np.random.default_rng(3).normal(2.0, 1.0, 400)
+    low, high = bootstrap_interval([values], lambda drawn: drawn.mean(axis=-1))
+    half = 1.96 * values.std() / 20.0
+    assert low == pytest.approx(values.mean() - half, abs=0.01)
+    assert high == pytest.approx(values.mean() + half, abs=0.01)
+
+
+def a_run(task, seed, success, **more):
+    result = {"success_last": success, "success_ever": 1.0}
+    return StudyRun(settings={"task": task, "seed": str(seed)}, state="finished", env_steps=9, result=result, **more)
+
+
+def test_a_row_for_each_task_and_one_for_all():
+    runs = [a_run("push", 0, 0.2), a_run("push", 1, 0.6), a_run("wall", 0, 1.0), a_run("wall", 1, 1.0)]
+    rows = summaries([*runs, StudyRun(settings={"task": "wall", "seed": "2"}, state="failed")])
+    assert [(settings, row.num) for settings, row in rows] == [
+        ({"task": "push"}, 2),
+        ({"task": "wall"}, 2),
+        ({"task": "all"}, 4),
+    ]
+    push, wall, both = (row for _, row in rows)
+    assert (push.mean, push.iqm, push.low, push.high) == pytest.approx((0.4, 0.4, 0.2, 0.6))
+    assert (wall.mean, wall.iqm, wall.low, wall.high) == (1.0, 1.0, 1.0, 1.0)
+    assert (both.mean, both.iqm) == pytest.approx((0.7, 0.8))  # of .2 .6 1 1 the middle two
+    assert (both.low, both.high) == pytest.approx((0.6, 0.8))  # .2 .2 | 1 1 has .6, .6 .6 | 1 1 has .8
+
+
+def test_a_line_for_each_run():
+    runs = {"a": a_run("push", 0, 0.25, wall_s=1.25), "b": StudyRun(settings={"task": "push", "seed": "1"})}
+    assert as_csv(runs) == (
+        "run,task,seed,state,env_steps,wall_s,success_last,success_ever\n"
+        "a,push,0,finished,9,1.2,0.25,1.0\n"
+        "b,push,1,waiting,0,0.0,,\n"
+    )
+
+
+# --- the best one ----------------------------------------------------------------------------------------------------
+
+
+def an_evaluation(success_last, distance_m=0.1, goals="mixed"):
+    return Evaluation(goals, 1000, 50, success_last, success_last - 0.02, success_last + 0.02, 1.0, distance_m)
+
+
+def test_the_best_is_chosen_by_the_selections_goals_alone():
+    def run(success, distance_m, reported, state="finished"):
+        result = {"selection_success_last": success, "selection_mean_distance_m": distance_m}
+        return StudyRun(settings={}, state=state, result=result | {"mixed_success_last": reported})
+
+    runs = {"0": run(0.90, 0.1, 0.99), "1": run(0.95, 0.03, 0.10), "2": run(0.95, 0.02, 0.10)}
+    assert best_of(runs) == "2"  # of equals, the one that ends nearer
+    assert best_of(runs | {"3": run(0.99, 0.0, 0.5, "failed"), "4": a_run("push", 0, 1.0)}) == "2"
+    assert best_of({"4": a_run("push", 0, 1.0)}) is None
+
+
+def test_goals_that_choose_are_not_those_that_are_reported(monkeypatch, tmp_path):
+    asked = []
+
+    def evaluate(policy, world, kind, *, num_episodes, num_steps, success_distance_m, seed, num_threads):
+        asked.append((kind, num_episodes, num_steps, seed))
+        return an_evaluation(0.5, goals=kind)
+
+    play(tmp_path, tiny_config(total_env_steps=120))
+    monkeypatch.setattr("service.actors.evaluation.evaluate", evaluate)
+    assert select(tmp_path) == {"selection_success_last": 0.5, "selection_mean_distance_m": 0.1}
+    assert asked == [("mixed", 1000, 2, SELECTION_SEED)]
+    # recorded figures are of these goals, and what chose is not what is reported
+    assert (EVALUATION_SEED, REPORTED_SEED, SELECTION_SEED) == (1_000_003, 1_000_004, 1_000_005)
+
+
+def test_a_better_run_found_by_a_resume_becomes_the_next_version(tmp_path):
+    registry, study = Registry(tmp_path / "registry"), StudyDirectory(tmp_path / "study")
+    study.begin({f"seed-{seed}": ({"seed": str(seed)}, tiny_config(seed=seed)) for seed in (0, 1)}, None)
+    result = {"mixed_success_last": 0.5, "selection_success_last": 0.75, "selection_mean_distance_m": 0.1}
+    run = StudyRun(settings={}, state="finished", env_steps=120, result=result)
+    published = []
+    for seed in (0, 1):
+        directory = study.path / f"seed-{seed}"
+        play(directory, tiny_config(seed=seed, total_env_steps=120))
+        published += [publish_best(directory, registry, run) for _ in range(2)]  # the second time it is there already
+    study.close()
+    assert [str(version) for version in published] == ["tiny@1", "tiny@1", "tiny@2", "tiny@2"]
+    manifest = registry.manifest("tiny@latest")
+    assert (manifest.version, manifest.config["seed"], manifest.parent) == (2, 1, None)
+    assert manifest.metrics == {
+        "selection/mixed_success_last": 0.75,
+        "evaluation/mixed_success_last": 0.5,
+        "env_steps": 120,
+    }
+
+
+# --- a whole one -----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.usefixtures("default_signals")
+def test_a_study_is_killed_stopped_resumed_and_names_its_best(tmp_path, monkeypatch):
+    monkeypatch.setattr(study_results, "SELECTION_EPISODES", 20)
+    path, registry = tmp_path / "study", tmp_path / "registry"
+    study, common = StudyDirectory(path), ("pretrain", "--run-dir", path, "--registry", registry)
+    places = {seed: RunDirectory(path / f"seed-{seed}") for seed in (3, 8)}
+    config = write_yaml(tmp_path / "tiny.yaml")
+
+    def told():
+        return {name: run.state for name, run in study.read().runs.items()}
+
+    def saved(seed):
+        return len(list(places[seed].checkpoints.glob("checkpoint-*"))) >= 2
+
+    def trouble():
+        """One run is killed, and the other goes on; then all are stopped."""
+        try:
+            wait_for(lambda: saved(3) and saved(8))
+            os.kill(json.loads((path / "seed-8" / ".lock").read_text())["pid"], signal.SIGKILL)
+            wait_for(lambda: told()["seed-8"] == "failed")
+            before = newest(path / "seed-3").step
+            wait_for(lambda: newest(path / "seed-3").step > before)
+        finally:
+            os.kill(os.getpid(), signal.SIGINT)
+
+    troublemaker = threading.Thread(target=trouble)
+    troublemaker.start()
+    endless = ("--set", "run.total_env_steps=1_000_000_000")
+    result = tandem(*common, "--config", config, "--seeds", "3,8", "--parallel", 2, *endless)
+    troublemaker.join()
+
+    assert result.exit_code == 130, result.output
+    assert f"saved; continue with: tandem train --resume --run-dir {path} --registry {registry}\n" in result.stdout
+    assert_one_line(result.stderr.splitlines()[-1], "seed-8 failed: ended by SIGKILL", path / "seed-8" / "log.txt")
+    assert re.search(r"^seed-[38]: [0-9,]+ of [0-9,]+ env steps, .* \| ", result.stderr, re.MULTILINE)
+    assert told() == {"seed-3": "interrupted", "seed-8": "failed"}
+    statuses = {run.run_id: run for run in DiskReader(tmp_path).runs()}  # as the status service lists them
+    assert set(statuses) == {"study-seed-3", "study-seed-8"}
+    assert newest(path / "seed-3").step == statuses["study-seed-3"].iteration  # nothing was lost
+    assert not registry.exists()
+
+    steps = max(newest(path / f"seed-{seed}").meta["env_steps"] for seed in (3, 8)) + 1
+    result = tandem(*common, "--resume", "--set", f"run.total_env_steps={steps}")
+    assert result.exit_code == 0, result.output
+    found = study.read()
+    assert told() == {"seed-3": "finished", "seed-8": "finished"}
+    for name, run in found.runs.items():
+        rows = read_lines(path / name / "metrics.jsonl")
+        assert [row["iteration"] for row in rows] == list(range(1, len(rows) + 1))
+        assert run.env_steps == rows[-1]["env_steps"] >= steps
+        assert f"seed-{RunDirectory(path / name).read_config().seed}" == name
+        assert (
+            run.result["mixed_success_last"]
+            == RunDirectory(path / name).read_result()["evaluation"]["mixed_success_last"]
+        )
+        assert 0.0 <= run.result["selection_success_last"] <= 1.0
+    assert f"best         {found.best}, " in result.stdout
+    assert (path / "curves.png").read_bytes()[:4] == b"\x89PNG"
+
+    versions = Registry(registry).versions("tiny")  # of the best alone
+    assert [str(version) for version in versions] == ["tiny@1"] == [found.published]
+    manifest, parameters = Registry(registry).load("tiny@latest")
+    assert f"seed-{manifest.config['seed']}" == found.best
+    assert manifest.metrics["env_steps"] == found.runs[found.best].env_steps
+    bob = load(str(path / found.best)).parameters
+    assert all(np.array_equal(parameters[name], array) for name, array in bob.items())
+    assert DiskReader(path).run(f"study-{found.best}").published == "tiny@1"
+
+    logs = [(place.path / "log.txt").read_bytes() for place in places.values()]
+    again = tandem(*common, "--seeds", "8,3", "--resume", "--config", config)  # nothing is left to do
+    assert again.exit_code == 0, again.output
+    assert [(place.path / "log.txt").read_bytes() for place in places.values()] == logs
+    assert len(Registry(registry).versions("tiny")) == 1
+
+
+def test_two_seeds_and_two_tasks_are_killed_with_their_study_and_go_on(tmp_path):
+    """The study's process and those of two runs are killed at once, and the other two have not begun."""
+    study = StudyDirectory(tmp_path / "night")
+    given = [*TINY_TASK, "push,wall", "--seeds", "0,1", "--run-dir", str(study.path), "--parallel", "2"]
+    command = [sys.executable, "-m", "service", "train", *given, "--set", "run.total_env_steps=1_000_000"]
+    begun = {name: study.path / name for name in ("push-seed-0", "push-seed-1")}
+
+    def saved(path):
+        return any(step >= 2 for step in CheckpointStore(path / "checkpoints", keep=1).steps())
+
+    with subprocess.Popen(command, cwd=ROOT, stderr=subprocess.PIPE, text=True) as process:
+        try:
+            wait_for(lambda: process.poll() is not None or all(map(saved, begun.values())))
+            assert process.poll() is None, process.stderr.read()
+            processes = [json.loads((path / ".lock").read_text())["pid"] for path in begun.values()]
+        finally:
+            process.kill()  # at once with the runs, which the kernel would tell to save
+        for each in processes:
+            os.kill(each, signal.SIGKILL)
+        wait_for(lambda: not any(map(is_locked, begun.values())))
+    states = {name: run.state for name, run in study.read().runs.items()}
+    waiting = ("wall-seed-0", "wall-seed-1")
+    assert states == dict.fromkeys(begun, "running") | dict.fromkeys(waiting, "waiting")
+    assert {run.study for run in DiskReader(tmp_path).runs()} == {"night"}  # the page shows them as one
+
+    steps = max(newest(path).meta["env_steps"] for path in begun.values()) + 200
+    result = tandem("train", "--resume", "--run-dir", study.path, "--set", f"run.total_env_steps={steps}")
+    assert result.exit_code == 0, result.output
+    found = study.read()
+    assert (found.best, found.published) == (None, None)
+    assert list(found.runs) == [f"{task}-seed-{seed}" for task in ("push", "wall") for seed in (0, 1)]
+    for name, run in found.runs.items():
+        rows = read_lines(study.path / name / "metrics.jsonl")
+        assert [row["iteration"] for row in rows] == list(range(1, len(rows) + 1))
+        assert (run.state, run.env_steps, rows[-1]["env_steps"]) == ("finished", steps, steps)
+        config = RunDirectory(study.path / name).read_config()
+        assert (config.task, str(config.seed)) == (run.settings["task"], run.settings["seed"])
+        assert run.result == RunDirectory(study.path / name).read_result()["evaluation"]
+        goes_on = any("goes on with the run" in entry.text for entry in read_log(study.path / name))
+        assert goes_on == (name in begun)
+    with (study.path / "results.csv").open() as file:
+        lines = list(csv.DictReader(file))
+    assert [(line["task"], line["seed"], line["success_last"]) for line in lines] == [
+        (run.settings["task"], run.settings["seed"], str(run.result["success_last"])) for run in found.runs.values()
+    ]
+    assert re.search(r"^push\t2\t.*^wall\t2\t.*^all\t4\t", result.stdout, re.MULTILINE | re.DOTALL)
+    assert (study.path / "curves.png").read_bytes()[:4] == b"\x89PNG"
+
+    logs = {path: path.read_bytes() for path in study.path.glob("*/log.txt")}
+    again = tandem("train", "push,wall", "--seeds", "1,0", "--run-dir", study.path, "--resume")
+    assert again.exit_code == 0, again.output
+    assert {path: path.read_bytes() for path in logs} == logs  # finished runs are left alone
+
+
+def test_a_run_is_told_when_the_process_of_the_study_is_gone(tmp_path):
+    """The study's process is the middle one: it is killed while the run, below it, waits."""
+    run = (
+        "import os, signal, sys, time; from service.cli.study_run import stop_with\n"
+        "signal.signal(signal.SIGUSR1, lambda *_: (print('told', flush=True), os._exit(0)))\n"
+        "stop_with(int(sys.argv[1])); print('ready', flush=True); time.sleep(60)"
+    )
+    middle = (
+        "import os, subprocess, sys, time\n"
+        f"subprocess.Popen([sys.executable, '-c', {run!r}, str(os.getpid())], start_new_session=True); time.sleep(60)"
+    )
+    with subprocess.Popen([sys.executable, "-c", middle], cwd=ROOT, stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout.readline() == "ready\n"
+        process.kill()
+        assert process.stdout.read() == "told\n"
+
+
+# --- what a mistake gets ---------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def begun(tmp_path_factory):
+    """A study that has begun, with one of its two runs."""
+    study = StudyDirectory(tmp_path_factory.mktemp("begun") / "study")
+    study.begin({f"seed-{seed}": ({"seed": str(seed)}, tiny_config(seed=seed)) for seed in (0, 1)}, None)
+    study.close()
+    play(study.path / "seed-0", tiny_config(total_env_steps=120))
+    return study
+
+
+@pytest.mark.parametrize(
+    ("arguments", "parts"),
+    [
+        (["--seeds", "0,0"], ["0 given twice"]),
+        (["--seeds", "0,1"], ["holds a study already", "--resume"]),
+        ([], ["holds a study already", "--resume"]),
+        (["--seeds", "0,1", "--set", "seed=3"], ["--set seed=3", "leave it out"]),
+        (["--resume", "--set", "seed=3"], ["--set seed=3", "leave it out"]),
+        (["--resume", "--seeds", "0-2"], ["has the runs seed-0, seed-1, not seed-0, seed-1, seed-2"]),
+        (["--resume", "--set", "game.num_worlds=3"], ["game.num_worlds=3", "keeps its configuration"]),
+        (["--resume", "--config", "OTHER"], ["game.num_goals", "keeps its configuration"]),
+        (["--seeds", "0", "--run-dir", "RUN"], ["seed-0 holds a run already", "another --run-dir"]),
+        (["--resume", "--seeds", "0", "--run-dir", "RUN"], ["no study in", "study.json"]),
+        (["--seeds", "0", "--run-dir", "PARENT"], ["seed-0 holds a run already", "another --run-dir"]),
+        (["--resume", "--seeds", "0", "--run-dir", "NOWHERE"], ["no study in", "--resume"]),
+        (["--parallel", "2", "--run-dir", "NOWHERE"], ["--parallel", "--seeds"]),
+        (["--seeds", "0", "--grid", "game.num_goals=1,x", "--run-dir", "NOWHERE"], ["game.num_goals", "'x'"]),
+        (["--seeds", "0", "--grid", "game.nums=1", "--run-dir", "NOWHERE"], ["game.nums", "unknown key"]),
+        (["push,wal", "--run-dir", "NOWHERE"], ["'wal'", "did you mean 'wall'"]),
+        (["push,push", "--run-dir", "NOWHERE"], ["push given twice"]),
+        (["push,panda-cube", "--run-dir", "NOWHERE", "--primitives", "x"], ["--primitives", "task"]),
+        (["push", "--method", "ours,lsd", "--run-dir", "NOWHERE"], ["panda-cube@", "skills"]),
+        (["push", "--method", "ours,our", "--run-dir", "NOWHERE"], ["'our'", "did you mean 'ours'"]),
+        (["push", "--grid", "task=wall", "--run-dir", "NOWHERE"], ["push", "--grid task=wall", "one of them"]),
+        (["--grid", "game.num_goals=1,2", "--set", "game.num_goals=3"], ["--set game.num_goals=3", "leave it out"]),
+        (["push,wall", "--publish", "--run-dir", "NOWHERE"], ["--publish", "--resume --publish --run-dir"]),
+        (["--seeds", "0", "--registry", "http://x:1", "--run-dir", "NOWHERE"], ["http://x:1", "read only"]),
+        (["--seeds", "0", "--runtime", "ray", "--num-actors", "2"], ["--num-actors", "--set run.num_threads=N"]),
+    ],
+)
+def test_mistakes_get_one_line_and_lose_nothing(begun, tmp_path, arguments, parts):
+    study = begun
+    before = {path: path.read_bytes() for path in study.path.rglob("*") if path.is_file()}
+    parent = tmp_path / "parent"  # runs without a study around them
+    (parent / "seed-0").mkdir(parents=True)
+    (parent / "seed-0" / "config.yaml").write_bytes((study.path / "seed-0" / "config.yaml").read_bytes())
+    other = tiny_config().model_dump(mode="json")
+    other["game"]["num_goals"] += 1
+    names = {
+        "OTHER": write_yaml(tmp_path / "other.yaml", other),
+        "RUN": study.path / "seed-0",
+        "PARENT": parent,
+        "NOWHERE": tmp_path / "nowhere",
+    }
+    where = [] if "--run-dir" in arguments else ["--run-dir", study.path]
+    result = tandem("pretrain", *where, *(names.get(each, each) for each in arguments))
+    assert result.exit_code == 2, result.output
+    assert_one_line(result.stderr, "error: ", *parts)
+    assert {path: path.read_bytes() for path in study.path.rglob("*") if path.is_file()} == before
+    assert not (tmp_path / "nowhere").exists()
+
+
+def test_two_processes_do_not_run_one_study(begun):
+    holder = StudyDirectory(begun.path)
+    holder.claim()
+    try:
+        result = tandem("pretrain", "--resume", "--run-dir", begun.path)
+    finally:
+        holder.close()
+    assert result.exit_code == 2
+    assert_one_line(result.stderr, begun.path, f"process {os.getpid()}", "stop that one first")
+
+
+def test_a_study_whose_file_cannot_be_read(tmp_path):
+    study = StudyDirectory(tmp_path)
+    study.begin({"seed-0": ({"seed": "0"}, tiny_config())}, None)
+    study.close()
+    for text in ("no json", "{}", '{"runs": {"a": 1}}', "[]", "[" * 10_000):
+        study.file.write_text(text)
+        with pytest.raises(TandemError) as error:
+            study.read()
+        assert_one_line(error.value, study.file, "does not name the runs")
+    study.file.write_text('{"seeds": [0], "from": null, "runs": {}}')
+    with pytest.raises(ConfigError) as error:
+        study.read()
+    assert_one_line(error.value, study.file, "use tandem 0.2")
