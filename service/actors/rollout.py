@@ -51,7 +51,7 @@ class Demonstrations:
     """Steps that a player clones: Alice's and Bob's own, relabelled for Bob, or Alice's own for herself."""
 
     observation: FloatArray
-    """(D, O) input of whoever clones; Bob's has the goal that was reached."""
+    """(D, O) input of the player that clones; Bob's has the goal that was reached."""
     action: FloatArray
     """(D, A)."""
 

@@ -214,10 +214,10 @@ class SelfPlay:
     ) -> tuple[Turns, BoolArray, BoolArray]:
         """Turns without a step, as ``_play_alice`` gives them."""
         num = self.worlds.num_worlds
-        nobody = np.zeros(num, dtype=bool)
+        no_world = np.zeros(num, dtype=bool)
         size = self.worlds.observed.full.size
-        turns = _empty_turns(self.config.game.alice_steps, num, size, size, learn=nobody)
-        return turns, np.zeros((num, 2), dtype=bool), nobody
+        turns = _empty_turns(self.config.game.alice_steps, num, size, size, learn=no_world)
+        return turns, np.zeros((num, 2), dtype=bool), no_world
 
     def _play_bob(
         self, players: Players, plan: RoundPlan, choice: GoalChoice, observe: Observer | None

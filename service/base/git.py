@@ -12,7 +12,7 @@ def git_commit() -> str | None:
     """The commit of this program's own checkout, with ``-dirty`` for local changes; None outside of one."""
     root = Path(__file__).resolve().parents[2]
     top = _git(root, "rev-parse", "--show-toplevel")
-    # an installation inside somebody else's repository must not claim that repository's commit
+    # an installation inside another repository must not claim that repository's commit
     if top is None or Path(top).resolve() != root:
         return None
     return _git(root, "describe", "--always", "--dirty", "--abbrev=40", "--exclude=*")

@@ -20,7 +20,7 @@ from service.base.regular_files import open_regular, open_to_append, read_regula
 
 LOCK_FILE = ".lock"
 WITHOUT_LOCKS = "TANDEM_WITHOUT_LOCKS"
-"""Variable of the environment that says, with 1, that somebody sees to it that one process uses a directory."""
+"""Variable of the environment that says, with 1, that the user sees to it that one process uses a directory."""
 WAIT_S = 0.5
 """Longer than ``is_locked`` of another process keeps the lock to itself."""
 _logger = logging.getLogger(__name__)
@@ -75,7 +75,7 @@ def is_locked(directory: Path) -> bool:
     try:
         with open_regular(directory / LOCK_FILE) as file:
             return not _take(file, fcntl.LOCK_SH, 0.0)
-    except OSError:  # nobody ever locked it, or nobody can
+    except OSError:  # it was never locked, or cannot be
         return False
 
 

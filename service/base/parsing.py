@@ -2,7 +2,7 @@
 
 The parsers alone follow wherever a text leads: brackets nested a hundred thousand deep, aliases of YAML that stand for
 a billion values, whole numbers that no float holds. What is refused here is refused with one line that says why. How
-long a text may be is for whoever reads the file to say; YAML is slow, so it has a limit here.
+long a text may be is for the reader of the file to say; YAML is slow, so it has a limit here.
 """
 
 from __future__ import annotations
@@ -143,7 +143,7 @@ class _BoundedLoader(yaml.SafeLoader):
 
 
 def _check(tree: Any, where: object, greatest: int, *, allow_nan: bool) -> None:
-    """Refuse what parsers take but nobody can work with; without recursion, which is what deep trees are made for."""
+    """Refuse what parsers take but no program can use; without recursion, which is what deep trees are made for."""
     level, depth = [tree], 0
     while level:
         inner: list[Any] = []

@@ -1,6 +1,6 @@
 """Regular files, opened without waiting: whatever a user names, or a run finds in its directory, is opened here.
 
-Anybody may have put something else there. A FIFO has nobody at its other end, and a device may never end.
+Another program may have put something else there. A FIFO may wait for ever, and a device may never end.
 """
 
 from __future__ import annotations

@@ -173,7 +173,7 @@ def _connected(
 ) -> Iterator[tuple[Backend, Callable[[], bool], Callable[[str], None]]]:
     """A robot with its dead-man's switch, and what asks people to get ready; signals come as exceptions.
 
-    Nobody is asked, nor has to hold a key, where nobody is in danger: by a simulator, and by a dry run.
+    A simulator and a dry run ask no question, and no key has to be held: they endanger no person.
     """
     from service.robot.backends import connect
     from service.robot.dead_man import HeldKey

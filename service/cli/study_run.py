@@ -24,7 +24,7 @@ def stop_with(parent: int) -> None:
 
     if sys.platform == "linux":
         ctypes.CDLL(None, use_errno=True).prctl(PR_SET_PDEATHSIG, int(PASSED_ON))
-    if os.getppid() != parent:  # it ended a moment ago, and nobody sends anything
+    if os.getppid() != parent:  # it ended a moment ago, and no signal comes
         sys.exit(128 + PASSED_ON)
 
 

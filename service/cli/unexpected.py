@@ -1,4 +1,4 @@
-"""Errors that nobody expected: one line for the user, and the traceback in a file for whoever mends the program."""
+"""Unexpected errors: one line for the user, and the traceback in a file for a developer."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ _logger = logging.getLogger(__name__)
 
 @contextmanager
 def traceback_in(directory: Path | None = None) -> Iterator[None]:
-    """Turn an error of the block that nobody expected into one line that names a file with its traceback.
+    """Turn an unexpected error of the block into one line that names a file with its traceback.
 
     Args:
         directory: of the run that the block is about; None, or where nothing can be written there: that for temporary
@@ -47,7 +47,7 @@ def traceback_in(directory: Path | None = None) -> Iterator[None]:
     except (TandemError, UsageError, typer.Exit, typer.Abort):
         raise
     except OSError as error:
-        if error.errno == errno.EPIPE:  # whoever read our output is gone, which typer knows how to end
+        if error.errno == errno.EPIPE:  # the reader of our output is gone, which typer knows how to end
             raise
         if error.errno in _PATH_ERRORS and error.filename is not None:
             raise TandemError(
@@ -88,7 +88,7 @@ def _unexpected(error: BaseException, directory: Path | None) -> UnexpectedError
 
 
 def _write_traceback(error: BaseException, directory: Path) -> Path:
-    """Make a file of its own, which only this user may read: a traceback may quote what is nobody else's business."""
+    """Make a file of its own, which only this user may read: a traceback may quote what is private."""
     stamp = time.strftime("%Y%m%d-%H%M%S", time.gmtime())
     path = directory / f"{TRACEBACK_PREFIX}{stamp}-{secrets.token_hex(4)}.txt"
     head = f"tandem {__version__}, Python {platform.python_version()}, {platform.platform()}\n{sys.argv}\n\n"

@@ -89,7 +89,7 @@ class ActorSlot:
 
     @property
     def overdue(self) -> bool:
-        """Whether its round takes far longer than its last ones did; of its first one nobody knows."""
+        """Whether its round takes far longer than its last ones did; of its first one that is not known."""
         if self.ticket is None or self.num_evaluations or not self.rounds_s:
             return False
         return self.watch.call_s > LATE_ROUNDS * median(self.rounds_s) + LATE_S

@@ -83,9 +83,9 @@ def connected(address: str | None, num_cpus: int | None = None) -> Iterator[None
         num_cpus: of a new one; None: all there are.
 
     Raises:
-        WorkersError: nobody there, another version of Ray or Python there, or it does not let us in; or Ray fails
+        WorkersError: nothing there, another version of Ray or Python there, or it does not let us in; or Ray fails
             while the block runs.
-        InterruptError: a signal that nobody else has taken over.
+        InterruptError: a signal for which no other handler was set.
     """
     address = address or ("auto" if os.environ.get("RAY_ADDRESS") else None)
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
@@ -171,7 +171,7 @@ def _check_reachable(address: str | None) -> None:
 
 
 def _check_token(address: str | None) -> None:
-    """Ask the cluster for its id, which needs the right token; Ray itself tries for 20 s, and says nobody answers."""
+    """Ask the cluster for its id, which needs the right token; Ray itself tries for 20 s, without a reason."""
     if address is None or address.startswith("ray://"):
         return
     import grpc

@@ -16,7 +16,7 @@ from service.cluster.watch import Clock
 
 PROBE_S = 0.5
 SILENT_S = 5.0
-"""A raylet that has not answered for so long may be frozen; until it answers, nobody else is called hung."""
+"""A raylet that has not answered for so long may be frozen; until it answers, no other process is called hung."""
 LOST_S = 40.0
 """One that has not answered for so long is given up."""
 

@@ -192,7 +192,7 @@ class RaySelfPlay(SelfPlay):
         }
 
     def load_state(self, state: State) -> None:
-        """Let the workers, which have not started, begin with a state, whoever made it."""
+        """Let the workers, which have not started, begin with a state of any origin."""
         self._states = {"learner": state["learner"], "generator": state["generator"]}
         if "pending" in state:
             self._carried = [ray.put(from_arrays(state["pending"]))]

@@ -39,7 +39,7 @@ class StatusWorker:
 
     def __init__(self, options: StatusOptions, runs_dir: Path, registry: Path, redis: RedisAddress | None) -> None:
         self._options, self._runs_dir, self._registry, self._redis = options, runs_dir, registry, redis
-        if ray.get_runtime_context().was_current_actor_reconstructed:  # nobody asks a second time
+        if ray.get_runtime_context().was_current_actor_reconstructed:  # it is not asked a second time
             self.start(patience_s=REBIND_S)
 
     def start(self, patience_s: float = 0.0) -> str:

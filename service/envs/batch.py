@@ -90,7 +90,7 @@ class WorldBatch:
         self._see()
         self.num_diverged = 0
         self.diverged: list[tuple[StateArray, FloatArray]] = []
-        """(last finite state, action) of every world whose physics diverged; whoever reports them clears the list."""
+        """(last finite state, action) of every world whose physics diverged; the reader clears the list."""
 
     def __enter__(self) -> Self:
         return self

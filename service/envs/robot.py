@@ -201,7 +201,7 @@ def _find_joint(spec: mujoco.MjSpec, robot: RobotConfig, name: str) -> mujoco.Mj
 def _check_joints(
     spec: mujoco.MjSpec, robot: RobotConfig, joints: list[mujoco.MjsJoint], fingers: list[mujoco.MjsJoint]
 ) -> None:
-    """Refuse joints that nobody moves, and an order that is not the model's."""
+    """Refuse joints without an actuator, and an order that is not the model's."""
     there, named = ([each.name for each in group] for group in (spec.joints, [*joints, *fingers]))
     if more := [name.removeprefix(_PREFIX) for name in there if name not in named]:
         raise ConfigError(

@@ -74,7 +74,7 @@ HARD_TASKS: Mapping[str, Task] = {
         world={**task.world, **_HARDER},
     )
     for name, task in TASKS.items()
-    if name not in ("sphere", "wall")  # a hand-written policy fails in most episodes, so nobody knows how hard they are
+    if name not in ("sphere", "wall")  # a hand-written policy fails in most episodes, so their difficulty is not known
 }
 """Tasks in a harder world, where chance seldom finds the object: docs/decisions/0007."""
 

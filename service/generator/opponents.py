@@ -38,7 +38,7 @@ class RoundPlan:
 
 @dataclass(frozen=True, slots=True)
 class Opponents:
-    """Past versions of both players, as a rollout worker gets them; nobody writes to them."""
+    """Past versions of both players, as a rollout worker gets them; read only."""
 
     version: int
     """Another one wherever the players are others."""

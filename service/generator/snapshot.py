@@ -51,9 +51,9 @@ class GoalChoice:
 
 @dataclass(frozen=True, slots=True)
 class GeneratorSnapshot:
-    """All that the choice of goals needs, as it was after some iteration: plain arrays to which nobody writes.
+    """All that the choice of goals needs, as it was after some iteration: plain arrays, read only.
 
-    It comes with the weights, so a worker that has both asks nobody in the middle of a round.
+    It comes with the weights, so a worker that has both asks for nothing in the middle of a round.
     """
 
     config: GeneratorConfig
@@ -92,7 +92,7 @@ class GeneratorSnapshot:
 
         Others are her earlier ones, replayed, or those of another ``goal_source``, which count as replayed, too.
 
-        Replayed goals go to the current Bob only: nobody learns from a past Bob, he shows how hard Alice's goals are.
+        Replayed goals go to the current Bob only: a past Bob's turns only show how hard Alice's goals are.
 
         Args:
             plan: who plays.
@@ -144,7 +144,7 @@ class GeneratorSnapshot:
     def _drawn_goals(
         self, start_state: StateArray, start_position: StateArray, rng: np.random.Generator
     ) -> _Candidates:
-        """Goals that nobody proposed, each from where some world is now."""
+        """Goals that Alice did not propose, each from where some world is now."""
         kind: GoalKind = "table" if self.config.goal_source == "table" else "mixed"
         rows = rng.integers(len(start_state), size=NUM_DRAWN)
         tasks = {

@@ -1,6 +1,6 @@
 """The off-policy loop: every world makes a step, the transitions are kept, and the learner makes several updates.
 
-Consumes worlds and a way to make batches; produces a learned actor. It waits for nobody: what is asked of ``play`` is
+Consumes worlds and a way to make batches; produces a learned actor. It waits for nothing: what is asked of ``play`` is
 done when it returns.
 """
 

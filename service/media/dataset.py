@@ -109,7 +109,7 @@ def write_dataset(name: str, played: Sequence[Played], config: Config, label: st
     about = {**description, "world": config.world.model_dump(mode="json")}
     try:
         with os_errors("write", place), warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # it asks for an author, and for more that nobody knows here
+            warnings.simplefilter("ignore")  # it asks for an author, and for more that is not known here
             minari.create_dataset_from_buffers(
                 full,
                 list(_buffers(played, config)),

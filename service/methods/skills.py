@@ -77,7 +77,7 @@ class SkillDiscovery(Method):
         return export_skills(self._loop.learner.averaged_parameters(), self._batches.reward.exported())
 
     def grid(self) -> GoalGrid:
-        """The cells into which episodes brought the object; nobody tries goals, so success says nothing."""
+        """The cells into which episodes brought the object; no goals are tried, so success says nothing."""
         return self.grid_of(self._cells, self._visits, np.full(len(self._cells), 0.5))
 
     def close(self) -> None:

@@ -55,7 +55,7 @@ class Registry:
             raise self.only_read()
 
     def only_read(self) -> RegistryError:
-        """Make the error of whoever writes a registry that is only read."""
+        """Make the error of a write to a registry that is only read."""
         return RegistryError(
             f"cannot write {self.root}: this registry is only read; "
             "name another directory with --registry or TANDEM_REGISTRY"
@@ -253,7 +253,7 @@ class Registry:
         make_manifest({**fields, "version": 1})  # a bad value must be found before anything is written
         self._blobs.put(data)
         while True:
-            # unique: only one writer makes number n; contiguous: nobody tries n + 1 before n is there
+            # unique: only one writer makes number n; contiguous: no writer tries n + 1 before n is there
             version = Version(name, max((last.number for last in self.versions(name)), default=0) + 1)
             path = self._manifest_path(version)
             with os_errors("write", path):

@@ -125,7 +125,7 @@ class FrankaRobot:
         """End the control of the arm, which brakes and holds; fingers that move halt, and those that hold go on."""
         self._stopped = True
         self._hand.halt()  # again, too: another thread may just have handed on a command
-        # Whatever the library says now, the robot brakes by itself once nobody controls it.
+        # Whatever the library says now, the robot brakes by itself once it is not controlled.
         with contextlib.suppress(Exception):
             if not self._ended and self._tracker is not None and self._tracker.is_running:
                 self._robot.move(self._franky.TorqueStopMotion(), asynchronous=True)
@@ -196,7 +196,7 @@ class _Hand:
         while not self._ended.wait(_HAND_PERIOD_S):
             try:
                 self.advance()
-            except Exception as error:  # whatever the library raises must reach whoever reads
+            except Exception as error:  # whatever the library raises must reach the reader
                 self.fault = one_line(f"{type(error).__name__}: {error}", 300)
                 return
 

@@ -68,7 +68,7 @@ class SafetyConfig(FrozenModel):
 
 
 def always_held() -> bool:
-    """A dead-man's switch that nobody has to hold, for simulators."""
+    """A dead-man's switch that is always held, for simulators."""
     return True
 
 
@@ -249,7 +249,7 @@ class SafeRobot:
             self._robot.stop()
 
     def release(self) -> None:
-        """Let a robot that was stopped be commanded again, once somebody has seen to what was wrong."""
+        """Let a robot that was stopped be commanded again, once a person has seen to what was wrong."""
         self.stopped = None
 
     @contextmanager
@@ -273,7 +273,7 @@ class SafeRobot:
         while not ended.wait(_POLL_S):
             try:
                 late_s = self._robot.now_s() - self._expected_s
-            except Exception as error:  # without a clock nobody looks after it
+            except Exception as error:  # without a clock nothing looks after it
                 self.stop(f"the robot's clock cannot be read: {error}")
                 return
             if self.stopped is None and late_s > self.config.max_late_s + _POLL_S:

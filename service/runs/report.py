@@ -182,7 +182,7 @@ class Report:
         )
 
     def stop_requested(self) -> bool:
-        """Whether somebody asked the run to stop."""
+        """Whether the run was asked to stop."""
         return self._writer.stop_requested()
 
     def end(self, state: RunState, *, published: str | None = None, error: str | None = None) -> None:

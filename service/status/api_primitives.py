@@ -39,7 +39,7 @@ _UNKNOWN = (404, "There is no such name, version or alias.")
 def primitives_router(registry: Registry) -> APIRouter:
     """Make the routes about frozen primitives: those of ``registry``, and beside them those that come with tandem.
 
-    Where both have a version of one name and number, that of ``registry`` counts, as for whoever loads primitives.
+    Where both have a version of one name and number, that of ``registry`` counts, as when primitives are loaded.
     """
     router = APIRouter(prefix="/v1", tags=["primitives"])
     shelf = Shelf(registry)

@@ -99,7 +99,7 @@ class CombinedReader:
         if on_disk is None or in_redis is None:
             (newer,) = (run for run in (on_disk, in_redis) if run is not None)
         else:
-            # Where nobody hears of it, the directory's lock tells whether its process lives.
+            # Where no report comes, the directory's lock tells whether its process lives.
             in_front = in_redis.heartbeat > on_disk.heartbeat - _ABOUT_EQUAL and in_redis.condition != "silent"
             newer = in_redis if in_front else on_disk
         failure = self._failure

@@ -90,7 +90,7 @@ def task_table(statuses: Iterable[RunStatus], directories: Mapping[str, Path]) -
 
 
 def _read(run_id: str, trial: Trial, path: Path) -> _Run:
-    """A run that learns a task. Its configuration is taken as data: no method of somebody's own is imported."""
+    """A run that learns a task. Its configuration is taken as data: no method of a user's own is imported."""
     config = path / "config.yaml"
     settings = _settings(config, config.stat().st_mtime_ns)
     result = RunDirectory(path).read_result()

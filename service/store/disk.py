@@ -4,7 +4,7 @@
 |---|---|
 | ``status.json`` | ``RunStatus``, at every change of state or condition and else about once a second |
 | ``goals.json`` | ``GoalGrid``, about every five seconds |
-| ``stop`` | is there when somebody asked the run to stop |
+| ``stop`` | is there when the run was asked to stop |
 
 Metrics are in ``metrics.jsonl``, where the run writes them for itself.
 """

@@ -6,7 +6,7 @@
 | ``tandem:run:ID:status`` | string | ``RunStatus`` as JSON |
 | ``tandem:run:ID:metrics`` | sorted set | records as JSON by iteration, the newest ``MAX_RECORDS`` |
 | ``tandem:run:ID:goals`` | string | ``GoalGrid`` as JSON |
-| ``tandem:run:ID:stop`` | string | is there when somebody asked the run to stop |
+| ``tandem:run:ID:stop`` | string | is there when the run was asked to stop |
 | ``tandem:run:ID:heartbeat`` | string, expires | is there until ``HEARTBEAT_S`` after its process last reported |
 | ``tandem:run:ID:epoch`` | string | ``RUN:EPOCH``: identity of the run and number of the process that reports |
 

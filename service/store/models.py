@@ -27,7 +27,7 @@ Condition = Literal["well", "clock", "redis", "disk", "stuck", "silent"]
 | ``redis`` | it is configured to report to Redis, which takes nothing |
 | ``disk`` | its files cannot be written, most likely because the disk is full |
 | ``stuck`` | its process has the run, and says nothing: it is frozen, or hangs |
-| ``silent`` | it says nothing, and nobody here knows whether its process lives |
+| ``silent`` | it says nothing, and it is not known here whether its process lives |
 """
 CONDITIONS: tuple[Condition, ...] = get_args(Condition)
 RUN_ID = r"^[A-Za-z0-9][A-Za-z0-9._-]{0,127}$"

@@ -109,7 +109,7 @@ class RedisWriter:
         self._grid = grid
 
     def stop_requested(self) -> bool:
-        """Whether somebody asked the run to stop since it was started, as of the last message to Redis."""
+        """Whether the run was asked to stop since it was started, as of the last message to Redis."""
         return self._stop
 
     def troubles(self) -> list[Trouble]:

@@ -17,7 +17,7 @@
 | ``log.jsonl`` | what happened: who died, who came back, how it ended; see ``service.store.run_log`` |
 | ``broken/`` | states of worlds whose physics diverged |
 | ``status.json``, ``goals.json``, ``stop`` | the run's state while it goes on; see ``service.store.disk`` |
-| ``tandem-error-*.txt`` | traceback of an error that nobody expected |
+| ``tandem-error-*.txt`` | traceback of an unexpected error |
 | ``.lock`` | held by the process that runs it |
 """
 

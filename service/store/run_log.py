@@ -1,6 +1,6 @@
 """What happened to a run, a line of JSON each: who died, who came back, what went wrong and how the run ended.
 
-It is what the process that runs it says on its way (``logging``), kept where whoever looks at the run later finds it.
+It is what the process that runs it says on its way (``logging``), kept where a later reader of the run finds it.
 """
 
 from __future__ import annotations

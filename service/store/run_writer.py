@@ -98,7 +98,7 @@ class RunWriter:
             self._redis.goals(grid)
 
     def stop_requested(self) -> bool:
-        """Whether somebody asked the run to stop anywhere since it was started."""
+        """Whether the run was asked to stop anywhere since it was started."""
         return self._stop_file.exists() or (self._redis is not None and self._redis.stop_requested())
 
     def troubles(self) -> list[Trouble]:

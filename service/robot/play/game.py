@@ -1,4 +1,4 @@
-"""What goes on in a live world: one world, stepped by Bob, by weights that somebody sets, or by Alice and then Bob.
+"""What goes on in a live world: one world, stepped by Bob, by weights that a user sets, or by Alice and then Bob.
 
 Nothing is drawn here, and nothing knows of a browser. All of a game is used by one thread.
 """
@@ -127,10 +127,10 @@ class Game:
         self._draw_goal()
 
     def set_mode(self, mode: Mode) -> None:
-        """Let somebody else act.
+        """Change who acts.
 
         Raises:
-            TandemError: nobody here does that.
+            TandemError: no such player here.
         """
         if mode not in self.modes:
             raise TandemError(f"mode {mode!r}: {self.title} can do {', '.join(self.modes)}")

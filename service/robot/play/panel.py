@@ -1,6 +1,6 @@
 """The controls beside the live world: who acts, pause, step, speed, weights of the primitives.
 
-What somebody does is put into a queue, and done between two steps by the thread to which the game belongs.
+What a user does is put into a queue. The thread to which the game belongs does it between two steps.
 """
 
 from __future__ import annotations
@@ -75,7 +75,7 @@ class Panel:
                 self._tell(slider, "value", round(float(weights[place]), 2))
 
     def _tell(self, handle: Any, name: str, value: Any) -> None:
-        """Set what the game has changed since it was told; not what somebody has, of which the game will hear yet."""
+        """Set what the game has changed since it was told; not what a user has, of which the game will hear yet."""
         if self._told.get((id(handle), name)) != value:
             self._told[id(handle), name] = value
             setattr(handle, name, value)

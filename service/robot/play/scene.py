@@ -49,7 +49,7 @@ class LiveScene:
             depth_test=False,
             translation_limits=tuple(zip(low, high, strict=True)),
         )
-        """The handle of the goal; its ``position`` is where somebody dragged it."""
+        """The handle of the goal; its ``position`` is where a user dragged it."""
         geoms = [geom for geom in range(self.model.ngeom) if self.model.geom(geom).name.startswith("object")]
         shape = merge_geoms(self.model, geoms)
         server.scene.add_mesh_simple(

@@ -1,6 +1,6 @@
 """The live world's server: a port on this machine, a loop that keeps up with the clock, and a clean end.
 
-The loop steps the game and tells the browsers; it waits for the clock alone, and while nobody watches, for a browser.
+The loop steps the game and tells the browsers; it waits for the clock alone, and without a viewer for a browser.
 """
 
 from __future__ import annotations
@@ -79,7 +79,7 @@ class LiveWorld:
         return f"http://{f'[{host}]' if ':' in host else host}:{self.port}"
 
     def run(self, stop: Callable[[], bool]) -> None:
-        """Play until ``stop`` says so; the world stands still while nobody watches."""
+        """Play until ``stop`` says so; the world stands still without a viewer."""
         last = time.monotonic()
         while not stop():
             begun = time.monotonic()
@@ -114,7 +114,7 @@ class LiveWorld:
         panel.show()
 
     def _take_dragged_goal(self) -> bool:
-        """Give the game the goal where somebody has put it."""
+        """Give the game the goal where a user has put it."""
         position = np.array(self.scene.goal.position)
         if self._shown_goal is None or np.allclose(position, self._shown_goal, atol=1e-6) or not self.game.shows_goal:
             return False
