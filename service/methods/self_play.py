@@ -24,7 +24,6 @@ from service.base.types import Metrics
 from service.config.self_play import SelfPlayConfig
 from service.envs.observations import layouts
 from service.generator.opponents import Opponents
-from service.learner.learner import torch_device
 from service.methods.method import Health, Iteration, Method, State
 from service.methods.workers import (
     GeneratorResult,
@@ -231,6 +230,8 @@ def _round_metrics(rounds: Sequence[RoundSummary]) -> Metrics:
 
 def check_here(config: SelfPlayConfig) -> None:
     """Check that the learner's device is on this machine."""
+    from service.learner.learner import torch_device  # here: a cluster's driver needs no torch
+
     torch_device(config.learner.device)
 
 
