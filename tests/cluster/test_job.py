@@ -2,6 +2,7 @@
 
 import json
 import os
+import random
 import shutil
 import signal
 import socket
@@ -10,6 +11,7 @@ import sys
 import tempfile
 import time
 import urllib.request
+from contextlib import suppress
 from http.client import HTTPException
 from pathlib import Path
 
@@ -29,17 +31,18 @@ PATIENCE_S = 480.0
 
 
 def free_ports(num):
-    """Ports nobody has, above those that Ray gives to its workers."""
-    probes, ports = [], []
-    while len(ports) < num:
-        probe = socket.socket()
-        probes.append(probe)
-        probe.bind(("127.0.0.1", 0))
-        if (port := probe.getsockname()[1]) > 20_000:
+    """Free ports, above those of Ray's workers and below those that the kernel gives to any connection.
+
+    Ray binds some of them only after seconds.
+    """
+    ports = []
+    for port in random.SystemRandom().sample(range(20_000, 32_768), 1_000):
+        with socket.socket() as probe, suppress(OSError):
+            probe.bind(("127.0.0.1", port))
             ports.append(port)
-    for probe in probes:
-        probe.close()
-    return ports
+        if len(ports) == num:
+            return ports
+    raise AssertionError("no free ports")
 
 
 def wait_for(what, because=lambda: ""):
