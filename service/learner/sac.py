@@ -108,15 +108,11 @@ class SACLearner:
 
     def state(self) -> Arrays:
         """Everything that ``load_state`` continues from, copied."""
-        arrays: Arrays = {name: tensor.detach().numpy().copy() for name, tensor in self._tensors().items()}
-        return arrays | {"random": self._random.get_state().numpy().copy()}
+        return copied(self._tensors(), self._random)
 
     def load_state(self, state: Mapping[str, Array]) -> None:
         """Continue, bit for bit, where ``state`` was taken by a learner of the same settings."""
-        with torch.no_grad():
-            for name, tensor in self._tensors().items():
-                tensor.copy_(torch.from_numpy(np.array(state[name])))
-        self._random.set_state(torch.from_numpy(np.array(state["random"])))
+        put_back(state, self._tensors(), self._random)
 
     def _tensors(self) -> dict[str, Tensor]:
         """All that changes but the random numbers, by name: the tensors themselves."""
@@ -157,6 +153,20 @@ class SACLearner:
 
     def _noise(self, like: Tensor) -> Tensor:
         return torch.randn(like.shape, generator=self._random)
+
+
+def copied(tensors: Mapping[str, Tensor], random: torch.Generator) -> Arrays:
+    """Tensors by name and the random generator's state, as arrays for a checkpoint."""
+    arrays: Arrays = {name: tensor.detach().numpy().copy() for name, tensor in tensors.items()}
+    return arrays | {"random": random.get_state().numpy().copy()}
+
+
+def put_back(state: Mapping[str, Array], tensors: Mapping[str, Tensor], random: torch.Generator) -> None:
+    """Write what ``copied`` gave into the tensors and the generator."""
+    with torch.no_grad():
+        for name, tensor in tensors.items():
+            tensor.copy_(torch.from_numpy(np.array(state[name])))
+    random.set_state(torch.from_numpy(np.array(state["random"])))
 
 
 def actions_at_random(shape: tuple[int, ...], rng: np.random.Generator) -> FloatArray:

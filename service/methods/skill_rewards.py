@@ -17,7 +17,7 @@ from torch.nn.utils.parametrizations import spectral_norm
 
 from service.base.types import Array, Arrays, FloatArray, Metrics
 from service.config.skills import SkillMethod, SkillsConfig
-from service.learner.sac import ADAM_EPSILON
+from service.learner.sac import ADAM_EPSILON, copied, put_back
 from service.learner.sac_networks import make_layers
 from service.policies.adam import Adam
 
@@ -73,15 +73,11 @@ class IntrinsicReward(ABC):
 
     def state(self) -> Arrays:
         """Everything that ``load_state`` continues from, copied."""
-        arrays: Arrays = {name: tensor.detach().numpy().copy() for name, tensor in self._tensors().items()}
-        return arrays | {"random": self._random.get_state().numpy().copy()}
+        return copied(self._tensors(), self._random)
 
     def load_state(self, state: Mapping[str, Array]) -> None:
         """Continue, bit for bit, where ``state`` was taken by a reward of the same settings."""
-        with torch.no_grad():
-            for name, tensor in self._tensors().items():
-                tensor.copy_(torch.from_numpy(np.array(state[name])))
-        self._random.set_state(torch.from_numpy(np.array(state["random"])))
+        put_back(state, self._tensors(), self._random)
 
     @abstractmethod
     def _make_network(self) -> nn.Module: ...

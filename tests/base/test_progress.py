@@ -9,17 +9,9 @@ import pytest
 from rich.console import Console
 
 from service.base.progress import PLAIN_INTERVAL_S, Display, answer, counted, doing
+from tests.clock import Clock
 
 ESCAPE = re.compile(r"\x1b\[[0-9;?]*[A-Za-z]")
-
-
-class Clock:
-    """Seconds that pass when told to."""
-
-    now_s = 1000.0
-
-    def __call__(self):
-        return self.now_s
 
 
 @pytest.fixture

@@ -9,15 +9,7 @@ from rich.console import Console
 from service.base.progress import PLAIN_INTERVAL_S, Display
 from service.methods.timing import Timing
 from service.runs.progress import Progress
-
-
-class Clock:
-    """Seconds that pass when told to."""
-
-    now_s = 1000.0
-
-    def __call__(self):
-        return self.now_s
+from tests.clock import Clock
 
 
 @pytest.fixture

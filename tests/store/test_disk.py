@@ -22,18 +22,9 @@ from service.store.pulse import Pulse
 from service.store.run_directory import RunDirectory
 from service.store.run_writer import RunWriter
 from service.store.tail import RecordFile
+from tests.clock import Clock
 from tests.runs.runs import assert_one_line, no_room_above
 from tests.store.stores import a_grid, a_record, a_silent_status, a_status, wait_until
-
-
-class Clock:
-    """Seconds that pass when told to."""
-
-    def __init__(self):
-        self.now_s = 0.0
-
-    def __call__(self):
-        return self.now_s
 
 
 def read_status(directory):
