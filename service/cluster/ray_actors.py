@@ -22,8 +22,8 @@ from service.base.liveness import count_work, work_done
 from service.base.types import Arrays
 from service.config.self_play import SelfPlayConfig
 from service.generator.opponents import Opponents
+from service.generator.records import GoalSummary
 from service.generator.snapshot import GeneratorSnapshot
-from service.generator.summary import GoalSummary
 from service.methods.workers import (
     GeneratorResult,
     GeneratorWorker,

@@ -9,7 +9,6 @@ import numpy as np
 from service.base.tensors import join_parts, split_parts
 from service.base.types import Array, Arrays, BoolArray, IntArray, StateArray
 from service.generator.bins import GoalCells
-from service.generator.state import take
 
 DECAY = 0.95
 """Weight that a try keeps from one record to the next: half after 13.5 iterations, so the rates follow Bob."""
@@ -54,12 +53,8 @@ class SuccessCounts:
         return {name: array.copy() for name, array in vars(self).items()}
 
     def load_state(self, state: Mapping[str, Array]) -> None:
-        """Take over what ``state`` gave.
-
-        Raises:
-            ConfigError: another number of bins.
-        """
-        vars(self).update({name: take(state, name, like) for name, like in vars(self).items()})
+        """Take over what ``state`` gave."""
+        vars(self).update({name: np.array(state[name]) for name in vars(self)})
 
 
 class DifficultyGrid:
@@ -138,11 +133,6 @@ class DifficultyGrid:
         )
 
     def load_state(self, state: Mapping[str, Array]) -> None:
-        """Take over what ``state`` gave.
-
-        Raises:
-            ConfigError: of a grid of another size.
-        """
-        self.seen = take(state, "seen", self.seen)
-        self.proposals = take(state, "proposals", self.proposals)
-        self.counts.load_state(split_parts(state).get("cells", {}))
+        """Take over what ``state`` gave."""
+        self.seen, self.proposals = np.array(state["seen"]), np.array(state["proposals"])
+        self.counts.load_state(split_parts(state)["cells"])

@@ -8,19 +8,54 @@ import numpy as np
 
 from service.base.tensors import join_parts, split_parts
 from service.base.types import Array, Arrays, Metrics, StateArray
-from service.config.self_play import SelfPlayConfig
+from service.config.self_play import GeneratorConfig, SelfPlayConfig
 from service.envs.state_layout import StateLayout
 from service.generator.bins import GoalCells, TaskBins, in_air
 from service.generator.difficulty import DifficultyGrid, SuccessCounts
-from service.generator.opponents import OpponentPool
-from service.generator.records import height_percentile, means
+from service.generator.opponents import Opponents
+from service.generator.records import GoalSummary, height_percentile, means
 from service.generator.ring import Ring
 from service.generator.snapshot import GeneratorSnapshot
-from service.generator.stopping import StopCriterion
-from service.generator.summary import GoalSummary
 
 NUM_STARTS = 1024
 """Starts of games kept for ``replay_from_reset``."""
+MIN_NUM_GOALS = 100
+"""Goals the window must hold before Bob's success rate says anything: its 95 % interval is then below +-10 points."""
+
+
+class StopCriterion:
+    """The paper's stop criterion over a window of iterations: Alice finds nothing new, and Bob solves all."""
+
+    num_iterations_without_new_cell: int
+    """Iterations since the last new goal cell."""
+
+    def __init__(self, config: GeneratorConfig) -> None:
+        self._stop_success_rate = config.stop_success_rate
+        self._window = np.zeros((config.novelty_window, 2), dtype=np.int64)  # tries and successes of an iteration
+        self._num_iterations = 0
+        self.num_iterations_without_new_cell = 0
+
+    def record(self, num_new_cells: int, num_tried: int, num_solved: int) -> None:
+        """Add one iteration: new goal cells, and tries and successes of the current players' goals."""
+        self._window[self._num_iterations % len(self._window)] = num_tried, num_solved
+        self._num_iterations += 1
+        self.num_iterations_without_new_cell = 0 if num_new_cells else self.num_iterations_without_new_cell + 1
+
+    def should_stop(self) -> bool:
+        """Whether, over a whole window, no cell was new and Bob solved enough of at least ``MIN_NUM_GOALS`` goals."""
+        num_tried, num_solved = self._window.sum(axis=0)
+        saturated = self.num_iterations_without_new_cell >= len(self._window)
+        return bool(saturated and num_tried >= MIN_NUM_GOALS and num_solved >= self._stop_success_rate * num_tried)
+
+    def state(self) -> Arrays:
+        """Everything, copied."""
+        counters = np.array([self._num_iterations, self.num_iterations_without_new_cell])
+        return {"window": self._window.copy(), "counters": counters}
+
+    def load_state(self, state: Mapping[str, Array]) -> None:
+        """Take over what ``state`` gave."""
+        self._window = np.array(state["window"])
+        self._num_iterations, self.num_iterations_without_new_cell = map(int, state["counters"])
 
 
 class TaskGenerator:
@@ -44,12 +79,11 @@ class TaskGenerator:
     from_reset: SuccessCounts
     """Bob's success from resets, by the goal's height and distance; those with a blocked gripper apart. They are harder
     than what starts where Alice left off."""
-    opponents: OpponentPool
+    opponents: Opponents
     """Past versions of both players."""
 
     def __init__(self, config: SelfPlayConfig, layout: StateLayout) -> None:
-        self._config = config.generator
-        self._success_distance_m, self._world = config.game.success_distance_m, config.world
+        self._config = config
         self.cells = GoalCells(config.world, config.generator.cell_size_m)
         self.tasks = TaskBins.from_config(config, layout)
         self.grid = DifficultyGrid(self.cells)
@@ -57,15 +91,14 @@ class TaskGenerator:
         num_parts = len(self.cells) if config.generator.replay_over_cells else 1
         self.buffer = Ring(config.generator.replay_buffer_size, num_parts, **columns, goal=3)
         self.starts = Ring(NUM_STARTS, **columns)
-        self.opponents = OpponentPool(config.generator.opponent_pool_size)
+        self.opponents = Opponents(0)
         self.from_reset = SuccessCounts(len(self.tasks))
         self._stop = StopCriterion(config.generator)
-        self._parts: dict[str, DifficultyGrid | Ring | SuccessCounts | OpponentPool | StopCriterion] = {
+        self._parts: dict[str, DifficultyGrid | Ring | SuccessCounts | StopCriterion] = {
             "grid": self.grid,
             "buffer": self.buffer,
             "starts": self.starts,
             "from_reset": self.from_reset,
-            "opponents": self.opponents,
             "stop": self._stop,
         }
 
@@ -74,8 +107,6 @@ class TaskGenerator:
         buffer, coverage = self.buffer.rows(), self.grid.seen.mean()
         return GeneratorSnapshot(
             config=self._config,
-            success_distance_m=self._success_distance_m,
-            world=self._world,
             cells=self.cells,
             tasks=self.tasks,
             buffer=buffer,
@@ -94,7 +125,7 @@ class TaskGenerator:
         The table is one layer of cells of seven, yet where most of what is asked of Bob begins or ends.
         """
         share = self.buffer.part_share()
-        if self._config.replay_over_cells:
+        if self._config.generator.replay_over_cells:
             air = in_air(goal, self.tasks.rest_height_m)
             for part in (air, ~air):
                 share[part] /= max(share[part].sum(), 1e-12)
@@ -112,7 +143,7 @@ class TaskGenerator:
         self.starts.add(None, **summary.starts)
         num_new_cells = self.grid.record(summary.proposed, summary.tries, summary.successes)
         self.from_reset.record(summary.reset_tries, summary.reset_successes)
-        cell = self.cells.index(summary.goals["goal"]) if self._config.replay_over_cells else None
+        cell = self.cells.index(summary.goals["goal"]) if self._config.generator.replay_over_cells else None
         self.buffer.add(cell, **summary.goals)
         num_tried, num_solved = summary.metrics["bob/success_rate"]  # of the current players' own goals
         self._stop.record(num_new_cells, num_tried, int(num_solved))
@@ -130,26 +161,25 @@ class TaskGenerator:
 
     def opponents_due(self, iteration: int) -> bool:
         """Whether the players of this iteration, counted from 0, join the pool; the untrained ones never do."""
-        return iteration > 0 and iteration % self._config.opponent_interval == 0
+        return iteration > 0 and iteration % self._config.generator.opponent_interval == 0
 
-    def add_opponents(self, alice: Mapping[str, Array], bob: Mapping[str, Array]) -> None:
-        """Add both players' parameters to the pool, copied; the oldest are dropped from a full pool."""
-        self.opponents.add(alice, bob)
+    def add_opponents(self, iteration: int, alice: Mapping[str, Array], bob: Mapping[str, Array]) -> None:
+        """Add the parameters of this iteration's players to the past ones, of which the oldest may go."""
+        # The number of the iteration is a version that is the same whichever process records it.
+        self.opponents = self.opponents.joined_by(alice, bob, iteration, self._config.generator.opponent_pool_size)
 
     def should_stop(self) -> bool:
         """Whether, over ``novelty_window`` iterations, Alice found no new goal cell and Bob solved her goals."""
         return self._stop.should_stop()
 
     def state(self) -> Arrays:
-        """Everything an exact resume needs, copied: flat named arrays."""
-        return join_parts({name: part.state() for name, part in self._parts.items()})
+        """Everything an exact resume needs: flat named arrays."""
+        parts = {name: part.state() for name, part in self._parts.items()}
+        return join_parts(parts | {"opponents": self.opponents.state()})
 
     def load_state(self, state: Mapping[str, Array]) -> None:
-        """Take over what ``state`` gave.
-
-        Raises:
-            ConfigError: an array is missing, or of another configuration.
-        """
+        """Take over what ``state`` gave."""
         states = split_parts(state)
         for name, part in self._parts.items():
-            part.load_state(states.get(name, {}))
+            part.load_state(states[name])
+        self.opponents = Opponents.from_state(0, states.get("opponents", {}))

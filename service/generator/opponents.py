@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -65,63 +65,26 @@ class Opponents:
         plan.bob_opponent[worlds[num_past : 2 * num_past]] = rng.integers(len(self.alice))
         return plan
 
+    def joined_by(self, alice: Mapping[str, Array], bob: Mapping[str, Array], version: int, capacity: int) -> Opponents:
+        """These players and both players' newest parameters, copied; the newest ``capacity`` of all."""
+        newest = [{name: np.array(array) for name, array in parameters.items()} for parameters in (alice, bob)]
+        return Opponents(version, (*self.alice, newest[0])[-capacity:], (*self.bob, newest[1])[-capacity:])
+
     def state(self) -> Arrays:
-        """All parameters as ``SNAPSHOT/PLAYER/NAME``, and how many there are; the version is left out."""
-        return _flatten(self.alice, self.bob) | {"num": np.array(len(self.alice))}
+        """All parameters as ``SNAPSHOT/PLAYER/NAME``; the version is left out."""
+        return {
+            f"{index}/{player}/{name}": array
+            for player, snapshots in (("alice", self.alice), ("bob", self.bob))
+            for index, parameters in enumerate(snapshots)
+            for name, array in parameters.items()
+        }
 
     @classmethod
     def from_state(cls, version: int, state: Mapping[str, Array]) -> Opponents:
-        """The players that ``state`` gave, as another version."""
+        """The players that ``state`` gave, as another version; ``num``, which a pending round adds, is not needed."""
         snapshots = split_parts({name: array for name, array in state.items() if name != "num"})
-        pairs = [split_parts(snapshots[str(index)]) for index in range(int(state["num"]))]
+        pairs = [split_parts(snapshots[index]) for index in sorted(snapshots, key=int)]
         return cls(version, tuple(each["alice"] for each in pairs), tuple(each["bob"] for each in pairs))
-
-
-class OpponentPool:
-    """The last ``capacity`` snapshots of both players, oldest first."""
-
-    alice: list[Arrays]
-    """Alice's parameters by name, one dict a snapshot."""
-    bob: list[Arrays]
-    """Bob's parameters by name, one dict a snapshot."""
-
-    def __init__(self, capacity: int) -> None:
-        self._capacity = capacity
-        self.alice, self.bob = [], []
-
-    def __len__(self) -> int:
-        """Number of snapshots held."""
-        return len(self.alice)
-
-    def add(self, alice: Mapping[str, Array], bob: Mapping[str, Array]) -> None:
-        """Add a snapshot of both players' parameters, copied; the oldest is dropped from a full pool."""
-        for pool, parameters in ((self.alice, alice), (self.bob, bob)):
-            pool.append({name: np.array(array) for name, array in parameters.items()})
-            del pool[: -self._capacity]
-
-    def freeze(self, version: int) -> Opponents:
-        """The snapshots held now, for rollout workers."""
-        return Opponents(version, tuple(self.alice), tuple(self.bob))
-
-    def state(self) -> Arrays:
-        """All parameters, copied, as ``SNAPSHOT/PLAYER/NAME``."""
-        return {name: array.copy() for name, array in _flatten(self.alice, self.bob).items()}
-
-    def load_state(self, state: Mapping[str, Array]) -> None:
-        """Take over what ``state`` gave; a smaller pool keeps the newest."""
-        self.alice, self.bob = [], []
-        snapshots = split_parts(state)
-        for index in sorted(snapshots, key=int):
-            self.add(**split_parts(snapshots[index]))
-
-
-def _flatten(alice: Sequence[Arrays], bob: Sequence[Arrays]) -> Arrays:
-    return {
-        f"{index}/{player}/{name}": array
-        for player, pool in (("alice", alice), ("bob", bob))
-        for index, parameters in enumerate(pool)
-        for name, array in parameters.items()
-    }
 
 
 def _round_at_random(count: float, rng: np.random.Generator) -> int:

@@ -6,9 +6,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from service.base.errors import ConfigError
 from service.base.types import Array, Arrays, IntArray, StateArray
-from service.generator.state import take
 
 Rows = dict[str, StateArray]
 """Named columns of equally many rows."""
@@ -77,22 +75,10 @@ class Ring:
         return state
 
     def load_state(self, state: Mapping[str, Array]) -> None:
-        """Take over what ``state`` gave.
-
-        Raises:
-            ConfigError: of a ring of another capacity, number of parts or row length.
-        """
-        loaded = {name: take(state, name, column, any_rows=True) for name, column in self._columns.items()}
-        num_added = take(state, "num_added", self._num_added)
-        size, num_held = len(next(iter(loaded.values()))), int(np.minimum(num_added, self._share).sum())
-        if size != num_held:
-            raise ConfigError(
-                f"generator state: {size} rows do not fit a buffer that holds {num_held} "
-                "(generator.replay_buffer_size for goals); resume with the configuration of the checkpoint"
-            )
-        self._num_added = num_added
+        """Take over what ``state`` gave."""
+        self._num_added = np.array(state["num_added"])
         for name, column in self._columns.items():
-            column[self._held] = loaded[name]
+            column[self._held] = state[name]
 
     @property
     def _num_held(self) -> IntArray:

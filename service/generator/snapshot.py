@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 
 from service.base.tensors import join_parts, split_parts
 from service.base.types import Array, Arrays, BoolArray, IntArray, StateArray
-from service.config import WorldConfig
-from service.config.self_play import GeneratorConfig
+from service.config.self_play import SelfPlayConfig
 from service.envs.obstacles import inside_obstacles, obstacle_places
 from service.envs.sampling import GoalKind, sample_goals
 from service.generator.bins import GoalCells, TaskBins, in_air
@@ -56,9 +55,7 @@ class GeneratorSnapshot:
     It comes with the weights, so a worker that has both asks for nothing in the middle of a round.
     """
 
-    config: GeneratorConfig
-    success_distance_m: float
-    world: WorldConfig
+    config: SelfPlayConfig
     cells: GoalCells
     tasks: TaskBins
     buffer: Rows
@@ -111,9 +108,9 @@ class GeneratorSnapshot:
         novelty[valid] = self.novelty[self.cells.index(proposal[valid])]
         choice = GoalChoice(proposal.copy(), *starts, replayed, from_reset, valid | replayed, novelty)
         if replayed.any():
-            own = self.config.goal_source == "alice"
-            candidates = self._earlier_goals() if own else self._drawn_goals(start_state, start_position, rng)
-            self._replay(choice, np.flatnonzero(replayed), candidates, rng)
+            own = self.config.generator.goal_source == "alice"
+            goals = self._earlier_goals() if own else self._drawn_goals(start_state, start_position, rng)
+            self._replay(choice, np.flatnonzero(replayed), *goals, rng)
         return choice
 
     def state(self) -> Arrays:
@@ -129,47 +126,59 @@ class GeneratorSnapshot:
 
     def _choose_replayed(self, valid: BoolArray, bob_past: BoolArray, rng: np.random.Generator) -> BoolArray:
         """(N,) worlds whose goal comes from the buffer."""
-        if self.config.goal_source == "alice" and len(self.buffer["goal"]) < MIN_REPLAY_GOALS:
+        config = self.config.generator
+        if config.goal_source == "alice" and len(self.buffer["goal"]) < MIN_REPLAY_GOALS:
             return np.zeros(len(valid), dtype=np.bool_)
         # While much of the workspace is new to her, what she proposes is worth more than what she once did.
-        replaced: BoolArray = valid & (rng.random(len(valid)) < self.config.replay_fraction * self.coverage)
-        filled: BoolArray = ~valid & self.config.replay_invalid
+        replaced: BoolArray = valid & (rng.random(len(valid)) < config.replay_fraction * self.coverage)
+        filled: BoolArray = ~valid & config.replay_invalid
         return (replaced | filled) & ~bob_past
 
-    def _earlier_goals(self) -> _Candidates:
-        """Alice's earlier goals, each from the start it was proposed from, by learnability and the buffer's parts."""
-        weight = (self.cell_learnability[self.cells.index(self.buffer["goal"])] + LEARNABILITY_FLOOR) * self.share
-        return _Candidates(self.buffer, weight, self.share)
+    def _earlier_goals(self) -> tuple[Rows, StateArray, StateArray]:
+        """Alice's earlier goals from the starts they were proposed from, their (M,) weights, and (M,) factors in these.
+
+        The factors, by the buffer's parts, are those of the same goals from the start of a game, too.
+        """
+        weight = self._weight(self.cell_learnability, self.cells.index(self.buffer["goal"]))
+        return self.buffer, weight * self.share, self.share
 
     def _drawn_goals(
         self, start_state: StateArray, start_position: StateArray, rng: np.random.Generator
-    ) -> _Candidates:
-        """Goals that Alice did not propose, each from where some world is now."""
-        kind: GoalKind = "table" if self.config.goal_source == "table" else "mixed"
+    ) -> tuple[Rows, StateArray, StateArray]:
+        """Goals that Alice did not propose, each from where some world is now; see ``_earlier_goals``."""
+        game, source = self.config.game, self.config.generator.goal_source
         rows = rng.integers(len(start_state), size=NUM_DRAWN)
+        kind: GoalKind = "table" if source == "table" else "mixed"
         tasks = {
-            "goal": sample_goals(kind, rng, NUM_DRAWN, self.world, self.success_distance_m),
+            "goal": sample_goals(kind, rng, NUM_DRAWN, self.config.world, game.success_distance_m),
             "start_state": start_state[rows],
             "start_position": start_position[rows],
         }
-        weight = np.full(NUM_DRAWN, 1.0)
-        if self._by_learnability:
-            weight = self.cell_learnability[self.cells.index(tasks["goal"])] + LEARNABILITY_FLOOR
-        return _Candidates(tasks, weight * self._is_task(**tasks), np.ones(NUM_DRAWN))
+        weight = self._weight(self.cell_learnability, self.cells.index(tasks["goal"])) * self._is_task(**tasks)
+        return tasks, weight, np.ones(NUM_DRAWN)
 
-    def _replay(self, choice: GoalChoice, worlds: IntArray, candidates: _Candidates, rng: np.random.Generator) -> None:
-        """Give ``worlds`` some of the candidates, from their own start or from that of some game.
+    def _replay(
+        self,
+        choice: GoalChoice,
+        worlds: IntArray,
+        tasks: Rows,
+        weight: StateArray,
+        share: StateArray,
+        rng: np.random.Generator,
+    ) -> None:
+        """Give ``worlds`` some of the tasks, from their own start or from that of some game.
 
         Whatever is asked of Bob downstream begins with a reset, but Alice reaches far goals over several rounds, so few
         of her own do. Both kinds of task compete by learnability: far goals from a reset wait until Bob is ready.
         """
-        # Each candidate is one from its own start and, behind all of these, one from the start of a game.
-        goal, num_starts = candidates.tasks["goal"], len(self.starts["start_position"])
-        tasks, weight = candidates.tasks, candidates.weight
-        if self.config.replay_from_reset and num_starts:
+        # Each goal is one from its own start and, behind all of these, one from the start of a game.
+        goal, num_starts = tasks["goal"], len(self.starts["start_position"])
+        if self.config.generator.replay_from_reset and num_starts:
             drawn = rng.choice(num_starts, size=len(goal))
             start = {name: rows[drawn] for name, rows in self.starts.items()}
-            weight = np.concatenate([weight, self._weight_from_reset(goal, **start) * candidates.share])
+            bins = self.tasks.index(goal, start["start_position"], start["start_state"])
+            from_reset = self._weight(self.reset_learnability, bins) * self._is_task(goal, **start) * share
+            weight = np.concatenate([weight, from_reset])
             tasks = join_rows([{name: tasks[name] for name in start}, start])
         drawn = rng.choice(len(weight), size=len(worlds), p=weight / weight.sum())
         choice.goal[worlds] = goal[drawn % len(goal)]
@@ -177,32 +186,16 @@ class GeneratorSnapshot:
         choice.start_state[worlds] = tasks["start_state"][drawn]
         choice.start_position[worlds] = tasks["start_position"][drawn]
 
-    @property
-    def _by_learnability(self) -> bool:
-        return self.config.goal_source in ("alice", "learnable")
-
-    def _weight_from_reset(self, goal: StateArray, start_state: StateArray, start_position: StateArray) -> StateArray:
-        """(M,) weight, but for its share, of (M, 3) goals from one (M, S) start of a game each."""
-        weight = np.full(len(goal), 1.0)
-        if self._by_learnability:
-            weight = self.reset_learnability[self.tasks.index(goal, start_position, start_state)] + LEARNABILITY_FLOOR
-        return weight * self._is_task(goal, start_state, start_position)
+    def _weight(self, learnability: StateArray, bins: IntArray) -> StateArray:
+        """(M,) weights of goals in (M,) bins: what Bob can learn there, or all alike where the source asks for that."""
+        if self.config.generator.goal_source in ("alice", "learnable"):
+            return learnability[bins] + LEARNABILITY_FLOOR
+        return np.ones(len(bins))
 
     def _is_task(self, goal: StateArray, start_state: StateArray, start_position: StateArray) -> BoolArray:
         """(M,) whether the object has to be moved, and can be: a closed gripper lifts nothing, obstacles take room."""
-        far: BoolArray = np.linalg.norm(goal - start_position, axis=1) > self.success_distance_m
-        if self.world.obstacles:
-            far &= ~inside_obstacles(goal, obstacle_places(start_state, self.tasks.obstacles), self.world)
+        world = self.config.world
+        far: BoolArray = np.linalg.norm(goal - start_position, axis=1) > self.config.game.success_distance_m
+        if world.obstacles:
+            far &= ~inside_obstacles(goal, obstacle_places(start_state, self.tasks.obstacles), world)
         return far & ~(self.tasks.blocked(start_state) & in_air(goal, self.tasks.rest_height_m))
-
-
-@dataclass(frozen=True, slots=True)
-class _Candidates:
-    """Tasks that Bob may be given besides those of this round's Alice."""
-
-    tasks: Rows
-    """(M,) ``goal``, ``start_state`` and ``start_position``."""
-    weight: StateArray
-    """(M,) from those starts."""
-    share: StateArray
-    """(M,) factor of the weight of the same goals from the start of a game."""

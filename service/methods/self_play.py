@@ -179,7 +179,8 @@ class LocalSelfPlay(SelfPlay):
             "bob": weights.bob_ema,
         }
         if self._opponents.version != self._generator.opponents().version:
-            parts["opponents"] = self._opponents.state()
+            num = {"num": np.array(len(self._opponents.alice))}  # so that there is a part where there are none, too
+            parts["opponents"] = self._opponents.state() | num
         if self._pending is not None:
             parts["pending"] = to_arrays(self._pending)
         return {

@@ -25,8 +25,8 @@ from service.envs.scene import build_layout
 from service.generator.bins import GoalCells, TaskBins
 from service.generator.generator import NUM_STARTS, TaskGenerator
 from service.generator.opponents import Opponents
+from service.generator.records import GoalSummary, join_summaries, summarize
 from service.generator.snapshot import GeneratorSnapshot
-from service.generator.summary import GoalSummary, join_summaries, summarize
 from service.policies.numpy_policy import NumpyGaussianPolicy, numpy_bob
 from service.store.models import GoalCell, GoalGrid
 
@@ -172,13 +172,12 @@ class GeneratorWorker:
     def __init__(self, config: SelfPlayConfig, state: Mapping[str, NDArray[Any]] | None = None) -> None:
         layout = build_layout(config.world, blocked_fraction=config.game.blocked_gripper_fraction)
         self.generator = TaskGenerator(config, layout)
-        self._opponents_version = 0
         if state is not None:
             self.generator.load_state(state)
 
     def opponents(self) -> Opponents:
         """Past players for the next rounds."""
-        return self.generator.opponents.freeze(self._opponents_version)
+        return self.generator.opponents
 
     def record(self, iteration: int, weights: Weights, goals: Sequence[GoalSummary]) -> GeneratorResult:
         """Learn from what became of an iteration's goals.
@@ -192,8 +191,7 @@ class GeneratorWorker:
         metrics = self.generator.record(joined)
         new_opponents = self.generator.opponents_due(iteration)
         if new_opponents:
-            self.generator.add_opponents(weights.alice, weights.bob)
-            self._opponents_version = iteration  # the same whichever process records it
+            self.generator.add_opponents(iteration, weights.alice, weights.bob)
         return GeneratorResult(metrics, self.generator.should_stop(), joined.shown, new_opponents)
 
     def grid(self, iteration: int, num_env_steps: int) -> GoalGrid:

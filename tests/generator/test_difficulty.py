@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from service.base.errors import ConfigError
 from service.config import WorkspaceConfig, WorldConfig
 from service.generator.bins import NUM_DISTANCE_BINS, NUM_TASK_BINS, GoalCells, distance_bins, height_bins, in_air
 from service.generator.difficulty import DECAY, PROPOSAL_DECAY, DifficultyGrid, SuccessCounts
@@ -145,12 +144,3 @@ def test_bins_of_distance_and_height_by_hand() -> None:
     assert distance_bins(goals, starts).tolist() == [0, 1, 2, 2, 4]
     assert height_bins(goals, 0.025).tolist() == [0, 0, 0, 2, 3]
     assert (NUM_DISTANCE_BINS, NUM_TASK_BINS) == (5, 20)
-
-
-def test_state_of_another_grid_is_refused() -> None:
-    state = make().state()
-    with pytest.raises(ConfigError, match=r"'seen' is bool \(343,\), this configuration needs bool \(64,\)"):
-        make(0.1).load_state(state)
-    del state["cells/tries"]
-    with pytest.raises(ConfigError, match="'tries' is missing"):
-        make().load_state(state)

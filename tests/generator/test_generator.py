@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -10,16 +9,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from service.base.errors import ConfigError
 from service.config import Config, parse_config
 from service.envs.state_layout import StateLayout
 from service.generator.generator import TaskGenerator
 from service.generator.opponents import CURRENT, RoundPlan
-from service.generator.records import GoalRecords
 from service.generator.ring import Rows
 from service.generator.snapshot import LEARNABILITY_FLOOR, MIN_REPLAY_GOALS, GeneratorSnapshot, GoalChoice
 from service.generator.validity import Verdict
-from tests.generator.outcomes import record, starts_of
+from tests.generator.outcomes import make_records, record, starts_of
 
 FREE = StateLayout(positions={"object": 3}, velocities={}, measured={}, kept={"gripper_blocked": 0})
 SOME_BLOCKED = StateLayout(positions={}, velocities={}, measured={}, kept={"gripper_blocked": 1, "object_mass": 2})
@@ -29,7 +26,6 @@ ONE_GAME = starts_of([1.0] * STATE_SIZE)
 BLOCKED = SOME_BLOCKED["gripper_blocked"].start
 OLD_GOAL = (0.0, 0.1, 0.025)
 VALID, OUTSIDE = int(Verdict.VALID), int(Verdict.OUTSIDE)
-MakeRecords = Callable[..., GoalRecords]
 
 
 def config(**generator: Any) -> Config:
@@ -40,9 +36,7 @@ def all_current(num: int) -> RoundPlan:
     return RoundPlan(np.full(num, CURRENT), np.full(num, CURRENT))
 
 
-def filled(
-    make_records: MakeRecords, num_goals: int = MIN_REPLAY_GOALS, starts: Rows | None = None, **settings: Any
-) -> TaskGenerator:
+def filled(num_goals: int = MIN_REPLAY_GOALS, starts: Rows | None = None, **settings: Any) -> TaskGenerator:
     """A generator whose buffer holds ``num_goals`` times the same old goal, from a state of sevens."""
     generator = TaskGenerator(config(**settings), FREE)
     states = np.full((num_goals, STATE_SIZE), 7.0)
@@ -80,57 +74,57 @@ def assert_rows(choice: GoalChoice, replayed: list[bool]) -> None:
         assert choice.start_position[index].tolist() == [0.0, 0.0, 0.025]
 
 
-def test_by_default_bob_plays_what_alice_proposed(make_records: MakeRecords) -> None:
-    choice = choose(filled(make_records, 200), [VALID, OUTSIDE, VALID, int(Verdict.NOT_MOVED), int(Verdict.FALLEN)])
+def test_by_default_bob_plays_what_alice_proposed() -> None:
+    choice = choose(filled(200), [VALID, OUTSIDE, VALID, int(Verdict.NOT_MOVED), int(Verdict.FALLEN)])
     assert_rows(choice, [False] * 5)
     assert choice.played.tolist() == [True, False, True, False, False]
 
 
-def test_a_choice_tells_how_rare_valid_proposals_are(make_records: MakeRecords) -> None:
-    generator = filled(make_records)
+def test_a_choice_tells_how_rare_valid_proposals_are() -> None:
+    generator = filled()
     num = len(generator.cells)  # goals were proposed in one of them so far, then in two
     np.testing.assert_allclose(choose(generator, [VALID, OUTSIDE]).novelty, [1 - 1 / num, 0.0], rtol=1e-15)
     record(generator, make_records(np.tile([-0.1, 0.0, 0.1], (8, 1))))
     np.testing.assert_allclose(choose(generator, [VALID, OUTSIDE]).novelty, [(1 - 2 / num) / 3, 0.0], rtol=1e-15)
 
 
-def test_replay_invalid_fills_worlds_without_a_goal(make_records: MakeRecords) -> None:
-    choice = choose(filled(make_records, replay_invalid=True), [VALID, OUTSIDE, VALID, OUTSIDE])
+def test_replay_invalid_fills_worlds_without_a_goal() -> None:
+    choice = choose(filled(replay_invalid=True), [VALID, OUTSIDE, VALID, OUTSIDE])
     assert_rows(choice, [False, True, False, True])
     assert choice.played.all()
 
 
-def test_replay_fraction_one_replaces_every_valid_goal(make_records: MakeRecords) -> None:
-    choice = choose(filled(make_records, replay_fraction=1.0), [VALID, OUTSIDE, VALID])
+def test_replay_fraction_one_replaces_every_valid_goal() -> None:
+    choice = choose(filled(replay_fraction=1.0), [VALID, OUTSIDE, VALID])
     assert_rows(choice, [True, False, True])
     assert choice.played.tolist() == [True, False, True]
 
 
-def test_replay_fraction_is_met_on_average(make_records: MakeRecords) -> None:
-    generator = filled(make_records, replay_fraction=0.3)
+def test_replay_fraction_is_met_on_average() -> None:
+    generator = filled(replay_fraction=0.3)
     assert choose(generator, [VALID] * 4000).replayed.mean() == pytest.approx(0.3, abs=0.03)
     assert np.array_equal(choose(generator, [VALID] * 50).replayed, choose(generator, [VALID] * 50).replayed)
 
 
-def test_replay_fraction_waits_for_coverage(make_records: MakeRecords) -> None:
-    generator = filled(make_records, replay_fraction=0.8)
+def test_replay_fraction_waits_for_coverage() -> None:
+    generator = filled(replay_fraction=0.8)
     for coverage in (0.0, 0.25):
         replayed = choose(generator, [VALID] * 4000, coverage=coverage).replayed
         assert replayed.mean() == pytest.approx(0.8 * coverage, abs=0.02)
     assert generator.snapshot().coverage == 1 / len(generator.cells)
-    invalid = filled(make_records, replay_fraction=0.8, replay_invalid=True)
+    invalid = filled(replay_fraction=0.8, replay_invalid=True)
     assert_rows(choose(invalid, [VALID, OUTSIDE], coverage=0.0), [False, True])
 
 
-def test_no_replay_before_the_buffer_holds_enough(make_records: MakeRecords) -> None:
-    generator = filled(make_records, MIN_REPLAY_GOALS - 1, replay_fraction=1.0, replay_invalid=True)
+def test_no_replay_before_the_buffer_holds_enough() -> None:
+    generator = filled(MIN_REPLAY_GOALS - 1, replay_fraction=1.0, replay_invalid=True)
     assert_rows(choose(generator, [VALID, OUTSIDE]), [False, False])
     record(generator, make_records(OLD_GOAL, start_state=np.full((1, STATE_SIZE), 7.0)))
     assert_rows(choose(generator, [VALID, OUTSIDE]), [True, True])
 
 
-def test_replayed_goals_may_start_where_a_game_did(make_records: MakeRecords) -> None:
-    generator = filled(make_records, starts=ONE_GAME, replay_fraction=1.0, replay_from_reset=True)
+def test_replayed_goals_may_start_where_a_game_did() -> None:
+    generator = filled(starts=ONE_GAME, replay_fraction=1.0, replay_from_reset=True)
     num_tries, num = MIN_REPLAY_GOALS, 2000
     first = choose(generator, [VALID] * num)
     # From their own starts the old goals were tried and failed; from a reset nothing is known, so 1/2.
@@ -140,12 +134,12 @@ def test_replayed_goals_may_start_where_a_game_did(make_records: MakeRecords) ->
     assert (first.start_state[:, 0] == np.where(first.from_reset, 1.0, 7.0)).all()
     assert first.replayed.all()
     assert (first.goal == OLD_GOAL).all()
-    switched_off = filled(make_records, starts=ONE_GAME, replay_fraction=1.0, replay_from_reset=False)
+    switched_off = filled(starts=ONE_GAME, replay_fraction=1.0, replay_from_reset=False)
     assert not choose(switched_off, [VALID] * num).from_reset.any()
 
 
-def test_tasks_from_a_reset_wait_until_bob_is_ready(make_records: MakeRecords) -> None:
-    generator = filled(make_records, starts=ONE_GAME, replay_fraction=1.0, replay_from_reset=True)
+def test_tasks_from_a_reset_wait_until_bob_is_ready() -> None:
+    generator = filled(starts=ONE_GAME, replay_fraction=1.0, replay_from_reset=True)
     goals, yes = np.tile(OLD_GOAL, (200, 1)), np.ones(200, dtype=np.bool_)
     record(generator, make_records(goals, from_reset=yes, replayed=yes))
     assert choose(generator, [VALID] * 500).from_reset.mean() < 0.6  # both kinds hopeless: only the floor speaks
@@ -153,15 +147,15 @@ def test_tasks_from_a_reset_wait_until_bob_is_ready(make_records: MakeRecords) -
     assert choose(generator, [VALID] * 500).from_reset.mean() > 0.8
 
 
-def test_a_start_next_to_the_goal_is_no_task(make_records: MakeRecords) -> None:
+def test_a_start_next_to_the_goal_is_no_task() -> None:
     position = np.tile(OLD_GOAL, (8, 1)) + np.array([0.03, 0.03, 0.0])
     near = {"start_state": np.ones((8, STATE_SIZE)), "start_position": position}
-    choice = choose(filled(make_records, starts=near, replay_fraction=1.0, replay_from_reset=True), [VALID] * 8)
+    choice = choose(filled(starts=near, replay_fraction=1.0, replay_from_reset=True), [VALID] * 8)
     assert (choice.start_state == 7.0).all()
     assert not choice.from_reset.any()
 
 
-def test_no_goal_in_the_air_from_a_blocked_reset(make_records: MakeRecords) -> None:
+def test_no_goal_in_the_air_from_a_blocked_reset() -> None:
     settings = {"generator": {"replay_fraction": 1.0, "replay_from_reset": True}}
     generator = TaskGenerator(
         parse_config({**settings, "game": {"blocked_gripper_fraction": 0.2}}, where="t"), SOME_BLOCKED
@@ -178,7 +172,7 @@ def test_no_goal_in_the_air_from_a_blocked_reset(make_records: MakeRecords) -> N
     assert not (blocked & in_air).any()
 
 
-def test_blocked_tasks_are_counted_apart(make_records: MakeRecords) -> None:
+def test_blocked_tasks_are_counted_apart() -> None:
     config = parse_config({"game": {"blocked_gripper_fraction": 0.2}}, where="test")
     generator = TaskGenerator(config, SOME_BLOCKED)
     blocked = np.arange(40) % 4 == 0
@@ -196,8 +190,8 @@ def test_blocked_tasks_are_counted_apart(make_records: MakeRecords) -> None:
     assert rates == pytest.approx(expected)
 
 
-def test_a_past_bob_plays_no_replayed_goals(make_records: MakeRecords) -> None:
-    generator = filled(make_records, replay_fraction=1.0, replay_invalid=True)
+def test_a_past_bob_plays_no_replayed_goals() -> None:
+    generator = filled(replay_fraction=1.0, replay_invalid=True)
     plan = RoundPlan(np.array([0, CURRENT, CURRENT]), np.array([CURRENT, 0, 0]))
     choice = choose(generator, [VALID, VALID, OUTSIDE], plan)
     assert_rows(choice, [True, False, False])
@@ -205,7 +199,7 @@ def test_a_past_bob_plays_no_replayed_goals(make_records: MakeRecords) -> None:
 
 
 @pytest.mark.parametrize("source", ["uniform", "table", "learnable"])
-def test_goals_that_nobody_proposed(make_records: MakeRecords, source: str) -> None:
+def test_goals_that_nobody_proposed(source: str) -> None:
     """From a game's start or from where some world is now, and never where nothing has to be done."""
     settings = {"goal_source": source, "replay_invalid": True, "replay_from_reset": True}
     generator = TaskGenerator(config(**settings), FREE)
@@ -226,7 +220,7 @@ def test_goals_that_nobody_proposed(make_records: MakeRecords, source: str) -> N
     assert (np.linalg.norm(choice.goal - choice.start_position, axis=1) > 0.05).all()
 
 
-def test_learnable_goals_are_drawn_by_learnability(make_records: MakeRecords) -> None:
+def test_learnable_goals_are_drawn_by_learnability() -> None:
     """Bob always solves goals in the cells with x below -2.5 cm, 20 of 35 cm; of the others nothing is known."""
     cells = TaskGenerator(config(), FREE).cells.centers().reshape(-1, 3)
     solved = np.repeat(cells[cells[:, 0] < -0.025], 100, axis=0)
@@ -254,8 +248,8 @@ def test_no_drawn_goal_in_the_air_where_the_gripper_is_blocked() -> None:
     assert (choice.goal[blocked, 2] <= 0.025 + 0.05).all()
 
 
-def test_choice_does_not_alias_its_inputs(make_records: MakeRecords) -> None:
-    generator = filled(make_records, replay_fraction=1.0)
+def test_choice_does_not_alias_its_inputs() -> None:
+    generator = filled(replay_fraction=1.0)
     start_state, position = np.ones((1, STATE_SIZE)), np.zeros((1, 3))
     verdict = np.zeros(1, dtype=np.int8)
     index = np.zeros(1, dtype=np.int64)
@@ -266,7 +260,7 @@ def test_choice_does_not_alias_its_inputs(make_records: MakeRecords) -> None:
     assert position.tolist() == [[0.0] * 3]
 
 
-def test_replay_prefers_learnable_goals(make_records: MakeRecords) -> None:
+def test_replay_prefers_learnable_goals() -> None:
     generator = TaskGenerator(config(replay_fraction=1.0), FREE)
     solved_always, solved_half = (0.1, 0.1, 0.025), (-0.1, -0.1, 0.025)
     goals = [solved_always] * 100 + [solved_half] * 100
@@ -277,7 +271,7 @@ def test_replay_prefers_learnable_goals(make_records: MakeRecords) -> None:
     assert np.mean(goal[:, 0] > 0) == pytest.approx(easy / (easy + hard), abs=0.015)
 
 
-def test_replay_over_cells_does_not_forget_what_alice_has_left(make_records: MakeRecords) -> None:
+def test_replay_over_cells_does_not_forget_what_alice_has_left() -> None:
     left, crowded = (-0.2, 0.0, 0.325), [(0.1, y, 0.025) for y in (-0.15, -0.1, -0.05, 0.0, 0.05, 0.1, 0.15)]
     for over_cells, share in ((True, 1 / 2), (False, 0.0)):  # the only goal in the air, beside seven on the table
         generator = TaskGenerator(config(replay_fraction=1.0, replay_over_cells=over_cells), FREE)
@@ -290,7 +284,7 @@ def test_replay_over_cells_does_not_forget_what_alice_has_left(make_records: Mak
         assert np.mean(goal[:, 1] == crowded[0][1]) == pytest.approx((1 - share) / 7, abs=0.02)
 
 
-def test_record_separates_who_learns_what(make_records: MakeRecords) -> None:
+def test_record_separates_who_learns_what() -> None:
     generator = TaskGenerator(config(), FREE)
     metrics = record(
         generator,
@@ -318,7 +312,7 @@ def test_record_separates_who_learns_what(make_records: MakeRecords) -> None:
     assert metrics["generator/mean_learnability"] == pytest.approx(expected)
 
 
-def test_metric_names_are_an_api(make_records: MakeRecords) -> None:
+def test_metric_names_are_an_api() -> None:
     metrics = record(
         TaskGenerator(config(), FREE), make_records([(0.1, 0.0, 0.025), (0.0, 0.0, 0.2)], solved=[True, True])
     )
@@ -332,7 +326,7 @@ def test_metric_names_are_an_api(make_records: MakeRecords) -> None:
     }
 
 
-def test_an_iteration_without_any_goal(make_records: MakeRecords) -> None:
+def test_an_iteration_without_any_goal() -> None:
     verdict = np.full(2, Verdict.FALLEN, dtype=np.int8)
     records = make_records(np.full((2, 3), np.nan), verdict=verdict, played=[False, False])
     metrics = record(TaskGenerator(config(), FREE), records)
@@ -343,7 +337,7 @@ def test_an_iteration_without_any_goal(make_records: MakeRecords) -> None:
     assert all(np.isfinite(value) for value in metrics.values())
 
 
-def test_stops_on_current_players_own_goals_only(make_records: MakeRecords) -> None:
+def test_stops_on_current_players_own_goals_only() -> None:
     goals = np.tile(OLD_GOAL, (100, 1))
     past, none = np.ones(100, dtype=np.bool_), np.zeros(100, dtype=np.bool_)
     for overrides, expected in (
@@ -365,19 +359,19 @@ def test_opponents_are_due_every_interval() -> None:
     assert [iteration for iteration in range(35) if generator.opponents_due(iteration)] == [10, 20, 30]
 
 
-def test_a_snapshot_is_a_copy(make_records: MakeRecords) -> None:
+def test_a_snapshot_is_a_copy() -> None:
     """Rounds that go on while the generator records see nothing of it."""
-    generator = filled(make_records, starts=ONE_GAME, replay_fraction=1.0, replay_from_reset=True)
+    generator = filled(starts=ONE_GAME, replay_fraction=1.0, replay_from_reset=True)
     snapshot = generator.snapshot()
     before = {name: array.copy() for name, array in snapshot.state().items()}
-    play(generator, make_records, np.random.default_rng(0), range(20))
+    play(generator, np.random.default_rng(0), range(20))
     assert all(np.array_equal(array, before[name]) for name, array in snapshot.state().items())
     assert not all(np.array_equal(array, before[name]) for name, array in generator.snapshot().state().items())
 
 
-def test_a_choice_writes_to_nothing_and_draws_the_same_again(make_records: MakeRecords) -> None:
+def test_a_choice_writes_to_nothing_and_draws_the_same_again() -> None:
     """Snapshots of other processes are read-only."""
-    generator = filled(make_records, starts=ONE_GAME, replay_fraction=0.5, replay_from_reset=True)
+    generator = filled(starts=ONE_GAME, replay_fraction=0.5, replay_from_reset=True)
     state = generator.snapshot().state()
     for array in state.values():
         array.flags.writeable = False
@@ -394,13 +388,13 @@ def test_a_choice_writes_to_nothing_and_draws_the_same_again(make_records: MakeR
         assert np.array_equal(getattr(first, name), getattr(whole, name))
 
 
-def play(generator: TaskGenerator, make_records: MakeRecords, rng: np.random.Generator, iterations: range) -> list[Any]:
+def play(generator: TaskGenerator, rng: np.random.Generator, iterations: range) -> list[Any]:
     """Run the verbs in call order on made-up proposals; everything that came out."""
     outcomes: list[Any] = []
     lower, upper = np.array([-0.2, -0.15, 0.0]), np.array([0.1, 0.15, 0.3])
     num = 20
     for iteration in iterations:
-        plan = generator.opponents.freeze(0).plan(num, 0.2, rng)
+        plan = generator.opponents.plan(num, 0.2, rng)
         start_state, start = rng.normal(size=(num, STATE_SIZE)), rng.uniform(lower, upper, size=(num, 3))
         proposal = rng.uniform(lower, upper, size=(num, 3))
         verdict = rng.choice([VALID, OUTSIDE], size=num, p=[0.7, 0.3]).astype(np.int8)
@@ -422,12 +416,12 @@ def play(generator: TaskGenerator, make_records: MakeRecords, rng: np.random.Gen
             )
         )
         if generator.opponents_due(iteration):
-            generator.add_opponents({"a/w": rng.normal(size=3)}, {"b.w": rng.normal(size=(2, 2))})
+            generator.add_opponents(iteration, {"a/w": rng.normal(size=3)}, {"b.w": rng.normal(size=(2, 2))})
         outcomes.append(generator.should_stop())
     return outcomes
 
 
-def test_exact_resume_through_a_file(make_records: MakeRecords, tmp_path: Path) -> None:
+def test_exact_resume_through_a_file(tmp_path: Path) -> None:
     settings = config(
         replay_fraction=0.3,
         replay_invalid=True,
@@ -438,46 +432,29 @@ def test_exact_resume_through_a_file(make_records: MakeRecords, tmp_path: Path) 
         novelty_window=5,
     )
     generator, rng = TaskGenerator(settings, FREE), np.random.default_rng(5)
-    play(generator, make_records, rng, range(12))
+    play(generator, rng, range(12))
     np.savez(tmp_path / "state.npz", **generator.state())  # type: ignore[arg-type]
     resumed, resumed_rng = TaskGenerator(settings, FREE), np.random.default_rng()
     resumed_rng.bit_generator.state = rng.bit_generator.state
     with np.load(tmp_path / "state.npz", allow_pickle=False) as state:
         resumed.load_state({name: state[name] for name in state.files})
-    assert play(resumed, make_records, resumed_rng, range(12, 24)) == play(generator, make_records, rng, range(12, 24))
+    assert play(resumed, resumed_rng, range(12, 24)) == play(generator, rng, range(12, 24))
     state, again = generator.state(), resumed.state()
     assert list(state) == list(again)
     assert all(np.array_equal(state[name], again[name]) and state[name].dtype == again[name].dtype for name in state)
 
 
-def test_state_is_a_copy(make_records: MakeRecords) -> None:
-    generator = filled(make_records)
-    generator.add_opponents({"w": np.ones(2)}, {"w": np.ones(2)})
+def test_state_is_a_copy() -> None:
+    generator = filled()
+    generator.add_opponents(10, {"w": np.ones(2)}, {"w": np.ones(2)})
     state = generator.state()
     before = {name: array.copy() for name, array in state.items()}
-    play(generator, make_records, np.random.default_rng(0), range(20))
+    play(generator, np.random.default_rng(0), range(20))
     assert all(np.array_equal(state[name], before[name]) for name in state)
 
 
-def test_state_of_a_new_generator_loads(make_records: MakeRecords) -> None:
-    generator = filled(make_records)
-    generator.add_opponents({"w": np.ones(2)}, {"w": np.ones(2)})
+def test_state_of_a_new_generator_loads() -> None:
+    generator = filled()
+    generator.add_opponents(10, {"w": np.ones(2)}, {"w": np.ones(2)})
     generator.load_state(TaskGenerator(config(), FREE).state())
-    assert len(generator.buffer) == len(generator.opponents) == generator.grid.num_cells_seen == 0
-
-
-def test_state_of_version_0_1_0_loads(make_records: MakeRecords) -> None:
-    """It also held when goals outside the workspace began to cost something."""
-    generator, resumed = filled(make_records), TaskGenerator(config(), FREE)
-    state = generator.state()
-    resumed.load_state(state | {"penalty/valid_fraction": np.array(0.4), "penalty/active": np.array(True)})
-    assert state.keys() == resumed.state().keys()
-    assert all(np.array_equal(array, resumed.state()[name]) for name, array in state.items())
-
-
-def test_state_of_another_configuration_is_refused() -> None:
-    state = TaskGenerator(config(), FREE).state()
-    with pytest.raises(ConfigError, match="resume with the configuration of the checkpoint"):
-        TaskGenerator(config(novelty_window=7), FREE).load_state(state)
-    with pytest.raises(ConfigError, match="missing"):
-        TaskGenerator(config(), FREE).load_state({})
+    assert len(generator.buffer) == len(generator.opponents.alice) == generator.grid.num_cells_seen == 0

@@ -1,37 +1,31 @@
-"""The pool of past players and the plan of a round."""
+"""Past players and the plan of a round."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
 
-from service.generator.opponents import CURRENT, OpponentPool, Opponents
+from service.generator.opponents import CURRENT, Opponents
 
 
-def pool_of(num: int, capacity: int = 5) -> OpponentPool:
-    pool = OpponentPool(capacity)
+def opponents(num: int, capacity: int = 12) -> Opponents:
+    pool = Opponents(0)
     for version in range(num):
-        pool.add({"w": np.array([version])}, {"w": np.array([-version])})
+        pool = pool.joined_by({"w": np.array([version])}, {"w": np.array([-version])}, version, capacity)
     return pool
 
 
-def opponents(num: int) -> Opponents:
-    return pool_of(num).freeze(0)
+def versions(pool: Opponents) -> list[tuple[int, int]]:
+    """Parameters of each Alice and Bob."""
+    return [(int(alice["w"][0]), int(bob["w"][0])) for alice, bob in zip(pool.alice, pool.bob, strict=True)]
 
 
-def test_full_pool_drops_the_oldest() -> None:
-    pool = pool_of(7, capacity=3)
-    assert len(pool) == 3
-    assert [int(parameters["w"][0]) for parameters in pool.alice] == [4, 5, 6]
-    assert [int(parameters["w"][0]) for parameters in pool.bob] == [-4, -5, -6]
-
-
-def test_pool_copies_parameters() -> None:
-    weights = np.ones(2)
-    pool = OpponentPool(2)
-    pool.add({"w": weights}, {"w": weights})
-    weights[:] = 0.0
-    assert pool.alice[0]["w"].tolist() == pool.bob[0]["w"].tolist() == [1.0, 1.0]
+def test_of_too_many_the_oldest_go_and_earlier_ones_stay_as_they_were() -> None:
+    before, weights = opponents(3, capacity=3), np.full(2, 9)
+    pool = before.joined_by({"w": weights}, {"w": weights}, 7, 3)
+    weights[:] = 0  # what has joined is a copy
+    assert (pool.version, versions(pool)) == (7, [(1, -1), (2, -2), (9, 9)])
+    assert (before.version, versions(before)) == (2, [(0, 0), (1, -1), (2, -2)])
 
 
 def test_no_past_opponents_while_the_pool_is_empty_or_the_fraction_zero() -> None:
@@ -85,30 +79,14 @@ def test_plan_is_deterministic_for_a_seed() -> None:
     assert not np.array_equal(first.alice_opponent, other.alice_opponent)
 
 
-def test_state_round_trip_keeps_order_and_slashes_in_names() -> None:
-    pool = OpponentPool(12)
-    for version in range(12):  # more than ten: "10" must not sort before "2"
-        pool.add({"body/0.weight": np.full((2, 3), version, dtype=np.float32)}, {"gate": np.array([version])})
-    copy = OpponentPool(12)
-    copy.load_state(pool.state())
-    assert [int(parameters["gate"][0]) for parameters in copy.bob] == list(range(12))
-    assert copy.alice[11]["body/0.weight"].dtype == np.float32
-    assert np.array_equal(copy.alice[11]["body/0.weight"], pool.alice[11]["body/0.weight"])
+@pytest.mark.parametrize("num", [0, 3, 12])  # of more than ten, "10" must not come before "2"
+def test_they_come_back_from_their_state(num: int) -> None:
+    back = Opponents.from_state(-1, opponents(num).state() | {"num": np.array(num)})
+    assert (back.version, versions(back)) == (-1, [(version, -version) for version in range(num)])
 
 
-def test_frozen_opponents_stay_as_they_were() -> None:
-    pool = pool_of(2, capacity=2)
-    frozen = pool.freeze(7)
-    pool.add({"w": np.array([9])}, {"w": np.array([-9])})
-    assert frozen.version == 7
-    assert [int(parameters["w"][0]) for parameters in frozen.alice] == [0, 1]
-    assert [int(parameters["w"][0]) for parameters in frozen.bob] == [0, -1]
-
-
-@pytest.mark.parametrize("num", [0, 3, 12])
-def test_frozen_opponents_come_back_from_their_state(num: int) -> None:
-    frozen = pool_of(num, capacity=12).freeze(7)
-    back = Opponents.from_state(-1, frozen.state())
-    assert back.version == -1
-    assert [int(parameters["w"][0]) for parameters in back.alice] == list(range(num))
-    assert [int(parameters["w"][0]) for parameters in back.bob] == [-version for version in range(num)]
+def test_slashes_in_names_come_back() -> None:
+    weight = np.ones((2, 3), dtype=np.float32)
+    state = Opponents(0).joined_by({"body/0.weight": weight}, {}, 1, 5).state()
+    assert list(state) == ["0/alice/body/0.weight"]
+    assert state["0/alice/body/0.weight"].dtype == np.float32

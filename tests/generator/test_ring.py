@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from service.base.errors import ConfigError
 from service.generator.ring import Ring, join_rows
 
 
@@ -54,18 +53,6 @@ def test_rows_are_copies_and_join_in_their_order() -> None:
     joined = join_rows([buffer.rows(), {"first": np.full((1, 2), 9.0), "second": np.full((1, 3), 9.5)}])
     assert joined["first"][:, 0].tolist() == [1.0, 2.0, 3.0, 9.0]
     assert joined["second"][:, 2].tolist() == [1.25, 2.25, 3.25, 9.5]
-
-
-def test_state_of_another_buffer_is_refused() -> None:
-    full = make(3, 2)
-    add(full, 1, 2, 3, 4)
-    for capacity in (2, 5):
-        with pytest.raises(
-            ConfigError, match=r"3 rows do not fit a buffer that holds \d .generator.replay_buffer_size"
-        ):
-            make(capacity).load_state(full.state())
-    with pytest.raises(ConfigError, match=r"'first' is float64 \(3, 2\)"):
-        make(3, 5).load_state(full.state())
 
 
 def test_every_part_keeps_its_newest_rows() -> None:

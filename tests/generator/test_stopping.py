@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from service.config.self_play import GeneratorConfig
-from service.generator.stopping import StopCriterion
+from service.generator.generator import StopCriterion
 
 CONFIG = GeneratorConfig(novelty_window=4, stop_success_rate=0.95)
 
