@@ -14,8 +14,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks.run_files import CELL_SIZE_M, RANDOM, STAGES
-from service.actors.coverage import NUM_SKILLS, RandomPolicy, skill_trajectories, visited_share
-from service.actors.skill_coverage import skill_paths
+from service.actors.coverage import NUM_SKILLS, RandomPolicy, skill_paths, skill_trajectories, visited_share
 from service.base.types import StateArray
 from service.config import Config
 from service.config.skills import SkillDiscoveryConfig

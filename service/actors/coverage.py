@@ -1,6 +1,7 @@
-"""Coverage: the share of the workspace that random compositions of primitives reach, the paper's figure as a number.
+"""Coverage: the share of the workspace that random skills reach, the paper's figure as a number.
 
-A skill is one gate weight drawn at random and held for a whole episode (Peng et al. 2019; paper, section 5.1).
+A skill of primitives is one gate weight drawn at random and held for a whole episode (Peng et al. 2019; paper, section
+5.1).
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ from service.base.types import FloatArray, StateArray
 from service.config import WorkspaceConfig, WorldConfig
 from service.envs.batch import WorldBatch
 from service.envs.observations import ACTION
+from service.policies.frozen_skills import FrozenSkills, SkillPlayer
 
 NUM_SKILLS = 32
 """Random skills of which coverage is measured, unless told otherwise (paper: 32)."""
@@ -58,6 +60,34 @@ def skill_trajectories(
         return mean + std * rng.standard_normal(mean.shape, dtype=np.float32)
 
     return object_paths(act, config, num_paths=num_skills, num_steps=num_steps, rng=rng, num_threads=num_threads)
+
+
+def skill_paths(
+    skills: FrozenSkills,
+    config: WorldConfig,
+    *,
+    num_skills: int,
+    num_steps: int,
+    seed: int,
+    num_threads: int = 0,
+    observe: Callable[[WorldBatch], None] = lambda worlds: None,
+) -> StateArray:
+    """Object positions under random skills, without noise; see ``object_paths``.
+
+    Returns:
+        (num_skills, num_steps + 1, 3) metres, each from a fresh reset.
+    """
+    rng = np.random.default_rng(seed)
+    player = SkillPlayer(skills, skills.draw(num_skills, rng))
+    return object_paths(
+        player,
+        config,
+        num_paths=num_skills,
+        num_steps=num_steps,
+        rng=rng,
+        num_threads=num_threads,
+        observe=observe,
+    )
 
 
 def object_paths(

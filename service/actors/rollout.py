@@ -82,15 +82,13 @@ class Rollout:
         return self.actor, self.incarnation, self.sequence
 
 
-def part_to_arrays(part: Turns | Demonstrations | GoalRecords) -> Arrays:
-    """The arrays of one part by name; ``type(part)(**arrays)`` gives an equal part back."""
-    return {field.name: getattr(part, field.name) for field in fields(part)}
-
-
 def to_arrays(rollout: Rollout) -> Arrays:
     """Flat named arrays, for a checkpoint; ``from_arrays`` gives an equal rollout back."""
-    parts = {part: part_to_arrays(getattr(rollout, part)) for part in _PARTS}
-    arrays = {f"{part}/{name}": array for part, own in parts.items() for name, array in own.items()}
+    arrays = {
+        f"{part}/{field.name}": getattr(getattr(rollout, part), field.name)
+        for part, kind in _PARTS.items()
+        for field in fields(kind)
+    }
     numbers = {name: np.array(getattr(rollout, name)) for name in _NUMBERS}
     return arrays | numbers | {f"metrics/{name}": np.array(value) for name, value in rollout.metrics.items()}
 

@@ -206,8 +206,7 @@ def coverage(
         raise TandemError(f"--out {out}: the picture is a PNG; name a file that ends in .png")
     reference, _ = what_is_meant(reference, primitives)
     with loading():
-        from service.actors.coverage import RandomPolicy, skill_trajectories, visited_share
-        from service.actors.skill_coverage import skill_paths
+        from service.actors.coverage import RandomPolicy, skill_paths, skill_trajectories, visited_share
         from service.media.plots import plot_coverage
         from service.registry.loading import load
 

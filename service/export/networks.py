@@ -12,8 +12,7 @@ from service.base.types import FloatArray
 from service.envs.observations import Layouts, ObservationLayout, layouts
 from service.methods.task_methods import find_method
 from service.policies.forward import FUNCTIONS
-from service.policies.inputs import STEP_SCALE_M
-from service.policies.numpy_actor import numpy_actor
+from service.policies.numpy_actor import STEP_SCALE_M, numpy_actor
 from service.policies.numpy_policy import NumpyMCPPolicy, NumpyPolicy
 from service.policies.parameters import Parameters
 from service.registry.learned import RESIDUAL, LearnedPolicy, action_weights, learner_inputs

@@ -1,4 +1,6 @@
-"""The off-policy loop: every world makes a step, the transitions are kept, and the learner makes several updates.
+"""The off-policy loop on tabletop worlds.
+
+Every world makes a step, the transitions are kept, and the learner makes several updates.
 
 Consumes worlds and a way to make batches; produces a learned actor. It waits for nothing: what is asked of ``play`` is
 done when it returns.
@@ -6,37 +8,127 @@ done when it returns.
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
-from typing import Any, Protocol
+from dataclasses import asdict
+from typing import TYPE_CHECKING, Any, NamedTuple
 
+import gymnasium
 import numpy as np
 
 from service.base.tensors import join_parts, split_parts
 from service.base.types import Array, Arrays, BoolArray, FloatArray, Metrics
+from service.envs.gym.vector import VectorState
 from service.learner.replay import Columns, ReplayBuffer
-from service.learner.sac import Batch, SACLearner, actions_at_random
+
+if TYPE_CHECKING:  # lists of methods are read where torch is not needed
+    from service.learner.sac import Batch, SACLearner
 
 
-class Worlds(Protocol):
-    """N worlds that step together; one whose episode ends begins the next within the same step."""
+class Step(NamedTuple):
+    """A step of N worlds."""
 
-    steps_per_action: int
+    previous: FloatArray
+    """(N, 11) positions one step before ``positions``."""
+    positions: FloatArray
+    """(N, 11) that were acted on."""
+    before: FloatArray
+    """(N, 11) one env step before ``following``: those that were acted on, where an action lasts for one."""
+    following: FloatArray
+    """(N, 11) that the actions led to."""
+    goal: FloatArray
+    """(N, 3) metres."""
+    reward: FloatArray
+    """(N,) of the worlds' task."""
+    ended: BoolArray
+    """(N,) it was the last of its episode."""
+    success: BoolArray
+    """(N,) the goal was reached, where ``ended``."""
+
+
+class TabletopWorlds(ABC):
+    """N worlds that step together, a ``TabletopVectorEnv``, bare or wrapped, and what it showed last.
+
+    A world whose episode ends begins the next within the same step.
+
+    Args:
+        env: restarts episodes in the same step (``gymnasium.vector.AutoresetMode.SAME_STEP``).
+        seed: episodes begin here; world i draws its own from ``seed + i``.
+    """
+
+    steps_per_action = 1
     """Env steps that an action lasts."""
 
+    def __init__(self, env: gymnasium.vector.VectorEnv[Any, Any, Any], seed: int) -> None:
+        self.env: Any = env
+        self._see(env.reset(seed=seed)[0])
+        self.previous = self.positions
+        """(N, 11) positions one step ago; at an episode's start those of now."""
+
+    @abstractmethod
     def inputs(self) -> FloatArray:
         """(N, I) what the actor sees now."""
 
+    @abstractmethod
     def step(self, actions: FloatArray) -> tuple[Columns, BoolArray]:
         """Act by (N, A) actions; the transitions, as a replay buffer keeps them, and (N,) whose episodes ended."""
 
+    @property
+    def num_worlds(self) -> int:
+        """N."""
+        return int(self.env.num_envs)
+
+    @property
+    def num_actions(self) -> int:
+        """Size of a learner's action."""
+        return int(self.env.single_action_space.shape[0])
+
+    def advance(self, actions: FloatArray) -> Step:
+        """Act by (N, A) actions; a world whose episode ends begins the next at once."""
+        observation, reward, terminated, truncated, info = self.env.step(actions)
+        ended = terminated | truncated
+        following, success = observation["observation"].copy(), np.zeros_like(ended)
+        for world in np.flatnonzero(ended):
+            following[world] = info["final_obs"][world]["observation"]
+            success[world] = info["final_info"]["is_success"][world]
+        step = Step(
+            self.previous,
+            self.positions,
+            self.positions,
+            following,
+            self.goal,
+            reward.astype(np.float32),
+            ended,
+            success,
+        )
+        self._see(observation)
+        self.previous = np.where(ended[:, None], self.positions, step.positions)
+        return step
+
     def state(self) -> tuple[Arrays, Any]:
-        """Everything that ``load_state`` continues from: arrays by name, and random numbers as plain values."""
+        """Copy everything that ``load_state`` needs: arrays by name, and random numbers as plain values."""
+        worlds = asdict(self.env.state())
+        random = worlds.pop("random")
+        return {**worlds, "previous": self.previous.copy()}, random
 
     def load_state(self, arrays: dict[str, Array], random: Any) -> None:
-        """Go back to a saved state; continues bit for bit."""
+        """Go back to a saved state; continues bit-identically."""
+        worlds: dict[str, Any] = {name: np.array(array) for name, array in arrays.items()}
+        self.previous = worlds.pop("previous")
+        self._see(self.env.restore(VectorState(**worlds, random=tuple(random))))
+
+    def close(self) -> None:
+        """Stop the worlds' threads."""
+        self.env.close()
+
+    def _see(self, observation: dict[str, FloatArray]) -> None:
+        self.positions: FloatArray = observation["observation"].copy()
+        """(N, 11) now."""
+        self.goal: FloatArray = observation["desired_goal"].copy()
+        """(N, 3) metres."""
 
 
-BatchMaker = Callable[[ReplayBuffer, int, np.random.Generator], Batch]
+BatchMaker = Callable[[ReplayBuffer, int, np.random.Generator], "Batch"]
 """Makes a batch of so many transitions from a replay buffer: draws them, and says what is seen and what is paid."""
 
 
@@ -52,7 +144,7 @@ class OffPolicyLoop:
     """
 
     def __init__(
-        self, worlds: Worlds, replay: ReplayBuffer, learner: SACLearner, make_batch: BatchMaker, seed: int
+        self, worlds: TabletopWorlds, replay: ReplayBuffer, learner: SACLearner, make_batch: BatchMaker, seed: int
     ) -> None:
         self.worlds, self.replay, self.learner, self.make_batch = worlds, replay, learner, make_batch
         self.num_updates = 0
@@ -105,3 +197,8 @@ class OffPolicyLoop:
         self.worlds.load_state(parts["worlds"], values["worlds"])
         self._rng.bit_generator.state = values["loop"]
         self.num_updates = values["num_updates"]
+
+
+def actions_at_random(shape: tuple[int, ...], rng: np.random.Generator) -> FloatArray:
+    """Uniform actions in [-1, 1], float32: what a new learner begins with."""
+    return rng.uniform(-1.0, 1.0, shape).astype(np.float32)

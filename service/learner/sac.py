@@ -167,8 +167,3 @@ def put_back(state: Mapping[str, Array], tensors: Mapping[str, Tensor], random: 
         for name, tensor in tensors.items():
             tensor.copy_(torch.from_numpy(np.array(state[name])))
     random.set_state(torch.from_numpy(np.array(state["random"])))
-
-
-def actions_at_random(shape: tuple[int, ...], rng: np.random.Generator) -> FloatArray:
-    """Uniform actions in [-1, 1], float32: what a new learner begins with."""
-    return rng.uniform(-1.0, 1.0, shape).astype(np.float32)

@@ -7,8 +7,7 @@ from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
-from service.actors.coverage import NUM_SKILLS, skill_trajectories
-from service.actors.skill_coverage import skill_paths
+from service.actors.coverage import NUM_SKILLS, skill_paths, skill_trajectories
 from service.base.errors import TandemError
 from service.base.progress import counted
 from service.config.self_play import SelfPlayConfig

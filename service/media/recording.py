@@ -13,9 +13,9 @@ from functools import partial
 
 import numpy as np
 
+from service.actors.coverage import skill_paths
 from service.actors.evaluation import DeterministicPolicy, evaluate
 from service.actors.self_play import Players, SelfPlay, StochasticPolicy
-from service.actors.skill_coverage import skill_paths
 from service.base.progress import counted, doing
 from service.base.types import BoolArray, FloatArray, StateArray
 from service.config import WorldConfig

@@ -15,14 +15,13 @@ from service.config import WorkspaceConfig
 from service.config.skills import SkillDiscoveryConfig, SkillsConfig
 from service.envs.gym.vector import TabletopVectorEnv
 from service.envs.observations import POSITIONS
-from service.learner.off_policy import OffPolicyLoop
-from service.learner.off_policy_worlds import TabletopWorlds
+from service.learner.off_policy import OffPolicyLoop, TabletopWorlds
 from service.learner.replay import Columns, ReplayBuffer
 from service.learner.sac import Batch, SACLearner
 from service.learner.sac_networks import GaussianActor
 from service.methods.skill_rewards import IntrinsicReward, make_reward
 from service.policies.frozen_skills import draw_skills, normalised_place, skill_inputs
-from service.policies.inputs import NUM_MOTION_INPUTS
+from service.policies.numpy_actor import NUM_MOTION_INPUTS
 
 _OBJECT = POSITIONS["object"]
 _STEP_COLUMNS = {"previous": POSITIONS.size, "positions": POSITIONS.size, "following": POSITIONS.size}

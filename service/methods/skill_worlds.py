@@ -8,7 +8,7 @@ import gymnasium
 import numpy as np
 
 from service.base.types import FloatArray
-from service.learner.off_policy_worlds import Step
+from service.learner.off_policy import Step
 from service.methods.task_worlds import TaskWorlds
 from service.policies.frozen_skills import FrozenSkills
 

@@ -9,9 +9,8 @@ from pathlib import Path
 
 import numpy as np
 
-from service.actors.coverage import NUM_SKILLS, visited_share
+from service.actors.coverage import NUM_SKILLS, skill_paths, visited_share
 from service.actors.evaluation import EVALUATION_SEED
-from service.actors.skill_coverage import skill_paths
 from service.base.errors import ConfigError
 from service.base.tensors import join_parts, split_parts
 from service.base.types import Metrics

@@ -9,7 +9,7 @@ import numpy as np
 
 from service.base.types import Array, Arrays, BoolArray, FloatArray
 from service.envs.observations import PAPER, POSITIONS, Layouts
-from service.learner.off_policy_worlds import TabletopWorlds
+from service.learner.off_policy import TabletopWorlds
 from service.learner.replay import Columns
 from service.registry.learned import learner_inputs
 

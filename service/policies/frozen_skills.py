@@ -11,8 +11,7 @@ from service.base.types import FloatArray
 from service.config.skills import SkillMethod
 from service.envs.observations import BOB, POSITIONS
 from service.policies.forward import prepared, relu_layers
-from service.policies.inputs import NUM_MOTION_INPUTS, motion_inputs
-from service.policies.numpy_actor import NumpyActor, relu_shapes
+from service.policies.numpy_actor import NUM_MOTION_INPUTS, NumpyActor, motion_inputs, relu_shapes
 from service.policies.parameters import Parameters, PolicyError, checked
 
 _OBJECT = POSITIONS["object"]
@@ -20,20 +19,15 @@ _GREATEST_SKILL = 1.5
 """Greatest component of a skill that an orchestrator sets, in standard deviations of the prior."""
 
 
-def object_state(positions: FloatArray) -> FloatArray:
-    """(N, 3) the object's position in (N, 11) positions, normalised: what rewards see, the paper's prior."""
-    return normalised_place(positions[:, _OBJECT])
-
-
 def normalised_place(place: FloatArray) -> FloatArray:
-    """(N, 3) places of the object, metres, normalised as ``object_state``."""
+    """(N, 3) places of the object, metres, normalised: what rewards see, the paper's prior."""
     normalisation = POSITIONS.normalisation
     state: FloatArray = (place - normalisation.offset[_OBJECT]) / normalisation.scale[_OBJECT]
     return state.astype(np.float32, copy=False)
 
 
 def skill_inputs(previous: FloatArray, positions: FloatArray, skill: FloatArray) -> FloatArray:
-    """(N, 17 + Z) inputs of a policy that (N, Z) skills steer; see ``sac.inputs.motion_inputs``."""
+    """(N, 17 + Z) inputs of a policy that (N, Z) skills steer; see ``motion_inputs``."""
     inputs: FloatArray = np.concatenate((motion_inputs(previous, positions), skill), axis=1)
     return inputs
 
@@ -133,7 +127,8 @@ class FrozenSkills:
             return found
         if self.method == "dads":
             raise TandemError("skills of DADS lead to no given goal; learn an orchestrator")
-        step = relu_layers(np, self.network, there) - relu_layers(np, self.network, object_state(positions))
+        here = normalised_place(positions[:, _OBJECT])
+        step = relu_layers(np, self.network, there) - relu_layers(np, self.network, here)
         mean_length = math.sqrt(2.0) * math.gamma((self.size + 1) / 2) / math.gamma(self.size / 2)  # of N(0, I)
         length = np.float32(1.0 if self.method == "metra" else mean_length)
         skills: FloatArray = length * step / np.maximum(np.linalg.norm(step, axis=1, keepdims=True), np.float32(1e-6))

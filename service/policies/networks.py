@@ -66,7 +66,6 @@ class InputNormalisation(nn.Module):
     scale: Tensor
 
     def __init__(self, normalisation: Normalisation) -> None:
-        """Copy the constants into buffers."""
         super().__init__()
         self.register_buffer("offset", torch.tensor(normalisation.offset))
         self.register_buffer("scale", torch.tensor(normalisation.scale))
@@ -113,7 +112,6 @@ class GaussianSquash(nn.Module):
     log_std_max: Tensor
 
     def __init__(self, log_std_min: float, log_std_max: float) -> None:
-        """Keep the bounds as buffers."""
         super().__init__()
         self.register_buffer("log_std_min", torch.tensor(log_std_min))
         self.register_buffer("log_std_max", torch.tensor(log_std_max))
@@ -160,16 +158,15 @@ class GaussianPolicy(nn.Module):
 class Primitives(nn.Module):
     """K Gaussians over actions at (..., P) positions: a shared trunk, one hidden layer of each primitive's own."""
 
-    def __init__(self, config: MCPConfig, action_size: int, positions: ObservationLayout = POSITIONS) -> None:
+    def __init__(self, config: MCPConfig, positions: ObservationLayout = POSITIONS) -> None:
         """Build; the initial std gives the composition ``exp(INITIAL_LOG_STD)`` under a new gate's weights."""
         super().__init__()
-        self.num_primitives, self.action_size = config.num_primitives, action_size
         self.input = InputNormalisation(positions.normalisation)
         self.trunk = HiddenLayers(positions.size, config.trunk_hidden_sizes)
         self.hidden = HiddenLayer(self.trunk.output_size, config.num_primitives * config.primitive_hidden_size)
-        heads = config.num_primitives, config.primitive_hidden_size, 2 * action_size
+        heads = config.num_primitives, config.primitive_hidden_size, 2 * ACTION.size
         self.output_weight = nn.Parameter(torch.empty(heads))
-        self.output_bias = nn.Parameter(torch.zeros(config.num_primitives, 2 * action_size))
+        self.output_bias = nn.Parameter(torch.zeros(config.num_primitives, 2 * ACTION.size))
         self.squash = GaussianSquash(config.log_std_min, config.log_std_max)
         self._initialise(config)
 
@@ -184,13 +181,13 @@ class Primitives(nn.Module):
     @torch.no_grad()
     def _initialise(self, config: MCPConfig) -> None:
         nn.init.zeros_(self.hidden.bias)
-        for hidden, output in zip(self.hidden.weight.chunk(self.num_primitives), self.output_weight, strict=True):
+        for hidden, output in zip(self.hidden.weight.chunk(config.num_primitives), self.output_weight, strict=True):
             nn.init.orthogonal_(hidden, _HIDDEN_GAIN)
-            nn.init.orthogonal_(output[:, : self.action_size], _PRIMITIVE_MEAN_GAIN)
-            nn.init.orthogonal_(output[:, self.action_size :], _SMALL_GAIN)
+            nn.init.orthogonal_(output[:, : ACTION.size], _PRIMITIVE_MEAN_GAIN)
+            nn.init.orthogonal_(output[:, ACTION.size :], _SMALL_GAIN)
         weight = config.weight_floor + (1.0 - config.weight_floor) * 0.5
         log_std = INITIAL_LOG_STD + 0.5 * math.log(config.num_primitives * weight)
-        self.output_bias[:, self.action_size :] = log_std_bias(log_std, config.log_std_min, config.log_std_max)
+        self.output_bias[:, ACTION.size :] = log_std_bias(log_std, config.log_std_min, config.log_std_max)
 
 
 class Gate(nn.Module):
@@ -225,11 +222,10 @@ class MCPPolicy(nn.Module):
     only widen or narrow a policy blind to the goal; the monolithic Bob of the ablation is a ``GaussianPolicy``.
     """
 
-    def __init__(self, config: MCPConfig, action_size: int = ACTION.size, layouts: Layouts = PAPER) -> None:
-        """Build both parts."""
+    def __init__(self, config: MCPConfig, layouts: Layouts = PAPER) -> None:
         super().__init__()
         self.num_positions = layouts.positions.size
-        self.primitives = Primitives(config, action_size, layouts.positions)
+        self.primitives = Primitives(config, layouts.positions)
         self.gate = Gate(config, layouts)
 
     def forward(self, observation: Tensor) -> tuple[Tensor, Tensor]:
@@ -263,7 +259,7 @@ def make_alice(config: PolicyConfig, layouts: Layouts = PAPER) -> GaussianPolicy
 def make_bob(config: PolicyConfig, layouts: Layouts = PAPER) -> MCPPolicy | GaussianPolicy:
     """A new Bob; draws from torch's global generator."""
     if config.monolithic_bob is None:
-        return MCPPolicy(config.bob, layouts=layouts)
+        return MCPPolicy(config.bob, layouts)
     return GaussianPolicy(
         layouts.bob.normalisation, config.monolithic_bob, config.bob.log_std_min, config.bob.log_std_max
     )

@@ -9,13 +9,12 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
-from types import MappingProxyType
 from typing import Any
 
 import numpy as np
 
 from service.base.types import FloatArray
-from service.envs.observations import POSITIONS
+from service.envs.observations import ACTION, POSITIONS
 from service.policies import forward
 from service.policies.parameters import (
     NUM_GOAL,
@@ -36,8 +35,10 @@ class NumpyPolicy(ABC):
 
     network: Mapping[str, Any]
     """Parameters as ``forward`` takes them."""
-    columns: Mapping[str, slice] = MappingProxyType({})
+    columns: Mapping[str, slice]
     """Places of what it looks for in an observation."""
+    action_size = ACTION.size
+    """A."""
 
     @abstractmethod
     def distribution(self, observation: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -69,9 +70,8 @@ class NumpyGaussianPolicy(NumpyPolicy):
             PolicyError: a parameter is missing, left over, of a wrong shape or not finite.
         """
         (self._num_inputs,) = shape_of(parameters, "input.offset", 1)
-        self.action_size = shape_of(parameters, "output.weight", 2)[0] // 2
-        expected = gaussian_shapes(self._num_inputs, layer_sizes(parameters, "hidden.{}"), self.action_size)
-        self.network = forward.prepared(np, checked(parameters, expected))
+        expected = gaussian_shapes(self._num_inputs, layer_sizes(parameters, "hidden.{}"))
+        self.network, self.columns = forward.prepared(np, checked(parameters, expected)), {}
 
     def distribution(self, observation: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Mean and std, (..., A) each; see ``NumpyPolicy.distribution``."""
@@ -91,18 +91,11 @@ class NumpyMCPPolicy(NumpyPolicy):
         """
         (self.num_positions,) = shape_of(parameters, "primitives.input.offset", 1)
         """P; the observation O is these and the goal."""
-        if self.num_positions < POSITIONS.size:
-            raise PolicyError(
-                f"policy parameters 'primitives.input': {self.num_positions} positions; every layout has at least "
-                f"{POSITIONS.size}"
-            )
-        self.num_primitives, head_size, num_outputs = shape_of(parameters, "primitives.output_weight", 3)
-        self.action_size = num_outputs // 2
+        self.num_primitives, head_size, _ = shape_of(parameters, "primitives.output_weight", 3)
         trunk, gate = (layer_sizes(parameters, name) for name in ("primitives.trunk.{}", "gate.hidden.{}"))
         goal = slice(self.num_positions, self.num_positions + NUM_GOAL)
         self.columns = {"positions": slice(0, self.num_positions), "object": POSITIONS["object"], "goal": goal}
-        heads = self.num_primitives, head_size
-        expected = bob_shapes(self.num_positions, trunk, heads, gate, self.action_size)
+        expected = bob_shapes(self.num_positions, trunk, (self.num_primitives, head_size), gate)
         self.network = forward.prepared(np, checked(parameters, expected))
 
     def primitives(self, positions: FloatArray) -> tuple[FloatArray, FloatArray]:

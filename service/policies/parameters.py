@@ -25,7 +25,6 @@ def bob_shapes(
     trunk: Sequence[int],
     heads: tuple[int, int],
     gate: Sequence[int],
-    action_size: int = ACTION.size,
 ) -> Shapes:
     """Shape of every parameter of a composed Bob.
 
@@ -34,7 +33,6 @@ def bob_shapes(
         trunk: sizes of the layers that the primitives share.
         heads: number of primitives, and hidden size of each.
         gate: sizes of the gate's hidden layers.
-        action_size: A.
     """
     num_primitives, head_size = heads
     num_seen = num_positions + NUM_GOAL + GOAL_FROM_OBJECT.size
@@ -43,8 +41,8 @@ def bob_shapes(
         **_input_shapes("primitives.input", num_positions),
         **layer_shapes("primitives.trunk.{}", (num_positions, *trunk)),
         **layer_shapes("primitives.hidden", (last_of_trunk, num_primitives * head_size)),
-        "primitives.output_weight": (num_primitives, head_size, 2 * action_size),
-        "primitives.output_bias": (num_primitives, 2 * action_size),
+        "primitives.output_weight": (num_primitives, head_size, 2 * ACTION.size),
+        "primitives.output_bias": (num_primitives, 2 * ACTION.size),
         **_squash_shapes("primitives.squash"),
         **_input_shapes("gate.input", num_seen),
         **layer_shapes("gate.hidden.{}", (num_seen, *gate)),
@@ -53,12 +51,12 @@ def bob_shapes(
     }
 
 
-def gaussian_shapes(num_inputs: int, hidden: Sequence[int], action_size: int) -> Shapes:
+def gaussian_shapes(num_inputs: int, hidden: Sequence[int]) -> Shapes:
     """Shape of every parameter of Alice, or of a monolithic Bob."""
     return {
         **_input_shapes("input", num_inputs),
         **layer_shapes("hidden.{}", (num_inputs, *hidden)),
-        **layer_shapes("output", ([num_inputs, *hidden][-1], 2 * action_size)),
+        **layer_shapes("output", ([num_inputs, *hidden][-1], 2 * ACTION.size)),
         **_squash_shapes("squash"),
     }
 
@@ -118,7 +116,7 @@ def checked(parameters: Parameters, expected: Shapes) -> dict[str, FloatArray]:
     """Float32 copies of parameters that have the expected shapes.
 
     Raises:
-        PolicyError: a parameter is missing, left over, of another shape, not finite, or out of its range.
+        PolicyError: a parameter is missing, left over, of another shape, or not finite.
     """
     for misfit in misfits(parameters, expected):
         raise PolicyError(f"{misfit}; export it again")
@@ -128,12 +126,6 @@ def checked(parameters: Parameters, expected: Shapes) -> dict[str, FloatArray]:
             raise PolicyError(f"{about} of shape {value.shape}: expected float32, got {value.dtype}")
         if not np.isfinite(value).all():
             raise PolicyError(f"{about} of shape {value.shape} is not finite; use an earlier version")
-        if name.endswith(".scale") and not (value > 0.0).all():
-            raise PolicyError(f"{about} = {value}: expected positive values")
-        if name.endswith("weight_floor") and not 0.0 < value < 1.0:
-            raise PolicyError(f"{about} = {value}: expected a value between 0 and 1")
-        if name.endswith("log_std_max") and not value > (low := parameters[f"{name.removesuffix('max')}min"]):
-            raise PolicyError(f"{about} = {value}: expected a value above the least, {low:g}")
     return {name: value.astype(np.float32) for name, value in parameters.items()}
 
 

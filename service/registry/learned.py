@@ -13,8 +13,7 @@ from service.envs.observations import GOAL_FROM_OBJECT, PAPER, POSITIONS, Layout
 from service.policies import forward
 from service.policies.forward import INPUT_CLIP
 from service.policies.frozen_skills import FrozenSkills
-from service.policies.inputs import NUM_MOTION_INPUTS, motion_inputs
-from service.policies.numpy_actor import numpy_actor
+from service.policies.numpy_actor import NUM_MOTION_INPUTS, motion_inputs, numpy_actor
 from service.policies.numpy_policy import NumpyMCPPolicy
 from service.policies.parameters import Parameters, PolicyError
 

@@ -7,9 +7,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from service.actors.coverage import NUM_SKILLS, visited_share
+from service.actors.coverage import NUM_SKILLS, skill_paths, visited_share
 from service.actors.evaluation import EVALUATED_GOALS, REPORTED_SEED, success_metrics
-from service.actors.skill_coverage import skill_paths
 from service.base import tensors
 from service.base.errors import StorageError, TandemError
 from service.config import Config

@@ -12,8 +12,7 @@ from service.config.self_play import SelfPlayConfig
 from service.config.skills import SkillDiscoveryConfig
 from service.envs.observations import ACTION, POSITIONS, layouts
 from service.policies.frozen_skills import FrozenSkills
-from service.policies.inputs import NUM_MOTION_INPUTS
-from service.policies.numpy_actor import numpy_actor
+from service.policies.numpy_actor import NUM_MOTION_INPUTS, numpy_actor
 from service.policies.numpy_policy import NumpyMCPPolicy
 from service.policies.parameters import Shapes, bob_shapes, layer_shapes, misfits
 from service.registry.acting import acting_config

@@ -7,8 +7,7 @@ import pytest
 
 from benchmarks import measuring, record_run, run_files
 from benchmarks.report import figures, skills
-from service.actors.coverage import visited_share
-from service.actors.skill_coverage import skill_paths
+from service.actors.coverage import skill_paths, visited_share
 from service.base.errors import TandemError
 from service.config import WorldConfig, parse_config
 from service.policies.frozen_skills import FrozenSkills

@@ -5,7 +5,8 @@ import pytest
 import torch
 
 from service.config.sac import SACConfig
-from service.learner.sac import Batch, SACLearner, actions_at_random
+from service.learner.off_policy import actions_at_random
+from service.learner.sac import Batch, SACLearner
 from service.learner.sac_networks import GaussianActor, sample_actions
 
 CONFIG = SACConfig(batch_size=6, gradient_steps=2, hidden_sizes=(8,), learning_rate=0.01, gamma=0.9, tau=0.2)

@@ -5,8 +5,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from service.actors.coverage import skill_paths
 from service.actors.evaluation import evaluate
-from service.actors.skill_coverage import skill_paths
 from service.config import WorldConfig
 from service.config.self_play import GameConfig, SelfPlayConfig
 from service.envs.batch import WorldBatch

@@ -6,8 +6,8 @@ from service.config import WorldConfig
 from service.config.skills import SkillDiscoveryConfig, SkillsConfig
 from service.learner.sac_networks import GaussianActor, make_layers
 from service.policies.frozen_skills import FrozenSkills, ZeroShotPolicy, export_skills
-from service.policies.inputs import NUM_MOTION_INPUTS
 from service.policies.networks import export_parameters
+from service.policies.numpy_actor import NUM_MOTION_INPUTS
 from service.registry.loading import Trained
 
 WORLD = WorldConfig(physics_step_s=0.005, num_substeps=8)

@@ -178,7 +178,7 @@ def test_the_digest_sees_a_single_bit(trained):
 
 def test_digests_stay_what_they_were_when_the_first_were_recorded():
     """Of Bob, ``tests/benchmarks`` has recorded ones."""
-    alone = gaussian_shapes(5, (3, 2), 4)
+    alone = gaussian_shapes(5, (3, 2))
     skills = layer_shapes("actor.layers.{}", (20, 3, 8), 2) | layer_shapes("network.{}", (3, 2, 3), 2)
     alone, skills = (
         {name: np.arange(1, 1 + math.prod(shape), dtype=np.float32).reshape(shape) for name, shape in shapes.items()}
