@@ -9,7 +9,6 @@ import numpy as np
 from service.base.types import Array, BoolArray, IntArray, StateArray
 from service.config import WorldConfig
 from service.config.self_play import SelfPlayConfig
-from service.config.world import Point
 from service.envs.obstacles import obstacle_columns
 from service.envs.state_layout import StateLayout
 
@@ -38,9 +37,8 @@ def height_bins(positions: StateArray, rest_height_m: float) -> IntArray:
 
 def distance_bins(goals: StateArray, start_positions: StateArray) -> IntArray:
     """(M,) bin between ``DISTANCE_EDGES_M`` of the way from (M, 3) starts to (M, 3) goals, metres."""
-    distance = np.linalg.norm(goals - start_positions, axis=-1)
-    bins: IntArray = np.digitize(distance, DISTANCE_EDGES_M).astype(np.int64)
-    return bins
+    distance: StateArray = np.linalg.norm(goals - start_positions, axis=-1)
+    return np.digitize(distance, DISTANCE_EDGES_M).astype(np.int64)
 
 
 CELL_SIZE_M = 0.05
@@ -50,20 +48,16 @@ CELL_SIZE_M = 0.05
 class GoalCells:
     """Cells that cover the workspace."""
 
-    bounds_m: tuple[Point, Point]
-    """Lower and upper corner of the workspace, metres."""
-    cell_size_m: float
-    """Edge of a cell; the last ones may reach beyond the workspace."""
-    shape: tuple[int, int, int]
-    """Number of cells in x, y and z."""
-
     def __init__(self, world: WorldConfig, cell_size_m: float) -> None:
         self.bounds_m = world.workspace.lower_m, world.workspace.upper_m
+        """Lower and upper corner of the workspace, metres."""
         self._lower: StateArray = np.array(self.bounds_m[0])
         self.cell_size_m = cell_size_m
+        """Edge of a cell; the last ones may reach beyond the workspace."""
         # Rounding may not add a cell: 0.45 / 0.03 is a little over 15.
         counted = np.ceil((self.bounds_m[1] - self._lower) / cell_size_m - 1e-9).astype(int)
         self.shape = (int(counted[0]), int(counted[1]), int(counted[2]))
+        """Number of cells in x, y and z."""
 
     def __len__(self) -> int:
         """Number of cells."""

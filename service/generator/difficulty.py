@@ -7,7 +7,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from service.base.tensors import join_parts, split_parts
-from service.base.types import Array, Arrays, BoolArray, IntArray, StateArray
+from service.base.types import Array, Arrays, IntArray, StateArray
 from service.generator.bins import GoalCells
 
 DECAY = 0.95
@@ -21,17 +21,13 @@ PRIOR_TRIES = 2.0
 class SuccessCounts:
     """Exponentially decayed tries and successes of ``num_bins`` bins."""
 
-    tries: StateArray
-    """(B,) decayed number of tries."""
-    successes: StateArray
-    """(B,) decayed number of successes."""
-    num_tries: IntArray
-    """(B,) tries ever, not decayed."""
-
     def __init__(self, num_bins: int) -> None:
         self.tries = np.zeros(num_bins)
+        """(B,) decayed number of tries."""
         self.successes = np.zeros(num_bins)
+        """(B,) decayed number of successes."""
         self.num_tries = np.zeros(num_bins, dtype=np.int64)
+        """(B,) tries ever, not decayed."""
 
     def record(self, tries: IntArray, successes: IntArray) -> None:
         """Age all counts by one iteration, then add its (B,) tries and (B,) successes."""
@@ -63,20 +59,12 @@ class DifficultyGrid:
     All rates are decayed running ones (see ``DECAY``), one ``record`` being one iteration, so they follow Bob.
     """
 
-    cells: GoalCells
-    """The cells themselves."""
-    counts: SuccessCounts
-    """Over the cells, x-major."""
-    seen: BoolArray
-    """(cells,) a valid goal was ever proposed there."""
-    proposals: StateArray
-    """(cells,) decayed number of valid proposals, see ``PROPOSAL_DECAY``."""
-
     def __init__(self, cells: GoalCells) -> None:
-        self.cells = cells
-        self.proposals = np.zeros(len(cells))
-        self.counts = SuccessCounts(len(cells))
+        self.cells, self.counts = cells, SuccessCounts(len(cells))
         self.seen = np.zeros(len(cells), dtype=np.bool_)
+        """(cells,) a valid goal was ever proposed there."""
+        self.proposals = np.zeros(len(cells))
+        """(cells,) decayed number of valid proposals, see ``PROPOSAL_DECAY``."""
 
     @property
     def num_cells_seen(self) -> int:
@@ -128,9 +116,8 @@ class DifficultyGrid:
 
     def state(self) -> Arrays:
         """All counts, copied."""
-        return {"seen": self.seen.copy(), "proposals": self.proposals.copy()} | join_parts(
-            {"cells": self.counts.state()}
-        )
+        own = {"seen": self.seen.copy(), "proposals": self.proposals.copy()}
+        return own | join_parts({"cells": self.counts.state()})
 
     def load_state(self, state: Mapping[str, Array]) -> None:
         """Take over what ``state`` gave."""

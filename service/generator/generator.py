@@ -26,14 +26,12 @@ MIN_NUM_GOALS = 100
 class StopCriterion:
     """The paper's stop criterion over a window of iterations: Alice finds nothing new, and Bob solves all."""
 
-    num_iterations_without_new_cell: int
-    """Iterations since the last new goal cell."""
-
     def __init__(self, config: GeneratorConfig) -> None:
         self._stop_success_rate = config.stop_success_rate
         self._window = np.zeros((config.novelty_window, 2), dtype=np.int64)  # tries and successes of an iteration
         self._num_iterations = 0
         self.num_iterations_without_new_cell = 0
+        """Iterations since the last new goal cell."""
 
     def record(self, num_new_cells: int, num_tried: int, num_solved: int) -> None:
         """Add one iteration: new goal cells, and tries and successes of the current players' goals."""
@@ -65,34 +63,23 @@ class TaskGenerator:
     one iteration. Nothing here is random.
     """
 
-    cells: GoalCells
-    """Cells of goals."""
-    tasks: TaskBins
-    """Bins of tasks from resets."""
-
-    grid: DifficultyGrid
-    """Bob's success over goal cells."""
-    buffer: Ring
-    """Earlier valid goals and the states they were proposed from, drawn by learnability (Rutherford et al. 2024)."""
-    starts: Ring
-    """States right after a reset."""
-    from_reset: SuccessCounts
-    """Bob's success from resets, by the goal's height and distance; those with a blocked gripper apart. They are harder
-    than what starts where Alice left off."""
-    opponents: Opponents
-    """Past versions of both players."""
-
     def __init__(self, config: SelfPlayConfig, layout: StateLayout) -> None:
         self._config = config
         self.cells = GoalCells(config.world, config.generator.cell_size_m)
         self.tasks = TaskBins.from_config(config, layout)
         self.grid = DifficultyGrid(self.cells)
+        """Bob's success over goal cells."""
         columns = {"start_state": layout.size, "start_position": 3}
         num_parts = len(self.cells) if config.generator.replay_over_cells else 1
         self.buffer = Ring(config.generator.replay_buffer_size, num_parts, **columns, goal=3)
+        """Earlier valid goals and the states they came from, drawn by learnability (Rutherford et al. 2024)."""
         self.starts = Ring(NUM_STARTS, **columns)
+        """States right after a reset."""
         self.opponents = Opponents(0)
+        """Past versions of both players."""
         self.from_reset = SuccessCounts(len(self.tasks))
+        """Bob's success from resets, by the goal's height and distance; those with a blocked gripper apart. They are
+        harder than what starts where Alice left off."""
         self._stop = StopCriterion(config.generator)
         self._parts: dict[str, DifficultyGrid | Ring | SuccessCounts | StopCriterion] = {
             "grid": self.grid,

@@ -44,11 +44,6 @@ class ReplayBuffer:
         self._last_step = np.full((num_steps, num_worlds), _GOES_ON, dtype=np.int32)  # of each transition's episode
         self._began = np.zeros(num_worlds, dtype=np.int64)
 
-    @property
-    def oldest(self) -> int:
-        """Number of the oldest step that is kept."""
-        return max(0, self.num_added - self.num_steps)
-
     def add(self, columns: Mapping[str, FloatArray], ended: BoolArray) -> None:
         """Add a step of every world.
 
@@ -69,7 +64,8 @@ class ReplayBuffer:
 
     def draw(self, size: int, rng: np.random.Generator, *, newest: int | None = None) -> Places:
         """Draw ``size`` transitions, all alike, with replacement; of the newest steps of every world, or of all."""
-        oldest = self.oldest if newest is None else max(self.oldest, self.num_added - newest)
+        kept = self.num_steps if newest is None else min(self.num_steps, newest)
+        oldest = max(0, self.num_added - kept)
         flat = rng.integers(oldest * self.num_worlds, self.num_added * self.num_worlds, size)
         return Places(*np.divmod(flat, self.num_worlds))
 
