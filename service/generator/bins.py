@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from service.base.types import Array, BoolArray, IntArray, StateArray
@@ -11,6 +9,7 @@ from service.config import WorldConfig
 from service.config.self_play import SelfPlayConfig
 from service.envs.obstacles import obstacle_columns
 from service.envs.state_layout import StateLayout
+from service.store.models import GoalCell, GoalGrid
 
 AIR_ABOVE_REST_M = 0.05
 """A goal is in the air when the object's centre is higher than it rests on the table by more than this."""
@@ -74,36 +73,61 @@ class GoalCells:
         return np.bincount(self.index(goals), minlength=len(self))
 
     def centers(self) -> Array:
-        """(X, Y, Z, 3) middle of each cell, metres."""
-        index = np.stack(np.meshgrid(*(np.arange(size) for size in self.shape), indexing="ij"), axis=-1)
+        """(cells, 3) middle of each cell, metres."""
+        index = np.stack(np.unravel_index(np.arange(len(self)), self.shape), axis=-1)
         centers: Array = self._lower + (index + 0.5) * self.cell_size_m
         return centers
 
+    def grid(
+        self,
+        shown: BoolArray,
+        num_tries: IntArray,
+        success_rate: StateArray,
+        learnability: StateArray,
+        *,
+        iteration: int,
+        num_env_steps: int,
+    ) -> GoalGrid:
+        """The cells that are ``shown`` as people and the service read them; all arrays are (cells,)."""
+        centers = np.round(self.centers(), 4)
+        cells = tuple(
+            GoalCell(
+                center_m=tuple(centers[cell].tolist()),
+                num_tries=int(num_tries[cell]),
+                success_rate=float(success_rate[cell]),
+                learnability=float(learnability[cell]),
+            )
+            for cell in np.flatnonzero(shown)
+        )
+        return GoalGrid(
+            iteration=iteration,
+            num_env_steps=num_env_steps,
+            cell_size_m=self.cell_size_m,
+            shape=self.shape,
+            num_cells=len(self),
+            lower_m=self.bounds_m[0],
+            upper_m=self.bounds_m[1],
+            cells=cells,
+        )
 
-@dataclass(frozen=True, slots=True)
+
 class TaskBins:
     """Bins of tasks, a task being a goal and a start, by what makes them hard for Bob.
 
     They are the goal's height, its distance from the object's start and, where a run blocks some grippers, the gripper.
+
+    Args:
+        config: the run.
+        layout: of its worlds' states.
     """
 
-    rest_height_m: float
-    """Height of the centre of an object that lies on the table."""
-    gripper_blocked: slice
-    """Columns of a state that say so; none where worlds have no such flag."""
-    some_blocked: bool
-    obstacles: slice
-    """Columns of a state that hold poses of obstacles."""
-
-    @classmethod
-    def from_config(cls, config: SelfPlayConfig, layout: StateLayout) -> TaskBins:
-        """The bins of a run whose worlds' states have this layout."""
-        return cls(
-            rest_height_m=config.world.rest_height_m,
-            gripper_blocked=layout["gripper_blocked"],
-            some_blocked=config.game.blocked_gripper_fraction > 0.0,
-            obstacles=obstacle_columns(layout, len(config.world.obstacles)),
-        )
+    def __init__(self, config: SelfPlayConfig, layout: StateLayout) -> None:
+        self.rest_height_m = config.world.rest_height_m
+        """Height of the centre of an object that lies on the table."""
+        self.some_blocked = config.game.blocked_gripper_fraction > 0.0
+        self.obstacles = obstacle_columns(layout, len(config.world.obstacles))
+        """Columns of a state that hold poses of obstacles."""
+        self._gripper_blocked = layout["gripper_blocked"]  # columns that say so; none where worlds have no such flag
 
     def __len__(self) -> int:
         """Number of bins."""
@@ -116,5 +140,5 @@ class TaskBins:
 
     def blocked(self, states: StateArray) -> BoolArray:
         """(M,) whether the gripper of (M, S) states is blocked; none is where states have no such flag."""
-        blocked: BoolArray = np.any(states[:, self.gripper_blocked] > 0.0, axis=1)
+        blocked: BoolArray = np.any(states[:, self._gripper_blocked] > 0.0, axis=1)
         return blocked

@@ -102,18 +102,6 @@ class DifficultyGrid:
         """Mean over the cells seen; not-a-number while there are none."""
         return float(self.counts.learnability()[self.seen].mean()) if self.seen.any() else float("nan")
 
-    def maps(self) -> dict[str, Array]:
-        """Arrays over the cells for plots and REST: (X, Y, Z) each, and ``center`` (X, Y, Z, 3) in metres."""
-        flat = {
-            "seen": self.seen.copy(),
-            "num_tries": self.counts.num_tries.copy(),
-            "success_rate": self.counts.success_rate(),
-            "learnability": self.counts.learnability(),
-        }
-        maps: dict[str, Array] = {name: array.reshape(self.cells.shape) for name, array in flat.items()}
-        maps["center"] = self.cells.centers()
-        return maps
-
     def state(self) -> Arrays:
         """All counts, copied."""
         own = {"seen": self.seen.copy(), "proposals": self.proposals.copy()}

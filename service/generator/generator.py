@@ -66,7 +66,7 @@ class TaskGenerator:
     def __init__(self, config: SelfPlayConfig, layout: StateLayout) -> None:
         self._config = config
         self.cells = GoalCells(config.world, config.generator.cell_size_m)
-        self.tasks = TaskBins.from_config(config, layout)
+        self.tasks = TaskBins(config, layout)
         self.grid = DifficultyGrid(self.cells)
         """Bob's success over goal cells."""
         columns = {"start_state": layout.size, "start_position": 3}

@@ -9,15 +9,13 @@ from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from typing import Any
 
-import numpy as np
-
 from service.actors.rollout import Diverged
 from service.base.errors import TandemError
 from service.base.types import IntArray, Metrics, StateArray
 from service.generator.bins import GoalCells
 from service.methods.timing import Timing
 from service.policies.parameters import Parameters
-from service.store.models import ActorStatus, GoalCell, GoalGrid
+from service.store.models import ActorStatus, GoalGrid
 
 State = Mapping[str, Any]
 """By the name of a component its arrays, which have names of their own, or plain values as JSON has them."""
@@ -153,24 +151,6 @@ class Method(ABC):
 
     def grid_of(self, cells: GoalCells, num_tries: IntArray, success_rate: StateArray) -> GoalGrid:
         """The grid of (cells,) tries and success rates; untried cells are left out."""
-        centers = cells.centers().reshape(-1, 3)
-        tried = tuple(
-            GoalCell(
-                center_m=tuple(np.round(centers[cell], 4).tolist()),
-                num_tries=int(num_tries[cell]),
-                success_rate=float(success_rate[cell]),
-                learnability=float(success_rate[cell] * (1.0 - success_rate[cell])),
-            )
-            for cell in np.flatnonzero(num_tries)
-        )
-        lower, upper = cells.bounds_m
-        return GoalGrid(
-            iteration=self.iteration,
-            num_env_steps=self.num_env_steps,
-            cell_size_m=cells.cell_size_m,
-            shape=cells.shape,
-            num_cells=len(cells),
-            lower_m=lower,
-            upper_m=upper,
-            cells=tried,
-        )
+        learnability = success_rate * (1.0 - success_rate)
+        counted = {"iteration": self.iteration, "num_env_steps": self.num_env_steps}
+        return cells.grid(num_tries > 0, num_tries, success_rate, learnability, **counted)

@@ -28,7 +28,7 @@ from service.generator.opponents import Opponents
 from service.generator.records import GoalSummary, join_summaries, summarize
 from service.generator.snapshot import GeneratorSnapshot
 from service.policies.numpy_policy import NumpyGaussianPolicy, numpy_bob
-from service.store.models import GoalCell, GoalGrid
+from service.store.models import GoalGrid
 
 if TYPE_CHECKING:
     from service.learner.weights import Weights
@@ -95,7 +95,7 @@ class RolloutWorker:
         self.rng = np.random.default_rng(source)
         self.game = SelfPlay(config, self.rng, actor=actor, incarnation=incarnation, num_threads=num_threads)
         self._cells = GoalCells(config.world, config.generator.cell_size_m)
-        self._tasks = TaskBins.from_config(config, self.game.worlds.layout)
+        self._tasks = TaskBins(config, self.game.worlds.layout)
         self._opponents_version: int | None = None
         self._past: list[tuple[StochasticPolicy, StochasticPolicy]] = []
 
@@ -197,27 +197,12 @@ class GeneratorWorker:
     def grid(self, iteration: int, num_env_steps: int) -> GoalGrid:
         """The cells in which a valid goal was ever proposed, as they are after ``iteration`` iterations."""
         grid = self.generator.grid
-        maps = grid.maps()
-        cells = tuple(
-            GoalCell(
-                center_m=tuple(np.round(maps["center"][tuple(at)], 4).tolist()),
-                num_tries=int(maps["num_tries"][tuple(at)]),
-                success_rate=round(float(maps["success_rate"][tuple(at)]), 4),
-                learnability=round(float(maps["learnability"][tuple(at)]), 4),
-            )
-            for at in np.argwhere(maps["seen"])
+        rates, learnability = (
+            np.array([round(float(value), 4) for value in values])
+            for values in (grid.counts.success_rate(), grid.counts.learnability())
         )
-        lower, upper = grid.cells.bounds_m
-        return GoalGrid(
-            iteration=iteration,
-            num_env_steps=num_env_steps,
-            cell_size_m=grid.cells.cell_size_m,
-            shape=grid.cells.shape,
-            num_cells=len(grid.cells),
-            lower_m=lower,
-            upper_m=upper,
-            cells=cells,
-        )
+        counted = {"iteration": iteration, "num_env_steps": num_env_steps}
+        return grid.cells.grid(grid.seen, grid.counts.num_tries, rates, learnability, **counted)
 
 
 class LearnerWorker:

@@ -95,14 +95,10 @@ def use_bfloat16(network: nn.Module) -> None:
             module.in_bfloat16 = True
 
 
-class HiddenLayers(nn.Sequential):
+def hidden_layers(input_size: int, hidden_sizes: Sequence[int]) -> nn.Sequential:
     """Hidden layers one after the other; orthogonal with gain sqrt(2)."""
-
-    def __init__(self, input_size: int, hidden_sizes: Sequence[int]) -> None:
-        """Build one layer per hidden size; ``output_size`` is the last."""
-        sizes = [input_size, *hidden_sizes]
-        super().__init__(*(initialised(HiddenLayer(*pair), gain=_HIDDEN_GAIN) for pair in pairwise(sizes)))
-        self.output_size = sizes[-1]
+    sizes = [input_size, *hidden_sizes]
+    return nn.Sequential(*(initialised(HiddenLayer(*pair), gain=_HIDDEN_GAIN) for pair in pairwise(sizes)))
 
 
 class GaussianSquash(nn.Module):
@@ -144,8 +140,8 @@ class GaussianPolicy(nn.Module):
         """Build with orthogonal weights; initially the mean is near 0 and the std ``exp(INITIAL_LOG_STD)``."""
         super().__init__()
         self.input = InputNormalisation(normalisation)
-        self.hidden = HiddenLayers(len(normalisation.offset), config.hidden_sizes)
-        self.output = initialised(nn.Linear(self.hidden.output_size, 2 * ACTION.size), gain=_SMALL_GAIN)
+        self.hidden = hidden_layers(len(normalisation.offset), config.hidden_sizes)
+        self.output = initialised(nn.Linear(config.hidden_sizes[-1], 2 * ACTION.size), gain=_SMALL_GAIN)
         self.squash = GaussianSquash(log_std_min, log_std_max)
         nn.init.constant_(self.output.bias[ACTION.size :], log_std_bias(INITIAL_LOG_STD, log_std_min, log_std_max))
 
@@ -162,8 +158,8 @@ class Primitives(nn.Module):
         """Build; the initial std gives the composition ``exp(INITIAL_LOG_STD)`` under a new gate's weights."""
         super().__init__()
         self.input = InputNormalisation(positions.normalisation)
-        self.trunk = HiddenLayers(positions.size, config.trunk_hidden_sizes)
-        self.hidden = HiddenLayer(self.trunk.output_size, config.num_primitives * config.primitive_hidden_size)
+        self.trunk = hidden_layers(positions.size, config.trunk_hidden_sizes)
+        self.hidden = HiddenLayer(config.trunk_hidden_sizes[-1], config.num_primitives * config.primitive_hidden_size)
         heads = config.num_primitives, config.primitive_hidden_size, 2 * ACTION.size
         self.output_weight = nn.Parameter(torch.empty(heads))
         self.output_bias = nn.Parameter(torch.zeros(config.num_primitives, 2 * ACTION.size))
@@ -203,8 +199,8 @@ class Gate(nn.Module):
         super().__init__()
         self._goal = layouts.bob["goal"]
         self.input = InputNormalisation(layouts.gate.normalisation)
-        self.hidden = HiddenLayers(layouts.gate.size, config.gate_hidden_sizes)
-        self.output = initialised(nn.Linear(self.hidden.output_size, config.num_primitives), gain=_GATE_GAIN)
+        self.hidden = hidden_layers(layouts.gate.size, config.gate_hidden_sizes)
+        self.output = initialised(nn.Linear(config.gate_hidden_sizes[-1], config.num_primitives), gain=_GATE_GAIN)
         self.register_buffer("weight_floor", torch.tensor(config.weight_floor))
 
     def forward(self, observation: Tensor) -> Tensor:
@@ -242,8 +238,8 @@ class ValueNetwork(nn.Module):
         """Build; initial values are near 0."""
         super().__init__()
         self.input = InputNormalisation(normalisation)
-        self.hidden = HiddenLayers(len(normalisation.offset), config.hidden_sizes)
-        self.output = initialised(nn.Linear(self.hidden.output_size, 1), gain=_SMALL_GAIN)
+        self.hidden = hidden_layers(len(normalisation.offset), config.hidden_sizes)
+        self.output = initialised(nn.Linear(config.hidden_sizes[-1], 1), gain=_SMALL_GAIN)
 
     def forward(self, observation: Tensor) -> Tensor:
         """Values (...,)."""

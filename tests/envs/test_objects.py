@@ -102,7 +102,7 @@ def test_a_cube_and_a_sphere_by_their_names_are_what_they_were():
 def test_what_has_to_know_how_high_it_lies_does():
     config = load_config(None, ["world.object={shape: cylinder, size_m: [0.05, 0.06]}"])
     with WorldBatch(config.world, 1) as worlds:
-        assert TaskBins.from_config(config, worlds.layout).rest_height_m == 0.03
+        assert TaskBins(config, worlds.layout).rest_height_m == 0.03
 
 
 @pytest.mark.parametrize("fixture", ["wall", "box"])

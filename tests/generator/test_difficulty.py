@@ -76,17 +76,19 @@ def test_cells_cover_an_off_centre_workspace() -> None:
     assert cells.count(goals[[1, 1, 0]])[[0, 1, 342]].tolist() == [1, 0, 2]
 
 
-def test_maps_are_indexed_by_x_y_z() -> None:
-    grid = make()
-    goal = (0.20, -0.17, 0.11)  # cell (5, 0, 2)
-    record(grid, [goal, goal], [True, True])
-    maps = grid.maps()
-    assert np.argwhere(maps["num_tries"]).tolist() == [[5, 0, 2]]
-    assert np.argwhere(maps["seen"]).tolist() == [[5, 0, 2]]
-    assert maps["success_rate"][5, 0, 2] == 0.75
-    np.testing.assert_allclose(maps["center"][5, 0, 2], [0.2, -0.15, 0.125], atol=1e-12)
-    np.testing.assert_allclose(maps["center"][0, 0, 0], [-0.05, -0.15, 0.025], atol=1e-12)
-    assert np.array_equal(grid.cells.index(maps["center"].reshape(-1, 3)), np.arange(343))
+def test_the_grid_of_what_is_shown() -> None:
+    cells = make().cells
+    shown = cells.count(np.array([(0.20, -0.17, 0.11)])) > 0  # cell (5, 0, 2)
+    numbers = np.arange(len(cells))
+    grid = cells.grid(shown, numbers, numbers / 1000, numbers / 2000, iteration=3, num_env_steps=40)
+    (cell,) = grid.cells
+    assert (cell.center_m, cell.num_tries, cell.success_rate, cell.learnability) == (
+        (0.2, -0.15, 0.125), 247, 0.247, 0.1235,
+    )  # fmt: skip
+    assert (grid.iteration, grid.num_env_steps, grid.cell_size_m, grid.shape) == (3, 40, 0.05, (7, 7, 7))
+    assert grid.num_cells == 343
+    assert (grid.lower_m, grid.upper_m) == (WORLD.workspace.lower_m, WORLD.workspace.upper_m)
+    assert np.array_equal(cells.index(cells.centers()), numbers)
 
 
 def test_grid_rates_by_hand() -> None:

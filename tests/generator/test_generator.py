@@ -222,7 +222,7 @@ def test_goals_that_nobody_proposed(source: str) -> None:
 
 def test_learnable_goals_are_drawn_by_learnability() -> None:
     """Bob always solves goals in the cells with x below -2.5 cm, 20 of 35 cm; of the others nothing is known."""
-    cells = TaskGenerator(config(), FREE).cells.centers().reshape(-1, 3)
+    cells = TaskGenerator(config(), FREE).cells.centers()
     solved = np.repeat(cells[cells[:, 0] < -0.025], 100, axis=0)
     known = 101 / 102 * 1 / 102
     for source, (left, right) in {"uniform": (1.0, 1.0), "learnable": (known + 0.01, 0.25 + 0.01)}.items():

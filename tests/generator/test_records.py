@@ -31,7 +31,7 @@ from tests.generator.outcomes import make_records, starts_of, summary_of
 
 CONFIG = parse_config({"game": {"blocked_gripper_fraction": 0.2}}, where="test")
 LAYOUT = StateLayout(positions={}, velocities={}, measured={}, kept={"gripper_blocked": 1, "object_mass": 2})
-CELLS, TASKS = GoalCells(CONFIG.world, CONFIG.generator.cell_size_m), TaskBins.from_config(CONFIG, LAYOUT)
+CELLS, TASKS = GoalCells(CONFIG.world, CONFIG.generator.cell_size_m), TaskBins(CONFIG, LAYOUT)
 BLOCKED = LAYOUT["gripper_blocked"].start
 REST = 0.025
 
