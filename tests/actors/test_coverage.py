@@ -37,19 +37,10 @@ def test_visited_share_by_hand(trajectories, cells):
     assert visited_share(trajectories, SQUARE) == cells / 16
 
 
-def test_everything_visited_is_one():
-    centers = [(x, y) for x in (-0.075, -0.025, 0.025, 0.075) for y in (-0.075, -0.025, 0.025, 0.075)]
-    assert visited_share(paths([(0.5, 0.5), *centers]), SQUARE) == 1.0
-
-
 def test_cells_of_another_size():
     trajectories = paths([(0.025, 0.025), (-0.075, 0.025)])
     assert visited_share(trajectories, SQUARE, cell_size_m=0.1) == 1 / 4
     assert visited_share(trajectories, SQUARE, cell_size_m=0.02) == 1 / 100
-
-
-def test_the_default_workspace_has_49_cells():
-    trajectories = paths([(-0.05, 0.0), (0.0, 0.0)])
     assert visited_share(trajectories, WorkspaceConfig()) == 1 / 49
 
 

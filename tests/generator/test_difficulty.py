@@ -35,27 +35,6 @@ def test_counts_by_hand() -> None:
     assert counts.num_tries.tolist() == [4, 1, 0]
 
 
-def test_counts_follow_bob() -> None:
-    counts = SuccessCounts(1)
-    for _ in range(200):
-        counts.record(np.array([5]), np.array([0]))
-    assert counts.success_rate()[0] < 0.02
-    for _ in range(60):
-        counts.record(np.array([5]), np.array([5]))
-    # Steady 5 / (1 - 0.95) = 100 tries, of which 0.95^60 = 4.6 % are still old failures.
-    expected = (100 * (1 - DECAY**60) + 1) / (100 + 2)
-    np.testing.assert_allclose(counts.success_rate()[0], expected, atol=1e-4)
-
-
-def test_untried_bins_forget_towards_the_prior() -> None:
-    counts = SuccessCounts(1)
-    counts.record(np.array([50]), np.array([50]))
-    nothing = np.array([0])
-    for _ in range(300):
-        counts.record(nothing, nothing)
-    np.testing.assert_allclose(counts.success_rate(), 0.5, atol=1e-4)
-
-
 @pytest.mark.parametrize(
     ("length_m", "cell_size_m", "num_cells"),
     [(0.35, 0.05, 7), (0.6, 0.2, 3), (0.3, 0.1, 3), (0.35, 0.1, 4), (0.35, 1.0, 1), (0.45, 0.03, 15)],

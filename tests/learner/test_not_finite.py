@@ -30,7 +30,7 @@ def not_finite(learner):
 
 
 @pytest.mark.parametrize(("part", "name"), FIELDS, ids="/".join)
-@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf, 3e38])
+@pytest.mark.parametrize("value", [np.nan, -np.inf, 3e38])
 def test_parameters_stay_finite_and_the_next_rollout_is_learned_from(part, name, value):
     learner = Learner(make_config())
     learn(learner, make_rollout(learner, 0))

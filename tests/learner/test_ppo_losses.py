@@ -56,17 +56,11 @@ def test_extreme_log_ratios_stay_finite(log_ratio, advantage):
 
 
 def test_cloning_clips_only_what_became_likelier():
-    log_prob = torch.tensor([math.log(1.1), math.log(1.3)], requires_grad=True)
-    loss = ppo.cloning_loss(log_prob, torch.zeros(2), clip=0.2)
+    log_prob = torch.tensor([math.log(1.1), math.log(1.3), -LN2], requires_grad=True)
+    loss = ppo.cloning_loss(log_prob, torch.zeros(3), clip=0.2)
     loss.backward()
-    assert loss.item() == pytest.approx(-(1.1 + 1.2) / 2)
-    assert log_prob.grad.tolist() == pytest.approx([-1.1 / 2, 0.0])
-
-
-def test_cloning_pulls_unlikely_actions():
-    log_prob = torch.tensor([-LN2], requires_grad=True)
-    ppo.cloning_loss(log_prob, torch.zeros(1), clip=0.2).backward()
-    assert log_prob.grad.tolist() == pytest.approx([-0.5])
+    assert loss.item() == pytest.approx(-(1.1 + 1.2 + 0.5) / 3)
+    assert log_prob.grad.tolist() == pytest.approx([-1.1 / 3, 0.0, -0.5 / 3])
 
 
 def test_value_loss_is_half_the_mean_squared_error():

@@ -31,35 +31,23 @@ def test_it_draws_all_alike():
 
 
 @pytest.mark.parametrize(
-    ("step", "world", "later"),
+    ("num_added", "end", "step", "world", "later"),
     [
-        (0, 0, {0, 1, 2}),  # its episode ended at 2
-        (2, 0, {2}),
-        (3, 0, {3, 4}),  # goes on: what there is so far
-        (0, 1, {0, 1, 2, 3, 4}),
+        (5, 2, 0, 0, {0, 1, 2}),  # its episode ended at 2
+        (5, 2, 2, 0, {2}),
+        (5, 2, 3, 0, {3, 4}),  # goes on: what there is so far
+        (5, 2, 0, 1, {0, 1, 2, 3, 4}),
+        (11, 9, 8, 0, {8, 9}),  # of its episode 3 to 9 are kept, and step 10 takes the place of 3
+        (11, 9, 10, 0, {10}),
+        (20, 19, 17, 0, {17, 18, 19}),  # its episode is longer than the buffer
     ],
 )
-def test_later_places_are_of_the_same_episode(step, world, later):
-    replay = filled(5, ends={(2, 0)})
+def test_later_places_are_of_the_same_episode(num_added, end, step, world, later):
+    replay = filled(num_added, ends={(end, 0)})
     places = Places(np.full(300, step), np.full(300, world))
     found = replay.draw_later(places, np.random.default_rng(0))
     assert set(found.step.tolist()) == later
     assert set(found.world.tolist()) == {world}
-
-
-def test_later_places_where_the_beginning_of_an_episode_was_overwritten():
-    """Steps 0 to 9 are one episode, of which 3 to 9 are kept; step 10 takes the place of 3."""
-    replay = filled(11, ends={(9, 0)})
-    found = replay.draw_later(Places(np.full(300, 8), np.zeros(300, dtype=np.int64)), np.random.default_rng(0))
-    assert set(found.step.tolist()) == {8, 9}
-    found = replay.draw_later(Places(np.full(300, 10), np.zeros(300, dtype=np.int64)), np.random.default_rng(0))
-    assert set(found.step.tolist()) == {10}
-
-
-def test_an_episode_longer_than_the_buffer():
-    replay = filled(20, ends={(19, 0)})
-    found = replay.draw_later(Places(np.full(300, 17), np.zeros(300, dtype=np.int64)), np.random.default_rng(0))
-    assert set(found.step.tolist()) == {17, 18, 19}
 
 
 @pytest.mark.parametrize("num_added", [4, 12])

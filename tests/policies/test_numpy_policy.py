@@ -65,34 +65,18 @@ def test_primitives_gate_and_compose_equal_torch(bob: MCPPolicy, config: PolicyC
 
 def test_act_samples_the_distribution_and_its_log_prob(players: Players, observe: Observe) -> None:
     for numpy_policy, policy, size in players:
-        rows = np.repeat(observe(2, size)[1:], 20_000, axis=0)
+        rows = np.repeat(observe(2, size)[1:], 5_000, axis=0)
         action, log_prob = numpy_policy.act(rows, np.random.default_rng(0))
         assert action.dtype == log_prob.dtype == np.float32
         mean, std = policy(torch.tensor(rows))
         expected = gaussian.log_prob(torch.tensor(action), mean, std)
         np.testing.assert_allclose(log_prob, expected.detach(), atol=2e-4)
         noise = (action - mean.detach().numpy()) / std.detach().numpy()
-        np.testing.assert_allclose(noise.mean(0), 0.0, atol=0.03)  # 4 standard errors
-        np.testing.assert_allclose(noise.std(0), 1.0, atol=0.02)
-        np.testing.assert_allclose(np.corrcoef(noise.T), np.eye(noise.shape[1]), atol=0.03)
-
-
-def test_actions_are_not_clipped_and_follow_the_seed(players: Players, observe: Observe) -> None:
-    for numpy_policy, _, size in players:
-        rows = observe(4000, size)
-        action, log_prob = numpy_policy.act(rows, np.random.default_rng(7))
-        again, log_prob_again = numpy_policy.act(rows, np.random.default_rng(7))
-        np.testing.assert_array_equal(action, again)
-        np.testing.assert_array_equal(log_prob, log_prob_again)
-        assert np.abs(action).max() > 1.0
-
-
-def test_a_row_does_not_depend_on_the_others(players: Players, observe: Observe) -> None:
-    for numpy_policy, _, size in players:
-        rows = observe(160, size)
-        together = np.stack(numpy_policy.distribution(rows))
-        alone = np.stack([np.stack(numpy_policy.distribution(row)) for row in rows], axis=1)
-        np.testing.assert_allclose(together, alone, atol=1e-5, rtol=1e-5)
+        np.testing.assert_allclose(noise.mean(0), 0.0, atol=0.06)  # 4 standard errors
+        np.testing.assert_allclose(noise.std(0), 1.0, atol=0.04)
+        np.testing.assert_allclose(np.corrcoef(noise.T), np.eye(noise.shape[1]), atol=0.06)
+        np.testing.assert_array_equal(action, numpy_policy.act(rows, np.random.default_rng(0))[0])
+        assert np.abs(action).max() > 1.0  # not clipped
 
 
 def test_evaluating_leaves_observations_and_parameters_alone(bob: MCPPolicy, observe: Observe) -> None:
