@@ -40,16 +40,6 @@ class Player:
         """Log-probabilities (B,) of (B, A) actions at (B, O) observations."""
         return gaussian.log_prob(action, *self.policy(observation))
 
-    def snapshot(self) -> list[Tensor]:
-        """Copy the parameters and Adam's state, for ``restore``."""
-        return [tensor.detach().clone() for tensor in self.tensors().values()]
-
-    def restore(self, snapshot: list[Tensor]) -> None:
-        """Go back to a snapshot; the learning rate stays."""
-        with torch.no_grad():
-            for tensor, value in zip(self.tensors().values(), snapshot, strict=True):
-                tensor.copy_(value)
-
     def state(self) -> Arrays:
         """Copy everything that changes: parameters, Adam's state, learning rate."""
         arrays: Arrays = {name: tensor.detach().cpu().numpy().copy() for name, tensor in self.tensors().items()}
@@ -71,11 +61,13 @@ class Player:
                 )
 
     def load_state(self, state: Mapping[str, Array]) -> None:
-        """Continue exactly where ``state``, which has been checked, was taken.
+        """Continue exactly where ``state``, which fits, was taken.
 
         Where a lower or higher learning rate is configured by now, the saved one is moved within its bounds.
         """
-        self.restore([torch.from_numpy(np.array(state[name])) for name in self.tensors()])
+        with torch.no_grad():
+            for name, tensor in self.tensors().items():
+                tensor.copy_(torch.from_numpy(np.array(state[name])))
         low, high = (self.config.learning_rate * bound for bound in LEARNING_RATE_BOUNDS)
         self.optimizer.learning_rate = min(max(float(state["learning_rate"]), low), high)
 

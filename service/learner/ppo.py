@@ -148,7 +148,7 @@ def update(
     rows = samples if samples is not None else demonstrations
     if rows is None:
         return metrics
-    snapshot, probed = player.snapshot(), rows.take(probes(len(rows)))
+    saved, probed = player.state(), rows.take(probes(len(rows)))
     with torch.no_grad():
         before = player.policy(probed.observation)
     stats = train(player, samples, demonstrations, how, rng, policy_learns=policy_learns)
@@ -156,7 +156,7 @@ def update(
         kl = float(gaussian.kl(*before, *player.policy(probed.observation)).mean())
     failed = stats.aborted or not kl <= KL_COLLAPSE * player.config.target_kl
     if failed:
-        player.restore(snapshot)
+        player.load_state(saved)
     if policy_learns:
         player.optimizer.learning_rate = _adapted_learning_rate(player, math.inf if failed or stats.stopped else kl)
     if samples is not None:

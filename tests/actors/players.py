@@ -104,6 +104,18 @@ def alices_own(start_state, start_position, round_index, proposal, verdict):
     )
 
 
+def given(goal, own=()):
+    """Bob plays these goals, (3,) or (N, 3), from where his world is; those of the worlds in ``own`` are Alice's."""
+
+    def choose(start_state, start_position, round_index, proposal, verdict):
+        every = np.ones(len(proposal), dtype=bool)
+        goals, starts = np.broadcast_to(goal, proposal.shape).copy(), (start_state.copy(), start_position.copy())
+        replayed, first = ~np.isin(np.arange(len(every)), own), np.asarray(round_index == 0)
+        return GoalChoice(goals, *starts, replayed, first, every, np.zeros(len(every)))
+
+    return choose
+
+
 def play(game, alice=None, bob=None, *, plan=None, choose_goals=alices_own, version=0, observe=None, **past):
     """One round; players who are not given do nothing."""
     players = Players(version, alice or Constant(), bob or Constant(), **past)

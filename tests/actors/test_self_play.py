@@ -9,7 +9,6 @@ import pytest
 from service.actors.self_play import SelfPlay
 from service.envs.batch import WorldBatch
 from service.generator.opponents import RoundPlan
-from service.generator.snapshot import GoalChoice
 from service.generator.validity import Verdict
 from tests.actors.players import (
     AT_REST,
@@ -25,6 +24,7 @@ from tests.actors.players import (
     alices_own,
     assert_same_rollout,
     assert_shapes,
+    given,
     learned_from,
     make_config,
     make_game,
@@ -395,14 +395,9 @@ def test_with_hindsight_bobs_failures_show_the_way_to_where_the_object_came():
     plan = RoundPlan(np.full(5, -1), np.array([-1, -1, -1, -1, 0]))
     slid = idle_positions(SLIDES, 7)[-1]
     goals = np.array([(-0.1, -0.1, 0.025)] * 3 + [slid] + [(-0.1, -0.1, 0.025)])
-
-    def choose(start_state, start_position, round_index, proposal, verdict):
-        """These goals everywhere; only the first world's is Alice's own."""
-        every, own = np.ones(5, dtype=bool), np.arange(5) == 0
-        return GoalChoice(goals.copy(), start_state.copy(), start_position.copy(), ~own, own, every, np.zeros(5))
-
     config = make_config(5, learner={"abc": {"hindsight": True}})
-    rollout = play(make_game(config, starts), Pusher(), Pusher(), plan=plan, choose_goals=choose, past_bob=[Pusher()])
+    chosen = given(goals, own=[0])
+    rollout = play(make_game(config, starts), Pusher(), Pusher(), plan=plan, choose_goals=chosen, past_bob=[Pusher()])
     assert rollout.records.solved.tolist() == [False, False, False, True, False]
     # Bob moved 0 and 4 to a place inside, but 4 was a past Bob. He left 1 alone, and 2 slid out of the workspace.
     demonstrations, bob = rollout.demonstrations, rollout.bob
@@ -414,20 +409,14 @@ def test_with_hindsight_bobs_failures_show_the_way_to_where_the_object_came():
     assert np.array_equal(demonstrations.observation[9:, :11], bob.observation[:, 0, :11])
     assert np.array_equal(demonstrations.observation[9:, 11:], np.tile(achieved, (7, 1)))
     assert np.array_equal(demonstrations.action[9:], bob.action[:, 0])
-    without = play(make_game(make_config(5), starts), Pusher(), Pusher(), choose_goals=choose)
+    without = play(make_game(make_config(5), starts), Pusher(), Pusher(), choose_goals=chosen)
     assert len(without.demonstrations.action) == 9
 
 
 def test_of_bobs_failures_no_more_steps_are_shown_than_of_alices_turns():
-    goals = np.tile((-0.1, -0.1, 0.025), (4, 1))
-
-    def choose(start_state, start_position, round_index, proposal, verdict):
-        """Only the first world's goal is Alice's own."""
-        every, own = np.ones(4, dtype=bool), np.arange(4) == 0
-        return GoalChoice(goals.copy(), start_state.copy(), start_position.copy(), ~own, own, every, np.zeros(4))
-
     config = make_config(4, learner={"abc": {"hindsight": True}})
-    rollout = play(make_game(config, [IN_FRONT] * 4), Pusher(), Pusher(), choose_goals=choose)
+    chosen = given((-0.1, -0.1, 0.025), own=[0])
+    rollout = play(make_game(config, [IN_FRONT] * 4), Pusher(), Pusher(), choose_goals=chosen)
     assert not rollout.records.solved.any()
     # 9 steps of Alice, and of Bob's 4 x 7 every fourth.
     actions = rollout.bob.action.swapaxes(0, 1).reshape(28, 4)
@@ -477,26 +466,13 @@ def test_contact_fractions():
 
 def without_alice(num_worlds, **game):
     goals = {"goal_source": "uniform", "replay_invalid": True}
-    config = make_config(num_worlds, game={"alice_plays": False, **game}, generator=goals)
-    return config
-
-
-def everywhere(goal):
-    """Every world's Bob plays the same goal from where his world is."""
-
-    def choose(start_state, start_position, round_index, proposal, verdict):
-        every = np.ones(len(proposal), dtype=bool)
-        goals = np.tile(goal, (len(proposal), 1))
-        first = np.asarray(round_index == 0)
-        return GoalChoice(goals, start_state.copy(), start_position.copy(), every, first, every, np.zeros(len(every)))
-
-    return choose
+    return make_config(num_worlds, game={"alice_plays": False, **game}, generator=goals)
 
 
 def test_without_alice_bob_goes_on_from_where_he_ended():
     game = make_game(without_alice(5, num_goals=3), STARTS)
     alice = Constant()
-    first = play(game, alice, Pusher(), choose_goals=everywhere((0.1, 0.1, 0.025)))
+    first = play(game, alice, Pusher(), choose_goals=given((0.1, 0.1, 0.025)))
     assert alice.seen == []
     assert not first.alice.active.any()
     assert not first.alice.learn.any()
@@ -508,16 +484,16 @@ def test_without_alice_bob_goes_on_from_where_he_ended():
     assert going_on.tolist() == [True, True, True, False, False]  # those that leave the workspace or fall begin anew
     end = game.worlds.object_position.copy()
     assert end[PUSHED, 0] > 0.05
-    second = play(game, choose_goals=everywhere((0.1, 0.1, 0.025)))
+    second = play(game, choose_goals=given((0.1, 0.1, 0.025)))
     np.testing.assert_array_equal(second.records.start_position[:3], end[:3])
-    play(game, choose_goals=everywhere((0.1, 0.1, 0.025)))
+    play(game, choose_goals=given((0.1, 0.1, 0.025)))
     assert (game._round_index[:3] == 0).all()
 
 
 def test_without_alice_one_in_four_of_bobs_failing_steps_is_a_demonstration():
     config = without_alice(4)
     config = config.model_copy(update={"learner": make_config(1, learner={"abc": {"hindsight": True}}).learner})
-    rollout = play(make_game(config, [IN_FRONT] * 4), bob=Pusher(), choose_goals=everywhere((-0.1, -0.1, 0.025)))
+    rollout = play(make_game(config, [IN_FRONT] * 4), bob=Pusher(), choose_goals=given((-0.1, -0.1, 0.025)))
     assert not rollout.records.solved.any()
     assert len(rollout.demonstrations.action) == 7  # of 4 x 7
 

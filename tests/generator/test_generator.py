@@ -88,16 +88,13 @@ def test_a_choice_tells_how_rare_valid_proposals_are() -> None:
     np.testing.assert_allclose(choose(generator, [VALID, OUTSIDE]).novelty, [(1 - 2 / num) / 3, 0.0], rtol=1e-15)
 
 
-def test_replay_invalid_fills_worlds_without_a_goal() -> None:
-    choice = choose(filled(replay_invalid=True), [VALID, OUTSIDE, VALID, OUTSIDE])
-    assert_rows(choice, [False, True, False, True])
-    assert choice.played.all()
-
-
-def test_replay_fraction_one_replaces_every_valid_goal() -> None:
-    choice = choose(filled(replay_fraction=1.0), [VALID, OUTSIDE, VALID])
-    assert_rows(choice, [True, False, True])
-    assert choice.played.tolist() == [True, False, True]
+def test_replayed_goals_fill_worlds_without_one_or_replace_every_valid_one() -> None:
+    filling = choose(filled(replay_invalid=True), [VALID, OUTSIDE, VALID])
+    assert_rows(filling, [False, True, False])
+    assert filling.played.all()
+    replacing = choose(filled(replay_fraction=1.0), [VALID, OUTSIDE, VALID])
+    assert_rows(replacing, [True, False, True])
+    assert replacing.played.tolist() == [True, False, True]
 
 
 def test_replay_fraction_is_met_on_average() -> None:
