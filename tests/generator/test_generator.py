@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 
 from service.config import Config, parse_config
+from service.config.self_play import GeneratorConfig
 from service.envs.state_layout import StateLayout
-from service.generator.generator import TaskGenerator
+from service.generator.generator import StopCriterion, TaskGenerator
 from service.generator.opponents import CURRENT, RoundPlan
 from service.generator.ring import Rows
 from service.generator.snapshot import LEARNABILITY_FLOOR, MIN_REPLAY_GOALS, GeneratorSnapshot, GoalChoice
@@ -26,6 +27,7 @@ ONE_GAME = starts_of([1.0] * STATE_SIZE)
 BLOCKED = SOME_BLOCKED["gripper_blocked"].start
 OLD_GOAL = (0.0, 0.1, 0.025)
 VALID, OUTSIDE = int(Verdict.VALID), int(Verdict.OUTSIDE)
+STOPPING = GeneratorConfig(novelty_window=4, stop_success_rate=0.95)
 
 
 def config(**generator: Any) -> Config:
@@ -309,20 +311,6 @@ def test_record_separates_who_learns_what() -> None:
     assert metrics["generator/mean_learnability"] == pytest.approx(expected)
 
 
-def test_metric_names_are_an_api() -> None:
-    metrics = record(
-        TaskGenerator(config(), FREE), make_records([(0.1, 0.0, 0.025), (0.0, 0.0, 0.2)], solved=[True, True])
-    )
-    assert set(metrics) == {
-        *(f"alice/{name}_fraction" for name in ("valid", "not_moved", "outside", "fallen", "lifted")),
-        *(f"alice/goal_height_{name}_fraction" for name in ("table", "low", "middle", "high")),
-        *("alice/goal_distance_m", "alice/goal_height_m", "alice/goal_height_p90_m"),
-        *("bob/success_rate", "bob/success_rate_table", "bob/success_rate_air", "bob/steps_to_success"),
-        *("generator/num_cells_seen", "generator/new_cells", "generator/iterations_without_new_cell"),
-        *("generator/buffer_size", "generator/mean_learnability", "generator/mean_success_rate"),
-    }
-
-
 def test_an_iteration_without_any_goal() -> None:
     verdict = np.full(2, Verdict.FALLEN, dtype=np.int8)
     records = make_records(np.full((2, 3), np.nan), verdict=verdict, played=[False, False])
@@ -455,3 +443,46 @@ def test_state_of_a_new_generator_loads() -> None:
     generator.add_opponents(10, {"w": np.ones(2)}, {"w": np.ones(2)})
     generator.load_state(TaskGenerator(config(), FREE).state())
     assert len(generator.buffer) == len(generator.opponents.alice) == generator.grid.num_cells_seen == 0
+
+
+def stop_after(*iterations: tuple[int, int, int]) -> StopCriterion:
+    stop = StopCriterion(STOPPING)
+    for num_new_cells, num_tried, num_solved in iterations:
+        stop.record(num_new_cells, num_tried, num_solved)
+    return stop
+
+
+@pytest.mark.parametrize(
+    ("iterations", "expected"),
+    [
+        ([(0, 40, 38)] * 4, True),  # 152 of 160 is exactly 95 %
+        ([(0, 40, 38)] * 3 + [(0, 40, 37)], False),
+        ([(0, 40, 40)] * 3, False),  # the window is not full
+        ([(0, 40, 40)] * 3 + [(1, 40, 40)], False),  # something new at the end
+        ([(1, 40, 40)] + [(0, 40, 40)] * 3, False),  # something new at the start of the window
+        ([(9, 40, 0)] + [(0, 40, 40)] * 4, True),  # both the novelty and the failures lie before the window
+        ([(0, 24, 24)] * 4, False),  # 96 goals are too few
+        ([(0, 25, 25)] * 4, True),
+        ([(0, 0, 0)] * 9, False),  # an Alice who never proposes does not end the run
+        ([], False),
+    ],
+)
+def test_should_stop(iterations: list[tuple[int, int, int]], expected: bool) -> None:
+    assert stop_after(*iterations).should_stop() is expected
+
+
+def test_iterations_without_new_cell() -> None:
+    assert stop_after((3, 1, 1), (0, 1, 1), (0, 1, 1)).num_iterations_without_new_cell == 2
+    assert stop_after((0, 1, 1), (2, 1, 1)).num_iterations_without_new_cell == 0
+
+
+def test_state_round_trip_continues_the_window() -> None:
+    stop, copy = stop_after((1, 40, 0), (0, 40, 40), (0, 40, 40)), StopCriterion(STOPPING)
+    copy.load_state(stop.state())
+    decisions: list[list[bool]] = []
+    for criterion in (stop, copy):
+        decisions.append([])
+        for _ in range(3):
+            criterion.record(0, 40, 40)
+            decisions[-1].append(criterion.should_stop())
+    assert decisions == [[False, True, True]] * 2

@@ -8,7 +8,6 @@ from torch import nn
 
 from service.config.self_play import ABCConfig, PPOConfig
 from service.learner import ppo
-from service.learner.diagnostics import probes
 from service.learner.player import Player
 from service.learner.ppo import MAX_NON_FINITE, train
 from service.learner.samples import DemonstrationRows, Samples
@@ -284,9 +283,3 @@ def test_reported_kl_is_that_of_the_whole_update():
     spread = math.exp(2 * log_std) + (mean - new_mean) ** 2
     expected = new_log_std - log_std + spread / (2 * math.exp(2 * new_log_std)) - 0.5
     assert metrics["kl"] == pytest.approx(expected, rel=1e-3)
-
-
-def test_probes_are_spread_over_all_rows():
-    assert probes(1024).tolist() == list(range(1024))
-    assert probes(1025).tolist() == list(range(0, 1025, 2))
-    assert len(probes(100_000)) <= 1024
