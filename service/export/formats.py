@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import importlib.util
+import importlib
 import logging
 import runpy
 import warnings
@@ -38,13 +38,11 @@ class Format:
     ending: str
     """Of its files' names."""
     write: Callable[[Network, Path], None]
-    """Writes a network to a file."""
+    """Writes a network to a file, and beside it what it needs to run."""
     read: Callable[[Network, Path], Run]
     """Reads it back: a function of the network's inputs to its outputs."""
     needs: tuple[str, ...] = ()
     """Packages of the extra ``export``."""
-    shared: Callable[[Path], None] = lambda folder: None
-    """Writes what all networks of a folder need."""
 
 
 def find_format(name: str) -> Format:
@@ -58,8 +56,7 @@ def find_format(name: str) -> Format:
         raise ExportError(f"unknown format {name!r}; choose one of {', '.join(FORMATS)}{did_you_mean(name, FORMATS)}")
     with needs_extra("export", f"the format {name}"):
         for package in FORMATS[name].needs:
-            if importlib.util.find_spec(package) is None:
-                raise ModuleNotFoundError(name=package)
+            importlib.import_module(package)
     return FORMATS[name]
 
 
@@ -68,16 +65,13 @@ def _write_numpy(network: Network, path: Path) -> None:
     about = {"function": network.function, "input_sizes": list(network.inputs.values()), **columns}
     arrays: dict[str, Any] = {**network.parameters, **about}
     np.savez(path, allow_pickle=False, **arrays)
+    (path.parent / PROGRAM).write_text(Path(forward.__file__).read_text(encoding="utf-8"), encoding="utf-8")
 
 
 def _read_numpy(network: Network, path: Path) -> Run:
     """Run the folder's own copy of the program, not the package's module."""
     loaded: Run = runpy.run_path(str(path.parent / PROGRAM))["load"](path)
     return loaded
-
-
-def _write_program(folder: Path) -> None:
-    (folder / PROGRAM).write_text(Path(forward.__file__).read_text(encoding="utf-8"), encoding="utf-8")
 
 
 def torch_module(network: Network) -> nn.Module:
@@ -177,22 +171,19 @@ def _read_onnx(network: Network, path: Path) -> Run:
 @contextmanager
 def _quiet_torch() -> Iterator[None]:
     """Keep torch from telling of its own deprecations, of packages that are not needed here, and of every node."""
-    loggers = [logging.getLogger(name) for name in ("torch.onnx", "onnxscript", "onnx_ir")]
-    levels = [logger.level for logger in loggers]
-    for logger in loggers:
-        logger.setLevel(logging.ERROR)
+    before = logging.root.manager.disable
+    logging.disable(logging.WARNING)
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             yield
     finally:
-        for logger, level in zip(loggers, levels, strict=True):
-            logger.setLevel(level)
+        logging.disable(before)
 
 
 FORMATS = {
     "onnx": Format(".onnx", _write_onnx, _read_onnx, ("onnx", "onnxscript", "onnxruntime")),
-    "numpy": Format(".npz", _write_numpy, _read_numpy, shared=_write_program),
+    "numpy": Format(".npz", _write_numpy, _read_numpy),
     "torchscript": Format(".pt", _write_torchscript, _read_torchscript),
 }
 """The formats by the names that commands take."""

@@ -49,7 +49,7 @@ class Network:
         return {name: array.shape[1:] for name, array in self.reference(*rows).items()}
 
 
-def networks_of_bob(trained: Trained) -> list[Network]:
+def network_of_bob(trained: Trained) -> Network:
     """The network of a whole Bob, composed or monolithic."""
     policy, function, title = trained.policy, "monolithic", "Bob, who has no primitives"
     assert isinstance(policy, NumpyPolicy)
@@ -57,7 +57,7 @@ def networks_of_bob(trained: Trained) -> list[Network]:
         function, title = "bob", f"Bob: {policy.num_primitives} primitives, composed by his gate"
     act = partial(FUNCTIONS[function], np, policy.network, policy.columns)
     inputs = {"observation": layouts(trained.config.world).bob.size}
-    return [Network("policy", function, title, trained.parameters, policy.columns, inputs, act)]
+    return Network("policy", function, title, trained.parameters, policy.columns, inputs, act)
 
 
 def networks_of_primitives(trained: Trained) -> list[Network]:
