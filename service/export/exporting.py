@@ -64,14 +64,16 @@ def networks_of(trained: Trained, part: str) -> list[Network]:
     if part not in PARTS:
         raise ExportError(f"unknown part {part!r}; choose one of {', '.join(PARTS)}")
     trained.expect("primitives", "orchestrator", by="tandem export")
-    frozen, make = trained, network_of_bob
+    frozen = trained
     if trained.kind == "orchestrator":
         if trained.trained is None or trained.trained.kind != "primitives":
             raise ExportError(
                 f"{trained.label} was trained with a method that composes no primitives: export one of ours"
             )
-        frozen, make = trained.trained, network_of_orchestrator
-    networks = [] if part == "primitives" else [make(trained)]
+        frozen = trained.trained
+    networks = []
+    if part != "primitives":
+        networks.append(network_of_bob(trained) if frozen is trained else network_of_orchestrator(trained))
     if part == "primitives" or (part == "all" and networks[0].function != "monolithic"):
         networks += networks_of_primitives(frozen)
     return networks
