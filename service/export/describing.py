@@ -32,7 +32,6 @@ from service.envs.robot import described
 from service.envs.scene import FIXTURE_PREFIX
 from service.export.measurements import Measured, tolerated_late_steps
 from service.export.networks import Network
-from service.export.parity import Differences
 from service.registry.loading import Trained
 
 Description = dict[str, Any]
@@ -65,14 +64,14 @@ _COUPLING = (
 
 
 def describe(
-    trained: Trained, format_name: str, networks: Mapping[str, tuple[Network, Differences]], measured: Measured
+    trained: Trained, format_name: str, networks: Mapping[str, tuple[Network, tuple[float, float]]], measured: Measured
 ) -> Description:
     """Describe an exported policy, by plain values.
 
     Args:
         trained: the policy, in its nominal world.
         format_name: of the files.
-        networks: by the names of their files, with what the parity test found.
+        networks: by the names of their files, with the differences that the parity test found.
         measured: in its world.
     """
     world, frozen = trained.world, trained.trained
@@ -154,15 +153,15 @@ def _fixtures(model: mujoco.MjModel) -> list[dict[str, Any]]:
     return found
 
 
-def _network(file: str, network: Network, differences: Differences) -> dict[str, Any]:
+def _network(file: str, network: Network, differences: tuple[float, float]) -> dict[str, Any]:
     """Shapes are without N, the number of rows."""
     return {
         "file": file,
         "title": network.title,
         "inputs": [{"name": name, "shape": [size]} for name, size in network.inputs.items()],
         "outputs": [{"name": name, "shape": shape} for name, shape in network.outputs.items()],
-        "max_abs_difference": differences.usual,  # of any output from the policy's, at usual inputs
-        "max_abs_difference_extreme": differences.extreme,
+        "max_abs_difference": differences[0],  # of any output from the policy's, at usual inputs
+        "max_abs_difference_extreme": differences[1],
     }
 
 

@@ -17,13 +17,13 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-from pydantic import Field, ValidationError
+from pydantic import Field
 
 from service.base.errors import RobotError, TandemError, one_line
 from service.base.extras import needs_extra
 from service.config.frozen import FrozenModel
 from service.config.world import Point, WorldConfig
-from service.robot.backends import Backend, first_error
+from service.robot.backends import Backend
 from service.robot.interface import Command, ObjectPose, PoseSource, RobotState
 
 _DOWN = (1.0, 0.0, 0.0, 0.0)  # x y z w
@@ -255,10 +255,7 @@ def connect(world: WorldConfig, parameters: Mapping[str, Any]) -> Backend:
         raise TandemError(
             f"robot franka: the policy was trained with the arm {world.robot.name!r}; take one of the panda"
         )
-    try:
-        given = FrankaParameters.model_validate(dict(parameters))
-    except ValidationError as error:
-        raise TandemError(f"robot franka: parameters: {first_error(error)}") from None
+    given = FrankaParameters.model_validate(parameters)
     with needs_extra("franka", "robot franka"):
         franky = importlib.import_module("franky")
     poses = _pose_source(given)

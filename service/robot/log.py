@@ -18,8 +18,6 @@ from service.envs.batch import WorldBatch
 from service.media.recording import RecordedEpisodes
 
 FORMAT_VERSION = 1
-_SIZES = {"effector_m": 3, "fingers_m": 2, "object_m": 3, "goal_m": 3}
-"""Of what is shown of a step."""
 _LONG_WAY = 30
 """Iterations that find the arm's joints from its home."""
 
@@ -73,25 +71,13 @@ def read_log(path: Path) -> LoggedRun:
     except ValidationError as error:
         raise TandemError(f"{path}: its world cannot be read: {error.errors()[0]['msg']}") from None
     episodes: dict[int, list[dict[str, Any]]] = {}
-    for line, row in enumerate(rows, start=2):
+    for row in rows:
         if "effector_m" in row:
-            _check(row, f"{path} line {line}")
             episodes.setdefault(row["episode"], []).append(row)
     return LoggedRun(header, world, list(episodes.values()))
 
 
-def _check(row: Mapping[str, Any], where: str) -> None:
-    """Assert that a step has everything that is shown of it."""
-    try:
-        sizes = {key: np.array(row[key], dtype=np.float64).shape for key in _SIZES}
-        damaged = not isinstance(row["episode"], int) or sizes != {key: (size,) for key, size in _SIZES.items()}
-    except (KeyError, TypeError, ValueError):
-        damaged = True
-    if damaged:
-        raise TandemError(f"{where} is no step of a robot: it was changed; remove that line and try again")
-
-
-def states_of(run: LoggedRun, success_distance_m: float) -> RecordedEpisodes:
+def states_of(run: LoggedRun) -> RecordedEpisodes:
     """What was logged as states of the policy's world: effector and object where they were measured.
 
     The object is drawn upright, as only its place was seen, and shorter episodes end with a still picture.
@@ -113,7 +99,7 @@ def states_of(run: LoggedRun, success_distance_m: float) -> RecordedEpisodes:
             states[step][:, layout["joints"]] = joints
             states[step][:, layout["fingers"]] = worlds.robot.finger_values(fingers[step].sum(axis=1))
             states[step][:, layout["object"]] = places[step]
-    reached = np.linalg.norm(places - goal, axis=2) <= success_distance_m
+    reached = np.linalg.norm(places - goal, axis=2) <= run.header["success_distance_m"]
     return RecordedEpisodes(states, goal, reached)
 
 

@@ -105,11 +105,11 @@ class SafeRobot:
 
     # --- measuring ---------------------------------------------------------------------------------------------------
 
-    def start(self, tick_s: float = 0.0) -> None:
+    def start(self, tick_s: float) -> None:
         """Begin where the robot is, at rest; all watchdogs begin anew.
 
         Args:
-            tick_s: time between two set-points; 0 for not known.
+            tick_s: time between two set-points.
 
         Raises:
             RobotError: it does not answer or answers too late, is outside its box (but for a dry run, which shows
@@ -121,7 +121,7 @@ class SafeRobot:
         for _ in range(_NUM_TRIED):
             self.measure(self._robot.now_s())
         took_s = (self._robot.now_s() - begin_s) / _NUM_TRIED
-        if 0.0 < tick_s < took_s:
+        if took_s > tick_s:
             self._fail(
                 f"it answers late: reading takes {1e3 * took_s:.1f} ms, and a set-point is due every "
                 f"{1e3 * tick_s:.1f} ms: lower set_points_per_step"
@@ -248,10 +248,6 @@ class SafeRobot:
         if not self._dry_run:
             self._robot.stop()
 
-    def release(self) -> None:
-        """Let a robot that was stopped be commanded again, once a person has seen to what was wrong."""
-        self.stopped = None
-
     @contextmanager
     def guarded(self) -> Iterator[None]:
         """Stop the robot if the block ends by an error or a signal, or if it hangs: another thread looks after it."""
@@ -262,7 +258,7 @@ class SafeRobot:
         try:
             yield
         except BaseException as error:
-            self.stop(self.stopped or f"{type(error).__name__}: {error}")
+            self.stop(f"{type(error).__name__}: {error}")
             raise
         finally:
             ended.set()

@@ -4,6 +4,7 @@ import pytest
 from service.base.errors import RobotError, TandemError
 from service.config import WorldConfig
 from service.envs.batch import WorldBatch
+from service.robot.backends import ExactPoses
 from service.robot.calibrate import Calibration, read_calibration, write_calibration
 from service.robot.interface import Command
 from service.robot.loop import Bridge, BridgeConfig
@@ -25,7 +26,7 @@ def test_without_bounds_the_bridge_plays_what_the_evaluator_plays(champion):
         robot = MujocoRobot(world)
         robot.reset(worlds.object_position[0])
         rows, paths = [], []
-        Bridge(champion.policy, robot, robot.poses, world, JUMPS, record=rows.append).run(goal[0], 50)
+        Bridge(champion.policy, robot, ExactPoses(robot, robot), world, JUMPS, record=rows.append).run(goal[0], 50)
         for _ in range(50):
             paths.append(worlds.ee_position[0].copy())
             worlds.step(champion.policy.act_deterministic(np.hstack([worlds.positions(), goal]).astype(np.float32)))
@@ -39,11 +40,11 @@ def test_the_champion_reaches_goals_within_the_bounds_of_a_franka(champion):
     """As recorded, 97 % and more of goals: none of these may be missed."""
     world = champion.config.world
     robot = MujocoRobot(world, MujocoParameters(feed_forward=1.0))
-    bridge = Bridge(champion.policy, robot, robot.poses, world, SMOOTH, gain=(0.62, 0.62, 0.62))
+    bridge = Bridge(champion.policy, robot, ExactPoses(robot, robot), world, SMOOTH, gain=(0.62, 0.62, 0.62))
     goals = np.array([[-0.1, 0.05, 0.2], [0.05, -0.1, 0.025], [-0.15, -0.1, 0.1]])
     for goal in goals:
         robot.reset(np.array([0.0, 0.05, 0.025]))
-        assert bridge.run(goal, 50).distance_m < 0.05
+        assert bridge.run(goal, 50) < 0.05
     assert robot.now_s() >= 2.0
 
 
@@ -59,7 +60,7 @@ def test_the_real_arm_stays_in_its_box_whatever_a_policy_wants(champion):
         def act_deterministic(self, observation):
             return corners[None, len(rows) // 15]
 
-    Bridge(ToTheCorners(), robot, robot.poses, world, SMOOTH, record=rows.append).run(np.zeros(3), 60)
+    Bridge(ToTheCorners(), robot, ExactPoses(robot, robot), world, SMOOTH, record=rows.append).run(np.zeros(3), 60)
     tip = np.concatenate([row["measured_m"] for row in rows])
     assert (tip > box.lower_m - 0.01).all()
     assert (tip < box.upper_m + 0.01).all()

@@ -7,7 +7,7 @@ import pytest
 
 from service.base.errors import ConfigError, RobotError, TandemError
 from service.config.world import WorldConfig
-from service.robot.backends import BackendConfig, connect
+from service.robot.backends import BackendConfig, ExactPoses, connect
 from service.robot.interface import Command
 from service.robot.pybullet_robot import CONTROL_STEP_S, PyBulletParameters, PyBulletRobot, lag_s, world_of
 
@@ -39,7 +39,7 @@ def test_it_starts_as_our_worlds_do_in_our_frame(robot):
     workspace = robot.world.workspace
     np.testing.assert_allclose(state.effector_m, [workspace.center_x_m, workspace.center_y_m, 0.08], atol=1e-3)
     np.testing.assert_allclose(state.fingers_m, [0.04, 0.04], atol=1e-4)
-    np.testing.assert_allclose(robot.poses.read().position_m, PLACE, atol=1e-6)
+    np.testing.assert_allclose(ExactPoses(robot, robot).read().position_m, PLACE, atol=1e-6)
     # The fingertips' own links: the left finger is on the side of negative y, and the gripper points down.
     left, right = (robot._link(finger)[0] for finger in (9, 10))
     assert left[1] < -0.03 < 0.03 < right[1]
