@@ -21,7 +21,7 @@ from service.envs.observations import Layouts, layouts
 from service.export.describing import Description, describe, make_readme
 from service.export.formats import Run, find_format
 from service.export.measurements import measure
-from service.export.networks import Network, network_of_bob, network_of_orchestrator, networks_of_primitives
+from service.export.networks import Network, network_of_bob, network_of_orchestrator, network_of_primitive
 from service.registry.loading import Trained
 
 PARTS = ("all", "policy", "primitives")
@@ -94,7 +94,7 @@ def networks_of(trained: Trained, part: str) -> list[Network]:
     if part != "primitives":
         networks.append(network_of_bob(trained) if frozen is trained else network_of_orchestrator(trained))
     if part == "primitives" or (part == "all" and networks[0].function != "monolithic"):
-        networks += networks_of_primitives(frozen)
+        networks += [network_of_primitive(frozen, number) for number in range(frozen.primitives.num_primitives)]
     return networks
 
 

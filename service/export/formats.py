@@ -22,7 +22,7 @@ from service.export.networks import Network, Outputs
 from service.policies import forward
 
 if TYPE_CHECKING:
-    from torch import nn
+    from torch import Tensor, nn
 
 Run = Callable[..., Outputs]
 PROGRAM = "policy.py"
@@ -74,10 +74,10 @@ def _read_numpy(network: Network, path: Path) -> Run:
     return loaded
 
 
-def torch_module(network: Network) -> nn.Module:
-    """The network in torch: its inputs to a tuple of its outputs, in their order."""
+def _in_torch(network: Network) -> tuple[nn.Module, tuple[Tensor, ...]]:
+    """The network in torch, its inputs to a tuple of its outputs in their order, and inputs to follow through it."""
     import torch
-    from torch import Tensor, nn
+    from torch import nn
 
     function = forward.FUNCTIONS[network.function]
 
@@ -107,20 +107,14 @@ def torch_module(network: Network) -> nn.Module:
             outputs = function(xp, forward.prepared(xp, stored), network.columns, *inputs)
             return tuple(outputs[name] for name in network.outputs)
 
-    return _Module().eval()
-
-
-def _examples(network: Network) -> tuple[Any, ...]:
-    import torch
-
-    return tuple(torch.zeros(_NUM_EXAMPLES, size) for size in network.inputs.values())
+    return _Module().eval(), tuple(torch.zeros(_NUM_EXAMPLES, size) for size in network.inputs.values())
 
 
 def _write_torchscript(network: Network, path: Path) -> None:
     import torch
 
     with torch.no_grad(), _quiet_torch():
-        traced: Any = torch.jit.trace(torch_module(network), _examples(network))
+        traced: Any = torch.jit.trace(*_in_torch(network))
         traced.save(str(path))
 
 
@@ -144,8 +138,7 @@ def _write_onnx(network: Network, path: Path) -> None:
     num_rows = torch.export.Dim("N", min=1)
     with torch.no_grad(), _quiet_torch():
         torch.onnx.export(
-            torch_module(network),
-            _examples(network),
+            *_in_torch(network),
             path,
             input_names=list(network.inputs),
             output_names=list(network.outputs),

@@ -164,13 +164,11 @@ class _Hand:
 
     def __init__(self, gripper: Any, parameters: FrankaParameters) -> None:
         self._gripper, self._parameters = gripper, parameters
-        self._lock = threading.Lock()
         self.width_m = float(gripper.width)
         """Last measured."""
         self.fault: str | None = None
         """Why it moves no longer."""
-        self._wanted: tuple[float, float] | None = None  # width, force
-        self._halting = False
+        self._wanted: tuple[float, float] | None = None  # width and force; None: to stand still
         self._sent_m, self._sent_s = self.width_m, 0.0
         self._running: Any = None
         self._ended = threading.Event()
@@ -179,13 +177,11 @@ class _Hand:
 
     def go_to(self, width_m: float, force_n: float) -> None:
         """Take a new wanted width; returns at once."""
-        with self._lock:
-            self._wanted = (width_m, force_n)
+        self._wanted = (width_m, force_n)
 
     def halt(self) -> None:
         """Forget what was wanted, and let the thread end a motion that is under way; returns at once."""
-        with self._lock:
-            self._wanted, self._halting = None, True
+        self._wanted = None
 
     def close(self) -> None:
         """End the thread."""
@@ -204,14 +200,12 @@ class _Hand:
         """Measure, and send the next motion where one is due."""
         state = self._gripper.state
         self.width_m = float(state.width)
-        with self._lock:
-            wanted, halting, self._halting = self._wanted, self._halting, False
-        if halting:
+        wanted = self._wanted
+        if wanted is None:
             self._end_motion()
+            return
         if self._is_moving() and time.monotonic() - self._sent_s > _MOST_MOTION_S:
             raise TimeoutError(f"a motion has not ended within {_MOST_MOTION_S:g} s")
-        if wanted is None:
-            return
         width_m, force_n = wanted
         change_m = width_m - self._sent_m
         if abs(change_m) < self._parameters.hand_tolerance_m or (change_m < 0.0 and state.is_grasped):

@@ -12,7 +12,6 @@ from pydantic import ValidationError
 
 from service.base.errors import TandemError
 from service.base.jsonl import JsonlWriter, read_jsonl
-from service.base.types import StateArray
 from service.config import WorldConfig
 from service.envs.batch import WorldBatch
 from service.media.recording import RecordedEpisodes
@@ -88,7 +87,11 @@ def states_of(run: LoggedRun) -> RecordedEpisodes:
     if not run.episodes:
         raise TandemError("the log has no step in which anything was measured: nothing to show")
     num_steps = max(map(len, run.episodes))
-    effector, fingers, places = (_stack(run, key, num_steps) for key in ("effector_m", "fingers_m", "object_m"))
+    padded = [steps + steps[-1:] * (num_steps - len(steps)) for steps in run.episodes]
+    effector, fingers, places = (
+        np.array([[step[key] for step in steps] for steps in padded], dtype=np.float64).swapaxes(0, 1)  # (T, N, ...)
+        for key in ("effector_m", "fingers_m", "object_m")
+    )
     goal = np.array([steps[0]["goal_m"] for steps in run.episodes])
     with WorldBatch(run.world, len(run.episodes), num_threads=1) as worlds:
         arm, layout = worlds.robot.arm, worlds.layout
@@ -101,12 +104,3 @@ def states_of(run: LoggedRun) -> RecordedEpisodes:
             states[step][:, layout["object"]] = places[step]
     reached = np.linalg.norm(places - goal, axis=2) <= run.header["success_distance_m"]
     return RecordedEpisodes(states, goal, reached)
-
-
-def _stack(run: LoggedRun, key: str, num_steps: int) -> StateArray:
-    """(T, N, ...) a measurement of all episodes, the last one of each repeated to the end."""
-    columns = []
-    for steps in run.episodes:
-        values = [step[key] for step in steps]
-        columns.append(values + values[-1:] * (num_steps - len(values)))
-    return np.array(columns, dtype=np.float64).swapaxes(0, 1)

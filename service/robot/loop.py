@@ -133,7 +133,7 @@ class Bridge:
                         self._record(row)
             end_s = start_s + num_steps * self._step_s
             self.safe.measure(end_s)
-            object_m = self.safe.object_m
+            object_m = self.safe.object.position_m
             self._settle(end_s)
         return float(np.linalg.norm(object_m - goal_m))
 
@@ -141,13 +141,13 @@ class Bridge:
         safe = self.safe
         row["time_s"] = self._robot.now_s()
         safe.measure(due_s)
-        state, object_m = safe.state, safe.object_m
+        state, object_m, object_time_s = safe.state, safe.object.position_m, safe.object.time_s
         row |= {"effector_m": state.effector_m, "fingers_m": state.fingers_m, "object_m": object_m}
-        row |= {"state_time_s": state.time_s, "object_time_s": safe.object_time_s}
+        row |= {"state_time_s": state.time_s, "object_time_s": object_time_s}
         self._states.append(state)
         then = state
-        if np.isfinite(safe.object_time_s):  # nothing sees the object where an arm is calibrated
-            then = min(reversed(self._states), key=lambda each: abs(each.time_s - safe.object_time_s))
+        if np.isfinite(object_time_s):  # nothing sees the object where an arm is calibrated
+            then = min(reversed(self._states), key=lambda each: abs(each.time_s - object_time_s))
         delay_steps = max(0, round((state.time_s - then.time_s) / self._step_s))
         observation = observe(self._layout, then, object_m, self._commands, goal_m, delay_steps)
         action = self._policy.act_deterministic(observation)[0].astype(np.float64)

@@ -59,6 +59,9 @@ class MujocoRobot:
             self.model, self._robot, self._layout = batch.model, batch.robot, batch.layout
             self._reach = batch.reach
             self._start = batch.states[0].copy()
+        self._fingers = slice(self._robot.num_joints, self._robot.num_joints + self._robot.num_fingers)
+        """Their joints and their actuators."""
+        self._widest_m = self._robot.opening_m if self.world.gripper == "free" else 0.0
         self._fit(given)
         self._data = mujoco.MjData(self.model)
         self._stopped = False
@@ -67,11 +70,6 @@ class MujocoRobot:
         self._known: tuple[float, Kinematics] | None = None
         self._grip = self.model.actuator_forcerange[self._fingers].copy()
         self.reset(self._start[self._layout["object"]])
-
-    @property
-    def _fingers(self) -> slice:
-        """Actuators of the fingers."""
-        return slice(self._robot.num_joints, self._robot.num_joints + self._robot.num_fingers)
 
     def _fit(self, given: MujocoParameters) -> None:
         """Change arm and motors of the compiled model."""
@@ -90,8 +88,8 @@ class MujocoRobot:
 
     def read(self) -> RobotState:
         """The robot as it is."""
-        fingers = self._data.qpos[self._robot.num_joints :][: self._robot.num_fingers]
-        return RobotState(self.now_s(), self._here().position[0].copy(), self._robot.openings(fingers[None])[0])
+        fingers = self._robot.openings(self._data.qpos[None, self._fingers])[0]
+        return RobotState(self.now_s(), self._here().position[0].copy(), fingers)
 
     def command(self, command: Command) -> None:
         """Send the servos to a set-point, as in training; after ``stop``, refuse until ``reset``.
@@ -148,21 +146,14 @@ class MujocoRobot:
         self._data.time, self._stopped = now_s, False
         self._last, self._known = (now_s, None), None
         self._data.qacc_warmstart[:] = 0.0
-        self._data.ctrl[:] = 0.0
-        num_joints = self._robot.num_joints
-        self._data.ctrl[:num_joints] = self._joints()[0]
-        self._data.ctrl[self._fingers] = self._data.qpos[num_joints:][: self._robot.num_fingers]
+        num = self._fingers.stop
+        self._data.ctrl[:num] = self._data.qpos[:num]
         mujoco.mj_forward(self.model, self._data)
 
     def object_position(self) -> StateArray:
         """(3,) where the object is, metres."""
-        first = self._robot.num_joints + self._robot.num_fingers
-        position: StateArray = self._data.qpos[first : first + 3].copy()
+        position: StateArray = self._data.qpos[self._fingers.stop :][:3].copy()
         return position
-
-    @property
-    def _widest_m(self) -> float:
-        return self._robot.opening_m if self.world.gripper == "free" else 0.0
 
     def _here(self) -> Kinematics:
         """Where the arm is now; reading it and solving for the next set-point both ask."""

@@ -7,7 +7,6 @@ origin and axes; the point between the fingertips is 1.6 mm nearer to the hand t
 
 from __future__ import annotations
 
-import functools
 import math
 from collections.abc import Mapping, Sequence
 from typing import Any, Literal
@@ -81,7 +80,12 @@ class PyBulletRobot:
     def __init__(self, world: WorldConfig, parameters: PyBulletParameters | None = None) -> None:
         self.parameters = parameters or PyBulletParameters()
         self.world = world_of(world, self.parameters)
-        self._bullet = _Engine()
+        with needs_extra("pybullet", "robot pybullet"):  # Python 3.11 has a wheel of it
+            import pybullet
+            import pybullet_data
+            from pybullet_utils.bullet_client import BulletClient
+        self._bullet = BulletClient(pybullet.DIRECT)
+        self._bullet.setAdditionalSearchPath(pybullet_data.getDataPath())
         self._build()
         self._set_joints(_NEUTRAL)
         self._home = self._solve(self._start_m())
@@ -215,9 +219,6 @@ class PyBulletRobot:
         area = self.world.workspace
         return area.center_x_m, area.center_y_m, self.world.start_height_m
 
-    def _joints(self) -> list[float]:
-        return [state[0] for state in self._bullet.getJointStates(self._robot, _ARM)]
-
     def _link(self, link: int) -> tuple[StateArray, StateArray]:
         state = self._bullet.getLinkState(self._robot, link, computeForwardKinematics=True)
         return np.array(state[4]), np.array(self._bullet.getMatrixFromQuaternion(state[5])).reshape(3, 3)
@@ -240,7 +241,7 @@ class PyBulletRobot:
         return list(solution[: len(_ARM)])
 
     def _hold(self) -> None:
-        self._target = np.array(self._joints())
+        self._target = np.array([state[0] for state in self._bullet.getJointStates(self._robot, _ARM)])
         self._set_point = self._target.copy()
         self._move_arm()
 
@@ -295,18 +296,3 @@ def world_of(world: WorldConfig, parameters: PyBulletParameters) -> WorldConfig:
     if world.obstacles:
         raise ConfigError("world.obstacles: PyBullet has the object alone; play a policy that was trained without")
     return world
-
-
-class _Engine:
-    """One of PyBullet's engines: the functions of its module, each told which engine is meant."""
-
-    def __init__(self) -> None:
-        with needs_extra("pybullet", "robot pybullet"):  # Python 3.11 has a wheel of it
-            import pybullet
-            import pybullet_data
-        self._pybullet, self._id = pybullet, pybullet.connect(pybullet.DIRECT)
-        self.setAdditionalSearchPath(pybullet_data.getDataPath())
-
-    def __getattr__(self, name: str) -> Any:
-        value = getattr(self._pybullet, name)
-        return functools.partial(value, physicsClientId=self._id) if callable(value) else value

@@ -15,6 +15,7 @@ from service.envs.sampling import draw_goals, draw_starts
 from service.methods.compose import check_robot
 from service.registry.loading import Trained
 from service.robot.backends import Backend
+from service.robot.limits import Box
 from service.robot.loop import Bridge
 
 _ROUNDING_M = 1e-6
@@ -60,9 +61,9 @@ def parse_goal(text: str, world: WorldConfig) -> StateArray:
         raise TandemError(f"--goal {text!r}: expected x,y,z in metres, such as -0.05,0.1,0.2")
     lower, upper = np.array(world.workspace.lower_m), np.array(world.workspace.upper_m)
     lower[2] = world.rest_height_m
-    if ((goal < lower - _ROUNDING_M) | (goal > upper + _ROUNDING_M)).any():
-        box = ", ".join(f"{axis} {low:g} to {high:g}" for axis, low, high in zip("xyz", lower, upper, strict=True))
-        raise TandemError(f"--goal {text}: outside the box that the policy was trained in: {box} m")
+    box = Box(lower, upper)
+    if not box.contains(goal, margin_m=_ROUNDING_M):
+        raise TandemError(f"--goal {text}: outside the box that the policy was trained in: {box}")
     if inside_fixtures(goal[None], world)[0]:
         raise TandemError(f"--goal {text}: the object would be inside a fixture, or the upright box around it")
     return goal

@@ -9,7 +9,7 @@ from service.base.errors import ParityError
 from service.export import exporting
 from service.export.exporting import check_parity, make_inputs
 from service.export.formats import find_format
-from service.export.networks import network_of_bob, network_of_orchestrator, networks_of_primitives
+from service.export.networks import network_of_bob, network_of_orchestrator, network_of_primitive
 from service.policies.numpy_policy import numpy_bob
 from service.registry.learned import LearnedPolicy
 from service.registry.loading import Trained
@@ -29,7 +29,7 @@ def networks():
     alone = Trained("made", "primitives", MONOLITHIC, numpy_bob(other), other)
     return {
         "bob": network_of_bob(bob),
-        "primitive": networks_of_primitives(bob)[1],
+        "primitive": network_of_primitive(bob, 1),
         "orchestrator": network_of_orchestrator(learned(bob, "ours-residual-her")),
         "orchestrator of weights alone": network_of_orchestrator(learned(bob, "ours")),
         "monolithic": network_of_bob(alone),

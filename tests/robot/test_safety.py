@@ -171,12 +171,12 @@ def test_a_jump_is_passed_over_and_the_pose_before_it_stands_in():
     for _ in range(3):
         robot.advance(0.02)
         safe.measure(robot.time_s)
-        np.testing.assert_array_equal(safe.object_m, OBJECT_M)
+        np.testing.assert_array_equal(safe.object.position_m, OBJECT_M)
     robot.fault = ""
     robot.poses.position_m = OBJECT_M + np.array([0.0, 0.04, 0.0])  # a step that a hand or a gripper can make
     robot.advance(0.02)
     safe.measure(robot.time_s)
-    np.testing.assert_array_equal(safe.object_m, robot.poses.position_m)
+    np.testing.assert_array_equal(safe.object.position_m, robot.poses.position_m)
 
 
 def test_measurements_two_steps_late_are_not_taken_for_frozen_ones_at_any_time_of_the_clock():
