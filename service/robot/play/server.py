@@ -46,7 +46,7 @@ class LiveWorld:
         with needs_extra("play", "tandem play"):
             import mjviser  # noqa: F401
             import viser
-        self.port = _free_port(host, port)
+        self.port = free_port(host, port)
         self.host = host
         self.game = Game(players, seed)
         self._server = _quiet_server(viser, host, self.port)
@@ -146,7 +146,7 @@ def _quiet_server(viser: Any, host: str, port: int) -> Any:
     return server
 
 
-def _free_port(host: str, port: int | None) -> int:
+def free_port(host: str, port: int | None) -> int:
     """A port that can be listened on: the one that is asked for, or the first free one from the usual one on.
 
     ``viser`` itself would silently take another one, and wait for ever where a host is not here.
