@@ -89,3 +89,8 @@ def test_the_arm_covers_a_part_of_a_full_action():
     for each in measured["width_response"]:
         assert each["asked_m"] == 0.08
         assert 0.06 < each["covered_m"] < 0.08
+
+
+def test_a_gripper_that_is_held_closed_covers_nothing():
+    widths = measure_response(WORLD.model_copy(update={"gripper": "blocked"}))["width_response"]
+    assert [each["asked_m"] for each in widths] == [0.0, 0.0]
