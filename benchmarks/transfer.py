@@ -26,8 +26,8 @@ from service.robot.backends import Backend, BackendConfig, Simulator, connect
 from service.robot.calibrate import Calibration, calibrate
 from service.robot.disturbed import DisturbanceConfig
 from service.robot.loop import Bridge, BridgeConfig
-from service.robot.policies import for_robot
 from service.robot.pybullet_robot import CONTROL_STEP_S, PyBulletParameters, PyBulletRobot, world_of
+from service.robot.running import for_robot
 from service.robot.safety import SafetyConfig
 from service.robot.watchdogs import WatchConfig
 

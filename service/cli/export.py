@@ -3,11 +3,20 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, cast
+from typing import Annotated
 
 import typer
 
-from service.cli.common import REFERENCE, SOURCE, ActsWithOption, JsonOption, QuietOption, SourceOption, loading
+from service.cli.common import (
+    REFERENCE,
+    SOURCE,
+    ActsWithOption,
+    JsonOption,
+    QuietOption,
+    SourceOption,
+    loading,
+    print_json,
+)
 
 
 def export(
@@ -35,20 +44,19 @@ def export(
     1e-5; with inputs far outside of what the policy meets, 1e-4.
     """
     with loading():
-        from service.export.exporting import Part
         from service.export.exporting import export as run
         from service.registry.loading import load
 
         trained = load(policy, registry, primitives)
-    about = run(trained, format_name, out, part=cast(Part, part), num_episodes=episodes)
+    about = run(trained, format_name, out, part=part, num_episodes=episodes)
     if as_json:
-        typer.echo(about.model_dump_json(indent=1))
+        print_json(about)
         return
-    usual = max(network.max_abs_difference for network in about.networks)
-    extreme = max(network.max_abs_difference_extreme for network in about.networks)
-    for network in about.networks:
-        typer.echo(f"  {network.file:<20} {network.title}")
+    usual = max(network["max_abs_difference"] for network in about["networks"])
+    extreme = max(network["max_abs_difference_extreme"] for network in about["networks"])
+    for network in about["networks"]:
+        typer.echo(f"  {network['file']:<20} {network['title']}")
     typer.echo(
-        f"{about.name} is in {out}, within {usual:.1e} of the policy itself (with extreme inputs {extreme:.1e}); "
+        f"{about['name']} is in {out}, within {usual:.1e} of the policy itself (with extreme inputs {extreme:.1e}); "
         "begin with its README.md"
     )

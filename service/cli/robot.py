@@ -134,7 +134,7 @@ def replay(
     from service.robot.log import read_log, states_of
 
     logged = read_log(log)
-    write_episode_video(states_of(logged, logged.header["success_distance_m"]), logged.world, out)
+    write_episode_video(states_of(logged), logged.world, out)
     typer.echo(f"video: {out}")
 
 
@@ -156,7 +156,7 @@ def _bridge_config(overrides: list[str] | None) -> BridgeConfig:
 
 def _load(policy: str, registry: str) -> Trained:
     from service.registry.loading import load
-    from service.robot.policies import for_robot
+    from service.robot.running import for_robot
 
     return for_robot(load(policy, registry))
 
@@ -176,8 +176,8 @@ def _connected(
     A simulator and a dry run ask no question, and no key has to be held: they endanger no person.
     """
     from service.robot.backends import connect
-    from service.robot.dead_man import HeldKey
     from service.robot.safety import always_held
+    from service.robot.watchdogs import HeldKey
     from service.runs.signals import InterruptError, StopSignals
 
     if dead_man not in (None, "key", "none"):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import importlib.util
+import importlib
 import logging
 import runpy
 import warnings
@@ -22,7 +22,7 @@ from service.export.networks import Network, Outputs
 from service.policies import forward
 
 if TYPE_CHECKING:
-    from torch import nn
+    from torch import Tensor, nn
 
 Run = Callable[..., Outputs]
 PROGRAM = "policy.py"
@@ -38,13 +38,11 @@ class Format:
     ending: str
     """Of its files' names."""
     write: Callable[[Network, Path], None]
-    """Writes a network to a file."""
+    """Writes a network to a file, and beside it what it needs to run."""
     read: Callable[[Network, Path], Run]
     """Reads it back: a function of the network's inputs to its outputs."""
     needs: tuple[str, ...] = ()
     """Packages of the extra ``export``."""
-    shared: Callable[[Path], None] = lambda folder: None
-    """Writes what all networks of a folder need."""
 
 
 def find_format(name: str) -> Format:
@@ -58,8 +56,7 @@ def find_format(name: str) -> Format:
         raise ExportError(f"unknown format {name!r}; choose one of {', '.join(FORMATS)}{did_you_mean(name, FORMATS)}")
     with needs_extra("export", f"the format {name}"):
         for package in FORMATS[name].needs:
-            if importlib.util.find_spec(package) is None:
-                raise ModuleNotFoundError(name=package)
+            importlib.import_module(package)
     return FORMATS[name]
 
 
@@ -68,6 +65,7 @@ def _write_numpy(network: Network, path: Path) -> None:
     about = {"function": network.function, "input_sizes": list(network.inputs.values()), **columns}
     arrays: dict[str, Any] = {**network.parameters, **about}
     np.savez(path, allow_pickle=False, **arrays)
+    (path.parent / PROGRAM).write_text(Path(forward.__file__).read_text(encoding="utf-8"), encoding="utf-8")
 
 
 def _read_numpy(network: Network, path: Path) -> Run:
@@ -76,14 +74,10 @@ def _read_numpy(network: Network, path: Path) -> Run:
     return loaded
 
 
-def _write_program(folder: Path) -> None:
-    (folder / PROGRAM).write_text(Path(forward.__file__).read_text(encoding="utf-8"), encoding="utf-8")
-
-
-def torch_module(network: Network) -> nn.Module:
-    """The network in torch: its inputs to a tuple of its outputs, in their order."""
+def _in_torch(network: Network) -> tuple[nn.Module, tuple[Tensor, ...]]:
+    """The network in torch, its inputs to a tuple of its outputs in their order, and inputs to follow through it."""
     import torch
-    from torch import Tensor, nn
+    from torch import nn
 
     function = forward.FUNCTIONS[network.function]
 
@@ -113,20 +107,14 @@ def torch_module(network: Network) -> nn.Module:
             outputs = function(xp, forward.prepared(xp, stored), network.columns, *inputs)
             return tuple(outputs[name] for name in network.outputs)
 
-    return _Module().eval()
-
-
-def _examples(network: Network) -> tuple[Any, ...]:
-    import torch
-
-    return tuple(torch.zeros(_NUM_EXAMPLES, size) for size in network.inputs.values())
+    return _Module().eval(), tuple(torch.zeros(_NUM_EXAMPLES, size) for size in network.inputs.values())
 
 
 def _write_torchscript(network: Network, path: Path) -> None:
     import torch
 
     with torch.no_grad(), _quiet_torch():
-        traced: Any = torch.jit.trace(torch_module(network), _examples(network))
+        traced: Any = torch.jit.trace(*_in_torch(network))
         traced.save(str(path))
 
 
@@ -150,8 +138,7 @@ def _write_onnx(network: Network, path: Path) -> None:
     num_rows = torch.export.Dim("N", min=1)
     with torch.no_grad(), _quiet_torch():
         torch.onnx.export(
-            torch_module(network),
-            _examples(network),
+            *_in_torch(network),
             path,
             input_names=list(network.inputs),
             output_names=list(network.outputs),
@@ -177,22 +164,19 @@ def _read_onnx(network: Network, path: Path) -> Run:
 @contextmanager
 def _quiet_torch() -> Iterator[None]:
     """Keep torch from telling of its own deprecations, of packages that are not needed here, and of every node."""
-    loggers = [logging.getLogger(name) for name in ("torch.onnx", "onnxscript", "onnx_ir")]
-    levels = [logger.level for logger in loggers]
-    for logger in loggers:
-        logger.setLevel(logging.ERROR)
+    before = logging.root.manager.disable
+    logging.disable(logging.WARNING)
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             yield
     finally:
-        for logger, level in zip(loggers, levels, strict=True):
-            logger.setLevel(level)
+        logging.disable(before)
 
 
 FORMATS = {
     "onnx": Format(".onnx", _write_onnx, _read_onnx, ("onnx", "onnxscript", "onnxruntime")),
-    "numpy": Format(".npz", _write_numpy, _read_numpy, shared=_write_program),
+    "numpy": Format(".npz", _write_numpy, _read_numpy),
     "torchscript": Format(".pt", _write_torchscript, _read_torchscript),
 }
 """The formats by the names that commands take."""

@@ -9,7 +9,7 @@ from functools import cached_property, partial
 import numpy as np
 
 from service.base.types import FloatArray
-from service.envs.observations import Layouts, ObservationLayout, layouts
+from service.envs.observations import ObservationLayout, layouts
 from service.methods.task_methods import find_method
 from service.policies.forward import FUNCTIONS
 from service.policies.numpy_actor import STEP_SCALE_M, numpy_actor
@@ -48,7 +48,7 @@ class Network:
         return {name: array.shape[1:] for name, array in self.reference(*rows).items()}
 
 
-def networks_of_bob(trained: Trained) -> list[Network]:
+def network_of_bob(trained: Trained) -> Network:
     """The network of a whole Bob, composed or monolithic."""
     policy, function, title = trained.policy, "monolithic", "Bob, who has no primitives"
     assert isinstance(policy, NumpyPolicy)
@@ -56,17 +56,29 @@ def networks_of_bob(trained: Trained) -> list[Network]:
         function, title = "bob", f"Bob: {policy.num_primitives} primitives, composed by his gate"
     act = partial(FUNCTIONS[function], np, policy.network, policy.columns)
     inputs = {"observation": layouts(trained.config.world).bob.size}
-    return [Network("policy", function, title, trained.parameters, policy.columns, inputs, act)]
+    return Network("policy", function, title, trained.parameters, policy.columns, inputs, act)
 
 
-def networks_of_primitives(trained: Trained) -> list[Network]:
-    """A network for each primitive.
+def network_of_primitive(trained: Trained, number: int) -> Network:
+    """The network of one primitive alone.
 
     Raises:
         TandemError: this Bob is monolithic.
     """
-    policy, seen = trained.primitives, layouts(trained.config.world)
-    return [_primitive(policy, trained.parameters, number, seen) for number in range(policy.num_primitives)]
+    policy = trained.primitives
+    own = {name: array for name, array in trained.parameters.items() if name.startswith("primitives.")}
+    hidden = own["primitives.output_weight"].shape[1]
+    for name in ("primitives.hidden.weight", "primitives.hidden.bias"):
+        own[name] = own[name][number * hidden : (number + 1) * hidden]
+    for name in ("primitives.output_weight", "primitives.output_bias"):
+        own[name] = own[name][number : number + 1]
+
+    def act(positions: FloatArray) -> Outputs:
+        mean, variance = (each[:, number] for each in policy.primitives(positions))
+        return {"action": np.clip(mean, -1.0, 1.0), "mean": mean, "variance": variance}
+
+    inputs = {"positions": policy.num_positions}
+    return Network(f"primitive_{number}", "primitive", f"primitive {number} alone", own, {}, inputs, act)
 
 
 def network_of_orchestrator(learned: Trained) -> Network:
@@ -109,19 +121,3 @@ def network_of_orchestrator(learned: Trained) -> Network:
     inputs = {"previous_positions": num_positions, "observation": seen.bob.size}
     title = f"an orchestrator of {policy.num_primitives} primitives ({find_method(str(learned.method)).title})"
     return Network("policy", "orchestrator", title, shown, columns, inputs, act)
-
-
-def _primitive(policy: NumpyMCPPolicy, parameters: Parameters, number: int, seen: Layouts) -> Network:
-    own = {name: array for name, array in parameters.items() if name.startswith("primitives.")}
-    hidden = own["primitives.output_weight"].shape[1]
-    for name in ("primitives.hidden.weight", "primitives.hidden.bias"):
-        own[name] = own[name][number * hidden : (number + 1) * hidden]
-    for name in ("primitives.output_weight", "primitives.output_bias"):
-        own[name] = own[name][number : number + 1]
-
-    def act(positions: FloatArray) -> Outputs:
-        mean, variance = (each[:, number] for each in policy.primitives(positions))
-        return {"action": np.clip(mean, -1.0, 1.0), "mean": mean, "variance": variance}
-
-    inputs = {"positions": seen.positions.size}
-    return Network(f"primitive_{number}", "primitive", f"primitive {number} alone", own, {}, inputs, act)

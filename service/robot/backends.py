@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib
-from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Protocol
@@ -16,14 +15,14 @@ from service.config.frozen import FrozenModel
 from service.config.tree import read_yaml
 from service.config.world import WorldConfig
 from service.robot.disturbed import DisturbanceConfig, DisturbedPoses, DisturbedRobot
-from service.robot.interface import PoseSource, RobotInterface
+from service.robot.interface import ObjectPose, PoseSource, RobotInterface
 
 BACKENDS = {
     "mujoco": "service.robot.mujoco_robot:connect",
     "pybullet": "service.robot.pybullet_robot:connect",
     "franka": "service.robot.franka_robot:connect",
 }
-"""Where the factory of each is, as ``module:function``."""
+"""Where the function of each is, as ``module:function``: of a policy's world and parameters to a ``Backend``."""
 
 
 class Simulator(Protocol):
@@ -34,6 +33,20 @@ class Simulator(Protocol):
 
     def object_position(self) -> StateArray:
         """(3,) where the object is in truth, metres."""
+
+
+class ExactPoses:
+    """Sees the object of a simulator as it is, at every moment."""
+
+    def __init__(self, robot: RobotInterface, simulator: Simulator) -> None:
+        self._robot, self._simulator = robot, simulator
+
+    def read(self) -> ObjectPose:
+        """The object's pose now."""
+        return ObjectPose(self._robot.now_s(), self._simulator.object_position())
+
+    def close(self) -> None:
+        """Nothing is left behind."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,10 +70,6 @@ class Backend:
         """Let go of both."""
         self.poses.close()
         self.robot.close()
-
-
-Factory = Callable[[WorldConfig, Mapping[str, Any]], Backend]
-"""Makes a back-end for a policy's world, with parameters of its own, such as an address; raises a ``TandemError``."""
 
 
 class BackendConfig(FrozenModel):
@@ -108,12 +117,24 @@ def connect(config: BackendConfig, world: WorldConfig, *, seed: int = 0) -> Back
     Raises:
         TandemError: no such back-end, what it needs is not installed, or it does not answer.
     """
-    made = _make(config, world)
-    wanted = config.disturbance
-    if wanted == DisturbanceConfig():
+    module, _, name = BACKENDS.get(config.backend, config.backend).partition(":")
+    try:
+        made = getattr(importlib.import_module(module), name)(world, config.parameters)
+    except ValidationError as error:
+        raise TandemError(f"robot {config.backend}: parameters: {first_error(error)}") from None
+    except TandemError:
+        raise
+    except Exception as error:  # it may be the user's own code
+        words = one_line(f"{type(error).__name__}: {error}", 300)
+        raise TandemError(f"robot {config.backend!r} cannot be made: {words}") from error
+    if not isinstance(made, Backend):
+        raise TandemError(
+            f"robot {config.backend!r} made {type(made).__name__}; return a service.robot.backends.Backend"
+        )
+    if config.disturbance == DisturbanceConfig():
         return made
-    poses = DisturbedPoses(made.poses, made.robot.now_s, wanted, seed=seed)
-    return replace(made, robot=DisturbedRobot(made.robot, wanted), poses=poses)
+    poses = DisturbedPoses(made.poses, made.robot.now_s, config.disturbance, seed=seed)
+    return replace(made, robot=DisturbedRobot(made.robot, config.disturbance), poses=poses)
 
 
 def first_error(error: ValidationError) -> str:
@@ -123,30 +144,3 @@ def first_error(error: ValidationError) -> str:
     if first["type"] == "extra_forbidden":
         return f"unknown key {key!r}"
     return f"{key} = {first['input']!r}: {first['msg']}"
-
-
-def _make(config: BackendConfig, world: WorldConfig) -> Backend:
-    factory = _factory(config.backend)
-    if config.backend in BACKENDS:
-        return factory(world, config.parameters)
-    try:
-        made = factory(world, config.parameters)
-    except TandemError:
-        raise
-    except Exception as error:  # it is the user's own code
-        words = one_line(f"{type(error).__name__}: {error}", 300)
-        raise TandemError(f"robot {config.backend!r} cannot be made: {words}") from error
-    if not isinstance(made, Backend):
-        raise TandemError(
-            f"robot {config.backend!r} made {type(made).__name__}; return a service.robot.backends.Backend"
-        )
-    return made
-
-
-def _factory(reference: str) -> Factory:
-    module, _, name = BACKENDS.get(reference, reference).partition(":")
-    try:
-        factory: Factory = getattr(importlib.import_module(module), name)
-    except Exception as error:  # it may be the user's own code
-        raise TandemError(f"robot {reference!r} cannot be loaded: {one_line(str(error), 300)}") from error
-    return factory

@@ -8,7 +8,6 @@ changes nothing: sent further ahead of itself, a slow arm overshoots, and that c
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -37,6 +36,7 @@ _ACTION, _APPROACH_ACTION = 0.4, 0.5
 _MOVED_M = 5e-4
 _LEAST_SHARE, _GREATEST_SHARE = 0.1, 2.0
 _Share = Annotated[float, Field(gt=0.0)]
+_Shares = tuple[_Share, _Share, _Share]
 _DIRECTIONS = np.concatenate([np.eye(3), -np.eye(3)])
 _AS_IN_TRAINING = BridgeConfig(
     pace=1.0,
@@ -54,10 +54,8 @@ class Calibration(FrozenModel):
     set_points_per_step: int
     max_speed_m_s: float
     max_acceleration_m_s2: float
-    covered_share: tuple[_Share, _Share, _Share] = Field(
-        description="of a commanded way, x, y, z, that the arm covers in a control step"
-    )
-    training_share: tuple[_Share, _Share, _Share] = Field(description="the same of the arm in training")
+    covered_share: _Shares = Field(description="of a commanded way, x, y, z, that the arm covers in a control step")
+    training_share: _Shares = Field(description="the same of the arm in training")
     delay_steps: float = Field(description="control steps from a command until the arm is seen to move")
 
     @property
@@ -79,14 +77,6 @@ class Calibration(FrozenModel):
                 raise TandemError(
                     f"calibration: measured with {key} {getattr(self, key)!r}, not {value!r}: calibrate again"
                 )
-
-
-@dataclass(frozen=True, slots=True)
-class Response:
-    """What an arm does with constant actions."""
-
-    covered_share: tuple[float, float, float]
-    delay_steps: float
 
 
 def calibrate(
@@ -111,26 +101,24 @@ def calibrate(
     """
     from service.robot.mujoco_robot import MujocoRobot
 
-    wanted = measure_response(MujocoRobot(world), world, _AS_IN_TRAINING)
+    wanted, _ = measure_response(MujocoRobot(world), world, _AS_IN_TRAINING)
     full = config.model_copy(update={"pace": 1.0})
-    found = measure_response(robot, world, full, held=held)
-    if not all(_LEAST_SHARE <= share <= _GREATEST_SHARE for share in found.covered_share):
+    found, delay_steps = measure_response(robot, world, full, held=held)
+    if not all(_LEAST_SHARE <= share <= _GREATEST_SHARE for share in found):
+        shares = ", ".join(f"{share:.0%}" for share in found)
         raise RobotError(
-            f"robot {name}: it covers {_percents(found.covered_share)} of a commanded step along x, y, z; "
+            f"robot {name}: it covers {shares} of a commanded step along x, y, z; "
             f"{_LEAST_SHARE:.0%} to {_GREATEST_SHARE:.0%} can be matched: look at its controller"
         )
     return Calibration(
-        **_setting(name, world, config),
-        covered_share=found.covered_share,
-        training_share=wanted.covered_share,
-        delay_steps=found.delay_steps,
+        **_setting(name, world, config), covered_share=found, training_share=wanted, delay_steps=delay_steps
     )
 
 
 def measure_response(
     robot: RobotInterface, world: WorldConfig, config: BridgeConfig, *, held: Callable[[], bool] = always_held
-) -> Response:
-    """Move along each axis, there and back; see ``calibrate``."""
+) -> tuple[_Shares, float]:
+    """Move along each axis, there and back; ``covered_share`` and ``delay_steps`` of a ``Calibration``."""
     rows: list[dict[str, Any]] = []
     box = config.safety.box(world.workspace)
     motions = _Motions((box.lower_m + box.upper_m) / 2)
@@ -150,7 +138,7 @@ def measure_response(
         raise RobotError(
             "calibration: the arm was not seen to move along any axis: look at what the robot says it is at"
         )
-    return Response((x, y, z), round(float(seen.mean()) / step_s, 3))
+    return (x, y, z), round(float(seen.mean()) / step_s, 3)
 
 
 def write_calibration(path: Path, calibration: Calibration) -> None:
@@ -220,7 +208,3 @@ def _setting(robot: str, world: WorldConfig, config: BridgeConfig) -> dict[str, 
         "max_speed_m_s": config.safety.max_speed_m_s,
         "max_acceleration_m_s2": config.safety.max_acceleration_m_s2,
     }
-
-
-def _percents(shares: tuple[float, float, float]) -> str:
-    return ", ".join(f"{share:.0%}" for share in shares)

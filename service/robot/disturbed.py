@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Generic, Protocol, TypeVar
+from typing import TypeVar
 
 import numpy as np
 from pydantic import Field
@@ -14,6 +14,7 @@ from service.config.frozen import FrozenModel
 from service.robot.interface import Command, ObjectPose, PoseSource, RobotInterface, RobotState
 
 _SAME_TIME_S = 1e-9
+_Measurement = TypeVar("_Measurement", RobotState, ObjectPose)
 
 
 class DisturbanceConfig(FrozenModel):
@@ -26,35 +27,11 @@ class DisturbanceConfig(FrozenModel):
     pose_offset_m: tuple[float, float, float] = Field((0.0, 0.0, 0.0), description="constant error of poses")
 
 
-class _Timed(Protocol):
-    @property
-    def time_s(self) -> float: ...
-
-
-_Measurement = TypeVar("_Measurement", bound=_Timed)
-
-
-class _History(Generic[_Measurement]):
-    """Measurements in their order, read some time later; they keep their time stamps."""
-
-    def __init__(self, delay_s: float) -> None:
-        self._delay_s = delay_s
-        self._kept: deque[_Measurement] = deque()
-
-    def is_new(self, measurement: _Measurement) -> bool:
-        return not self._kept or measurement.time_s != self._kept[-1].time_s
-
-    def add(self, measurement: _Measurement) -> None:
-        self._kept.append(measurement)
-
-    def forget(self) -> None:
-        self._kept.clear()
-
-    def read(self, now_s: float) -> _Measurement:
-        """The newest that is old enough, or else the oldest that there is."""
-        while len(self._kept) > 1 and self._kept[1].time_s <= now_s - self._delay_s + _SAME_TIME_S:
-            self._kept.popleft()
-        return self._kept[0]
+def _as_of(time_s: float, kept: deque[_Measurement]) -> _Measurement:
+    """The newest measurement of that time or before, or else the oldest that there is; those before it are dropped."""
+    while len(kept) > 1 and kept[1].time_s <= time_s + _SAME_TIME_S:
+        kept.popleft()
+    return kept[0]
 
 
 class DisturbedRobot:
@@ -65,7 +42,7 @@ class DisturbedRobot:
 
     def __init__(self, robot: RobotInterface, config: DisturbanceConfig) -> None:
         self._robot, self._config = robot, config
-        self._states: _History[RobotState] = _History(config.state_delay_s)
+        self._states: deque[RobotState] = deque()
         self._commands: deque[tuple[float, Command]] = deque()
 
     def now_s(self) -> float:
@@ -74,8 +51,8 @@ class DisturbedRobot:
 
     def read(self) -> RobotState:
         """The robot as it was ``state_delay_s`` ago."""
-        self._states.add(self._robot.read())
-        return self._states.read(self.now_s())
+        self._states.append(self._robot.read())
+        return _as_of(self.now_s() - self._config.state_delay_s, self._states)
 
     def command(self, command: Command) -> None:
         """Keep a set-point until it is due; ``wait_until`` hands it on."""
@@ -94,7 +71,7 @@ class DisturbedRobot:
 
     def forget(self) -> None:
         """Begin anew: nothing was read or commanded before."""
-        self._states.forget()
+        self._states.clear()
         self._commands.clear()
 
     def stop(self) -> None:
@@ -104,7 +81,6 @@ class DisturbedRobot:
 
     def close(self) -> None:
         """Give the robot back."""
-        self._commands.clear()
         self._robot.close()
 
 
@@ -123,19 +99,19 @@ class DisturbedPoses:
     ) -> None:
         self._poses, self._now_s, self._config = poses, now_s, config
         self._rng = np.random.default_rng(seed)
-        self._seen: _History[ObjectPose] = _History(config.pose_delay_s)
+        self._seen: deque[ObjectPose] = deque()
 
     def read(self) -> ObjectPose:
         """The object as it was ``pose_delay_s`` ago, with noise and offset."""
         pose = self._poses.read()
-        if self._seen.is_new(pose):
+        if not self._seen or pose.time_s != self._seen[-1].time_s:
             noise = self._rng.normal(0.0, self._config.pose_noise_m, 3) if self._config.pose_noise_m else 0.0
-            self._seen.add(replace(pose, position_m=pose.position_m + self._config.pose_offset_m + noise))
-        return self._seen.read(self._now_s())
+            self._seen.append(replace(pose, position_m=pose.position_m + self._config.pose_offset_m + noise))
+        return _as_of(self._now_s() - self._config.pose_delay_s, self._seen)
 
     def forget(self) -> None:
         """Begin anew: nothing was seen before."""
-        self._seen.forget()
+        self._seen.clear()
 
     def close(self) -> None:
         """Let go of what sees the object."""

@@ -17,13 +17,13 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-from pydantic import Field, ValidationError
+from pydantic import Field
 
 from service.base.errors import RobotError, TandemError, one_line
 from service.base.extras import needs_extra
 from service.config.frozen import FrozenModel
 from service.config.world import Point, WorldConfig
-from service.robot.backends import Backend, first_error
+from service.robot.backends import Backend
 from service.robot.interface import Command, ObjectPose, PoseSource, RobotState
 
 _DOWN = (1.0, 0.0, 0.0, 0.0)  # x y z w
@@ -78,7 +78,7 @@ class FrankaRobot:
             tilt_rad = float(np.arccos(np.clip(-self._pose().matrix[2, 2], -1.0, 1.0)))
             if tilt_rad > _MOST_TILT_RAD:
                 raise RobotError(self._words(f"its gripper is {tilt_rad:.1f} rad off pointing down: guide it there"))
-            self._hand = _Hand(franky.Gripper(parameters.host), parameters)
+            self._hand = Hand(franky.Gripper(parameters.host), parameters)
 
     def now_s(self) -> float:
         """Read the computer's clock, seconds."""
@@ -155,7 +155,7 @@ class FrankaRobot:
         return f"robot franka at {self._parameters.host}: {text}"
 
 
-class _Hand:
+class Hand:
     """A Franka hand that follows a wanted width, by single motions in a thread of its own.
 
     To close is to grasp: the fingers go to the wanted width and press where something is in the way. What is held stays
@@ -164,13 +164,11 @@ class _Hand:
 
     def __init__(self, gripper: Any, parameters: FrankaParameters) -> None:
         self._gripper, self._parameters = gripper, parameters
-        self._lock = threading.Lock()
         self.width_m = float(gripper.width)
         """Last measured."""
         self.fault: str | None = None
         """Why it moves no longer."""
-        self._wanted: tuple[float, float] | None = None  # width, force
-        self._halting = False
+        self._wanted: tuple[float, float] | None = None  # width and force; None: to stand still
         self._sent_m, self._sent_s = self.width_m, 0.0
         self._running: Any = None
         self._ended = threading.Event()
@@ -179,13 +177,11 @@ class _Hand:
 
     def go_to(self, width_m: float, force_n: float) -> None:
         """Take a new wanted width; returns at once."""
-        with self._lock:
-            self._wanted = (width_m, force_n)
+        self._wanted = (width_m, force_n)
 
     def halt(self) -> None:
         """Forget what was wanted, and let the thread end a motion that is under way; returns at once."""
-        with self._lock:
-            self._wanted, self._halting = None, True
+        self._wanted = None
 
     def close(self) -> None:
         """End the thread."""
@@ -204,14 +200,12 @@ class _Hand:
         """Measure, and send the next motion where one is due."""
         state = self._gripper.state
         self.width_m = float(state.width)
-        with self._lock:
-            wanted, halting, self._halting = self._wanted, self._halting, False
-        if halting:
+        wanted = self._wanted
+        if wanted is None:
             self._end_motion()
+            return
         if self._is_moving() and time.monotonic() - self._sent_s > _MOST_MOTION_S:
             raise TimeoutError(f"a motion has not ended within {_MOST_MOTION_S:g} s")
-        if wanted is None:
-            return
         width_m, force_n = wanted
         change_m = width_m - self._sent_m
         if abs(change_m) < self._parameters.hand_tolerance_m or (change_m < 0.0 and state.is_grasped):
@@ -255,10 +249,7 @@ def connect(world: WorldConfig, parameters: Mapping[str, Any]) -> Backend:
         raise TandemError(
             f"robot franka: the policy was trained with the arm {world.robot.name!r}; take one of the panda"
         )
-    try:
-        given = FrankaParameters.model_validate(dict(parameters))
-    except ValidationError as error:
-        raise TandemError(f"robot franka: parameters: {first_error(error)}") from None
+    given = FrankaParameters.model_validate(parameters)
     with needs_extra("franka", "robot franka"):
         franky = importlib.import_module("franky")
     poses = _pose_source(given)

@@ -15,12 +15,10 @@ _STILL_M_S = 1e-9
 
 @dataclass(frozen=True)
 class Box:
-    """Where the set-point of the end effector may be."""
+    """Where the set-point of the end effector may be: between two (3,) corners."""
 
     lower_m: StateArray
-    """(3,)."""
     upper_m: StateArray
-    """(3,)."""
 
     def clip(self, point_m: StateArray) -> StateArray:
         """Nearest point inside."""

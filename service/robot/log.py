@@ -12,14 +12,11 @@ from pydantic import ValidationError
 
 from service.base.errors import TandemError
 from service.base.jsonl import JsonlWriter, read_jsonl
-from service.base.types import StateArray
 from service.config import WorldConfig
 from service.envs.batch import WorldBatch
 from service.media.recording import RecordedEpisodes
 
 FORMAT_VERSION = 1
-_SIZES = {"effector_m": 3, "fingers_m": 2, "object_m": 3, "goal_m": 3}
-"""Of what is shown of a step."""
 _LONG_WAY = 30
 """Iterations that find the arm's joints from its home."""
 
@@ -73,25 +70,13 @@ def read_log(path: Path) -> LoggedRun:
     except ValidationError as error:
         raise TandemError(f"{path}: its world cannot be read: {error.errors()[0]['msg']}") from None
     episodes: dict[int, list[dict[str, Any]]] = {}
-    for line, row in enumerate(rows, start=2):
+    for row in rows:
         if "effector_m" in row:
-            _check(row, f"{path} line {line}")
             episodes.setdefault(row["episode"], []).append(row)
     return LoggedRun(header, world, list(episodes.values()))
 
 
-def _check(row: Mapping[str, Any], where: str) -> None:
-    """Assert that a step has everything that is shown of it."""
-    try:
-        sizes = {key: np.array(row[key], dtype=np.float64).shape for key in _SIZES}
-        damaged = not isinstance(row["episode"], int) or sizes != {key: (size,) for key, size in _SIZES.items()}
-    except (KeyError, TypeError, ValueError):
-        damaged = True
-    if damaged:
-        raise TandemError(f"{where} is no step of a robot: it was changed; remove that line and try again")
-
-
-def states_of(run: LoggedRun, success_distance_m: float) -> RecordedEpisodes:
+def states_of(run: LoggedRun) -> RecordedEpisodes:
     """What was logged as states of the policy's world: effector and object where they were measured.
 
     The object is drawn upright, as only its place was seen, and shorter episodes end with a still picture.
@@ -102,7 +87,11 @@ def states_of(run: LoggedRun, success_distance_m: float) -> RecordedEpisodes:
     if not run.episodes:
         raise TandemError("the log has no step in which anything was measured: nothing to show")
     num_steps = max(map(len, run.episodes))
-    effector, fingers, places = (_stack(run, key, num_steps) for key in ("effector_m", "fingers_m", "object_m"))
+    padded = [steps + steps[-1:] * (num_steps - len(steps)) for steps in run.episodes]
+    effector, fingers, places = (
+        np.array([[step[key] for step in steps] for steps in padded], dtype=np.float64).swapaxes(0, 1)  # (T, N, ...)
+        for key in ("effector_m", "fingers_m", "object_m")
+    )
     goal = np.array([steps[0]["goal_m"] for steps in run.episodes])
     with WorldBatch(run.world, len(run.episodes), num_threads=1) as worlds:
         arm, layout = worlds.robot.arm, worlds.layout
@@ -113,14 +102,5 @@ def states_of(run: LoggedRun, success_distance_m: float) -> RecordedEpisodes:
             states[step][:, layout["joints"]] = joints
             states[step][:, layout["fingers"]] = worlds.robot.finger_values(fingers[step].sum(axis=1))
             states[step][:, layout["object"]] = places[step]
-    reached = np.linalg.norm(places - goal, axis=2) <= success_distance_m
+    reached = np.linalg.norm(places - goal, axis=2) <= run.header["success_distance_m"]
     return RecordedEpisodes(states, goal, reached)
-
-
-def _stack(run: LoggedRun, key: str, num_steps: int) -> StateArray:
-    """(T, N, ...) a measurement of all episodes, the last one of each repeated to the end."""
-    columns = []
-    for steps in run.episodes:
-        values = [step[key] for step in steps]
-        columns.append(values + values[-1:] * (num_steps - len(values)))
-    return np.array(columns, dtype=np.float64).swapaxes(0, 1)

@@ -12,7 +12,6 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -29,8 +28,6 @@ from service.robot.safety import SafeRobot, SafetyConfig, always_held
 
 Record = Callable[[dict[str, Any]], None]
 """Takes what happened in a step: see ``Bridge.run``."""
-_Seen = tuple[RobotState, StateArray]
-"""The robot as it was when the object was seen at (3,) metres."""
 
 _MORE_SETTLE_S = 0.5
 """Beyond the time that braking from the greatest speed takes."""
@@ -51,23 +48,7 @@ class BridgeConfig(FrozenModel):
         description="share of an action's way that is commanded. Behind a bound on acceleration an arm turns late, and "
         "at full pace it overshoots (docs/decisions/0025)",
     )
-    observation_delay_steps: int = Field(
-        0,
-        ge=0,
-        le=10,
-        description="act on what was seen so many steps ago, to try out what that costs; a policy still knows its last "
-        "commands, and its delay",
-    )
     safety: SafetyConfig = SafetyConfig()
-
-
-@dataclass(frozen=True, slots=True)
-class Episode:
-    """What came of a goal."""
-
-    num_steps: int
-    distance_m: float
-    """From the object, as it was last seen, to the goal; NaN where nothing sees it."""
 
 
 class Bridge:
@@ -112,7 +93,7 @@ class Bridge:
         self.safe = SafeRobot(robot, poses, config.safety, box, held=held, dry_run=dry_run)
         """The only way to the robot."""
 
-    def run(self, goal_m: StateArray, num_steps: int) -> Episode:
+    def run(self, goal_m: StateArray, num_steps: int) -> float:
         """Play one goal, and come to rest.
 
         What is recorded of a step: ``step``; ``time_s`` and ``due_s`` of its begin; ``effector_m``, ``fingers_m``,
@@ -124,16 +105,17 @@ class Bridge:
             goal_m: (3,) where the object should go, metres.
             num_steps: control steps.
 
+        Returns:
+            Distance from the object, as it was last seen, to the goal, metres; NaN where nothing sees it.
+
         Raises:
             RobotError: the robot was stopped; the message says why.
         """
         begin = getattr(self._policy, "begin", None)
         if begin is not None:
             begin()
-        num = self._num_commands
-        commands = deque([np.zeros(ACTION.size)] * num, maxlen=num)
+        self._commands = deque([np.zeros(ACTION.size)] * self._num_commands, maxlen=self._num_commands)
         self._states: deque[RobotState] = deque(maxlen=_KEPT_STATES)
-        seen: deque[_Seen] = deque(maxlen=self._config.observation_delay_steps + 1)
         with self.safe.guarded():
             self.safe.start(self._tick_s)
             start_s = self._robot.now_s()
@@ -141,46 +123,38 @@ class Bridge:
                 due_s = start_s + step * self._step_s
                 row: dict[str, Any] = {"step": step, "due_s": due_s, "goal_m": goal_m}
                 try:
-                    self._play_step(row, due_s, goal_m, commands, seen)
+                    self._play_step(row, due_s, goal_m)
                 except BaseException as error:
-                    row["stopped"] = self.safe.stopped or f"{type(error).__name__}: {error}"
+                    self.safe.stop(f"{type(error).__name__}: {error}")
+                    row["stopped"] = self.safe.stopped  # the first reason
                     raise
                 finally:
                     if self._record is not None:
                         self._record(row)
             end_s = start_s + num_steps * self._step_s
             self.safe.measure(end_s)
-            object_m = self.safe.object_m
+            object_m = self.safe.object.position_m
             self._settle(end_s)
-        return Episode(num_steps, float(np.linalg.norm(object_m - goal_m)))
+        return float(np.linalg.norm(object_m - goal_m))
 
-    def _play_step(
-        self,
-        row: dict[str, Any],
-        due_s: float,
-        goal_m: StateArray,
-        commands: deque[StateArray],
-        seen: deque[_Seen],
-    ) -> None:
+    def _play_step(self, row: dict[str, Any], due_s: float, goal_m: StateArray) -> None:
         safe = self.safe
         row["time_s"] = self._robot.now_s()
         safe.measure(due_s)
-        state, object_m = safe.state, safe.object_m
+        state, object_m, object_time_s = safe.state, safe.object.position_m, safe.object.time_s
         row |= {"effector_m": state.effector_m, "fingers_m": state.fingers_m, "object_m": object_m}
-        row |= {"state_time_s": state.time_s, "object_time_s": safe.object_time_s}
+        row |= {"state_time_s": state.time_s, "object_time_s": object_time_s}
         self._states.append(state)
         then = state
-        if np.isfinite(safe.object_time_s):  # nothing sees the object where an arm is calibrated
-            then = min(reversed(self._states), key=lambda each: abs(each.time_s - safe.object_time_s))
-        age_steps = max(0, round((state.time_s - then.time_s) / self._step_s))
-        seen.append((then, object_m))
-        delay_steps = age_steps + self._config.observation_delay_steps
-        observation = observe(self._layout, *seen[0], commands, goal_m, delay_steps)
+        if np.isfinite(object_time_s):  # nothing sees the object where an arm is calibrated
+            then = min(reversed(self._states), key=lambda each: abs(each.time_s - object_time_s))
+        delay_steps = max(0, round((state.time_s - then.time_s) / self._step_s))
+        observation = observe(self._layout, then, object_m, self._commands, goal_m, delay_steps)
         action = self._policy.act_deterministic(observation)[0].astype(np.float64)
         row["action"] = action
         safe.check_finite(action, "the policy's action")
         action = np.clip(action, -1.0, 1.0)
-        commands.appendleft(action)
+        self._commands.appendleft(action)
         target_m = state.effector_m + DISPLACEMENT_M * self._gain * action[:3]
         # What a policy of a gripper held closed says of its width never meant anything.
         width_m = 0.0 if self._blocked else float(state.fingers_m.sum() + WIDTH_CHANGE_M * action[3])

@@ -7,7 +7,7 @@ from typing import Any
 
 import mujoco
 import numpy as np
-from pydantic import Field, ValidationError
+from pydantic import Field
 
 from service.base.errors import RobotError, TandemError
 from service.base.types import StateArray
@@ -15,8 +15,8 @@ from service.config.frozen import FrozenModel
 from service.config.world import WorldConfig
 from service.envs.batch import MAX_SPEED, MAX_TURN_RAD, WorldBatch
 from service.envs.kinematics import Kinematics
-from service.robot.backends import Backend, first_error
-from service.robot.interface import Command, ObjectPose, RobotState
+from service.robot.backends import Backend, ExactPoses
+from service.robot.interface import Command, RobotState
 
 _EARLY_S = 1e-9
 
@@ -25,9 +25,6 @@ class MujocoParameters(FrozenModel):
     """What differs from the world of training; nothing by default."""
 
     stiffness_scale: float = Field(1.0, gt=0.0, le=10.0, description="times the gains of the arm's servos")
-    damping_scale: float = Field(1.0, gt=0.0, le=10.0, description="times their damping")
-    max_force_scale: float = Field(1.0, gt=0.0, le=10.0, description="times the greatest force of the arm's servos")
-    armature_scale: float = Field(1.0, gt=0.0, le=10.0, description="times the inertia of the arm's motors")
     feed_forward: float = Field(
         0.0,
         ge=0.0,
@@ -44,7 +41,7 @@ class MujocoParameters(FrozenModel):
 
 
 class MujocoRobot:
-    """One world as a ``RobotInterface``; ``poses`` sees the object exactly. Its clock goes on while the loop waits.
+    """One world as a ``RobotInterface`` and as a ``Simulator``. Its clock goes on while the loop waits.
 
     Args:
         world: of the policy.
@@ -62,6 +59,9 @@ class MujocoRobot:
             self.model, self._robot, self._layout = batch.model, batch.robot, batch.layout
             self._reach = batch.reach
             self._start = batch.states[0].copy()
+        self._fingers = slice(self._robot.num_joints, self._robot.num_joints + self._robot.num_fingers)
+        """Their joints and their actuators."""
+        self._widest_m = self._robot.opening_m if self.world.gripper == "free" else 0.0
         self._fit(given)
         self._data = mujoco.MjData(self.model)
         self._stopped = False
@@ -69,22 +69,13 @@ class MujocoRobot:
         """When the joints got their last set-points, and which, before they were moved on."""
         self._known: tuple[float, Kinematics] | None = None
         self._grip = self.model.actuator_forcerange[self._fingers].copy()
-        self.poses = ExactPoses(self)
         self.reset(self._start[self._layout["object"]])
-
-    @property
-    def _fingers(self) -> slice:
-        """Actuators of the fingers."""
-        return slice(self._robot.num_joints, self._robot.num_joints + self._robot.num_fingers)
 
     def _fit(self, given: MujocoParameters) -> None:
         """Change arm and motors of the compiled model."""
         arm = slice(0, self._robot.num_joints)
         self.model.actuator_gainprm[arm, 0] *= given.stiffness_scale
         self.model.actuator_biasprm[arm, 1] *= given.stiffness_scale
-        self.model.actuator_biasprm[arm, 2] *= given.damping_scale
-        self.model.actuator_forcerange[arm] *= given.max_force_scale
-        self.model.dof_armature[arm] *= given.armature_scale
         self.model.dof_frictionloss[arm] += given.joint_friction_nm
         lag_s = -self.model.actuator_biasprm[arm, 2] / self.model.actuator_gainprm[arm, 0]
         self._lead_s = given.feed_forward * lag_s
@@ -97,8 +88,8 @@ class MujocoRobot:
 
     def read(self) -> RobotState:
         """The robot as it is."""
-        fingers = self._data.qpos[self._robot.num_joints :][: self._robot.num_fingers]
-        return RobotState(self.now_s(), self._here().position[0].copy(), self._robot.openings(fingers[None])[0])
+        fingers = self._robot.openings(self._data.qpos[None, self._fingers])[0]
+        return RobotState(self.now_s(), self._here().position[0].copy(), fingers)
 
     def command(self, command: Command) -> None:
         """Send the servos to a set-point, as in training; after ``stop``, refuse until ``reset``.
@@ -155,21 +146,14 @@ class MujocoRobot:
         self._data.time, self._stopped = now_s, False
         self._last, self._known = (now_s, None), None
         self._data.qacc_warmstart[:] = 0.0
-        self._data.ctrl[:] = 0.0
-        num_joints = self._robot.num_joints
-        self._data.ctrl[:num_joints] = self._joints()[0]
-        self._data.ctrl[self._fingers] = self._data.qpos[num_joints:][: self._robot.num_fingers]
+        num = self._fingers.stop
+        self._data.ctrl[:num] = self._data.qpos[:num]
         mujoco.mj_forward(self.model, self._data)
 
     def object_position(self) -> StateArray:
         """(3,) where the object is, metres."""
-        first = self._robot.num_joints + self._robot.num_fingers
-        position: StateArray = self._data.qpos[first : first + 3].copy()
+        position: StateArray = self._data.qpos[self._fingers.stop :][:3].copy()
         return position
-
-    @property
-    def _widest_m(self) -> float:
-        return self._robot.opening_m if self.world.gripper == "free" else 0.0
 
     def _here(self) -> Kinematics:
         """Where the arm is now; reading it and solving for the next set-point both ask."""
@@ -183,20 +167,6 @@ class MujocoRobot:
         return joints
 
 
-class ExactPoses:
-    """Sees the object of a simulator as it is, at every moment."""
-
-    def __init__(self, robot: MujocoRobot) -> None:
-        self._robot = robot
-
-    def read(self) -> ObjectPose:
-        """The object's pose now."""
-        return ObjectPose(self._robot.now_s(), self._robot.object_position())
-
-    def close(self) -> None:
-        """Nothing is left behind."""
-
-
 def connect(world: WorldConfig, parameters: Mapping[str, Any]) -> Backend:
     """Make the back-end ``mujoco``.
 
@@ -207,11 +177,8 @@ def connect(world: WorldConfig, parameters: Mapping[str, Any]) -> Backend:
         raise TandemError("robot mujoco: the box is elsewhere in every episode, and nothing tells a bridge where")
     if world.obstacles:  # starts would be drawn into them
         raise TandemError("robot mujoco: obstacles are elsewhere in every episode, and nothing tells a bridge where")
-    try:
-        given = MujocoParameters.model_validate(dict(parameters))
-    except ValidationError as error:
-        raise TandemError(f"robot mujoco: parameters: {first_error(error)}") from None
+    given = MujocoParameters.model_validate(parameters)
     if given.object_size_m is not None and not isinstance(world.object, str):
         raise TandemError("robot mujoco: parameters: object_size_m is of a cube or sphere; this object has its own")
     robot = MujocoRobot(world, given)
-    return Backend(robot, robot.poses, robot)
+    return Backend(robot, ExactPoses(robot, robot), robot)

@@ -7,21 +7,20 @@ origin and axes; the point between the fingertips is 1.6 mm nearer to the hand t
 
 from __future__ import annotations
 
-import functools
 import math
 from collections.abc import Mapping, Sequence
 from typing import Any, Literal
 
 import numpy as np
-from pydantic import Field, ValidationError
+from pydantic import Field
 
-from service.base.errors import ConfigError, RobotError, TandemError
+from service.base.errors import ConfigError, RobotError
 from service.base.extras import needs_extra
 from service.base.types import StateArray
 from service.config.frozen import FrozenModel
 from service.config.world import WorldConfig
-from service.robot.backends import Backend, first_error
-from service.robot.interface import Command, ObjectPose, RobotState
+from service.robot.backends import Backend, ExactPoses
+from service.robot.interface import Command, RobotState
 
 CONTROL_STEP_S = 0.04
 """Time of one action of a policy, for which ``PyBulletParameters.response`` is given."""
@@ -41,7 +40,11 @@ _STROKE_M = 0.04
 _SURFACE_FRICTION, _FINGER_FRICTION, _FINGER_SPIN = 0.5, 1.0, 0.001
 _TABLE_SIZE_M, _TABLE_X_M = (1.1, 0.7, 0.4), -0.3
 _MAX_ITERATIONS, _RESIDUAL = 300, 1e-4  # less than 0.1 mm
-_EARLY_S = 1e-9
+_PHYSICS_STEP_S, _EARLY_S = 0.002, 1e-9
+_POSITION_GAIN = 0.1
+"""Share of its error that a joint's motor makes good in a physics step, as in panda-gym."""
+_MAX_FINGER_FORCE_N = 140.0
+"""Of each finger, whatever a command says; a Franka hand's greatest."""
 _STIFF_LAG_S = 0.007
 """Time constant of stiff motors; that of the servos of our own world, to whose lag it also comes second."""
 _STIFF_FORCE = 10.0
@@ -49,12 +52,8 @@ _STIFF_FORCE = 10.0
 
 
 class PyBulletParameters(FrozenModel):
-    """Parameters of the engine, the motors and the gripper. The defaults are panda-gym's, but for the gripper's."""
+    """Parameters of the motors and the cube. The defaults are panda-gym's."""
 
-    physics_step_s: float = Field(0.002, gt=0.0, le=0.01)
-    position_gain: float = Field(
-        0.1, gt=0.0, le=1.0, description="share of its error that a joint's motor makes good in a physics step"
-    )
     response: float | None = Field(
         None,
         gt=0.0,
@@ -62,19 +61,13 @@ class PyBulletParameters(FrozenModel):
         description="share of the way to a set-point that the arm has gone after 40 ms, by a first-order lag before "
         "motors that are stiff; None: the motors alone, as in panda-gym",
     )
-    max_finger_force_n: float = Field(
-        140.0, gt=0.0, le=200.0, description="of each finger, whatever a command says; a Franka hand's greatest is 140"
-    )
-    fingers_coupled: bool = Field(
-        True, description="by a gear, as a Franka hand's are by a belt; in panda-gym each moves alone, with 170 N"
-    )
     cube: Literal["panda-gym", "world"] = Field(
         "panda-gym", description="size, mass and friction: 4 cm, 1 kg, 0.25 on the table, or what the world says"
     )
 
 
 class PyBulletRobot:
-    """The arm as a ``RobotInterface``; ``poses`` sees the object. Several may live in one process.
+    """The arm as a ``RobotInterface`` and as a ``Simulator``. Several may live in one process.
 
     Args:
         world: where the arm starts, its object and fixture; a cube, no fixture or the wall.
@@ -87,7 +80,12 @@ class PyBulletRobot:
     def __init__(self, world: WorldConfig, parameters: PyBulletParameters | None = None) -> None:
         self.parameters = parameters or PyBulletParameters()
         self.world = world_of(world, self.parameters)
-        self._bullet = _start_engine()
+        with needs_extra("pybullet", "robot pybullet"):  # Python 3.11 has a wheel of it
+            import pybullet
+            import pybullet_data
+            from pybullet_utils.bullet_client import BulletClient
+        self._bullet = BulletClient(pybullet.DIRECT)
+        self._bullet.setAdditionalSearchPath(pybullet_data.getDataPath())
         self._build()
         self._set_joints(_NEUTRAL)
         self._home = self._solve(self._start_m())
@@ -95,12 +93,11 @@ class PyBulletRobot:
         self.num_touching_steps = 0
         """Physics steps in which the arm or its gripper touched the object, the table or a wall."""
         self._stopped = self._held = False
-        step_s, response = self.parameters.physics_step_s, self.parameters.response
-        self._follow = 1.0 if response is None else 1.0 - math.exp(-step_s / lag_s(response))
-        gain = self.parameters.position_gain if response is None else 1.0 - math.exp(-step_s / _STIFF_LAG_S)
-        self._gains = [gain] * len(_ARM)
-        self._forces = [(1.0 if response is None else _STIFF_FORCE) * force for force in _ARM_FORCES]
-        self.poses = ObjectTracker(self)
+        self._follow, gain, strength = 1.0, _POSITION_GAIN, 1.0
+        if self.parameters.response is not None:
+            self._follow = 1.0 - math.exp(-_PHYSICS_STEP_S / lag_s(self.parameters.response))
+            gain, strength = 1.0 - math.exp(-_PHYSICS_STEP_S / _STIFF_LAG_S), _STIFF_FORCE
+        self._gains, self._forces = [gain] * len(_ARM), [strength * force for force in _ARM_FORCES]
         self._fresh = self._bullet.saveState()
         self.reset(np.array([*self._start_m()[:2], self.world.rest_height_m]))
 
@@ -108,7 +105,7 @@ class PyBulletRobot:
 
     def now_s(self) -> float:
         """Read the engine's clock, which only ``wait_until`` moves."""
-        return self._num_steps * self.parameters.physics_step_s
+        return self._num_steps * _PHYSICS_STEP_S
 
     def read(self) -> RobotState:
         """Measure the arm as it is now."""
@@ -131,7 +128,7 @@ class PyBulletRobot:
             _FINGERS,
             self._bullet.POSITION_CONTROL,
             targetPositions=[width_m / 2] * 2,
-            forces=[min(command.grip_force_n, self.parameters.max_finger_force_n)] * 2,
+            forces=[min(command.grip_force_n, _MAX_FINGER_FORCE_N)] * 2,
         )
 
     def wait_until(self, time_s: float) -> None:
@@ -177,18 +174,21 @@ class PyBulletRobot:
 
     def _build(self) -> None:
         bullet, world = self._bullet, self.world
-        bullet.setTimeStep(self.parameters.physics_step_s)
+        bullet.setTimeStep(_PHYSICS_STEP_S)
         bullet.setGravity(0.0, 0.0, -9.81)
         self._robot = bullet.loadURDF("franka_panda/panda.urdf", basePosition=_BASE_M, useFixedBase=True)
-        finger_friction = _FINGER_FRICTION if self.parameters.cube == "panda-gym" else world.pad_friction
+        own, theirs = (
+            (world.friction, world.pad_friction, 1.0),
+            (_SURFACE_FRICTION, _FINGER_FRICTION, _SURFACE_FRICTION),
+        )
+        cube, pads, surface = theirs if self.parameters.cube == "panda-gym" else own
         for finger in _FINGERS:
-            bullet.changeDynamics(self._robot, finger, lateralFriction=finger_friction, spinningFriction=_FINGER_SPIN)
-        if self.parameters.fingers_coupled:
-            gear = bullet.createConstraint(
-                self._robot, _FINGERS[0], self._robot, _FINGERS[1], bullet.JOINT_GEAR, (1, 0, 0), (0, 0, 0), (0, 0, 0)
-            )
-            bullet.changeConstraint(gear, gearRatio=-1.0, erp=0.1, maxForce=self.parameters.max_finger_force_n)
-        surface = _SURFACE_FRICTION if self.parameters.cube == "panda-gym" else 1.0
+            bullet.changeDynamics(self._robot, finger, lateralFriction=pads, spinningFriction=_FINGER_SPIN)
+        # The fingers are coupled by a gear, as a Franka hand's are by a belt; in panda-gym each moves alone.
+        gear = bullet.createConstraint(
+            self._robot, _FINGERS[0], self._robot, _FINGERS[1], bullet.JOINT_GEAR, (1, 0, 0), (0, 0, 0), (0, 0, 0)
+        )
+        bullet.changeConstraint(gear, gearRatio=-1.0, erp=0.1, maxForce=_MAX_FINGER_FORCE_N)
         length, width, height = _TABLE_SIZE_M
         self._add_box((length / 2, width / 2, height / 2), (_TABLE_X_M, 0.0, -height / 2), surface)
         if world.fixture == "wall":
@@ -201,7 +201,7 @@ class PyBulletRobot:
         self._object = self._add_box(
             (edge, edge, edge),
             (0.0, 0.0, edge),
-            _SURFACE_FRICTION if self.parameters.cube == "panda-gym" else world.friction,
+            cube,
             mass_kg=world.object_mass_kg,
         )
 
@@ -218,9 +218,6 @@ class PyBulletRobot:
     def _start_m(self) -> tuple[float, float, float]:
         area = self.world.workspace
         return area.center_x_m, area.center_y_m, self.world.start_height_m
-
-    def _joints(self) -> list[float]:
-        return [state[0] for state in self._bullet.getJointStates(self._robot, _ARM)]
 
     def _link(self, link: int) -> tuple[StateArray, StateArray]:
         state = self._bullet.getLinkState(self._robot, link, computeForwardKinematics=True)
@@ -244,7 +241,7 @@ class PyBulletRobot:
         return list(solution[: len(_ARM)])
 
     def _hold(self) -> None:
-        self._target = np.array(self._joints())
+        self._target = np.array([state[0] for state in self._bullet.getJointStates(self._robot, _ARM)])
         self._set_point = self._target.copy()
         self._move_arm()
 
@@ -259,32 +256,14 @@ class PyBulletRobot:
         )
 
 
-class ObjectTracker:
-    """The object of a ``PyBulletRobot`` as a ``PoseSource``, without error."""
-
-    def __init__(self, robot: PyBulletRobot) -> None:
-        self._robot = robot
-
-    def read(self) -> ObjectPose:
-        """Return where the object is now."""
-        return ObjectPose(self._robot.now_s(), self._robot.object_position())
-
-    def close(self) -> None:
-        """Do nothing: the robot's engine is its own to end."""
-
-
 def connect(world: WorldConfig, parameters: Mapping[str, Any]) -> Backend:
     """Make the back-end ``pybullet``.
 
     Raises:
         TandemError: PyBullet is not installed, unknown parameters, or a world that it cannot show.
     """
-    try:
-        given = PyBulletParameters.model_validate(dict(parameters))
-    except ValidationError as error:
-        raise TandemError(f"robot pybullet: parameters: {first_error(error)}") from None
-    robot = PyBulletRobot(world, given)
-    return Backend(robot, robot.poses, robot)
+    robot = PyBulletRobot(world, PyBulletParameters.model_validate(parameters))
+    return Backend(robot, ExactPoses(robot, robot), robot)
 
 
 def lag_s(response: float) -> float:
@@ -317,23 +296,3 @@ def world_of(world: WorldConfig, parameters: PyBulletParameters) -> WorldConfig:
     if world.obstacles:
         raise ConfigError("world.obstacles: PyBullet has the object alone; play a policy that was trained without")
     return world
-
-
-class _Engine:
-    """One of PyBullet's engines: the functions of its module, each told which engine is meant."""
-
-    def __init__(self, pybullet: Any) -> None:
-        self._pybullet, self._id = pybullet, pybullet.connect(pybullet.DIRECT)
-
-    def __getattr__(self, name: str) -> Any:
-        value = getattr(self._pybullet, name)
-        return functools.partial(value, physicsClientId=self._id) if callable(value) else value
-
-
-def _start_engine() -> _Engine:
-    with needs_extra("pybullet", "robot pybullet"):  # Python 3.11 has a wheel of it
-        import pybullet
-        import pybullet_data
-    bullet = _Engine(pybullet)
-    bullet.setAdditionalSearchPath(pybullet_data.getDataPath())
-    return bullet

@@ -1,4 +1,4 @@
-"""Goals of a robot, one after another: where they are, and what came of them."""
+"""Goals of a robot, one after another: which policies play them, where they are, and what came of them."""
 
 from __future__ import annotations
 
@@ -12,8 +12,10 @@ from service.base.types import StateArray
 from service.config.world import WorldConfig
 from service.envs.obstacles import inside_fixtures
 from service.envs.sampling import draw_goals, draw_starts
+from service.methods.compose import check_robot
 from service.registry.loading import Trained
 from service.robot.backends import Backend
+from service.robot.limits import Box
 from service.robot.loop import Bridge
 
 _ROUNDING_M = 1e-6
@@ -27,6 +29,22 @@ class Outcome:
     distance_m: float
     """From the object to it at the last step; of a simulator in truth, else as it was seen."""
     reached: bool
+
+
+def for_robot(trained: Trained) -> Trained:
+    """The same in its nominal world, where it was trained in worlds that are drawn: a robot is one.
+
+    Raises:
+        TandemError: skills, a policy that composes nothing, or one of another robot.
+    """
+    trained.expect("primitives", "orchestrator", by="tandem robot")
+    if trained.kind == "orchestrator" and trained.trained is None:
+        raise TandemError(f"{trained.label} acts without primitives; a bridge plays what composes them")
+    check_robot(trained.trained or trained)
+    found = trained.nominal
+    if found.world.num_observed_obstacles:
+        raise TandemError(f"{found.label} observes obstacles, and the bridge measures the object alone; train without")
+    return found
 
 
 def parse_goal(text: str, world: WorldConfig) -> StateArray:
@@ -43,9 +61,9 @@ def parse_goal(text: str, world: WorldConfig) -> StateArray:
         raise TandemError(f"--goal {text!r}: expected x,y,z in metres, such as -0.05,0.1,0.2")
     lower, upper = np.array(world.workspace.lower_m), np.array(world.workspace.upper_m)
     lower[2] = world.rest_height_m
-    if ((goal < lower - _ROUNDING_M) | (goal > upper + _ROUNDING_M)).any():
-        box = ", ".join(f"{axis} {low:g} to {high:g}" for axis, low, high in zip("xyz", lower, upper, strict=True))
-        raise TandemError(f"--goal {text}: outside the box that the policy was trained in: {box} m")
+    box = Box(lower, upper)
+    if not box.contains(goal, margin_m=_ROUNDING_M):
+        raise TandemError(f"--goal {text}: outside the box that the policy was trained in: {box}")
     if inside_fixtures(goal[None], world)[0]:
         raise TandemError(f"--goal {text}: the object would be inside a fixture, or the upright box around it")
     return goal
@@ -61,7 +79,6 @@ def play(
     num_steps: int,
     seed: int,
     ready: Callable[[int, StateArray], None],
-    first: int = 0,
 ) -> Iterator[Outcome]:
     """Play goals; a simulator starts each with its object anywhere, as an evaluation does.
 
@@ -74,7 +91,6 @@ def play(
         num_steps: of each.
         seed: of starts and goals.
         ready: called with the episode's number and its goal, before anything moves: people put things back then.
-        first: number of the episode to begin with; starts and goals of the others stay what they are.
 
     Raises:
         RobotError: the robot was stopped.
@@ -82,32 +98,27 @@ def play(
     rng = np.random.default_rng(seed)
     starts, boxes = draw_starts(rng, num_episodes, policy.world)
     goals = draw_goals(policy.goals, rng, policy.world, policy.success_distance_m, start=starts, box=boxes)
-    for episode in range(first, num_episodes):
+    for episode in range(num_episodes):
         if backend.simulator is not None:
             backend.begin(starts[episode])
         elif goal_m is None and policy.world.fixture != "none":
-            goals[episode] = _goal_for(_seen(backend), rng, policy)
+            goals[episode] = _goal_from(backend, rng, policy)
         goal = goals[episode] if goal_m is None else goal_m
         ready(episode, goal)
-        distance_m = bridge.run(goal, num_steps).distance_m
+        distance_m = bridge.run(goal, num_steps)
         if backend.simulator is not None:
             distance_m = float(np.linalg.norm(backend.simulator.object_position() - goal))
         yield Outcome(goal, distance_m, distance_m <= policy.success_distance_m)
 
 
-def _seen(backend: Backend) -> StateArray:
-    position = backend.poses.read().position_m
-    if not np.isfinite(position).all():
+def _goal_from(backend: Backend, rng: np.random.Generator, policy: Trained) -> StateArray:
+    """(3,) a goal for the object where it lies; behind a wall it depends on that."""
+    object_m = backend.poses.read().position_m
+    if not np.isfinite(object_m).all():
         raise RobotError("the object is not seen: put it on the table in view of what sees it")
-    return position
-
-
-def _goal_for(object_m: StateArray, rng: np.random.Generator, policy: Trained) -> StateArray:
-    """(3,) a goal for an object that lies somewhere; behind a wall it depends on that."""
     if policy.world.fixture == "box":
         raise RobotError(f"{policy.label} brings the object into a box, and nothing tells a bridge where it is: --goal")
-    start = object_m[None]
     goal: StateArray = draw_goals(
-        policy.goals, rng, policy.world, policy.success_distance_m, start=start, box=np.empty((1, 0))
+        policy.goals, rng, policy.world, policy.success_distance_m, start=object_m[None], box=np.empty((1, 0))
     )[0]
     return goal

@@ -5,10 +5,9 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import Self
 
 import numpy as np
-from pydantic import Field, model_validator
+from pydantic import Field
 
 from service.base.errors import ConfigError, RobotError, SafetyStopError
 from service.base.types import StateArray
@@ -44,12 +43,6 @@ class SafetyConfig(FrozenModel):
     )
     max_late_s: float = Field(0.03, gt=0.0, le=0.05, description="a control step or set-point later than this")
     watch: WatchConfig = WatchConfig()
-
-    @model_validator(mode="after")
-    def _ordered(self) -> Self:
-        if self.min_width_m > self.max_width_m:
-            raise ValueError(f"min_width_m {self.min_width_m:g} is above max_width_m {self.max_width_m:g}")
-        return self
 
     def box(self, workspace: WorkspaceConfig) -> Box:
         """The box of set-points of a policy with a workspace.
@@ -105,23 +98,23 @@ class SafeRobot:
 
     # --- measuring ---------------------------------------------------------------------------------------------------
 
-    def start(self, tick_s: float = 0.0) -> None:
+    def start(self, tick_s: float) -> None:
         """Begin where the robot is, at rest; all watchdogs begin anew.
 
         Args:
-            tick_s: time between two set-points; 0 for not known.
+            tick_s: time between two set-points.
 
         Raises:
             RobotError: it does not answer or answers too late, is outside its box (but for a dry run, which shows
                 where it is), the switch is not held, or the object is not seen.
         """
-        self._state_watch, self._pose_watch = StateWatch(self.config.watch), PoseWatch(self.config.watch)
+        self._state_watch, self.object = StateWatch(self.config.watch), PoseWatch(self.config.watch)
         self.limiter.position_m = np.full(3, np.nan)  # nothing was commanded that the robot could be away from
         begin_s = self._robot.now_s()
         for _ in range(_NUM_TRIED):
             self.measure(self._robot.now_s())
         took_s = (self._robot.now_s() - begin_s) / _NUM_TRIED
-        if 0.0 < tick_s < took_s:
+        if took_s > tick_s:
             self._fail(
                 f"it answers late: reading takes {1e3 * took_s:.1f} ms, and a set-point is due every "
                 f"{1e3 * tick_s:.1f} ms: lower set_points_per_step"
@@ -134,7 +127,7 @@ class SafeRobot:
         self._moved_s = self._expected_s - tick_s
 
     def measure(self, due_s: float) -> None:
-        """Read robot and object into ``state`` and ``object_m``, and check them and the time.
+        """Read robot and object into ``state`` and ``object``, and check them and the time.
 
         Args:
             due_s: when this should have happened.
@@ -151,16 +144,6 @@ class SafeRobot:
         if fault is not None:
             self._fail(fault)
 
-    @property
-    def object_m(self) -> StateArray:
-        """(3,) where the object was seen last, metres; NaN where nothing sees it."""
-        return self._pose_watch.position_m
-
-    @property
-    def object_time_s(self) -> float:
-        """When that was."""
-        return self._pose_watch.time_s
-
     def _fault(self, now_s: float, due_s: float) -> str | None:
         """What is wrong, if anything."""
         if now_s - due_s > self.config.max_late_s:
@@ -176,7 +159,7 @@ class SafeRobot:
         fault = self._state_watch.check(self.state, now_s)
         if fault is None and self._poses is not None:
             # A source of the user's own may return nothing once it sees nothing.
-            fault = "no pose was read: return one of NaN" if pose is None else self._pose_watch.check(pose, now_s)
+            fault = "no pose was read: return one of NaN" if pose is None else self.object.check(pose, now_s)
         if fault is not None:
             return fault
         away_m = float(np.linalg.norm(self.state.effector_m - self.limiter.position_m))
@@ -248,10 +231,6 @@ class SafeRobot:
         if not self._dry_run:
             self._robot.stop()
 
-    def release(self) -> None:
-        """Let a robot that was stopped be commanded again, once a person has seen to what was wrong."""
-        self.stopped = None
-
     @contextmanager
     def guarded(self) -> Iterator[None]:
         """Stop the robot if the block ends by an error or a signal, or if it hangs: another thread looks after it."""
@@ -262,7 +241,7 @@ class SafeRobot:
         try:
             yield
         except BaseException as error:
-            self.stop(self.stopped or f"{type(error).__name__}: {error}")
+            self.stop(f"{type(error).__name__}: {error}")
             raise
         finally:
             ended.set()

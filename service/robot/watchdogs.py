@@ -1,10 +1,21 @@
-"""Watchdogs over what is measured: late, frozen, jumping and missing measurements of a robot and of its object."""
+"""What watches a robot: over its measurements, late, frozen, jumping and missing ones, and a person with a key.
+
+The key is a dead-man's switch: one of the terminal that has to be held down.
+"""
 
 from __future__ import annotations
+
+import os
+import select
+import termios
+import time
+import tty
+from typing import Self
 
 import numpy as np
 from pydantic import Field
 
+from service.base.errors import TandemError
 from service.base.types import StateArray
 from service.config.frozen import FrozenModel
 from service.robot.interface import ObjectPose, RobotState
@@ -12,6 +23,11 @@ from service.robot.interface import ObjectPose, RobotState
 _CLOCKS_AGREE_S = 0.02
 _ROUNDING_S = 1e-6
 """Of times that are differences: what is 80 ms late has, at first, kept its time stamp for 80 ms."""
+
+_RELEASED_S = 0.1
+"""A key that is held repeats some 30 times a second; without one for so long it was let go."""
+_HELD_S = 1.0
+"""A key must be held so long before anything moves: terminals wait half a second before they repeat one."""
 
 
 class WatchConfig(FrozenModel):
@@ -102,3 +118,47 @@ class PoseWatch:
                 return
         self._jumping_since_s = None
         self.position_m, self.time_s = np.array(pose.position_m, dtype=np.float64), pose.time_s
+
+
+class HeldKey:
+    """True while any key of a terminal is held down.
+
+    Args:
+        descriptor: of the terminal; standard input by default.
+
+    Raises:
+        TandemError: it is no terminal.
+    """
+
+    def __init__(self, descriptor: int = 0) -> None:
+        self._descriptor = descriptor
+        if not os.isatty(descriptor):
+            raise TandemError(
+                "the dead-man's switch is a key, and standard input is no terminal: run in one, or give "
+                "--dead-man none if your robot has a switch of its own"
+            )
+        self._pressed_s = -float("inf")
+
+    def __enter__(self) -> Self:
+        self._settings = termios.tcgetattr(self._descriptor)
+        tty.setcbreak(self._descriptor)
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        termios.tcsetattr(self._descriptor, termios.TCSAFLUSH, self._settings)
+
+    def __call__(self) -> bool:
+        """Whether a key is held now."""
+        while select.select([self._descriptor], [], [], 0.0)[0]:
+            if not os.read(self._descriptor, 1024):
+                return False
+            self._pressed_s = time.monotonic()
+        return time.monotonic() - self._pressed_s <= _RELEASED_S
+
+    def wait(self) -> None:
+        """Return once a key has been held for a second."""
+        since_s = time.monotonic()
+        while time.monotonic() - since_s < _HELD_S:
+            time.sleep(0.02)
+            if not self():
+                since_s = time.monotonic()

@@ -7,7 +7,7 @@ from service.actors.evaluation import IdlePolicy
 from service.config import RunConfig
 from service.config.world import ObservedConfig
 from service.envs.observations import ACTION, layouts
-from service.export.measurements import LateObservations, Measured, measure, measure_response
+from service.export.measurements import measure, measure_response, tolerated_late_steps
 from service.registry.loading import Trained
 from tests.export.policies import CONFIG, SEEN, WORLD
 
@@ -46,14 +46,14 @@ def test_late_positions_and_the_speed_of_the_tip():
         np.testing.assert_array_equal(late[:, :, commands], on_time[:, :, commands])
         np.testing.assert_array_equal(late[steps:][:, :, places], on_time[:-steps][:, :, places])
         np.testing.assert_array_equal(late[0], on_time[0])
-    motion = measured.motion
+    motion = measured["motion"]
     velocity = np.diff(observations[:, :, :3].astype(float), axis=0) / 0.04
     speed = np.linalg.norm(velocity, axis=2)
-    assert motion.tip_speed_m_s.max == pytest.approx(speed.max(), rel=1e-3)
-    assert motion.tip_speed_m_s.median == pytest.approx(np.median(speed), rel=1e-3)
+    assert motion["tip_speed_m_s"]["max"] == pytest.approx(speed.max(), rel=1e-3)
+    assert motion["tip_speed_m_s"]["median"] == pytest.approx(np.median(speed), rel=1e-3)
     acceleration = np.linalg.norm(np.diff(velocity, axis=0), axis=2) / 0.04
-    assert motion.tip_acceleration_m_s2.max == pytest.approx(acceleration.max(), rel=1e-3)
-    assert motion.num_episodes == 3
+    assert motion["tip_acceleration_m_s2"]["max"] == pytest.approx(acceleration.max(), rel=1e-3)
+    assert motion["num_episodes"] == 3
 
 
 def test_a_policy_that_observes_its_delay_is_told_it():
@@ -65,30 +65,32 @@ def test_a_policy_that_observes_its_delay_is_told_it():
 
 def test_who_stands_still():
     measured, _ = measure(trained(IdlePolicy()), 3)
-    assert measured.motion.tip_speed_m_s.max < 0.01
-    assert measured.motion.outside_workspace == 0.0
-    assert measured.tolerated_late_steps == 2
+    assert measured["motion"]["tip_speed_m_s"]["max"] < 0.01
+    assert measured["motion"]["outside_workspace"] == 0.0
+    assert tolerated_late_steps(measured) == 2
 
 
 @pytest.mark.parametrize(("rates", "tolerated"), [((0.9, 0.85, 0.5), 1), ((0.9, 0.5, 0.9), 0), ((0.9, 0.8, 0.8), 2)])
 def test_tolerated_delay(rates, tolerated):
-    late = tuple(
-        LateObservations(steps=steps, success_last=rate, success_last_low=0.0, success_last_high=1.0)
-        for steps, rate in enumerate(rates)
-    )
-    assert Measured.model_construct(late_observations=late).tolerated_late_steps == tolerated
+    assert tolerated_late_steps({"late_observations": [{"success_last": rate} for rate in rates]}) == tolerated
 
 
 def test_the_arm_covers_a_part_of_a_full_action():
     """56 to 61 % in motion, less from rest; the gripper nearly all of its way."""
-    response, widths = measure_response(WORLD)
-    assert [(each.axis, each.direction) for each in response] == [
+    measured = measure_response(WORLD)
+    assert [(each["axis"], each["direction"]) for each in measured["response"]] == [
         (axis, direction) for axis in "xyz" for direction in (1, -1)
     ]
-    for each in response:
-        assert 0.56 < each.moving_mean < 0.62
-        assert each.from_rest_mean < each.moving_mean
-        assert 0.0 < each.moving_std < 0.03
-    for each in widths:
-        assert each.asked_m == 0.08
-        assert 0.06 < each.covered_m < 0.08
+    for each in measured["response"]:
+        assert 0.56 < each["moving_mean"] < 0.62
+        assert each["from_rest_mean"] < each["moving_mean"]
+        assert 0.0 < each["moving_std"] < 0.03
+    assert [each["direction"] for each in measured["width_response"]] == [1, -1]
+    for each in measured["width_response"]:
+        assert each["asked_m"] == 0.08
+        assert 0.06 < each["covered_m"] < 0.08
+
+
+def test_a_gripper_that_is_held_closed_covers_nothing():
+    widths = measure_response(WORLD.model_copy(update={"gripper": "blocked"}))["width_response"]
+    assert [each["asked_m"] for each in widths] == [0.0, 0.0]

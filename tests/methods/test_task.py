@@ -23,7 +23,7 @@ from service.registry.bundled import BUNDLED
 from service.registry.publishing import publish
 from service.registry.registry import Registry
 from service.registry.verification import network_problems
-from service.robot.policies import for_robot
+from service.robot.running import for_robot
 from service.runs.resuming import resumed_config
 from service.runs.train import train
 from service.store.disk import read_status

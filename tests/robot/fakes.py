@@ -67,21 +67,19 @@ class FakePoses:
         self.robot, self.position_m = robot, OBJECT_M.copy()
 
     def read(self):
-        robot = self.robot
-        since_s = robot.time_s - robot.fault_s
-        if robot.has("frozen pose"):
-            return ObjectPose(robot.fault_s, self.position_m)
-        if robot.has("ageing pose"):
-            return ObjectPose(robot.fault_s + 0.1 * since_s, self.position_m)
-        if robot.has("unseen"):
-            return ObjectPose(robot.time_s, np.full(3, np.nan))
-        if robot.has("jumping pose"):
-            return ObjectPose(robot.time_s, self.position_m + np.array([0.0, 0.3, 0.0]))
-        if robot.has("no pose"):
-            return None
-        if robot.has("early pose"):
-            return ObjectPose(robot.time_s + 5.0, self.position_m)
-        return ObjectPose(robot.time_s, self.position_m)
+        robot, place = self.robot, self.position_m
+        now_s, fault_s = robot.time_s, robot.fault_s
+        if now_s < fault_s:
+            return ObjectPose(now_s, place)
+        wrong = {
+            "frozen pose": ObjectPose(fault_s, place),
+            "ageing pose": ObjectPose(fault_s + 0.1 * (now_s - fault_s), place),
+            "unseen": ObjectPose(now_s, np.full(3, np.nan)),
+            "jumping pose": ObjectPose(now_s, place + np.array([0.0, 0.3, 0.0])),
+            "early pose": ObjectPose(now_s + 5.0, place),
+            "no pose": None,
+        }
+        return wrong.get(robot.fault, ObjectPose(now_s, place))
 
     def close(self):
         pass

@@ -1,6 +1,5 @@
-"""The back-end of a Franka: against a fake of ``franky``, against its signatures, and against its simulator."""
+"""The back-end of a Franka: against a fake of ``franky``, and against the library in its simulator."""
 
-import inspect
 import sys
 import time
 from types import SimpleNamespace
@@ -11,12 +10,14 @@ import pytest
 from service.base.errors import RobotError, TandemError
 from service.config.world import WorldConfig
 from service.envs import panda
+from service.robot import franka_robot
 from service.robot.backends import BackendConfig, connect
-from service.robot.franka_robot import FrankaParameters, FrankaRobot, _Hand
+from service.robot.franka_robot import FrankaParameters, FrankaRobot, Hand
 from service.robot.interface import Command, ObjectPose
 
 PARAMETERS = FrankaParameters(host="robot.local")
 TIP_IN_BASE = np.array([0.55, 0.02, 0.10])
+MINE = WorldConfig.model_construct(robot=panda.PANDA.model_copy(update={"name": "my-arm"}))
 
 
 class Affine:
@@ -40,7 +41,7 @@ class Future:
 class Gripper:
     """Records what it is told; a motion ends when the test says so."""
 
-    def __init__(self, host="robot.local"):
+    def __init__(self):
         self.width, self.max_width, self.is_grasped, self.told, self.ends = 0.08, 0.08, False, [], True
 
     @property
@@ -63,11 +64,11 @@ class Gripper:
 class Franky:
     """As much of ``franky`` as the back-end uses."""
 
-    Affine, Gripper = Affine, Gripper
+    Affine = Affine
     RealtimeConfig = SimpleNamespace(Enforce="enforce", Ignore="ignore")
 
     def __init__(self, down=True):
-        self.targets, self.motions = [], []
+        self.targets, self.motions, self.gripper = [], [], Gripper()
         pose = Affine(TIP_IN_BASE, [1.0, 0.0, 0.0, 0.0] if down else [0.7071, 0.0, 0.0, 0.7071])
         self.robot = SimpleNamespace(
             has_errors=False,
@@ -81,6 +82,9 @@ class Franky:
     def Robot(self, host, realtime_config):  # noqa: N802
         self.host, self.realtime = host, realtime_config
         return self.robot
+
+    def Gripper(self, host):  # noqa: N802
+        return self.gripper
 
     def CartesianImpedanceTracker(self, robot, **given):  # noqa: N802
         assert robot is self.robot
@@ -103,6 +107,13 @@ def robot(franky):
     made.close()
 
 
+def until(condition):
+    end_s = time.monotonic() + 5.0
+    while not condition():
+        assert time.monotonic() < end_s
+        time.sleep(0.005)
+
+
 def test_what_it_says_is_in_the_frame_of_the_primitives(robot, franky):
     state = robot.read()
     np.testing.assert_allclose(state.effector_m, TIP_IN_BASE - [0.6, 0.0, 0.0])
@@ -122,85 +133,88 @@ def test_set_points_go_out_in_the_frame_of_the_arm_and_begin_its_control(robot, 
 
 
 def test_stop_ends_the_control_once_and_for_all(robot, franky):
-    robot.command(Command(np.zeros(3), 0.08))
+    franky.gripper.ends = False
+    robot.command(Command(np.zeros(3), 0.0))
+    until(lambda: franky.gripper.told)
     robot.stop()
-    robot._hand.go_to(0.0, 20.0)  # a command of the other thread, which was under way
     robot.stop()
-    assert robot._hand._wanted is None
+    until(lambda: franky.gripper.told[-1] == ("stop",))
     assert franky.motions == ["stop motion"]
     with pytest.raises(RobotError, match=r"franka at robot\.local: it was stopped"):
         robot.command(Command(np.zeros(3), 0.08))
 
 
-def test_a_reflex_shows_as_no_longer_connected(robot, franky):
+def test_a_reflex_shows_as_no_longer_connected_and_an_error_as_one_line(robot, franky):
     robot.command(Command(np.zeros(3), 0.08))
     franky.tracker.is_running = False
     assert not robot.read().connected
     franky.tracker.is_running, franky.robot.has_errors = True, True
     assert not robot.read().connected
-
-
-def test_errors_of_the_library_are_one_line(robot, franky):
     del franky.robot.current_pose
     with pytest.raises(RobotError, match=r"^robot franka at robot\.local: read: AttributeError: [^\n]*$"):
         robot.read()
 
 
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [({"has_errors": True}, "unlock it again"), ({}, "1.6 rad off pointing down: guide it there")],
-)
-def test_a_robot_that_is_not_ready_is_refused_before_anything_moves(change, message):
-    franky = Franky(down=not message.startswith("1.6"))
-    vars(franky.robot).update(change)
+@pytest.mark.parametrize(("errors", "down", "message"), [(True, True, "unlock"), (False, False, "1.6 rad off")])
+def test_a_robot_that_is_not_ready_is_refused_before_anything_moves(errors, down, message):
+    franky = Franky(down)
+    franky.robot.has_errors = errors
     with pytest.raises(RobotError, match=message):
         FrankaRobot(franky, PARAMETERS)
     assert not franky.motions
 
 
 @pytest.fixture
-def hand():
-    made = _Hand(Gripper(), PARAMETERS)
+def gripper():
+    return Gripper()
+
+
+@pytest.fixture
+def hand(gripper):
+    made = Hand(gripper, PARAMETERS)
     made.close()  # the test itself does what the thread does
     return made
 
 
-def test_the_hand_grasps_to_close_moves_to_open_and_keeps_what_it_holds(hand):
-    told, gripper = hand._gripper.told, hand._gripper
+def test_the_hand_grasps_to_close_moves_to_open_and_keeps_what_it_holds(hand, gripper):
     for width in (0.079, 0.05, 0.049):  # the first and the last are no change worth a motion
         hand.go_to(width, 20.0)
         hand.advance()
-    assert told == [("grasp", 0.05, 20.0)]
+    assert gripper.told == [("grasp", 0.05, 20.0)]
     gripper.width, gripper.is_grasped = 0.05, True
     hand.go_to(0.0, 20.0)
     hand.advance()
-    assert len(told) == 1
+    assert len(gripper.told) == 1
     assert hand.width_m == 0.05
     hand.go_to(0.07, 20.0)
     hand.advance()
-    assert told[-1] == ("move", 0.07)
+    assert gripper.told[-1] == ("move", 0.07)
 
 
-def test_the_hand_ends_a_motion_before_the_next_and_when_it_is_halted(hand):
-    told, hand._gripper.ends = hand._gripper.told, False
+def test_the_hand_ends_a_motion_before_the_next_and_when_it_is_halted(hand, gripper):
+    gripper.ends = False
     for width in (0.0, 0.08):
         hand.go_to(width, 20.0)
         hand.advance()
-    assert told == [("grasp", 0.0, 20.0), ("stop",), ("move", 0.08)]
+    assert gripper.told == [("grasp", 0.0, 20.0), ("stop",), ("move", 0.08)]
     hand.halt()
     hand.advance()
     hand.advance()
-    assert told[-1] == ("stop",)
-    assert len(told) == 4
+    assert gripper.told[3:] == [("stop",)]
 
 
-def test_a_hand_that_does_not_end_its_motion_stops_the_robot(robot, monkeypatch):
-    monkeypatch.setattr("service.robot.franka_robot._MOST_MOTION_S", 0.0)
-    robot._hand._gripper.ends = False
+def test_a_hand_that_does_not_end_its_motion_stops_the_robot(robot, franky, monkeypatch):
+    monkeypatch.setattr(franka_robot, "_MOST_MOTION_S", 0.0)
+    franky.gripper.ends = False
     robot.command(Command(np.zeros(3), 0.0))
-    robot._hand._thread.join(5.0)
-    with pytest.raises(RobotError, match=r"hand: TimeoutError: a motion has not ended"):
-        robot.read()
+
+    def fails():
+        try:
+            robot.read()
+        except RobotError as error:
+            return "hand: TimeoutError: a motion has not ended" in str(error)
+
+    until(fails)
 
 
 class Camera:
@@ -214,69 +228,37 @@ class Camera:
         pass
 
 
+def connected(world=None, **parameters):
+    return connect(BackendConfig(backend="franka", parameters=parameters), world or WorldConfig())
+
+
 def test_what_sees_the_object_is_named_by_the_user(monkeypatch, franky):
     monkeypatch.setitem(sys.modules, "franky", franky)
     monkeypatch.setitem(sys.modules, "lab", SimpleNamespace(Camera=Camera))
-    given = {"host": "robot.local", "poses": "lab:Camera", "pose_parameters": {"place": [0.1, 0.2, 0.3]}}
-    backend = connect(BackendConfig(backend="franka", parameters=given), WorldConfig())
+    backend = connected(host="a", poses="lab:Camera", pose_parameters={"place": [0.1, 0.2, 0.3]})
     np.testing.assert_array_equal(backend.poses.read().position_m, [0.1, 0.2, 0.3])
     backend.close()
-    backend = connect(BackendConfig(backend="franka", parameters={"host": "robot.local"}), WorldConfig())
+    backend = connected(host="a")
     assert np.isnan(backend.poses.read().position_m).all()
     backend.close()
-    given["pose_parameters"] = {"lens": 1}
-    with pytest.raises(TandemError, match=r"poses = 'lab:Camera' cannot be made: .*unexpected keyword argument 'lens'"):
-        connect(BackendConfig(backend="franka", parameters=given), WorldConfig())
+    with pytest.raises(TandemError, match=r"poses = 'lab:Camera' cannot be made: .*'lens'"):
+        connected(host="a", poses="lab:Camera", pose_parameters={"lens": 1})
 
 
-def test_a_missing_library_or_address_is_told_in_one_line(monkeypatch):
-    monkeypatch.setitem(sys.modules, "franky", None)
-    for parameters, message in (
+@pytest.mark.parametrize(
+    ("parameters", "message"),
+    [
         ({}, "parameters: host"),
-        ({"host": "a"}, r"pip install 'tandem-skills\[franka\]'"),
         ({"host": "a", "ip": "b"}, "unknown key 'ip'"),
-    ):
-        with pytest.raises(TandemError, match=message) as caught:
-            connect(BackendConfig(backend="franka", parameters=parameters), WorldConfig())
-        assert "\n" not in str(caught.value)
-
-
-def test_a_policy_of_another_arm_is_refused():
-    other = WorldConfig.model_construct(robot=panda.PANDA.model_copy(update={"name": "my-arm"}))
-    with pytest.raises(TandemError, match="the policy was trained with the arm 'my-arm'"):
-        connect(BackendConfig(backend="franka", parameters={"host": "a"}), other)
-
-
-def test_the_library_has_what_is_called():
-    franky = pytest.importorskip("franky", reason="needs franky: pip install 'tandem-skills[franka]'")
-    target = franky.Affine(np.array([0.55, 0.1, 0.2]), np.array([1.0, 0.0, 0.0, 0.0]))
-    np.testing.assert_allclose(target.matrix[:3, :3], np.diag([1.0, -1.0, -1.0]), atol=1e-12)  # x y z w
-    np.testing.assert_allclose(np.array(target.translation).reshape(3), [0.55, 0.1, 0.2])
-    tracker = inspect.signature(franky.CartesianImpedanceTracker.__init__).parameters
-    assert {"robot", "translational_stiffness", "rotational_stiffness"} <= set(tracker)
-    assert hasattr(franky.CartesianImpedanceTracker, "is_running")
-    assert list(inspect.signature(franky.CartesianImpedanceTracker.set_target).parameters)[1] == "pose"
-    franky.TorqueStopMotion()
-    # Compiled functions say their arguments in the first line of their documentation.
-    for owner, name, words in (
-        (franky.Robot, "__init__", ("fci_hostname", "realtime_config")),
-        (franky.Robot, "move", ("asynchronous",)),
-        (franky.Robot, "join_motion", ("timeout",)),
-        (franky.Robot, "set_collision_behavior", ("torque_thresholds", "force_thresholds")),
-        (franky.Gripper, "move_async", ("width", "speed")),
-        (franky.Gripper, "grasp_async", ("width", "speed", "force", "epsilon_inner", "epsilon_outer")),
-        (franky.Gripper, "stop_async", ()),
-        (franky.BoolFuture, "wait", ("timeout",)),
-    ):
-        assert all(word in getattr(owner, name).__doc__ for word in words), name
-    for owner, names in (
-        (franky.Robot, ("has_errors", "current_pose")),
-        (franky.RobotPose, ("end_effector_pose",)),
-        (franky.Gripper, ("width", "max_width", "state")),
-        (franky.GripperState, ("width", "is_grasped")),
-        (franky.RealtimeConfig, ("Enforce", "Ignore")),
-    ):
-        assert all(hasattr(owner, name) for name in names), names
+        ({"host": "a"}, r"pip install 'tandem-skills\[franka\]'"),
+        ({"host": "a", "world": MINE}, "trained with the arm 'my-arm'"),
+    ],
+)
+def test_what_cannot_be_connected_is_told_in_one_line(parameters, message, monkeypatch):
+    monkeypatch.setitem(sys.modules, "franky", None)
+    with pytest.raises(TandemError, match=message) as caught:
+        connected(**parameters)
+    assert "\n" not in str(caught.value)
 
 
 def test_an_arm_in_the_librarys_simulator_goes_where_it_is_sent():

@@ -1,11 +1,9 @@
-from collections import deque
-
 import numpy as np
 
 from service.config import WorldConfig
-from service.envs.observations import Layouts, layouts
-from service.robot.interface import RobotState
-from service.robot.loop import Bridge, BridgeConfig, observe
+from service.envs.observations import layouts
+from service.robot.disturbed import DisturbanceConfig, DisturbedPoses
+from service.robot.loop import Bridge, BridgeConfig
 from tests.robot.fakes import HOME_M, OBJECT_M, FakeRobot, Steady
 
 GOAL_M = np.array([0.0, 0.1, 0.2])
@@ -49,19 +47,23 @@ def test_an_observation_has_the_layout_of_the_policys_world():
     np.testing.assert_allclose(third[bob["command_2"]], 0.01, atol=1e-6)
 
 
-def test_observations_come_as_many_steps_late_as_asked():
-    _, on_time, _, _ = played(BridgeConfig())
-    _, late, rows, bridge = played(BridgeConfig(observation_delay_steps=2))
-    np.testing.assert_allclose([row[:3] for row in late[2:]], [row["effector_m"] for row in rows[:3]], atol=1e-6)
-    assert (late[4] != on_time[4]).any()
+def test_where_the_object_is_seen_late_the_robot_is_shown_as_it_was_then():
     world = WorldConfig(observed={"num_commands": 2, "delay": True})
-    bob, (_, told, _, _) = layouts(world).bob, played(BridgeConfig(observation_delay_steps=2), world)
-    np.testing.assert_allclose(told[4][:3], rows[2]["effector_m"], atol=1e-6)
-    np.testing.assert_allclose(told[4][bob["command_1"]], 0.04, atol=1e-6)  # what it asked for is known at once
-    np.testing.assert_allclose(told[4][bob["command_2"]], 0.03, atol=1e-6)
-    assert told[4][bob["delay"]] == 2.0
+    bob = layouts(world).bob
+    robot, policy, rows = FakeRobot(), Counting(), []
+    poses = DisturbedPoses(robot.poses, robot.now_s, DisturbanceConfig(pose_delay_s=0.08))
+    bridge = Bridge(policy, robot, poses, world, BridgeConfig(), record=rows.append)
+    bridge.run(GOAL_M, 5)
+    seen = policy.seen
+    np.testing.assert_allclose([row[:3] for row in seen[2:]], [row["effector_m"] for row in rows[:3]], atol=1e-6)
+    assert (seen[4][:3] != rows[4]["effector_m"]).any()
+    np.testing.assert_allclose(seen[4][bob["command_1"]], 0.04, atol=1e-6)  # what it asked for is known at once
+    np.testing.assert_allclose(seen[4][bob["command_2"]], 0.03, atol=1e-6)
+    assert [row[bob["delay"]] for row in seen] == [[0.0], [1.0], [2.0], [2.0], [2.0]]
+    poses.forget()
     bridge.run(GOAL_M, 1)  # a new episode remembers nothing of the one before
-    np.testing.assert_allclose(bridge._policy.seen[0][:3], rows[5]["effector_m"], atol=1e-6)
+    np.testing.assert_allclose(policy.seen[0][:3], rows[5]["effector_m"], atol=1e-6)
+    np.testing.assert_allclose(policy.seen[0][bob["command_1"]], 0.0)
 
 
 def test_a_gripper_that_was_held_closed_in_training_stays_closed():
@@ -85,15 +87,3 @@ def test_it_comes_to_rest_however_slowly_it_may_brake():
     bridge.run(GOAL_M, 60)
     assert len(robot.commands) > 60 * 4 + 100  # braking took more than a second
     assert bridge.safe.limiter.is_still
-
-
-def test_a_policy_that_observes_its_delay_and_commands_is_told():
-    """Entries beyond the paper's: what the layout says, from what the bridge knows."""
-    layout = Layouts(num_commands=2, delay=True).positions
-    state = RobotState(0.0, np.array([0.1, 0.2, 0.3]), np.array([0.01, 0.02]))
-    commands = deque([np.array([0.1, 0.2, 0.3, 0.4]), np.array([-0.1, 0.0, 0.0, 1.0])])
-    row = observe(layout, state, np.array([0.0, 0.0, 0.03]), commands, np.array([0.1, 0.1, 0.1]), 2)[0]
-    np.testing.assert_allclose(row[layout["command_1"]], [0.1, 0.2, 0.3, 0.4], rtol=1e-6)
-    np.testing.assert_allclose(row[layout["command_2"]], [-0.1, 0.0, 0.0, 1.0], rtol=1e-6)
-    assert row[layout["delay"]] == 2.0
-    np.testing.assert_allclose(row[-3:], 0.1, rtol=1e-6)

@@ -45,18 +45,13 @@ class Game:
         config, on_task = players.config, players.task is not None
         rules = config.game if isinstance(config, SelfPlayConfig) else GameConfig()
         self.players, self.title, self.world = players, players.title, players.world
-        self.bob = players.policy
         acting = players.trained or players
         self.primitives = acting.policy if isinstance(acting.policy, NumpyMCPPolicy) else None
         """What sliders drive."""
         self.alice: StochasticPolicy | None = players.alice if rules.alice_plays else None
-        self.alice_steps = rules.alice_steps
-        self.num_goals = rules.num_goals
-        """Rounds of a game."""
-        self.bob_steps = EPISODE_STEPS if on_task else rules.bob_steps
-        """Of a goal, after which another one comes."""
-        self.hold_steps = EPISODE_STEPS // 4 if on_task else max(rules.bob_hold_steps, 1)
-        """At the goal, after which it counts as solved."""
+        self._alice_steps, self._num_rounds = rules.alice_steps, rules.num_goals
+        self._bob_steps = EPISODE_STEPS if on_task else rules.bob_steps
+        self._hold_steps = EPISODE_STEPS // 4 if on_task else max(rules.bob_hold_steps, 1)
         self._rng = np.random.default_rng(seed)
         self.worlds = WorldBatch(self.world, 1, num_threads=1)
         self.step_s = self.world.physics_step_s * self.world.num_substeps
@@ -93,25 +88,23 @@ class Game:
     @property
     def modes(self) -> tuple[Mode, ...]:
         """What these players can do."""
-        modes: list[Mode] = ["goals"]
-        modes += ["primitives"] if self.primitives is not None else []
-        return (*modes, "alice") if self.alice is not None else tuple(modes)
+        possible: dict[Mode, bool] = {
+            "goals": True,
+            "primitives": self.primitives is not None,
+            "alice": self.alice is not None,
+        }
+        return tuple(mode for mode in possible if possible[mode])
 
     @property
     def shows_goal(self) -> bool:
         """Whether there is a goal now."""
         return self.mode == "goals" or (self.mode == "alice" and self._turn == "bob")
 
-    @property
-    def distance_m(self) -> float:
-        """From the object to the goal, metres."""
-        return float(np.linalg.norm(self.worlds.object_position[0] - self.goal))
-
     def weights_now(self) -> FloatArray | None:
         """(K,) weights that act now: those that are set, or the gate's; None where neither is known."""
         if self.mode == "primitives":
             return self.weights
-        bob = self.bob
+        bob = self.players.policy
         if self._turn == "bob" and isinstance(bob, NumpyMCPPolicy):
             gate: FloatArray = bob.gate(bob_observation(self.worlds.positions(), self.goal[None]))[0]
             return gate
@@ -173,7 +166,7 @@ class Game:
             self._pause("the object fell off the table" if not diverged else "the physics diverged", "reset")
         elif self._turn == "alice":
             self.caption = f"Alice proposes: {self._seconds()}"
-            if self._steps >= self.alice_steps:
+            if self._steps >= self._alice_steps:
                 self._judge()
         elif self.mode == "primitives":
             self.caption = "Primitives by your weights"
@@ -184,19 +177,18 @@ class Game:
         worlds = self.worlds
         if self._turn == "alice":
             assert self.alice is not None
-            return self.alice.act(worlds.full(self._steps / max(self.alice_steps, 1)), self._rng)[0]
+            return self.alice.act(worlds.full(self._steps / self._alice_steps), self._rng)[0]
         if self.mode == "primitives":
             assert self.primitives is not None
             return self.primitives.compose(worlds.positions(), self.weights[None])[0]
-        return self.bob.act_deterministic(bob_observation(worlds.positions(), self.goal[None]))
+        return self.players.act_deterministic(bob_observation(worlds.positions(), self.goal[None]))
 
     def _follow_bob(self) -> None:
-        there = self.distance_m <= self.players.success_distance_m
+        distance_m = float(np.linalg.norm(self.worlds.object_position[0] - self.goal))
+        there = distance_m <= self.players.success_distance_m
         self._held = self._held + 1 if there else 0
-        self.caption = (
-            f"At the goal, {100 * self.distance_m:.1f} cm away" if there else f"On the way: {self._seconds()}"
-        )
-        solved, late = self._held >= self.hold_steps, self._steps >= self.bob_steps
+        self.caption = f"At the goal, {100 * distance_m:.1f} cm away" if there else f"On the way: {self._seconds()}"
+        solved, late = self._held >= self._hold_steps, self._steps >= self._bob_steps
         if self.mode == "alice":
             if solved or late:
                 self._pause(f"Bob: solved after {self._seconds()}" if solved else "Bob: not solved", "round")
@@ -227,7 +219,7 @@ class Game:
         if self._after == "bob":
             self.worlds.restore(self._start)
             self._begin_turn("bob")
-        elif self._after == "round" and self._round + 1 < self.num_goals:
+        elif self._after == "round" and self._round + 1 < self._num_rounds:
             self._round += 1
             self.worlds.restore(self._end_state)  # as games do: the next round starts where Alice ended
             self._begin_turn("alice")

@@ -8,7 +8,6 @@ from __future__ import annotations
 import contextlib
 import errno
 import logging
-import os
 import socket
 import time
 from collections.abc import Callable
@@ -20,8 +19,7 @@ from service.base.errors import TandemError
 from service.base.extras import needs_extra
 from service.registry.loading import Trained
 from service.robot.play.game import Game
-from service.robot.play.panel import Panel
-from service.robot.play.scene import LiveScene
+from service.robot.play.page import LiveScene, Panel
 
 PORT = 8322
 _NUM_PORTS = 50
@@ -45,8 +43,10 @@ class LiveWorld:
     """
 
     def __init__(self, players: Trained, host: str = "127.0.0.1", port: int | None = None, seed: int = 0) -> None:
-        viser = _import_viser()
-        self.port = _free_port(host, port)
+        with needs_extra("play", "tandem play"):
+            import mjviser  # noqa: F401
+            import viser
+        self.port = free_port(host, port)
         self.host = host
         self.game = Game(players, seed)
         self._server = _quiet_server(viser, host, self.port)
@@ -131,13 +131,6 @@ def _has_jumped(before: Any, after: Any, game: Game) -> bool:
     return bool(far_m > 0.15 or far_rad > 0.6)
 
 
-def _import_viser() -> Any:
-    with needs_extra("play", "tandem play"):
-        import mjviser  # noqa: F401
-        import viser
-    return viser
-
-
 def _quiet_server(viser: Any, host: str, port: int) -> Any:
     """Start a server that says nothing on the terminal and opens no tunnel to viser's own site."""
     import rich
@@ -153,7 +146,7 @@ def _quiet_server(viser: Any, host: str, port: int) -> Any:
     return server
 
 
-def _free_port(host: str, port: int | None) -> int:
+def free_port(host: str, port: int | None) -> int:
     """A port that can be listened on: the one that is asked for, or the first free one from the usual one on.
 
     ``viser`` itself would silently take another one, and wait for ever where a host is not here.
@@ -162,11 +155,9 @@ def _free_port(host: str, port: int | None) -> int:
         try:
             with contextlib.closing(socket.create_server((host, candidate), reuse_port=False)) as found:
                 return int(found.getsockname()[1])
-        except (OSError, UnicodeError, TypeError) as error:  # the last two: a host that is no text
-            number = error.errno if isinstance(error, OSError) else None
-            if number == errno.EADDRINUSE and port is None:
+        except OSError as error:
+            if port is None and error.errno == errno.EADDRINUSE:
                 continue
-            advice = "take another --port, or leave it out" if number == errno.EADDRINUSE else "check --host"
-            reason = os.strerror(number) if number else str(error)
-            raise TandemError(f"cannot listen on {host}:{candidate}: {reason}; {advice}") from None
+            reason = f"cannot listen on {host}:{candidate}: {error.strerror}"
+            raise TandemError(f"{reason}; take another --port or leave it out, and check --host") from None
     raise TandemError(f"ports {PORT} to {PORT + _NUM_PORTS - 1} are all taken; name a free one with --port")

@@ -32,8 +32,9 @@ def test_bob_goes_where_the_goal_is_put_and_stays(game):
     for goal in ([0.1, 0.1, 0.2], [-0.1, -0.05, 0.1]):
         game.set_goal(np.array(goal))
         go(game, 75)
-        assert np.linalg.norm(game.worlds.object_position[0] - goal) < 0.05
-        assert game.caption.startswith("At the goal")
+        distance_m = np.linalg.norm(game.worlds.object_position[0] - goal)
+        assert distance_m < 0.05
+        assert game.caption == f"At the goal, {100 * distance_m:.1f} cm away"
     game.set_goal(np.array([9.0, 0.0, -1.0]))
     workspace = game.world.workspace
     assert game.goal.tolist() == [workspace.upper_m[0], 0.0, game.world.rest_height_m]

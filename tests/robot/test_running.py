@@ -1,12 +1,10 @@
-import dataclasses
-
 import numpy as np
 import pytest
 
 from service.base.errors import TandemError
 from service.registry.bundled import BUNDLED
 from service.registry.loading import load
-from service.robot.policies import for_robot
+from service.robot.running import for_robot
 from tests.export.policies import publish_bob, write_training
 from tests.methods.skill_sets import made
 
@@ -27,12 +25,5 @@ def test_what_is_no_policy_for_a_robot(champion, tmp_path):
     write_training(tmp_path / "alone", champion, "scratch-mcp-her")
     with pytest.raises(TandemError, match="acts without primitives"):
         for_robot(load(str(tmp_path / "alone"), BUNDLED))
-
-    class Narrow:
-        def act_deterministic(self, observation):
-            return observation @ np.zeros((12, 4), dtype=np.float32)
-
-    with pytest.raises(TandemError, match="does not take 14 numbers"):
-        for_robot(dataclasses.replace(champion, policy=Narrow()))
     with pytest.raises(TandemError, match="made@1 is a set of skills of lsd; tandem robot needs primitives"):
         for_robot(made())

@@ -3,15 +3,15 @@ import os
 import pytest
 
 from service.base.errors import TandemError
-from service.robot import dead_man
+from service.robot import watchdogs
 
 
 def test_a_key_counts_while_it_repeats(monkeypatch):
     clock = [100.0]
-    monkeypatch.setattr(dead_man.time, "monotonic", lambda: clock[0])
+    monkeypatch.setattr(watchdogs.time, "monotonic", lambda: clock[0])
     ours, theirs = os.openpty()
     try:
-        with dead_man.HeldKey(theirs) as held:
+        with watchdogs.HeldKey(theirs) as held:
             assert not held()
             for _ in range(5):
                 os.write(ours, b" ")
@@ -26,7 +26,7 @@ def test_a_key_counts_while_it_repeats(monkeypatch):
                 os.write(ours, next(steps))
                 clock[0] += 0.05
 
-            monkeypatch.setattr(dead_man.time, "sleep", press)
+            monkeypatch.setattr(watchdogs.time, "sleep", press)
             before_s = clock[0]
             held.wait()
             assert clock[0] - before_s >= 1.0
@@ -37,7 +37,7 @@ def test_a_key_counts_while_it_repeats(monkeypatch):
 
 def test_without_a_terminal_there_is_no_key():
     reading, writing = os.pipe()
-    with pytest.raises(TandemError, match="no terminal: run in one, or give --dead-man none"):
-        dead_man.HeldKey(reading)
+    with pytest.raises(TandemError, match="no terminal: run in one"):
+        watchdogs.HeldKey(reading)
     os.close(reading)
     os.close(writing)
