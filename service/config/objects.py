@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import math
-from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
 from pydantic import BeforeValidator, Discriminator, Field, Tag, ValidationError, model_validator
 
 from service.config.frozen import FrozenModel
-from service.config.mesh_files import LEAST_M, measure
-from service.config.model_files import absolute
+from service.config.model_files import LEAST_M, MeshConfig, Vector
 
 Shape = Literal["box", "sphere", "cylinder", "capsule", "ellipsoid", "mesh"]
 _NUM_SIZES: dict[Shape, tuple[int, str]] = {
@@ -23,25 +21,6 @@ _NUM_SIZES: dict[Shape, tuple[int, str]] = {
 }
 ROUND: frozenset[Shape] = frozenset({"sphere", "cylinder", "capsule", "ellipsoid", "mesh"})
 """Shapes that may roll."""
-Color = tuple[float, float, float]
-
-
-class MeshConfig(FrozenModel):
-    """A mesh of convex pieces, each in a file; what is read from them is kept, so that they need not be read again."""
-
-    pieces: tuple[str, ...] = Field(
-        min_length=1, description="STL or OBJ files, each of one convex piece; package:NAME/FILE for one in a package"
-    )
-    scale: float = Field(1.0, gt=0.0, description="metres in a unit of the files: 0.001 where they are in millimetres")
-    sha256: tuple[str, ...] = Field((), description="of each file, when it was read first")
-    center_m: tuple[float, float, float] = Field((0.0, 0.0, 0.0), description="middle of its extent, from its origin")
-    volume_m3: float = Field(0.0, ge=0.0)
-
-    @model_validator(mode="after")
-    def _was_read(self) -> Self:
-        if self.sha256 and (len(self.sha256) != len(self.pieces) or not self.volume_m3):
-            raise ValueError("sha256, center_m and volume_m3 are read from its files: leave them out")
-        return self
 
 
 class ObjectConfig(FrozenModel):
@@ -56,7 +35,7 @@ class ObjectConfig(FrozenModel):
         "diameter, whole length"
     )
     mesh: MeshConfig | None = Field(None, description="files of a mesh; size_m is read from them")
-    color: Color = Field((0.86, 0.13, 0.11), description="red, green, blue in pictures, 0 to 1")
+    color: Vector = Field((0.86, 0.13, 0.11), description="red, green, blue in pictures, 0 to 1")
 
     @model_validator(mode="after")
     def _fits_shape(self) -> Self:
@@ -72,7 +51,7 @@ class ObjectConfig(FrozenModel):
         return self
 
     @property
-    def extent_m(self) -> tuple[float, float, float]:
+    def extent_m(self) -> Vector:
         """Extent along x, y and z as it starts, metres."""
         first, *others = self.size_m
         if self.shape == "sphere":
@@ -90,16 +69,16 @@ class FixtureConfig(ObjectConfig):
     position_m: tuple[float, float] = Field(description="middle of its bottom, x and y")
     bottom_m: float = Field(0.0, ge=0.0, le=1.0, description="height of its bottom above the table: a shelf's")
     turn_rad: float = Field(0.0, description="about the vertical")
-    color: Color = (0.42, 0.47, 0.54)
+    color: Vector = (0.42, 0.47, 0.54)
 
     @property
-    def lower_m(self) -> tuple[float, float, float]:
+    def lower_m(self) -> Vector:
         """Corner with the least coordinates of the upright box around it, metres."""
         half_x, half_y = self._half_m
         return self.position_m[0] - half_x, self.position_m[1] - half_y, self.bottom_m
 
     @property
-    def upper_m(self) -> tuple[float, float, float]:
+    def upper_m(self) -> Vector:
         """Corner with the greatest coordinates, metres."""
         half_x, half_y = self._half_m
         return self.position_m[0] + half_x, self.position_m[1] + half_y, self.bottom_m + self.extent_m[2]
@@ -116,7 +95,7 @@ class ObstacleConfig(ObjectConfig):
 
     mass_kg: float = Field(0.1, gt=0.0, le=5.0)
     friction: float = Field(1.0, gt=0.0, le=3.0, description="sliding friction of it on the table and on other things")
-    color: Color = (0.90, 0.66, 0.20)
+    color: Vector = (0.90, 0.66, 0.20)
 
 
 def simple_object(name: Literal["cube", "sphere"], size_m: float) -> ObjectConfig:
@@ -135,10 +114,8 @@ def _read_mesh(value: Any) -> Any:
         return {"size_m": (LEAST_M,) * 3, **value}  # what is wrong with it is said with its place
     if mesh.sha256:
         return value
-    pieces = tuple(absolute(piece, Path()) for piece in mesh.pieces)
-    found = measure(pieces, mesh.scale)
-    read = {"pieces": pieces, "sha256": found.sha256, "center_m": found.center_m, "volume_m3": found.volume_m3}
-    return {**value, "mesh": mesh.model_copy(update=read), "size_m": found.extent_m}
+    read, extent_m = mesh.measured()
+    return {**value, "mesh": read, "size_m": extent_m}
 
 
 _NAMED, _DESCRIBED = "named", "described"

@@ -11,11 +11,10 @@ from service.base.errors import ConfigError, did_you_mean
 from service.base.parsing import MAX_YAML_CHARACTERS, ParseError, parse_yaml
 from service.base.regular_files import read_regular
 from service.config.frozen import FrozenModel, reason
-from service.config.model_files import absolute, digest_of
+from service.config.model_files import Vector, absolute, digest_of
 from service.config.recipes import robots
 from service.config.tree import check_numbers
 
-Vector = tuple[float, float, float]
 Quaternion = tuple[float, float, float, float]
 Numbers = float | tuple[float, ...]
 """One for all joints, or one each."""

@@ -14,11 +14,12 @@ from service.base.types import BoolArray, FloatArray, IntArray, StateArray
 from service.config import WorldConfig
 from service.envs.model_bank import ModelBank
 from service.envs.noise import KEYS, normal
-from service.envs.observations import ACTION, COMMAND_PREFIX, OBSTACLE_PREFIX, Layouts, ObservationLayout, layouts
-from service.envs.obstacles import SEEN_WITHIN_M, Places, draw_starts, gripper_boxes, obstacle_columns, obstacle_places
+from service.envs.observations import ACTION, COMMAND_PREFIX, Layouts, ObservationLayout, layouts
 from service.envs.reach import reach_of
 from service.envs.robot import Robot, described
+from service.envs.sampling import Places, draw_starts, gripper_boxes
 from service.envs.scene import FIXTURE_PREFIX, build_layout
+from service.envs.state_layout import OBSTACLE_PREFIX, obstacle_columns, obstacle_places
 
 DISPLACEMENT_M = 0.05
 """Way from the end effector to its set-point that a full action asks for (paper); in a step the arm covers a part of
@@ -27,6 +28,8 @@ WIDTH_CHANGE_M = 0.10
 """Change of the finger width that a full action asks for (paper)."""
 MAX_TURN_RAD = 0.5
 """Most a joint is asked to turn in one action; behind the base and near a straight arm the solution would ask for 2."""
+SEEN_WITHIN_M = 1.0
+"""An obstacle further from the origin along an axis, such as one on the floor, is seen at this bound."""
 MAX_SPEED = 1e3
 """A joint (rad/s) or object (m/s, rad/s) faster than this has diverged; the arm reaches 3, a falling object 30."""
 _TOUCHING_M = 1e-4
@@ -148,8 +151,8 @@ class WorldBatch:
         """(num, S) states in which games and episodes start.
 
         The arm is at home, the gripper open unless it is blocked, the object anywhere on the table inside the
-        workspace, and so are obstacles. Beside a wall or a box the object is where ``sampling.draw_starts`` says, and a
-        box is anywhere.
+        workspace, and so are obstacles. Beside a wall or a box the object is where ``sampling.draw_objects`` says, and
+        a box is anywhere.
         """
         states = np.tile(self._fresh_state, (num, 1))
         places = draw_starts(rng, num, self.bank.largest, self._gripper_at_start)

@@ -14,7 +14,7 @@ import mujoco
 import numpy as np
 
 from service.config.robot import EffectorConfig, FingerConfig, RobotConfig
-from service.envs.contacts import BODY_FRICTION, GRIPPER_BIT, grip
+from service.envs.objects import BODY_FRICTION, GRIPPER_BIT, grip
 
 JOINT_LOWER = np.array([-2.8973, -1.7628, -2.8973, -3.0718, -2.8973, -0.0175, -2.8973])
 JOINT_UPPER = np.array([2.8973, 1.7628, 2.8973, -0.0698, 2.8973, 3.7525, 2.8973])

@@ -15,8 +15,8 @@ from service.config import WorldConfig
 from service.config.model_files import model_file
 from service.config.robot import Numbers, PadConfig, RobotConfig
 from service.envs import panda
-from service.envs.contacts import BODY_FRICTION, GRIPPER_BIT, add_finger_sensors, grip
 from service.envs.kinematics import Chain
+from service.envs.objects import BODY_FRICTION, GRIPPER_BIT, add_finger_sensors, grip
 
 _PREFIX, _HAND_PREFIX = "robot/", "hand/"
 """Begin the names of all that comes from a file, so that none is that of something in the scene; a hand's has both."""
@@ -76,8 +76,6 @@ class Robot:
         self.num_joints, self.num_fingers = len(robot.joints), len(robot.fingers)
         self.opening_m = robot.opening_m
         """Between the fingertips where the gripper is open."""
-        self.lowest_m = robot.lowest_m
-        """Least height of a commanded end effector."""
         prefix = _prefix(robot)
         self.arm = Chain(
             model,

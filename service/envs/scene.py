@@ -15,11 +15,19 @@ import numpy as np
 
 from service.base.errors import ConfigError
 from service.config import WorldConfig
-from service.envs.contacts import GRIPPER_BIT, OBJECT_BIT, STIFF, TABLE_BIT
-from service.envs.objects import add_floor, add_object, add_obstacle, parts_of
-from service.envs.observations import ACTION, OBSTACLE_PREFIX
+from service.envs.objects import (
+    GRIPPER_BIT,
+    OBJECT_BIT,
+    STIFF,
+    TABLE_BIT,
+    add_floor,
+    add_object,
+    add_obstacle,
+    parts_of,
+)
+from service.envs.observations import ACTION
 from service.envs.robot import add_robot, described
-from service.envs.state_layout import StateLayout
+from service.envs.state_layout import OBSTACLE_PREFIX, StateLayout
 
 TABLE_CENTER_X_M = -0.3
 TABLE_HALF_SIZE_M = (0.55, 0.45, 0.2)

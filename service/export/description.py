@@ -12,7 +12,8 @@ from service.base.files import os_errors
 from service.base.parsing import ParseError, parse_json
 from service.base.regular_files import read_regular
 from service.config.frozen import FrozenModel
-from service.config.robot import EffectorConfig, Vector
+from service.config.model_files import Vector
+from service.config.robot import EffectorConfig
 from service.export.measurements import Measured
 
 FILE = "policy.json"

@@ -10,8 +10,7 @@ from service.base.types import Array, BoolArray, IntArray, StateArray
 from service.config import WorldConfig
 from service.config.self_play import SelfPlayConfig
 from service.config.world import Point
-from service.envs.obstacles import obstacle_columns
-from service.envs.state_layout import StateLayout
+from service.envs.state_layout import StateLayout, obstacle_columns
 
 AIR_ABOVE_REST_M = 0.05
 """A goal is in the air when the object's centre is higher than it rests on the table by more than this."""

@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from itertools import combinations, cycle, product
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -122,33 +122,47 @@ _DISTILLATION_CURVES = (
     _Curve("gate", "learner/gate_error", "error", BLUE),
     _Curve("rate", "learner/learning_rate", "rate", BLUE),
 )
+
+_TASK_PANELS = {
+    "success": _Panel("The task", "last: there at the last step", "solved"),
+    "return": _Panel("Return of an episode", "grows, with noise", "steps at the goal"),
+    "entropy": _Panel("Entropy coefficient", "falls", ""),
+}
+_TASK_CURVES = (
+    _Curve("success", "evaluation/success_last", "last", BLUE),
+    _Curve("success", "evaluation/success_ever", "ever", GREEN, dashed=True),
+    _Curve("success", "rollout/success_last", "learning", ORANGE),
+    _Curve("return", "rollout/return", "return", BLUE),
+    _Curve("entropy", "learner/entropy_coefficient", "weight", BLUE),
+)
 _DRAWN = {
     "self-play": (_PANELS, _CURVES),
     "skills": (_SKILL_PANELS, _SKILL_CURVES),
     "distillation": (_DISTILLATION_PANELS, _DISTILLATION_CURVES),
 }
+"""Panels and curves by method; those of learning a task are the same for all of its methods."""
 
 
-def plot_curves(run_dir: Path, kind: Literal["self-play", "skills", "distillation"] = "self-play") -> Path:
-    """Draw ``curves.png`` from the run's ``metrics.jsonl``: six small panels over env steps, raw thin, smoothed thick.
+def plot_curves(run_dir: Path, method: str = "self-play") -> Path:
+    """Draw ``curves.png`` from the run's ``metrics.jsonl``: small panels over env steps, raw thin, smoothed thick.
 
     A value that is missing, null or not finite leaves a gap; a panel without values says so.
 
     Args:
         run_dir: of the run.
-        kind: of the run, which says what there is to draw.
+        method: of the run, which says what there is to draw.
 
     Raises:
         TandemError: the run has no metrics yet, they are damaged, or the picture cannot be written.
     """
     records = read_records(run_dir / "metrics.jsonl")
-    steps = column(records, "env_steps") / 1e6
-    figure = new_figure(14.0, 7.8, f"{run_dir.resolve().name}: {_progress(records)}")
-    panels, curves = _DRAWN[kind]
-    for place, (axes, (name, panel)) in enumerate(zip(figure.subplots(2, 3).flat, panels.items(), strict=True)):
-        _draw_panel(axes, panel, [curve for curve in curves if curve.panel == name], steps, records)
-        axes.set_xlabel("million env steps" if place >= 3 else "", color=FAINT)
-    figure.subplots_adjust(left=0.05, right=0.908, top=0.85, bottom=0.08, wspace=0.64, hspace=0.42)
+    panels, curves = _DRAWN.get(method, (_TASK_PANELS, _TASK_CURVES))
+    num_rows = len(panels) // 3
+    figure = new_figure(14.0, 3.9 * num_rows, f"{run_dir.resolve().name}: {_progress(records)}")
+    for axes, (name, panel) in zip(figure.subplots(num_rows, 3).flat, panels.items(), strict=True):
+        _draw_panel(axes, panel, [(curve, records) for curve in curves if curve.panel == name])
+    edges = {"left": 0.05, "right": 0.908, "top": 1.0 - 0.3 / num_rows, "bottom": 0.16 / num_rows}
+    figure.subplots_adjust(**edges, wspace=0.64, hspace=0.46)
     return save(figure, run_dir / "curves.png")
 
 
@@ -179,18 +193,10 @@ def plot_study(run_dirs: Mapping[str, Path], path: Path) -> Path:
     figure = new_figure(14.0, 5.2, f"{path.parent.resolve().name}: {counted(len(found), 'run')}")
     tasks = any("rollout/success_last" in record for records in found.values() for record in records[-1:])
     for axes, (title, key) in zip(figure.subplots(1, 2), _TASKS if tasks else _SELF_PLAY, strict=True):
-        style_axes(axes)
-        axes.set_title(f"{title}: {key.split('/')[1]}", loc="left", fontsize=12, weight="bold", color=INK)
-        axes.set_xlabel("million env steps", color=FAINT)
-        axes.set_ylim(0.0, 1.0)
-        ends = []
-        for (label, records), color in zip(found.items(), cycle(_COLORS), strict=False):
-            curve = _Curve(title, key, label, color)
-            end = _draw_curve(axes, curve, column(records, "env_steps") / 1e6, column(records, key))
-            ends += [(end, curve)] if end is not None else []
-        axes.set_xlim(left=0.0)
-        _label_ends(axes, ends)
-    figure.subplots_adjust(left=0.05, right=0.908, top=0.82, bottom=0.12, wspace=0.3)
+        runs = zip(found.items(), cycle(_COLORS), strict=False)
+        curves = [(_Curve(title, key, label, color), records) for (label, records), color in runs]
+        _draw_panel(axes, _Panel(title, key.split("/")[1], "solved"), curves)
+    figure.subplots_adjust(left=0.05, right=0.908, top=0.8, bottom=0.12, wspace=0.3)
     return save(figure, path)
 
 
@@ -216,19 +222,18 @@ def _smooth(values: StateArray, span: float) -> StateArray:
     return smoothed
 
 
-def _draw_panel(
-    axes: Axes, panel: _Panel, curves: Sequence[_Curve], steps: StateArray, records: Sequence[dict[str, Any]]
-) -> None:
+def _draw_panel(axes: Axes, panel: _Panel, curves: Sequence[tuple[_Curve, Sequence[dict[str, Any]]]]) -> None:
+    """Draw curves, each of a run's records."""
     style_axes(axes)
     axes.set_title(panel.title, loc="left", fontsize=12, weight="bold", color=INK, pad=20)
     axes.text(0.0, 1.03, panel.look_for, transform=axes.transAxes, fontsize=9.5, color="#666666")
+    axes.set_xlabel("million env steps", color=FAINT)
     axes.set_ylabel(panel.unit, color=FAINT)
-    if np.isfinite(steps).any():
-        axes.set_xlim(0.0, max(float(np.nanmax(steps)), 1e-6))
-    ends = [(_draw_curve(axes, curve, steps, column(records, curve.key)), curve) for curve in curves]
+    ends = [(_draw_curve(axes, curve, records), curve) for curve, records in curves]
     drawn = [(end, curve) for end, curve in ends if end is not None]
     if not drawn:
         axes.text(0.5, 0.5, "no values yet", transform=axes.transAxes, ha="center", color=FAINT)
+    axes.set_xlim(left=0.0)
     if panel.unit in ("fraction", "solved"):
         axes.set_ylim(0.0, 1.0)
     elif panel.unit in ("metres", "cells"):
@@ -236,8 +241,9 @@ def _draw_panel(
     _label_ends(axes, drawn)
 
 
-def _draw_curve(axes: Axes, curve: _Curve, steps: StateArray, values: StateArray) -> float | None:
+def _draw_curve(axes: Axes, curve: _Curve, records: Sequence[dict[str, Any]]) -> float | None:
     """Draw one curve; the height at which it ends, None when it has no values."""
+    steps, values = column(records, "env_steps") / 1e6, column(records, curve.key)
     known = np.isfinite(values) & np.isfinite(steps)
     x, y = steps[known], values[known]
     if not len(x):
@@ -284,13 +290,12 @@ def plot_goals(run_dir: Path, workspace: WorkspaceConfig) -> Path:
     """
     from matplotlib.lines import Line2D
 
-    path = run_dir / "goals.jsonl"
-    records = read_records(path)
+    records = read_records(run_dir / "goals.jsonl")
     figure = new_figure(14.0, 7.8, f"{run_dir.resolve().name}: where Alice's goals are, and which of them Bob solves")
     columns = figure.subplots(2, _NUM_SLICES, sharex="row", sharey="row").T
     for (above, side), slice_ in zip(columns, np.array_split(np.arange(len(records)), _NUM_SLICES), strict=True):
         chosen = [records[index] for index in slice_]
-        goals = _goals(chosen, path)
+        goals = _goals(chosen)
         _draw_goals(above, side, goals, workspace)
         above.set_title(_slice_title(chosen, goals), loc="left", fontsize=11, color=INK)
     columns[0][1].set_xlim(left=0.0)
@@ -304,15 +309,10 @@ def plot_goals(run_dir: Path, workspace: WorkspaceConfig) -> Path:
     return save(figure, run_dir / "goals.png")
 
 
-def _goals(records: Sequence[dict[str, Any]], path: Path) -> StateArray:
+def _goals(records: Sequence[dict[str, Any]]) -> StateArray:
     """The records' goals, (number, 7): start xyz, goal xyz, solved; any that is not finite is left out."""
-    try:
-        rows = [row for record in records for row in record.get("goals") or ()]
-        goals = np.array(rows, dtype=np.float64).reshape(len(rows), 7)
-    except (TypeError, ValueError) as error:
-        raise TandemError(
-            f"{path}: a goal is not 7 numbers (start xyz, goal xyz, solved): {error}; remove its line and draw again"
-        ) from error
+    rows = [row for record in records for row in record.get("goals") or ()]
+    goals = np.array(rows, dtype=np.float64).reshape(len(rows), 7)
     return goals[np.isfinite(goals).all(axis=1)]
 
 
@@ -383,36 +383,25 @@ def draw_paths(box: Any, above: Axes, paths: StateArray, workspace: WorkspaceCon
     """Draw (M, T, 3) paths of the object in metres, one colour each, as ``plot_coverage`` does.
 
     Args:
-        box: 3-D axes, made with ``computed_zorder=False``, for the workspace's box.
+        box: 3-D axes, made with ``computed_zorder=False``, for the workspace's box; None: the view from above alone.
         above: plain axes, for the view from above.
         paths: of the object.
         workspace: the box.
     """
-    _draw_box(box, workspace)
-    for path, color in zip(paths, _path_colors(len(paths)), strict=True):
-        points = _inside(path, workspace)
-        box.plot(*points.T, color=color, linewidth=1.5)
-        if np.isfinite(points[-1]).all():
-            box.plot(*points[-1:].T, color=color, marker="o", markersize=4.5)
-    draw_paths_above(above, paths, workspace)
-
-
-def draw_paths_above(axes: Axes, paths: StateArray, workspace: WorkspaceConfig) -> None:
-    """Draw (M, T, 3) paths of the object in metres as seen from above, one colour each."""
-    _draw_outline(axes, workspace)
-    for path, color in zip(paths, _path_colors(len(paths)), strict=True):
-        points = _inside(path, workspace)
-        axes.plot(points[:, 0], points[:, 1], color=color, linewidth=1.5)
-        if np.isfinite(points[-1]).all():
-            axes.plot(*points[-1:, :2].T, color=color, marker="o", markersize=5, markeredgecolor="white")
-
-
-def _path_colors(num: int) -> StateArray:
-    """(num, 4) colours; the map's ends are nearly black, where neighbours no longer differ."""
     from matplotlib import colormaps
 
-    colors: StateArray = colormaps["turbo"](np.linspace(0.05, 0.95, num))
-    return colors
+    _draw_outline(above, workspace)
+    if box is not None:
+        _draw_box(box, workspace)
+    # The map's ends are nearly black, where neighbours no longer differ.
+    for path, color in zip(paths, colormaps["turbo"](np.linspace(0.05, 0.95, len(paths))), strict=True):
+        points = _inside(path, workspace)
+        end = points[-1:] if np.isfinite(points[-1]).all() else points[:0]
+        above.plot(*points[:, :2].T, color=color, linewidth=1.5)
+        above.plot(*end[:, :2].T, color=color, marker="o", markersize=5, markeredgecolor="white")
+        if box is not None:
+            box.plot(*points.T, color=color, linewidth=1.5)
+            box.plot(*end.T, color=color, marker="o", markersize=4.5)
 
 
 def _inside(points: StateArray, workspace: WorkspaceConfig) -> StateArray:

@@ -176,7 +176,7 @@ def play_task(
     with WorldBatch(config, num_episodes, num_threads=num_threads) as worlds:
         worlds.reset(rng)
         start = worlds.object_position.copy()
-        goal = draw_goals(find_task(task).goals, rng, config, SUCCESS_DISTANCE_M, start=start, box=worlds.box_place)
+        goal = draw_goals(find_task(task).goals, rng, config, SUCCESS_DISTANCE_M, worlds.places)
         script = Scripted(worlds, goal)
         distances = []
         for _ in range(num_steps):

@@ -5,6 +5,7 @@ import pytest
 
 from service.base.errors import ConfigError
 from service.config import dump_config, load_config
+from service.config.model_files import MeshConfig
 from service.envs.batch import WorldBatch
 from tests.envs.scripted import place_in_air
 from tests.runs.runs import assert_one_line
@@ -121,7 +122,7 @@ def test_it_is_read_once(tmp_path, monkeypatch):
     (tmp_path / "saved.yaml").write_text(dump_config(config))
     monkeypatch.chdir("/")
     WorldBatch(config.world, 1).close()
-    monkeypatch.setattr("service.config.objects.measure", None)
+    monkeypatch.setattr(MeshConfig, "measured", None)
     assert load_config(tmp_path / "saved.yaml") == config
     write_box(file, (0.05, 0.04, 0.03))
     with pytest.raises(ConfigError) as error:

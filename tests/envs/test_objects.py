@@ -7,7 +7,7 @@ import pytest
 from service.base.errors import ConfigError
 from service.config import WorldConfig, load_config
 from service.envs.batch import WorldBatch
-from service.envs.sampling import draw_starts
+from service.envs.sampling import draw_objects
 from service.generator.bins import TaskBins
 from tests.envs.scripted import place_in_air
 from tests.runs.runs import assert_one_line
@@ -108,7 +108,7 @@ def test_what_has_to_know_how_high_it_lies_does():
 @pytest.mark.parametrize("fixture", ["wall", "box"])
 def test_a_long_object_starts_clear_of_a_fixture(fixture):
     world = WorldConfig(object={"shape": "box", "size_m": (0.12, 0.03, 0.03)}, fixture=fixture)
-    position, box = draw_starts(np.random.default_rng(0), 2000, world)
+    position, box, _ = draw_objects(np.random.default_rng(0), 2000, world)
     if fixture == "wall":
         assert np.abs(position[:, 0] - world.workspace.center_x_m).min() >= 0.06 + 0.005 + 0.005
     else:

@@ -6,12 +6,12 @@ import pytest
 
 from service.base.errors import ConfigError
 from service.config import WorldConfig, load_config
-from service.envs.batch import WorldBatch
+from service.envs.batch import SEEN_WITHIN_M, WorldBatch
 from service.envs.gym.tabletop import TabletopEnv
 from service.envs.gym.vector import TabletopVectorEnv
 from service.envs.objects import FLOOR_Z_M
 from service.envs.observations import POSITIONS, layouts
-from service.envs.obstacles import SEEN_WITHIN_M, draw_goals
+from service.envs.sampling import draw_goals
 from service.generator.generator import TaskGenerator
 from tests.envs.scripted import CLOSE, drive
 from tests.envs.test_meshes import write_box

@@ -11,7 +11,7 @@ import pytest
 from service.base.errors import ConfigError
 from service.config import dump_config, load_config
 from service.envs.batch import DISPLACEMENT_M, WorldBatch
-from service.envs.contacts import GRIPPER_BIT
+from service.envs.objects import GRIPPER_BIT
 from tests.envs.robots import GANTRY, GANTRY_DESCRIPTION, PINCHER, URDF, URDF_DESCRIPTION, write_robot
 from tests.envs.scripted import CLOSE, OPEN, drive, grasp, place_in_air
 from tests.envs.test_meshes import write_box

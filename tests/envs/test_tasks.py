@@ -38,8 +38,8 @@ def draw(task, num, seed=0):
     rng = np.random.default_rng(seed)
     with WorldBatch(config, num, num_threads=1) as worlds:
         worlds.reset(rng)
-        start, box = worlds.object_position.copy(), worlds.box_place.copy()
-    return start, draw_goals(find_task(task).goals, rng, config, 0.05, start=start, box=box), box
+        places = worlds.places
+        return places.object, draw_goals(find_task(task).goals, rng, config, 0.05, places), places.box
 
 
 def drive(worlds, target, num_steps, grip=-1.0):

@@ -139,20 +139,13 @@ def test_goals_are_drawn_for_short_and_long_runs(tmp_path, num_records):
     assert _png_size(path)[0] > 20_000
 
 
-def test_goals_of_many_records_are_joined_and_broken_ones_left_out(tmp_path):
+def test_goals_of_many_records_are_joined_and_broken_ones_left_out():
     unsolved, broken = [*GOAL[:6], 0], [None, *GOAL[1:]]
     records = [{"env_steps": 1e6, "goals": [GOAL, unsolved]}, {}, {"env_steps": 3e6, "goals": [GOAL, broken, GOAL]}]
-    goals = _goals(records, tmp_path)
+    goals = _goals(records)
     np.testing.assert_array_equal(goals, [GOAL, unsolved, GOAL, GOAL])
     assert _slice_title(records, goals) == "1.00 to 3.00 M env steps\n4 goals, 75% solved"
     assert _slice_title([], goals[:0]) == "\nno goals yet"
-
-
-@pytest.mark.parametrize("goals", [[GOAL[:6]], [GOAL, [1]], [GOAL * 2], [["a"] * 7], 5])
-def test_goals_of_another_layout_are_refused(tmp_path, goals):
-    _append(tmp_path / "goals.jsonl", {"iteration": 0, "goals": goals})
-    with pytest.raises(TandemError, match=r"goals\.jsonl: a goal is not 7 numbers"):
-        plot_goals(tmp_path, WORKSPACE)
 
 
 @pytest.mark.filterwarnings("error")

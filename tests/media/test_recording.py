@@ -123,7 +123,7 @@ def test_the_caption_says_solved_where_the_runs_own_rule_does(monkeypatch, dista
     monkeypatch.setattr(video, "_bar", lambda width, text, *more: words.append(text) or bar(width, text, *more))
     said, near = [], []
     for played in (played for played in rounds if played.verdict == Verdict.VALID):
-        list(video._round_frames(blank, played, "", 1, 0.04))
+        list(video._round_frames(blank, played, "", 1, 0.04, 0.04))
         said.append(words[-1])
         near.append(np.linalg.norm(played.bob_states[-1, OBJECT] - played.goal) <= distance_m)
     assert said == ["Bob: solved after 0.4 s" if solved else "Bob: not solved in 0.4 s" for solved in near]

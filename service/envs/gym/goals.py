@@ -10,9 +10,16 @@ import numpy as np
 from service.base.errors import TandemError, did_you_mean
 from service.base.types import Array, BoolArray, StateArray
 from service.config import WorldConfig
-from service.envs.obstacles import Places, draw_goals, inside_fixtures, inside_obstacles
 from service.envs.reach import Reach
-from service.envs.sampling import GOAL_KINDS, GoalKind, check_goals
+from service.envs.sampling import (
+    GOAL_KINDS,
+    GoalKind,
+    Places,
+    check_goals,
+    draw_goals,
+    inside_fixtures,
+    inside_obstacles,
+)
 
 GoalSampler = Callable[[np.random.Generator, int, WorldConfig], Any]
 """Draws goals: (random numbers, how many, the world) to (num, 3), metres."""
