@@ -9,7 +9,7 @@ import gymnasium
 import numpy as np
 
 from service.base.types import Array, Arrays, BoolArray, FloatArray
-from service.envs.gym.vector import VectorState
+from service.envs.gym.tabletop import EnvState
 
 
 class Step(NamedTuple):
@@ -92,7 +92,7 @@ class TabletopWorlds:
         """Go back to a saved state; continues bit-identically."""
         worlds: dict[str, Any] = {name: np.array(array) for name, array in arrays.items()}
         self.previous = worlds.pop("previous")
-        self._see(self.env.restore(VectorState(**worlds, random=tuple(random))))
+        self._see(self.env.restore(EnvState(**worlds, random=tuple(random))))
 
     def close(self) -> None:
         """Stop the worlds' threads."""
