@@ -12,9 +12,8 @@ from mujoco import rollout
 from service.base.errors import ConfigError, DivergedError
 from service.base.types import BoolArray, FloatArray, IntArray, StateArray
 from service.config import WorldConfig
-from service.envs.model_bank import ModelBank
-from service.envs.noise import KEYS, normal
 from service.envs.observations import ACTION, COMMAND_PREFIX, Layouts, ObservationLayout, layouts
+from service.envs.randomisation import KEYS, ModelBank, normal
 from service.envs.reach import reach_of
 from service.envs.robot import Robot, described
 from service.envs.sampling import Places, draw_starts, gripper_boxes
@@ -116,11 +115,6 @@ class WorldBatch:
     def object_position(self) -> StateArray:
         """(N, 3) object centre, metres."""
         return self.states[:, self.layout["object"]]
-
-    @property
-    def seen_object_position(self) -> StateArray:
-        """(N, 3) the same as policies see it: with the errors of ``config.randomisation``."""
-        return self._seen_object
 
     @property
     def box_place(self) -> StateArray:
@@ -314,9 +308,9 @@ class WorldBatch:
         if name == "delay" and self.config.randomisation.delay_steps is None:
             return np.zeros((self.num_worlds, 1))
         if name == "object":
-            return self.seen_object_position
+            return self._seen_object
         if name == "object_from_effector":
-            return self.seen_object_position - self.ee_position
+            return self._seen_object - self.ee_position
         if name == "effector_velocity":
             velocity = self.states[:, self.layout["joint_velocities"]]
             linear: StateArray = np.matmul(self._kinematics.jacobian[:, :3], velocity[:, :, None])[:, :, 0]
@@ -326,7 +320,7 @@ class WorldBatch:
     def _see(self) -> None:
         """Compute what several observations of the same states need."""
         self._kinematics = self.robot.arm.forward(self.joints)
-        self._seen_object, drawn = self.object_position, self.config.randomisation
+        self._seen_object, drawn = self.object_position, self.config.randomisation  # with the errors of what is seen
         if drawn.object_offset_m is not None:
             self._seen_object = self._seen_object + self.states[:, self.layout["object_offset"]]
         if drawn.object_noise_m is not None:

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from service.config.sac import SACConfig
+from service.config.skills import SACConfig
 from service.learner.sac import Batch, SACLearner, actions_at_random
 from service.learner.sac_networks import GaussianActor, sample_actions
 
