@@ -19,6 +19,9 @@ _NUM_SIZES: dict[Shape, tuple[int, str]] = {
     "ellipsoid": (3, "its extent along x, y and z"),
     "mesh": (3, "its extent along x, y and z, which is read from its files"),
 }
+_Share = Annotated[float, Field(ge=0.0, le=1.0)]
+Color = tuple[_Share, _Share, _Share]
+"""Red, green and blue."""
 ROUND: frozenset[Shape] = frozenset({"sphere", "cylinder", "capsule", "ellipsoid", "mesh"})
 """Shapes that may roll."""
 
@@ -35,7 +38,7 @@ class ObjectConfig(FrozenModel):
         "diameter, whole length"
     )
     mesh: MeshConfig | None = Field(None, description="files of a mesh; size_m is read from them")
-    color: Vector = Field((0.86, 0.13, 0.11), description="red, green, blue in pictures, 0 to 1")
+    color: Color = Field((0.86, 0.13, 0.11), description="red, green, blue in pictures, 0 to 1")
 
     @model_validator(mode="after")
     def _fits_shape(self) -> Self:
@@ -46,8 +49,6 @@ class ObjectConfig(FrozenModel):
             raise ValueError("mesh, which names files as pieces, belongs to shape: mesh and to no other")
         if self.shape == "capsule" and self.size_m[1] <= self.size_m[0]:
             raise ValueError(f"size_m of a capsule: its length {self.size_m[1]:g} must exceed its diameter")
-        if not all(0.0 <= each <= 1.0 for each in self.color):
-            raise ValueError(f"color {self.color}: red, green and blue are from 0 to 1")
         return self
 
     @property
@@ -69,25 +70,15 @@ class FixtureConfig(ObjectConfig):
     position_m: tuple[float, float] = Field(description="middle of its bottom, x and y")
     bottom_m: float = Field(0.0, ge=0.0, le=1.0, description="height of its bottom above the table: a shelf's")
     turn_rad: float = Field(0.0, description="about the vertical")
-    color: Vector = (0.42, 0.47, 0.54)
+    color: Color = (0.42, 0.47, 0.54)
 
     @property
-    def lower_m(self) -> Vector:
-        """Corner with the least coordinates of the upright box around it, metres."""
-        half_x, half_y = self._half_m
-        return self.position_m[0] - half_x, self.position_m[1] - half_y, self.bottom_m
-
-    @property
-    def upper_m(self) -> Vector:
-        """Corner with the greatest coordinates, metres."""
-        half_x, half_y = self._half_m
-        return self.position_m[0] + half_x, self.position_m[1] + half_y, self.bottom_m + self.extent_m[2]
-
-    @property
-    def _half_m(self) -> tuple[float, float]:
-        x, y, _ = self.extent_m
+    def corners_m(self) -> tuple[Vector, Vector]:
+        """Corners with the least and the greatest coordinates of the upright box around it, metres."""
+        (x, y), (length, width, height) = self.position_m, self.extent_m
         cosine, sine = abs(math.cos(self.turn_rad)), abs(math.sin(self.turn_rad))
-        return (cosine * x + sine * y) / 2, (sine * x + cosine * y) / 2
+        half_x, half_y = (cosine * length + sine * width) / 2, (sine * length + cosine * width) / 2
+        return (x - half_x, y - half_y, self.bottom_m), (x + half_x, y + half_y, self.bottom_m + height)
 
 
 class ObstacleConfig(ObjectConfig):
@@ -95,7 +86,7 @@ class ObstacleConfig(ObjectConfig):
 
     mass_kg: float = Field(0.1, gt=0.0, le=5.0)
     friction: float = Field(1.0, gt=0.0, le=3.0, description="sliding friction of it on the table and on other things")
-    color: Vector = (0.90, 0.66, 0.20)
+    color: Color = (0.90, 0.66, 0.20)
 
 
 def simple_object(name: Literal["cube", "sphere"], size_m: float) -> ObjectConfig:

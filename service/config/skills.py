@@ -1,4 +1,4 @@
-"""Configuration of soft actor-critic, and of the skill-discovery baselines that learn by it: LSD, DIAYN, DADS, METRA."""
+"""Configuration of soft actor-critic, and of the baselines that discover skills by it: LSD, DIAYN, DADS and METRA."""
 
 from __future__ import annotations
 

@@ -15,6 +15,18 @@ Point = tuple[float, float, float]
 """x, y, z in the world frame."""
 Range = tuple[float, float]
 """Least and greatest value, all in between alike."""
+_LIMITS = {
+    "object_size": (0.2, 3.0),
+    "object_mass_kg": (1e-3, 10.0),
+    "friction": (0.01, 5.0),
+    "gain": (0.05, 20.0),
+    "damping": (0.05, 20.0),
+    "table_height_m": (-0.05, 0.05),
+    "delay_steps": (0, 8),
+    "object_noise_m": (0.0, 0.1),
+    "object_offset_m": (0.0, 0.1),
+}
+"""Within which a range has to be, by its name."""
 
 
 class WorkspaceConfig(FrozenModel):
@@ -84,19 +96,14 @@ class RandomisationConfig(FrozenModel):
 
     @model_validator(mode="after")
     def _in_order(self) -> Self:
-        least = {"object_size": 0.2, "object_mass_kg": 1e-3, "friction": 0.01, "gain": 0.05, "damping": 0.05}
-        most = {"object_size": 3.0, "object_mass_kg": 10.0, "friction": 5.0, "gain": 20.0, "damping": 20.0}
-        least |= {"table_height_m": -0.05, "delay_steps": 0, "object_noise_m": 0.0, "object_offset_m": 0.0}
-        most |= {"table_height_m": 0.05, "delay_steps": 8, "object_noise_m": 0.1, "object_offset_m": 0.1}
-        for name in least:
-            given = getattr(self, name)
-            if given is None:
+        for name, (least, most) in _LIMITS.items():
+            if (given := getattr(self, name)) is None:
                 continue
             low, high = given
             if low > high:
                 raise ValueError(f"{name} = [{low:g}, {high:g}] is the wrong way round: give the lesser number first")
-            if low < least[name] or high > most[name]:
-                raise ValueError(f"{name} = [{low:g}, {high:g}] goes beyond [{least[name]:g}, {most[name]:g}]")
+            if low < least or high > most:
+                raise ValueError(f"{name} = [{low:g}, {high:g}] goes beyond [{least:g}, {most:g}]")
         return self
 
     @property
@@ -159,19 +166,11 @@ class WorldConfig(FrozenModel):
     num_substeps: int = Field(20, ge=1, le=200, description="physics steps per action; 20 x 2 ms = 25 Hz as panda-gym")
 
     @model_validator(mode="after")
-    def _one_kind_of_fixtures(self) -> Self:
+    def _fits_together(self) -> Self:
         if self.fixtures and self.fixture != "none":
             raise ValueError(f"fixture = {self.fixture!r} and fixtures: a world has the one or the other")
-        return self
-
-    @model_validator(mode="after")
-    def _observes_what_is_there(self) -> Self:
         if self.observed.obstacles and not self.obstacles:
             raise ValueError("observed.obstacles, and no obstacles: describe some, or leave it out")
-        return self
-
-    @model_validator(mode="after")
-    def _object_is_lower_than_the_workspace(self) -> Self:
         if self.rest_height_m >= self.workspace.height_m:
             raise ValueError(
                 f"the object's centre lies {self.rest_height_m:g} m high, and the workspace ends at "

@@ -68,7 +68,9 @@ class WorldBatch:
         robot = described(config)
         self.reach = reach_of(robot, self.robot.arm)
         """Where the end effector can be commanded to."""
-        _quieten_mujoco()
+        log = mujoco.MjLogConfig.get()  # MuJoCo's own log is a file in the working directory
+        log.logto_file = log.logto_console = False
+        log.set()
         num_threads = min(num_threads or os.cpu_count() or 1, num_worlds)
         self._pool = rollout.Rollout(nthread=num_threads if num_threads > 1 else 0)
         self._data = [mujoco.MjData(self.model) for _ in range(max(num_threads, 1))]
@@ -365,10 +367,3 @@ class WorldBatch:
                     f"at its start, {self.config.start_height_m:g} m above the middle of the workspace, the gripper is "
                     f"inside {fixed[0]}: raise world.start_height_m, or put the fixture elsewhere"
                 )
-
-
-def _quieten_mujoco() -> None:
-    """Turn off MuJoCo's own log, a file in the working directory; ``WorldBatch`` itself reports diverged worlds."""
-    log = mujoco.MjLogConfig.get()
-    log.logto_file = log.logto_console = False
-    log.set()

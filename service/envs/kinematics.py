@@ -76,7 +76,9 @@ class Chain:
         ids = [model.joint(name).id for name in joints]
         axes, anchors = data.xaxis[ids], data.xanchor[ids]
         is_slide = model.jnt_type[ids] == mujoco.mjtJoint.mjJNT_SLIDE
-        self.lower, self.upper = _limits(model, ids)
+        lower, upper = model.jnt_range[ids].T
+        margin, limited = np.minimum(_LIMIT_MARGIN, 0.05 * (upper - lower)), model.jnt_limited[ids].astype(bool)
+        self.lower, self.upper = np.where(limited, lower + margin, -np.inf), np.where(limited, upper - margin, np.inf)
         """(J,) limits less a margin, rad or metres; infinite where a joint has none."""
         is_upright = not is_slide[0] and abs(axes[0, 2]) > 1.0 - 1e-6
         self.base_axis: StateArray | None = anchors[0, :2] if is_upright else None
@@ -202,13 +204,6 @@ def orientation_error(rotation: StateArray) -> StateArray:
     error[:, 1] = 0.5 * (rotation[:, 2, 0] + rotation[:, 0, 2])
     error[:, 2] = -0.5 * (rotation[:, 1, 0] + rotation[:, 0, 1])
     return error
-
-
-def _limits(model: mujoco.MjModel, joints: Sequence[int]) -> tuple[StateArray, StateArray]:
-    lower, upper = model.jnt_range[joints].T
-    margin = np.minimum(_LIMIT_MARGIN, 0.05 * (upper - lower))
-    limited = model.jnt_limited[joints].astype(bool)
-    return np.where(limited, lower + margin, -np.inf), np.where(limited, upper - margin, np.inf)
 
 
 def _common_normal(axes: StateArray, anchors: StateArray) -> tuple[StateArray, StateArray, StateArray]:

@@ -209,8 +209,8 @@ def _check_joints(
     there, named = ([each.name.removeprefix(_PREFIX) for each in group] for group in (spec.joints, [*joints, *fingers]))
     if there != named:
         raise ConfigError(
-            f"robot {robot.name}: joints and fingers are not all of the model's in their order, {', '.join(there)}: name "
-            "them so, or weld those that do not move"
+            f"robot {robot.name}: joints and fingers are not all of the model's in their order, {', '.join(there)}: "
+            "name them so, or weld those that do not move"
         )
 
 

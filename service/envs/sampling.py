@@ -317,8 +317,8 @@ def _around_fixtures(config: WorldConfig) -> Boxes:
 
 
 def _boxes_of(fixtures: Sequence[FixtureConfig]) -> Boxes:
-    lower, upper = ([getattr(each, corner) for each in fixtures] for corner in ("lower_m", "upper_m"))
-    return Boxes(np.reshape(lower, (-1, 3)), np.reshape(upper, (-1, 3)))
+    corners = np.array([each.corners_m for each in fixtures]).reshape(-1, 2, 3)
+    return Boxes(corners[:, 0], corners[:, 1])
 
 
 def _join(one: Boxes, other: Boxes) -> Boxes:

@@ -20,11 +20,10 @@ WORLD = WorldConfig(fixtures=[BLOCK, POST])
 
 def test_the_box_around_one_that_is_turned_by_hand():
     fixture = FixtureConfig(**BLOCK, turn_rad=np.pi / 2, bottom_m=0.3)
-    np.testing.assert_allclose(fixture.lower_m, (-0.08, 0.05, 0.3))
-    np.testing.assert_allclose(fixture.upper_m, (-0.02, 0.15, 0.34))
+    np.testing.assert_allclose(fixture.corners_m, [(-0.08, 0.05, 0.3), (-0.02, 0.15, 0.34)])
     slanted = FixtureConfig(**BLOCK, turn_rad=-np.pi / 4)
     half = (0.05 + 0.03) / np.sqrt(2)
-    np.testing.assert_allclose(slanted.lower_m, (-0.05 - half, 0.1 - half, 0.0))
+    np.testing.assert_allclose(slanted.corners_m[0], (-0.05 - half, 0.1 - half, 0.0))
 
 
 def test_they_stand_where_they_are_described_and_carry_the_object():
@@ -53,7 +52,7 @@ def test_the_gripper_cannot_pass_through():
 
 def inside(position, gap_m=(0.0, 0.0, 0.0)):
     half = 0.025 + np.array(gap_m)
-    boxes = [(np.array(each.lower_m) - half, np.array(each.upper_m) + half) for each in WORLD.fixtures]
+    boxes = [(np.array(low) - half, np.array(high) + half) for low, high in (each.corners_m for each in WORLD.fixtures)]
     return np.any([((position > low) & (position < high)).all(axis=1) for low, high in boxes], axis=0)
 
 
@@ -77,7 +76,7 @@ def test_a_mesh(tmp_path):
     file = write_box(tmp_path / "block.obj", (0.10, 0.06, 0.04), (5.0, 5.0, 5.0))
     described = f"{{shape: mesh, mesh: {{pieces: [{file}]}}, position_m: [-0.05, 0.1]}}"
     world = load_config(None, [f"world.fixtures=[{described}]"]).world
-    np.testing.assert_allclose(world.fixtures[0].upper_m, WORLD.fixtures[0].upper_m, atol=1e-6)
+    np.testing.assert_allclose(world.fixtures[0].corners_m, WORLD.fixtures[0].corners_m, atol=1e-6)
     with WorldBatch(world, 1) as worlds:
         states = worlds.states.copy()
         states[:, worlds.layout["object"]] = (-0.05, 0.1, 0.066)
