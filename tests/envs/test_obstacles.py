@@ -7,14 +7,11 @@ import pytest
 from service.base.errors import ConfigError
 from service.config import WorldConfig, load_config
 from service.envs.batch import SEEN_WITHIN_M, WorldBatch
-from service.envs.gym.tabletop import TabletopEnv
-from service.envs.gym.vector import TabletopVectorEnv
 from service.envs.objects import FLOOR_Z_M
 from service.envs.observations import POSITIONS, layouts
 from service.envs.sampling import draw_goals
 from service.generator.generator import TaskGenerator
 from tests.envs.scripted import CLOSE, drive
-from tests.envs.test_meshes import write_box
 from tests.runs.runs import assert_one_line, play, tiny_config
 
 BLOCK = {"shape": "box", "size_m": (0.06, 0.04, 0.05), "mass_kg": 0.2}
@@ -86,13 +83,6 @@ def test_on_a_table_of_another_height_they_lie_on_it_and_clear_of_the_gripper():
         np.testing.assert_allclose(worlds.obstacle_positions[:, 0, 2], height, atol=1e-3)
 
 
-def test_a_tall_object_does_not_start_inside_the_gripper():
-    tall = WorldConfig(object={"shape": "cylinder", "size_m": (0.05, 0.15)})
-    with WorldBatch(tall, 300) as worlds:
-        worlds.reset(np.random.default_rng(0))
-        assert touching(worlds) == set()
-
-
 def test_worlds_without_any_are_as_they_were():
     with WorldBatch(WorldConfig(), 50) as worlds:
         drawn = worlds.draw_starts(np.random.default_rng(3), 50)[:, worlds.layout["object"]]
@@ -155,15 +145,6 @@ def test_one_that_falls_off_the_table_lies_on_the_floor_and_is_seen_at_the_bound
         np.testing.assert_allclose(seen, (SEEN_WITHIN_M, 0.0, FLOOR_Z_M + 0.025), atol=2e-3)
 
 
-def test_a_world_in_which_one_flies_off_has_diverged():
-    with WorldBatch(WORLD, 2) as worlds:
-        worlds.reset(np.random.default_rng(0))
-        worlds.states[1, worlds.layout["obstacle_3_velocity"]] = (0.0, 0.0, 2e3)
-        before = worlds.states.copy()
-        assert worlds.step(np.zeros((2, 4), dtype=np.float32)).tolist() == [False, True]
-        np.testing.assert_array_equal(worlds.states[1], before[1])
-
-
 def test_positions_of_obstacles_follow_those_of_the_paper():
     world = WORLD.model_copy(update={"observed": WORLD.observed.model_copy(update={"num_commands": 1})})
     seen, first = layouts(world), POSITIONS.size
@@ -214,26 +195,6 @@ def test_no_goal_that_is_replayed_from_a_reset_is_inside_one():
     assert found.tolist() == [False, True]
 
 
-def test_both_environments_serve_them_alike():
-    one, many = TabletopEnv(WORLD), TabletopVectorEnv(2, WORLD)
-    try:
-        assert one.observation_space["observation"].shape == (20,)
-        many.reset(seed=[7, 8])
-        single, _ = one.reset(seed=8)
-        for action in np.random.default_rng(0).uniform(-1.0, 1.0, (5, 4)).astype(np.float32):
-            single = one.step(action)[0]
-            both = many.step(np.stack([action, action]))[0]
-        for name, value in single.items():
-            np.testing.assert_array_equal(value, both[name][1])
-        saved = one.state()
-        onward = [one.step(STAY[0])[0]["observation"] for _ in range(2)][-1]
-        one.restore(saved)
-        np.testing.assert_array_equal([one.step(STAY[0])[0]["observation"] for _ in range(2)][-1], onward)
-    finally:
-        one.close()
-        many.close()
-
-
 def test_a_run_learns_with_them_is_saved_and_goes_on(tmp_path):
     tree = tiny_config(total_env_steps=400).model_dump()
     small = [{"shape": "box", "size_m": (0.02, 0.02, 0.03)}, {"shape": "sphere", "size_m": (0.02,)}]
@@ -246,22 +207,9 @@ def test_a_run_learns_with_them_is_saved_and_goes_on(tmp_path):
     assert second.num_env_steps > first.num_env_steps >= 400
 
 
-def test_a_mesh(tmp_path):
-    file = write_box(tmp_path / "block.obj", (0.06, 0.04, 0.05), (1.0, 2.0, 3.0))
-    world = load_config(None, [f"world.obstacles=[{{shape: mesh, mesh: {{pieces: [{file}]}}, mass_kg: 0.2}}]"]).world
-    with WorldBatch(world, 1) as worlds:
-        assert worlds.model.body("obstacle_1").mass[0] == pytest.approx(0.2, rel=1e-5)
-        put(worlds, obstacle_1=(0.05, 0.1, 0.026))
-        for _ in range(20):
-            worlds.step(STAY)
-        np.testing.assert_allclose(worlds.obstacle_positions[0], [[0.05, 0.1, 0.025]], atol=1e-3)
-
-
 @pytest.mark.parametrize(
     ("described", "said"),
     [
-        ("[{shape: sphere, size_m: [50]}]", ["world.obstacles.0.size_m.0", "less than or equal to 0.5"]),
-        ("[{shape: box, size_m: [0.1]}]", ["world.obstacles.0", "size_m of a box has 3 numbers"]),
         ("[{shape: sphere, size_m: [0.05], mass_kg: 0}]", ["world.obstacles.0.mass_kg", "greater than 0"]),
         ("[{shape: sphere, size_m: [0.05], position_m: [0, 0]}]", ["world.obstacles.0.position_m", "unknown key"]),
         (f"[{', '.join(['{shape: sphere, size_m: [0.02]}'] * 9)}]", ["world.obstacles", "at most 8"]),
@@ -271,15 +219,6 @@ def test_mistakes_in_a_description_are_one_line(described, said):
     with pytest.raises(ConfigError) as error:
         load_config(None, [f"world.obstacles={described}"])
     assert_one_line(error.value, *said)
-
-
-def test_meshes_that_are_open_or_in_millimetres_are_one_line(tmp_path):
-    opened = write_box(tmp_path / "open.obj", leave_out=1)
-    large = write_box(tmp_path / "large.obj", (60.0, 40.0, 30.0))
-    for file, said in ((opened, "is not closed"), (large, "with scale: 0.001 it would fit")):
-        with pytest.raises(ConfigError) as error:
-            load_config(None, [f"world.obstacles=[{{shape: mesh, mesh: {{pieces: [{file}]}}}}]"])
-        assert_one_line(error.value, file.name, said)
 
 
 @pytest.mark.parametrize(

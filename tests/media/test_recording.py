@@ -153,26 +153,10 @@ def test_blocked_grippers_stay_closed():
     assert any(len(played.bob_actions) for played in blocked)
 
 
-def test_a_bob_who_does_nothing_runs_out_of_time():
-    (played,) = record(bob=NOTHING, num_rounds=1)
-    assert not played.solved
-    assert len(played.bob_states) == 13
-
-
-def test_an_alice_who_does_nothing_is_shown_as_she_is():
-    rounds = record(NOTHING, num_rounds=2)
-    assert [played.verdict for played in rounds] == [Verdict.NOT_MOVED] * 2
-    assert [len(played.bob_states) for played in rounds] == [1, 1]
-
-
 def test_a_seed_determines_the_rounds():
     one, same, other = (record(seed=seed, num_rounds=1)[0] for seed in (0, 0, 1))
     np.testing.assert_array_equal(one.alice_states, same.alice_states)
     assert not np.array_equal(one.goal, other.goal)
-
-
-def test_more_rounds_than_worlds_can_be_asked_for():
-    assert len(record(num_rounds=70)) == 70
 
 
 def test_played_before_lifted_before_far():
@@ -184,17 +168,6 @@ def test_played_before_lifted_before_far():
 
 
 # --- episodes --------------------------------------------------------------------------------------------------------
-
-
-def test_recorded_episodes_keep_every_state():
-    episodes = record_episodes(
-        Constant(NOTHING), WorldConfig(), "table", num_episodes=5, num_steps=4, success_distance_m=0.15, seed=2
-    )
-    assert episodes.states.shape[:2] == episodes.reached.shape == (5, 5)
-    distance = np.linalg.norm(episodes.states[..., OBJECT] - episodes.goal, axis=2)
-    np.testing.assert_array_equal(episodes.reached, distance <= 0.15)
-    assert episodes.reached.any()
-    assert not episodes.reached.all()
 
 
 def test_recorded_episodes_are_those_of_the_evaluation():
