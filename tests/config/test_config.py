@@ -95,83 +95,41 @@ def test_overrides_beat_the_file_and_the_last_one_wins(tmp_path):
     assert (config.seed, config.game.bob_steps, config.game.alice_steps) == (3, 60, 30)
 
 
-@pytest.mark.parametrize("override", ["seed", "=3", "", "  =3"])
-def test_override_without_key_or_value_says_the_form(override):
-    text = message(overrides=[override])
-    assert repr(override) in text
-    assert "KEY=VALUE" in text
-
-
-def test_override_that_is_not_yaml():
-    assert "'policy.alice.hidden_sizes=[64'" in message(overrides=["policy.alice.hidden_sizes=[64"])
-
-
-def test_override_through_a_value():
-    text = message(overrides=["seed=1", "seed.x=2"])
-    assert "'seed.x=2'" in text
-    assert "not a group" in text
-
-
 @pytest.mark.parametrize(
-    ("override", "key", "known"),
+    ("override", "said"),
     [
-        ("sed=1", "'sed'", "game, generator, learner, method, name, policy, run, seed, world"),
-        ("game.bob_step=1", "'game.bob_step'", "bob_steps"),
-        ("learner.bob.lr=1", "'learner.bob.lr'", "learning_rate"),
-        ("world.workspace.width_m=1", "'world.workspace.width_m'", "length_x_m, length_y_m"),
-        (
-            "world.object={shape: sphere, size_m: [0.05], width_m: 1}",
-            "'world.object.width_m'",
-            "known there: color, mesh, shape, size_m",
-        ),
-        (
-            "world.obstacles=[{shape: sphere, size_m: [0.05], width_m: 1}]",
-            "'world.obstacles.0.width_m'",
-            "mass_kg, mesh, shape, size_m",
-        ),
+        ("seed", ["'seed'", "KEY=VALUE"]),
+        ("  =3", ["'  =3'", "KEY=VALUE"]),
+        ("policy.alice.hidden_sizes=[64", ["'policy.alice.hidden_sizes=[64'"]),
+        ("seed.x=2", ["'seed.x=2'", "not a group"]),
+        ("sed=1", ["unknown key 'sed'", "game, generator, learner, method, name, policy, run, seed, world"]),
+        ("game.bob_step=1", ["unknown key 'game.bob_step'", "did you mean 'bob_steps'"]),
+        ("clip=1", ["did you mean learner.abc.clip or learner.alice.clip or learner.bob.clip"]),
+        ("skill_steps=1", ["it is a key of method=ours"]),
+        ("world.workspace.width_m=1", ["unknown key 'world.workspace.width_m'", "length_x_m, length_y_m"]),
+        ("world.object={shape: sphere, size_m: [0.05], w: 1}", ["'world.object.w'; known there: color, mesh, shape"]),
+        ("world.obstacles=[{shape: sphere, size_m: [0.05], w: 1}]", ["'world.obstacles.0.w'; known there: color"]),
+        ("game.num_worlds=0", ["game.num_worlds = 0"]),
+        ("world.object=teapot", ["world.object = ", "teapot"]),
+        ("seed=0.5", ["seed = 0.5"]),
+        ("learner.bob.learning_rate=nan", ["learner.bob.learning_rate = nan"]),
+        ("learner.device=tpu", ["learner.device = 'tpu'"]),
+        ("name=../escape", ["name = '../escape'"]),
+        ("policy.alice.hidden_sizes=[64,0]", ["policy.alice.hidden_sizes.1 = 0"]),
+        ("policy.bob.log_std_min=0.5", ["policy.bob: log_std_min 0.5"]),
+        ("policy.alice_log_std_min=0.5", ["policy: alice_log_std_min 0.5"]),
+        ("world.workspace.height_m=0.02", ["world: ", "lies 0.025 m high, and the workspace ends at 0.02 m"]),
+        ("world.object={shape: mesh, mesh: {pieces: a.stl}}", ["world.object.mesh.pieces = 'a.stl'"]),
+        ("world.object={shape: mesh, mesh: {pieces: [a.stl], scale: 0}}", ["world.object.mesh.scale = 0"]),
+        ("game=3", ["game = 3"]),
+        ("game.bob_margin_m=0.05", ["game: bob_margin_m 0.05 must be less than success_distance_m 0.05"]),
+        ("world.fixtures=[{shape: box, size_m: [0.05, 0.05, 0]}]", ["(and 1 more)"]),
     ],
 )
-def test_unknown_key_lists_the_known_ones(override, key, known):
-    text = message(overrides=[override])
-    assert f"unknown key {key}" in text
-    assert known in text
-
-
-@pytest.mark.parametrize(
-    ("override", "key", "value"),
-    [
-        ("game.num_worlds=0", "game.num_worlds", "0"),
-        ("world.object_size_m=0.5", "world.object_size_m", "0.5"),
-        ("world.object=teapot", "world.object", "teapot"),
-        ("seed=half", "seed", "half"),
-        ("seed=0.5", "seed", "0.5"),
-        ("learner.bob.learning_rate=nan", "learner.bob.learning_rate", "nan"),
-        ("learner.bob.learning_rate=.inf", "learner.bob.learning_rate", "inf"),
-        ("learner.device=tpu", "learner.device", "tpu"),
-        ("name=Panda Cube", "name", "Panda Cube"),
-        ("name=../escape", "name", "../escape"),
-        ("policy.alice.hidden_sizes=[64,0]", "policy.alice.hidden_sizes.1", "0"),
-        ("policy.bob.log_std_min=0.5", "policy.bob", "0.5"),
-        ("policy.alice_log_std_min=0.5", "policy", "0.5"),
-        ("world.workspace.height_m=0.02", "world", "lies 0.025 m high, and the workspace ends at 0.02 m"),
-        ("world.object={shape: mesh, mesh: {pieces: a.stl}}", "world.object.mesh.pieces", "a.stl"),
-        ("world.object={shape: mesh, mesh: {pieces: [a.stl], scale: 0}}", "world.object.mesh.scale", "0"),
-        ("game=3", "game", "3"),
-    ],
-)
-def test_a_bad_value_is_named_with_its_key(override, key, value):
-    text = message(overrides=[override])
-    is_group = key in (
-        "policy",
-        "policy.bob",
-        "world",
-    )  # where two of its values do not fit together, it is not shown whole
-    assert f"{key}: " in text if is_group else f"{key} = " in text
-    assert value in text
-
-
-def test_several_mistakes_are_counted():
-    assert "(and 1 more)" in message(overrides=["seed=-1", "game.num_goals=0"])
+def test_a_mistake_is_one_line_that_names_it(override, said):
+    text = message(overrides=["seed=1", override])
+    for words in said:
+        assert words in text
 
 
 def test_the_file_is_named_in_its_errors(tmp_path):
@@ -214,12 +172,6 @@ def test_every_shipped_configuration_loads():
     assert robots
     for path in robots:  # their models are in packages that need not be installed
         assert RobotConfig.model_validate(parse_yaml(path.read_bytes(), path)).model.startswith("package:")
-
-
-def test_a_margin_as_wide_as_success_is_refused():
-    text = message(overrides=["game.bob_margin_m=0.05"])
-    assert "bob_margin_m 0.05 must be less than success_distance_m 0.05" in text
-    assert load_config(overrides=["game.bob_margin_m=0.04"]).game.bob_margin_m == 0.04
 
 
 def test_self_imitation_of_turns_that_no_reward_reaches_is_refused():

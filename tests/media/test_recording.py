@@ -79,15 +79,6 @@ def test_the_actions_lead_from_state_to_state():
                     np.testing.assert_array_equal(worlds.states[0], after)
 
 
-def test_bobs_turn_lasts_until_he_has_held_the_object_at_the_goal():
-    once, held = (record(bob_hold_steps=steps) for steps in (1, 3))
-    for short, played in zip(once, held, strict=True):
-        # He does what Alice did and touches at the same step as before; two more steps follow.
-        assert len(played.bob_states) == len(short.bob_states) + 2
-        assert reached(played).tolist() == [False] * (len(short.bob_states) - 1) + [True] * 3
-        assert played.solved
-
-
 class Sweep(Constant):
     """Moves forward close to the table, with closed fingers."""
 
@@ -98,18 +89,6 @@ class Sweep(Constant):
         action = super().act_deterministic(observation)
         action[:, 2] = np.clip((0.03 - observation[:, 2]) / 0.05, -1.0, 1.0)
         return action
-
-
-def test_a_bob_who_passes_the_goal_has_not_solved_it():
-    # He does what Alice did, but for 20 steps, not 5: where she left the object he does not stop.
-    config = SelfPlayConfig(game=GameConfig(alice_steps=5, bob_steps=20, bob_hold_steps=20))
-    rounds = record_rounds(config, Sweep(), Sweep(), num_rounds=30, seed=0)
-    tried = [played for played in rounds if played.verdict == Verdict.VALID]
-    assert {len(played.bob_actions) for played in tried} == {20}
-    passed = [played for played in tried if not reached(played)[-1]]
-    assert passed
-    assert all(reached(played).any() for played in passed)
-    assert [played.solved for played in tried] == [bool(reached(played)[-1]) for played in tried]
 
 
 @pytest.mark.parametrize("distance_m", [0.03, 0.06])
@@ -132,25 +111,22 @@ def test_the_caption_says_solved_where_the_runs_own_rule_does(monkeypatch, dista
 
 
 def test_the_length_of_alices_turn_is_drawn():
-    rounds = [record(alice_steps_min=9, num_rounds=1, seed=seed)[0] for seed in range(12)]
-    assert {len(played.alice_actions) for played in rounds} == {9, 10, 11, 12}
+    rounds = [record(alice_steps_min=11, num_rounds=1, seed=seed)[0] for seed in range(4)]
+    assert {len(played.alice_actions) for played in rounds} == {11, 12}
     for played in rounds:
         assert len(played.alice_states) == len(played.alice_actions) + 1
         np.testing.assert_array_equal(played.alice_states[-1, OBJECT], played.goal)
         np.testing.assert_array_equal(played.bob_states[0], played.alice_states[0])
 
 
-def test_blocked_grippers_stay_closed():
-    rounds = record(OPEN_AND_PUSH, OPEN_AND_PUSH, num_rounds=64, blocked_gripper_fraction=0.5)
-    blocked = [played for played in rounds if played.alice_states[0, -1] == 1.0]
-    assert 20 < len(blocked) < 44  # four standard deviations of 64 draws are 16
-    for played in rounds:
-        states = np.concatenate([played.alice_states, played.bob_states])
-        is_blocked = played.alice_states[0, -1] == 1.0
-        assert (states[:, -1] == is_blocked).all()
+def test_grippers_are_blocked_as_at_the_end_of_a_run():
+    rounds = record(OPEN_AND_PUSH, num_rounds=64, blocked_gripper_fraction=0.5, blocked_gripper_min_success=0.9)
+    blocked = [played.alice_states[0, -1] == 1.0 for played in rounds]
+    assert 20 < sum(blocked) < 44  # four standard deviations of 64 draws are 16
+    for played, is_blocked in zip(rounds, blocked, strict=True):
         # Open fingers are at 4 cm; a blow against the table moves blocked ones by millimetres.
-        assert states[:, FINGERS].max() < 0.005 if is_blocked else states[:, FINGERS].max() > 0.039
-    assert any(len(played.bob_actions) for played in blocked)
+        widest = played.alice_states[:, FINGERS].max()
+        assert widest < 0.005 if is_blocked else widest > 0.039
 
 
 def test_a_seed_determines_the_rounds():
