@@ -161,7 +161,12 @@ class Chain:
 
     def errors(self, here: Kinematics, target: StateArray) -> StateArray:
         """(N, E) way to (N, 3) targets, metres, and the turn to the orientation, rad, as far as one is asked."""
-        return np.concatenate([target - here.position, orientation_error(here.rotation)], axis=1)[:, : self._num_rows]
+        rotation, turn = here.rotation, np.empty((len(target), 3))
+        # Half the sum of the axes' cross products with those of DOWN, written out, as it has only three numbers.
+        turn[:, 0] = 0.5 * (rotation[:, 2, 1] - rotation[:, 1, 2])
+        turn[:, 1] = 0.5 * (rotation[:, 2, 0] + rotation[:, 0, 2])
+        turn[:, 2] = -0.5 * (rotation[:, 1, 0] + rotation[:, 0, 1])
+        return np.concatenate([target - here.position, turn], axis=1)[:, : self._num_rows]
 
     def solve(
         self, joints: StateArray, target: StateArray, *, at: Kinematics | None = None, num_iterations: int = 2
@@ -195,15 +200,6 @@ class Chain:
             step = np.matmul(transposed, np.linalg.solve(square, error[:, :, None]))[:, :, 0]
             joints = np.clip(joints + posture + step, self.lower, self.upper)
         return joints
-
-
-def orientation_error(rotation: StateArray) -> StateArray:
-    """(N, 3) small rotation vector that takes ``rotation`` to ``DOWN``: half the sum of the axes' cross products."""
-    error = np.empty((rotation.shape[0], 3))  # written out, as DOWN has only three numbers
-    error[:, 0] = 0.5 * (rotation[:, 2, 1] - rotation[:, 1, 2])
-    error[:, 1] = 0.5 * (rotation[:, 2, 0] + rotation[:, 0, 2])
-    error[:, 2] = -0.5 * (rotation[:, 1, 0] + rotation[:, 0, 1])
-    return error
 
 
 def _common_normal(axes: StateArray, anchors: StateArray) -> tuple[StateArray, StateArray, StateArray]:

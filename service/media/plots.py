@@ -201,13 +201,9 @@ def plot_study(run_dirs: Mapping[str, Path], path: Path) -> Path:
 
 
 def _progress(records: Sequence[dict[str, Any]]) -> str:
-    steps, seconds = (column(records, key) for key in ("env_steps", "time/wall_s"))
-    words = [counted(len(records), "iteration")]
-    if np.isfinite(steps).any():
-        words.append(f"{np.nanmax(steps) / 1e6:.2f} M env steps")
-    if np.isfinite(seconds).any():
-        words.append(f"{np.nanmax(seconds) / 60:.0f} min")
-    return ", ".join(words)
+    steps = column(records, "env_steps")
+    done = f", {np.nanmax(steps) / 1e6:.2f} M env steps" if np.isfinite(steps).any() else ""
+    return counted(len(records), "iteration") + done
 
 
 def _smooth(values: StateArray, span: float) -> StateArray:

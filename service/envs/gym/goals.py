@@ -51,28 +51,26 @@ class GoalSource:
         if isinstance(goals, str):
             check_goals(goals, config)
         elif not callable(goals):
-            self._lower, self._upper = self._checked_box(goals)
+            self._check_box(np.array(goals, dtype=np.float64))
 
     def draw(self, rng: np.random.Generator, places: Places) -> StateArray:
         """(N, 3) goals for N worlds whose things are at ``places``, metres.
 
+        Those of a function or a box are drawn again where they are out of reach, or inside something.
+
         Raises:
-            TandemError: a function that drew something else, or goals out of reach or inside a fixture.
+            TandemError: a function that drew something else, or no goal that is within reach and clear.
         """
         if isinstance(self._goals, str):
             return draw_goals(self._goals, rng, self._config, self._success_distance_m, places)
-        num = len(places.object)
-        if callable(self._goals):
-            goal = self._checked("goals: the function's goal", self._goals(rng, num, self._config), (num, 3))
-            return self._clear("goals: the function's goal", goal)
-        goal = self._from_box(rng, num)
+        goal = self._sample(rng, len(places.object))
         for _ in range(_MAX_DRAWS):
             wrong = self._out_of_reach(goal) | inside_fixtures(goal, self._config)
             wrong |= inside_obstacles(goal, places.obstacles, self._config)
             if not wrong.any():
                 return goal
-            goal[wrong] = self._from_box(rng, int(wrong.sum()))
-        raise TandemError(f"goals = {self._goals!r}: no place in it is within reach and clear: choose another box")
+            goal[wrong] = self._sample(rng, int(wrong.sum()))
+        raise TandemError(f"goals = {self._goals!r}: no place in it is within reach and clear: choose others")
 
     def given(self, options: dict[str, Any] | None, num: int) -> StateArray | None:
         """(num, 3) goals that ``options`` of a reset give, metres; None where they give none.
@@ -84,44 +82,43 @@ class GoalSource:
             raise TandemError(f"reset: unknown option {name!r}; the only one is goal")
         if not options or options["goal"] is None:
             return None
-        goal = self._checked("reset: options['goal']", options["goal"], (3,), (num, 3))
-        return self._clear("reset: options['goal']", goal)
-
-    def _checked(self, what: str, value: Any, *shapes: tuple[int, ...]) -> StateArray:
-        """Goals of one of these shapes as (N, 3), a copy."""
-        goal = np.array(value, dtype=np.float64)
-        if goal.shape not in shapes:
-            known = " or ".join(str(shape) for shape in shapes)
-            raise TandemError(f"{what} has shape {goal.shape}, not {known}: write x, y, z in metres")
+        goal = np.array(options["goal"], dtype=np.float64)
+        if goal.shape not in ((3,), (num, 3)):
+            raise TandemError(f"reset: options['goal'] has shape {goal.shape}, not (3,) or {(num, 3)}: give metres")
         goal = goal.reshape(-1, 3)
+        self._check_reach("reset: options['goal']", goal)
+        for bad in goal[inside_fixtures(goal, self._config)]:
+            raise TandemError(
+                f"reset: options['goal'] {_point(bad)} m: the object would be inside a fixture, or the upright box "
+                "around it"
+            )
+        return goal
+
+    def _sample(self, rng: np.random.Generator, num: int) -> StateArray:
+        """(num, 3) goals of the user's function or box, metres."""
+        if not callable(self._goals):
+            return rng.uniform(*np.array(self._goals, dtype=np.float64), (num, 3))
+        goal = np.array(self._goals(rng, num, self._config), dtype=np.float64)
+        if goal.shape != (num, 3):
+            raise TandemError(f"goals: the function's goal has shape {goal.shape}, not {(num, 3)}: give metres")
+        return goal
+
+    def _check_box(self, box: StateArray) -> None:
+        if box.shape != (2, 3):
+            raise TandemError(
+                f"goals = {self._goals!r}; choose one of {', '.join(GOAL_KINDS)}, a function (rng, num, world) -> "
+                "(num, 3), or a box ((x, y, z), (x, y, z)): its lowest and its highest corner, metres"
+            )
+        if (box[0] > box[1]).any():
+            raise TandemError(
+                f"goals = {self._goals!r}: the first corner of a box is the lowest: no number above the second"
+            )
+        self._check_reach("goals: the box's corner", np.stack(np.meshgrid(*box.T), axis=-1).reshape(-1, 3))
+
+    def _check_reach(self, what: str, goal: StateArray) -> None:
         for bad in goal[self._out_of_reach(goal)]:
             near = _point(self._nearest(bad[None])[0])
             raise TandemError(f"{what} {_point(bad)} m is out of reach: the nearest the arm comes is {near} m")
-        return goal
-
-    def _clear(self, what: str, goal: StateArray) -> StateArray:
-        """Goals that are not inside a fixture."""
-        for bad in goal[inside_fixtures(goal, self._config)]:
-            raise TandemError(
-                f"{what} {_point(bad)} m: the object would be inside a fixture, or the upright box around it"
-            )
-        return goal
-
-    def _checked_box(self, goals: GoalBox) -> tuple[StateArray, StateArray]:
-        box = np.array(goals, dtype=np.float64)
-        if box.shape != (2, 3):
-            raise TandemError(
-                f"goals = {goals!r}; choose one of {', '.join(GOAL_KINDS)}, a function (rng, num, world) -> (num, 3), "
-                "or a box ((x, y, z), (x, y, z)): its lowest and its highest corner, metres"
-            )
-        if (box[0] > box[1]).any():
-            raise TandemError(f"goals = {goals!r}: the first corner of a box is the lowest: no number above the second")
-        corners = np.stack(np.meshgrid(*box.T), axis=-1).reshape(-1, 3)
-        self._checked("goals: the box's corner", corners, corners.shape)
-        return box[0], box[1]
-
-    def _from_box(self, rng: np.random.Generator, num: int) -> StateArray:
-        return rng.uniform(self._lower, self._upper, (num, 3))
 
     def _nearest(self, goal: StateArray) -> StateArray:
         """(N, 3) where the object can be brought, nearest to (N, 3); on the table it may be lower than the arm."""
