@@ -79,7 +79,6 @@ class WorldBatch:
         self._commands = self.layout["commands"]
         self._obstacles = obstacle_columns(self.layout, len(config.obstacles))
         self._num_commands = self._commands.stop - self._commands.start
-        assert (self.model.nq, self.model.nv) == (self.layout.num_positions, self.layout.num_velocities)
         # The weights of object and obstacles are actuators, too, the last ones, which ignore their control.
         assert self.model.nu == self.robot.num_joints + self.robot.num_fingers + 1 + len(config.obstacles)
         assert mujoco.mj_stateSize(self.model, _PHYSICS) == self.layout.physics.stop

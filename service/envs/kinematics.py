@@ -87,8 +87,8 @@ class Chain:
         self._slides: BoolArray = is_slide
         end_axes, end_origin = self._read_table(axes, anchors, end_rotation[:, 0])
         zero = model.qpos0[model.jnt_qposadr[ids]]
-        self._angle = np.where(is_slide, self._angle, self._angle - zero)
-        self._offset_d = np.where(is_slide, self._offset_d - zero, self._offset_d)
+        self._angle[~is_slide] -= zero[~is_slide]
+        self._offset_d[is_slide] -= zero[is_slide]
         self._end_position = _rounded(end_axes.T @ (end_position - end_origin))
         self._end_axes = _rounded(end_axes.T @ end_rotation).T
 

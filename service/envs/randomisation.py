@@ -12,7 +12,6 @@ import numpy as np
 
 from service.base.types import Array, StateArray
 from service.config import WorldConfig
-from service.config.objects import ObjectConfig
 from service.envs.robot import described
 from service.envs.scene import FIXTURE_PREFIX, build_model
 
@@ -68,20 +67,14 @@ def _variant(config: WorldConfig, drawn: dict[str, float]) -> WorldConfig:
     """The world with an object as drawn."""
     changed: dict[str, object] = {name: drawn[name] for name in ("object_mass_kg", "friction") if name in drawn}
     if (factor := drawn.get("object_size")) is not None:
-        if isinstance(config.object, ObjectConfig):
-            changed["object"] = _scaled(config.object, factor)
-        else:
-            changed["object_size_m"] = config.object_size_m * factor
+        shape = config.shape
+        size, mesh = tuple(factor * each for each in shape.size_m), shape.mesh
+        if mesh is not None:
+            center = tuple(factor * each for each in mesh.center_m)
+            of_size = {"scale": mesh.scale * factor, "center_m": center, "volume_m3": mesh.volume_m3 * factor**3}
+            mesh = mesh.model_copy(update=of_size)
+        changed["object"] = shape.model_copy(update={"size_m": size, "mesh": mesh})
     return config.model_copy(update=changed)
-
-
-def _scaled(shape: ObjectConfig, factor: float) -> ObjectConfig:
-    mesh = shape.mesh
-    if mesh is not None:
-        center = tuple(factor * each for each in mesh.center_m)
-        of_size = {"scale": mesh.scale * factor, "center_m": center, "volume_m3": mesh.volume_m3 * factor**3}
-        mesh = mesh.model_copy(update=of_size)
-    return shape.model_copy(update={"size_m": tuple(factor * each for each in shape.size_m), "mesh": mesh})
 
 
 def _compile(config: WorldConfig, drawn: dict[str, float]) -> mujoco.MjModel:

@@ -40,11 +40,10 @@ class StateLayout:
         groups = ({"time": 1}, positions, velocities, measured, kept)
         self._columns = columns({name: size for group in groups for name, size in group.items()})
         assert len(self._columns) == sum(map(len, groups)), "two parts of the same name"
-        self.num_positions, self.num_velocities = sum(positions.values()), sum(velocities.values())
-        """Numbers in qpos and in qvel."""
-        self.physics = slice(0, 1 + self.num_positions + self.num_velocities)
+        first_velocity = 1 + sum(positions.values())
+        self.physics = slice(0, first_velocity + sum(velocities.values()))
         """MuJoCo's full physics state."""
-        self.velocities = slice(1 + self.num_positions, self.physics.stop)
+        self.velocities = slice(first_velocity, self.physics.stop)
         """All velocities."""
         first_kept: int = self.physics.stop + sum(measured.values())
         self.size = first_kept + sum(kept.values())

@@ -97,7 +97,8 @@ class GoalSource:
     def _sample(self, rng: np.random.Generator, num: int) -> StateArray:
         """(num, 3) goals of the user's function or box, metres."""
         if not callable(self._goals):
-            return rng.uniform(*np.array(self._goals, dtype=np.float64), (num, 3))
+            lower, upper = np.array(self._goals, dtype=np.float64)
+            return rng.uniform(lower, upper, (num, 3))
         goal = np.array(self._goals(rng, num, self._config), dtype=np.float64)
         if goal.shape != (num, 3):
             raise TandemError(f"goals: the function's goal has shape {goal.shape}, not {(num, 3)}: give metres")

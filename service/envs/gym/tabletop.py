@@ -124,7 +124,7 @@ class GoalWorlds:
             worlds: (N,) where.
             goal: (N, 3) in place of random goals, metres; random numbers go on as with these.
         """
-        index, generators = np.flatnonzero(worlds), self._generators()
+        index, generators = np.flatnonzero(worlds).tolist(), self._generators()
         starts = [self._worlds.draw_starts(generators[world], 1) for world in index]
         self._worlds.restore(np.concatenate(starts), worlds)
         for world in index:
