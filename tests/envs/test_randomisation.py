@@ -176,14 +176,6 @@ def test_saved_states_go_on_exactly_in_another_batch():
         assert len(np.unique(one.states[:, one.layout["model"]])) > 1
 
 
-def test_without_ranges_a_world_is_the_same_world():
-    with WorldBatch(world(), 2, num_threads=1) as worlds:
-        assert len(worlds.bank) == 1
-        assert worlds.states.shape[1] == worlds.layout.physics.stop + 2  # its contacts
-        config = world(**EVERYTHING).nominal
-        assert config == world()
-
-
 @pytest.mark.parametrize(
     ("given", "expected"),
     [

@@ -1,7 +1,7 @@
 """The Gymnasium goal environment: the convention, both checkers, exact seeds and states."""
 
 import sys
-import types
+from types import SimpleNamespace
 
 import gymnasium
 import numpy as np
@@ -86,44 +86,52 @@ def test_compute_reward_by_hand(env):
     wide.close()
 
 
-def test_a_seed_gives_the_same_episodes_and_another_does_not(env):
-    actions = random_actions(20)
-    episodes = {}
-    for name, seed in (("first", 5), ("again", 5), ("other", 6)):
-        start, _ = env.reset(seed=seed)
-        rows = play(env, actions)
-        following, _ = env.reset()
-        episodes[name] = (start, rows, following)
-    for left, right in zip(episodes["first"], episodes["again"], strict=True):
-        if isinstance(left, dict):
-            assert_same(left, right)
-        else:
-            np.testing.assert_array_equal(left, right)
-    assert (episodes["first"][0]["achieved_goal"] != episodes["other"][0]["achieved_goal"]).any()
-    assert (episodes["first"][0]["desired_goal"] != episodes["first"][2]["desired_goal"]).any()
-
-
-def test_a_restored_state_continues_bit_identically(env):
-    env.reset(seed=0)
+@pytest.mark.parametrize("task", [None, "box"])
+def test_a_restored_state_continues_bit_identically(task):
+    env = TabletopEnv(CONFIG, task=task)
+    start, _ = env.reset(seed=5)
+    assert (env.reset(seed=6)[0]["achieved_goal"] != start["achieved_goal"]).any()
+    assert_same(env.reset(seed=5)[0], start)
     play(env, random_actions(7))
     state = env.state()
-    expected, expected_start = play(env, random_actions(15, seed=1)), env.reset()[0]
-    for other in (env, TabletopEnv(CONFIG)):
+    expected, following = play(env, random_actions(15, seed=1)), env.reset()[0]
+    assert (following["desired_goal"] != start["desired_goal"]).any()
+    for other in (env, TabletopEnv(CONFIG, task=task)):
         observation = other.restore(state)
         assert observation in env.observation_space
         np.testing.assert_array_equal(play(other, random_actions(15, seed=1)), expected)
-        assert_same(other.reset()[0], expected_start)
+        assert_same(other.reset()[0], following)
         other.close()
 
 
-def test_a_saved_state_is_a_copy(env):
+def test_it_is_drawn_when_asked_by_a_renderer_that_is_closed(monkeypatch, env):
+    """By one that needs no OpenGL."""
+    calls = []
+
+    class Renderer:
+        def __init__(self, config, width, height):
+            calls.append((config, width, height))
+
+        def render(self, state, goal):
+            calls.append((state.copy(), goal.copy()))
+
+        def close(self):
+            calls.append("close")
+
+    module = SimpleNamespace(SceneRenderer=Renderer)
+    monkeypatch.setitem(sys.modules, "service.envs.rendering.renderer", module)
     env.reset(seed=0)
-    state = env.state()
-    worlds, goal = state.worlds.copy(), state.goal.copy()
-    play(env, random_actions(3))
-    env.reset()
-    np.testing.assert_array_equal(state.worlds, worlds)
-    np.testing.assert_array_equal(state.goal, goal)
+    assert env.render() is None
+    drawn = TabletopEnv(CONFIG, render_mode="rgb_array", width=160, height=120)
+    drawn.reset(seed=0)
+    assert calls == []
+    for _ in range(2):
+        drawn.render()
+    drawn.close()
+    assert (calls[0], calls[3]) == ((CONFIG, 160, 120), "close")
+    for state, goal in calls[1:3]:
+        np.testing.assert_array_equal(state, drawn.state().worlds[0])
+        np.testing.assert_array_equal(goal, drawn.state().goal[0])
 
 
 def test_an_object_in_free_fall_stays_in_the_space(env):
@@ -162,43 +170,3 @@ def test_bad_options_are_named(option, value):
     with pytest.raises(TandemError, match=rf"{option} = {value!r}") as caught:
         TabletopEnv(CONFIG, **{option: value})
     assert "\n" not in str(caught.value)
-
-
-class TestRender:
-    @pytest.fixture
-    def calls(self, monkeypatch):
-        """A renderer that needs no OpenGL."""
-        calls = []
-
-        class Renderer:
-            def __init__(self, config, width, height):
-                calls.append(("open", config, width, height))
-
-            def render(self, state, goal):
-                calls.append(("render", state.copy(), goal.copy()))
-                return np.zeros((120, 160, 3), dtype=np.uint8)
-
-            def close(self):
-                calls.append(("close",))
-
-        fake = types.ModuleType("service.envs.rendering.renderer")
-        fake.SceneRenderer = Renderer
-        monkeypatch.setitem(sys.modules, "service.envs.rendering.renderer", fake)
-        return calls
-
-    def test_the_renderer_is_opened_when_asked_and_closed(self, calls):
-        env = TabletopEnv(CONFIG, render_mode="rgb_array", width=160, height=120)
-        env.reset(seed=0)
-        assert calls == []
-        for _ in range(2):
-            assert env.render().shape == (120, 160, 3)
-        env.close()
-        assert [call[0] for call in calls] == ["open", "render", "render", "close"]
-        assert calls[0][1:] == (CONFIG, 160, 120)
-        np.testing.assert_array_equal(calls[1][1], env.state().worlds[0])
-        np.testing.assert_array_equal(calls[1][2], env.state().goal[0])
-
-    def test_without_a_mode_nothing_is_drawn(self, calls, env):
-        env.reset(seed=0)
-        assert env.render() is None
-        assert calls == []

@@ -1,5 +1,4 @@
 import os
-import platform
 import subprocess
 import sys
 
@@ -117,15 +116,6 @@ def test_the_goal_is_a_ghost_where_it_should_be(renderer):
     assert with_goal[round(row), round(column), 1] > 1.3 * renderer.render(state)[red(without)][:, 1].mean()
 
 
-def test_a_picture_leaves_no_trace(renderer):
-    state = state_with_object_at(0.1, 0.1, 0.025)
-    before = state.copy()
-    first = renderer.render(state)
-    renderer.render(state, GOAL)
-    np.testing.assert_array_equal(renderer.render(state), first)
-    np.testing.assert_array_equal(state, before)
-
-
 def test_a_sphere_is_round():
     config = WorldConfig(object="sphere", object_size_m=0.07)
     with open_renderer(config) as renderer:
@@ -159,15 +149,6 @@ def test_closed_is_closed():
 def test_rendering_that_is_turned_off(monkeypatch):
     monkeypatch.setenv("MUJOCO_GL", "disabled")
     with pytest.raises(RenderError, match="MUJOCO_GL=disabled turns rendering off; unset it"):
-        open_drawing(build_spec(WorldConfig()).compile(), 32, 32)
-
-
-@pytest.mark.skipif(platform.system() != "Linux", reason="a display is a matter of variables on Linux only")
-def test_a_window_without_a_display(monkeypatch):
-    monkeypatch.setenv("MUJOCO_GL", "glfw")
-    monkeypatch.delenv("DISPLAY", raising=False)
-    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
-    with pytest.raises(RenderError, match=r"glfw failed .* apt-get install libegl1 .* training works without"):
         open_drawing(build_spec(WorldConfig()).compile(), 32, 32)
 
 
