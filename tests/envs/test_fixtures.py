@@ -5,12 +5,11 @@ import numpy as np
 import pytest
 
 from service.base.errors import ConfigError
-from service.config import WorldConfig, load_config
+from service.config import WorldConfig
 from service.config.objects import FixtureConfig
 from service.envs.batch import WorldBatch
 from service.envs.sampling import draw_objects, sample_goals
 from tests.envs.scripted import CLOSE, drive
-from tests.envs.test_meshes import write_box
 from tests.runs.runs import assert_one_line
 
 BLOCK = {"shape": "box", "size_m": (0.10, 0.06, 0.04), "position_m": (-0.05, 0.1)}
@@ -73,20 +72,6 @@ def test_an_open_finger_fits_beside_every_start():
     assert inside(position, (0.02, 0.06, 0.02)).any()
 
 
-def test_a_mesh(tmp_path):
-    file = write_box(tmp_path / "block.obj", (0.10, 0.06, 0.04), (5.0, 5.0, 5.0))
-    described = f"{{shape: mesh, mesh: {{pieces: [{file}]}}, position_m: [-0.05, 0.1]}}"
-    world = load_config(None, [f"world.fixtures=[{described}]"]).world
-    np.testing.assert_allclose(world.fixtures[0].corners_m, WORLD.fixtures[0].corners_m, atol=1e-6)
-    with WorldBatch(world, 1) as worlds:
-        states = worlds.states.copy()
-        states[:, worlds.layout["object"]] = (-0.05, 0.1, 0.066)
-        worlds.restore(states)
-        for _ in range(40):
-            worlds.step(np.zeros((1, 4), dtype=np.float32))
-        np.testing.assert_allclose(worlds.object_position, [[-0.05, 0.1, 0.065]], atol=1e-3)
-
-
 @pytest.mark.parametrize(
     ("world", "said"),
     [
@@ -99,24 +84,3 @@ def test_worlds_that_cannot_begin_are_one_line(world, said):
     with pytest.raises(ConfigError) as error, WorldBatch(WorldConfig(**world), 1) as worlds:
         worlds.reset(np.random.default_rng(0))
     assert_one_line(error.value, *said)
-
-
-@pytest.mark.parametrize(
-    ("described", "said"),
-    [
-        ("[{shape: box, size_m: [0.1, 0.1, 0.1]}]", ["world.fixtures.0.position_m", "required"]),
-        ("[{shape: box, size_m: [0.1], position_m: [0, 0]}]", ["world.fixtures.0", "size_m of a box has 3 numbers"]),
-        ("{shape: box}", ["world.fixtures"]),
-    ],
-)
-def test_mistakes_in_a_description_are_one_line(described, said):
-    with pytest.raises(ConfigError) as error:
-        load_config(None, [f"world.fixtures={described}"])
-    assert_one_line(error.value, *said)
-
-
-def test_a_wall_and_others_are_one_line():
-    post = "{shape: cylinder, size_m: [0.04, 0.2], position_m: [0.08, -0.1]}"
-    with pytest.raises(ConfigError) as error:
-        load_config(None, ["world.fixture=wall", f"world.fixtures=[{post}]"])
-    assert_one_line(error.value, "the one or the other")

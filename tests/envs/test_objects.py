@@ -116,28 +116,6 @@ def test_a_long_object_starts_clear_of_a_fixture(fixture):
         assert ((away[:, 0] >= 0.05 + 0.06 + 0.005) | (away[:, 1] >= 0.05 + 0.015 + 0.04)).all()
 
 
-@pytest.mark.parametrize(
-    ("described", "said"),
-    [
-        ("{shape: cone, size_m: [0.05]}", ["world.object.shape", "'cone'"]),
-        ("{shape: box, size_m: [0.05]}", ["size_m of a box has 3 numbers", "got 1"]),
-        ("{shape: cylinder, size_m: [0.05, 0.05, 0.05]}", ["size_m of a cylinder has 2 numbers", "height"]),
-        ("{shape: capsule, size_m: [0.05, 0.04]}", ["length 0.04 must exceed its diameter"]),
-        ("{shape: sphere, size_m: [50]}", ["world.object.size_m.0", "less than or equal to 0.5"]),
-        ("{shape: sphere, size_m: [-0.05]}", ["world.object.size_m.0"]),
-        ("{shape: sphere, size_m: [0.05], color: [1, 2, 3]}", ["world.object.color", "less than or equal to 1"]),
-        ("{shape: sphere, size_m: [0.05], weight: 3}", ["world.object.weight", "unknown key"]),
-        ("{shape: sphere}", ["world.object.size_m", "required"]),
-        ("pyramid", ["world.object", "'pyramid'"]),
-        ("[1, 2]", ["world.object"]),
-    ],
-)
-def test_mistakes_in_a_description_are_one_line(described, said):
-    with pytest.raises(ConfigError) as error:
-        load_config(None, [f"world.object={described}"])
-    assert_one_line(error.value, *said)
-
-
 def test_an_object_wider_than_the_gripper_opens():
     with pytest.raises(ConfigError) as error:
         WorldBatch(WorldConfig(object={"shape": "box", "size_m": (0.05, 0.09, 0.05)}), 1)

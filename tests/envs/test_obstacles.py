@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from service.base.errors import ConfigError
-from service.config import WorldConfig, load_config
+from service.config import WorldConfig
 from service.envs.batch import SEEN_WITHIN_M, WorldBatch
 from service.envs.objects import FLOOR_Z_M
 from service.envs.observations import POSITIONS, layouts
@@ -189,20 +189,6 @@ def test_a_run_learns_with_them_is_saved_and_goes_on(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("described", "said"),
-    [
-        ("[{shape: sphere, size_m: [0.05], mass_kg: 0}]", ["world.obstacles.0.mass_kg", "greater than 0"]),
-        ("[{shape: sphere, size_m: [0.05], position_m: [0, 0]}]", ["world.obstacles.0.position_m", "unknown key"]),
-        (f"[{', '.join(['{shape: sphere, size_m: [0.02]}'] * 9)}]", ["world.obstacles", "at most 8"]),
-    ],
-)
-def test_mistakes_in_a_description_are_one_line(described, said):
-    with pytest.raises(ConfigError) as error:
-        load_config(None, [f"world.obstacles={described}"])
-    assert_one_line(error.value, *said)
-
-
-@pytest.mark.parametrize(
     ("world", "said"),
     [
         ({"obstacles": [{"shape": "box", "size_m": (0.3, 0.3, 0.05)}] * 5}, ["world.obstacles", "the 5 of them"]),
@@ -217,9 +203,3 @@ def test_worlds_without_room_are_refused_when_they_are_made(world, said):
     with pytest.raises(ConfigError) as error:
         WorldBatch(WorldConfig(**world), 1)
     assert_one_line(error.value, *said)
-
-
-def test_none_can_be_seen_where_there_are_none():
-    with pytest.raises(ConfigError) as error:
-        load_config(None, ["world.observed.obstacles=true"])
-    assert_one_line(error.value, "observed.obstacles", "describe some")

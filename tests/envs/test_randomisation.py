@@ -4,8 +4,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from service.base.errors import ConfigError
-from service.config import WorldConfig, parse_config
+from service.config import WorldConfig
 from service.envs.batch import WorldBatch
 from service.envs.observations import POSITIONS
 from service.envs.randomisation import KEYS, ModelBank, normal
@@ -174,19 +173,3 @@ def test_saved_states_go_on_exactly_in_another_batch():
         np.testing.assert_array_equal(one.states, other.states)
         np.testing.assert_array_equal(one.positions(), other.positions())
         assert len(np.unique(one.states[:, one.layout["model"]])) > 1
-
-
-@pytest.mark.parametrize(
-    ("given", "expected"),
-    [
-        ({"friction": [1.0, 0.5]}, "friction = [1, 0.5] is the wrong way round"),
-        ({"delay_steps": [0, 20]}, "delay_steps = [0, 20] goes beyond [0, 8]"),
-        ({"object_mass_kg": [0.0, 1.0]}, "object_mass_kg = [0, 1] goes beyond"),
-        ({"mass": [0.1, 1.0]}, "unknown key 'world.randomisation.mass'"),
-    ],
-)
-def test_ranges_that_cannot_be(given, expected):
-    with pytest.raises(ConfigError) as raised:
-        parse_config({"world": {"randomisation": given}}, where="a test")
-    assert expected in str(raised.value)
-    assert "\n" not in str(raised.value)
