@@ -46,11 +46,14 @@ def parse_config(tree: dict[str, Any], *, where: str) -> Config:
         where: its origin, named in errors.
 
     Raises:
-        ConfigError: unknown key, or value out of range.
+        ConfigError: unknown method or key, or value out of range.
     """
-    kind = class_of(tree, where=where)
+    method = tree.get("method", DEFAULT_METHOD)
+    if not isinstance(method, str):
+        raise ConfigError(f"{where}: method = {method!r}: expected a name")
+    kind = find_class(method)
     if "method" in tree:
-        tree = {**tree, "method": exact_name(tree["method"])}
+        tree = {**tree, "method": exact_name(method)}
     try:
         return kind.model_validate(tree)
     except ValidationError as error:
@@ -65,21 +68,6 @@ def parse_config(tree: dict[str, Any], *, where: str) -> Config:
             hint = _elsewhere(keys, name) or did_you_mean(name, known)
             raise ConfigError(f"{where}: unknown key {key!r}; known there: {', '.join(known)}{more}{hint}") from None
         raise ConfigError(f"{where}: {key}{found}: {reason(first)}{more}") from None
-
-
-def class_of(tree: dict[str, Any], *, where: str) -> type[Config]:
-    """The class that a plain tree is to be validated by.
-
-    Raises:
-        ConfigError: its method is none.
-    """
-    method = tree.get("method", DEFAULT_METHOD)
-    if not isinstance(method, str):
-        raise ConfigError(f"{where}: method = {method!r}: expected a name")
-    try:
-        return find_class(method)
-    except ConfigError as error:
-        raise ConfigError(f"{where}: {error}") from None
 
 
 def changed_config(config: Config, overrides: Sequence[str]) -> Config:

@@ -9,7 +9,8 @@ import mujoco
 
 from service.config import WorldConfig
 from service.config.model_files import MeshConfig, Vector, model_file
-from service.config.objects import ROUND, ObjectConfig, ObstacleConfig
+from service.config.objects import ROUND, ObjectConfig
+from service.envs.state_layout import OBSTACLE_PREFIX
 
 GRIPPER_BIT, OBJECT_BIT, TABLE_BIT, FLOOR_BIT = 1, 2, 4, 8
 """MuJoCo's contact types. Table and fixtures are touched by gripper and object, the object by the gripper. Obstacles
@@ -75,27 +76,27 @@ def parts_of(spec: mujoco.MjSpec, shape: ObjectConfig, name: str, mass_kg: float
     return [{"type": kind, "size": size, "quat": quaternion, "mass": mass_kg}]
 
 
-def add_object(spec: mujoco.MjSpec, config: WorldConfig) -> None:
-    """Add the object that players move: the gripper touches it, and it touches table, fixtures and obstacles."""
+def add_things(spec: mujoco.MjSpec, config: WorldConfig) -> None:
+    """Add the object that players move, and obstacles: a game goes on when one of these falls onto the floor.
+
+    The gripper touches them, and they touch table, fixtures and each other. An obstacle's friction counts wherever it
+    lies, not the greater one of it and the table's, as without a priority.
+    """
     touching = {"contype": OBJECT_BIT, "conaffinity": GRIPPER_BIT}
     _add_free(spec, config.shape, "object", config.object_mass_kg, config.friction, touching)
-
-
-def add_obstacle(spec: mujoco.MjSpec, obstacle: ObstacleConfig, name: str) -> None:
-    """Add a further object. It touches what the object touches, the object, its like, and the floor.
-
-    Its friction counts wherever it lies, not the greater one of it and the table's, as without a priority.
-    """
     touching = {
         "contype": OBJECT_BIT,
         "conaffinity": GRIPPER_BIT | OBJECT_BIT | FLOOR_BIT,
         "priority": OBSTACLE_PRIORITY,
     }
-    _add_free(spec, obstacle, name, obstacle.mass_kg, obstacle.friction, touching)
+    for number, obstacle in enumerate(config.obstacles, start=1):
+        _add_free(spec, obstacle, f"{OBSTACLE_PREFIX}{number}", obstacle.mass_kg, obstacle.friction, touching)
+    if config.obstacles:
+        _add_floor(spec)
 
 
-def add_floor(spec: mujoco.MjSpec) -> None:
-    """Add a floor for obstacles: a game goes on when one falls off the table, and it shall not fall for ever."""
+def _add_floor(spec: mujoco.MjSpec) -> None:
+    """Add a floor, so that what falls off the table does not fall for ever."""
     # A body of its own: the tree of bounds of the world's geoms is made once, and a model bank moves the table later.
     spec.worldbody.add_body(name="ground").add_geom(
         name="ground",

@@ -98,8 +98,7 @@ class Robot:
 
     def openings(self, fingers: StateArray) -> StateArray:
         """(N, 2) distance of the left and right fingertip from the middle, metres, for (N, F) values of fingers."""
-        openings: StateArray = ((fingers - self._closed)[:, :, None] * self._openings).sum(axis=1)
-        return openings
+        return self.opening_speeds(fingers - self._closed)
 
     def opening_speeds(self, fingers: StateArray) -> StateArray:
         """(N, 2) the same for (N, F) velocities, m/s."""

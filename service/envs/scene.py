@@ -15,16 +15,7 @@ import numpy as np
 
 from service.base.errors import ConfigError
 from service.config import WorldConfig
-from service.envs.objects import (
-    GRIPPER_BIT,
-    OBJECT_BIT,
-    STIFF,
-    TABLE_BIT,
-    add_floor,
-    add_object,
-    add_obstacle,
-    parts_of,
-)
+from service.envs.objects import GRIPPER_BIT, OBJECT_BIT, STIFF, TABLE_BIT, add_things, parts_of
 from service.envs.observations import ACTION
 from service.envs.robot import add_robot, described
 from service.envs.state_layout import OBSTACLE_PREFIX, StateLayout
@@ -83,11 +74,7 @@ def build_spec(config: WorldConfig) -> mujoco.MjSpec:
         group=3,
         **STIFF,
     )
-    add_object(spec, config)
-    for number, obstacle in enumerate(config.obstacles, start=1):
-        add_obstacle(spec, obstacle, f"{OBSTACLE_PREFIX}{number}")
-    if config.obstacles:
-        add_floor(spec)
+    add_things(spec, config)
     _add_fixture(spec, config)
     _add_described_fixtures(spec, config)
     return spec

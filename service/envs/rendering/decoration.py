@@ -161,23 +161,7 @@ def _add_panda_visuals(spec: mujoco.MjSpec) -> None:
     Each part is the convex hull of spheres, rounded discs or bevelled boxes, in metres, in the link frames. They follow
     the robot's outline closely enough for a picture; physics does not use them.
     """
-    _add_lower_arm(spec)
-    _add_upper_arm(spec)
-    _add_wrist(spec)
-    _add_gripper(spec)
-
-
-def _make_visual(geom: Any, material: str, *, casts_shadow: bool = True) -> None:
-    """Make a geom one that is only drawn: it touches nothing and weighs nothing."""
-    geom.material = material
-    geom.contype = geom.conaffinity = 0
-    geom.mass = 0.0
-    geom.group = 1
-    geom.castshadow = casts_shadow
-
-
-def _add_lower_arm(spec: mujoco.MjSpec) -> None:
-    """Add the base to the shoulder."""
+    # The base to the shoulder.
     _hull(spec, "link0", "cover", _disc((0, 0, 0.03), _Z, 0.075, 0.03), _disc((-0.10, 0, 0.025), _Z, 0.062, 0.025))
     _hull(spec, "link0", "cover", _disc((0, 0, 0.04), _Z, 0.070, 0.03), _disc((0, 0, 0.125), _Z, 0.056, 0.012))
     _hull(spec, "link0", "joint", _disc((0, 0, 0.139), _Z, 0.0545, 0.006, 0.002))
@@ -187,10 +171,7 @@ def _add_lower_arm(spec: mujoco.MjSpec) -> None:
         _hull(spec, "link1", "joint", _disc((0, side * 0.054, 0), _Y, 0.0545, 0.006, 0.002))
         _hull(spec, "link2", "cover", _disc((0, 0, side * 0.074), _Z, 0.057, 0.016, 0.010))
         _hull(spec, "link2", "cap", _disc((0, 0, side * 0.0895), _Z, 0.041, 0.002, 0.001))
-
-
-def _add_upper_arm(spec: mujoco.MjSpec) -> None:
-    """Add the shoulder to the forearm's ring."""
+    # The shoulder to the forearm's ring.
     _hull(spec, "link2", "cover", _disc((0, -0.03, 0), _Z, 0.052, 0.085, 0.03), _disc((0, -0.17, 0), _Y, 0.056, 0.014))
     _hull(spec, "link2", "joint", _disc((0, -0.189, 0), _Y, 0.0545, 0.006, 0.002))
     _hull(spec, "link3", "cover", _disc((0, 0, -0.105), _Z, 0.056, 0.014), _disc((0.078, 0, 0), _Y, 0.053, 0.05, 0.02))
@@ -201,10 +182,7 @@ def _add_upper_arm(spec: mujoco.MjSpec) -> None:
     elbow, ring = _disc((0, 0.01, 0), _Z, 0.050, 0.080, 0.03), _disc((-0.0825, 0.105, 0), _Y, 0.055, 0.014)
     _hull(spec, "link4", "cover", elbow, ring)
     _hull(spec, "link4", "joint", _disc((-0.0825, 0.124, 0), _Y, 0.0535, 0.006, 0.002))
-
-
-def _add_wrist(spec: mujoco.MjSpec) -> None:
-    """Add the forearm, which narrows and bends to the side of the wrist, to the flange."""
+    # The forearm, which narrows and bends to the side of the wrist, to the flange.
     waist, knuckle = _sphere((0, 0.035, -0.13), 0.043), _disc((0.05, 0, 0), _Z, 0.044, 0.040, 0.012)
     _hull(spec, "link5", "cover", _disc((0, 0, -0.24), _Z, 0.055, 0.014), waist)
     _hull(spec, "link5", "cover", waist, _disc((0, 0.066, 0), _Y, 0.045, 0.02, 0.012))
@@ -215,9 +193,7 @@ def _add_wrist(spec: mujoco.MjSpec) -> None:
     _hull(spec, "link7", "joint", _disc((0, 0, 0.057), _Z, 0.0445, 0.006, 0.002))
     _hull(spec, "link7", "cover", _disc((0, 0, 0.078), _Z, 0.045, 0.018))
     _hull(spec, "link7", "steel", _disc((0, 0, 0.101), _Z, 0.0315, 0.006, 0.002))
-
-
-def _add_gripper(spec: mujoco.MjSpec) -> None:
+    # The gripper.
     bottom = [_sphere((x, y, 0.022), 0.010) for x in (-0.022, 0.022) for y in (-0.092, 0.092)]
     top = [_sphere((x, y, 0.052), 0.010) for x in (-0.020, 0.020) for y in (-0.090, 0.090)]
     foot = [_sphere((x, y, 0.022), 0.010) for x in (-0.022, 0.022) for y in (-0.05, 0.05)]
@@ -230,6 +206,15 @@ def _add_gripper(spec: mujoco.MjSpec) -> None:
         _hull(spec, finger, "steel", _bevelled((-0.0105, 0.004, 0.006), (0.0105, 0.027, 0.022), 0.002))
         _hull(spec, finger, "steel", knuckle, tip)
         _hull(spec, finger, "rubber", _bevelled((-0.0095, 0.0002, 0.032), (0.0095, 0.005, 0.0518), 0.001))
+
+
+def _make_visual(geom: Any, material: str, *, casts_shadow: bool = True) -> None:
+    """Make a geom one that is only drawn: it touches nothing and weighs nothing."""
+    geom.material = material
+    geom.contype = geom.conaffinity = 0
+    geom.mass = 0.0
+    geom.group = 1
+    geom.castshadow = casts_shadow
 
 
 def _hull(spec: mujoco.MjSpec, body: str, material: str, *clouds: StateArray) -> None:
