@@ -5,10 +5,9 @@ import numpy as np
 import pytest
 
 from service.base.errors import ConfigError
-from service.config import WorldConfig, load_config
+from service.config import WorldConfig
 from service.envs.batch import WorldBatch
 from service.envs.sampling import draw_objects
-from service.generator.bins import TaskBins
 from tests.envs.scripted import place_in_air
 from tests.runs.runs import assert_one_line
 
@@ -97,12 +96,6 @@ def test_a_cube_and_a_sphere_by_their_names_are_what_they_were():
     by_name = WorldConfig(object="sphere", object_size_m=0.05)
     assert by_name.shape == world_with("sphere").shape
     assert by_name != world_with("sphere")  # a recorded configuration stays as it was written
-
-
-def test_what_has_to_know_how_high_it_lies_does():
-    config = load_config(None, ["world.object={shape: cylinder, size_m: [0.05, 0.06]}"])
-    with WorldBatch(config.world, 1) as worlds:
-        assert TaskBins.from_config(config, worlds.layout).rest_height_m == 0.03
 
 
 @pytest.mark.parametrize("fixture", ["wall", "box"])

@@ -82,12 +82,6 @@ def test_bobs_input_is_put_together(worlds):
     np.testing.assert_array_equal(found, worlds.observe(observations.BOB, goal=GOALS))
 
 
-def test_the_gate_computes_with_the_way_of_the_object(worlds):
-    relative = GOALS - [[0.2, -0.1, 0.3], [-0.15, 0.12, 0.025]]
-    found = worlds.observe(observations.GATE, goal=GOALS, goal_from_object=relative)
-    assert_layout(found, np.hstack([positions(worlds), GOALS, relative]), 17)
-
-
 def test_a_name_means_one_entry():
     with pytest.raises(AssertionError, match="same name"):
         observations.BOB + observations.POSITIONS

@@ -11,7 +11,7 @@ from service.cli.main import app
 from service.config import WorldConfig
 from service.config.self_play import SelfPlayConfig
 from service.envs.gym.tabletop import TabletopEnv
-from service.media.dataset import Played, check_name, played_episodes, played_turns, write_dataset
+from service.media.dataset import Played, played_episodes, played_turns, write_dataset
 from service.media.recording import play_rounds, record_episodes
 from tests.media.test_recording import NOTHING, PUSH, Constant
 
@@ -93,15 +93,6 @@ def test_a_name_that_is_none_is_refused(place, name):
     done = tandem("panda-cube@champion", "--episodes", 1, "--out", name)
     assert (done.exit_code, done.stderr.count("\n")) == (2, 1)
     assert f"--out '{name}': write NAME" in done.stderr
-
-
-@pytest.mark.parametrize("name", ["x-v0", "a/b/cube-1-v12"])
-def test_a_name_that_is_taken_is_one_that_minari_reads(place, name):
-    from minari.dataset.minari_dataset import parse_dataset_id
-
-    assert check_name(name) == name
-    group, rest, version = parse_dataset_id(name)
-    assert "/".join(filter(None, (group, f"{rest}-v{version}"))) == name
 
 
 def test_half_a_data_set_is_taken_away(place):

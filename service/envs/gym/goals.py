@@ -133,21 +133,5 @@ class GoalSource:
         return ~near  # what is no number is out of reach, too
 
 
-def succeeded(success: Success, achieved: Array, desired: Array) -> BoolArray:
-    """(...) what a user's function says of (..., 3) goals.
-
-    Raises:
-        TandemError: it says something of another shape, or that is neither true nor false.
-    """
-    found = np.asarray(success(achieved, desired))
-    shape = np.broadcast_shapes(achieved.shape, desired.shape)[:-1]
-    if found.shape != shape or found.dtype != np.bool_:
-        raise TandemError(
-            f"success: the function gave {found.dtype} of shape {found.shape} for goals of shape {achieved.shape}; "
-            f"give bool of shape {shape}"
-        )
-    return found
-
-
 def _point(position: StateArray) -> str:
     return f"({', '.join(f'{each:.3g}' for each in position)})"

@@ -15,7 +15,7 @@ from service.base.errors import TandemError
 from service.base.types import BoolArray, FloatArray, StateArray
 from service.config import WorldConfig
 from service.envs.batch import WorldBatch
-from service.envs.gym.goals import Goals, GoalSource, Success, succeeded
+from service.envs.gym.goals import Goals, GoalSource, Success
 from service.envs.observations import ACTION, layouts
 from service.envs.tasks import find_task
 
@@ -87,9 +87,16 @@ class GoalWorlds:
             TandemError: the user's ``success`` gave no bool for each.
         """
         achieved, desired = np.asarray(achieved_goal), np.asarray(desired_goal)
-        if self._success is not None:
-            return succeeded(self._success, achieved, desired).astype(np.float64)
-        return (np.linalg.norm(achieved - desired, axis=-1) <= self.success_distance_m).astype(np.float64)
+        if self._success is None:
+            return (np.linalg.norm(achieved - desired, axis=-1) <= self.success_distance_m).astype(np.float64)
+        found = np.asarray(self._success(achieved, desired))
+        shape = np.broadcast_shapes(achieved.shape, desired.shape)[:-1]
+        if found.shape != shape or found.dtype != np.bool_:
+            raise TandemError(
+                f"success: the function gave {found.dtype} of shape {found.shape} for goals of shape {achieved.shape}; "
+                f"give bool of shape {shape}"
+            )
+        return found.astype(np.float64)
 
     def state(self) -> EnvState:
         """Copy everything that :meth:`restore` needs."""
