@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from copy import deepcopy
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import gymnasium
 import numpy as np
+from gymnasium.utils import seeding
 from numpy.typing import NDArray
 
 from service.base.errors import TandemError
@@ -77,6 +77,7 @@ class GoalWorlds:
         self._source = GoalSource(self.goals, self.config, self._worlds.reach, success_distance_m)
         self._goal = self._worlds.object_position.copy()
         self._elapsed = np.zeros(num_worlds, dtype=np.int64)
+        self._random = [seeding.np_random()[0] for _ in range(num_worlds)]
 
     def compute_reward(self, achieved_goal: NDArray[Any], desired_goal: NDArray[Any], info: Any) -> Any:
         """Reward of (..., 3) achieved for (..., 3) desired goals, metres: (...) float64, 1 where reached, else 0.
@@ -100,7 +101,7 @@ class GoalWorlds:
 
     def state(self) -> EnvState:
         """Copy everything that :meth:`restore` needs."""
-        random = tuple(deepcopy(dict(each.bit_generator.state)) for each in self._generators())
+        random = tuple(deepcopy(dict(each.bit_generator.state)) for each in self._random)
         return EnvState(self._worlds.states.copy(), self._goal.copy(), self._elapsed.copy(), random)
 
     def restore(self, state: EnvState) -> Observation:
@@ -116,13 +117,9 @@ class GoalWorlds:
             raise ValueError(f"states: expected shape {self._worlds.states.shape}, got {state.worlds.shape}")
         self._worlds.restore(state.worlds)
         self._goal, self._elapsed = state.goal.copy(), state.elapsed.copy()
-        for generator, random in zip(self._generators(), state.random, strict=True):
+        for generator, random in zip(self._random, state.random, strict=True):
             generator.bit_generator.state = deepcopy(random)
         return self._observe()[0]
-
-    def _generators(self) -> Sequence[np.random.Generator]:
-        """Random numbers of each world."""
-        raise NotImplementedError
 
     def _start(self, worlds: BoolArray, goal: StateArray | None = None) -> None:
         """Start new episodes, each from its own world's random numbers: no world depends on when others end.
@@ -131,12 +128,12 @@ class GoalWorlds:
             worlds: (N,) where.
             goal: (N, 3) in place of random goals, metres; random numbers go on as with these.
         """
-        index, generators = np.flatnonzero(worlds).tolist(), self._generators()
-        starts = [self._worlds.draw_starts(generators[world], 1) for world in index]
+        index = np.flatnonzero(worlds).tolist()
+        starts = [self._worlds.draw_starts(self._random[world], 1) for world in index]
         self._worlds.restore(np.concatenate(starts), worlds)
         for world in index:
             here = slice(world, world + 1)
-            self._goal[here] = self._source.draw(generators[world], self._worlds.places.of(here))
+            self._goal[here] = self._source.draw(self._random[world], self._worlds.places.of(here))
         if goal is not None:
             self._goal[:] = goal
         self._elapsed[worlds] = 0
@@ -212,7 +209,7 @@ class TabletopEnv(GoalWorlds, gymnasium.Env[Any, FloatArray]):
         if render_mode not in (None, *self.metadata["render_modes"]):
             raise TandemError(f"TabletopEnv: render_mode = {render_mode!r}; choose rgb_array or None")
         super().__init__(1, 1, config, task, goals, success_distance_m, success)
-        self.render_mode = render_mode
+        self.np_random, self.render_mode = self._random[0], render_mode
         self.observation_space = goal_space(self.config)
         self.action_space = action_space()
         self._image_size = (width, height)
@@ -233,6 +230,7 @@ class TabletopEnv(GoalWorlds, gymnasium.Env[Any, FloatArray]):
         """
         goal = self._source.given(options, 1)
         super().reset(seed=seed, options=options)
+        self._random = [self.np_random]
         self._start(np.ones(1, dtype=bool), goal)
         observation, success = self._observe_first()
         return observation, {"is_success": success}
@@ -267,9 +265,6 @@ class TabletopEnv(GoalWorlds, gymnasium.Env[Any, FloatArray]):
             self._renderer.close()
             self._renderer = None
         self._worlds.close()
-
-    def _generators(self) -> Sequence[np.random.Generator]:
-        return [self.np_random]
 
     def _observe_first(self) -> tuple[Observation, bool]:
         observation, success = self._observe()

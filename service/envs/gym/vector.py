@@ -67,7 +67,6 @@ class TabletopVectorEnv(GoalWorlds, gymnasium.vector.VectorEnv[Any, FloatArray, 
         self.single_observation_space, self.single_action_space = goal_space(self.config), action_space()
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
-        self._random = [seeding.np_random()[0] for _ in range(num_envs)]
 
     def reset(
         self, *, seed: int | Sequence[int | None] | None = None, options: Info | None = None
@@ -121,9 +120,6 @@ class TabletopVectorEnv(GoalWorlds, gymnasium.vector.VectorEnv[Any, FloatArray, 
     def close_extras(self, **kwargs: Any) -> None:
         """Stop the native threads."""
         self._worlds.close()
-
-    def _generators(self) -> Sequence[np.random.Generator]:
-        return self._random
 
 
 def _with_masks(values: Info, mask: BoolArray | None = None) -> Info:

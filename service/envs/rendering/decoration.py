@@ -1,7 +1,7 @@
 """Decoration of the scene for pictures: the Panda's covers, table, floor, sky, light, and the workspace's edges.
 
-All of it is made from numbers. No part collides, weighs anything or moves by itself, so a
-state of the physics model is a state of the decorated one.
+All of it is made from numbers. No part collides, weighs anything or moves by itself, so a state of the physics model is
+a state of the decorated one.
 """
 
 from __future__ import annotations
