@@ -43,104 +43,137 @@ _EDGE_STYLE = (0, (4, 3))
 # --- curves ----------------------------------------------------------------------------------------------------------
 
 
-class _Panel(NamedTuple):
-    title: str
-    look_for: str
-    unit: str
-
-
 class _Curve(NamedTuple):
-    panel: str
     key: str
     label: str
     color: str
     dashed: bool = False
 
 
-_PANELS = {
-    "proposals": _Panel("Alice's proposals", "valid settles high, lifted grows", "fraction"),
-    "bob": _Panel("Bob on Alice's goals", "holds up while the goals get harder", "solved"),
-    "random": _Panel("Bob on random goals", "grows; last: there at the last step", "solved"),
-    "goals": _Panel("How far and how high the goals are", "grow: Alice raises the bar", "metres"),
-    "refused": _Panel("Why proposals are refused", "not moved falls early, outside stays low", "fraction"),
-    "entropy": _Panel("Entropy of the policies", "falls slowly, without a collapse", "nats"),
-}
-_CURVES = (
-    _Curve("proposals", "alice/valid_fraction", "valid", BLUE),
-    _Curve("proposals", "alice/lifted_fraction", "lifted", ORANGE),
-    _Curve("proposals", "alice/contact_fraction", "touched", GREEN),
-    _Curve("bob", "bob/success_rate", "all", BLUE),
-    _Curve("bob", "bob/success_rate_table", "table", GREEN),
-    _Curve("bob", "bob/success_rate_air", "air", ORANGE),
-    _Curve("random", "evaluation/table_success_ever", "table, ever", GREEN, dashed=True),
-    _Curve("random", "evaluation/table_success_last", "table, last", GREEN),
-    _Curve("random", "evaluation/air_success_ever", "air, ever", ORANGE, dashed=True),
-    _Curve("random", "evaluation/air_success_last", "air, last", ORANGE),
-    _Curve("random", "evaluation/mixed_success_last", "mixed, last", BLUE),
-    _Curve("goals", "alice/goal_distance_m", "distance", BLUE),
-    _Curve("goals", "alice/goal_height_m", "height", ORANGE),
-    _Curve("goals", "alice/goal_height_p90_m", "height p90", ORANGE, dashed=True),
-    _Curve("refused", "alice/not_moved_fraction", "not moved", BLUE),
-    _Curve("refused", "alice/outside_fraction", "outside", ORANGE),
-    _Curve("entropy", "learner/alice_entropy", "Alice", ORANGE),
-    _Curve("entropy", "learner/bob_entropy", "Bob", BLUE),
-)
+class _Panel(NamedTuple):
+    title: str
+    look_for: str
+    unit: str
+    curves: Sequence[_Curve] = ()
 
 
-_SKILL_PANELS = {
-    "moved": _Panel("What episodes do to the object", "moved grows", "fraction"),
-    "coverage": _Panel("Coverage of random skills", "grows", "fraction"),
-    "cells": _Panel("Cells in which episodes ended", "grow", "cells"),
-    "distance": _Panel("How far the object came", "grows", "metres"),
-    "loss": _Panel("Loss of the reward's network", "settles", ""),
-    "entropy": _Panel("Entropy of the policy", "falls slowly, without a collapse", "nats"),
-}
-_SKILL_CURVES = (
-    _Curve("moved", "skills/moved_fraction", "moved", BLUE),
-    _Curve("moved", "skills/lifted_fraction", "lifted", ORANGE),
-    _Curve("moved", "skills/outside_fraction", "outside", GREEN),
-    _Curve("coverage", "evaluation/coverage", "32 skills", BLUE),
-    _Curve("cells", "skills/num_cells_seen", "ever", BLUE),
-    _Curve("distance", "skills/distance_m", "distance", BLUE),
-    _Curve("loss", "learner/representation_loss", "loss", BLUE),
-    _Curve("entropy", "learner/entropy", "policy", BLUE),
+_BOB = _Panel(
+    "Bob on Alice's goals",
+    "holds up while the goals get harder",
+    "solved",
+    (
+        _Curve("bob/success_rate", "all", BLUE),
+        _Curve("bob/success_rate_table", "table", GREEN),
+        _Curve("bob/success_rate_air", "air", ORANGE),
+    ),
 )
-
-_DISTILLATION_PANELS = {
-    "solved": _Panel("The student on random goals", "grows, with noise and random actions", "solved"),
-    "random": _PANELS["random"],
-    "action": _Panel("Error of actions", "falls; noise of what is seen leaves a rest", "squared"),
-    "primitives": _Panel("Error of primitives", "falls", "squared"),
-    "gate": _Panel("Error of the gate", "falls", "squared, of logs"),
-    "rate": _Panel("Learning rate", "falls", ""),
-}
-_DISTILLATION_CURVES = (
-    _Curve("solved", "bob/success_rate", "own gate", BLUE),
-    *(curve for curve in _CURVES if curve.panel == "random"),
-    _Curve("action", "learner/action_error", "error", BLUE),
-    _Curve("primitives", "learner/primitives_error", "error", BLUE),
-    _Curve("gate", "learner/gate_error", "error", BLUE),
-    _Curve("rate", "learner/learning_rate", "rate", BLUE),
+_RANDOM = _Panel(
+    "Bob on random goals",
+    "grows; last: there at the last step",
+    "solved",
+    (
+        _Curve("evaluation/table_success_ever", "table, ever", GREEN, dashed=True),
+        _Curve("evaluation/table_success_last", "table, last", GREEN),
+        _Curve("evaluation/air_success_ever", "air, ever", ORANGE, dashed=True),
+        _Curve("evaluation/air_success_last", "air, last", ORANGE),
+        _Curve("evaluation/mixed_success_last", "mixed, last", BLUE),
+    ),
 )
-
-_TASK_PANELS = {
-    "success": _Panel("The task", "last: there at the last step", "solved"),
-    "return": _Panel("Return of an episode", "grows, with noise", "steps at the goal"),
-    "entropy": _Panel("Entropy coefficient", "falls", ""),
-}
-_TASK_CURVES = (
-    _Curve("success", "evaluation/success_last", "last", BLUE),
-    _Curve("success", "evaluation/success_ever", "ever", GREEN, dashed=True),
-    _Curve("success", "rollout/success_last", "learning", ORANGE),
-    _Curve("return", "rollout/return", "return", BLUE),
-    _Curve("entropy", "learner/entropy_coefficient", "weight", BLUE),
+_SELF_PLAY = (
+    _Panel(
+        "Alice's proposals",
+        "valid settles high, lifted grows",
+        "fraction",
+        (
+            _Curve("alice/valid_fraction", "valid", BLUE),
+            _Curve("alice/lifted_fraction", "lifted", ORANGE),
+            _Curve("alice/contact_fraction", "touched", GREEN),
+        ),
+    ),
+    _BOB,
+    _RANDOM,
+    _Panel(
+        "How far and how high the goals are",
+        "grow: Alice raises the bar",
+        "metres",
+        (
+            _Curve("alice/goal_distance_m", "distance", BLUE),
+            _Curve("alice/goal_height_m", "height", ORANGE),
+            _Curve("alice/goal_height_p90_m", "height p90", ORANGE, dashed=True),
+        ),
+    ),
+    _Panel(
+        "Why proposals are refused",
+        "not moved falls early, outside stays low",
+        "fraction",
+        (
+            _Curve("alice/not_moved_fraction", "not moved", BLUE),
+            _Curve("alice/outside_fraction", "outside", ORANGE),
+        ),
+    ),
+    _Panel(
+        "Entropy of the policies",
+        "falls slowly, without a collapse",
+        "nats",
+        (_Curve("learner/alice_entropy", "Alice", ORANGE), _Curve("learner/bob_entropy", "Bob", BLUE)),
+    ),
 )
-_DRAWN = {
-    "self-play": (_PANELS, _CURVES),
-    "skills": (_SKILL_PANELS, _SKILL_CURVES),
-    "distillation": (_DISTILLATION_PANELS, _DISTILLATION_CURVES),
-}
-"""Panels and curves by method; those of learning a task are the same for all of its methods."""
+_SKILLS = (
+    _Panel(
+        "What episodes do to the object",
+        "moved grows",
+        "fraction",
+        (
+            _Curve("skills/moved_fraction", "moved", BLUE),
+            _Curve("skills/lifted_fraction", "lifted", ORANGE),
+            _Curve("skills/outside_fraction", "outside", GREEN),
+        ),
+    ),
+    _Panel("Coverage of random skills", "grows", "fraction", (_Curve("evaluation/coverage", "32 skills", BLUE),)),
+    _Panel("Cells in which episodes ended", "grow", "cells", (_Curve("skills/num_cells_seen", "ever", BLUE),)),
+    _Panel("How far the object came", "grows", "metres", (_Curve("skills/distance_m", "distance", BLUE),)),
+    _Panel("Loss of the reward's network", "settles", "", (_Curve("learner/representation_loss", "loss", BLUE),)),
+    _Panel(
+        "Entropy of the policy",
+        "falls slowly, without a collapse",
+        "nats",
+        (_Curve("learner/entropy", "policy", BLUE),),
+    ),
+)
+_DISTILLATION = (
+    _Panel(
+        "The student on random goals",
+        "grows, with noise and random actions",
+        "solved",
+        (_Curve("bob/success_rate", "own gate", BLUE),),
+    ),
+    _RANDOM,
+    _Panel(
+        "Error of actions",
+        "falls; noise of what is seen leaves a rest",
+        "squared",
+        (_Curve("learner/action_error", "error", BLUE),),
+    ),
+    _Panel("Error of primitives", "falls", "squared", (_Curve("learner/primitives_error", "error", BLUE),)),
+    _Panel("Error of the gate", "falls", "squared, of logs", (_Curve("learner/gate_error", "error", BLUE),)),
+    _Panel("Learning rate", "falls", "", (_Curve("learner/learning_rate", "rate", BLUE),)),
+)
+_TASK = (
+    _Panel(
+        "The task",
+        "last: there at the last step",
+        "solved",
+        (
+            _Curve("evaluation/success_last", "last", BLUE),
+            _Curve("evaluation/success_ever", "ever", GREEN, dashed=True),
+            _Curve("rollout/success_last", "learning", ORANGE),
+        ),
+    ),
+    _Panel("Return of an episode", "grows", "steps at the goal", (_Curve("rollout/return", "with noise", BLUE),)),
+    _Panel("Entropy coefficient", "falls", "", (_Curve("learner/entropy_coefficient", "weight", BLUE),)),
+)
+_PANELS = {"self-play": _SELF_PLAY, "skills": _SKILLS, "distillation": _DISTILLATION}
+"""Panels by method; those of learning a task are the same for all of its methods."""
 
 
 def plot_curves(run_dir: Path, method: str = "self-play") -> Path:
@@ -156,21 +189,18 @@ def plot_curves(run_dir: Path, method: str = "self-play") -> Path:
         TandemError: the run has no metrics yet, they are damaged, or the picture cannot be written.
     """
     records = read_records(run_dir / "metrics.jsonl")
-    panels, curves = _DRAWN.get(method, (_TASK_PANELS, _TASK_CURVES))
+    panels = _PANELS.get(method, _TASK)
     num_rows = len(panels) // 3
     figure = new_figure(14.0, 3.9 * num_rows, f"{run_dir.resolve().name}: {_progress(records)}")
-    for axes, (name, panel) in zip(figure.subplots(num_rows, 3).flat, panels.items(), strict=True):
-        _draw_panel(axes, panel, [(curve, records) for curve in curves if curve.panel == name])
+    for axes, panel in zip(figure.subplots(num_rows, 3).flat, panels, strict=True):
+        _draw_panel(axes, panel, [(curve, records) for curve in panel.curves])
     edges = {"left": 0.05, "right": 0.908, "top": 1.0 - 0.3 / num_rows, "bottom": 0.16 / num_rows}
     figure.subplots_adjust(**edges, wspace=0.64, hspace=0.46)
     return save(figure, run_dir / "curves.png")
 
 
-_SELF_PLAY = (
-    (_PANELS["random"].title, "evaluation/mixed_success_last"),
-    (_PANELS["bob"].title, "bob/success_rate"),
-)
-_TASKS = (("Evaluated", "evaluation/success_last"), ("While learning, with noise", "rollout/success_last"))
+_OF_STUDIES = ((_RANDOM.title, "evaluation/mixed_success_last"), (_BOB.title, "bob/success_rate"))
+_OF_TASKS = (("Evaluated", "evaluation/success_last"), ("While learning, with noise", "rollout/success_last"))
 """Curves of a study, with their titles."""
 
 
@@ -192,9 +222,9 @@ def plot_study(run_dirs: Mapping[str, Path], path: Path) -> Path:
         raise TandemError(f"no run in {path.parent} has metrics yet; wait for a first iteration")
     figure = new_figure(14.0, 5.2, f"{path.parent.resolve().name}: {counted(len(found), 'run')}")
     tasks = any("rollout/success_last" in record for records in found.values() for record in records[-1:])
-    for axes, (title, key) in zip(figure.subplots(1, 2), _TASKS if tasks else _SELF_PLAY, strict=True):
+    for axes, (title, key) in zip(figure.subplots(1, 2), _OF_TASKS if tasks else _OF_STUDIES, strict=True):
         runs = zip(found.items(), cycle(_COLORS), strict=False)
-        curves = [(_Curve(title, key, label, color), records) for (label, records), color in runs]
+        curves = [(_Curve(key, label, color), records) for (label, records), color in runs]
         _draw_panel(axes, _Panel(title, key.split("/")[1], "solved"), curves)
     figure.subplots_adjust(left=0.05, right=0.908, top=0.8, bottom=0.12, wspace=0.3)
     return save(figure, path)
