@@ -9,6 +9,7 @@ from service.envs.batch import WorldBatch
 from service.envs.observations import ACTION, FULL
 from service.envs.panda import PANDA
 from service.envs.sampling import sample_in_volume
+from service.envs.scene import build_model
 from tests.envs.scripted import CLOSE, OPEN, grasp, place_in_air
 from tests.envs.world_soak import soak
 
@@ -75,6 +76,27 @@ def test_rough_play_breaks_nothing(shape, physics, num_steps):
     extremes = soak(WorldConfig(object=shape, **physics), num_worlds=60, num_steps=num_steps, seed=0)
     assert extremes.contact_share > 0.05
     assert extremes.within_bounds(), extremes
+
+
+def test_contacts_are_those_that_published_primitives_were_trained_with():
+    ball = {"shape": "sphere", "size_m": (0.05,)}
+    model = build_model(WorldConfig(fixture="box", obstacles=[ball], start_height_m=0.2))
+    assert np.unique(model.geom_friction[:, 1:], axis=0).tolist() == [[0.005, 0.0001]]
+    option = model.opt
+    assert (option.impratio, option.noslip_iterations, option.iterations, option.tolerance) == (1.0, 5, 50, 1e-8)
+    expected = {  # sliding friction, time of a contact, its least and most impedance, dimensions, priority, type, affinity
+        "table": (1.0, 0.01, 0.95, 0.99, 3, 0, 4, 3),
+        "hand": (0.3, 0.02, 0.9, 0.95, 3, 0, 1, 0),
+        "left_pad_front": (1.0, 0.01, 0.9, 0.95, 4, 2, 1, 0),
+        "object": (1.0, 0.01, 0.95, 0.99, 3, 0, 2, 1),
+        "obstacle_1": (1.0, 0.01, 0.95, 0.99, 6, 1, 2, 11),
+        "ground": (1.0, 0.01, 0.95, 0.99, 3, 0, 8, 0),
+        "fixture_near": (1.0, 0.01, 0.95, 0.99, 3, 0, 0, 3),
+    }
+    for name, numbers in expected.items():
+        geom = model.geom(name)
+        touching = (geom.condim[0], geom.priority[0], geom.contype[0], geom.conaffinity[0])
+        assert (geom.friction[0], geom.solref[0], *geom.solimp[:2], *touching) == numbers, name
 
 
 def test_no_action_no_motion():
