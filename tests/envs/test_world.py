@@ -84,7 +84,7 @@ def test_contacts_are_those_that_published_primitives_were_trained_with():
     assert np.unique(model.geom_friction[:, 1:], axis=0).tolist() == [[0.005, 0.0001]]
     option = model.opt
     assert (option.impratio, option.noslip_iterations, option.iterations, option.tolerance) == (1.0, 5, 50, 1e-8)
-    expected = {  # sliding friction, time of a contact, its least and most impedance, dimensions, priority, type, affinity
+    expected = {  # sliding friction, time, least and most impedance, dimensions, priority, type, affinity
         "table": (1.0, 0.01, 0.95, 0.99, 3, 0, 4, 3),
         "hand": (0.3, 0.02, 0.9, 0.95, 3, 0, 1, 0),
         "left_pad_front": (1.0, 0.01, 0.9, 0.95, 4, 2, 1, 0),
