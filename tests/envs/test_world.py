@@ -82,6 +82,9 @@ def test_contacts_are_those_that_published_primitives_were_trained_with():
     ball = {"shape": "sphere", "size_m": (0.05,)}
     model = build_model(WorldConfig(fixture="box", obstacles=[ball], start_height_m=0.2))
     assert np.unique(model.geom_friction[:, 1:], axis=0).tolist() == [[0.005, 0.0001]]
+    sides = np.array([model.geom(f"fixture_{name}").pos for name in ("near", "far", "left", "right")])
+    np.testing.assert_allclose(np.sort(sides, axis=0)[[0, -1]], [[-0.0475, -0.0475, 0.025], [0.0475, 0.0475, 0.025]])
+    np.testing.assert_allclose(sides.sum(axis=0), [0.0, 0.0, 0.1])
     option = model.opt
     assert (option.impratio, option.noslip_iterations, option.iterations, option.tolerance) == (1.0, 5, 50, 1e-8)
     expected = {  # sliding friction, time, least and most impedance, dimensions, priority, type, affinity

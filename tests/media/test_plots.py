@@ -12,8 +12,11 @@ from service.base.jsonl import JsonlWriter
 from service.config import WorkspaceConfig
 from service.media.figures import column, new_figure
 from service.media.plots import (
+    _Curve,
+    _draw_panel,
     _goals,
     _inside,
+    _Panel,
     _slice_title,
     _smooth,
     _summary,
@@ -56,6 +59,15 @@ def test_curves_are_drawn_1400_pixels_wide(tmp_path, method):
     assert width == 1400
     assert size > 30_000
     assert sorted(file.name for file in tmp_path.iterdir()) == ["curves.png", "metrics.jsonl"]
+
+
+def test_a_panel_names_its_curves_with_the_last_value_that_is_known():
+    axes = new_figure(4.0, 4.0, "").subplots()
+    curves = (_Curve("a", "one", "red"), _Curve("evaluation/b", "two", "blue"), _Curve("c", "three", "green"))
+    records = [{"env_steps": 1e6, "a": 0.5}, {"env_steps": 2e6, "a": None, "evaluation/b": 0.25}, {"a": 0.75}]
+    _draw_panel(axes, _Panel("Title", "grows", "solved"), [(curve, records) for curve in curves])
+    assert {text.get_text() for text in axes.texts} == {"grows", "one 0.50", "two 0.25"}
+    assert (axes.get_ylim(), axes.get_xlim()[0]) == ((0.0, 1.0), 0.0)
 
 
 def test_the_runs_of_a_study_in_one_picture(tmp_path):
