@@ -149,6 +149,10 @@ def test_recorded_episodes_are_those_of_the_evaluation():
     assert result.success_ever == episodes.reached[1:].any(axis=0).mean()
     distance = np.linalg.norm(episodes.states[-1][:, OBJECT] - episodes.goal, axis=1)
     assert result.mean_distance_m == pytest.approx(distance.mean(), abs=1e-12)
+    few = episodes.first(3)
+    np.testing.assert_array_equal(few.states, episodes.states[:, :3])
+    np.testing.assert_array_equal(few.actions, episodes.actions[:, :3])
+    np.testing.assert_array_equal(few.goal, episodes.goal[:3])
 
 
 def test_recorded_skills_are_those_of_the_coverage():
