@@ -11,6 +11,7 @@ from service.envs.objects import FLOOR_Z_M
 from service.envs.observations import POSITIONS, layouts
 from service.envs.sampling import draw_goals
 from service.generator.generator import TaskGenerator
+from tests.envs.robots import write_robot
 from tests.envs.scripted import CLOSE, drive
 from tests.runs.runs import assert_one_line, play, tiny_config
 
@@ -19,6 +20,7 @@ BALL = {"shape": "sphere", "size_m": (0.05,)}
 BOTTLE = {"shape": "cylinder", "size_m": (0.04, 0.16), "mass_kg": 0.3}
 POST = {"shape": "cylinder", "size_m": (0.04, 0.2), "position_m": (0.08, -0.1)}
 SEEN = {"obstacles": True}
+SIDES = ("length_x_m", "length_y_m", "height_m")
 WORLD = WorldConfig(obstacles=[BLOCK, BALL, BOTTLE], observed=SEEN, physics_step_s=0.004, num_substeps=10)
 STAY = np.zeros((1, 4), dtype=np.float32)
 
@@ -176,18 +178,6 @@ def test_no_goal_that_is_replayed_from_a_reset_is_inside_one():
     assert found.tolist() == [False, True]
 
 
-def test_a_run_learns_with_them_is_saved_and_goes_on(tmp_path):
-    tree = tiny_config(total_env_steps=400).model_dump()
-    small = [{"shape": "box", "size_m": (0.02, 0.02, 0.03)}, {"shape": "sphere", "size_m": (0.02,)}]
-    tree["world"] |= {"obstacles": small, "observed": SEEN, "object_size_m": 0.04}
-    tree["world"]["workspace"] |= {"length_x_m": 0.25, "length_y_m": 0.25}
-    config = type(tiny_config()).model_validate(tree)
-    _, first = play(tmp_path / "run", config)
-    longer = config.model_copy(update={"run": config.run.model_copy(update={"total_env_steps": 800})})
-    _, second = play(tmp_path / "run", longer, resume=True)
-    assert second.num_env_steps > first.num_env_steps >= 400
-
-
 @pytest.mark.parametrize(
     ("world", "said"),
     [
@@ -203,3 +193,15 @@ def test_worlds_without_room_are_refused_when_they_are_made(world, said):
     with pytest.raises(ConfigError) as error:
         WorldBatch(WorldConfig(**world), 1)
     assert_one_line(error.value, *said)
+
+
+def test_a_run_learns_with_them_on_a_robot_of_five_joints_and_goes_on(tmp_path):
+    tree = tiny_config(total_env_steps=400).model_dump()
+    small = [{"shape": "box", "size_m": (0.02, 0.02, 0.03)}, {"shape": "sphere", "size_m": (0.02,)}]
+    tree["world"] |= {"obstacles": small, "observed": SEEN, "object_size_m": 0.04}
+    tree["world"] |= {"robot": str(write_robot(tmp_path)), "workspace": dict.fromkeys(SIDES, 0.2)}
+    config = type(tiny_config()).model_validate(tree)
+    _, first = play(tmp_path / "run", config)
+    longer = config.model_copy(update={"run": config.run.model_copy(update={"total_env_steps": 800})})
+    _, second = play(tmp_path / "run", longer, resume=True)
+    assert second.num_env_steps > first.num_env_steps >= 400

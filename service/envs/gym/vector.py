@@ -12,7 +12,6 @@ from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
-from service.base.errors import TandemError
 from service.base.types import BoolArray, FloatArray
 from service.config import WorldConfig
 from service.envs.gym.goals import Goals, Success
@@ -41,7 +40,7 @@ class TabletopVectorEnv(GoalWorlds, gymnasium.vector.VectorEnv[Any, FloatArray, 
         num_threads: native threads; 0 for one per core.
 
     Raises:
-        TandemError: unknown ``task`` or ``goals``, or a number that is not positive.
+        TandemError: unknown ``task`` or ``goals``, or a distance that is not positive.
     """
 
     metadata: dict[str, Any] = {"render_modes": [], "autoreset_mode": AutoresetMode.SAME_STEP}  # noqa: RUF012 - as the base class has it
@@ -58,9 +57,6 @@ class TabletopVectorEnv(GoalWorlds, gymnasium.vector.VectorEnv[Any, FloatArray, 
         max_episode_steps: int = 50,
         num_threads: int = 0,
     ) -> None:
-        for name, value in {"num_envs": num_envs, "max_episode_steps": max_episode_steps}.items():
-            if value < 1:
-                raise TandemError(f"TabletopVectorEnv: {name} = {value}; give at least 1")
         super().__init__(num_envs, num_threads, config, task, goals, success_distance_m, success)
         self.num_envs = num_envs
         self.max_episode_steps = max_episode_steps
