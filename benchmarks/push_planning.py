@@ -18,7 +18,7 @@ import numpy as np
 from benchmarks.measuring import primitives_benchmark
 from service.actors.evaluation import wilson_interval
 from service.envs.batch import WorldBatch
-from service.envs.sampling import draw_goals
+from service.envs.sampling import Places, draw_goals
 from service.envs.tasks import EPISODE_STEPS, SUCCESS_DISTANCE_M, find_task
 from service.methods.compose import check_primitives
 from service.registry.learned import compose_actions
@@ -66,7 +66,8 @@ class _Search:
         config = self.worlds.config
         starts = self.worlds.draw_starts(rng, num)
         start = starts[:, self.worlds.layout["object"]]
-        goals = draw_goals(goal_kind, rng, config, SUCCESS_DISTANCE_M, start=start, box=self.worlds.box_place)
+        places = Places(start, self.worlds.box_place, np.empty((num, 0, 3)))
+        goals = draw_goals(goal_kind, rng, config, SUCCESS_DISTANCE_M, places)
         shape = (num, EPISODE_STEPS // _HELD_STEPS, self.primitives.num_primitives)
         mean, std = np.zeros(shape), np.ones(shape)
         best = np.full(num, np.inf)

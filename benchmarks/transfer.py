@@ -20,7 +20,7 @@ from benchmarks.report.markdown import percent, table
 from service.actors.evaluation import evaluate, wilson_interval
 from service.base.errors import RobotError, TandemError
 from service.base.types import BoolArray, StateArray
-from service.envs.sampling import draw_goals, draw_starts
+from service.envs.sampling import draw_goals, draw_objects
 from service.registry.loading import Trained, load
 from service.robot.backends import Backend, BackendConfig, Simulator, connect
 from service.robot.calibrate import Calibration, calibrate
@@ -180,8 +180,8 @@ def play_chunk(row: Row, chunk: int, settings: Settings, gain: Gain) -> list[Pla
 def draw_episodes(policy: Trained, settings: Settings) -> tuple[StateArray, StateArray]:
     """(N, 3) places of the object at first, and (N, 3) goals, metres: the same as of an evaluation in MuJoCo."""
     rng = np.random.default_rng(settings.seed)
-    starts, boxes = draw_starts(rng, settings.num_goals, policy.world)
-    return starts, draw_goals(policy.goals, rng, policy.world, policy.success_distance_m, start=starts, box=boxes)
+    places = draw_objects(rng, settings.num_goals, policy.world)
+    return places.object, draw_goals(policy.goals, rng, policy.world, policy.success_distance_m, places)
 
 
 def inside_limits(positions_m: StateArray, gap_s: float) -> StateArray:

@@ -42,7 +42,7 @@ from service.media.figures import (
     save,
     style_axes,
 )
-from service.media.plots import draw_paths, draw_paths_above, plot_goals
+from service.media.plots import draw_paths, plot_goals
 from service.store.run_directory import RunDirectory
 
 if TYPE_CHECKING:
@@ -316,7 +316,7 @@ def _draw_skills_of(axes: Axes, run: Run, name: str, method: str) -> None:
         axes.set_visible(False)
         return
     workspace = WorkspaceConfig.model_validate(run["config"]["world"]["workspace"])
-    draw_paths_above(axes, paths_m(stages[name]), workspace)
+    draw_paths(None, axes, paths_m(stages[name]), workspace)
     _draw_table_cells(axes, workspace)
     axes.set(xlabel="", ylabel="")
     axes.set_title(f"{method}{_stage_words(name, stages[name], stages[RANDOM])}", fontsize=8)

@@ -15,7 +15,7 @@ from service.base.types import BoolArray, FloatArray, IntArray, StateArray
 from service.config.distillation import DistillingConfig
 from service.envs.batch import WorldBatch
 from service.envs.observations import Layouts, bob_observation
-from service.envs.obstacles import draw_goals
+from service.envs.sampling import draw_goals
 from service.policies.numpy_policy import NumpyMCPPolicy
 
 _LEAST_LOG_WEIGHT = np.log(0.01)

@@ -14,8 +14,7 @@ from service.base.types import FloatArray, Metrics, StateArray
 from service.config import Config, WorldConfig
 from service.envs.batch import WorldBatch
 from service.envs.observations import ACTION, bob_observation
-from service.envs.obstacles import draw_goals
-from service.envs.sampling import GoalKind
+from service.envs.sampling import GoalKind, draw_goals
 
 Observer = Callable[[WorldBatch, StateArray], None]
 """Called with the worlds and their (N, 3) goals, metres, at the start and after each step."""

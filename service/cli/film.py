@@ -71,8 +71,7 @@ def parse_goals(text: str, world: WorldConfig) -> GoalKind | StateArray:
     """
     import numpy as np
 
-    from service.envs.obstacles import inside_fixtures
-    from service.envs.sampling import GOAL_KINDS, check_goals
+    from service.envs.sampling import GOAL_KINDS, check_goals, inside_fixtures
     from service.generator.validity import in_workspace
 
     for kind in GOAL_KINDS:

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from copy import deepcopy
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, get_args
 
@@ -14,7 +13,7 @@ from service.base.errors import ConfigError, did_you_mean
 from service.config.find import METHODS, exact_name, find_class
 from service.config.frozen import reason
 from service.config.run import Config
-from service.config.tree import apply_override, check_numbers, read_yaml
+from service.config.tree import apply_override, read_yaml
 from service.config.world import NO_KEYS
 
 DEFAULT_METHOD = "self-play"
@@ -32,17 +31,11 @@ def load_config(path: Path | str | None = None, overrides: Sequence[str] = ()) -
         ConfigError: file missing or not YAML, unknown key, value out of range; one line a user can act on.
     """
     tree = read_yaml(Path(path)) if path is not None else {}
-    whole = deepcopy(tree)
     for override in overrides:
-        apply_override(whole, override)
-    where = str(path) if path is not None else "the overrides"
-    try:
-        return parse_config(whole, where=where)
-    except ConfigError:
-        if path is not None and overrides:
-            parse_config(tree, where=where)  # what is wrong with the file alone
-            parse_config(whole, where=f"the overrides of {path}")
-        raise
+        apply_override(tree, override)
+    if path is None:
+        return parse_config(tree, where="the overrides")
+    return parse_config(tree, where=f"{path} and the overrides" if overrides else str(path))
 
 
 def parse_config(tree: dict[str, Any], *, where: str) -> Config:
@@ -53,40 +46,28 @@ def parse_config(tree: dict[str, Any], *, where: str) -> Config:
         where: its origin, named in errors.
 
     Raises:
-        ConfigError: unknown key, or value out of range.
+        ConfigError: unknown method or key, or value out of range.
     """
-    kind = class_of(tree, where=where)
+    method = tree.get("method", DEFAULT_METHOD)
+    if not isinstance(method, str):
+        raise ConfigError(f"{where}: method = {method!r}: expected a name")
+    kind = find_class(method)
     if "method" in tree:
-        tree = {**tree, "method": exact_name(tree["method"])}
+        tree = {**tree, "method": exact_name(method)}
     try:
-        config = kind.model_validate(tree)
-        check_numbers(tree, config.model_dump(mode="json"), where=where)
-        return config
+        return kind.model_validate(tree)
     except ValidationError as error:
         first = error.errors()[0]
         key = ".".join(str(part) for part in first["loc"] if part not in NO_KEYS) or "the top level"
         found = "" if isinstance(first["input"], dict) else f" = {first['input']!r}"  # a whole group says nothing
         more = f" (and {error.error_count() - 1} more)" if error.error_count() > 1 else ""
         if first["type"] == "extra_forbidden":
-            known = _known_keys(kind, first["loc"])
-            hint = _elsewhere(kind, str(first["loc"][-1])) or did_you_mean(str(first["loc"][-1]), known)
+            *groups, name = (part for part in first["loc"] if isinstance(part, str) and part not in NO_KEYS)
+            prefix, keys = "".join(f"{group}." for group in groups), list(_keys(kind))
+            known = sorted(name for before, name in keys if before == prefix)
+            hint = _elsewhere(keys, name) or did_you_mean(name, known)
             raise ConfigError(f"{where}: unknown key {key!r}; known there: {', '.join(known)}{more}{hint}") from None
         raise ConfigError(f"{where}: {key}{found}: {reason(first)}{more}") from None
-
-
-def class_of(tree: dict[str, Any], *, where: str) -> type[Config]:
-    """The class that a plain tree is to be validated by.
-
-    Raises:
-        ConfigError: its method is none.
-    """
-    method = tree.get("method", DEFAULT_METHOD)
-    if not isinstance(method, str):
-        raise ConfigError(f"{where}: method = {method!r}: expected a name")
-    try:
-        return find_class(method)
-    except ConfigError as error:
-        raise ConfigError(f"{where}: {error}") from None
 
 
 def changed_config(config: Config, overrides: Sequence[str]) -> Config:
@@ -107,37 +88,25 @@ def dump_config(config: Config) -> str:
     return text
 
 
-def _known_keys(kind: type[Config], location: tuple[int | str, ...]) -> list[str]:
-    model: type[BaseModel] = kind
-    for part in location[:-1]:
-        if isinstance(part, int) or part in NO_KEYS:
-            continue
-        group = _groups(model).get(part)
-        if group is None:
-            break
-        model = group
-    return sorted(model.model_fields)
+def _keys(model: type[BaseModel], prefix: str = "") -> Iterator[tuple[str, str]]:
+    """All keys of a model and of its groups, each after the groups that it is in, such as ``learner.bob.``."""
+    for name, field in model.model_fields.items():
+        yield prefix, name
+        group = _group_in(field.annotation)
+        if group is not None:
+            yield from _keys(group, f"{prefix}{name}.")
 
 
-def _elsewhere(kind: type[Config], name: str) -> str:
+def _elsewhere(keys: Sequence[tuple[str, str]], name: str) -> str:
     """The end of a message about a key that is not in its group, where another group or method has it."""
-    found, groups = list[str](), list[tuple[str, type[BaseModel]]]([("", kind)])
-    while groups:
-        prefix, model = groups.pop()
-        found += [prefix + name] * (name in model.model_fields)
-        groups += [(f"{prefix}{key}.", group) for key, group in _groups(model).items()]
+    found = sorted(prefix + name for prefix, other in keys if other == name)
     if found:
-        return f"; did you mean {' or '.join(sorted(found))}?"
+        return f"; did you mean {' or '.join(found)}?"
     others: dict[type[Config], str] = {}  # one method of each class
     for method in METHODS:
         if name in (other := find_class(method)).model_fields:
             others.setdefault(other, method)
     return f"; it is a key of method={' and '.join(others.values())}" if others else ""
-
-
-def _groups(model: type[BaseModel]) -> dict[str, type[BaseModel]]:
-    kinds = {name: _group_in(field.annotation) for name, field in model.model_fields.items()}
-    return {name: kind for name, kind in kinds.items() if kind is not None}
 
 
 def _group_in(annotation: Any) -> type[BaseModel] | None:

@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import math
-from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
 from pydantic import BeforeValidator, Discriminator, Field, Tag, ValidationError, model_validator
 
 from service.config.frozen import FrozenModel
-from service.config.mesh_files import LEAST_M, measure
-from service.config.model_files import absolute
+from service.config.model_files import LEAST_M, MeshConfig, Vector
 
 Shape = Literal["box", "sphere", "cylinder", "capsule", "ellipsoid", "mesh"]
 _NUM_SIZES: dict[Shape, tuple[int, str]] = {
@@ -21,27 +19,11 @@ _NUM_SIZES: dict[Shape, tuple[int, str]] = {
     "ellipsoid": (3, "its extent along x, y and z"),
     "mesh": (3, "its extent along x, y and z, which is read from its files"),
 }
+_Share = Annotated[float, Field(ge=0.0, le=1.0)]
+Color = tuple[_Share, _Share, _Share]
+"""Red, green and blue."""
 ROUND: frozenset[Shape] = frozenset({"sphere", "cylinder", "capsule", "ellipsoid", "mesh"})
 """Shapes that may roll."""
-Color = tuple[float, float, float]
-
-
-class MeshConfig(FrozenModel):
-    """A mesh of convex pieces, each in a file; what is read from them is kept, so that they need not be read again."""
-
-    pieces: tuple[str, ...] = Field(
-        min_length=1, description="STL or OBJ files, each of one convex piece; package:NAME/FILE for one in a package"
-    )
-    scale: float = Field(1.0, gt=0.0, description="metres in a unit of the files: 0.001 where they are in millimetres")
-    sha256: tuple[str, ...] = Field((), description="of each file, when it was read first")
-    center_m: tuple[float, float, float] = Field((0.0, 0.0, 0.0), description="middle of its extent, from its origin")
-    volume_m3: float = Field(0.0, ge=0.0)
-
-    @model_validator(mode="after")
-    def _was_read(self) -> Self:
-        if self.sha256 and (len(self.sha256) != len(self.pieces) or not self.volume_m3):
-            raise ValueError("sha256, center_m and volume_m3 are read from its files: leave them out")
-        return self
 
 
 class ObjectConfig(FrozenModel):
@@ -67,12 +49,10 @@ class ObjectConfig(FrozenModel):
             raise ValueError("mesh, which names files as pieces, belongs to shape: mesh and to no other")
         if self.shape == "capsule" and self.size_m[1] <= self.size_m[0]:
             raise ValueError(f"size_m of a capsule: its length {self.size_m[1]:g} must exceed its diameter")
-        if not all(0.0 <= each <= 1.0 for each in self.color):
-            raise ValueError(f"color {self.color}: red, green and blue are from 0 to 1")
         return self
 
     @property
-    def extent_m(self) -> tuple[float, float, float]:
+    def extent_m(self) -> Vector:
         """Extent along x, y and z as it starts, metres."""
         first, *others = self.size_m
         if self.shape == "sphere":
@@ -93,22 +73,12 @@ class FixtureConfig(ObjectConfig):
     color: Color = (0.42, 0.47, 0.54)
 
     @property
-    def lower_m(self) -> tuple[float, float, float]:
-        """Corner with the least coordinates of the upright box around it, metres."""
-        half_x, half_y = self._half_m
-        return self.position_m[0] - half_x, self.position_m[1] - half_y, self.bottom_m
-
-    @property
-    def upper_m(self) -> tuple[float, float, float]:
-        """Corner with the greatest coordinates, metres."""
-        half_x, half_y = self._half_m
-        return self.position_m[0] + half_x, self.position_m[1] + half_y, self.bottom_m + self.extent_m[2]
-
-    @property
-    def _half_m(self) -> tuple[float, float]:
-        x, y, _ = self.extent_m
+    def corners_m(self) -> tuple[Vector, Vector]:
+        """Corners with the least and the greatest coordinates of the upright box around it, metres."""
+        (x, y), (length, width, height) = self.position_m, self.extent_m
         cosine, sine = abs(math.cos(self.turn_rad)), abs(math.sin(self.turn_rad))
-        return (cosine * x + sine * y) / 2, (sine * x + cosine * y) / 2
+        half_x, half_y = (cosine * length + sine * width) / 2, (sine * length + cosine * width) / 2
+        return (x - half_x, y - half_y, self.bottom_m), (x + half_x, y + half_y, self.bottom_m + height)
 
 
 class ObstacleConfig(ObjectConfig):
@@ -135,10 +105,8 @@ def _read_mesh(value: Any) -> Any:
         return {"size_m": (LEAST_M,) * 3, **value}  # what is wrong with it is said with its place
     if mesh.sha256:
         return value
-    pieces = tuple(absolute(piece, Path()) for piece in mesh.pieces)
-    found = measure(pieces, mesh.scale)
-    read = {"pieces": pieces, "sha256": found.sha256, "center_m": found.center_m, "volume_m3": found.volume_m3}
-    return {**value, "mesh": mesh.model_copy(update=read), "size_m": found.extent_m}
+    read, extent_m = mesh.measured()
+    return {**value, "mesh": read, "size_m": extent_m}
 
 
 _NAMED, _DESCRIBED = "named", "described"

@@ -3,21 +3,18 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any, Literal, Self
+from typing import Annotated, Any, Literal, Self
 
 from pydantic import Field, ValidationError, model_validator
 
-from service.base.errors import ConfigError, did_you_mean
-from service.base.parsing import MAX_YAML_CHARACTERS, ParseError, parse_yaml
-from service.base.regular_files import read_regular
+from service.base.errors import ConfigError
 from service.config.frozen import FrozenModel, reason
-from service.config.model_files import absolute, digest_of
-from service.config.recipes import robots
-from service.config.tree import check_numbers
+from service.config.model_files import Vector, absolute, digest_of
+from service.config.tree import read_yaml
 
-Vector = tuple[float, float, float]
 Quaternion = tuple[float, float, float, float]
-Numbers = float | tuple[float, ...]
+_Number = Annotated[float, Field(ge=0.0)]
+Numbers = _Number | tuple[_Number, ...]
 """One for all joints, or one each."""
 
 
@@ -131,17 +128,10 @@ class RobotConfig(FrozenModel):
             if isinstance(value, tuple) and len(value) != expected:
                 what = "fingers" if field in _OF_FINGERS else "joints"
                 raise ValueError(f"{field} has {len(value)} numbers, there are {expected} {what}")
-            if field != "home" and value is not None and (least := _least(value)) < 0.0:
-                raise ValueError(f"{field} = {least:g} is less than 0")
         names = [*self.joints, *(finger.joint for finger in self.fingers)]
-        for name in names:
-            if names.count(name) > 1:
-                raise ValueError(f"joint {name!r} is named twice")
+        if twice := [name for name in names if names.count(name) > 1]:
+            raise ValueError(f"joint {twice[0]!r} is named twice")
         return self
-
-
-def _least(numbers: Numbers) -> float:
-    return min(numbers, default=0.0) if isinstance(numbers, tuple) else numbers
 
 
 _OF_JOINTS = ("stiffness", "damping", "max_force", "armature", "friction_loss")
@@ -155,21 +145,10 @@ def read_robot(path: Path) -> RobotConfig:
         ConfigError: no such file, no description, or no such model.
     """
     try:
-        tree = parse_yaml(read_regular(path, MAX_YAML_CHARACTERS, follow=True), path)
-    except OSError as error:
-        known = ("panda", *robots())
-        raise ConfigError(
-            f"robot {path}: {error.strerror}; name {', '.join(known)}, or a YAML file with a description"
-            f"{did_you_mean(str(path), known)}"
-        ) from None
-    except ParseError as error:
-        raise ConfigError(f"robot {path}: {error.reason}") from None
-    try:
-        robot = RobotConfig.model_validate(tree)
-        check_numbers(tree, robot.model_dump(mode="json"), where=f"robot {path}")
+        robot = RobotConfig.model_validate(read_yaml(path))
     except ValidationError as error:
         first = error.errors()[0]
-        key = ".".join(str(part) for part in first["loc"]) or "the top level"
+        key = ".".join(map(str, first["loc"]))
         raise ConfigError(f"robot {path}: {key}: {reason(first)}") from None
     if robot.model is None:
         raise ConfigError(f"robot {path}: model is missing: name an MJCF or URDF file")

@@ -298,16 +298,12 @@ class SelfPlayConfig(Config):
         return self.policy.monolithic_bob is None
 
     @model_validator(mode="after")
-    def _there_are_goals(self) -> Self:
+    def _fits_together(self) -> Self:
         if not self.game.alice_plays and (self.generator.goal_source == "alice" or not self.generator.replay_invalid):
             raise ValueError(
                 "without Alice there are no goals: set generator.goal_source to uniform, table or learnable, and "
                 "generator.replay_invalid=true, or game.alice_plays=true"
             )
-        return self
-
-    @model_validator(mode="after")
-    def _some_turn_is_imitated(self) -> Self:
         game, how = self.game, self.learner.self_imitation
         most = game.alice_valid_reward + game.alice_difficult_reward + game.alice_novelty_reward
         if how.weight and how.min_reward > most:

@@ -9,8 +9,7 @@ from typing import Any, ClassVar, Literal, Self, get_args
 from pydantic import Field, model_validator
 
 from service.config.run import SUCCESS_DISTANCE_M, Config, RunConfig
-from service.config.sac import SACConfig
-from service.config.skills import SkillMethod
+from service.config.skills import SACConfig, SkillMethod
 
 EPISODE_STEPS = 50
 """Env steps of an episode of every task (paper: 50)."""

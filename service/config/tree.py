@@ -10,7 +10,7 @@ from typing import Any
 from service.base.errors import ConfigError, did_you_mean, one_line
 from service.base.parsing import MAX_YAML_CHARACTERS, ParseError, parse_yaml
 from service.base.regular_files import read_regular
-from service.config.recipes import recipes
+from service.config.recipes import recipes, robots
 
 
 def read_yaml(path: Path) -> dict[str, Any]:
@@ -20,16 +20,14 @@ def read_yaml(path: Path) -> dict[str, Any]:
     except FileNotFoundError:
         raise ConfigError(
             f"no configuration file {path}; tandem configs lists those that come with tandem"
-            f"{did_you_mean(str(path), recipes())}"
+            f"{did_you_mean(str(path), {**recipes(), **robots()})}"
         ) from None
     except OSError as error:
         raise ConfigError(f"{path}: cannot be read: {error.strerror}; name a YAML file") from None
     except ParseError as error:
         raise ConfigError(f"{path}: cannot be read as YAML: {error.reason}") from None
-    if tree is None:
-        raise ConfigError(f"{path}: holds no key; write {{}} into it for the defaults")
     if not isinstance(tree, dict):
-        raise ConfigError(f"{path}: expected keys and values at the top level, got {type(tree).__name__}")
+        raise ConfigError(f"{path}: expected keys and values, got {type(tree).__name__}; {{}} stands for the defaults")
     return tree
 
 
@@ -56,29 +54,6 @@ def apply_override(tree: dict[str, Any], override: str) -> None:
             value = float(value)  # YAML 1.1 reads 1e-3 as text
     group, name = group_of(tree, key.strip(), where=f"override {override!r}")
     group[name] = value
-
-
-def check_numbers(tree: Any, read: Any, *, where: str, key: str = "") -> None:
-    """Refuse true and false where a number is expected, of which pydantic makes 1 and 0.
-
-    Args:
-        tree: as it was written.
-        read: the same as a model understood it, as plain values.
-        where: its origin, named in errors.
-        key: of the two in a greater tree.
-
-    Raises:
-        ConfigError: one was taken for a number.
-    """
-    if isinstance(tree, bool) and type(read) in (int, float):
-        raise ConfigError(f"{where}: {key} = {tree!r}: expected a number, not true or false")
-    inner: list[tuple[Any, Any, Any]] = []
-    if isinstance(tree, dict) and isinstance(read, dict):
-        inner = [(name, value, read.get(name)) for name, value in tree.items()]
-    elif isinstance(tree, (list, tuple)) and isinstance(read, list):
-        inner = [(index, *pair) for index, pair in enumerate(zip(tree, read, strict=False))]
-    for name, value, found in inner:
-        check_numbers(value, found, where=where, key=f"{key}.{name}" if key else str(name))
 
 
 def group_of(tree: dict[str, Any], key: str, *, where: str) -> tuple[dict[str, Any], str]:

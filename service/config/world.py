@@ -1,4 +1,4 @@
-"""The configuration of a world: robot, table, object, workspace."""
+"""The configuration of a world: robot, table, object, workspace, and ranges of what is not known exactly."""
 
 from __future__ import annotations
 
@@ -8,12 +8,25 @@ from pydantic import BeforeValidator, Discriminator, Field, Tag, model_validator
 
 from service.config.frozen import FrozenModel
 from service.config.objects import Fixture, Object, ObjectConfig, Obstacle, simple_object
-from service.config.randomisation import RandomisationConfig
 from service.config.recipes import find_file, robots
 from service.config.robot import RobotConfig, read_robot
 
 Point = tuple[float, float, float]
 """x, y, z in the world frame."""
+Range = tuple[float, float]
+"""Least and greatest value, all in between alike."""
+_LIMITS = {
+    "object_size": (0.2, 3.0),
+    "object_mass_kg": (1e-3, 10.0),
+    "friction": (0.01, 5.0),
+    "gain": (0.05, 20.0),
+    "damping": (0.05, 20.0),
+    "table_height_m": (-0.05, 0.05),
+    "delay_steps": (0, 8),
+    "object_noise_m": (0.0, 0.1),
+    "object_offset_m": (0.0, 0.1),
+}
+"""Within which a range has to be, by its name."""
 
 
 class WorkspaceConfig(FrozenModel):
@@ -52,6 +65,52 @@ class ObservedConfig(FrozenModel):
         "how many what is seen is late",
     )
     obstacles: bool = Field(False, description="whether policies see where the middle of each of world.obstacles is")
+
+
+class RandomisationConfig(FrozenModel):
+    """Each start of a world draws anew, where there is a range; None leaves what the world says.
+
+    What is part of the physics comes from a bank of models, made once, that cover the ranges evenly.
+    """
+
+    num_models: int = Field(
+        32, ge=1, le=1024, description="in the bank; more cover the ranges more densely, and 64 cost 5 % of throughput"
+    )
+    object_size: Range | None = Field(None, description="factor of all sizes of the object")
+    object_mass_kg: Range | None = Field(None)
+    friction: Range | None = Field(None, description="sliding friction of the object, also on the table")
+    gain: Range | None = Field(None, description="factor of the stiffness of the arm's servos")
+    damping: Range | None = Field(
+        None, description="factor of their damping; of the Panda's 0.4 to 1.7 cover 100 to 40 % of a step of 5 cm"
+    )
+    table_height_m: Range | None = Field(None, description="of the table and of what stands on it, above where it is")
+    delay_steps: tuple[int, int] | None = Field(
+        None, description="control steps until an action counts, drawn by game; let policies see as many commands"
+    )
+    object_noise_m: Range | None = Field(
+        None, description="standard deviation of an object's seen position, each axis and step anew"
+    )
+    object_offset_m: Range | None = Field(
+        None, description="length of an error of its seen position that stays for a game; its direction is any"
+    )
+
+    @model_validator(mode="after")
+    def _in_order(self) -> Self:
+        for name, (least, most) in _LIMITS.items():
+            if (given := getattr(self, name)) is None:
+                continue
+            low, high = given
+            if low > high:
+                raise ValueError(f"{name} = [{low:g}, {high:g}] is the wrong way round: give the lesser number first")
+            if low < least or high > most:
+                raise ValueError(f"{name} = [{low:g}, {high:g}] goes beyond [{least:g}, {most:g}]")
+        return self
+
+    @property
+    def model_ranges(self) -> dict[str, Range]:
+        """Those of the physics, by name."""
+        names = ("object_size", "object_mass_kg", "friction", "gain", "damping", "table_height_m")
+        return {name: given for name in names if (given := getattr(self, name)) is not None}
 
 
 def _read_robot(value: Any) -> Any:
@@ -107,19 +166,11 @@ class WorldConfig(FrozenModel):
     num_substeps: int = Field(20, ge=1, le=200, description="physics steps per action; 20 x 2 ms = 25 Hz as panda-gym")
 
     @model_validator(mode="after")
-    def _one_kind_of_fixtures(self) -> Self:
+    def _fits_together(self) -> Self:
         if self.fixtures and self.fixture != "none":
             raise ValueError(f"fixture = {self.fixture!r} and fixtures: a world has the one or the other")
-        return self
-
-    @model_validator(mode="after")
-    def _observes_what_is_there(self) -> Self:
         if self.observed.obstacles and not self.obstacles:
             raise ValueError("observed.obstacles, and no obstacles: describe some, or leave it out")
-        return self
-
-    @model_validator(mode="after")
-    def _object_is_lower_than_the_workspace(self) -> Self:
         if self.rest_height_m >= self.workspace.height_m:
             raise ValueError(
                 f"the object's centre lies {self.rest_height_m:g} m high, and the workspace ends at "

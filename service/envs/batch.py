@@ -12,13 +12,13 @@ from mujoco import rollout
 from service.base.errors import ConfigError, DivergedError
 from service.base.types import BoolArray, FloatArray, IntArray, StateArray
 from service.config import WorldConfig
-from service.envs.model_bank import ModelBank
-from service.envs.noise import KEYS, normal
-from service.envs.observations import ACTION, COMMAND_PREFIX, OBSTACLE_PREFIX, Layouts, ObservationLayout, layouts
-from service.envs.obstacles import SEEN_WITHIN_M, Places, draw_starts, gripper_boxes, obstacle_columns, obstacle_places
+from service.envs.observations import ACTION, COMMAND_PREFIX, Layouts, ObservationLayout, layouts
+from service.envs.randomisation import KEYS, ModelBank, normal
 from service.envs.reach import reach_of
 from service.envs.robot import Robot, described
+from service.envs.sampling import Places, draw_starts, gripper_boxes
 from service.envs.scene import FIXTURE_PREFIX, build_layout
+from service.envs.state_layout import OBSTACLE_PREFIX, obstacle_columns, obstacle_places
 
 DISPLACEMENT_M = 0.05
 """Way from the end effector to its set-point that a full action asks for (paper); in a step the arm covers a part of
@@ -27,6 +27,8 @@ WIDTH_CHANGE_M = 0.10
 """Change of the finger width that a full action asks for (paper)."""
 MAX_TURN_RAD = 0.5
 """Most a joint is asked to turn in one action; behind the base and near a straight arm the solution would ask for 2."""
+SEEN_WITHIN_M = 1.0
+"""An obstacle further from the origin along an axis, such as one on the floor, is seen at this bound."""
 MAX_SPEED = 1e3
 """A joint (rad/s) or object (m/s, rad/s) faster than this has diverged; the arm reaches 3, a falling object 30."""
 _TOUCHING_M = 1e-4
@@ -66,7 +68,9 @@ class WorldBatch:
         robot = described(config)
         self.reach = reach_of(robot, self.robot.arm)
         """Where the end effector can be commanded to."""
-        _quieten_mujoco()
+        log = mujoco.MjLogConfig.get()  # MuJoCo's own log is a file in the working directory
+        log.logto_file = log.logto_console = False
+        log.set()
         num_threads = min(num_threads or os.cpu_count() or 1, num_worlds)
         self._pool = rollout.Rollout(nthread=num_threads if num_threads > 1 else 0)
         self._data = [mujoco.MjData(self.model) for _ in range(max(num_threads, 1))]
@@ -75,7 +79,6 @@ class WorldBatch:
         self._commands = self.layout["commands"]
         self._obstacles = obstacle_columns(self.layout, len(config.obstacles))
         self._num_commands = self._commands.stop - self._commands.start
-        assert (self.model.nq, self.model.nv) == (self.layout.num_positions, self.layout.num_velocities)
         # The weights of object and obstacles are actuators, too, the last ones, which ignore their control.
         assert self.model.nu == self.robot.num_joints + self.robot.num_fingers + 1 + len(config.obstacles)
         assert mujoco.mj_stateSize(self.model, _PHYSICS) == self.layout.physics.stop
@@ -115,11 +118,6 @@ class WorldBatch:
         return self.states[:, self.layout["object"]]
 
     @property
-    def seen_object_position(self) -> StateArray:
-        """(N, 3) the same as policies see it: with the errors of ``config.randomisation``."""
-        return self._seen_object
-
-    @property
     def box_place(self) -> StateArray:
         """(N, 3) middle of the bottom of each world's box, metres; (N, 0) in worlds without."""
         return self.states[:, self.layout["box_place"]]
@@ -148,8 +146,8 @@ class WorldBatch:
         """(num, S) states in which games and episodes start.
 
         The arm is at home, the gripper open unless it is blocked, the object anywhere on the table inside the
-        workspace, and so are obstacles. Beside a wall or a box the object is where ``sampling.draw_starts`` says, and a
-        box is anywhere.
+        workspace, and so are obstacles. Beside a wall or a box the object is where ``sampling.draw_objects`` says, and
+        a box is anywhere.
         """
         states = np.tile(self._fresh_state, (num, 1))
         places = draw_starts(rng, num, self.bank.largest, self._gripper_at_start)
@@ -311,9 +309,9 @@ class WorldBatch:
         if name == "delay" and self.config.randomisation.delay_steps is None:
             return np.zeros((self.num_worlds, 1))
         if name == "object":
-            return self.seen_object_position
+            return self._seen_object
         if name == "object_from_effector":
-            return self.seen_object_position - self.ee_position
+            return self._seen_object - self.ee_position
         if name == "effector_velocity":
             velocity = self.states[:, self.layout["joint_velocities"]]
             linear: StateArray = np.matmul(self._kinematics.jacobian[:, :3], velocity[:, :, None])[:, :, 0]
@@ -323,7 +321,7 @@ class WorldBatch:
     def _see(self) -> None:
         """Compute what several observations of the same states need."""
         self._kinematics = self.robot.arm.forward(self.joints)
-        self._seen_object, drawn = self.object_position, self.config.randomisation
+        self._seen_object, drawn = self.object_position, self.config.randomisation  # with the errors of what is seen
         if drawn.object_offset_m is not None:
             self._seen_object = self._seen_object + self.states[:, self.layout["object_offset"]]
         if drawn.object_noise_m is not None:
@@ -368,10 +366,3 @@ class WorldBatch:
                     f"at its start, {self.config.start_height_m:g} m above the middle of the workspace, the gripper is "
                     f"inside {fixed[0]}: raise world.start_height_m, or put the fixture elsewhere"
                 )
-
-
-def _quieten_mujoco() -> None:
-    """Turn off MuJoCo's own log, a file in the working directory; ``WorldBatch`` itself reports diverged worlds."""
-    log = mujoco.MjLogConfig.get()
-    log.logto_file = log.logto_console = False
-    log.set()

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal
 
 import mujoco
 import numpy as np
@@ -76,21 +76,54 @@ class Chain:
         ids = [model.joint(name).id for name in joints]
         axes, anchors = data.xaxis[ids], data.xanchor[ids]
         is_slide = model.jnt_type[ids] == mujoco.mjtJoint.mjJNT_SLIDE
-        self.lower, self.upper = _limits(model, ids)
+        lower, upper = model.jnt_range[ids].T
+        margin, limited = np.minimum(_LIMIT_MARGIN, 0.05 * (upper - lower)), model.jnt_limited[ids].astype(bool)
+        self.lower, self.upper = np.where(limited, lower + margin, -np.inf), np.where(limited, upper - margin, np.inf)
         """(J,) limits less a margin, rad or metres; infinite where a joint has none."""
         is_upright = not is_slide[0] and abs(axes[0, 2]) > 1.0 - 1e-6
         self.base_axis: StateArray | None = anchors[0, :2] if is_upright else None
         """(2,) place of the first joint's axis, metres, if it is a hinge about the vertical."""
         end_position, end_rotation = _pose(model, data, frame, position, quaternion)
-        table = _denavit_hartenberg(axes, anchors, end_rotation[:, 0])
-        zero = model.qpos0[model.jnt_qposadr[ids]]
         self._slides: BoolArray = is_slide
-        self._angle = np.where(is_slide, table.angle, table.angle - zero)
-        self._offset_d = np.where(is_slide, table.offset_d - zero, table.offset_d)
-        self._offset_a, self._twist = table.offset_a, table.twist
-        self._base = table.base
-        self._end_position = _rounded(table.end.T @ (end_position - table.end_origin))
-        self._end_axes = _rounded(table.end.T @ end_rotation).T
+        end_axes, end_origin = self._read_table(axes, anchors, end_rotation[:, 0])
+        zero = model.qpos0[model.jnt_qposadr[ids]]
+        self._angle[~is_slide] -= zero[~is_slide]
+        self._offset_d[is_slide] -= zero[is_slide]
+        self._end_position = _rounded(end_axes.T @ (end_position - end_origin))
+        self._end_axes = _rounded(end_axes.T @ end_rotation).T
+
+    def _read_table(self, axes: StateArray, anchors: StateArray, last_x: StateArray) -> tuple[StateArray, StateArray]:
+        """Set the table of Denavit and Hartenberg for one configuration.
+
+        Frame i has its z axis on joint i, and its x axis on the common normal of joints i and i + 1.
+
+        Args:
+            axes: (J, 3) directions of the joints.
+            anchors: (J, 3) a point of each axis, metres.
+            last_x: (3,) direction that the last frame's x axis gets, as far as it is free.
+
+        Returns:
+            The frame after the last joint: (3, 3) axes, which are columns, and (3,) origin, metres.
+        """
+        num = len(axes)
+        normals, feet, ends = np.empty((3, num, 3))  # common normal, where it leaves axis i, where it meets axis i + 1
+        for index in range(num - 1):
+            pair = slice(index, index + 2)
+            normals[index], feet[index], ends[index] = _common_normal(axes[pair], anchors[pair])
+        across = last_x - axes[-1] * (axes[-1] @ last_x)
+        free = across if np.linalg.norm(across) > 1e-6 else normals[num - 2]
+        normals[-1], feet[-1] = free / np.linalg.norm(free), ends[num - 2]
+        self._offset_a, self._twist = [0.0], [(1.0, 0.0)]  # along the x axis before each joint, metres; about it
+        self._offset_d, self._angle = np.zeros(num), np.zeros(num)  # along the joint's own axis, metres; about it, rad
+        for index in range(1, num):
+            before, x_axis = axes[index - 1], normals[index - 1]
+            self._offset_a.append(float(_rounded((ends[index - 1] - feet[index - 1]) @ x_axis)))
+            cosine, sine = _rounded(np.array([before @ axes[index], np.cross(before, axes[index]) @ x_axis]))
+            self._twist.append((float(cosine), float(sine)))
+            self._offset_d[index] = _rounded((feet[index] - ends[index - 1]) @ axes[index])
+            self._angle[index] = np.arctan2(np.cross(x_axis, normals[index]) @ axes[index], x_axis @ normals[index])
+        self._base = np.stack([normals[0], np.cross(axes[0], normals[0]), axes[0], feet[0]])
+        return np.stack([normals[-1], np.cross(axes[-1], normals[-1]), axes[-1]], axis=1), feet[-1]
 
     def forward(self, joints: StateArray) -> Kinematics:
         """Forward kinematics of (N, J) joint values, rad or metres."""
@@ -128,7 +161,12 @@ class Chain:
 
     def errors(self, here: Kinematics, target: StateArray) -> StateArray:
         """(N, E) way to (N, 3) targets, metres, and the turn to the orientation, rad, as far as one is asked."""
-        return np.concatenate([target - here.position, orientation_error(here.rotation)], axis=1)[:, : self._num_rows]
+        rotation, turn = here.rotation, np.empty((len(target), 3))
+        # Half the sum of the axes' cross products with those of DOWN, written out, as it has only three numbers.
+        turn[:, 0] = 0.5 * (rotation[:, 2, 1] - rotation[:, 1, 2])
+        turn[:, 1] = 0.5 * (rotation[:, 2, 0] + rotation[:, 0, 2])
+        turn[:, 2] = -0.5 * (rotation[:, 1, 0] + rotation[:, 0, 1])
+        return np.concatenate([target - here.position, turn], axis=1)[:, : self._num_rows]
 
     def solve(
         self, joints: StateArray, target: StateArray, *, at: Kinematics | None = None, num_iterations: int = 2
@@ -162,71 +200,6 @@ class Chain:
             step = np.matmul(transposed, np.linalg.solve(square, error[:, :, None]))[:, :, 0]
             joints = np.clip(joints + posture + step, self.lower, self.upper)
         return joints
-
-
-def orientation_error(rotation: StateArray) -> StateArray:
-    """(N, 3) small rotation vector that takes ``rotation`` to ``DOWN``: half the sum of the axes' cross products."""
-    error = np.empty((rotation.shape[0], 3))  # written out, as DOWN has only three numbers
-    error[:, 0] = 0.5 * (rotation[:, 2, 1] - rotation[:, 1, 2])
-    error[:, 1] = 0.5 * (rotation[:, 2, 0] + rotation[:, 0, 2])
-    error[:, 2] = -0.5 * (rotation[:, 1, 0] + rotation[:, 0, 1])
-    return error
-
-
-def _limits(model: mujoco.MjModel, joints: Sequence[int]) -> tuple[StateArray, StateArray]:
-    lower, upper = model.jnt_range[joints].T
-    margin = np.minimum(_LIMIT_MARGIN, 0.05 * (upper - lower))
-    limited = model.jnt_limited[joints].astype(bool)
-    return np.where(limited, lower + margin, -np.inf), np.where(limited, upper - margin, np.inf)
-
-
-class _Table(NamedTuple):
-    """A table of Denavit and Hartenberg for one configuration, and the frames at its two ends."""
-
-    offset_a: list[float]
-    """Of each joint along the x axis of the frame before it, metres."""
-    twist: list[tuple[float, float]]
-    """Cosine and sine of the turn about that x axis."""
-    offset_d: StateArray
-    """(J,) along the joint's own axis, metres."""
-    angle: StateArray
-    """(J,) about it, rad."""
-    base: StateArray
-    """(4, 3) x, y, z axis and origin before the first joint."""
-    end: StateArray
-    """(3, 3) frame after the last joint; columns are its axes."""
-    end_origin: StateArray
-    """(3,) metres."""
-
-
-def _denavit_hartenberg(axes: StateArray, anchors: StateArray, last_x: StateArray) -> _Table:
-    """The table of a chain.
-
-    Frame i has its z axis on joint i, and its x axis on the common normal of joints i and i + 1.
-
-    Args:
-        axes: (J, 3) directions of the joints.
-        anchors: (J, 3) a point of each axis, metres.
-        last_x: (3,) direction that the last frame's x axis gets, as far as it is free.
-    """
-    num = len(axes)
-    normals, feet, ends = np.empty((3, num, 3))  # common normal, where it leaves axis i, where it meets axis i + 1
-    for index in range(num - 1):
-        normals[index], feet[index], ends[index] = _common_normal(axes[index : index + 2], anchors[index : index + 2])
-    across = last_x - axes[-1] * (axes[-1] @ last_x)
-    free = across if np.linalg.norm(across) > 1e-6 else normals[num - 2]
-    normals[-1], feet[-1] = free / np.linalg.norm(free), ends[num - 2]
-    offset_a, twist, offset_d, angle = [0.0], [(1.0, 0.0)], np.zeros(num), np.zeros(num)
-    for index in range(1, num):
-        before, x_axis = axes[index - 1], normals[index - 1]
-        offset_a.append(float(_rounded((ends[index - 1] - feet[index - 1]) @ x_axis)))
-        cosine, sine = _rounded(np.array([before @ axes[index], np.cross(before, axes[index]) @ x_axis]))
-        twist.append((float(cosine), float(sine)))
-        offset_d[index] = _rounded((feet[index] - ends[index - 1]) @ axes[index])
-        angle[index] = np.arctan2(np.cross(x_axis, normals[index]) @ axes[index], x_axis @ normals[index])
-    base = np.stack([normals[0], np.cross(axes[0], normals[0]), axes[0], feet[0]])
-    end = np.stack([normals[-1], np.cross(axes[-1], normals[-1]), axes[-1]], axis=1)
-    return _Table(offset_a, twist, offset_d, angle, base, end, feet[-1])
 
 
 def _common_normal(axes: StateArray, anchors: StateArray) -> tuple[StateArray, StateArray, StateArray]:

@@ -1,22 +1,55 @@
-"""Rigid things that lie on the table and move when they are pushed: the object, and obstacles."""
+"""Rigid things in a scene: what touches what, how stiffly, and the object and the obstacles that lie on the table."""
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import Any
 
 import mujoco
 
 from service.config import WorldConfig
-from service.config.objects import ROUND, ObjectConfig, ObstacleConfig
-from service.envs.contacts import FLOOR_BIT, GRIPPER_BIT, OBJECT_BIT, OBSTACLE_PRIORITY, STIFF
-from service.envs.meshes import add_mesh, center_of_mass
+from service.config.model_files import MeshConfig, Vector, model_file
+from service.config.objects import ROUND, ObjectConfig
+from service.envs.state_layout import OBSTACLE_PREFIX
 
+GRIPPER_BIT, OBJECT_BIT, TABLE_BIT, FLOOR_BIT = 1, 2, 4, 8
+"""MuJoCo's contact types. Table and fixtures are touched by gripper and object, the object by the gripper. Obstacles
+are objects that are also touched by objects, and by the floor."""
+OBSTACLE_PRIORITY, _PAD_PRIORITY = 1, 2
+"""Where two touch, friction and stiffness are those of the one with more."""
+STIFF = {"solref": (0.01, 1.0), "solimp": (0.95, 0.99, 0.001, 0.5, 2.0)}
+"""Contacts of objects and what they lie on. MuJoCo's default yields more the lighter the object: an arm leaning on the
+cube pressed it 11 mm down. These let it give 1 mm."""
+BODY_FRICTION = 0.3
+"""Sliding friction of a gripper but for its fingertips."""
 GRAVITY_MS2 = 9.81
 FLOOR_Z_M = -0.74
 _HIDDEN = 3
 """Group of what is not drawn."""
 _UPRIGHT = "upright"
 """Site whose z axis is up: forces on other sites have its directions."""
+
+
+def grip(geom: mujoco.MjsGeom, friction: float) -> None:
+    """Let a geom of a finger hold what it touches."""
+    geom.friction = (friction, 0.005, 0.0001)
+    geom.condim = 4  # torsion, or a cube turns between the fingers
+    geom.solref, geom.solimp = (0.01, 1.0), (0.9, 0.95, 0.001, 0.5, 2.0)
+    geom.priority = _PAD_PRIORITY  # these parameters, not a mixture with the object's
+
+
+def add_finger_sensors(spec: mujoco.MjSpec, fingers: Iterable[str]) -> None:
+    """Sensors of whether each finger, a body with all that hangs on it, touches the object: above 0 where it does."""
+    for finger in fingers:
+        sensor = spec.add_sensor(
+            name=f"{finger}_contact",
+            type=mujoco.mjtSensor.mjSENS_CONTACT,
+            objtype=mujoco.mjtObj.mjOBJ_XBODY,
+            objname=finger,
+            reftype=mujoco.mjtObj.mjOBJ_BODY,
+            refname="object",
+        )
+        sensor.intprm[:3] = (1, 0, 1)  # data bits (1: "found"), reduction (0: none), slots (1)
 
 
 def geometry(shape: ObjectConfig) -> tuple[mujoco.mjtGeom, tuple[float, float, float], tuple[float, ...]]:
@@ -38,32 +71,32 @@ def parts_of(spec: mujoco.MjSpec, shape: ObjectConfig, name: str, mass_kg: float
         ConfigError: a file of a mesh is gone, or another than it was.
     """
     if shape.mesh is not None:
-        return add_mesh(spec, shape.mesh, name, mass_kg)
+        return _add_mesh(spec, shape.mesh, name, mass_kg)
     kind, size, quaternion = geometry(shape)
     return [{"type": kind, "size": size, "quat": quaternion, "mass": mass_kg}]
 
 
-def add_object(spec: mujoco.MjSpec, config: WorldConfig) -> None:
-    """Add the object that players move: the gripper touches it, and it touches table, fixtures and obstacles."""
+def add_things(spec: mujoco.MjSpec, config: WorldConfig) -> None:
+    """Add the object that players move, and obstacles: a game goes on when one of these falls onto the floor.
+
+    The gripper touches them, and they touch table, fixtures and each other. An obstacle's friction counts wherever it
+    lies, not the greater one of it and the table's, as without a priority.
+    """
     touching = {"contype": OBJECT_BIT, "conaffinity": GRIPPER_BIT}
     _add_free(spec, config.shape, "object", config.object_mass_kg, config.friction, touching)
-
-
-def add_obstacle(spec: mujoco.MjSpec, obstacle: ObstacleConfig, name: str) -> None:
-    """Add a further object. It touches what the object touches, the object, its like, and the floor.
-
-    Its friction counts wherever it lies, not the greater one of it and the table's, as without a priority.
-    """
     touching = {
         "contype": OBJECT_BIT,
         "conaffinity": GRIPPER_BIT | OBJECT_BIT | FLOOR_BIT,
         "priority": OBSTACLE_PRIORITY,
     }
-    _add_free(spec, obstacle, name, obstacle.mass_kg, obstacle.friction, touching)
+    for number, obstacle in enumerate(config.obstacles, start=1):
+        _add_free(spec, obstacle, f"{OBSTACLE_PREFIX}{number}", obstacle.mass_kg, obstacle.friction, touching)
+    if config.obstacles:
+        _add_floor(spec)
 
 
-def add_floor(spec: mujoco.MjSpec) -> None:
-    """Add a floor for obstacles: a game goes on when one falls off the table, and it shall not fall for ever."""
+def _add_floor(spec: mujoco.MjSpec) -> None:
+    """Add a floor, so that what falls off the table does not fall for ever."""
     # A body of its own: the tree of bounds of the world's geoms is made once, and a model bank moves the table later.
     spec.worldbody.add_body(name="ground").add_geom(
         name="ground",
@@ -109,5 +142,39 @@ def _held_by(spec: mujoco.MjSpec, body: mujoco.MjsBody, shape: ObjectConfig) -> 
         return {"target": body.name, "trntype": mujoco.mjtTrn.mjTRN_JOINT}
     if spec.site(_UPRIGHT) is None:
         spec.worldbody.add_site(name=_UPRIGHT, group=_HIDDEN)
-    center = body.add_site(name=f"{body.name}_center", pos=center_of_mass(shape.mesh), group=_HIDDEN)
+    center = body.add_site(name=f"{body.name}_center", pos=_center_of_mass(shape.mesh), group=_HIDDEN)
     return {"target": center.name, "refsite": _UPRIGHT, "trntype": mujoco.mjtTrn.mjTRN_SITE}
+
+
+def _add_mesh(spec: mujoco.MjSpec, mesh: MeshConfig, name: str, mass_kg: float) -> list[dict[str, Any]]:
+    """Add the pieces of a mesh to a scene under construction; returns the settings of a geom for each.
+
+    Raises:
+        ConfigError: a file is gone, or another than it was.
+    """
+    parts = []
+    for index, (piece, sha256) in enumerate(zip(mesh.pieces, mesh.sha256, strict=True)):
+        spec.add_mesh(name=f"{name}{index}", file=str(model_file(piece, sha256)), scale=[mesh.scale] * 3)
+        parts.append(
+            {
+                "type": mujoco.mjtGeom.mjGEOM_MESH,
+                "meshname": f"{name}{index}",
+                "pos": [-each for each in mesh.center_m],
+                "density": mass_kg / mesh.volume_m3,
+            }
+        )
+    return parts
+
+
+def _center_of_mass(mesh: MeshConfig) -> Vector:
+    """Center of mass of a mesh, as dense everywhere, from the middle of its extent, metres.
+
+    Raises:
+        ConfigError: a file is gone, or another than it was.
+    """
+    spec = mujoco.MjSpec()
+    body = spec.worldbody.add_body(name="mesh")
+    for part in _add_mesh(spec, mesh, "piece", 1.0):
+        body.add_geom(**part)
+    x, y, z = map(float, spec.compile().body("mesh").ipos)
+    return x, y, z

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.base.types import FloatArray
-from service.envs.state_layout import columns
+from service.envs.state_layout import OBSTACLE_PREFIX, columns
 
 if TYPE_CHECKING:
     from service.config.world import WorldConfig  # acting needs no pydantic
@@ -143,8 +143,6 @@ DELAY = "delay"
 _DELAY = Entry(DELAY, SCALAR, "control steps", 1.0, 1.0)
 COMMAND_PREFIX = "command_"
 """Begins the names of past commands; ``command_1`` is the last one."""
-OBSTACLE_PREFIX = "obstacle_"
-"""Begins the names of the obstacles' positions; ``obstacle_1`` is the first one described."""
 
 
 class Layouts:

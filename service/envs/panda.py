@@ -14,7 +14,7 @@ import mujoco
 import numpy as np
 
 from service.config.robot import EffectorConfig, FingerConfig, RobotConfig
-from service.envs.contacts import BODY_FRICTION, GRIPPER_BIT, grip
+from service.envs.objects import BODY_FRICTION, GRIPPER_BIT, grip
 
 JOINT_LOWER = np.array([-2.8973, -1.7628, -2.8973, -3.0718, -2.8973, -0.0175, -2.8973])
 JOINT_UPPER = np.array([2.8973, 1.7628, 2.8973, -0.0698, 2.8973, 3.7525, 2.8973])
@@ -109,11 +109,12 @@ def add_panda(spec: mujoco.MjSpec, *, pad_friction: float, physics_step_s: float
     )
     _collision(hand, "hand", 0.038, ((0, -0.062, 0.03), (0, 0.062, 0.03)))
     for side, quaternion in (("left", (1, 0, 0, 0)), ("right", (0, 0, 0, 1))):
-        finger = _add_finger(hand, side, quaternion, physics_step_s)
-        _add_pads(finger, side, pad_friction)
+        _add_finger(hand, side, quaternion, pad_friction, physics_step_s)
 
 
-def _add_finger(hand: Any, side: str, quaternion: tuple[float, ...], physics_step_s: float) -> Any:
+def _add_finger(
+    hand: Any, side: str, quaternion: tuple[float, ...], pad_friction: float, physics_step_s: float
+) -> None:
     finger = hand.add_body(
         name=f"{side}_finger",
         pos=(0, 0, 0.0584),
@@ -135,16 +136,12 @@ def _add_finger(hand: Any, side: str, quaternion: tuple[float, ...], physics_ste
         solimp_limit=_STOP_SOLIMP,
     )
     _collision(finger, f"{side}_shaft", 0.009, ((0, 0.013, 0.009), (0, 0.011, 0.043)))
-    return finger
-
-
-def _add_pads(finger: Any, side: str, friction: float) -> None:
     # Two upright capsules touch a cube's face in four points that span the pad: fewer and cheaper contacts than box on
     # box at the same grip. (One line of contact is not enough: a cube rolls out between two lines nearer than its own
     # width.) Their inner surface is the pad plane y = 0; they end 7 mm below the end effector.
     for end, x in (("front", 0.0075), ("back", -0.0075)):
         pad = _collision(finger, f"{side}_pad_{end}", _PAD_RADIUS, ((x, _PAD_RADIUS, 0.034), (x, _PAD_RADIUS, 0.046)))
-        grip(pad, friction)
+        grip(pad, pad_friction)
 
 
 def _collision(body: Any, name: str, radius: float, ends: tuple[tuple[float, ...], ...]) -> Any:

@@ -53,10 +53,6 @@ class Reach:
         clipped[:, :2] = self.axis + away * (np.clip(distance, nearest, furthest) / distance)[:, None]
         return clipped
 
-    def share(self, points: StateArray) -> float:
-        """Share of (N, 3) points, metres, that are within it."""
-        return float((np.linalg.norm(self.clip(points) - points, axis=1) < 1e-9).mean())
-
     def check(self, workspace: WorkspaceConfig, name: str) -> None:
         """Assert that nearly all of a workspace, from the least commanded height on, is within reach of a robot.
 
@@ -66,20 +62,16 @@ class Reach:
         lower, upper = np.array(workspace.lower_m), np.array(workspace.upper_m)
         lower[2] = self.height[0]
         sides = [np.linspace(low, high, 15) for low, high in zip(lower, upper, strict=True)]
-        share = self.share(np.stack(np.meshgrid(*sides), axis=-1).reshape(-1, 3))
+        points = np.stack(np.meshgrid(*sides), axis=-1).reshape(-1, 3)
+        share = float((np.linalg.norm(self.clip(points) - points, axis=1) < 1e-9).mean())
         if share < _LEAST_SHARE:
+            x, y = self.axis
             raise ConfigError(
-                f"robot {name}: {1.0 - share:.0%} of the workspace is out of its reach, which is {self._describe()}: "
-                "make world.workspace smaller, or move the robot's base_position_m"
+                f"robot {name}: {1.0 - share:.0%} of the workspace is out of its reach, which is "
+                f"{self.nearest.min():.2f} to {self.furthest.max():.2f} m from x = {x:.2f}, y = {y:.2f} where it is "
+                f"widest, and up to {self.height[-1]:.2f} m high: make world.workspace smaller, or move the robot's "
+                "base_position_m"
             )
-
-    def _describe(self) -> str:
-        near, far = float(self.nearest.min()), float(self.furthest.max())
-        x, y = self.axis
-        return (
-            f"{near:.2f} to {far:.2f} m from x = {x:.2f}, y = {y:.2f} where it is widest, and up to "
-            f"{self.height[-1]:.2f} m high"
-        )
 
 
 _found: dict[RobotConfig, Reach] = {}

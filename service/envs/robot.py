@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from itertools import chain as joined
 from pathlib import Path
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -15,8 +16,8 @@ from service.config import WorldConfig
 from service.config.model_files import model_file
 from service.config.robot import Numbers, PadConfig, RobotConfig
 from service.envs import panda
-from service.envs.contacts import BODY_FRICTION, GRIPPER_BIT, add_finger_sensors, grip
 from service.envs.kinematics import Chain
+from service.envs.objects import BODY_FRICTION, GRIPPER_BIT, add_finger_sensors, grip
 
 _PREFIX, _HAND_PREFIX = "robot/", "hand/"
 """Begin the names of all that comes from a file, so that none is that of something in the scene; a hand's has both."""
@@ -76,8 +77,6 @@ class Robot:
         self.num_joints, self.num_fingers = len(robot.joints), len(robot.fingers)
         self.opening_m = robot.opening_m
         """Between the fingertips where the gripper is open."""
-        self.lowest_m = robot.lowest_m
-        """Least height of a commanded end effector."""
         prefix = _prefix(robot)
         self.arm = Chain(
             model,
@@ -99,8 +98,7 @@ class Robot:
 
     def openings(self, fingers: StateArray) -> StateArray:
         """(N, 2) distance of the left and right fingertip from the middle, metres, for (N, F) values of fingers."""
-        openings: StateArray = ((fingers - self._closed)[:, :, None] * self._openings).sum(axis=1)
-        return openings
+        return self.opening_speeds(fingers - self._closed)
 
     def opening_speeds(self, fingers: StateArray) -> StateArray:
         """(N, 2) the same for (N, F) velocities, m/s."""
@@ -127,22 +125,29 @@ def _add_from_files(spec: mujoco.MjSpec, robot: RobotConfig) -> None:
         raise ConfigError(
             f"robot {robot.name}: {robot.model} has {len(roots)} bodies at its top ({found}): name one as root"
         )
-    root = roots[0] if robot.root is None else arm.body(robot.root)
-    if root is None:
-        raise ConfigError(f"robot {robot.name}: {robot.model} has no body {robot.root!r}, named as root")
+    root = roots[0] if robot.root is None else _there(arm.body(robot.root), robot, f"body {robot.root!r}")
     root.pos = (0.0, 0.0, 0.0)
     half = robot.base_turn_rad / 2
     frame = spec.worldbody.add_frame(pos=robot.base_position_m, quat=(np.cos(half), 0.0, 0.0, np.sin(half)))
     frame.attach_body(root, _PREFIX, "")
     if robot.hand is not None:
         hand = _read(robot.hand.model, robot.hand.model_sha256, spec)
-        site, body = spec.site(_PREFIX + robot.hand.at), spec.body(_PREFIX + robot.hand.at)
-        if site is None and body is None:
-            raise ConfigError(
-                f"robot {robot.name}: no site or body {robot.hand.at!r} to put the hand on in {robot.model}"
-            )
+        at = _PREFIX + robot.hand.at
+        site = spec.site(at)
+        body = site or _there(spec.body(at), robot, f"site or body {robot.hand.at!r} to put the hand on")
         place = {"site": site} if site is not None else {"frame": body.add_frame()}
         spec.attach(hand, prefix=_PREFIX + _HAND_PREFIX, **place)
+
+
+def _there(found: Any, robot: RobotConfig, what: str) -> Any:
+    """What was found in a robot's model under a name of its description.
+
+    Raises:
+        ConfigError: nothing was.
+    """
+    if found is None:
+        raise ConfigError(f"robot {robot.name}: no {what} in its model")
+    return found
 
 
 def _read(name: str, sha256: str | None, scene: mujoco.MjSpec) -> mujoco.MjSpec:
@@ -189,10 +194,8 @@ def _take_settings(spec: mujoco.MjSpec, scene: mujoco.MjSpec) -> None:
 
 def _find_joint(spec: mujoco.MjSpec, robot: RobotConfig, name: str) -> mujoco.MjsJoint:
     prefix = _prefix(robot)
-    joint = spec.joint(prefix + name)
-    if joint is None:
-        found = ", ".join(each.name.removeprefix(prefix) for each in spec.joints)
-        raise ConfigError(f"robot {robot.name}: no joint {name!r} in its model; it has {found}")
+    known = ", ".join(each.name.removeprefix(prefix) for each in spec.joints)
+    joint: mujoco.MjsJoint = _there(spec.joint(prefix + name), robot, f"joint {name!r}, only {known},")
     if joint.type not in (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE):
         raise ConfigError(f"robot {robot.name}: joint {name!r} is neither a hinge nor a slide")
     return joint
@@ -202,21 +205,17 @@ def _check_joints(
     spec: mujoco.MjSpec, robot: RobotConfig, joints: list[mujoco.MjsJoint], fingers: list[mujoco.MjsJoint]
 ) -> None:
     """Refuse joints without an actuator, and an order that is not the model's."""
-    there, named = ([each.name for each in group] for group in (spec.joints, [*joints, *fingers]))
-    if more := [name.removeprefix(_PREFIX) for name in there if name not in named]:
-        raise ConfigError(
-            f"robot {robot.name}: joints {', '.join(more)} are neither of the arm nor of a finger: name them, or weld "
-            "them in the model"
-        )
+    there, named = ([each.name.removeprefix(_PREFIX) for each in group] for group in (spec.joints, [*joints, *fingers]))
     if there != named:
-        found = ", ".join(name.removeprefix(_PREFIX) for name in there)
-        raise ConfigError(f"robot {robot.name}: its joints and fingers are not in the order of the model: {found}")
+        raise ConfigError(
+            f"robot {robot.name}: joints and fingers are not all of the model's in their order, {', '.join(there)}: "
+            "name them so, or weld those that do not move"
+        )
 
 
 def _check_effector(spec: mujoco.MjSpec, robot: RobotConfig, config: WorldConfig) -> None:
-    prefix, frame = _prefix(robot), robot.effector.frame
-    if spec.site(prefix + frame) is None and spec.body(prefix + frame) is None:
-        raise ConfigError(f"robot {robot.name}: no site or body {frame!r} in its model, named as the effector's frame")
+    frame = _prefix(robot) + robot.effector.frame
+    _there(spec.site(frame) or spec.body(frame), robot, f"site or body {robot.effector.frame!r}, the effector's frame,")
     width_m = config.shape.extent_m[1]
     if config.gripper == "free" and width_m >= robot.opening_m:
         raise ConfigError(
@@ -245,7 +244,8 @@ def _let_touch(spec: mujoco.MjSpec, robot: RobotConfig, fingers: list[mujoco.Mjs
     solid = {geom.id: geom for geom in root.find_all(mujoco.mjtObj.mjOBJ_GEOM) if geom.contype or geom.conaffinity}
     for geom in solid.values():
         geom.contype = geom.conaffinity = 0
-    others = [_body(spec, robot, name) for name in robot.touching] + [finger.parent for finger in fingers]
+    touching = [_there(spec.body(_PREFIX + name), robot, f"body {name!r}, of touching,") for name in robot.touching]
+    others = touching + [finger.parent for finger in fingers]
     for geom in joined.from_iterable(body.geoms for body in others):
         if geom.id in solid:
             geom.contype, geom.friction = GRIPPER_BIT, (BODY_FRICTION, 0.005, 0.0001)
@@ -265,13 +265,6 @@ def _add_pad(finger: mujoco.MjsBody, pad: PadConfig) -> mujoco.MjsGeom:
         mass=0.0,
         group=3,
     )
-
-
-def _body(spec: mujoco.MjSpec, robot: RobotConfig, name: str) -> mujoco.MjsBody:
-    body = spec.body(_PREFIX + name)
-    if body is None:
-        raise ConfigError(f"robot {robot.name}: no body {name!r} in its model, named under touching")
-    return body
 
 
 def _add_servo(spec: mujoco.MjSpec, joint: mujoco.MjsJoint, stiffness: float, damping: float, max_force: float) -> None:

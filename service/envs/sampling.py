@@ -1,23 +1,61 @@
-"""Random starts of objects and boxes, and random goals, for self-play, evaluation and the Gymnasium environments."""
+"""Random places: of object, box and obstacles at a start, clear of each other and of the gripper; and of goals.
+
+Things are as they were described, not turned, so each is in an upright box, and two are clear of each other where their
+boxes are.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Literal
+from typing import Literal, NamedTuple
 
+import mujoco
 import numpy as np
+from numpy.typing import NDArray
 
 from service.base.errors import ConfigError, TandemError
-from service.base.types import StateArray
+from service.base.types import BoolArray, StateArray
 from service.config import WorkspaceConfig, WorldConfig
+from service.config.objects import FixtureConfig, ObjectConfig
 from service.envs import scene
+from service.envs.objects import GRIPPER_BIT
 
 GoalKind = Literal["table", "air", "mixed", "volume"]
 GOAL_KINDS: tuple[GoalKind, ...] = ("table", "air", "mixed", "volume")
-
-_MAX_DRAWS = 1000
 MIXED_AIR_SHARE = 0.7
 """Share of mixed goals drawn anywhere in the workspace's volume; the rest lie on the table (paper: p = 0.7)."""
+_NUM_DRAWS = 20
+"""Of the place of one obstacle, before all in a world are drawn anew."""
+_NUM_ARRANGEMENTS = 60
+_MAX_DRAWS = 1000
+_TOUCHES_M = 0.001
+"""An object that stands on a fixture is not inside it, however its place was rounded."""
+_BESIDE_OBJECT_M = np.array([scene.GAP_M, scene.FINGER_GAP_M, scene.GAP_M])
+
+
+class Places(NamedTuple):
+    """Where things are in N worlds, metres."""
+
+    object: StateArray
+    """(N, 3) its centre."""
+    box: StateArray
+    """(N, 3) the middle of its bottom; (N, 0) in worlds without."""
+    obstacles: StateArray
+    """(N, K, 3) their centres; (N, 0, 3) where they are not known."""
+
+    def of(self, worlds: slice | BoolArray | NDArray[np.intp]) -> Places:
+        """Those of some worlds."""
+        return Places(*(each[worlds] for each in self))
+
+
+class Boxes(NamedTuple):
+    """Upright boxes by two corners, metres: (M, 3) the same in all worlds, or (N, M, 3)."""
+
+    lower: StateArray
+    upper: StateArray
+
+
+# --- starts -----------------------------------------------------------------------------------------------------------
 
 
 def sample_on_table(
@@ -32,35 +70,108 @@ def sample_on_table(
     return position
 
 
-def sample_in_volume(
-    rng: np.random.Generator, num: int, workspace: WorkspaceConfig, object_height_m: float, *, lowest_m: float
-) -> StateArray:
-    """(num, 3) object centres, uniform in the workspace above ``lowest_m``."""
-    position = sample_on_table(rng, num, workspace, object_height_m)
-    position[:, 2] = rng.uniform(lowest_m, workspace.height_m, num)
-    return position
-
-
-def draw_starts(rng: np.random.Generator, num: int, config: WorldConfig) -> tuple[StateArray, StateArray]:
-    """Random starts of objects, and of the box where there is one.
+def draw_objects(rng: np.random.Generator, num: int, config: WorldConfig) -> Places:
+    """Random starts of objects, and of the box where there is one; obstacles are left out.
 
     Without a fixture, anywhere on the table inside the workspace; so far from fixtures that are described that an open
     finger fits between. Beside a wall, in one of its two areas, either with equal chance. With a box, the box's middle
     is anywhere in the workspace, and the object outside of it: as far as from other fixtures.
-
-    Returns:
-        (num, 3) object centres and (num, 3) places of the box, metres; (num, 0) places in worlds without.
     """
+    box, no_obstacles = np.empty((num, 0)), np.empty((num, 0, 3))
     if config.fixture == "wall":
-        return _beside_wall(rng, rng.choice((-1.0, 1.0), num), config), np.empty((num, 0))
-    gap_m = (scene.GAP_M, scene.FINGER_GAP_M, scene.GAP_M)
-    anywhere = clear_of_fixtures(
-        lambda num: sample_on_table(rng, num, config.workspace, 2 * config.rest_height_m), num, config, gap_m
-    )
+        return Places(_beside_wall(rng, rng.choice((-1.0, 1.0), num), config), box, no_obstacles)
+    position = _clear_of_fixtures(lambda num: _on_table(rng, num, config), num, config, _BESIDE_OBJECT_M)
     if config.fixture == "box":
-        place = anywhere * (1.0, 1.0, 0.0)
-        return _outside_boxes(rng, place, config), place
-    return anywhere, np.empty((num, 0))
+        box = position * (1.0, 1.0, 0.0)
+        position = _outside_boxes(rng, box, config)
+    return Places(position, box, no_obstacles)
+
+
+def draw_starts(rng: np.random.Generator, num: int, config: WorldConfig, gripper: Boxes) -> Places:
+    """Random places of what starts elsewhere in every game: see ``draw_objects`` for object and box.
+
+    Obstacles lie on the table with their centres inside the workspace, clear of fixtures, the box, the gripper and each
+    other, and so far from the object that an open finger fits between. Where some find no place, object and box are
+    drawn anew, too.
+
+    Raises:
+        ConfigError: there is no room.
+    """
+    places = draw_objects(rng, num, config)._replace(obstacles=np.empty((num, len(config.obstacles), 3)))
+    standing = _join(_around_fixtures(config), gripper)
+    left = np.arange(num)
+    for _ in range(_NUM_ARRANGEMENTS):
+        here = places.of(left)
+        clear = ~_overlap(_around(here.object, config.shape), gripper)
+        if config.obstacles:
+            clear &= _place_obstacles(rng, here, config, standing)
+            places.obstacles[left] = here.obstacles
+        left = left[~clear]
+        if not left.size:
+            return places
+        places.object[left], places.box[left], _ = draw_objects(rng, left.size, config)
+    if not config.obstacles:
+        raise ConfigError(
+            f"world.object is {config.shape.extent_m[2]:g} m high and starts inside the gripper, wherever it is put: "
+            f"raise world.start_height_m, which is {config.start_height_m:g}"
+        )
+    raise ConfigError(
+        f"world.obstacles: no room in the workspace for the {len(config.obstacles)} of them beside the object, each "
+        "other, fixtures and the gripper: leave some out, make them smaller, or make world.workspace larger"
+    )
+
+
+def _place_obstacles(rng: np.random.Generator, places: Places, config: WorldConfig, standing: Boxes) -> BoolArray:
+    """Draw ``places.obstacles``; (N,) worlds where all are clear."""
+    num = len(places.object)
+    own = _around(places.object, config.shape)
+    taken = [Boxes(own.lower - _BESIDE_OBJECT_M + scene.GAP_M, own.upper + _BESIDE_OBJECT_M - scene.GAP_M)]
+    if places.box.size:
+        half = np.array([scene.BOX_SIZE_M / 2, scene.BOX_SIZE_M / 2, 0.0])
+        taken.append(Boxes(places.box - half, places.box + half + [0.0, 0.0, scene.BOX_HEIGHT_M]))
+    all_clear = np.ones(num, dtype=bool)
+    for index, obstacle in enumerate(config.obstacles):
+        others = Boxes(np.stack([each.lower for each in taken], 1), np.stack([each.upper for each in taken], 1))
+        here = np.empty((num, 3))
+        blocked = np.ones(num, dtype=bool)
+        for _ in range(_NUM_DRAWS):
+            here[blocked] = sample_on_table(rng, int(blocked.sum()), config.workspace, obstacle.extent_m[2])
+            around = _around(here, obstacle)
+            beside = Boxes(around.lower - scene.GAP_M, around.upper + scene.GAP_M)
+            blocked = _overlap(beside, standing) | _overlap(beside, others)
+            if not blocked.any():
+                break
+        all_clear &= ~blocked
+        places.obstacles[:, index] = here
+        taken.append(_around(here, obstacle))
+    return all_clear
+
+
+def _on_table(rng: np.random.Generator, num: int, config: WorldConfig) -> StateArray:
+    """(num, 3) centres of the world's object, resting on the table."""
+    return sample_on_table(rng, num, config.workspace, 2 * config.rest_height_m)
+
+
+def _beside_wall(rng: np.random.Generator, side: StateArray, config: WorldConfig) -> StateArray:
+    """(num, 3) object centres in the area on each (num,) side: -1 is nearer to the robot, 1 farther."""
+    position = _on_table(rng, len(side), config)
+    nearest = scene.WALL_THICKNESS_M / 2 + scene.GAP_M + config.shape.extent_m[0] / 2
+    distance = nearest + rng.uniform(0.0, scene.AREA_LENGTH_M, len(side))
+    position[:, 0] = config.workspace.center_x_m + side * distance
+    return position
+
+
+def _outside_boxes(rng: np.random.Generator, place: StateArray, config: WorldConfig) -> StateArray:
+    """(num, 3) object centres in the workspace, each drawn again until it is clear of its box."""
+    apart = scene.BOX_SIZE_M / 2 + np.array(config.shape.extent_m[:2]) / 2
+    least = apart + np.array([scene.GAP_M, scene.FINGER_GAP_M])
+    position = _on_table(rng, len(place), config)
+    while (inside := (np.abs(position - place)[:, :2] < least).all(axis=1)).any():
+        position[inside] = _on_table(rng, int(inside.sum()), config)
+    return position
+
+
+# --- goals ------------------------------------------------------------------------------------------------------------
 
 
 def sample_goals(
@@ -72,47 +183,64 @@ def sample_goals(
     (p = 1 in the paper's words). ``mixed``: as most of the paper's downstream tasks, anywhere in the volume with
     probability 0.7, else on the table. None is where the object would be inside a fixture.
     """
-    return clear_of_fixtures(lambda num: _draw_goals(kind, rng, num, config, success_distance_m), num, config)
+
+    def draw(num: int) -> StateArray:
+        table = _on_table(rng, num, config)
+        if kind == "table":
+            return table
+        lowest = config.rest_height_m + (success_distance_m if kind == "air" else 0.0)
+        volume = sample_in_volume(rng, num, config.workspace, 2 * config.rest_height_m, lowest_m=lowest)
+        if kind != "mixed":
+            return volume
+        return np.where(rng.random((num, 1)) < MIXED_AIR_SHARE, volume, table)
+
+    return _clear_of_fixtures(draw, num, config, np.zeros(3))
 
 
-def _draw_goals(
-    kind: GoalKind, rng: np.random.Generator, num: int, config: WorldConfig, success_distance_m: float
+def sample_in_volume(
+    rng: np.random.Generator, num: int, workspace: WorkspaceConfig, object_height_m: float, *, lowest_m: float
 ) -> StateArray:
-    table = sample_on_table(rng, num, config.workspace, 2 * config.rest_height_m)
-    if kind == "table":
-        return table
-    lowest = config.rest_height_m + (success_distance_m if kind == "air" else 0.0)
-    volume = sample_in_volume(rng, num, config.workspace, 2 * config.rest_height_m, lowest_m=lowest)
-    if kind != "mixed":
-        return volume
-    return np.where(rng.random((num, 1)) < MIXED_AIR_SHARE, volume, table)
+    """(num, 3) object centres, uniform in the workspace above ``lowest_m``."""
+    position = sample_on_table(rng, num, workspace, object_height_m)
+    position[:, 2] = rng.uniform(lowest_m, workspace.height_m, num)
+    return position
 
 
 def draw_goals(
-    kind: GoalKind,
-    rng: np.random.Generator,
-    config: WorldConfig,
-    success_distance_m: float,
-    *,
-    start: StateArray,
-    box: StateArray,
+    kind: GoalKind, rng: np.random.Generator, config: WorldConfig, success_distance_m: float, places: Places
 ) -> StateArray:
-    """(num, 3) goals for worlds whose (num, 3) objects and boxes are at ``start`` and ``box``, metres.
+    """(N, 3) goals for N worlds whose things are at ``places``, metres; none is inside an obstacle's place.
 
     With a wall, they are on the table in the area on the other side of it than the object. With a box, in its middle,
     as high as an object on the table: one within 5 cm has its underside below the rim; one on the bottom is 5 mm too
-    high. Else ``sample_goals`` draws them, and ``box`` is (num, 0).
+    high. Else ``sample_goals`` draws them.
 
     Raises:
-        TandemError: goals off the table in a world with a fixture.
+        TandemError: goals off the table in a world with a fixture, or no room for any.
     """
     check_goals(kind, config)
-    if config.fixture == "wall":
-        return _beside_wall(rng, np.where(start[:, 0] < config.workspace.center_x_m, 1.0, -1.0), config)
-    if config.fixture == "box":
-        in_box: StateArray = box + np.array([0.0, 0.0, config.rest_height_m])
-        return in_box
-    return sample_goals(kind, rng, len(start), config, success_distance_m)
+
+    def draw(places: Places) -> StateArray:
+        if config.fixture == "wall":
+            other_side = np.where(places.object[:, 0] < config.workspace.center_x_m, 1.0, -1.0)
+            return _beside_wall(rng, other_side, config)
+        if config.fixture == "box":
+            in_box: StateArray = places.box + np.array([0.0, 0.0, config.rest_height_m])
+            return in_box
+        return sample_goals(kind, rng, len(places.object), config, success_distance_m)
+
+    goal = draw(places)
+    if not places.obstacles.size:
+        return goal
+    for _ in range(_MAX_DRAWS):
+        inside = inside_obstacles(goal, places.obstacles, config)
+        if not inside.any():
+            return goal
+        goal[inside] = draw(places.of(inside))
+    raise ConfigError(
+        f"world.obstacles: the {len(config.obstacles)} of them leave no place for a goal: leave some out, or make "
+        "world.workspace larger"
+    )
 
 
 def check_goals(kind: GoalKind, config: WorldConfig) -> None:
@@ -128,40 +256,77 @@ def check_goals(kind: GoalKind, config: WorldConfig) -> None:
         raise TandemError(f"goals = {kind!r} with a {config.fixture}: its goals lie {where}; choose table")
 
 
-def clear_of_fixtures(
-    draw: Callable[[int], StateArray], num: int, config: WorldConfig, gap_m: Sequence[float] = (0.0, 0.0, 0.0)
+# --- what is in the way -----------------------------------------------------------------------------------------------
+
+
+def gripper_boxes(model: mujoco.MjModel, data: mujoco.MjData) -> Boxes:
+    """Boxes around what may touch of a gripper, where it is in ``data``."""
+    solid = np.flatnonzero(model.geom_contype == GRIPPER_BIT)
+    turned = data.geom_xmat[solid].reshape(-1, 3, 3)
+    center = data.geom_xpos[solid] + np.einsum("gij,gj->gi", turned, model.geom_aabb[solid, :3])
+    half = np.einsum("gij,gj->gi", np.abs(turned), model.geom_aabb[solid, 3:])
+    return Boxes(center - half, center + half)
+
+
+def inside_obstacles(position: StateArray, obstacles: StateArray, config: WorldConfig) -> BoolArray:
+    """(N,) whether an object at (N, 3) would be inside one of the obstacles at (N, K, 3), metres."""
+    half = np.array([each.extent_m for each in config.obstacles]).reshape(-1, 3) / 2
+    return _overlap(_around(position, config.shape), Boxes(obstacles - half, obstacles + half))
+
+
+def inside_fixtures(position: StateArray, config: WorldConfig) -> BoolArray:
+    """(N,) whether an object at (N, 3) would be more than a millimetre inside a fixture or the wall, metres.
+
+    A box, which is elsewhere in every game, is none of them.
+    """
+    around = _around(position, config.shape)
+    return _overlap(Boxes(around.lower + _TOUCHES_M, around.upper - _TOUCHES_M), _around_fixtures(config))
+
+
+def _clear_of_fixtures(
+    draw: Callable[[int], StateArray], num: int, config: WorldConfig, gap_m: StateArray
 ) -> StateArray:
-    """(num, 3) object centres, each drawn again until the object is clear of all described fixtures."""
-    position = draw(num)
-    half = np.array(config.shape.extent_m) / 2 + gap_m
-    boxes = [(np.array(each.lower_m) - half, np.array(each.upper_m) + half) for each in config.fixtures]
-    for _ in range(_MAX_DRAWS if boxes else 0):
-        inside = np.any([((position > low) & (position < high)).all(axis=1) for low, high in boxes], axis=0)
+    """(num, 3) object centres, each drawn again until the object is that far from all described fixtures."""
+    position, fixtures = draw(num), _boxes_of(config.fixtures)
+    for _ in range(_MAX_DRAWS):
+        around = _around(position, config.shape)
+        inside = _overlap(Boxes(around.lower - gap_m, around.upper + gap_m), fixtures)
         if not inside.any():
             return position
         position[inside] = draw(int(inside.sum()))
-    if boxes:
-        raise ConfigError(
-            f"world.fixtures: the {len(boxes)} of them leave no room for the object in the workspace: take some away, "
-            "or make world.workspace larger"
-        )
-    return position
+    raise ConfigError(
+        f"world.fixtures: the {len(config.fixtures)} of them leave no room for the object in the workspace: take some "
+        "away, or make world.workspace larger"
+    )
 
 
-def _beside_wall(rng: np.random.Generator, side: StateArray, config: WorldConfig) -> StateArray:
-    """(num, 3) object centres in the area on each (num,) side: -1 is nearer to the robot, 1 farther."""
-    position = sample_on_table(rng, len(side), config.workspace, 2 * config.rest_height_m)
-    nearest = scene.WALL_THICKNESS_M / 2 + scene.GAP_M + config.shape.extent_m[0] / 2
-    distance = nearest + rng.uniform(0.0, scene.AREA_LENGTH_M, len(side))
-    position[:, 0] = config.workspace.center_x_m + side * distance
-    return position
+def _around(position: StateArray, shape: ObjectConfig) -> Boxes:
+    """(N, 3) boxes around a thing at (N, 3) places."""
+    half = np.array(shape.extent_m) / 2
+    return Boxes(position - half, position + half)
 
 
-def _outside_boxes(rng: np.random.Generator, place: StateArray, config: WorldConfig) -> StateArray:
-    """(num, 3) object centres in the workspace, each drawn again until it is clear of its box."""
-    apart = scene.BOX_SIZE_M / 2 + np.array(config.shape.extent_m[:2]) / 2
-    least = apart + np.array([scene.GAP_M, scene.FINGER_GAP_M])
-    position = sample_on_table(rng, len(place), config.workspace, 2 * config.rest_height_m)
-    while (inside := (np.abs(position - place)[:, :2] < least).all(axis=1)).any():
-        position[inside] = sample_on_table(rng, int(inside.sum()), config.workspace, 2 * config.rest_height_m)
-    return position
+def _around_fixtures(config: WorldConfig) -> Boxes:
+    """Boxes around all fixtures that are described, or around the wall."""
+    if config.fixture != "wall":
+        return _boxes_of(config.fixtures)
+    workspace = config.workspace
+    half = np.array([scene.WALL_THICKNESS_M, workspace.length_y_m, 2 * scene.WALL_HEIGHT_M]) / 2
+    middle = np.array([[workspace.center_x_m, workspace.center_y_m, 0.0]])
+    return Boxes(middle - half, middle + half)
+
+
+def _boxes_of(fixtures: Sequence[FixtureConfig]) -> Boxes:
+    corners = np.array([each.corners_m for each in fixtures]).reshape(-1, 2, 3)
+    return Boxes(corners[:, 0], corners[:, 1])
+
+
+def _join(one: Boxes, other: Boxes) -> Boxes:
+    return Boxes(*(np.concatenate(pair) for pair in zip(one, other, strict=True)))
+
+
+def _overlap(one: Boxes, others: Boxes) -> BoolArray:
+    """(N,) whether (N, 3) boxes overlap one of ``others``."""
+    overlapping = (one.lower[:, None] < others.upper) & (one.upper[:, None] > others.lower)
+    some: BoolArray = np.any(np.all(overlapping, axis=-1), axis=1)
+    return some

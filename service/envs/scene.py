@@ -15,11 +15,10 @@ import numpy as np
 
 from service.base.errors import ConfigError
 from service.config import WorldConfig
-from service.envs.contacts import GRIPPER_BIT, OBJECT_BIT, STIFF, TABLE_BIT
-from service.envs.objects import add_floor, add_object, add_obstacle, parts_of
-from service.envs.observations import ACTION, OBSTACLE_PREFIX
+from service.envs.objects import GRIPPER_BIT, OBJECT_BIT, STIFF, TABLE_BIT, add_things, parts_of
+from service.envs.observations import ACTION
 from service.envs.robot import add_robot, described
-from service.envs.state_layout import StateLayout
+from service.envs.state_layout import OBSTACLE_PREFIX, StateLayout
 
 TABLE_CENTER_X_M = -0.3
 TABLE_HALF_SIZE_M = (0.55, 0.45, 0.2)
@@ -75,11 +74,7 @@ def build_spec(config: WorldConfig) -> mujoco.MjSpec:
         group=3,
         **STIFF,
     )
-    add_object(spec, config)
-    for number, obstacle in enumerate(config.obstacles, start=1):
-        add_obstacle(spec, obstacle, f"{OBSTACLE_PREFIX}{number}")
-    if config.obstacles:
-        add_floor(spec)
+    add_things(spec, config)
     _add_fixture(spec, config)
     _add_described_fixtures(spec, config)
     return spec
@@ -138,16 +133,20 @@ def _add_fixture(spec: mujoco.MjSpec, config: WorldConfig) -> None:
     workspace = config.workspace
     if config.fixture == "wall":
         half = (WALL_THICKNESS_M / 2, workspace.length_y_m / 2, WALL_HEIGHT_M / 2)
-        _add_plate(spec.worldbody, "wall", (workspace.center_x_m, workspace.center_y_m, half[2]), half, config)
+        middle = (workspace.center_x_m, workspace.center_y_m, half[2])
+        _add_fixed(spec.worldbody, "wall", config, type=mujoco.mjtGeom.mjGEOM_BOX, pos=middle, size=half)
     elif config.fixture == "box":
         box = spec.worldbody.add_body(name="box", pos=(workspace.center_x_m, workspace.center_y_m, 0.0), mocap=True)
-        outer, half_shell, half_height = BOX_SIZE_M / 2, BOX_SHELL_M / 2, BOX_HEIGHT_M / 2
-        side, inner = outer - half_shell, outer - BOX_SHELL_M
-        _add_plate(box, "bottom", (0.0, 0.0, half_shell), (outer, outer, half_shell), config)
-        _add_plate(box, "near", (-side, 0.0, half_height), (half_shell, outer, half_height), config)
-        _add_plate(box, "far", (side, 0.0, half_height), (half_shell, outer, half_height), config)
-        _add_plate(box, "left", (0.0, -side, half_height), (inner, half_shell, half_height), config)
-        _add_plate(box, "right", (0.0, side, half_height), (inner, half_shell, half_height), config)
+        outer, shell, height = BOX_SIZE_M / 2, BOX_SHELL_M / 2, BOX_HEIGHT_M / 2
+        side, inner = outer - shell, outer - BOX_SHELL_M
+        for name, middle, half in (
+            ("bottom", (0.0, 0.0, shell), (outer, outer, shell)),
+            ("near", (-side, 0.0, height), (shell, outer, height)),
+            ("far", (side, 0.0, height), (shell, outer, height)),
+            ("left", (0.0, -side, height), (inner, shell, height)),
+            ("right", (0.0, side, height), (inner, shell, height)),
+        ):
+            _add_fixed(box, name, config, type=mujoco.mjtGeom.mjGEOM_BOX, pos=middle, size=half)
 
 
 def _add_described_fixtures(spec: mujoco.MjSpec, config: WorldConfig) -> None:
@@ -159,27 +158,17 @@ def _add_described_fixtures(spec: mujoco.MjSpec, config: WorldConfig) -> None:
             pos=(x, y, fixture.bottom_m + fixture.extent_m[2] / 2), quat=(np.cos(half), 0.0, 0.0, np.sin(half))
         )
         for index, part in enumerate(parts_of(spec, fixture, f"fixture{number}-", 1.0)):
-            body.add_geom(
-                name=f"{FIXTURE_PREFIX}{number}-{index}",
-                contype=0,
-                conaffinity=GRIPPER_BIT | OBJECT_BIT,
-                friction=(config.friction, 0.005, 0.0001),
-                group=2,
-                rgba=(*fixture.color, 1.0),
-                **part,
-                **STIFF,
-            )
+            _add_fixed(body, f"{number}-{index}", config, rgba=(*fixture.color, 1.0), **part)
 
 
-def _add_plate(body: Any, name: str, middle: tuple[float, ...], half: tuple[float, ...], config: WorldConfig) -> None:
+def _add_fixed(body: Any, name: str, config: WorldConfig, **shape: Any) -> None:
+    """Add a geom that object and gripper touch."""
     body.add_geom(
         name=FIXTURE_PREFIX + name,
-        type=mujoco.mjtGeom.mjGEOM_BOX,
-        pos=middle,
-        size=half,
         contype=0,
         conaffinity=GRIPPER_BIT | OBJECT_BIT,
         friction=(config.friction, 0.005, 0.0001),
         group=2,
+        **shape,
         **STIFF,
     )

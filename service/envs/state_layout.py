@@ -4,8 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
+from service.base.types import StateArray
+
 Sizes = Mapping[str, int]
 """Number of columns by name, in their order."""
+OBSTACLE_PREFIX = "obstacle_"
+"""Begins the names of the obstacles' positions; ``obstacle_1`` is the first one described."""
+_COLUMNS_EACH = 7
+"""Columns of an obstacle: position and quaternion."""
 
 
 def columns(sizes: Sizes) -> dict[str, slice]:
@@ -34,11 +40,10 @@ class StateLayout:
         groups = ({"time": 1}, positions, velocities, measured, kept)
         self._columns = columns({name: size for group in groups for name, size in group.items()})
         assert len(self._columns) == sum(map(len, groups)), "two parts of the same name"
-        self.num_positions, self.num_velocities = sum(positions.values()), sum(velocities.values())
-        """Numbers in qpos and in qvel."""
-        self.physics = slice(0, 1 + self.num_positions + self.num_velocities)
+        first_velocity = 1 + sum(positions.values())
+        self.physics = slice(0, first_velocity + sum(velocities.values()))
         """MuJoCo's full physics state."""
-        self.velocities = slice(1 + self.num_positions, self.physics.stop)
+        self.velocities = slice(first_velocity, self.physics.stop)
         """All velocities."""
         first_kept: int = self.physics.stop + sum(measured.values())
         self.size = first_kept + sum(kept.values())
@@ -49,3 +54,15 @@ class StateLayout:
     def __getitem__(self, name: str) -> slice:
         """Columns of a part."""
         return self._columns[name]
+
+
+def obstacle_columns(layout: StateLayout, num: int) -> slice:
+    """Columns of a state that hold poses of ``num`` obstacles."""
+    first = layout[f"{OBSTACLE_PREFIX}1"].start if num else 0
+    return slice(first, first + _COLUMNS_EACH * num)
+
+
+def obstacle_places(states: StateArray, columns: slice) -> StateArray:
+    """(N, K, 3) centres of the obstacles of (N, S) states, metres; a view."""
+    num = (columns.stop - columns.start) // _COLUMNS_EACH
+    return states[:, columns].reshape(len(states), num, _COLUMNS_EACH)[:, :, :3]

@@ -7,8 +7,7 @@ import numpy as np
 from service.base.types import Array, BoolArray, IntArray, StateArray
 from service.config import WorldConfig
 from service.config.self_play import SelfPlayConfig
-from service.envs.obstacles import obstacle_columns
-from service.envs.state_layout import StateLayout
+from service.envs.state_layout import StateLayout, obstacle_columns
 from service.store.models import GoalCell, GoalGrid
 
 AIR_ABOVE_REST_M = 0.05

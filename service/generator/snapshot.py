@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from service.base.tensors import join_parts, split_parts
 from service.base.types import Array, Arrays, BoolArray, IntArray, StateArray
 from service.config.self_play import SelfPlayConfig
-from service.envs.obstacles import inside_obstacles, obstacle_places
-from service.envs.sampling import GoalKind, sample_goals
+from service.envs.sampling import GoalKind, inside_obstacles, sample_goals
+from service.envs.state_layout import obstacle_places
 from service.generator.bins import GoalCells, TaskBins, in_air
 from service.generator.opponents import RoundPlan
 from service.generator.ring import Rows, join_rows

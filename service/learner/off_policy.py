@@ -18,7 +18,7 @@ import numpy as np
 
 from service.base.tensors import join_parts, split_parts
 from service.base.types import Array, Arrays, BoolArray, FloatArray, Metrics
-from service.envs.gym.vector import VectorState
+from service.envs.gym.tabletop import EnvState
 from service.learner.replay import Columns, ReplayBuffer
 
 if TYPE_CHECKING:  # lists of methods are read where torch is not needed
@@ -115,7 +115,7 @@ class TabletopWorlds(ABC):
         """Go back to a saved state; continues bit-identically."""
         worlds: dict[str, Any] = {name: np.array(array) for name, array in arrays.items()}
         self.previous = worlds.pop("previous")
-        self._see(self.env.restore(VectorState(**worlds, random=tuple(random))))
+        self._see(self.env.restore(EnvState(**worlds, random=tuple(random))))
 
     def close(self) -> None:
         """Stop the worlds' threads."""

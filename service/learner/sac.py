@@ -15,7 +15,7 @@ import torch
 from torch import Tensor, nn
 
 from service.base.types import Array, Arrays, FloatArray, Metrics
-from service.config.sac import SACConfig
+from service.config.skills import SACConfig
 from service.learner.sac_networks import Critics, sample_actions
 from service.policies.adam import Adam
 from service.policies.networks import export_parameters

@@ -14,7 +14,6 @@ from service.config.self_play import SelfPlayConfig
 from service.config.skills import SkillDiscoveryConfig
 from service.media import recording, video
 from service.media.plots import plot_coverage, plot_curves, plot_goals
-from service.media.task_curves import draw_training
 from service.policies.numpy_policy import NumpyMCPPolicy
 from service.registry.loading import Trained, load
 from service.store.run_directory import RunDirectory
@@ -33,35 +32,21 @@ def make_artifacts(directory: RunDirectory, registry: Path | str = "registry") -
         Files by what they show. What cannot be made, for want of an OpenGL library or of room on the disk, is left
         out, and a warning says why.
     """
-    makers: dict[str, Callable[[], Path]]
-    if directory.read_config().makes is None:
+    config = directory.read_config()
+    if config.makes is None:
         return {}
     trained = load(str(directory.path), registry)
-    world = trained.config.world
+    makers: dict[str, Callable[[], Path]] = {"curves": partial(plot_curves, directory.path, config.method)}
     if trained.kind == "orchestrator":
-        return _make(
-            {
-                "curves": partial(draw_training, directory.path),
-                "video": partial(_draw_episodes, directory, trained),
-            }
-        )
-    if trained.kind == "skills":
-        makers = {
-            "curves": partial(plot_curves, directory.path, "skills"),
-            "coverage": partial(_draw_skills, directory, trained),
-            "video": partial(_draw_skill_video, directory, trained),
-        }
-        return _make(makers)
-    makers = {
-        "curves": partial(plot_curves, directory.path, "self-play" if trained.alice else "distillation"),
-        "goals": partial(plot_goals, directory.path, world.workspace),
-    }
-    if isinstance(trained.policy, NumpyMCPPolicy):
-        makers["coverage"] = partial(_draw_coverage, directory, trained)
-    return _make(makers | {"video": partial(_draw_rounds if trained.alice else _draw_episodes, directory, trained)})
-
-
-def _make(makers: dict[str, Callable[[], Path]]) -> dict[str, Path]:
+        makers["video"] = partial(_draw_episodes, directory, trained)
+    elif trained.kind == "skills":
+        makers["coverage"] = partial(_draw_skills, directory, trained)
+        makers["video"] = partial(_draw_skill_video, directory, trained)
+    else:
+        makers["goals"] = partial(plot_goals, directory.path, config.world.workspace)
+        if isinstance(trained.policy, NumpyMCPPolicy):
+            makers["coverage"] = partial(_draw_coverage, directory, trained)
+        makers["video"] = partial(_draw_rounds if trained.alice else _draw_episodes, directory, trained)
     files = {}
     for name, make in counted(makers.items(), "drawing", len(makers), "pictures"):
         try:

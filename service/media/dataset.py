@@ -129,14 +129,11 @@ def write_dataset(name: str, played: Sequence[Played], config: Config, label: st
 def _buffers(played: Sequence[Played], config: Config) -> Iterator[object]:
     from minari.data_collector import EpisodeBuffer
 
-    longest, columns = max(len(each.states) for each in played), played[0].states.shape[1]
-    worlds = WorldBatch(config.world, longest, num_threads=1)
-    if worlds.states.shape[1] != columns:  # those of self-play have a column more
-        worlds.close()
-        assert isinstance(config, SelfPlayConfig)
+    longest = max(len(each.states) for each in played)
+    blocked = 0.0
+    if isinstance(config, SelfPlayConfig) and played[0].is_alice:  # states of self-play may have a column more
         blocked = config.game.blocked_gripper_fraction
-        worlds = WorldBatch(config.world, longest, num_threads=1, blocked_fraction=blocked)
-    with worlds:
+    with WorldBatch(config.world, longest, num_threads=1, blocked_fraction=blocked) as worlds:
         for each in counted(played, "writing the data set", len(played), "episodes"):
             yield EpisodeBuffer(**_arrays(each, worlds, config.success_distance_m))
 

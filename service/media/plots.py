@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from itertools import combinations, cycle, product
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -43,120 +43,164 @@ _EDGE_STYLE = (0, (4, 3))
 # --- curves ----------------------------------------------------------------------------------------------------------
 
 
-class _Panel(NamedTuple):
-    title: str
-    look_for: str
-    unit: str
-
-
 class _Curve(NamedTuple):
-    panel: str
     key: str
     label: str
     color: str
     dashed: bool = False
 
 
-_PANELS = {
-    "proposals": _Panel("Alice's proposals", "valid settles high, lifted grows", "fraction"),
-    "bob": _Panel("Bob on Alice's goals", "holds up while the goals get harder", "solved"),
-    "random": _Panel("Bob on random goals", "grows; last: there at the last step", "solved"),
-    "goals": _Panel("How far and how high the goals are", "grow: Alice raises the bar", "metres"),
-    "refused": _Panel("Why proposals are refused", "not moved falls early, outside stays low", "fraction"),
-    "entropy": _Panel("Entropy of the policies", "falls slowly, without a collapse", "nats"),
-}
-_CURVES = (
-    _Curve("proposals", "alice/valid_fraction", "valid", BLUE),
-    _Curve("proposals", "alice/lifted_fraction", "lifted", ORANGE),
-    _Curve("proposals", "alice/contact_fraction", "touched", GREEN),
-    _Curve("bob", "bob/success_rate", "all", BLUE),
-    _Curve("bob", "bob/success_rate_table", "table", GREEN),
-    _Curve("bob", "bob/success_rate_air", "air", ORANGE),
-    _Curve("random", "evaluation/table_success_ever", "table, ever", GREEN, dashed=True),
-    _Curve("random", "evaluation/table_success_last", "table, last", GREEN),
-    _Curve("random", "evaluation/air_success_ever", "air, ever", ORANGE, dashed=True),
-    _Curve("random", "evaluation/air_success_last", "air, last", ORANGE),
-    _Curve("random", "evaluation/mixed_success_last", "mixed, last", BLUE),
-    _Curve("goals", "alice/goal_distance_m", "distance", BLUE),
-    _Curve("goals", "alice/goal_height_m", "height", ORANGE),
-    _Curve("goals", "alice/goal_height_p90_m", "height p90", ORANGE, dashed=True),
-    _Curve("refused", "alice/not_moved_fraction", "not moved", BLUE),
-    _Curve("refused", "alice/outside_fraction", "outside", ORANGE),
-    _Curve("entropy", "learner/alice_entropy", "Alice", ORANGE),
-    _Curve("entropy", "learner/bob_entropy", "Bob", BLUE),
+class _Panel(NamedTuple):
+    title: str
+    look_for: str
+    unit: str
+    curves: Sequence[_Curve] = ()
+
+
+_BOB = _Panel(
+    "Bob on Alice's goals",
+    "holds up while the goals get harder",
+    "solved",
+    (
+        _Curve("bob/success_rate", "all", BLUE),
+        _Curve("bob/success_rate_table", "table", GREEN),
+        _Curve("bob/success_rate_air", "air", ORANGE),
+    ),
 )
-
-
-_SKILL_PANELS = {
-    "moved": _Panel("What episodes do to the object", "moved grows", "fraction"),
-    "coverage": _Panel("Coverage of random skills", "grows", "fraction"),
-    "cells": _Panel("Cells in which episodes ended", "grow", "cells"),
-    "distance": _Panel("How far the object came", "grows", "metres"),
-    "loss": _Panel("Loss of the reward's network", "settles", ""),
-    "entropy": _Panel("Entropy of the policy", "falls slowly, without a collapse", "nats"),
-}
-_SKILL_CURVES = (
-    _Curve("moved", "skills/moved_fraction", "moved", BLUE),
-    _Curve("moved", "skills/lifted_fraction", "lifted", ORANGE),
-    _Curve("moved", "skills/outside_fraction", "outside", GREEN),
-    _Curve("coverage", "evaluation/coverage", "32 skills", BLUE),
-    _Curve("cells", "skills/num_cells_seen", "ever", BLUE),
-    _Curve("distance", "skills/distance_m", "distance", BLUE),
-    _Curve("loss", "learner/representation_loss", "loss", BLUE),
-    _Curve("entropy", "learner/entropy", "policy", BLUE),
+_RANDOM = _Panel(
+    "Bob on random goals",
+    "grows; last: there at the last step",
+    "solved",
+    (
+        _Curve("evaluation/table_success_ever", "table, ever", GREEN, dashed=True),
+        _Curve("evaluation/table_success_last", "table, last", GREEN),
+        _Curve("evaluation/air_success_ever", "air, ever", ORANGE, dashed=True),
+        _Curve("evaluation/air_success_last", "air, last", ORANGE),
+        _Curve("evaluation/mixed_success_last", "mixed, last", BLUE),
+    ),
 )
-
-_DISTILLATION_PANELS = {
-    "solved": _Panel("The student on random goals", "grows, with noise and random actions", "solved"),
-    "random": _PANELS["random"],
-    "action": _Panel("Error of actions", "falls; noise of what is seen leaves a rest", "squared"),
-    "primitives": _Panel("Error of primitives", "falls", "squared"),
-    "gate": _Panel("Error of the gate", "falls", "squared, of logs"),
-    "rate": _Panel("Learning rate", "falls", ""),
-}
-_DISTILLATION_CURVES = (
-    _Curve("solved", "bob/success_rate", "own gate", BLUE),
-    *(curve for curve in _CURVES if curve.panel == "random"),
-    _Curve("action", "learner/action_error", "error", BLUE),
-    _Curve("primitives", "learner/primitives_error", "error", BLUE),
-    _Curve("gate", "learner/gate_error", "error", BLUE),
-    _Curve("rate", "learner/learning_rate", "rate", BLUE),
+_SELF_PLAY = (
+    _Panel(
+        "Alice's proposals",
+        "valid settles high, lifted grows",
+        "fraction",
+        (
+            _Curve("alice/valid_fraction", "valid", BLUE),
+            _Curve("alice/lifted_fraction", "lifted", ORANGE),
+            _Curve("alice/contact_fraction", "touched", GREEN),
+        ),
+    ),
+    _BOB,
+    _RANDOM,
+    _Panel(
+        "How far and how high the goals are",
+        "grow: Alice raises the bar",
+        "metres",
+        (
+            _Curve("alice/goal_distance_m", "distance", BLUE),
+            _Curve("alice/goal_height_m", "height", ORANGE),
+            _Curve("alice/goal_height_p90_m", "height p90", ORANGE, dashed=True),
+        ),
+    ),
+    _Panel(
+        "Why proposals are refused",
+        "not moved falls early, outside stays low",
+        "fraction",
+        (
+            _Curve("alice/not_moved_fraction", "not moved", BLUE),
+            _Curve("alice/outside_fraction", "outside", ORANGE),
+        ),
+    ),
+    _Panel(
+        "Entropy of the policies",
+        "falls slowly, without a collapse",
+        "nats",
+        (_Curve("learner/alice_entropy", "Alice", ORANGE), _Curve("learner/bob_entropy", "Bob", BLUE)),
+    ),
 )
-_DRAWN = {
-    "self-play": (_PANELS, _CURVES),
-    "skills": (_SKILL_PANELS, _SKILL_CURVES),
-    "distillation": (_DISTILLATION_PANELS, _DISTILLATION_CURVES),
-}
+_SKILLS = (
+    _Panel(
+        "What episodes do to the object",
+        "moved grows",
+        "fraction",
+        (
+            _Curve("skills/moved_fraction", "moved", BLUE),
+            _Curve("skills/lifted_fraction", "lifted", ORANGE),
+            _Curve("skills/outside_fraction", "outside", GREEN),
+        ),
+    ),
+    _Panel("Coverage of random skills", "grows", "fraction", (_Curve("evaluation/coverage", "32 skills", BLUE),)),
+    _Panel("Cells in which episodes ended", "grow", "cells", (_Curve("skills/num_cells_seen", "ever", BLUE),)),
+    _Panel("How far the object came", "grows", "metres", (_Curve("skills/distance_m", "distance", BLUE),)),
+    _Panel("Loss of the reward's network", "settles", "", (_Curve("learner/representation_loss", "loss", BLUE),)),
+    _Panel(
+        "Entropy of the policy",
+        "falls slowly, without a collapse",
+        "nats",
+        (_Curve("learner/entropy", "policy", BLUE),),
+    ),
+)
+_DISTILLATION = (
+    _Panel(
+        "The student on random goals",
+        "grows, with noise and random actions",
+        "solved",
+        (_Curve("bob/success_rate", "own gate", BLUE),),
+    ),
+    _RANDOM,
+    _Panel(
+        "Error of actions",
+        "falls; noise of what is seen leaves a rest",
+        "squared",
+        (_Curve("learner/action_error", "error", BLUE),),
+    ),
+    _Panel("Error of primitives", "falls", "squared", (_Curve("learner/primitives_error", "error", BLUE),)),
+    _Panel("Error of the gate", "falls", "squared, of logs", (_Curve("learner/gate_error", "error", BLUE),)),
+    _Panel("Learning rate", "falls", "", (_Curve("learner/learning_rate", "rate", BLUE),)),
+)
+_TASK = (
+    _Panel(
+        "The task",
+        "last: there at the last step",
+        "solved",
+        (
+            _Curve("evaluation/success_last", "last", BLUE),
+            _Curve("evaluation/success_ever", "ever", GREEN, dashed=True),
+            _Curve("rollout/success_last", "learning", ORANGE),
+        ),
+    ),
+    _Panel("Return of an episode", "grows", "steps at the goal", (_Curve("rollout/return", "with noise", BLUE),)),
+    _Panel("Entropy coefficient", "falls", "", (_Curve("learner/entropy_coefficient", "weight", BLUE),)),
+)
+_PANELS = {"self-play": _SELF_PLAY, "skills": _SKILLS, "distillation": _DISTILLATION}
+"""Panels by method; those of learning a task are the same for all of its methods."""
 
 
-def plot_curves(run_dir: Path, kind: Literal["self-play", "skills", "distillation"] = "self-play") -> Path:
-    """Draw ``curves.png`` from the run's ``metrics.jsonl``: six small panels over env steps, raw thin, smoothed thick.
+def plot_curves(run_dir: Path, method: str = "self-play") -> Path:
+    """Draw ``curves.png`` from the run's ``metrics.jsonl``: small panels over env steps, raw thin, smoothed thick.
 
     A value that is missing, null or not finite leaves a gap; a panel without values says so.
 
     Args:
         run_dir: of the run.
-        kind: of the run, which says what there is to draw.
+        method: of the run, which says what there is to draw.
 
     Raises:
         TandemError: the run has no metrics yet, they are damaged, or the picture cannot be written.
     """
     records = read_records(run_dir / "metrics.jsonl")
-    steps = column(records, "env_steps") / 1e6
-    figure = new_figure(14.0, 7.8, f"{run_dir.resolve().name}: {_progress(records)}")
-    panels, curves = _DRAWN[kind]
-    for place, (axes, (name, panel)) in enumerate(zip(figure.subplots(2, 3).flat, panels.items(), strict=True)):
-        _draw_panel(axes, panel, [curve for curve in curves if curve.panel == name], steps, records)
-        axes.set_xlabel("million env steps" if place >= 3 else "", color=FAINT)
-    figure.subplots_adjust(left=0.05, right=0.908, top=0.85, bottom=0.08, wspace=0.64, hspace=0.42)
+    panels = _PANELS.get(method, _TASK)
+    num_rows = len(panels) // 3
+    figure = new_figure(14.0, 3.9 * num_rows, f"{run_dir.resolve().name}: {_progress(records)}")
+    for axes, panel in zip(figure.subplots(num_rows, 3).flat, panels, strict=True):
+        _draw_panel(axes, panel, [(curve, records) for curve in panel.curves])
+    edges = {"left": 0.05, "right": 0.908, "top": 1.0 - 0.3 / num_rows, "bottom": 0.16 / num_rows}
+    figure.subplots_adjust(**edges, wspace=0.64, hspace=0.46)
     return save(figure, run_dir / "curves.png")
 
 
-_SELF_PLAY = (
-    (_PANELS["random"].title, "evaluation/mixed_success_last"),
-    (_PANELS["bob"].title, "bob/success_rate"),
-)
-_TASKS = (("Evaluated", "evaluation/success_last"), ("While learning, with noise", "rollout/success_last"))
+_OF_STUDIES = ((_RANDOM.title, "evaluation/mixed_success_last"), (_BOB.title, "bob/success_rate"))
+_OF_TASKS = (("Evaluated", "evaluation/success_last"), ("While learning, with noise", "rollout/success_last"))
 """Curves of a study, with their titles."""
 
 
@@ -178,30 +222,18 @@ def plot_study(run_dirs: Mapping[str, Path], path: Path) -> Path:
         raise TandemError(f"no run in {path.parent} has metrics yet; wait for a first iteration")
     figure = new_figure(14.0, 5.2, f"{path.parent.resolve().name}: {counted(len(found), 'run')}")
     tasks = any("rollout/success_last" in record for records in found.values() for record in records[-1:])
-    for axes, (title, key) in zip(figure.subplots(1, 2), _TASKS if tasks else _SELF_PLAY, strict=True):
-        style_axes(axes)
-        axes.set_title(f"{title}: {key.split('/')[1]}", loc="left", fontsize=12, weight="bold", color=INK)
-        axes.set_xlabel("million env steps", color=FAINT)
-        axes.set_ylim(0.0, 1.0)
-        ends = []
-        for (label, records), color in zip(found.items(), cycle(_COLORS), strict=False):
-            curve = _Curve(title, key, label, color)
-            end = _draw_curve(axes, curve, column(records, "env_steps") / 1e6, column(records, key))
-            ends += [(end, curve)] if end is not None else []
-        axes.set_xlim(left=0.0)
-        _label_ends(axes, ends)
-    figure.subplots_adjust(left=0.05, right=0.908, top=0.82, bottom=0.12, wspace=0.3)
+    for axes, (title, key) in zip(figure.subplots(1, 2), _OF_TASKS if tasks else _OF_STUDIES, strict=True):
+        runs = zip(found.items(), cycle(_COLORS), strict=False)
+        curves = [(_Curve(key, label, color), records) for (label, records), color in runs]
+        _draw_panel(axes, _Panel(title, key.split("/")[1], "solved"), curves)
+    figure.subplots_adjust(left=0.05, right=0.908, top=0.8, bottom=0.12, wspace=0.3)
     return save(figure, path)
 
 
 def _progress(records: Sequence[dict[str, Any]]) -> str:
-    steps, seconds = (column(records, key) for key in ("env_steps", "time/wall_s"))
-    words = [counted(len(records), "iteration")]
-    if np.isfinite(steps).any():
-        words.append(f"{np.nanmax(steps) / 1e6:.2f} M env steps")
-    if np.isfinite(seconds).any():
-        words.append(f"{np.nanmax(seconds) / 60:.0f} min")
-    return ", ".join(words)
+    steps = column(records, "env_steps")
+    done = f", {np.nanmax(steps) / 1e6:.2f} M env steps" if np.isfinite(steps).any() else ""
+    return counted(len(records), "iteration") + done
 
 
 def _smooth(values: StateArray, span: float) -> StateArray:
@@ -216,19 +248,18 @@ def _smooth(values: StateArray, span: float) -> StateArray:
     return smoothed
 
 
-def _draw_panel(
-    axes: Axes, panel: _Panel, curves: Sequence[_Curve], steps: StateArray, records: Sequence[dict[str, Any]]
-) -> None:
+def _draw_panel(axes: Axes, panel: _Panel, curves: Sequence[tuple[_Curve, Sequence[dict[str, Any]]]]) -> None:
+    """Draw curves, each of a run's records."""
     style_axes(axes)
     axes.set_title(panel.title, loc="left", fontsize=12, weight="bold", color=INK, pad=20)
     axes.text(0.0, 1.03, panel.look_for, transform=axes.transAxes, fontsize=9.5, color="#666666")
+    axes.set_xlabel("million env steps", color=FAINT)
     axes.set_ylabel(panel.unit, color=FAINT)
-    if np.isfinite(steps).any():
-        axes.set_xlim(0.0, max(float(np.nanmax(steps)), 1e-6))
-    ends = [(_draw_curve(axes, curve, steps, column(records, curve.key)), curve) for curve in curves]
+    ends = [(_draw_curve(axes, curve, records), curve) for curve, records in curves]
     drawn = [(end, curve) for end, curve in ends if end is not None]
     if not drawn:
         axes.text(0.5, 0.5, "no values yet", transform=axes.transAxes, ha="center", color=FAINT)
+    axes.set_xlim(left=0.0)
     if panel.unit in ("fraction", "solved"):
         axes.set_ylim(0.0, 1.0)
     elif panel.unit in ("metres", "cells"):
@@ -236,8 +267,9 @@ def _draw_panel(
     _label_ends(axes, drawn)
 
 
-def _draw_curve(axes: Axes, curve: _Curve, steps: StateArray, values: StateArray) -> float | None:
+def _draw_curve(axes: Axes, curve: _Curve, records: Sequence[dict[str, Any]]) -> float | None:
     """Draw one curve; the height at which it ends, None when it has no values."""
+    steps, values = column(records, "env_steps") / 1e6, column(records, curve.key)
     known = np.isfinite(values) & np.isfinite(steps)
     x, y = steps[known], values[known]
     if not len(x):
@@ -284,13 +316,12 @@ def plot_goals(run_dir: Path, workspace: WorkspaceConfig) -> Path:
     """
     from matplotlib.lines import Line2D
 
-    path = run_dir / "goals.jsonl"
-    records = read_records(path)
+    records = read_records(run_dir / "goals.jsonl")
     figure = new_figure(14.0, 7.8, f"{run_dir.resolve().name}: where Alice's goals are, and which of them Bob solves")
     columns = figure.subplots(2, _NUM_SLICES, sharex="row", sharey="row").T
     for (above, side), slice_ in zip(columns, np.array_split(np.arange(len(records)), _NUM_SLICES), strict=True):
         chosen = [records[index] for index in slice_]
-        goals = _goals(chosen, path)
+        goals = _goals(chosen)
         _draw_goals(above, side, goals, workspace)
         above.set_title(_slice_title(chosen, goals), loc="left", fontsize=11, color=INK)
     columns[0][1].set_xlim(left=0.0)
@@ -304,15 +335,10 @@ def plot_goals(run_dir: Path, workspace: WorkspaceConfig) -> Path:
     return save(figure, run_dir / "goals.png")
 
 
-def _goals(records: Sequence[dict[str, Any]], path: Path) -> StateArray:
+def _goals(records: Sequence[dict[str, Any]]) -> StateArray:
     """The records' goals, (number, 7): start xyz, goal xyz, solved; any that is not finite is left out."""
-    try:
-        rows = [row for record in records for row in record.get("goals") or ()]
-        goals = np.array(rows, dtype=np.float64).reshape(len(rows), 7)
-    except (TypeError, ValueError) as error:
-        raise TandemError(
-            f"{path}: a goal is not 7 numbers (start xyz, goal xyz, solved): {error}; remove its line and draw again"
-        ) from error
+    rows = [row for record in records for row in record.get("goals") or ()]
+    goals = np.array(rows, dtype=np.float64).reshape(len(rows), 7)
     return goals[np.isfinite(goals).all(axis=1)]
 
 
@@ -383,36 +409,25 @@ def draw_paths(box: Any, above: Axes, paths: StateArray, workspace: WorkspaceCon
     """Draw (M, T, 3) paths of the object in metres, one colour each, as ``plot_coverage`` does.
 
     Args:
-        box: 3-D axes, made with ``computed_zorder=False``, for the workspace's box.
+        box: 3-D axes, made with ``computed_zorder=False``, for the workspace's box; None: the view from above alone.
         above: plain axes, for the view from above.
         paths: of the object.
         workspace: the box.
     """
-    _draw_box(box, workspace)
-    for path, color in zip(paths, _path_colors(len(paths)), strict=True):
-        points = _inside(path, workspace)
-        box.plot(*points.T, color=color, linewidth=1.5)
-        if np.isfinite(points[-1]).all():
-            box.plot(*points[-1:].T, color=color, marker="o", markersize=4.5)
-    draw_paths_above(above, paths, workspace)
-
-
-def draw_paths_above(axes: Axes, paths: StateArray, workspace: WorkspaceConfig) -> None:
-    """Draw (M, T, 3) paths of the object in metres as seen from above, one colour each."""
-    _draw_outline(axes, workspace)
-    for path, color in zip(paths, _path_colors(len(paths)), strict=True):
-        points = _inside(path, workspace)
-        axes.plot(points[:, 0], points[:, 1], color=color, linewidth=1.5)
-        if np.isfinite(points[-1]).all():
-            axes.plot(*points[-1:, :2].T, color=color, marker="o", markersize=5, markeredgecolor="white")
-
-
-def _path_colors(num: int) -> StateArray:
-    """(num, 4) colours; the map's ends are nearly black, where neighbours no longer differ."""
     from matplotlib import colormaps
 
-    colors: StateArray = colormaps["turbo"](np.linspace(0.05, 0.95, num))
-    return colors
+    _draw_outline(above, workspace)
+    if box is not None:
+        _draw_box(box, workspace)
+    # The map's ends are nearly black, where neighbours no longer differ.
+    for path, color in zip(paths, colormaps["turbo"](np.linspace(0.05, 0.95, len(paths))), strict=True):
+        points = _inside(path, workspace)
+        end = points[-1:] if np.isfinite(points[-1]).all() else points[:0]
+        above.plot(*points[:, :2].T, color=color, linewidth=1.5)
+        above.plot(*end[:, :2].T, color=color, marker="o", markersize=5, markeredgecolor="white")
+        if box is not None:
+            box.plot(*points.T, color=color, linewidth=1.5)
+            box.plot(*end.T, color=color, marker="o", markersize=4.5)
 
 
 def _inside(points: StateArray, workspace: WorkspaceConfig) -> StateArray:
@@ -440,8 +455,3 @@ def _draw_box(axes: Any, workspace: WorkspaceConfig) -> None:
     axes.set(xlabel="x (m)", ylabel="y (m)", zlabel="z (m)", xlim=x, ylim=y, zlim=(0.0, high[2]))
     axes.set_box_aspect((np.ptp(x), np.ptp(y), high[2]), zoom=1.05)
     axes.view_init(elev=22, azim=-58)
-    axes.tick_params(colors="#555555", labelsize=8)
-    axes.locator_params(nbins=5)
-    for axis in (axes.xaxis, axes.yaxis, axes.zaxis):
-        axis.pane.fill = False
-        axis._axinfo["grid"]["color"] = "#ececec"

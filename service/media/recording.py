@@ -7,16 +7,18 @@ Nothing is drawn or learned here.
 from __future__ import annotations
 
 import contextlib
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import partial
+from itertools import islice
 
 import numpy as np
 
 from service.actors.coverage import skill_paths
 from service.actors.evaluation import DeterministicPolicy, evaluate
 from service.actors.self_play import Players, SelfPlay, StochasticPolicy
-from service.base.progress import counted, doing
+from service.base.progress import counted
 from service.base.types import BoolArray, FloatArray, StateArray
 from service.config import WorldConfig
 from service.config.self_play import SelfPlayConfig
@@ -80,14 +82,11 @@ def play_rounds(
 
     Alice samples her actions as in training; Bob acts without noise.
     """
-    rounds: list[RecordedRound] = []
-    with doing("playing rounds", num_rounds, "rounds") as task:
-        for _, recorded in _play(config, alice, bob, num_worlds=min(_NUM_WORLDS, num_rounds), seed=seed):
-            rounds += recorded[: num_rounds - len(rounds)]
-            task.advance(len(rounds) - task.done)
-            if len(rounds) == num_rounds:
-                break
-    return rounds
+    num_worlds = min(_NUM_WORLDS, num_rounds)
+    num_batches = math.ceil(num_rounds / num_worlds)
+    batches = islice(_play(config, alice, bob, num_worlds=num_worlds, seed=seed), num_batches)
+    played = counted(batches, "playing rounds", num_batches, "batches")
+    return [each for _, recorded in played for each in recorded][:num_rounds]
 
 
 def record_rounds(
@@ -103,8 +102,8 @@ def record_rounds(
     """
     rounds: list[tuple[_Interest, RecordedRound]] = []
     played = _play(config, alice, bob, num_worlds=max(_NUM_WORLDS, num_rounds), seed=seed)
-    batches = zip(range(_MAX_ROLLOUTS), played, strict=False)
-    for _, (records, recorded) in counted(batches, "playing rounds", _MAX_ROLLOUTS, "batches at most"):
+    batches = islice(played, _MAX_ROLLOUTS)
+    for records, recorded in counted(batches, "playing rounds", _MAX_ROLLOUTS, "batches at most"):
         rounds += zip(_interest(records, config.world.rest_height_m), recorded, strict=True)
         if sum(played for (played, *_), _ in rounds) >= num_rounds:
             break

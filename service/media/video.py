@@ -1,35 +1,32 @@
 """Videos of recorded rounds, Alice's turn beside Bob's, and of recorded episodes, several at once.
 
 A video plays in real time unless another speed is asked for. Without a graphics card a picture takes 50 to 200 ms to
-draw, so a slow machine's video shows only every second state.
+draw.
 """
 
 from __future__ import annotations
 
 import functools
 import math
-import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 
 from service.base.progress import counted
-from service.base.types import StateArray
 from service.config import WorldConfig
 from service.envs.rendering.camera import DEFAULT_VIEW, View
 from service.envs.rendering.renderer import Image, SceneRenderer
 from service.generator.validity import Verdict
-from service.media.encoding import check_format, encode
+from service.media.encoding import encode
 from service.media.recording import RecordedEpisodes, RecordedRound
 
 Colour = tuple[int, int, int]
 
 BAR_HEIGHT = 36
 """Height of the caption over each picture, pixels."""
-MAX_DRAWING_S = 25.0
-"""Only every second state is drawn if all of them would take longer."""
 MAX_FPS = 50.0
 """A faster film leaves states out; browsers show a GIF no faster."""
 _PANE_SHAPE = 4 / 3
@@ -76,19 +73,15 @@ def write_video(
         TandemError: no such format, the disk is full, or the file cannot be written.
     """
     options = options or FilmOptions()
-    check_format(path)
-    num_pictures = sum(len(each.alice_states) + len(each.bob_states) for each in rounds)
-    step_s, pane_height = _step_s(config), options.height - BAR_HEIGHT
-    with SceneRenderer(config, options.width // 2, pane_height, options.view) as renderer:
-        stride = _stride(renderer, rounds[0].alice_states[0], num_pictures, options.speed * _rate(config))
+    stride, frame_s = _timing(config, options.speed)
+    with SceneRenderer(config, options.width // 2, options.height - BAR_HEIGHT, options.view) as renderer:
+        numbered = counted(enumerate(rounds, start=1), "drawing the video", len(rounds), "rounds")
         frames = (
             frame
-            for number, each in enumerate(rounds, start=1)
-            for frame in _round_frames(renderer, each, f"{number}/{len(rounds)}", stride, step_s, options.speed)
+            for number, each in numbered
+            for frame in _round_frames(renderer, each, f"{number}/{len(rounds)}", stride, frame_s, _step_s(config))
         )
-        num = sum(_num_frames(each, stride, stride * step_s / options.speed) for each in rounds)
-        drawn = counted(frames, "drawing the video", num, "pictures")
-        return encode(drawn, path, fps=options.speed / (stride * step_s))
+        return encode(frames, path, fps=1 / frame_s)
 
 
 def write_episode_video(
@@ -96,17 +89,11 @@ def write_episode_video(
 ) -> Path:
     """Write episodes all at once, in rows that fill the film; arguments and errors are those of ``write_video``."""
     options = options or FilmOptions()
-    check_format(path)
-    num_steps, num_episodes = episodes.reached.shape
-    panes = pane_rows(num_episodes, options.width, options.height)
+    panes = pane_rows(episodes.reached.shape[1], options.width, options.height)
+    stride, frame_s = _timing(config, options.speed)
     widest = max(width for row in panes for width, _ in row)
     with SceneRenderer(config, widest, panes[0][0][1], options.view) as renderer:
-        pictures = num_steps * num_episodes
-        stride = _stride(renderer, episodes.states[0, 0], pictures, options.speed * _rate(config))
-        frame_s = stride * _step_s(config) / options.speed
-        num = len(_thinned(num_steps, stride)) + _num_held(END_PAUSE_S, frame_s)
-        frames = _episode_frames(renderer, episodes, panes, stride, frame_s)
-        return encode(counted(frames, "drawing the video", num, "pictures"), path, fps=1 / frame_s)
+        return encode(_episode_frames(renderer, episodes, panes, stride, frame_s), path, fps=1 / frame_s)
 
 
 def pane_rows(num: int, width: int, height: int) -> list[list[tuple[int, int]]]:
@@ -116,35 +103,29 @@ def pane_rows(num: int, width: int, height: int) -> list[list[tuple[int, int]]]:
     the best shape.
     """
 
-    def rows_of(num_rows: int) -> list[list[tuple[int, int]]]:
-        pane_height = height // num_rows - BAR_HEIGHT
-        counts = [num // num_rows + (row < num % num_rows) for row in range(num_rows)]
-        heights = [pane_height] * num_rows
-        return [
-            [(_share(width, column, count), each) for column in range(count)]
-            for count, each in zip(counts, heights, strict=True)
-        ]
-
     def unshapely(rows: list[list[tuple[int, int]]]) -> float:
-        shapes = [pane[0] / max(pane[1], 1) / _PANE_SHAPE for row in rows for pane in row]
-        return max(abs(math.log(max(shape, 1e-6))) for shape in shapes)
+        return max(abs(math.log(pane[0] / max(pane[1], 1) / _PANE_SHAPE)) for row in rows for pane in row)
 
-    return min((rows_of(num_rows) for num_rows in range(1, num + 1)), key=unshapely)
+    return min((_rows_of(num, num_rows, width, height) for num_rows in range(1, num + 1)), key=unshapely)
 
 
-def _share(total: int, place: int, num: int) -> int:
-    """Size of one of ``num`` parts of ``total`` pixels, which together have all of them."""
-    return total * (place + 1) // num - total * place // num
+def _rows_of(num: int, num_rows: int, width: int, height: int) -> list[list[tuple[int, int]]]:
+    """So many panes in so many rows."""
+    rows = []
+    for row in range(num_rows):
+        count = num // num_rows + (row < num % num_rows)
+        edges = [width * column // count for column in range(count + 1)]
+        rows.append([(right - left, height // num_rows - BAR_HEIGHT) for left, right in pairwise(edges)])
+    return rows
 
 
 # --- what is shown -------------------------------------------------------------------------------------------------
 
 
 def _round_frames(
-    renderer: SceneRenderer, played: RecordedRound, number: str, stride: int, step_s: float, speed: float = 1.0
+    renderer: SceneRenderer, played: RecordedRound, number: str, stride: int, frame_s: float, step_s: float
 ) -> Iterator[Image]:
     """Alice moves while Bob waits, then Bob moves, then both rest; ``number`` stands in the caption."""
-    frame_s = stride * step_s / speed
     faded = (0.45 * renderer.render(played.bob_states[0]) + 0.55 * 235).astype(np.uint8)
     right = _caption(faded, "Bob waits", _FAINT, number)
     for step in _thinned(len(played.alice_states), stride):
@@ -160,14 +141,9 @@ def _round_frames(
     for step in _thinned(len(played.bob_states), stride):
         picture = renderer.render(played.bob_states[step], played.goal)
         yield np.hstack([left, _caption(picture, f"Bob tries: {step * step_s:.1f} s", _BLUE, number)])
-    yield from _hold(np.hstack([left, _caption(picture, *_result(played, step_s), number)]), END_PAUSE_S, frame_s)
-
-
-def _result(played: RecordedRound, step_s: float) -> tuple[str, Colour]:
-    elapsed_s = (len(played.bob_states) - 1) * step_s
-    if played.solved:
-        return f"Bob: solved after {elapsed_s:.1f} s", _GREEN
-    return f"Bob: not solved in {elapsed_s:.1f} s", _ORANGE
+    text, colour = ("solved after", _GREEN) if played.solved else ("not solved in", _ORANGE)
+    ended = _caption(picture, f"Bob: {text} {len(played.bob_actions) * step_s:.1f} s", colour, number)
+    yield from _hold(np.hstack([left, ended]), END_PAUSE_S, frame_s)
 
 
 def _episode_frames(
@@ -178,7 +154,8 @@ def _episode_frames(
     frame_s: float,
 ) -> Iterator[Image]:
     num = episodes.states.shape[1]
-    for step in _thinned(len(episodes.states), stride):
+    steps = _thinned(len(episodes.states), stride)
+    for step in counted(steps, "drawing the video", len(steps), "pictures"):
         episode, rows = 0, []
         for row in panes:
             pictures = []
@@ -200,27 +177,11 @@ def _step_s(config: WorldConfig) -> float:
     return config.physics_step_s * config.num_substeps
 
 
-def _rate(config: WorldConfig) -> float:
-    """States a second."""
-    return 1 / _step_s(config)
-
-
-def _stride(renderer: SceneRenderer, state: StateArray, num_pictures: int, fps: float) -> int:
-    """How many states a picture stands for: 1, or 2 where this machine is slow; more where the film is fast.
-
-    Args:
-        renderer: draws.
-        state: (S,) to draw.
-        num_pictures: that there would be.
-        fps: of a film with every state.
-    """
-    renderer.render(state)  # the first picture takes longer
-    start = time.perf_counter()
-    renderer.render(state)
-    least = math.ceil(fps / MAX_FPS - 1e-9)
-    if num_pictures / max(least, 1) * (time.perf_counter() - start) > MAX_DRAWING_S:
-        return max(least, 2)
-    return max(least, 1)
+def _timing(config: WorldConfig, speed: float) -> tuple[int, float]:
+    """How many states a frame stands for, more than 1 where the film is fast, and its seconds."""
+    state_s = _step_s(config) / speed
+    stride = max(math.ceil(1 / (MAX_FPS * state_s) - 1e-9), 1)
+    return stride, stride * state_s
 
 
 def _thinned(num: int, stride: int) -> list[int]:
@@ -229,19 +190,7 @@ def _thinned(num: int, stride: int) -> list[int]:
 
 
 def _hold(frame: Image, pause_s: float, frame_s: float) -> list[Image]:
-    return [frame] * _num_held(pause_s, frame_s)
-
-
-def _num_held(pause_s: float, frame_s: float) -> int:
-    return max(round(pause_s / frame_s), 1)
-
-
-def _num_frames(played: RecordedRound, stride: int, frame_s: float) -> int:
-    """Number of frames that ``_round_frames`` gives."""
-    num = len(_thinned(len(played.alice_states), stride)) + _num_held(END_PAUSE_S, frame_s)
-    if played.verdict != Verdict.VALID:
-        return num
-    return num + len(_thinned(len(played.bob_states), stride)) + _num_held(GOAL_PAUSE_S, frame_s)
+    return [frame] * max(round(pause_s / frame_s), 1)
 
 
 # --- pictures ------------------------------------------------------------------------------------------------------

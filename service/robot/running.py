@@ -10,8 +10,7 @@ import numpy as np
 from service.base.errors import RobotError, TandemError
 from service.base.types import StateArray
 from service.config.world import WorldConfig
-from service.envs.obstacles import inside_fixtures
-from service.envs.sampling import draw_goals, draw_starts
+from service.envs.sampling import Places, draw_goals, draw_objects, inside_fixtures
 from service.methods.compose import check_robot
 from service.registry.loading import Trained
 from service.robot.backends import Backend
@@ -96,11 +95,11 @@ def play(
         RobotError: the robot was stopped.
     """
     rng = np.random.default_rng(seed)
-    starts, boxes = draw_starts(rng, num_episodes, policy.world)
-    goals = draw_goals(policy.goals, rng, policy.world, policy.success_distance_m, start=starts, box=boxes)
+    places = draw_objects(rng, num_episodes, policy.world)
+    goals = draw_goals(policy.goals, rng, policy.world, policy.success_distance_m, places)
     for episode in range(num_episodes):
         if backend.simulator is not None:
-            backend.begin(starts[episode])
+            backend.begin(places.object[episode])
         elif goal_m is None and policy.world.fixture != "none":
             goals[episode] = _goal_from(backend, rng, policy)
         goal = goals[episode] if goal_m is None else goal_m
@@ -118,7 +117,6 @@ def _goal_from(backend: Backend, rng: np.random.Generator, policy: Trained) -> S
         raise RobotError("the object is not seen: put it on the table in view of what sees it")
     if policy.world.fixture == "box":
         raise RobotError(f"{policy.label} brings the object into a box, and nothing tells a bridge where it is: --goal")
-    goal: StateArray = draw_goals(
-        policy.goals, rng, policy.world, policy.success_distance_m, start=object_m[None], box=np.empty((1, 0))
-    )[0]
+    places = Places(object_m[None], np.empty((1, 0)), np.empty((1, 0, 3)))
+    goal: StateArray = draw_goals(policy.goals, rng, policy.world, policy.success_distance_m, places)[0]
     return goal

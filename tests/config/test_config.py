@@ -3,11 +3,10 @@
 from pathlib import Path
 
 import pytest
-from pydantic import ValidationError
 
 from service.base.errors import ConfigError
 from service.base.parsing import parse_yaml
-from service.config import WorkspaceConfig, dump_config, load_config, parse_config
+from service.config import WorkspaceConfig, dump_config, load_config
 from service.config.robot import RobotConfig
 from service.config.self_play import SelfPlayConfig
 from tests.runs.runs import assert_one_line
@@ -53,15 +52,6 @@ def test_yaml_round_trip(tmp_path):
     assert load_config(path) == config
 
 
-def test_a_file_may_name_only_what_differs(tmp_path):
-    path = tmp_path / "run.yaml"
-    path.write_text("learner:\n  alice: {learning_rate: 1e-4}\n")
-    config = load_config(path)
-    assert config.learner.alice.learning_rate == 1e-4
-    assert config.learner.bob == SelfPlayConfig().learner.bob
-    assert config.game == SelfPlayConfig().game
-
-
 @pytest.mark.parametrize("text", ["", "# nothing here\n", "null", "---\n"])
 def test_an_empty_file_is_refused(tmp_path, text):
     """It is what a full disk leaves of a file."""
@@ -69,33 +59,9 @@ def test_an_empty_file_is_refused(tmp_path, text):
     path.write_text(text)
     with pytest.raises(ConfigError) as error:
         load_config(path)
-    assert_one_line(error.value, path, "holds no key", "write {}")
+    assert_one_line(error.value, path, "got NoneType", "{} stands for the defaults")
     path.write_text("{}")
     assert load_config(path) == SelfPlayConfig()
-
-
-@pytest.mark.parametrize(
-    "override",
-    [
-        "game.num_worlds=true",
-        "game.alice_steps_min=true",
-        "generator.replay_fraction=false",
-        "policy.alice.hidden_sizes=[true, 64]",
-        "world.randomisation.delay_steps=[false, true]",
-    ],
-)
-def test_true_and_false_are_no_numbers(override):
-    with pytest.raises(ConfigError) as error:
-        load_config(None, [override])
-    assert_one_line(error.value, override.partition("=")[0], "expected a number, not true or false")
-
-
-def test_frozen():
-    config = SelfPlayConfig()
-    with pytest.raises(ValidationError, match="frozen"):
-        config.seed = 1
-    with pytest.raises(ValidationError, match="frozen"):
-        config.world.workspace.height_m = 0.2
 
 
 @pytest.mark.parametrize(
@@ -129,83 +95,58 @@ def test_overrides_beat_the_file_and_the_last_one_wins(tmp_path):
     assert (config.seed, config.game.bob_steps, config.game.alice_steps) == (3, 60, 30)
 
 
-@pytest.mark.parametrize("override", ["seed", "=3", "", "  =3"])
-def test_override_without_key_or_value_says_the_form(override):
-    text = message(overrides=[override])
-    assert repr(override) in text
-    assert "KEY=VALUE" in text
-
-
-def test_override_that_is_not_yaml():
-    assert "'policy.alice.hidden_sizes=[64'" in message(overrides=["policy.alice.hidden_sizes=[64"])
-
-
-def test_override_through_a_value():
-    text = message(overrides=["seed=1", "seed.x=2"])
-    assert "'seed.x=2'" in text
-    assert "not a group" in text
-
-
 @pytest.mark.parametrize(
-    ("override", "key", "known"),
+    ("override", "said"),
     [
-        ("sed=1", "'sed'", "game, generator, learner, method, name, policy, run, seed, world"),
-        ("game.bob_step=1", "'game.bob_step'", "bob_steps"),
-        ("learner.bob.lr=1", "'learner.bob.lr'", "learning_rate"),
-        ("world.workspace.width_m=1", "'world.workspace.width_m'", "length_x_m, length_y_m"),
+        ("seed", ["'seed'", "KEY=VALUE"]),
+        ("  =3", ["'  =3'", "KEY=VALUE"]),
+        ("policy.alice.hidden_sizes=[64", ["'policy.alice.hidden_sizes=[64'"]),
+        ("seed.x=2", ["'seed.x=2'", "not a group"]),
+        ("sed=1", ["unknown key 'sed'", "game, generator, learner, method, name, policy, run, seed, world"]),
+        ("game.bob_step=1", ["unknown key 'game.bob_step'", "did you mean 'bob_steps'"]),
+        ("clip=1", ["did you mean learner.abc.clip or learner.alice.clip or learner.bob.clip"]),
+        ("skill_steps=1", ["it is a key of method=ours"]),
+        ("world.workspace.width_m=1", ["unknown key 'world.workspace.width_m'", "length_x_m, length_y_m"]),
+        ("world.object={shape: sphere, size_m: [0.05], w: 1}", ["'world.object.w'; known there: color, mesh, shape"]),
+        ("world.obstacles=[{shape: sphere, size_m: [0.05], w: 1}]", ["'world.obstacles.0.w'; known there: color"]),
+        ("game.num_worlds=0", ["game.num_worlds = 0"]),
+        ("world.object=teapot", ["world.object = ", "teapot"]),
+        ("seed=0.5", ["seed = 0.5"]),
+        ("learner.bob.learning_rate=nan", ["learner.bob.learning_rate = nan"]),
+        ("learner.device=tpu", ["learner.device = 'tpu'"]),
+        ("name=../escape", ["name = '../escape'"]),
+        ("policy.alice.hidden_sizes=[64,0]", ["policy.alice.hidden_sizes.1 = 0"]),
+        ("policy.bob.log_std_min=0.5", ["policy.bob: log_std_min 0.5"]),
+        ("policy.alice_log_std_min=0.5", ["policy: alice_log_std_min 0.5"]),
+        ("world.workspace.height_m=0.02", ["world: ", "lies 0.025 m high, and the workspace ends at 0.02 m"]),
+        ("world.object={shape: mesh, mesh: {pieces: a.stl}}", ["world.object.mesh.pieces = 'a.stl'"]),
+        ("world.object={shape: mesh, mesh: {pieces: [a.stl], scale: 0}}", ["world.object.mesh.scale = 0"]),
+        ("game=3", ["game = 3"]),
+        ("game.bob_margin_m=0.05", ["game: bob_margin_m 0.05 must be less than success_distance_m 0.05"]),
+        ("world.object={shape: cone, size_m: [0.05]}", ["world.object.shape = 'cone'"]),
+        ("world.object={shape: cylinder, size_m: [0.05]}", ["size_m of a cylinder has 2 numbers", "height; got 1"]),
+        ("world.object={shape: capsule, size_m: [0.05, 0.04]}", ["length 0.04 must exceed its diameter"]),
+        ("world.object={shape: sphere, size_m: [50]}", ["world.object.size_m.0", "less than or equal to 0.5"]),
+        ("world.object={shape: sphere, size_m: [0.05], color: [1, 2, 0]}", ["color.1", "less than or equal to 1"]),
+        ("world.fixtures=[{shape: box, size_m: [0.05, 0.05, 0.05]}]", ["world.fixtures.0.position_m", "required"]),
+        ("game={num_worlds: 0, num_goals: 0}", ["game.num_worlds = 0", "(and 1 more)"]),
+        ("world.fixtures={shape: box}", ["world.fixtures"]),
+        (f"world.obstacles=[{', '.join(['{shape: sphere, size_m: [0.02]}'] * 9)}]", ["world.obstacles", "at most 8"]),
+        ("world.obstacles=[{shape: sphere, size_m: [0.05], mass_kg: 0}]", ["mass_kg = 0", "greater than 0"]),
+        ("world.observed.obstacles=true", ["observed.obstacles", "describe some"]),
+        ("world.randomisation.friction=[1, 0.5]", ["friction = [1, 0.5] is the wrong way round"]),
+        ("world.randomisation.delay_steps=[0, 20]", ["delay_steps = [0, 20] goes beyond [0, 8]"]),
+        ("world.randomisation.object_mass_kg=[0, 1]", ["object_mass_kg = [0, 1] goes beyond"]),
         (
-            "world.object={shape: sphere, size_m: [0.05], width_m: 1}",
-            "'world.object.width_m'",
-            "known there: color, mesh, shape, size_m",
-        ),
-        (
-            "world.obstacles=[{shape: sphere, size_m: [0.05], width_m: 1}]",
-            "'world.obstacles.0.width_m'",
-            "mass_kg, mesh, shape, size_m",
+            "world={fixture: wall, fixtures: [{shape: sphere, size_m: [0.05], position_m: [0, 0]}]}",
+            ["the one or the other"],
         ),
     ],
 )
-def test_unknown_key_lists_the_known_ones(override, key, known):
-    text = message(overrides=[override])
-    assert f"unknown key {key}" in text
-    assert known in text
-
-
-@pytest.mark.parametrize(
-    ("override", "key", "value"),
-    [
-        ("game.num_worlds=0", "game.num_worlds", "0"),
-        ("world.object_size_m=0.5", "world.object_size_m", "0.5"),
-        ("world.object=teapot", "world.object", "teapot"),
-        ("seed=half", "seed", "half"),
-        ("seed=0.5", "seed", "0.5"),
-        ("learner.bob.learning_rate=nan", "learner.bob.learning_rate", "nan"),
-        ("learner.bob.learning_rate=.inf", "learner.bob.learning_rate", "inf"),
-        ("learner.device=tpu", "learner.device", "tpu"),
-        ("name=Panda Cube", "name", "Panda Cube"),
-        ("name=../escape", "name", "../escape"),
-        ("policy.alice.hidden_sizes=[64,0]", "policy.alice.hidden_sizes.1", "0"),
-        ("policy.bob.log_std_min=0.5", "policy.bob", "0.5"),
-        ("policy.alice_log_std_min=0.5", "policy", "0.5"),
-        ("world.workspace.height_m=0.02", "world", "lies 0.025 m high, and the workspace ends at 0.02 m"),
-        ("world.object={shape: mesh, mesh: {pieces: a.stl}}", "world.object.mesh.pieces", "a.stl"),
-        ("world.object={shape: mesh, mesh: {pieces: [a.stl], scale: 0}}", "world.object.mesh.scale", "0"),
-        ("game=3", "game", "3"),
-    ],
-)
-def test_a_bad_value_is_named_with_its_key(override, key, value):
-    text = message(overrides=[override])
-    is_group = key in (
-        "policy",
-        "policy.bob",
-        "world",
-    )  # where two of its values do not fit together, it is not shown whole
-    assert f"{key}: " in text if is_group else f"{key} = " in text
-    assert value in text
-
-
-def test_several_mistakes_are_counted():
-    assert "(and 1 more)" in message(overrides=["seed=-1", "game.num_goals=0"])
+def test_a_mistake_is_one_line_that_names_it(override, said):
+    text = message(overrides=["seed=1", override])
+    for words in said:
+        assert words in text
 
 
 def test_the_file_is_named_in_its_errors(tmp_path):
@@ -239,11 +180,6 @@ def test_a_directory_is_no_file(tmp_path):
     assert str(tmp_path) in message(tmp_path)
 
 
-def test_parse_config_names_where_the_tree_came_from():
-    with pytest.raises(ConfigError, match=r"^the manifest: unknown key 'colour'"):
-        parse_config({"colour": "red"}, where="the manifest")
-
-
 def test_every_shipped_configuration_loads():
     robots = set(CONFIGS.glob("robots/*.yaml"))
     paths = sorted(set(CONFIGS.rglob("*.yaml")) - robots)
@@ -253,12 +189,6 @@ def test_every_shipped_configuration_loads():
     assert robots
     for path in robots:  # their models are in packages that need not be installed
         assert RobotConfig.model_validate(parse_yaml(path.read_bytes(), path)).model.startswith("package:")
-
-
-def test_a_margin_as_wide_as_success_is_refused():
-    text = message(overrides=["game.bob_margin_m=0.05"])
-    assert "bob_margin_m 0.05 must be less than success_distance_m 0.05" in text
-    assert load_config(overrides=["game.bob_margin_m=0.04"]).game.bob_margin_m == 0.04
 
 
 def test_self_imitation_of_turns_that_no_reward_reaches_is_refused():

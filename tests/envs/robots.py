@@ -116,92 +116,52 @@ GANTRY_DESCRIPTION = {
     "finger_stiffness": 20.0,
     "finger_damping": 1.0,
 }
-URDF = """
+
+
+def _link(name, mass, inertia, shape="", origin="0 0 0"):
+    spread = f'<inertia ixx="{inertia}" iyy="{inertia}" izz="{inertia}" ixy="0" ixz="0" iyz="0"/>'
+    inertial = f'<inertial><origin xyz="{origin}"/><mass value="{mass}"/>{spread}</inertial>'
+    collision = f'<collision><origin xyz="{origin}"/><geometry>{shape}</geometry></collision>' if shape else ""
+    return f'<link name="{name}">{inertial}{collision}</link>'
+
+
+def _joint(name, kind, parent, child, origin, axis, limit):
+    ends = f'<parent link="{parent}"/><child link="{child}"/><origin xyz="{origin}"/><axis xyz="{axis}"/>'
+    return f'<joint name="{name}" type="{kind}">{ends}<limit effort="100" velocity="3" {limit}/></joint>'
+
+
+def _turn(limit):
+    return f'lower="-{limit}" upper="{limit}"'
+
+
+URDF = f"""
 <robot name="sixer">
   <link name="base">
     <visual><geometry><cylinder radius="0.06" length="0.1"/></geometry></visual>
     <collision><origin xyz="0 0 0.05"/><geometry><cylinder radius="0.06" length="0.1"/></geometry></collision>
   </link>
-  <joint name="yaw" type="revolute">
-    <parent link="base"/><child link="shoulder"/><origin xyz="0 0 0.15"/><axis xyz="0 0 1"/>
-    <limit lower="-3.1" upper="3.1" effort="150" velocity="3"/>
-  </joint>
-  <link name="shoulder">
-    <inertial><mass value="3"/><inertia ixx="0.01" iyy="0.01" izz="0.01" ixy="0" ixz="0" iyz="0"/></inertial>
-    <collision><geometry><sphere radius="0.06"/></geometry></collision>
-  </link>
-  <joint name="lift" type="revolute">
-    <parent link="shoulder"/><child link="upper"/><origin xyz="0 0.1 0"/><axis xyz="0 1 0"/>
-    <limit lower="-2.5" upper="2.5" effort="150" velocity="3"/>
-  </joint>
-  <link name="upper">
-    <inertial>
-      <origin xyz="0 0 0.2"/><mass value="4"/><inertia ixx="0.05" iyy="0.05" izz="0.01" ixy="0" ixz="0" iyz="0"/>
-    </inertial>
-    <collision><origin xyz="0 0 0.2"/><geometry><box size="0.08 0.08 0.4"/></geometry></collision>
-  </link>
-  <joint name="elbow" type="revolute">
-    <parent link="upper"/><child link="fore"/><origin xyz="0 -0.1 0.4"/><axis xyz="0 1 0"/>
-    <limit lower="-2.8" upper="2.8" effort="100" velocity="3"/>
-  </joint>
-  <link name="fore">
-    <inertial>
-      <origin xyz="0 0 0.18"/><mass value="2"/><inertia ixx="0.03" iyy="0.03" izz="0.01" ixy="0" ixz="0" iyz="0"/>
-    </inertial>
-    <collision><origin xyz="0 0 0.18"/><geometry><box size="0.07 0.07 0.36"/></geometry></collision>
-  </link>
-  <joint name="bend" type="revolute">
-    <parent link="fore"/><child link="wrist"/><origin xyz="0 0 0.36"/><axis xyz="0 1 0"/>
-    <limit lower="-2.8" upper="2.8" effort="40" velocity="5"/>
-  </joint>
-  <link name="wrist">
-    <inertial><mass value="1"/><inertia ixx="0.002" iyy="0.002" izz="0.002" ixy="0" ixz="0" iyz="0"/></inertial>
-  </link>
-  <joint name="roll" type="continuous">
-    <parent link="wrist"/><child link="wrist2"/><origin xyz="0 0.08 0"/><axis xyz="0 0 1"/>
-    <limit effort="40" velocity="5"/>
-  </joint>
-  <link name="wrist2">
-    <inertial><mass value="1"/><inertia ixx="0.002" iyy="0.002" izz="0.002" ixy="0" ixz="0" iyz="0"/></inertial>
-  </link>
-  <joint name="turn" type="revolute">
-    <parent link="wrist2"/><child link="flange"/><origin xyz="0 0 0.09"/><axis xyz="0 1 0"/>
-    <limit lower="-3.1" upper="3.1" effort="40" velocity="5"/>
-  </joint>
-  <link name="flange">
-    <inertial><mass value="0.5"/><inertia ixx="0.001" iyy="0.001" izz="0.001" ixy="0" ixz="0" iyz="0"/></inertial>
-  </link>
+  {_joint("yaw", "revolute", "base", "shoulder", "0 0 0.15", "0 0 1", _turn(3.1))}
+  {_link("shoulder", 3, 0.01, '<sphere radius="0.06"/>')}
+  {_joint("lift", "revolute", "shoulder", "upper", "0 0.1 0", "0 1 0", _turn(2.5))}
+  {_link("upper", 4, 0.05, '<box size="0.08 0.08 0.4"/>', "0 0 0.2")}
+  {_joint("elbow", "revolute", "upper", "fore", "0 -0.1 0.4", "0 1 0", _turn(2.8))}
+  {_link("fore", 2, 0.03, '<box size="0.07 0.07 0.36"/>', "0 0 0.18")}
+  {_joint("bend", "revolute", "fore", "wrist", "0 0 0.36", "0 1 0", _turn(2.8))}
+  {_link("wrist", 1, 0.002)}
+  {_joint("roll", "continuous", "wrist", "wrist2", "0 0.08 0", "0 0 1", "")}
+  {_link("wrist2", 1, 0.002)}
+  {_joint("turn", "revolute", "wrist2", "flange", "0 0 0.09", "0 1 0", _turn(3.1))}
+  {_link("flange", 0.5, 0.001)}
   <joint name="mount" type="fixed">
     <parent link="flange"/><child link="palm"/><origin xyz="0 0.06 0" rpy="-1.5707963267948966 0 0"/>
   </joint>
-  <link name="palm">
-    <inertial><mass value="0.3"/><inertia ixx="0.001" iyy="0.001" izz="0.001" ixy="0" ixz="0" iyz="0"/></inertial>
-    <collision><origin xyz="0 0 0.02"/><geometry><box size="0.05 0.16 0.04"/></geometry></collision>
-  </link>
+  {_link("palm", 0.3, 0.001, '<box size="0.05 0.16 0.04"/>', "0 0 0.02")}
   <joint name="tip" type="fixed"><parent link="palm"/><child link="tool"/><origin xyz="0 0 0.12"/></joint>
   <link name="tool"/>
-  <joint name="left" type="prismatic">
-    <parent link="palm"/><child link="left_finger"/><origin xyz="0 0 0.04"/><axis xyz="0 1 0"/>
-    <limit lower="0" upper="0.04" effort="40" velocity="0.3"/>
-  </joint>
-  <link name="left_finger">
-    <inertial>
-      <origin xyz="0 0.01 0.05"/><mass value="0.05"/>
-      <inertia ixx="1e-4" iyy="1e-4" izz="1e-4" ixy="0" ixz="0" iyz="0"/>
-    </inertial>
-    <collision><origin xyz="0 0.008 0.05"/><geometry><box size="0.02 0.016 0.08"/></geometry></collision>
-  </link>
-  <joint name="right" type="prismatic">
-    <parent link="palm"/><child link="right_finger"/><origin xyz="0 0 0.04"/><axis xyz="0 -1 0"/>
-    <limit lower="0" upper="0.04" effort="40" velocity="0.3"/>
-  </joint>
-  <link name="right_finger">
-    <inertial>
-      <origin xyz="0 -0.01 0.05"/><mass value="0.05"/>
-      <inertia ixx="1e-4" iyy="1e-4" izz="1e-4" ixy="0" ixz="0" iyz="0"/>
-    </inertial>
-    <collision><origin xyz="0 -0.008 0.05"/><geometry><box size="0.02 0.016 0.08"/></geometry></collision>
-  </link>
+  {_joint("left", "prismatic", "palm", "left_finger", "0 0 0.04", "0 1 0", 'lower="0" upper="0.04"')}
+  {_link("left_finger", 0.05, 1e-4, '<box size="0.02 0.016 0.08"/>', "0 0.008 0.05")}
+  {_joint("right", "prismatic", "palm", "right_finger", "0 0 0.04", "0 -1 0", 'lower="0" upper="0.04"')}
+  {_link("right_finger", 0.05, 1e-4, '<box size="0.02 0.016 0.08"/>', "0 -0.008 0.05")}
 </robot>
 """
 """Six joints with shifted axes, one of them without limits, as URDF has them; the hand hangs on fixed joints."""

@@ -27,13 +27,11 @@ def make_actions(worlds, rng):
     return actions.astype(np.float32)
 
 
-def play(worlds, rng, num_steps):
-    """States after every step: (T, N, S)."""
-    trajectory = []
-    for _ in range(num_steps):
+def play(worlds):
+    """Five random steps."""
+    rng = np.random.default_rng(1)
+    for _ in range(5):
         worlds.step(make_actions(worlds, rng))
-        trajectory.append(worlds.states.copy())
-    return np.array(trajectory)
 
 
 def replay(worlds, actions):
@@ -60,30 +58,16 @@ def recorded():
     return start, np.array(actions), np.array(states)
 
 
-def test_two_runs_of_a_seed_are_bit_identical():
-    runs = []
-    for _ in range(2):
-        rng = np.random.default_rng(7)
-        with WorldBatch(CONFIG, NUM_WORLDS, num_threads=2) as batch:
-            batch.reset(rng)
-            runs.append(play(batch, rng, 25))
-    np.testing.assert_array_equal(runs[0], runs[1])
-
-
-@pytest.mark.parametrize("num_threads", [1, 3])
-def test_a_restored_state_continues_bit_identically_with_other_threads(recorded, num_threads):
+@pytest.mark.parametrize(
+    ("rows", "num_threads"),
+    [([4], 1), ([0, 2, 8], 3), ([8, 7, 6, 5, 4, 3, 2, 1, 0, 4, 4], 2)],
+    ids=["one", "three", "eleven"],
+)
+def test_a_restored_state_continues_bit_identically_in_another_batch(recorded, rows, num_threads):
     _, actions, states = recorded
-    with WorldBatch(CONFIG, NUM_WORLDS, num_threads=num_threads) as other:
+    with WorldBatch(CONFIG, len(rows), num_threads=num_threads) as other:
         other.reset(np.random.default_rng(99))
-        other.step(actions[0])
-        other.restore(states[14])
-        np.testing.assert_array_equal(replay(other, actions[15:]), states[15:])
-
-
-@pytest.mark.parametrize("rows", [[4], [0, 2, 8], [8, 7, 6, 5, 4, 3, 2, 1, 0, 4, 4]], ids=["one", "three", "eleven"])
-def test_a_restored_state_continues_bit_identically_in_another_batch(recorded, rows):
-    _, actions, states = recorded
-    with WorldBatch(CONFIG, len(rows), num_threads=2) as other:
+        other.step(actions[0, rows])
         other.restore(states[14, rows])
         np.testing.assert_array_equal(replay(other, actions[15:, rows]), states[15:, rows])
 
@@ -101,19 +85,8 @@ def test_worlds_that_step_alone_go_where_they_go_together(recorded, worlds):
         np.testing.assert_array_equal(worlds.states, expected)
 
 
-def test_restoring_some_leaves_the_others(recorded, worlds):
-    _, actions, states = recorded
-    mask = np.zeros(NUM_WORLDS, dtype=bool)
-    mask[[2, 5]] = True
-    before = worlds.states.copy()
-    worlds.restore(states[14, mask], mask)
-    np.testing.assert_array_equal(worlds.states[mask], states[14, mask])
-    np.testing.assert_array_equal(worlds.states[~mask], before[~mask])
-    np.testing.assert_array_equal(replay(worlds, actions[15:])[:, mask], states[15:, mask])
-
-
 def test_reset_puts_everything_at_its_start(worlds):
-    play(worlds, np.random.default_rng(1), 5)
+    play(worlds)
     worlds.reset(np.random.default_rng(2))
     np.testing.assert_allclose(worlds.ee_position, np.tile([-0.05, 0.0, 0.08], (NUM_WORLDS, 1)), rtol=0, atol=1e-3)
     np.testing.assert_allclose(worlds.positions()[:, 3:5], FINGER_STROKE_M, rtol=0, atol=1e-7)
@@ -123,7 +96,7 @@ def test_reset_puts_everything_at_its_start(worlds):
 
 
 def test_resetting_some_leaves_the_others(worlds):
-    play(worlds, np.random.default_rng(1), 5)
+    play(worlds)
     mask = np.arange(NUM_WORLDS) % 2 == 0
     before = worlds.states.copy()
     worlds.reset(np.random.default_rng(2), mask)
@@ -148,11 +121,6 @@ def test_actions_of_a_wrong_shape_are_refused(worlds, shape):
         worlds.step(np.zeros(shape, dtype=np.float32))
     assert str(shape) in str(caught.value)
     np.testing.assert_array_equal(worlds.states, before)
-
-
-def test_actions_are_as_many_as_the_worlds_that_act(worlds):
-    with pytest.raises(ValueError, match=r"actions.*\(2, 4\).*\(9, 4\)"):
-        worlds.step(np.zeros((NUM_WORLDS, 4), dtype=np.float32), np.array([1, 2]))
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
@@ -203,11 +171,6 @@ class TestDivergence:
         found = replay(diverging, actions[:5])
         np.testing.assert_array_equal(np.delete(found, self.BAD, axis=1), np.delete(states[:5], self.BAD, axis=1))
 
-    def test_it_is_reported_by_its_number_when_few_step(self, diverging):
-        index = np.array([6, self.BAD])
-        diverged = diverging.step(np.zeros((2, 4), dtype=np.float32), index)
-        assert np.flatnonzero(diverged).tolist() == [self.BAD]
-
     def test_a_state_that_is_not_a_number_is_reported(self, worlds):
         states = worlds.states.copy()
         states[self.BAD, 1] = np.nan
@@ -215,30 +178,15 @@ class TestDivergence:
         diverged = worlds.step(np.zeros((NUM_WORLDS, 4), dtype=np.float32))
         assert np.flatnonzero(diverged).tolist() == [self.BAD]
 
-    def test_it_goes_on_after_a_reset(self, diverging):
-        diverged = diverging.step(np.zeros((NUM_WORLDS, 4), dtype=np.float32))
-        diverging.reset(np.random.default_rng(0), diverged)
-        assert not diverging.step(np.zeros((NUM_WORLDS, 4), dtype=np.float32)).any()
-        assert np.isfinite(diverging.states).all()
-
 
 class TestSampling:
     WORKSPACE = WorkspaceConfig(center_x_m=-0.1, center_y_m=0.05, length_x_m=0.2, length_y_m=0.4, height_m=0.3)
-
-    def test_on_the_table(self):
-        found = sample_on_table(np.random.default_rng(0), 4000, self.WORKSPACE, 0.06)
-        np.testing.assert_array_equal(found[:, 2], 0.03)
-        assert_uniform(found[:, 0], -0.2, 0.0)
-        assert_uniform(found[:, 1], -0.15, 0.25)
 
     def test_in_the_volume(self):
         found = sample_in_volume(np.random.default_rng(0), 4000, self.WORKSPACE, 0.06, lowest_m=0.08)
         assert_uniform(found[:, 0], -0.2, 0.0)
         assert_uniform(found[:, 1], -0.15, 0.25)
         assert_uniform(found[:, 2], 0.08, 0.3)
-
-    def test_of_none(self):
-        assert sample_in_volume(np.random.default_rng(0), 0, self.WORKSPACE, 0.06, lowest_m=0.03).shape == (0, 3)
 
 
 def assert_uniform(values, low, high):
@@ -274,19 +222,3 @@ class TestBlockedGrippers:
             assert (np.abs(some.positions()[blocked, self.FINGERS]) < 2e-3).all()
             assert (some.states[:, -1] == blocked).all()
         assert (some.positions()[~blocked, self.FINGERS] > 0.03).all()
-
-    def test_a_state_takes_it_along(self, some):
-        states = some.states.copy()
-        blocked = states[:, -1] == 1.0
-        some.restore(states[::-1])
-        some.step(np.ones((200, 4), dtype=np.float32))
-        first = some.states.copy()
-        assert (first[:, -1] == blocked[::-1]).all()
-        some.restore(states)
-        some.step(np.ones((200, 4), dtype=np.float32))
-        assert (some.states[::-1] == first).all()
-
-    def test_without_any_nothing_changes(self, worlds):
-        with WorldBatch(CONFIG, NUM_WORLDS, blocked_fraction=0.0) as same:
-            same.reset(np.random.default_rng(0))
-            assert (same.states == worlds.states).all()

@@ -112,21 +112,6 @@ def test_the_end_effector_is_between_the_fingertips(arm, model):
     np.testing.assert_allclose(left - right, [0.0, -0.06, 0.0], rtol=0, atol=1e-6)
 
 
-def test_jacobian_is_the_derivative(arm, joints):
-    step = 1e-6
-    found = arm.forward(joints)
-    for joint in range(7):
-        shift = np.zeros(7)
-        shift[joint] = step
-        after, before = arm.forward(joints + shift), arm.forward(joints - shift)
-        linear = (after.position - before.position) / (2 * step)
-        # R' R^T is the cross-product matrix of the angular velocity.
-        skew = np.matmul((after.rotation - before.rotation) / (2 * step), found.rotation.transpose(0, 2, 1))
-        angular = np.stack([skew[:, 2, 1], skew[:, 0, 2], skew[:, 1, 0]], axis=1)
-        np.testing.assert_allclose(found.jacobian[:, :3, joint], linear, rtol=0, atol=1e-8)
-        np.testing.assert_allclose(found.jacobian[:, 3:, joint], angular, rtol=0, atol=1e-8)
-
-
 def solve_from_home(arm, target):
     return arm.solve(np.tile(arm.home, (target.shape[0], 1)), target, num_iterations=60)
 
@@ -148,9 +133,9 @@ def assert_reached(arm, joints, target, tolerance_m):
 )
 def test_inverse_reaches_the_workspace(arm, workspace, least_share):
     target = sample_in_volume(np.random.default_rng(1), 2000, workspace, 0.05, lowest_m=PANDA.lowest_m)
-    reach = reach_of(PANDA, arm)
-    assert reach.share(target) >= least_share
-    reachable = target[np.linalg.norm(reach.clip(target) - target, axis=1) < 1e-9]
+    within = np.linalg.norm(reach_of(PANDA, arm).clip(target) - target, axis=1) < 1e-9
+    assert within.mean() >= least_share
+    reachable = target[within]
     assert_reached(arm, solve_from_home(arm, reachable), reachable, 1e-3)
 
 
@@ -164,39 +149,11 @@ def test_two_iterations_are_enough_for_one_action(arm):
     assert error.max() < 4e-3  # where the arm is nearly straight
 
 
-def test_known_pose_saves_only_work(arm, joints):
-    target = np.tile([0.0, 0.1, 0.2], (200, 1))
-    at = arm.forward(joints)
-    np.testing.assert_array_equal(arm.solve(joints, target, at=at), arm.solve(joints, target))
-    np.testing.assert_array_equal(at[3:5].jacobian, at.jacobian[3:5])
-
-
 def test_solution_stays_inside_the_limits(arm, joints):
     far = np.random.default_rng(3).uniform(-2.0, 2.0, (200, 3))
     solved = arm.solve(joints, far, num_iterations=5)
     assert (solved > JOINT_LOWER).all()
     assert (solved < JOINT_UPPER).all()
-
-
-@pytest.mark.parametrize(
-    ("kinds", "orientation", "rows"),
-    [(("hinge",) * 5, "down_any_turn", 5), (("hinge",) * 6, "down", 6), (("slide",) * 3, "free", 3)],
-)
-def test_an_arm_of_any_number_of_joints_comes_where_it_was(kinds, orientation, rows):
-    """What it is sent to is where it was in other postures, upside down so that its gripper points down."""
-    model, names = random_arm(kinds, seed=7)
-    rng = np.random.default_rng(8)
-    there = rng.uniform(-0.7, 0.7, (40, len(kinds)))
-    plain = Chain(model, names, "tip", position=(0, 0, 0), quaternion=(1, 0, 0, 0), home=there[0], orientation="free")
-    turned = plain.forward(there[:1]).rotation[0].T @ DOWN
-    quaternion = np.empty(4)
-    mujoco.mju_mat2Quat(quaternion, turned.ravel())
-    arm = Chain(model, names, "tip", position=(0, 0, 0), quaternion=quaternion, home=there[0], orientation=orientation)
-    target = arm.forward(there[:1]).position
-    found = arm.forward(arm.solve(there[:1] + 0.1, target, num_iterations=100))
-    error = arm.errors(found, target)
-    assert error.shape == (1, rows)
-    assert np.abs(error).max() < 1e-6
 
 
 class TestReach:
@@ -207,19 +164,6 @@ class TestReach:
     @pytest.fixture
     def target(self):
         return np.random.default_rng(4).uniform((-0.5, -1.0, -0.5), (1.0, 1.0, 1.5), (5000, 3))
-
-    def test_leaves_what_is_reachable(self, reach):
-        target = sample_in_volume(np.random.default_rng(5), 2000, WorkspaceConfig(), 0.05, lowest_m=0.025)
-        np.testing.assert_allclose(reach.clip(target), target, rtol=0, atol=1e-12)
-
-    def test_does_not_write_to_its_input(self, reach, target):
-        before = target.copy()
-        reach.clip(target)
-        np.testing.assert_array_equal(target, before)
-
-    def test_clips_once_and_for_all(self, reach, target):
-        once = reach.clip(target)
-        np.testing.assert_allclose(reach.clip(once), once, rtol=0, atol=1e-12)
 
     def test_height_first_then_towards_the_base(self, reach, target):
         clipped = reach.clip(target)

@@ -75,38 +75,11 @@ def test_bob_value(worlds):
     assert_layout(worlds.bob_value(GOALS), expected, observations.BOB_VALUE.size)
 
 
-def test_named_slices_are_where_the_table_says(worlds):
-    bob = np.hstack([worlds.positions(), GOALS.astype(np.float32)])
-    assert bob.shape[1] == observations.BOB.size
-    np.testing.assert_array_equal(bob[:, observations.BOB["object"]], worlds.object_position.astype(np.float32))
-    np.testing.assert_array_equal(bob[:, observations.BOB["goal"]], GOALS.astype(np.float32))
-
-
 def test_bobs_input_is_put_together(worlds):
     expected = np.hstack([positions(worlds), GOALS])
     found = observations.bob_observation(worlds.positions(), GOALS)
     assert_layout(found, expected, observations.BOB.size)
     np.testing.assert_array_equal(found, worlds.observe(observations.BOB, goal=GOALS))
-
-
-def test_the_gate_computes_with_the_way_of_the_object(worlds):
-    relative = GOALS - [[0.2, -0.1, 0.3], [-0.15, 0.12, 0.025]]
-    found = worlds.observe(observations.GATE, goal=GOALS, goal_from_object=relative)
-    assert_layout(found, np.hstack([positions(worlds), GOALS, relative]), 17)
-
-
-def test_the_last_command_as_a_further_input(worlds):
-    layout = observations.BOB + observations.ACTION
-    assert (layout["goal"], layout["displacement"], layout["width_change"]) == (
-        slice(11, 14), slice(14, 17), slice(17, 18),
-    )  # fmt: skip
-    command = np.array([[0.1, 0.2, 0.3, 0.4], [-0.5, -0.6, -0.7, -0.8]])
-    found = worlds.observe(layout, goal=GOALS, displacement=command[:, :3], width_change=command[:, 3:])
-    assert_layout(found, np.hstack([positions(worlds), GOALS, command]), 18)
-    vector = np.array([*POSITIONS, 12, 13, 14, 15, 16, 17, 18], dtype=np.float32)
-    assert layout.mirror(vector).tolist() == [*MIRRORED_POSITIONS, 12, -13, 14, 15, -16, 17, 18]
-    assert (layout.normalisation.offset[14:] == 0.0).all()
-    assert (layout.normalisation.scale[14:] == 1.0).all()
 
 
 def test_a_name_means_one_entry():
@@ -147,45 +120,3 @@ def test_mirror_swaps_fingers_and_negates_y(mirror, vector, expected):
     np.testing.assert_array_equal(mirror(batch), np.array([[expected], [expected]], dtype=np.float32))
     np.testing.assert_array_equal(mirror(mirror(batch)), batch)
     assert mirror(batch).dtype == np.float32
-
-
-@pytest.mark.parametrize(
-    ("normalisation", "size"),
-    [
-        (observations.POSITIONS.normalisation, observations.POSITIONS.size),
-        (observations.FULL.normalisation, observations.FULL.size),
-        (observations.BOB.normalisation, observations.BOB.size),
-        (observations.BOB_VALUE.normalisation, observations.BOB_VALUE.size),
-    ],
-    ids=["positions", "full", "bob", "bob value"],
-)
-def test_normalisation_fits_its_vector(normalisation, size):
-    for part in (normalisation.offset, normalisation.scale):
-        assert part.shape == (size,)
-        assert part.dtype == np.float32
-    assert (normalisation.scale > 0).all()
-    shared = observations.POSITIONS.normalisation
-    np.testing.assert_array_equal(normalisation.offset[: observations.POSITIONS.size], shared.offset)
-    np.testing.assert_array_equal(normalisation.scale[: observations.POSITIONS.size], shared.scale)
-
-
-def test_goal_and_object_are_normalised_alike():
-    bob = observations.BOB.normalisation
-    for part in (bob.offset, bob.scale):
-        np.testing.assert_array_equal(part[observations.BOB["goal"]], part[observations.BOB["object"]])
-
-
-@pytest.mark.parametrize(
-    ("normalisation", "mirror"),
-    [
-        (observations.FULL.normalisation, observations.FULL.mirror),
-        (observations.BOB.normalisation, observations.BOB.mirror),
-        (observations.BOB_VALUE.normalisation, observations.BOB_VALUE.mirror),
-    ],
-    ids=["full", "bob", "bob value"],
-)
-def test_mirror_and_normalisation_commute(normalisation, mirror):
-    vector = np.random.default_rng(0).normal(size=(20, normalisation.offset.size)).astype(np.float32)
-    normalised = (vector - normalisation.offset) / normalisation.scale
-    mirrored = (mirror(vector) - normalisation.offset) / normalisation.scale
-    np.testing.assert_allclose(mirror(normalised), mirrored, rtol=1e-6, atol=1e-6)

@@ -4,13 +4,10 @@ import mujoco
 import numpy as np
 import pytest
 
-from service.base.errors import ConfigError
-from service.config import WorldConfig, parse_config
+from service.config import WorldConfig
 from service.envs.batch import WorldBatch
-from service.envs.model_bank import ModelBank
-from service.envs.noise import KEYS, normal
 from service.envs.observations import POSITIONS
-from tests.runs.runs import assert_one_line
+from service.envs.randomisation import KEYS, ModelBank, normal
 
 COARSE = {"physics_step_s": 0.005, "num_substeps": 8}
 EVERYTHING = {
@@ -90,17 +87,6 @@ def test_what_stands_on_the_table_goes_up_with_it(fixture):
         assert worlds.object_position[0, 2] == pytest.approx(0.045)
 
 
-def test_objects_of_every_model_lie_still_where_they_start():
-    config = world(num_models=8, object_size=[0.6, 1.2], table_height_m=[-0.01, 0.01], object_mass_kg=[0.05, 1.0])
-    with WorldBatch(config, 24, num_threads=1) as worlds:
-        worlds.reset(np.random.default_rng(0))
-        before = worlds.object_position.copy()
-        assert len(np.unique(before[:, 2].round(6))) > 4
-        for _ in range(10):
-            worlds.step(np.zeros((24, 4), np.float32))
-        assert np.abs(worlds.object_position - before).max() < 1e-3
-
-
 def test_the_largest_object_starts_clear_of_the_gripper_and_of_fixtures():
     """Objects up to 9 cm high, under fingers at 8 cm; places are drawn for the largest, up to 7.5 cm wide."""
     tall = {"shape": "cylinder", "size_m": [0.05, 0.06]}
@@ -118,12 +104,6 @@ def test_the_largest_object_starts_clear_of_the_gripper_and_of_fixtures():
             mujoco.mj_forward(model, here)
             touched = [contact for contact in here.contact[: here.ncon] if contact.dist < -1e-4]
             assert not touched, [model.geom(int(geom)).name for geom in touched[0].geom]
-
-
-def test_an_object_drawn_too_wide_for_the_gripper_is_one_line_that_names_the_range():
-    with pytest.raises(ConfigError) as error:
-        ModelBank(world(num_models=4, object_size=[1.0, 2.0]))
-    assert_one_line(error.value, "world.randomisation.object_size", "opens to 0.08 m")
 
 
 def test_a_late_command_does_later_what_it_would_have_done():
@@ -193,27 +173,3 @@ def test_saved_states_go_on_exactly_in_another_batch():
         np.testing.assert_array_equal(one.states, other.states)
         np.testing.assert_array_equal(one.positions(), other.positions())
         assert len(np.unique(one.states[:, one.layout["model"]])) > 1
-
-
-def test_without_ranges_a_world_is_the_same_world():
-    with WorldBatch(world(), 2, num_threads=1) as worlds:
-        assert len(worlds.bank) == 1
-        assert worlds.states.shape[1] == worlds.layout.physics.stop + 2  # its contacts
-        config = world(**EVERYTHING).nominal
-        assert config == world()
-
-
-@pytest.mark.parametrize(
-    ("given", "expected"),
-    [
-        ({"friction": [1.0, 0.5]}, "friction = [1, 0.5] is the wrong way round"),
-        ({"delay_steps": [0, 20]}, "delay_steps = [0, 20] goes beyond [0, 8]"),
-        ({"object_mass_kg": [0.0, 1.0]}, "object_mass_kg = [0, 1] goes beyond"),
-        ({"mass": [0.1, 1.0]}, "unknown key 'world.randomisation.mass'"),
-    ],
-)
-def test_ranges_that_cannot_be(given, expected):
-    with pytest.raises(ConfigError) as raised:
-        parse_config({"world": {"randomisation": given}}, where="a test")
-    assert expected in str(raised.value)
-    assert "\n" not in str(raised.value)

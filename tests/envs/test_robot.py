@@ -1,6 +1,5 @@
 """Robots by description: arms and grippers that nobody here drew, in the same scene."""
 
-import os
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -11,11 +10,11 @@ import pytest
 from service.base.errors import ConfigError
 from service.config import dump_config, load_config
 from service.envs.batch import DISPLACEMENT_M, WorldBatch
-from service.envs.contacts import GRIPPER_BIT
+from service.envs.objects import GRIPPER_BIT
 from tests.envs.robots import GANTRY, GANTRY_DESCRIPTION, PINCHER, URDF, URDF_DESCRIPTION, write_robot
-from tests.envs.scripted import CLOSE, OPEN, drive, grasp, place_in_air
+from tests.envs.scripted import CLOSE, drive, grasp, place_in_air
 from tests.envs.test_meshes import write_box
-from tests.runs.runs import assert_one_line, play, tiny_config
+from tests.runs.runs import assert_one_line
 
 ROBOTS = Path(__file__).parents[2] / "configs" / "robots"
 RECIPE = ROBOTS.parent / "pretrain" / "panda_cube.yaml"
@@ -42,11 +41,11 @@ def sixer(tmp_path):
 
 
 def test_an_arm_of_five_joints_with_one_jaw_picks_things_up(pincher):
-    with WorldBatch(world_of(pincher, "world.object_size_m=0.04"), 30) as worlds:
+    with WorldBatch(world_of(pincher, "world.object_size_m=0.04"), 12) as worlds:
         worlds.reset(np.random.default_rng(0))
         assert worlds.states.shape[1] == 1 + (6 + 7) + (6 + 6) + 2
         np.testing.assert_allclose(worlds.positions()[:, 3:5], 0.035, atol=1e-6)  # each half of the opening
-        np.testing.assert_allclose(worlds.ee_position, [[-0.05, 0.0, 0.08]] * 30, atol=1e-3)
+        np.testing.assert_allclose(worlds.ee_position, [[-0.05, 0.0, 0.08]] * 12, atol=1e-3)
         grasp(worlds)
         assert worlds.contacts().all(axis=1).mean() >= 0.9
         above = worlds.ee_position + np.array([0.0, 0.0, 0.1])
@@ -89,12 +88,9 @@ def test_an_arm_of_a_urdf_is_where_mujoco_has_it(sixer):
         for row, values in enumerate(joints):
             data.qpos[:6] = values
             mujoco.mj_kinematics(model, data)
-            mujoco.mj_comPos(model, data)
-            tool, linear, angular = data.body("robot/tool"), np.empty((3, model.nv)), np.empty((3, model.nv))
-            mujoco.mj_jac(model, data, linear, angular, tool.xpos, tool.id)
+            tool = data.body("robot/tool")
             np.testing.assert_allclose(found.position[row], tool.xpos, rtol=0, atol=1e-10)
             np.testing.assert_allclose(found.rotation[row], tool.xmat.reshape(3, 3), rtol=0, atol=1e-10)
-            np.testing.assert_allclose(found.jacobian[row], np.vstack([linear, angular])[:, :6], rtol=0, atol=1e-10)
 
 
 def with_mesh(name):
@@ -116,7 +112,7 @@ def test_meshes_of_a_urdf_are_found_beside_it_and_by_ros_addresses(tmp_path, add
 
 
 def test_an_arm_of_a_urdf_picks_and_places(sixer):
-    placement = place_in_air(load_config(RECIPE, [f"world.robot={sixer}"]).world, 30, seed=0)
+    placement = place_in_air(load_config(RECIPE, [f"world.robot={sixer}"]).world, 12, seed=0)
     held = (placement.distance_m < 0.01) & (placement.distance_after_hold_m < 0.01) & (placement.slip_m <= 0.005)
     assert held.mean() >= 0.95
     assert placement.grasped.mean() >= 0.95
@@ -141,27 +137,6 @@ def test_pads_touch_instead_of_a_fingers_own_shapes(tmp_path):
         model = worlds.model
         solid = [model.geom(index) for index in range(model.ngeom) if model.geom_contype[index] == GRIPPER_BIT]
         assert [geom.type[0] for geom in solid if geom.name != "robot/fixed"] == [mujoco.mjtGeom.mjGEOM_CAPSULE] * 2
-
-
-def test_a_blocked_gripper_starts_and_stays_closed(gantry):
-    with WorldBatch(world_of(gantry, "world.gripper=blocked"), 1) as worlds:
-        worlds.reset(np.random.default_rng(0))
-        np.testing.assert_allclose(worlds.positions()[0, 3:5], 0.0, atol=1e-7)
-        for _ in range(5):
-            worlds.step(np.float32([[0, 0, 0, OPEN]]))
-        np.testing.assert_allclose(worlds.positions()[0, 3:5], 0.0, atol=3e-3)
-
-
-def test_it_learns_is_saved_and_goes_on(pincher, tmp_path):
-    """A run of the whole service with a robot of five joints."""
-    tree = tiny_config(total_env_steps=400).model_dump()
-    tree["world"]["robot"] = world_of(pincher).robot.model_dump()
-    tree["world"] |= {"object_size_m": 0.05, "workspace": {"length_x_m": 0.15, "length_y_m": 0.15, "height_m": 0.2}}
-    config = type(tiny_config()).model_validate(tree)
-    _, first = play(tmp_path / "run", config)
-    longer = config.model_copy(update={"run": config.run.model_copy(update={"total_env_steps": 800})})
-    _, second = play(tmp_path / "run", longer, resume=True)
-    assert second.num_env_steps > first.num_env_steps >= 400
 
 
 def test_a_description_is_part_of_the_configuration(pincher, tmp_path, monkeypatch):
@@ -205,9 +180,12 @@ def test_another_model_than_the_one_that_was_described_is_refused(pincher, tmp_p
     [
         ({"model": "none.xml"}, ["none.xml", "No such file"]),
         ({"model": None}, ["model is missing"]),
-        ({"joints": ["yaw", "lift", "elbow", "bend"], "home": [0.0] * 4}, ["roll", "neither of the arm nor"]),
-        ({"joints": ["yaw", "lift", "elbow", "bend", "twist"]}, ["no joint 'twist'", "it has yaw, lift"]),
-        ({"joints": ["lift", "yaw", "elbow", "bend", "roll"]}, ["not in the order", "yaw, lift, elbow"]),
+        (
+            {"joints": ["yaw", "lift", "elbow", "bend"], "home": [0.0] * 4},
+            ["yaw, lift, elbow, bend, roll, jaw", "weld"],
+        ),
+        ({"joints": ["yaw", "lift", "elbow", "bend", "twist"]}, ["no joint 'twist', only yaw, lift"]),
+        ({"joints": ["lift", "yaw", "elbow", "bend", "roll"]}, ["in their order, yaw, lift, elbow"]),
         ({"joints": ["yaw", "yaw", "elbow", "bend", "roll"]}, ["'yaw' is named twice"]),
         ({"home": [0.0, 0.3, 1.5]}, ["home has 3 numbers, there are 5 joints"]),
         ({"stiffness": [1.0, 2.0]}, ["stiffness has 2 numbers, there are 5 joints"]),
@@ -216,12 +194,12 @@ def test_another_model_than_the_one_that_was_described_is_refused(pincher, tmp_p
         ({"fingers": [{"joint": "jaw", "closed": 0.0, "open": 0.0}]}, ["closed and open are both 0"]),
         ({"opening_m": 0.04}, ["opens to 0.04 m", "0.05 m wide"]),
         ({"touching": ["ear"]}, ["no body 'ear'", "touching"]),
-        ({"root": "plinth"}, ["no body 'plinth'", "root"]),
+        ({"root": "plinth"}, ["no body 'plinth'"]),
         ({"base_position_m": [-1.5, 0.0, 0.0]}, ["100% of the workspace is out of its reach", "base_position_m"]),
         ({"home": [0.0, 0.3, 0.0, 0.0, 0.0]}, ["home posture", "check home, effector and orientation"]),
         ({"home": [0.0, 0.0, 0.0, 0.0, 0.0]}, ["on the axis of its base", "bend the arm"]),
         ({"fingers": [{"joint": "jaw", "closed": 0.0, "open": 5.0}]}, ["open at 5", "its joint goes from"]),
-        ({"stiffness": -1.0}, ["stiffness = -1 is less than 0"]),
+        ({"stiffness": -1.0}, ["stiffness", "greater than or equal to 0"]),
         ({"effector": {"frame": "nose", "quaternion": [0, 0, 0, 0]}}, ["quaternion: all four numbers are 0"]),
         ({"hand": {"model": "hand.xml", "at": "elbow"}}, ["no site or body 'elbow'"]),
         ({"wheels": 4}, ["wheels", "Extra inputs"]),
@@ -281,11 +259,3 @@ def test_arms_that_nobody_here_drew_pick_and_place(robot, package, kept):
     placement = place_in_air(world, 100, seed=0)
     held = (placement.distance_m < 0.01) & (placement.distance_after_hold_m < 0.01) & (placement.slip_m <= 0.005)
     assert held.mean() >= kept
-
-
-def test_a_description_that_would_never_be_read_to_its_end(tmp_path):
-    fifo = tmp_path / "robot.yaml"
-    os.mkfifo(fifo)
-    with pytest.raises(ConfigError) as error:
-        world_of(fifo)
-    assert_one_line(error.value, "robot.yaml", "not a regular file")

@@ -6,7 +6,6 @@ import pytest
 from service.config import WorldConfig
 from service.envs.batch import WorldBatch
 from service.envs.scene import build_layout, build_spec
-from service.envs.state_layout import StateLayout
 
 
 @pytest.mark.parametrize("fixture", ["none", "wall", "box"])
@@ -47,26 +46,3 @@ def test_what_follows_the_physics(fixture, blocked_fraction, box_place, gripper_
     assert (layout["box_place"], layout["gripper_blocked"]) == (box_place, gripper_blocked)
     assert layout.kept == slice(34, gripper_blocked.stop)
     assert shape == (1, layout.size) == (1, gripper_blocked.stop)
-
-
-def test_another_robot_two_objects_and_masses_that_differ_by_world():
-    layout = StateLayout(
-        positions={"joints": 6, "fingers": 1, "cube": 3, "cube_quaternion": 4, "ball": 3, "ball_quaternion": 4},
-        velocities={
-            "joint_velocities": 6, "finger_velocities": 1, "cube_velocity": 3, "cube_spin": 3, "ball_velocity": 3,
-            "ball_spin": 3,
-        },
-        measured={"contacts": 4},
-        kept={"masses": 2, "friction": 1},
-    )  # fmt: skip
-    assert (layout.num_positions, layout.num_velocities) == (21, 19)
-    assert layout["ball"] == slice(15, 18)
-    assert layout["ball_velocity"] == slice(35, 38)
-    assert (layout.physics, layout.velocities) == (slice(0, 41), slice(22, 41))
-    assert (layout["contacts"], layout["masses"], layout["friction"]) == (slice(41, 45), slice(45, 47), slice(47, 48))
-    assert (layout.kept, layout.size) == (slice(45, 48), 48)
-
-
-def test_a_name_means_one_part():
-    with pytest.raises(AssertionError, match="same name"):
-        StateLayout(positions={"joints": 7}, velocities={"joints": 7}, measured={}, kept={})

@@ -9,6 +9,7 @@ from service.envs.batch import WorldBatch
 from service.envs.observations import ACTION, FULL
 from service.envs.panda import PANDA
 from service.envs.sampling import sample_in_volume
+from service.envs.scene import build_model
 from tests.envs.scripted import CLOSE, OPEN, grasp, place_in_air
 from tests.envs.world_soak import soak
 
@@ -38,12 +39,11 @@ def spread_out(worlds, rng, lowest_m=PANDA.lowest_m):
 @pytest.mark.parametrize(
     ("shape", "physics", "num_worlds", "least_share"),
     [
-        ("cube", FINE, 60, 0.99),
-        ("cube", COARSE, 100, 0.99),
-        ("sphere", FINE, 60, 0.95),
-        ("sphere", COARSE, 60, 0.95),
+        ("cube", FINE, 16, 1.0),
+        ("cube", COARSE, 30, 1.0),
+        ("sphere", COARSE, 30, 0.95),
     ],
-    ids=["cube", "cube-coarse", "sphere", "sphere-coarse"],
+    ids=["cube", "cube-coarse", "sphere-coarse"],
 )
 def test_pick_and_place_in_the_air_and_hold(shape, physics, num_worlds, least_share):
     placement = place_in_air(WorldConfig(object=shape, **physics), num_worlds, seed=0)
@@ -61,7 +61,7 @@ def test_an_object_at_rest_stays(shape, physics):
         worlds.reset(np.random.default_rng(0))
         before = worlds.object_position.copy()
         furthest = 0.0
-        for _ in range(250):
+        for _ in range(100):
             act(worlds, 0, 0, 0, 0)
             furthest = max(furthest, np.linalg.norm(worlds.object_position - before, axis=1).max())
         assert furthest < 1e-3
@@ -69,13 +69,37 @@ def test_an_object_at_rest_stays(shape, physics):
 
 @pytest.mark.parametrize(
     ("shape", "physics", "num_steps"),
-    [("cube", FINE, 60), ("cube", COARSE, 100), ("sphere", COARSE, 100)],
-    ids=["cube", "cube-coarse", "sphere-coarse"],
+    [("cube", FINE, 50), ("sphere", COARSE, 50)],
+    ids=["cube", "sphere-coarse"],
 )
 def test_rough_play_breaks_nothing(shape, physics, num_steps):
-    extremes = soak(WorldConfig(object=shape, **physics), num_worlds=201, num_steps=num_steps, seed=0)
+    extremes = soak(WorldConfig(object=shape, **physics), num_worlds=60, num_steps=num_steps, seed=0)
     assert extremes.contact_share > 0.05
     assert extremes.within_bounds(), extremes
+
+
+def test_contacts_are_those_that_published_primitives_were_trained_with():
+    ball = {"shape": "sphere", "size_m": (0.05,)}
+    model = build_model(WorldConfig(fixture="box", obstacles=[ball], start_height_m=0.2))
+    assert np.unique(model.geom_friction[:, 1:], axis=0).tolist() == [[0.005, 0.0001]]
+    sides = np.array([model.geom(f"fixture_{name}").pos for name in ("near", "far", "left", "right")])
+    np.testing.assert_allclose(np.sort(sides, axis=0)[[0, -1]], [[-0.0475, -0.0475, 0.025], [0.0475, 0.0475, 0.025]])
+    np.testing.assert_allclose(sides.sum(axis=0), [0.0, 0.0, 0.1])
+    option = model.opt
+    assert (option.impratio, option.noslip_iterations, option.iterations, option.tolerance) == (1.0, 5, 50, 1e-8)
+    expected = {  # sliding friction, time, least and most impedance, dimensions, priority, type, affinity
+        "table": (1.0, 0.01, 0.95, 0.99, 3, 0, 4, 3),
+        "hand": (0.3, 0.02, 0.9, 0.95, 3, 0, 1, 0),
+        "left_pad_front": (1.0, 0.01, 0.9, 0.95, 4, 2, 1, 0),
+        "object": (1.0, 0.01, 0.95, 0.99, 3, 0, 2, 1),
+        "obstacle_1": (1.0, 0.01, 0.95, 0.99, 6, 1, 2, 11),
+        "ground": (1.0, 0.01, 0.95, 0.99, 3, 0, 8, 0),
+        "fixture_near": (1.0, 0.01, 0.95, 0.99, 3, 0, 0, 3),
+    }
+    for name, numbers in expected.items():
+        geom = model.geom(name)
+        touching = (geom.condim[0], geom.priority[0], geom.contype[0], geom.conaffinity[0])
+        assert (geom.friction[0], geom.solref[0], *geom.solimp[:2], *touching) == numbers, name
 
 
 def test_no_action_no_motion():
@@ -85,8 +109,7 @@ def test_no_action_no_motion():
         assert drift.max() < 0.5e-3
 
 
-@pytest.mark.parametrize("axis", [0, 1, 2])
-@pytest.mark.parametrize("sign", [-1.0, 1.0])
+@pytest.mark.parametrize(("axis", "sign"), [(0, -1.0), (1, 1.0), (2, -1.0)])
 def test_a_full_action_moves_a_few_centimetres_along_its_axis(axis, sign):
     action = np.zeros(4)
     action[axis] = sign
@@ -175,40 +198,19 @@ def make_symmetric(model):
     mujoco.mj_setConst(model, mujoco.MjData(model))
 
 
-def mirrored_runs(symmetric, num_steps, noslip=True):
-    """(T, 22) largest differences between a run's reflection and the run of its reflection, after each step."""
+def test_the_task_has_no_left_and_right():
+    """A run's reflection is the run of its reflection; noslip goes through contacts in an order, so it is off here."""
     rng = np.random.default_rng(0)
-    with WorldBatch(WorldConfig(), 40) as worlds, WorldBatch(WorldConfig(), 40) as reflected:
-        if symmetric:
-            make_symmetric(worlds.model)
-            make_symmetric(reflected.model)
+    with WorldBatch(WorldConfig(), 30) as worlds, WorldBatch(WorldConfig(), 30) as reflected:
         for model in (worlds.model, reflected.model):
-            model.opt.noslip_iterations *= noslip
+            make_symmetric(model)
+            model.opt.noslip_iterations = 0
         worlds.reset(rng)
         reflected.restore(mirror_state(worlds.states))
         np.testing.assert_allclose(reflected.full(0.5), FULL.mirror(worlds.full(0.5)), rtol=0, atol=1e-12)
-        differences = []
-        for _ in range(num_steps):
-            actions = rng.uniform(-1.0, 1.0, (40, 4)).astype(np.float32)
+        for tolerance in (1e-7, 1e-5, 1e-5, 1e-5):  # contacts magnify the last bits, so not for longer
+            actions = rng.uniform(-1.0, 1.0, (30, 4)).astype(np.float32)
             worlds.step(actions)
             reflected.step(ACTION.mirror(actions))
-            differences.append(np.abs(FULL.mirror(worlds.full(0.5)) - reflected.full(0.5)).max(axis=0))
-    return np.array(differences)
-
-
-def test_the_task_has_no_left_and_right():
-    differences = mirrored_runs(symmetric=True, num_steps=4, noslip=False)
-    assert differences[0].max() < 1e-7
-    assert differences[:, :11].max() < 1e-5  # contacts magnify the last bits, so not for longer
-
-
-def test_noslip_goes_through_contacts_in_an_order_which_is_worth_less_than_a_millimetre():
-    differences = mirrored_runs(symmetric=True, num_steps=5)
-    assert differences[0].max() < 1e-6
-    assert differences[:, :11].max() < 5e-4  # half of what the real links do in one step
-
-
-def test_the_real_links_spoil_the_mirror_by_a_millimetre_a_step():
-    differences = mirrored_runs(symmetric=False, num_steps=3)
-    assert 1e-5 < differences[0, :3].max() < 2e-3
-    assert differences[:, :3].max() < 4e-3
+            difference = np.abs(FULL.mirror(worlds.full(0.5)) - reflected.full(0.5))
+            assert difference[:, :11].max() < tolerance

@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 import torch
 
-from service.config.sac import SACConfig
 from service.config.self_play import MCPConfig
+from service.config.skills import SACConfig
 from service.learner.off_policy import actions_at_random
 from service.learner.sac import Batch, SACLearner
 from service.learner.sac_networks import Critics, GaussianActor, MCPActor, sample_actions

@@ -12,8 +12,11 @@ from service.base.jsonl import JsonlWriter
 from service.config import WorkspaceConfig
 from service.media.figures import column, new_figure
 from service.media.plots import (
+    _Curve,
+    _draw_panel,
     _goals,
     _inside,
+    _Panel,
     _slice_title,
     _smooth,
     _summary,
@@ -41,15 +44,16 @@ def _append(path, *records):
 
 def _metrics(iteration):
     wave = 0.5 + 0.4 * np.sin(iteration)
-    keys = ("alice/valid_fraction", "bob/success_rate", "alice/goal_height_m", "learner/bob_entropy")
+    keys = ("alice/valid_fraction", "bob/success_rate", "alice/goal_height_m", "skills/distance_m", "rollout/return")
     return {"iteration": iteration, "env_steps": iteration * 1000, "time/wall_s": iteration * 2.0} | dict.fromkeys(
         keys, wave
     )
 
 
-def test_curves_are_drawn_1400_pixels_wide(tmp_path):
+@pytest.mark.parametrize("method", ["self-play", "distillation", "skills", "ours"])
+def test_curves_are_drawn_1400_pixels_wide(tmp_path, method):
     _append(tmp_path / "metrics.jsonl", *map(_metrics, range(30)))
-    path = plot_curves(tmp_path)
+    path = plot_curves(tmp_path, method)
     size, width = _png_size(path)
     assert path == tmp_path / "curves.png"
     assert width == 1400
@@ -57,12 +61,13 @@ def test_curves_are_drawn_1400_pixels_wide(tmp_path):
     assert sorted(file.name for file in tmp_path.iterdir()) == ["curves.png", "metrics.jsonl"]
 
 
-def test_more_values_change_the_picture(tmp_path):
-    _append(tmp_path / "metrics.jsonl", *map(_metrics, range(10)))
-    before = plot_curves(tmp_path).read_bytes()
-    assert plot_curves(tmp_path).read_bytes() == before
-    _append(tmp_path / "metrics.jsonl", {"iteration": 10, "env_steps": 9000, "evaluation/air_success_ever": 0.5})
-    assert plot_curves(tmp_path).read_bytes() != before
+def test_a_panel_names_its_curves_with_the_last_value_that_is_known():
+    axes = new_figure(4.0, 4.0, "").subplots()
+    curves = (_Curve("a", "one", "red"), _Curve("evaluation/b", "two", "blue"), _Curve("c", "three", "green"))
+    records = [{"env_steps": 1e6, "a": 0.5}, {"env_steps": 2e6, "a": None, "evaluation/b": 0.25}, {"a": 0.75}]
+    _draw_panel(axes, _Panel("Title", "grows", "solved"), [(curve, records) for curve in curves])
+    assert {text.get_text() for text in axes.texts} == {"grows", "one 0.50", "two 0.25"}
+    assert (axes.get_ylim(), axes.get_xlim()[0]) == ((0.0, 1.0), 0.0)
 
 
 def test_the_runs_of_a_study_in_one_picture(tmp_path):
@@ -86,8 +91,6 @@ def test_the_runs_of_a_study_in_one_picture(tmp_path):
     [
         [{"iteration": 0}],
         [_metrics(0)],
-        [_metrics(5)],
-        [{"iteration": 0, "env_steps": 10, "bob/success_rate": None}, _metrics(2)],
         [_metrics(1), {"iteration": 2, "bob/success_rate": 0.5}, _metrics(3) | {"alice/valid_fraction": float("nan")}],
     ],
 )
@@ -95,14 +98,6 @@ def test_the_runs_of_a_study_in_one_picture(tmp_path):
 def test_curves_bear_missing_values(tmp_path, records):
     _append(tmp_path / "metrics.jsonl", *records)
     assert _png_size(plot_curves(tmp_path))[0] > 20_000
-
-
-def test_a_torn_last_line_does_not_change_the_picture(tmp_path):
-    _append(tmp_path / "metrics.jsonl", *map(_metrics, range(5)))
-    before = plot_curves(tmp_path).read_bytes()
-    with (tmp_path / "metrics.jsonl").open("a") as file:
-        file.write('{"iteration": 5, "env_st')
-    assert plot_curves(tmp_path).read_bytes() == before
 
 
 @pytest.mark.parametrize(
@@ -128,7 +123,7 @@ def test_smoothing_by_hand():
 
 
 @pytest.mark.filterwarnings("error")
-@pytest.mark.parametrize("num_records", [1, 3, 9])
+@pytest.mark.parametrize("num_records", [1, 9])
 def test_goals_are_drawn_for_short_and_long_runs(tmp_path, num_records):
     _append(
         tmp_path / "goals.jsonl",
@@ -139,20 +134,13 @@ def test_goals_are_drawn_for_short_and_long_runs(tmp_path, num_records):
     assert _png_size(path)[0] > 20_000
 
 
-def test_goals_of_many_records_are_joined_and_broken_ones_left_out(tmp_path):
+def test_goals_of_many_records_are_joined_and_broken_ones_left_out():
     unsolved, broken = [*GOAL[:6], 0], [None, *GOAL[1:]]
     records = [{"env_steps": 1e6, "goals": [GOAL, unsolved]}, {}, {"env_steps": 3e6, "goals": [GOAL, broken, GOAL]}]
-    goals = _goals(records, tmp_path)
+    goals = _goals(records)
     np.testing.assert_array_equal(goals, [GOAL, unsolved, GOAL, GOAL])
     assert _slice_title(records, goals) == "1.00 to 3.00 M env steps\n4 goals, 75% solved"
     assert _slice_title([], goals[:0]) == "\nno goals yet"
-
-
-@pytest.mark.parametrize("goals", [[GOAL[:6]], [GOAL, [1]], [GOAL * 2], [["a"] * 7], 5])
-def test_goals_of_another_layout_are_refused(tmp_path, goals):
-    _append(tmp_path / "goals.jsonl", {"iteration": 0, "goals": goals})
-    with pytest.raises(TandemError, match=r"goals\.jsonl: a goal is not 7 numbers"):
-        plot_goals(tmp_path, WORKSPACE)
 
 
 @pytest.mark.filterwarnings("error")
@@ -175,12 +163,6 @@ def test_coverage_counts_by_hand():
 def test_points_far_outside_break_the_line():
     points = np.array([[0.0, 0.0, 0.1], [0.12, 0.0, 0.1], [0.14, 0.0, 0.1]])
     np.testing.assert_array_equal(np.isnan(_inside(points, WORKSPACE))[:, 0], [False, False, True])
-
-
-def test_a_picture_that_cannot_be_written_is_one_line_for_the_user(tmp_path):
-    (tmp_path / "taken").write_text("a file where a directory should be")
-    with pytest.raises(TandemError, match="cannot write"):
-        plot_coverage(np.zeros((1, 2, 3)), WORKSPACE, tmp_path / "taken" / "coverage.png", "v1")
 
 
 def test_import_loads_no_matplotlib_and_drawing_no_pyplot():

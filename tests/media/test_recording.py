@@ -79,15 +79,6 @@ def test_the_actions_lead_from_state_to_state():
                     np.testing.assert_array_equal(worlds.states[0], after)
 
 
-def test_bobs_turn_lasts_until_he_has_held_the_object_at_the_goal():
-    once, held = (record(bob_hold_steps=steps) for steps in (1, 3))
-    for short, played in zip(once, held, strict=True):
-        # He does what Alice did and touches at the same step as before; two more steps follow.
-        assert len(played.bob_states) == len(short.bob_states) + 2
-        assert reached(played).tolist() == [False] * (len(short.bob_states) - 1) + [True] * 3
-        assert played.solved
-
-
 class Sweep(Constant):
     """Moves forward close to the table, with closed fingers."""
 
@@ -98,18 +89,6 @@ class Sweep(Constant):
         action = super().act_deterministic(observation)
         action[:, 2] = np.clip((0.03 - observation[:, 2]) / 0.05, -1.0, 1.0)
         return action
-
-
-def test_a_bob_who_passes_the_goal_has_not_solved_it():
-    # He does what Alice did, but for 20 steps, not 5: where she left the object he does not stop.
-    config = SelfPlayConfig(game=GameConfig(alice_steps=5, bob_steps=20, bob_hold_steps=20))
-    rounds = record_rounds(config, Sweep(), Sweep(), num_rounds=30, seed=0)
-    tried = [played for played in rounds if played.verdict == Verdict.VALID]
-    assert {len(played.bob_actions) for played in tried} == {20}
-    passed = [played for played in tried if not reached(played)[-1]]
-    assert passed
-    assert all(reached(played).any() for played in passed)
-    assert [played.solved for played in tried] == [bool(reached(played)[-1]) for played in tried]
 
 
 @pytest.mark.parametrize("distance_m", [0.03, 0.06])
@@ -123,7 +102,7 @@ def test_the_caption_says_solved_where_the_runs_own_rule_does(monkeypatch, dista
     monkeypatch.setattr(video, "_bar", lambda width, text, *more: words.append(text) or bar(width, text, *more))
     said, near = [], []
     for played in (played for played in rounds if played.verdict == Verdict.VALID):
-        list(video._round_frames(blank, played, "", 1, 0.04))
+        list(video._round_frames(blank, played, "", 1, 0.04, 0.04))
         said.append(words[-1])
         near.append(np.linalg.norm(played.bob_states[-1, OBJECT] - played.goal) <= distance_m)
     assert said == ["Bob: solved after 0.4 s" if solved else "Bob: not solved in 0.4 s" for solved in near]
@@ -132,47 +111,22 @@ def test_the_caption_says_solved_where_the_runs_own_rule_does(monkeypatch, dista
 
 
 def test_the_length_of_alices_turn_is_drawn():
-    rounds = [record(alice_steps_min=9, num_rounds=1, seed=seed)[0] for seed in range(12)]
-    assert {len(played.alice_actions) for played in rounds} == {9, 10, 11, 12}
+    rounds = [record(alice_steps_min=11, num_rounds=1, seed=seed)[0] for seed in range(4)]
+    assert {len(played.alice_actions) for played in rounds} == {11, 12}
     for played in rounds:
         assert len(played.alice_states) == len(played.alice_actions) + 1
         np.testing.assert_array_equal(played.alice_states[-1, OBJECT], played.goal)
         np.testing.assert_array_equal(played.bob_states[0], played.alice_states[0])
 
 
-def test_blocked_grippers_stay_closed():
-    rounds = record(OPEN_AND_PUSH, OPEN_AND_PUSH, num_rounds=64, blocked_gripper_fraction=0.5)
-    blocked = [played for played in rounds if played.alice_states[0, -1] == 1.0]
-    assert 20 < len(blocked) < 44  # four standard deviations of 64 draws are 16
-    for played in rounds:
-        states = np.concatenate([played.alice_states, played.bob_states])
-        is_blocked = played.alice_states[0, -1] == 1.0
-        assert (states[:, -1] == is_blocked).all()
+def test_grippers_are_blocked_as_at_the_end_of_a_run():
+    rounds = record(OPEN_AND_PUSH, num_rounds=64, blocked_gripper_fraction=0.5, blocked_gripper_min_success=0.9)
+    blocked = [played.alice_states[0, -1] == 1.0 for played in rounds]
+    assert 20 < sum(blocked) < 44  # four standard deviations of 64 draws are 16
+    for played, is_blocked in zip(rounds, blocked, strict=True):
         # Open fingers are at 4 cm; a blow against the table moves blocked ones by millimetres.
-        assert states[:, FINGERS].max() < 0.005 if is_blocked else states[:, FINGERS].max() > 0.039
-    assert any(len(played.bob_actions) for played in blocked)
-
-
-def test_a_bob_who_does_nothing_runs_out_of_time():
-    (played,) = record(bob=NOTHING, num_rounds=1)
-    assert not played.solved
-    assert len(played.bob_states) == 13
-
-
-def test_an_alice_who_does_nothing_is_shown_as_she_is():
-    rounds = record(NOTHING, num_rounds=2)
-    assert [played.verdict for played in rounds] == [Verdict.NOT_MOVED] * 2
-    assert [len(played.bob_states) for played in rounds] == [1, 1]
-
-
-def test_a_seed_determines_the_rounds():
-    one, same, other = (record(seed=seed, num_rounds=1)[0] for seed in (0, 0, 1))
-    np.testing.assert_array_equal(one.alice_states, same.alice_states)
-    assert not np.array_equal(one.goal, other.goal)
-
-
-def test_more_rounds_than_worlds_can_be_asked_for():
-    assert len(record(num_rounds=70)) == 70
+        widest = played.alice_states[:, FINGERS].max()
+        assert widest < 0.005 if is_blocked else widest > 0.039
 
 
 def test_played_before_lifted_before_far():
@@ -186,17 +140,6 @@ def test_played_before_lifted_before_far():
 # --- episodes --------------------------------------------------------------------------------------------------------
 
 
-def test_recorded_episodes_keep_every_state():
-    episodes = record_episodes(
-        Constant(NOTHING), WorldConfig(), "table", num_episodes=5, num_steps=4, success_distance_m=0.15, seed=2
-    )
-    assert episodes.states.shape[:2] == episodes.reached.shape == (5, 5)
-    distance = np.linalg.norm(episodes.states[..., OBJECT] - episodes.goal, axis=2)
-    np.testing.assert_array_equal(episodes.reached, distance <= 0.15)
-    assert episodes.reached.any()
-    assert not episodes.reached.all()
-
-
 def test_recorded_episodes_are_those_of_the_evaluation():
     common = {"num_episodes": 40, "num_steps": 20, "success_distance_m": 0.12, "seed": 3}
     episodes = record_episodes(Constant(PUSH), WorldConfig(), "table", **common)
@@ -206,6 +149,10 @@ def test_recorded_episodes_are_those_of_the_evaluation():
     assert result.success_ever == episodes.reached[1:].any(axis=0).mean()
     distance = np.linalg.norm(episodes.states[-1][:, OBJECT] - episodes.goal, axis=1)
     assert result.mean_distance_m == pytest.approx(distance.mean(), abs=1e-12)
+    few = episodes.first(3)
+    np.testing.assert_array_equal(few.states, episodes.states[:, :3])
+    np.testing.assert_array_equal(few.actions, episodes.actions[:, :3])
+    np.testing.assert_array_equal(few.goal, episodes.goal[:3])
 
 
 def test_recorded_skills_are_those_of_the_coverage():

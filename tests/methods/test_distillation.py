@@ -12,7 +12,7 @@ from service.config import parse_config
 from service.config.distillation import DistillationConfig
 from service.envs.batch import WorldBatch
 from service.envs.observations import PAPER, POSITIONS, layouts
-from service.envs.obstacles import inside_obstacles
+from service.envs.sampling import inside_obstacles
 from service.learner.distillation import Distiller
 from service.learner.transfer import take_over
 from service.policies import networks

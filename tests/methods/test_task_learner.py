@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from service.config.sac import SACConfig
+from service.config.skills import SACConfig
 from service.methods.task import TaskLearning
 from service.methods.task_learner import Hindsight, set_progress
 from service.methods.task_methods import METHODS

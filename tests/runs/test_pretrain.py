@@ -11,7 +11,7 @@ import pytest
 from service.actors import evaluation
 from service.base.errors import ConfigError, TandemError
 from service.config import parse_config
-from service.envs.obstacles import draw_goals
+from service.envs.sampling import draw_goals
 from service.registry.bundled import BUNDLED
 from service.registry.registry import Registry
 from service.runs import train as module

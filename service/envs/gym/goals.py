@@ -7,12 +7,19 @@ from typing import Any
 
 import numpy as np
 
-from service.base.errors import TandemError, did_you_mean
+from service.base.errors import TandemError
 from service.base.types import Array, BoolArray, StateArray
 from service.config import WorldConfig
-from service.envs.obstacles import Places, draw_goals, inside_fixtures, inside_obstacles
 from service.envs.reach import Reach
-from service.envs.sampling import GOAL_KINDS, GoalKind, check_goals
+from service.envs.sampling import (
+    GOAL_KINDS,
+    GoalKind,
+    Places,
+    check_goals,
+    draw_goals,
+    inside_fixtures,
+    inside_obstacles,
+)
 
 GoalSampler = Callable[[np.random.Generator, int, WorldConfig], Any]
 """Draws goals: (random numbers, how many, the world) to (num, 3), metres."""
@@ -23,7 +30,6 @@ Success = Callable[[Array, Array], Any]
 """What counts: (..., 3) achieved and (..., 3) desired goals, metres, to (...) bool."""
 
 _MAX_DRAWS = 1000
-_AS_NUMBERS = "write x, y, z in metres"
 
 
 class GoalSource:
@@ -45,88 +51,75 @@ class GoalSource:
         if isinstance(goals, str):
             check_goals(goals, config)
         elif not callable(goals):
-            self._lower, self._upper = self._checked_box(goals)
+            self._check_box(np.array(goals, dtype=np.float64))
 
     def draw(self, rng: np.random.Generator, places: Places) -> StateArray:
         """(N, 3) goals for N worlds whose things are at ``places``, metres.
 
+        Those of a function or a box are drawn again where they are out of reach, or inside something.
+
         Raises:
-            TandemError: a function that drew something else, or goals out of reach or inside a fixture.
+            TandemError: a function that drew something else, or no goal that is within reach and clear.
         """
         if isinstance(self._goals, str):
             return draw_goals(self._goals, rng, self._config, self._success_distance_m, places)
-        num = len(places.object)
-        if callable(self._goals):
-            goal = self._checked("goals: the function's goal", self._goals(rng, num, self._config), (num, 3))
-            return self._clear("goals: the function's goal", goal)
-        goal = self._from_box(rng, num)
+        goal = self._sample(rng, len(places.object))
         for _ in range(_MAX_DRAWS):
             wrong = self._out_of_reach(goal) | inside_fixtures(goal, self._config)
             wrong |= inside_obstacles(goal, places.obstacles, self._config)
             if not wrong.any():
                 return goal
-            goal[wrong] = self._from_box(rng, int(wrong.sum()))
-        raise TandemError(f"goals = {self._goals!r}: no place in it is within reach and clear: choose another box")
+            goal[wrong] = self._sample(rng, int(wrong.sum()))
+        raise TandemError(f"goals = {self._goals!r}: no place in it is within reach and clear: choose others")
 
     def given(self, options: dict[str, Any] | None, num: int) -> StateArray | None:
         """(num, 3) goals that ``options`` of a reset give, metres; None where they give none.
 
         Raises:
-            TandemError: another option, or a goal of another shape, not finite, out of reach or inside a fixture.
+            TandemError: another option, or a goal of another shape, out of reach or inside a fixture.
         """
-        for name in options or {}:
-            if name != "goal":
-                raise TandemError(f"reset: unknown option {name!r}; the only one is goal{did_you_mean(name, ['goal'])}")
+        for name in (options or {}).keys() - {"goal"}:
+            raise TandemError(f"reset: unknown option {name!r}; the only one is goal")
         if not options or options["goal"] is None:
             return None
-        goal = self._checked("reset: options['goal']", options["goal"], (3,), (num, 3))
-        return self._clear("reset: options['goal']", goal)
-
-    def _checked(self, what: str, value: Any, *shapes: tuple[int, ...]) -> StateArray:
-        """Goals of one of these shapes as (N, 3), a copy."""
-        try:
-            goal = np.array(value, dtype=np.float64)
-        except (TypeError, ValueError):
-            raise TandemError(f"{what} is no array of numbers: {_AS_NUMBERS}") from None
-        if goal.shape not in shapes:
-            known = " or ".join(str(shape) for shape in shapes)
-            raise TandemError(f"{what} has shape {goal.shape}, not {known}: {_AS_NUMBERS}")
+        goal = np.array(options["goal"], dtype=np.float64)
+        if goal.shape not in ((3,), (num, 3)):
+            raise TandemError(f"reset: options['goal'] has shape {goal.shape}, not (3,) or {(num, 3)}: give metres")
         goal = goal.reshape(-1, 3)
-        if not np.isfinite(goal).all():
-            bad = goal[~np.isfinite(goal).all(axis=1)][0]
-            raise TandemError(f"{what} {_point(bad)} is not finite: {_AS_NUMBERS}")
-        if (away := self._out_of_reach(goal)).any():
-            bad = goal[away][0]
-            near = _point(self._nearest(bad[None])[0])
-            raise TandemError(f"{what} {_point(bad)} m is out of reach: the nearest the arm comes is {near} m")
-        return goal
-
-    def _clear(self, what: str, goal: StateArray) -> StateArray:
-        """Goals that are not inside a fixture."""
+        self._check_reach("reset: options['goal']", goal)
         for bad in goal[inside_fixtures(goal, self._config)]:
             raise TandemError(
-                f"{what} {_point(bad)} m: the object would be inside a fixture, or the upright box around it"
+                f"reset: options['goal'] {_point(bad)} m: the object would be inside a fixture, or the upright box "
+                "around it"
             )
         return goal
 
-    def _checked_box(self, goals: GoalBox) -> tuple[StateArray, StateArray]:
-        try:
-            box = np.array(goals, dtype=np.float64)
-        except (TypeError, ValueError):
-            box = np.empty(0)
+    def _sample(self, rng: np.random.Generator, num: int) -> StateArray:
+        """(num, 3) goals of the user's function or box, metres."""
+        if not callable(self._goals):
+            lower, upper = np.array(self._goals, dtype=np.float64)
+            return rng.uniform(lower, upper, (num, 3))
+        goal = np.array(self._goals(rng, num, self._config), dtype=np.float64)
+        if goal.shape != (num, 3):
+            raise TandemError(f"goals: the function's goal has shape {goal.shape}, not {(num, 3)}: give metres")
+        return goal
+
+    def _check_box(self, box: StateArray) -> None:
         if box.shape != (2, 3):
             raise TandemError(
-                f"goals = {goals!r}; choose one of {', '.join(GOAL_KINDS)}, a function (rng, num, world) -> (num, 3), "
-                "or a box ((x, y, z), (x, y, z)): its lowest and its highest corner, metres"
+                f"goals = {self._goals!r}; choose one of {', '.join(GOAL_KINDS)}, a function (rng, num, world) -> "
+                "(num, 3), or a box ((x, y, z), (x, y, z)): its lowest and its highest corner, metres"
             )
         if (box[0] > box[1]).any():
-            raise TandemError(f"goals = {goals!r}: the first corner of a box is the lowest: no number above the second")
-        corners = np.stack(np.meshgrid(*box.T), axis=-1).reshape(-1, 3)
-        self._checked("goals: the box's corner", corners, corners.shape)
-        return box[0], box[1]
+            raise TandemError(
+                f"goals = {self._goals!r}: the first corner of a box is the lowest: no number above the second"
+            )
+        self._check_reach("goals: the box's corner", np.stack(np.meshgrid(*box.T), axis=-1).reshape(-1, 3))
 
-    def _from_box(self, rng: np.random.Generator, num: int) -> StateArray:
-        return rng.uniform(self._lower, self._upper, (num, 3))
+    def _check_reach(self, what: str, goal: StateArray) -> None:
+        for bad in goal[self._out_of_reach(goal)]:
+            near = _point(self._nearest(bad[None])[0])
+            raise TandemError(f"{what} {_point(bad)} m is out of reach: the nearest the arm comes is {near} m")
 
     def _nearest(self, goal: StateArray) -> StateArray:
         """(N, 3) where the object can be brought, nearest to (N, 3); on the table it may be lower than the arm."""
@@ -136,24 +129,8 @@ class GoalSource:
         return reached
 
     def _out_of_reach(self, goal: StateArray) -> BoolArray:
-        far: BoolArray = np.linalg.norm(self._nearest(goal) - goal, axis=1) > self._success_distance_m
-        return far
-
-
-def succeeded(success: Success, achieved: Array, desired: Array) -> BoolArray:
-    """(...) what a user's function says of (..., 3) goals.
-
-    Raises:
-        TandemError: it says something of another shape, or that is neither true nor false.
-    """
-    found = np.asarray(success(achieved, desired))
-    shape = np.broadcast_shapes(achieved.shape, desired.shape)[:-1]
-    if found.shape != shape or found.dtype != np.bool_:
-        raise TandemError(
-            f"success: the function gave {found.dtype} of shape {found.shape} for goals of shape {achieved.shape}; "
-            f"give bool of shape {shape}"
-        )
-    return found
+        near: BoolArray = np.linalg.norm(self._nearest(goal) - goal, axis=1) <= self._success_distance_m
+        return ~near  # what is no number is out of reach, too
 
 
 def _point(position: StateArray) -> str:

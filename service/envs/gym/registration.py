@@ -12,20 +12,15 @@ import gymnasium
 from service.envs.tasks import EPISODE_STEPS, HARD_TASKS, TASKS
 
 TABLETOP_ID = "tandem/Tabletop-v1"
-
-
-def register_all() -> None:
-    """Register every environment; a second call changes nothing."""
-    tasks = {**TASKS, **HARD_TASKS}
-    options: dict[str, dict[str, str]] = {TABLETOP_ID: {}, **{task.id: {"task": name} for name, task in tasks.items()}}
-    for name in [name for name in options if name not in gymnasium.registry]:
-        gymnasium.register(
-            id=name,
-            entry_point="service.envs.gym.tabletop:TabletopEnv",
-            vector_entry_point="service.envs.gym.vector:TabletopVectorEnv",
-            max_episode_steps=EPISODE_STEPS,
-            kwargs=options[name],
-        )
-
-
-register_all()
+_OPTIONS: dict[str, dict[str, str]] = {
+    TABLETOP_ID: {},
+    **{task.id: {"task": name} for name, task in {**TASKS, **HARD_TASKS}.items()},
+}
+for _name, _options in _OPTIONS.items():
+    gymnasium.register(
+        id=_name,
+        entry_point="service.envs.gym.tabletop:TabletopEnv",
+        vector_entry_point="service.envs.gym.vector:TabletopVectorEnv",
+        max_episode_steps=EPISODE_STEPS,
+        kwargs=_options,
+    )

@@ -8,13 +8,14 @@ from typing import TYPE_CHECKING, Any
 
 import gymnasium
 import numpy as np
+from gymnasium.utils import seeding
 from numpy.typing import NDArray
 
 from service.base.errors import TandemError
 from service.base.types import BoolArray, FloatArray, StateArray
 from service.config import WorldConfig
 from service.envs.batch import WorldBatch
-from service.envs.gym.goals import Goals, GoalSource, Success, succeeded
+from service.envs.gym.goals import Goals, GoalSource, Success
 from service.envs.observations import ACTION, layouts
 from service.envs.tasks import find_task
 
@@ -25,6 +26,20 @@ Observation = dict[str, FloatArray]
 
 _FURTHEST_M = 10.0
 """Bound of every position: an object off the table falls for ever, a space needs an end."""
+
+
+@dataclass(frozen=True, slots=True)
+class EnvState:
+    """Everything that an environment of N worlds continues from."""
+
+    worlds: StateArray
+    """(N, S) ``WorldBatch.states``."""
+    goal: StateArray
+    """(N, 3) metres."""
+    elapsed: NDArray[np.int64]
+    """(N,) steps of the episode; 0 in a ``TabletopEnv``, whose time limit is its wrapper's."""
+    random: tuple[dict[str, Any], ...]
+    """State of each world's bit generator, which draws object and goal at the next reset."""
 
 
 class GoalWorlds:
@@ -61,6 +76,8 @@ class GoalWorlds:
         self._worlds = WorldBatch(self.config, num_worlds, num_threads=num_threads)
         self._source = GoalSource(self.goals, self.config, self._worlds.reach, success_distance_m)
         self._goal = self._worlds.object_position.copy()
+        self._elapsed = np.zeros(num_worlds, dtype=np.int64)
+        self._random = [seeding.np_random()[0] for _ in range(num_worlds)]
 
     def compute_reward(self, achieved_goal: NDArray[Any], desired_goal: NDArray[Any], info: Any) -> Any:
         """Reward of (..., 3) achieved for (..., 3) desired goals, metres: (...) float64, 1 where reached, else 0.
@@ -71,13 +88,55 @@ class GoalWorlds:
             TandemError: the user's ``success`` gave no bool for each.
         """
         achieved, desired = np.asarray(achieved_goal), np.asarray(desired_goal)
-        if self._success is not None:
-            return succeeded(self._success, achieved, desired).astype(np.float64)
-        return (np.linalg.norm(achieved - desired, axis=-1) <= self.success_distance_m).astype(np.float64)
+        if self._success is None:
+            return (np.linalg.norm(achieved - desired, axis=-1) <= self.success_distance_m).astype(np.float64)
+        found = np.asarray(self._success(achieved, desired))
+        shape = np.broadcast_shapes(achieved.shape, desired.shape)[:-1]
+        if found.shape != shape or found.dtype != np.bool_:
+            raise TandemError(
+                f"success: the function gave {found.dtype} of shape {found.shape} for goals of shape {achieved.shape}; "
+                f"give bool of shape {shape}"
+            )
+        return found.astype(np.float64)
 
-    def _draw_goals(self, rng: np.random.Generator, worlds: slice) -> None:
-        """Give new goals to worlds at their start."""
-        self._goal[worlds] = self._source.draw(rng, self._worlds.places.of(worlds))
+    def state(self) -> EnvState:
+        """Copy everything that :meth:`restore` needs."""
+        random = tuple(deepcopy(dict(each.bit_generator.state)) for each in self._random)
+        return EnvState(self._worlds.states.copy(), self._goal.copy(), self._elapsed.copy(), random)
+
+    def restore(self, state: EnvState) -> Observation:
+        """Go back to a saved state, of this or another environment of the same config; continues bit-identically.
+
+        Returns:
+            The observation there.
+
+        Raises:
+            ValueError: a state of another number of worlds.
+        """
+        if state.worlds.shape != self._worlds.states.shape:
+            raise ValueError(f"states: expected shape {self._worlds.states.shape}, got {state.worlds.shape}")
+        self._worlds.restore(state.worlds)
+        self._goal, self._elapsed = state.goal.copy(), state.elapsed.copy()
+        for generator, random in zip(self._random, state.random, strict=True):
+            generator.bit_generator.state = deepcopy(random)
+        return self._observe()[0]
+
+    def _start(self, worlds: BoolArray, goal: StateArray | None = None) -> None:
+        """Start new episodes, each from its own world's random numbers: no world depends on when others end.
+
+        Args:
+            worlds: (N,) where.
+            goal: (N, 3) in place of random goals, metres; random numbers go on as with these.
+        """
+        index = np.flatnonzero(worlds).tolist()
+        starts = [self._worlds.draw_starts(self._random[world], 1) for world in index]
+        self._worlds.restore(np.concatenate(starts), worlds)
+        for world in index:
+            here = slice(world, world + 1)
+            self._goal[here] = self._source.draw(self._random[world], self._worlds.places.of(here))
+        if goal is not None:
+            self._goal[:] = goal
+        self._elapsed[worlds] = 0
 
     def _observe(self) -> tuple[Observation, BoolArray]:
         """(N, ...) observations, and (N,) true where the object is at its goal."""
@@ -99,18 +158,6 @@ def goal_space(config: WorldConfig) -> gymnasium.spaces.Dict:
 def action_space() -> gymnasium.Space[FloatArray]:
     """Make the space of the actions of one world."""
     return gymnasium.spaces.Box(-1.0, 1.0, (ACTION.size,), np.float32)
-
-
-@dataclass(frozen=True, slots=True)
-class TabletopState:
-    """Everything a :class:`TabletopEnv` continues from."""
-
-    world: StateArray
-    """(S,) row of ``WorldBatch.states``."""
-    goal: StateArray
-    """(3,) metres."""
-    random: dict[str, Any]
-    """State of the bit generator that draws object and goal at the next reset."""
 
 
 class TabletopEnv(GoalWorlds, gymnasium.Env[Any, FloatArray]):
@@ -162,7 +209,7 @@ class TabletopEnv(GoalWorlds, gymnasium.Env[Any, FloatArray]):
         if render_mode not in (None, *self.metadata["render_modes"]):
             raise TandemError(f"TabletopEnv: render_mode = {render_mode!r}; choose rgb_array or None")
         super().__init__(1, 1, config, task, goals, success_distance_m, success)
-        self.render_mode = render_mode
+        self.np_random, self.render_mode = self._random[0], render_mode
         self.observation_space = goal_space(self.config)
         self.action_space = action_space()
         self._image_size = (width, height)
@@ -183,10 +230,8 @@ class TabletopEnv(GoalWorlds, gymnasium.Env[Any, FloatArray]):
         """
         goal = self._source.given(options, 1)
         super().reset(seed=seed, options=options)
-        self._worlds.reset(self.np_random)
-        self._draw_goals(self.np_random, slice(None))
-        if goal is not None:
-            self._goal[:] = goal
+        self._random = [self.np_random]
+        self._start(np.ones(1, dtype=bool), goal)
         observation, success = self._observe_first()
         return observation, {"is_success": success}
 
@@ -200,21 +245,9 @@ class TabletopEnv(GoalWorlds, gymnasium.Env[Any, FloatArray]):
         observation, success = self._observe_first()
         return observation, float(success), False, diverged, {"is_success": success, "diverged": diverged}
 
-    def state(self) -> TabletopState:
-        """Copy everything that :meth:`restore` needs; the elapsed steps of a time limit belong to its wrapper."""
-        random = deepcopy(self.np_random.bit_generator.state)
-        return TabletopState(self._worlds.states[0].copy(), self._goal[0].copy(), dict(random))
-
-    def restore(self, state: TabletopState) -> Observation:
-        """Go back to a saved state, of this or another environment of the same config; continues bit-identically.
-
-        Returns:
-            The observation there.
-        """
-        self._worlds.restore(state.world[None])
-        self._goal[0] = state.goal
-        self.np_random.bit_generator.state = deepcopy(state.random)
-        return self._observe_first()[0]
+    def restore(self, state: EnvState) -> Observation:
+        """Go back to a saved state; see ``GoalWorlds``."""
+        return _first(super().restore(state))
 
     def render(self) -> Any:
         """(height, width, 3) uint8 picture of the world and its goal; None without a render mode."""
@@ -235,4 +268,8 @@ class TabletopEnv(GoalWorlds, gymnasium.Env[Any, FloatArray]):
 
     def _observe_first(self) -> tuple[Observation, bool]:
         observation, success = self._observe()
-        return {name: value[0] for name, value in observation.items()}, bool(success[0])
+        return _first(observation), bool(success[0])
+
+
+def _first(observation: Observation) -> Observation:
+    return {name: value[0] for name, value in observation.items()}

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from copy import deepcopy
-from dataclasses import dataclass
 from typing import Any
 
 import gymnasium
@@ -14,27 +12,12 @@ from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
-from service.base.errors import TandemError
-from service.base.types import BoolArray, FloatArray, StateArray
+from service.base.types import BoolArray, FloatArray
 from service.config import WorldConfig
 from service.envs.gym.goals import Goals, Success
 from service.envs.gym.tabletop import GoalWorlds, Observation, action_space, goal_space
 
 Info = dict[str, Any]
-
-
-@dataclass(frozen=True, slots=True)
-class VectorState:
-    """Everything a :class:`TabletopVectorEnv` continues from."""
-
-    worlds: StateArray
-    """(N, S) ``WorldBatch.states``."""
-    goal: StateArray
-    """(N, 3) metres."""
-    elapsed: NDArray[np.int64]
-    """(N,) steps of the episode."""
-    random: tuple[dict[str, Any], ...]
-    """State of each world's bit generator."""
 
 
 class TabletopVectorEnv(GoalWorlds, gymnasium.vector.VectorEnv[Any, FloatArray, NDArray[Any]]):
@@ -57,7 +40,7 @@ class TabletopVectorEnv(GoalWorlds, gymnasium.vector.VectorEnv[Any, FloatArray, 
         num_threads: native threads; 0 for one per core.
 
     Raises:
-        TandemError: unknown ``task`` or ``goals``, or a number that is not positive.
+        TandemError: unknown ``task`` or ``goals``, or a distance that is not positive.
     """
 
     metadata: dict[str, Any] = {"render_modes": [], "autoreset_mode": AutoresetMode.SAME_STEP}  # noqa: RUF012 - as the base class has it
@@ -74,17 +57,12 @@ class TabletopVectorEnv(GoalWorlds, gymnasium.vector.VectorEnv[Any, FloatArray, 
         max_episode_steps: int = 50,
         num_threads: int = 0,
     ) -> None:
-        for name, value in {"num_envs": num_envs, "max_episode_steps": max_episode_steps}.items():
-            if value < 1:
-                raise TandemError(f"TabletopVectorEnv: {name} = {value}; give at least 1")
         super().__init__(num_envs, num_threads, config, task, goals, success_distance_m, success)
         self.num_envs = num_envs
         self.max_episode_steps = max_episode_steps
         self.single_observation_space, self.single_action_space = goal_space(self.config), action_space()
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
-        self._elapsed = np.zeros(num_envs, dtype=np.int64)
-        self._random = [seeding.np_random()[0] for _ in range(num_envs)]
 
     def reset(
         self, *, seed: int | Sequence[int | None] | None = None, options: Info | None = None
@@ -108,9 +86,7 @@ class TabletopVectorEnv(GoalWorlds, gymnasium.vector.VectorEnv[Any, FloatArray, 
             for world, each in enumerate(seeds):
                 if each is not None:
                     self._random[world] = seeding.np_random(each)[0]
-        self._start(np.ones(self.num_envs, dtype=bool))
-        if goal is not None:
-            self._goal[:] = goal
+        self._start(np.ones(self.num_envs, dtype=bool), goal)
         observation, success = self._observe()
         return observation, _with_masks({"is_success": success})
 
@@ -137,40 +113,9 @@ class TabletopVectorEnv(GoalWorlds, gymnasium.vector.VectorEnv[Any, FloatArray, 
             info |= _with_masks({"diverged": diverged & ~truncated}, ~truncated)
         return observation, reward, np.zeros_like(truncated), truncated, info
 
-    def state(self) -> VectorState:
-        """Copy everything that :meth:`restore` needs."""
-        random = tuple(deepcopy(dict(each.bit_generator.state)) for each in self._random)
-        return VectorState(self._worlds.states.copy(), self._goal.copy(), self._elapsed.copy(), random)
-
-    def restore(self, state: VectorState) -> Observation:
-        """Go back to a saved state, of this or another environment alike; continues bit-identically.
-
-        Returns:
-            The observation there.
-
-        Raises:
-            ValueError: a state of another number of worlds.
-        """
-        if state.worlds.shape != self._worlds.states.shape:
-            raise ValueError(f"states: expected shape {self._worlds.states.shape}, got {state.worlds.shape}")
-        self._worlds.restore(state.worlds)
-        self._goal, self._elapsed = state.goal.copy(), state.elapsed.copy()
-        for generator, random in zip(self._random, state.random, strict=True):
-            generator.bit_generator.state = deepcopy(random)
-        return self._observe()[0]
-
     def close_extras(self, **kwargs: Any) -> None:
         """Stop the native threads."""
         self._worlds.close()
-
-    def _start(self, worlds: BoolArray) -> None:
-        """Start new episodes, each from its own world's random numbers: no world depends on when others end."""
-        index = np.flatnonzero(worlds)
-        starts = [self._worlds.draw_starts(self._random[world], 1) for world in index]
-        self._worlds.restore(np.concatenate(starts), worlds)
-        for world in index:
-            self._draw_goals(self._random[world], slice(world, world + 1))
-        self._elapsed[worlds] = 0
 
 
 def _with_masks(values: Info, mask: BoolArray | None = None) -> Info:

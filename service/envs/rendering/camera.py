@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import mujoco
@@ -52,8 +53,12 @@ VIEWS = {
 }
 """Views by the names that commands take."""
 DEFAULT_VIEW = VIEWS["front"]
-_RANGES = {"azimuth": (-360.0, 360.0), "elevation": (-90.0, 90.0), "distance": (0.2, 20.0)}
-_FIELDS = {"azimuth": "azimuth_deg", "elevation": "elevation_deg", "distance": "distance_m"}
+_NUMBERS = {
+    "azimuth": ("azimuth_deg", -360.0, 360.0),
+    "elevation": ("elevation_deg", -90.0, 90.0),
+    "distance": ("distance_m", 0.2, 20.0),
+}
+"""Fields and ranges of the numbers that may be given."""
 
 
 def parse_view(text: str) -> View:
@@ -70,14 +75,13 @@ def parse_view(text: str) -> View:
     changes: dict[str, float] = {}
     for part in rest:
         key, _, value = part.partition("=")
-        if key not in _RANGES:
+        if key not in _NUMBERS:
             raise TandemError(f"camera {part!r}: {_HOW}")
-        low, high = _RANGES[key]
-        try:
+        field, low, high = _NUMBERS[key]
+        number = math.nan
+        with suppress(ValueError):
             number = float(value)
-        except ValueError:
-            number = math.nan
         if not low <= number <= high:
             raise TandemError(f"camera {part!r}: give a number from {low:g} to {high:g}")
-        changes[_FIELDS[key]] = number
+        changes[field] = number
     return replace(VIEWS[first], **changes)  # type: ignore[arg-type]

@@ -98,8 +98,6 @@ class SceneRenderer:
             self._add_goal(np.asarray(goal, dtype=np.float64))
         self._context.make_current()
         rectangle = self._rectangle if size is None else mujoco.MjrRect(0, 0, *size)
-        assert rectangle.width <= self._rectangle.width, "wider than the renderer"
-        assert rectangle.height <= self._rectangle.height, "higher than the renderer"
         image = np.empty((rectangle.height, rectangle.width, 3), dtype=np.uint8)
         mujoco.mjr_render(rectangle, self._scene, self._drawing)
         mujoco.mjr_readPixels(image, None, rectangle, self._drawing)

@@ -15,8 +15,7 @@ from service.base.types import FloatArray, StateArray
 from service.config.self_play import GameConfig, SelfPlayConfig
 from service.envs.batch import WorldBatch
 from service.envs.observations import bob_observation
-from service.envs.obstacles import inside_fixtures
-from service.envs.sampling import draw_goals
+from service.envs.sampling import draw_goals, inside_fixtures
 from service.envs.tasks import EPISODE_STEPS
 from service.generator.validity import FALLEN_BELOW_M, Verdict, classify_goal
 from service.policies.numpy_policy import NumpyMCPPolicy
@@ -235,14 +234,12 @@ class Game:
             self.players.begin()
 
     def _draw_goal(self) -> None:
-        worlds = self.worlds
         self.goal = draw_goals(
             self.players.goals,
             self._rng,
             self.world,
             self.players.success_distance_m,
-            start=worlds.object_position,
-            box=worlds.box_place,
+            self.worlds.places,
         )[0]
 
     def _seconds(self) -> str:

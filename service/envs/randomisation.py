@@ -1,7 +1,8 @@
-"""Compiled models that differ in what a world's configuration gives ranges for, made once for many worlds.
+"""What worlds draw where their configuration gives ranges: a compiled model of a bank, and noise of what is seen.
 
 Compiling a model takes milliseconds and stepping another one costs nothing, so worlds draw one of the bank at each
-start instead of changing one of their own (domain randomisation of dynamics, Peng et al. 2018).
+start instead of changing one of their own (domain randomisation of dynamics, Peng et al. 2018). Noise is a function of
+a key and a count, so that a world's state says all of it.
 """
 
 from __future__ import annotations
@@ -9,14 +10,15 @@ from __future__ import annotations
 import mujoco
 import numpy as np
 
-from service.base.errors import ConfigError
 from service.base.types import Array, StateArray
 from service.config import WorldConfig
-from service.config.objects import ObjectConfig
 from service.envs.robot import described
 from service.envs.scene import FIXTURE_PREFIX, build_model
 
 _SEED = 0
+KEYS = 1 << 52
+"""Keys are whole numbers below this, which a float64 holds exactly."""
+_GOLDEN, _FIRST, _SECOND = (np.uint64(each) for each in (0x9E3779B97F4A7C15, 0xBF58476D1CE4E5B9, 0x94D049BB133111EB))
 
 
 class ModelBank:
@@ -37,12 +39,9 @@ class ModelBank:
         num = config.randomisation.num_models if ranges else 1
         rows = [{name: float(values[index]) for name, values in self.drawn.items()} for index in range(num)]
         variants = [_variant(config, row) for row in rows]
-        try:
-            self.models = [
-                self.nominal if not row else _compile(variant, row) for variant, row in zip(variants, rows, strict=True)
-            ]
-        except ConfigError as error:  # of a size: the nominal world was built
-            raise ConfigError(f"world.randomisation.object_size: {error}") from None
+        self.models = [
+            self.nominal if not row else _compile(variant, row) for variant, row in zip(variants, rows, strict=True)
+        ]
         """M of them."""
         self.table_height_m: StateArray = self.drawn.get("table_height_m", np.zeros(num))
         """(M,) above where the configuration has it."""
@@ -68,20 +67,14 @@ def _variant(config: WorldConfig, drawn: dict[str, float]) -> WorldConfig:
     """The world with an object as drawn."""
     changed: dict[str, object] = {name: drawn[name] for name in ("object_mass_kg", "friction") if name in drawn}
     if (factor := drawn.get("object_size")) is not None:
-        if isinstance(config.object, ObjectConfig):
-            changed["object"] = _scaled(config.object, factor)
-        else:
-            changed["object_size_m"] = config.object_size_m * factor
+        shape = config.shape
+        size, mesh = tuple(factor * each for each in shape.size_m), shape.mesh
+        if mesh is not None:
+            center = tuple(factor * each for each in mesh.center_m)
+            of_size = {"scale": mesh.scale * factor, "center_m": center, "volume_m3": mesh.volume_m3 * factor**3}
+            mesh = mesh.model_copy(update=of_size)
+        changed["object"] = shape.model_copy(update={"size_m": size, "mesh": mesh})
     return config.model_copy(update=changed)
-
-
-def _scaled(shape: ObjectConfig, factor: float) -> ObjectConfig:
-    mesh = shape.mesh
-    if mesh is not None:
-        center = tuple(factor * each for each in mesh.center_m)
-        of_size = {"scale": mesh.scale * factor, "center_m": center, "volume_m3": mesh.volume_m3 * factor**3}
-        mesh = mesh.model_copy(update=of_size)
-    return shape.model_copy(update={"size_m": tuple(factor * each for each in shape.size_m), "mesh": mesh})
 
 
 def _compile(config: WorldConfig, drawn: dict[str, float]) -> mujoco.MjModel:
@@ -102,3 +95,21 @@ def _compile(config: WorldConfig, drawn: dict[str, float]) -> mujoco.MjModel:
         elif model.body_mocapid[body] < 0 and geom == model.body_geomadr[body]:  # once for a body of several geoms
             model.body_pos[body, 2] += height_m
     return model
+
+
+def normal(key: StateArray, count: StateArray, size: int) -> StateArray:
+    """(N, size) independent standard normal numbers for (N,) keys and counts; equal ones give equal numbers."""
+    draws = np.arange(2 * size, dtype=np.uint64)
+    state = (_mixed(key.astype(np.uint64)) + count.astype(np.uint64))[:, None] * np.uint64(2 * size) + draws
+    uniform = (_mixed(state) >> np.uint64(11)).astype(np.float64) * 2.0**-53
+    radius = np.sqrt(-2.0 * np.log1p(-uniform[:, :size]))
+    made: StateArray = radius * np.cos(2.0 * np.pi * uniform[:, size:])  # Box and Muller 1958
+    return made
+
+
+def _mixed(values: np.ndarray) -> np.ndarray:
+    """SplitMix64 (Steele et al. 2014)."""
+    mixed = values * _GOLDEN + _GOLDEN
+    mixed = (mixed ^ (mixed >> np.uint64(30))) * _FIRST
+    mixed = (mixed ^ (mixed >> np.uint64(27))) * _SECOND
+    return mixed ^ (mixed >> np.uint64(31))
