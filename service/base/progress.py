@@ -133,8 +133,8 @@ class Display:
                 get_time=self._get_time, speed_estimate_period=math.inf,
             )  # fmt: skip
             self._bars.start()
-        number = self._bars.add_task(task.title, total=task.total, completed=task.done, unit=task.unit, note=task.note)
-        task.bar = next(bar for bar in self._bars.tasks if bar.id == number)
+        self._bars.add_task(task.title, total=task.total, completed=task.done, unit=task.unit, note=task.note)
+        task.bar = self._bars.tasks[-1]
         task.display, task.told_s = self, self._get_time()
 
     def advanced(self, task: Task) -> None:
@@ -161,11 +161,8 @@ class Display:
         if self._bars is not None and self.moves:
             self._bars.answer = text
             return
-        try:
+        with suppress(OSError, ValueError):  # it is closed, or no file
             os.write(self.console.file.fileno(), f"{text}\n".encode())
-        except (OSError, ValueError):  # it has no descriptor
-            with suppress(OSError, ValueError):
-                self.console.file.write(f"{text}\n")
 
     def _stop(self) -> None:
         bars, self._bars = self._bars, None

@@ -7,7 +7,7 @@ from importlib.util import find_spec
 from pathlib import Path
 
 from service.base.errors import ConfigError
-from service.base.regular_files import read_regular
+from service.base.files import read_regular
 
 MAX_BYTES = 64 * 1024 * 1024
 """Of a file; usual are some ten thousand."""

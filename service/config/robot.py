@@ -8,8 +8,8 @@ from typing import Any, Literal, Self
 from pydantic import Field, ValidationError, model_validator
 
 from service.base.errors import ConfigError, did_you_mean
+from service.base.files import read_regular
 from service.base.parsing import MAX_YAML_CHARACTERS, ParseError, parse_yaml
-from service.base.regular_files import read_regular
 from service.config.frozen import FrozenModel, reason
 from service.config.model_files import absolute, digest_of
 from service.config.recipes import robots

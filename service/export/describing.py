@@ -8,8 +8,7 @@ from datetime import UTC, datetime
 import mujoco
 import numpy as np
 
-from service.base.git import git_commit
-from service.base.version import __version__
+from service.base.version import __version__, git_commit
 from service.config import WorldConfig
 from service.config.robot import Numbers, RobotConfig
 from service.envs.batch import DISPLACEMENT_M, MAX_TURN_RAD, WIDTH_CHANGE_M, WorldBatch

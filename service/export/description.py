@@ -8,9 +8,8 @@ from typing import Literal
 from pydantic import Field, ValidationError
 
 from service.base.errors import ExportError
-from service.base.files import os_errors
+from service.base.files import os_errors, read_regular
 from service.base.parsing import ParseError, parse_json
-from service.base.regular_files import read_regular
 from service.config.frozen import FrozenModel
 from service.config.robot import EffectorConfig, Vector
 from service.export.measurements import Measured

@@ -5,7 +5,6 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Callable
-from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -13,8 +12,17 @@ from pydantic import BaseModel
 
 from service.base.files import write_atomic
 from service.store.address import RedisAddress
-from service.store.disk import GOALS_FILE, STATUS_FILE, STOP_FILE
-from service.store.models import Condition, GoalGrid, Record, RunState, RunStatus, Trouble
+from service.store.models import (
+    GOALS_FILE,
+    STATUS_FILE,
+    STOP_FILE,
+    Condition,
+    GoalGrid,
+    Record,
+    RunState,
+    RunStatus,
+    Trouble,
+)
 from service.store.run_directory import RunDirectory
 
 if TYPE_CHECKING:
@@ -36,7 +44,6 @@ def reporting_to(directory: RunDirectory, run_id: str, address: RedisAddress | N
         return RunWriter(directory)
     from service.store.redis_writer import RedisWriter  # where there is no Redis, its package is not needed
 
-    assert directory.history is not None
     return RunWriter(directory, RedisWriter(address, run_id, run=directory.history.run, epoch=directory.epoch))
 
 
@@ -108,12 +115,11 @@ class RunWriter:
         return [*found, *(self._redis.troubles() if self._redis is not None else ())]
 
     def close(self) -> None:
-        """Write what still waits, for a bounded time, to every store, also where another fails."""
-        with ExitStack() as stack:
-            if self._redis is not None:
-                stack.callback(self._redis.close)
-            stack.callback(self._goals.flush)
-            stack.callback(self._status.flush)
+        """Write what still waits, for a bounded time."""
+        self._status.flush()
+        self._goals.flush()
+        if self._redis is not None:
+            self._redis.close()
 
 
 class _LatestFile:

@@ -3,9 +3,9 @@
 import pytest
 
 from service.base import epoch
-from service.base.epoch import claim_epoch, newest_epoch
 from service.base.errors import RunTakenError, StorageError
 from service.base.jsonl import JsonlWriter, read_jsonl
+from service.base.lock import claim_epoch, newest_epoch
 from service.store.checkpoints import CheckpointStore
 from service.store.run_directory import RunDirectory
 from tests.runs.runs import assert_one_line, play, tiny_config

@@ -4,7 +4,7 @@ import os
 
 import pytest
 
-from service.base.regular_files import open_regular, open_to_append, read_regular
+from service.base.files import open_regular, open_to_append, read_regular
 
 
 @pytest.fixture

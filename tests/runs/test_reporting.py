@@ -11,8 +11,8 @@ import httpx
 import pytest
 
 from service.base import lock
-from service.base.epoch import claim_epoch
 from service.base.errors import DivergedError, RunTakenError, StoreUnavailableError, TandemError
+from service.base.lock import claim_epoch
 from service.registry.registry import Registry
 from service.runs import train as module
 from service.runs.resuming import resumed_config

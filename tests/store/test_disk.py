@@ -18,7 +18,7 @@ from service.base.jsonl import JsonlWriter
 from service.base.lock import DirectoryLock
 from service.store import disk_reader
 from service.store.disk_reader import DiskReader, run_id_of
-from service.store.pulse import Pulse
+from service.store.models import Pulse
 from service.store.run_directory import RunDirectory
 from service.store.run_writer import RunWriter
 from service.store.tail import RecordFile

@@ -5,7 +5,7 @@ import json
 import pytest
 
 from service.base.errors import RunTakenError
-from service.store.keys import run_key
+from service.store.address import run_key
 from service.store.redis_reader import RedisReader
 from service.store.redis_writer import RedisWriter
 from service.store.run_directory import RunDirectory
