@@ -39,12 +39,6 @@ def without(monkeypatch):
             "tandem serve needs the package fastapi, .*'tandem-skills[serve]'",
         ),
         (
-            "minari",
-            (),
-            ["dataset", "panda-cube@champion", "--out", "some"],
-            "tandem dataset needs the package minari, .*'tandem-skills[data]'",
-        ),
-        (
             "h5py",  # said before anything is played, or goals are read
             (),
             ["dataset", "panda-cube@champion", "--out", "some", "--goals", "nowhere"],
@@ -56,7 +50,6 @@ def without(monkeypatch):
             ["pretrain", "--runtime", "ray"],
             "--runtime ray needs the package ray, .*'tandem-skills[cluster]'",
         ),
-        ("ray", (), ["train", "push,wall", "--runtime", "ray"], "'tandem-skills[cluster]'"),
         (
             "httpx",
             ("registry.client",),
