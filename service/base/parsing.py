@@ -107,7 +107,7 @@ _TOO_DEEP = f"nested more than {MAX_DEPTH} deep"
 class _Loader(yaml.SafeLoader):
     """PyYAML's safe loader, which refuses a key that is there twice; PyYAML alone takes the last one."""
 
-    def compose_mapping_node(self, anchor: str | None) -> yaml.MappingNode:
+    def compose_mapping_node(self, anchor: Any) -> yaml.MappingNode:
         """Read one mapping with all that is in it."""
         node: yaml.MappingNode = super().compose_mapping_node(anchor)
         counts = Counter((key.tag, key.value) for key, _ in node.value if isinstance(key, yaml.ScalarNode))

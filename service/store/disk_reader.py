@@ -51,14 +51,14 @@ def run_id_of(directory: Path) -> str:
 
     That of a study's run begins with the name of the study.
     """
-    path = _real(directory)
+    path = Path(os.path.realpath(directory))  # ``Path.resolve`` does not survive a loop of links
     name = f"{path.parent.name[: 127 - len(path.name[:100])]}-{path.name}" if is_study(path.parent) else path.name
     return re.sub(r"[^A-Za-z0-9._-]", "-", name).lstrip("._-")[:128] or "run"
 
 
 def study_of(directory: Path) -> str | None:
     """The name of the study whose run this is; None for a run of its own."""
-    parent = _real(directory).parent
+    parent = Path(os.path.realpath(directory)).parent
     return parent.name if is_study(parent) else None
 
 
@@ -175,7 +175,12 @@ class DiskReader:
         if (free := shutil.disk_usage(path).free) < FULL_BYTES:
             text = f"its process lives, and cannot say how it is: the disk of {path} is full ({free:,} bytes are left)"
             return status.suffering("disk", text)
-        return _stuck(status, path, age_s) if silent else status
+        if not silent:
+            return status
+        host, pid = holder(path) or ("", 0)
+        who = f"its process {pid} on {host}" if pid else "its process"
+        text = f"{who} lives, and has not been heard of for {age_s:.0f} s: it is frozen, hangs, or cannot write here"
+        return status.suffering("stuck", f"{text}; once it is ended, --resume goes on from its last checkpoint")
 
     @contextmanager
     def _using(self, run_id: str) -> Iterator[Path]:
@@ -224,11 +229,6 @@ def _is_run(path: Path) -> bool:
     return any(os.path.isfile(path / name) for name in (STATUS_FILE, "config.yaml"))
 
 
-def _real(path: Path) -> Path:
-    """A path without links; of a loop of links, which ``Path.resolve`` does not survive, some path in it."""
-    return Path(os.path.realpath(path))
-
-
 def _damaged(run_id: str, path: Path, cause: str) -> RunStatus:
     """The status of a directory of which nothing can be said but why."""
     try:
@@ -245,11 +245,3 @@ def _damaged(run_id: str, path: Path, cause: str) -> RunStatus:
         total_env_steps=1,
         last_error=cause,
     )
-
-
-def _stuck(status: RunStatus, path: Path, age_s: float) -> RunStatus:
-    """The status of a silent run whose process lives, since it has the lock."""
-    host, pid = holder(path) or ("", 0)
-    who = f"its process {pid} on {host}" if pid else "its process"
-    text = f"{who} lives, and has not been heard of for {age_s:.0f} s: it is frozen, hangs, or cannot write here"
-    return status.suffering("stuck", f"{text}; once it is ended, --resume goes on from its last checkpoint")

@@ -9,7 +9,7 @@ from service.base.errors import DamagedStoreError, UnknownRunError
 from service.base.parsing import ParseError, parse_with
 from service.store.address import RUNS, Content, RedisAddress, run_key
 from service.store.models import ACTIVE, SILENT_AFTER, Columns, GoalGrid, Pulse, Record, RunStatus
-from service.store.tail import columns_of, parse_record
+from service.store.tail import Table, parse_record
 
 TIMEOUT_S = 0.5
 _logger = logging.getLogger(__name__)
@@ -52,7 +52,10 @@ class RedisReader:
 
     def columns(self, run_id: str, names: Sequence[str] | None) -> Columns:
         """These metrics of all iterations that Redis keeps."""
-        return columns_of(self.metrics(run_id), names)
+        table = Table()
+        for record in self.metrics(run_id):
+            table.add(record)
+        return table.columns(names)
 
     def sample(self, run_id: str, name: str, number: int) -> list[float | None]:
         """One metric of about ``number`` records, evenly over those that Redis keeps."""

@@ -16,7 +16,7 @@ from redis.exceptions import RedisError, WatchError
 from service.base.errors import RunTakenError
 from service.base.jsonl import plain
 from service.store import address as keys
-from service.store.address import RedisAddress, reason_of
+from service.store.address import Content, RedisAddress, reason_of
 from service.store.models import GoalGrid, Record, RunStatus, Trouble
 
 TICK_S = 0.5
@@ -64,10 +64,10 @@ class RedisWriter:
                 )
             self._client.set(self._key("epoch"), self._mine)
             self._client.delete(self._key("stop"))
-        self._status: RunStatus | None = None
-        self._grid: GoalGrid | None = None
-        self._sent_status: RunStatus | None = None
-        self._sent_grid: GoalGrid | None = None
+        self._newest: dict[Content, RunStatus | GoalGrid] = {}
+        """Status and grid as they are now."""
+        self._there: dict[Content, RunStatus | GoalGrid] = {}
+        """Status and grid as Redis has them."""
         self._told: SimpleQueue[tuple[int, str]] = SimpleQueue()
         """Iterations and texts of records that the thread has not seen yet."""
         self._waiting: list[tuple[int, str]] = []
@@ -83,7 +83,7 @@ class RedisWriter:
 
     def status(self, status: RunStatus) -> None:
         """Replace what is known about the run."""
-        self._status = status
+        self._newest["status"] = status
 
     def metrics(self, record: Record) -> None:
         """Append one iteration's metrics; those of it and of later ones, made before the run went back, are dropped."""
@@ -91,7 +91,7 @@ class RedisWriter:
 
     def goals(self, grid: GoalGrid) -> None:
         """Replace the grid."""
-        self._grid = grid
+        self._newest["goals"] = grid
 
     def stop_requested(self) -> bool:
         """Whether the run was asked to stop since it was started, as of the last message to Redis."""
@@ -160,7 +160,7 @@ class RedisWriter:
             RunTakenError: a newer process reports under this run id.
         """
         self._take_in()
-        status, grid, records = self._status, self._grid, self._waiting[:BATCH]
+        newest, records = dict(self._newest), self._waiting[:BATCH]
         with self._client.pipeline() as pipe:
             pipe.watch(self._key("epoch"))
             if self._is_newer(pipe.get(self._key("epoch"))):
@@ -168,11 +168,11 @@ class RedisWriter:
             pipe.multi()
             pipe.set(self._key("epoch"), self._mine)  # a Redis that lost its data has forgotten it
             pipe.set(self._key("heartbeat"), 1, px=int(1000 * keys.HEARTBEAT_S))
-            if status is not None and status is not self._sent_status:
-                pipe.zadd(keys.RUNS, {self._run_id: status.started.timestamp()})
-                pipe.set(self._key("status"), status.model_dump_json())
-            if grid is not None and grid is not self._sent_grid:
-                pipe.set(self._key("goals"), grid.model_dump_json())
+            for content, value in newest.items():
+                if value is not self._there.get(content):
+                    pipe.set(self._key(content), value.model_dump_json())
+                if isinstance(value, RunStatus):
+                    pipe.zadd(keys.RUNS, {self._run_id: value.started.timestamp()})
             key = self._key("metrics")
             for iteration, text in records:
                 pipe.zremrangebyscore(key, iteration, "+inf")
@@ -180,12 +180,12 @@ class RedisWriter:
             pipe.zremrangebyrank(key, 0, -keys.MAX_RECORDS - 1)
             pipe.exists(self._key("stop"))
             self._stop = bool(pipe.execute()[-1])
-        self._sent_status, self._sent_grid = status, grid
+        self._there = newest
         self._sent.extend(records)
         del self._waiting[:BATCH]
         if self._connected_anew.is_set():  # a Redis that was killed has forgotten what came last
             self._connected_anew.clear()
-            self._sent_status = self._sent_grid = None
+            self._there = {}
             self._waiting[:0] = self._sent
             self._sent.clear()
 
@@ -207,4 +207,4 @@ class RedisWriter:
         return self._told.qsize() + len(self._waiting)
 
     def _pending(self) -> bool:
-        return bool(self._num_waiting()) or (self._status, self._grid) != (self._sent_status, self._sent_grid)
+        return self._num_waiting() > 0 or self._newest != self._there

@@ -284,24 +284,25 @@ class RunDirectory:
 
     def record(self, metrics: dict[str, float]) -> None:
         """Append one iteration's metrics to metrics.jsonl and TensorBoard; where a disk is full they wait in memory."""
-        with self._keep_running(self.metrics_file):
+        with self.keep_running(self.metrics_file):
             self._metrics.append(metrics)
         if self._events is not None:
-            with self._keep_running(self._events.path):
+            with self.keep_running(self._events.path):
                 self._events.add(metrics)
 
     def record_goals(self, iteration: int, num_env_steps: int, goals: StateArray) -> None:
         """Append a sample of an iteration's valid proposals: (M, 7) start x y z, goal x y z (metres), solved 0/1."""
-        with self._keep_running(self.goals_file):
+        with self.keep_running(self.goals_file):
             self._goals.append({"iteration": iteration, "env_steps": num_env_steps, "goals": np.round(goals, 4)})
 
     def keep_recording(self, path: Path) -> None:
         """Put a video aside that is about to be replaced; of more than twenty, the oldest go."""
-        with self._keep_running(path), os_errors("write", self.path / RECORDINGS), suppress(FileNotFoundError):
+        kept_in = self.path / RECORDINGS
+        with self.keep_running(kept_in), os_errors("write", kept_in), suppress(FileNotFoundError):
             when = datetime.fromtimestamp(path.stat().st_mtime, UTC).strftime("%Y%m%dT%H%M%S")
-            (self.path / RECORDINGS).mkdir(exist_ok=True)
-            path.replace(self.path / RECORDINGS / f"{path.stem}-{when}{path.suffix}")
-            kept = sorted((self.path / RECORDINGS).glob(f"{path.stem}-*{path.suffix}"))
+            kept_in.mkdir(exist_ok=True)
+            path.replace(kept_in / f"{path.stem}-{when}{path.suffix}")
+            kept = sorted(kept_in.glob(f"{path.stem}-*{path.suffix}"))
             for old in kept[:-MAX_RECORDINGS]:
                 old.unlink(missing_ok=True)
 
@@ -313,13 +314,13 @@ class RunDirectory:
         path, data = self.diverged / f"round-{name}.npz", io.BytesIO()
         np.savez(data, states=np.stack(states), actions=np.stack(actions))
         _logger.warning("physics diverged in %d worlds, which go on from sound states; see %s", len(states), path)
-        with self._keep_running(self.diverged), os_errors("write", path):
+        with self.keep_running(self.diverged), os_errors("write", path):
             write_atomic(path, data.getvalue())
 
     def sync(self) -> dict[str, Extent]:
         """Wait until the disk has every record, and say what there is: a checkpoint must not know more than they do."""
         for writer in self._writers():
-            with self._keep_running(writer.path):
+            with self.keep_running(writer.path):
                 writer.sync()
         return {writer.path.name: writer.extent for writer in (self._metrics, self._goals)}
 
@@ -349,9 +350,9 @@ class RunDirectory:
         return [self._metrics, self._goals, *([self._events] if self._events is not None else [])]
 
     def problems(self) -> list[str]:
-        """Why records or checkpoints cannot be written at the moment; empty when all is well."""
-        kept = (*(writer.path for writer in self._writers()), self.checkpoints)
-        return [self._failing[path] for path in kept if path in self._failing]
+        """Why records, reports or checkpoints cannot be written at the moment; empty when all is well."""
+        minor = self.diverged, self.path / RECORDINGS
+        return [problem for path, problem in list(self._failing.items()) if path not in minor]
 
     @contextmanager
     def noting(self, path: Path) -> Iterator[None]:
@@ -364,7 +365,7 @@ class RunDirectory:
         self._failing.pop(path, None)
 
     @contextmanager
-    def _keep_running(self, path: Path) -> Iterator[None]:
+    def keep_running(self, path: Path) -> Iterator[None]:
         """Turn a full disk into one warning for ``path`` until a write succeeds again: the run does not end for it."""
         known = path in self._failing
         try:

@@ -5,12 +5,11 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Callable
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 from pydantic import BaseModel
 
-from service.base.files import write_atomic
+from service.base.files import os_errors, write_atomic
 from service.store.address import RedisAddress
 from service.store.models import (
     GOALS_FILE,
@@ -69,8 +68,8 @@ class RunWriter:
         """Take back the stop request of an earlier process."""
         self._directory, self._redis = directory, redis
         self._stop_file = directory.path / STOP_FILE
-        self._status = _LatestFile(directory.path / STATUS_FILE, STATUS_INTERVAL_S, clock)
-        self._goals = _LatestFile(directory.path / GOALS_FILE, GOALS_INTERVAL_S, clock)
+        self._status = _LatestFile(directory, STATUS_FILE, STATUS_INTERVAL_S, clock)
+        self._goals = _LatestFile(directory, GOALS_FILE, GOALS_INTERVAL_S, clock)
         self._told: tuple[RunState, Condition] | None = None
         try:
             self._stop_file.unlink(missing_ok=True)
@@ -110,8 +109,7 @@ class RunWriter:
 
     def troubles(self) -> list[Trouble]:
         """Problems at the moment, such as files that cannot be written; empty when all is well."""
-        problems = [self._status.problem, self._goals.problem, *self._directory.problems()]
-        found = [Trouble("disk", problem) for problem in problems if problem is not None]
+        found = [Trouble("disk", problem) for problem in self._directory.problems()]
         return [*found, *(self._redis.troubles() if self._redis is not None else ())]
 
     def close(self) -> None:
@@ -125,11 +123,10 @@ class RunWriter:
 class _LatestFile:
     """Holds the newest of what it is given, not older than ``interval_s`` when something newer comes."""
 
-    def __init__(self, path: Path, interval_s: float, clock: Callable[[], float]) -> None:
-        self._path, self._interval_s, self._clock = path, interval_s, clock
+    def __init__(self, directory: RunDirectory, name: str, interval_s: float, clock: Callable[[], float]) -> None:
+        self._directory, self._path, self._interval_s, self._clock = directory, directory.path / name, interval_s, clock
         self._waiting: BaseModel | None = None
         self._written_s = float("-inf")
-        self.problem: str | None = None
 
     def put(self, content: BaseModel, *, now: bool = False) -> None:
         self._waiting = content
@@ -140,12 +137,6 @@ class _LatestFile:
         if self._waiting is None:
             return
         self._written_s = self._clock()
-        try:
+        with self._directory.keep_running(self._path), os_errors("write", self._path):
             write_atomic(self._path, self._waiting.model_dump_json().encode() + b"\n", flush=False)
-        except OSError as error:
-            problem = f"{self._path.name} cannot be written: {error.strerror}"
-            if self.problem is None:
-                _logger.warning("%s: %s; the run goes on", self._path.parent, problem)
-            self.problem = problem
-        else:
-            self._waiting, self.problem = None, None
+            self._waiting = None

@@ -7,7 +7,7 @@ import math
 import sys
 from array import array
 from bisect import bisect_left
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from io import BytesIO
 from pathlib import Path
@@ -85,6 +85,15 @@ class RecordFile:
         self._path, self._lock = path, Lock()
         self.forget()
 
+    def forget(self) -> None:
+        """Free the memory of all columns."""
+        self._table = Table()
+        self._end, self._seal = 0, b""
+        self.num_bytes = 0
+        """Memory that the columns take."""
+        self.num_passed_over = 0
+        """Lines that are no records, of those in columns."""
+
     def after(self, iteration: int) -> list[Record]:
         """The records of iterations above ``iteration``, in order."""
         with self._open() as file:
@@ -126,15 +135,6 @@ class RecordFile:
             self.num_bytes = sum(8 * len(column) for column in self._table.values())
             return self._table.columns(names)
 
-    def forget(self) -> None:
-        """Free the memory of all columns."""
-        self._table = Table()
-        self._end, self._seal = 0, b""
-        self.num_bytes = 0
-        """Memory that the columns take."""
-        self.num_passed_over = 0
-        """Lines that are no records, of those in columns."""
-
     def _open(self) -> BinaryIO:
         try:
             return open_regular(self._path)
@@ -150,7 +150,9 @@ def parse_record(text: bytes) -> Record | None:
         record = None
         with suppress(ParseError):
             record = parse_json(text, "record", allow_nan=True)
-    iteration = record.get("iteration") if isinstance(record, dict) else None
+    if not isinstance(record, dict):
+        return None
+    iteration = record.get("iteration")
     if type(iteration) is not int or abs(iteration) > MAX_ITERATION:
         return None
     return {
@@ -158,14 +160,6 @@ def parse_record(text: bytes) -> Record | None:
         for name, value in record.items()
         if value is None or type(value) in (int, float)
     }
-
-
-def columns_of(records: Iterable[Record], names: Sequence[str] | None) -> Columns:
-    """Records in columns."""
-    table = Table()
-    for record in records:
-        table.add(record)
-    return table.columns(names)
 
 
 def _iteration(record: Record) -> int:
