@@ -55,7 +55,7 @@ def test_unset_and_empty_mean_none(monkeypatch):
     assert address_from_environment() is None
 
 
-def test_nobody_there():
+def test_no_server_there():
     with socket.socket() as taken:  # bound, and nobody listens
         taken.bind(("127.0.0.1", 0))
         address = RedisAddress(f"redis://:{SECRET}@127.0.0.1:{taken.getsockname()[1]}/0")

@@ -178,10 +178,10 @@ def test_kill_9_at_any_moment_leaves_a_whole_checkpoint(store: CheckpointStore) 
 
 
 def test_what_a_killed_writer_left_is_ignored_and_removed(store: CheckpointStore) -> None:
-    save(store, 20)
+    store.directory.mkdir()
     leftover = store.directory / ".tmp-123-abc"
     leftover.write_bytes(b"half")
-    assert store.load_latest().step == 20
+    assert store.steps() == []
     save(store, 40)
     assert not leftover.exists()
 

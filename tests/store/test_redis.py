@@ -67,22 +67,20 @@ def test_killed_and_back_at_the_same_place(redis, writer, reader):
     wait_until(lambda: writer.troubles() == [])
 
 
-@pytest.mark.parametrize("timeout_s", [0.3, 3600.0])
-def test_stopped_for_a_while(redis, reader, monkeypatch, timeout_s):
-    """It answers nobody, and its connections stay open: worse than being dead."""
-    monkeypatch.setattr(redis_writer, "TIMEOUT_S", timeout_s)
+def test_stopped_for_a_while(redis, reader, monkeypatch):
+    """It does not answer, and its connections stay open: worse than being dead."""
+    monkeypatch.setattr(redis_writer, "TIMEOUT_S", 0.3)
     writer = a_writer(redis.address, "cube")
     train(writer, range(1, 6))
     wait_until(lambda: reader.runs() != [])
-    os.kill(redis.server.pid, signal.SIGSTOP)
+    os.kill(redis.pid, signal.SIGSTOP)
     try:
         assert returns(lambda: train(writer, range(6, 40)))
         with pytest.raises(StoreUnavailableError, match="no answer in time"):
             reader.ready()
-        if timeout_s < 1.0:
-            assert "no answer in time" in wait_until(writer.troubles)[0].text
+        assert "no answer in time" in wait_until(writer.troubles)[0].text
     finally:
-        os.kill(redis.server.pid, signal.SIGCONT)
+        os.kill(redis.pid, signal.SIGCONT)
     wait_until(lambda: iterations(reader)[-1:] == [39])
     assert iterations(reader) == list(range(1, 40))
     writer.close()
@@ -118,23 +116,6 @@ def test_a_restart_between_two_messages_is_noticed(redis, reader, monkeypatch):
     assert reader.goals("cube") == a_grid(10)
 
 
-def test_a_run_that_goes_back_by_itself(writer, reader):
-    """As when the machine that had the newest state is lost."""
-    train(writer, range(1, 8))
-    train(writer, range(4, 6))
-    wait_until(lambda: reader.runs() and iterations(reader) == [1, 2, 3, 4, 5])
-    assert reader.run("cube").iteration == 5
-
-
-def test_a_disk_that_lost_everything_gets_what_comes(redis, writer, reader):
-    train(writer, range(1, 4))
-    wait_until(lambda: reader.runs() != [])
-    redis.address.client(1.0).flushall()
-    writer.status(a_status(iteration=4))
-    wait_until(lambda: reader.runs() != [])
-    assert reader.run("cube").iteration == 4
-
-
 def test_too_many_records_for_memory_are_counted(redis, writer, reader, monkeypatch):
     monkeypatch.setattr(redis_writer, "MAX_WAITING", 10)
     writer.status(a_status())
@@ -149,47 +130,28 @@ def test_too_many_records_for_memory_are_counted(redis, writer, reader, monkeypa
     assert iterations(reader) == list(range(6, 16))
 
 
-def test_history_in_redis_is_bounded(writer, reader, monkeypatch):
+def test_closing_sends_what_waits_and_history_in_redis_is_bounded(redis, reader, monkeypatch):
     monkeypatch.setattr(address, "MAX_RECORDS", 20)
+    monkeypatch.setattr(redis_writer, "BATCH", 7)
+    writer = a_writer(redis.address)
     for number in range(1, 31):
         writer.metrics(a_record(number))
-    writer.status(a_status())
-    wait_until(lambda: reader.runs() and iterations(reader)[-1:] == [30])
+    writer.status(a_status(state="finished"))
+    writer.close()
     assert iterations(reader) == list(range(11, 31))
+    assert reader.run("cube").state == "finished"
 
 
 def test_closing_waits_for_a_bounded_time(redis, caplog, monkeypatch):
     monkeypatch.setattr(redis_writer, "TIMEOUT_S", 3600.0)
     writer = a_writer(redis.address, "cube")
-    os.kill(redis.server.pid, signal.SIGSTOP)
+    os.kill(redis.pid, signal.SIGSTOP)
     try:
         writer.metrics(a_record(1))
         assert returns(lambda: writer.close(timeout_s=0.3))
     finally:
-        os.kill(redis.server.pid, signal.SIGCONT)
+        os.kill(redis.pid, signal.SIGCONT)
     assert_one_line(caplog.messages[-1], "did not get the end of run cube", "its files have it")
-
-
-def test_closing_sends_what_waits(redis, reader):
-    writer = a_writer(redis.address, "cube")
-    for number in range(1, 601):  # more than one message takes
-        writer.metrics(a_record(number))
-    writer.status(a_status(state="finished"))
-    writer.close()
-    assert len(iterations(reader)) == 600
-    assert reader.run("cube").state == "finished"
-
-
-def test_a_reader_goes_on_when_redis_is_back(redis, writer, reader):
-    writer.status(a_status())
-    wait_until(lambda: reader.runs() != [])
-    redis.kill()
-    with pytest.raises(StoreUnavailableError) as error:
-        reader.run("cube")
-    assert_one_line(error.value, f"Redis at {redis.address}")
-    redis.revive()
-    wait_until(lambda: reader.runs() != [])  # it may have forgotten the last second, which the writer knows
-    assert reader.run("cube").run_id == "cube"
 
 
 def test_no_thread_and_no_heartbeat_is_left(redis, writer):
@@ -238,9 +200,7 @@ def test_another_run_of_the_same_id_is_refused_while_the_first_reports(redis, wr
     other.close()
 
 
-@pytest.mark.parametrize(
-    ("found", "goes_on"), [(b"a:3", True), (b"a:2", True), (b"a:4", False), (b"b:1", False), (b"7", False)]
-)
+@pytest.mark.parametrize(("found", "goes_on"), [(b"a:2", True), (b"a:4", False), (b"b:1", False), (b"7", False)])
 def test_only_a_higher_epoch_or_another_run_is_newer(redis, reader, found, goes_on):
     """A Redis that begins again from an older copy has an older number."""
     client, key = redis.address.client(1.0), run_key("cube", "epoch")
@@ -271,7 +231,7 @@ def test_a_run_does_not_begin_without_the_redis_it_was_given(redis):
     assert_one_line(error.value, f"Redis at {redis.address}", "refused")
 
 
-@pytest.mark.parametrize("content", [b"", b"{}", b"\xff", b"[1]", b'{"run_id": "cube", "heartbeat": "now"}'])
+@pytest.mark.parametrize("content", [b"", b'{"run_id": "cube", "heartbeat": "now"}'])
 def test_a_damaged_status_hides_only_its_own_run(redis, reader, caplog, content):
     for run_id in ("cube", "sound"):
         writer = a_writer(redis.address, run_id)
@@ -301,17 +261,4 @@ def test_a_key_of_another_type_is_damage_or_what_redis_says(redis, reader, write
     ((_, warning),) = wait_until(writer.troubles)
     assert_one_line(warning, "WRONGTYPE", "1 records wait")
     client.delete(run_key("cube", "metrics"))
-    wait_until(lambda: iterations(reader) == [1])
-
-
-def test_full_of_data(redis, writer, reader):
-    """Redis may refuse to write when its memory is full; that passes."""
-    writer.status(a_status())
-    wait_until(lambda: reader.runs() != [])
-    client = redis.address.client(1.0)
-    client.config_set("maxmemory", "1")
-    writer.metrics(a_record(1))
-    ((_, warning),) = wait_until(writer.troubles)
-    assert "maxmemory" in warning
-    client.config_set("maxmemory", "0")
     wait_until(lambda: iterations(reader) == [1])
