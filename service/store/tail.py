@@ -11,7 +11,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from io import BytesIO
 from pathlib import Path
-from threading import Lock
+from threading import RLock
 from typing import BinaryIO
 
 import msgspec
@@ -59,11 +59,12 @@ class Table(dict[str, "array[float]"]):
     def columns(self, names: Sequence[str] | None) -> Columns:
         """Metrics over all iterations; None for all that there are. Names that no record has are left out."""
         there = sorted(self.keys() - set(INDEX))
+        wanted = there if names is None else [name for name in names if name in there]
         iterations, env_steps = map(self._whole, INDEX)
         return Columns(
             iteration=iterations.astype(np.int64),
             env_steps=np.nan_to_num(env_steps).astype(np.int64),
-            metrics={name: self._whole(name) for name in there if names is None or name in names},
+            metrics={name: self._whole(name) for name in wanted},
             names=tuple(there),
         )
 
@@ -82,17 +83,18 @@ class RecordFile:
     """
 
     def __init__(self, path: Path) -> None:
-        self._path, self._lock = path, Lock()
+        self._path, self._lock = path, RLock()
         self.forget()
 
     def forget(self) -> None:
         """Free the memory of all columns."""
-        self._table = Table()
-        self._end, self._seal = 0, b""
-        self.num_bytes = 0
-        """Memory that the columns take."""
-        self.num_passed_over = 0
-        """Lines that are no records, of those in columns."""
+        with self._lock:
+            self._table = Table()
+            self._end, self._seal = 0, b""
+            self.num_bytes = 0
+            """Memory that the columns take."""
+            self.num_passed_over = 0
+            """Lines that are no records, of those in columns."""
 
     def after(self, iteration: int) -> list[Record]:
         """The records of iterations above ``iteration``, in order."""

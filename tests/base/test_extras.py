@@ -34,7 +34,6 @@ WITHOUT = {
     # said before anything is played, or goals are read
     "h5py": ((), ["dataset", "panda-cube@champion", "--out", "x", "--goals", "y"], "tandem dataset needs", "data"),
     "ray": ((), ["pretrain", "--runtime", "ray"], "--runtime ray needs", "cluster"),
-    "httpx": (("registry.client",), ["train", "wall", "--registry", "http://127.0.0.1:9"], "fetching", "serve"),
 }
 
 
@@ -46,6 +45,13 @@ def test_a_command_says_which_one_to_install(tmp_path, monkeypatch, without, pac
     result = CliRunner().invoke(app, arguments)
     assert result.exit_code == 2, result.output
     assert_one_line(result.stderr, said, f"the package {package}, which is not installed", f"'tandem-skills[{extra}]'")
+
+
+def test_what_fetches_says_which_one_to_install(without):
+    without("httpx", ours=["service.registry.client"])
+    with pytest.raises(MissingPackageError) as error:
+        import_module("service.registry.client")
+    assert_one_line(error.value, "fetching primitives needs the package httpx", "'tandem-skills[serve]'")
 
 
 def test_every_extra_that_a_command_needs_is_named_somewhere():

@@ -52,7 +52,8 @@ def returns(call):
 # --- away ------------------------------------------------------------------------------------------------------------
 
 
-def test_killed_and_back_at_the_same_place(redis, writer, reader):
+def test_killed_and_back_at_the_same_place(redis, writer, reader, monkeypatch):
+    monkeypatch.setattr(redis_writer, "BATCH", 7)  # some wait when the newest are sent again
     train(writer, range(1, 31))
     wait_until(lambda: reader.runs() and iterations(reader)[-1:] == [30])
     redis.kill()
