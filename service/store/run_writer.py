@@ -65,16 +65,18 @@ class RunWriter:
         *,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
-        """Take back the stop request of an earlier process."""
+        """Take back the stop request of an earlier process.
+
+        Raises:
+            StorageError: it cannot be deleted; the run would stop at once.
+        """
         self._directory, self._redis = directory, redis
         self._stop_file = directory.path / STOP_FILE
         self._status = _LatestFile(directory, STATUS_FILE, STATUS_INTERVAL_S, clock)
         self._goals = _LatestFile(directory, GOALS_FILE, GOALS_INTERVAL_S, clock)
         self._told: tuple[RunState, Condition] | None = None
-        try:
+        with os_errors("write", self._stop_file):
             self._stop_file.unlink(missing_ok=True)
-        except OSError as error:
-            _logger.warning("cannot delete %s: %s; the run will stop at once", self._stop_file, error.strerror)
 
     def check(self) -> None:
         """Assert that this process is still the one that runs the run.
