@@ -136,9 +136,10 @@ class _LatestFile:
             self.flush()
 
     def flush(self) -> None:
-        if self._waiting is None:
+        content = self._waiting
+        if content is None:
             return
         self._written_s = self._clock()
         with self._directory.keep_running(self._path), os_errors("write", self._path):
-            write_atomic(self._path, self._waiting.model_dump_json().encode() + b"\n", flush=False)
+            write_atomic(self._path, content.model_dump_json().encode() + b"\n", flush=False)
             self._waiting = None
