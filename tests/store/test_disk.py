@@ -328,22 +328,6 @@ def bytes_read():
         return int(file.readline().removeprefix("rchar:"))
 
 
-def test_a_metric_may_come_later_and_be_missing(growing):
-    _, writer, records = growing
-    for number in range(1, 4):
-        writer.append(a_record(number, **{f"only/{number}": number}))
-    found = records.columns(None)
-    assert found.names == ("bob/success_rate", "only/1", "only/2", "only/3")
-    assert found.env_steps.tolist() == [100, 200, 300]
-    nan = float("nan")
-    for number, values in ((1, [1, nan, nan]), (2, [nan, 2, nan]), (3, [nan, nan, 3])):
-        assert found.metrics[f"only/{number}"].tolist() == pytest.approx(values, nan_ok=True)
-    assert records.num_bytes > 0
-    records.forget()
-    assert records.num_bytes == 0
-    assert records.columns(["only/2"]).metrics["only/2"][1] == 2
-
-
 def test_a_torn_line_waits_for_its_end(growing):
     path, writer, records = growing
     writer.append(a_record(1))

@@ -7,9 +7,9 @@ import time
 
 import pytest
 
-from service.base.errors import DamagedStoreError, RunTakenError, StoreUnavailableError
+from service.base.errors import DamagedStoreError, StoreUnavailableError
 from service.store import address, redis_writer
-from service.store.address import RUNS, RedisAddress, run_key
+from service.store.address import RUNS, run_key
 from service.store.redis_reader import RedisReader
 from tests.runs.runs import assert_one_line
 from tests.store.stores import a_grid, a_record, a_status, a_writer, wait_until
@@ -187,20 +187,6 @@ def test_the_next_process_of_a_run_reports_and_the_one_before_falls_silent(redis
     assert redis.address.client(1.0).get(run_key("cube", "epoch")) == b"a:2"
 
 
-def test_another_run_of_the_same_id_is_refused_while_the_first_reports(redis, writer, reader):
-    writer.status(a_status(iteration=1))
-    wait_until(lambda: reader.runs() != [])
-    with pytest.raises(RunTakenError) as error:
-        a_writer(redis.address, run="b")
-    assert_one_line(error.value, "another run with the id cube reports to Redis at", "wait 10 s", "--run-dir")
-    a_writer(redis.address, "cube-2", run="b").close()
-    writer.close()
-    other = a_writer(redis.address, run="b")
-    other.status(a_status(iteration=2))
-    wait_until(lambda: reader.run("cube").iteration == 2)
-    other.close()
-
-
 @pytest.mark.parametrize(("found", "goes_on"), [(b"a:2", True), (b"a:4", False), (b"b:1", False), (b"7", False)])
 def test_only_a_higher_epoch_or_another_run_is_newer(redis, reader, found, goes_on):
     """A Redis that begins again from an older copy has an older number."""
@@ -218,18 +204,6 @@ def test_only_a_higher_epoch_or_another_run_is_newer(redis, reader, found, goes_
 
 
 # --- what is wrong ---------------------------------------------------------------------------------------------------
-
-
-def test_a_run_does_not_begin_without_the_redis_it_was_given(redis):
-    wrong = RedisAddress(redis.address.url.replace("redis://:", "redis://:not-"))
-    with pytest.raises(StoreUnavailableError, match="wrong or missing password"):
-        a_writer(wrong)
-    with pytest.raises(StoreUnavailableError, match="wrong or missing password"):
-        RedisReader(wrong).runs()
-    redis.kill()
-    with pytest.raises(StoreUnavailableError) as error:
-        a_writer(redis.address, "cube")
-    assert_one_line(error.value, f"Redis at {redis.address}", "refused")
 
 
 @pytest.mark.parametrize("content", [b"", b'{"run_id": "cube", "heartbeat": "now"}'])
