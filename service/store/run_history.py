@@ -99,5 +99,5 @@ def read_note(path: Path, parser: Callable[[bytes], _Note]) -> _Note | None:
             return None
     try:
         return parse_with(parser, data, path)
-    except ParseError as error:
-        raise StorageError(str(error)) from None
+    except ParseError:
+        raise StorageError(f"{path} is damaged; restore it from a copy, or remove it") from None
