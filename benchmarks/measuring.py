@@ -25,7 +25,7 @@ from typing import Any, TypeVar
 from benchmarks.report.markdown import table
 from service.base.errors import TandemError
 from service.base.files import os_errors, write_atomic
-from service.base.git import git_commit
+from service.base.version import git_commit
 from service.registry.loading import load
 
 ROOT = Path(__file__).parents[1]

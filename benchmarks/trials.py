@@ -19,9 +19,9 @@ from benchmarks.measuring import write_json
 from benchmarks.report.results import FORMAT_VERSION, TRIAL, Result
 from service.actors.evaluation import DeterministicPolicy, IdlePolicy, evaluate, wilson_interval
 from service.base.errors import TandemError
-from service.base.git import git_commit
 from service.base.jsonl import read_jsonl
 from service.base.types import Metrics
+from service.base.version import git_commit
 from service.config.load import parse_config
 from service.config.task import TaskConfig
 from service.config.tree import apply_override

@@ -199,18 +199,16 @@ OPENS_OR_PARSES = re.compile(
     r"|json\.loads?|msgspec\.json\.(decode|Decoder)"
 )
 ALLOWED = {
-    "service/base/regular_files.py": {"open", "os.open", "FileIO"},
+    "service/base/files.py": {"open", "os.open", "FileIO"},
     "service/base/parsing.py": {"yaml.load"},
     "service/store/tail.py": {"msgspec.json.Decoder"},  # which parse_with calls
     # what comes with the package, or is the kernel's
     "service/config/recipes.py": {"path.read_text"},
     "service/cli/configs.py": {"known[name].read_text"},
     "service/export/formats.py": {"Path(forward.__file__).read_text"},
-    "service/store/disk_reader.py": {"Path(f'/proc/{pid}/stat').read_text"},
     "service/policies/forward.py": {"np.load"},  # runs where this package is not
     # makes a file that must not be there yet, or opens a directory
     "service/cli/unexpected.py": {"open", "os.open"},
-    "service/base/files.py": {"os.open"},
 }
 """Where files are opened and texts are parsed, and why it is not by the functions that all others use."""
 

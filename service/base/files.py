@@ -1,8 +1,11 @@
-"""Files that are wholly there or not at all, and files that grow by whole pieces.
+"""Files that are wholly there or not at all, files that grow by whole pieces, and regular files, read without waiting.
 
 A whole file is written to a temporary file beside its target, flushed to the disk, and then takes its name in one step,
 so a kill or a power cut leaves the old one or the new one. A temporary file's name starts with ``.tmp-``, which no name
 or alias can, so readers never meet one. A full disk leaves no torn piece at the end of a growing file.
+
+Another program may have put something else where a user or a run expects a file. A FIFO may wait for ever, and a
+device may never end. So only regular files are opened, and no more is read than a file of its kind can have.
 """
 
 from __future__ import annotations
@@ -12,16 +15,68 @@ import errno
 import os
 import secrets
 import shutil
+import stat
 from collections import deque
 from collections.abc import Iterator
 from io import FileIO
 from pathlib import Path
-from typing import Literal
+from typing import BinaryIO, Literal
 
 from service.base.errors import StorageError
-from service.base.regular_files import open_regular, open_to_append
 
 TEMPORARY_PREFIX = ".tmp-"
+MAX_BYTES = 8 * 1024**3
+"""Greatest size of a file of a run: of a million iterations its records have some two gigabytes."""
+
+
+def open_regular(path: Path, *, follow: bool = False) -> BinaryIO:
+    """Open a regular file to read it.
+
+    Args:
+        path: of the file.
+        follow: whether it may be a link to one.
+
+    Raises:
+        OSError: it cannot be opened, or is something else than a regular file; ``strerror`` says which.
+    """
+    return open(_descriptor(path, os.O_RDONLY, follow=follow), "rb")
+
+
+def open_to_append(path: Path) -> FileIO:
+    """Open a regular file to append to it, and make it when missing; what a link leads to is not ours to change.
+
+    Raises:
+        OSError: as for ``open_regular``.
+    """
+    return FileIO(_descriptor(path, os.O_RDWR | os.O_APPEND | os.O_CREAT, follow=False), "a")
+
+
+def read_regular(path: Path, max_bytes: int = MAX_BYTES, *, follow: bool = False) -> bytes:
+    """Read a regular file as it is now.
+
+    Args:
+        path: of the file.
+        max_bytes: that it may have.
+        follow: whether it may be a link to one.
+
+    Raises:
+        OSError: as for ``open_regular``, or it is longer.
+    """
+    with open_regular(path, follow=follow) as file:
+        size = os.fstat(file.fileno()).st_size
+        if size > max_bytes:
+            raise OSError(errno.EFBIG, f"longer than {max_bytes} bytes", str(path))
+        return file.read(size)
+
+
+def _descriptor(path: Path, flags: int, *, follow: bool) -> int:
+    if not follow and os.path.islink(path):
+        raise OSError(errno.ELOOP, "a symbolic link, which is not followed", str(path))
+    descriptor = os.open(path, flags | os.O_NONBLOCK | os.O_CLOEXEC, 0o666)
+    if not stat.S_ISREG(os.fstat(descriptor).st_mode):
+        os.close(descriptor)
+        raise OSError(errno.EINVAL, "not a regular file", str(path))
+    return descriptor
 
 
 def write_atomic(path: Path, data: bytes, *, flush: bool = True) -> None:

@@ -14,12 +14,9 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from service.base.errors import StorageError
-from service.base.files import Appender, os_errors, write_atomic
+from service.base.files import Appender, os_errors, read_regular, write_atomic
 from service.base.parsing import ParseError, parse_json
-from service.base.regular_files import read_regular
 
-MAX_BYTES = 8 * 1024**3
-"""Of a run's records; a million iterations have some two gigabytes."""
 _logger = logging.getLogger(__name__)
 
 
@@ -104,27 +101,17 @@ class JsonlWriter(Appender):
         """
         self._replace(_read(self.path, missing_ok=True)[:num_bytes])
 
-    def cut_after(self, iteration: int, *, accept_damage: bool = False) -> None:
-        """Keep the records up to an iteration, in one atomic step.
-
-        Args:
-            iteration: the last one whose record stays.
-            accept_damage: leave out lines that are no records in their order.
+    def cut_after(self, iteration: int) -> None:
+        """Keep the records up to an iteration, in one atomic step; lines that are no records in their order go.
 
         Raises:
-            StorageError: there are such lines, and that is not accepted; or the file cannot be read or written. It is
-                then as it was.
+            StorageError: the file cannot be read or written; it is then as it was.
         """
         *lines, _ = _read(self.path, missing_ok=True).split(b"\n")
         kept, newest, num_strange = list[bytes](), -1, 0
-        for place, line in enumerate(lines, start=1):
+        for line in lines:
             number = (_parse(line) or {}).get("iteration")
             if not isinstance(number, int) or not newest < number < 2**63:
-                if not accept_damage:
-                    raise StorageError(
-                        f"{self.path} line {place}: {line[:40]!r} is no record, or has not its iteration; remove that "
-                        "line and try again"
-                    )
                 num_strange += 1
             elif number <= iteration:
                 kept.append(line)
@@ -135,22 +122,16 @@ class JsonlWriter(Appender):
 
     def _replace(self, kept: bytes) -> None:
         self.extent = Extent.of(kept)
-        if not self.path.exists():
-            return
-        same = kept == _read(self.path)
-        self.take_new_file()
-        try:
+        if self.path.exists():
+            self.take_new_file()
             with os_errors("write", self.path):
                 write_atomic(self.path, kept)  # also the same bytes: see Appender
-        except StorageError:
-            if not same:  # else a disk that is full need not be written to
-                raise
 
 
 def _read(path: Path, *, missing_ok: bool = False) -> bytes:
     with os_errors("read", path):
         try:
-            return read_regular(path, MAX_BYTES)
+            return read_regular(path)
         except FileNotFoundError:
             if not missing_ok:
                 raise

@@ -1,4 +1,11 @@
-"""A lock on a directory: one process at a time, and the kernel frees it when its holder dies, however that happens."""
+"""One process at a time in a directory.
+
+A lock keeps others out, and the kernel frees it when its holder dies, however that happens. But where a network file
+system has none, or has given it away while its holder was cut off, a file system cannot refuse what a stale process
+writes. So each process that ever ran a run has a number, its epoch, of which only the highest may write. A number is
+claimed by making a file that must not be there yet. It is part of the names of checkpoints and of the status, and
+readers take the highest.
+"""
 
 from __future__ import annotations
 
@@ -14,11 +21,12 @@ from pathlib import Path
 from typing import BinaryIO
 
 from service.base.errors import RunTakenError, TandemError
-from service.base.files import os_errors
+from service.base.files import open_regular, open_to_append, os_errors, read_regular
 from service.base.parsing import parse_json
-from service.base.regular_files import open_regular, open_to_append, read_regular
 
 LOCK_FILE = ".lock"
+EPOCHS = "epochs"
+"""Directory of a file for each number that was claimed."""
 WITHOUT_LOCKS = "TANDEM_WITHOUT_LOCKS"
 """Variable of the environment that says, with 1, that the user sees to it that one process uses a directory."""
 WAIT_S = 0.5
@@ -97,3 +105,39 @@ def _take(file: FileIO | BinaryIO, kind: int, wait_s: float) -> bool:
             if time.monotonic() >= deadline_s:
                 return False
             time.sleep(0.02)
+
+
+def claim_epoch(directory: Path) -> int:
+    """Claim the next number of a run directory: one above all others.
+
+    Raises:
+        StorageError: it cannot be claimed.
+    """
+    while True:
+        number = newest_epoch(directory) + 1
+        path = _epoch_file(directory, number)
+        with os_errors("write", path):
+            path.parent.mkdir(parents=True, exist_ok=True)
+            with contextlib.suppress(FileExistsError):  # another process was quicker
+                path.touch(exist_ok=False)
+                return number
+
+
+def give_back_epoch(directory: Path, number: int) -> None:
+    """Let a number go, of a run that did not begin."""
+    with contextlib.suppress(OSError):
+        _epoch_file(directory, number).unlink()
+        (directory / EPOCHS).rmdir()
+
+
+def newest_epoch(directory: Path) -> int:
+    """The highest number that was claimed in a run directory; 0 where there is none."""
+    try:
+        names = os.listdir(directory / EPOCHS)
+    except OSError:
+        return 0
+    return max((int(name) for name in names if name.isdecimal()), default=0)
+
+
+def _epoch_file(directory: Path, number: int) -> Path:
+    return directory / EPOCHS / f"{number:08d}"

@@ -95,59 +95,40 @@ def parse_yaml(text: str | bytes, where: object) -> Any:
     """
     if len(text) > MAX_YAML_CHARACTERS:
         raise ParseError(where, f"too long for YAML ({len(text)} characters; {MAX_YAML_CHARACTERS} are the most)")
-    tree = parse_with(lambda text: yaml.load(text, _BoundedLoader), text, where, "YAML")
-    _check(tree, where, MAX_YAML_NUMBER, allow_nan=True)  # whose fields they are refuses them where they are no good
+    tree = parse_with(lambda text: yaml.load(text, _Loader), text, where, "YAML")
+    # NaN may pass: the field whose value it is refuses it where it is no good
+    _check(tree, where, MAX_YAML_NUMBER, allow_nan=True, max_values=MAX_YAML_VALUES)
     return tree
 
 
 _TOO_DEEP = f"nested more than {MAX_DEPTH} deep"
 
 
-class _BoundedLoader(yaml.SafeLoader):
-    """PyYAML's safe loader, which stops where a text is nested too deep or stands for too many values."""
+class _Loader(yaml.SafeLoader):
+    """PyYAML's safe loader, which refuses a key that is there twice; PyYAML alone takes the last one."""
 
-    def __init__(self, text: str | bytes) -> None:
-        super().__init__(text)
-        self._depth = self._num_values = 0
-        self._sizes: dict[int, int] = {}
-        """By node: how many values it stands for, where each alias stands for all that it repeats."""
-
-    def compose_node(self, parent: yaml.Node | None, index: int) -> yaml.Node | None:
-        """Read one value with all that is in it."""
-        self._depth += 1
-        if self._depth > MAX_DEPTH:
-            raise yaml.YAMLError(_TOO_DEEP)
-        is_alias = self.check_event(yaml.AliasEvent)
-        before = self._num_values
-        node = super().compose_node(parent, index)
-        if is_alias:
-            if id(node) not in self._sizes:  # it is still being read
-                raise yaml.YAMLError("an alias within what it stands for")
-            self._num_values += self._sizes[id(node)]
-        else:
-            self._num_values += 1
-            self._sizes[id(node)] = self._num_values - before
-            if isinstance(node, yaml.MappingNode):
-                self._check_keys(node)
-        if self._num_values > MAX_YAML_VALUES:
-            raise yaml.YAMLError(f"more than {MAX_YAML_VALUES} values")
-        self._depth -= 1
-        return node
-
-    def _check_keys(self, node: yaml.MappingNode) -> None:
-        """Refuse a key that is there twice, of which PyYAML would take the last."""
+    def compose_mapping_node(self, anchor: Any) -> yaml.MappingNode:
+        """Read one mapping with all that is in it."""
+        node: yaml.MappingNode = super().compose_mapping_node(anchor)
         counts = Counter((key.tag, key.value) for key, _ in node.value if isinstance(key, yaml.ScalarNode))
         for (_, key), count in counts.items():
             if count > 1:
                 raise yaml.YAMLError(f"the key {key!r} is there {count} times")
+        return node
 
 
-def _check(tree: Any, where: object, greatest: int, *, allow_nan: bool) -> None:
-    """Refuse what parsers take but no program can use; without recursion, which is what deep trees are made for."""
-    level, depth = [tree], 0
+def _check(tree: Any, where: object, greatest: int, *, allow_nan: bool, max_values: float = math.inf) -> None:
+    """Refuse what parsers take but no program can use; without recursion, which deep trees would exhaust.
+
+    A value that aliases repeat is looked at as often as it is there.
+    """
+    level, depth, num_values = [tree], 0, 0
     while level:
         inner: list[Any] = []
         for value in level:
+            num_values += 1
+            if num_values + len(inner) > max_values:
+                raise ParseError(where, f"more than {max_values} values")
             if depth == MAX_DEPTH and isinstance(value, (dict, list, tuple, set)):
                 raise ParseError(where, _TOO_DEEP)
             if isinstance(value, dict):

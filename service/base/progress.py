@@ -38,11 +38,13 @@ class Task:
         done: how much was done before, by another process.
     """
 
+    bar: Bar
+    """What rich knows of it, once a display shows it."""
+
     def __init__(self, title: str, total: int | None = None, unit: str = "", done: int = 0) -> None:
         self.title, self.total, self.unit, self.done = title, total, unit, done
         self.note = ""
         """What else is known, shown after the rest."""
-        self.bar: Bar | None = None
         self.told_s = 0.0
         """Time of its last plain line."""
         self.display: Display | None = None
@@ -101,7 +103,7 @@ class Display:
     ) -> None:
         self.console, self.quiet = console, quiet
         self._get_time = get_time
-        self._bars: _Bars | None = None
+        self._bars = self._new_bars()
 
     def __enter__(self) -> Self:
         self._token = _open.set(self)
@@ -111,7 +113,7 @@ class Display:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         _open.reset(self._token)
-        self._stop()
+        self._bars.stop()
 
     @property
     def moves(self) -> bool:
@@ -125,22 +127,14 @@ class Display:
 
     def begin(self, task: Task) -> None:
         """Show a task that begins."""
-        if self._bars is None:
-            # What commands print for other programs must not come onto our console when it is sent somewhere else.
-            self._bars = _Bars(
-                TextColumn("{task.description}", markup=False), BarColumn(20), _Numbers(),
-                console=self.console, transient=True, redirect_stdout=sys.stdout.isatty(), disable=not self.moves,
-                get_time=self._get_time, speed_estimate_period=math.inf,
-            )  # fmt: skip
-            self._bars.start()
-        number = self._bars.add_task(task.title, total=task.total, completed=task.done, unit=task.unit, note=task.note)
-        task.bar = next(bar for bar in self._bars.tasks if bar.id == number)
+        self._bars.disable = not self.moves
+        self._bars.start()
+        self._bars.add_task(task.title, total=task.total, completed=task.done, unit=task.unit, note=task.note)
+        task.bar = self._bars.tasks[-1]
         task.display, task.told_s = self, self._get_time()
 
     def advanced(self, task: Task) -> None:
         """Show how far a task is."""
-        if self._bars is None or task.bar is None:
-            return
         self._bars.update(task.bar.id, description=task.title, completed=task.done, note=task.note)
         now_s = self._get_time()
         if not self.moves and now_s - task.told_s >= PLAIN_INTERVAL_S:
@@ -150,27 +144,26 @@ class Display:
     def end(self, task: Task) -> None:
         """Show a task no more."""
         task.display = None
-        if self._bars is None or task.bar is None:
-            return
         self._bars.remove_task(task.bar.id)
         if not self._bars.tasks:
-            self._stop()
+            self._bars.stop()
+            self._bars = self._new_bars()
 
     def answer(self, text: str) -> None:
         """See ``answer``: bars show it when they move next; elsewhere it goes straight to the file."""
-        if self._bars is not None and self.moves:
+        if self._bars.tasks and self.moves:
             self._bars.answer = text
             return
-        try:
+        with suppress(OSError, ValueError):  # it is closed, or no file
             os.write(self.console.file.fileno(), f"{text}\n".encode())
-        except (OSError, ValueError):  # it has no descriptor
-            with suppress(OSError, ValueError):
-                self.console.file.write(f"{text}\n")
 
-    def _stop(self) -> None:
-        bars, self._bars = self._bars, None
-        if bars is not None:
-            bars.stop()
+    def _new_bars(self) -> _Bars:
+        # What commands print for other programs must not come onto our console when it is sent somewhere else.
+        return _Bars(
+            TextColumn("{task.description}", markup=False), BarColumn(20), _Numbers(),
+            console=self.console, transient=True, redirect_stdout=sys.stdout.isatty(), disable=True,
+            get_time=self._get_time, speed_estimate_period=math.inf,
+        )  # fmt: skip
 
 
 class _Bars(Progress):
@@ -191,7 +184,7 @@ class _Numbers(ProgressColumn):
 
 def line(task: Task) -> str:
     """How far a task is that has been shown, in one line."""
-    return f"{task.title}: {' | '.join(filter(None, (_numbers(task.bar), task.note)))}" if task.bar is not None else ""
+    return f"{task.title}: {' | '.join(filter(None, (_numbers(task.bar), task.note)))}"
 
 
 def _numbers(bar: Bar) -> str:

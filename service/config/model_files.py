@@ -11,7 +11,7 @@ import numpy as np
 from pydantic import Field
 
 from service.base.errors import ConfigError
-from service.base.regular_files import read_regular
+from service.base.files import read_regular
 from service.base.types import StateArray
 from service.config.frozen import FrozenModel
 

@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Any
 
 from service.base.errors import ConfigError, did_you_mean, one_line
+from service.base.files import read_regular
 from service.base.parsing import MAX_YAML_CHARACTERS, ParseError, parse_yaml
-from service.base.regular_files import read_regular
 from service.config.recipes import recipes, robots
 
 

@@ -9,10 +9,9 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from service.base.git import git_commit
 from service.base.tensors import digest_of
 from service.base.types import FloatArray
-from service.base.version import __version__
+from service.base.version import __version__, git_commit
 from service.config.robot import Numbers, RobotConfig
 from service.envs.batch import DISPLACEMENT_M, MAX_TURN_RAD, WIDTH_CHANGE_M, WorldBatch
 from service.envs.observations import (

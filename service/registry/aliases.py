@@ -6,8 +6,7 @@ import fcntl
 from pathlib import Path
 
 from service.base.errors import RegistryError
-from service.base.files import os_errors, write_atomic
-from service.base.regular_files import open_to_append, read_regular
+from service.base.files import open_to_append, os_errors, read_regular, write_atomic
 from service.registry.names import check_alias, is_name, is_number
 
 MAX_BYTES = 100

@@ -7,8 +7,7 @@ import hashlib
 from pathlib import Path
 
 from service.base.errors import DamagedBlobError
-from service.base.files import os_errors, write_atomic
-from service.base.regular_files import read_regular
+from service.base.files import os_errors, read_regular, write_atomic
 
 MAX_BYTES = 1024**3
 """Of a blob; the largest primitives there are have about a megabyte."""

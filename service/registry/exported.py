@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from service.base.files import os_errors
-from service.base.regular_files import read_regular
+from service.base.files import os_errors, read_regular
 from service.registry.blobs import BlobStore
 from service.registry.manifest import MAX_BYTES, parse_manifest
 from service.registry.names import Version

@@ -22,9 +22,8 @@ import numpy as np
 
 from service.base import tensors
 from service.base.errors import DamagedBlobError, RegistryError, StorageError, UnknownVersionError, did_you_mean
-from service.base.files import os_errors, write_atomic, write_exclusive
-from service.base.git import git_commit
-from service.base.regular_files import read_regular
+from service.base.files import os_errors, read_regular, write_atomic, write_exclusive
+from service.base.version import git_commit
 from service.registry import names
 from service.registry.aliases import move_alias, read_alias, read_aliases
 from service.registry.blobs import BlobStore, sha256_of

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Literal
 
 from service.base.errors import StatusError
-from service.base.regular_files import read_regular
+from service.base.files import read_regular
 
 VARIABLE = "TANDEM_TOKEN"
 SESSION_COOKIE = "tandem_session"

@@ -69,7 +69,6 @@ class Saves:
         """
         directory = self._directory
         directory.check_owner()
-        assert directory.history is not None
         arrays, values = flatten(state)
         meta = {
             **counters,

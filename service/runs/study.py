@@ -21,10 +21,9 @@ from signal import SIGKILL, SIGTERM, Signals
 from typing import Protocol
 
 from service.base.errors import StorageError, StoreError, TandemError
-from service.base.files import os_errors, write_atomic
+from service.base.files import open_regular, open_to_append, os_errors, write_atomic
 from service.base.lock import is_locked
 from service.base.progress import answer, counted
-from service.base.regular_files import open_regular, open_to_append
 from service.config import Config, dump_config, load_config
 from service.config.self_play import SelfPlayConfig
 from service.media.plots import plot_study
@@ -34,8 +33,8 @@ from service.runs.resuming import resumable_settings
 from service.runs.signals import PASSED_ON, STOPPING, StopSignals
 from service.runs.study_file import ENDED, StudyDirectory, StudyRun
 from service.runs.study_results import SELECTED, as_csv, best_of, publish_best, select
-from service.store.disk import OUTPUT_FILE, read_status
 from service.store.disk_reader import DiskReader, run_id_of
+from service.store.models import OUTPUT_FILE, read_status
 from service.store.run_directory import RunDirectory
 
 POLL_S = 0.2

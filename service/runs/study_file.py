@@ -20,15 +20,13 @@ from typing import Literal
 from pydantic import Field, JsonValue, ValidationError
 
 from service.base.errors import ConfigError, StorageError, TandemError
-from service.base.files import os_errors, write_atomic
+from service.base.files import os_errors, read_regular, write_atomic
 from service.base.lock import LOCK_FILE, DirectoryLock
 from service.base.parsing import ParseError, parse_json
-from service.base.regular_files import read_regular
 from service.config import Config, dump_config, load_config
 from service.config.frozen import FrozenModel
 from service.runs.grid import Settings
-from service.store.disk import STUDY_FILE
-from service.store.models import RunState
+from service.store.models import STUDY_FILE, RunState
 from service.store.run_directory import RunDirectory
 from service.store.run_history import SECOND_VERSION, written_by
 

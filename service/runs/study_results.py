@@ -27,8 +27,8 @@ from service.registry.registry import Registry
 from service.runs.grid import SEED, Settings
 from service.runs.study_file import StudyRun
 from service.store.address import address_from_environment
-from service.store.disk import read_status
 from service.store.disk_reader import run_id_of
+from service.store.models import read_status
 from service.store.run_directory import RunDirectory
 from service.store.run_writer import reporting_to
 

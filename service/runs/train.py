@@ -31,10 +31,10 @@ from service.runs.run import OnIteration, Run, RunResult
 from service.runs.signals import InterruptError, StopSignals
 from service.store.address import address_from_environment
 from service.store.checkpoints import CheckpointStore
-from service.store.disk import read_status
 from service.store.disk_reader import run_id_of
+from service.store.models import read_status
 from service.store.run_directory import Published, RunDirectory
-from service.store.run_log import RunLog
+from service.store.run_log import logging_to
 from service.store.run_writer import reporting_to
 
 if TYPE_CHECKING:
@@ -137,9 +137,9 @@ def train(
         writer = reporting_to(directory, run_id, address_from_environment())
         published, epoch = last.version if last is not None else None, directory.epoch
         report = Report(config, run_id, runtime.name, writer, published=published, previous=previous, epoch=epoch)
-        log = stack.enter_context(RunLog(directory.path))
+        log = stack.enter_context(logging_to(directory.path))
         begins = "goes on with" if resume else "begins"
-        log.note(f"process {os.getpid()} on {socket.gethostname()} {begins} the run ({runtime.name} runtime)")
+        log(f"process {os.getpid()} on {socket.gethostname()} {begins} the run ({runtime.name} runtime)")
         stack.enter_context(report)
         stack.enter_context(runtime.around(directory.path, Path(registry), partial(_end_now, report, directory)))
         num_lost, furthest = 0, -1
@@ -159,7 +159,7 @@ def train(
                 else:
                     said = f", published {done.version}" if done.version is not None else ""
                     at = f"iteration {done.result.iteration}, {done.result.num_env_steps} env steps"
-                    log.note(f"the run is {done.result.reason} at {at}{said}")
+                    log(f"the run is {done.result.reason} at {at}{said}")
                     return replace(done, signal=signals.first)
             time.sleep(BACK_OFF_S * (2 ** (num_lost - 1) - 1))
 

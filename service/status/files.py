@@ -14,7 +14,7 @@ from fastapi import Request
 from starlette.responses import FileResponse, Response
 from starlette.staticfiles import NotModifiedResponse, StaticFiles
 
-from service.base.regular_files import open_regular
+from service.base.files import open_regular
 from service.status.openapi import problems
 from service.status.problems import ProblemError
 from service.status.schemas import RunFile

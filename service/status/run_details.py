@@ -9,13 +9,12 @@ from typing import Any
 import numpy as np
 
 from service.base.errors import ConfigError
+from service.base.files import open_regular
 from service.base.parsing import ParseError, parse_json
-from service.base.regular_files import open_regular
 from service.config.tree import read_yaml
 from service.status.schemas import GoalFrame, GoalFrames, LogEntry, RunCommand, RunLog, RunSetup
-from service.store.disk import OUTPUT_FILE
 from service.store.disk_reader import is_study
-from service.store.models import ACTIVE, GoalGrid, RunStatus
+from service.store.models import ACTIVE, OUTPUT_FILE, GoalGrid, RunStatus
 from service.store.run_history import read_history
 from service.store.run_log import read_log
 

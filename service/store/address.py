@@ -1,17 +1,37 @@
-"""The address of Redis, which keeps its password out of every log."""
+"""Redis: its address, which keeps its password out of every log, and the keys that tandem uses there.
+
+| key | type | content |
+|---|---|---|
+| ``tandem:runs`` | sorted set | run ids by when they were last started, in seconds since 1970 |
+| ``tandem:run:ID:status`` | string | ``RunStatus`` as JSON |
+| ``tandem:run:ID:metrics`` | sorted set | records as JSON by iteration, the newest ``MAX_RECORDS`` |
+| ``tandem:run:ID:goals`` | string | ``GoalGrid`` as JSON |
+| ``tandem:run:ID:stop`` | string | is there when the run was asked to stop |
+| ``tandem:run:ID:heartbeat`` | string, expires | is there until ``HEARTBEAT_S`` after its process last reported |
+| ``tandem:run:ID:epoch`` | string | ``RUN:EPOCH``: identity of the run and number of the process that reports |
+
+Records are in a sorted set and no stream: written twice, as after an answer that got lost, a record is there once, and
+a resumed run's takes the place of the earlier one.
+"""
 
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Literal
 from urllib.parse import urlsplit
 
 from service.base.errors import StoreError, StoreUnavailableError
 from service.base.extras import needs_extra
 
 VARIABLE = "TANDEM_REDIS_URL"
+RUNS = "tandem:runs"
+Content = Literal["status", "metrics", "goals", "stop", "heartbeat", "epoch"]
+MAX_RECORDS = 20_000
+"""Of one run, about 60 MB; ``metrics.jsonl`` has them all."""
+HEARTBEAT_S = 10.0
 _FORM = "redis://[[USER]:PASSWORD@]HOST[:PORT][/DB], with %-escapes for other characters than letters and digits"
 
 
@@ -68,9 +88,25 @@ class RedisAddress:
             protocol=2,  # one shape of replies, whatever redis-py makes the default
         )
 
-    def unavailable(self, error: Exception) -> StoreUnavailableError:
-        """The error for a user that stands for a client's ``error``."""
-        return StoreUnavailableError(f"Redis at {self}: {reason_of(error)}; check {VARIABLE} and the server")
+    @contextmanager
+    def errors(self) -> Iterator[None]:
+        """Turn a client's error of the block into one line for the user.
+
+        Raises:
+            StoreUnavailableError: Redis does not answer, does not let us in, or refuses what was asked.
+        """
+        from redis.exceptions import RedisError
+
+        try:
+            yield
+        except (RedisError, OSError) as error:
+            reason = reason_of(error)
+            raise StoreUnavailableError(f"Redis at {self}: {reason}; check {VARIABLE} and the server") from None
+
+
+def run_key(run_id: str, content: Content) -> str:
+    """Key of one value of a run."""
+    return f"tandem:run:{run_id}:{content}"
 
 
 def address_from_environment() -> RedisAddress | None:

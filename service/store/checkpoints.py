@@ -17,13 +17,10 @@ import numpy as np
 
 from service.base import tensors
 from service.base.errors import CheckpointError, FormatVersionError
-from service.base.files import os_errors, remove_temporaries, write_atomic
+from service.base.files import os_errors, read_regular, remove_temporaries, write_atomic
 from service.base.parsing import parse_json
-from service.base.regular_files import read_regular
 
 FORMAT_VERSION = 1
-MAX_BYTES = 8 * 1024**3
-"""Of a checkpoint; a replay buffer of a million steps has half a gigabyte."""
 _HEADER_KEY = "tandem_checkpoint"
 _FILE_PATTERN = re.compile(r"checkpoint-(?:e([0-9]{8,})-)?([0-9]{8,})\.safetensors")
 _logger = logging.getLogger(__name__)
@@ -93,16 +90,14 @@ class CheckpointStore:
                 lists.
 
         Raises:
-            CheckpointError: an array or value that cannot be saved, or a full disk; earlier checkpoints are intact.
+            CheckpointError: a full disk; earlier checkpoints are intact.
+            TypeError, ValueError: a value or an array that cannot be saved; nothing was written.
         """
         assert step >= 0
         path = self.path(step)
         content = {"format_version": FORMAT_VERSION, "step": step, "meta": dict(meta)}
-        try:
-            digest = tensors.digest_of(json.dumps(content, sort_keys=True), arrays)
-            data = tensors.encode(arrays, {_HEADER_KEY: json.dumps({**content, "sha256": digest}, sort_keys=True)})
-        except (TypeError, ValueError) as error:
-            raise CheckpointError(f"cannot write {path}: {error}; give plain arrays and JSON values") from None
+        digest = tensors.digest_of(json.dumps(content, sort_keys=True), arrays)
+        data = tensors.encode(arrays, {_HEADER_KEY: json.dumps({**content, "sha256": digest}, sort_keys=True)})
         with os_errors("write", path, CheckpointError):
             write_atomic(path, data)
         self._prune(step)
@@ -148,7 +143,7 @@ def read_checkpoint(path: Path) -> Checkpoint:
         FormatVersionError: it is of another format.
     """
     with os_errors("read", path, CheckpointError):
-        data = read_regular(path, MAX_BYTES, follow=True)
+        data = read_regular(path, follow=True)
     try:
         header = parse_json(tensors.read_metadata(data)[_HEADER_KEY], path, allow_nan=True)
         format_version = header["format_version"]
@@ -164,7 +159,4 @@ def read_checkpoint(path: Path) -> Checkpoint:
     actual = tensors.digest_of(json.dumps(header, sort_keys=True), arrays)
     if actual != expected:
         raise CheckpointError(f"{path} is damaged: expected sha256 {expected}, it has {actual}")
-    step, meta = header.get("step"), header.get("meta")
-    if type(step) is not int or not isinstance(meta, dict):
-        raise CheckpointError(f"{path} is damaged: it has no step, or nothing beside its arrays")
-    return Checkpoint(step, arrays, meta)
+    return Checkpoint(header["step"], arrays, header["meta"])

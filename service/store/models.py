@@ -1,20 +1,44 @@
-"""The report of a run about itself, as its runner writes it and the status service hands it out."""
+"""The report of a run about itself, as its runner writes it and the status service hands it out.
+
+| file in the run directory | content |
+|---|---|
+| ``status.json`` | ``RunStatus``, at every change of state or condition and else about once a second |
+| ``goals.json`` | ``GoalGrid``, about every five seconds |
+| ``stop`` | is there when the run was asked to stop |
+
+Metrics are in ``metrics.jsonl``, where the run writes them for itself.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import time
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
+from pathlib import Path
 from typing import Literal, NamedTuple, Protocol, Self, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import AwareDatetime, Field
 
+from service.base.files import read_regular
+from service.base.parsing import ParseError, parse_with
 from service.config.frozen import FrozenModel
 
+MAX_BYTES = 64 * 1024 * 1024
+"""Greatest size of a run's status, and of its grid of goals."""
+STATUS_FILE = "status.json"
+GOALS_FILE = "goals.json"
+STOP_FILE = "stop"
+STUDY_FILE = "study.json"
+"""In the directory of a study, which has a run directory for each of its runs."""
+OUTPUT_FILE = "log.txt"
+"""All that the processes of a study's run said."""
 RunState = Literal["starting", "running", "finished", "converged", "interrupted", "failed"]
 ACTIVE: frozenset[RunState] = frozenset({"starting", "running"})
+MAX_AHEAD = timedelta(seconds=5)
+"""A heartbeat from further in the future says that two clocks differ."""
 SILENT_AFTER = timedelta(seconds=60)
 """A run without a word for so long may have lost its process, killed or cut off from power."""
 Condition = Literal["well", "clock", "redis", "disk", "stuck", "silent"]
@@ -120,10 +144,6 @@ class RunStatus(FrozenModel):
     warnings: tuple[str, ...] = Field((), description="what is not as it should be right now, such as Redis being away")
     actors: tuple[ActorStatus, ...] = ()
 
-    def is_silent(self, age_s: float) -> bool:
-        """Whether the run has not ended, and its last heartbeat, so many seconds ago, is long past."""
-        return self.state in ACTIVE and age_s > SILENT_AFTER.total_seconds()
-
     def suffering(self, condition: Condition, text: str) -> Self:
         """The status with another trouble, and the worst of the two as its condition."""
         worst = max(self.condition, condition, key=CONDITIONS.index)
@@ -138,6 +158,49 @@ class RunStatus(FrozenModel):
         )
         ended = {"state": "interrupted", "condition": "well", "warnings": (), "stopping": False, "last_error": error}
         return self.model_copy(update=ended)
+
+
+def read_status(directory: Path) -> RunStatus | None:
+    """The status that the last process of a run left in its directory; None where there is none that can be read."""
+    try:
+        return parse_with(RunStatus.model_validate_json, read_regular(directory / STATUS_FILE, MAX_BYTES), STATUS_FILE)
+    except (OSError, ParseError):
+        return None
+
+
+class Pulse:
+    """Age of the heartbeats of runs, as their reader's own clock counts it: clocks of two machines differ, and jump.
+
+    The first time that a run is asked about, its heartbeat is as old as the clocks say. From then on it grows older by
+    this process's own clock, until there is another one.
+
+    Args:
+        clock: counts seconds, and never jumps.
+    """
+
+    def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
+        self._clock = clock
+        self._seen: dict[str, tuple[datetime, float, float]] = {}
+        """By run: its heartbeat, and the clock at that and at the last look."""
+
+    def age_s(self, run_id: str, heartbeat: datetime) -> float:
+        """Seconds since a run's last heartbeat; never negative."""
+        by_date = max(0.0, (datetime.now(UTC) - heartbeat).total_seconds())
+        now_s = self._clock()
+        last, beat_s, looked_s = self._seen.get(run_id, (heartbeat, now_s - by_date, now_s))
+        if heartbeat != last:  # it came at some time since the last look
+            beat_s = max(now_s - by_date, looked_s)
+        self._seen[run_id] = heartbeat, beat_s, now_s
+        return now_s - beat_s
+
+    def look(self, status: RunStatus) -> tuple[RunStatus, float]:
+        """The status of a run, and how long ago it was heard of; one from the future has a warning."""
+        age_s = self.age_s(status.run_id, status.heartbeat)
+        ahead = status.heartbeat - datetime.now(UTC)
+        if status.state in ACTIVE and ahead > MAX_AHEAD:
+            text = f"its heartbeat is {ahead.total_seconds():.0f} s in the future: the clock of its machine, or the one"
+            status = status.suffering("clock", f"{text} here, is wrong")
+        return status, age_s
 
 
 class GoalCell(FrozenModel):

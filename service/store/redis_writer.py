@@ -8,15 +8,15 @@ import time
 from collections import deque
 from contextlib import suppress
 from functools import partial
-from threading import Event, Lock, Thread
-from typing import NamedTuple
+from queue import Empty, SimpleQueue
+from threading import Event, Thread
 
 from redis.exceptions import RedisError, WatchError
 
 from service.base.errors import RunTakenError
 from service.base.jsonl import plain
-from service.store import keys
-from service.store.address import RedisAddress, reason_of
+from service.store import address as keys
+from service.store.address import Content, RedisAddress, reason_of
 from service.store.models import GoalGrid, Record, RunStatus, Trouble
 
 TICK_S = 0.5
@@ -27,19 +27,10 @@ TIMEOUT_S = 2.0
 MAX_WAITING = 20_000
 """Records that wait for Redis to come back, about 60 MB; of more, the oldest are left out, and a warning says so."""
 BATCH = 500
-KEPT_S = 5.0
-"""Age of the oldest report that is sent again over a new connection. Redis flushes its file every second, so one that
-is killed may forget what it confirmed."""
+KEPT = 100
+"""Records that are sent again over a new connection. Redis flushes its file every second, so one that is killed may
+forget what it confirmed."""
 _logger = logging.getLogger(__name__)
-
-
-class _Line(NamedTuple):
-    iteration: int
-    text: str
-
-
-class _NewerProcessError(Exception):
-    """A newer process reports under this run id."""
 
 
 class RedisWriter:
@@ -64,7 +55,7 @@ class RedisWriter:
         self._mine, self._key = f"{run}:{epoch}".encode(), partial(keys.run_key, run_id)
         self._connected_anew = Event()
         self._client = address.client(TIMEOUT_S, self._connected_anew.set)
-        try:
+        with address.errors():
             theirs = self._client.get(self._key("epoch")) or self._mine
             if theirs.partition(b":")[0] != self._run and self._client.exists(self._key("heartbeat")):
                 raise RunTakenError(
@@ -73,15 +64,14 @@ class RedisWriter:
                 )
             self._client.set(self._key("epoch"), self._mine)
             self._client.delete(self._key("stop"))
-        except (RedisError, OSError) as error:
-            raise address.unavailable(error) from None
-        self._lock = Lock()
-        self._status: RunStatus | None = None
-        self._grid: GoalGrid | None = None
-        self._sent_status: RunStatus | None = None
-        self._sent_grid: GoalGrid | None = None
-        self._waiting: deque[_Line] = deque()
-        self._sent: deque[tuple[float, _Line]] = deque()
+        self._newest: dict[Content, RunStatus | GoalGrid] = {}
+        """Status and grid as they are now."""
+        self._there: dict[Content, RunStatus | GoalGrid] = {}
+        """Status and grid as Redis has them."""
+        self._told: SimpleQueue[tuple[int, str]] = SimpleQueue()
+        """Iterations and texts of records that the thread has not seen yet."""
+        self._waiting: list[tuple[int, str]] = []
+        self._sent: deque[tuple[int, str]] = deque(maxlen=KEPT)
         self._num_lost = 0
         self._stop = False
         self._away: tuple[float, str] | None = None
@@ -93,20 +83,15 @@ class RedisWriter:
 
     def status(self, status: RunStatus) -> None:
         """Replace what is known about the run."""
-        self._status = status
+        self._newest["status"] = status
 
     def metrics(self, record: Record) -> None:
         """Append one iteration's metrics; those of it and of later ones, made before the run went back, are dropped."""
-        line = _Line(int(record["iteration"] or 0), json.dumps(plain(record)))
-        with self._lock:
-            self._waiting.append(line)
-            if len(self._waiting) > MAX_WAITING:
-                self._waiting.popleft()
-                self._num_lost += 1
+        self._told.put((int(record["iteration"] or 0), json.dumps(plain(record))))
 
     def goals(self, grid: GoalGrid) -> None:
         """Replace the grid."""
-        self._grid = grid
+        self._newest["goals"] = grid
 
     def stop_requested(self) -> bool:
         """Whether the run was asked to stop since it was started, as of the last message to Redis."""
@@ -118,8 +103,8 @@ class RedisWriter:
         if away is not None:
             since_s = time.monotonic() - away[0]
             found.append(
-                f"Redis at {self._address} has taken nothing for {since_s:.0f} s: {away[1]}; {len(self._waiting)} "
-                "records wait for it"
+                f"Redis at {self._address} has taken nothing for {since_s:.0f} s: {away[1]}; "
+                f"{self._num_waiting()} records wait for it"
             )
         if self._replaced:
             found.append(
@@ -141,99 +126,85 @@ class RedisWriter:
     # --- the thread ---------------------------------------------------------------------------------------------------
 
     def _work(self) -> None:
-        pause_s = 0.0
-        while True:
-            self._closing.wait(pause_s)
-            ending = self._closing.is_set()
+        pause_s, ending = 0.0, False
+        while not ending or (self._pending() and time.monotonic() < self._deadline_s):
+            ending = self._closing.wait(pause_s)
             try:
-                more = self._send()
-            except _NewerProcessError:
+                self._send()
+            except RunTakenError:
                 self._replaced = True
                 break
             except WatchError:  # another process began in this very moment; the next try tells
                 pause_s = 0.0
             except (RedisError, OSError) as error:
-                self._note_failure(reason_of(error))
+                if self._away is None:
+                    _logger.warning("Redis at %s: %s; the run goes on", self._address, reason_of(error))
+                self._away = (self._away[0] if self._away else time.monotonic(), reason_of(error))
                 pause_s = min(2 * pause_s + 0.05, RETRY_S)
                 if ending:
                     time.sleep(0.05)
             else:
-                self._note_recovery()
-                pause_s = 0.0 if more else TICK_S
-                if ending and not self._pending():
-                    break
-            if time.monotonic() > self._deadline_s:
-                break
+                if self._away is not None:
+                    _logger.info("Redis at %s is back after %.0f s", self._address, time.monotonic() - self._away[0])
+                self._away = None
+                pause_s = 0.0 if self._num_waiting() else TICK_S
         with suppress(RedisError, OSError):  # it expires by itself
             if not self._replaced:
                 self._client.delete(self._key("heartbeat"))
             self._client.close()
 
-    def _send(self) -> bool:
-        """Send one transaction; True when records are left for another."""
-        status, grid = self._status, self._grid
-        with self._lock:
-            batch = list(self._waiting)[:BATCH]
+    def _send(self) -> None:
+        """Send one transaction.
+
+        Raises:
+            RunTakenError: a newer process reports under this run id.
+        """
+        self._take_in()
+        newest, records = dict(self._newest), self._waiting[:BATCH]
         with self._client.pipeline() as pipe:
             pipe.watch(self._key("epoch"))
             if self._is_newer(pipe.get(self._key("epoch"))):
-                raise _NewerProcessError
+                raise RunTakenError(self._run_id)
             pipe.multi()
             pipe.set(self._key("epoch"), self._mine)  # a Redis that lost its data has forgotten it
             pipe.set(self._key("heartbeat"), 1, px=int(1000 * keys.HEARTBEAT_S))
-            if status is not None and status is not self._sent_status:
-                pipe.zadd(keys.RUNS, {self._run_id: status.started.timestamp()})
-                pipe.set(self._key("status"), status.model_dump_json())
-            if grid is not None and grid is not self._sent_grid:
-                pipe.set(self._key("goals"), grid.model_dump_json())
+            for content, value in newest.items():
+                if value is not self._there.get(content):
+                    pipe.set(self._key(content), value.model_dump_json())
+                if isinstance(value, RunStatus):
+                    pipe.zadd(keys.RUNS, {self._run_id: value.started.timestamp()})
             key = self._key("metrics")
-            for line in batch:
-                pipe.zremrangebyscore(key, line.iteration, "+inf")
-                pipe.zadd(key, {line.text: line.iteration})
-            if batch:
-                pipe.zremrangebyrank(key, 0, -keys.MAX_RECORDS - 1)
+            for iteration, text in records:
+                pipe.zremrangebyscore(key, iteration, "+inf")
+                pipe.zadd(key, {text: iteration})
+            pipe.zremrangebyrank(key, 0, -keys.MAX_RECORDS - 1)
             pipe.exists(self._key("stop"))
             self._stop = bool(pipe.execute()[-1])
-        self._sent_status, self._sent_grid = status, grid
-        more = self._count(batch)
-        return self._send_again() or more
+        self._there = newest
+        self._sent.extend(records)
+        del self._waiting[:BATCH]
+        if self._connected_anew.is_set():  # a Redis that was killed has forgotten what came last
+            self._connected_anew.clear()
+            self._there = {}
+            self._waiting[:0] = self._sent
+            self._sent.clear()
+
+    def _take_in(self) -> None:
+        """Take in the records that were told, and leave out the oldest of too many."""
+        with suppress(Empty):
+            while True:
+                self._waiting.append(self._told.get_nowait())
+        num_lost = max(0, len(self._waiting) - MAX_WAITING)
+        del self._waiting[:num_lost]
+        self._num_lost += num_lost
 
     def _is_newer(self, found: bytes | None) -> bool:
         """Whether the process of an epoch in Redis began after this one; one from an older copy of its data did not."""
         run, _, epoch = (found or self._mine).partition(b":")
         return run != self._run or not epoch.isdigit() or int(epoch) > self._epoch
 
-    def _count(self, batch: list[_Line]) -> bool:
-        now_s = time.monotonic()
-        with self._lock:
-            for line in batch:
-                if self._waiting and self._waiting[0] is line:  # else it was left out meanwhile
-                    self._waiting.popleft()
-                self._sent.append((now_s, line))
-            while self._sent and self._sent[0][0] < now_s - KEPT_S:
-                self._sent.popleft()
-            return bool(self._waiting)
-
-    def _send_again(self) -> bool:
-        """Queue the newest reports again after a reconnect: a Redis that was killed has forgotten what came last."""
-        if not self._connected_anew.is_set():
-            return False
-        self._connected_anew.clear()
-        with self._lock:
-            self._waiting.extendleft(line for _, line in reversed(self._sent))
-            self._sent.clear()
-        self._sent_status = self._sent_grid = None
-        return True
+    def _num_waiting(self) -> int:
+        return self._told.qsize() + len(self._waiting)
 
     def _pending(self) -> bool:
-        return bool(self._waiting) or self._status is not self._sent_status or self._grid is not self._sent_grid
-
-    def _note_failure(self, reason: str) -> None:
-        if self._away is None:
-            _logger.warning("Redis at %s: %s; the run goes on", self._address, reason)
-        self._away = (self._away[0] if self._away else time.monotonic(), reason)
-
-    def _note_recovery(self) -> None:
-        if self._away is not None:
-            _logger.info("Redis at %s is back after %.0f s", self._address, time.monotonic() - self._away[0])
-        self._away = None
+        return self._num_waiting() > 0 or self._newest != self._there

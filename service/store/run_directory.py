@@ -16,7 +16,7 @@
 | ``recordings/`` | earlier videos, with the time at which a newer one took their place |
 | ``log.jsonl`` | what happened: who died, who came back, how it ended; see ``service.store.run_log`` |
 | ``broken/`` | states of worlds whose physics diverged |
-| ``status.json``, ``goals.json``, ``stop`` | the run's state while it goes on; see ``service.store.disk`` |
+| ``status.json``, ``goals.json``, ``stop`` | the run's state while it goes on; see ``service.store.models`` |
 | ``tandem-error-*.txt`` | traceback of an unexpected error |
 | ``.lock`` | held by the process that runs it |
 """
@@ -37,28 +37,24 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
-from pydantic import BaseModel, JsonValue
+from pydantic import BaseModel, JsonValue, TypeAdapter
 
-from service.base.epoch import claim_epoch, give_back_epoch, newest_epoch
 from service.base.errors import CheckpointError, ConfigError, RunTakenError, StorageError, TandemError
 from service.base.files import Appender, os_errors, remove_temporaries, write_atomic
-from service.base.git import git_commit
 from service.base.jsonl import Extent, JsonlWriter
-from service.base.lock import LOCK_FILE, DirectoryLock
-from service.base.parsing import ParseError, parse_json
-from service.base.regular_files import read_regular
+from service.base.lock import LOCK_FILE, DirectoryLock, claim_epoch, give_back_epoch, newest_epoch
+from service.base.parsing import parse_json
 from service.base.types import FloatArray, StateArray
+from service.base.version import git_commit
 from service.config import Config, dump_config, load_config
 from service.store.checkpoints import CheckpointStore
-from service.store.run_history import FIRST_VERSION, RunHistory, is_of_this_version, read_history, written_by
+from service.store.run_history import FIRST_VERSION, RunHistory, is_of_this_version, read_history, read_note, written_by
 
 if TYPE_CHECKING:
     from service.base.tensorboard import EventFile
 
 _logger = logging.getLogger(__name__)
 MAX_DIVERGED_FILES = 100
-MAX_NOTE_BYTES = 10_000
-MAX_RESULT_BYTES = 1_000_000
 RECORDINGS = "recordings"
 RESULT_FILE = "result.json"
 """What was measured at the end of a run."""
@@ -121,8 +117,10 @@ class RunDirectory:
         self._events: EventFile | None = None
         self._failing: dict[Path, str] = {}
         self._lock: DirectoryLock | None = None
-        self.history: RunHistory | None = None
-        """Identity of the run, and what was not as before when a process went on with it; None before ``claim``."""
+        self._damaged: dict[str, str] = {}
+        """What is wrong with files of records, by their names, and was accepted."""
+        self.history = RunHistory.new()
+        """Identity of the run, and what was not as before when a process went on with it; read by ``claim``."""
         self.epoch = 0
         """Number of this process among those that ever ran the run; 0 before ``claim``."""
 
@@ -136,23 +134,15 @@ class RunDirectory:
 
         Raises:
             ConfigError: no run here, one of another version, or its configuration cannot be read.
-            StorageError: see ``version``.
+            StorageError: the file that names its version cannot be read, or is damaged.
         """
         if not self.exists:
             raise ConfigError(f"no run in {self.path}: {self.config_file.name} is missing; name the directory of a run")
-        if not is_of_this_version(self.version):
-            raise ConfigError(written_by(self.path, self.version))
-        return load_config(self.config_file, overrides)
-
-    @property
-    def version(self) -> str:
-        """The version of tandem that began the run which is here.
-
-        Raises:
-            StorageError: the file that says so cannot be read, or is damaged.
-        """
         history = read_history(self.path)
-        return history.tandem if history is not None else FIRST_VERSION
+        version = history.tandem if history is not None else FIRST_VERSION
+        if not is_of_this_version(version):
+            raise ConfigError(written_by(self.path, version))
+        return load_config(self.config_file, overrides)
 
     def start(self, config: Config, resumption: Resumption | None = None) -> None:
         """Begin a run here, or continue one: then records of later iterations, which will be made again, are dropped.
@@ -162,29 +152,25 @@ class RunDirectory:
             resumption: where it goes on; None for a run that begins.
 
         Raises:
-            TandemError: a new run where there is one already, or a directory that cannot be written.
+            StorageError: the directory cannot be read or written.
         """
         from service.base.tensorboard import EventFile  # TensorBoard's packages, which only a run needs
 
-        if resumption is None:
-            self.check_free()
         with os_errors("write", self.path):
             self.checkpoints.mkdir(parents=True, exist_ok=True)
             remove_temporaries(self.path)
-        damaged = self._damaged(resumption) if resumption is not None else {}
         for writer in (self._metrics, self._goals):
             if resumption is None:
                 writer.cut(0)
-            elif writer.path.name in damaged:
-                writer.cut_after(resumption.iteration, accept_damage=True)
+            elif writer.path.name in self._damaged:
+                writer.cut_after(resumption.iteration)
             else:
                 writer.cut(resumption.records[writer.path.name].num_bytes)
         with os_errors("write", self.path):
             after_step = resumption.num_env_steps if resumption is not None else None
             self._events = EventFile(self.path / "tensorboard", after_step=after_step)
-            self.history = self.history or RunHistory.new()
             if resumption is not None:
-                said = [f"{name} {what}" for name, what in damaged.items()]
+                said = [f"{name} {what}" for name, what in self._damaged.items()]
                 at = datetime.now(UTC)
                 self.history = self.history.with_event(at, resumption.iteration, resumption.changed, said)
             self.history.write(self.path)
@@ -197,22 +183,7 @@ class RunDirectory:
         Raises:
             StorageError: the file that says so cannot be read, or is damaged.
         """
-        path = self.published_file
-        with os_errors("read", path):
-            try:
-                data = read_regular(path, MAX_NOTE_BYTES, follow=True)
-            except FileNotFoundError:
-                return None
-        try:
-            note = parse_json(data, path)
-            version, digest = note["version"], note["blob_sha256"]
-        except (ParseError, KeyError, TypeError):
-            version = digest = None
-        if not (isinstance(version, str) and isinstance(digest, str)):
-            raise StorageError(
-                f"{path} names no version and digest; remove it: what the run publishes next then has no parent"
-            )
-        return Published(version, digest)
+        return read_note(self.published_file, TypeAdapter(Published).validate_json)
 
     def read_result(self) -> dict[str, Any] | None:
         """What was measured at the end; None before it.
@@ -220,18 +191,13 @@ class RunDirectory:
         Raises:
             StorageError: the file that says so cannot be read, or is damaged.
         """
-        path = self.path / RESULT_FILE
-        with os_errors("read", path):
-            try:
-                data = read_regular(path, MAX_RESULT_BYTES, follow=True)
-            except FileNotFoundError:
-                return None
-        try:
-            result: dict[str, Any] = dict(parse_json(data, path))
+
+        def parse(data: bytes) -> dict[str, Any]:
+            result: dict[str, Any] = parse_json(data, RESULT_FILE)
             _Result.model_validate(result)
-        except (ParseError, ValueError, TypeError):
-            raise StorageError(f"{path} is no result; remove it, and --resume makes it again") from None
-        return result
+            return result
+
+        return read_note(self.path / RESULT_FILE, parse)
 
     def write_result(self, result: Mapping[str, JsonValue]) -> None:
         """Keep what was measured at the end, in ``result.json``.
@@ -264,11 +230,11 @@ class RunDirectory:
         if resume:
             CheckpointStore(self.checkpoints, keep=1).check_any()
         else:
-            self.check_free()
+            self._check_free()
         self._lock = DirectoryLock(self.path, "stop that one first, or name another --run-dir")
         if not resume:
-            self.check_free()  # of two that begin at once, the second sees here what the first has made
-        self.history = read_history(self.path) if resume else RunHistory.new()
+            self._check_free()  # of two that begin at once, the second sees here what the first has made
+        self.history = (read_history(self.path) if resume else None) or self.history
         self.epoch = claim_epoch(self.path)
 
     def check_owner(self) -> None:
@@ -292,58 +258,51 @@ class RunDirectory:
             CheckpointError: it is of another run.
             StorageError: records are damaged and that is not accepted, or they cannot be read.
         """
-        if self.history is not None and self.history.run != resumption.run:
+        if self.history.run != resumption.run:
             raise CheckpointError(
                 f"{self.path}: its newest checkpoint is of another run ({resumption.run[:8]}, not "
                 f"{self.history.run[:8]}); put that of this run back"
             )
-        damaged = self._damaged(resumption)
-        said = "; ".join(f"{self.path / name} {what}" for name, what in damaged.items())
-        if damaged and not self._accept_damaged_records:
+        found = {
+            each.path.name: each.damage(resumption.records[each.path.name]) for each in (self._metrics, self._goals)
+        }
+        self._damaged = {name: damage for name, damage in found.items() if damage is not None}
+        if not self._damaged:
+            return True
+        said = "; ".join(f"{self.path / name} {what}" for name, what in self._damaged.items())
+        if not self._accept_damaged_records:
             raise StorageError(
                 f"{said}: restore it from a copy, or go on with those records that can be read by "
                 "--accept-damaged-records"
             )
-        if damaged:
-            _logger.warning("%s; going on with those records that can be read", said)
-        return not damaged
+        _logger.warning("%s; going on with those records that can be read", said)
+        return False
 
-    def _damaged(self, resumption: Resumption) -> dict[str, str]:
-        """What is wrong with files of records, by their names."""
-        found = {
-            each.path.name: each.damage(resumption.records[each.path.name]) for each in (self._metrics, self._goals)
-        }
-        return {name: damage for name, damage in found.items() if damage is not None}
-
-    def check_free(self) -> None:
-        """Assert that no run has begun here.
-
-        Raises:
-            TandemError: one has.
-        """
+    def _check_free(self) -> None:
         if self.exists:
             raise TandemError(f"{self.path} holds a run already; continue it with --resume, or name another --run-dir")
 
     def record(self, metrics: dict[str, float]) -> None:
         """Append one iteration's metrics to metrics.jsonl and TensorBoard; where a disk is full they wait in memory."""
-        with self._keep_running(self.metrics_file):
+        with self.keep_running(self.metrics_file):
             self._metrics.append(metrics)
         if self._events is not None:
-            with self._keep_running(self._events.path):
+            with self.keep_running(self._events.path):
                 self._events.add(metrics)
 
     def record_goals(self, iteration: int, num_env_steps: int, goals: StateArray) -> None:
         """Append a sample of an iteration's valid proposals: (M, 7) start x y z, goal x y z (metres), solved 0/1."""
-        with self._keep_running(self.goals_file):
+        with self.keep_running(self.goals_file):
             self._goals.append({"iteration": iteration, "env_steps": num_env_steps, "goals": np.round(goals, 4)})
 
     def keep_recording(self, path: Path) -> None:
         """Put a video aside that is about to be replaced; of more than twenty, the oldest go."""
-        with self._keep_running(path), os_errors("write", self.path / RECORDINGS), suppress(FileNotFoundError):
+        kept_in = self.path / RECORDINGS
+        with self.keep_running(kept_in), os_errors("write", kept_in), suppress(FileNotFoundError):
             when = datetime.fromtimestamp(path.stat().st_mtime, UTC).strftime("%Y%m%dT%H%M%S")
-            (self.path / RECORDINGS).mkdir(exist_ok=True)
-            path.replace(self.path / RECORDINGS / f"{path.stem}-{when}{path.suffix}")
-            kept = sorted((self.path / RECORDINGS).glob(f"{path.stem}-*{path.suffix}"))
+            kept_in.mkdir(exist_ok=True)
+            path.replace(kept_in / f"{path.stem}-{when}{path.suffix}")
+            kept = sorted(kept_in.glob(f"{path.stem}-*{path.suffix}"))
             for old in kept[:-MAX_RECORDINGS]:
                 old.unlink(missing_ok=True)
 
@@ -355,13 +314,13 @@ class RunDirectory:
         path, data = self.diverged / f"round-{name}.npz", io.BytesIO()
         np.savez(data, states=np.stack(states), actions=np.stack(actions))
         _logger.warning("physics diverged in %d worlds, which go on from sound states; see %s", len(states), path)
-        with self._keep_running(self.diverged), os_errors("write", path):
+        with self.keep_running(self.diverged), os_errors("write", path):
             write_atomic(path, data.getvalue())
 
     def sync(self) -> dict[str, Extent]:
         """Wait until the disk has every record, and say what there is: a checkpoint must not know more than they do."""
         for writer in self._writers():
-            with self._keep_running(writer.path):
+            with self.keep_running(writer.path):
                 writer.sync()
         return {writer.path.name: writer.extent for writer in (self._metrics, self._goals)}
 
@@ -391,9 +350,9 @@ class RunDirectory:
         return [self._metrics, self._goals, *([self._events] if self._events is not None else [])]
 
     def problems(self) -> list[str]:
-        """Why records or checkpoints cannot be written at the moment; empty when all is well."""
-        kept = (*(writer.path for writer in self._writers()), self.checkpoints)
-        return [self._failing[path] for path in kept if path in self._failing]
+        """Why records, reports or checkpoints cannot be written at the moment; empty when all is well."""
+        minor = self.diverged, self.path / RECORDINGS
+        return [problem for path, problem in list(self._failing.items()) if path not in minor]
 
     @contextmanager
     def noting(self, path: Path) -> Iterator[None]:
@@ -406,7 +365,7 @@ class RunDirectory:
         self._failing.pop(path, None)
 
     @contextmanager
-    def _keep_running(self, path: Path) -> Iterator[None]:
+    def keep_running(self, path: Path) -> Iterator[None]:
         """Turn a full disk into one warning for ``path`` until a write succeeds again: the run does not end for it."""
         known = path in self._failing
         try:

@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import secrets
+from collections.abc import Callable
 from datetime import datetime
 from pathlib import Path
+from typing import TypeVar
 
 from pydantic import AwareDatetime, Field, JsonValue
 
 from service.base.errors import StorageError
-from service.base.files import os_errors, write_atomic
+from service.base.files import os_errors, read_regular, write_atomic
 from service.base.parsing import ParseError, parse_with
-from service.base.regular_files import read_regular
 from service.base.version import __version__
 from service.config.frozen import FrozenModel
 
@@ -19,6 +20,7 @@ FILE = "run.json"
 FIRST_VERSION, SECOND_VERSION = "0.1.0", "0.2.0"
 """Versions that wrote no ``run.json``, and one that does not say which version wrote it."""
 MAX_BYTES = 16 * 1024 * 1024
+_Note = TypeVar("_Note")
 
 
 class Event(FrozenModel):
@@ -77,13 +79,25 @@ def read_history(directory: Path) -> RunHistory | None:
     Raises:
         StorageError: it cannot be read, or is damaged.
     """
-    path = directory / FILE
+    return read_note(directory / FILE, RunHistory.model_validate_json)
+
+
+def read_note(path: Path, parser: Callable[[bytes], _Note]) -> _Note | None:
+    """Read a file of JSON in a run directory; None where there is none.
+
+    Args:
+        path: of the file.
+        parser: makes a value of its content, or raises an error.
+
+    Raises:
+        StorageError: it cannot be read, or is damaged.
+    """
     with os_errors("read", path):
         try:
-            data = read_regular(path, MAX_BYTES)
+            data = read_regular(path, MAX_BYTES, follow=True)
         except FileNotFoundError:
             return None
     try:
-        return parse_with(RunHistory.model_validate_json, data, path)
+        return parse_with(parser, data, path)
     except ParseError:
-        raise StorageError(f"{path} is damaged; restore it from a copy") from None
+        raise StorageError(f"{path} is damaged; restore it from a copy, or remove it") from None

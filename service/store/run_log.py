@@ -7,17 +7,18 @@ from __future__ import annotations
 
 import json
 import logging
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from datetime import UTC, datetime
 from io import BufferedWriter, TextIOWrapper
 from logging.handlers import RotatingFileHandler
 from pathlib import Path
-from types import TracebackType
-from typing import Literal, Self
+from typing import Literal
 
 from pydantic import AwareDatetime
 
+from service.base.files import open_to_append, read_regular
 from service.base.parsing import ParseError, parse_with
-from service.base.regular_files import open_to_append, read_regular
 from service.config.frozen import FrozenModel
 
 FILE = "log.jsonl"
@@ -35,34 +36,31 @@ class LogLine(FrozenModel):
     text: str
 
 
-class RunLog:
-    """Keeps, in a block, what ``service`` logs in a run directory; its caller has the directory's lock.
+@contextmanager
+def logging_to(directory: Path) -> Iterator[Callable[[str], None]]:
+    """Keep, in the block, what ``service`` logs in a run directory; the caller has the directory's lock.
 
     A disk that is full loses lines, and stops nothing.
+
+    Yields:
+        A function that writes a line that is of no use on a terminal.
     """
+    handler = _Handler(directory / FILE, maxBytes=MAX_FILE_BYTES, backupCount=1, delay=True)
+    handler.setFormatter(_Formatter())
+    handler.setLevel(logging.INFO)
 
-    def __init__(self, directory: Path) -> None:
-        self._handler = _Handler(directory / FILE, maxBytes=MAX_FILE_BYTES, backupCount=1, delay=True)
-        self._handler.setFormatter(_Formatter())
-        self._handler.setLevel(logging.INFO)
+    def note(text: str, level: int = logging.INFO) -> None:
+        handler.handle(logging.LogRecord("service", level, __file__, 0, text, None, None))
 
-    def note(self, text: str) -> None:
-        """Write a line that is of no use on a terminal."""
-        self._handler.handle(logging.LogRecord("service", logging.INFO, __file__, 0, text, None, None))
-
-    def __enter__(self) -> Self:
-        _LOGGER.addHandler(self._handler)
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        if isinstance(error, Exception):
-            self._handler.handle(
-                logging.LogRecord("service", logging.ERROR, __file__, 0, "the run failed: %s", (error,), None)
-            )
-        _LOGGER.removeHandler(self._handler)
-        self._handler.close()
+    _LOGGER.addHandler(handler)
+    try:
+        yield note
+    except Exception as error:
+        note(f"the run failed: {error}", logging.ERROR)
+        raise
+    finally:
+        _LOGGER.removeHandler(handler)
+        handler.close()
 
 
 class _Handler(RotatingFileHandler):

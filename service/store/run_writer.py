@@ -5,16 +5,23 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Callable
-from contextlib import ExitStack
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 from pydantic import BaseModel
 
-from service.base.files import write_atomic
+from service.base.files import os_errors, write_atomic
 from service.store.address import RedisAddress
-from service.store.disk import GOALS_FILE, STATUS_FILE, STOP_FILE
-from service.store.models import Condition, GoalGrid, Record, RunState, RunStatus, Trouble
+from service.store.models import (
+    GOALS_FILE,
+    STATUS_FILE,
+    STOP_FILE,
+    Condition,
+    GoalGrid,
+    Record,
+    RunState,
+    RunStatus,
+    Trouble,
+)
 from service.store.run_directory import RunDirectory
 
 if TYPE_CHECKING:
@@ -36,7 +43,6 @@ def reporting_to(directory: RunDirectory, run_id: str, address: RedisAddress | N
         return RunWriter(directory)
     from service.store.redis_writer import RedisWriter  # where there is no Redis, its package is not needed
 
-    assert directory.history is not None
     return RunWriter(directory, RedisWriter(address, run_id, run=directory.history.run, epoch=directory.epoch))
 
 
@@ -59,16 +65,18 @@ class RunWriter:
         *,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
-        """Take back the stop request of an earlier process."""
+        """Take back the stop request of an earlier process.
+
+        Raises:
+            StorageError: it cannot be deleted; the run would stop at once.
+        """
         self._directory, self._redis = directory, redis
         self._stop_file = directory.path / STOP_FILE
-        self._status = _LatestFile(directory.path / STATUS_FILE, STATUS_INTERVAL_S, clock)
-        self._goals = _LatestFile(directory.path / GOALS_FILE, GOALS_INTERVAL_S, clock)
+        self._status = _LatestFile(directory, STATUS_FILE, STATUS_INTERVAL_S, clock)
+        self._goals = _LatestFile(directory, GOALS_FILE, GOALS_INTERVAL_S, clock)
         self._told: tuple[RunState, Condition] | None = None
-        try:
+        with os_errors("write", self._stop_file):
             self._stop_file.unlink(missing_ok=True)
-        except OSError as error:
-            _logger.warning("cannot delete %s: %s; the run will stop at once", self._stop_file, error.strerror)
 
     def check(self) -> None:
         """Assert that this process is still the one that runs the run.
@@ -103,27 +111,24 @@ class RunWriter:
 
     def troubles(self) -> list[Trouble]:
         """Problems at the moment, such as files that cannot be written; empty when all is well."""
-        problems = [self._status.problem, self._goals.problem, *self._directory.problems()]
-        found = [Trouble("disk", problem) for problem in problems if problem is not None]
+        found = [Trouble("disk", problem) for problem in self._directory.problems()]
         return [*found, *(self._redis.troubles() if self._redis is not None else ())]
 
     def close(self) -> None:
-        """Write what still waits, for a bounded time, to every store, also where another fails."""
-        with ExitStack() as stack:
-            if self._redis is not None:
-                stack.callback(self._redis.close)
-            stack.callback(self._goals.flush)
-            stack.callback(self._status.flush)
+        """Write what still waits, for a bounded time."""
+        self._status.flush()
+        self._goals.flush()
+        if self._redis is not None:
+            self._redis.close()
 
 
 class _LatestFile:
     """Holds the newest of what it is given, not older than ``interval_s`` when something newer comes."""
 
-    def __init__(self, path: Path, interval_s: float, clock: Callable[[], float]) -> None:
-        self._path, self._interval_s, self._clock = path, interval_s, clock
+    def __init__(self, directory: RunDirectory, name: str, interval_s: float, clock: Callable[[], float]) -> None:
+        self._directory, self._path, self._interval_s, self._clock = directory, directory.path / name, interval_s, clock
         self._waiting: BaseModel | None = None
         self._written_s = float("-inf")
-        self.problem: str | None = None
 
     def put(self, content: BaseModel, *, now: bool = False) -> None:
         self._waiting = content
@@ -131,15 +136,10 @@ class _LatestFile:
             self.flush()
 
     def flush(self) -> None:
-        if self._waiting is None:
+        content = self._waiting
+        if content is None:
             return
         self._written_s = self._clock()
-        try:
-            write_atomic(self._path, self._waiting.model_dump_json().encode() + b"\n", flush=False)
-        except OSError as error:
-            problem = f"{self._path.name} cannot be written: {error.strerror}"
-            if self.problem is None:
-                _logger.warning("%s: %s; the run goes on", self._path.parent, problem)
-            self.problem = problem
-        else:
-            self._waiting, self.problem = None, None
+        with self._directory.keep_running(self._path), os_errors("write", self._path):
+            write_atomic(self._path, content.model_dump_json().encode() + b"\n", flush=False)
+            self._waiting = None

@@ -7,19 +7,19 @@ import math
 import sys
 from array import array
 from bisect import bisect_left
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
-from functools import cache
 from io import BytesIO
 from pathlib import Path
-from threading import Lock
-from typing import Any, BinaryIO
+from threading import RLock
+from typing import BinaryIO
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from service.base.files import open_regular
 from service.base.parsing import ParseError, parse_json, parse_with
-from service.base.regular_files import open_regular
 from service.store.models import Columns, Record
 
 INDEX = ("iteration", "env_steps")
@@ -29,9 +29,50 @@ _SEAL_BYTES = 256
 """Length of the end of what was read, by which a file is known again that was cut meanwhile."""
 _MAX_LINE_BYTES = 1024 * 1024
 _TAIL_BYTES = 32 * 1024
-_BATCH = 1000
-"""Lines that are decoded before they become numbers of NumPy's, which need a tenth of the room."""
+_parse = msgspec.json.Decoder(dict[str, int | float | None]).decode
+"""Parses a line ten times as fast as the ``json`` of Python, which reads what this one refuses."""
 _logger = logging.getLogger(__name__)
+
+
+class Table(dict[str, "array[float]"]):
+    """Records as a column for each key, which takes a tenth of their memory; NaN where a record has nothing.
+
+    An iteration that comes again cuts off all after it. A column ends with the last record that has its key.
+    """
+
+    def add(self, record: Record) -> None:
+        """Append one record."""
+        iterations = self.setdefault("iteration", array("d"))
+        if iterations and _iteration(record) <= iterations[-1]:
+            size = bisect_left(iterations, _iteration(record))
+            for column in self.values():
+                del column[size:]
+        size = len(iterations)
+        for name, value in record.items():
+            if name not in self:
+                self[name] = array("d")
+            column = self[name]
+            if len(column) < size:
+                column.extend([math.nan] * (size - len(column)))
+            column.append(math.nan if value is None else value)
+
+    def columns(self, names: Sequence[str] | None) -> Columns:
+        """Metrics over all iterations; None for all that there are. Names that no record has are left out."""
+        there = sorted(self.keys() - set(INDEX))
+        wanted = there if names is None else [name for name in names if name in there]
+        iterations, env_steps = map(self._whole, INDEX)
+        return Columns(
+            iteration=iterations.astype(np.int64),
+            env_steps=np.nan_to_num(env_steps).astype(np.int64),
+            metrics={name: self._whole(name) for name in wanted},
+            names=tuple(there),
+        )
+
+    def _whole(self, name: str) -> NDArray[np.float64]:
+        whole = np.full(len(self.get("iteration", ())), np.nan)
+        column = self.get(name, ())
+        whole[: len(column)] = column
+        return whole
 
 
 class RecordFile:
@@ -42,29 +83,29 @@ class RecordFile:
     """
 
     def __init__(self, path: Path) -> None:
-        self._path, self._lock = path, Lock()
+        self._path, self._lock = path, RLock()
         self.forget()
+
+    def forget(self) -> None:
+        """Free the memory of all columns."""
+        with self._lock:
+            self._table = Table()
+            self._end, self._seal = 0, b""
+            self.num_bytes = 0
+            """Memory that the columns take."""
+            self.num_passed_over = 0
+            """Lines that are no records, of those in columns."""
 
     def after(self, iteration: int) -> list[Record]:
         """The records of iterations above ``iteration``, in order."""
         with self._open() as file:
-            for whole, records in _newest_first(file):
-                if whole or (records and _iteration(records[0]) <= iteration):
-                    kept: list[Record] = []
-                    for record in records:
-                        while kept and _iteration(kept[-1]) >= _iteration(record):
-                            kept.pop()
-                        kept.append(record)
-                    return [record for record in kept if _iteration(record) > iteration]
-        return []
-
-    def last(self) -> Record | None:
-        """The newest record; None before the first."""
-        with self._open() as file:
-            return next((records[-1] for _, records in _newest_first(file) if records), None)
+            kept = _read_from(file, max(0, file.seek(0, 2) - _TAIL_BYTES))
+            if not kept or _iteration(kept[0]) > iteration:
+                kept = _read_from(file, 0)
+        return [record for record in kept if _iteration(record) > iteration]
 
     def sample(self, name: str, number: int) -> list[float | None]:
-        """A metric of about ``number`` records, evenly over the file, without reading the others."""
+        """A metric of about ``number`` records, evenly over the file and with the last, without reading the others."""
         found: dict[int, Record] = {}
         with self._open() as file:
             size = file.seek(0, 2)
@@ -74,40 +115,27 @@ class RecordFile:
                     file.readline(_MAX_LINE_BYTES)  # the rest of a line
                 if (record := parse_record(file.readline(_MAX_LINE_BYTES))) is not None:
                     found[_iteration(record)] = record
-        if (last := self.last()) is not None:
-            found[_iteration(last)] = last
+            for last in _read_from(file, max(0, size - _TAIL_BYTES))[-1:]:
+                found[_iteration(last)] = last
         return [record.get(name) for record in found.values()]
 
     def columns(self, names: Sequence[str] | None) -> Columns:
-        """Metrics over all iterations; None for all that there are. Names that no record has are left out."""
+        """Metrics over all iterations; see ``Table.columns``."""
         with self._lock, self._open() as file:
-            try:
-                self._catch_up(file)
-            except OSError:  # in the middle of a batch
+            file.seek(self._end - len(self._seal))
+            if file.read(len(self._seal)) != self._seal:  # cut by a resume, or another file
                 self.forget()
-                raise
-            there = sorted(self._columns.keys() - set(INDEX))
-            wanted = there if names is None else [name for name in names if name in self._columns and name not in INDEX]
-            return Columns(
-                iteration=np.array(self._iterations, dtype=np.int64),
-                env_steps=np.nan_to_num(np.array(self._columns["env_steps"])).astype(np.int64),
-                metrics={name: np.array(self._columns[name]) for name in wanted},  # a view would keep it from growing
-                names=tuple(there),
-            )
-
-    @property
-    def num_bytes(self) -> int:
-        """Memory that the columns take."""
-        return 8 * len(self._iterations) * len(self._columns)
-
-    def forget(self) -> None:
-        """Free the memory of all columns."""
-        self._iterations = array("q")
-        self._columns: dict[str, array[float]] = {}
-        self._learn(["env_steps"])
-        self._end, self._seal = 0, b""
-        self.num_passed_over = 0
-        """Lines that are no records, of those in columns."""
+                file.seek(0)
+            for line in _lines(file):  # a torn last one waits for its end
+                if (record := parse_record(line)) is not None:
+                    self._table.add(record)
+                else:
+                    self.num_passed_over += 1
+                    _logger.warning("%s: passing over what is no record: %r", self._path, line[:60])
+                self._end += len(line)
+                self._seal = line[-_SEAL_BYTES:]
+            self.num_bytes = sum(8 * len(column) for column in self._table.values())
+            return self._table.columns(names)
 
     def _open(self) -> BinaryIO:
         try:
@@ -115,103 +143,25 @@ class RecordFile:
         except FileNotFoundError:
             return BytesIO()
 
-    def _catch_up(self, file: BinaryIO) -> None:
-        """Add the lines that are new to the columns; a torn last one waits for its end."""
-        file.seek(self._end - len(self._seal))
-        if file.read(len(self._seal)) != self._seal:  # cut by a resume, or another file
-            self.forget()
-            file.seek(0)
-        rows: list[tuple[float | None, ...]] = []
-        for line in _lines(file):
-            try:
-                row = parse_with(self._decode, line, "record")
-            except ParseError:  # no record, or one with a metric that is new, or with something that is no number
-                record = parse_record(line)
-                if record is not None and (new := record.keys() - self._columns.keys() - {"iteration"}):
-                    self._extend(rows)
-                    self._learn(sorted(new))
-                row = (record["iteration"], *map(record.get, self._columns)) if record is not None else (None,)
-            if row[0] is None or abs(row[0]) > MAX_ITERATION:
-                self.num_passed_over += 1
-                _logger.warning("%s: passing over what is no record: %r", self._path, line[:60])
-            else:
-                if self._iterations and row[0] <= self._iterations[-1]:
-                    self._extend(rows)
-                    self._cut(bisect_left(self._iterations, row[0]))
-                elif len(rows) == _BATCH:
-                    self._extend(rows)
-                self._iterations.append(int(row[0]))
-                rows.append(row)
-            self._end += len(line)
-            self._seal = line[-_SEAL_BYTES:]
-        self._extend(rows)
-
-    def _cut(self, size: int) -> None:
-        del self._iterations[size:]
-        for column in self._columns.values():
-            del column[size:]
-
-    def _extend(self, rows: list[tuple[float | None, ...]]) -> None:
-        """Put decoded rows into the columns, and empty the list."""
-        if rows:
-            numbers: NDArray[np.float64] = np.array(rows, dtype=np.float64).T[1:].copy()
-            for column, values in zip(self._columns.values(), numbers, strict=True):
-                column.frombytes(values.tobytes())
-            rows.clear()
-
-    def _learn(self, names: Sequence[str]) -> None:
-        """Begin a column for each of these metrics, and make the decoder of all: ten times as fast as a parser."""
-        import msgspec
-
-        self._columns.update({name: array("d", [math.nan]) * len(self._iterations) for name in names})
-        keys = {f"f{index}": name for index, name in enumerate(self._columns)}
-        fields: list[Any] = [("iteration", int), *((field, float | None, None) for field in keys)]
-        kind = msgspec.defstruct("Line", fields, rename=keys, gc=False, forbid_unknown_fields=True)
-        decode, values = msgspec.json.Decoder(kind).decode, msgspec.structs.astuple
-        self._decode: Callable[[bytes], tuple[float | None, ...]] = lambda line: values(decode(line))
-
 
 def parse_record(text: bytes) -> Record | None:
-    """One record of JSON text; None where it is none."""
+    """One record of JSON text; None where it is none. What is no number is left out; no finite one is None."""
     try:
-        return _check_record(parse_with(_fast_parser(), text, "record"))
+        record = parse_with(_parse, text, "record")
     except ParseError:  # NaN, which is no JSON, or something that is no number
+        record = None
         with suppress(ParseError):
-            return _check_record(parse_json(text, "record", allow_nan=True))
-    return None
-
-
-@cache
-def _fast_parser() -> Callable[[bytes], Any]:
-    import msgspec
-
-    return msgspec.json.Decoder(dict[str, int | float | None]).decode
-
-
-def _check_record(record: Any) -> Record | None:
-    iteration = record.get("iteration") if isinstance(record, dict) else None
+            record = parse_json(text, "record", allow_nan=True)
+    if not isinstance(record, dict):
+        return None
+    iteration = record.get("iteration")
     if type(iteration) is not int or abs(iteration) > MAX_ITERATION:
         return None
-    values = {name: value for name, value in record.items() if value is None or type(value) in (int, float)}
     return {
-        name: value if value is None or abs(value) <= sys.float_info.max else None for name, value in values.items()
+        name: value if value is None or abs(value) <= sys.float_info.max else None
+        for name, value in record.items()
+        if value is None or type(value) in (int, float)
     }
-
-
-def columns_of(records: Sequence[Record], names: Sequence[str] | None) -> Columns:
-    """Records in columns."""
-    there = {name for record in records for name in record if name not in INDEX}
-    wanted = sorted(there) if names is None else [name for name in names if name in there]
-
-    def column(name: str) -> NDArray[np.float64]:
-        return np.array([record.get(name) for record in records], dtype=np.float64)
-
-    return Columns(
-        iteration=column("iteration").astype(np.int64),
-        env_steps=np.nan_to_num(column("env_steps")).astype(np.int64),
-        metrics={name: column(name) for name in wanted},
-        names=tuple(sorted(there)),
-    )
 
 
 def _iteration(record: Record) -> int:
@@ -224,12 +174,14 @@ def _lines(file: BinaryIO) -> Iterator[bytes]:
         yield line
 
 
-def _newest_first(file: BinaryIO) -> Iterator[tuple[bool, list[Record]]]:
-    """The records at the end of a file, then those of the whole file; and which of both it is."""
-    start = max(0, file.seek(0, 2) - _TAIL_BYTES)
-    for begin in dict.fromkeys((start, 0)):
-        file.seek(begin)
-        if begin:
-            file.readline(_MAX_LINE_BYTES)  # the rest of a line
-        found = map(parse_record, _lines(file))
-        yield begin == 0, [record for record in found if record is not None]
+def _read_from(file: BinaryIO, start: int) -> list[Record]:
+    """The records after a place in a file, each iteration once."""
+    file.seek(start)
+    if start:
+        file.readline(_MAX_LINE_BYTES)  # the rest of a line
+    kept: list[Record] = []
+    for record in filter(None, map(parse_record, _lines(file))):
+        while kept and _iteration(kept[-1]) >= _iteration(record):
+            kept.pop()
+        kept.append(record)
+    return kept

@@ -1,10 +1,12 @@
+"""Files that grow by whole pieces, new directories, and regular files, beside which nothing is waited for."""
+
 import os
 
 import pytest
 
 from service.base import files
 from service.base.errors import StorageError
-from service.base.files import Appender
+from service.base.files import Appender, open_regular, open_to_append, read_regular
 from tests.runs.runs import assert_one_line, no_room_above
 
 
@@ -20,6 +22,9 @@ def test_pieces_come_one_after_the_other_behind_what_is_there(path):
     Appender(path).append_bytes(b"c")
     appender.append_bytes(b"d")
     assert path.read_bytes() == b"abcd"
+    path.unlink()
+    appender.append_bytes(b"e")  # a file that was removed begins anew
+    assert path.read_bytes() == b"e"
 
 
 def test_a_piece_that_does_not_fit_leaves_no_part_and_comes_before_the_next(path):
@@ -57,30 +62,10 @@ def test_a_part_is_taken_back_when_a_signal_comes_between_two_writes(path, monke
 
     appender = Appender(path)
     appender.append_bytes(b"aaa")
-    with monkeypatch.context() as patch:
-        unbuffered = files.open_to_append
-        patch.setattr(files, "open_to_append", lambda path: Interrupted(unbuffered(path)))
-        with pytest.raises(KeyboardInterrupt):
-            appender.append_bytes(b"bbb")
+    monkeypatch.setattr(files, "open_to_append", lambda path: Interrupted(open_to_append(path)))
+    with pytest.raises(KeyboardInterrupt):
+        appender.append_bytes(b"bbb")
     assert path.read_bytes() == b"aaa"
-
-
-@pytest.mark.parametrize(
-    ("make", "reason"),
-    [
-        (os.mkfifo, "not a regular file"),
-        (lambda path: path.symlink_to("/dev/full"), "a symbolic link, which is not followed"),
-        (lambda path: path.symlink_to(path.with_name("precious")), "a symbolic link, which is not followed"),
-    ],
-)
-def test_nothing_is_appended_to_what_is_no_file_of_the_run(path, make, reason):
-    path.parent.mkdir()
-    path.with_name("precious").write_text("precious")
-    make(path)
-    with pytest.raises(StorageError) as error:
-        Appender(path).append_bytes(b"a")
-    assert_one_line(error.value, "cannot write", path, reason)
-    assert path.with_name("precious").read_text() == "precious"
 
 
 def test_a_new_directory_takes_its_name_when_all_is_well_and_not_before(tmp_path):
@@ -89,21 +74,56 @@ def test_a_new_directory_takes_its_name_when_all_is_well_and_not_before(tmp_path
         (temporary / "file").write_text("whole")
         assert not path.exists()
     assert [each.name for each in path.parent.iterdir()] == ["folder"]
-    assert (path / "file").read_text() == "whole"
     with pytest.raises(StorageError) as error, files.new_directory(path):
         pass
-    assert_one_line(error.value, "cannot write", path, "it exists; name another folder")
+    assert_one_line(error.value, "cannot write", path, "it exists")
     assert (path / "file").read_text() == "whole"
 
 
 def test_nothing_is_left_of_a_new_directory_that_was_not_finished(tmp_path):
-    def begin():
-        with files.new_directory(tmp_path / "folder") as temporary:
-            (temporary / "file").touch()
-            raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        begin()
+    with pytest.raises(KeyboardInterrupt), files.new_directory(tmp_path / "folder"):
+        raise KeyboardInterrupt
     with pytest.raises(StorageError, match="cannot write"), files.new_directory(tmp_path / "other"):
         (tmp_path / "other" / "of another process").mkdir(parents=True)
     assert sorted(each.name for each in tmp_path.iterdir()) == ["other"]
+
+
+# --- regular files ---------------------------------------------------------------------------------------------------
+
+
+def test_a_file_is_read_whole_and_no_more_than_is_allowed(tmp_path):
+    path, link = tmp_path / "file", tmp_path / "link"
+    path.write_bytes(b"12345")
+    link.symlink_to(path)
+    assert read_regular(path, 5) == read_regular(link, 5, follow=True) == b"12345"
+    with pytest.raises(OSError, match="longer than 4 bytes"):
+        read_regular(path, 4)
+    with path.open("wb") as file:
+        file.truncate(1 << 40)  # without a block on the disk
+    with pytest.raises(OSError, match="longer than"):
+        read_regular(path)
+
+
+@pytest.mark.parametrize("make", [os.mkfifo, os.mkdir, lambda path: path.symlink_to("/dev/zero")])
+def test_what_is_no_file_is_neither_read_nor_written(tmp_path, make):
+    path = tmp_path / "other"
+    make(path)
+    before = len(os.listdir("/proc/self/fd"))
+    for _ in range(3):
+        with pytest.raises(OSError, match="not a regular file"):
+            open_regular(path, follow=True)
+        with pytest.raises(OSError, match=r"not a regular file|Is a directory|not followed"):
+            open_to_append(path)
+    assert len(os.listdir("/proc/self/fd")) == before
+
+
+def test_what_a_link_leads_to_is_not_changed(tmp_path):
+    (tmp_path / "precious").write_text("precious")
+    (tmp_path / "link").symlink_to("precious")
+    for use in (open_regular, open_to_append, read_regular):
+        with pytest.raises(OSError, match="a symbolic link"):
+            use(tmp_path / "link")
+    with pytest.raises(StorageError) as error:
+        Appender(tmp_path / "link").append_bytes(b"a")
+    assert_one_line(error.value, "cannot write", tmp_path / "link", "a symbolic link")
+    assert (tmp_path / "precious").read_text() == "precious"

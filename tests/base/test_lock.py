@@ -1,4 +1,4 @@
-"""One process at a time in a directory."""
+"""One process at a time in a directory, and the number of each that ever ran a run, of which the highest counts."""
 
 import logging
 import os
@@ -11,7 +11,7 @@ import pytest
 
 from service.base import lock
 from service.base.errors import RunTakenError, StorageError
-from service.base.lock import DirectoryLock, is_locked
+from service.base.lock import DirectoryLock, claim_epoch, is_locked, newest_epoch
 from tests.runs.runs import assert_one_line
 
 HOLD = """
@@ -33,27 +33,18 @@ def other(tmp_path):
         process.kill()
 
 
-def test_a_second_process_is_refused_in_one_line(tmp_path, other):
+def test_a_second_process_is_refused_in_one_line_until_the_first_is_killed(tmp_path, other, monkeypatch):
     with pytest.raises(RunTakenError) as error:
         DirectoryLock(tmp_path, "name another one")
     assert_one_line(error.value, tmp_path, f"process {other.pid} on {os.uname().nodename}", "name another one")
-
-
-def test_a_process_that_is_killed_leaves_no_lock(tmp_path, other):
     assert is_locked(tmp_path)
-    other.send_signal(signal.SIGKILL)
-    other.wait()
-    assert not is_locked(tmp_path)
-    DirectoryLock(tmp_path, "").release()
-
-
-def test_a_lock_is_waited_for(tmp_path, other, monkeypatch):
-    monkeypatch.setattr(lock, "WAIT_S", 600.0)
+    monkeypatch.setattr(lock, "WAIT_S", 600.0)  # it is waited for
     start_s = time.monotonic()
     signal.signal(signal.SIGALRM, lambda *_: other.kill())
     signal.setitimer(signal.ITIMER_REAL, 0.2)
     DirectoryLock(tmp_path, "").release()
     assert time.monotonic() - start_s >= 0.2
+    assert not is_locked(tmp_path)
 
 
 def test_asking_does_not_take_the_lock(tmp_path):
@@ -64,15 +55,14 @@ def test_asking_does_not_take_the_lock(tmp_path):
     first.release()
     first.release()
     assert not is_locked(tmp_path)
-    with pytest.raises(RunTakenError):  # an object counts as a process does
-        _ = DirectoryLock(tmp_path, ""), DirectoryLock(tmp_path, "")
 
 
-def test_a_damaged_lock_file_is_as_good_as_any(tmp_path):
+def test_a_damaged_lock_file_is_as_good_as_any(tmp_path, monkeypatch):
+    monkeypatch.setattr(lock, "WAIT_S", 0.0)
     (tmp_path / ".lock").write_bytes(b"\xff{")
     first = DirectoryLock(tmp_path, "")
     (tmp_path / ".lock").write_bytes(b"\xff{")
-    with pytest.raises(RunTakenError, match="in use by another process"):
+    with pytest.raises(RunTakenError, match="in use by another process"):  # an object counts as a process does
         DirectoryLock(tmp_path, "")
     first.release()
 
@@ -103,3 +93,31 @@ def test_a_file_system_without_locks_is_refused_unless_one_says_so(tmp_path, mon
     with caplog.at_level(logging.WARNING):
         DirectoryLock(tmp_path, "").release()
     assert_one_line(caplog.messages[0], tmp_path, "no locks", "Operation not supported")
+
+
+# --- epochs ----------------------------------------------------------------------------------------------------------
+
+
+def test_each_number_is_claimed_once(tmp_path, monkeypatch):
+    """Another process takes the number that this one has just seen to be free."""
+
+    def look(directory):
+        monkeypatch.undo()
+        seen = newest_epoch(directory)
+        assert claim_epoch(directory) == 1
+        return seen
+
+    monkeypatch.setattr(lock, "newest_epoch", look)
+    assert claim_epoch(tmp_path) == 2
+    assert (newest_epoch(tmp_path), claim_epoch(tmp_path)) == (2, 3)
+
+
+def test_a_number_beyond_eight_digits(tmp_path):
+    """It once made a run that was resumed hang for ever."""
+    (tmp_path / "epochs").mkdir()
+    (tmp_path / "epochs" / "99999999").touch()
+    assert (claim_epoch(tmp_path), claim_epoch(tmp_path)) == (10**8, 10**8 + 1)
+    (tmp_path / "epochs" / ("9" * 255)).touch()
+    with pytest.raises(StorageError) as error:
+        claim_epoch(tmp_path)
+    assert_one_line(error.value, tmp_path, "File name too long")

@@ -4,7 +4,8 @@ from itertools import pairwise
 
 import pytest
 
-from service.base.parsing import MAX_DEPTH, MAX_YAML_VALUES, ParseError, parse_json, parse_yaml
+from service.base.parsing import MAX_DEPTH, ParseError, parse_json, parse_yaml
+from tests.runs.runs import assert_one_line
 
 
 @pytest.mark.parametrize(
@@ -12,7 +13,7 @@ from service.base.parsing import MAX_DEPTH, MAX_YAML_VALUES, ParseError, parse_j
     [
         ('{"a": [1, 2.5, null, true, "\\u00e4"]}', {"a": [1, 2.5, None, True, "\u00e4"]}),
         ("[" * MAX_DEPTH + "]" * MAX_DEPTH, None),
-        (str(2**128), 2**128),  # as states of random generators are
+        (str(10**300), 10**300),  # states of random generators have 39 digits
     ],
 )
 def test_json_is_read_as_it_is(text, value):
@@ -43,8 +44,7 @@ def test_json_of_pythons_own_numbers():
 def test_json_that_is_refused(text, reason):
     with pytest.raises(ParseError) as error:
         parse_json(text, "a file")
-    assert str(error.value).startswith(f"a file: {reason}")
-    assert "\n" not in str(error.value)
+    assert_one_line(error.value, f"a file: {reason}")
 
 
 def test_yaml_with_aliases():
@@ -69,16 +69,12 @@ LAUGHS = "a: &a [x, x, x]\n" + "".join(
         ("a: [1", "not YAML (while parsing a flow sequence"),
         (b"\x00", "not YAML (unacceptable character"),
         ("x" * 300_000, "too long for YAML (300000 characters"),
-        ("- " * 100_000, "not YAML (nested more than 64 deep)"),
-        ("[" * 100_000, "not YAML (nested more than 64 deep)"),
-        (LAUGHS, "not YAML (more than 5000 values)"),
-        ("[" + "1," * MAX_YAML_VALUES + "]", "not YAML (more than 5000 values)"),
-        ("&a [*a, *a]", "not YAML (an alias within what it stands for)"),
-        ("a: &a {b: {c: *a}}", "not YAML (an alias within what it stands for)"),
+        ("- " * 100_000, "nested more than 64 deep"),
+        ("[" * (MAX_DEPTH + 1) + "]" * (MAX_DEPTH + 1), "nested more than 64 deep"),
+        (LAUGHS, "more than 5000 values"),
+        ("a: &a {b: {c: *a}}", "nested more than 64 deep"),
         ("!!python/object/apply:os.system [id]", "not YAML (could not determine a constructor"),
         ("!!bool x", "not YAML ('x')"),
-        ("!!int ''", "not YAML (string index out of range)"),
-        ("!!timestamp x", "not YAML ("),
         ("2026-02-30", "not YAML (day is out of range"),
         ("0x" + "f" * 20, "a whole number beyond 9.22e+18"),
         ("9" * 10_000, "not YAML (Exceeds the limit"),
@@ -90,8 +86,7 @@ LAUGHS = "a: &a [x, x, x]\n" + "".join(
 def test_yaml_that_is_refused(text, reason):
     with pytest.raises(ParseError) as error:
         parse_yaml(text, "a file")
-    assert str(error.value).startswith(f"a file: {reason}")
-    assert "\n" not in str(error.value)
+    assert_one_line(error.value, f"a file: {reason}")
 
 
 def test_aliases_may_repeat_as_much_as_is_allowed():
@@ -99,5 +94,5 @@ def test_aliases_may_repeat_as_much_as_is_allowed():
     tens = "[1, 1, 1, 1, 1, 1, 1, 1, 1]"  # with the list itself ten values
     repeated = f"- &a {tens}\n" + "- *a\n" * 498
     assert len(parse_yaml(repeated, "a file")) == 499
-    with pytest.raises(ParseError, match="more than 5000 values"):
+    with pytest.raises(ParseError, match="5000"):
         parse_yaml(repeated + "- *a\n- *a\n", "a file")

@@ -1,13 +1,11 @@
 """TensorBoard's events, read back by TensorBoard's own reader."""
 
-import shutil
-
 import pytest
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from service.base import tensorboard as events
 from service.base.tensorboard import EventFile
-from tests.runs.runs import no_room_above, play, read_lines, tiny_config
+from tests.runs.runs import no_room_above
 
 
 def shown(directory, tag="loss"):
@@ -57,15 +55,3 @@ def test_a_full_disk_leaves_whole_events(tmp_path):
     assert shown(tmp_path) == [(1, 1.0)]
     add(file, 3)
     assert [step for step, _ in shown(tmp_path)] == [1, 2, 3]
-
-
-def test_a_run_that_was_killed_twice_shows_every_iteration_once(tmp_path):
-    config = tiny_config(checkpoint_interval=3)
-    play(tmp_path / "run", config, kill_after=5)
-    shutil.copytree(tmp_path / "run", tmp_path / "copy")
-    play(tmp_path / "copy", config, resume=True, kill_after=5)
-    play(tmp_path / "copy", config, resume=True)
-    rows = read_lines(tmp_path / "copy" / "metrics.jsonl")
-    tag = "alice/valid_fraction"
-    expected = [(row["env_steps"], pytest.approx(row[tag])) for row in rows]
-    assert shown(tmp_path / "copy" / "tensorboard", tag) == expected

@@ -20,9 +20,6 @@ def test_equal_arrays_give_equal_bytes_whatever_their_order() -> None:
     arrays = arrays_of_all_kinds()
     backwards = dict(reversed(arrays.items()))
     assert tensors.encode(arrays) == tensors.encode(backwards)
-
-
-def test_no_arrays_at_all() -> None:
     assert tensors.decode(tensors.encode({})) == {}
 
 

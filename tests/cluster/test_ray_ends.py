@@ -11,7 +11,7 @@ import pytest
 
 from benchmarks.processes import descendants
 from service.base.jsonl import read_jsonl
-from service.store.disk import read_status
+from service.store.models import read_status
 from service.store.run_directory import RunDirectory
 from tests.runs.runs import ROOT, assert_one_line, is_alive, write_yaml
 

@@ -6,7 +6,7 @@ from service.base.errors import ConfigError
 from service.config import load_config, parse_config
 from service.runs.resuming import resumed_config
 from service.runs.train import train
-from service.store.disk import read_status
+from service.store.models import read_status
 from service.store.run_directory import RunDirectory
 from tests.runs.runs import KilledError, assert_one_line, assert_same_run, newest, read_lines
 

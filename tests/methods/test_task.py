@@ -26,8 +26,8 @@ from service.registry.verification import network_problems
 from service.robot.running import for_robot
 from service.runs.resuming import resumed_config
 from service.runs.train import train
-from service.store.disk import read_status
 from service.store.disk_reader import DiskReader
+from service.store.models import read_status
 from service.store.run_directory import RunDirectory
 from tests.methods import skill_sets
 from tests.methods.trials import small_trial

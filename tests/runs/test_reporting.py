@@ -11,8 +11,8 @@ import httpx
 import pytest
 
 from service.base import lock
-from service.base.epoch import claim_epoch
 from service.base.errors import DivergedError, RunTakenError, StoreUnavailableError, TandemError
+from service.base.lock import claim_epoch
 from service.registry.registry import Registry
 from service.runs import train as module
 from service.runs.resuming import resumed_config
@@ -34,7 +34,8 @@ from tests.runs.runs import (
     tiny_config,
 )
 from tests.status.runs import BEARER, CLIENT, TOKEN
-from tests.store.stores import Killable, a_writer, wait_until
+from tests.store.redis_server import RedisServer
+from tests.store.stores import a_writer, wait_until
 
 pytestmark = pytest.mark.usefixtures("default_signals")
 
@@ -48,10 +49,10 @@ def quick(monkeypatch):
 
 @pytest.fixture
 def redis(tmp_path, monkeypatch):
-    killable = Killable(tmp_path / "redis")
+    killable = RedisServer(tmp_path / "redis")
     monkeypatch.setenv("TANDEM_REDIS_URL", killable.address.url)
     yield killable
-    killable.server.close()
+    killable.close()
 
 
 def run(tmp_path, config=None, *, resume=False, on_iteration=lambda metrics: None):

@@ -6,8 +6,8 @@ import shutil
 import pytest
 import yaml
 
-from service.base.epoch import claim_epoch
 from service.base.errors import CheckpointError, ConfigError, StorageError
+from service.base.lock import claim_epoch
 from service.registry.registry import Registry
 from service.runs.resuming import resumed_config
 from service.runs.train import open_run, train

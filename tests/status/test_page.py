@@ -12,7 +12,7 @@ from service.registry.registry import Registry
 from service.status.server import StatusServer
 from service.store.disk_reader import DiskReader
 from service.store.models import ActorStatus
-from service.store.run_log import RunLog
+from service.store.run_log import logging_to
 from tests.status.browser import CHROMIUM, Visit, chromium
 from tests.status.conftest import serve
 from tests.status.runs import TOKEN, VIDEO, WRONG, append, grid, publish, record, write_runs, write_status, write_trial
@@ -183,7 +183,7 @@ def test_log_commands_and_configuration(own):
     visit, home, _ = own
     run = home / "runs" / "cube"
     (run / "config.yaml").write_text("name: panda-cube\nlearner: {bob: {target_kl: 0.03}}\n")
-    with RunLog(run):
+    with logging_to(run):
         logging.getLogger("service.cluster").warning("rollout actor 3 is gone (killed); another takes its place")
     page = visit.go("#/runs/cube").page
     page.locator(".log .warning").get_by_text("rollout actor 3 is gone (killed)").wait_for()

@@ -9,13 +9,14 @@ from service.status.run_reader import RETRY_AFTER_S, CombinedReader, open_reader
 from service.store.disk_reader import DiskReader
 from service.store.redis_reader import RedisReader
 from tests.status.runs import append, grid, record, status, write_runs, write_status
-from tests.store.stores import Killable, a_writer, wait_until
+from tests.store.redis_server import RedisServer
+from tests.store.stores import a_writer, wait_until
 
 
 @pytest.fixture(scope="module")
 def redis(tmp_path_factory):
     """A Redis with the runs "cube", which also has a directory, and "far", which has none."""
-    killable = Killable(tmp_path_factory.mktemp("redis"))
+    killable = RedisServer(tmp_path_factory.mktemp("redis"))
     for run_id in ("cube", "far"):
         writer = a_writer(killable.address, run_id)
         writer.status(status(run_id, iteration=7, state="interrupted" if run_id == "far" else "running"))
@@ -23,7 +24,7 @@ def redis(tmp_path_factory):
         writer.goals(grid().model_copy(update={"iteration": 7}))
         writer.close()
     yield killable
-    killable.server.close()
+    killable.close()
 
 
 @pytest.fixture

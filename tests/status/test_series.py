@@ -169,13 +169,13 @@ def test_a_sample_of_few_records_has_each_once(root):
 
 
 def test_memory_is_bounded(root, monkeypatch):
-    num_columns = len(record(1, x=1)) - 1  # all but the iteration
+    num_columns = len(record(1, x=1))
     monkeypatch.setattr(disk_reader, "MAX_COLUMN_BYTES", 2 * 8 * 100 * num_columns)
     reader = DiskReader(root)
     for run_id in ("a", "b", "c"):
         write_status(root, run_id, started=STARTED)
         append(root, run_id, *(record(i, x=i) for i in range(1, 101)))
         assert len(ask(reader, run_id=run_id).metrics["x"]) == 100
-    kept = [path.name for path, records in reader._found.values() if records.num_bytes]
+    kept = [path.name for path, records in reader._records.items() if records.num_bytes]
     assert sorted(kept) == ["b", "c"]
     assert ask(reader, run_id="a").metrics["x"][99] == 100

@@ -20,7 +20,8 @@ from service.store.disk_reader import DiskReader
 from service.store.redis_reader import RedisReader
 from tests.status.conftest import serve
 from tests.status.runs import BEARER, CLIENT, append, record, status, write_status
-from tests.store.stores import Killable, a_writer
+from tests.store.redis_server import RedisServer
+from tests.store.stores import a_writer
 
 
 @pytest.fixture
@@ -123,7 +124,7 @@ def test_a_browser_that_reconnects_after_a_resume(root, service):
 
 
 def test_a_run_that_is_only_in_redis(tmp_path):
-    redis = Killable(tmp_path)
+    redis = RedisServer(tmp_path)
     try:
         writer = a_writer(redis.address, "far")
         writer.status(status("far", state="finished", iteration=5))
@@ -136,7 +137,7 @@ def test_a_run_that_is_only_in_redis(tmp_path):
                 first, second, known, last = events(answer)
             missing = httpx.get(url.replace("far", "nobody"), **CLIENT)
     finally:
-        redis.server.close()
+        redis.close()
     assert [first, second] == [("metrics", record(4), "4"), ("metrics", record(5), "5")]
     assert (known[0], last[0], last[1]["state"]) == ("status", "end", "finished")
     assert missing.json()["type"] == "urn:tandem:unknown-run"

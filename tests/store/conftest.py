@@ -3,14 +3,13 @@
 import pytest
 
 from service.store import redis_writer
-from tests.store.stores import Killable
+from tests.store.redis_server import RedisServer
 
 
 @pytest.fixture
 def redis(tmp_path):
-    killable = Killable(tmp_path / "redis")
-    yield killable
-    killable.server.close()
+    with RedisServer(tmp_path / "redis") as server:
+        yield server
 
 
 @pytest.fixture(autouse=True)

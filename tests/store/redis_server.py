@@ -44,7 +44,8 @@ class RedisServer:
         for _ in range(_ATTEMPTS):  # a free port may be taken by others before the server has it
             chosen = port or _free_port()
             self.address = RedisAddress(f"redis://:{password}@127.0.0.1:{chosen}/0")
-            self._start(directory, _CONFIG.format(port=chosen, password=password))
+            self._config = _CONFIG.format(port=chosen, password=password)
+            self._start()
             if self._answers():
                 return
             self.close()
@@ -66,6 +67,12 @@ class RedisServer:
         self._process.kill()
         self._process.wait()
 
+    def revive(self) -> None:
+        """Start it again at the same place, with the same data."""
+        self.close()
+        self._start()
+        assert self._answers()
+
     def close(self) -> None:
         """Stop it, its data written."""
         self._watch.kill()  # first: it must not hit a process that gets this number later
@@ -73,12 +80,12 @@ class RedisServer:
         self._process.terminate()
         self._process.wait()
 
-    def _start(self, directory: Path, config: str) -> None:
-        self._process = _spawn([_find_binary(), "-"], directory)
-        self._watch = _spawn(["sh", "-c", _WATCH, "watch", str(self.pid)], directory)
+    def _start(self) -> None:
+        self._process = _spawn([_find_binary(), "-"], self.directory)
+        self._watch = _spawn(["sh", "-c", _WATCH, "watch", str(self.pid)], self.directory)
         assert self._process.stdin is not None
         try:  # not on the command line, which everybody can read: it has the password in it
-            self._process.stdin.write(config.encode())
+            self._process.stdin.write(self._config.encode())
             self._process.stdin.close()
         except BrokenPipeError:
             pass  # it has ended, and `_answers` will notice

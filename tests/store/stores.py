@@ -1,11 +1,10 @@
-"""Runs to tell about, real Redis servers, and how to wait for what another thread or process does."""
+"""Runs to tell about, and how to wait for what another thread or process does."""
 
 import time
 from datetime import UTC, datetime, timedelta
 
 from service.store.models import GoalCell, GoalGrid, RunStatus
 from service.store.redis_writer import RedisWriter
-from tests.store.redis_server import RedisServer
 
 
 def a_status(run_id="cube", **changes):
@@ -48,24 +47,3 @@ def wait_until(holds, *, within_s=300.0):
         assert time.monotonic() < deadline_s, f"still {said!r} after {within_s} s"
         time.sleep(0.01)
     return said
-
-
-class Killable:
-    """A Redis that can be killed and come back at the same place with the same data."""
-
-    def __init__(self, directory):
-        self._directory = directory
-        self.server = RedisServer(directory)
-        self.address = self.server.address
-
-    def kill(self):
-        self.server.kill()
-
-    def revive(self):
-        port, password = int(self.address.url.rpartition(":")[2].partition("/")[0]), self._password()
-        self.server.close()
-        self.server = RedisServer(self._directory, port=port, password=password)
-        assert self.server.address.url == self.address.url
-
-    def _password(self):
-        return self.address.url.removeprefix("redis://:").partition("@")[0]

@@ -4,18 +4,19 @@ from datetime import UTC, datetime, timedelta
 
 import pytest
 
-from service.store.pulse import Pulse, with_clock
+from service.store.models import Pulse
+from tests.clock import Clock
 from tests.store.stores import a_status
 
 
 @pytest.fixture
 def clock():
-    return [100.0]
+    return Clock()
 
 
 @pytest.fixture
 def pulse(clock):
-    return Pulse(lambda: clock[0])
+    return Pulse(clock)
 
 
 def ago(seconds):
@@ -25,7 +26,7 @@ def ago(seconds):
 def test_at_first_it_is_as_old_as_the_clocks_say_and_then_grows_by_our_own(pulse, clock):
     beat = ago(10)
     assert pulse.age_s("cube", beat) == pytest.approx(10.0, abs=1.0)
-    clock[0] += 50.0
+    clock.now_s += 50.0
     assert pulse.age_s("cube", beat) == pytest.approx(60.0, abs=1.0)
     assert pulse.age_s("other", beat) == pytest.approx(10.0, abs=1.0)
 
@@ -33,19 +34,23 @@ def test_at_first_it_is_as_old_as_the_clocks_say_and_then_grows_by_our_own(pulse
 def test_one_from_the_future_grows_old_like_any_other(pulse, clock):
     beat = ago(-3600)
     assert pulse.age_s("cube", beat) == 0.0
-    clock[0] += 61.0
+    clock.now_s += 61.0
     assert pulse.age_s("cube", beat) == 61.0
 
 
 def test_a_new_one_is_not_older_than_our_last_look(pulse, clock):
     pulse.age_s("cube", ago(5))
-    clock[0] += 2.0
+    clock.now_s += 2.0
     assert pulse.age_s("cube", ago(3600)) == 2.0  # the clock of its machine is an hour slow, and it beats
-    clock[0] += 3600.0
+    clock.now_s += 3600.0
     assert pulse.age_s("cube", ago(1000)) == pytest.approx(1000.0, abs=1.0)  # it beat while nobody looked
 
 
 def test_a_heartbeat_from_the_future_says_that_a_clock_is_wrong():
-    assert [with_clock(a_status(heartbeat=ago(age))).condition for age in (60, -3, -60)] == ["well", "well", "clock"]
-    assert "is 60 s in the future" in with_clock(a_status(heartbeat=ago(-60.4))).warnings[0]
-    assert with_clock(a_status(heartbeat=ago(-60), state="finished")).condition == "well"
+    assert [Pulse().look(a_status(heartbeat=ago(age)))[0].condition for age in (60, -3, -60)] == [
+        "well",
+        "well",
+        "clock",
+    ]
+    assert "is 60 s in the future" in Pulse().look(a_status(heartbeat=ago(-60.4)))[0].warnings[0]
+    assert Pulse().look(a_status(heartbeat=ago(-60), state="finished"))[0].condition == "well"

@@ -8,8 +8,8 @@ import pytest
 from service.base.errors import DamagedStoreError, StoreUnavailableError, UnknownRunError
 from service.base.jsonl import JsonlWriter
 from service.base.lock import DirectoryLock
+from service.store.address import run_key
 from service.store.disk_reader import DiskReader
-from service.store.keys import run_key
 from service.store.models import SILENT_AFTER
 from service.store.redis_reader import RedisReader
 from service.store.run_directory import RunDirectory
@@ -106,21 +106,12 @@ def test_it_reads_what_a_run_told(store):
     store.reader.ready()
 
 
-def test_the_newest_start_comes_first(store):
-    now = a_status().started
-    for run_id, age in (("b", 2), ("c", 3), ("a", 1)):
-        tell(store, run_id, state="finished", started=now - age * SILENT_AFTER)
-    assert [run.run_id for run in store.reader.runs()] == ["a", "b", "c"]
-
-
-def test_there_may_be_nothing_yet(store):
+def test_records_after_an_iteration_and_nothing_yet(store):
     assert store.reader.runs() == []
     tell(store)
     assert store.reader.metrics("cube") == []
+    assert store.reader.sample("cube", "x", 5) == []
     assert store.reader.goals("cube") is None
-
-
-def test_records_after_an_iteration(store):
     tell(store, records=[a_record(number) for number in range(1, 8)])
     assert [each["iteration"] for each in store.reader.metrics("cube", after_iteration=4)] == [5, 6, 7]
     assert store.reader.metrics("cube", after_iteration=7) == []
@@ -152,12 +143,13 @@ def test_a_resumed_run_makes_its_last_iterations_again(store):
     assert [(each["iteration"], each["past"]) for each in records] == [(1, 0), (2, 0), (3, 0), (4, 0), (5, 1), (6, 2)]
 
 
-def test_an_unknown_run(store):
-    for name in ("b", "a"):
-        tell(store, name)
-    reader = store.reader
+def test_the_newest_start_comes_first_and_an_unknown_run_is_told_which_there_are(store):
+    now, reader = a_status().started, store.reader
+    for run_id, age in (("b", 1), ("a", 2)):
+        tell(store, run_id, state="finished", started=now - age * SILENT_AFTER)
+    assert [run.run_id for run in reader.runs()] == ["b", "a"]
     for ask in (reader.run, reader.metrics, reader.goals, reader.request_stop):
-        for run_id in ("nobody", "../a", "", "a/..", "x" * 5000, "a\nb", "*"):
+        for run_id in ("nobody", "../a", "", "x" * 5000):
             with pytest.raises(UnknownRunError) as error:
                 ask(run_id)
             assert_one_line(error.value, "no run", "it holds: a, b")
@@ -177,19 +169,13 @@ def test_a_stop_request_reaches_the_run(store):
     writer.status(a_status(state="interrupted"))
     writer.close()
     assert not store.reader.run("cube").stopping
+    store.reader.request_stop("cube")  # it has ended: nothing happens
     again = store.writer("cube")  # the request was for the process that has ended
-    assert not again.stop_requested()
-    again.close()
-
-
-def test_a_run_that_has_ended_is_not_asked_to_stop(store):
-    tell(store, state="finished")
-    store.reader.request_stop("cube")
-    writer = store.writer("cube")
-    writer.status(a_status())
+    again.status(a_status())
     wait_until(lambda: store.reader.run("cube").state == "running")
+    assert not again.stop_requested()
     assert not store.reader.run("cube").stopping
-    writer.close()
+    again.close()
 
 
 def test_a_run_whose_process_is_gone_does_not_run_for_ever(store):
@@ -210,18 +196,11 @@ def test_a_run_whose_process_is_gone_does_not_run_for_ever(store):
         assert re.search(r"Redis has heard nothing of it for 6\d s", seen.warnings[-1])
 
 
-def test_a_run_that_was_heard_of_just_now_runs(store):
-    tell(store)
-    assert store.reader.run("cube").state == "running"
-
-
-def test_records_that_are_none_are_passed_over(store, caplog):
+def test_records_that_are_none_are_passed_over(store):
     tell(store, records=[a_record(1), a_record(2)])
     store.damage_records("cube")
     assert [each["iteration"] for each in store.reader.metrics("cube")] == [1, 2]
-    caplog.clear()
     assert store.reader.columns("cube", None).iteration.tolist() == [1, 2]
-    assert len([message for message in caplog.messages if "passing over" in message]) == 3
 
 
 def test_a_damaged_grid(store):

@@ -7,9 +7,9 @@ import time
 
 import pytest
 
-from service.base.errors import DamagedStoreError, RunTakenError, StoreUnavailableError
-from service.store import keys, redis_writer
-from service.store.address import RedisAddress
+from service.base.errors import DamagedStoreError, StoreUnavailableError
+from service.store import address, redis_writer
+from service.store.address import RUNS, run_key
 from service.store.redis_reader import RedisReader
 from tests.runs.runs import assert_one_line
 from tests.store.stores import a_grid, a_record, a_status, a_writer, wait_until
@@ -52,7 +52,8 @@ def returns(call):
 # --- away ------------------------------------------------------------------------------------------------------------
 
 
-def test_killed_and_back_at_the_same_place(redis, writer, reader):
+def test_killed_and_back_at_the_same_place(redis, writer, reader, monkeypatch):
+    monkeypatch.setattr(redis_writer, "BATCH", 7)  # some wait when the newest are sent again
     train(writer, range(1, 31))
     wait_until(lambda: reader.runs() and iterations(reader)[-1:] == [30])
     redis.kill()
@@ -67,22 +68,20 @@ def test_killed_and_back_at_the_same_place(redis, writer, reader):
     wait_until(lambda: writer.troubles() == [])
 
 
-@pytest.mark.parametrize("timeout_s", [0.3, 3600.0])
-def test_stopped_for_a_while(redis, reader, monkeypatch, timeout_s):
-    """It answers nobody, and its connections stay open: worse than being dead."""
-    monkeypatch.setattr(redis_writer, "TIMEOUT_S", timeout_s)
+def test_stopped_for_a_while(redis, reader, monkeypatch):
+    """It does not answer, and its connections stay open: worse than being dead."""
+    monkeypatch.setattr(redis_writer, "TIMEOUT_S", 0.3)
     writer = a_writer(redis.address, "cube")
     train(writer, range(1, 6))
     wait_until(lambda: reader.runs() != [])
-    os.kill(redis.server.pid, signal.SIGSTOP)
+    os.kill(redis.pid, signal.SIGSTOP)
     try:
         assert returns(lambda: train(writer, range(6, 40)))
         with pytest.raises(StoreUnavailableError, match="no answer in time"):
             reader.ready()
-        if timeout_s < 1.0:
-            assert "no answer in time" in wait_until(writer.troubles)[0].text
+        assert "no answer in time" in wait_until(writer.troubles)[0].text
     finally:
-        os.kill(redis.server.pid, signal.SIGCONT)
+        os.kill(redis.pid, signal.SIGCONT)
     wait_until(lambda: iterations(reader)[-1:] == [39])
     assert iterations(reader) == list(range(1, 40))
     writer.close()
@@ -92,8 +91,8 @@ def test_what_redis_forgot_that_it_had_is_sent_again(redis, writer, reader):
     """A machine that loses power takes the last second with it, and all that was answered in it."""
     train(writer, range(1, 11))
     wait_until(lambda: reader.runs() and iterations(reader)[-1:] == [10])
-    redis.address.client(1.0).zremrangebyscore(keys.run_key("cube", "metrics"), 6, "+inf")
-    redis.address.client(1.0).delete(keys.run_key("cube", "status"), keys.run_key("cube", "goals"))
+    redis.address.client(1.0).zremrangebyscore(run_key("cube", "metrics"), 6, "+inf")
+    redis.address.client(1.0).delete(run_key("cube", "status"), run_key("cube", "goals"))
     redis.kill()
     wait_until(writer.troubles)
     redis.revive()
@@ -118,23 +117,6 @@ def test_a_restart_between_two_messages_is_noticed(redis, reader, monkeypatch):
     assert reader.goals("cube") == a_grid(10)
 
 
-def test_a_run_that_goes_back_by_itself(writer, reader):
-    """As when the machine that had the newest state is lost."""
-    train(writer, range(1, 8))
-    train(writer, range(4, 6))
-    wait_until(lambda: reader.runs() and iterations(reader) == [1, 2, 3, 4, 5])
-    assert reader.run("cube").iteration == 5
-
-
-def test_a_disk_that_lost_everything_gets_what_comes(redis, writer, reader):
-    train(writer, range(1, 4))
-    wait_until(lambda: reader.runs() != [])
-    redis.address.client(1.0).flushall()
-    writer.status(a_status(iteration=4))
-    wait_until(lambda: reader.runs() != [])
-    assert reader.run("cube").iteration == 4
-
-
 def test_too_many_records_for_memory_are_counted(redis, writer, reader, monkeypatch):
     monkeypatch.setattr(redis_writer, "MAX_WAITING", 10)
     writer.status(a_status())
@@ -143,61 +125,42 @@ def test_too_many_records_for_memory_are_counted(redis, writer, reader, monkeypa
     wait_until(writer.troubles)
     for number in range(1, 16):
         writer.metrics(a_record(number))
-    assert "5 records did not reach Redis" in writer.troubles()[-1].text
+    wait_until(lambda: "5 records did not reach Redis" in writer.troubles()[-1].text)
     redis.revive()
     wait_until(lambda: len(iterations(reader)) == 10)
     assert iterations(reader) == list(range(6, 16))
 
 
-def test_history_in_redis_is_bounded(writer, reader, monkeypatch):
-    monkeypatch.setattr(keys, "MAX_RECORDS", 20)
-    for number in range(1, 1201):  # more than one message takes
+def test_closing_sends_what_waits_and_history_in_redis_is_bounded(redis, reader, monkeypatch):
+    monkeypatch.setattr(address, "MAX_RECORDS", 20)
+    monkeypatch.setattr(redis_writer, "BATCH", 7)
+    writer = a_writer(redis.address)
+    for number in range(1, 31):
         writer.metrics(a_record(number))
-    writer.status(a_status())
-    wait_until(lambda: reader.runs() and iterations(reader)[-1:] == [1200])
-    assert iterations(reader) == list(range(1181, 1201))
+    writer.status(a_status(state="finished"))
+    writer.close()
+    assert iterations(reader) == list(range(11, 31))
+    assert reader.run("cube").state == "finished"
 
 
 def test_closing_waits_for_a_bounded_time(redis, caplog, monkeypatch):
     monkeypatch.setattr(redis_writer, "TIMEOUT_S", 3600.0)
     writer = a_writer(redis.address, "cube")
-    os.kill(redis.server.pid, signal.SIGSTOP)
+    os.kill(redis.pid, signal.SIGSTOP)
     try:
         writer.metrics(a_record(1))
         assert returns(lambda: writer.close(timeout_s=0.3))
     finally:
-        os.kill(redis.server.pid, signal.SIGCONT)
+        os.kill(redis.pid, signal.SIGCONT)
     assert_one_line(caplog.messages[-1], "did not get the end of run cube", "its files have it")
-
-
-def test_closing_sends_what_waits(redis, reader):
-    writer = a_writer(redis.address, "cube")
-    for number in range(1, 1201):
-        writer.metrics(a_record(number))
-    writer.status(a_status(state="finished"))
-    writer.close()
-    assert len(iterations(reader)) == 1200
-    assert reader.run("cube").state == "finished"
-
-
-def test_a_reader_goes_on_when_redis_is_back(redis, writer, reader):
-    writer.status(a_status())
-    wait_until(lambda: reader.runs() != [])
-    redis.kill()
-    with pytest.raises(StoreUnavailableError) as error:
-        reader.run("cube")
-    assert_one_line(error.value, f"Redis at {redis.address}")
-    redis.revive()
-    wait_until(lambda: reader.runs() != [])  # it may have forgotten the last second, which the writer knows
-    assert reader.run("cube").run_id == "cube"
 
 
 def test_no_thread_and_no_heartbeat_is_left(redis, writer):
     client = redis.address.client(1.0)
-    assert wait_until(lambda: 0 < client.pttl(keys.run_key("cube", "heartbeat")) <= 10_000)
+    assert wait_until(lambda: 0 < client.pttl(run_key("cube", "heartbeat")) <= 10_000)
     writer.close()
     assert not writer._thread.is_alive()
-    assert client.exists(keys.run_key("cube", "heartbeat")) == 0
+    assert client.exists(run_key("cube", "heartbeat")) == 0
 
 
 # --- who reports -----------------------------------------------------------------------------------------------------
@@ -221,29 +184,13 @@ def test_the_next_process_of_a_run_reports_and_the_one_before_falls_silent(redis
     assert_one_line(warning, f"Redis at {redis.address} gets nothing more", "another process reports there as run cube")
     first.close()
     assert (reader.run("cube").iteration, iterations(reader)) == (2, [])
-    assert redis.address.client(1.0).get(keys.run_key("cube", "epoch")) == b"a:2"
+    assert redis.address.client(1.0).get(run_key("cube", "epoch")) == b"a:2"
 
 
-def test_another_run_of_the_same_id_is_refused_while_the_first_reports(redis, writer, reader):
-    writer.status(a_status(iteration=1))
-    wait_until(lambda: reader.runs() != [])
-    with pytest.raises(RunTakenError) as error:
-        a_writer(redis.address, run="b")
-    assert_one_line(error.value, "another run with the id cube reports to Redis at", "wait 10 s", "--run-dir")
-    a_writer(redis.address, "cube-2", run="b").close()
-    writer.close()
-    other = a_writer(redis.address, run="b")
-    other.status(a_status(iteration=2))
-    wait_until(lambda: reader.run("cube").iteration == 2)
-    other.close()
-
-
-@pytest.mark.parametrize(
-    ("found", "goes_on"), [(b"a:3", True), (b"a:2", True), (b"a:4", False), (b"b:1", False), (b"7", False)]
-)
+@pytest.mark.parametrize(("found", "goes_on"), [(b"a:2", True), (b"a:4", False), (b"b:1", False), (b"7", False)])
 def test_only_a_higher_epoch_or_another_run_is_newer(redis, reader, found, goes_on):
     """A Redis that begins again from an older copy has an older number."""
-    client, key = redis.address.client(1.0), keys.run_key("cube", "epoch")
+    client, key = redis.address.client(1.0), run_key("cube", "epoch")
     writer = a_writer(redis.address, epoch=3)
     client.set(key, found)
     writer.status(a_status(iteration=7))
@@ -259,62 +206,34 @@ def test_only_a_higher_epoch_or_another_run_is_newer(redis, reader, found, goes_
 # --- what is wrong ---------------------------------------------------------------------------------------------------
 
 
-def test_a_run_does_not_begin_without_the_redis_it_was_given(redis):
-    wrong = RedisAddress(redis.address.url.replace("redis://:", "redis://:not-"))
-    with pytest.raises(StoreUnavailableError, match="wrong or missing password"):
-        a_writer(wrong)
-    with pytest.raises(StoreUnavailableError, match="wrong or missing password"):
-        RedisReader(wrong).runs()
-    redis.kill()
-    with pytest.raises(StoreUnavailableError) as error:
-        a_writer(redis.address, "cube")
-    assert_one_line(error.value, f"Redis at {redis.address}", "refused")
-
-
-@pytest.mark.parametrize("content", [b"", b"{}", b"\xff", b"[1]", b'{"run_id": "cube", "heartbeat": "now"}'])
+@pytest.mark.parametrize("content", [b"", b'{"run_id": "cube", "heartbeat": "now"}'])
 def test_a_damaged_status_hides_only_its_own_run(redis, reader, caplog, content):
     for run_id in ("cube", "sound"):
         writer = a_writer(redis.address, run_id)
         writer.status(a_status(run_id))
         writer.close()
-    redis.address.client(1.0).set(keys.run_key("cube", "status"), content)
+    redis.address.client(1.0).set(run_key("cube", "status"), content)
     assert [run.run_id for run in reader.runs()] == ["sound"]
     with pytest.raises(DamagedStoreError) as error:
         reader.run("cube")
-    assert_one_line(error.value, keys.run_key("cube", "status"), "delete that key")
-    assert_one_line(caplog.messages[-1], keys.run_key("cube", "status"))
+    assert_one_line(error.value, run_key("cube", "status"), "delete that key")
+    assert_one_line(caplog.messages[-1], run_key("cube", "status"))
 
 
-def test_keys_of_another_type(redis, reader, writer):
+def test_a_key_of_another_type_is_damage_or_what_redis_says(redis, reader, writer, caplog):
     writer.status(a_status())
     wait_until(lambda: reader.runs() != [])
     client = redis.address.client(1.0)
-    client.delete(keys.run_key("cube", "metrics"))
-    client.rpush(keys.run_key("cube", "metrics"), 1)
-    with pytest.raises(DamagedStoreError) as error:
+    client.zadd(RUNS, {"ghost": 1.0, b"\xff": 2.0})
+    client.rpush(run_key("other", "status"), 1)
+    client.zadd(RUNS, {"other": 3.0})
+    assert [run.run_id for run in reader.runs()] == ["cube"]
+    assert len(caplog.messages) == 3
+    client.rpush(run_key("cube", "metrics"), 1)
+    with pytest.raises(StoreUnavailableError, match="WRONGTYPE"):
         reader.metrics("cube")
-    assert_one_line(error.value, f"Redis at {redis.address}", "another type", "delete tandem:*")
     writer.metrics(a_record(1))
     ((_, warning),) = wait_until(writer.troubles)
     assert_one_line(warning, "WRONGTYPE", "1 records wait")
-    client.delete(keys.run_key("cube", "metrics"))
-    wait_until(lambda: iterations(reader) == [1])
-
-
-def test_an_index_that_names_a_run_without_a_status(redis, reader, caplog):
-    redis.address.client(1.0).zadd(keys.RUNS, {"ghost": 1.0, b"\xff": 2.0})
-    assert reader.runs() == []
-    assert len(caplog.messages) == 2
-
-
-def test_full_of_data(redis, writer, reader):
-    """Redis may refuse to write when its memory is full; that passes."""
-    writer.status(a_status())
-    wait_until(lambda: reader.runs() != [])
-    client = redis.address.client(1.0)
-    client.config_set("maxmemory", "1")
-    writer.metrics(a_record(1))
-    ((_, warning),) = wait_until(writer.troubles)
-    assert "maxmemory" in warning
-    client.config_set("maxmemory", "0")
+    client.delete(run_key("cube", "metrics"))
     wait_until(lambda: iterations(reader) == [1])

@@ -2,11 +2,15 @@
 
 import numpy as np
 import pytest
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+from tensorboard.backend.event_processing.event_file_loader import EventFileLoader
 
-from service.base.errors import ConfigError, TandemError
+from service.base.errors import CheckpointError, ConfigError, RunTakenError, StorageError, TandemError
 from service.base.jsonl import Extent
+from service.base.lock import claim_epoch
 from service.config import load_config
-from service.store.run_directory import MAX_DIVERGED_FILES, Resumption, RunDirectory
+from service.store import run_directory
+from service.store.run_directory import Published, Resumption, RunDirectory
 from tests.runs.runs import assert_one_line, no_room_above, read_lines, tiny_config
 
 
@@ -34,20 +38,12 @@ def resumption(directory, iteration):
 
 def read_events(path):
     """(step, {tag: value}) of every TensorBoard event with a summary, in the order of the files' names."""
-    from tensorboard.backend.event_processing.event_file_loader import EventFileLoader
-
     events = [event for file in sorted(path.iterdir()) for event in EventFileLoader(str(file)).Load()]
     values = [(event.step, {v.tag: v.tensor.float_val[0] for v in event.summary.value}) for event in events]
     return [(step, value) for step, value in values if value]
 
 
 # --- beginning a run -------------------------------------------------------------------------------------------------
-
-
-def test_nothing_is_made_before_the_start(tmp_path):
-    directory = RunDirectory(tmp_path / "run")
-    assert not directory.exists
-    assert list(tmp_path.iterdir()) == []
 
 
 def test_a_started_run_holds_its_resolved_configuration(directory):
@@ -59,25 +55,56 @@ def test_a_started_run_holds_its_resolved_configuration(directory):
 
 def test_a_second_run_is_refused(directory):
     with pytest.raises(TandemError) as error:
-        RunDirectory(directory.path).start(tiny_config(seed=3))
+        RunDirectory(directory.path).claim(resume=False)
     assert_one_line(error.value, directory.path, "--resume", "--run-dir")
-    assert directory.read_config() == tiny_config()
 
 
-def test_no_run_there(tmp_path):
-    with pytest.raises(ConfigError) as error:
-        RunDirectory(tmp_path / "none").read_config()
-    assert_one_line(error.value, tmp_path / "none", "config.yaml")
+def test_nothing_is_left_of_a_run_that_did_not_begin(tmp_path):
+    directory = RunDirectory(tmp_path / "run")
+    directory.claim(resume=False)
+    assert directory.epoch == 1
+    directory.close()
+    assert list(tmp_path.iterdir()) == []
+    with pytest.raises(CheckpointError):
+        directory.claim(resume=True)
 
 
-def test_a_damaged_configuration_is_named(directory):
+def test_only_the_process_of_the_highest_epoch_may_write(tmp_path):
+    directory = RunDirectory(tmp_path / "run")
+    directory.claim(resume=False)
+    directory.check_owner()
+    claim_epoch(tmp_path / "run")  # as another machine may where its file system has no locks
+    with pytest.raises(RunTakenError) as error:
+        directory.check_owner()
+    assert_one_line(error.value, tmp_path, "taken over by another process", "stops")
+    directory.close()
+
+
+def test_no_run_there_or_one_with_a_damaged_configuration(directory, tmp_path):
     directory.config_file.write_text("game: {num_worlds: many}\n")
-    with pytest.raises(ConfigError) as error:
-        directory.read_config()
-    assert_one_line(error.value, directory.config_file, "game.num_worlds", "many")
+    for each, said in ((RunDirectory(tmp_path / "none"), "config.yaml"), (directory, "game.num_worlds")):
+        with pytest.raises(ConfigError) as error:
+            each.read_config()
+        assert_one_line(error.value, each.path, said)
 
 
-@pytest.mark.parametrize("name", ["", "checkpoints", "tensorboard"])
+def test_notes_are_read_back_and_damaged_ones_named(directory):
+    assert (directory.read_published(), directory.read_result()) == (None, None)
+    directory.write_published(Published("cube@3", "0" * 64))
+    directory.write_result({"evaluation": {"success": 0.5}, "env_steps": 7, "wall_s": 1.5})
+    assert directory.read_published() == ("cube@3", "0" * 64)
+    result = directory.read_result()
+    assert (result["evaluation"], result["env_steps"], result["made"].keys()) == (
+        {"success": 0.5}, 7, {"git_commit", "num_cores"}
+    )  # fmt: skip
+    for name, read in (("published.json", directory.read_published), ("result.json", directory.read_result)):
+        (directory.path / name).write_text('{"version": 1}')
+        with pytest.raises(StorageError) as error:
+            read()
+        assert_one_line(error.value, directory.path / name)
+
+
+@pytest.mark.parametrize("name", ["", "tensorboard"])
 def test_a_directory_that_cannot_be_made_is_one_line(tmp_path, name):
     path = tmp_path / "run"
     if name:
@@ -119,12 +146,9 @@ def test_a_resume_cuts_both_files_and_goes_on(directory):
     assert [row["iteration"] for row in read_lines(resumed.metrics_file)] == [1, 2]
     assert [row["iteration"] for row in read_lines(resumed.goals_file)] == [1]
     assert resumed.read_config().run.total_env_steps == 900
-    assert [step for step, _ in read_events(resumed.path / "tensorboard")][-1] == 200
-
-
-def test_close_twice(directory):
-    directory.close()
-    directory.close()
+    assert [step for step, _ in read_events(resumed.path / "tensorboard")] == [100, 200, 300, 200]
+    accumulator = EventAccumulator(str(resumed.path / "tensorboard")).Reload()  # as TensorBoard shows them
+    assert [event.step for event in accumulator.Scalars("bob/success_rate")] == [100, 200]
 
 
 def test_goals_are_start_goal_and_result(directory):
@@ -136,14 +160,15 @@ def test_goals_are_start_goal_and_result(directory):
     ]
 
 
-def test_broken_worlds_are_kept_but_not_without_end(directory):
+def test_broken_worlds_are_kept_but_not_without_end(directory, monkeypatch):
+    monkeypatch.setattr(run_directory, "MAX_DIVERGED_FILES", 3)
     diverged = ((np.arange(4.0), np.zeros(4, dtype=np.float32)), (np.arange(4.0) + 1, np.ones(4, dtype=np.float32)))
     directory.dump_diverged("000000", ())
     assert not (directory.path / "broken").exists()
-    for sequence in range(MAX_DIVERGED_FILES + 5):
+    for sequence in range(5):
         directory.dump_diverged(f"{sequence:06d}", diverged)
     files = sorted((directory.path / "broken").iterdir())
-    assert len(files) == MAX_DIVERGED_FILES
+    assert len(files) == 3
     with np.load(files[0]) as dump:
         assert dump["states"].tolist() == [[0.0, 1.0, 2.0, 3.0], [1.0, 2.0, 3.0, 4.0]]
         assert dump["actions"].tolist() == [[0.0] * 4, [1.0] * 4]
@@ -163,15 +188,13 @@ def test_records_wait_for_room_and_then_come_in_their_order(directory, caplog):
     metrics, events = caplog.messages  # said once each, although two records did not fit
     assert_one_line(metrics, "cannot write", directory.metrics_file, "File too large", "the run goes on")
     assert_one_line(events, "cannot write", "tensorboard", "the run goes on")
-
-
-def test_a_disk_that_fills_up_again_is_said_again(directory, caplog):
-    for iteration in (1, 3):
-        with no_room_above(0):
-            record(directory, iteration)
-        record(directory, iteration + 1)
-    assert [row["iteration"] for row in read_lines(directory.metrics_file)] == [1, 2, 3, 4]
-    assert sum("metrics.jsonl" in message for message in caplog.messages) == 2
+    assert directory.problems() == []
+    with no_room_above(0):
+        record(directory, 5)
+        assert_one_line(directory.problems()[0], "cannot write", directory.metrics_file)
+    assert sum("metrics.jsonl" in message for message in caplog.messages) == 2  # said again
+    directory.close()  # now there is room
+    assert [row["iteration"] for row in read_lines(directory.metrics_file)] == [1, 2, 3, 4, 5]
 
 
 def test_goals_and_broken_worlds_on_a_full_disk_do_not_end_a_run(directory, caplog):
@@ -182,13 +205,6 @@ def test_goals_and_broken_worlds_on_a_full_disk_do_not_end_a_run(directory, capl
     assert [row["iteration"] for row in read_lines(directory.goals_file)] == [1, 2]
     assert list((directory.path / "broken").iterdir()) == []
     assert "round-000000.npz: File too large" in caplog.text
-
-
-def test_what_still_waits_when_a_run_ends_is_written_then(directory):
-    with no_room_above(0):
-        record(directory, 1)
-    directory.close()
-    assert [row["iteration"] for row in read_lines(directory.metrics_file)] == [1]
 
 
 def test_closing_on_a_full_disk_does_not_hide_why_the_run_ended(directory, caplog):
@@ -203,9 +219,3 @@ def test_closing_on_a_full_disk_does_not_hide_why_the_run_ended(directory, caplo
     record(resumed, 2)
     resumed.close()
     assert [row["iteration"] for row in read_lines(directory.metrics_file)] == [2]
-
-
-def test_a_resume_that_cuts_nothing_needs_no_room_for_the_records(directory):
-    record(directory, 1)
-    with no_room_above(0):
-        directory._metrics.cut(directory.metrics_file.stat().st_size)

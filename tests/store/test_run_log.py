@@ -7,7 +7,7 @@ import pytest
 
 from service.store import run_log
 from service.store.run_directory import RunDirectory
-from service.store.run_log import RunLog, read_log
+from service.store.run_log import logging_to, read_log
 
 
 def said(directory):
@@ -16,8 +16,8 @@ def said(directory):
 
 def test_what_a_run_says_is_kept_until_it_ends(tmp_path):
     logger = logging.getLogger("service.cluster.self_play")
-    with RunLog(tmp_path) as log:
-        log.note("process 7 begins the run")
+    with logging_to(tmp_path) as log:
+        log("process 7 begins the run")
         logger.warning("rollout actor %d is gone\n(%s)", 3, "killed")
         logging.getLogger("ray").warning("not ours")
     logger.warning("after the end")
@@ -27,7 +27,7 @@ def test_what_a_run_says_is_kept_until_it_ends(tmp_path):
 
 
 def test_a_run_that_fails_says_why(tmp_path):
-    with pytest.raises(ValueError, match="broke"), RunLog(tmp_path):
+    with pytest.raises(ValueError, match="broke"), logging_to(tmp_path):
         raise ValueError("it broke")
     assert said(tmp_path) == [("error", "the run failed: it broke")]
 
@@ -36,16 +36,16 @@ def test_a_run_that_fails_says_why(tmp_path):
 def test_what_is_no_log_is_neither_waited_for_nor_written(tmp_path, make):
     (tmp_path / "precious").write_text("precious")
     make(tmp_path / "log.jsonl")
-    with RunLog(tmp_path) as log:
-        log.note("this line is lost")
+    with logging_to(tmp_path) as log:
+        log("this line is lost")
     assert (tmp_path / "precious").read_text() == "precious"
 
 
 def test_a_log_is_bounded(tmp_path, monkeypatch):
     monkeypatch.setattr(run_log, "MAX_FILE_BYTES", 1000)
-    with RunLog(tmp_path) as log:
+    with logging_to(tmp_path) as log:
         for number in range(100):
-            log.note(f"line {number}")
+            log(f"line {number}")
     assert sum(path.stat().st_size for path in tmp_path.iterdir()) <= 2000
     texts = [text for _, text in said(tmp_path)]
     assert texts[-1] == "line 99"
@@ -53,8 +53,8 @@ def test_a_log_is_bounded(tmp_path, monkeypatch):
 
 
 def test_a_directory_that_is_gone_stops_nothing(tmp_path):
-    with RunLog(tmp_path / "gone") as log:
-        log.note("a line")
+    with logging_to(tmp_path / "gone") as log:
+        log("a line")
     assert read_log(tmp_path / "gone") == []
 
 

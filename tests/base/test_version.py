@@ -3,7 +3,7 @@
 import subprocess
 from pathlib import Path
 
-from service.base.git import git_commit
+from service.base.version import git_commit
 
 ROOT = Path(__file__).parents[2]
 
