@@ -186,23 +186,6 @@ def load_start(reference: str, registry: Path | str) -> Trained:
     return load(reference, registry).expect("primitives", by="--from")
 
 
-def directory_of(registry: str, *, publish: bool) -> Path:
-    """The directory of a registry in which a run publishes, if it does.
-
-    Raises:
-        TandemError: it does, and the registry is a service.
-    """
-    from service.registry.names import is_service
-
-    if not is_service(registry):
-        return Path(registry)
-    if publish:
-        raise TandemError(
-            f"{registry} is read only: publish in a directory (--registry DIR), and serve that; or give --no-publish"
-        )
-    return REGISTRY
-
-
 def how_to_go_on(run_dir: Path, registry: Path | str, *, runtime: str = "local", address: str | None = None) -> str:
     """The command that continues a run or a study, where it was begun."""
     place = ["--runtime", runtime] * (runtime != "local") + (["--address", address] if address is not None else [])

@@ -24,6 +24,7 @@ from service.cli.robot import robot_app
 from service.cli.serve import serve
 from service.cli.train import TrainCommand, demo, train
 from service.cli.unexpected import report_thread_error
+from service.runs.signals import stop_with_parent
 
 app = typer.Typer(name="tandem", help="Robot skills, pre-trained.", cls=CommandGroup, no_args_is_help=True)
 app.command(cls=TrainCommand)(train)
@@ -68,6 +69,7 @@ class _Log(logging.Handler):
 
 def main() -> None:
     """Entry point of ``tandem`` and ``python -m service``."""
+    stop_with_parent()
     # NumPy's and torch's own threads only get in each other's way: worlds are stepped by MuJoCo's threads. Both read
     # these variables when they are first imported, which is after this line.
     for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):

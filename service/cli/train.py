@@ -6,7 +6,6 @@ import re
 import shlex
 from collections.abc import Sequence
 from contextlib import AbstractContextManager, closing, nullcontext
-from functools import partial
 from importlib.util import find_spec
 from itertools import count
 from pathlib import Path
@@ -15,7 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Any, NoReturn
 import typer
 from typer.core import TyperCommand
 
-from service.base.errors import TandemError, did_you_mean
+from service.base.errors import TandemError
 from service.cli.common import (
     CHAMPION,
     EXIT_SIGNAL,
@@ -29,14 +28,13 @@ from service.cli.common import (
     load_start,
     loading,
     shown,
-    task_names,
     was_typed,
 )
-from service.cli.configs import config_names
+from service.cli.configs import config_names, named, targets
 from service.cli.evaluate import evaluate
 from service.cli.study import is_study, train_study
 from service.cli.unexpected import traceback_in
-from service.config.recipes import DEFAULT_RECIPE, find_file, recipes
+from service.config.recipes import DEFAULT_RECIPE, recipes
 from service.runs.trackers import Trackers, find_factory
 
 if TYPE_CHECKING:
@@ -50,11 +48,6 @@ AUTO, EXACTLY = "auto", "exactly"
 """Values of ``--resume``; the second where it is typed alone."""
 _CLUSTER_ONLY = ("address", "num_actors", "actor_threads", "learner_cpus", "status", "token_file")
 """Options that mean nothing in one process."""
-
-
-def _targets() -> list[str]:
-    """What the shell completes."""
-    return [*recipes(), *task_names()]
 
 
 class TrainCommand(TyperCommand):
@@ -74,7 +67,7 @@ def train(
         str | None,
         typer.Argument(
             metavar="RECIPE|TASK|FILE|all",
-            autocompletion=_targets,
+            autocompletion=targets,
             help="A name of tandem configs, a task such as push, or a YAML file; what that leaves out has its default. "
             f"Without: {DEFAULT_RECIPE}, or what a resumed run has. Several, such as push,wall, or all: a study.",
         ),
@@ -198,26 +191,25 @@ def train(
                     "--set run.num_threads=N says"
                 )
         train_study(
-            run_dir, what, method, seeds, grid or (),
-            name_one=partial(_named, primitives=primitives), overrides=overrides or [], runs=runs, source=source,
-            resume=None if resume == AUTO else again, publish=publish, parallel=parallel,
-            cluster=cluster_options if runtime == "ray" else None, address=address, trackers=trackers,
-            start_from=start_from,
+            run_dir, what, method, primitives, seeds, grid or (),
+            overrides=overrides or [], runs=runs, source=source, resume=None if resume == AUTO else again,
+            publish=publish, parallel=parallel, cluster=cluster_options if runtime == "ray" else None, address=address,
+            trackers=trackers, start_from=start_from,
         )  # fmt: skip
         return
-    named, first = _named(what, method, primitives)
+    file, first = named(what, method, primitives)
     overrides = [*first, *(overrides or [])]
     if parallel is not None:
         raise TandemError("--parallel is for the runs of a study: give --seeds or --grid, too, or leave it out")
     if again and run_dir is None:
         raise TandemError("--resume needs --run-dir, the directory of the run to continue")
-    begun = named if named is not None or first else recipes()[DEFAULT_RECIPE]
+    begun = file if file is not None or first else recipes()[DEFAULT_RECIPE]
     run_dir = run_dir or runs / load_config(begun, overrides).directory_name
     if resume == AUTO:
         again = RunDirectory(run_dir).exists
     start = None
     if again:
-        resolved = resumed_config(RunDirectory(run_dir), overrides, named)
+        resolved = resumed_config(RunDirectory(run_dir), overrides, file)
     else:
         start = load_start(start_from, source) if start_from is not None else None
         with loading():
@@ -252,37 +244,6 @@ def _check_used(context: typer.Context, runtime: str, status: str | None) -> Non
         raise TandemError("--token-file is for the status service, and --status off leaves that out: drop one of them")
     if was_typed(context, "runs") and was_typed(context, "run_dir"):
         raise TandemError("--run-dir names the run's directory, and --runs the one it would be in: drop one of them")
-
-
-def _named(what: str | None, method: str | None, primitives: str | None) -> tuple[Path | None, list[str]]:
-    """The file of a recipe or configuration, if any, and the overrides that a task or method stands for.
-
-    Raises:
-        TandemError: no such recipe, task or file; or options that mean nothing there.
-    """
-    from service.config.find import METHODS
-    from service.methods.task_methods import METHODS as OF_TASKS
-
-    known = _targets()
-    if what in task_names():
-        if method in OF_TASKS and method not in METHODS:
-            raise TandemError(f"{method} learns nothing: measure it by tandem evaluate --task {what} --method {method}")
-        chosen = [f"task={what}", f"method={method or 'ours'}"]
-        return None, chosen + [f"primitives={primitives}"] * (primitives is not None)
-    if primitives is not None:
-        raise TandemError("--primitives is for learning a task: name one, such as push; a run begins from --from")
-    if what is None:
-        recipe = recipes().get(f"{DEFAULT_RECIPE}-{method}")
-        if recipe is None and method in OF_TASKS:
-            raise TandemError(f"--method {method} is for a task: name one, such as tandem train push")
-        return recipe, [f"method={method}"] if method is not None and recipe is None else []
-    if what not in known and not Path(what).suffix and not Path(what).exists():
-        raise TandemError(
-            f"{what!r}: no recipe, task or file of that name; there are {', '.join(known)}{did_you_mean(what, known)}"
-        )
-    if method is not None:
-        raise TandemError(f"{what} says its method itself: leave out --method, or change it by --set method={method}")
-    return find_file(what, recipes()), []
 
 
 def demo(
@@ -365,11 +326,11 @@ def _train(
             connection or nullcontext(),
             traceback_in(directory.path),
             Trackers(trackers, run_id_of(directory.path), config.model_dump(mode="json")) as tracked,
-            Progress(config.run.total_env_steps, shown()) as progress,
+            closing(Progress(shown())) as progress,
         ):
 
             def tell(metrics: dict[str, float]) -> None:
-                progress.show(metrics)
+                progress.show(metrics, config.run.total_env_steps)
                 tracked.log(metrics)
 
             done = run(

@@ -31,16 +31,12 @@ def parse_seeds(text: str) -> tuple[int, ...]:
     seeds: list[int] = []
     for part in text.split(","):
         match = re.fullmatch(r"([0-9]{1,9})(?:-([0-9]{1,9}))?", part.strip())
-        if match is None:
+        first, last = (int(match[1]), int(match[2] or match[1])) if match is not None else (0, -1)
+        if last < first or len(seeds) + last - first >= MAX_RUNS:
             raise ConfigError(
-                f"--seeds {text!r}: {part.strip()!r} is not a whole number from 0 on or a range; "
-                "write for example 0,1,2 or 0-4"
+                f"--seeds {text!r}: write whole numbers from 0 on and ranges, for example 0,1,2 or 0-4, of at most "
+                f"{MAX_RUNS} seeds; {part.strip()!r} is none of them"
             )
-        first, last = int(match[1]), int(match[2] or match[1])
-        if last < first:
-            raise ConfigError(f"--seeds {text!r}: the range {part.strip()} goes down; write {last}-{first}")
-        if len(seeds) + last - first >= MAX_RUNS:
-            raise ConfigError(f"--seeds {text!r}: more than {MAX_RUNS} seeds; give fewer")
         seeds.extend(range(first, last + 1))
     check_once(f"--seeds {text!r}", list(map(str, seeds)))
     return tuple(seeds)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import closing, suppress
 from pathlib import Path
 from typing import NamedTuple
@@ -25,7 +25,7 @@ from service.registry.names import Version
 from service.registry.publishing import publish_run
 from service.registry.registry import Registry
 from service.runs.grid import SEED, Settings
-from service.runs.study_file import StudyRun
+from service.runs.study_run import StudyRun
 from service.store.address import address_from_environment
 from service.store.disk import read_status
 from service.store.disk_reader import run_id_of
@@ -69,19 +69,18 @@ def interquartile_mean(values: StateArray) -> StateArray:
     return middle
 
 
-def bootstrap_interval(
-    groups: Sequence[Sequence[float]], estimate: Callable[[StateArray], StateArray] = interquartile_mean
-) -> tuple[float, float]:
-    """Both ends of the 95 % percentile bootstrap interval (Efron 1979; of several tasks Agarwal et al. 2021).
+def bootstrap_interval(groups: Sequence[Sequence[float]]) -> tuple[float, float]:
+    """Both ends of the 95 % percentile bootstrap interval of the interquartile mean.
+
+    Efron 1979; of several tasks Agarwal et al. 2021.
 
     Args:
         groups: values of one task each; each group is resampled by itself.
-        estimate: (R, N) resampled values of all groups to (R,).
     """
     rng = np.random.default_rng(0)  # the same runs have the same interval
     arrays = [np.asarray(values, dtype=np.float64) for values in groups]
     drawn = [values[rng.integers(len(values), size=(NUM_RESAMPLES, len(values)))] for values in arrays]
-    low, high = np.percentile(estimate(np.concatenate(drawn, axis=1)), (2.5, 97.5))
+    low, high = np.percentile(interquartile_mean(np.concatenate(drawn, axis=1)), (2.5, 97.5))
     return float(low), float(high)
 
 

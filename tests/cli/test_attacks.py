@@ -11,7 +11,7 @@ import shutil
 import signal
 import socket
 import zipfile
-from contextlib import closing, contextmanager
+from contextlib import contextmanager
 from itertools import pairwise
 
 import numpy as np
@@ -21,8 +21,7 @@ from typer.testing import CliRunner
 from service.cli.main import app
 from service.registry.publishing import publish
 from service.registry.registry import Registry
-from service.runs.study_file import StudyDirectory
-from tests.runs.runs import play, tiny_config, write_yaml
+from tests.runs.runs import begin_study, play, tiny_config, write_yaml
 
 LIMIT_S = 60
 """Far more than any refusal takes, and far less than forever."""
@@ -160,10 +159,7 @@ def good(tmp_path_factory):
     write_yaml(home / "tiny.yaml", config.model_dump(mode="json"))
     registry = Registry(home / "registry")
     publish(registry, config, run.method.parameters(), {"env_steps": 600.0})
-    with closing(StudyDirectory(home / "study")) as study:
-        study.begin(
-            {f"seed-{seed}": ({"seed": str(seed)}, config.model_copy(update={"seed": seed})) for seed in (0, 1)}, None
-        )
+    begin_study(home / "study", config)
     return home
 
 
