@@ -122,7 +122,7 @@ def what_is_meant(reference: str | None, primitives: str | None) -> tuple[str, s
 
 def was_typed(context: typer.Context, name: str) -> bool:
     """Whether an option was typed, and has not its default or what a variable says."""
-    source = context.get_parameter_source(name)
+    source = context.get_parameter_source("start_from" if name == "from" else name)
     return source is not None and source.name == "COMMANDLINE"  # typer has a ParameterSource of its own
 
 

@@ -90,8 +90,7 @@ def train_study(
     planned = _plan(what, method, primitives, seeds, grid, None if resume else recipes()[DEFAULT_RECIPE])
     start = None
     if resume:
-        if run_dir is None:
-            raise TandemError("--resume needs --run-dir, the directory of the study to continue")
+        assert run_dir is not None, "checked"
         study = Study(run_dir)
         configs = _resumed(study, planned, (None, []) if planned else named(what, method, primitives), overrides)
     else:

@@ -5,8 +5,7 @@ from __future__ import annotations
 import re
 import shlex
 from collections.abc import Sequence
-from contextlib import AbstractContextManager, closing, nullcontext
-from importlib.util import find_spec
+from contextlib import ExitStack, closing
 from itertools import count
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, NoReturn
@@ -41,12 +40,12 @@ if TYPE_CHECKING:
     from service.cluster.ray_connection import ClusterOptions
     from service.config import Config
     from service.registry.loading import Trained
-    from service.runs.train import Finished, Runtime
+    from service.runs.train import Finished
     from service.store.run_directory import RunDirectory
 
 AUTO, EXACTLY = "auto", "exactly"
 """Values of ``--resume``; the second where it is typed alone."""
-_CLUSTER_ONLY = ("address", "num_actors", "actor_threads", "learner_cpus", "status", "token_file")
+_OF_RAY, _OF_A_RUN_ON_RAY = ("address", "status", "token_file"), ("num_actors", "actor_threads", "learner_cpus")
 """Options that mean nothing in one process."""
 
 
@@ -152,7 +151,6 @@ def train(
     """Train what a recipe, a task or a file says, in this process or on a Ray cluster, and publish it."""
     from service.config import load_config
     from service.runs.resuming import resumed_config
-    from service.runs.train import prepare
     from service.store.models import RUN_ID
     from service.store.run_directory import RunDirectory
 
@@ -165,85 +163,62 @@ def train(
 
     if what is not None and config is not None:
         raise TandemError(f"{what} and --config {config}: name one of them")
-    what, trackers = what or config, tracker or []
+    what, trackers, grid, overrides = what or config, tracker or [], grid or [], overrides or []
     for each in trackers:
         find_factory(each)  # now, not after Ray has started
-    _check_used(context, choose("--runtime", runtime, ("local", "ray")), status)
+    choose("--runtime", runtime, ("local", "ray"))
     again = resume is not None and choose("--resume", resume, (AUTO, EXACTLY)) == EXACTLY
-    if start_from is not None and again:
-        raise TandemError("--from is for a run that begins, and --resume goes on with one: leave out one of them")
     if run_id is not None:
-        if resume is not None or run_dir is not None:
-            raise TandemError("--run-id names the run directory, and continues what is there: leave out the other two")
         if re.fullmatch(RUN_ID, run_id) is None:
             raise TandemError(
                 f"--run-id {run_id!r}: use 1 to 128 letters, digits, '.', '_' and '-', the first a letter or digit; "
                 "for another place there is --run-dir"
             )
         run_dir, resume = runs / run_id, AUTO
-    if is_study(run_dir, seeds, grid or (), what, method):
-        if accept_damaged_records:
-            raise TandemError("--accept-damaged-records is for one run of a study: resume that one by its --run-dir")
-        for name in ("num_actors", "actor_threads", "learner_cpus"):
-            if was_typed(context, name):
-                raise TandemError(
-                    f"--{name.replace('_', '-')} is for one run: each run of a study on Ray is a task, whose cores "
-                    "--set run.num_threads=N says"
-                )
+    study = is_study(run_dir, seeds, grid, what, method)
+    for is_so, names, why in (
+        (runtime == "local", (*_OF_A_RUN_ON_RAY, *_OF_RAY), "is for a run on Ray: give --runtime ray, or leave it out"),
+        (study, _OF_A_RUN_ON_RAY, "is for one run: --set run.num_threads=N says the cores of each run of a study"),
+        (study, ["accept_damaged_records"], "is for one run of a study: resume that one by its --run-dir"),
+        (not study, ["parallel"], "is for the runs of a study: give --seeds or --grid, too, or leave it out"),
+        (status == "off", ["token_file"], "is for the service that --status off leaves out: drop one of them"),
+        (run_dir is not None, ["runs"], "is where --run-dir would be: drop one of them"),
+        (run_id is not None, ["resume", "run_dir"], "is what --run-id says already: leave it out"),
+        (again, ["from"], "is for a run that begins, and --resume goes on with one: leave out one of them"),
+    ):
+        for name in names:
+            if is_so and was_typed(context, name):
+                raise TandemError(f"--{name.replace('_', '-')} {why}")
+    if again and run_dir is None:
+        raise TandemError("--resume needs --run-dir, the directory of what is to be continued")
+    if study:
         train_study(
-            run_dir, what, method, primitives, seeds, grid or (),
-            overrides=overrides or [], runs=runs, source=source, resume=None if resume == AUTO else again,
+            run_dir, what, method, primitives, seeds, grid,
+            overrides=overrides, runs=runs, source=source, resume=None if resume == AUTO else again,
             publish=publish, parallel=parallel, cluster=cluster_options if runtime == "ray" else None, address=address,
             trackers=trackers, start_from=start_from,
         )  # fmt: skip
         return
     file, first = named(what, method, primitives)
-    overrides = [*first, *(overrides or [])]
-    if parallel is not None:
-        raise TandemError("--parallel is for the runs of a study: give --seeds or --grid, too, or leave it out")
-    if again and run_dir is None:
-        raise TandemError("--resume needs --run-dir, the directory of the run to continue")
+    overrides = [*first, *overrides]
     begun = file if file is not None or first else recipes()[DEFAULT_RECIPE]
     run_dir = run_dir or runs / load_config(begun, overrides).directory_name
+    directory = RunDirectory(run_dir, accept_damaged_records=accept_damaged_records)
     if resume == AUTO:
-        again = RunDirectory(run_dir).exists
+        again = directory.exists
     start = None
     if again:
-        resolved = resumed_config(RunDirectory(run_dir), overrides, file)
+        resolved = resumed_config(directory, overrides, file)
     else:
         start = load_start(start_from, source) if start_from is not None else None
         with loading():
             resolved = load_config(begun, overrides).begin(source, start)
     if publish is None:
         publish = resolved.makes != "orchestrator"
-    directory = RunDirectory(run_dir, accept_damaged_records=accept_damaged_records)
-    if runtime == "local":
-        _train(resolved, directory, source, resume=again, publish=publish, start=start, trackers=trackers)
-        return
-    from service.cluster.ray_connection import connected
-    from service.cluster.ray_runtime import RayRuntime
-
-    cluster = RayRuntime(cluster_options())
-    with closing(directory), traceback_in(run_dir):
-        prepare(resolved, directory, source, resume=again, publish=publish, runtime=cluster)
-        _train(
-            resolved, directory, source, resume=again, publish=publish, start=start, trackers=trackers,
-            runtime=cluster, address=address, connection=connected(address),
-        )  # fmt: skip
-
-
-def _check_used(context: typer.Context, runtime: str, status: str | None) -> None:
-    """Refuse options that were typed and would do nothing."""
-    if runtime == "local":
-        for name in _CLUSTER_ONLY:
-            if was_typed(context, name):
-                raise TandemError(
-                    f"--{name.replace('_', '-')} is for a run on Ray: give --runtime ray, or leave it out"
-                )
-    if status == "off" and was_typed(context, "token_file"):
-        raise TandemError("--token-file is for the status service, and --status off leaves that out: drop one of them")
-    if was_typed(context, "runs") and was_typed(context, "run_dir"):
-        raise TandemError("--run-dir names the run's directory, and --runs the one it would be in: drop one of them")
+    _train(
+        resolved, directory, source, resume=again, publish=publish, start=start, trackers=trackers,
+        cluster=cluster_options() if runtime == "ray" else None, address=address,
+    )  # fmt: skip
 
 
 def demo(
@@ -279,9 +254,6 @@ def demo(
     typer.echo(f"  tandem coverage {CHAMPION} --out champion.png")
     typer.echo(f"  tandem play     {CHAMPION}")
     typer.echo(f"  {shlex.join(['tandem', 'serve', '--runs', str(path.parent)])}")
-    missing = [extra for extra, package in (("play", "viser"), ("serve", "fastapi")) if find_spec(package) is None]
-    if missing:
-        typer.echo(f"tandem {' and '.join(missing)} need: pip install 'tandem-skills[{','.join(missing)}]'")
 
 
 def _in_words(done: Finished) -> str:
@@ -302,38 +274,43 @@ def _train(
     *,
     resume: bool,
     publish: bool = True,
-    runtime: Runtime | None = None,
-    address: str | None = None,
     start: Trained | None = None,
     trackers: Sequence[str] = (),
-    connection: AbstractContextManager[None] | None = None,
+    cluster: ClusterOptions | None = None,
+    address: str | None = None,
 ) -> Finished:
+    """Train, show how far that is, and say what came out, or how to go on."""
     with loading():
-        from service.runs.train import train as run
+        from service.runs import train as training
     from service.runs.progress import Progress
     from service.runs.signals import InterruptError
     from service.store.disk_reader import run_id_of
 
     def say_stopped(what: str, number: int) -> NoReturn:
         """Say how to go on, and exit as a process that a signal ends."""
-        name = "local" if runtime is None else runtime.name
-        how = how_to_go_on(directory.path, registry, runtime=name, address=address)
+        how = how_to_go_on(directory.path, registry, runtime=runtime.name, address=address)
         typer.echo(f"{what}; {how if directory.exists else 'nothing was saved yet'}")
         raise typer.Exit(EXIT_SIGNAL + number)
 
+    runtime = training.Runtime()
     try:
-        with (
-            connection or nullcontext(),
-            traceback_in(directory.path),
-            Trackers(trackers, run_id_of(directory.path), config.model_dump(mode="json")) as tracked,
-            closing(Progress(shown())) as progress,
-        ):
+        with traceback_in(directory.path), closing(directory), ExitStack() as stack:
+            if cluster is not None:
+                from service.cluster.ray_connection import connected
+                from service.cluster.ray_runtime import RayRuntime
+
+                runtime = RayRuntime(cluster)
+                training.prepare(config, directory, registry, resume=resume, publish=publish, runtime=runtime)
+                stack.enter_context(connected(address))
+            tree = config.model_dump(mode="json")
+            tracked = stack.enter_context(closing(Trackers(trackers, run_id_of(directory.path), tree)))
+            progress = stack.enter_context(closing(Progress(shown())))
 
             def tell(metrics: dict[str, float]) -> None:
                 progress.show(metrics, config.run.total_env_steps)
                 tracked.log(metrics)
 
-            done = run(
+            done = training.train(
                 config, directory, registry,
                 resume=resume, publish=publish, on_iteration=tell, runtime=runtime, start=start,
             )  # fmt: skip
@@ -351,9 +328,8 @@ def _train(
     for name, value in done.metrics.items():
         is_share = "success" in name or name == "coverage"
         typer.echo(f"{name:<36} {value:.1%}" if is_share else f"{name:<36} {value:g}")
-    for name, file in done.files.items():
+    for name, file in [*done.files.items(), ("checkpoint", directory.checkpoints)]:
         typer.echo(f"{name:<12} {file}")
-    typer.echo(f"{'checkpoint':<12} {directory.checkpoints}")
     if done.version is not None:
         typer.echo(f"{config.makes:<12} {done.version} in {registry}")
     return done

@@ -3,18 +3,16 @@
 from __future__ import annotations
 
 import errno
-import logging
 import os
 import platform
 import re
 import secrets
 import sys
 import tempfile
-import threading
 import time
 import traceback
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import typer
@@ -26,7 +24,6 @@ UsageError: type[Exception] = typer.BadParameter.__bases__[0]
 """The error of arguments that typer cannot read; it has no public name in all versions of typer."""
 _PATH_ERRORS = (errno.EACCES, errno.EPERM, errno.ENAMETOOLONG, errno.ELOOP, errno.ENOTDIR, errno.EISDIR)
 """Reasons for which a path that was typed cannot be used."""
-_logger = logging.getLogger(__name__)
 
 
 @contextmanager
@@ -66,25 +63,13 @@ def traceback_in(directory: Path | None = None) -> Iterator[None]:
         raise _unexpected(error, directory) from error
 
 
-def report_thread_error(arguments: threading.ExceptHookArgs) -> None:
-    """Log one line where a thread ends with an error; to be ``threading.excepthook``."""
-    if arguments.exc_value is not None and not isinstance(arguments.exc_value, SystemExit):
-        name = arguments.thread.name if arguments.thread is not None else "?"
-        _logger.error("thread %s: %s", name, _unexpected(arguments.exc_value, None))
-
-
 def _unexpected(error: BaseException, directory: Path | None) -> UnexpectedError:
     said = one_line(str(error), 300)
     what = f"unexpected {type(error).__name__}{': ' if said else ''}{said}"
     for place in ([directory] if directory is not None and directory.is_dir() else []) + [Path(tempfile.gettempdir())]:
-        try:
-            path = _write_traceback(error, place)
-        except OSError:
-            continue
-        return UnexpectedError(f"{what}; its traceback is in {path}, please report it")
-    last = traceback.extract_tb(error.__traceback__)[-1:]
-    where = "".join(f" ({Path(frame.filename).name}, line {frame.lineno})" for frame in last)
-    return UnexpectedError(f"{what}{where}; its traceback cannot be written anywhere; please report it")
+        with suppress(OSError):
+            return UnexpectedError(f"{what}; its traceback is in {_write_traceback(error, place)}, please report it")
+    return UnexpectedError(f"{what}; its traceback cannot be written anywhere; please report it")
 
 
 def _write_traceback(error: BaseException, directory: Path) -> Path:

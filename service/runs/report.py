@@ -20,6 +20,13 @@ from service.store.run_writer import GOALS_INTERVAL_S, RunWriter
 
 BEAT_S = 2.0
 """Time between two heartbeats of what follows learning."""
+_MEASURED = {
+    "success": "last",
+    "success_low": "last_low",
+    "success_high": "last_high",
+    "success_ever": "ever",
+}
+"""Results of a task in its status, by the ends of their metrics' names."""
 
 
 class Report:
@@ -139,24 +146,26 @@ class Report:
         self.beat(run)
 
     def beat(self, run: Run) -> None:
-        """Tell that the run is alive, how far it is, and how its parts are.
+        """Tell that the run is alive, how far it is, and how its parts are; stop it where that was asked for.
 
         Raises:
             RunTakenError: another process has taken it over.
         """
         self.check()
-        health = run.method.health()
-        counters = self._counters(run)
+        health, counters = run.method.health(), self._counters(run)
         for name, value in counters.items():
             self._totals[name] = self._totals.get(name, 0) + max(0, value - self._counted.get(name, 0))
         self._counted = counters
+        stopping = self._writer.stop_requested()
+        if stopping:
+            run.request_stop()
         self._tell(
             totals=RunTotals(**self._totals),
             iteration=run.iteration,
             num_env_steps=run.num_env_steps,
             num_rollouts_counted=health.num_rollouts_counted,
             num_rollouts_refused=health.num_rollouts_refused,
-            stopping=self.stop_requested(),
+            stopping=stopping,
             actors=health.actors,
             last_error=health.last_error,
             warnings=health.warnings,
@@ -165,25 +174,10 @@ class Report:
     def measured(self, metrics: Mapping[str, float]) -> None:
         """Tell how well the run does in the end; of a task that is shown beside its name."""
         trial = self._status.trial
-        if trial is None:
-            return
-        found = {name: metrics.get(f"evaluation/{name}") for name in ("success_last", "success_ever")}
-        low, high = (metrics.get(f"evaluation/success_last_{end}") for end in ("low", "high"))
-        self._tell(
-            trial=trial.model_copy(
-                update={
-                    "success": found["success_last"],
-                    "success_low": low,
-                    "success_high": high,
-                    "success_ever": found["success_ever"],
-                    "num_episodes": int(metrics.get("evaluation/num_episodes", 0)) or None,
-                }
-            )
-        )
-
-    def stop_requested(self) -> bool:
-        """Whether the run was asked to stop."""
-        return self._writer.stop_requested()
+        if trial is not None:
+            found = {name: metrics.get(f"evaluation/success_{place}") for name, place in _MEASURED.items()}
+            num_episodes = int(metrics.get("evaluation/num_episodes", 0)) or None
+            self._tell(trial=trial.model_copy(update={**found, "num_episodes": num_episodes}))
 
     def end(self, state: RunState, *, published: str | None = None, error: str | None = None) -> None:
         """Say how the run ended."""

@@ -9,7 +9,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, closing, contextmanager, suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from threading import Thread
@@ -54,14 +54,14 @@ class Finished:
     """Results of a training."""
 
     result: RunResult
-    files: dict[str, Path]
-    """Pictures and video by what they show."""
-    version: Version | None
-    """What it published; None when interrupted, or when nothing was to be published."""
-    metrics: dict[str, float]
-    """Metrics of the final evaluation."""
     timing: str
     """Where the time went, as a text tree."""
+    files: dict[str, Path] = field(default_factory=dict)
+    """Pictures and video by what they show."""
+    version: Version | None = None
+    """What it published; None when interrupted, or when nothing was to be published."""
+    metrics: dict[str, float] = field(default_factory=dict)
+    """Metrics of the final evaluation."""
     signal: int | None = None
     """The signal that ended it before its time."""
 
@@ -160,7 +160,7 @@ def train(
                     said = f", published {done.version}" if done.version is not None else ""
                     at = f"iteration {done.result.iteration}, {done.result.num_env_steps} env steps"
                     log.note(f"the run is {done.result.reason} at {at}{said}")
-                    return replace(done, signal=signals.first)
+                    return done
             time.sleep(BACK_OFF_S * (2 ** (num_lost - 1) - 1))
 
 
@@ -214,32 +214,24 @@ def _end_now(report: Report, directory: RunDirectory, what: str) -> None:
 def _run(
     run: Run, registry: Path | str, publish: bool, signals: StopSignals, report: Report, on_iteration: OnIteration
 ) -> Finished:
-    def beat() -> None:
-        report.beat(run)
-        if report.stop_requested():
-            run.request_stop()
-
     def tell(metrics: dict[str, float]) -> None:
         on_iteration(metrics)
         report.iteration(run, metrics)
-        if report.stop_requested():
-            run.request_stop()
-
-    report.begin(run)
 
     def stop() -> None:
         run.request_stop()
         answer("stopping after this iteration; again to end now")
 
+    report.begin(run)
     with signals.asking(stop):
-        result = run.run(tell, beat)
-    done = Finished(result, {}, None, {}, run.method.timing.tree(), signals.first)
+        result = run.run(tell, partial(report.beat, run))
+    done = Finished(result, timing=run.method.timing.tree())
     if result.reason != "interrupted" and signals.first is None:
         with suppress(InterruptError), report.beating():
             done = _finish(done, run, registry, publish, report)
     complete = result.reason if signals.first is None else "interrupted"  # --resume does what is left
     report.end(cast("RunState", complete), published=str(done.version) if done.version is not None else None)
-    return done
+    return replace(done, signal=signals.first)
 
 
 def _finish(done: Finished, run: Run, registry: Path | str, publish: bool, report: Report) -> Finished:

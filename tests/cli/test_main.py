@@ -16,7 +16,7 @@ from typer.testing import CliRunner
 
 from service.base.errors import TandemError
 from service.base.lock import DirectoryLock
-from service.cli.film import parse_goals
+from service.cli.evaluate import parse_goals
 from service.cli.main import app
 from service.config import WorldConfig, load_config
 from service.config.recipes import recipes
@@ -201,7 +201,7 @@ def test_demo_ends_with_what_comes_with_tandem_and_what_to_type(monkeypatch, tmp
     metrics = {"evaluation/table_success_last": 0.12, "evaluation/air_success_last": 0.03}
 
     def pretrain(*args, **kwargs):
-        return Finished(RunResult("finished", 1, 7), {}, Version("panda-cube-demo", 1), metrics, "total 1 s")
+        return Finished(RunResult("finished", 1, 7), "total 1 s", {}, Version("panda-cube-demo", 1), metrics)
 
     real = evaluation.evaluate
     few = {"num_episodes": 4, "num_steps": 2}

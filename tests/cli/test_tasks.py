@@ -2,14 +2,10 @@
 
 import json
 import os
-import re
 import shutil
 import signal
-import subprocess
-import sys
 
 import pytest
-import typer
 from typer.testing import CliRunner
 
 from service.base.lock import DirectoryLock
@@ -177,39 +173,6 @@ def test_methods_and_tasks_are_listed():
     assert all(5 < len(row["about"]) < 110 for row in methods.values())
     listed = tandem("tasks").stdout.splitlines()
     assert [line.partition("\t")[0] for line in listed[:3]] == ["name", "larger", "inair"]
-
-
-@pytest.mark.parametrize(
-    "typed",
-    [
-        "train --task wall --method ours --primitives panda-cube@champion --seed 0 --help",
-        "table --runtime ray --num-workers 8",
-        "evaluate runs/downstream/wall-ours-0 -q",
-        "render x",
-        "play x",
-        "publish x --name y",
-        "methods",
-        "",
-        "lift",
-    ],
-)
-def test_commands_of_before_name_those_of_now(typed):
-    refused = tandem("downstream", *typed.split())
-    assert_refused(refused, "is now tandem")
-    commands = typer.main.get_command(app).commands
-    named = re.findall(r"now tandem (\w+)", refused.stderr)
-    assert named
-    assert set(named) <= commands.keys() - {"downstream"}
-    assert set(re.findall(r" (--\w+)", refused.stderr)) <= {
-        option for command in commands.values() for each in command.params for option in each.opts
-    }
-
-
-def test_a_process_of_before_ends_with_one_line():
-    command = [sys.executable, "-m", "service", "downstream", "train", "--task", "wall", "--seed", "0"]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=600)
-    assert (done.returncode, done.stdout, done.stderr.count("\n")) == (2, "", 1)
-    assert "tandem downstream train is now tandem train TASK" in done.stderr
 
 
 @pytest.mark.parametrize(
