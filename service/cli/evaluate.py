@@ -112,7 +112,13 @@ def evaluate(
         asked = None if goals is None else choose("--goals", goals, GOAL_KINDS)
         trained = load(reference, registry, primitives).on(task)
     players, on = _players(trained, method), trained.task
-    _check_used(trained, method, out)
+    for option, value in (("--method", method), ("--out", out)):
+        if value is not None and on is None:
+            raise TandemError(f"{option} is for a task: name one by --task, such as --task push")
+    if out is not None and method is None and trained.kind == "orchestrator":
+        raise TandemError(f"--out {out}: {trained.label} has learned, and its run has the result.json; leave out --out")
+    if out is not None and out.exists():  # now, not after playing
+        raise TandemError(f"--out {out} is there already: name another file, or move it away")
     config = changed_config(trained.config, overrides or ())
     world, distance_m = replace(trained, config=config).world, trained.success_distance_m
     kind = cast("GoalKind", asked or ("mixed" if on is None else trained.goals))
@@ -166,22 +172,9 @@ def _players(trained: Trained, method: str | None) -> dict[str, DeterministicPol
     return players | {"idle": IdlePolicy()}
 
 
-def _check_used(trained: Trained, method: str | None, out: Path | None) -> None:
-    """Refuse options that mean nothing without a task, and a file that is there or would have no result."""
-    for option, value in (("--method", method), ("--out", out)):
-        if value is not None and trained.task is None:
-            raise TandemError(f"{option} is for a task: name one by --task, such as --task push")
-    if out is None:
-        return
-    if method is None and trained.kind == "orchestrator":
-        raise TandemError(f"--out {out}: {trained.label} has learned, and its run has the result.json; leave out --out")
-    if out.exists():
-        raise TandemError(f"--out {out} is there already: name another file, or move it away")
-
-
 def _write_result(path: Path, trained: Trained, method: str | None, seed: int, numbers: Metrics) -> None:
     """Write a file that says what a run's configuration and result say."""
-    from service.base.files import os_errors, write_exclusive
+    from service.base.files import os_errors, write_atomic
     from service.methods.task_methods import METHODS
     from service.store.run_directory import encode_result
 
@@ -198,9 +191,7 @@ def _write_result(path: Path, trained: Trained, method: str | None, seed: int, n
         "wall_s": 0.0,
     }
     with os_errors("write", path):
-        path.parent.mkdir(parents=True, exist_ok=True)
-        if not write_exclusive(path, encode_result(result)):
-            raise TandemError(f"--out {path} is there already: name another file, or move it away")
+        write_atomic(path, encode_result(result))
 
 
 def coverage(

@@ -51,7 +51,7 @@ def publish(
     with loading():
         from service.registry.names import check_alias
         from service.registry.registry import Registry
-        from service.runs.publishing import publish_learned
+        from service.runs.train import publish_learned
 
     if alias is not None:
         check_alias(alias)

@@ -55,12 +55,13 @@ def run(
     registry: SourceOption = SOURCE,
 ) -> None:
     """Bring the object to goals; Ctrl-C stops the robot first."""
+    from service.robot.backends import read_backend
     from service.robot.calibrate import read_calibration
     from service.robot.log import RobotLog
     from service.robot.loop import Bridge
     from service.robot.running import parse_goal, play
 
-    config, described, player = _bridge_config(overrides), _backend_config(robot), _load(policy, registry)
+    config, described, player = _bridge_config(overrides), read_backend(robot), _load(policy, registry)
     goal_m = None if goal is None else parse_goal(goal, player.world)
     gain = (1.0, 1.0, 1.0)
     if calibration is not None:
@@ -112,8 +113,9 @@ def calibrate(
 ) -> None:
     """Measure the response of an arm by motions of some 6 cm about the middle of its safety box, without an object."""
     from service.robot import calibrate as measuring
+    from service.robot.backends import read_backend
 
-    config, described, player = _bridge_config(overrides), _backend_config(robot), _load(policy, registry)
+    config, described, player = _bridge_config(overrides), read_backend(robot), _load(policy, registry)
     with _connected(described, player, 0, dead_man) as (backend, held, wait):
         wait("take everything out of the arm's way")
         found = measuring.calibrate(described.label, backend.robot, player.world, config, held=held)
@@ -159,12 +161,6 @@ def _load(policy: str, registry: str) -> Trained:
     from service.robot.policies import for_robot
 
     return for_robot(load(policy, registry))
-
-
-def _backend_config(reference: str) -> BackendConfig:
-    from service.robot.backends import read_backend
-
-    return read_backend(reference)
 
 
 @contextlib.contextmanager

@@ -10,9 +10,8 @@ from typing import TYPE_CHECKING
 import typer
 
 from service.base.errors import ConfigError, TandemError, one_line
-from service.cli.common import EXIT_SIGNAL, REGISTRY, how_to_go_on, load_start, loading, print_table, shown
+from service.cli.common import EXIT_SIGNAL, REGISTRY, how_to_go_on, loading, print_table, shown, traceback_in
 from service.cli.configs import named
-from service.cli.unexpected import traceback_in
 from service.config.recipes import DEFAULT_RECIPE, recipes
 from service.runs.grid import SEED, Settings, check_once, name_runs, parse_grid
 
@@ -76,6 +75,7 @@ def train_study(
         start_from: as typed; what the runs of a new study begin from.
     """
     from service.config import load_config
+    from service.registry.loading import load
     from service.registry.names import is_service
     from service.runs.progress import Progress
     from service.runs.signals import InterruptError, StopSignals
@@ -94,7 +94,7 @@ def train_study(
         study = Study(run_dir)
         configs = _resumed(study, planned, (None, []) if planned else named(what, method, primitives), overrides)
     else:
-        start = load_start(start_from, source) if start_from is not None else None
+        start = load(start_from, source).expect("primitives", by="--from") if start_from is not None else None
         with loading():
             configs = {
                 name: load_config(file, [*given, *overrides]).begin(source, start)

@@ -24,15 +24,14 @@ from service.cli.common import (
     TrackerOption,
     choose,
     how_to_go_on,
-    load_start,
     loading,
     shown,
+    traceback_in,
     was_typed,
 )
 from service.cli.configs import config_names, named, targets
 from service.cli.evaluate import evaluate
 from service.cli.study import is_study, train_study
-from service.cli.unexpected import traceback_in
 from service.config.recipes import DEFAULT_RECIPE, recipes
 from service.runs.trackers import Trackers, find_factory
 
@@ -47,6 +46,7 @@ AUTO, EXACTLY = "auto", "exactly"
 """Values of ``--resume``; the second where it is typed alone."""
 _OF_RAY, _OF_A_RUN_ON_RAY = ("address", "status", "token_file"), ("num_actors", "actor_threads", "learner_cpus")
 """Options that mean nothing in one process."""
+_WHERE = {"table": "on the table", "air": "in the air"}
 
 
 class TrainCommand(TyperCommand):
@@ -150,6 +150,7 @@ def train(
 ) -> None:
     """Train what a recipe, a task or a file says, in this process or on a Ray cluster, and publish it."""
     from service.config import load_config
+    from service.registry.loading import load
     from service.runs.resuming import resumed_config
     from service.store.models import RUN_ID
     from service.store.run_directory import RunDirectory
@@ -210,8 +211,8 @@ def train(
     if again:
         resolved = resumed_config(directory, overrides, file)
     else:
-        start = load_start(start_from, source) if start_from is not None else None
         with loading():
+            start = load(start_from, source).expect("primitives", by="--from") if start_from is not None else None
             resolved = load_config(begun, overrides).begin(source, start)
     if publish is None:
         publish = resolved.makes != "orchestrator"
@@ -245,26 +246,21 @@ def demo(
     overrides = [f"run.total_env_steps={env_steps}", "name=panda-cube-demo", "run.evaluation_interval=25"]
     config = load_config(recipes()[DEFAULT_RECIPE], overrides)
     done = _train(config, RunDirectory(path), path / "registry", resume=False)
-    typer.echo(f"\n{_in_words(done)}")
-    typer.echo(f"\nThat was a beginning. Primitives that have learned for longer come with tandem; {CHAMPION}:")
-    evaluate(CHAMPION, registry=str(BUNDLED))  # prints what the first of the next commands prints
-    typer.echo("\nLook at them, or at the run on its page, in a browser:")
-    typer.echo(f"  tandem evaluate {CHAMPION} --goals mixed --episodes 300")
-    typer.echo(f"  tandem render   {CHAMPION} --out champion.mp4")
-    typer.echo(f"  tandem coverage {CHAMPION} --out champion.png")
-    typer.echo(f"  tandem play     {CHAMPION}")
-    typer.echo(f"  {shlex.join(['tandem', 'serve', '--runs', str(path.parent)])}")
-
-
-def _in_words(done: Finished) -> str:
-    """What a short run has come to."""
     rates = {where: done.metrics.get(f"evaluation/{name}_success_last") for name, where in _WHERE.items()}
     told = [f"{rate:.0%} of random goals {where}" for where, rate in rates.items() if rate is not None]
-    said = f"Bob has practised for {done.result.num_env_steps:,} steps"
-    return f"{said}, and now reaches {' and '.join(told)}." if told else f"{said}."
-
-
-_WHERE = {"table": "on the table", "air": "in the air"}
+    reaches = f", and now reaches {' and '.join(told)}" if told else ""
+    typer.echo(f"\nBob has practised for {done.result.num_env_steps:,} steps{reaches}.")
+    typer.echo(f"\nThat was a beginning. Primitives that have learned for longer come with tandem; {CHAMPION}:")
+    evaluate(CHAMPION, registry=str(BUNDLED))  # prints what the first of the next commands prints
+    commands = [
+        f"evaluate {CHAMPION} --goals mixed --episodes 300",
+        f"render   {CHAMPION} --out champion.mp4",
+        f"coverage {CHAMPION} --out champion.png",
+        f"play     {CHAMPION}",
+        shlex.join(["serve", "--runs", str(path.parent)]),
+    ]
+    typer.echo("\nLook at them, or at the run on its page, in a browser:")
+    typer.echo("\n".join(f"  tandem {command}" for command in commands))
 
 
 def _train(

@@ -60,7 +60,16 @@ class Report:
         self._totals = previous.totals.model_dump() if previous is not None else {}
         self._counted: dict[str, int] = {}
         self._gridded_s = float("-inf")
-        now = datetime.now(UTC)
+        now, trial = datetime.now(UTC), None
+        if isinstance(config, TaskConfig):
+            digest = config.primitives_digest
+            trial = Trial(
+                task=config.task,
+                method=config.method,
+                seed=config.seed,
+                primitives=config.primitives if digest is not None else None,
+                primitives_digest=digest,
+            )
         self._status = RunStatus(
             run_id=run_id,
             name=config.name,
@@ -70,7 +79,7 @@ class Report:
             heartbeat=now,
             epoch=epoch,
             total_env_steps=config.run.total_env_steps,
-            trial=_trial_of(config),
+            trial=trial,
             published=published,
             totals=previous.totals if previous is not None else RunTotals(),
         )
@@ -203,17 +212,3 @@ class Report:
         changes |= {"heartbeat": datetime.now(UTC), "condition": condition, "warnings": warnings}
         self._status = self._status.model_copy(update=changes)
         self._writer.status(self._status)
-
-
-def _trial_of(config: Config) -> Trial | None:
-    """What a run that learns a task is about; None for others."""
-    if not isinstance(config, TaskConfig):
-        return None
-    has = config.primitives_digest is not None
-    return Trial(
-        task=config.task,
-        method=config.method,
-        seed=config.seed,
-        primitives=config.primitives if has else None,
-        primitives_digest=config.primitives_digest,
-    )

@@ -260,7 +260,7 @@ class Study:
     ) -> tuple[dict[str, Job], int]:
         """Those runs that have more to learn, and how many are to go on at once."""
         jobs, start = dict[str, Job](), self._study.start
-        going = {name: run for name, run in self._study.runs.items() if run.has_more(configs[name])}
+        going = {name: run for name, run in self._study.runs.items() if run.has_more(configs[name].run.total_env_steps)}
         if not going:
             return jobs, 0
         num_parallel, cores = share([configs[name] for name in going], place, parallel)

@@ -57,9 +57,9 @@ class StudyRun(FrozenModel):
         """Whether it has learned all it was to learn."""
         return self.state in ENDED
 
-    def has_more(self, config: Config) -> bool:
+    def has_more(self, total_env_steps: int) -> bool:
         """Whether it is to learn more: it has not ended, or has a larger budget by now."""
-        return not self.has_ended or (self.state == "finished" and self.env_steps < config.run.total_env_steps)
+        return not self.has_ended or (self.state == "finished" and self.env_steps < total_env_steps)
 
     def now(self, state: RunState | Literal["waiting"], error: str | None = None) -> StudyRun:
         """The run in another state."""
@@ -87,17 +87,12 @@ class Job:
         status = read_status(self.directory) if place.exists else None
         if status is None:
             return self.run.now("interrupted" if place.exists else "waiting")
-        state, result = status.state, place.read_result()
-        if state not in (*ENDED, "failed") or (
-            state == "finished" and status.num_env_steps < self.total_env_steps  # it has a larger budget
-        ):
-            state, result = "interrupted", None
-        found: dict[str, object] = {"state": state, "env_steps": status.num_env_steps, "error": None, "result": {}}
-        if state == "failed":  # others have told of what they survived
-            found["error"] = status.last_error
-        if result is not None:
-            found |= {"result": result["evaluation"], "wall_s": result["wall_s"]}
-        return self.run.model_copy(update=found)
+        found = self.run.model_copy(update={"env_steps": status.num_env_steps, "result": {}})
+        found = found.now(status.state, status.last_error if status.state == "failed" else None)
+        if found.state != "failed" and found.has_more(self.total_env_steps):
+            return found.now("interrupted")
+        result = place.read_result() or {"evaluation": {}, "wall_s": found.wall_s}
+        return found.model_copy(update={"result": result["evaluation"], "wall_s": result["wall_s"]})
 
     def arguments(self) -> list[str]:
         """The arguments of ``tandem`` that begin the run or go on with it; nothing is published yet.
@@ -187,14 +182,15 @@ class Place:
     """Runs a job until it ends, or until what was asked for is done; called in a thread."""
 
 
-def cores_of(config: Config) -> int:
-    """The fewest cores of a run: one plays and another learns, and a task is learned by a thread that does both."""
-    return 1 if config.makes == "orchestrator" else 2
-
-
 def share(configs: Sequence[Config], place: Place, parallel: int | None) -> tuple[int, list[int]]:
-    """Runs at once, and the cores of each: those of the configuration, else a share of all; of a task always one."""
-    least = max(config.run.num_threads or cores_of(config) for config in configs)
+    """Runs at once, and the cores of each: those of the configuration, else a share of all.
+
+    A run has two at least, as one plays and another learns. A task is learned by a thread that does both, and has one.
+    """
+    one = [config.makes == "orchestrator" for config in configs]
+    least = max(each.run.num_threads or (1 if alone else 2) for each, alone in zip(configs, one, strict=True))
     num_parallel = min(len(configs), parallel or max(1, place.num_cores // least))
     fair = max(1, min(place.num_cores // num_parallel, place.most_cores or place.num_cores))
-    return num_parallel, [config.run.num_threads or (1 if cores_of(config) == 1 else fair) for config in configs]
+    return num_parallel, [
+        each.run.num_threads or (1 if alone else fair) for each, alone in zip(configs, one, strict=True)
+    ]
