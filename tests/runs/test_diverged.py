@@ -26,13 +26,6 @@ class NotANumber(NumpyGaussianPolicy):
         return action, log_prob
 
 
-@pytest.fixture(scope="module")
-def uninterrupted(tmp_path_factory):
-    path = tmp_path_factory.mktemp("uninterrupted")
-    play(path)
-    return path
-
-
 def diverge_after(patch, iteration):
     """Alice's policy is no good from the iteration behind this one."""
     players, rounds = RolloutWorker._players, count()

@@ -46,13 +46,6 @@ def elsewhere(path, to):
     return to
 
 
-@pytest.fixture(scope="module")
-def uninterrupted(tmp_path_factory):
-    path = tmp_path_factory.mktemp("uninterrupted")
-    play(path)
-    return path
-
-
 def in_half_a_temporary_file(patch):
     write = files._write_flushed
 

@@ -2,8 +2,6 @@
 
 import json
 import signal
-import subprocess
-import sys
 import threading
 import time
 
@@ -25,7 +23,6 @@ from service.store.disk_reader import DiskReader
 from service.store.redis_reader import RedisReader
 from service.store.run_directory import RunDirectory
 from tests.runs.runs import (
-    ROOT,
     assert_one_line,
     assert_same_run,
     play,
@@ -197,11 +194,9 @@ def test_a_second_process_is_refused_and_a_killed_one_has_vanished(tmp_path):
         reader = DiskReader(tmp_path)
         wait_until(lambda: reader.runs() and reader.run("run").iteration > 0, within_s=600.0)
         assert reader.run("run").state == "running"
-        command = [sys.executable, "-m", "service", "pretrain", "--resume", "--run-dir", str(path)]
-        second = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=600)
-        assert process.poll() is None
-        assert second.returncode == 2
-        assert_one_line(second.stderr, f"{path} is in use by process {process.pid}", "--run-dir")
+        with pytest.raises(RunTakenError) as error:
+            RunDirectory(path).claim(resume=True)
+        assert_one_line(error.value, f"{path} is in use by process {process.pid}", "--run-dir")
     finally:
         process.kill()
         process.communicate()
