@@ -95,7 +95,8 @@ class Study:
             tree = parse_json(data, self.file)
             if isinstance(tree, dict) and "seeds" in tree:
                 raise ConfigError(written_by(self.file, SECOND_VERSION))
-            return StudyFile.model_validate(tree)
+            self._study = StudyFile.model_validate(tree)
+            return self._study
         raise StorageError(
             f"{self.file} does not name the runs of a study; restore it from a copy, or go on with each run by "
             "--resume --run-dir"
@@ -183,7 +184,7 @@ class Study:
         Raises:
             InterruptError: a second signal.
         """
-        self._study = self.read()
+        self.read()  # again: before it was claimed, another process may have gone on with it
         jobs, num_parallel = self._jobs(configs, place, parallel, options)
         if not jobs:
             return

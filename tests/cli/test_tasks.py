@@ -179,7 +179,6 @@ def test_methods_and_tasks_are_listed():
     ("arguments", "words"),
     [
         (["lift"], "'lift': no recipe, task or file of that name"),
-        (["walls", "--method", "ours"], "did you mean 'wall'?"),
         (["wall", "--method", "vic"], "method = 'vic': choose one of"),
         (["wall", "--method", "idle"], "idle learns nothing: measure it by tandem evaluate --task wall --method idle"),
         (["--method", "ours"], "--method ours is for a task"),

@@ -10,6 +10,7 @@ from typer.testing import CliRunner
 
 from service.cli.main import app
 from service.registry.registry import Registry
+from service.runs import train as training
 from service.runs.run import Run
 from service.runs.signals import PASSED_ON, STOPPING, InterruptError, StopSignals
 from tests.runs.runs import assert_same_run, newest, play, write_yaml
@@ -97,18 +98,23 @@ def test_a_stop_that_comes_directly_and_is_passed_on_is_one(order):
 @pytest.fixture
 def home(tmp_path, monkeypatch):
     """A quick end of a run, and ``run(*more)``: a pre-training there from the command line."""
+    make_artifacts = training.make_artifacts
+    monkeypatch.setattr(training, "make_artifacts", lambda directory, registry: {})
     monkeypatch.setattr("service.media.artifacts.NUM_SKILLS", 2)
     monkeypatch.setattr("service.media.artifacts.COVERAGE_STEPS", 2)
     monkeypatch.setattr("service.media.video.write_video", lambda takes, world, path: path)
     home = SimpleNamespace(path=tmp_path / "run", registry=tmp_path / "registry")
     config = write_yaml(tmp_path / "tiny.yaml")
 
+    def draw():
+        monkeypatch.setattr(training, "make_artifacts", make_artifacts)
+
     def run(*more):
         arguments = ("pretrain", "--run-dir", home.path, "--registry", home.registry, *more)
         arguments += () if "--resume" in more else ("--config", config)
         return CliRunner().invoke(app, [str(part) for part in arguments], env={"COLUMNS": "80"})
 
-    home.run = run
+    home.run, home.draw = run, draw
     home.hint = f"continue with: tandem train --resume --run-dir {home.path} --registry {home.registry}\n"
     return home
 
@@ -117,11 +123,11 @@ def home(tmp_path, monkeypatch):
     ("where", "number"),
     [
         ("service.registry.publishing.success_metrics", signal.SIGINT),
-        ("service.runs.train.publish_run", signal.SIGTERM),
         ("service.media.recording.record_rounds", signal.SIGTERM),
     ],
 )
 def test_a_signal_behind_the_learning(home, uninterrupted, where, number):
+    home.draw()
     with pytest.MonkeyPatch.context() as patch:
         send_when_called(patch, where, number)
         result = home.run()
@@ -132,6 +138,7 @@ def test_a_signal_behind_the_learning(home, uninterrupted, where, number):
 
 
 def test_a_resume_does_what_the_signal_kept_from_being_done(home, uninterrupted, monkeypatch):
+    home.draw()
     with monkeypatch.context() as patch:
         send_when_called(patch, "service.media.artifacts.plot_goals", signal.SIGTERM)
         assert home.run().exit_code == 143
@@ -142,42 +149,38 @@ def test_a_resume_does_what_the_signal_kept_from_being_done(home, uninterrupted,
     assert_same_run(home.path, uninterrupted)
 
 
-@pytest.mark.parametrize(
-    ("where", "number"),
-    [("service.methods.workers.SelfPlay", signal.SIGINT), ("service.store.checkpoints.write_atomic", signal.SIGTERM)],
-)
-def test_a_signal_while_a_run_is_being_begun(home, monkeypatch, where, number):
+def test_a_signal_while_a_run_is_being_begun(home, monkeypatch):
     with monkeypatch.context() as patch:
-        send_when_called(patch, where, number)
+        send_when_called(patch, "service.store.checkpoints.write_atomic", signal.SIGTERM)
         result = home.run()
-    assert result.exit_code == 128 + number
+    assert result.exit_code == 128 + signal.SIGTERM
     assert result.stdout == "stopped at once; nothing was saved yet\n"
     assert home.run().exit_code == 0  # the same command works
 
 
-def test_a_signal_while_a_run_is_being_loaded(home, uninterrupted, monkeypatch, number=signal.SIGTERM):
+def test_a_signal_while_a_run_is_being_loaded(home, uninterrupted, monkeypatch):
     play(home.path, kill_after=3)
     with monkeypatch.context() as patch:
-        send_when_called(patch, "service.methods.workers.TaskGenerator.load_state", number)
+        send_when_called(patch, "service.methods.workers.TaskGenerator.load_state", signal.SIGTERM)
         result = home.run("--resume")
-    assert result.exit_code == 128 + number
+    assert result.exit_code == 128 + signal.SIGTERM
     assert result.stdout == f"stopped at once; {home.hint}"
     home.run("--resume")
     assert_same_run(home.path, uninterrupted)
 
 
-def test_a_signal_during_an_iteration(home, uninterrupted, monkeypatch, number=signal.SIGINT):
+def test_a_signal_during_an_iteration(home, uninterrupted, monkeypatch):
     record = Run._take_snapshot
 
     def signalled(self, **kwargs):
         record(self, **kwargs)
         if self.iteration == 3:
-            send(number)
+            send(signal.SIGINT)
 
     with monkeypatch.context() as patch:
         patch.setattr(Run, "_take_snapshot", signalled)
         result = home.run()
-    assert result.exit_code == 128 + number
+    assert result.exit_code == 130
     assert "stopping after this iteration; again to end now\n" in result.stderr
     assert "interrupted after" in result.stdout
     assert result.stdout.endswith(f"\nsaved; {home.hint}")

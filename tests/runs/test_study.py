@@ -501,17 +501,6 @@ def test_mistakes_get_one_line_and_lose_nothing(begun, tmp_path, arguments, part
     assert not (tmp_path / "nowhere").exists()
 
 
-def test_two_processes_do_not_run_one_study(begun):
-    holder = Study(begun.path)
-    holder.claim()
-    try:
-        result = tandem("pretrain", "--resume", "--run-dir", begun.path)
-    finally:
-        holder.close()
-    assert result.exit_code == 2
-    assert_one_line(result.stderr, begun.path, f"process {os.getpid()}", "stop that one first")
-
-
 def test_a_study_whose_file_cannot_be_read(tmp_path):
     study = begin_study(tmp_path)
     for text in ("no json", "{}", '{"runs": {"a": 1}}', "[]", "[" * 10_000):
