@@ -8,7 +8,6 @@ import logging
 import os
 import platform
 import re
-import secrets
 import shlex
 import sys
 import tempfile
@@ -205,30 +204,26 @@ def traceback_in(directory: Path | None = None) -> Iterator[None]:
     """
     try:
         yield
-    except (TandemError, UsageError, typer.Exit, typer.Abort):
+    except (TandemError, UsageError, typer.Exit, typer.Abort, BrokenPipeError):  # typer ends where no reader is left
         raise
-    except OSError as error:
-        if error.errno == errno.EPIPE:  # the reader of our output is gone, which typer knows how to end
-            raise
-        if error.errno in _PATH_ERRORS and error.filename is not None:
-            raise TandemError(
-                f"cannot use {os.fsdecode(error.filename)}: {error.strerror}; check the path and its permissions"
-            ) from error
-        if error.errno in (errno.ENOSPC, errno.EDQUOT):
-            where = os.fsdecode(error.filename) if error.filename is not None else "what is printed"
-            raise NoRoomError(f"cannot write {where}: {error.strerror}; free some space and try again") from error
-        raise _unexpected(error, directory) from error
     except Exception as error:
-        if isinstance(error, MemoryError) or re.search(r"allocate memory|out of memory", str(error)):  # NumPy, torch
-            raise NoRoomError(
-                f"not enough memory: {one_line(str(error), 300) or 'none is left'}; ask for less, such as fewer worlds "
-                "(game.num_worlds) or smaller networks, or take a machine with more"
-            ) from error
-        raise _unexpected(error, directory) from error
+        raise _explained(error, directory) from error
 
 
-def _unexpected(error: BaseException, directory: Path | None) -> UnexpectedError:
+def _explained(error: Exception, directory: Path | None) -> TandemError:
     said = one_line(str(error), 300)
+    if isinstance(error, OSError):
+        file = os.fsdecode(error.filename) if error.filename is not None else None
+        if error.errno in _PATH_ERRORS and file is not None:
+            return TandemError(f"cannot use {file}: {error.strerror}; check the path and its permissions")
+        if error.errno in (errno.ENOSPC, errno.EDQUOT):
+            where = file or "what is printed"
+            return NoRoomError(f"cannot write {where}: {error.strerror}; free some space and try again")
+    if isinstance(error, MemoryError) or re.search(r"allocate memory|out of memory", said):  # NumPy, torch
+        return NoRoomError(
+            f"not enough memory: {said or 'none is left'}; ask for less, such as fewer worlds (game.num_worlds) or "
+            "smaller networks, or take a machine with more"
+        )
     what = f"unexpected {type(error).__name__}{': ' if said else ''}{said}"
     for place in ([directory] if directory is not None and directory.is_dir() else []) + [Path(tempfile.gettempdir())]:
         with suppress(OSError):
@@ -236,15 +231,13 @@ def _unexpected(error: BaseException, directory: Path | None) -> UnexpectedError
     return UnexpectedError(f"{what}; its traceback cannot be written anywhere; please report it")
 
 
-def _write_traceback(error: BaseException, directory: Path) -> Path:
+def _write_traceback(error: Exception, directory: Path) -> str:
     """Make a file of its own, which only this user may read: a traceback may quote what is private."""
     stamp = time.strftime("%Y%m%d-%H%M%S", time.gmtime())
-    path = directory / f"{TRACEBACK_PREFIX}{stamp}-{secrets.token_hex(4)}.txt"
     head = f"tandem {__version__}, Python {platform.python_version()}, {platform.platform()}\n{sys.argv}\n\n"
-    text = head + "".join(traceback.format_exception(error))
-    descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW, 0o600)
+    descriptor, path = tempfile.mkstemp(".txt", f"{TRACEBACK_PREFIX}{stamp}-", directory)
     with open(descriptor, "w", encoding="utf-8", errors="backslashreplace") as file:
-        file.write(text)
+        file.write(head + "".join(traceback.format_exception(error)))
     return path
 
 
@@ -267,7 +260,6 @@ def print_table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
         for row in (header, *rows):
             typer.echo("\t".join(row))
         return
-    from rich.console import Console
     from rich.markup import escape
     from rich.table import Column, Table
 

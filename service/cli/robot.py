@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from service.base.errors import TandemError
-from service.cli.common import CHAMPION, EXIT_SIGNAL, REFERENCE, SOURCE, CommandGroup, SourceOption, print_json
+from service.cli.common import CHAMPION, REFERENCE, SOURCE, CommandGroup, SourceOption, print_json
 
 if TYPE_CHECKING:
     from service.base.types import StateArray
@@ -174,29 +174,25 @@ def _connected(
     from service.robot.backends import connect
     from service.robot.dead_man import HeldKey
     from service.robot.safety import always_held
-    from service.runs.signals import InterruptError, StopSignals
+    from service.runs.signals import StopSignals
 
     if dead_man not in (None, "key", "none"):
         raise TandemError(f"--dead-man {dead_man!r}: choose key or none")
-    try:
-        with StopSignals(), contextlib.ExitStack() as stack:
-            backend = stack.enter_context(contextlib.closing(connect(described, player.world, seed=seed)))
-            harmless = backend.simulator is not None or dry_run
-            needed = dead_man == "key" or (dead_man is None and not harmless)
-            key = stack.enter_context(HeldKey()) if needed else None
+    with StopSignals(), contextlib.ExitStack() as stack:
+        backend = stack.enter_context(contextlib.closing(connect(described, player.world, seed=seed)))
+        harmless = backend.simulator is not None or dry_run
+        needed = dead_man == "key" or (dead_man is None and not harmless)
+        key = stack.enter_context(HeldKey()) if needed else None
 
-            def wait(what: str) -> None:
-                if key is not None:
-                    typer.echo(f"{what}, then hold any key; letting go stops the robot", err=True)
-                    key.wait()
-                elif not harmless:
-                    typer.echo(f"{what}, then press Enter", err=True)
-                    sys.stdin.readline()
+        def wait(what: str) -> None:
+            if key is not None:
+                typer.echo(f"{what}, then hold any key; letting go stops the robot", err=True)
+                key.wait()
+            elif not harmless:
+                typer.echo(f"{what}, then press Enter", err=True)
+                sys.stdin.readline()
 
-            yield backend, key or always_held, wait
-    except InterruptError as interrupt:
-        typer.echo("stopped", err=True)
-        raise typer.Exit(EXIT_SIGNAL + interrupt.number) from None
+        yield backend, key or always_held, wait
 
 
 def _header(

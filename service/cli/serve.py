@@ -12,7 +12,6 @@ import typer
 
 from service.base.extras import needs_extra
 from service.cli.common import (
-    EXIT_SIGNAL,
     REGISTRY,
     SOURCE,
     ActsWithOption,
@@ -82,20 +81,17 @@ def play(
     with loading():
         from service.registry.loading import load
         from service.robot.play.server import LiveWorld
-        from service.runs.signals import InterruptError, StopSignals
+        from service.runs.signals import StopSignals
 
         players = load(reference, registry, primitives).expect_goals("tandem play").on(task)
     with StopSignals() as signals:
-        try:
-            with loading():
-                world = LiveWorld(players, host, port, seed)
-            with world as live, signals.asking(lambda: None):
-                typer.echo(f"{players.title}: {live.url}")
-                typer.echo(
-                    f"from another machine: ssh -L {live.port}:127.0.0.1:{live.port} {socket.gethostname()}, "
-                    f"then http://127.0.0.1:{live.port} there; Ctrl-C ends"
-                )
-                live.run(lambda: signals.first is not None)
-        except InterruptError as interrupt:
-            raise typer.Exit(EXIT_SIGNAL + interrupt.number) from None
+        with loading():
+            world = LiveWorld(players, host, port, seed)
+        with world as live, signals.asking(lambda: None):
+            typer.echo(f"{players.title}: {live.url}")
+            typer.echo(
+                f"from another machine: ssh -L {live.port}:127.0.0.1:{live.port} {socket.gethostname()}, "
+                f"then http://127.0.0.1:{live.port} there; Ctrl-C ends"
+            )
+            live.run(lambda: signals.first is not None)
     typer.echo("stopped")

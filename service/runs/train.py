@@ -13,7 +13,7 @@ from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from threading import Thread
-from typing import TYPE_CHECKING, Literal, cast
+from typing import Literal, cast
 
 from pydantic import JsonValue
 
@@ -37,12 +37,10 @@ from service.store.address import address_from_environment
 from service.store.checkpoints import CheckpointStore
 from service.store.disk import read_status
 from service.store.disk_reader import run_id_of
+from service.store.models import RunState
 from service.store.run_directory import Published, RunDirectory
 from service.store.run_log import RunLog
 from service.store.run_writer import reporting_to
-
-if TYPE_CHECKING:
-    from service.store.models import RunState
 
 MAX_STATES_LOST = 5
 """Times in a row that a run goes back to a checkpoint without getting beyond it."""
@@ -234,7 +232,7 @@ def _run(
         with suppress(InterruptError), report.beating():
             done = _finish(done, run, registry, publish, report)
     complete = result.reason if signals.first is None else "interrupted"  # --resume does what is left
-    report.end(cast("RunState", complete), published=str(done.version) if done.version is not None else None)
+    report.end(cast(RunState, complete), published=str(done.version) if done.version is not None else None)
     return replace(done, signal=signals.first)
 
 

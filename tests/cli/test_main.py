@@ -5,8 +5,6 @@ import os
 import re
 import shlex
 import signal
-import subprocess
-import sys
 from contextlib import nullcontext
 from pathlib import Path
 from types import SimpleNamespace
@@ -213,16 +211,6 @@ def test_demo_ends_with_what_comes_with_tandem_and_what_to_type(monkeypatch, tmp
     evaluated = tandem(*commands[0])
     assert evaluated.exit_code == 0, evaluated.output
     assert evaluated.stdout in shown  # it says the same again
-
-
-@pytest.mark.parametrize(
-    "option",
-    ["--address=auto", "--num-actors=2", "--actor-threads=1", "--learner-cpus=1", "--status=off", "--token-file=x"],
-)
-def test_options_of_a_cluster_are_refused_without_one(tmp_path, option):
-    result = tandem("pretrain", "--run-dir", tmp_path / "run", option)
-    assert_user_error(result, option.partition("=")[0], "--runtime ray")
-    assert not (tmp_path / "run").exists()
 
 
 @pytest.mark.parametrize("seeds", [(), ("--seeds", "0,1")])
@@ -482,16 +470,6 @@ def test_a_disk_that_is_full_to_the_end(tmp_path):
     assert result.exit_code == 1
     assert_one_line(result.stderr, "error: ", "File too large", "saved is iteration 2", "--resume")
     assert not (tmp_path / "none").exists()
-
-
-def test_a_mistake_in_a_real_process_is_one_line():
-    result = subprocess.run(
-        [sys.executable, "-m", "service", "pretrain", "--set", "game.num_world=3"],
-        cwd=ROOT, capture_output=True, text=True, timeout=600,
-    )  # fmt: skip
-    assert (result.returncode, result.stdout) == (2, "")
-    assert result.stderr.count("\n") == 1
-    assert "game.num_world" in result.stderr
 
 
 def test_a_method_makes_a_run_of_skills_under_its_own_name(asked):

@@ -42,7 +42,7 @@ def check(result, directory):
     (name,) = SAID.fullmatch(result.stderr).groups()
     path = Path(name)
     assert path.parent == directory
-    assert re.fullmatch(r"tandem-error-[0-9]{8}-[0-9]{6}-[0-9a-f]{8}\.txt", path.name)
+    assert re.fullmatch(r"tandem-error-[0-9]{8}-[0-9]{6}-\w+\.txt", path.name)
     assert stat.S_IMODE(path.stat().st_mode) == 0o600
     text = path.read_text()
     assert "Traceback (most recent call last)" in text

@@ -193,37 +193,6 @@ def test_a_run_that_has_converged_ends(tmp_path, monkeypatch):
     assert newest(tmp_path).step == 3
 
 
-def test_a_world_whose_physics_breaks_is_counted_and_its_state_kept(tmp_path):
-    class Diverging:
-        def __init__(self, pool):
-            self._pool, self._calls = pool, 0
-
-        def rollout(self, *args, **kwargs):
-            states, sensors = self._pool.rollout(*args, **kwargs)
-            if self._calls == 1:
-                states = states.copy()
-                states[3] = np.nan
-            self._calls += 1
-            return states, sensors
-
-        def close(self):
-            self._pool.close()
-
-    directory = RunDirectory(tmp_path)
-    run = open_run(tiny_config(), directory)
-    run.method.game.worlds._pool = Diverging(run.method.game.worlds._pool)
-    assert run.run().reason == "finished"
-    directory.close()
-    rows = read_lines(tmp_path / "metrics.jsonl")
-    assert {row["world/num_broken"] for row in rows} == {1.0}
-    assert rows[0]["alice/fallen_fraction"] == pytest.approx(1 / 24)
-    (file,) = (tmp_path / "broken").iterdir()
-    with np.load(file) as dump:
-        assert dump["states"].shape == (1, run.method.game.worlds.layout.size)
-        assert dump["actions"].shape == (1, 4)
-        assert np.isfinite(dump["states"]).all()
-
-
 # --- exact resume ----------------------------------------------------------------------------------------------------
 
 

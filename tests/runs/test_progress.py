@@ -114,12 +114,3 @@ def test_timing_counts_what_failed(monkeypatch):
     with pytest.raises(RuntimeError), timing("play"):
         fail()
     assert timing.seconds["play"] == 3.0
-
-
-def test_timing_columns_line_up():
-    timing = Timing()
-    for name in ("play", "wait for learner"):
-        with timing(name):
-            pass
-    rows = timing.tree().splitlines()[1:]
-    assert len({row.index(" s ") for row in rows}) == 1

@@ -90,15 +90,6 @@ def test_only_the_value_network_learns_at_first(tmp_path):
     assert {name for name in changed if name.startswith("alice/policy/")}
 
 
-@pytest.mark.parametrize(
-    ("reference", "expected"),
-    [("nobody@1", "nobody"), ("some/where", "no such directory of a run")],
-)
-def test_what_cannot_be_begun_from(tmp_path, reference, expected):
-    with pytest.raises(TandemError, match=expected):
-        load(reference, tmp_path)
-
-
 def test_nothing_that_fits_is_refused_and_another_try_can_begin(trained, tmp_path):
     root, _, version = trained
     start = load(str(version), root / "registry")
