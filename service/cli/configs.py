@@ -14,11 +14,6 @@ from service.config.recipes import DEFAULT_RECIPE, find_file, first_comment, rec
 configs_app = typer.Typer(name="configs", help="Recipes and robots that come with tandem.", cls=CommandGroup)
 
 
-def config_names() -> list[str]:
-    """Names for ``--config``; the shell completes them."""
-    return list(recipes())
-
-
 def targets() -> list[str]:
     """Names for ``tandem train NAME``; the shell completes them."""
     return [*recipes(), *task_names()]

@@ -29,7 +29,7 @@ from service.cli.common import (
     traceback_in,
     was_typed,
 )
-from service.cli.configs import config_names, named, targets
+from service.cli.configs import named, targets
 from service.cli.evaluate import evaluate
 from service.cli.study import is_study, train_study
 from service.config.recipes import DEFAULT_RECIPE, recipes
@@ -72,7 +72,7 @@ def train(
         ),
     ] = None,
     config: Annotated[
-        str | None, typer.Option(metavar="NAME|FILE", autocompletion=config_names, help="The same as an option.")
+        str | None, typer.Option(metavar="NAME|FILE", autocompletion=targets, help="The same as an option.")
     ] = None,
     method: Annotated[
         str | None,

@@ -118,11 +118,12 @@ def as_csv(runs: Mapping[str, StudyRun]) -> str:
     settings = list(dict.fromkeys(key for run in runs.values() for key in run.settings))
     results = list(dict.fromkeys(key for run in runs.values() for key in run.result))
     file = io.StringIO()
-    writer = csv.writer(file, lineterminator="\n")
-    writer.writerow(["run", *settings, "state", "env_steps", "wall_s", *results])
+    columns = ["run", *settings, "state", "env_steps", "wall_s", *results]
+    writer = csv.DictWriter(file, columns, restval="", lineterminator="\n")
+    writer.writeheader()
     for name, run in runs.items():
-        told = [run.settings.get(key, "") for key in settings] + [run.state, run.env_steps, round(run.wall_s, 1)]
-        writer.writerow([name, *told, *(run.result.get(key, "") for key in results)])
+        own = {"run": name, "state": run.state, "env_steps": run.env_steps, "wall_s": round(run.wall_s, 1)}
+        writer.writerow({**run.settings, **run.result, **own})
     return file.getvalue()
 
 

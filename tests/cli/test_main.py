@@ -308,20 +308,6 @@ def test_coverage(trained, tmp_path):
     assert f"picture: {picture}\n" in text  # on one line, to be copied
 
 
-def test_what_comes_with_tandem_needs_no_registry_and_no_directory_of_its_own(filmed, monkeypatch, tmp_path):
-    monkeypatch.chdir(tmp_path)
-    champion = ("panda-cube@champion",)
-    label = f"{Registry(BUNDLED).resolve('panda-cube@champion')} (bundled)"
-    result = tandem("evaluate", *champion, "--goals", "mixed", "--episodes", 4, "--steps", 2, "--json")
-    assert result.exit_code == 0, result.output
-    assert list(json.loads(result.stdout)) == [label, "idle"]
-    result = tandem("coverage", *champion, "--skills", 2, "--steps", 2, "--json")
-    assert list(json.loads(result.stdout)["share_of_table_cells_visited"]) == [label, "random policy"]
-    assert tandem("render", *champion, "--episodes", 2).exit_code == 0
-    assert filmed == [((2, 3), Path("video.mp4"))]
-    assert [path.name for path in tmp_path.iterdir()] == ["coverage.png"]
-
-
 @pytest.fixture
 def filmed(monkeypatch):
     """(number of takes or episodes, file) of each video, none of which is drawn."""

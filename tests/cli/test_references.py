@@ -58,7 +58,9 @@ def test_skills_are_taken_as_primitives_are(home, monkeypatch):
     found = tandem("coverage", "dads", "--skills", 3, "--steps", 4, "--json")
     assert json.loads(found.stdout)["share_of_table_cells_visited"].keys() == {"dads@1", "random policy"}
     assert (home / "coverage.png").stat().st_size > 10_000
-    rows = json.loads(tandem("evaluate", "skills", "--steps", 3, *SMALL).stdout)  # the one towards the goal acts
+    rows = json.loads(
+        tandem("evaluate", "skills", "--episodes", 5, "--steps", 3, "--json").stdout
+    )  # the one towards the goal acts
     assert rows["skills@1"]["mean_distance_m"] != rows["idle"]["mean_distance_m"]
     refused = tandem("evaluate", "dads", *SMALL)
     assert (refused.exit_code, refused.stderr.count("\n")) == (2, 1)
