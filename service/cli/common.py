@@ -248,6 +248,12 @@ def how_to_go_on(run_dir: Path, registry: Path | str, *, runtime: str = "local",
     return f"continue with: {shlex.join(command)}"
 
 
+def stopped(what: str, number: int, hint: str, *, begun: bool = True) -> typer.Exit:
+    """Say how to go on with what a signal ended; returns the exit of a process that a signal ends."""
+    typer.echo(f"{what}; {hint if begun else 'nothing was saved yet'}")
+    return typer.Exit(EXIT_SIGNAL + number)
+
+
 def print_json(tree: Any) -> None:
     """Print a tree of plain values."""
     typer.echo(json.dumps(tree, indent=1))

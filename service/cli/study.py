@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import typer
 
 from service.base.errors import ConfigError, TandemError, one_line
-from service.cli.common import EXIT_SIGNAL, REGISTRY, how_to_go_on, loading, print_table, shown, traceback_in
+from service.cli.common import REGISTRY, how_to_go_on, loading, print_table, shown, stopped, traceback_in
 from service.cli.configs import named
 from service.config.recipes import DEFAULT_RECIPE, recipes
 from service.runs.grid import SEED, Settings, check_once, name_runs, parse_grid
@@ -123,8 +123,7 @@ def train_study(
                 if signals.first is None:
                     study.finish(configs, registry, progress)
     except InterruptError as interrupt:
-        typer.echo(f"stopped at once; {hint if study.exists else 'nothing was saved yet'}")
-        raise typer.Exit(EXIT_SIGNAL + interrupt.number) from None
+        raise stopped("stopped at once", interrupt.number, hint, begun=study.exists) from None
     found = study.read()
     if signals.first is None:
         _print(found, study.path, registry)
@@ -132,8 +131,7 @@ def train_study(
     for name, run in failed.items():
         typer.echo(one_line(f"{name} failed: {run.error}"), err=True)
     if signals.first is not None:
-        typer.echo(f"saved; {hint}")
-        raise typer.Exit(EXIT_SIGNAL + signals.first)
+        raise stopped("saved", signals.first, hint)
     if not all(run.has_ended for run in found.runs.values()):
         typer.echo(hint)
     if failed:

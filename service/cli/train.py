@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from contextlib import ExitStack, closing
 from itertools import count
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, NoReturn
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from typer.core import TyperCommand
@@ -16,7 +16,6 @@ from typer.core import TyperCommand
 from service.base.errors import TandemError
 from service.cli.common import (
     CHAMPION,
-    EXIT_SIGNAL,
     REFERENCE,
     SOURCE,
     QuietOption,
@@ -26,6 +25,7 @@ from service.cli.common import (
     how_to_go_on,
     loading,
     shown,
+    stopped,
     traceback_in,
     was_typed,
 )
@@ -282,13 +282,9 @@ def _train(
     from service.runs.signals import InterruptError
     from service.store.disk_reader import run_id_of
 
-    def say_stopped(what: str, number: int) -> NoReturn:
-        """Say how to go on, and exit as a process that a signal ends."""
-        how = how_to_go_on(directory.path, registry, runtime=runtime.name, address=address)
-        typer.echo(f"{what}; {how if directory.exists else 'nothing was saved yet'}")
-        raise typer.Exit(EXIT_SIGNAL + number)
-
     runtime = training.Runtime()
+    where = "local" if cluster is None else "ray"
+    hint = how_to_go_on(directory.path, registry, runtime=where, address=address)
     try:
         with traceback_in(directory.path), closing(directory), ExitStack() as stack:
             if cluster is not None:
@@ -314,13 +310,13 @@ def _train(
                 final = {name.replace("evaluation/", "final/", 1): value for name, value in done.metrics.items()}
                 tracked.log({"env_steps": done.result.num_env_steps, **final})
     except InterruptError as interrupt:
-        say_stopped("stopped at once", interrupt.number)
+        raise stopped("stopped at once", interrupt.number, hint, begun=directory.exists) from None
     result = done.result
     typer.echo(f"\n{result.reason} after {result.num_env_steps:,} env steps, {result.iteration} iterations")
     typer.echo(done.timing)
     if done.signal is not None:
         rest = "" if result.reason == "interrupted" else ", but not evaluated, published and drawn to the end"
-        say_stopped(f"saved{rest}", done.signal)
+        raise stopped(f"saved{rest}", done.signal, hint)
     for name, value in done.metrics.items():
         is_share = "success" in name or name == "coverage"
         typer.echo(f"{name:<36} {value:.1%}" if is_share else f"{name:<36} {value:g}")

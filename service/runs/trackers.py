@@ -6,7 +6,7 @@ import importlib
 import logging
 import sys
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, Protocol
+from typing import Any
 
 from service.base.errors import TandemError, one_line
 
@@ -17,15 +17,8 @@ _ENDS = ("close", "finish")
 """Names of what ends a tracker, one of which is called where it is there."""
 
 
-class Tracker(Protocol):
-    """Takes metrics."""
-
-    def log(self, metrics: dict[str, float], *, step: int) -> Any:
-        """Take one record; ``step`` is the number of env steps."""
-
-
-Factory = Callable[[str, dict[str, Any]], Tracker]
-"""Makes a tracker of a run's name and its configuration, a tree of plain values."""
+Factory = Callable[[str, dict[str, Any]], Any]
+"""Makes an object with ``log(metrics, step)``, the number of env steps, of a run's name and configuration."""
 
 
 class Trackers:
@@ -45,7 +38,7 @@ class Trackers:
 
     def __init__(self, references: Sequence[str], name: str, config: Mapping[str, Any]) -> None:
         factories = {reference: find_factory(reference) for reference in references}
-        self._going: dict[str, Tracker] = {}
+        self._going: dict[str, Any] = {}
         try:
             for reference, factory in factories.items():
                 self._going[reference] = _make(reference, factory, name, dict(config))
@@ -97,7 +90,7 @@ def find_factory(reference: str) -> Factory:
     return factory
 
 
-def _make(reference: str, factory: Factory, name: str, config: dict[str, Any]) -> Tracker:
+def _make(reference: str, factory: Factory, name: str, config: dict[str, Any]) -> Any:
     try:
         tracker = factory(name, config)
     except Exception as error:

@@ -1,6 +1,7 @@
 """Studies: seeds, grids, cores, intervals, which run is the best, and real ones through kills, signals and resumes."""
 
 import csv
+import io
 import json
 import os
 import re
@@ -9,22 +10,26 @@ import subprocess
 import sys
 import threading
 import time
+from contextlib import nullcontext
 
 import numpy as np
 import pytest
+from rich.console import Console
 from typer.testing import CliRunner
 
 from service.actors.evaluation import EVALUATION_SEED, REPORTED_SEED, SELECTION_SEED, Evaluation
 from service.base.errors import ConfigError, TandemError
 from service.base.lock import is_locked
+from service.base.progress import Display
 from service.cli.main import app
 from service.config import dump_config, load_config
 from service.registry.loading import load
 from service.registry.registry import Registry
 from service.runs import study_results
 from service.runs.grid import name_runs, parse_grid, parse_seeds
+from service.runs.progress import Progress
 from service.runs.resuming import resumed_config
-from service.runs.signals import PARENT
+from service.runs.signals import PARENT, InterruptError, StopSignals
 from service.runs.study import Study
 from service.runs.study_results import (
     as_csv,
@@ -292,6 +297,35 @@ def test_a_better_run_found_by_a_resume_becomes_the_next_version(tmp_path):
         "evaluation/mixed_success_last": 0.5,
         "env_steps": 120,
     }
+
+
+# --- side by side ----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.usefixtures("default_signals")
+@pytest.mark.parametrize("num_signals", [0, 1, 2])
+def test_runs_begin_in_turn_and_are_asked_to_stop_and_then_to_end(tmp_path, num_signals):
+    study, told = begin_study(tmp_path / "study"), {}
+    configs = {name: load_config(study.config_file(name)) for name in ("seed-0", "seed-1")}
+
+    def run(job, asked):
+        wait_for(lambda: Study(study.path).read().runs[job.directory.name].state == "running")
+        for wanted in range(1, num_signals + 1):
+            os.kill(os.getpid(), signal.SIGINT)
+            wait_for(lambda wanted=wanted: asked() == wanted)
+        told[job.directory.name] = (asked(), job.options)
+        return job.run.now("failed", "no luck") if num_signals == 0 else job.run.now("interrupted")
+
+    progress = Progress(Display(Console(file=io.StringIO())))
+    with StopSignals() as signals, pytest.raises(InterruptError) if num_signals == 2 else nullcontext():
+        study.train(configs, Place(2, run=run), None, ["--registry", "r"], signals, progress)
+    states = [(each.state, each.error) for each in study.read().runs.values()]
+    if num_signals == 0:
+        assert states == [("failed", "no luck")] * 2
+    else:
+        assert states == [("interrupted", None), ("waiting", None)]
+    options = ("--registry", "r", "--set", "run.num_threads=1")  # which the configuration says
+    assert told == dict.fromkeys(configs if num_signals == 0 else ["seed-0"], (num_signals, options))
 
 
 # --- a whole one -----------------------------------------------------------------------------------------------------
