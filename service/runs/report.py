@@ -101,14 +101,6 @@ class Report:
         finally:
             self._writer.close()
 
-    def check(self) -> None:
-        """Assert that this process is still the one that runs the run.
-
-        Raises:
-            RunTakenError: another one has taken it over.
-        """
-        self._writer.check()
-
     @contextmanager
     def beating(self) -> Iterator[None]:
         """Tell in a block that takes long that the run is alive, for as long as its work goes on (``liveness``)."""
@@ -139,7 +131,7 @@ class Report:
 
     def iteration(self, run: Run, metrics: Mapping[str, float]) -> None:
         """Tell an iteration's metrics, where the run is, and now and then what the generator knows; see ``beat``."""
-        self.check()
+        self._writer.check()
         self._writer.metrics(dict(metrics))
         if time.monotonic() - self._gridded_s >= GOALS_INTERVAL_S:
             self._gridded_s = time.monotonic()
@@ -160,7 +152,7 @@ class Report:
         Raises:
             RunTakenError: another process has taken it over.
         """
-        self.check()
+        self._writer.check()
         health, counters = run.method.health(), self._counters(run)
         for name, value in counters.items():
             self._totals[name] = self._totals.get(name, 0) + max(0, value - self._counted.get(name, 0))

@@ -158,13 +158,15 @@ class Run:
 
     def _advance(self) -> None:
         method, before, begun = self.method, self.num_env_steps, time.perf_counter()
-        with self._explaining_divergence():
+        played, interval = self.iteration, self.config.run.evaluation_interval
+        evaluated: Metrics = {}
+        try:
             ended = method.step()
-            interval = self.config.run.evaluation_interval
-            evaluated: Metrics = {}
             if ended is not None and interval and self.iteration % interval == 0:
                 with method.timing("evaluate"):
                     evaluated = method.evaluate()
+        except (DivergedError, PolicyError) as error:
+            raise self._diverged(error, played) from error
         self._iteration_s += time.perf_counter() - begun
         if ended is None:
             self._beat()
@@ -259,20 +261,13 @@ class Run:
         except CheckpointError as error:
             _logger.warning("%s; the run goes on, %s", error, consequence)
 
-    @contextmanager
-    def _explaining_divergence(self) -> Iterator[None]:
-        """Add to the error of a policy that has diverged when that was, and how to go on from before it."""
-        played = self.iteration
-        try:
-            yield
-        except (DivergedError, PolicyError) as error:
-            newest = self.checkpoints.newest()
-            is_played = newest is not None and self.checkpoints.steps()[-1] == played
-            has_it = f"delete {newest.name}, which has this policy; " if newest is not None and is_played else ""
-            said = str(error).strip().splitlines()[-1]  # from another process it comes with its traceback
-            raise DivergedError(
-                f"{self.directory.path}, iteration {played + 1}: {said}: {has_it}{self.method.remedy}"
-            ) from error
+    def _diverged(self, error: Exception, played: int) -> DivergedError:
+        """The error of a policy that has diverged, with when that was, and how to go on from before it."""
+        newest = self.checkpoints.newest()
+        is_played = newest is not None and self.checkpoints.steps()[-1] == played
+        has_it = f"delete {newest.name}, which has this policy; " if newest is not None and is_played else ""
+        said = str(error).strip().splitlines()[-1]  # from another process it comes with its traceback
+        return DivergedError(f"{self.directory.path}, iteration {played + 1}: {said}: {has_it}{self.method.remedy}")
 
     def _save_last(self) -> None:
         """Save the last iteration, if it is not, and say what is lost where that fails."""

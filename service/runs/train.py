@@ -241,7 +241,7 @@ def _finish(done: Finished, run: Run, registry: Path | str, publish: bool, repor
     config, directory, parameters = run.config, run.directory, run.method.parameters()
     metrics, version = run.method.measure(), None
     run.close()
-    report.check()
+    directory.check_owner()
     found: dict[str, JsonValue] = {name.removeprefix("evaluation/"): value for name, value in metrics.items()}
     directory.write_result({"evaluation": found, "env_steps": run.num_env_steps, "wall_s": run.wall_s})
     report.measured(metrics)
@@ -251,7 +251,7 @@ def _finish(done: Finished, run: Run, registry: Path | str, publish: bool, repor
             version = publish_run(directory, Registry(Path(registry)), config, parameters, known)
     except TandemError as error:
         raise UnfinishedError(f"learning is over and saved, but not published: {error}; --resume does it") from error
-    report.check()
+    directory.check_owner()
     files, timing = make_artifacts(directory, registry), run.method.timing.tree()
     return replace(done, files=files, version=version, metrics=metrics, timing=timing)
 

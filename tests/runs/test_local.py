@@ -71,9 +71,9 @@ METRICS = {
 
 
 @pytest.fixture(scope="module")
-def uninterrupted(tmp_path_factory):
+def long_run(tmp_path_factory):
     """A run from start to end."""
-    path = tmp_path_factory.mktemp("uninterrupted")
+    path = tmp_path_factory.mktemp("long")
     _, result = play(path, tiny_config(**LONG))
     assert result.reason == "finished"
     return path
@@ -82,17 +82,17 @@ def uninterrupted(tmp_path_factory):
 # --- one run ---------------------------------------------------------------------------------------------------------
 
 
-def test_what_a_run_records(uninterrupted):
+def test_what_a_run_records(long_run):
     """The comparisons below mean something only if all of this takes part."""
-    rows = read_lines(uninterrupted / "metrics.jsonl")
+    rows = read_lines(long_run / "metrics.jsonl")
     names = set().union(*rows)
     assert {"bob/success_rate_replayed", "bob/success_rate_past_alice", "learner/demonstration_log_ratio"} <= names
     assert any(row.get("bob/success_rate", 0.0) > 0.0 for row in rows)
-    assert sum(len(row["goals"]) for row in read_lines(uninterrupted / "goals.jsonl")) > 20
+    assert sum(len(row["goals"]) for row in read_lines(long_run / "goals.jsonl")) > 20
     assert [row["iteration"] for row in rows] == list(range(1, len(rows) + 1))
     steps = [row["env_steps"] for row in rows]
     assert steps[-1] >= 1500 > steps[-2]
-    assert (newest(uninterrupted).step, newest(uninterrupted).meta["env_steps"]) == (len(rows), steps[-1])
+    assert (newest(long_run).step, newest(long_run).meta["env_steps"]) == (len(rows), steps[-1])
     alice = 24 * 4  # she always plays on
     assert all(alice <= after - before <= 2 * alice for before, after in zip([0, *steps], steps, strict=False))
     lags = [row.get("learner/policy_lag") for row in rows]
@@ -119,10 +119,10 @@ def test_every_metric_is_recorded_under_its_name(tmp_path):
 
 
 def test_evaluations_come_at_their_interval_and_change_nothing(uninterrupted, tmp_path):
-    play(tmp_path, tiny_config(**LONG, evaluation_interval=3))
+    play(tmp_path, tiny_config(evaluation_interval=2))
     rows = read_lines(tmp_path / "metrics.jsonl")
     evaluated = [row["iteration"] for row in rows if "evaluation/table_success_last" in row]
-    assert evaluated == list(range(3, len(rows) + 1, 3))
+    assert evaluated == list(range(2, len(rows) + 1, 2))
     without = [{k: v for k, v in row.items() if not k.startswith("evaluation/")} for row in timeless_metrics(tmp_path)]
     assert without == timeless_metrics(uninterrupted)
 
@@ -165,13 +165,13 @@ def test_the_newest_checkpoints_are_kept(tmp_path):
     assert CheckpointStore(tmp_path / "checkpoints", keep=1).steps() == [result.iteration]
 
 
-def test_bob_is_kept_untrained_and_after_each_tenth(uninterrupted):
-    steps = [0, *(row["env_steps"] for row in read_lines(uninterrupted / "metrics.jsonl"))]
+def test_bob_is_kept_untrained_and_after_each_tenth(long_run):
+    steps = [0, *(row["env_steps"] for row in read_lines(long_run / "metrics.jsonl"))]
     expected = sorted({min(step for step in steps if step >= tenth * 150) for tenth in range(11)})
-    stages = read_stages(RunDirectory(uninterrupted))
+    stages = read_stages(RunDirectory(long_run))
     assert list(stages) == expected
     assert len(stages) > 4
-    untrained, last = Learner(tiny_config(**LONG)).weights().bob, load(str(uninterrupted)).parameters
+    untrained, last = Learner(tiny_config(**LONG)).weights().bob, load(str(long_run)).parameters
     for bob, same in ((stages[0], untrained), (stages[steps[-1]], last)):
         assert bob.keys() == same.keys()
         assert all(np.array_equal(bob[name], array) for name, array in same.items())
@@ -196,7 +196,7 @@ def test_a_run_that_has_converged_ends(tmp_path, monkeypatch):
 # --- exact resume ----------------------------------------------------------------------------------------------------
 
 
-def test_a_run_killed_between_two_iterations(uninterrupted, tmp_path):
+def test_a_run_killed_between_two_iterations(long_run, tmp_path):
     config = tiny_config(**LONG)
     _, result = play(tmp_path, config, kill_after=8)
     assert result is None
@@ -206,16 +206,16 @@ def test_a_run_killed_between_two_iterations(uninterrupted, tmp_path):
     (tmp_path / "checkpoints" / ".tmp-1-ab").write_bytes(b"half a checkpoint")
     run, result = play(tmp_path, config, resume=True)
     assert result.reason == "finished"
-    assert_same_run(tmp_path, uninterrupted)
+    assert_same_run(tmp_path, long_run)
     assert run.wall_s > 0.0
     snapshots = [
-        {file.name: file.read_bytes() for file in (path / "snapshots").iterdir()} for path in (tmp_path, uninterrupted)
+        {file.name: file.read_bytes() for file in (path / "snapshots").iterdir()} for path in (tmp_path, long_run)
     ]
     assert snapshots[0] == snapshots[1]
     assert list((tmp_path / "checkpoints").glob(".tmp-*")) == []
 
 
-def test_a_stop_is_saved_and_resumed(uninterrupted, tmp_path):
+def test_a_stop_is_saved_and_resumed(long_run, tmp_path):
     """Here right after players joined the past ones, whom the next round does not meet yet."""
     config = tiny_config(**LONG, checkpoint_interval=100)
 
@@ -229,13 +229,13 @@ def test_a_stop_is_saved_and_resumed(uninterrupted, tmp_path):
     assert int(newest(tmp_path).arrays["opponents/num"]) == 1
     config = resumed_config(RunDirectory(tmp_path), ["run.checkpoint_interval=2"])
     play(tmp_path, config, resume=True)
-    assert_same_run(tmp_path, uninterrupted)
+    assert_same_run(tmp_path, long_run)
 
 
 def test_a_finished_run_goes_on_with_a_larger_budget(uninterrupted, tmp_path):
-    _, result = play(tmp_path, tiny_config(total_env_steps=600))
+    _, result = play(tmp_path, tiny_config(total_env_steps=300))
     assert result.reason == "finished"
-    config = resumed_config(RunDirectory(tmp_path), ["run.total_env_steps=1500"])
+    config = resumed_config(RunDirectory(tmp_path), ["run.total_env_steps=600"])
     _, longer = play(tmp_path, config, resume=True)
     assert longer.iteration > result.iteration
     assert_same_run(tmp_path, uninterrupted)
@@ -243,7 +243,7 @@ def test_a_finished_run_goes_on_with_a_larger_budget(uninterrupted, tmp_path):
 
 def test_a_finished_run_resumed_as_it_is_stays_as_it_is(uninterrupted, tmp_path):
     shutil.copytree(uninterrupted, tmp_path / "copy")
-    _, result = play(tmp_path / "copy", tiny_config(**LONG), resume=True)
+    _, result = play(tmp_path / "copy", tiny_config(), resume=True)
     assert result.reason == "finished"
     assert_same_run(tmp_path / "copy", uninterrupted)
 
@@ -255,7 +255,7 @@ def test_a_damaged_newest_checkpoint_is_passed_over(uninterrupted, tmp_path, cap
     data = bytearray(last.read_bytes())
     data[len(data) // 2] ^= 1
     last.write_bytes(data)
-    config, started = tiny_config(**LONG), []
+    config, started = tiny_config(), []
     play(path, config, resume=True, on_iteration=lambda run, metrics: started.append(run.iteration))
     assert started[0] == int(before.stem.rpartition("-")[2]) + 1
     assert last.name in caplog.text
@@ -283,7 +283,7 @@ def test_a_new_run_does_not_touch_an_old_one(uninterrupted, tmp_path):
 
 
 def test_a_full_disk_leaves_the_earlier_checkpoint(uninterrupted, tmp_path, caplog):
-    config = tiny_config(**LONG)
+    config = tiny_config()
     with no_room_above(175_000), pytest.raises(UnsavedError) as error:
         play(tmp_path, config)
     last = newest(uninterrupted).step
@@ -300,7 +300,7 @@ def test_a_full_disk_leaves_the_earlier_checkpoint(uninterrupted, tmp_path, capl
     assert_same_run(tmp_path, uninterrupted)
 
 
-def test_a_disk_that_was_full_for_a_while_costs_nothing(uninterrupted, tmp_path, caplog):
+def test_a_disk_that_was_full_for_a_while_costs_nothing(long_run, tmp_path, caplog):
     """Checkpoints are skipped, and records that did not fit come later, in their places."""
     with ExitStack() as stack:
 
@@ -313,7 +313,7 @@ def test_a_disk_that_was_full_for_a_while_costs_nothing(uninterrupted, tmp_path,
 
         _, result = play(tmp_path, tiny_config(**LONG), on_iteration=fill_and_clear)
     assert result.reason == "finished"
-    assert_same_run(tmp_path, uninterrupted)
+    assert_same_run(tmp_path, long_run)
     for name in ("e00000001-00000004", "e00000001-00000008", "metrics.jsonl", "goals.jsonl", "snapshots"):
         assert name in caplog.text
     assert "e00000001-00000010" not in caplog.text

@@ -26,6 +26,7 @@ from service.config import dump_config, load_config
 from service.registry.loading import load
 from service.registry.registry import Registry
 from service.runs import study_results
+from service.runs import train as training
 from service.runs.grid import name_runs, parse_grid, parse_seeds
 from service.runs.progress import Progress
 from service.runs.resuming import resumed_config
@@ -318,7 +319,7 @@ def test_runs_begin_in_turn_and_are_asked_to_stop_and_then_to_end(tmp_path, num_
 
     progress = Progress(Display(Console(file=io.StringIO())))
     with StopSignals() as signals, pytest.raises(InterruptError) if num_signals == 2 else nullcontext():
-        study.train(configs, Place(2, run=run), None, ["--registry", "r"], signals, progress)
+        study.train(configs, Place(1, run=run), None, ["--registry", "r"], signals, progress)
     states = [(each.state, each.error) for each in study.read().runs.values()]
     if num_signals == 0:
         assert states == [("failed", "no luck")] * 2
@@ -334,6 +335,7 @@ def test_runs_begin_in_turn_and_are_asked_to_stop_and_then_to_end(tmp_path, num_
 @pytest.mark.usefixtures("default_signals")
 def test_a_study_is_killed_stopped_resumed_and_names_its_best(tmp_path, monkeypatch):
     monkeypatch.setattr(study_results, "SELECTION_EPISODES", 20)
+    monkeypatch.setattr(training, "make_artifacts", lambda directory, registry: {})
     path, registry = tmp_path / "study", tmp_path / "registry"
     study, common = Study(path), ("pretrain", "--run-dir", path, "--registry", registry)
     places = {seed: RunDirectory(path / f"seed-{seed}") for seed in (3, 8)}
@@ -373,6 +375,9 @@ def test_a_study_is_killed_stopped_resumed_and_names_its_best(tmp_path, monkeypa
     assert not registry.exists()
 
     steps = max(newest(path / f"seed-{seed}").meta["env_steps"] for seed in (3, 8)) + 1
+    for place in places.values():  # in this process, which is quicker; the study finds them as they were left
+        longer = resumed_config(place, [f"run.total_env_steps={steps}"])
+        training.train(longer, place, registry, resume=True, publish=False, on_iteration=lambda metrics: None)
     result = tandem(*common, "--resume", "--set", f"run.total_env_steps={steps}")
     assert result.exit_code == 0, result.output
     found = study.read()
