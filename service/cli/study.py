@@ -18,7 +18,6 @@ from service.runs.grid import SEED, Settings, check_once, name_runs, parse_grid
 if TYPE_CHECKING:
     from service.cluster.ray_connection import ClusterOptions
     from service.config import Config
-    from service.registry.registry import Registry
     from service.runs.study import Study, StudyFile
     from service.runs.study_run import Place
 
@@ -211,14 +210,13 @@ def _listed(names: Iterable[str]) -> str:
     return first + (", ..." if more else "")
 
 
-def _registry(source: str, configs: Iterable[Config], publish: bool | None) -> Registry | None:
+def _registry(source: str, configs: Iterable[Config], publish: bool | None) -> Path | None:
     """Where the best run is published; None: nowhere.
 
     Raises:
         TandemError: a registry that is only read, or nothing to be published.
     """
     from service.registry.publishing import check_publishable
-    from service.registry.registry import Registry
 
     if publish is False:
         return None
@@ -230,7 +228,7 @@ def _registry(source: str, configs: Iterable[Config], publish: bool | None) -> R
         )
     for config in best.values():
         check_publishable(config, source)  # now, not after hours of learning
-    return Registry(Path(source)) if best else None
+    return Path(source) if best else None
 
 
 def _on_ray(stack: ExitStack, options: ClusterOptions, address: str | None, path: Path, source: str) -> Place:
@@ -249,7 +247,7 @@ def _on_ray(stack: ExitStack, options: ClusterOptions, address: str | None, path
     return cluster_place()
 
 
-def _print(study: StudyFile, path: Path, registry: Registry | None) -> None:
+def _print(study: StudyFile, path: Path, registry: Path | None) -> None:
     """Print a line for each run, one for all that differ in nothing but their seed, and where everything is."""
     from service.runs.study_results import measure_of, summaries
 
@@ -278,4 +276,4 @@ def _print(study: StudyFile, path: Path, registry: Registry | None) -> None:
         typer.echo(f"best         {study.best}, chosen by goals other than those reported here")
     typer.echo(f"results      {path / 'results.csv'}")
     if study.published is not None and registry is not None:
-        typer.echo(f"primitives   {study.published} in {registry.root}")
+        typer.echo(f"primitives   {study.published} in {registry}")

@@ -33,12 +33,12 @@ from service.config import Config, dump_config
 from service.config.frozen import FrozenModel
 from service.config.self_play import SelfPlayConfig
 from service.media.plots import plot_study
-from service.registry.registry import Registry
 from service.runs.grid import Settings
 from service.runs.progress import Progress
 from service.runs.signals import StopSignals
-from service.runs.study_results import SELECTED, as_csv, best_of, publish_best, select
+from service.runs.study_results import SELECTED, as_csv, best_of, published_metrics, select
 from service.runs.study_run import END_NOW, GO_ON, POLL_S, STOP, Job, Place, StudyRun, share
+from service.runs.train import publish_learned
 from service.store.disk import STUDY_FILE
 from service.store.disk_reader import DiskReader, run_id_of
 from service.store.run_directory import RunDirectory
@@ -224,7 +224,7 @@ class Study:
                     if self._study.runs[name].state == "running":
                         self._note(name, self._study.runs[name].now("interrupted"))
 
-    def finish(self, configs: Mapping[str, Config], registry: Registry | None, progress: Progress) -> None:
+    def finish(self, configs: Mapping[str, Config], registry: Path | None, progress: Progress) -> None:
         """Name the best of the runs that make primitives, publish it, and write the table and the picture.
 
         Args:
@@ -252,9 +252,9 @@ class Study:
             plot_study({name: self.path / name for name in runs}, self.path / "curves.png")
         best = best_of(runs)
         self._write(self._study.model_copy(update={"best": best}))  # known, whatever happens while it is published
-        if best is not None and registry is not None:
-            version = publish_best(self.path / best, registry, runs[best])
-            self._write(self._study.model_copy(update={"published": str(version) if version is not None else None}))
+        if best is not None and registry is not None and configs[best].publishable:
+            version = publish_learned(self.path / best, registry, metrics=published_metrics(runs[best]))
+            self._write(self._study.model_copy(update={"published": str(version)}))
 
     def _jobs(
         self, configs: Mapping[str, Config], place: Place, parallel: int | None, options: Sequence[str]

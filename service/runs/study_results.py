@@ -9,28 +9,18 @@ from __future__ import annotations
 import csv
 import io
 from collections.abc import Iterable, Mapping, Sequence
-from contextlib import closing, suppress
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
 from service.actors.evaluation import SELECTION_SEED, evaluate_run
-from service.base.errors import StoreError
 from service.base.types import StateArray
 from service.envs.sampling import GoalKind
 from service.policies.numpy_policy import numpy_bob
 from service.registry.loading import load
-from service.registry.names import Version
-from service.registry.publishing import publish_run
-from service.registry.registry import Registry
 from service.runs.grid import SEED, Settings
 from service.runs.study_run import StudyRun
-from service.store.address import address_from_environment
-from service.store.disk import read_status
-from service.store.disk_reader import run_id_of
-from service.store.run_directory import RunDirectory
-from service.store.run_writer import reporting_to
 
 SELECTION_GOALS: GoalKind = "mixed"
 SELECTION_EPISODES = 1000
@@ -145,27 +135,7 @@ def best_of(runs: Mapping[str, StudyRun]) -> str | None:
     return max(scores, key=lambda name: (scores[name][SELECTED], -scores[name][DISTANCE]), default=None)
 
 
-def publish_best(directory: Path, registry: Registry, run: StudyRun) -> Version | None:
-    """Publish the Bob of one run of a study, whose manifest then has its settings in its configuration.
-
-    Returns:
-        The version, as ``publish_run`` does; None for a Bob without primitives.
-
-    Raises:
-        StorageError: see ``publish_run``.
-    """
-    place = RunDirectory(directory)
-    config = place.read_config()
-    if not config.publishable:
-        return None
+def published_metrics(run: StudyRun) -> dict[str, float]:
+    """What a version says of the best run: what was measured at its end, and its success on the goals that chose it."""
     metrics = {f"evaluation/{name}": value for name, value in run.result.items() if not name.startswith("selection_")}
-    metrics |= {f"selection/{SELECTION_GOALS}_success_last": run.result[SELECTED], "env_steps": float(run.env_steps)}
-    version = publish_run(place, registry, config, load(str(directory)).parameters, metrics)
-    status, run_id = read_status(directory), run_id_of(directory)
-    place.claim(resume=True)
-    with closing(place), suppress(StoreError):
-        if status is not None:
-            told = status.model_copy(update={"run_id": run_id, "published": str(version), "epoch": place.epoch})
-            with closing(reporting_to(place, run_id, address_from_environment())) as writer:
-                writer.status(told)
-    return version
+    return metrics | {f"selection/{SELECTION_GOALS}_success_last": run.result[SELECTED], "env_steps": run.env_steps}

@@ -17,7 +17,7 @@ from typing import Literal, cast
 
 from pydantic import JsonValue
 
-from service.base.errors import TandemError
+from service.base.errors import StoreError, TandemError
 from service.base.progress import answer, doing
 from service.base.types import Metrics
 from service.config import Config
@@ -37,7 +37,7 @@ from service.store.address import address_from_environment
 from service.store.checkpoints import CheckpointStore
 from service.store.disk import read_status
 from service.store.disk_reader import run_id_of
-from service.store.models import RunState
+from service.store.models import ACTIVE, RunState
 from service.store.run_directory import Published, RunDirectory
 from service.store.run_log import RunLog
 from service.store.run_writer import reporting_to
@@ -257,15 +257,20 @@ def _finish(done: Finished, run: Run, registry: Path | str, publish: bool, repor
 
 
 def publish_learned(
-    path: Path, registry: Path | str, name: str | None = None, primitives: str | None = None
+    path: Path,
+    registry: Path | str,
+    name: str | None = None,
+    primitives: str | None = None,
+    metrics: Metrics | None = None,
 ) -> Version:
-    """Publish what the newest checkpoint of a run holds, measured on the goals of the end of a run.
+    """Publish what the newest checkpoint of a run holds, and say so in the run's status.
 
     Args:
         path: of the run, which no process may be running.
         registry: directory to publish in.
         name: of what is published; None: the run's.
         primitives: published version that a policy of a task acts with, if that has another name than in its run.
+        metrics: what is known of it; None: measure it on the goals of the end of a run.
 
     Returns:
         The new version, or the newest one of that name where it has the same parameters already.
@@ -283,9 +288,16 @@ def publish_learned(
             changed["primitives"] = learned.trained.reference
         config = config.model_copy(update=changed)
         check_publishable(config, registry)
-        saved = CheckpointStore(directory.checkpoints, keep=1).load_latest()
-        metrics = _measure(config, learned) | {"env_steps": saved.meta["env_steps"]}
-        return publish_run(directory, Registry(Path(registry)), config, learned.parameters, metrics)
+        if metrics is None:
+            saved = CheckpointStore(directory.checkpoints, keep=1).load_latest()
+            metrics = _measure(config, learned) | {"env_steps": saved.meta["env_steps"]}
+        version = publish_run(directory, Registry(Path(registry)), config, learned.parameters, metrics)
+        status, run_id = read_status(path), run_id_of(path)
+        if status is not None and status.state not in ACTIVE:
+            told = status.model_copy(update={"run_id": run_id, "published": str(version), "epoch": directory.epoch})
+            with suppress(StoreError), closing(reporting_to(directory, run_id, address_from_environment())) as writer:
+                writer.status(told)
+    return version
 
 
 def _measure(config: Config, learned: Trained) -> Metrics:

@@ -13,6 +13,7 @@ from service.cli.main import app
 from service.config.find import METHODS
 from service.registry.bundled import BUNDLED
 from service.registry.registry import Registry
+from service.store.disk import read_status
 from service.store.run_directory import RunDirectory
 from tests.runs.runs import play
 from tests.status.conftest import serve
@@ -89,6 +90,7 @@ def test_what_was_learned_is_published_measured_and_filmed(learned, monkeypatch)
     for _ in range(2):  # the second time nothing new is made
         done = tandem("publish", run, "--name", "wall-orchestrator", "--alias", "best")
         assert done.stdout == "wall-orchestrator@1 is in registry\n", done.output
+    assert read_status(learned / run).published == "wall-orchestrator@1"  # so the page says it
     manifest = Registry(learned / "registry").manifest("wall-orchestrator@1")
     result = json.loads((learned / run / "result.json").read_text())["evaluation"]
     assert manifest.metrics == {f"evaluation/{key}": value for key, value in result.items()} | {"env_steps": 600}

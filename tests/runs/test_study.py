@@ -37,11 +37,12 @@ from service.runs.study_results import (
     best_of,
     bootstrap_interval,
     interquartile_mean,
-    publish_best,
+    published_metrics,
     select,
     summaries,
 )
 from service.runs.study_run import Job, Place, StudyRun, share
+from service.runs.train import publish_learned
 from service.store.checkpoints import CheckpointStore
 from service.store.disk_reader import DiskReader
 from service.store.run_directory import RunDirectory
@@ -285,11 +286,13 @@ def test_a_better_run_found_by_a_resume_becomes_the_next_version(tmp_path):
     registry, study = Registry(tmp_path / "registry"), begin_study(tmp_path / "study")
     result = {"mixed_success_last": 0.5, "selection_success_last": 0.75, "selection_mean_distance_m": 0.1}
     run = StudyRun(settings={}, state="finished", env_steps=120, result=result)
-    published = []
+    published, metrics = [], published_metrics(run)
     for seed in (0, 1):
         directory = study.path / f"seed-{seed}"
         play(directory, tiny_config(seed=seed, total_env_steps=120))
-        published += [publish_best(directory, registry, run) for _ in range(2)]  # the second time it is there already
+        published += [
+            publish_learned(directory, registry.root, metrics=metrics) for _ in range(2)
+        ]  # again: it is there
     assert [str(version) for version in published] == ["tiny@1", "tiny@1", "tiny@2", "tiny@2"]
     manifest = registry.manifest("tiny@latest")
     assert (manifest.version, manifest.config["seed"], manifest.parent) == (2, 1, None)
