@@ -410,19 +410,6 @@ def test_a_resume_without_a_checkpoint(tmp_path):
     assert_user_error(tandem("pretrain", "--resume", "--run-dir", tmp_path), "no checkpoint in", tmp_path)
 
 
-def test_no_cuda_here(tmp_path, monkeypatch):
-    monkeypatch.setattr("torch.cuda.is_available", lambda: False)
-    result = tandem("pretrain", "--run-dir", tmp_path / "run", "--set", "learner.device=cuda")
-    assert_user_error(result, "learner.device", "cuda", "cpu")
-    assert not (tmp_path / "run").exists()
-
-
-def test_a_run_directory_that_is_a_file(tmp_path):
-    (tmp_path / "run").write_text("")
-    result = tandem("pretrain", "--config", write_yaml(tmp_path / "tiny.yaml"), "--run-dir", tmp_path / "run")
-    assert_user_error(result, "cannot write", tmp_path / "run")
-
-
 @pytest.mark.parametrize(
     ("arguments", "parts"),
     [

@@ -2,7 +2,6 @@
 
 import json
 import os
-import shutil
 import signal
 
 import pytest
@@ -16,7 +15,6 @@ from service.registry.registry import Registry
 from service.store.disk import read_status
 from service.store.run_directory import RunDirectory
 from tests.runs.runs import play
-from tests.status.conftest import serve
 
 CHAMPION = str(Registry(BUNDLED).resolve("panda-cube@champion"))
 SETS = [
@@ -211,19 +209,3 @@ def test_what_is_wrong_is_one_line_and_nothing_is_written(tmp_path, arguments, w
     assert refused.stderr.count("\n") == 1
     assert words in refused.stderr
     assert list(tmp_path.iterdir()) == []
-
-
-def test_a_registry_that_serves_a_wrong_digest(tmp_path, monkeypatch):
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-    home = tmp_path / "home"
-    (home / "runs").mkdir(parents=True)
-    shutil.copytree(BUNDLED, home / "registry")
-    for blob in (home / "registry" / "blobs" / "sha256").iterdir():
-        blob.chmod(0o600)
-        blob.write_bytes(b"x" * blob.stat().st_size)
-    with serve(home) as server:
-        refused = tandem("train", "wall", "--registry", server.url)
-    assert refused.stderr.startswith(f"error: {server.url} says: ")
-    assert "is damaged: expected sha256" in refused.stderr
-    assert refused.stderr.count("\n") == 1
-    assert {path.name for path in tmp_path.iterdir()} <= {"home", "cache"}
