@@ -183,7 +183,7 @@ def train(
         (study, ["accept_damaged_records"], "is for one run of a study: resume that one by its --run-dir"),
         (not study, ["parallel"], "is for the runs of a study: give --seeds or --grid, too, or leave it out"),
         (status == "off", ["token_file"], "is for the service that --status off leaves out: drop one of them"),
-        (run_dir is not None, ["runs"], "is where --run-dir would be: drop one of them"),
+        (was_typed(context, "run_dir"), ["runs"], "is where --run-dir would be: drop one of them"),
         (run_id is not None, ["resume", "run_dir"], "is what --run-id says already: leave it out"),
         (again, ["from"], "is for a run that begins, and --resume goes on with one: leave out one of them"),
     ):

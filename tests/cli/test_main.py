@@ -163,9 +163,11 @@ def test_a_resumed_run_takes_the_file_it_was_begun_with(trained, asked):
 def test_pretrain_goes_to_runs_by_its_name(asked):
     tandem("pretrain", "--set", "name=blue")
     tandem("pretrain", "--set", "name=blue", "--run-dir", "here", TANDEM_REGISTRY="/there")
+    tandem("pretrain", "--set", "name=blue", "--runs", "jobs", "--run-id", "7")
     assert [(config.name, path, registry, options["resume"]) for config, path, registry, options in asked] == [
         ("blue", Path("runs/blue"), "registry", False),
         ("blue", Path("here"), "/there", False),
+        ("blue", Path("jobs/7"), "registry", False),
     ]
 
 

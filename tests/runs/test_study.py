@@ -25,7 +25,7 @@ from service.cli.main import app
 from service.config import dump_config, load_config
 from service.registry.loading import load
 from service.registry.registry import Registry
-from service.runs import study_results
+from service.runs import study_results, study_run
 from service.runs import train as training
 from service.runs.grid import name_runs, parse_grid, parse_seeds
 from service.runs.progress import Progress
@@ -41,7 +41,7 @@ from service.runs.study_results import (
     select,
     summaries,
 )
-from service.runs.study_run import Job, Place, StudyRun, share
+from service.runs.study_run import END_NOW, GO_ON, STOP, Job, Place, StudyRun, run_process, share
 from service.runs.train import publish_learned
 from service.store.checkpoints import CheckpointStore
 from service.store.disk_reader import DiskReader
@@ -330,6 +330,28 @@ def test_runs_begin_in_turn_and_are_asked_to_stop_and_then_to_end(tmp_path, num_
         assert states == [("interrupted", None), ("waiting", None)]
     options = ("--registry", "r", "--set", "run.num_threads=1")  # which the configuration says
     assert told == dict.fromkeys(configs if num_signals == 0 else ["seed-0"], (num_signals, options))
+
+
+@pytest.mark.parametrize(
+    ("script", "asked", "state", "error"),
+    [
+        ("echo 'error: no luck'; exit 3", GO_ON, "failed", "no luck; all it said is in"),
+        ("exit 0", GO_ON, "waiting", None),
+        ("trap 'exit 138' USR1; echo ready; while :; do sleep 0.05; done", STOP, "waiting", None),
+        ("trap '' USR1 TERM; echo ready; while :; do sleep 0.05; done", END_NOW, "failed", "ended by SIGKILL"),
+    ],
+)
+def test_how_the_process_of_a_run_ends(tmp_path, monkeypatch, script, asked, state, error):
+    """A shell script in place of a run, which is told to stop or to end once it is ready."""
+    program, job = tmp_path / "python", Job(tmp_path / "run", dump_config(tiny_config()), 600, StudyRun(settings={}))
+    program.write_text(f"#!/bin/sh\n{script}\n")
+    program.chmod(0o755)
+    monkeypatch.setattr(sys, "executable", str(program))
+    monkeypatch.setattr(study_run, "PATIENCE_S", (0.1, 0.1, 60.0))
+    log = job.directory / "log.txt"
+    found = run_process(job, lambda: asked if log.exists() and "ready" in log.read_text() else GO_ON)
+    assert (found.state, found.error is None) == (state, error is None)
+    assert error is None or error in found.error
 
 
 # --- a whole one -----------------------------------------------------------------------------------------------------
