@@ -1,6 +1,7 @@
 """What a run in one process tells while it goes on, and that only one process runs it."""
 
 import json
+import os
 import signal
 import threading
 import time
@@ -27,7 +28,6 @@ from tests.runs.runs import (
     assert_same_run,
     play,
     read_lines,
-    start_endless_run,
     tiny_config,
 )
 from tests.status.runs import BEARER, CLIENT, TOKEN
@@ -180,20 +180,25 @@ def test_a_run_that_another_took_over_stops_at_once_and_leaves_its_status_alone(
 
 
 def test_a_second_process_is_refused_and_a_killed_one_has_vanished(tmp_path):
-    process, path = start_endless_run(tmp_path)
+    path, reader = tmp_path / "runs" / "cube", DiskReader(tmp_path / "runs")
+    child = os.fork()
+    if child == 0:
+        try:
+            run(tmp_path, tiny_config(total_env_steps=10**9))
+        finally:
+            os._exit(1)
     try:
-        reader = DiskReader(tmp_path)
-        wait_until(lambda: reader.runs() and reader.run("run").iteration > 0, within_s=600.0)
-        assert reader.run("run").state == "running"
+        wait_until(lambda: path.exists() and reader.runs() and reader.run("cube").iteration > 0, within_s=600.0)
+        assert reader.run("cube").state == "running"
         with pytest.raises(RunTakenError) as error:
             RunDirectory(path).claim(resume=True)
-        assert_one_line(error.value, f"{path} is in use by process {process.pid}", "--run-dir")
+        assert_one_line(error.value, f"{path} is in use by process {child}", "--run-dir")
     finally:
-        process.kill()
-        process.communicate()
+        os.kill(child, signal.SIGKILL)
+        os.waitpid(child, 0)
     told = json.loads((path / "status.json").read_text())
     (path / "status.json").write_text(json.dumps(told | {"heartbeat": "2024-05-01T00:00:00Z"}))
-    seen = DiskReader(tmp_path).run("run")  # a reader who has seen it alive does not care for dates
+    seen = status(tmp_path)  # a reader who has seen it alive does not care for dates
     assert (seen.state, "vanished" in seen.last_error) == ("interrupted", True)
     directory = RunDirectory(path)
     directory.claim(resume=True)  # the kernel has freed it
