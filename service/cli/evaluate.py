@@ -1,4 +1,4 @@
-"""``tandem evaluate``, ``coverage`` and ``render``: how good trained primitives are, and what they do."""
+"""``tandem evaluate``, ``coverage`` and ``render``: how good a trained thing is, and what it does; options of films."""
 
 from __future__ import annotations
 
