@@ -2,28 +2,42 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import logging
+import os
+import platform
 import re
 import shlex
 import sys
+import tempfile
+import time
+import traceback
 from collections.abc import Iterable, Iterator, Sequence
-from contextlib import AbstractContextManager, contextmanager, nullcontext
+from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import typer
 from rich.console import Console
 from typer.core import TyperGroup
 
-from service.base.errors import TandemError, did_you_mean, one_line
+from service.base.errors import (
+    TRACEBACK_PREFIX,
+    NoRoomError,
+    TandemError,
+    UnexpectedError,
+    did_you_mean,
+    one_line,
+)
 from service.base.progress import Display, Task, display, doing
-from service.cli.unexpected import UsageError, traceback_in
+from service.base.version import __version__
 from service.runs.signals import InterruptError
 
-if TYPE_CHECKING:
-    from service.registry.loading import Trained
-
+UsageError: type[Exception] = typer.BadParameter.__bases__[0]
+"""The error of arguments that typer cannot read; it has no public name in all versions of typer."""
+_PATH_ERRORS = (errno.EACCES, errno.EPERM, errno.ENAMETOOLONG, errno.ELOOP, errno.ENOTDIR, errno.EISDIR)
+"""Reasons for which a path that was typed cannot be used."""
 CHAMPION = "panda-cube@champion"
 """The primitives that come with the package."""
 EXIT_SIGNAL = 128
@@ -122,7 +136,7 @@ def what_is_meant(reference: str | None, primitives: str | None) -> tuple[str, s
 
 def was_typed(context: typer.Context, name: str) -> bool:
     """Whether an option was typed, and has not its default or what a variable says."""
-    source = context.get_parameter_source(name)
+    source = context.get_parameter_source("start_from" if name == "from" else name)
     return source is not None and source.name == "COMMANDLINE"  # typer has a ParameterSource of its own
 
 
@@ -175,32 +189,56 @@ def _one_line() -> Iterator[None]:
         raise typer.Exit(said.exit_code) from None
 
 
-def load_start(reference: str, registry: Path | str) -> Trained:
-    """What a run of that configuration begins from.
+@contextmanager
+def traceback_in(directory: Path | None = None) -> Iterator[None]:
+    """Turn an unexpected error of the block into one line that names a file with its traceback.
+
+    Args:
+        directory: of the run that the block is about; None, or where nothing can be written there: that for temporary
+            files.
 
     Raises:
-        TandemError: nothing there, no primitives, or a run of skills.
+        UnexpectedError: it happened.
+        NoRoomError: no memory, or a full disk.
+        TandemError: a path that cannot be used; or whatever the block raised.
     """
-    from service.registry.loading import load
+    try:
+        yield
+    except (TandemError, UsageError, typer.Exit, typer.Abort, BrokenPipeError):  # typer ends where no reader is left
+        raise
+    except Exception as error:
+        raise _explained(error, directory) from error
 
-    return load(reference, registry).expect("primitives", by="--from")
 
-
-def directory_of(registry: str, *, publish: bool) -> Path:
-    """The directory of a registry in which a run publishes, if it does.
-
-    Raises:
-        TandemError: it does, and the registry is a service.
-    """
-    from service.registry.names import is_service
-
-    if not is_service(registry):
-        return Path(registry)
-    if publish:
-        raise TandemError(
-            f"{registry} is read only: publish in a directory (--registry DIR), and serve that; or give --no-publish"
+def _explained(error: Exception, directory: Path | None) -> TandemError:
+    said = one_line(str(error), 300)
+    if isinstance(error, OSError):
+        file = os.fsdecode(error.filename) if error.filename is not None else None
+        if error.errno in _PATH_ERRORS and file is not None:
+            return TandemError(f"cannot use {file}: {error.strerror}; check the path and its permissions")
+        if error.errno in (errno.ENOSPC, errno.EDQUOT):
+            where = file or "what is printed"
+            return NoRoomError(f"cannot write {where}: {error.strerror}; free some space and try again")
+    if isinstance(error, MemoryError) or re.search(r"allocate memory|out of memory", said):  # NumPy, torch
+        return NoRoomError(
+            f"not enough memory: {said or 'none is left'}; ask for less, such as fewer worlds (game.num_worlds) or "
+            "smaller networks, or take a machine with more"
         )
-    return REGISTRY
+    what = f"unexpected {type(error).__name__}{': ' if said else ''}{said}"
+    for place in ([directory] if directory is not None and directory.is_dir() else []) + [Path(tempfile.gettempdir())]:
+        with suppress(OSError):
+            return UnexpectedError(f"{what}; its traceback is in {_write_traceback(error, place)}, please report it")
+    return UnexpectedError(f"{what}; its traceback cannot be written anywhere; please report it")
+
+
+def _write_traceback(error: Exception, directory: Path) -> str:
+    """Make a file of its own, which only this user may read: a traceback may quote what is private."""
+    stamp = time.strftime("%Y%m%d-%H%M%S", time.gmtime())
+    head = f"tandem {__version__}, Python {platform.python_version()}, {platform.platform()}\n{sys.argv}\n\n"
+    descriptor, path = tempfile.mkstemp(".txt", f"{TRACEBACK_PREFIX}{stamp}-", directory)
+    with open(descriptor, "w", encoding="utf-8", errors="backslashreplace") as file:
+        file.write(head + "".join(traceback.format_exception(error)))
+    return path
 
 
 def how_to_go_on(run_dir: Path, registry: Path | str, *, runtime: str = "local", address: str | None = None) -> str:
@@ -208,6 +246,12 @@ def how_to_go_on(run_dir: Path, registry: Path | str, *, runtime: str = "local",
     place = ["--runtime", runtime] * (runtime != "local") + (["--address", address] if address is not None else [])
     command = ["tandem", "train", "--resume", "--run-dir", str(run_dir), "--registry", str(registry), *place]
     return f"continue with: {shlex.join(command)}"
+
+
+def stopped(what: str, number: int, hint: str, *, begun: bool = True) -> typer.Exit:
+    """Say how to go on with what a signal ended; returns the exit of a process that a signal ends."""
+    typer.echo(f"{what}; {hint if begun else 'nothing was saved yet'}")
+    return typer.Exit(EXIT_SIGNAL + number)
 
 
 def print_json(tree: Any) -> None:
@@ -222,7 +266,6 @@ def print_table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
         for row in (header, *rows):
             typer.echo("\t".join(row))
         return
-    from rich.console import Console
     from rich.markup import escape
     from rich.table import Column, Table
 

@@ -2,20 +2,52 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from service.base.errors import TandemError, did_you_mean
-from service.cli.common import CommandGroup, JsonOption, print_json, print_table
-from service.config.recipes import first_comment, recipes, robots
+from service.cli.common import CommandGroup, JsonOption, print_json, print_table, task_names
+from service.config.recipes import DEFAULT_RECIPE, find_file, first_comment, recipes, robots
 
 configs_app = typer.Typer(name="configs", help="Recipes and robots that come with tandem.", cls=CommandGroup)
 
 
-def config_names() -> list[str]:
-    """Names for ``--config``; the shell completes them."""
-    return list(recipes())
+def targets() -> list[str]:
+    """Names for ``tandem train NAME``; the shell completes them."""
+    return [*recipes(), *task_names()]
+
+
+def named(what: str | None, method: str | None, primitives: str | None) -> tuple[Path | None, list[str]]:
+    """The file of a recipe or configuration, if any, and the overrides that a task or method stands for.
+
+    Raises:
+        TandemError: no such recipe, task or file; or options that mean nothing there.
+    """
+    from service.config.find import METHODS
+    from service.methods.task_methods import METHODS as OF_TASKS
+
+    known = targets()
+    if what in task_names():
+        if method in OF_TASKS and method not in METHODS:
+            raise TandemError(f"{method} learns nothing: measure it by tandem evaluate --task {what} --method {method}")
+        chosen = [f"task={what}", f"method={method or 'ours'}"]
+        return None, chosen + [f"primitives={primitives}"] * (primitives is not None)
+    if primitives is not None:
+        raise TandemError("--primitives is for learning a task: name one, such as push; a run begins from --from")
+    if what is None:
+        recipe = recipes().get(f"{DEFAULT_RECIPE}-{method}")
+        if recipe is None and method in OF_TASKS:
+            raise TandemError(f"--method {method} is for a task: name one, such as tandem train push")
+        return recipe, [f"method={method}"] if method is not None and recipe is None else []
+    if what not in known and not Path(what).suffix and not Path(what).exists():
+        raise TandemError(
+            f"{what!r}: no recipe, task or file of that name; there are {', '.join(known)}{did_you_mean(what, known)}"
+        )
+    if method is not None:
+        raise TandemError(f"{what} says its method itself: leave out --method, or change it by --set method={method}")
+    return find_file(what, recipes()), []
 
 
 @configs_app.callback(invoke_without_command=True)

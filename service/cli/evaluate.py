@@ -1,7 +1,9 @@
-"""``tandem evaluate``, ``coverage`` and ``render``: how good trained primitives are, and what they do."""
+"""``tandem evaluate``, ``coverage`` and ``render``: how good a trained thing is, and what it does; options of films."""
 
 from __future__ import annotations
 
+import re
+from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, cast
@@ -22,29 +24,40 @@ from service.cli.common import (
     print_json,
     what_is_meant,
 )
-from service.cli.film import (
-    CAMERA,
-    OUT,
-    SIZE,
-    SPEED,
-    CameraOption,
-    GoalsOption,
-    OutOption,
-    SizeOption,
-    SpeedOption,
-    film_options,
-    parse_goals,
-)
 
 if TYPE_CHECKING:
     from pydantic import JsonValue
 
     from service.actors.evaluation import DeterministicPolicy
-    from service.base.types import Metrics
+    from service.base.types import Metrics, StateArray
+    from service.config import WorldConfig
     from service.envs.sampling import GoalKind
+    from service.media.video import FilmOptions
     from service.registry.loading import Trained
 
 _Seed = Annotated[int, typer.Option(help="Of the episodes.", min=0)]
+SizeOption = Annotated[str, typer.Option("--size", metavar="WxH", help="Of the whole film, pixels.")]
+CameraOption = Annotated[
+    str,
+    typer.Option(
+        "--camera",
+        metavar="VIEW",
+        help="front, far, close, side, behind or top; also, or after it, azimuth=DEG,elevation=DEG,distance=M.",
+    ),
+]
+SpeedOption = Annotated[float, typer.Option("--speed", help="0.5: half as fast as in the world.", min=0.05, max=20)]
+GoalsOption = Annotated[
+    str | None,
+    typer.Option(
+        "--goals",
+        metavar="KIND|POINTS",
+        help="table, air, volume or mixed; or points in metres, such as '0.1,0,0.2; 0,-0.1,0.025'.",
+    ),
+]
+OutOption = Annotated[Path, typer.Option("--out", metavar="FILE", help="Film to write: .mp4 or .gif.")]
+SIZE, CAMERA, SPEED, OUT = "1280x720", "front", 1.0, Path("video.mp4")
+
+_SIZES = (64, 4096)
 
 
 def evaluate(
@@ -99,7 +112,13 @@ def evaluate(
         asked = None if goals is None else choose("--goals", goals, GOAL_KINDS)
         trained = load(reference, registry, primitives).on(task)
     players, on = _players(trained, method), trained.task
-    _check_used(trained, method, out)
+    for option, value in (("--method", method), ("--out", out)):
+        if value is not None and on is None:
+            raise TandemError(f"{option} is for a task: name one by --task, such as --task push")
+    if out is not None and method is None and trained.kind == "orchestrator":
+        raise TandemError(f"--out {out}: {trained.label} has learned, and its run has the result.json; leave out --out")
+    if out is not None and out.exists():  # now, not after playing
+        raise TandemError(f"--out {out} is there already: name another file, or move it away")
     config = changed_config(trained.config, overrides or ())
     world, distance_m = replace(trained, config=config).world, trained.success_distance_m
     kind = cast("GoalKind", asked or ("mixed" if on is None else trained.goals))
@@ -153,22 +172,9 @@ def _players(trained: Trained, method: str | None) -> dict[str, DeterministicPol
     return players | {"idle": IdlePolicy()}
 
 
-def _check_used(trained: Trained, method: str | None, out: Path | None) -> None:
-    """Refuse options that mean nothing without a task, and a file that is there or would have no result."""
-    for option, value in (("--method", method), ("--out", out)):
-        if value is not None and trained.task is None:
-            raise TandemError(f"{option} is for a task: name one by --task, such as --task push")
-    if out is None:
-        return
-    if method is None and trained.kind == "orchestrator":
-        raise TandemError(f"--out {out}: {trained.label} has learned, and its run has the result.json; leave out --out")
-    if out.exists():
-        raise TandemError(f"--out {out} is there already: name another file, or move it away")
-
-
 def _write_result(path: Path, trained: Trained, method: str | None, seed: int, numbers: Metrics) -> None:
     """Write a file that says what a run's configuration and result say."""
-    from service.base.files import os_errors, write_exclusive
+    from service.base.files import os_errors, write_atomic
     from service.methods.task_methods import METHODS
     from service.store.run_directory import encode_result
 
@@ -185,9 +191,7 @@ def _write_result(path: Path, trained: Trained, method: str | None, seed: int, n
         "wall_s": 0.0,
     }
     with os_errors("write", path):
-        path.parent.mkdir(parents=True, exist_ok=True)
-        if not write_exclusive(path, encode_result(result)):
-            raise TandemError(f"--out {path} is there already: name another file, or move it away")
+        write_atomic(path, encode_result(result))
 
 
 def coverage(
@@ -284,3 +288,60 @@ def render(
         )
         video.write_episode_video(recorded, trained.world, out, options)
     typer.echo(f"video: {out}")
+
+
+def film_options(size: str, camera: str, speed: float, out: Path) -> FilmOptions:
+    """How a film shall look.
+
+    Raises:
+        TandemError: a size, camera, speed or end of the file's name that no film has.
+    """
+    from service.envs.rendering.camera import parse_view
+    from service.media.encoding import check_format
+    from service.media.video import FilmOptions
+
+    check_format(out)
+    found = re.fullmatch(r"([0-9]{1,5})x([0-9]{1,5})", size)
+    width, height = map(int, found.groups()) if found else (0, 0)
+    if any(side % 2 or not _SIZES[0] <= side <= _SIZES[1] for side in (width, height)):
+        raise TandemError(
+            f"--size {size!r}: write WIDTHxHEIGHT, even numbers from {_SIZES[0]} to {_SIZES[1]}, such as 1280x720"
+        )
+    return FilmOptions(width, height, parse_view(camera), speed)
+
+
+def parse_goals(text: str, world: WorldConfig) -> GoalKind | StateArray:
+    """A kind of random goals, or (N, 3) goals in metres.
+
+    Raises:
+        TandemError: neither; or a goal outside of the workspace, or inside a fixture.
+    """
+    import numpy as np
+
+    from service.envs.sampling import GOAL_KINDS, check_goals, inside_fixtures
+    from service.generator.validity import in_workspace
+
+    for kind in GOAL_KINDS:
+        if text.strip() == kind:
+            check_goals(kind, world)
+            return kind
+    try:
+        points = np.array([[float(part) for part in point.split(",")] for point in text.strip("; ").split(";")])
+    except ValueError:
+        points = np.empty(0)
+    if points.shape[1:] != (3,) or not np.isfinite(points).all():
+        raise TandemError(
+            f"--goals {text!r}: write one of {', '.join(GOAL_KINDS)}, or points x,y,z in metres with ; between"
+        )
+    for point in points[~in_workspace(points, world.workspace)]:
+        low, high = (_numbers(corner) for corner in (world.workspace.lower_m, world.workspace.upper_m))
+        raise TandemError(f"--goals: {_numbers(point)} is outside of the workspace, ({low}) to ({high}) m")
+    for point in points[inside_fixtures(points, world)]:
+        raise TandemError(
+            f"--goals: at {_numbers(point)} the object would be inside a fixture, or the upright box around it"
+        )
+    return points
+
+
+def _numbers(point: Iterable[float]) -> str:
+    return ", ".join(f"{each:g}" for each in point)

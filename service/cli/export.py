@@ -1,4 +1,4 @@
-"""``tandem export``: a policy as one folder that needs nothing of tandem."""
+"""``tandem export`` and ``tandem dataset``: what was trained, written for use elsewhere."""
 
 from __future__ import annotations
 
@@ -17,6 +17,9 @@ from service.cli.common import (
     loading,
     print_json,
 )
+from service.cli.evaluate import CAMERA, SIZE, SPEED, GoalsOption, film_options, parse_goals
+
+_MAX_FILMED = 16
 
 
 def export(
@@ -60,3 +63,61 @@ def export(
         f"{about['name']} is in {out}, within {usual:.1e} of the policy itself (with extreme inputs {extreme:.1e}); "
         "begin with its README.md"
     )
+
+
+def dataset(
+    players: Annotated[
+        str,
+        typer.Argument(metavar=REFERENCE, help="A run's Alice and Bob, primitives, or a policy of a task."),
+    ],
+    out: Annotated[
+        str, typer.Option(metavar="NAME", help="Of the data set, such as panda-cube; -v0 is added where no -vN is.")
+    ],
+    episodes: Annotated[int, typer.Option(help="Bob's episodes, or rounds of self-play.", min=1)] = 100,
+    goals: GoalsOption = None,
+    seed: Annotated[int, typer.Option(help="Of the episodes.", min=0)] = 0,
+    video: Annotated[
+        Path | None, typer.Option(metavar="FILE", help=f"Film of the first {_MAX_FILMED}, too: .mp4 or .gif.")
+    ] = None,
+    registry: SourceOption = SOURCE,
+    quiet: QuietOption = False,
+) -> None:
+    """Write Bob's episodes, or of a run without --goals its self-play, as a Minari data set."""
+    with loading():
+        from service.config.self_play import SelfPlayConfig
+        from service.media import recording
+        from service.media.dataset import check_name, played_episodes, played_turns, write_dataset
+        from service.media.video import write_episode_video, write_video
+        from service.registry.loading import load
+
+        name = check_name(out)  # now, not after hours of playing
+        options = film_options(SIZE, CAMERA, SPEED, video) if video is not None else None
+        trained = load(players, registry).expect("primitives", "orchestrator", by="tandem dataset")
+    config = trained.config.model_copy(update={"world": trained.world})
+    if trained.alice is not None and isinstance(config, SelfPlayConfig) and goals is None:
+        rounds = recording.play_rounds(config, trained.alice, trained.policy, num_rounds=episodes, seed=seed)
+        played = played_turns(rounds)
+        if video is not None:
+            write_video(rounds[:_MAX_FILMED], config.world, video, options)
+    else:
+        asked = parse_goals(goals or ("mixed" if trained.task is None else trained.goals), config.world)
+        points = None if isinstance(asked, str) else asked
+        if points is not None:
+            points = points[[index % len(points) for index in range(episodes)]]
+        recorded = recording.record_episodes(
+            trained.policy,
+            config.world,
+            asked if isinstance(asked, str) else "mixed",
+            num_episodes=episodes,
+            num_steps=trained.num_steps,
+            success_distance_m=trained.success_distance_m,
+            seed=seed,
+            goal=points,
+        )
+        played = played_episodes(recorded)
+        if video is not None:
+            write_episode_video(recorded.first(_MAX_FILMED), config.world, video, options)
+    place = write_dataset(name, played, config, trained.label)
+    typer.echo(f"{len(played)} episodes, {sum(len(each.actions) for each in played):,} steps: {name} in {place}")
+    if video is not None:
+        typer.echo(f"video: {video}")

@@ -5,7 +5,6 @@ from __future__ import annotations
 import logging
 import os
 import sys
-import threading
 from typing import Annotated
 
 import typer
@@ -13,25 +12,19 @@ import typer
 from service.base.version import __version__
 from service.cli.common import CommandGroup, QuietOption, quieten
 from service.cli.configs import configs_app, methods, tasks
-from service.cli.dataset import dataset
 from service.cli.evaluate import coverage, evaluate, render
-from service.cli.export import export
-from service.cli.moved import downstream
-from service.cli.play import play
-from service.cli.publish import publish
-from service.cli.registry import registry_app
+from service.cli.export import dataset, export
+from service.cli.registry import publish, registry_app
 from service.cli.robot import robot_app
-from service.cli.serve import serve
+from service.cli.serve import play, serve
 from service.cli.train import TrainCommand, demo, train
-from service.cli.unexpected import report_thread_error
+from service.runs.signals import stop_with_parent
 
 app = typer.Typer(name="tandem", help="Robot skills, pre-trained.", cls=CommandGroup, no_args_is_help=True)
 app.command(cls=TrainCommand)(train)
 app.command("pretrain", cls=TrainCommand, help="The same as tandem train, by its name for self-play.")(train)
 for command in (demo, evaluate, coverage, render, play, dataset, export, publish, serve, methods, tasks):
     app.command()(command)
-_anything = {"ignore_unknown_options": True, "help_option_names": []}
-app.command(hidden=True, context_settings=_anything)(downstream)
 app.add_typer(registry_app)
 app.add_typer(robot_app)
 app.add_typer(configs_app)
@@ -60,20 +53,19 @@ class _Log(logging.Handler):
     def emit(self, record: logging.LogRecord) -> None:
         """Write a line."""
         try:
-            sys.stderr.write(f"{self.format(record)}\n")
-            sys.stderr.flush()
+            print(self.format(record), file=sys.stderr, flush=True)
         except Exception:
             self.handleError(record)
 
 
 def main() -> None:
     """Entry point of ``tandem`` and ``python -m service``."""
+    stop_with_parent()
     # NumPy's and torch's own threads only get in each other's way: worlds are stepped by MuJoCo's threads. Both read
     # these variables when they are first imported, which is after this line.
     for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
         os.environ.setdefault(name, "1")
     logging.basicConfig(level=logging.INFO, format="%(message)s", handlers=[_Log()])
-    threading.excepthook = report_thread_error
     for name in ("OpenGL", "torch"):  # they say at INFO what they do without, and what their caches held
         logging.getLogger(name).setLevel(logging.WARNING)
     app()

@@ -1,4 +1,4 @@
-"""``tandem registry``: list, show, verify, alias, export, card."""
+"""``tandem registry``: list, show, verify, alias, export, card; and ``tandem publish``, which fills it by hand."""
 
 from __future__ import annotations
 
@@ -9,7 +9,19 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from service.base.errors import one_line
-from service.cli.common import REGISTRY, CommandGroup, JsonOption, RegistryOption, print_json, print_table
+from service.cli.common import (
+    REGISTRY,
+    SOURCE,
+    ActsWithOption,
+    CommandGroup,
+    JsonOption,
+    QuietOption,
+    RegistryOption,
+    SourceOption,
+    loading,
+    print_json,
+    print_table,
+)
 
 if TYPE_CHECKING:
     from service.registry.manifest import Manifest
@@ -25,6 +37,28 @@ _Reference = Annotated[
         help="NAME, NAME@VERSION or NAME@ALIAS; NAME is NAME@latest. Or the directory of an exported version."
     ),
 ]
+
+
+def publish(
+    run: Annotated[Path, typer.Argument(metavar="RUN", help="Directory of a run that no process is running.")],
+    name: Annotated[str | None, typer.Option(help="Of what is published. Default: that of the run.")] = None,
+    alias: Annotated[str | None, typer.Option(help="Make or move this alias, too.")] = None,
+    primitives: ActsWithOption = None,
+    registry: SourceOption = SOURCE,
+    quiet: QuietOption = False,
+) -> None:
+    """Measure what a run has learned until now, and publish it: primitives, skills or a policy of a task."""
+    with loading():
+        from service.registry.names import check_alias
+        from service.registry.registry import Registry
+        from service.runs.train import publish_learned
+
+    if alias is not None:
+        check_alias(alias)
+    version = publish_learned(run, registry, name, primitives)
+    if alias is not None:
+        Registry(Path(registry)).set_alias(version.name, alias, version.number)
+    typer.echo(f"{version} is in {registry}")
 
 
 @registry_app.command("list")

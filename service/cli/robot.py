@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from service.base.errors import TandemError
-from service.cli.common import CHAMPION, EXIT_SIGNAL, REFERENCE, SOURCE, CommandGroup, SourceOption, print_json
+from service.cli.common import CHAMPION, REFERENCE, SOURCE, CommandGroup, SourceOption, print_json
 
 if TYPE_CHECKING:
     from service.base.types import StateArray
@@ -55,12 +55,13 @@ def run(
     registry: SourceOption = SOURCE,
 ) -> None:
     """Bring the object to goals; Ctrl-C stops the robot first."""
+    from service.robot.backends import read_backend
     from service.robot.calibrate import read_calibration
     from service.robot.log import RobotLog
     from service.robot.loop import Bridge
     from service.robot.running import parse_goal, play
 
-    config, described, player = _bridge_config(overrides), _backend_config(robot), _load(policy, registry)
+    config, described, player = _bridge_config(overrides), read_backend(robot), _load(policy, registry)
     goal_m = None if goal is None else parse_goal(goal, player.world)
     gain = (1.0, 1.0, 1.0)
     if calibration is not None:
@@ -112,8 +113,9 @@ def calibrate(
 ) -> None:
     """Measure the response of an arm by motions of some 6 cm about the middle of its safety box, without an object."""
     from service.robot import calibrate as measuring
+    from service.robot.backends import read_backend
 
-    config, described, player = _bridge_config(overrides), _backend_config(robot), _load(policy, registry)
+    config, described, player = _bridge_config(overrides), read_backend(robot), _load(policy, registry)
     with _connected(described, player, 0, dead_man) as (backend, held, wait):
         wait("take everything out of the arm's way")
         found = measuring.calibrate(described.label, backend.robot, player.world, config, held=held)
@@ -161,12 +163,6 @@ def _load(policy: str, registry: str) -> Trained:
     return for_robot(load(policy, registry))
 
 
-def _backend_config(reference: str) -> BackendConfig:
-    from service.robot.backends import read_backend
-
-    return read_backend(reference)
-
-
 @contextlib.contextmanager
 def _connected(
     described: BackendConfig, player: Trained, seed: int, dead_man: str | None, dry_run: bool = False
@@ -178,29 +174,25 @@ def _connected(
     from service.robot.backends import connect
     from service.robot.safety import always_held
     from service.robot.watchdogs import HeldKey
-    from service.runs.signals import InterruptError, StopSignals
+    from service.runs.signals import StopSignals
 
     if dead_man not in (None, "key", "none"):
         raise TandemError(f"--dead-man {dead_man!r}: choose key or none")
-    try:
-        with StopSignals(), contextlib.ExitStack() as stack:
-            backend = stack.enter_context(contextlib.closing(connect(described, player.world, seed=seed)))
-            harmless = backend.simulator is not None or dry_run
-            needed = dead_man == "key" or (dead_man is None and not harmless)
-            key = stack.enter_context(HeldKey()) if needed else None
+    with StopSignals(), contextlib.ExitStack() as stack:
+        backend = stack.enter_context(contextlib.closing(connect(described, player.world, seed=seed)))
+        harmless = backend.simulator is not None or dry_run
+        needed = dead_man == "key" or (dead_man is None and not harmless)
+        key = stack.enter_context(HeldKey()) if needed else None
 
-            def wait(what: str) -> None:
-                if key is not None:
-                    typer.echo(f"{what}, then hold any key; letting go stops the robot", err=True)
-                    key.wait()
-                elif not harmless:
-                    typer.echo(f"{what}, then press Enter", err=True)
-                    sys.stdin.readline()
+        def wait(what: str) -> None:
+            if key is not None:
+                typer.echo(f"{what}, then hold any key; letting go stops the robot", err=True)
+                key.wait()
+            elif not harmless:
+                typer.echo(f"{what}, then press Enter", err=True)
+                sys.stdin.readline()
 
-            yield backend, key or always_held, wait
-    except InterruptError as interrupt:
-        typer.echo("stopped", err=True)
-        raise typer.Exit(EXIT_SIGNAL + interrupt.number) from None
+        yield backend, key or always_held, wait
 
 
 def _header(

@@ -1,8 +1,9 @@
-"""``tandem serve``."""
+"""``tandem serve`` and ``tandem play``: runs, the registry and a live world in the browser."""
 
 from __future__ import annotations
 
 import logging
+import socket
 from contextlib import suppress
 from pathlib import Path
 from typing import Annotated, Any
@@ -10,7 +11,18 @@ from typing import Annotated, Any
 import typer
 
 from service.base.extras import needs_extra
-from service.cli.common import REGISTRY, QuietOption, RegistryOption
+from service.cli.common import (
+    REGISTRY,
+    SOURCE,
+    ActsWithOption,
+    QuietOption,
+    ReferenceArgument,
+    RegistryOption,
+    SourceOption,
+    TaskOption,
+    loading,
+    what_is_meant,
+)
 
 
 def serve(
@@ -50,3 +62,36 @@ def serve(
     if token is None:
         typer.echo(f"read-only, for this machine: with {VARIABLE} set, runs can be stopped and aliases moved")
     server.run()
+
+
+def play(
+    reference: ReferenceArgument = None,
+    task: TaskOption = None,
+    host: Annotated[
+        str, typer.Option(help="Where to listen; on others than this machine's, all who reach it play along.")
+    ] = "127.0.0.1",
+    port: Annotated[int | None, typer.Option(help="Default: 8322, or the next that is free.", min=0, max=65535)] = None,
+    seed: Annotated[int, typer.Option(help="Of starts and goals.", min=0)] = 0,
+    primitives: ActsWithOption = None,
+    registry: SourceOption = SOURCE,
+    quiet: QuietOption = False,
+) -> None:
+    """Watch a live world in the browser: drag the goal, drive the primitives, see a run's Alice propose."""
+    reference, primitives = what_is_meant(reference, primitives)
+    with loading():
+        from service.registry.loading import load
+        from service.robot.play.server import LiveWorld
+        from service.runs.signals import StopSignals
+
+        players = load(reference, registry, primitives).expect_goals("tandem play").on(task)
+    with StopSignals() as signals:
+        with loading():
+            world = LiveWorld(players, host, port, seed)
+        with world as live, signals.asking(lambda: None):
+            typer.echo(f"{players.title}: {live.url}")
+            typer.echo(
+                f"from another machine: ssh -L {live.port}:127.0.0.1:{live.port} {socket.gethostname()}, "
+                f"then http://127.0.0.1:{live.port} there; Ctrl-C ends"
+            )
+            live.run(lambda: signals.first is not None)
+    typer.echo("stopped")

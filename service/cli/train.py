@@ -5,20 +5,17 @@ from __future__ import annotations
 import re
 import shlex
 from collections.abc import Sequence
-from contextlib import AbstractContextManager, closing, nullcontext
-from functools import partial
-from importlib.util import find_spec
+from contextlib import ExitStack, closing
 from itertools import count
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, NoReturn
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from typer.core import TyperCommand
 
-from service.base.errors import TandemError, did_you_mean
+from service.base.errors import TandemError
 from service.cli.common import (
     CHAMPION,
-    EXIT_SIGNAL,
     REFERENCE,
     SOURCE,
     QuietOption,
@@ -26,35 +23,30 @@ from service.cli.common import (
     TrackerOption,
     choose,
     how_to_go_on,
-    load_start,
     loading,
     shown,
-    task_names,
+    stopped,
+    traceback_in,
     was_typed,
 )
-from service.cli.configs import config_names
+from service.cli.configs import named, targets
 from service.cli.evaluate import evaluate
 from service.cli.study import is_study, train_study
-from service.cli.unexpected import traceback_in
-from service.config.recipes import DEFAULT_RECIPE, find_file, recipes
+from service.config.recipes import DEFAULT_RECIPE, recipes
 from service.runs.trackers import Trackers, find_factory
 
 if TYPE_CHECKING:
     from service.cluster.ray_connection import ClusterOptions
     from service.config import Config
     from service.registry.loading import Trained
-    from service.runs.train import Finished, Runtime
+    from service.runs.train import Finished
     from service.store.run_directory import RunDirectory
 
 AUTO, EXACTLY = "auto", "exactly"
 """Values of ``--resume``; the second where it is typed alone."""
-_CLUSTER_ONLY = ("address", "num_actors", "actor_threads", "learner_cpus", "status", "token_file")
+_OF_RAY, _OF_A_RUN_ON_RAY = ("address", "status", "token_file"), ("num_actors", "actor_threads", "learner_cpus")
 """Options that mean nothing in one process."""
-
-
-def _targets() -> list[str]:
-    """What the shell completes."""
-    return [*recipes(), *task_names()]
+_WHERE = {"table": "on the table", "air": "in the air"}
 
 
 class TrainCommand(TyperCommand):
@@ -74,13 +66,13 @@ def train(
         str | None,
         typer.Argument(
             metavar="RECIPE|TASK|FILE|all",
-            autocompletion=_targets,
+            autocompletion=targets,
             help="A name of tandem configs, a task such as push, or a YAML file; what that leaves out has its default. "
             f"Without: {DEFAULT_RECIPE}, or what a resumed run has. Several, such as push,wall, or all: a study.",
         ),
     ] = None,
     config: Annotated[
-        str | None, typer.Option(metavar="NAME|FILE", autocompletion=config_names, help="The same as an option.")
+        str | None, typer.Option(metavar="NAME|FILE", autocompletion=targets, help="The same as an option.")
     ] = None,
     method: Annotated[
         str | None,
@@ -158,8 +150,8 @@ def train(
 ) -> None:
     """Train what a recipe, a task or a file says, in this process or on a Ray cluster, and publish it."""
     from service.config import load_config
+    from service.registry.loading import load
     from service.runs.resuming import resumed_config
-    from service.runs.train import prepare
     from service.store.models import RUN_ID
     from service.store.run_directory import RunDirectory
 
@@ -172,117 +164,62 @@ def train(
 
     if what is not None and config is not None:
         raise TandemError(f"{what} and --config {config}: name one of them")
-    what, trackers = what or config, tracker or []
+    what, trackers, grid, overrides = what or config, tracker or [], grid or [], overrides or []
     for each in trackers:
         find_factory(each)  # now, not after Ray has started
-    _check_used(context, choose("--runtime", runtime, ("local", "ray")), status)
+    choose("--runtime", runtime, ("local", "ray"))
     again = resume is not None and choose("--resume", resume, (AUTO, EXACTLY)) == EXACTLY
-    if start_from is not None and again:
-        raise TandemError("--from is for a run that begins, and --resume goes on with one: leave out one of them")
     if run_id is not None:
-        if resume is not None or run_dir is not None:
-            raise TandemError("--run-id names the run directory, and continues what is there: leave out the other two")
         if re.fullmatch(RUN_ID, run_id) is None:
             raise TandemError(
                 f"--run-id {run_id!r}: use 1 to 128 letters, digits, '.', '_' and '-', the first a letter or digit; "
                 "for another place there is --run-dir"
             )
         run_dir, resume = runs / run_id, AUTO
-    if is_study(run_dir, seeds, grid or (), what, method):
-        if accept_damaged_records:
-            raise TandemError("--accept-damaged-records is for one run of a study: resume that one by its --run-dir")
-        for name in ("num_actors", "actor_threads", "learner_cpus"):
-            if was_typed(context, name):
-                raise TandemError(
-                    f"--{name.replace('_', '-')} is for one run: each run of a study on Ray is a task, whose cores "
-                    "--set run.num_threads=N says"
-                )
+    study = is_study(run_dir, seeds, grid, what, method)
+    for is_so, names, why in (
+        (runtime == "local", (*_OF_A_RUN_ON_RAY, *_OF_RAY), "is for a run on Ray: give --runtime ray, or leave it out"),
+        (study, _OF_A_RUN_ON_RAY, "is for one run: --set run.num_threads=N says the cores of each run of a study"),
+        (study, ["accept_damaged_records"], "is for one run of a study: resume that one by its --run-dir"),
+        (not study, ["parallel"], "is for the runs of a study: give --seeds or --grid, too, or leave it out"),
+        (status == "off", ["token_file"], "is for the service that --status off leaves out: drop one of them"),
+        (was_typed(context, "run_dir"), ["runs"], "is where --run-dir would be: drop one of them"),
+        (run_id is not None, ["resume", "run_dir"], "is what --run-id says already: leave it out"),
+        (again, ["from"], "is for a run that begins, and --resume goes on with one: leave out one of them"),
+    ):
+        for name in names:
+            if is_so and was_typed(context, name):
+                raise TandemError(f"--{name.replace('_', '-')} {why}")
+    if again and run_dir is None:
+        raise TandemError("--resume needs --run-dir, the directory of what is to be continued")
+    if study:
         train_study(
-            run_dir, what, method, seeds, grid or (),
-            name_one=partial(_named, primitives=primitives), overrides=overrides or [], runs=runs, source=source,
-            resume=None if resume == AUTO else again, publish=publish, parallel=parallel,
-            cluster=cluster_options if runtime == "ray" else None, address=address, trackers=trackers,
-            start_from=start_from,
+            run_dir, what, method, primitives, seeds, grid,
+            overrides=overrides, runs=runs, source=source, resume=None if resume == AUTO else again,
+            publish=publish, parallel=parallel, cluster=cluster_options if runtime == "ray" else None, address=address,
+            trackers=trackers, start_from=start_from,
         )  # fmt: skip
         return
-    named, first = _named(what, method, primitives)
-    overrides = [*first, *(overrides or [])]
-    if parallel is not None:
-        raise TandemError("--parallel is for the runs of a study: give --seeds or --grid, too, or leave it out")
-    if again and run_dir is None:
-        raise TandemError("--resume needs --run-dir, the directory of the run to continue")
-    begun = named if named is not None or first else recipes()[DEFAULT_RECIPE]
+    file, first = named(what, method, primitives)
+    overrides = [*first, *overrides]
+    begun = file if file is not None or first else recipes()[DEFAULT_RECIPE]
     run_dir = run_dir or runs / load_config(begun, overrides).directory_name
+    directory = RunDirectory(run_dir, accept_damaged_records=accept_damaged_records)
     if resume == AUTO:
-        again = RunDirectory(run_dir).exists
+        again = directory.exists
     start = None
     if again:
-        resolved = resumed_config(RunDirectory(run_dir), overrides, named)
+        resolved = resumed_config(directory, overrides, file)
     else:
-        start = load_start(start_from, source) if start_from is not None else None
         with loading():
+            start = load(start_from, source).expect("primitives", by="--from") if start_from is not None else None
             resolved = load_config(begun, overrides).begin(source, start)
     if publish is None:
         publish = resolved.makes != "orchestrator"
-    directory = RunDirectory(run_dir, accept_damaged_records=accept_damaged_records)
-    if runtime == "local":
-        _train(resolved, directory, source, resume=again, publish=publish, start=start, trackers=trackers)
-        return
-    from service.cluster.ray_connection import connected
-    from service.cluster.ray_runtime import RayRuntime
-
-    cluster = RayRuntime(cluster_options())
-    with closing(directory), traceback_in(run_dir):
-        prepare(resolved, directory, source, resume=again, publish=publish, runtime=cluster)
-        _train(
-            resolved, directory, source, resume=again, publish=publish, start=start, trackers=trackers,
-            runtime=cluster, address=address, connection=connected(address),
-        )  # fmt: skip
-
-
-def _check_used(context: typer.Context, runtime: str, status: str | None) -> None:
-    """Refuse options that were typed and would do nothing."""
-    if runtime == "local":
-        for name in _CLUSTER_ONLY:
-            if was_typed(context, name):
-                raise TandemError(
-                    f"--{name.replace('_', '-')} is for a run on Ray: give --runtime ray, or leave it out"
-                )
-    if status == "off" and was_typed(context, "token_file"):
-        raise TandemError("--token-file is for the status service, and --status off leaves that out: drop one of them")
-    if was_typed(context, "runs") and was_typed(context, "run_dir"):
-        raise TandemError("--run-dir names the run's directory, and --runs the one it would be in: drop one of them")
-
-
-def _named(what: str | None, method: str | None, primitives: str | None) -> tuple[Path | None, list[str]]:
-    """The file of a recipe or configuration, if any, and the overrides that a task or method stands for.
-
-    Raises:
-        TandemError: no such recipe, task or file; or options that mean nothing there.
-    """
-    from service.config.find import METHODS
-    from service.methods.task_methods import METHODS as OF_TASKS
-
-    known = _targets()
-    if what in task_names():
-        if method in OF_TASKS and method not in METHODS:
-            raise TandemError(f"{method} learns nothing: measure it by tandem evaluate --task {what} --method {method}")
-        chosen = [f"task={what}", f"method={method or 'ours'}"]
-        return None, chosen + [f"primitives={primitives}"] * (primitives is not None)
-    if primitives is not None:
-        raise TandemError("--primitives is for learning a task: name one, such as push; a run begins from --from")
-    if what is None:
-        recipe = recipes().get(f"{DEFAULT_RECIPE}-{method}")
-        if recipe is None and method in OF_TASKS:
-            raise TandemError(f"--method {method} is for a task: name one, such as tandem train push")
-        return recipe, [f"method={method}"] if method is not None and recipe is None else []
-    if what not in known and not Path(what).suffix and not Path(what).exists():
-        raise TandemError(
-            f"{what!r}: no recipe, task or file of that name; there are {', '.join(known)}{did_you_mean(what, known)}"
-        )
-    if method is not None:
-        raise TandemError(f"{what} says its method itself: leave out --method, or change it by --set method={method}")
-    return find_file(what, recipes()), []
+    _train(
+        resolved, directory, source, resume=again, publish=publish, start=start, trackers=trackers,
+        cluster=cluster_options() if runtime == "ray" else None, address=address,
+    )  # fmt: skip
 
 
 def demo(
@@ -309,29 +246,21 @@ def demo(
     overrides = [f"run.total_env_steps={env_steps}", "name=panda-cube-demo", "run.evaluation_interval=25"]
     config = load_config(recipes()[DEFAULT_RECIPE], overrides)
     done = _train(config, RunDirectory(path), path / "registry", resume=False)
-    typer.echo(f"\n{_in_words(done)}")
-    typer.echo(f"\nThat was a beginning. Primitives that have learned for longer come with tandem; {CHAMPION}:")
-    evaluate(CHAMPION, registry=str(BUNDLED))  # prints what the first of the next commands prints
-    typer.echo("\nLook at them, or at the run on its page, in a browser:")
-    typer.echo(f"  tandem evaluate {CHAMPION} --goals mixed --episodes 300")
-    typer.echo(f"  tandem render   {CHAMPION} --out champion.mp4")
-    typer.echo(f"  tandem coverage {CHAMPION} --out champion.png")
-    typer.echo(f"  tandem play     {CHAMPION}")
-    typer.echo(f"  {shlex.join(['tandem', 'serve', '--runs', str(path.parent)])}")
-    missing = [extra for extra, package in (("play", "viser"), ("serve", "fastapi")) if find_spec(package) is None]
-    if missing:
-        typer.echo(f"tandem {' and '.join(missing)} need: pip install 'tandem-skills[{','.join(missing)}]'")
-
-
-def _in_words(done: Finished) -> str:
-    """What a short run has come to."""
     rates = {where: done.metrics.get(f"evaluation/{name}_success_last") for name, where in _WHERE.items()}
     told = [f"{rate:.0%} of random goals {where}" for where, rate in rates.items() if rate is not None]
-    said = f"Bob has practised for {done.result.num_env_steps:,} steps"
-    return f"{said}, and now reaches {' and '.join(told)}." if told else f"{said}."
-
-
-_WHERE = {"table": "on the table", "air": "in the air"}
+    reaches = f", and now reaches {' and '.join(told)}" if told else ""
+    typer.echo(f"\nBob has practised for {done.result.num_env_steps:,} steps{reaches}.")
+    typer.echo(f"\nThat was a beginning. Primitives that have learned for longer come with tandem; {CHAMPION}:")
+    evaluate(CHAMPION, registry=str(BUNDLED))  # prints what the first of the next commands prints
+    commands = [
+        f"evaluate {CHAMPION} --goals mixed --episodes 300",
+        f"render   {CHAMPION} --out champion.mp4",
+        f"coverage {CHAMPION} --out champion.png",
+        f"play     {CHAMPION}",
+        shlex.join(["serve", "--runs", str(path.parent)]),
+    ]
+    typer.echo("\nLook at them, or at the run on its page, in a browser:")
+    typer.echo("\n".join(f"  tandem {command}" for command in commands))
 
 
 def _train(
@@ -341,38 +270,39 @@ def _train(
     *,
     resume: bool,
     publish: bool = True,
-    runtime: Runtime | None = None,
-    address: str | None = None,
     start: Trained | None = None,
     trackers: Sequence[str] = (),
-    connection: AbstractContextManager[None] | None = None,
+    cluster: ClusterOptions | None = None,
+    address: str | None = None,
 ) -> Finished:
+    """Train, show how far that is, and say what came out, or how to go on."""
     with loading():
-        from service.runs.train import train as run
+        from service.runs import train as training
     from service.runs.progress import Progress
     from service.runs.signals import InterruptError
     from service.store.disk_reader import run_id_of
 
-    def say_stopped(what: str, number: int) -> NoReturn:
-        """Say how to go on, and exit as a process that a signal ends."""
-        name = "local" if runtime is None else runtime.name
-        how = how_to_go_on(directory.path, registry, runtime=name, address=address)
-        typer.echo(f"{what}; {how if directory.exists else 'nothing was saved yet'}")
-        raise typer.Exit(EXIT_SIGNAL + number)
-
+    runtime = training.Runtime()
+    where = "local" if cluster is None else "ray"
+    hint = how_to_go_on(directory.path, registry, runtime=where, address=address)
     try:
-        with (
-            connection or nullcontext(),
-            traceback_in(directory.path),
-            Trackers(trackers, run_id_of(directory.path), config.model_dump(mode="json")) as tracked,
-            Progress(config.run.total_env_steps, shown()) as progress,
-        ):
+        with traceback_in(directory.path), closing(directory), ExitStack() as stack:
+            if cluster is not None:
+                from service.cluster.ray_connection import connected
+                from service.cluster.ray_runtime import RayRuntime
+
+                runtime = RayRuntime(cluster)
+                training.prepare(config, directory, registry, resume=resume, publish=publish, runtime=runtime)
+                stack.enter_context(connected(address))
+            tree = config.model_dump(mode="json")
+            tracked = stack.enter_context(closing(Trackers(trackers, run_id_of(directory.path), tree)))
+            progress = stack.enter_context(closing(Progress(shown())))
 
             def tell(metrics: dict[str, float]) -> None:
-                progress.show(metrics)
+                progress.show(metrics, config.run.total_env_steps)
                 tracked.log(metrics)
 
-            done = run(
+            done = training.train(
                 config, directory, registry,
                 resume=resume, publish=publish, on_iteration=tell, runtime=runtime, start=start,
             )  # fmt: skip
@@ -380,19 +310,18 @@ def _train(
                 final = {name.replace("evaluation/", "final/", 1): value for name, value in done.metrics.items()}
                 tracked.log({"env_steps": done.result.num_env_steps, **final})
     except InterruptError as interrupt:
-        say_stopped("stopped at once", interrupt.number)
+        raise stopped("stopped at once", interrupt.number, hint, begun=directory.exists) from None
     result = done.result
     typer.echo(f"\n{result.reason} after {result.num_env_steps:,} env steps, {result.iteration} iterations")
     typer.echo(done.timing)
     if done.signal is not None:
         rest = "" if result.reason == "interrupted" else ", but not evaluated, published and drawn to the end"
-        say_stopped(f"saved{rest}", done.signal)
+        raise stopped(f"saved{rest}", done.signal, hint)
     for name, value in done.metrics.items():
         is_share = "success" in name or name == "coverage"
         typer.echo(f"{name:<36} {value:.1%}" if is_share else f"{name:<36} {value:g}")
-    for name, file in done.files.items():
+    for name, file in [*done.files.items(), ("checkpoint", directory.checkpoints)]:
         typer.echo(f"{name:<12} {file}")
-    typer.echo(f"{'checkpoint':<12} {directory.checkpoints}")
     if done.version is not None:
         typer.echo(f"{config.makes:<12} {done.version} in {registry}")
     return done

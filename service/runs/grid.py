@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping, Sequence
 from itertools import product
+from math import prod
 
 import yaml
 
@@ -16,8 +17,6 @@ MAX_NAME = 100
 SEED = "seed"
 PLAIN = ("task", "method", "recipe")
 """Settings whose values say what they are, so that their names are left out of a run's."""
-Grid = Mapping[str, Sequence[str]]
-"""Values by key, as they are typed."""
 Settings = dict[str, str]
 """The value of each key in one run."""
 
@@ -31,16 +30,12 @@ def parse_seeds(text: str) -> tuple[int, ...]:
     seeds: list[int] = []
     for part in text.split(","):
         match = re.fullmatch(r"([0-9]{1,9})(?:-([0-9]{1,9}))?", part.strip())
-        if match is None:
+        first, last = (int(match[1]), int(match[2] or match[1])) if match is not None else (0, -1)
+        if last < first or len(seeds) + last - first >= MAX_RUNS:
             raise ConfigError(
-                f"--seeds {text!r}: {part.strip()!r} is not a whole number from 0 on or a range; "
-                "write for example 0,1,2 or 0-4"
+                f"--seeds {text!r}: write whole numbers from 0 on and ranges, for example 0,1,2 or 0-4, of at most "
+                f"{MAX_RUNS} seeds; {part.strip()!r} is none of them"
             )
-        first, last = int(match[1]), int(match[2] or match[1])
-        if last < first:
-            raise ConfigError(f"--seeds {text!r}: the range {part.strip()} goes down; write {last}-{first}")
-        if len(seeds) + last - first >= MAX_RUNS:
-            raise ConfigError(f"--seeds {text!r}: more than {MAX_RUNS} seeds; give fewer")
         seeds.extend(range(first, last + 1))
     check_once(f"--seeds {text!r}", list(map(str, seeds)))
     return tuple(seeds)
@@ -83,7 +78,7 @@ def check_once(option: str, values: Sequence[str]) -> None:
         raise ConfigError(f"{option}: {', '.join(twice[:10])} given twice; name each once")
 
 
-def name_runs(grid: Grid) -> dict[str, Settings]:
+def name_runs(grid: Mapping[str, Sequence[str]]) -> dict[str, Settings]:
     """The settings of each run by its name, such as ``push-ours-seed-0``; empty for an empty grid.
 
     Raises:
@@ -91,9 +86,7 @@ def name_runs(grid: Grid) -> dict[str, Settings]:
     """
     short = [key.rpartition(".")[2] for key in grid]
     labels = [name if short.count(name) == 1 else key for key, name in zip(grid, short, strict=True)]
-    num_runs, runs = 1, dict[str, Settings]()
-    for values in grid.values():
-        num_runs *= len(values)
+    num_runs, runs = prod(map(len, grid.values())), dict[str, Settings]()
     if num_runs > MAX_RUNS:
         raise ConfigError(f"{num_runs} runs: a study has at most {MAX_RUNS}; give fewer values")
     for values in product(*grid.values()) if grid else ():

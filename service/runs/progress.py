@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from math import inf
-from types import TracebackType
-from typing import Self
 
 from service.base.progress import Display, Task, line
 
@@ -27,24 +25,19 @@ _SMOOTHING = 0.8
 
 
 class Progress:
-    """Shows every iteration's metrics of a run, or of several side by side; a context manager. The last lines stay.
+    """Shows every iteration's metrics of a run, or of several side by side, until ``close``. The last lines stay.
 
     Args:
-        total_env_steps: of each run.
         display: where they are shown.
     """
 
-    def __init__(self, total_env_steps: int, display: Display) -> None:
-        self._total, self._display = total_env_steps, display
+    def __init__(self, display: Display) -> None:
+        self._display = display
         self._runs: dict[str, tuple[Task, dict[str, float]]] = {}
         """Bars and rates by title."""
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def close(self) -> None:
+        """End the bars."""
         for task, _ in self._runs.values():
             self._end(task)
 
@@ -52,12 +45,12 @@ class Progress:
         """Print a plain line."""
         self._display.say(text)
 
-    def show(self, metrics: Mapping[str, float | None], title: str = "learning", total: int | None = None) -> None:
-        """Take in one iteration of the run with this title, of so many env steps where runs differ in that.
+    def show(self, metrics: Mapping[str, float | None], total: int, title: str = "learning") -> None:
+        """Take in one iteration of the run with this title, which has so many env steps in all.
 
         Rates are smoothed over about five iterations; evaluations are shown as they are.
         """
-        env_steps, total = int(metrics["env_steps"] or 0), total or self._total
+        env_steps = int(metrics["env_steps"] or 0)
         if title not in self._runs:
             self._runs[title] = Task(title, total, "env steps"), {}
             self._display.begin(self._runs[title][0])

@@ -20,6 +20,13 @@ from service.store.run_writer import GOALS_INTERVAL_S, RunWriter
 
 BEAT_S = 2.0
 """Time between two heartbeats of what follows learning."""
+_MEASURED = {
+    "success": "last",
+    "success_low": "last_low",
+    "success_high": "last_high",
+    "success_ever": "ever",
+}
+"""Results of a task in its status, by the ends of their metrics' names."""
 
 
 class Report:
@@ -53,7 +60,16 @@ class Report:
         self._totals = previous.totals.model_dump() if previous is not None else {}
         self._counted: dict[str, int] = {}
         self._gridded_s = float("-inf")
-        now = datetime.now(UTC)
+        now, trial = datetime.now(UTC), None
+        if isinstance(config, TaskConfig):
+            digest = config.primitives_digest
+            trial = Trial(
+                task=config.task,
+                method=config.method,
+                seed=config.seed,
+                primitives=config.primitives if digest is not None else None,
+                primitives_digest=digest,
+            )
         self._status = RunStatus(
             run_id=run_id,
             name=config.name,
@@ -63,7 +79,7 @@ class Report:
             heartbeat=now,
             epoch=epoch,
             total_env_steps=config.run.total_env_steps,
-            trial=_trial_of(config),
+            trial=trial,
             published=published,
             totals=previous.totals if previous is not None else RunTotals(),
         )
@@ -84,14 +100,6 @@ class Report:
                 self.end("interrupted", error=f"ended at once by {error}" if str(error) else None)
         finally:
             self._writer.close()
-
-    def check(self) -> None:
-        """Assert that this process is still the one that runs the run.
-
-        Raises:
-            RunTakenError: another one has taken it over.
-        """
-        self._writer.check()
 
     @contextmanager
     def beating(self) -> Iterator[None]:
@@ -123,7 +131,7 @@ class Report:
 
     def iteration(self, run: Run, metrics: Mapping[str, float]) -> None:
         """Tell an iteration's metrics, where the run is, and now and then what the generator knows; see ``beat``."""
-        self.check()
+        self._writer.check()
         self._writer.metrics(dict(metrics))
         if time.monotonic() - self._gridded_s >= GOALS_INTERVAL_S:
             self._gridded_s = time.monotonic()
@@ -139,24 +147,26 @@ class Report:
         self.beat(run)
 
     def beat(self, run: Run) -> None:
-        """Tell that the run is alive, how far it is, and how its parts are.
+        """Tell that the run is alive, how far it is, and how its parts are; stop it where that was asked for.
 
         Raises:
             RunTakenError: another process has taken it over.
         """
-        self.check()
-        health = run.method.health()
-        counters = self._counters(run)
+        self._writer.check()
+        health, counters = run.method.health(), self._counters(run)
         for name, value in counters.items():
             self._totals[name] = self._totals.get(name, 0) + max(0, value - self._counted.get(name, 0))
         self._counted = counters
+        stopping = self._writer.stop_requested()
+        if stopping:
+            run.request_stop()
         self._tell(
             totals=RunTotals(**self._totals),
             iteration=run.iteration,
             num_env_steps=run.num_env_steps,
             num_rollouts_counted=health.num_rollouts_counted,
             num_rollouts_refused=health.num_rollouts_refused,
-            stopping=self.stop_requested(),
+            stopping=stopping,
             actors=health.actors,
             last_error=health.last_error,
             warnings=health.warnings,
@@ -165,25 +175,10 @@ class Report:
     def measured(self, metrics: Mapping[str, float]) -> None:
         """Tell how well the run does in the end; of a task that is shown beside its name."""
         trial = self._status.trial
-        if trial is None:
-            return
-        found = {name: metrics.get(f"evaluation/{name}") for name in ("success_last", "success_ever")}
-        low, high = (metrics.get(f"evaluation/success_last_{end}") for end in ("low", "high"))
-        self._tell(
-            trial=trial.model_copy(
-                update={
-                    "success": found["success_last"],
-                    "success_low": low,
-                    "success_high": high,
-                    "success_ever": found["success_ever"],
-                    "num_episodes": int(metrics.get("evaluation/num_episodes", 0)) or None,
-                }
-            )
-        )
-
-    def stop_requested(self) -> bool:
-        """Whether the run was asked to stop."""
-        return self._writer.stop_requested()
+        if trial is not None:
+            found = {name: metrics.get(f"evaluation/success_{place}") for name, place in _MEASURED.items()}
+            num_episodes = int(metrics.get("evaluation/num_episodes", 0)) or None
+            self._tell(trial=trial.model_copy(update={**found, "num_episodes": num_episodes}))
 
     def end(self, state: RunState, *, published: str | None = None, error: str | None = None) -> None:
         """Say how the run ended."""
@@ -209,17 +204,3 @@ class Report:
         changes |= {"heartbeat": datetime.now(UTC), "condition": condition, "warnings": warnings}
         self._status = self._status.model_copy(update=changes)
         self._writer.status(self._status)
-
-
-def _trial_of(config: Config) -> Trial | None:
-    """What a run that learns a task is about; None for others."""
-    if not isinstance(config, TaskConfig):
-        return None
-    has = config.primitives_digest is not None
-    return Trial(
-        task=config.task,
-        method=config.method,
-        seed=config.seed,
-        primitives=config.primitives if has else None,
-        primitives_digest=config.primitives_digest,
-    )

@@ -3,73 +3,61 @@
 from __future__ import annotations
 
 import json
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from service.base.errors import CheckpointError, ConfigError
 from service.config import Config, load_config
 from service.config.tree import leaves
-from service.runs.study_file import SavedConfig
 from service.store.run_directory import RunDirectory
 
 
-def resumed_config(directory: RunDirectory | SavedConfig, overrides: list[str], file: Path | None = None) -> Config:
+def resumed_config(directory: RunDirectory | Path, overrides: list[str], file: Path | None = None) -> Config:
     """The configuration to resume a run with: the saved one, changed only where its class says it is ``resumable``.
 
     Args:
-        directory: of the run; or what a run of a study begins with.
+        directory: of the run; or the file with the configuration of a run of a study.
         overrides: ``run.a=b`` strings, or learning rates; others may only say what the run has.
-        file: YAML that, with ``overrides``, says the same as the saved one outside ``run``; what it says there comes
-            before ``overrides``.
+        file: YAML that, with ``overrides``, says the same as the saved one where that may not change; where it may,
+            what it says comes before ``overrides``.
 
     Raises:
         ConfigError: no run there, an override of anything else, or a file that says otherwise.
     """
-    saved = directory.read_config()
+    read = partial(load_config, directory) if isinstance(directory, Path) else directory.read_config
+    saved = read()
+
+    def as_saved(given: Config) -> Config:
+        return given.as_in(saved) if type(given) is type(saved) else given
+
+    def says(override: str) -> bool:
+        try:
+            return as_saved(read([override])) == saved
+        except ConfigError:
+            return False
+
     fixed = [override for override in overrides if not override.startswith(saved.resumable)]
     for override in fixed:
-        if not _says(saved, directory, override):
+        if not says(override):
+            may = " and ".join(key.rstrip("=") if key.endswith("=") else f"{key}*" for key in saved.resumable)
             raise ConfigError(
-                f"override {override!r}: a resumed run keeps its configuration; only {_resumable(saved)} may change, "
-                "for example run.total_env_steps"
+                f"override {override!r}: a resumed run keeps its configuration; only {may} may change, for example "
+                "run.total_env_steps"
             )
+    changing = [override for override in overrides if override not in fixed]
     if file is not None:
         given = load_config(file, fixed)
-        _check_same_outside_run(saved, _as_in(saved, given), file)
-        named = given.run.model_dump(mode="json", exclude_unset=True)
-        overrides = [f"run.{key}={json.dumps(value)}" for key, value in named.items()] + overrides
-    return directory.read_config([override for override in overrides if override not in fixed])
-
-
-def _resumable(config: Config) -> str:
-    return " and ".join(key.rstrip("=") if key.endswith("=") else f"{key}*" for key in config.resumable)
-
-
-def _says(saved: Config, directory: RunDirectory | SavedConfig, override: str) -> bool:
-    try:
-        return _as_in(saved, directory.read_config([override])) == saved
-    except ConfigError:
-        return False
-
-
-def _as_in(saved: Config, given: Config) -> Config:
-    return given.as_in(saved) if type(given) is type(saved) else given
-
-
-def _check_same_outside_run(saved: Config, given: Config, file: Path) -> None:
-    left, right = (dict(leaves(config.model_dump(mode="json", exclude={"run"}))) for config in (saved, given))
-    for key in sorted(left.keys() | right.keys()):
-        if left.get(key) != right.get(key):
-            raise ConfigError(
-                f"{file}: {key} = {right.get(key)!r}, but the run has {left.get(key)!r}; a resumed run keeps its "
-                "configuration: leave out --config, or start another run without --resume"
-            )
-
-
-def resumable_settings(config: Config) -> list[str]:
-    """All that may differ from what a run was begun with, as overrides."""
-    settings = leaves(config.model_dump(mode="json"))
-    return [f"{key}={json.dumps(value)}" for key, value in settings if f"{key}=".startswith(config.resumable)]
+        for key, (old, new) in _differences(_tree(saved), _tree(as_saved(given))).items():
+            if not f"{key}=".startswith(saved.resumable):
+                raise ConfigError(
+                    f"{file}: {key} = {new!r}, but the run has {old!r}; a resumed run keeps its configuration: leave "
+                    "out --config, or start another run without --resume"
+                )
+        named = leaves(given.model_dump(mode="json", exclude_unset=True))
+        settings = [f"{key}={json.dumps(value)}" for key, value in named]
+        changing = [setting for setting in settings if setting.startswith(saved.resumable)] + changing
+    return read(changing)
 
 
 def changed_settings(saved: dict[str, Any], config: Config, directory: Path) -> dict[str, tuple[Any, Any]]:
@@ -83,8 +71,7 @@ def changed_settings(saved: dict[str, Any], config: Config, directory: Path) -> 
     Raises:
         CheckpointError: a setting that may not change.
     """
-    was, now = dict(leaves(saved)), dict(leaves(config.model_dump(mode="json")))
-    changed = {key: (was.get(key), now.get(key)) for key in {**was, **now} if was.get(key) != now.get(key)}
+    changed = _differences(saved, _tree(config))
     for key, (old, new) in changed.items():
         if not f"{key}=".startswith(config.resumable):
             raise CheckpointError(
@@ -92,3 +79,13 @@ def changed_settings(saved: dict[str, Any], config: Config, directory: Path) -> 
                 "that back, or start another run without --resume"
             )
     return changed
+
+
+def _tree(config: Config) -> dict[str, Any]:
+    return config.model_dump(mode="json")
+
+
+def _differences(saved: dict[str, Any], given: dict[str, Any]) -> dict[str, tuple[Any, Any]]:
+    """By key the values in two configurations, where they differ; None where one has no such key."""
+    was, now = dict(leaves(saved)), dict(leaves(given))
+    return {key: (was.get(key), now.get(key)) for key in {**was, **now} if was.get(key) != now.get(key)}

@@ -7,21 +7,30 @@ the method alone, which also says whether an iteration has ended.
 from __future__ import annotations
 
 import logging
+import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
 
 from service.base.errors import CheckpointError, DivergedError
-from service.base.types import Metrics
+from service.base.jsonl import Extent
+from service.base.tensors import split_parts
+from service.base.types import Arrays, Metrics
 from service.config import Config
-from service.methods.method import Iteration, Method
+from service.methods.method import Iteration, Method, State
 from service.policies.parameters import PolicyError
-from service.runs.saving import Saves
-from service.store.run_directory import Published, RunDirectory
+from service.runs.resuming import changed_settings
+from service.store.checkpoints import CheckpointStore
+from service.store.run_directory import Published, Resumption, RunDirectory
 
 OnIteration = Callable[[Metrics], None]
 OnBeat = Callable[[], None]
+NUM_SNAPSHOTS = 10
+"""Snapshots of what was learned, evenly over a run's env steps; one of it untrained comes before them."""
 BEAT_S = 1.0
 """Time between two heartbeats of a run whose iterations take longer."""
 _logger = logging.getLogger(__name__)
@@ -69,7 +78,10 @@ class Run:
     ) -> None:
         directory.claim(resume=resume)
         self.config, self.directory = config, directory
-        self.saves = Saves(config, directory)
+        self.checkpoints = CheckpointStore(directory.checkpoints, config.run.keep_checkpoints, epoch=directory.epoch)
+        self._snapshots = CheckpointStore(directory.snapshots, keep=sys.maxsize)
+        self._saved: int | None = None
+        """The iteration of the newest checkpoint, where the records are as it says; None before the first."""
         self.wall_s = 0.0
         """Seconds spent on iterations, by all processes that ran this run."""
         self._iteration_s = 0.0
@@ -77,17 +89,17 @@ class Run:
         self._stop_requested = False
         self._on_iteration: OnIteration = lambda metrics: None
         self._on_beat: OnBeat = lambda: None
-        saved = self.saves.load() if resume else None
+        saved = self._load() if resume else None
         self.method = method = make()
         method.on_wait = self._beat
         try:
             if saved is not None:
-                resumption, state, self.wall_s = saved
+                resumption, state = saved
                 method.iteration, method.num_env_steps = resumption.iteration, resumption.num_env_steps
                 method.start(state)
                 _logger.info("resumed at iteration %d, %d env steps", self.iteration, self.num_env_steps)
                 directory.start(config, resumption)
-                if not self._is_saved:  # records are not as the checkpoint says, and that was accepted
+                if self._saved is None:  # records are not as the checkpoint says, and that was accepted
                     self._save()
             else:
                 method.start()
@@ -146,13 +158,15 @@ class Run:
 
     def _advance(self) -> None:
         method, before, begun = self.method, self.num_env_steps, time.perf_counter()
-        with self._explaining_divergence():
+        played, interval = self.iteration, self.config.run.evaluation_interval
+        evaluated: Metrics = {}
+        try:
             ended = method.step()
-            interval = self.config.run.evaluation_interval
-            evaluated: Metrics = {}
             if ended is not None and interval and self.iteration % interval == 0:
                 with method.timing("evaluate"):
                     evaluated = method.evaluate()
+        except (DivergedError, PolicyError) as error:
+            raise self._diverged(error, played) from error
         self._iteration_s += time.perf_counter() - begun
         if ended is None:
             self._beat()
@@ -184,19 +198,59 @@ class Run:
 
     # --- saving ----------------------------------------------------------------------------------------------------
 
-    @property
-    def _is_saved(self) -> bool:
-        return self.saves.saved == self.iteration
+    def _load(self) -> tuple[Resumption, State]:
+        """Read the newest checkpoint, once it is clear that it is of this run, and that its records are there.
+
+        Raises:
+            CheckpointError: there is no usable one, or it is of another run or configuration.
+            StorageError: see ``RunDirectory.check_resumable``.
+        """
+        checkpoint = self.checkpoints.load_latest()
+        meta = checkpoint.meta
+        changed = changed_settings(meta["config"], self.config, self.directory.path)
+        records = {name: Extent(*extent) for name, extent in meta["records"].items()}
+        resumption = Resumption(checkpoint.step, int(meta["env_steps"]), meta["run"], records, changed)
+        if self.directory.check_resumable(resumption):
+            self._saved = checkpoint.step
+        if changed:
+            said = ", ".join(f"{key} from {was!r} to {now!r}" for key, (was, now) in changed.items())
+            _logger.info("changed since iteration %d: %s", checkpoint.step, said)
+        self.wall_s = float(meta["wall_s"])
+        return resumption, {**split_parts(checkpoint.arrays), **meta["state"]}
 
     def _save(self) -> None:
+        """Write a checkpoint: with it alone a new process goes on.
+
+        Raises:
+            CheckpointError: a full disk; earlier checkpoints are intact.
+        """
+        directory = self.directory
         with self.method.timing("checkpoint"):
-            counters = {"env_steps": self.num_env_steps, "wall_s": self.wall_s}
-            self.saves.save(self.iteration, self.method.state(), counters)
+            arrays, values = flatten(self.method.state())
+            directory.check_owner()
+            meta = {
+                "env_steps": self.num_env_steps,
+                "wall_s": self.wall_s,
+                "config": self.config.model_dump(mode="json"),
+                "run": directory.history.run,
+                "records": directory.sync(),
+                "state": values,
+            }
+            with directory.noting(directory.checkpoints):
+                self.checkpoints.save(self.iteration, arrays, meta)
+        self._saved = self.iteration
 
     def _take_snapshot(self, *, before: int) -> None:
-        if self.saves.snapshot_due(before, self.num_env_steps):
+        """Keep what was learned for good, if a tenth of the budget is over since so many env steps.
+
+        Checkpoints go, and later it is asked what could be done when. A resumed run takes those it takes again with
+        the same bits.
+        """
+        tenths = [steps * NUM_SNAPSHOTS // self.config.run.total_env_steps for steps in (before, self.num_env_steps)]
+        if tenths[0] != tenths[1]:
             with self.method.timing("checkpoint"):
-                self.saves.take_snapshot(self.iteration, self.num_env_steps, self.method.parameters())
+                arrays = {f"{self.config.part}/{name}": array for name, array in self.method.parameters().items()}
+                self._snapshots.save(self.iteration, arrays, {"env_steps": self.num_env_steps})
 
     @contextmanager
     def _tolerating(self, consequence: str) -> Iterator[None]:
@@ -206,29 +260,33 @@ class Run:
         except CheckpointError as error:
             _logger.warning("%s; the run goes on, %s", error, consequence)
 
-    @contextmanager
-    def _explaining_divergence(self) -> Iterator[None]:
-        """Add to the error of a policy that has diverged when that was, and how to go on from before it."""
-        played = self.iteration
-        try:
-            yield
-        except (DivergedError, PolicyError) as error:
-            checkpoints = self.saves.checkpoints
-            newest = checkpoints.newest()
-            is_played = newest is not None and checkpoints.steps()[-1] == played
-            has_it = f"delete {newest.name}, which has this policy; " if newest is not None and is_played else ""
-            said = str(error).strip().splitlines()[-1]  # from another process it comes with its traceback
-            raise DivergedError(
-                f"{self.directory.path}, iteration {played + 1}: {said}: {has_it}{self.method.remedy}"
-            ) from error
+    def _diverged(self, error: Exception, played: int) -> DivergedError:
+        """The error of a policy that has diverged, with when that was, and how to go on from before it."""
+        newest = self.checkpoints.newest()
+        is_played = newest is not None and self.checkpoints.steps()[-1] == played
+        has_it = f"delete {newest.name}, which has this policy; " if newest is not None and is_played else ""
+        said = str(error).strip().splitlines()[-1]  # from another process it comes with its traceback
+        return DivergedError(f"{self.directory.path}, iteration {played + 1}: {said}: {has_it}{self.method.remedy}")
 
     def _save_last(self) -> None:
         """Save the last iteration, if it is not, and say what is lost where that fails."""
         try:
-            if not self._is_saved:
+            if self._saved != self.iteration:
                 self._save()
         except CheckpointError as error:
-            saved = next(reversed(self.saves.checkpoints.steps()), None)
+            saved = next(reversed(self.checkpoints.steps()), None)
             raise UnsavedError(
                 f"{error}; the run is at iteration {self.iteration}, saved is iteration {saved}: --resume goes on there"
             ) from error
+
+
+def flatten(state: State) -> tuple[Arrays, dict[str, Any]]:
+    """The arrays of a state as ``COMPONENT/NAME``, and its plain values by name."""
+    arrays: Arrays = {}
+    values: dict[str, Any] = {}
+    for name, part in state.items():
+        if isinstance(part, Mapping) and all(isinstance(each, np.ndarray) for each in part.values()):
+            arrays |= {f"{name}/{key}": array for key, array in part.items()}
+        else:
+            values[name] = part
+    return arrays, values

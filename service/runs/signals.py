@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import ctypes
+import os
 import signal
+import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from types import FrameType, TracebackType
@@ -12,6 +15,10 @@ PASSED_ON = signal.SIGUSR1
 """A stop that the process above passes on. It counts only where no other signal came: a supervisor, such as Ray's for
 jobs, signals a process and those below it, and what comes twice that way must not count as a second signal."""
 STOPPING = (signal.SIGINT, signal.SIGTERM, PASSED_ON)
+PARENT = "TANDEM_STUDY_PROCESS"
+"""Variable of the environment with the id of the process above that a run of a study ends with."""
+_PR_SET_PDEATHSIG = 1
+"""From linux/prctl.h."""
 
 
 class InterruptError(KeyboardInterrupt):
@@ -72,3 +79,17 @@ class StopSignals:
         if ask is None:
             raise InterruptError(number)
         ask()
+
+
+def stop_with_parent() -> None:
+    """Let the kernel send ``PASSED_ON`` when the process of the study ends, if this is a run of one.
+
+    Else it would go on alone. Only Linux can do that.
+    """
+    parent = os.environ.pop(PARENT, None)
+    if parent is None:
+        return
+    if sys.platform == "linux":
+        ctypes.CDLL(None, use_errno=True).prctl(_PR_SET_PDEATHSIG, int(PASSED_ON))
+    if os.getppid() != int(parent):  # it ended a moment ago, and no signal comes
+        sys.exit(128 + PASSED_ON)

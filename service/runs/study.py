@@ -1,349 +1,303 @@
-"""Runs a study: its runs side by side, then the best of them, a table and a picture.
+"""A study: runs side by side in one directory, then the best of them, a table and a picture.
 
-Each run is a process of ``tandem train`` with a run directory of its own, so one that fails takes no other with it.
-Consumes ``study.json`` and what the runs write into their directories; produces ``study.json``, progress, and at the
-end ``results.csv`` and ``curves.png``. Waits for the next run to end.
+| file | content |
+|---|---|
+| ``study.json`` | the settings of each run, how far it is, and its results; the best one |
+| ``NAME.yaml`` | the configuration of the run NAME |
+| ``NAME/`` | its run directory; ``log.txt`` in it has what its processes said |
+| ``results.csv``, ``curves.png`` | at the end: a line and a curve for each run |
+| ``.lock`` | held by the process that runs the study |
+
+Each run is a process of ``tandem train``, so one that fails takes no other with it. A thread waits for each of them;
+the main thread writes ``study.json`` and shows what the runs write into their directories.
 """
 
 from __future__ import annotations
 
 import logging
-import os
-import subprocess
-import sys
 import time
-from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
-from dataclasses import dataclass, field
 from pathlib import Path
-from signal import SIGKILL, SIGTERM, Signals
-from typing import Protocol
 
-from service.base.errors import StorageError, StoreError, TandemError
-from service.base.files import open_regular, open_to_append, os_errors, write_atomic
-from service.base.lock import is_locked
+from pydantic import Field, ValidationError
+
+from service.base.errors import ConfigError, StorageError, StoreError, TandemError
+from service.base.files import os_errors, read_regular, write_atomic
+from service.base.lock import LOCK_FILE, DirectoryLock
+from service.base.parsing import ParseError, parse_json
 from service.base.progress import answer, counted
-from service.config import Config, dump_config, load_config
+from service.config import Config, dump_config
+from service.config.frozen import FrozenModel
 from service.config.self_play import SelfPlayConfig
 from service.media.plots import plot_study
-from service.registry.registry import Registry
+from service.runs.grid import Settings
 from service.runs.progress import Progress
-from service.runs.resuming import resumable_settings
-from service.runs.signals import PASSED_ON, STOPPING, StopSignals
-from service.runs.study_file import ENDED, StudyDirectory, StudyRun
-from service.runs.study_results import SELECTED, as_csv, best_of, publish_best, select
+from service.runs.signals import StopSignals
+from service.runs.study_results import SELECTED, as_csv, best_of, published_metrics, select
+from service.runs.study_run import END_NOW, GO_ON, POLL_S, STOP, Job, Place, StudyRun, share
+from service.runs.train import publish_learned
 from service.store.disk_reader import DiskReader, run_id_of
-from service.store.models import OUTPUT_FILE, read_status
+from service.store.models import STUDY_FILE
 from service.store.run_directory import RunDirectory
+from service.store.run_history import SECOND_VERSION, written_by
 
-POLL_S = 0.2
 SHOW_S = 1.0
 """Time between two looks into the run directories."""
-TAKEN_S = 60.0
-"""Time that the process of an earlier study has to end, which is told that its study is gone."""
-PATIENCE_S = (1.0, 5.0, 5.0)
-"""Time that a process has to end after SIGTERM, a second SIGTERM, and SIGKILL."""
-LAST_WORDS_BYTES = 100_000
-"""End of a log in which a run said why it failed."""
+MAX_BYTES = 64 * 1024 * 1024
 _logger = logging.getLogger(__name__)
 
 
-@dataclass(frozen=True, slots=True)
-class Job:
-    """A run of a study, as it is sent to where it is to run."""
+class StudyFile(FrozenModel):
+    """Content of ``study.json``."""
 
-    directory: Path
-    config: str
-    """YAML of its configuration."""
-    run: StudyRun
-    options: tuple[str, ...] = ()
-    """Of ``tandem train``."""
-    first: tuple[str, ...] = ()
-    """Options with which it only begins."""
-    num_cores: int = 1
-    device: str = "cpu"
-    """Of its learner."""
-
-    def left(self) -> StudyRun:
-        """The run as its directory shows it, which no process runs now."""
-        place = RunDirectory(self.directory)
-        status = read_status(self.directory) if place.exists else None
-        if status is None:
-            return self.run.model_copy(update={"state": "interrupted" if place.exists else "waiting", "error": None})
-        state, result = status.state, place.read_result()
-        if state not in (*ENDED, "failed") or (
-            state == "finished" and status.num_env_steps < self._config.run.total_env_steps  # it has a larger budget
-        ):
-            state, result = "interrupted", None
-        found: dict[str, object] = {"state": state, "env_steps": status.num_env_steps, "error": None, "result": {}}
-        if state == "failed":  # others have told of what they survived
-            found["error"] = status.last_error
-        if result is not None:
-            found |= {"result": result["evaluation"], "wall_s": result["wall_s"]}
-        return self.run.model_copy(update=found)
-
-    def arguments(self) -> list[str]:
-        """The arguments of ``tandem`` that begin the run or go on with it; nothing is published yet."""
-        place = ["--run-dir", str(self.directory), "--no-publish"]
-        if not RunDirectory(self.directory).exists:
-            return ["train", str(self._config_file), *place, *self.options, *self.first]
-        settings = [part for setting in resumable_settings(self._config) for part in ("--set", setting)]
-        return ["train", "--resume", *place, *settings, *self.options]
-
-    def write_config(self) -> None:
-        """Put the configuration where the run is to begin, which another machine may not see otherwise."""
-        with os_errors("write", self._config_file):
-            self.directory.mkdir(parents=True, exist_ok=True)
-            write_atomic(self._config_file, self.config.encode())
-
-    @property
-    def _config_file(self) -> Path:
-        return self.directory.with_name(f"{self.directory.name}.yaml")
-
-    @property
-    def _config(self) -> Config:
-        return load_config(self._config_file)
-
-
-class Running(Protocol):
-    """A run of a study that has been started."""
-
-    def poll(self) -> StudyRun | None:
-        """How it was left; None while it goes on."""
-
-    def stop(self) -> None:
-        """Ask it to end after its iteration, saved."""
-
-    def close(self) -> None:
-        """End it at once, if it goes on."""
-
-
-class RunProcess:
-    """The process of a run on this machine. What it says goes into its ``log.txt``."""
-
-    def __init__(self, job: Job) -> None:
-        self._job = job
-        self._process: subprocess.Popen[bytes] | None = None
-        self._stopping = False
-        self._start_by_s = time.monotonic() + TAKEN_S
-
-    def poll(self) -> StudyRun | None:
-        """How the run was left; None while it goes on."""
-        try:
-            if self._process is None:
-                return self._begin()
-            code = self._process.poll()
-            if code is None:
-                return None
-            found = self._job.left()
-        except TandemError as error:  # its directory cannot be used; the other runs go on
-            return self._job.run.model_copy(update={"state": "failed", "error": str(error)})
-        asked = code in (0, *(128 + number for number in STOPPING)) or (self._stopping and -code in STOPPING)
-        return found if asked else found.model_copy(update={"state": "failed", "error": self._reason(code)})
-
-    def stop(self) -> None:
-        """Ask it to end after its iteration, saved."""
-        self._stopping = True
-        if self._process is not None:
-            self._process.send_signal(PASSED_ON)
-
-    def close(self) -> None:
-        """End it at once, if it goes on; it has a checkpoint that is at most an interval old."""
-        for number, patience_s in zip((SIGTERM, SIGTERM, SIGKILL), PATIENCE_S, strict=True):
-            if self._process is not None and self._process.poll() is None:
-                self._process.send_signal(number)
-                with suppress(subprocess.TimeoutExpired):
-                    self._process.wait(patience_s)
-
-    def _begin(self) -> StudyRun | None:
-        if is_locked(self._job.directory) and time.monotonic() < self._start_by_s and not self._stopping:
-            return None
-        self._job.write_config()
-        found = self._job.left()
-        if found.has_ended or self._stopping:
-            return found
-        log_file = self._job.directory / OUTPUT_FILE
-        with os_errors("write", log_file):
-            log = open_to_append(log_file)
-        command = [sys.executable, "-m", "service.cli.study_run", str(os.getpid()), *self._job.arguments()]
-        with log:
-            # A session of its own: Ctrl-C on a terminal is for this process, which passes it on.
-            self._process = subprocess.Popen(
-                command, stdin=subprocess.DEVNULL, stdout=log, stderr=subprocess.STDOUT, start_new_session=True
-            )
-        return None
-
-    def _reason(self, code: int) -> str:
-        log_file = self._job.directory / OUTPUT_FILE
-        if code < 0:
-            said = f"ended by {Signals(-code).name}"
-        else:
-            text = ""
-            with suppress(OSError), open_regular(log_file) as file:
-                file.seek(max(0, file.seek(0, os.SEEK_END) - LAST_WORDS_BYTES))
-                text = file.read(LAST_WORDS_BYTES).decode(errors="replace")
-            lines = [line.strip() for line in text.splitlines()[-20:] if line.strip()]
-            said = (lines[-1] if lines else f"exit code {code}").removeprefix("error: ")
-        return f"{said[:500]}; all it said is in {log_file}"
-
-
-@dataclass(frozen=True, slots=True)
-class Place:
-    """Where the runs of a study are: on this machine."""
-
-    num_cores: int = field(default_factory=lambda: len(os.sched_getaffinity(0)))
-    most_cores: int | None = None
-    """Cores of its largest machine; None: of its only one."""
-    start: Callable[[Job], Running] = RunProcess
-
-
-def cores_of(config: Config) -> int:
-    """The fewest cores of a run: one plays and another learns, and a task is learned by a thread that does both."""
-    return 1 if config.makes == "orchestrator" else 2
-
-
-def share(configs: Sequence[Config], place: Place, parallel: int | None) -> tuple[int, list[int]]:
-    """Runs at once, and the cores of each: those of the configuration, else a share of all; of a task always one."""
-    least = max(config.run.num_threads or cores_of(config) for config in configs)
-    num_parallel = min(len(configs), parallel or max(1, place.num_cores // least))
-    fair = max(1, min(place.num_cores // num_parallel, place.most_cores or place.num_cores))
-    return num_parallel, [config.run.num_threads or (1 if cores_of(config) == 1 else fair) for config in configs]
+    start: str | None = Field(None, description="reference of what the runs begin from")
+    runs: dict[str, StudyRun]
+    best: str | None = Field(None, description="name of the best run")
+    published: str | None = Field(None, description="version of its primitives")
 
 
 class Study:
-    """A study in its directory, which this process has claimed."""
+    """A study in its directory. Nothing is written before ``claim``.
 
-    def __init__(self, directory: StudyDirectory, progress: Progress) -> None:
-        self.directory, self._progress = directory, progress
-        self.file = directory.read()
-        self._configs = {name: directory.config(name).read_config() for name in self.file.runs}
-        self._reader = DiskReader(directory.path)
-        self._shown = dict.fromkeys(self.file.runs, 0)
-        """Last iteration of each run that was shown."""
+    Args:
+        path: of the directory.
+    """
 
-    def train(self, place: Place, parallel: int | None, options: Sequence[str], signals: StopSignals) -> None:
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.file = path / STUDY_FILE
+        self._lock: DirectoryLock | None = None
+        self._study = StudyFile(runs={})
+
+    @property
+    def exists(self) -> bool:
+        """Whether a study has begun here."""
+        return self.file.is_file()
+
+    def config_file(self, name: str) -> Path:
+        """The file with the configuration of a run."""
+        return self.path / f"{name}.yaml"
+
+    def read(self) -> StudyFile:
+        """Read ``study.json``.
+
+        Raises:
+            TandemError: no study here, one of another version, or its file cannot be read.
+        """
+        if not self.exists:
+            raise ConfigError(f"no study in {self.path}: {STUDY_FILE} is missing; leave out --resume to begin one")
+        with os_errors("read", self.file):
+            data = read_regular(self.file, MAX_BYTES, follow=True)
+        with suppress(ParseError, ValidationError):
+            tree = parse_json(data, self.file)
+            if isinstance(tree, dict) and "seeds" in tree:
+                raise ConfigError(written_by(self.file, SECOND_VERSION))
+            self._study = StudyFile.model_validate(tree)
+            return self._study
+        raise StorageError(
+            f"{self.file} does not name the runs of a study; restore it from a copy, or go on with each run by "
+            "--resume --run-dir"
+        )
+
+    def claim(self) -> None:
+        """Keep every other process from running this study until ``close``.
+
+        Raises:
+            RunTakenError: another process runs it.
+            StorageError: the directory cannot be written.
+        """
+        self._lock = DirectoryLock(self.path, "stop that one first, or name another --run-dir")
+
+    def close(self) -> None:
+        """Let other processes in; a second call does nothing."""
+        if self._lock is not None:
+            if not self.exists:  # a study that did not begin leaves nothing
+                with suppress(OSError):
+                    (self.path / LOCK_FILE).unlink()
+                    self.path.rmdir()
+            self._lock.release()
+            self._lock = None
+
+    def check_free(self, names: Iterable[str]) -> None:
+        """Check that neither a study nor one of its runs has begun here.
+
+        Raises:
+            TandemError: one has.
+        """
+        if self.exists:
+            raise TandemError(
+                f"{self.path} holds a study already; continue it with --resume, or name another --run-dir"
+            )
+        for directory in (RunDirectory(self.path), *(RunDirectory(self.path / name) for name in names)):
+            if directory.exists:
+                raise TandemError(f"{directory.path} holds a run already; name another --run-dir for this study")
+
+    def begin(self, runs: Mapping[str, Settings], configs: Mapping[str, Config], start: str | None) -> None:
+        """Begin a study here, which has been claimed.
+
+        Args:
+            runs: settings of each.
+            configs: configuration of each.
+            start: reference of what they begin from.
+
+        Raises:
+            TandemError: a study, or a run, is here already, or the directory cannot be written.
+        """
+        self.check_free(runs)  # of two that begin at once, the second sees here what the first has made
+        self.write_configs(configs)
+        # Last: a start that failed can be tried again.
+        self._write(StudyFile(start=start, runs={name: StudyRun(settings=each) for name, each in runs.items()}))
+
+    def write_configs(self, configs: Mapping[str, Config]) -> None:
+        """Replace the configurations of runs.
+
+        Raises:
+            StorageError: they cannot be written.
+        """
+        for name, config in configs.items():
+            self._put(self.config_file(name), dump_config(config))
+
+    def train(
+        self,
+        configs: Mapping[str, Config],
+        place: Place,
+        parallel: int | None,
+        options: Sequence[str],
+        signals: StopSignals,
+        progress: Progress,
+    ) -> None:
         """Run all runs that have not ended, several at once.
 
         The first signal ends them where they can be resumed; a second one raises, and ends them at once.
 
         Args:
+            configs: configuration of each run.
             place: where they are.
             parallel: how many at once; None: as many as there are cores for.
             options: of ``tandem train`` for every run.
             signals: of this process.
+            progress: shows how far they are.
 
         Raises:
             InterruptError: a second signal.
         """
-        num_parallel, waiting = self._jobs(place, parallel, options)
-        running: dict[str, Running] = {}
-        stopping, told, last_s = False, False, float("-inf")
+        self.read()  # again: before it was claimed, another process may have gone on with it
+        jobs, num_parallel = self._jobs(configs, place, parallel, options)
+        if not jobs:
+            return
+        progress.say(f"runs to go: {len(jobs)}, at once: {num_parallel}")
+        reader, shown, shown_s = DiskReader(self.path), dict.fromkeys(jobs, 0), float("-inf")
+        asked = GO_ON
 
         def stop() -> None:
-            nonlocal stopping
-            stopping = True
+            nonlocal asked
+            asked = STOP
+            answer("stopping each run after its iteration; again to end now")
 
-        if waiting:
-            self._progress.say(f"runs to go: {len(waiting)}, at once: {num_parallel}")
-        try:
-            with signals.asking(stop):
-                while running or (waiting and not stopping):
-                    while waiting and not stopping and len(running) < num_parallel:
-                        name, job = waiting.popleft()
-                        running[name] = place.start(job)
-                        self._note(name, job.run.model_copy(update={"state": "running", "error": None}))
-                    if stopping and not told:
-                        answer("stopping each run after its iteration; again to end now")
-                        told = True
-                        for each in running.values():
-                            each.stop()
-                    time.sleep(POLL_S)
-                    if time.monotonic() - last_s >= SHOW_S:
-                        last_s = time.monotonic()
-                        self._show()
-                    for name, found in [(name, each.poll()) for name, each in running.items()]:
-                        if found is not None:
-                            del running[name]
-                            self._note(name, found, aloud=True)
-                self._show()
-        finally:
-            for each in running.values():
-                each.close()
-            for name in running:
-                self._note(name, self.file.runs[name].model_copy(update={"state": "interrupted"}))
+        def run(job: Job) -> StudyRun | None:
+            return place.run(job, lambda: asked) if asked == GO_ON else None
 
-    def finish(self, registry: Registry | None) -> None:
+        with ThreadPoolExecutor(num_parallel) as threads:
+            going = {name: threads.submit(run, job) for name, job in jobs.items()}
+            try:
+                with signals.asking(stop):
+                    while going:
+                        time.sleep(POLL_S)
+                        for name, thread in list(going.items()):
+                            if thread.done():
+                                del going[name]
+                                if (found := thread.result()) is not None:
+                                    self._note(name, found)
+                                    why = f": {found.error}" if found.error else ""
+                                    progress.say(f"{name}: {found.state} after {found.env_steps:,} env steps{why}")
+                            elif thread.running() and self._study.runs[name].state != "running":
+                                self._note(name, self._study.runs[name].now("running"))
+                        if time.monotonic() - shown_s >= SHOW_S or not going:
+                            shown_s = time.monotonic()
+                            self._show(reader, shown, configs, progress)
+            finally:
+                asked = END_NOW
+                for name in going:
+                    if self._study.runs[name].state == "running":
+                        self._note(name, self._study.runs[name].now("interrupted"))
+
+    def finish(self, configs: Mapping[str, Config], registry: Path | None, progress: Progress) -> None:
         """Name the best of the runs that make primitives, publish it, and write the table and the picture.
 
         Args:
-            registry: where it is published; None: nowhere.
+            configs: configuration of each run.
+            registry: where the best is published; None: nowhere.
+            progress: says what is done.
 
         Raises:
             TandemError: something cannot be written or published.
         """
-        runs = self.file.runs
-        chosen = [name for name, run in runs.items() if run.has_ended and self._configs[name].makes == "primitives"]
+        runs = self._study.runs
+        chosen = [name for name, run in runs.items() if run.has_ended and configs[name].makes == "primitives"]
         missing = [name for name in chosen if SELECTED not in runs[name].result]
         if missing:
-            self._progress.say(f"learning is over; runs to evaluate: {len(missing)}")
+            progress.say(f"learning is over; runs to evaluate: {len(missing)}")
         for name in counted(missing, "evaluating the runs", len(missing), "runs"):
-            run = self.file.runs[name]
             try:
-                self._note(name, run.model_copy(update={"result": run.result | select(self.directory.path / name)}))
+                result = runs[name].result | select(self.path / name)
+                self._note(name, runs[name].model_copy(update={"result": result}))
             except TandemError as error:  # a damaged checkpoint
-                self._note(name, run.model_copy(update={"state": "failed", "error": str(error)}))
-        self.directory.write_file("results.csv", as_csv(self.file.runs))
+                self._note(name, runs[name].now("failed", str(error)))
+        runs = self._study.runs
+        self._put(self.path / "results.csv", as_csv(runs))
         with suppress(TandemError):  # none has metrics yet
-            plot_study({name: self.directory.path / name for name in runs}, self.directory.path / "curves.png")
-        best = best_of(self.file.runs)
-        self._write(best=best)  # known, whatever happens while it is published
-        if best is not None and registry is not None:
-            version = publish_best(self.directory.path / best, registry, self.file.runs[best])
-            self._write(published=str(version) if version is not None else None)
+            plot_study({name: self.path / name for name in runs}, self.path / "curves.png")
+        best = best_of(runs)
+        self._write(self._study.model_copy(update={"best": best}))  # known, whatever happens while it is published
+        if best is not None and registry is not None and configs[best].publishable:
+            version = publish_learned(self.path / best, registry, metrics=published_metrics(runs[best]))
+            self._write(self._study.model_copy(update={"published": str(version)}))
 
-    def _jobs(self, place: Place, parallel: int | None, options: Sequence[str]) -> tuple[int, deque[tuple[str, Job]]]:
-        """How many runs are to go on at once, and those that have not ended."""
-        names = [name for name, run in self.file.runs.items() if self._has_more(name, run)]
-        num_parallel, cores = share([self._configs[name] for name in names], place, parallel) if names else (0, [])
-        first = ("--from", self.file.start) if self.file.start is not None else ()
-        jobs = deque[tuple[str, Job]]()
-        for name, num in zip(names, cores, strict=True):
-            config = self._configs[name]
-            job = Job(
-                directory=(self.directory.path / name).absolute(),
+    def _jobs(
+        self, configs: Mapping[str, Config], place: Place, parallel: int | None, options: Sequence[str]
+    ) -> tuple[dict[str, Job], int]:
+        """Those runs that have more to learn, and how many are to go on at once."""
+        jobs, start = dict[str, Job](), self._study.start
+        going = {name: run for name, run in self._study.runs.items() if run.has_more(configs[name].run.total_env_steps)}
+        if not going:
+            return jobs, 0
+        num_parallel, cores = share([configs[name] for name in going], place, parallel)
+        for (name, run), num in zip(going.items(), cores, strict=True):
+            config, more = configs[name], ("--from", start) if start is not None else ()
+            jobs[name] = Job(
+                directory=(self.path / name).absolute(),
                 config=dump_config(config),
-                run=self.file.runs[name],
-                options=(*options, "--set", f"run.num_threads={num}"),
-                first=first,
+                total_env_steps=config.run.total_env_steps,
+                run=run,
+                options=(*options, *more, "--set", f"run.num_threads={num}"),
                 num_cores=num,
                 device=config.learner.device if isinstance(config, SelfPlayConfig) else "cpu",
             )
-            jobs.append((name, job))
-        return num_parallel, jobs
+        return jobs, num_parallel
 
-    def _has_more(self, name: str, run: StudyRun) -> bool:
-        larger = run.state == "finished" and run.env_steps < self._configs[name].run.total_env_steps
-        return larger or not run.has_ended
-
-    def _note(self, name: str, run: StudyRun, *, aloud: bool = False) -> None:
-        self.file = self.file.model_copy(update={"runs": self.file.runs | {name: run}})
+    def _note(self, name: str, run: StudyRun) -> None:
+        self._study = self._study.model_copy(update={"runs": self._study.runs | {name: run}})
         try:
-            self._write()
+            self._write(self._study)
         except StorageError as error:  # the runs go on
             _logger.warning("%s", error)
-        if aloud:
-            why = f": {run.error}" if run.error else ""
-            self._progress.say(f"{name}: {run.state} after {run.env_steps:,} env steps{why}")
 
-    def _write(self, **changed: str | None) -> None:
-        self.file = self.file.model_copy(update=changed)
-        self.directory.write(self.file)
+    def _write(self, study: StudyFile) -> None:
+        self._study = study
+        self._put(self.file, study.model_dump_json(indent=1) + "\n")
 
-    def _show(self) -> None:
-        for name in self.file.runs:
-            path = self.directory.path / name
+    def _put(self, path: Path, text: str) -> None:
+        with os_errors("write", path):
+            write_atomic(path, text.encode())
+
+    def _show(
+        self, reader: DiskReader, shown: dict[str, int], configs: Mapping[str, Config], progress: Progress
+    ) -> None:
+        """Show the records that runs have written since the last iterations that were shown."""
+        for name in shown:
             with suppress(StoreError):  # it has not begun, is elsewhere, or the disk is away for a moment
-                for record in self._reader.metrics(run_id_of(path), after_iteration=self._shown[name]):
-                    self._shown[name] = int(record["iteration"] or 0)
-                    self._progress.show(record, name, self._configs[name].run.total_env_steps)
+                for record in reader.metrics(run_id_of(self.path / name), after_iteration=shown[name]):
+                    shown[name] = int(record["iteration"] or 0)
+                    progress.show(record, configs[name].run.total_env_steps, name)

@@ -8,29 +8,19 @@ from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from contextlib import closing, suppress
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
 from service.actors.evaluation import SELECTION_SEED, evaluate_run
-from service.base.errors import StoreError
 from service.base.types import StateArray
 from service.envs.sampling import GoalKind
 from service.policies.numpy_policy import numpy_bob
 from service.registry.loading import load
-from service.registry.names import Version
-from service.registry.publishing import publish_run
-from service.registry.registry import Registry
 from service.runs.grid import SEED, Settings
-from service.runs.study_file import StudyRun
-from service.store.address import address_from_environment
-from service.store.disk_reader import run_id_of
-from service.store.models import read_status
-from service.store.run_directory import RunDirectory
-from service.store.run_writer import reporting_to
+from service.runs.study_run import StudyRun
 
 SELECTION_GOALS: GoalKind = "mixed"
 SELECTION_EPISODES = 1000
@@ -69,19 +59,18 @@ def interquartile_mean(values: StateArray) -> StateArray:
     return middle
 
 
-def bootstrap_interval(
-    groups: Sequence[Sequence[float]], estimate: Callable[[StateArray], StateArray] = interquartile_mean
-) -> tuple[float, float]:
-    """Both ends of the 95 % percentile bootstrap interval (Efron 1979; of several tasks Agarwal et al. 2021).
+def bootstrap_interval(groups: Sequence[Sequence[float]]) -> tuple[float, float]:
+    """Both ends of the 95 % percentile bootstrap interval of the interquartile mean.
+
+    Efron 1979; of several tasks Agarwal et al. 2021.
 
     Args:
         groups: values of one task each; each group is resampled by itself.
-        estimate: (R, N) resampled values of all groups to (R,).
     """
     rng = np.random.default_rng(0)  # the same runs have the same interval
     arrays = [np.asarray(values, dtype=np.float64) for values in groups]
     drawn = [values[rng.integers(len(values), size=(NUM_RESAMPLES, len(values)))] for values in arrays]
-    low, high = np.percentile(estimate(np.concatenate(drawn, axis=1)), (2.5, 97.5))
+    low, high = np.percentile(interquartile_mean(np.concatenate(drawn, axis=1)), (2.5, 97.5))
     return float(low), float(high)
 
 
@@ -119,11 +108,12 @@ def as_csv(runs: Mapping[str, StudyRun]) -> str:
     settings = list(dict.fromkeys(key for run in runs.values() for key in run.settings))
     results = list(dict.fromkeys(key for run in runs.values() for key in run.result))
     file = io.StringIO()
-    writer = csv.writer(file, lineterminator="\n")
-    writer.writerow(["run", *settings, "state", "env_steps", "wall_s", *results])
+    columns = ["run", *settings, "state", "env_steps", "wall_s", *results]
+    writer = csv.DictWriter(file, columns, restval="", lineterminator="\n")
+    writer.writeheader()
     for name, run in runs.items():
-        told = [run.settings.get(key, "") for key in settings] + [run.state, run.env_steps, round(run.wall_s, 1)]
-        writer.writerow([name, *told, *(run.result.get(key, "") for key in results)])
+        own = {"run": name, "state": run.state, "env_steps": run.env_steps, "wall_s": round(run.wall_s, 1)}
+        writer.writerow({**run.settings, **run.result, **own})
     return file.getvalue()
 
 
@@ -145,27 +135,7 @@ def best_of(runs: Mapping[str, StudyRun]) -> str | None:
     return max(scores, key=lambda name: (scores[name][SELECTED], -scores[name][DISTANCE]), default=None)
 
 
-def publish_best(directory: Path, registry: Registry, run: StudyRun) -> Version | None:
-    """Publish the Bob of one run of a study, whose manifest then has its settings in its configuration.
-
-    Returns:
-        The version, as ``publish_run`` does; None for a Bob without primitives.
-
-    Raises:
-        StorageError: see ``publish_run``.
-    """
-    place = RunDirectory(directory)
-    config = place.read_config()
-    if not config.publishable:
-        return None
+def published_metrics(run: StudyRun) -> dict[str, float]:
+    """What a version says of the best run: what was measured at its end, and its success on the goals that chose it."""
     metrics = {f"evaluation/{name}": value for name, value in run.result.items() if not name.startswith("selection_")}
-    metrics |= {f"selection/{SELECTION_GOALS}_success_last": run.result[SELECTED], "env_steps": float(run.env_steps)}
-    version = publish_run(place, registry, config, load(str(directory)).parameters, metrics)
-    status, run_id = read_status(directory), run_id_of(directory)
-    place.claim(resume=True)
-    with closing(place), suppress(StoreError):
-        if status is not None:
-            told = status.model_copy(update={"run_id": run_id, "published": str(version), "epoch": place.epoch})
-            with closing(reporting_to(place, run_id, address_from_environment())) as writer:
-                writer.status(told)
-    return version
+    return metrics | {f"selection/{SELECTION_GOALS}_success_last": run.result[SELECTED], "env_steps": run.env_steps}

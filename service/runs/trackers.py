@@ -6,8 +6,7 @@ import importlib
 import logging
 import sys
 from collections.abc import Callable, Mapping, Sequence
-from types import TracebackType
-from typing import Any, Protocol, Self
+from typing import Any
 
 from service.base.errors import TandemError, one_line
 
@@ -18,19 +17,12 @@ _ENDS = ("close", "finish")
 """Names of what ends a tracker, one of which is called where it is there."""
 
 
-class Tracker(Protocol):
-    """Takes metrics."""
-
-    def log(self, metrics: dict[str, float], *, step: int) -> Any:
-        """Take one record; ``step`` is the number of env steps."""
-
-
-Factory = Callable[[str, dict[str, Any]], Tracker]
-"""Makes a tracker of a run's name and its configuration, a tree of plain values."""
+Factory = Callable[[str, dict[str, Any]], Any]
+"""Makes an object with ``log(metrics, step)``, the number of env steps, of a run's name and configuration."""
 
 
 class Trackers:
-    """The trackers of a run: a context manager that ends them.
+    """The trackers of a run, until ``close``.
 
     A tracker that throws is left out from then on, which is said once; training goes on. They are called between
     iterations by the process that has the run, on a cluster its driver, so that one that waits makes the run wait.
@@ -46,45 +38,35 @@ class Trackers:
 
     def __init__(self, references: Sequence[str], name: str, config: Mapping[str, Any]) -> None:
         factories = {reference: find_factory(reference) for reference in references}
-        self._made: dict[str, Tracker] = {}
-        self._left_out: set[str] = set()
+        self._going: dict[str, Any] = {}
         try:
             for reference, factory in factories.items():
-                self._made[reference] = _make(reference, factory, name, dict(config))
+                self._going[reference] = _make(reference, factory, name, dict(config))
         except BaseException:
-            self._close()
+            self.close()
             raise
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self._close()
 
     def log(self, metrics: Mapping[str, float]) -> None:
         """Give a record, which has ``env_steps`` in it, to all that have not thrown."""
-        for reference, tracker in self._made.items():
-            if reference not in self._left_out:
-                try:
-                    tracker.log(dict(metrics), step=int(metrics[_COUNTED]))
-                except Exception as error:  # whatever it is, the run is worth more
-                    self._leave_out(reference, error)
-
-    def _close(self) -> None:
-        for reference, tracker in self._made.items():
+        for reference, tracker in list(self._going.items()):
             try:
-                for end in [getattr(tracker, name, None) for name in _ENDS]:
-                    if callable(end):
-                        end()
-                        break
-            except Exception as error:
-                self._leave_out(reference, error)
+                tracker.log(dict(metrics), step=int(metrics[_COUNTED]))
+            except Exception as error:  # whatever it is, the run is worth more
+                self._end(reference, error)
 
-    def _leave_out(self, reference: str, error: Exception) -> None:
-        if reference not in self._left_out:
-            self._left_out.add(reference)
+    def close(self) -> None:
+        """End them."""
+        for reference in list(self._going):
+            self._end(reference)
+
+    def _end(self, reference: str, error: Exception | None = None) -> None:
+        tracker = self._going.pop(reference)
+        ends = [getattr(tracker, name, None) for name in _ENDS]
+        try:
+            next(filter(callable, ends), lambda: None)()
+        except Exception as failure:
+            error = error or failure
+        if error is not None:
             _logger.warning("tracker %s is left out from now on, the run goes on: %s", reference, _told(error))
 
 
@@ -95,23 +77,20 @@ def find_factory(reference: str) -> Factory:
         TandemError: there is none by that name.
     """
     module, _, name = reference.partition(":")
-    if not module or not name:
-        raise TandemError(f"--tracker {reference!r}: write module:factory, such as my_trackers:wandb")
     before = list(sys.path)
     sys.path.insert(0, "")  # the command, unlike python -m, does not look into the working directory
     try:
-        factory = getattr(importlib.import_module(module), name)
+        factory: Factory = getattr(importlib.import_module(module), name)
     except Exception as error:  # of the module's own code, too
-        raise TandemError(f"--tracker {reference!r} cannot be loaded: {_told(error)}") from None
+        raise TandemError(
+            f"--tracker {reference!r} cannot be loaded: {_told(error)}; write module:factory, such as my_trackers:wandb"
+        ) from None
     finally:
         sys.path[:] = before
-    if not callable(factory):
-        raise TandemError(f"--tracker {reference!r} is no function: name one that makes a tracker")
-    made: Factory = factory
-    return made
+    return factory
 
 
-def _make(reference: str, factory: Factory, name: str, config: dict[str, Any]) -> Tracker:
+def _make(reference: str, factory: Factory, name: str, config: dict[str, Any]) -> Any:
     try:
         tracker = factory(name, config)
     except Exception as error:

@@ -1,4 +1,4 @@
-"""A training from the first signal handler to what it publishes."""
+"""A training from the first signal handler to what it publishes; and publishing by hand what a run has learned."""
 
 from __future__ import annotations
 
@@ -9,22 +9,26 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, closing, contextmanager, suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from threading import Thread
-from typing import TYPE_CHECKING, Literal, cast
+from typing import Literal, cast
 
 from pydantic import JsonValue
 
-from service.base.errors import TandemError
+from service.base.errors import StoreError, TandemError
 from service.base.progress import answer, doing
+from service.base.types import Metrics
 from service.config import Config
+from service.config.skills import SkillDiscoveryConfig
+from service.config.task import TaskConfig
 from service.media.artifacts import make_artifacts
 from service.methods.method import Method, StateLostError, WorkersError
-from service.registry.loading import Trained
-from service.registry.names import Version
-from service.registry.publishing import check_publishable, publish_run
+from service.methods.task_evaluation import FINAL_SEED, evaluate_on, numbers_of
+from service.registry.loading import Trained, load
+from service.registry.names import Version, check_name
+from service.registry.publishing import check_publishable, measure_bob, measure_skills, publish_run
 from service.registry.registry import Registry
 from service.runs.report import Report
 from service.runs.run import OnIteration, Run, RunResult
@@ -32,13 +36,10 @@ from service.runs.signals import InterruptError, StopSignals
 from service.store.address import address_from_environment
 from service.store.checkpoints import CheckpointStore
 from service.store.disk_reader import run_id_of
-from service.store.models import read_status
+from service.store.models import ACTIVE, RunState, read_status
 from service.store.run_directory import Published, RunDirectory
 from service.store.run_log import logging_to
 from service.store.run_writer import reporting_to
-
-if TYPE_CHECKING:
-    from service.store.models import RunState
 
 MAX_STATES_LOST = 5
 """Times in a row that a run goes back to a checkpoint without getting beyond it."""
@@ -54,14 +55,14 @@ class Finished:
     """Results of a training."""
 
     result: RunResult
-    files: dict[str, Path]
-    """Pictures and video by what they show."""
-    version: Version | None
-    """What it published; None when interrupted, or when nothing was to be published."""
-    metrics: dict[str, float]
-    """Metrics of the final evaluation."""
     timing: str
     """Where the time went, as a text tree."""
+    files: dict[str, Path] = field(default_factory=dict)
+    """Pictures and video by what they show."""
+    version: Version | None = None
+    """What it published; None when interrupted, or when nothing was to be published."""
+    metrics: dict[str, float] = field(default_factory=dict)
+    """Metrics of the final evaluation."""
     signal: int | None = None
     """The signal that ended it before its time."""
 
@@ -160,7 +161,7 @@ def train(
                     said = f", published {done.version}" if done.version is not None else ""
                     at = f"iteration {done.result.iteration}, {done.result.num_env_steps} env steps"
                     log(f"the run is {done.result.reason} at {at}{said}")
-                    return replace(done, signal=signals.first)
+                    return done
             time.sleep(BACK_OFF_S * (2 ** (num_lost - 1) - 1))
 
 
@@ -214,32 +215,24 @@ def _end_now(report: Report, directory: RunDirectory, what: str) -> None:
 def _run(
     run: Run, registry: Path | str, publish: bool, signals: StopSignals, report: Report, on_iteration: OnIteration
 ) -> Finished:
-    def beat() -> None:
-        report.beat(run)
-        if report.stop_requested():
-            run.request_stop()
-
     def tell(metrics: dict[str, float]) -> None:
         on_iteration(metrics)
         report.iteration(run, metrics)
-        if report.stop_requested():
-            run.request_stop()
-
-    report.begin(run)
 
     def stop() -> None:
         run.request_stop()
         answer("stopping after this iteration; again to end now")
 
+    report.begin(run)
     with signals.asking(stop):
-        result = run.run(tell, beat)
-    done = Finished(result, {}, None, {}, run.method.timing.tree(), signals.first)
+        result = run.run(tell, partial(report.beat, run))
+    done = Finished(result, timing=run.method.timing.tree())
     if result.reason != "interrupted" and signals.first is None:
         with suppress(InterruptError), report.beating():
             done = _finish(done, run, registry, publish, report)
     complete = result.reason if signals.first is None else "interrupted"  # --resume does what is left
-    report.end(cast("RunState", complete), published=str(done.version) if done.version is not None else None)
-    return done
+    report.end(cast(RunState, complete), published=str(done.version) if done.version is not None else None)
+    return replace(done, signal=signals.first)
 
 
 def _finish(done: Finished, run: Run, registry: Path | str, publish: bool, report: Report) -> Finished:
@@ -247,7 +240,7 @@ def _finish(done: Finished, run: Run, registry: Path | str, publish: bool, repor
     config, directory, parameters = run.config, run.directory, run.method.parameters()
     metrics, version = run.method.measure(), None
     run.close()
-    report.check()
+    directory.check_owner()
     found: dict[str, JsonValue] = {name.removeprefix("evaluation/"): value for name, value in metrics.items()}
     directory.write_result({"evaluation": found, "env_steps": run.num_env_steps, "wall_s": run.wall_s})
     report.measured(metrics)
@@ -257,6 +250,62 @@ def _finish(done: Finished, run: Run, registry: Path | str, publish: bool, repor
             version = publish_run(directory, Registry(Path(registry)), config, parameters, known)
     except TandemError as error:
         raise UnfinishedError(f"learning is over and saved, but not published: {error}; --resume does it") from error
-    report.check()
+    directory.check_owner()
     files, timing = make_artifacts(directory, registry), run.method.timing.tree()
     return replace(done, files=files, version=version, metrics=metrics, timing=timing)
+
+
+def publish_learned(
+    path: Path,
+    registry: Path | str,
+    name: str | None = None,
+    primitives: str | None = None,
+    metrics: Metrics | None = None,
+) -> Version:
+    """Publish what the newest checkpoint of a run holds, and say so in the run's status.
+
+    Args:
+        path: of the run, which no process may be running.
+        registry: directory to publish in.
+        name: of what is published; None: the run's.
+        primitives: published version that a policy of a task acts with, if that has another name than in its run.
+        metrics: what is known of it; None: measure it on the goals of the end of a run.
+
+    Returns:
+        The new version, or the newest one of that name where it has the same parameters already.
+
+    Raises:
+        TandemError: no run, one that goes on, or what it has learned cannot be published; nothing was written.
+    """
+    directory = RunDirectory(path)
+    config = directory.read_config()
+    changed = {"name": check_name(name or config.name)}
+    directory.claim(resume=True)
+    with closing(directory):
+        learned = load(str(path.absolute()), registry, primitives)
+        if learned.trained is not None:
+            changed["primitives"] = learned.trained.reference
+        config = config.model_copy(update=changed)
+        check_publishable(config, registry)
+        if metrics is None:
+            saved = CheckpointStore(directory.checkpoints, keep=1).load_latest()
+            metrics = _measure(config, learned) | {"env_steps": saved.meta["env_steps"]}
+        version = publish_run(directory, Registry(Path(registry)), config, learned.parameters, metrics)
+        status, run_id = read_status(path), run_id_of(path)
+        if status is not None and status.state not in ACTIVE:
+            told = status.model_copy(update={"run_id": run_id, "published": str(version), "epoch": directory.epoch})
+            with suppress(StoreError), closing(reporting_to(directory, run_id, address_from_environment())) as writer:
+                writer.status(told)
+    return version
+
+
+def _measure(config: Config, learned: Trained) -> Metrics:
+    """What the method of the run measures at its end."""
+    if isinstance(config, SkillDiscoveryConfig):
+        return measure_skills(config, learned.parameters)
+    if isinstance(config, TaskConfig):
+        seed, run = config.seed + FINAL_SEED, config.run
+        player = learned.player()
+        found = evaluate_on(config.task, config.world, player, run.final_episodes, seed, run.num_threads)
+        return {f"evaluation/{key}": value for key, value in numbers_of(found).items()}
+    return measure_bob(config, learned.parameters)

@@ -3,52 +3,23 @@
 To add an attack, add a line to ``NOT_FILES`` or ``NO_CONTENT``; to add a place that is attacked, one to ``PLACES``.
 """
 
-import gzip
-import io
 import os
 import pickle
 import shutil
 import signal
-import socket
-import zipfile
-from contextlib import closing, contextmanager
+from contextlib import contextmanager
 from itertools import pairwise
 
-import numpy as np
 import pytest
 from typer.testing import CliRunner
 
 from service.cli.main import app
 from service.registry.publishing import publish
 from service.registry.registry import Registry
-from service.runs.study_file import StudyDirectory
-from tests.runs.runs import play, tiny_config, write_yaml
+from tests.runs.runs import begin_study, play, tiny_config, write_yaml
 
 LIMIT_S = 60
 """Far more than any refusal takes, and far less than forever."""
-
-
-def a_socket(path):
-    here = os.getcwd()
-    os.chdir(path.parent)  # a socket's path has at most 107 bytes
-    try:
-        with socket.socket(socket.AF_UNIX) as made:
-            made.bind(path.name)
-    finally:
-        os.chdir(here)
-
-
-def an_archive():
-    data = io.BytesIO()
-    with zipfile.ZipFile(data, "w") as archive:
-        archive.writestr("primitives.safetensors", "x")
-    return data.getvalue()
-
-
-def some_arrays():
-    data = io.BytesIO()
-    np.savez(data, weight=np.ones(3))
-    return data.getvalue()
 
 
 def a_billion_laughs():
@@ -61,68 +32,42 @@ def a_billion_laughs():
 NOT_FILES = {
     "fifo": os.mkfifo,
     "directory": os.mkdir,
-    "socket": a_socket,
     "endless device": lambda path: path.symlink_to("/dev/zero"),
-    "full device": lambda path: path.symlink_to("/dev/full"),
 }
 NO_CONTENT = {
     "noise": b"\x93\xff\x00noise" * 20,
-    "zeros": bytes(1000),
     "pickle": pickle.dumps({"weight": [1.0]}),
-    "npz": some_arrays(),
-    "zip": an_archive(),
-    "gzip": gzip.compress(b"x"),
-    "UTF-16": "words".encode("utf-16"),
     "brackets, a hundred thousand deep": b"[" * 100_000,
-    "objects, deep": b'{"a":' * 20_000,
-    "lists, deeper than anybody needs": b"[" * 100 + b"]" * 100,
     "billion laughs": a_billion_laughs(),
     "list within itself": b"&a [*a, *a]",
     "tag of a Python object": b"!!python/object/apply:os.system [id]",
-    "tag that does not fit": b"!!bool x",
     "5000 digits": b"9" * 5000,
-    "400 digits": b'{"version": %s, "seeds": [%s], "seed": %s}' % ((b"9" * 400,) * 3),
-    "5000 hexadecimal digits": b"seed: 0x" + b"f" * 5000,
     "greater than any float": b'{"version": 1e999, "seeds": [1e999], "seed": 1e999}',
-    "not a number": b"NaN",
     "half a character": b'{"name": "\\ud800", "version": "\\ud800", "seeds": ["\\ud800"]}',
-    "list": b"[1, 2]",
     "wrong types": b'{"version": [1], "seeds": "x", "name": {"a": 1}, "format_version": 1, "run": 4, "cell": 3}',
-    "keys that are no text": b"{1: 2, null: 3, 2026-01-01: 4}",
-    "iteration that no computer counts to": b'{"iteration": %s, "version": 1}' % (b"9" * 100),
     "nothing": b"",
-    "a key twice": b"name: x\nname: y\nname: x\n",
     "lines for a terminal": b'name: "x\\nTraceback (most recent call last):\\n\\e[2J"',
 }
 EVALUATE = ("evaluate", "--episodes", "2", "--steps", "2", "--registry", "registry", "--primitives")
 RESUME = ("pretrain", "--resume", "--registry", "registry", "--run-dir")
 CHECKPOINT = "run/checkpoints/*"
-VERSION, ALIAS, BLOB = "registry/models/tiny/versions/1", "registry/models/tiny/aliases/latest", "registry/blobs/*/*"
+VERSION, BLOB = "registry/models/tiny/versions/1", "registry/blobs/*/*"
 PLACES = {
     "--config": ("tiny.yaml", ("pretrain", "--config", "tiny.yaml", "--run-dir", "new")),
     "--config of a resume": ("tiny.yaml", (*RESUME, "run", "--config", "tiny.yaml")),
     "config.yaml": ("run/config.yaml", (*RESUME, "run")),
-    "config.yaml to evaluate": ("run/config.yaml", (*EVALUATE, "run")),
     "checkpoint": (CHECKPOINT, (*RESUME, "run")),
-    "checkpoint to evaluate": (CHECKPOINT, (*EVALUATE, "run")),
     "published.json": ("run/published.json", (*RESUME, "run")),
     "run.json": ("run/run.json", (*RESUME, "run")),
     "study's config": ("study/seed-1.yaml", (*RESUME, "study", "--seeds", "0,1")),
     "study.json": ("study/study.json", (*RESUME, "study", "--seeds", "0,1")),
     "manifest": (VERSION, (*EVALUATE, "tiny")),
-    "manifest to list": (VERSION, ("registry", "list", "--registry", "registry")),
     "manifest to verify": (VERSION, ("registry", "verify", "--registry", "registry")),
-    "alias": (ALIAS, (*EVALUATE, "tiny")),
     "blob": (BLOB, (*EVALUATE, "tiny")),
     "blob to verify": (BLOB, ("registry", "verify", "--registry", "registry")),
-    "blob to export": (BLOB, ("registry", "export", "tiny", "out", "--registry", "registry")),
     "checkpoint to publish": (CHECKPOINT, ("publish", "run", "--registry", "registry")),
-}
-RECORDS = {
     "metrics.jsonl": ("run/metrics.jsonl", (*RESUME, "run")),
-    "goals.jsonl": ("run/goals.jsonl", (*RESUME, "run")),
 }
-"""Places of files with a line for each iteration."""
 
 
 @contextmanager
@@ -160,10 +105,7 @@ def good(tmp_path_factory):
     write_yaml(home / "tiny.yaml", config.model_dump(mode="json"))
     registry = Registry(home / "registry")
     publish(registry, config, run.method.parameters(), {"env_steps": 600.0})
-    with closing(StudyDirectory(home / "study")) as study:
-        study.begin(
-            {f"seed-{seed}": ({"seed": str(seed)}, config.model_copy(update={"seed": seed})) for seed in (0, 1)}, None
-        )
+    begin_study(home / "study", config)
     return home
 
 
@@ -182,9 +124,9 @@ def take_away(home, file):
     return path
 
 
-@pytest.mark.parametrize("place", [*PLACES, *RECORDS])
+@pytest.mark.parametrize("place", PLACES)
 def test_what_is_no_file(home, place):
-    file, arguments = (PLACES | RECORDS)[place]
+    file, arguments = PLACES[place]
     path = take_away(home, file)
     for make in NOT_FILES.values():
         make(path)
@@ -192,12 +134,12 @@ def test_what_is_no_file(home, place):
         (path.rmdir if path.is_dir() else path.unlink)()
 
 
-@pytest.mark.parametrize("place", [*PLACES, *RECORDS])
+@pytest.mark.parametrize("place", PLACES)
 def test_a_file_with_something_else_in_it(home, place):
-    file, arguments = (PLACES | RECORDS)[place]
+    file, arguments = PLACES[place]
     path = take_away(home, file)
     for name, content in NO_CONTENT.items():
-        path.write_bytes(content + b"\n" * (place in RECORDS))  # else it would be a torn line
+        path.write_bytes(content + b"\n" * (place == "metrics.jsonl"))  # else it would be a torn line
         said = refuse(arguments)
         assert path.name in said or "tiny" in said, (name, said)
     with path.open("wb") as huge:
@@ -209,21 +151,13 @@ NOT_UTF8 = os.fsdecode(b"\xb2")
 PRETRAIN = ("pretrain", "--config", "tiny.yaml", "--registry", "new", "--set", "run.total_env_steps=200")
 TYPED = {
     "no id": ((*PRETRAIN, "--run-id", ""), "--run-id: an argument is empty"),
-    "no id, joined": ((*PRETRAIN, "--run-id="), "--run-id=: an argument is empty"),
     "no command": (("",), "the first word: an argument is empty"),
     "no directory": ((*PRETRAIN, "--run-dir", ""), "--run-dir: an argument is empty"),
-    "no host": (("serve", "--runs", ".", "--host", ""), "--host: an argument is empty"),
     "an id that leads out": ((*PRETRAIN, "--run-id", "../../etc"), "--run-id '../../etc': use 1 to 128 letters"),
-    "an id of a parent": ((*PRETRAIN, "--run-id", ".."), "--run-id '..'"),
-    "an absolute id": ((*PRETRAIN, "--run-id", "/tmp/x"), "--run-id '/tmp/x'"),
     "an id with a line end": ((*PRETRAIN, "--run-id", "x\n"), "--run-id 'x\\n'"),
     "true as a number": ((*PRETRAIN, "--run-dir", "new", "--set", "game.num_worlds=true"), "expected a number"),
-    "true as a number of a task": (("train", "push", "--run-dir", "new", "--set", "sac.num_worlds=true"),
-        "expected a number"),
     "a lock that is a link": ((*PRETRAIN, "--run-dir", "locked"), "locked/.lock: a symbolic link"),
     "a host that is no text": (("serve", "--runs", ".", "--host", NOT_UTF8), "--host is a name or address"),
-    "a host that is no text, to play": (("play", "--primitives", "tiny", "--registry", "registry", "--host", NOT_UTF8),
-        "check --host"),
     "a file as registry": (("registry", "list", "--registry", "tiny.yaml"), "tiny.yaml is no directory"),
     "a token from a FIFO": (("serve", "--runs", ".", "--token-file", "fifo"), "--token-file fifo: not a regular file"),
     "a token from a device": (("serve", "--runs", ".", "--token-file", "/dev/zero"), "/dev/zero: not a regular file"),

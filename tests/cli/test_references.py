@@ -48,6 +48,28 @@ def test_primitives_are_tried_on_a_task(home):
     assert list(json.loads(found.stdout)) == ["task", "made@1", "idle"]
 
 
+def test_skills_are_taken_as_primitives_are(home, monkeypatch):
+    shown = []
+    monkeypatch.setattr("service.media.video.write_episode_video", lambda *arguments: shown.append(arguments))
+    dads = skill_sets.CONFIG.model_copy(
+        update={"name": "dads", "skills": skill_sets.CONFIG.skills.model_copy(update={"method": "dads"})}
+    )
+    publish(Registry(home / "registry"), dads, skill_sets.parameters(), {})
+    found = tandem("coverage", "dads", "--skills", 3, "--steps", 4, "--json")
+    assert json.loads(found.stdout)["share_of_table_cells_visited"].keys() == {"dads@1", "random policy"}
+    assert (home / "coverage.png").stat().st_size > 10_000
+    rows = json.loads(
+        tandem("evaluate", "skills", "--episodes", 5, "--steps", 3, "--json").stdout
+    )  # the one towards the goal acts
+    assert rows["skills@1"]["mean_distance_m"] != rows["idle"]["mean_distance_m"]
+    refused = tandem("evaluate", "dads", *SMALL)
+    assert (refused.exit_code, refused.stderr.count("\n")) == (2, 1)
+    assert refused.stderr.startswith("error: dads@1 is a set of skills of dads, which no goal leads")
+    tandem("render", "dads", "--episodes", 2, "--out", "skills.mp4")
+    ((episodes, _, path, _),) = shown
+    assert (episodes.states.shape[:2], episodes.goal, path.name) == ((51, 2), None, "skills.mp4")
+
+
 def test_a_registry_may_be_a_url(home, monkeypatch):
     monkeypatch.setenv("XDG_CACHE_HOME", str(home / "cache"))
     with serve(home) as server:
@@ -70,22 +92,13 @@ def test_a_registry_may_be_a_url(home, monkeypatch):
     ("arguments", "said"),
     [
         (("coverage", "training"), "tandem coverage needs primitives or skills: name made@1, which it"),
-        (
-            ("dataset", "skills", "--out", "d"),
-            "skills@1 is a set of skills of lsd; tandem dataset needs primitives or a",
-        ),
-        (
-            ("robot", "run", "--robot", "mujoco", "--policy", "skills"),
-            "skills@1 is a set of skills of lsd; tandem robot",
-        ),
+        (("dataset", "skills", "--out", "d"), "skills@1 is a set of skills of lsd; tandem dataset needs primitives"),
+        (("robot", "run", "--robot", "mujoco", "--policy", "skills"), "set of skills of lsd; tandem robot"),
         (
             ("pretrain", "--from", "training"),
-            "training is a policy of the task wall; --from needs primitives: name made",
+            "is a policy of the task wall; --from needs primitives: name made",
         ),
-        (
-            ("train", "wall", "--primitives", "training"),
-            "the method ours needs primitives: name",
-        ),
+        (("train", "wall", "--primitives", "training"), "the method ours needs primitives: name"),
         (("publish", "made@1", "--name", "x"), "no run in made@1"),
         (("export", "runs", "--format", "numpy", "--out", "o"), "no run in runs"),
     ],

@@ -44,24 +44,18 @@ def assert_user_error(result: Any, *parts: str) -> None:
 
 
 def test_list(run: Run) -> None:
-    lines = run("list").stdout.splitlines()
-    assert lines[0].split("\t") == ["name", "version", "where", "created", "bytes", "aliases", "parent", "kind"]
-    assert [line.split("\t")[:3] for line in lines[1:3]] == [["panda-cube", str(n), "yours"] for n in (1, 2)]
-    assert lines[2].split("\t")[5:] == ["latest", "panda-cube@1", "primitives"]
+    lines = [line.split("\t") for line in run("list").stdout.splitlines()]
+    assert lines[0] == ["name", "version", "where", "created", "bytes", "aliases", "parent", "kind"]
+    assert [line[:3] for line in lines[1:3]] == [["panda-cube", str(n), "yours"] for n in (1, 2)]
+    assert lines[2][5:] == ["latest", "panda-cube@1", "primitives"]
     bundled = [Registry(BUNDLED).resolve(f"{name}@champion") for name in ("panda-cube", "panda-cube-robust")]
-    assert [line.split("\t")[:3] for line in lines[3:]] == [
-        [each.name, str(each.number), "bundled"] for each in bundled
-    ]
-
-
-def test_list_json(run: Run) -> None:
+    assert [line[:3] for line in lines[3:]] == [[each.name, str(each.number), "bundled"] for each in bundled]
     rows = json.loads(run("list", "--json").stdout)
-    own = [row for row in rows if row["where"] == "yours"]
-    assert [(row["name"], row["version"], row["aliases"], row["parent"]) for row in own] == [
-        ("panda-cube", 1, [], None),
-        ("panda-cube", 2, ["latest"], "panda-cube@1"),
+    assert [(row["name"], row["version"], row["aliases"], row["parent"], row["where"]) for row in rows[:2]] == [
+        ("panda-cube", 1, [], None, "yours"),
+        ("panda-cube", 2, ["latest"], "panda-cube@1", "yours"),
     ]
-    assert {row["where"] for row in rows[len(own) :]} == {"bundled"}
+    assert {row["where"] for row in rows[2:]} == {"bundled"}
 
 
 @pytest.mark.parametrize("directory", [".", "none"])

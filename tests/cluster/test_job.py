@@ -20,7 +20,7 @@ from ray.job_submission import JobSubmissionClient
 
 from service.registry.publishing import publish
 from service.registry.registry import Registry
-from service.runs.study_file import StudyDirectory
+from service.runs.study import Study
 from service.store.checkpoints import CheckpointStore
 from service.store.run_directory import RunDirectory
 from tests.runs.runs import ROOT, TINY_TASK, newest, play, read_lines, tiny_config, write_yaml
@@ -159,7 +159,7 @@ def test_a_study_of_tasks_is_killed_with_its_driver_and_stopped_and_goes_on(head
             assert last.returncode == 0, last.stderr
         finally:
             server.terminate()
-    found = StudyDirectory(path).read()
+    found = Study(path).read()
     assert {(run.state, run.env_steps) for run in found.runs.values()} == {("finished", steps)}
     for name, each in found.runs.items():
         rows = read_lines(path / name / "metrics.jsonl")

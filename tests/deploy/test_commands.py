@@ -12,7 +12,8 @@ from typer.testing import CliRunner
 from service.cli.main import app
 from service.config import dump_config
 from service.config.recipes import recipes
-from service.runs.study import Place, Study
+from service.runs.study import Study
+from service.runs.study_run import Place
 from service.store.checkpoints import CheckpointStore
 from service.store.run_history import RunHistory
 from tests.deploy.files import DEPLOY, DOCUMENTS, commands, compose, container, manifest, manifests, pod_templates
@@ -87,7 +88,7 @@ def test_a_run_begins_with_it_and_goes_on_with_it(arguments, monkeypatch, tmp_pa
         directory.config_file.write_text(dump_config(config))
 
     def begin(study, *arguments):
-        begun.append((study.directory.path, resumed))
+        begun.append((study.path, resumed))
 
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("service.cli.train._train", train)

@@ -9,7 +9,7 @@ import resource
 import subprocess
 import sys
 import time
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, closing, contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +17,7 @@ import yaml
 
 from service.config import parse_config
 from service.runs.report import Report
+from service.runs.study import Study
 from service.runs.train import open_run
 from service.store.checkpoints import CheckpointStore
 from service.store.disk_reader import DiskReader
@@ -108,6 +109,15 @@ def play(path, config=None, *, resume=False, kill_after=None, on_iteration=None)
     finally:
         run.close()
         directory.close()
+
+
+def begin_study(path, config=None):
+    """A study of two seeds that has begun, and none of its runs."""
+    configs = {f"seed-{seed}": (config or tiny_config()).model_copy(update={"seed": seed}) for seed in (0, 1)}
+    with closing(Study(path)) as study:
+        study.claim()
+        study.begin({name: {"seed": str(each.seed)} for name, each in configs.items()}, configs, None)
+    return study
 
 
 @contextmanager

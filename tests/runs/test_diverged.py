@@ -26,13 +26,6 @@ class NotANumber(NumpyGaussianPolicy):
         return action, log_prob
 
 
-@pytest.fixture(scope="module")
-def uninterrupted(tmp_path_factory):
-    path = tmp_path_factory.mktemp("uninterrupted")
-    play(path)
-    return path
-
-
 def diverge_after(patch, iteration):
     """Alice's policy is no good from the iteration behind this one."""
     players, rounds = RolloutWorker._players, count()
@@ -119,5 +112,9 @@ def test_a_world_that_breaks_is_said_recorded_and_starts_anew(tmp_path, caplog):
     assert set(diverged[2:]) == {1.0}
     (file,) = (tmp_path / "broken").iterdir()
     assert_one_line(caplog.messages[0], "physics diverged", file)
+    with np.load(file) as dump:
+        assert dump["states"].shape[1:] == (run.method.game.worlds.layout.size,)
+        assert dump["actions"].shape[1:] == (4,)
+        assert len(dump["states"]) == len(dump["actions"]) == 1
     state = run.method.learner.state()
     assert all(np.isfinite(array).all() for array in state.values() if array.dtype.kind == "f")

@@ -46,13 +46,6 @@ def elsewhere(path, to):
     return to
 
 
-@pytest.fixture(scope="module")
-def uninterrupted(tmp_path_factory):
-    path = tmp_path_factory.mktemp("uninterrupted")
-    play(path)
-    return path
-
-
 def in_half_a_temporary_file(patch):
     write = files._write_flushed
 
@@ -63,17 +56,6 @@ def in_half_a_temporary_file(patch):
         write(path, data)
 
     patch.setattr(files, "_write_flushed", half)
-
-
-def before_the_file_takes_its_name(patch):
-    write = files._write_flushed
-
-    def whole(path, data):
-        write(path, data)
-        if _is_checkpoint(path, STEP):
-            die()
-
-    patch.setattr(files, "_write_flushed", whole)
 
 
 def before_old_ones_are_deleted(patch):
@@ -99,19 +81,6 @@ def in_half_a_line(patch):
     patch.setattr(files, "_write_whole", half)
 
 
-def in_half_an_event(patch):
-    write, calls = files._write_whole, []
-
-    def half(file, piece):
-        calls.append(piece)
-        if len(calls) > 10 and not piece.startswith(b"{"):
-            file.write(piece[: len(piece) // 2])
-            die()
-        write(file, piece)
-
-    patch.setattr(files, "_write_whole", half)
-
-
 def _is_checkpoint(temporary, step):
     """Whether this file is to become the checkpoint of ``step``: the one two iterations earlier is there."""
     directory = temporary.parent
@@ -120,10 +89,8 @@ def _is_checkpoint(temporary, step):
 
 MOMENTS = {
     in_half_a_temporary_file: 2,
-    before_the_file_takes_its_name: 2,
     before_old_ones_are_deleted: 4,
     in_half_a_line: 4,
-    in_half_an_event: 2,
 }
 """And the iteration from which the run goes on then."""
 

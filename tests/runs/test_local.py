@@ -18,7 +18,6 @@ from service.store.checkpoints import CheckpointStore
 from service.store.run_directory import RunDirectory
 from tests.runs.runs import (
     FullForAWhile,
-    KilledError,
     assert_one_line,
     assert_same_run,
     newest,
@@ -72,47 +71,34 @@ METRICS = {
 
 
 @pytest.fixture(scope="module")
-def uninterrupted(tmp_path_factory):
+def long_run(tmp_path_factory):
     """A run from start to end."""
-    path = tmp_path_factory.mktemp("uninterrupted")
+    path = tmp_path_factory.mktemp("long")
     _, result = play(path, tiny_config(**LONG))
     assert result.reason == "finished"
     return path
 
 
-def names_in(path):
-    return set().union(*read_lines(path / "metrics.jsonl"))
-
-
 # --- one run ---------------------------------------------------------------------------------------------------------
 
 
-def test_the_tiny_run_is_no_empty_one(uninterrupted):
-    """The comparisons below mean something only if these take part."""
-    names = names_in(uninterrupted)
+def test_what_a_run_records(long_run):
+    """The comparisons below mean something only if all of this takes part."""
+    rows = read_lines(long_run / "metrics.jsonl")
+    names = set().union(*rows)
     assert {"bob/success_rate_replayed", "bob/success_rate_past_alice", "learner/demonstration_log_ratio"} <= names
-    rows = read_lines(uninterrupted / "metrics.jsonl")
     assert any(row.get("bob/success_rate", 0.0) > 0.0 for row in rows)
-    assert sum(len(row["goals"]) for row in read_lines(uninterrupted / "goals.jsonl")) > 20
-
-
-def test_iterations_and_env_steps_add_up(uninterrupted):
-    rows = read_lines(uninterrupted / "metrics.jsonl")
+    assert sum(len(row["goals"]) for row in read_lines(long_run / "goals.jsonl")) > 20
     assert [row["iteration"] for row in rows] == list(range(1, len(rows) + 1))
     steps = [row["env_steps"] for row in rows]
     assert steps[-1] >= 1500 > steps[-2]
-    assert newest(uninterrupted).step == len(rows)
-    assert newest(uninterrupted).meta["env_steps"] == steps[-1]
+    assert (newest(long_run).step, newest(long_run).meta["env_steps"]) == (len(rows), steps[-1])
     alice = 24 * 4  # she always plays on
     assert all(alice <= after - before <= 2 * alice for before, after in zip([0, *steps], steps, strict=False))
-
-
-def test_policy_lag_is_one(uninterrupted):
-    lags = [row.get("learner/policy_lag") for row in read_lines(uninterrupted / "metrics.jsonl")]
+    lags = [row.get("learner/policy_lag") for row in rows]
     assert lags[:2] == [None, 0.0]  # nothing to learn from yet, then both rounds by version 0
     assert set(lags[2:]) == {1.0}
-    versions = [row.get("learner/version") for row in read_lines(uninterrupted / "metrics.jsonl")]
-    assert versions[1:] == list(range(1, len(versions)))
+    assert [row.get("learner/version") for row in rows][1:] == list(range(1, len(rows)))
 
 
 def test_another_seed_is_another_run(uninterrupted, tmp_path):
@@ -129,14 +115,14 @@ def test_every_metric_is_recorded_under_its_name(tmp_path):
         run.method.game.worlds.restore(states)
 
     play(tmp_path, tiny_config(**LONG, evaluation_interval=4), on_iteration=lift)
-    assert names_in(tmp_path) == METRICS
+    assert set().union(*read_lines(tmp_path / "metrics.jsonl")) == METRICS
 
 
 def test_evaluations_come_at_their_interval_and_change_nothing(uninterrupted, tmp_path):
-    play(tmp_path, tiny_config(**LONG, evaluation_interval=3))
+    play(tmp_path, tiny_config(evaluation_interval=2))
     rows = read_lines(tmp_path / "metrics.jsonl")
     evaluated = [row["iteration"] for row in rows if "evaluation/table_success_last" in row]
-    assert evaluated == list(range(3, len(rows) + 1, 3))
+    assert evaluated == list(range(2, len(rows) + 1, 2))
     without = [{k: v for k, v in row.items() if not k.startswith("evaluation/")} for row in timeless_metrics(tmp_path)]
     assert without == timeless_metrics(uninterrupted)
 
@@ -179,13 +165,13 @@ def test_the_newest_checkpoints_are_kept(tmp_path):
     assert CheckpointStore(tmp_path / "checkpoints", keep=1).steps() == [result.iteration]
 
 
-def test_bob_is_kept_untrained_and_after_each_tenth(uninterrupted):
-    steps = [0, *(row["env_steps"] for row in read_lines(uninterrupted / "metrics.jsonl"))]
+def test_bob_is_kept_untrained_and_after_each_tenth(long_run):
+    steps = [0, *(row["env_steps"] for row in read_lines(long_run / "metrics.jsonl"))]
     expected = sorted({min(step for step in steps if step >= tenth * 150) for tenth in range(11)})
-    stages = read_stages(RunDirectory(uninterrupted))
+    stages = read_stages(RunDirectory(long_run))
     assert list(stages) == expected
     assert len(stages) > 4
-    untrained, last = Learner(tiny_config(**LONG)).weights().bob, load(str(uninterrupted)).parameters
+    untrained, last = Learner(tiny_config(**LONG)).weights().bob, load(str(long_run)).parameters
     for bob, same in ((stages[0], untrained), (stages[steps[-1]], last)):
         assert bob.keys() == same.keys()
         assert all(np.array_equal(bob[name], array) for name, array in same.items())
@@ -207,106 +193,49 @@ def test_a_run_that_has_converged_ends(tmp_path, monkeypatch):
     assert newest(tmp_path).step == 3
 
 
-def test_a_world_whose_physics_breaks_is_counted_and_its_state_kept(tmp_path):
-    class Diverging:
-        def __init__(self, pool):
-            self._pool, self._calls = pool, 0
-
-        def rollout(self, *args, **kwargs):
-            states, sensors = self._pool.rollout(*args, **kwargs)
-            if self._calls == 1:
-                states = states.copy()
-                states[3] = np.nan
-            self._calls += 1
-            return states, sensors
-
-        def close(self):
-            self._pool.close()
-
-    directory = RunDirectory(tmp_path)
-    run = open_run(tiny_config(), directory)
-    run.method.game.worlds._pool = Diverging(run.method.game.worlds._pool)
-    assert run.run().reason == "finished"
-    directory.close()
-    rows = read_lines(tmp_path / "metrics.jsonl")
-    assert {row["world/num_broken"] for row in rows} == {1.0}
-    assert rows[0]["alice/fallen_fraction"] == pytest.approx(1 / 24)
-    (file,) = (tmp_path / "broken").iterdir()
-    with np.load(file) as dump:
-        assert dump["states"].shape == (1, run.method.game.worlds.layout.size)
-        assert dump["actions"].shape == (1, 4)
-        assert np.isfinite(dump["states"]).all()
-
-
 # --- exact resume ----------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("iteration", [4, 9])
-def test_a_run_killed_between_two_iterations(uninterrupted, tmp_path, iteration):
+def test_a_run_killed_between_two_iterations(long_run, tmp_path):
     config = tiny_config(**LONG)
-    _, result = play(tmp_path, config, kill_after=iteration)
+    _, result = play(tmp_path, config, kill_after=8)
     assert result is None
-    assert newest(tmp_path).step == (iteration - 1) // 2 * 2  # the one due now had not been written
+    assert newest(tmp_path).step == 6  # the one due now had not been written
     with (tmp_path / "metrics.jsonl").open("ab") as file:
         file.write(b'{"iteration": 10, "env_st')
     (tmp_path / "checkpoints" / ".tmp-1-ab").write_bytes(b"half a checkpoint")
     run, result = play(tmp_path, config, resume=True)
     assert result.reason == "finished"
-    assert_same_run(tmp_path, uninterrupted)
+    assert_same_run(tmp_path, long_run)
     assert run.wall_s > 0.0
     snapshots = [
-        {file.name: file.read_bytes() for file in (path / "snapshots").iterdir()} for path in (tmp_path, uninterrupted)
+        {file.name: file.read_bytes() for file in (path / "snapshots").iterdir()} for path in (tmp_path, long_run)
     ]
     assert snapshots[0] == snapshots[1]
     assert list((tmp_path / "checkpoints").glob(".tmp-*")) == []
 
 
-def test_a_run_killed_before_its_first_checkpoint(uninterrupted, tmp_path):
-    config = tiny_config(**LONG)
-    play(tmp_path, config, kill_after=1)
-    play(tmp_path, config, resume=True)
-    assert_same_run(tmp_path, uninterrupted)
-
-
-def test_a_run_killed_while_it_learns_and_plays(uninterrupted, tmp_path, monkeypatch):
-    """Goals of the iteration are written, its metrics are not."""
-    config, original = tiny_config(**LONG), RunDirectory.record_goals
-
-    def record_goals(self, iteration, *args):
-        original(self, iteration, *args)
-        if iteration == 5:
-            raise KilledError
-
-    with monkeypatch.context() as patch:
-        patch.setattr(RunDirectory, "record_goals", record_goals)
-        assert play(tmp_path, config)[1] is None
-    assert len(read_lines(tmp_path / "goals.jsonl")) == 5
-    play(tmp_path, config, resume=True)
-    assert_same_run(tmp_path, uninterrupted)
-
-
-@pytest.mark.parametrize(("iteration", "num_past"), [(3, 0), (5, 1)])
-def test_a_stop_is_saved_and_resumed(uninterrupted, tmp_path, iteration, num_past):
+def test_a_stop_is_saved_and_resumed(long_run, tmp_path):
     """Here right after players joined the past ones, whom the next round does not meet yet."""
     config = tiny_config(**LONG, checkpoint_interval=100)
 
     def stop(run, metrics):
-        if run.iteration == iteration:
+        if run.iteration == 5:
             run.request_stop()
 
     _, result = play(tmp_path, config, on_iteration=stop)
-    assert (result.reason, result.iteration) == ("interrupted", iteration)
-    assert newest(tmp_path).step == iteration
-    assert int(newest(tmp_path).arrays["opponents/num"]) == num_past
+    assert (result.reason, result.iteration) == ("interrupted", 5)
+    assert newest(tmp_path).step == 5
+    assert int(newest(tmp_path).arrays["opponents/num"]) == 1
     config = resumed_config(RunDirectory(tmp_path), ["run.checkpoint_interval=2"])
     play(tmp_path, config, resume=True)
-    assert_same_run(tmp_path, uninterrupted)
+    assert_same_run(tmp_path, long_run)
 
 
 def test_a_finished_run_goes_on_with_a_larger_budget(uninterrupted, tmp_path):
-    _, result = play(tmp_path, tiny_config(total_env_steps=600))
+    _, result = play(tmp_path, tiny_config(total_env_steps=300))
     assert result.reason == "finished"
-    config = resumed_config(RunDirectory(tmp_path), ["run.total_env_steps=1500"])
+    config = resumed_config(RunDirectory(tmp_path), ["run.total_env_steps=600"])
     _, longer = play(tmp_path, config, resume=True)
     assert longer.iteration > result.iteration
     assert_same_run(tmp_path, uninterrupted)
@@ -314,20 +243,19 @@ def test_a_finished_run_goes_on_with_a_larger_budget(uninterrupted, tmp_path):
 
 def test_a_finished_run_resumed_as_it_is_stays_as_it_is(uninterrupted, tmp_path):
     shutil.copytree(uninterrupted, tmp_path / "copy")
-    _, result = play(tmp_path / "copy", tiny_config(**LONG), resume=True)
+    _, result = play(tmp_path / "copy", tiny_config(), resume=True)
     assert result.reason == "finished"
     assert_same_run(tmp_path / "copy", uninterrupted)
 
 
-@pytest.mark.parametrize("damage", ["flip", "cut"])
-def test_a_damaged_newest_checkpoint_is_passed_over(uninterrupted, tmp_path, caplog, damage):
+def test_a_damaged_newest_checkpoint_is_passed_over(uninterrupted, tmp_path, caplog):
     path = tmp_path / "copy"
     shutil.copytree(uninterrupted, path)
     *_, before, last = sorted((path / "checkpoints").iterdir())
     data = bytearray(last.read_bytes())
     data[len(data) // 2] ^= 1
-    last.write_bytes(data if damage == "flip" else data[: len(data) // 2])
-    config, started = tiny_config(**LONG), []
+    last.write_bytes(data)
+    config, started = tiny_config(), []
     play(path, config, resume=True, on_iteration=lambda run, metrics: started.append(run.iteration))
     assert started[0] == int(before.stem.rpartition("-")[2]) + 1
     assert last.name in caplog.text
@@ -355,7 +283,7 @@ def test_a_new_run_does_not_touch_an_old_one(uninterrupted, tmp_path):
 
 
 def test_a_full_disk_leaves_the_earlier_checkpoint(uninterrupted, tmp_path, caplog):
-    config = tiny_config(**LONG)
+    config = tiny_config()
     with no_room_above(175_000), pytest.raises(UnsavedError) as error:
         play(tmp_path, config)
     last = newest(uninterrupted).step
@@ -372,7 +300,7 @@ def test_a_full_disk_leaves_the_earlier_checkpoint(uninterrupted, tmp_path, capl
     assert_same_run(tmp_path, uninterrupted)
 
 
-def test_a_disk_that_was_full_for_a_while_costs_nothing(uninterrupted, tmp_path, caplog):
+def test_a_disk_that_was_full_for_a_while_costs_nothing(long_run, tmp_path, caplog):
     """Checkpoints are skipped, and records that did not fit come later, in their places."""
     with ExitStack() as stack:
 
@@ -385,7 +313,7 @@ def test_a_disk_that_was_full_for_a_while_costs_nothing(uninterrupted, tmp_path,
 
         _, result = play(tmp_path, tiny_config(**LONG), on_iteration=fill_and_clear)
     assert result.reason == "finished"
-    assert_same_run(tmp_path, uninterrupted)
+    assert_same_run(tmp_path, long_run)
     for name in ("e00000001-00000004", "e00000001-00000008", "metrics.jsonl", "goals.jsonl", "snapshots"):
         assert name in caplog.text
     assert "e00000001-00000010" not in caplog.text
@@ -395,17 +323,6 @@ def test_a_checkpoint_that_does_not_fit_is_said_until_one_does(tmp_path):
     told = FullForAWhile("local")
     play(tmp_path / "run", tiny_config(total_env_steps=1000), on_iteration=told)
     told.check()
-
-
-def test_records_that_do_not_fit_are_said_until_they_do(tmp_path):
-    directory = RunDirectory(tmp_path)
-    directory.record({"iteration": 1, "env_steps": 100})
-    with no_room_above(40):
-        directory.record({"iteration": 2, "env_steps": 200})
-        (problem,) = directory.problems()
-        assert_one_line(problem, "cannot write", "metrics.jsonl", "File too large")
-    directory.sync()
-    assert directory.problems() == []
 
 
 def test_the_last_checkpoint_is_not_written_twice(tmp_path, monkeypatch):

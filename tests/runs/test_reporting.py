@@ -1,9 +1,8 @@
 """What a run in one process tells while it goes on, and that only one process runs it."""
 
 import json
+import os
 import signal
-import subprocess
-import sys
 import threading
 import time
 
@@ -25,12 +24,10 @@ from service.store.disk_reader import DiskReader
 from service.store.redis_reader import RedisReader
 from service.store.run_directory import RunDirectory
 from tests.runs.runs import (
-    ROOT,
     assert_one_line,
     assert_same_run,
     play,
     read_lines,
-    start_endless_run,
     tiny_config,
 )
 from tests.status.runs import BEARER, CLIENT, TOKEN
@@ -84,14 +81,11 @@ def test_a_run_tells_how_far_it_is_and_how_it_ended(tmp_path):
     assert grid.num_cells >= len(grid.cells) > 0
     assert sum(cell.num_tries for cell in grid.cells) > 0
 
-
-def test_a_resumed_run_tells_where_it_goes_on_and_what_it_published_before(tmp_path):
-    run(tmp_path)
-    first, seen = status(tmp_path), []
+    seen.clear()  # a resumed run tells where it goes on, and what was published before
     config = resumed_config(RunDirectory(tmp_path / "runs" / "cube"), ["run.total_env_steps=600"])
     run(tmp_path, config, resume=True, on_iteration=lambda metrics: seen.append(status(tmp_path)))
-    assert (seen[0].state, seen[0].iteration, seen[0].published) == ("running", first.iteration, "tiny@1")
-    assert seen[0].started > first.started
+    assert (seen[0].state, seen[0].iteration, seen[0].published) == ("running", last.iteration, "tiny@1")
+    assert seen[0].started > last.started
     assert status(tmp_path).published == "tiny@2"
 
 
@@ -116,24 +110,18 @@ def test_a_stop_request_ends_the_run_after_its_iteration_saved(tmp_path):
 
 
 def test_how_a_run_failed(tmp_path, monkeypatch):
-    def fail(self, metrics):
+    def fail(*_):
         raise DivergedError("a\nproblem")
 
-    monkeypatch.setattr(RunDirectory, "record", fail)
-    with pytest.raises(DivergedError):
-        run(tmp_path)
-    last = status(tmp_path)
-    assert (last.state, last.last_error) == ("failed", "DivergedError: a problem")
-
-
-def test_a_run_that_cannot_publish_has_failed(tmp_path, monkeypatch):
-    def fail(*_):
-        raise TandemError("no room")
-
+    with monkeypatch.context() as patch:
+        patch.setattr(RunDirectory, "record", fail)
+        with pytest.raises(DivergedError):
+            run(tmp_path)
+    assert (status(tmp_path).state, status(tmp_path).last_error) == ("failed", "DivergedError: a problem")
     monkeypatch.setattr(module, "publish_run", fail)
     with pytest.raises(UnfinishedError):
-        run(tmp_path)
-    assert_one_line(status(tmp_path).last_error, "saved, but not published: no room", "--resume")
+        run(tmp_path, resume=True)
+    assert_one_line(status(tmp_path).last_error, "saved, but not published: a problem", "--resume")
 
 
 def test_a_second_signal_is_an_interruption(tmp_path):
@@ -193,22 +181,25 @@ def test_a_run_that_another_took_over_stops_at_once_and_leaves_its_status_alone(
 
 
 def test_a_second_process_is_refused_and_a_killed_one_has_vanished(tmp_path):
-    process, path = start_endless_run(tmp_path)
+    path, reader = tmp_path / "runs" / "cube", DiskReader(tmp_path / "runs")
+    child = os.fork()
+    if child == 0:
+        try:
+            run(tmp_path, tiny_config(total_env_steps=10**9))
+        finally:
+            os._exit(1)
     try:
-        reader = DiskReader(tmp_path)
-        wait_until(lambda: reader.runs() and reader.run("run").iteration > 0, within_s=600.0)
-        assert reader.run("run").state == "running"
-        command = [sys.executable, "-m", "service", "pretrain", "--resume", "--run-dir", str(path)]
-        second = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=600)
-        assert process.poll() is None
-        assert second.returncode == 2
-        assert_one_line(second.stderr, f"{path} is in use by process {process.pid}", "--run-dir")
+        wait_until(lambda: path.exists() and reader.runs() and reader.run("cube").iteration > 0, within_s=600.0)
+        assert reader.run("cube").state == "running"
+        with pytest.raises(RunTakenError) as error:
+            RunDirectory(path).claim(resume=True)
+        assert_one_line(error.value, f"{path} is in use by process {child}", "--run-dir")
     finally:
-        process.kill()
-        process.communicate()
+        os.kill(child, signal.SIGKILL)
+        os.waitpid(child, 0)
     told = json.loads((path / "status.json").read_text())
     (path / "status.json").write_text(json.dumps(told | {"heartbeat": "2024-05-01T00:00:00Z"}))
-    seen = DiskReader(tmp_path).run("run")  # a reader who has seen it alive does not care for dates
+    seen = status(tmp_path)  # a reader who has seen it alive does not care for dates
     assert (seen.state, "vanished" in seen.last_error) == ("interrupted", True)
     directory = RunDirectory(path)
     directory.claim(resume=True)  # the kernel has freed it
@@ -238,29 +229,7 @@ def test_of_two_new_runs_at_once_one_begins(tmp_path, monkeypatch):
     second.close()
 
 
-def test_a_run_in_use_is_not_touched(tmp_path):
-    play(tmp_path, tiny_config(total_env_steps=200))
-    first = RunDirectory(tmp_path)
-    first.claim(resume=True)
-    before = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
-    with pytest.raises(RunTakenError):
-        train(
-            tiny_config(), RunDirectory(tmp_path), tmp_path / "registry", resume=True, on_iteration=lambda metrics: None
-        )
-    assert {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()} == before
-    first.close()
-
-
 # --- Redis -----------------------------------------------------------------------------------------------------------
-
-
-def test_a_run_tells_redis_too(tmp_path, redis):
-    run(tmp_path)
-    reader = RedisReader(redis.address)
-    (told,) = reader.runs()
-    assert told.model_dump(exclude={"heartbeat"}) == status(tmp_path).model_dump(exclude={"heartbeat"})
-    assert reader.metrics("cube") == read_lines(tmp_path / "runs" / "cube" / "metrics.jsonl")
-    assert reader.goals("cube") is not None
 
 
 def test_a_run_whose_redis_is_killed_and_comes_back(tmp_path, redis, monkeypatch):
@@ -282,7 +251,9 @@ def test_a_run_whose_redis_is_killed_and_comes_back(tmp_path, redis, monkeypatch
     assert_one_line(warned[0], f"Redis at {redis.address} has taken nothing for")
     reader = RedisReader(redis.address)
     assert reader.metrics("cube") == read_lines(tmp_path / "runs" / "cube" / "metrics.jsonl")
-    assert reader.run("cube").state == "finished"
+    (told,) = reader.runs()
+    assert told.model_dump(exclude={"heartbeat"}) == status(tmp_path).model_dump(exclude={"heartbeat"})
+    assert (told.state, reader.goals("cube") is not None) == ("finished", True)
     play(tmp_path / "whole", config)
     assert_same_run(tmp_path / "runs" / "cube", tmp_path / "whole")
 

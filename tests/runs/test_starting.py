@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from service.base.errors import TandemError
-from service.cli.common import load_start
 from service.config import parse_config
 from service.policies.numpy_policy import numpy_bob
 from service.registry.loading import load
@@ -89,15 +88,6 @@ def test_only_the_value_network_learns_at_first(tmp_path):
     assert not {name for name in changed if name.startswith("bob/policy/")}
     assert {name for name in changed if name.startswith("bob/value/")}
     assert {name for name in changed if name.startswith("alice/policy/")}
-
-
-@pytest.mark.parametrize(
-    ("reference", "expected"),
-    [("nobody@1", "nobody"), ("some/where", "no such directory of a run")],
-)
-def test_what_cannot_be_begun_from(tmp_path, reference, expected):
-    with pytest.raises(TandemError, match=expected):
-        load_start(reference, tmp_path)
 
 
 def test_nothing_that_fits_is_refused_and_another_try_can_begin(trained, tmp_path):

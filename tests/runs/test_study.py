@@ -1,6 +1,7 @@
 """Studies: seeds, grids, cores, intervals, which run is the best, and real ones through kills, signals and resumes."""
 
 import csv
+import io
 import json
 import os
 import re
@@ -9,37 +10,54 @@ import subprocess
 import sys
 import threading
 import time
+from contextlib import nullcontext
 
 import numpy as np
 import pytest
+from rich.console import Console
 from typer.testing import CliRunner
 
 from service.actors.evaluation import EVALUATION_SEED, REPORTED_SEED, SELECTION_SEED, Evaluation
 from service.base.errors import ConfigError, TandemError
 from service.base.lock import is_locked
+from service.base.progress import Display
 from service.cli.main import app
 from service.config import dump_config, load_config
 from service.registry.loading import load
 from service.registry.registry import Registry
-from service.runs import study_results
+from service.runs import study_results, study_run
+from service.runs import train as training
 from service.runs.grid import name_runs, parse_grid, parse_seeds
+from service.runs.progress import Progress
 from service.runs.resuming import resumed_config
-from service.runs.study import Job, Place, share
-from service.runs.study_file import StudyDirectory, StudyRun
+from service.runs.signals import PARENT, InterruptError, StopSignals
+from service.runs.study import Study
 from service.runs.study_results import (
     as_csv,
     best_of,
     bootstrap_interval,
     interquartile_mean,
-    publish_best,
+    published_metrics,
     select,
     summaries,
 )
+from service.runs.study_run import END_NOW, GO_ON, STOP, Job, Place, StudyRun, run_process, share
+from service.runs.train import publish_learned
 from service.store.checkpoints import CheckpointStore
 from service.store.disk_reader import DiskReader
 from service.store.run_directory import RunDirectory
 from service.store.run_log import read_log
-from tests.runs.runs import ROOT, TINY_TASK, assert_one_line, newest, play, read_lines, tiny_config, write_yaml
+from tests.runs.runs import (
+    ROOT,
+    TINY_TASK,
+    assert_one_line,
+    begin_study,
+    newest,
+    play,
+    read_lines,
+    tiny_config,
+    write_yaml,
+)
 
 PATIENCE_S = 300.0
 
@@ -69,25 +87,23 @@ def test_seeds_are_numbers_and_ranges(text, seeds):
 
 
 @pytest.mark.parametrize(
-    ("text", "parts"),
+    ("text", "part"),
     [
-        ("0,0", ["0 given twice", "name each once"]),
-        ("0-3,2,1", ["1, 2 given twice"]),
-        ("0,a", ["'a'", "0,1,2 or 0-4"]),
-        ("1.5", ["'1.5'"]),
-        ("-1", ["'-1'"]),
-        ("", ["''"]),
-        ("0,", ["''"]),
-        ("4-0", ["4-0", "goes down", "0-4"]),
-        ("0-999999999", ["more than 1000"]),
-        ("0-998,1000-1001", ["more than 1000"]),
-        ("\u0663", ["\u0663"]),  # a digit, in another script
+        ("0-3,2,1", "1, 2 given twice"),
+        ("0,a", "'a'"),
+        ("1.5", "'1.5'"),
+        ("-1", "'-1'"),
+        ("0,", "''"),
+        ("4-0", "'4-0'"),
+        ("0-999999999", "at most 1000"),
+        ("0-998,1000-1001", "at most 1000"),
+        ("\u0663", "\u0663"),  # a digit, in another script
     ],
 )
-def test_seeds_that_are_none_are_refused_with_one_line(text, parts):
+def test_seeds_that_are_none_are_refused_with_one_line(text, part):
     with pytest.raises(ConfigError) as error:
         parse_seeds(text)
-    assert_one_line(error.value, "--seeds", *parts)
+    assert_one_line(error.value, "--seeds", part)
 
 
 def test_as_many_seeds_as_there_may_be():
@@ -110,25 +126,19 @@ def test_a_grid_has_values_as_they_are_typed(texts, grid):
 
 
 @pytest.mark.parametrize(
-    ("texts", "seeds", "parts"),
+    ("texts", "seeds", "part"),
     [
-        (["a"], None, ["--grid 'a'", "KEY=VALUE,VALUE"]),
-        (["=1"], None, ["KEY=VALUE,VALUE"]),
-        (["a="], None, ["KEY=VALUE,VALUE"]),
-        (["a=1,"], None, ["KEY=VALUE,VALUE"]),
-        (["a=,1"], None, ["KEY=VALUE,VALUE"]),
-        (["a=[1,2"], None, ["KEY=VALUE,VALUE"]),
-        (["a=1],[2"], None, ["KEY=VALUE,VALUE"]),
-        (["a=" + "[" * 5000], None, ["KEY=VALUE,VALUE"]),
-        (["a=1,2,1"], None, ["1 given twice"]),
-        (["a=1", "a=2"], None, ["a is given by another --grid"]),
-        (["seed=1,2"], "0", ["--seeds 0", "--grid seed", "one of them"]),
+        *(([text], None, "KEY=VALUE,VALUE") for text in ("a", "=1", "a=", "a=1,", "a=,1", "a=[1,2", "a=1],[2")),
+        (["a=" + "[" * 5000], None, "KEY=VALUE,VALUE"),
+        (["a=1,2,1"], None, "1 given twice"),
+        (["a=1", "a=2"], None, "a is given by another --grid"),
+        (["seed=1,2"], "0", "--seeds 0 and --grid seed"),
     ],
 )
-def test_a_grid_that_is_none_is_refused_with_one_line(texts, seeds, parts):
+def test_a_grid_that_is_none_is_refused_with_one_line(texts, seeds, part):
     with pytest.raises(ConfigError) as error:
         parse_grid(texts, seeds)
-    assert_one_line(error.value, *parts)
+    assert_one_line(error.value, part)
 
 
 def test_names_of_runs_say_what_they_differ_in():
@@ -150,32 +160,22 @@ def test_names_of_runs_say_what_they_differ_in():
         assert_one_line(error.value, *parts)
 
 
-@pytest.mark.parametrize(
-    ("num_cores", "num_runs", "parallel", "found"),
-    [
-        (2, 3, None, (1, 2)),
-        (1, 3, None, (1, 1)),
-        (8, 3, None, (3, 2)),
-        (16, 3, None, (3, 5)),
-        (16, 20, None, (8, 2)),
-        (2, 3, 2, (2, 1)),
-        (2, 3, 9, (3, 1)),
-    ],
-)
-def test_cores_are_shared_out(num_cores, num_runs, parallel, found):
-    assert share([tiny_config(num_threads=0)] * num_runs, Place(num_cores), parallel) == (
-        found[0],
-        [found[1]] * num_runs,
-    )
-
-
-def test_a_task_has_one_core_and_no_run_more_than_its_machine_or_than_it_was_given():
-    task = tiny_task(num_threads=0)
-    assert share([task] * 9, Place(4), None) == (4, [1] * 9)
-    assert share([task] * 9, Place(4), 2) == (2, [1] * 9)
-    assert share([tiny_config(num_threads=0)] * 2, Place(64, 16), None) == (2, [16, 16])
-    assert share([tiny_config(num_threads=0)], Place(64, 16), None) == (1, [16])
-    assert share([tiny_config(num_threads=4), task], Place(8), None) == (2, [4, 1])
+def test_cores_are_shared_out():
+    play, task = tiny_config(num_threads=0), tiny_task(num_threads=0)
+    for configs, place, parallel, found in (
+        ([play] * 3, Place(2), None, (1, [2] * 3)),
+        ([play] * 3, Place(1), None, (1, [1] * 3)),
+        ([play] * 3, Place(8), None, (3, [2] * 3)),
+        ([play] * 3, Place(16), None, (3, [5] * 3)),
+        ([play] * 3, Place(2), 2, (2, [1] * 3)),
+        ([play] * 3, Place(2), 9, (3, [1] * 3)),
+        ([task] * 9, Place(4), None, (4, [1] * 9)),
+        ([task] * 9, Place(4), 2, (2, [1] * 9)),
+        ([play] * 2, Place(64, 16), None, (2, [16, 16])),  # no more than its machine has
+        ([play], Place(64, 16), None, (1, [16])),
+        ([tiny_config(num_threads=4), task], Place(8), None, (2, [4, 1])),
+    ):
+        assert share(configs, place, parallel) == found
 
 
 def tiny_task(**run):
@@ -183,19 +183,16 @@ def tiny_task(**run):
 
 
 def test_what_a_run_is_told(tmp_path):
-    """It begins with its file and with what it begins from; once it has begun, it goes on with the study's budget."""
+    """It begins with its file, and once it has begun, goes on with what the study changes in that."""
     config, path = tiny_config(seed=3, total_env_steps=999), tmp_path / "seed-3"
-    run = StudyRun(settings={"seed": "3"})
-    job = Job(path, dump_config(config), run, ("--registry", "r"), ("--from", "panda-cube@6"))
-    place = ["--run-dir", str(path), "--no-publish"]
-    assert job.arguments() == ["train", f"{path}.yaml", *place, "--registry", "r", "--from", "panda-cube@6"]
-    play(path, tiny_config(seed=3, total_env_steps=120))
-    job.write_config()
-    arguments = job.arguments()
-    assert arguments[:5] == ["train", "--resume", *place]
-    assert arguments[-2:] == ["--registry", "r"]
-    overrides = [arguments[place + 1] for place, each in enumerate(arguments) if each == "--set"]
-    assert resumed_config(RunDirectory(path), overrides) == config
+    job = Job(path, dump_config(config), 999, StudyRun(settings={"seed": "3"}), ("--registry", "r"))
+    assert job.arguments() == [
+        *("train", f"{path}.yaml", "--run-dir", str(path), "--resume=auto", "--no-publish", "--registry", "r"),
+    ]
+    assert load_config(tmp_path / "seed-3.yaml") == config
+    bob = config.learner.bob.model_copy(update={"learning_rate": 1e-6})
+    play(path, config.model_copy(update={"learner": config.learner.model_copy(update={"bob": bob})}), kill_after=1)
+    assert resumed_config(RunDirectory(path), [], tmp_path / "seed-3.yaml") == config
 
 
 # --- numbers ---------------------------------------------------------------------------------------------------------
@@ -221,14 +218,6 @@ def test_bootstrap_intervals_by_hand():
     # A task is resampled by itself: what differs between tasks adds nothing to the interval.
     assert bootstrap_interval([[0.0, 0.0], [1.0, 1.0]]) == (0.5, 0.5)
     assert bootstrap_interval([[0.7]]) == (0.7, 0.7)
-
-
-def test_a_mean_of_many_has_the_interval_of_the_normal_distribution():
-    values = np.random.default_rng(3).normal(2.0, 1.0, 400)
-    low, high = bootstrap_interval([values], lambda drawn: drawn.mean(axis=-1))
-    half = 1.96 * values.std() / 20.0
-    assert low == pytest.approx(values.mean() - half, abs=0.01)
-    assert high == pytest.approx(values.mean() + half, abs=0.01)
 
 
 def a_run(task, seed, success, **more):
@@ -294,16 +283,16 @@ def test_goals_that_choose_are_not_those_that_are_reported(monkeypatch, tmp_path
 
 
 def test_a_better_run_found_by_a_resume_becomes_the_next_version(tmp_path):
-    registry, study = Registry(tmp_path / "registry"), StudyDirectory(tmp_path / "study")
-    study.begin({f"seed-{seed}": ({"seed": str(seed)}, tiny_config(seed=seed)) for seed in (0, 1)}, None)
+    registry, study = Registry(tmp_path / "registry"), begin_study(tmp_path / "study")
     result = {"mixed_success_last": 0.5, "selection_success_last": 0.75, "selection_mean_distance_m": 0.1}
     run = StudyRun(settings={}, state="finished", env_steps=120, result=result)
-    published = []
+    published, metrics = [], published_metrics(run)
     for seed in (0, 1):
         directory = study.path / f"seed-{seed}"
         play(directory, tiny_config(seed=seed, total_env_steps=120))
-        published += [publish_best(directory, registry, run) for _ in range(2)]  # the second time it is there already
-    study.close()
+        published += [
+            publish_learned(directory, registry.root, metrics=metrics) for _ in range(2)
+        ]  # again: it is there
     assert [str(version) for version in published] == ["tiny@1", "tiny@1", "tiny@2", "tiny@2"]
     manifest = registry.manifest("tiny@latest")
     assert (manifest.version, manifest.config["seed"], manifest.parent) == (2, 1, None)
@@ -314,14 +303,66 @@ def test_a_better_run_found_by_a_resume_becomes_the_next_version(tmp_path):
     }
 
 
+# --- side by side ----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.usefixtures("default_signals")
+@pytest.mark.parametrize("num_signals", [0, 1, 2])
+def test_runs_begin_in_turn_and_are_asked_to_stop_and_then_to_end(tmp_path, num_signals):
+    study, told = begin_study(tmp_path / "study"), {}
+    configs = {name: load_config(study.config_file(name)) for name in ("seed-0", "seed-1")}
+
+    def run(job, asked):
+        wait_for(lambda: Study(study.path).read().runs[job.directory.name].state == "running")
+        for wanted in range(1, num_signals + 1):
+            os.kill(os.getpid(), signal.SIGINT)
+            wait_for(lambda wanted=wanted: asked() == wanted)
+        told[job.directory.name] = (asked(), job.options)
+        return job.run.now("failed", "no luck") if num_signals == 0 else job.run.now("interrupted")
+
+    progress = Progress(Display(Console(file=io.StringIO())))
+    with StopSignals() as signals, pytest.raises(InterruptError) if num_signals == 2 else nullcontext():
+        study.train(configs, Place(1, run=run), None, ["--registry", "r"], signals, progress)
+    states = [(each.state, each.error) for each in study.read().runs.values()]
+    if num_signals == 0:
+        assert states == [("failed", "no luck")] * 2
+    else:
+        assert states == [("interrupted", None), ("waiting", None)]
+    options = ("--registry", "r", "--set", "run.num_threads=1")  # which the configuration says
+    assert told == dict.fromkeys(configs if num_signals == 0 else ["seed-0"], (num_signals, options))
+
+
+@pytest.mark.parametrize(
+    ("script", "asked", "state", "error"),
+    [
+        ("echo 'error: no luck'; exit 3", GO_ON, "failed", "no luck; all it said is in"),
+        ("exit 0", GO_ON, "waiting", None),
+        ("trap 'exit 138' USR1; echo ready; while :; do sleep 0.05; done", STOP, "waiting", None),
+        ("trap '' USR1 TERM; echo ready; while :; do sleep 0.05; done", END_NOW, "failed", "ended by SIGKILL"),
+    ],
+)
+def test_how_the_process_of_a_run_ends(tmp_path, monkeypatch, script, asked, state, error):
+    """A shell script in place of a run, which is told to stop or to end once it is ready."""
+    program, job = tmp_path / "python", Job(tmp_path / "run", dump_config(tiny_config()), 600, StudyRun(settings={}))
+    program.write_text(f"#!/bin/sh\n{script}\n")
+    program.chmod(0o755)
+    monkeypatch.setattr(sys, "executable", str(program))
+    monkeypatch.setattr(study_run, "PATIENCE_S", (0.1, 0.1, 60.0))
+    log = job.directory / "log.txt"
+    found = run_process(job, lambda: asked if log.exists() and "ready" in log.read_text() else GO_ON)
+    assert (found.state, found.error is None) == (state, error is None)
+    assert error is None or error in found.error
+
+
 # --- a whole one -----------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.usefixtures("default_signals")
 def test_a_study_is_killed_stopped_resumed_and_names_its_best(tmp_path, monkeypatch):
     monkeypatch.setattr(study_results, "SELECTION_EPISODES", 20)
+    monkeypatch.setattr(training, "make_artifacts", lambda directory, registry: {})
     path, registry = tmp_path / "study", tmp_path / "registry"
-    study, common = StudyDirectory(path), ("pretrain", "--run-dir", path, "--registry", registry)
+    study, common = Study(path), ("pretrain", "--run-dir", path, "--registry", registry)
     places = {seed: RunDirectory(path / f"seed-{seed}") for seed in (3, 8)}
     config = write_yaml(tmp_path / "tiny.yaml")
 
@@ -359,6 +400,9 @@ def test_a_study_is_killed_stopped_resumed_and_names_its_best(tmp_path, monkeypa
     assert not registry.exists()
 
     steps = max(newest(path / f"seed-{seed}").meta["env_steps"] for seed in (3, 8)) + 1
+    for place in places.values():  # in this process, which is quicker; the study finds them as they were left
+        longer = resumed_config(place, [f"run.total_env_steps={steps}"])
+        training.train(longer, place, registry, resume=True, publish=False, on_iteration=lambda metrics: None)
     result = tandem(*common, "--resume", "--set", f"run.total_env_steps={steps}")
     assert result.exit_code == 0, result.output
     found = study.read()
@@ -392,37 +436,33 @@ def test_a_study_is_killed_stopped_resumed_and_names_its_best(tmp_path, monkeypa
     assert len(Registry(registry).versions("tiny")) == 1
 
 
-def test_two_seeds_and_two_tasks_are_killed_with_their_study_and_go_on(tmp_path):
-    """The study's process and those of two runs are killed at once, and the other two have not begun."""
-    study = StudyDirectory(tmp_path / "night")
-    given = [*TINY_TASK, "push,wall", "--seeds", "0,1", "--run-dir", str(study.path), "--parallel", "2"]
+def test_two_tasks_are_killed_with_their_study_and_go_on(tmp_path):
+    """The study's process and that of a run are killed at once, and the other run has not begun."""
+    study = Study(tmp_path / "night")
+    given = [*TINY_TASK, "push,wall", "--seeds", "0", "--run-dir", str(study.path), "--parallel", "1"]
     command = [sys.executable, "-m", "service", "train", *given, "--set", "run.total_env_steps=1_000_000"]
-    begun = {name: study.path / name for name in ("push-seed-0", "push-seed-1")}
+    begun = study.path / "push-seed-0"
 
-    def saved(path):
-        return any(step >= 2 for step in CheckpointStore(path / "checkpoints", keep=1).steps())
+    def saved():
+        return any(step >= 2 for step in CheckpointStore(begun / "checkpoints", keep=1).steps())
 
     with subprocess.Popen(command, cwd=ROOT, stderr=subprocess.PIPE, text=True) as process:
         try:
-            wait_for(lambda: process.poll() is not None or all(map(saved, begun.values())))
+            wait_for(lambda: process.poll() is not None or saved())
             assert process.poll() is None, process.stderr.read()
-            processes = [json.loads((path / ".lock").read_text())["pid"] for path in begun.values()]
         finally:
-            process.kill()  # at once with the runs, which the kernel would tell to save
-        for each in processes:
-            os.kill(each, signal.SIGKILL)
-        wait_for(lambda: not any(map(is_locked, begun.values())))
+            process.kill()  # at once with the run, which the kernel would tell to save
+        os.kill(json.loads((begun / ".lock").read_text())["pid"], signal.SIGKILL)
+        wait_for(lambda: not is_locked(begun))
     states = {name: run.state for name, run in study.read().runs.items()}
-    waiting = ("wall-seed-0", "wall-seed-1")
-    assert states == dict.fromkeys(begun, "running") | dict.fromkeys(waiting, "waiting")
+    assert states == {"push-seed-0": "running", "wall-seed-0": "waiting"}
     assert {run.study for run in DiskReader(tmp_path).runs()} == {"night"}  # the page shows them as one
 
-    steps = max(newest(path).meta["env_steps"] for path in begun.values()) + 200
+    steps = newest(begun).meta["env_steps"] + 200
     result = tandem("train", "--resume", "--run-dir", study.path, "--set", f"run.total_env_steps={steps}")
     assert result.exit_code == 0, result.output
     found = study.read()
-    assert (found.best, found.published) == (None, None)
-    assert list(found.runs) == [f"{task}-seed-{seed}" for task in ("push", "wall") for seed in (0, 1)]
+    assert (found.best, found.published, list(found.runs)) == (None, None, list(states))
     for name, run in found.runs.items():
         rows = read_lines(study.path / name / "metrics.jsonl")
         assert [row["iteration"] for row in rows] == list(range(1, len(rows) + 1))
@@ -431,17 +471,17 @@ def test_two_seeds_and_two_tasks_are_killed_with_their_study_and_go_on(tmp_path)
         assert (config.task, str(config.seed)) == (run.settings["task"], run.settings["seed"])
         assert run.result == RunDirectory(study.path / name).read_result()["evaluation"]
         goes_on = any("goes on with the run" in entry.text for entry in read_log(study.path / name))
-        assert goes_on == (name in begun)
+        assert goes_on == (name == begun.name)
     with (study.path / "results.csv").open() as file:
         lines = list(csv.DictReader(file))
     assert [(line["task"], line["seed"], line["success_last"]) for line in lines] == [
         (run.settings["task"], run.settings["seed"], str(run.result["success_last"])) for run in found.runs.values()
     ]
-    assert re.search(r"^push\t2\t.*^wall\t2\t.*^all\t4\t", result.stdout, re.MULTILINE | re.DOTALL)
+    assert re.search(r"^push\t1\t.*^wall\t1\t.*^all\t2\t", result.stdout, re.MULTILINE | re.DOTALL)
     assert (study.path / "curves.png").read_bytes()[:4] == b"\x89PNG"
 
     logs = {path: path.read_bytes() for path in study.path.glob("*/log.txt")}
-    again = tandem("train", "push,wall", "--seeds", "1,0", "--run-dir", study.path, "--resume")
+    again = tandem("train", "push,wall", "--seeds", "0", "--run-dir", study.path, "--resume")
     assert again.exit_code == 0, again.output
     assert {path: path.read_bytes() for path in logs} == logs  # finished runs are left alone
 
@@ -449,13 +489,14 @@ def test_two_seeds_and_two_tasks_are_killed_with_their_study_and_go_on(tmp_path)
 def test_a_run_is_told_when_the_process_of_the_study_is_gone(tmp_path):
     """The study's process is the middle one: it is killed while the run, below it, waits."""
     run = (
-        "import os, signal, sys, time; from service.cli.study_run import stop_with\n"
+        "import os, signal, time; from service.runs.signals import stop_with_parent\n"
         "signal.signal(signal.SIGUSR1, lambda *_: (print('told', flush=True), os._exit(0)))\n"
-        "stop_with(int(sys.argv[1])); print('ready', flush=True); time.sleep(60)"
+        "stop_with_parent(); print('ready', flush=True); time.sleep(60)"
     )
     middle = (
         "import os, subprocess, sys, time\n"
-        f"subprocess.Popen([sys.executable, '-c', {run!r}, str(os.getpid())], start_new_session=True); time.sleep(60)"
+        f"subprocess.Popen([sys.executable, '-c', {run!r}], env=dict(os.environ, {PARENT}=str(os.getpid())),"
+        " start_new_session=True); time.sleep(60)"
     )
     with subprocess.Popen([sys.executable, "-c", middle], cwd=ROOT, stdout=subprocess.PIPE, text=True) as process:
         assert process.stdout.readline() == "ready\n"
@@ -469,41 +510,37 @@ def test_a_run_is_told_when_the_process_of_the_study_is_gone(tmp_path):
 @pytest.fixture(scope="module")
 def begun(tmp_path_factory):
     """A study that has begun, with one of its two runs."""
-    study = StudyDirectory(tmp_path_factory.mktemp("begun") / "study")
-    study.begin({f"seed-{seed}": ({"seed": str(seed)}, tiny_config(seed=seed)) for seed in (0, 1)}, None)
-    study.close()
+    study = begin_study(tmp_path_factory.mktemp("begun") / "study")
     play(study.path / "seed-0", tiny_config(total_env_steps=120))
     return study
+
+
+NOWHERE = ("--run-dir", "NOWHERE")
 
 
 @pytest.mark.parametrize(
     ("arguments", "parts"),
     [
-        (["--seeds", "0,0"], ["0 given twice"]),
         (["--seeds", "0,1"], ["holds a study already", "--resume"]),
         ([], ["holds a study already", "--resume"]),
         (["--seeds", "0,1", "--set", "seed=3"], ["--set seed=3", "leave it out"]),
-        (["--resume", "--set", "seed=3"], ["--set seed=3", "leave it out"]),
         (["--resume", "--seeds", "0-2"], ["has the runs seed-0, seed-1, not seed-0, seed-1, seed-2"]),
         (["--resume", "--set", "game.num_worlds=3"], ["game.num_worlds=3", "keeps its configuration"]),
         (["--resume", "--config", "OTHER"], ["game.num_goals", "keeps its configuration"]),
         (["--seeds", "0", "--run-dir", "RUN"], ["seed-0 holds a run already", "another --run-dir"]),
-        (["--resume", "--seeds", "0", "--run-dir", "RUN"], ["no study in", "study.json"]),
         (["--seeds", "0", "--run-dir", "PARENT"], ["seed-0 holds a run already", "another --run-dir"]),
-        (["--resume", "--seeds", "0", "--run-dir", "NOWHERE"], ["no study in", "--resume"]),
-        (["--parallel", "2", "--run-dir", "NOWHERE"], ["--parallel", "--seeds"]),
-        (["--seeds", "0", "--grid", "game.num_goals=1,x", "--run-dir", "NOWHERE"], ["game.num_goals", "'x'"]),
-        (["--seeds", "0", "--grid", "game.nums=1", "--run-dir", "NOWHERE"], ["game.nums", "unknown key"]),
-        (["push,wal", "--run-dir", "NOWHERE"], ["'wal'", "did you mean 'wall'"]),
-        (["push,push", "--run-dir", "NOWHERE"], ["push given twice"]),
-        (["push,panda-cube", "--run-dir", "NOWHERE", "--primitives", "x"], ["--primitives", "task"]),
-        (["push", "--method", "ours,lsd", "--run-dir", "NOWHERE"], ["panda-cube@", "skills"]),
-        (["push", "--method", "ours,our", "--run-dir", "NOWHERE"], ["'our'", "did you mean 'ours'"]),
-        (["push", "--grid", "task=wall", "--run-dir", "NOWHERE"], ["push", "--grid task=wall", "one of them"]),
-        (["--grid", "game.num_goals=1,2", "--set", "game.num_goals=3"], ["--set game.num_goals=3", "leave it out"]),
-        (["push,wall", "--publish", "--run-dir", "NOWHERE"], ["--publish", "--resume --publish --run-dir"]),
-        (["--seeds", "0", "--registry", "http://x:1", "--run-dir", "NOWHERE"], ["http://x:1", "read only"]),
-        (["--seeds", "0", "--runtime", "ray", "--num-actors", "2"], ["--num-actors", "--set run.num_threads=N"]),
+        (["--resume", "--seeds", "0", *NOWHERE], ["no study in", "study.json", "--resume"]),
+        (["--parallel", "2", *NOWHERE], ["--parallel", "--seeds"]),
+        (["--seeds", "0", "--grid", "game.num_goals=1,x", *NOWHERE], ["game.num_goals", "'x'"]),
+        (["--seeds", "0", "--grid", "game.nums=1", *NOWHERE], ["game.nums", "unknown key"]),
+        (["push,wal", *NOWHERE], ["'wal'", "did you mean 'wall'"]),
+        (["push,push", *NOWHERE], ["push given twice"]),
+        (["push,panda-cube", *NOWHERE, "--primitives", "x"], ["--primitives", "task"]),
+        (["push", "--method", "ours,lsd", *NOWHERE], ["panda-cube@", "skills"]),
+        (["push", "--grid", "task=wall", *NOWHERE], ["push", "--grid task=wall", "one of them"]),
+        (["push,wall", "--publish", *NOWHERE], ["--publish", "--resume --publish --run-dir"]),
+        (["--seeds", "0", "--registry", "http://x:1", *NOWHERE], ["http://x:1", "read only"]),
+        (["--seeds", "0", "--runtime", "ray", "--num-actors", "2"], ["--num-actors", "run.num_threads=N"]),
     ],
 )
 def test_mistakes_get_one_line_and_lose_nothing(begun, tmp_path, arguments, parts):
@@ -528,21 +565,8 @@ def test_mistakes_get_one_line_and_lose_nothing(begun, tmp_path, arguments, part
     assert not (tmp_path / "nowhere").exists()
 
 
-def test_two_processes_do_not_run_one_study(begun):
-    holder = StudyDirectory(begun.path)
-    holder.claim()
-    try:
-        result = tandem("pretrain", "--resume", "--run-dir", begun.path)
-    finally:
-        holder.close()
-    assert result.exit_code == 2
-    assert_one_line(result.stderr, begun.path, f"process {os.getpid()}", "stop that one first")
-
-
 def test_a_study_whose_file_cannot_be_read(tmp_path):
-    study = StudyDirectory(tmp_path)
-    study.begin({"seed-0": ({"seed": "0"}, tiny_config())}, None)
-    study.close()
+    study = begin_study(tmp_path)
     for text in ("no json", "{}", '{"runs": {"a": 1}}', "[]", "[" * 10_000):
         study.file.write_text(text)
         with pytest.raises(TandemError) as error:

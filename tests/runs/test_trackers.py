@@ -110,11 +110,11 @@ def test_learning_a_task_has_them_too(tmp_path, champion):
 @pytest.mark.parametrize(
     ("reference", "said"),
     [
-        ("wandb", "write module:factory"),
+        ("json", "write module:factory"),
         (":File", "write module:factory"),
         ("no_such_module_here:File", "cannot be loaded: ModuleNotFoundError: No module named 'no_such_module_here'"),
         ("trackers_of_a_test:Nothing", "cannot be loaded: AttributeError"),
-        ("trackers_of_a_test:number", "is no function"),
+        ("trackers_of_a_test:number", "'int' object is not callable"),
         ("trackers_of_a_test:no_log", "made something without log, of type int"),
         ("trackers_of_a_test:refuses", "RuntimeError: log in first"),
     ],
