@@ -22,7 +22,7 @@ import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.measuring import describe_ratio, measure_in_turn, parser_of, rates, rates_table, ratio, run_benchmark
+from benchmarks.measuring import describe_ratio, measure_in_turn, rates, rates_table, ratio, run_benchmark
 from service.base.errors import TandemError
 from service.config import WorldConfig
 from service.envs.batch import DISPLACEMENT_M, WorldBatch
@@ -184,11 +184,5 @@ def report(result: dict[str, Any]) -> str:
     return "\n".join([rates_table(result["rows"]), *ratios])
 
 
-def main() -> int:
-    """Parse the command line, measure, print."""
-    given = parser_of(__doc__, Settings()).parse_args()
-    return run_benchmark("env_throughput", PACKAGES, given, Settings, benchmark, report)
-
-
 if __name__ == "__main__":
-    raise SystemExit(main())
+    raise SystemExit(run_benchmark("env_throughput", PACKAGES, __doc__, Settings, benchmark, report))

@@ -17,7 +17,7 @@ import sys
 import time
 import urllib.request
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import dataclass
 from http.client import HTTPException
 from pathlib import Path
@@ -25,11 +25,12 @@ from tempfile import mkdtemp
 from types import MappingProxyType
 from typing import Any, Literal, Self, TypeVar
 
+import psutil
 import yaml
 from pydantic import ValidationError
 
 from benchmarks.measuring import ROOT, Sample
-from benchmarks.processes import cpu_s_by_role, descendants, is_running
+from benchmarks.processes import cpu_s_by_role
 from service.base.errors import StoreError, TandemError
 from service.store.checkpoints import CheckpointStore
 from service.store.disk_reader import DiskReader
@@ -44,7 +45,8 @@ NUM_WARMUP_ITERATIONS = 4
 """After a start, before it is measured: by then the learner and all actors are busy."""
 START_S = 240.0
 """Until the first iteration, on a machine that may be busy."""
-STOP_S = 60.0
+STOP_S, LEFT_S = 60.0, 5.0
+"""Until a run has ended, and then all that it started; what is left is killed."""
 _LOOK_S = 0.005
 _DIRECT = urllib.request.build_opener(urllib.request.ProxyHandler({}))
 _Answer = TypeVar("_Answer")
@@ -146,15 +148,15 @@ class Training:
     def stop(self) -> None:
         """End the run as ``ray job stop`` does: SIGTERM, which saves; what is left after a minute is killed."""
         if self.ended is None:
-            before = descendants(self.pid)
+            below = psutil.Process(self.pid).children(recursive=True)
             self._process.send_signal(signal.SIGTERM)
             try:
                 self._process.wait(STOP_S)
             except subprocess.TimeoutExpired:
                 self._process.kill()
                 self._process.wait()
-            for pid in before:
-                _end(pid)
+            for left in psutil.wait_procs(below, LEFT_S)[1]:
+                left.kill()
 
     def last_words(self) -> str:
         """The last line of its log."""
@@ -305,16 +307,6 @@ def copy_run(source: RunDirectory, home: Path, name: str = "run") -> RunDirector
 def overrides(settings: Mapping[str, object]) -> list[str]:
     """``--set`` arguments of the command line."""
     return [part for key, value in settings.items() for part in ("--set", f"{key}={value}")]
-
-
-def _end(pid: int) -> None:
-    """Kill what a stopped run left behind, after a moment to end by itself."""
-    for _ in range(100):
-        if not is_running(pid):
-            return
-        time.sleep(0.05)
-    with suppress(ProcessLookupError):
-        os.kill(pid, signal.SIGKILL)
 
 
 def _free_port() -> int:

@@ -10,12 +10,11 @@ from __future__ import annotations
 
 import argparse
 import os
-import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-from benchmarks.measuring import write_json
+from benchmarks.measuring import one_line_errors, write_json
 from benchmarks.report.results import FORMAT_VERSION, TRIAL, Result
 from service.actors.evaluation import DeterministicPolicy, IdlePolicy, evaluate, wilson_interval
 from service.base.errors import TandemError
@@ -130,6 +129,7 @@ def _recorded(config: TaskConfig, registry: Path, result: dict[str, Any], record
     }
 
 
+@one_line_errors
 def main() -> int:
     """Parse the command line, run and record what is not there yet."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -143,16 +143,12 @@ def main() -> int:
     add("--runs", type=Path, metavar="DIR", default=Path("runs"), help="of run directories (default: %(default)s)")
     add("--out", type=Path, metavar="FILE", required=True)
     given = parser.parse_args()
-    try:
-        if given.out.exists():
-            print(f"skipped, {given.out} is there")
-            return 0
-        config = trial_config(given.task, given.method, given.seed, given.primitives, given.settings)
-        result = run_trial(config, given.registry, given.runs / config.directory_name)
-        write_json(given.out, result)
-    except TandemError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
+    if given.out.exists():
+        print(f"skipped, {given.out} is there")
+        return 0
+    config = trial_config(given.task, given.method, given.seed, given.primitives, given.settings)
+    result = run_trial(config, given.registry, given.runs / config.directory_name)
+    write_json(given.out, result)
     print(f"{given.out}: {result['evaluation']['success_last']:.1%} at the last step")
     return 0
 

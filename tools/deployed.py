@@ -24,7 +24,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from benchmarks.measuring import machine, write_json
+from benchmarks.measuring import machine, one_line_errors, write_json
 from service.base.errors import TandemError
 from tools.compose_services import read_services, read_variables
 from tools.containers import Containers, need_programs, remove_memory_groups, run
@@ -38,6 +38,7 @@ INSIDE = "TANDEM_DEPLOYED_INSIDE"
 _log = logging.getLogger("deployed")
 
 
+@one_line_errors
 def main() -> int:
     """Parse the command line; build; start again in namespaces of our own, and check there."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -53,13 +54,9 @@ def main() -> int:
     logging.basicConfig(format="%(asctime)s %(message)s", level=logging.INFO)
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))
     store = Store(given.home)
-    try:
-        if INSIDE in os.environ:
-            return check(store, Path(os.environ[INSIDE]), only, given.json)
-        return build_and_enter(store, given.wheels, given.debian)
-    except TandemError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
+    if INSIDE in os.environ:
+        return check(store, Path(os.environ[INSIDE]), only, given.json)
+    return build_and_enter(store, given.wheels, given.debian)
 
 
 def build_and_enter(store: Store, wheels: Path | None, debian: str) -> int:

@@ -11,49 +11,26 @@ from __future__ import annotations
 
 import argparse
 import json
-import sys
 from collections import defaultdict
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
 
-from benchmarks import time_to_skill
-from benchmarks.report import (
-    champion,
-    comparison,
-    figures,
-    measured,
-    mutation,
-    pretraining,
-    recipe,
-    scaling,
-    skills,
-    summary,
-    transfer,
-)
+from benchmarks import scaling, time_to_skill, transfer
+from benchmarks.measuring import one_line_errors
+from benchmarks.report import comparison, figures, measured, pretraining, recipe, skills
 from benchmarks.report.downstream import draw_table, write_results
+from benchmarks.report.recipe import RECIPE
 from benchmarks.report.results import Result, read_trials
 from benchmarks.reproduce import Places, experiments
-from benchmarks.run_files import Run, read_run
+from benchmarks.run_files import Run
 from service.base.errors import TandemError
 from service.base.files import os_errors, write_atomic
 
-PROGRAMS = {
-    "env_throughput": "benchmarks.env_throughput",
-    "throughput": "benchmarks.compare_commits",
-    "world_speed": "benchmarks.compare_commits --worlds",
-    "deployed": "tools.deployed",
-    "mutation": "tools.mutation",
-    "scaling": "benchmarks.scaling of commit 82ca6fd",
-    "scaling_box": "benchmarks.scaling",
-    "robots": "benchmarks.robots",
-    "transfer": "benchmarks.transfer",
-    "transfer_champion": "benchmarks.transfer --name transfer_champion",
-}
-"""Modules by the name of the recorded file that they make."""
-RECIPE = "recipe"
-"""Name of the recorded time to a skill with the recipe, without any change."""
+FILES = ("env_throughput", "throughput", "world_speed", "deployed", "mutation", "scaling", "scaling_box", "robots",
+         "transfer", "transfer_champion")  # fmt: skip
+"""Names of the recorded files of which there is one each."""
 PAGES = {
     "results/pretraining.md": ("skill", "champion", "tasks", "curves", "curriculum", "coverage", "throughput"),
     "results/deployed.md": ("checks",),
@@ -86,7 +63,7 @@ MEASURED: Mapping[str, Mapping[str, Sequence[tuple[str, Callable[[Mapping[str, A
     },
     "results/README.md": {
         "throughput": [("env_throughput", measured.ratios_block)],
-        "mutation": [("mutation", mutation.mutation_words), ("mutation", mutation.mutation_table)],
+        "mutation": [("mutation", measured.mutation_words), ("mutation", measured.mutation_table)],
     },
 }  # fmt: skip
 """What says a block of a page, each from the recorded file of that name."""
@@ -116,35 +93,10 @@ def replace_blocks(path: Path, blocks: Mapping[str, str]) -> str:
     return page
 
 
-def read_results(results: Path) -> dict[str, dict[str, Any]]:
-    """Recorded files by the name of their benchmark; what is not there is left out."""
-    found = {}
-    for name, program in PROGRAMS.items():
-        path = results / f"{name}.json"
-        if not path.exists():
-            continue
-        try:
-            result = json.loads(path.read_text(encoding="utf-8"))
-        except (OSError, ValueError) as error:
-            raise TandemError(f"cannot read {path}: {error}; make it with python -m {program}") from error
-        if not isinstance(result, dict) or name not in (result.get("benchmark"), result.get("tool")):
-            raise TandemError(f"{path} is not what python -m {program} writes; make it anew")
-        found[name] = result
-    return found
-
-
-def read_studies(directory: Path) -> dict[str, dict[str, Any]]:
-    """Recorded times to a skill by the name of their file."""
-    studies = {}
-    for path in sorted(directory.glob("*.json")):
-        with os_errors("read", path):
-            studies[path.stem] = json.loads(path.read_text(encoding="utf-8"))
-    return studies
-
-
-def read_all(directory: Path) -> list[Run]:
-    """Recorded runs in the order of their names."""
-    return [read_run(path) for path in sorted(directory.glob("*.json"))]
+def read_all(directory: Path, names: Collection[str] | None = None) -> dict[str, dict[str, Any]]:
+    """Recorded files of a directory by their names, in order; of ``names``, those that are there."""
+    paths = (path for path in sorted(directory.glob("*.json")) if names is None or path.stem in names)
+    return {path.stem: json.loads(path.read_text(encoding="utf-8")) for path in paths}
 
 
 class Report:
@@ -161,11 +113,11 @@ class Report:
 
     def write(self) -> None:
         """Write all pages and pictures."""
-        found = read_results(self._results)
-        runs = [run for run in read_all(self._results / "runs") if "ablation" not in run]
-        studies = read_studies(self._results / "time_to_skill")
+        found = read_all(self._results, FILES)
+        runs = [run for run in read_all(self._results / "runs").values() if "ablation" not in run]
+        studies = read_all(self._results / "time_to_skill")
         trials, longer = (read_trials(self._results / name) for name in ("downstream", "downstream_longer"))
-        recorded_skills, controls = (read_all(self._results / name) for name in ("skills", "controls"))
+        recorded_skills, controls = (list(read_all(self._results / name).values()) for name in ("skills", "controls"))
         for page, names in PAGES.items():  # what is wrong with a page is found before anything is drawn
             words = replace_blocks(self._docs / page, dict.fromkeys(names, ""))
             if page in ABOUT_THE_RECIPE and RECIPE in studies:
@@ -176,7 +128,7 @@ class Report:
             }
             for page, blocks in MEASURED.items()
         }
-        headline = {"headline": [summary.headline_table(trials)] if trials else []}
+        headline = {"headline": [comparison.headline_table(trials)] if trials else []}
         made |= {
             "results/pretraining.md": self.pretraining_blocks(runs, found, studies),
             "results/skills.md": self.skills_blocks(recorded_skills, controls, runs),
@@ -196,11 +148,11 @@ class Report:
 
     def pretraining_blocks(self, runs: Sequence[Run], found: Results, studies: Results) -> Blocks:
         """Parts of the blocks about pre-training."""
-        show, blocks = self._show, defaultdict[str, list[str]](list)
+        show, blocks = self.show, defaultdict[str, list[str]](list)
         if RECIPE in studies:
             blocks["skill"] = [recipe.recipe_words(studies[RECIPE]), time_to_skill.report(studies[RECIPE])]
         if runs:
-            blocks["champion"] = [champion.champion_words(runs)]
+            blocks["champion"] = [pretraining.champion_words(runs)]
             blocks["tasks"] = [pretraining.tasks_table(runs)]
             blocks["curves"] = [
                 show("Over env steps", "pretraining", figures.draw_curves, runs),
@@ -226,10 +178,10 @@ class Report:
         """Parts of the blocks about skills, and about controls of self-play."""
         blocks = {}
         if runs:
-            picture = self._show("Random skills at three stages of training", "skills", figures.draw_skills, runs)
+            picture = self.show("Random skills at three stages of training", "skills", figures.draw_skills, runs)
             blocks["coverage"] = [skills.coverage_table(runs), picture]
         if learned := [run for run in runs if run["method"] != "ours"]:
-            picture = self._show("Skill discovery over env steps", "skills-curves", figures.draw_skill_curves, learned)
+            picture = self.show("Skill discovery over env steps", "skills-curves", figures.draw_skill_curves, learned)
             blocks["curves"] = [picture]
         if controls:
             blocks["controls"] = [skills.controls_table(controls), skills.alike_table([*pretrained, *controls])]
@@ -244,11 +196,12 @@ class Report:
             blocks["below"] = [comparison.distances_table(trials)]
             blocks["harder"] = [comparison.harder_table(trials)]
         if longer:
-            picture = self._show("Success over more env steps", "downstream-longer", draw_table, longer)
+            picture = self.show("Success over more env steps", "downstream-longer", draw_table, longer)
             blocks["longer"] = [comparison.longer_table(trials, longer), picture]
         return blocks
 
-    def _show(self, words: str, name: str, draw: Callable[[Any, Path], Path], recorded: Any) -> str:
+    def show(self, words: str, name: str, draw: Callable[[Any, Path], Path], recorded: Any) -> str:
+        """Draw a picture; the line of a page that shows it."""
         self.files.append(draw(recorded, self._results / f"{name}.png"))
         return f"![{words}]({name}.png)"
 
@@ -259,21 +212,18 @@ def scaling_blocks(found: Results, studies: Results) -> Blocks:
     if (box := found.get("scaling_box", found.get("scaling"))) is not None:  # the newer one, where there is one
         blocks["box"] = [scaling.box_block(box)]
     if studies:
-        blocks["batches"] = [scaling.batches_block(studies), recipe.recipe_words(studies[RECIPE])]
+        blocks["batches"] = [recipe.batches_block(studies), recipe.recipe_words(studies[RECIPE])]
     return blocks
 
 
+@one_line_errors
 def main() -> int:
     """Parse the command line, draw, say what was written."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--docs", type=Path, metavar="DIR", default=Path("docs"), help="default: %(default)s")
     given = parser.parse_args()
     report = Report(given.docs)
-    try:
-        report.write()
-    except TandemError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
+    report.write()
     print("\n".join(map(str, report.files)))
     return 0
 

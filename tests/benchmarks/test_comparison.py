@@ -4,6 +4,7 @@ from benchmarks.report.comparison import (
     comparison_table,
     distances_table,
     harder_table,
+    headline_table,
     longer_table,
     missing_table,
 )
@@ -79,3 +80,23 @@ def test_what_is_missing_by_hand(tmp_path):
         "| controls | 0 of 2 | all: seeds 0, 2 |",
     ]
     assert missing_table(some[:1]) == "1 of 1 experiments are recorded."
+
+
+def test_systems_in_four_rows_by_hand():
+    results = [trial("ours-her", "push", seed, rate) for seed, rate in enumerate((0.90, 0.92, 0.97))]
+    results += [trial("ours", "push", 0, 1.0), trial("asp-only", "inair", 0, 0.99)]
+    results += [trial("scratch-mcp", "box", 0, 0.31), trial("scratch-mcp-her", "box", 0, 0.2)]
+    results += [trial("scratch-mcp-her", "box", 1, 0.3), trial("scratch-mcp-her", "wall", 0, 0.5)]
+    results += [trial("idle", "wall", 0, 0.9)]
+    lines = headline_table(results).splitlines()
+    assert lines[0] == "|  | Larger | InAir | Push | Sphere | Wall | Box |"
+    assert lines[2:] == [
+        "| composing frozen primitives, with hindsight |  |  | 93 % (3) |  |  |  |",
+        "| Bob alone, no downstream step |  | 99 % (1) |  |  |  |  |",
+        "| learned from nothing, the best of up to 2 on each task |  |  |  |  | 50 % (1) | 31 % (1) |",
+        "| *the best of the paper* | *94 % (3)* | *100 % (3)* | *92 % (3)* | *100 % (3)* | *98 % (3)* | *98 % (3)* |",
+        "",
+        "Success at the last step, the mean of the seeds; in brackets how many seeds.",
+    ]
+    (only,) = [line for line in headline_table(results[:6]).splitlines() if "nothing" in line]
+    assert only == "| learned from nothing: scratch MCP |  |  |  |  |  | 31 % (1) |"

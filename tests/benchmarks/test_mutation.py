@@ -1,6 +1,6 @@
 """The words on mutation testing, by hand."""
 
-from benchmarks.report.mutation import mutation_table, mutation_words
+from benchmarks.report.measured import mutation_table, mutation_words
 
 MACHINE = {"num_cpus": 2, "cpu": "a CPU", "git_commit": "0123456789", "time": "2026-11-25T10:00:00"}
 

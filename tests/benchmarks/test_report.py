@@ -21,24 +21,37 @@ from service.registry.digest import parameters_digest
 DOCS = Path(__file__).parents[2] / "docs"
 
 
+class FirstOfEachKind(Report):
+    """Of several pictures of one kind it draws the first."""
+
+    kinds = ()
+
+    def show(self, words, name, draw, recorded):
+        if draw in self.kinds:
+            return f"![{words}]({name}.png)"
+        self.kinds = (*self.kinds, draw)
+        return super().show(words, name, draw, recorded)
+
+
 @pytest.fixture(scope="module")
 def made(tmp_path_factory):
-    """A copy of the documents with all that the report writes made anew."""
+    """A copy of the documents with what the report writes made anew; the report."""
     docs = tmp_path_factory.mktemp("report") / "docs"
-    shutil.copytree(DOCS, docs)
+    shutil.copytree(DOCS, docs, ignore=shutil.ignore_patterns("primitives"))
     shutil.copy(DOCS.parent / "README.md", docs.parent)
-    Report(docs).write()
-    return docs
+    report = FirstOfEachKind(docs)
+    report.write()
+    return docs, report
 
 
 @pytest.mark.parametrize("page", [*PAGES, "results/downstream.md"])
 def test_the_committed_page_is_what_the_recorded_files_give(made, page):
-    assert (made / page).read_text() == (DOCS / page).read_text()
+    assert (made[0] / page).read_text() == (DOCS / page).read_text()
 
 
 def test_the_committed_pictures_show_what_the_recorded_files_give(made):
-    pictures = sorted((made / "results").glob("*.png"))
-    assert len(pictures) == 25
+    pictures = [path for path in made[1].files if path.suffix == ".png"]
+    assert len(pictures) == 8
     for picture in pictures:
         ours, theirs = (
             np.asarray(Image.open(path).convert("RGB"), dtype=np.int16)
