@@ -14,9 +14,9 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from benchmarks.measuring import RECIPE_FILE, ROOT, machine, one_line_errors, write_json
-from benchmarks.record_run import PACKAGES, measure_tasks
-from benchmarks.run_files import COUNTERS, FORMAT_VERSION, Run, thin
+from benchmarks.measuring import RECIPE_FILE, ROOT, one_line_errors, write_json
+from benchmarks.record_run import head_of, measure_tasks
+from benchmarks.run_files import COUNTERS, Run, thin
 from benchmarks.trials import NUM_EPISODES, run_trial, trial_config
 from service.base.errors import TandemError
 from service.config import Config, load_config
@@ -61,13 +61,9 @@ def record_control(directory: RunDirectory, name: str, downstream: dict[str, Any
     config, records = directory.read_config(), read_records(directory.metrics_file)
     kept = [{key: value for key, value in record.items() if key.startswith(_KEPT)} for record in records]
     bob = load(str(directory.path)).policy
-    return {
-        "format_version": FORMAT_VERSION,
-        "name": f"{name}-{config.seed}",
+    return head_of(config, f"{name}-{config.seed}") | {
         "control": name,
         "overrides": list(CONTROLS[name]),
-        "recorded": machine(*PACKAGES),
-        "config": config.model_dump(mode="json"),
         "env_steps": int(records[-1]["env_steps"]),
         "bob_env_steps": bob_env_steps(records),
         "evaluations": measure_tasks(bob, config, num_episodes=NUM_EPISODES),

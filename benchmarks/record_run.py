@@ -77,17 +77,21 @@ _Player = Callable[..., StateArray]
 """Plays the random skills of a ``seed``; their paths."""
 
 
+def head_of(config: Config, name: str) -> Run:
+    """What every file of a run begins with; ``name`` is for tables."""
+    recorded = machine(*PACKAGES)
+    return {
+        "format_version": FORMAT_VERSION, "name": name, "recorded": recorded, "config": config.model_dump(mode="json")
+    }  # fmt: skip
+
+
 def record_run(directory: RunDirectory, name: str, note: str = "") -> Run:
     """Everything that is kept of a run without measuring anything; ``name`` is for tables, ``note`` for people."""
     config = directory.read_config()
     goals = read_records(directory.goals_file)
-    return {
-        "format_version": FORMAT_VERSION,
-        "name": name,
+    return head_of(config, name) | {
         "note": note,
-        "recorded": machine(*PACKAGES),
         "environment": _environment(directory),
-        "config": config.model_dump(mode="json"),
         "series": thin(read_records(directory.metrics_file)),
         "curriculum": count_goals(goals, config.world.rest_height_m),
         "goals": sample_goals(goals),
@@ -111,13 +115,9 @@ def record_skills(directory: RunDirectory, name: str, note: str = "") -> Run:
         {key: value for key, value in record.items() if key.startswith(KEPT_OF_SKILLS)}
         for record in read_records(directory.metrics_file)
     ]
-    return {
-        "format_version": FORMAT_VERSION,
-        "name": name,
+    return head_of(config, name) | {
         "note": note,
         "method": config.skills.method if isinstance(config, SkillDiscoveryConfig) else OURS,
-        "recorded": machine(*PACKAGES),
-        "config": config.model_dump(mode="json"),
         "series": thin(kept, SKILL_POINTS),
         "coverage": coverage,
     }

@@ -41,6 +41,8 @@ from service.store.run_history import FILE as RUN_FILE
 ENDLESS = {"run.total_env_steps": 1_000_000_000_000}
 PLAIN = {"run.checkpoint_interval": 1_000_000_000, "run.evaluation_interval": 0}
 """Neither evaluations nor checkpoints."""
+NAME = "run"
+"""Of the run directory, below ``runs`` of its home."""
 NUM_WARMUP_ITERATIONS = 4
 """After a start, before it is measured: by then the learner and all actors are busy."""
 START_S = 240.0
@@ -58,7 +60,6 @@ class Training:
     Args:
         home: directory for its run, its registry and Ray's files; its path has to be short.
         arguments: of ``tandem pretrain``, besides runtime, run directory and status.
-        name: of the run directory.
         runtime: which runner; ``ray`` has a status service.
         tree: checkout whose code runs.
         num_cores: that its Ray believes to have; None: those there are.
@@ -70,13 +71,12 @@ class Training:
         home: Path,
         arguments: Sequence[str],
         *,
-        name: str = "run",
         runtime: Literal["local", "ray"] = "ray",
         tree: Path = ROOT,
         num_cores: int | None = None,
         variables: Mapping[str, str] = MappingProxyType({}),
     ) -> None:
-        self.name, self.directory, self.log_file = name, RunDirectory(home / "runs" / name), home / f"{name}.log"
+        self.directory, self.log_file = RunDirectory(home / "runs" / NAME), home / f"{NAME}.log"
         self.address = ("127.0.0.1", _free_port())
         """Host and port of the status service."""
         home.mkdir(parents=True, exist_ok=True)
@@ -125,9 +125,9 @@ class Training:
     def status(self) -> RunStatus | None:
         """The run's status by its status service, else as one for its directory has it; None before there is one."""
         try:
-            if told := self.get(f"/v1/runs/{self.name}", 2.0):
+            if told := self.get(f"/v1/runs/{NAME}", 2.0):
                 return RunStatus.model_validate_json(told)
-            return self._reader.run(self.name)
+            return self._reader.run(NAME)
         except (StoreError, ValidationError):
             return None
 
@@ -291,9 +291,9 @@ def scratch() -> Iterator[Path]:
         shutil.rmtree(path, ignore_errors=True)
 
 
-def copy_run(source: RunDirectory, home: Path, name: str = "run") -> RunDirectory:
+def copy_run(source: RunDirectory, home: Path) -> RunDirectory:
     """Copy what a ``Training`` in ``home`` needs to go on from the newest checkpoint of ``source``."""
-    store, target = CheckpointStore(source.checkpoints, keep=1), RunDirectory(home / "runs" / name)
+    store, target = CheckpointStore(source.checkpoints, keep=1), RunDirectory(home / "runs" / NAME)
     if (newest := store.newest()) is None:
         raise TandemError(f"no run with a checkpoint in {source.path}; name one that has one")
     target.checkpoints.mkdir(parents=True)

@@ -18,7 +18,7 @@ import numpy as np
 from benchmarks.measuring import run_benchmark
 from benchmarks.report.markdown import measured_on, percent, table
 from service.actors.evaluation import evaluate, wilson_interval
-from service.base.errors import RobotError, TandemError
+from service.base.errors import RobotError
 from service.base.types import BoolArray, StateArray
 from service.envs.sampling import draw_goals, draw_starts
 from service.registry.loading import Trained, load
@@ -54,8 +54,6 @@ class Settings:
     wall: str = ""
     """The same for Wall."""
     registry: str = "registry"
-    rows: str = ""
-    """Names of rows, with commas; all by default."""
     num_goals: int = 300
     num_steps: int = 50
     seed: int = 0
@@ -277,10 +275,7 @@ def summarise(played: Sequence[Played]) -> dict[str, Any]:
 
 def benchmark(settings: Settings) -> dict[str, Any]:
     """Everything measured, for JSON."""
-    names = [name for name in settings.rows.split(",") if name] or list(ROWS)
-    if unknown := [name for name in names if name not in ROWS]:
-        raise TandemError(f"--rows: no row {unknown[0]!r}; choose of {', '.join(ROWS)}")
-    names = [name for name in names if getattr(settings, ROWS[name].policy)]
+    names = [name for name, row in ROWS.items() if getattr(settings, row.policy)]
     policy = for_robot(load(settings.policy, settings.registry))
     rows: dict[str, Any] = {}
     for name in names:

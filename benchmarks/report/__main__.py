@@ -23,7 +23,7 @@ from benchmarks.report import comparison, figures, measured, pretraining, recipe
 from benchmarks.report.downstream import draw_table, write_results
 from benchmarks.report.recipe import RECIPE
 from benchmarks.report.results import Result, read_trials
-from benchmarks.reproduce import Places, experiments
+from benchmarks.reproduce import experiments
 from benchmarks.run_files import Run
 from service.base.errors import TandemError
 from service.base.files import os_errors, write_atomic
@@ -189,8 +189,7 @@ class Report:
 
     def comparison_blocks(self, trials: Sequence[Result], longer: Sequence[Result]) -> Blocks:
         """Parts of the blocks that compare with the paper."""
-        places = Places(self._results, self._results)
-        blocks = {"missing": [comparison.missing_table(list(experiments(places)))]}
+        blocks = {"missing": [comparison.missing_table(list(experiments(self._results)))]}
         if trials:
             blocks["rows"] = [comparison.comparison_table(trials)]
             blocks["below"] = [comparison.distances_table(trials)]

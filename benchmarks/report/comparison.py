@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 
-from benchmarks.report.downstream import BEST, PAPER, Seeds
+from benchmarks.report.downstream import BEST, PAPER, Seeds, each_seed
 from benchmarks.report.markdown import Row, percent, table
 from benchmarks.report.results import TRIAL, Result, by_method_and_task
 from benchmarks.reproduce import Experiment
@@ -75,7 +75,9 @@ def harder_table(results: Sequence[Result]) -> str:
             {each[TRIAL]["seed"]: each for each in of.get((method, task), [])} for task in ("hard-push", "push")
         )
         if hard:
-            rows.append((METHODS[method].title, _each(hard.values()), _each(plain[s] for s in hard if s in plain)))
+            rows.append(
+                (METHODS[method].title, each_seed(hard.values()), each_seed(plain[s] for s in hard if s in plain))
+            )
     return table(("", "HardPush", "Push, the same seeds"), rows) if rows else ""
 
 
@@ -92,10 +94,6 @@ def missing_table(planned: Sequence[Experiment]) -> str:
     ]
     words = f"{sum(done.values())} of {len(planned)} experiments are recorded."
     return f"{words} Missing:\n\n{table(('', 'recorded', 'missing'), rows)}" if rows else words
-
-
-def _each(trials: Iterable[Result]) -> str:
-    return ", ".join(f"{100 * each['evaluation']['success_last']:.1f}" for each in trials)
 
 
 def _missing(group: Sequence[Experiment]) -> str:

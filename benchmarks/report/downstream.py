@@ -83,7 +83,7 @@ def write_page(results: Sequence[Result], picture: str) -> str:
         "\n## Success at any step\n",
         _table(of, _rate("success_ever")),
         "\n## Each seed, at the last step\n",
-        _table(of, _each_seed),
+        _table(of, each_seed),
         "\n## Learning curves\n",
         f"![Success at the last step over env steps; bands from the least to the greatest seed]({picture})\n",
         "Without noise, 100 goals a point; dotted: what learns nothing. Where a curve still rises, the tables say what "
@@ -110,7 +110,7 @@ def _harder(of: Mapping[tuple[str, str], Seeds]) -> Sequence[str]:
         "grip ([decision 7](../decisions/0007-the-downstream-tasks.md)). At the last step, each seed, and at any "
         "step:\n",
         _table(of, _rate("success_last"), tasks=tasks),
-        _table(of, _each_seed, tasks=tasks),
+        _table(of, each_seed, tasks=tasks),
         _table(of, _rate("success_ever"), tasks=tasks),
         "Env steps and time:\n",
         _table(of, _cost, tasks=tasks),
@@ -173,7 +173,8 @@ def _rate(key: str) -> Callable[[Seeds], str]:
     return lambda seeds: str(rate_of(seeds, key)).replace("*", "\\*")
 
 
-def _each_seed(seeds: Seeds) -> str:
+def each_seed(seeds: Iterable[Result]) -> str:
+    """Success of each at the last step."""
     return ", ".join(f"{100 * result['evaluation']['success_last']:.1f}" for result in seeds)
 
 

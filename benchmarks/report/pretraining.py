@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from benchmarks.record_run import ASKED, ASKED_RATES, ASKED_STEPS, NUM_STEPS, TASKS
@@ -52,10 +52,10 @@ def tasks_table(runs: Sequence[Run]) -> str:
     return table(head, [*rows, ("asked for", *asked, millions(ASKED_STEPS)), ("doing nothing", *idle, "")])
 
 
-def tasks_cells(evaluations: Records, tasks: Iterable[str] = TASKS, *, idle: bool = False) -> list[str]:
+def tasks_cells(evaluations: Records, *, idle: bool = False) -> list[str]:
     """Success at the last step on each task, empty where it was not measured."""
     rows = {row["goals"]: row for row in evaluations if (row["policy"] == "idle") == idle}
-    return [_success(rows[task]) if task in rows else "" for task in tasks]
+    return [_success(rows[task]) if task in rows else "" for task in TASKS]
 
 
 def _judged(evaluations: Records) -> list[str]:

@@ -7,7 +7,6 @@ from benchmarks.transfer import (
     ROWS,
     Played,
     Settings,
-    benchmark,
     draw_episodes,
     inside_limits,
     play_chunk,
@@ -16,7 +15,6 @@ from benchmarks.transfer import (
     transfer_words,
 )
 from benchmarks.transfer import policy_of as policy_of_row
-from service.base.errors import TandemError
 from service.robot.calibrate import Calibration
 
 MACHINE = {"num_cpus": 2, "cpu": "a processor", "git_commit": "a" * 40, "time": "2026-11-24T10:00:00+00:00"}
@@ -75,11 +73,6 @@ def test_a_chunk_is_played_alike_again_in_the_real_engine():
     assert [each.num_steps for each in first] == [8, 8]
     assert play_chunk(*asked) == first
     assert all(0 < each.free[0] <= 8 for each in first)  # it comes from above
-
-
-def test_an_unknown_row_is_told_in_one_line():
-    with pytest.raises(TandemError, match="--rows: no row 'windy'; choose of nominal, together"):
-        benchmark(Settings(rows="windy"))
 
 
 def test_the_page_has_a_row_for_each_and_says_what_was_not_measured():
