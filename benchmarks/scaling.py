@@ -27,6 +27,7 @@ from benchmarks.training_process import (
     overrides,
     scratch,
 )  # fmt: skip
+from service.config.self_play import SelfPlayConfig
 from service.store.run_directory import RunDirectory
 
 PACKAGES = ("ray", "redis", "mujoco", "numpy", "torch")
@@ -60,28 +61,40 @@ def benchmark(settings: Settings) -> dict[str, Any]:
     """Everything, in directories that are deleted at the end."""
     source = RunDirectory(Path(settings.run_dir))
     ways = {str(num): (num, 1) for num in range(1, settings.max_actors + 1)}
+    config = source.read_config()
+    assert isinstance(config, SelfPlayConfig)
     ways[f"1, of {settings.max_actors} threads"] = (1, settings.max_actors)
     found = {}
     with scratch() as home:
         for name, (num_actors, num_threads) in ways.items():
-            found[name] = box(measure_run(source, home, settings.num_iterations, num_actors, num_threads))
+            measured = measure_run(source, home, settings.num_iterations, num_actors, num_threads)
+            found[name] = box(measured, num_actors, -(-config.game.num_worlds // num_actors))
             print(f"{name} actors: {found[name]['env_steps_per_s']:,.0f} env steps/s", flush=True)
     return {"one_box": found}
 
 
-def box(each: Measured) -> dict[str, Any]:
-    """A measurement, for JSON."""
+def box(measured: Measured, num_actors: int, num_worlds: int) -> dict[str, Any]:
+    """A measurement of some actors with ``num_worlds`` each, for JSON.
+
+    The learner is idle while there is no update, an actor while it plays no round; evaluations, which actors make too,
+    count as idle.
+    """
+    rows, wall_s = measured.rows[1:], measured.wall_s
+    rollouts = [row.get("actor/num_rollouts", 1.0) for row in rows]
+    played_s = sum(row.get("time/play_s", 0.0) * num for row, num in zip(rows, rollouts, strict=True))
+    learned_s = sum(row.get("time/learn_s", 0.0) for row in rows)
+    roles = sorted(measured.role_cpu_s.items())
     return {
-        "env_steps_per_s": each.num_steps / each.wall_s,
-        "iteration_s": each.wall_s / each.num_iterations,
-        "rollouts_per_iteration": each.num_rollouts / each.num_iterations,
-        "num_worlds": each.num_worlds,
-        "play_s": each.play_s,
-        "learn_s": each.learn_s,
-        "learner_idle_share": each.learner_idle_share,
-        "actor_idle_share": each.actor_idle_share,
-        "cores": {role: seconds / each.wall_s for role, seconds in sorted(each.role_cpu_s.items())},
-        "cpu_s_per_iteration": {role: value / each.num_iterations for role, value in sorted(each.role_cpu_s.items())},
+        "env_steps_per_s": measured.sample.steps_per_s,
+        "iteration_s": wall_s / len(rows),
+        "rollouts_per_iteration": sum(rollouts) / len(rows),
+        "num_worlds": num_worlds,
+        "play_s": played_s / sum(rollouts),
+        "learn_s": learned_s / len(rows),
+        "learner_idle_share": 1.0 - learned_s / wall_s,
+        "actor_idle_share": 1.0 - played_s / (num_actors * wall_s),
+        "cores": {role: seconds / wall_s for role, seconds in roles},
+        "cpu_s_per_iteration": {role: seconds / len(rows) for role, seconds in roles},
     }
 
 

@@ -11,7 +11,6 @@ import secrets
 import shutil
 import signal
 import socket
-import statistics
 import subprocess
 import sys
 import time
@@ -26,7 +25,6 @@ from types import MappingProxyType
 from typing import Any, Literal, Self, TypeVar
 
 import psutil
-import yaml
 from pydantic import ValidationError
 
 from benchmarks.measuring import ROOT, Sample
@@ -189,36 +187,19 @@ class Records:
 
 @dataclass(frozen=True, slots=True)
 class Measured:
-    """Costs of some iterations of a run."""
+    """Some iterations of a run."""
 
-    num_steps: int
+    rows: Sequence[Mapping[str, float]]
+    """Their records, and before them the last one that is not measured."""
     wall_s: float
-    num_iterations: int
-    num_rollouts: int
-    num_actors: int
-    num_worlds: int
-    """Worlds of each actor."""
-    play_s: float
-    """Mean duration of a round; 0 where play and learning share a process."""
-    learn_s: float
-    """Mean duration of an update."""
-    role_cpu_s: dict[str, float]
+    role_cpu_s: Mapping[str, float]
     """CPU seconds by role of process, several of one role together."""
 
     @property
     def sample(self) -> Sample:
-        """Its env steps and times."""
-        return Sample(self.num_steps, self.wall_s, sum(self.role_cpu_s.values()))
-
-    @property
-    def learner_idle_share(self) -> float:
-        """Share of the wall time without an update."""
-        return 1.0 - self.num_iterations * self.learn_s / self.wall_s
-
-    @property
-    def actor_idle_share(self) -> float:
-        """Share of the actors' wall time without a round; evaluations, which actors make too, count as idle."""
-        return 1.0 - self.num_rollouts * self.play_s / (self.num_actors * self.wall_s)
+        """Env steps and times."""
+        num_steps = self.rows[-1]["env_steps"] - self.rows[0]["env_steps"]
+        return Sample(int(num_steps), self.wall_s, sum(self.role_cpu_s.values()))
 
 
 def measure_training(
@@ -240,37 +221,7 @@ def measure_training(
     training.stop()
     (num_before, first_s, before), (_, last_s, after) = marks
     role_cpu_s = {role: seconds - before.get(role, 0.0) for role, seconds in after.items()}
-    num_worlds = _num_worlds(training.directory)
-    return summarise_rows(rows, num_before, last_s - first_s, role_cpu_s, num_actors, -(-num_worlds // num_actors))
-
-
-def _num_worlds(directory: RunDirectory) -> int:
-    """Worlds of a run, which may be one of another version."""
-    return int(yaml.safe_load(directory.config_file.read_text(encoding="utf-8"))["game"]["num_worlds"])
-
-
-def summarise_rows(
-    rows: Sequence[Mapping[str, float]], num_before: int, wall_s: float, role_cpu_s: Mapping[str, float],
-    num_actors: int, num_worlds: int,
-) -> Measured:  # fmt: skip
-    """Costs of the records after the first ``num_before``, at least 1, which took ``wall_s`` and ``role_cpu_s``."""
-    measured = rows[num_before:]
-    rollouts = [row.get("actor/num_rollouts", 1.0) for row in measured]
-
-    def mean_of_rounds(key: str) -> float:
-        return sum(row.get(key, 0.0) * num for row, num in zip(measured, rollouts, strict=True)) / sum(rollouts)
-
-    return Measured(
-        num_steps=int(measured[-1]["env_steps"] - rows[num_before - 1]["env_steps"]),
-        wall_s=wall_s,
-        num_iterations=len(measured),
-        num_rollouts=int(sum(rollouts)),
-        num_actors=num_actors,
-        num_worlds=num_worlds,
-        play_s=mean_of_rounds("time/play_s"),
-        learn_s=statistics.fmean(row.get("time/learn_s", 0.0) for row in measured),
-        role_cpu_s=dict(role_cpu_s),
-    )
+    return Measured(rows[num_before - 1 :], last_s - first_s, role_cpu_s)
 
 
 def environment(home: Path, tree: Path = ROOT) -> dict[str, str]:

@@ -11,7 +11,7 @@ from benchmarks.compare_commits import measure_commit, train
 from benchmarks.measuring import ROOT
 from benchmarks.report import __main__ as report
 from benchmarks.report.recipe import batches_block
-from benchmarks.training_process import Measured, Records, measure_training, summarise_rows
+from benchmarks.training_process import Measured, Records, measure_training
 from service.base.errors import TandemError
 from service.config import dump_config, load_config
 from service.store.models import ActorStatus, RunStatus
@@ -104,27 +104,6 @@ def test_a_fault_with_rollouts_lost_is_missed():
 # --- throughput -------------------------------------------------------------------------------------------------------
 
 
-def measured(**changed):
-    given = {
-        "num_steps": 1000, "wall_s": 10.0, "num_iterations": 4, "num_rollouts": 8, "num_actors": 2,
-        "num_worlds": 10, "play_s": 2.0, "learn_s": 1.5,
-        "role_cpu_s": {},
-    }  # fmt: skip
-    return Measured(**(given | changed))
-
-
-def test_costs_of_some_iterations_by_hand():
-    rows = [
-        {"env_steps": 10.0 * index, "actor/num_rollouts": float(num),
-         "time/learn_s": 0.5, "time/play_s": float(index)}
-        for index, num in enumerate((2, 2, 2, 1, 3))
-    ]  # fmt: skip
-    found = summarise_rows(rows, 3, 5.0, {"driver": 1.5, "actor": 2.0}, num_actors=2, num_worlds=7)
-    assert (found.num_steps, found.num_iterations, found.num_rollouts) == (20, 2, 4)
-    assert (found.wall_s, found.sample.cpu_s, found.num_worlds, found.learn_s) == (5.0, 3.5, 7, 0.5)
-    assert found.play_s == pytest.approx((3.0 + 3 * 4.0) / 4)  # weighted by rounds
-
-
 class Scripted:
     """A run whose records come in given portions; it has the directory of a real one."""
 
@@ -151,7 +130,7 @@ def test_it_is_measured_from_when_all_actors_are_up(tiny):
     run = Scripted(tiny, portions)
     found = measure_training(run, 2, num_actors=2, num_warmup=1)
     assert run.stopped
-    assert (found.num_steps, found.num_iterations, found.num_actors, found.num_worlds) == (20, 2, 2, 12)
+    assert (found.sample.num_steps, len(found.rows)) == (20, 3)
 
 
 def test_a_commit_goes_on_from_a_checkpoint_is_measured_and_ended(tiny, tmp_path):
@@ -186,12 +165,20 @@ def tiny(tmp_path_factory):
 
 
 def test_a_box_by_hand():
-    found = scaling.box(measured(role_cpu_s={"learner": 5.0, "actor": 20.0}))
-    assert (found["env_steps_per_s"], found["iteration_s"], found["rollouts_per_iteration"]) == (100.0, 2.5, 2.0)
-    assert found["learner_idle_share"] == pytest.approx(0.4)  # 4 updates of 1.5 in 10 s
-    assert found["actor_idle_share"] == pytest.approx(0.2)  # 8 rounds of 2 s in 20 s of two actors
+    rows = [
+        {"env_steps": 250.0 * index, "actor/num_rollouts": float(num), "time/learn_s": learn_s, "time/play_s": play_s}
+        for index, (num, learn_s, play_s) in enumerate([(9, 9.0, 9.0), (2, 1.0, 1.0), (1, 2.0, 2.0), (3, 1.0, 4.0)])
+    ]
+    measured = Measured(rows, 10.0, {"learner": 5.0, "actor": 20.0})
+    assert (measured.sample.num_steps, measured.sample.cpu_s) == (750, 25.0)
+    found = scaling.box(measured, num_actors=2, num_worlds=10)
+    assert (found["env_steps_per_s"], found["iteration_s"], found["rollouts_per_iteration"]) == (75.0, 10.0 / 3, 2.0)
+    assert found["play_s"] == pytest.approx((2 * 1.0 + 2.0 + 3 * 4.0) / 6)  # weighted by rounds
+    assert found["learn_s"] == pytest.approx(4.0 / 3)
+    assert found["learner_idle_share"] == pytest.approx(0.6)  # 4 s of updates in 10 s
+    assert found["actor_idle_share"] == pytest.approx(0.2)  # 16 s of rounds in 20 s of two actors
     assert found["cores"] == {"actor": 2.0, "learner": 0.5}
-    assert found["cpu_s_per_iteration"] == {"actor": 5.0, "learner": 1.25}
+    assert found["cpu_s_per_iteration"]["learner"] == pytest.approx(5.0 / 3)
 
 
 # --- scaling ----------------------------------------------------------------------------------------------------------
