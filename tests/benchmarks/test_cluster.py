@@ -10,10 +10,9 @@ from benchmarks import processes, scaling
 from benchmarks.compare_commits import measure_commit, train
 from benchmarks.measuring import ROOT
 from benchmarks.report import __main__ as report
-from benchmarks.report.recipe import batches_block
 from benchmarks.training_process import Measured, Records, measure_training
 from service.base.errors import TandemError
-from service.config import dump_config, load_config
+from service.config import dump_config
 from service.store.models import ActorStatus, RunStatus
 from tests.runs.runs import tiny_config
 from tools import faults
@@ -179,30 +178,6 @@ def test_a_box_by_hand():
     assert found["actor_idle_share"] == pytest.approx(0.2)  # 16 s of rounds in 20 s of two actors
     assert found["cores"] == {"actor": 2.0, "learner": 0.5}
     assert found["cpu_s_per_iteration"]["learner"] == pytest.approx(5.0 / 3)
-
-
-# --- scaling ----------------------------------------------------------------------------------------------------------
-
-
-def test_sizes_of_updates_by_hand():
-    there = [
-        {"seed": seed, "reached": True, "at": {"iteration": num, "env_steps": 1e4 * num}}
-        for seed, num in enumerate((300, 500, 400))
-    ]
-    settings = {"recipe": load_config(None).model_dump(mode="json")}
-    studies = {
-        "few": {
-            "settings": settings | {"num_worlds": 10},
-            "runs": [there[0] | {"at": {"iteration": 1, "env_steps": 1e6}}],
-        },
-        "large": {"settings": settings | {"num_worlds": 40}, "runs": [{"seed": 1, "reached": False}]},
-        "recipe": {"settings": settings | {"num_worlds": 20}, "runs": [*there, {"seed": 3, "reached": False}]},
-    }
-    assert batches_block(studies).splitlines()[2:] == [
-        "| 10 | `few.json` | 1 of 1 | 1 M | 1 | 300 |",
-        "| 20 | `recipe.json` | 3 of 4 | 4.5 M | 450 | 450 |",
-        "| 40 | `large.json` | 0 of 1 |  |  | 500 |",
-    ]
 
 
 # --- the pages --------------------------------------------------------------------------------------------------------
