@@ -18,7 +18,6 @@ from benchmarks import (
     time_to_skill,
 )
 from benchmarks.measuring import Sample
-from benchmarks.report.__main__ import PAGES, Report, begin, end
 from benchmarks.report.figures import quantiles
 from service.actors.coverage import RandomPolicy, skill_trajectories, visited_share
 from service.base.errors import TandemError
@@ -374,27 +373,6 @@ def test_a_run_is_measured_from_its_snapshots_and_its_checkpoint(tmp_path, monke
     assert (measured["coverage"][0], measured["coverage"][run.num_env_steps]) == (first, newest)
     assert set(measured["coverage"]) == set(read_stages(RunDirectory(tmp_path)))
     assert newest != first
-
-
-# --- the page ---------------------------------------------------------------------------------------------------------
-
-
-def _documents(path):
-    """A directory of documents whose pages have blocks and no words."""
-    (path / "results" / "runs").mkdir(parents=True)
-    for page, names in PAGES.items():
-        (path / page).write_text("\n".join(f"## {name}\n\n{begin(name)}\n{end(name)}\n" for name in names))
-    return path
-
-
-def test_a_page_without_markers_is_left_alone(tmp_path):
-    docs = _documents(tmp_path)
-    page = docs / "results" / "pretraining.md"
-    page.write_text(page.read_text().replace(end("coverage"), ""))
-    before = {path: path.read_bytes() for path in docs.rglob("*.md")}
-    with pytest.raises(TandemError, match="no markers for coverage"):
-        Report(docs).write()
-    assert {path: path.read_bytes() for path in docs.rglob("*.*")} == before
 
 
 # --- two commits ------------------------------------------------------------------------------------------------------

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import argparse
 import json
-from collections import defaultdict
 from collections.abc import Callable, Collection, Mapping, Sequence
 from functools import partial
 from pathlib import Path
@@ -50,23 +49,6 @@ Results = Mapping[str, Mapping[str, Any]]
 """Recorded files by the name of their benchmark."""
 Blocks = dict[str, list[str]]
 """Parts of the text of each block."""
-MEASURED: Mapping[str, Mapping[str, Sequence[tuple[str, Callable[[Mapping[str, Any]], str]]]]] = {
-    "results/deployed.md": {"checks": [("deployed", measured.checks_words), ("deployed", measured.checks_table)]},
-    "robots.md": {
-        "robots": [
-            ("robots", measured.robots_table), ("robots", measured.robots_words), ("world_speed", measured.speed_words)
-        ]
-    },
-    "results/transfer.md": {
-        name: [(name, transfer.transfer_table), (name, transfer.transfer_words)]
-        for name in ("transfer", "transfer_champion")
-    },
-    "results/README.md": {
-        "throughput": [("env_throughput", measured.ratios_block)],
-        "mutation": [("mutation", measured.mutation_words), ("mutation", measured.mutation_table)],
-    },
-}  # fmt: skip
-"""What says a block of a page, each from the recorded file of that name."""
 _NOTHING = "Not recorded yet."
 
 
@@ -120,27 +102,23 @@ class Report:
         recorded_skills, controls = (list(read_all(self._results / name).values()) for name in ("skills", "controls"))
         for page, names in PAGES.items():  # what is wrong with a page is found before anything is drawn
             words = replace_blocks(self._docs / page, dict.fromkeys(names, ""))
-            if page in ABOUT_THE_RECIPE and RECIPE in studies:
+            if page in ABOUT_THE_RECIPE:
                 recipe.check_words(self._docs / page, words, studies[RECIPE])
-        made = {
-            page: {
-                block: [part(found[name]) for name, part in parts if name in found] for block, parts in blocks.items()
-            }
-            for page, blocks in MEASURED.items()
-        }
-        headline = {"headline": [comparison.headline_table(trials)] if trials else []}
-        made |= {
+        headline = {"headline": [comparison.headline_table(trials)]}
+        made = measured_blocks(found) | {
             "results/pretraining.md": self.pretraining_blocks(runs, found, studies),
             "results/skills.md": self.skills_blocks(recorded_skills, controls, runs),
             "results/comparison.md": self.comparison_blocks(trials, longer),
             "downstream.md": headline,
             "../README.md": headline,
-            "scaling.md": scaling_blocks(found, studies),
+            "scaling.md": {
+                "box": [scaling.box_block(found.get("scaling_box", found["scaling"]))],
+                "batches": [recipe.batches_block(studies), recipe.recipe_words(studies[RECIPE])],
+            },
         }
-        for page, names in PAGES.items():
-            blocks = made[page]
+        for page, blocks in made.items():
             path = self._docs / page
-            text = replace_blocks(path, {name: "\n\n".join(blocks.get(name, ())) for name in names})
+            text = replace_blocks(path, {name: "\n\n".join(blocks[name]) for name in PAGES[page]})
             with os_errors("write", path):
                 write_atomic(path, text.encode())
             self.files.append(path)
@@ -148,53 +126,57 @@ class Report:
 
     def pretraining_blocks(self, runs: Sequence[Run], found: Results, studies: Results) -> Blocks:
         """Parts of the blocks about pre-training."""
-        show, blocks = self.show, defaultdict[str, list[str]](list)
-        if RECIPE in studies:
-            blocks["skill"] = [recipe.recipe_words(studies[RECIPE]), time_to_skill.report(studies[RECIPE])]
-        if runs:
-            blocks["champion"] = [pretraining.champion_words(runs)]
-            blocks["tasks"] = [pretraining.tasks_table(runs)]
-            blocks["curves"] = [
+        show = self.show
+        counted = [run for run in runs if "curriculum" in run]  # older files have only a sample of the goals
+        covered = [run for run in runs if run.get("coverage")]
+        goals = [
+            show(f"Where the goals of {run['name']} were", f"pretraining-goals-{run['name']}", figures.draw_goals, run)
+            for run in runs
+        ]
+        coverage = [
+            show(
+                f"Random compositions of {run['name']}",
+                f"pretraining-coverage-{run['name']}",
+                figures.draw_coverage,
+                run,
+            )
+            for run in covered
+        ]
+        return {
+            "skill": [recipe.recipe_words(studies[RECIPE]), time_to_skill.report(studies[RECIPE])],
+            "champion": [pretraining.champion_words(runs)],
+            "tasks": [pretraining.tasks_table(runs)],
+            "curves": [
                 show("Over env steps", "pretraining", figures.draw_curves, runs),
                 show("Over wall-clock time", "pretraining-time", partial(figures.draw_curves, over_time=True), runs),
                 pretraining.training_table(runs),
-            ]
-        if counted := [run for run in runs if "curriculum" in run]:  # older files have only a sample of the goals
-            picture = show("The curriculum", "pretraining-curriculum", figures.draw_curriculum, counted)
-            blocks["curriculum"].append(picture)
-        for run in runs:
-            words, picture = f"Where the goals of {run['name']} were", f"pretraining-goals-{run['name']}"
-            blocks["curriculum"].append(show(words, picture, figures.draw_goals, run))
-        if covered := [run for run in runs if run.get("coverage")]:
-            blocks["coverage"].append(pretraining.coverage_table(covered))
-        for run in covered:
-            words, picture = f"Random compositions of {run['name']}", f"pretraining-coverage-{run['name']}"
-            blocks["coverage"].append(show(words, picture, figures.draw_coverage, run))
-        if "throughput" in found:
-            blocks["throughput"] = [pretraining.throughput_words(found["throughput"])]
-        return blocks
+            ],
+            "curriculum": [show("The curriculum", "pretraining-curriculum", figures.draw_curriculum, counted), *goals],
+            "coverage": [pretraining.coverage_table(covered), *coverage],
+            "throughput": [pretraining.throughput_words(found["throughput"])],
+        }
 
     def skills_blocks(self, runs: Sequence[Run], controls: Sequence[Run], pretrained: Sequence[Run]) -> Blocks:
         """Parts of the blocks about skills, and about controls of self-play."""
-        blocks = {}
-        if runs:
-            picture = self.show("Random skills at three stages of training", "skills", figures.draw_skills, runs)
-            blocks["coverage"] = [skills.coverage_table(runs), picture]
-        if learned := [run for run in runs if run["method"] != "ours"]:
-            picture = self.show("Skill discovery over env steps", "skills-curves", figures.draw_skill_curves, learned)
-            blocks["curves"] = [picture]
-        if controls:
-            blocks["controls"] = [skills.controls_table(controls), skills.alike_table([*pretrained, *controls])]
-        return blocks
+        stages = self.show("Random skills at three stages of training", "skills", figures.draw_skills, runs)
+        learned = [run for run in runs if run["method"] != "ours"]
+        curves = self.show("Skill discovery over env steps", "skills-curves", figures.draw_skill_curves, learned)
+        return {
+            "coverage": [skills.coverage_table(runs), stages],
+            "curves": [curves],
+            "controls": [skills.controls_table(controls), skills.alike_table([*pretrained, *controls])],
+        }
 
     def comparison_blocks(self, trials: Sequence[Result], longer: Sequence[Result]) -> Blocks:
         """Parts of the blocks that compare with the paper."""
-        blocks = {"missing": [comparison.missing_table(list(experiments(self._results)))]}
-        if trials:
-            blocks["rows"] = [comparison.comparison_table(trials)]
-            blocks["below"] = [comparison.distances_table(trials)]
-            blocks["harder"] = [comparison.harder_table(trials)]
-        if longer:
+        blocks = {
+            "rows": [comparison.comparison_table(trials)],
+            "longer": [],
+            "below": [comparison.distances_table(trials)],
+            "harder": [comparison.harder_table(trials)],
+            "missing": [comparison.missing_table(list(experiments(self._results)))],
+        }
+        if longer:  # none was recorded yet
             picture = self.show("Success over more env steps", "downstream-longer", draw_table, longer)
             blocks["longer"] = [comparison.longer_table(trials, longer), picture]
         return blocks
@@ -205,14 +187,22 @@ class Report:
         return f"![{words}]({name}.png)"
 
 
-def scaling_blocks(found: Results, studies: Results) -> Blocks:
-    """Parts of the blocks about scaling."""
-    blocks = {}
-    if (box := found.get("scaling_box", found.get("scaling"))) is not None:  # the newer one, where there is one
-        blocks["box"] = [scaling.box_block(box)]
-    if studies:
-        blocks["batches"] = [recipe.batches_block(studies), recipe.recipe_words(studies[RECIPE])]
-    return blocks
+def measured_blocks(found: Results) -> dict[str, Blocks]:
+    """Parts of the blocks that are of one recorded file each, by page."""
+    deployed, robots, mutants = found["deployed"], found["robots"], found["mutation"]
+    speed = measured.speed_words(found["world_speed"])
+    return {
+        "results/deployed.md": {"checks": [measured.checks_words(deployed), measured.checks_table(deployed)]},
+        "robots.md": {"robots": [measured.robots_table(robots), measured.robots_words(robots), speed]},
+        "results/transfer.md": {
+            name: [transfer.transfer_table(found[name]), transfer.transfer_words(found[name])]
+            for name in PAGES["results/transfer.md"]
+        },
+        "results/README.md": {
+            "throughput": [measured.ratios_block(found["env_throughput"])],
+            "mutation": [measured.mutation_words(mutants), measured.mutation_table(mutants)],
+        },
+    }
 
 
 @one_line_errors

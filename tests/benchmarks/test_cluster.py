@@ -9,7 +9,6 @@ import pytest
 from benchmarks import processes, scaling
 from benchmarks.compare_commits import measure_commit, train
 from benchmarks.measuring import ROOT
-from benchmarks.report import __main__ as report
 from benchmarks.training_process import Measured, Records, measure_training
 from service.base.errors import TandemError
 from service.config import dump_config
@@ -178,15 +177,3 @@ def test_a_box_by_hand():
     assert found["actor_idle_share"] == pytest.approx(0.2)  # 16 s of rounds in 20 s of two actors
     assert found["cores"] == {"actor": 2.0, "learner": 0.5}
     assert found["cpu_s_per_iteration"]["learner"] == pytest.approx(5.0 / 3)
-
-
-# --- the pages --------------------------------------------------------------------------------------------------------
-
-
-def test_what_is_not_recorded_is_said(tmp_path):
-    page = tmp_path / "page.md"
-    page.write_text(f"a {report.begin('box')} old {report.end('box')} b")
-    assert report.replace_blocks(page, {"box": ""}) == (
-        f"a {report.begin('box')}\n\nNot recorded yet.\n\n{report.end('box')} b"
-    )
-    assert report.scaling_blocks({}, {}) == {}

@@ -12,7 +12,7 @@ from PIL import Image
 
 import service
 from benchmarks.measuring import RECIPE_FILE
-from benchmarks.report.__main__ import ABOUT_THE_RECIPE, PAGES, Report
+from benchmarks.report.__main__ import ABOUT_THE_RECIPE, PAGES, Report, begin, end, replace_blocks
 from benchmarks.report.recipe import SHIPPED, check_words, differences, recipe_words
 from service.base.errors import TandemError
 from service.config import load_config
@@ -60,6 +60,14 @@ def test_the_committed_pictures_show_what_the_recorded_files_give(made):
         assert ours.shape == theirs.shape, picture.name
         # another version of the fonts may move the edges of letters
         assert np.mean(np.abs(ours - theirs).max(axis=2) > 64) < 0.005, picture.name
+
+
+def test_blocks_are_replaced_between_their_markers(tmp_path):
+    page = tmp_path / "page.md"
+    page.write_text(f"a {begin('box')} old {end('box')} b")
+    assert replace_blocks(page, {"box": ""}) == f"a {begin('box')}\n\nNot recorded yet.\n\n{end('box')} b"
+    with pytest.raises(TandemError, match="no markers for chaos"):
+        replace_blocks(page, {"box": "new", "chaos": "text"})
 
 
 # --- words by hand ----------------------------------------------------------------------------------------------------
