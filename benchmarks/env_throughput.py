@@ -11,10 +11,7 @@ is the physics of pre-training, half as many steps of 4 ms; panda-gym is not com
 
 from __future__ import annotations
 
-import os
-import sys
-from collections.abc import Iterator, Mapping
-from contextlib import ExitStack, contextmanager
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -139,12 +136,11 @@ def contenders(num_worlds: int) -> dict[str, BatchContender | GymnasiumContender
 
 def panda_gym(name: str, *, grasping: bool = False) -> GymnasiumContender:
     """An environment of panda-gym."""
-    with _silent_stdout():  # PyBullet prints its arguments
-        try:
-            import panda_gym  # noqa: F401 - registers its environments
-        except ImportError as error:
-            raise TandemError(f"panda-gym cannot be imported ({error}): run `make bench`, which installs it") from None
-        return GymnasiumContender(name, grasping=grasping)
+    try:
+        import panda_gym  # noqa: F401 - registers its environments
+    except ImportError as error:
+        raise TandemError(f"panda-gym cannot be imported ({error}): run `make bench`, which installs it") from None
+    return GymnasiumContender(name, grasping=grasping)
 
 
 def benchmark(settings: Settings) -> dict[str, Any]:
@@ -164,18 +160,6 @@ def measure_rows(rows: Mapping[str, BatchContender | GymnasiumContender], settin
         if {ours, theirs} <= samples.keys()
     }
     return {"rows": {name: rates(each) for name, each in samples.items()}, "ratios": ratios}
-
-
-@contextmanager
-def _silent_stdout() -> Iterator[None]:
-    sys.stdout.flush()
-    with ExitStack() as stack:
-        kept, nothing = os.dup(1), os.open(os.devnull, os.O_WRONLY)
-        stack.callback(os.close, kept)
-        stack.callback(os.close, nothing)
-        stack.callback(os.dup2, kept, 1)
-        os.dup2(nothing, 1)
-        yield
 
 
 def report(result: dict[str, Any]) -> str:

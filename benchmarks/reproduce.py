@@ -15,7 +15,7 @@ import os
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -50,8 +50,8 @@ class Experiment:
     part: str
     """What it is in its group, besides its seed."""
     seed: int
-    commands: Callable[[], Sequence[Command]]
-    """What to run, in this order, which may depend on what is there already."""
+    commands: Sequence[Command]
+    """What to run, in this order."""
     needs: Path | None = None
     """It can be run if this is there."""
 
@@ -98,23 +98,23 @@ def _table(
     """A trial with primitives or skills of the recorded registry."""
     name, file = f"{directory}/{task}-{method}-{seed}", out / directory / f"{task}-{method}-{seed}.json"
     command = _python(
-        *("-m", "benchmarks.trials", task, method, str(seed), "--primitives", reference, "--out", str(file)),
+        *("benchmarks.trials", task, method, str(seed), "--primitives", reference, "--out", str(file)),
         *("--registry", str(out / "primitives"), "--runs", str(RUNS / directory)),
         *("--set", "run.num_threads=1", *extra),
     )
     versions = out / "primitives" / "models" / reference.partition("@")[0]
     group, part = (METHODS[method].title, task) if task in TASKS else (find_task(task).title, method)
-    return Experiment(name, file, group, part, seed, lambda: [command], versions)
+    return Experiment(name, file, group, part, seed, (command,), versions)
 
 
 def _control(out: Path, name: str, seed: int) -> Experiment:
     out /= "controls"
     command = _python(
-        *("-m", "benchmarks.controls", name, "--seed", str(seed)),
+        *("benchmarks.controls", name, "--seed", str(seed)),
         *("--run-dir", str(RUNS / "controls"), "--out", str(out), "--set", "run.num_threads=1"),
     )
     file = out / f"{name}-{seed}.json"
-    return Experiment(f"controls/{name}-{seed}", file, "controls of self-play", name, seed, lambda: [command])
+    return Experiment(f"controls/{name}-{seed}", file, "controls of self-play", name, seed, (command,))
 
 
 def _skills(out: Path, seed: int) -> Iterator[Experiment]:
@@ -136,25 +136,17 @@ def _skills_name(method: str, seed: int) -> str:
 
 def _discover(out: Path, method: str, seed: int) -> Experiment:
     run, file = RUNS / f"{method}-{seed}", out / "skills" / f"{method}-{seed}.json"
-    train = _tandem(
-        *("train", f"panda-cube-{method}", "--run-dir", str(run)),
+    train = _python(
+        *("service", "train", f"panda-cube-{method}", "--run-dir", str(run), "--resume", "auto"),
         *("--registry", str(out / "primitives"), "--set", f"name={_skills_name(method, seed)}"),
         *("--set", f"seed={seed}", "--set", f"run.total_env_steps={SKILL_ENV_STEPS}", "--set", "run.num_threads=1"),
     )
-    record = _python("-m", "benchmarks.record_run", str(run), "--skills", "--out", str(file))
-
-    def commands() -> Sequence[Command]:
-        return [(*train, "--resume") if run.exists() else train, record]
-
-    return Experiment(f"skills/{method}-{seed}", file, "skill discovery", method, seed, commands)
+    record = _python("benchmarks.record_run", str(run), "--skills", "--out", str(file))
+    return Experiment(f"skills/{method}-{seed}", file, "skill discovery", method, seed, (train, record))
 
 
 def _python(*arguments: str) -> Command:
-    return (sys.executable, *arguments)
-
-
-def _tandem(*arguments: str) -> Command:
-    return _python("-m", "service", *arguments)
+    return (sys.executable, "-m", *arguments)
 
 
 def run_all(waiting: Sequence[Experiment], parallel: int, logs: Path) -> list[str]:
@@ -178,7 +170,7 @@ def _run_one(experiment: Experiment, logs: Path) -> None:
     started = time.monotonic()
     print(f"{experiment.name} ...", flush=True)
     with (logs / f"{experiment.name.replace('/', '-')}.log").open("ab") as log:
-        code = _run(experiment.commands(), log.fileno())
+        code = _run(experiment.commands, log.fileno())
     print(f"{experiment.name}: exit code {code}, {(time.monotonic() - started) / 60:.1f} min", flush=True)
 
 
@@ -203,7 +195,7 @@ def main() -> int:
     if given.list:
         for experiment in missing:
             print(experiment.name)
-            for command in experiment.commands():
+            for command in experiment.commands:
                 print("   ", *command)
         return 0
     failed = run_all(missing, given.parallel, RUNS / "logs")

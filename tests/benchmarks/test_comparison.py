@@ -28,7 +28,7 @@ def test_what_is_missing_by_hand(tmp_path):
         file = tmp_path / f"{part}-{seed}.json"
         if done:
             file.touch()
-        return Experiment(file.stem, file, group, part, seed, lambda: [])
+        return Experiment(file.stem, file, group, part, seed, [])
 
     some = [planned("ours", "box", 0, done=True), planned("controls", "uniform", 0, done=False)]
     some += [planned("ours", part, seed, done=False) for seed in (1, 2) for part in ("box", "wall", "push")]

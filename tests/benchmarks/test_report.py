@@ -80,9 +80,8 @@ def study_of(recipe):
     return STUDY | {"settings": STUDY["settings"] | {"recipe": recipe}}
 
 
-@pytest.mark.parametrize("page", ABOUT_THE_RECIPE)
-def test_a_page_that_says_the_shipped_recipe_is_not_made_where_another_one_was_recorded(tmp_path, page):
-    docs = tmp_path / "docs"
+def test_a_page_that_says_the_shipped_recipe_is_not_made_where_another_one_was_recorded(tmp_path):
+    docs, page = tmp_path / "docs", ABOUT_THE_RECIPE[-1]
     shutil.copytree(DOCS, docs, ignore=shutil.ignore_patterns("*.png", "primitives"))
     shutil.copy(DOCS.parent / "README.md", tmp_path)
     recorded = docs / "results" / "time_to_skill" / "recipe.json"

@@ -27,7 +27,7 @@ def test_every_command_is_accepted_by_its_program(tmp_path):
     """Commands are parsed, and the configurations that they stand for are made."""
     main = typer.main.get_command(app)
     for each in experiments(tmp_path):
-        for _, _, module, *words in each.commands():
+        for _, _, module, *words in each.commands:
             if module == "benchmarks.trials":
                 task, method, seed = words[:3]
                 settings = [value for option, value in pairwise(words) if option == "--set"]
@@ -43,7 +43,7 @@ def test_every_command_is_accepted_by_its_program(tmp_path):
 def making(tmp_path, name, *, needs=None, code=0):
     """An experiment that writes its name, unless it fails."""
     program = f"import pathlib, sys; {code} or pathlib.Path({str(tmp_path / name)!r}).touch(); sys.exit({code})"
-    return Experiment(name, tmp_path / name, "", name, 0, lambda: [(sys.executable, "-c", program)], needs)
+    return Experiment(name, tmp_path / name, "", name, 0, [(sys.executable, "-c", program)], needs)
 
 
 def test_one_waits_for_what_it_needs_and_failures_are_named(tmp_path):
