@@ -53,13 +53,14 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     if missing := [each for each in SLOW if not (TESTS / each).exists()]:
         raise pytest.UsageError(f"tests/conftest.py names slow tests that are not there: {', '.join(missing)}")
 
-    def place(item: pytest.Item) -> int:
-        return next((index for index, each in enumerate(SLOW) if item.path.is_relative_to(TESTS / each)), len(SLOW))
+    @functools.cache
+    def place(path: Path) -> int:
+        return next((index for index, each in enumerate(SLOW) if path.is_relative_to(TESTS / each)), len(SLOW))
 
     for item in items:
-        if place(item) < len(SLOW):
+        if place(item.path) < len(SLOW):
             item.add_marker("slow")
-    items.sort(key=place)
+    items.sort(key=lambda item: place(item.path))
 
 
 def pytest_collection_finish() -> None:
