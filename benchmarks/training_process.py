@@ -16,7 +16,7 @@ import sys
 import time
 import urllib.request
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from http.client import HTTPException
 from pathlib import Path
@@ -154,7 +154,8 @@ class Training:
                 self._process.kill()
                 self._process.wait()
             for left in psutil.wait_procs(below, LEFT_S)[1]:
-                left.kill()
+                with suppress(psutil.NoSuchProcess):
+                    left.kill()
 
     def last_words(self) -> str:
         """The last line of its log."""

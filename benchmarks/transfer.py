@@ -151,7 +151,8 @@ def calibrate_row(row: Row, settings: Settings) -> Calibration:
     backend = connect(_backend(row), world)
     try:
         assert backend.simulator is not None
-        backend.simulator.reset(_out_of_the_way(world.workspace.upper_m, world.rest_height_m))
+        x, y, _ = world.workspace.upper_m  # out of the way
+        backend.simulator.reset(np.array([x, y, world.rest_height_m]))
         return calibrate(row.backend, backend.robot, world, bridge_config(settings))
     finally:
         backend.close()
@@ -251,10 +252,6 @@ def _steps_inside(path: StateArray, gap_s: float, num_ticks: int) -> BoolArray:
 
 def _backend(row: Row) -> BackendConfig:
     return BackendConfig(backend=row.backend, parameters=dict(row.parameters), disturbance=row.disturbance)
-
-
-def _out_of_the_way(upper_m: Sequence[float], height_m: float) -> StateArray:
-    return np.array([upper_m[0], upper_m[1], height_m])
 
 
 def summarise(played: Sequence[Played]) -> dict[str, Any]:
